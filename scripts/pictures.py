@@ -40,7 +40,7 @@ from vla_zenoh.lab.recording.reader import open_recording
 from vla_zenoh.lab.recording.run import load_run
 from vla_zenoh.lab.view.paths import TIMELINE
 from vla_zenoh.lab.view.rerun_logger import APPLICATION, RerunLogger
-from vla_zenoh.lab.view.viewer import open_headless
+from vla_zenoh.lab.view.viewer import open_window
 from vla_zenoh.profile import read_profile
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -88,7 +88,7 @@ SETTLED_S = 15.0
 def picture_view(run: Path, at_s: float, out: Path) -> None:
     """Rerun's window with `run`, `at_s` after the first activation."""
     file = open_recording(run)
-    viewer = open_headless(*VIEW_PX)
+    viewer = open_window("--headless", "--window-size", "{}x{}".format(*VIEW_PX))
     try:
         stream = rr.RecordingStream(APPLICATION)
         stream.connect_grpc(viewer.data_url)

@@ -277,7 +277,8 @@ def test_a_router_that_runs_already_is_used_and_left_running(tmp_path: Path) -> 
 def test_with_json_every_line_is_an_object_that_says_when_and_which_node(tmp_path: Path) -> None:
     path = write_profile(tmp_path, more="hosts: {here: {nodes: [router]}}\n")
     with up(str(path), "--json", "--log-dir", str(tmp_path)) as running:
-        until("the router", lambda: "ready: router" in running.text, READY_PATIENCE_S)
+        until("the router", lambda: "routing, small" in running.text, READY_PATIENCE_S)
+        until("all is told", lambda: "watch: " in running.text, READY_PATIENCE_S)
         running.end(signal.SIGTERM)
         running.thread.join(5.0)
     told = [json.loads(line) for line in running.lines]

@@ -10,6 +10,7 @@ from arm_rig import activate
 from panda_arm import ARM_JOINTS, HOME_RAD, panda
 
 from vla_zenoh.control.reachability import make_reachability_filter
+from vla_zenoh.kinematics.ik import pose_error
 from vla_zenoh.lab.lockstep import Lockstep
 from vla_zenoh.policy import (
     ActionSpec,
@@ -79,7 +80,6 @@ class Arm:
         self.loop.put("rate", 5.0)
         self.loop.run(1.1)
         activate(self.loop)
-        self.error_rad: list[float] = []
 
     def follow(self, path: Path, duration_s: float) -> FloatArray:
         """Follow `path`, then rest; the joints reached."""
@@ -96,8 +96,6 @@ def swivelled(swivel: float) -> FloatArray:
     """Joints with the TCP of home, and the elbow turned about it by a motion of the null space."""
     kinematics, joints = panda(), HOME_RAD.copy()
     home = kinematics.forward(HOME_RAD)
-    from vla_zenoh.kinematics.ik import pose_error
-
     for _ in range(400):
         pose, jacobian = kinematics.pose_and_jacobian(joints)
         _, _, rows = np.linalg.svd(jacobian)
@@ -115,7 +113,6 @@ def test_an_elbow_swivels_with_the_tcp_at_rest() -> None:
 
 
 def test_joints_go_through_a_wrist_singularity() -> None:
-    # With joint 6 at zero... the wrist of a Panda is singular; its range ends just before.
     arm = Arm()
     start_rad = HOME_RAD + [0, 0, 0, 0, 0.5, -0.6, 0]
     goal_rad = HOME_RAD + [0, 0, 0, 0, -0.5, -0.6, 0]
@@ -128,12 +125,14 @@ def test_joints_go_through_a_wrist_singularity() -> None:
 def test_random_smooth_motions_end_where_they_were_asked_to(seed: int) -> None:
     rng, arm, here_rad = np.random.default_rng(seed), Arm(), HOME_RAD
     kinematics = panda()
-    box = np.array([PROFILE.limits.workspace.x_m, PROFILE.limits.workspace.y_m, PROFILE.limits.workspace.z_m])
+    box = np.array(
+        [PROFILE.limits.workspace.x_m, PROFILE.limits.workspace.y_m, PROFILE.limits.workspace.z_m]
+    )
     errors = []
     while len(errors) < 5:
         goal_rad = HOME_RAD + rng.uniform(-0.4, 0.4, 7)
         place = kinematics.forward(goal_rad).position_m
-        if (place < box[:, 0] + 0.03).any() or (place > box[:, 1] - 0.03).any() or place[2] < 0.1:
+        if (place < low + [0.03, 0.03, 0.1]).any() or (place > high - 0.03).any():
             continue
         reached = arm.follow(eased(here_rad, goal_rad, 2.5), 2.5)
         errors.append(float(np.abs(reached - goal_rad).max()))

@@ -82,10 +82,9 @@ def test_a_mailbox_keeps_the_newest_in_order_and_no_more_than_it_holds() -> None
         open_session(profile) as writer,
     ):
         box = ZenohRing(3)
-        subscriber = reader.declare_subscriber("test/box", box.channel())
-        box.receive_from(subscriber.try_recv)
+        _subscriber = box.subscribe(reader, "test/box")
         await_match(writer, "test/box")
-        last = reader.declare_subscriber("test/end", ZenohRing(1).channel())
+        last = reader.declare_subscriber("test/end", zenoh.handlers.RingChannel(1))
         await_match(writer, "test/end")
         for number in range(10):
             writer.put("test/box", str(number))
@@ -182,8 +181,7 @@ def test_zenoh_itself_passes_over_what_nobody_could_read() -> None:
         open_session(profile) as writer,
     ):
         box = ZenohRing(4, MAX_MESSAGE_BYTES)
-        subscriber = reader.declare_subscriber("test/box", box.channel())
-        box.receive_from(subscriber.try_recv)
+        _subscriber = box.subscribe(reader, "test/box")
         await_match(writer, "test/box")
         writer.put("test/box", bytes(MAX_MESSAGE_BYTES + 1))
         writer.put("test/box", b"after")

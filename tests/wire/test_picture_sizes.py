@@ -14,6 +14,7 @@ import pytest
 import zenoh
 from camera_rig import Rig, camera_rig, free_endpoint, grey, until
 
+from vla_zenoh.bus.buffers import header_of
 from vla_zenoh.bus.node import Node, Publisher
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec.image import decode_jpeg, encode_jpeg
@@ -179,7 +180,7 @@ def test_plain_pictures_are_taken_while_none_come_in_the_own_size_and_no_longer(
             heard = ears.pop()
             if heard is None:
                 return False
-            header = worker.header(heard.arrival)
+            header = header_of(heard.arrival.sample)
             heard.writer.check(header, heard.arrival.mono_ns)
             heard.writer.accept(header, heard.arrival.mono_ns)
             return str(heard.arrival.sample.key_expr) == stream.key

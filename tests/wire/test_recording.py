@@ -125,14 +125,6 @@ def test_its_evaluation_tells_what_the_arm_did(run_file: Path) -> None:
     assert len(found.views) == 3 + len(seen)
 
 
-def test_the_first_requests_alone_can_be_evaluated(run_file: Path) -> None:
-    found = evaluate_run(run_file, 3)
-    assert found.requests == 3
-    assert len(found.stages_ms["end_to_end"]) <= 3
-    assert found.path_m is not None
-    assert found.path_m < evaluate_run(run_file).path_m  # pyright: ignore
-
-
 # -- replay ---------------------------------------------------------------------------------------
 def moved_equally(one: Run, other: Run, kind: str) -> None:
     """Every record of the one is in the other, later by one and the same time."""

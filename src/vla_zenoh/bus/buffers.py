@@ -11,7 +11,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import zenoh
 
@@ -48,27 +48,14 @@ def check_size(sample: zenoh.Sample, limit: int) -> None:
         raise CodecError("oversize", f"{size} bytes, at most {limit} are accepted")
 
 
-def payload_and_attachment(sample: zenoh.Sample, limit: int) -> tuple[bytes, bytes | None]:
-    """Payload and attachment of a sample.
-
-    Raises:
-        CodecError: see `check_size`.
-    """
-    check_size(sample, limit)
-    attachment = sample.attachment
-    return sample.payload.to_bytes(), attachment.to_bytes() if attachment is not None else None
-
-
 def header_of(sample: zenoh.Sample) -> Header:
     """Header of a sample.
 
     Raises:
         CodecError: there is none that can be decoded.
     """
-    attachment = sample.attachment
-    if attachment is None:
-        return records.decode_header(None)
-    return records.decode_header(bytes_of(attachment, records.MAX_HEADER_BYTES))
+    given = bytes_of(sample.attachment, records.MAX_HEADER_BYTES)
+    return records.decode_header(None if sample.attachment is None else given)
 
 
 class ReceivedSample(NamedTuple):
@@ -111,6 +98,14 @@ class SampleBuffer:
     def __init__(self, limit: int) -> None:
         self._limit = limit
         self._rejected: dict[str, RejectedSample] = {}
+
+    def __call__(self, sample: zenoh.Sample) -> None:
+        """Keep a sample; runs on Zenoh's thread."""
+        raise NotImplementedError
+
+    def subscribe(self, session: zenoh.Session, key: str) -> zenoh.Subscriber[Any]:
+        """A subscriber whose samples go here; the caller undeclares it."""
+        return session.declare_subscriber(key, zenoh.handlers.Callback(self, indirect=False))
 
     def _accepts(self, sample: zenoh.Sample) -> bool:
         try:
@@ -218,13 +213,10 @@ class ZenohRing(SampleBuffer):
         self._size = size
         self._receive: Callable[[], zenoh.Sample | None] = lambda: None
 
-    def channel(self) -> zenoh.handlers.RingChannel[zenoh.Sample]:
-        """Handler to declare a subscriber with."""
-        return zenoh.handlers.RingChannel(self._size)
-
-    def receive_from(self, receive: Callable[[], zenoh.Sample | None]) -> None:
-        """Set the function that receives one sample, or None if there is none."""
-        self._receive = receive
+    def subscribe(self, session: zenoh.Session, key: str) -> zenoh.Subscriber[Any]:
+        subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(self._size))
+        self._receive = subscriber.try_recv
+        return subscriber
 
     def drain(self) -> list[ReceivedSample]:
         """At most `size` samples, oldest first, however fast they come."""

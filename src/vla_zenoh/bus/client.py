@@ -71,15 +71,12 @@ class Client:
     def subscribe(self) -> Client:
         """Subscribe to status, events, liveliness and the task; returns the client."""
         liveliness = self.session.liveliness()
+        on_alive = zenoh.handlers.Callback(self._on_alive, indirect=False)
         self._subscriptions += [
             self._subscribe(self.keys.all_status, self._on_status),
             self._subscribe(self.keys.all_events, self._on_event),
             self._subscribe(self.keys.task, self._on_task),
-            liveliness.declare_subscriber(
-                self.keys.all_alive,
-                zenoh.handlers.Callback(self._on_alive, indirect=False),
-                history=True,
-            ),
+            liveliness.declare_subscriber(self.keys.all_alive, on_alive, history=True),
         ]
         return self
 
@@ -100,9 +97,8 @@ class Client:
     def _on_status(self, sample: zenoh.Sample) -> None:
         found = self._decode(NodeStatus, sample, MAX_STATUS_BYTES)
         if found is not None:
-            self._nodes.status_received(
-                last_chunk(str(sample.key_expr)), found[1], len(sample.payload)
-            )
+            name = last_chunk(str(sample.key_expr))
+            self._nodes.status_received(name, found[1], len(sample.payload))
 
     def _on_event(self, sample: zenoh.Sample) -> None:
         found = self._decode(Event, sample, MAX_EVENT_BYTES)
@@ -196,14 +192,12 @@ class Client:
         Raises:
             CodecError: it is not allowed.
         """
+
+        def taken(task: Task) -> bool:
+            return math.isclose(task.rate_hz, rate_hz, rel_tol=1e-5)
+
         settings.decode_rate(f"{rate_hz:g}".encode())
-        return self._set(
-            self.keys.rate,
-            f"{rate_hz:g}",
-            lambda task: math.isclose(task.rate_hz, rate_hz, rel_tol=1e-5),
-            "rate",
-            timeout_s,
-        )
+        return self._set(self.keys.rate, f"{rate_hz:g}", taken, "rate", timeout_s)
 
     def set_speed(self, percent: float, timeout_s: float = 2.0) -> Task:
         """Set the speed override, 0 to 100 percent of the planned speed, as `set_prompt`."""
@@ -255,10 +249,8 @@ class Client:
         self.release_deadman()
         holder = f"{what}-{secrets.token_hex(4)}"
         self._token = self.session.liveliness().declare_token(self.keys.holding(holder))
-        text, give_up_s = (
-            encode_deadman_activation(holder).decode(),
-            time.monotonic() + HOLD_PATIENCE_S,
-        )
+        text = encode_deadman_activation(holder).decode()
+        give_up_s = time.monotonic() + HOLD_PATIENCE_S
         while True:
             try:
                 return self._activate(text, timeout_s)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Any, Protocol
 
 import zenoh
@@ -88,15 +88,6 @@ class Sender(Protocol):
     def sent_bytes(self) -> int: ...
 
 
-@dataclass(slots=True)
-class _Source:
-    """A source on a key: its first sequence number and our count then, and losses since."""
-
-    seq: int
-    arrivals: int
-    lost: int = 0
-
-
 class Traffic:
     """Rates of published records, from one status to the next, and records that were lost.
 
@@ -108,8 +99,9 @@ class Traffic:
         self._sessions = [session]
         self._reported_s = time.monotonic()
         self._sent: dict[str, tuple[int, int]] = {}
-        self._received: dict[tuple[str, str], _Source] = {}  # the one received last comes last
-        self._lost_before: Counter[str] = Counter()
+        # (key, source) -> its first seq, our count then, losses since; the newest comes last
+        self._received: dict[tuple[str, str], tuple[int, int, int]] = {}
+        self._lost: Counter[str] = Counter()
         self._links: list[str] = []
         self._links_s = -1e9
 
@@ -131,18 +123,14 @@ class Traffic:
         if arrivals == 0:
             return
         who = (key, header.source)
-        known = self._received.pop(who, None) or _Source(header.seq, arrivals)
-        missing = (header.seq - known.seq) - (arrivals - known.arrivals)
-        known.lost = max(missing, known.lost)
-        self._received[who] = known
+        seq, count, before = self._received.pop(who, (header.seq, arrivals, 0))
+        lost = max((header.seq - seq) - (arrivals - count), before)
+        self._received[who] = (seq, count, lost)
+        if lost > before:
+            full = key not in self._lost and len(self._lost) >= MAX_SENDERS
+            self._lost[OTHERS if full else key] += lost - before
         if len(self._received) > MAX_SENDERS:
-            self._forget(next(iter(self._received)))
-
-    def _forget(self, who: tuple[str, str]) -> None:
-        key, lost = who[0], self._received.pop(who).lost
-        if lost:
-            full = key not in self._lost_before and len(self._lost_before) >= MAX_SENDERS
-            self._lost_before[OTHERS if full else key] += lost
+            del self._received[next(iter(self._received))]
 
     def sent(self, streams: Iterable[Sender]) -> dict[str, list[float]]:
         """Key -> records and bytes per second since the last call, of keys with traffic."""
@@ -161,10 +149,7 @@ class Traffic:
 
     def lost(self) -> dict[str, int]:
         """Key -> records that never arrived here."""
-        out = Counter(self._lost_before)
-        for (key, _), heard in list(self._received.items()):  # other threads may add to it
-            out[key] += heard.lost
-        return {key: count for key, count in out.items() if count}
+        return dict(self._lost)
 
     def links(self) -> list[str]:
         """Endpoints this node is connected to, as Zenoh writes them."""
@@ -173,10 +158,6 @@ class Traffic:
             found = {str(link.dst) for one in self._sessions for link in one.info.links()}
             self._links = sorted(found)[:MAX_LINKS]
         return self._links
-
-    def detail(self, streams: Iterable[Sender]) -> Mapping[str, Any]:
-        """Traffic for the status: sent, lost, links."""
-        return {"sent": self.sent(streams), "lost": self.lost(), "links": self.links()}
 
 
 PERIOD_S = 0.25

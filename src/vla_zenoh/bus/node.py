@@ -11,15 +11,7 @@ from typing import Any, TypeVar
 
 import zenoh
 
-from vla_zenoh.bus.buffers import (
-    CallbackRing,
-    LatestSample,
-    ReceivedSample,
-    SampleBuffer,
-    ZenohRing,
-    bytes_of,
-    header_of,
-)
+from vla_zenoh.bus.buffers import ReceivedSample, SampleBuffer, bytes_of, header_of
 from vla_zenoh.bus.clock import Clock, own_host_id
 from vla_zenoh.bus.clock_sync import ClockSync, reply_with_stamps
 from vla_zenoh.bus.metrics import EventThrottle, Traffic
@@ -36,7 +28,7 @@ STATUS_PERIOD_S = 0.5
 IMAGE_LINK_TIMEOUT_S = 10.0
 
 Record = TypeVar("Record")
-AnyBuffer = TypeVar("AnyBuffer", LatestSample, CallbackRing, ZenohRing)
+AnyBuffer = TypeVar("AnyBuffer", bound=SampleBuffer)
 
 
 class Publisher:
@@ -191,11 +183,7 @@ class Node:
         self._status_s, self._last_state = time.monotonic(), state
         self._status.publish(
             NodeStatus(
-                self.name,
-                state,
-                self.host_id.host,
-                os.getpid(),
-                self.started_wall_ns,
+                *(self.name, state, self.host_id.host, os.getpid(), self.started_wall_ns),
                 ages_s or {},
                 rates_hz or {},
                 latency_ms or {},
@@ -214,11 +202,11 @@ class Node:
         return due or state != self._last_state
 
     def _traffic_detail(self) -> dict[str, Any]:
+        short, traffic = self.keys.short, self.traffic
         return {
-            name: {self.keys.short(key): value for key, value in part.items()}
-            if isinstance(part, Mapping)
-            else part
-            for name, part in self.traffic.detail(self._publishers).items()
+            "sent": {short(key): rates for key, rates in traffic.sent(self._publishers).items()},
+            "lost": {short(key): count for key, count in traffic.lost().items()},
+            "links": traffic.links(),
         }
 
     def _clock_detail(self) -> dict[str, dict[str, float]]:
@@ -245,15 +233,8 @@ class Node:
         Raises:
             SessionError: the router does not answer at the port for images.
         """
-        session = self._session_for(kind)
         self.watch_buffer(buffer)
-        if isinstance(buffer, ZenohRing):
-            subscriber = session.declare_subscriber(key, buffer.channel())
-            buffer.receive_from(subscriber.try_recv)
-        else:
-            handler = zenoh.handlers.Callback(buffer, indirect=False)
-            subscriber = session.declare_subscriber(key, handler)
-        self._subscribers.append((buffer, subscriber))
+        self._subscribers.append((buffer, buffer.subscribe(self._session_for(kind), key)))
         return buffer
 
     def unsubscribe(self, buffer: SampleBuffer) -> None:
@@ -276,12 +257,11 @@ class Node:
                 self.counters[f"refused.{found.reason}"] += found.times - 1
                 self.reject(found.reason, f"{key}: {found.why}", key)
 
-    def on_alive(self, callback: Callable[[str, bool], None]) -> None:
-        """Call back with (node, alive) now and at every change, on Zenoh's thread."""
-        self.on_tokens(self.keys.all_alive, callback)
-
     def on_tokens(self, expression: str, callback: Callable[[str, bool], None]) -> None:
-        """Call back with (last part of the key, alive) for every liveliness token."""
+        """Call back with (last part of the key, alive) for every liveliness token.
+
+        Now and at every change, on Zenoh's thread.
+        """
 
         def change(sample: zenoh.Sample) -> None:
             callback(last_chunk(str(sample.key_expr)), sample.kind == zenoh.SampleKind.PUT)
@@ -331,7 +311,7 @@ class Node:
         """
         key = str(arrival.sample.key_expr)
         try:
-            header = header or self.header(arrival)
+            header = header or header_of(arrival.sample)
             if writer_filter is not None:  # first: a flood by another source must cost little
                 writer_filter.check(header, arrival.mono_ns)
             record = records.decode(kind, bytes_of(arrival.sample.payload))
@@ -343,15 +323,6 @@ class Node:
             writer_filter.accept(header, arrival.mono_ns)
         self.traffic.received(key, header, arrival.nth)
         return Stamped(here, record, self.arrival_wall_ns(arrival))
-
-    @staticmethod
-    def header(arrival: ReceivedSample) -> Header:
-        """Header of a sample.
-
-        Raises:
-            CodecError: there is none that can be decoded.
-        """
-        return header_of(arrival.sample)
 
     def decode_text(
         self, decode: Callable[[bytes], Record], arrival: ReceivedSample

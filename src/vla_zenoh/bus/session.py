@@ -154,12 +154,7 @@ def open_session(
     """Open a session of a profile.
 
     Args:
-        profile: the session section.
-        mode: of the session.
-        connect: overrides the profile's endpoints; of a router: other routers.
-        identity: node whose certificate is used; None: the operator at this computer.
-        access: section ``access_control`` of a router.
-        images: use the separate link for images, see ``separate_links``.
+        profile: the session section; what follows it is explained at `session_config`.
         wait_s: retry for this long.
         stop: gives up as soon as it is set.
 
@@ -168,12 +163,7 @@ def open_session(
         SessionError: no router answers, or the address is in use; says what to do.
     """
     settings = session_config(
-        profile,
-        mode=mode,
-        connect=connect,
-        identity=identity,
-        access=access,
-        images=images,
+        profile, mode=mode, connect=connect, identity=identity, access=access, images=images
     )
     give_up = time.monotonic() + wait_s
     stop = stop or threading.Event()

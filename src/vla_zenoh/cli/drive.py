@@ -56,11 +56,8 @@ def prompt(
     decode_text(text.encode())  # rejects it before a router is asked
     with target.operator("prompt", text) as client:
         task = client.set_prompt(text)
-        _show(
-            target,
-            client,
-            f"prompt: {task.prompt!r} (worker {task.worker}, {task.rate_hz:g} Hz)",
-        )
+        text = f"prompt: {task.prompt!r} (worker {task.worker}, {task.rate_hz:g} Hz)"
+        _show(target, client, text)
 
 
 @_answered
@@ -74,14 +71,14 @@ def activate(
 ) -> None:
     """Let the worker move the arm. Rejected with every reason while something is not ready."""
     with target.operator("activate") as client:
-        stop = _stop_on_signals() if held else None
+        stop = None
+        if held:
+            from vla_zenoh.runtime.process import stop_on_signals
+
+            stop = stop_on_signals()
         task = client.activate() if stop is None else client.activate_with_deadman("person")
-        _show(
-            target,
-            client,
-            f"{_mode(client)} | active: worker {task.worker}, prompt {task.prompt!r}, "
-            f"{task.rate_hz:g} Hz",
-        )
+        what = f"worker {task.worker}, prompt {task.prompt!r}, {task.rate_hz:g} Hz"
+        _show(target, client, f"{_mode(client)} | active: {what}")
         if stop is not None:
             _hold(target, client, task, stop)
 
@@ -92,12 +89,6 @@ def _mode(client: Client) -> str:
 
     client.wait_for(lambda: client.status("command"), MODE_PATIENCE_S)
     return MODE_WORDS[mode_of(client.snapshot())][0]
-
-
-def _stop_on_signals() -> threading.Event:
-    from vla_zenoh.runtime.process import stop_on_signals
-
-    return stop_on_signals()
 
 
 def _hold(target: RobotTarget, client: Client, activated: Task, stop: threading.Event) -> None:
@@ -161,10 +152,9 @@ def _require_worker(client: Client, worker: str) -> None:
         named = worker_node("")
         alive = sorted(name[len(named) :] for name in client.alive if name.startswith(named))
         said = client.status(worker_node(worker))
-        crashed = said is not None and said.state == CRASHED
-        why = (
-            f": {said.detail.get('complaint', '')}." if said and crashed else nearest(worker, alive)
-        )
+        why = nearest(worker, alive)
+        if said is not None and said.state == CRASHED:
+            why = f": {said.detail.get('complaint', '')}."
         fail(f"worker {worker!r} is not alive{why} Alive are: {', '.join(alive) or 'none'}")
 
 
@@ -290,11 +280,9 @@ def _fail(target: RobotTarget, client: Client, command: str, what: str) -> NoRet
     if why := target.not_operator(client.profile, command):
         fail(f"{target.named(client)} does not {what}: {why}")
     if "command" not in client.alive:
-        fail(target.no_command_node(client, command))
-    fail(
-        f"the command node of {target.named(client)} does not {what}; see "
-        f"`{target.typed('status')}`"
-    )
+        fail(target.no_node(client, command, kind="command node"))
+    see = target.typed("status")
+    fail(f"the command node of {target.named(client)} does not {what}; see `{see}`")
 
 
 def _stop_all(target: RobotTarget, own: Client) -> None:

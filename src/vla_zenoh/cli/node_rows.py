@@ -74,12 +74,9 @@ def node_rows(
 
 
 def _unheard(name: str, host: str, *, lives: bool) -> NodeRow:
-    if lives:
-        return NodeRow(
-            name, host, STARTING, "it has not published its status yet", None, None, True
-        )
     why = f"not running; see the output of `vla-zenoh up` on host {host}, which is to start it"
-    return NodeRow(name, host, MISSING, why, None, None, False)
+    state, why = (STARTING, "it has not published its status yet") if lives else (MISSING, why)
+    return NodeRow(name, host, state, why, None, None, lives)
 
 
 def hosts_down(

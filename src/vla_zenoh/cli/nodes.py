@@ -110,16 +110,11 @@ def camera(
     ] = "camera",
 ) -> None:
     """Publish images of cameras: V4L2 devices, RTSP streams, files and the simulator's."""
-    from vla_zenoh.nodes.camera.node import CameraNode
+    from vla_zenoh.nodes.camera.node import CameraNode, choose_cameras
 
     profile = node.load()
-    for wanted in cameras or ():
-        if wanted not in profile.cameras:
-            raise typer.BadParameter(
-                f"no camera {wanted!r} in profile {profile.name}; it has: "
-                + ", ".join(profile.cameras)
-            )
     chosen = tuple(cameras) if cameras else None
+    choose_cameras(profile, chosen)  # rejects a wrong one before a router is asked
     run_node(
         profile,
         lambda session, stop: CameraNode(profile, session, name=name, cameras=chosen).run(stop),

@@ -92,15 +92,15 @@ def options(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def effective_profile(
-    name: str,
+    profile: str | Profile,
     connect: list[str] | None = None,
     listen: list[str] | None = None,
     host: str | None = None,
 ) -> Profile:
-    """Load a profile, with endpoints of the command line in place of its own.
+    """A profile with endpoints of the command line in place of its own.
 
     Args:
-        name: of the profile, or its path.
+        profile: its name or path, or a loaded one.
         connect: in place of session.connect.
         listen: in place of session.listen.
         host: which of the profile's hosts this computer is; selects the certificates.
@@ -108,24 +108,12 @@ def effective_profile(
     Raises:
         ProfileError: the profile is invalid.
     """
-    return overridden(load_profile(name), connect, listen, host)
-
-
-def overridden(
-    profile: Profile,
-    connect: list[str] | None = None,
-    listen: list[str] | None = None,
-    host: str | None = None,
-) -> Profile:
-    """A profile with endpoints of the command line in place of its own; see `effective_profile`."""
-    changes: dict[str, Any] = {}
-    if host is not None and profile.session.security is not None:
+    loaded = load_profile(profile) if isinstance(profile, str) else profile
+    changes: dict[str, Any] = {"connect": connect} if connect else {}
+    changes |= {"listen": listen} if listen else {}
+    if host is not None and loaded.session.security is not None:
         changes["security"] = {"host": host}
-    if connect:
-        changes["connect"] = connect
-    if listen:
-        changes["listen"] = listen
-    return override(profile, {"session": changes}) if changes else profile
+    return override(loaded, {"session": changes}) if changes else loaded
 
 
 @dataclass(frozen=True)

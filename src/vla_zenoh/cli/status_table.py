@@ -214,5 +214,6 @@ def _bad_cameras(cameras: Mapping[str, Any]) -> list[str]:
 def _event(node: str, header: Header, event: Event) -> Text:
     when = time.strftime("%H:%M:%S", time.localtime(header.stamp_wall_ns / 1e9))
     again = f" (x{event.count})" if event.count > 1 else ""
-    text = f"{one_line(event.what)}{again}: {one_line(event.why, 160)}"
+    why = f": {one_line(event.why, 160)}" if event.why else ""
+    text = f"{one_line(event.what)}{again}{why}"
     return styled(f"{when} {one_line(node):>16} {text}", LEVELS.get(event.level, "white"))

@@ -130,26 +130,19 @@ class RobotTarget:
             except SessionError as error:
                 if "command" in client.alive:
                     raise
-                raise SessionError(self.no_command_node(client, *command)) from error
+                raise SessionError(self.no_node(client, *command, kind="command node")) from error
 
     # -- messages -----------------------------------------------------------------------------
     def named(self, client: Client) -> str:
         """Robot and profile."""
         return f"robot {client.keys.robot} (profile {self.profile})"
 
-    def no_command_node(self, client: Client, *command: str) -> str:
-        """Message that this robot has no command node, with `command` for the other robots."""
-        return f"no command node of {self.named(client)} is alive. {self._others(client, *command)}"
-
-    def no_node(self, client: Client, *command: str) -> str:
-        """Message that this robot has no node, with `command` for the other robots."""
-        return f"no node of {self.named(client)} is alive. {self._others(client, *command)}"
-
-    def _others(self, client: Client, *command: str) -> str:
+    def no_node(self, client: Client, *command: str, kind: str = "node") -> str:
+        """Message that this robot has no such node, with `command` for the other robots."""
         others = [f"{name} (`{self.typed(*command, robot=name)}`)" for name in self.others(client)]
-        if not others:
-            return "Nor is another robot visible on this router; `vla-zenoh up` starts one"
-        return f"Alive on this router: {', '.join(others)}"
+        there = f"Alive on this router: {', '.join(others)}"
+        none = "Nor is another robot visible on this router; `vla-zenoh up` starts one"
+        return f"no {kind} of {self.named(client)} is alive. {there if others else none}"
 
     def others(self, client: Client) -> list[str]:
         """Other robots whose command node is alive."""
@@ -210,13 +203,8 @@ def _first(choices: Sequence[Profile]) -> tuple[Profile, zenoh.Session]:
             return profile, open_session(profile.session)
         except (SecurityError, SessionError) as error:
             failed.append(error)
-            if profile is not choices[-1]:
-                _warn_next(profile, error)
+            security = profile.session.security
+            if profile is not choices[-1] and security is not None:
+                why = error if isinstance(error, SecurityError) else "no router accepts it"
+                warn(f"not with the certificate of {security.host} ({why}); trying the next one")
     raise failed[0]
-
-
-def _warn_next(profile: Profile, error: SecurityError | SessionError) -> None:
-    security = profile.session.security
-    assert security is not None
-    why = error if isinstance(error, SecurityError) else "no router accepts it"
-    warn(f"not with the certificate of {security.host} ({why}); trying the next one here")

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import sys
 from typing import Annotated, Literal
 
 import typer
 
 from vla_zenoh.cli.options import HostOption, ModelOptions, NodeOptions, effective_profile, options
+from vla_zenoh.cli.plain import say
 from vla_zenoh.keys import worker_node
 from vla_zenoh.nodes.worker.node import WorkerNode
 from vla_zenoh.policy.loader import make_policy
@@ -26,10 +28,6 @@ def worker(
     name: Annotated[
         str | None, typer.Option("--name", help="Name in its keys; default: the model's name.")
     ] = None,
-    images: Annotated[
-        Literal["auto", "raw", "jpeg"],
-        typer.Option(help="Images to subscribe to; auto: raw where the cameras are on this host."),
-    ] = "auto",
     delay_ms: Annotated[
         float, typer.Option("--delay", min=0, help="Milliseconds added to every inference.")
     ] = 0.0,
@@ -41,7 +39,8 @@ def worker(
     # Returns only where this environment has what the model's header asks for.
     run_in_own_environment(chosen.model, model_options.python)
     policy = make_policy(chosen.model, chosen.options, profile=node.profile)
-    form = _image_form(profile, host) if images == "auto" else images
+    if sys.stdout.isatty():
+        say(f"worker {chosen.name} of robot {profile.robot.name} runs; Ctrl-C ends it")
     run_node(
         profile,
         lambda session, stop: WorkerNode(
@@ -49,7 +48,7 @@ def worker(
             session,
             policy,
             chosen.name,
-            images=form,
+            images=_image_form(profile, host),
             host=host,
             delay_s=delay_ms / 1e3,
             robots=profile.serves.get(chosen.name, ()),

@@ -41,7 +41,9 @@ REST_OFFSET = 1e-6
 
 QUIET = (1e-8, 1e-8, 1e-6)
 """m or rad, per s, per s^2: smaller values are noise and set to zero. The first two are the
-precision of Ruckig's solver; such an acceleration changes a velocity by less in a tick."""
+precision of Ruckig's solver; such an acceleration changes a velocity by less in a tick. Of a motion
+that is slower by a factor, the last two are smaller by it and its square: see
+`AxisSmoother._pace_of`."""
 OVERSHOOT = 1e-6
 """m and rad: rounding by which a plan may leave the range between start, target and stop."""
 
@@ -85,11 +87,14 @@ class _Plan:
         start: (n,) its start.
         basis: (n, k).
         path: of the k coordinates, which start at zero.
+        pace: time of the path per second.
     """
 
-    def __init__(self, start: FloatArray, basis: FloatArray, path: Trajectory) -> None:
-        self._start, self._basis, self._path = start, basis, path
-        self.duration_s: float = path.duration
+    def __init__(
+        self, start: FloatArray, basis: FloatArray, path: Trajectory, pace: float = 1.0
+    ) -> None:
+        self._start, self._basis, self._path, self._pace = start, basis, path, pace
+        self.duration_s: float = path.duration / pace
         self.end = start + basis @ path.at_time(path.duration)[0]
         """(n,) its end."""
 
@@ -106,9 +111,13 @@ class _Plan:
         if time_s >= self.duration_s:
             zeros = np.zeros(len(self.end))
             return AxisState(self.end, zeros, zeros)
-        position, velocity, acceleration = self._path.at_time(time_s)
-        basis = self._basis
-        return AxisState(self._start + basis @ position, basis @ velocity, basis @ acceleration)
+        pace, basis = self._pace, self._basis
+        position, velocity, acceleration = self._path.at_time(time_s * pace)
+        return AxisState(
+            self._start + basis @ position,
+            pace * (basis @ velocity),
+            pace * pace * (basis @ acceleration),
+        )
 
 
 class AxisSmoother:
@@ -143,6 +152,7 @@ class AxisSmoother:
         self._plan: _Plan | None = None
         self._elapsed_s = 0.0
         self._jerk, self._sign = zeros, zeros
+        self._pace = 1.0
         self._again: tuple[Shares, bool] | None = None
         self._too_fast = zeros > 0.0
         self.braking = False
@@ -167,6 +177,7 @@ class AxisSmoother:
         Returns:
             whether the shares suffice.
         """
+        self._pace = shares.jerk ** (1 / 3)
         self._settle()
         return self._plan_to(target, shares, all_to_stop)
 
@@ -193,7 +204,7 @@ class AxisSmoother:
         """
         if self.braking:
             return
-        self._again = None
+        self._again, self._pace = None, 1.0
         self._settle()
         limits = self.box
         if shares is not None:
@@ -245,7 +256,7 @@ class AxisSmoother:
                 path = self._calculated(ask)
                 if path is None:
                     continue
-                found = _Plan(self._state.position, basis, path)
+                found = _Plan(self._state.position, basis, path, self._pace_of(most))
                 overshoots = self._overshoots(path, basis.T @ way, (basis, may_take, parts))
                 if not overshoots and not self._leaves(found):
                     if most is not limits:
@@ -276,7 +287,7 @@ class AxisSmoother:
         One, if the motion is already along `way`. Otherwise those of each group: the line and the
         directions beside it if the motion there is small, or the axes.
         """
-        whole = _line(way, *self._state[1:])
+        whole = _line(way, *self._state[1:], self._pace)
         if whole is not None:
             return whole[:, None], [1.0]
         columns: list[FloatArray] = []
@@ -294,7 +305,7 @@ class AxisSmoother:
         """The same for m axes: (m, k), with `way` (m,) and `limits` (3, m)."""
         size = len(way)
         motion = np.array([self._state.velocity[axes], self._state.acceleration[axes]])
-        line = _line(way, *motion)
+        line = _line(way, *motion, self._pace)
         if line is not None:
             return (line[:, None], [1.0]) if line.any() else (np.zeros((size, 0)), [])
         length = norm3(way) if size == 3 else float(np.linalg.norm(way))
@@ -352,7 +363,7 @@ class AxisSmoother:
             ask.synchronization = synchronization
             path = self._calculated(ask)
             if path is not None:
-                return _Plan(self._state.position, basis, path)
+                return _Plan(self._state.position, basis, path, self._pace_of(limits))
         return None
 
     def _input(
@@ -368,9 +379,13 @@ class AxisSmoother:
                 With all of its acceleration it would have to reverse before that has ended.
         """
         _, velocity, acceleration = self._state
+        paces = self._pace_of(limits) ** np.array([1.0, 2.0, 3.0])
         with np.errstate(divide="ignore"):
             along = (limits[:, :, None] / np.abs(basis)).min(axis=1) * np.array(parts)
-        velocity, acceleration = velocity @ basis, acceleration @ basis
+        along /= paces[:, None]
+        velocity, acceleration = velocity @ basis / paces[0], acceleration @ basis / paces[1]
+        velocity[np.abs(velocity) < QUIET[1]] = 0.0
+        acceleration[np.abs(acceleration) < QUIET[2]] = 0.0
         # Slowing down, and slow enough once that ends: braking harder would reverse the motion.
         speed = np.abs(velocity)
         slows = velocity * acceleration < 0
@@ -396,6 +411,10 @@ class AxisSmoother:
             return None
         return path if done else None
 
+    def _pace_of(self, limits: FloatArray) -> float:
+        """Time for Ruckig per second: it rounds absolute values, and motions may be slow."""
+        return float((limits[2] / self.box[2]).max() ** (1 / 3))
+
     def _limits(self, shares: Shares) -> tuple[FloatArray, FloatArray]:
         """Limits (3, n) of every axis: `shares` of them and as much jerk as an axis needs, twice.
 
@@ -407,7 +426,8 @@ class AxisSmoother:
         _, velocity, acceleration = self._state
         speed = np.abs(velocity)
         slows = velocity * acceleration < 0
-        room = np.maximum(np.where(slows, speed, self.box[0] - speed), REST_VELOCITY)
+        least = REST_VELOCITY * self._pace
+        room = np.maximum(np.where(slows, speed, self.box[0] - speed), least)
         needed = np.minimum(acceleration**2 / (2 * room) / self.box[2], 1.0)
         kept = np.where(acceleration * self._sign > 0.0, self._jerk, 0.0)
         self._jerk = np.maximum(np.where(slows, 0.0, needed), kept)
@@ -421,7 +441,8 @@ class AxisSmoother:
     def _slows(self) -> NDArray[np.bool_]:
         """(n,) which axes slow down, by more than rounding noise."""
         _, velocity, acceleration = self._state
-        return (velocity * acceleration < 0) & (np.abs(acceleration) > QUIET[2])
+        noise = QUIET[2] * self._pace**2
+        return (velocity * acceleration < 0) & (np.abs(acceleration) > noise)
 
     # -- moving -------------------------------------------------------------------------------
     def advance(self, pace: float) -> bool:
@@ -466,8 +487,8 @@ class AxisSmoother:
         """Set noise to zero, before the motion is planned."""
         position, velocity, acceleration = self._state
         velocity, acceleration = velocity.copy(), acceleration.copy()
-        velocity[np.abs(velocity) < QUIET[1]] = 0.0
-        acceleration[np.abs(acceleration) < QUIET[2]] = 0.0
+        velocity[np.abs(velocity) < QUIET[1] * self._pace] = 0.0
+        acceleration[np.abs(acceleration) < QUIET[2] * self._pace**2] = 0.0
         self._state = AxisState(position, velocity, acceleration)
 
 
@@ -481,13 +502,15 @@ def _across(along: FloatArray) -> FloatArray:
     return np.stack([across, cross3(along, across)])
 
 
-def _line(way: FloatArray, velocity: FloatArray, acceleration: FloatArray) -> FloatArray | None:
+def _line(
+    way: FloatArray, velocity: FloatArray, acceleration: FloatArray, pace: float
+) -> FloatArray | None:
     """The direction of a motion on a straight line through its target, None if it is on none.
 
     That of the way if there is one; the motion's own where the target is about to be passed, and
     so near that its direction is rounding. Zero where there is neither way nor motion.
     """
-    motion = np.stack([way, velocity, acceleration])
+    motion = np.stack([way, velocity / pace, acceleration / pace**2])
     lengths = np.sqrt((motion * motion).sum(axis=1))
     if not lengths.any():
         return way

@@ -94,6 +94,7 @@ class Smoother(AxisSmoother):
 
     def target(self, pose: Pose, shares: Shares = FULL, *, all_to_stop: bool = False) -> bool:
         """Move to `pose` from the present state; see `AxisSmoother.move_to`."""
+        self._pace = shares.jerk ** (1 / 3)
         self._settle()
         self._aim = pose
         target = np.array([*pose.position_m, *log3(self._anchor.T @ pose.rotation)])

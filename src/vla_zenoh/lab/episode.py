@@ -23,7 +23,7 @@ COMMAND, SIM = "command", "sim"
 READY_PATIENCE_S = 60.0
 LOAD_PATIENCE_S = 600.0
 """While the worker reports that it loads; it may be building its environment."""
-SETTLE_PATIENCE_S = 5.0
+SETTLE_PATIENCE_S = 15.0
 """For cameras and worker to have data; then activation names what is missing."""
 UNSETTLED = {"waiting", "degraded"}
 ACTIVATE_PATIENCE_S, ACTIVATE_PERIOD_S = 15.0, 0.2

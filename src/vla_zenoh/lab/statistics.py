@@ -177,8 +177,5 @@ def mcnemar_exact(first: int, second: int) -> float:
         second: setups that the second alone succeeded on, not negative.
     """
     n = first + second
-    tail = term = 1  # of n over 0; each next one is made of the last
-    for k in range(1, min(first, second) + 1):
-        term = term * (n - k + 1) // k
-        tail += term
+    tail = sum(math.comb(n, k) for k in range(min(first, second) + 1))
     return min(1.0, 2 * tail / 2**n)

@@ -9,12 +9,11 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import zenoh
 
-from vla_zenoh.bus.client import DROPPED_HINT, Client
+from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.clock import HOST_VARIABLE, own_boot_id
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import NodeError, ProfileError, SessionError
@@ -32,8 +31,6 @@ EXPENDABLE = ("worker",)
 ROUTER_PATIENCE_S = 10.0
 BRAKE_PATIENCE_S = 1.0
 STOP_BUDGET_S = 2.9
-STRANGERS_PERIOD_S = 600.0
-"""Foreign statuses and tokens are reported at most this often."""
 
 
 def choose_host(profile: Profile, host: str | None) -> tuple[str, HostProfile]:
@@ -99,27 +96,26 @@ def node_commands(
             f"{' and '.join(routers) or 'no host'} does"
         )
     common = ("--profile", str(profile_file))
+    more: dict[str, Sequence[str]] = {
+        "router": (
+            "--host",
+            host,
+            *(word for file in also_files for word in ("--also", str(file))),
+        ),
+        "camera": ("--name", profile.node_name(host, "camera"), *(part.cameras or ())),
+        "command": ("--dry-run",) if dry_run else (),
+    }
     commands: list[NodeCommand] = []
     for kind in sorted(part.nodes, key=list(NODE_KINDS).index):
-        name = profile.node_name(host, kind)
-        if kind == "worker":
-            for worker in profile.workers_of(part):
-                arguments = ["worker", worker, *common, "--host", host, *worker_arguments]
-                for option in (worker_options or {}).get(worker, ()):
-                    arguments += ["--set", option]
-                commands.append(NodeCommand(worker_node(worker), kind, tuple(arguments)))
-        elif kind == "camera":
-            arguments = ["node", "camera", *(part.cameras or ()), *common, "--name", name]
-            commands.append(NodeCommand(name, kind, tuple(arguments)))
-        elif kind == "router":
-            others = [word for file in also_files for word in ("--also", str(file))]
-            commands.append(
-                NodeCommand(name, kind, ("node", kind, *common, "--host", host, *others))
-            )
-        elif kind == "command" and dry_run:
-            commands.append(NodeCommand(kind, kind, ("node", kind, *common, "--dry-run")))
-        else:
-            commands.append(NodeCommand(kind, kind, ("node", kind, *common)))
+        if kind != "worker":
+            words = ("node", kind, *common, *more.get(kind, ()))
+            commands.append(NodeCommand(profile.node_name(host, kind), kind, words))
+            continue
+        for worker in profile.workers_of(part):
+            options = (worker_options or {}).get(worker, ())
+            words = ("worker", worker, *common, "--host", host, *worker_arguments)
+            words += tuple(word for option in options for word in ("--set", option))
+            commands.append(NodeCommand(worker_node(worker), kind, words))
     return commands
 
 
@@ -158,9 +154,7 @@ class Host:
         dry_run: bool = False,
     ) -> None:
         self.host, part = choose_host(profile, host)
-        changes: dict[str, Any] = {}
-        if part.connect is not None:
-            changes["connect"] = list(part.connect)
+        changes: dict[str, Any] = {"connect": list(part.connect)} if part.connect else {}
         if profile.session.security is not None:
             changes["security"] = {"host": self.host}
         if changes:
@@ -174,16 +168,9 @@ class Host:
         # Children read the very profile that is in force here, whatever its options were.
         self.profile_file = self._write(profile)
         self._also = [self._write(other) for other in also]
+        files = (self.profile_file, worker_options, worker_arguments, self._also)
         self.supervisor = Supervisor(
-            node_commands(
-                profile,
-                self.host,
-                self.profile_file,
-                worker_options,
-                worker_arguments,
-                self._also,
-                dry_run=dry_run,
-            ),
+            node_commands(profile, self.host, *files, dry_run=dry_run),
             log=log,
             tell=tell,
             folder=Path(self._folder.name),
@@ -194,7 +181,6 @@ class Host:
         self._down: DownNodes | None = None
         self._ready, self._dry_run = False, dry_run
         self._expiry = CertificateExpiry(profile.session.security)
-        self._left_out, self._strangers_told_s = 0, -1e9
         self.session: zenoh.Session | None = None
         self.client: Client | None = None
 
@@ -208,7 +194,7 @@ class Host:
         try:
             self._start()
         except BaseException:
-            self.__exit__(None, None, None)
+            self.stop()
             raise
         return self
 
@@ -254,12 +240,7 @@ class Host:
             return False
         return True
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.stop()
 
     def stop(self) -> None:
@@ -326,7 +307,6 @@ class Host:
             self._end_what_hangs()
             for sentence in self._expiry.due():
                 self._tell("up", sentence)
-            self._tell_of_strangers()
             self._tell_when_ready()
             self.poll(spare=EXPENDABLE)
 
@@ -339,13 +319,9 @@ class Host:
         Raises:
             NodeError: another node dies again and again.
         """
-        if not self.supervisor.poll(spare=spare):
-            given_up = self.supervisor.given_up
-            name = given_up.command.name if given_up else "a node"
-            why = given_up.why if given_up else ""
-            raise NodeError(
-                f"{name} dies again and again{f': {why}' if why else '; its last lines say why'}"
-            )
+        if not self.supervisor.poll(spare=spare) and (given_up := self.supervisor.given_up):
+            why = f": {given_up.why}" if given_up.why else "; its last lines say why"
+            raise NodeError(f"{given_up.command.name} dies again and again{why}")
 
     def _tell_when_ready(self) -> None:
         if self._ready or self.client is None:
@@ -363,21 +339,11 @@ class Host:
             return "DRY RUN"
         return "SIM" if self.profile.robot.driver == "sim" else "LIVE"
 
-    def _tell_of_strangers(self) -> None:
-        left_out = self.client.dropped if self.client is not None else 0
-        now_s = time.monotonic()
-        if left_out > self._left_out and now_s - self._strangers_told_s > STRANGERS_PERIOD_S:
-            self._tell("up", f"{left_out} {DROPPED_HINT}")
-            self._left_out, self._strangers_told_s = left_out, now_s
-
     def _end_what_hangs(self) -> None:
         if self.client is None:
             return
-        said = {
-            name: LastStatus(status.pid, age_s)
-            for name, (status, age_s, _) in self.client.snapshot().items()
-        }
+        heard = self.client.snapshot().items()
+        said = {name: LastStatus(status.pid, age_s) for name, (status, age_s, _) in heard}
         for name in hung_nodes(self.supervisor.running(), said):
-            self.supervisor.terminate(
-                name, f"silent for {said[name].age_s:.0f} s; it hangs, ending it"
-            )
+            why = f"silent for {said[name].age_s:.0f} s; it hangs, ending it"
+            self.supervisor.terminate(name, why)

@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -36,8 +36,7 @@ RUST_SOURCE = re.compile(r" at /\S+\.rs:\d+(?=\.?$)")
 """Where in its sources Zenoh wrote a line of its log: a path of the computer it was built on."""
 
 
-@dataclass(frozen=True, slots=True)
-class NodeCommand:
+class NodeCommand(NamedTuple):
     """A node to run.
 
     Args:
@@ -60,9 +59,9 @@ class Child:
     started_s: float = 0.0
     deaths_in_a_row: int = 0
     left_alone: bool = False
-    restarts: int = 0
     start_again_s: float = 0.0
-    threads: list[threading.Thread] = field(default_factory=list)
+    reader: threading.Thread | None = None
+    """Of its output."""
     pid: int = 0
     why: str = ""
     """Why it ended, if it said so."""
@@ -139,7 +138,6 @@ class Supervisor:
             if child.process is not None and child.process.poll() is not None:
                 self._mourn(child, child.process.returncode, now)
             elif child.process is None and child.start_again_s and now >= child.start_again_s:
-                child.restarts += 1
                 self._spawn(child)
             if child.deaths_in_a_row < GIVE_UP_AFTER or child.left_alone:
                 continue
@@ -164,36 +162,41 @@ class Supervisor:
             deadline_s: monotonic clock; nodes that still run then are killed.
         """
         for kinds, left_s in STOP_ORDER:
-            self._signal(kinds, signal.SIGTERM)
-            self._await(kinds, deadline_s - left_s)
+            processes = [
+                child.process
+                for child in self.children
+                if child.process is not None and child.command.kind in kinds
+            ]
+            for process in processes:
+                if process.poll() is None:
+                    _signal_group(process, signal.SIGTERM)
+            while any(process.poll() is None for process in processes):
+                if time.monotonic() >= deadline_s - left_s:
+                    break
+                time.sleep(POLL_S)
         self.kill()
         for child in self.children:
-            for thread in child.threads:
-                thread.join(0.2)
+            if child.reader is not None:
+                child.reader.join(0.2)
 
     def kill(self) -> None:
         """End whatever still runs, at once."""
         for child in self.children:
             if child.process is not None:
-                _kill_group(child.process)
+                _signal_group(child.process, signal.SIGKILL)
                 child.process.wait()
 
-    def pids(self) -> dict[str, int]:
-        """Node name -> process number of those that run."""
+    def running(self) -> dict[str, tuple[str, int]]:
+        """Node name -> (kind, process number) of those that run."""
         return {
-            child.command.name: child.process.pid
+            child.command.name: (child.command.kind, child.process.pid)
             for child in self.children
             if child.process is not None and child.process.poll() is None
         }
 
-    def running(self) -> dict[str, tuple[str, int]]:
-        """Node name -> (kind, process number) of those that run."""
-        pids = self.pids()
-        return {
-            child.command.name: (child.command.kind, pids[child.command.name])
-            for child in self.children
-            if child.command.name in pids
-        }
+    def pids(self) -> dict[str, int]:
+        """Node name -> process number of those that run."""
+        return {name: pid for name, (_, pid) in self.running().items()}
 
     def owns(self, name: str, pid: int) -> bool:
         """Whether a process of this computer is that node as it was started here, and runs.
@@ -225,7 +228,7 @@ class Supervisor:
         for child in self.children:
             if child.command.name == name and child.process is not None:
                 self._tell(name, why)
-                _kill_group(child.process)
+                _signal_group(child.process, signal.SIGKILL)
 
     def _spawn(self, child: Child) -> None:
         environment = {**os.environ, **self._variables}
@@ -248,9 +251,9 @@ class Supervisor:
         )
         child.started_s, child.start_again_s = time.monotonic(), 0.0
         child.pid, child.why = child.process.pid, ""
-        thread = threading.Thread(target=self._forward, args=(child, child.process), daemon=True)
-        thread.start()
-        child.threads = [thread]
+        reader = threading.Thread(target=self._forward, args=(child, child.process), daemon=True)
+        reader.start()
+        child.reader = reader
         started = f"started (pid {child.process.pid})"
         if child.told:  # again, after what was told
             self._log(child.command.name, f"{DETAIL}{started}")
@@ -271,10 +274,10 @@ class Supervisor:
         child.deaths_in_a_row = 1 if stable else child.deaths_in_a_row + 1
         wait_s = BACKOFF_S[min(child.deaths_in_a_row, len(BACKOFF_S)) - 1]
         if child.process is not None:
-            _kill_group(child.process)
+            _signal_group(child.process, signal.SIGKILL)
         child.process, child.start_again_s = None, now + wait_s
-        for thread in child.threads:
-            thread.join(LAST_LINES_S)
+        if child.reader is not None:
+            child.reader.join(LAST_LINES_S)
         how = f"killed by {_signal_name(-code)}" if code < 0 else f"ended with code {code}"
         sentence = how
         if child.deaths_in_a_row < GIVE_UP_AFTER:
@@ -287,31 +290,14 @@ class Supervisor:
             self._tell(child.command.name, sentence)
         child.told, child.end = child.why, how
 
-    def _signal(self, kinds: Sequence[str], number: signal.Signals) -> None:
-        for process in self._running(kinds):
-            # All of its group: between us and the node there may be a process that made its
-            # environment.
-            with suppress(ProcessLookupError):
-                os.killpg(process.pid, number)
 
-    def _running(self, kinds: Sequence[str]) -> list[subprocess.Popen[str]]:
-        return [
-            child.process
-            for child in self.children
-            if child.command.kind in kinds
-            and child.process is not None
-            and child.process.poll() is None
-        ]
+def _signal_group(process: subprocess.Popen[str], number: signal.Signals) -> None:
+    """Signal the process and all that it started, such as what made its environment.
 
-    def _await(self, kinds: Sequence[str], deadline_s: float) -> None:
-        while self._running(kinds) and time.monotonic() < deadline_s:
-            time.sleep(POLL_S)
-
-
-def _kill_group(process: subprocess.Popen[str]) -> None:
-    """End the process and all that it started. Its group has its number (`start_new_session`)."""
+    The group has the number of the process (`start_new_session`).
+    """
     with suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)
+        os.killpg(process.pid, number)
 
 
 def _signal_name(number: int) -> str:

@@ -14,15 +14,7 @@ from itertools import product
 from vla_zenoh.keys import Keys
 from vla_zenoh.security.identity import Identity, Role
 
-ROBOT, CAMERA, WORKER, COMMAND, OPERATOR, VIEWER, REPLAY = (
-    Role.ROBOT,
-    Role.CAMERA,
-    Role.WORKER,
-    Role.COMMAND,
-    Role.OPERATOR,
-    Role.VIEWER,
-    Role.REPLAY,
-)
+_, ROBOT, CAMERA, WORKER, COMMAND, OPERATOR, VIEWER, REPLAY, _ = Role
 NODES = frozenset({ROBOT, CAMERA, WORKER, COMMAND})
 LOOKERS = frozenset({OPERATOR, VIEWER})
 SPEAKERS = NODES | {OPERATOR, REPLAY}

@@ -122,16 +122,8 @@ def with_operator(text: str, host: str, role: Role) -> str:
 
 
 def _host(host: HostProfile, secure: Callable[[Sequence[str]], list[str]]) -> dict[str, Any]:
-    out: dict[str, Any] = {"nodes": list(host.nodes)}
-    for name in ("connect", "listen", "link"):
-        endpoints: Sequence[str] | None = getattr(host, name)
-        if endpoints is not None:
-            out[name] = secure(endpoints)
-    for name in ("cameras", "workers"):
-        names = getattr(host, name)
-        if names is not None:
-            out[name] = list(names)
-    return out
+    out = host.model_dump(mode="json", exclude_none=True)
+    return out | {name: secure(out[name]) for name in ("connect", "listen", "link") if name in out}
 
 
 def _with_tilde(folder: Path) -> str:

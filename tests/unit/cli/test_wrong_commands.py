@@ -93,7 +93,6 @@ WRONG: list[tuple[str, int, str]] = [
         USAGE,
         "Invalid value for '--delay': must be at least 0 (given:",
     ),
-    ("worker scripted --images png", USAGE, "Invalid value for '--images': 'png' is not one of"),
     (
         "worker scripted --python no-such-python",
         FAILED,
@@ -109,7 +108,7 @@ WRONG: list[tuple[str, int, str]] = [
         FAILED,
         "error: --python '/bin/false' has no vla-zenoh; install it there: pip install",
     ),
-    ("node camera nosuch", USAGE, "no camera 'nosuch' in profile panda_sim; it has: front, wrist"),
+    ("node camera nosuch", FAILED, "has no camera 'nosuch'; this node can serve: front, wrist"),
     ("node", USAGE, ""),
     ("teleop --frame foo", USAGE, "Invalid value for '--frame': 'foo' is not one of 'base', 'tcp'"),
     ("eval /absent.mcap", FAILED, "/absent.mcap cannot be read: No such file or directory"),

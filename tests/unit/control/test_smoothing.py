@@ -370,6 +370,21 @@ def test_a_motion_along_a_line_stays_on_it_whatever_the_limits_become(
             assert np.abs(beside).max() < AT_GOAL[0]
 
 
+def test_an_axis_at_one_percent_of_the_speed_brakes_however_often_its_goal_is_repeated() -> None:
+    slow, often, once = Shares(1e-2, 1e-4, 1e-6), smoother(), smoother()
+    for motion in (often, once):
+        motion.target(Pose(START.position_m + [0.0, 2e-4, 1e-4], START.rotation), slow)
+        for _ in range(700):
+            motion.tick()
+    goal = Pose(START.position_m + [0.0, 5e-5, 3e-4], START.rotation)
+    once.target(goal, slow)
+    for _ in range(3000):
+        often.target(goal, slow)
+        apart_m = often.tick().pose.position_m - once.tick().pose.position_m
+        assert np.abs(apart_m).max() < AT_GOAL[0] / 10
+    assert np.abs(often.motion.pose.position_m - goal.position_m).max() < AT_GOAL[0] / 10
+
+
 def test_an_arm_that_goes_back_over_its_start_slowly_stays_on_its_line() -> None:
     motion, slow = smoother(), Shares(0.02, 0.01, 0.001)
     line = np.array([-0.39, 0.9, 0.156]) / norm3(np.array([-0.39, 0.9, 0.156]))

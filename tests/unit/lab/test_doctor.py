@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import socket
-import subprocess
-import sys
 import threading
 from pathlib import Path
 
@@ -21,18 +18,15 @@ from vla_zenoh.lab.cli.doctor import try_zenoh
 from vla_zenoh.lab.doctor import HostFinding, Needs, examine, needs_of
 from vla_zenoh.lab.doctor.access import router
 from vla_zenoh.lab.doctor.computer import (
-    SHARED_MEMORY,
     TIME_ERROR,
     clock_finding,
     disk,
     governor,
     kernel_state,
-    left_segments,
     niceness,
     processors,
     real_time_priority,
     shared_memory,
-    terminal,
     video_devices,
 )
 from vla_zenoh.lab.doctor.software import (
@@ -208,44 +202,6 @@ def test_absent_shared_memory_is_a_warning(tmp_path: Path) -> None:
     assert shared_memory(tmp_path / "absent").level == "warn"
 
 
-def test_a_segment_that_nobody_holds_is_left_over_and_a_held_one_is_not(tmp_path: Path) -> None:
-    held, left = tmp_path / "1.zenoh", tmp_path / "2.zenoh"
-    for path in (held, left):
-        path.write_bytes(bytes(SEGMENT_BYTES))
-    with held.open("rb") as file:
-        fcntl.flock(file, fcntl.LOCK_SH)
-        finding = left_segments(tmp_path)
-    assert finding.level == "warn"
-    assert finding.found.startswith("1 Zenoh segments, 3 MiB")
-    assert finding.advice.endswith(f"rm {left}")
-
-
-def test_segments_of_a_living_session_are_not_left_over_and_those_of_a_killed_one_are() -> None:
-    code = (
-        "import time, zenoh\n"
-        "provider = zenoh.shm.ShmProvider.default_backend(65536)\n"
-        "buffer = provider.alloc(4096)\n"
-        "print('ready', flush=True)\n"
-        "time.sleep(60)\n"
-    )
-    before = set(SHARED_MEMORY.glob("*.zenoh"))
-    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as process:
-        try:
-            assert process.stdout is not None
-            assert process.stdout.readline() == b"ready\n"
-            new = set(SHARED_MEMORY.glob("*.zenoh")) - before
-            living = left_segments()
-        finally:
-            process.kill()
-    killed = left_segments()
-    still_there = [path for path in new if path.exists()]  # any new session may have swept them
-    for path in still_there:
-        path.unlink(missing_ok=True)
-    assert new
-    assert all(str(path) not in living.advice for path in new)
-    assert all(str(path) in killed.advice for path in still_there)
-
-
 def test_a_full_disk_is_worse_than_a_nearly_full_one(tmp_path: Path) -> None:
     assert disk(tmp_path, wanted_mib=1).level == "ok"
     assert disk(tmp_path, wanted_mib=TIBIBYTE_MIB * 1024).level in {"warn", "fail"}
@@ -319,7 +275,7 @@ def test_other_links_than_tcp_are_tried_with_a_session() -> None:
     assert router(endpoint, is_router=False, try_zenoh=refuse).level == "warn"
 
 
-# -- cameras and terminal ---------------------------------------------------------------------
+# -- cameras ---------------------------------------------------------------------
 def test_a_camera_the_profile_names_has_to_be_there(tmp_path: Path) -> None:
     (tmp_path / "video0").write_bytes(b"")
     assert video_devices(["0"], tmp_path).level == "ok"
@@ -340,12 +296,6 @@ def test_a_camera_without_permission_names_the_group(tmp_path: Path) -> None:
     finding = video_devices(["0"], tmp_path)
     assert finding.level == "fail"
     assert "--groups video" in finding.advice
-
-
-def test_a_terminal_without_utf_8_or_too_narrow_is_a_warning() -> None:
-    assert terminal({"TERM": "xterm"}, "utf-8", 80).level == "ok"
-    assert terminal({}, "ascii", 80).advice == "export LANG=C.UTF-8"
-    assert "80 columns" in terminal({"TERM": "xterm"}, "utf-8", 40).advice
 
 
 # -- needs ------------------------------------------------------------------------------------
@@ -376,7 +326,7 @@ def test_an_unknown_host_gets_the_list() -> None:
 def test_every_finding_that_is_not_well_has_an_advice() -> None:
     needs = Needs(endpoints=(f"tcp/127.0.0.1:{free_port()}",))
     findings = list(examine(needs, refuse))
-    assert {"Python", "processors", "disk", "wall clock", "terminal"} <= {f.name for f in findings}
+    assert {"Python", "processors", "disk", "wall clock"} <= {f.name for f in findings}
     for finding in findings:
         assert finding.found
         assert bool(finding.advice) == (finding.level != "ok"), finding

@@ -184,7 +184,6 @@ def test_requests_are_those_of_the_obeyed_worker_and_their_success_is_counted(
     asked = SECONDS * 1_000_000_000 // CHUNK_NS
     assert run.requests == asked
     assert run.succeeded == asked - 1, "the last chunk came too late for any command"
-    assert evaluate_run(recording, 5).requests == 5
 
 
 def test_seams_tell_how_far_the_goal_went(recording: Path) -> None:

@@ -141,10 +141,9 @@ def test_a_folder_shows_its_pictures_and_skips_other_files(tmp_path: Path) -> No
     write_grey(tmp_path, "1.png", "2.bmp", "10.jpg")
     (tmp_path / "3.txt").write_text("not a picture")
     (tmp_path / "4.png").mkdir()
-    reel = open_frames(tmp_path)
     levels = []
-    while reel.step():
-        picture = reel.image()
+    for decode in open_frames(tmp_path).images:
+        picture = decode()
         assert picture is not None
         levels.append(int(picture[4, 4, 0]))
     assert levels == [0, 10, 20]

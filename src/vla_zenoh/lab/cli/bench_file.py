@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+from collections import deque
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,6 +19,7 @@ from vla_zenoh.cli.output import console, errors, print_json
 from vla_zenoh.lab.cli.output_path import ForceOption, output_file
 
 if TYPE_CHECKING:
+    from vla_zenoh.profile import Profile
     from vla_zenoh.runtime.launch import Host
 
 LAST_LINES = 20
@@ -114,3 +117,29 @@ def up_with_last_lines(host: Host, lines: Collection[str]) -> Iterator[Host]:
         last = (failed_at or [*lines])[-LAST_LINES:]
         errors().print("\n".join(last), style="dim", soft_wrap=True)
         raise
+
+
+@contextmanager
+def running_nodes(
+    profile: Profile, log_file: Path | None = None, **settings: Any
+) -> Iterator[Host]:
+    """All nodes of a simulated robot; a failure of the block shows the last log lines.
+
+    Args:
+        profile: at an address of its own.
+        log_file: for their log; None: it is not kept.
+        settings: see `Host`.
+    """
+    from vla_zenoh.runtime.launch import Host
+
+    last: deque[str] = deque(maxlen=LAST_LINES)
+    with (log_file or Path(os.devnull)).open("w", encoding="utf-8") as log:
+
+        def write(node: str, line: str) -> None:
+            last.append(f"{node:>16} | {line}")
+            log.write(f"{last[-1]}\n")
+            log.flush()
+
+        host = Host(profile, None, log=write, tell=write, own_router=True, **settings)
+        with up_with_last_lines(host, last) as running:
+            yield running

@@ -23,7 +23,7 @@ from vla_zenoh.cli.options import (
 )
 from vla_zenoh.cli.output import console, print_json, progress_bars
 from vla_zenoh.lab.bench.motion import PROTOCOL, STEPS, Conditions, MotionCase
-from vla_zenoh.lab.cli.bench_file import up_with_last_lines, write_json
+from vla_zenoh.lab.cli.bench_file import running_nodes, write_json
 from vla_zenoh.lab.cli.output_path import ForceOption, output_folder
 from vla_zenoh.profile import Profile
 
@@ -122,15 +122,9 @@ class _Run:
         self, profile: Profile, conditions: Sequence[Conditions], current: TaskID
     ) -> None:
         from vla_zenoh.lab.bench.motion_runner import run_in_real_time
-        from vla_zenoh.runtime.launch import Host
-
-        lines: list[str] = []
 
         def progress(case: MotionCase, each: Conditions, done: int) -> None:
             self.bars.update(current, description=f"{case.name} at {each.name}", completed=done)
-
-        def log(node: str, line: str) -> None:
-            lines.append(f"{node:>16} | {line}")
 
         first = conditions[0]
         settings = (
@@ -138,15 +132,8 @@ class _Run:
             f"delay_ms={first.delay_ms:g}",
             f"jitter={first.jitter:g}",
         )
-        host = Host(
-            profile,
-            None,
-            log=log,
-            tell=log,
-            own_router=True,
-            worker_options={profile.task.worker: settings},
-        )
-        with TemporaryDirectory() as folder, up_with_last_lines(host, lines) as running:
+        nodes = running_nodes(profile, worker_options={profile.task.worker: settings})
+        with TemporaryDirectory() as folder, nodes as running:
             for row, run in run_in_real_time(
                 running, self._cases, conditions, self._stop, Path(folder), progress
             ):

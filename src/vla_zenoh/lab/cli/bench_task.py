@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -24,11 +22,7 @@ from vla_zenoh.cli.options import (
 )
 from vla_zenoh.cli.output import console, new_table, print_json, progress_bars
 from vla_zenoh.lab.bench.task import BASELINES, SCENE, TaskPlan, TaskScore
-from vla_zenoh.lab.cli.bench_file import (
-    LAST_LINES,
-    up_with_last_lines,
-    write_json,
-)
+from vla_zenoh.lab.cli.bench_file import running_nodes, write_json
 from vla_zenoh.lab.cli.output_path import ForceOption, output_folder, require_free_folder
 from vla_zenoh.lab.tasks import FAMILIES, LIMIT_S
 from vla_zenoh.policy.loader import find_model
@@ -260,7 +254,7 @@ def _lockstep(
         score.options,
         _camera(profile),
         stop,
-        processes or os.cpu_count() or 1,
+        processes,
         named=named,
     ):
         score.ended.append(ended)
@@ -279,39 +273,27 @@ def _real_time(
     from vla_zenoh.lab.bench.task_runner import TaskRunner
     from vla_zenoh.lab.cli.loopback import own_address
     from vla_zenoh.lab.episode import Interrupted
-    from vla_zenoh.runtime.launch import Host
     from vla_zenoh.runtime.process import die_with_parent
 
     die_with_parent()
     plan = score.plan
     arguments = [*(["--delay", f"{plan.delay_ms:g}"] if plan.delay_ms else [])]
     arguments += ["--python", model.python] if model.python else []
-    last: deque[str] = deque(maxlen=LAST_LINES)
-    with Path(os.devnull if out is None else out / "nodes.log").open("w", encoding="utf-8") as log:
-
-        def write(node: str, line: str) -> None:
-            last.append(f"{node:>16} | {line}")
-            log.write(f"{last[-1]}\n")
-            log.flush()
-
-        host = Host(
-            own_address(profile),
-            None,
-            log=write,
-            tell=write,
-            own_router=True,
-            worker_options={plan.worker: model.settings or []},
-            worker_arguments=arguments,
-        )
-        try:
-            with up_with_last_lines(host, last) as running:
-                run = TaskRunner(running, plan, stop, _camera(profile))
-                for ended in run.run():
-                    score.ended.append(ended)
-                    score.latency_ms = run.latency_ms()
-                    advance(score)
-        except Interrupted:
-            pass
+    nodes = running_nodes(
+        own_address(profile),
+        None if out is None else out / "nodes.log",
+        worker_options={plan.worker: model.settings or []},
+        worker_arguments=arguments,
+    )
+    try:
+        with nodes as running:
+            run = TaskRunner(running, plan, stop, _camera(profile))
+            for ended in run.run():
+                score.ended.append(ended)
+                score.latency_ms = run.latency_ms()
+                advance(score)
+    except Interrupted:
+        pass
 
 
 def _print(result: dict[str, Any]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
@@ -23,9 +23,6 @@ dataset_app = typer.Typer(
 def export(
     runs: Annotated[list[Path], typer.Argument(help="Recordings (.mcap), or folders of them.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="New folder for the dataset.")],
-    form: Annotated[
-        Literal["lerobot"], typer.Option("--format", help="LeRobotDataset v3.0.")
-    ] = "lerobot",
     worker: Annotated[
         str | None, typer.Option("--worker", help="Only episodes of this worker.")
     ] = None,
@@ -42,7 +39,7 @@ def export(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Export a dataset with one episode per activation of a worker."""
+    """Export a LeRobotDataset v3.0 with one episode per activation of a worker."""
     from vla_zenoh.lab.dataset.episodes import episodes_of
     from vla_zenoh.lab.dataset.lerobot import export as write
     from vla_zenoh.lab.dataset.success import succeeded

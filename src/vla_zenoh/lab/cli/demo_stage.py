@@ -18,6 +18,7 @@ from rich.progress import Progress
 
 from vla_zenoh.cli.options import effective_profile
 from vla_zenoh.cli.output import Screen, errors, progress_bars
+from vla_zenoh.lab.cli.bench_file import running_nodes
 from vla_zenoh.lab.cli.loopback import own_address
 from vla_zenoh.lab.cli.output_path import RUNS, output_folder
 from vla_zenoh.lab.evaluation.mcap_file import evaluate_loaded
@@ -29,8 +30,6 @@ from vla_zenoh.profile import Profile, to_yaml
 from vla_zenoh.runtime.launch import Host
 from vla_zenoh.runtime.process import die_with_parent, stop_on_signals
 from vla_zenoh.types import NodeStatus
-
-MAX_LOG_LINES = 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,35 +70,21 @@ class Stage:
         Args:
             width: of the descriptions of the bars, in characters.
         """
-        profile, lines = self.profile, []
-        with (
-            (self.folder / "nodes.log").open("w", encoding="utf-8") as log_file,
-            progress_bars(width, self.screen) as bars,
-        ):
+        with progress_bars(width, self.screen) as bars:
             coming_up = bars.add_task("starting the nodes", total=None)
-
-            def log(node: str, line: str) -> None:
-                log_file.write(f"{node:>16} | {line}\n")
-                lines.append(f"{node}: {line}")
-
-            try:
-                with Host(profile, None, log=log, tell=log, own_router=True) as running:
-                    assert running.session is not None
-                    bars.update(coming_up, visible=False)
-                    recorder = Recorder(
-                        profile,
-                        running.session,
-                        self.recording,
-                        about={"command": shlex.join(["vla-zenoh", *sys.argv[1:]])},
-                    ).start()
-                    try:
-                        yield running, bars
-                    finally:
-                        recorder.close(self.facts)
-            except Exception:
-                last = "\n".join(lines[-MAX_LOG_LINES:])
-                self.screen.print(last, style="dim")
-                raise
+            with running_nodes(self.profile, self.folder / "nodes.log") as running:
+                assert running.session is not None
+                bars.update(coming_up, visible=False)
+                recorder = Recorder(
+                    self.profile,
+                    running.session,
+                    self.recording,
+                    about={"command": shlex.join(["vla-zenoh", *sys.argv[1:]])},
+                ).start()
+                try:
+                    yield running, bars
+                finally:
+                    recorder.close(self.facts)
 
     def recorded(self) -> Run:
         """Load the recording."""

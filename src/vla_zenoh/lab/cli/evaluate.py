@@ -40,9 +40,6 @@ def evaluation(
         list[Path],
         typer.Argument(help="Recordings (.mcap), or folders of them."),
     ],
-    first: Annotated[
-        int | None, typer.Option("--first", help="Only this many requests of each run.", min=1)
-    ] = None,
     output: Annotated[
         list[Path] | None,
         typer.Option(
@@ -75,7 +72,6 @@ def evaluation(
             bar = bars.add_task("evaluating", total=len(files))
             runs, faults = evaluate(
                 files,
-                first,
                 pictures=images if HTML in kinds else 0,
                 evaluated=lambda path: bars.update(bar, advance=1, description=path.name),
             )

@@ -102,7 +102,7 @@ def _fail(target: RobotTarget, client: Client, worker: str | None) -> NoReturn:
     """End with the reason why no worker published an inference."""
     words = ("lab", "inspect", *([] if worker is None else [worker]))
     if "command" not in client.alive:
-        fail(target.no_command_node(client, *words))
+        fail(target.no_node(client, *words, kind="command node"))
     if why := target.not_operator(client.profile, *words):
         fail(f"inferences are for operators: {why}")
     fail(

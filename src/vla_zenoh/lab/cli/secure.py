@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
-from rich.text import Text
 
-from vla_zenoh.cli.addresses import is_own
 from vla_zenoh.cli.options import DEFAULT_PROFILE, HostOption, JsonOption, ProfileOption
-from vla_zenoh.cli.output import console, errors, fail, new_table, print_json, styled
+from vla_zenoh.cli.output import console, errors, fail, print_json
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import SecurityError, VlaZenohError
+from vla_zenoh.lab.cli.addresses import is_own
+from vla_zenoh.lab.cli.certificate_table import certificate_row, print_certificates
 from vla_zenoh.lab.cli.output_path import ForceOption, output_file
 from vla_zenoh.lab.cli.secure_copying import copy_commands
 from vla_zenoh.profile import Profile, load_profile, profile_file
@@ -25,7 +25,7 @@ from vla_zenoh.resources import is_path
 from vla_zenoh.security.authority import AUTHORITY_DAYS, CERTIFICATE_DAYS
 from vla_zenoh.security.bridge import bridges
 from vla_zenoh.security.identity import PEOPLE, Role, identities, identities_of, operator_identities
-from vla_zenoh.security.lab_certificates import Entry, LabCertificates
+from vla_zenoh.security.lab_certificates import LabCertificates
 from vla_zenoh.security.secure_profile import (
     moved_hosts,
     profile_text,
@@ -240,9 +240,9 @@ def show(
             for entry in entries
         ]
     if as_json:
-        print_json([_mapping(entry, now) for entry in entries])
+        print_json([certificate_row(entry, now) for entry in entries])
     else:
-        _print(entries, now)
+        print_certificates(entries, now)
         if (host := store.known_host()) is not None:
             console().print(f"this computer is {host}")
     if not entries:
@@ -311,43 +311,3 @@ def _warn_of_loopback(profile: Profile) -> None:
             "--at HOST=ADDRESS",
             style="yellow",
         )
-
-
-def _print(entries: list[Entry], now: dt.datetime) -> None:
-    table = new_table("host", "node", "valid until", "days", "serves as")
-    wrong: list[Text] = []
-    for entry in entries:
-        found, colour = entry.certificate, "green"
-        if entry.faults:
-            colour = "bold red"
-        elif entry.warning:
-            colour = "yellow"
-        table.add_row(
-            entry.host or "(the lab)",
-            entry.node,
-            styled(f"{found.not_after:%Y-%m-%d}", colour) if found else "",
-            styled(found.days_left(now), colour) if found else "",
-            ", ".join(found.addresses) if found else "",
-        )
-        named = f"{entry.host or 'the lab'}/{entry.node}"
-        whys = entry.faults or ([entry.warning] if entry.warning else [])
-        wrong += [styled(f"{named}: {why}", colour) for why in whys]
-    screen = console()
-    screen.print(table)
-    for line in wrong:
-        screen.print(line, soft_wrap=True)
-
-
-def _mapping(entry: Entry, now: dt.datetime) -> dict[str, object]:
-    found = entry.certificate
-    return {
-        "host": entry.host,
-        "node": entry.node,
-        "file": str(entry.path),
-        "common_name": found.common_name if found else None,
-        "not_after": found.not_after.isoformat() if found else None,
-        "days_left": found.days_left(now) if found else None,
-        "addresses": list(found.addresses) if found else [],
-        "faults": list(entry.faults),
-        "warning": entry.warning,
-    }

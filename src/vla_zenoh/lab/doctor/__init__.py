@@ -8,12 +8,10 @@ from vla_zenoh.lab.doctor.access import router
 from vla_zenoh.lab.doctor.computer import (
     disk,
     governor,
-    left_segments,
     niceness,
     processors,
     real_time_priority,
     shared_memory,
-    terminal,
     video_devices,
     wall_clock,
 )
@@ -45,10 +43,8 @@ def examine(needs: Needs, try_zenoh: Callable[[str], str]) -> Iterator[HostFindi
     yield real_time_priority()
     yield niceness()
     yield shared_memory()
-    yield left_segments()
     yield disk()
     for endpoint in needs.endpoints:
         yield router(endpoint, is_router=needs.is_router, try_zenoh=try_zenoh)
     yield wall_clock()
     yield video_devices(needs.devices)
-    yield terminal()

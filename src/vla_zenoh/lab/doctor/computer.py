@@ -1,16 +1,13 @@
-"""Checks of the computer: scheduling, processors, memory, disk, cameras, clock, terminal."""
+"""Checks of the computer: scheduling, processors, memory, disk, cameras, clock."""
 
 from __future__ import annotations
 
-import codecs
 import ctypes
 import ctypes.util
-import fcntl
 import os
 import resource
 import shutil
-import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from vla_zenoh.lab.doctor.finding import HostFinding
@@ -127,23 +124,6 @@ def shared_memory(
     return HostFinding("shared memory", "ok", found)
 
 
-def left_segments(folder: Path = SHARED_MEMORY) -> HostFinding:
-    """No Zenoh shared memory left behind by killed processes of this user."""
-    segments = sorted(folder.glob("*.zenoh"))
-    left = [path for path in segments if _is_left(path)]
-    if not left:
-        in_use = f"{len(segments)} segments in use" if segments else "no segments"
-        return HostFinding("left shared memory", "ok", f"none; {in_use}")
-    size_mib = sum(_size(path) for path in left) // MIB
-    return HostFinding(
-        "left shared memory",
-        "warn",
-        f"{len(left)} Zenoh segments, {size_mib} MiB, left by processes that were killed",
-        "the next Zenoh session on this host removes them; by hand: rm "
-        + " ".join(str(path) for path in left),
-    )
-
-
 def disk(folder: Path | None = None, wanted_mib: int = DISK_WANTED_MIB) -> HostFinding:
     """Room on the disk for recordings and videos."""
     folder = folder or Path.cwd()
@@ -153,23 +133,6 @@ def disk(folder: Path | None = None, wanted_mib: int = DISK_WANTED_MIB) -> HostF
         return HostFinding("disk", "ok", found)
     level = "fail" if free_mib < min(DISK_NEEDED_MIB, wanted_mib) else "warn"
     return HostFinding("disk", level, found, "free some space, or work in a folder on another disk")
-
-
-def _size(path: Path) -> int:
-    try:
-        return path.stat().st_size
-    except OSError:
-        return 0
-
-
-def _is_left(segment: Path) -> bool:
-    """No process uses `segment`: each that does holds a shared lock on it."""
-    try:
-        with segment.open("rb") as file:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:  # in use, gone, or another user's
-        return False
-    return True
 
 
 DEV = Path("/dev")
@@ -235,23 +198,3 @@ def kernel_state() -> int | None:
     except (OSError, AttributeError):
         return None
     return state if state >= 0 else None
-
-
-NARROWEST_COLUMNS = 80
-
-
-def terminal(
-    environ: Mapping[str, str] | None = None,
-    encoding: str | None = None,
-    columns: int | None = None,
-) -> HostFinding:
-    """The terminal shows UTF-8 and is wide enough; arguments replace what it reports."""
-    environ = os.environ if environ is None else environ
-    encoding = encoding or str(sys.stdout.encoding or "ascii")
-    columns = columns or shutil.get_terminal_size().columns
-    found = f"{environ.get('TERM') or 'no TERM'}, {encoding}, {columns} columns"
-    if codecs.lookup(encoding).name != "utf-8":
-        return HostFinding("terminal", "warn", found, "export LANG=C.UTF-8")
-    if columns < NARROWEST_COLUMNS:
-        return HostFinding("terminal", "warn", found, f"make it {NARROWEST_COLUMNS} columns wide")
-    return HostFinding("terminal", "ok", found)

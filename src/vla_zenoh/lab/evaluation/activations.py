@@ -7,15 +7,10 @@ original is.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 from vla_zenoh.lab.recording.run import RecordedSample, Run
 from vla_zenoh.types import Task
-
-
-def until(stream: Sequence[RecordedSample], until_ns: int) -> list[RecordedSample]:
-    """Entries stamped before a time."""
-    return [entry for entry in stream if entry.header.stamp_wall_ns < until_ns]
 
 
 def obeyed_chunks(run: Run) -> list[RecordedSample]:

@@ -36,7 +36,6 @@ def recordings(paths: Iterable[Path]) -> Iterator[Path]:
 
 def evaluate(
     paths: Sequence[Path],
-    first: int | None = None,
     *,
     pictures: int = 0,
     evaluated: Callable[[Path], None] = lambda path: None,
@@ -45,7 +44,6 @@ def evaluate(
 
     Args:
         paths: files and folders.
-        first: only this many requests of each.
         pictures: number of moments to show of each camera.
         evaluated: called after each file.
 
@@ -62,7 +60,7 @@ def evaluate(
             faults[str(path)] = EMPTY.format(path)
         for file in found:
             try:
-                runs.append(evaluate_run(file, first, pictures=pictures))
+                runs.append(evaluate_run(file, pictures=pictures))
             except RecordingError as error:
                 faults[str(file)] = str(error)
             evaluated(file)

@@ -7,19 +7,13 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from vla_zenoh.errors import MissingExtraError
 from vla_zenoh.lab.evaluation import trajectory
-from vla_zenoh.lab.evaluation.activations import (
-    activations,
-    last_ns,
-    obeyed_chunks,
-    prompt_intervals,
-    until,
-)
+from vla_zenoh.lab.evaluation.activations import activations, obeyed_chunks, prompt_intervals
 from vla_zenoh.lab.evaluation.filmstrip import filmstrip
 from vla_zenoh.lab.evaluation.provenance import provenance, verdicts
 from vla_zenoh.lab.evaluation.result import Evaluation, PlotTrace
@@ -48,22 +42,20 @@ class MeasuredMotion(NamedTuple):
         return MeasuredMotion(*(column[first:last] for column in self))
 
 
-def evaluate_run(path: Path, first: int | None = None, *, pictures: int = 0) -> Evaluation:
+def evaluate_run(path: Path, *, pictures: int = 0) -> Evaluation:
     """Evaluate a recording; `Evaluation.problems` lists what cannot be read.
 
     Args:
         path: of the file.
-        first: only this many chunks of the obeyed worker.
         pictures: number of moments to show of each camera.
 
     Raises:
         RecordingError: the file cannot be opened, or is of another program.
     """
-    run = load_run(path)
-    return evaluate_loaded(run, first, pictures=pictures)
+    return evaluate_loaded(load_run(path), pictures=pictures)
 
 
-def evaluate_loaded(run: Run, first: int | None = None, *, pictures: int = 0) -> Evaluation:
+def evaluate_loaded(run: Run, *, pictures: int = 0) -> Evaluation:
     """`evaluate_run` of a run in memory."""
     zero_ns = run.began_ns
     name = run.path.parent.name if run.path.stem == "run" else run.path.stem
@@ -74,25 +66,18 @@ def evaluate_loaded(run: Run, first: int | None = None, *, pictures: int = 0) ->
         out.problems.append(f"the recorder dropped {run.file.dropped} samples")
     obeyed = obeyed_chunks(run)
     causes = run.first_commands()
-    until_ns = last_ns(run) + 1
-    if first is not None:
-        if len(obeyed) < first:
-            out.problems.append(f"it has {len(obeyed)} chunks, fewer than the {first} asked for")
-        elif len(obeyed) > first:
-            until_ns = obeyed[first].header.stamp_wall_ns
-        obeyed = obeyed[:first]
-        wanted = {(entry.record.worker, entry.header.seq) for entry in obeyed}
-        causes = [each for each in causes if (each[0].worker, each[0].chunk_seq) in wanted]
     _requests(out, obeyed, causes, zero_ns)
-    measured = _add_motion(out, run, zero_ns, until_ns)
-    _seams(out, until(run.commands, until_ns))
-    _joint_jerk(out, until(run.joint_commands, until_ns))
-    active = _active(run, until_ns, zero_ns)
-    _idle(out, active, measured)
+    measured, commanded = _stream(run.poses, zero_ns), _commanded(run, zero_ns)
+    _motion(out, measured, commanded)
+    out.width_m = np.array([entry.record.width_m for entry in run.grippers])
+    out.width_t_s = np.array([(e.header.stamp_wall_ns - zero_ns) / 1e9 for e in run.grippers])
+    _seams(out, run.commands)
+    _joint_jerk(out, run.joint_commands)
+    _idle(out, run, measured)
     out.refusals = _counted(run.first_statuses, run.statuses, "refused.")
     out.skipped = _counted(run.first_statuses, run.statuses, "skipped.")
-    out.gripper_orders = len(until(run.gripper_commands, until_ns))
-    _segments(out, run, causes, measured, until_ns)
+    out.gripper_orders = len(run.gripper_commands)
+    _segments(out, run, causes, measured)
     out.about, out.verdicts = provenance(run), verdicts(run)
     if pictures:
         out.views = filmstrip(run, [entry.record for entry in obeyed], pictures)
@@ -110,16 +95,6 @@ def _film(run: Run) -> bytes:
             return path.read_bytes() if write_film(path, run, FILM) else b""
         except MissingExtraError:
             return b""
-
-
-def _add_motion(out: Evaluation, run: Run, zero_ns: int, until_ns: int) -> MeasuredMotion:
-    """Add what the arm and the gripper did; returns the measured motion."""
-    measured, commanded = _measured(run, zero_ns, until_ns), _commanded(run, zero_ns, until_ns)
-    _motion(out, measured, commanded)
-    grippers = until(run.grippers, until_ns)
-    out.width_m = np.array([entry.record.width_m for entry in grippers])
-    out.width_t_s = np.array([(e.header.stamp_wall_ns - zero_ns) / 1e9 for e in grippers])
-    return measured
 
 
 # -- requests -------------------------------------------------------------------------------------
@@ -143,10 +118,16 @@ def _requests(
 
 
 # -- motion ---------------------------------------------------------------------------------------
-def _stream(entries: Iterable[Any], zero_ns: int) -> MeasuredMotion:
+def _stream(entries: Iterable[RecordedSample], zero_ns: int, prefix: str = "") -> MeasuredMotion:
+    """Poses of records, or with ``reference_`` those of the controller's reference."""
     rows = [
-        ((stamp_ns - zero_ns) / 1e9, position, quat, twist)
-        for stamp_ns, position, quat, twist in entries
+        (
+            (entry.header.stamp_wall_ns - zero_ns) / 1e9,
+            getattr(entry.record, f"{prefix}position_m"),
+            getattr(entry.record, f"{prefix}quat_xyzw"),
+            entry.record.twist,
+        )
+        for entry in entries
     ]
     if not rows:
         return MeasuredMotion(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 6)))
@@ -155,40 +136,12 @@ def _stream(entries: Iterable[Any], zero_ns: int) -> MeasuredMotion:
     return MeasuredMotion(t_s[order], position[order], quat[order], twist[order])
 
 
-def _measured(run: Run, zero_ns: int, until_ns: int) -> MeasuredMotion:
-    return _stream(
-        (
-            (e.header.stamp_wall_ns, e.record.position_m, e.record.quat_xyzw, e.record.twist)
-            for e in until(run.poses, until_ns)
-        ),
-        zero_ns,
-    )
-
-
-def _commanded(run: Run, zero_ns: int, until_ns: int) -> MeasuredMotion:
+def _commanded(run: Run, zero_ns: int) -> MeasuredMotion:
     """Pose commands; for joint commands the reference pose of the controller."""
     if run.commands:
-        return _stream(
-            (
-                (e.header.stamp_wall_ns, e.record.position_m, e.record.quat_xyzw, e.record.twist)
-                for e in until(run.commands, until_ns)
-            ),
-            zero_ns,
-        )
-    poses = until(run.poses, until_ns)
-    return _stream(
-        (
-            (
-                e.header.stamp_wall_ns,
-                e.record.reference_position_m,
-                e.record.reference_quat_xyzw,
-                e.record.twist,
-            )
-            for e in poses
-            if e.record.reference_position_m is not None
-        ),
-        zero_ns,
-    )
+        return _stream(run.commands, zero_ns)
+    told = [entry for entry in run.poses if entry.record.reference_position_m is not None]
+    return _stream(told, zero_ns, "reference_")
 
 
 def _motion(out: Evaluation, measured: MeasuredMotion, commanded: MeasuredMotion) -> None:
@@ -258,15 +211,11 @@ def _joint_jerk(out: Evaluation, commands: Sequence[RecordedSample]) -> None:
 
 
 # -- activity -------------------------------------------------------------------------------------
-def _active(run: Run, until_ns: int, zero_ns: int) -> list[tuple[float, float]]:
-    return [
-        ((since_ns - zero_ns) / 1e9, (min(end_ns, until_ns) - zero_ns) / 1e9)
+def _idle(out: Evaluation, run: Run, measured: MeasuredMotion) -> None:
+    active = [
+        ((since_ns - run.began_ns) / 1e9, (end_ns - run.began_ns) / 1e9)
         for since_ns, end_ns, _ in activations(run)
-        if since_ns < until_ns
     ]
-
-
-def _idle(out: Evaluation, active: Sequence[tuple[float, float]], measured: MeasuredMotion) -> None:
     if not active:
         return
     out.active_s = sum(until_s - since_s for since_s, until_s in active)
@@ -300,15 +249,11 @@ def _segments(
     run: Run,
     causes: Sequence[tuple[Cause, int]],
     measured: MeasuredMotion,
-    until_ns: int,
 ) -> None:
     """A segment for each prompt in force while the arm was active."""
     zero_ns = run.began_ns
     steps = {(e.record.worker, e.header.seq): len(e.record.steps) for e in run.chunks}
     for since_ns, end_ns, prompt in prompt_intervals(run):
-        if since_ns >= until_ns:
-            break
-        end_ns = min(end_ns, until_ns)
         out.prompts.append(prompt)
         since_s, until_s = (since_ns - zero_ns) / 1e9, (end_ns - zero_ns) / 1e9
         out.marks.append((since_s, prompt))

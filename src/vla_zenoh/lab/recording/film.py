@@ -36,13 +36,11 @@ class Film:
         height_px: of the images.
         rate_hz: frames per second.
         quality: x264's constant rate factor; lower is better.
-        cameras: to show; empty: all recorded ones.
     """
 
     height_px: int = 480
     rate_hz: int = 15
     quality: int = 24
-    cameras: tuple[str, ...] = ()
 
 
 def write_film(
@@ -64,7 +62,7 @@ def write_film(
     Raises:
         MissingExtraError: PyAV is not installed.
     """
-    cameras = [name for name in sorted(run.picture_counts) if name in (look.cameras or (name,))]
+    cameras = sorted(run.picture_counts)
     if not cameras:
         return 0
     keys = {run.keys.camera_jpeg(camera): camera for camera in cameras}

@@ -125,7 +125,7 @@ class Replay:
         self._alive = alive_nodes(session, profile.keys)
         self._reject_live_robot()
         self.node = Node(NAME, profile, session)
-        self.node.on_alive(self._on_alive)
+        self.node.on_tokens(self.node.keys.all_alive, self._on_alive)
         self._publishers: dict[str, Any] = {}
         self._raw: dict[str, Any] = {}
         self.replayed = ReplayResult()

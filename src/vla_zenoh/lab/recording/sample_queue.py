@@ -8,7 +8,7 @@ from collections.abc import Iterable
 
 import zenoh
 
-from vla_zenoh.bus.buffers import payload_and_attachment
+from vla_zenoh.bus.buffers import bytes_of, check_size
 from vla_zenoh.bus.clock import Clock
 from vla_zenoh.errors import CodecError, RecordingError
 from vla_zenoh.lab.recording.sample import Sample, received_sample
@@ -61,7 +61,7 @@ class SampleQueue:
         """Add a sample from Zenoh, also from the reply to a query."""
         key = str(sample.key_expr)
         try:
-            payload, attachment = payload_and_attachment(sample, self._max_bytes)
+            check_size(sample, self._max_bytes)
         except CodecError as error:  # copying an oversized one costs as much as keeping it
             with self._lock:
                 if error.reason == "oversize":
@@ -69,7 +69,9 @@ class SampleQueue:
                 else:
                     self.rejected[error.reason] += 1
             return
-        self.add(key, payload, str(sample.encoding), attachment)
+        header = bytes_of(sample.attachment, self._max_bytes)
+        attachment = None if sample.attachment is None else header
+        self.add(key, bytes_of(sample.payload, self._max_bytes), str(sample.encoding), attachment)
 
     def add(self, key: str, payload: bytes, encoding: str, attachment: bytes | None) -> None:
         """Add a sample; it is dropped and counted when the queue is full."""

@@ -50,34 +50,25 @@ class Viewer:
             self.process.wait()
 
 
-def open_window() -> Viewer:
+def open_window(*more: str) -> Viewer:
     """Open Rerun's viewer on this computer's screen.
+
+    Args:
+        more: arguments of its program; with ``--headless`` it needs a Vulkan driver, not a screen.
 
     Raises:
         NodeError: there is no screen, or the viewer does not start.
         MissingExtraError: rerun-sdk is not installed.
     """
-    if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
+    screen = "--headless" in more or sys.platform != "linux"
+    if not screen and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
         raise NodeError(
             "there is no screen here (neither DISPLAY nor WAYLAND_DISPLAY is set); look with a "
             "browser: --serve, or write a file for later: -o FILE.rrd"
         )
     port = _free_port()
     arguments = ("--bind", HERE, "--port", str(port), "--hide-welcome-screen", "--expect-data-soon")
-    return Viewer(_data_url(HERE, port), "", _start(arguments, HERE, port))
-
-
-def open_headless(width_px: int, height_px: int) -> Viewer:
-    """Open Rerun's viewer without a window, for screenshots.
-
-    Raises:
-        NodeError: the viewer does not start; it needs a Vulkan driver.
-        MissingExtraError: rerun-sdk is not installed.
-    """
-    port = _free_port()
-    arguments = ("--headless", "--bind", HERE, "--port", str(port))
-    size = ("--window-size", f"{width_px}x{height_px}")
-    return Viewer(_data_url(HERE, port), "", _start((*arguments, *size), HERE, port))
+    return Viewer(_data_url(HERE, port), "", _start((*arguments, *more), HERE, port))
 
 
 def open_server(address: str, port: int) -> Viewer:

@@ -6,9 +6,10 @@ import math
 import re
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Generator
+from functools import partial
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple
 
 import cv2
 
@@ -21,69 +22,40 @@ LOOK_S = 0.5
 MAX_VIDEO_HZ = 1000.0
 
 
-class FrameReader(Protocol):
-    """Reads the images of a file or folder once, in order."""
+class Frames(NamedTuple):
+    """The images of a file or folder, once, in order.
 
-    backend: str
-    rate_hz: float | None
+    Args:
+        images: each decodes one image, None where it is corrupt. Closing it closes the file.
+        backend: name of the library that reads them.
+        rate_hz: of a video; None: unknown.
+    """
 
-    def step(self) -> bool:
-        """Go to the next image; False at the end."""
-        ...
-
-    def image(self) -> Pixels | None:
-        """The current image; None if it is corrupt."""
-        ...
-
-    def close(self) -> None:
-        """Close the file."""
-        ...
+    images: Generator[Callable[[], Pixels | None]]
+    backend: str = "pictures"
+    rate_hz: float | None = None
 
 
-class VideoFile:
-    """Reader of a video file.
+def open_video(path: Path) -> Frames:
+    """The images of a video.
 
     Raises:
         NodeError: not a readable video.
     """
+    capture = Capture()
+    if not capture.open(str(path), cv2.CAP_FFMPEG):
+        raise NodeError(f"{path} is neither an image nor a video that can be read")
 
-    def __init__(self, path: Path) -> None:
-        self._capture = Capture()
-        if not self._capture.open(str(path), cv2.CAP_FFMPEG):
-            raise NodeError(f"{path} is neither an image nor a video that can be read")
-        self.backend = self._capture.backend
-        rate_hz = self._capture.get(cv2.CAP_PROP_FPS)
-        sane = math.isfinite(rate_hz) and 0 < rate_hz <= MAX_VIDEO_HZ
-        self.rate_hz: float | None = rate_hz if sane else None
+    def images() -> Generator[Callable[[], Pixels | None]]:
+        try:
+            while capture.grab():
+                yield capture.retrieve
+        finally:
+            capture.close()
 
-    def step(self) -> bool:
-        return self._capture.grab()
-
-    def image(self) -> Pixels | None:
-        return self._capture.retrieve()
-
-    def close(self) -> None:
-        self._capture.close()
-
-
-class ImageFiles:
-    """Reader of image files; each is decoded on demand."""
-
-    def __init__(self, paths: Iterable[Path]) -> None:
-        self._rest = iter(paths)
-        self._path: Path | None = None
-        self.backend = "pictures"
-        self.rate_hz: float | None = None
-
-    def step(self) -> bool:
-        self._path = next(self._rest, None)
-        return self._path is not None
-
-    def image(self) -> Pixels | None:
-        return cv2.imread(str(self._path), cv2.IMREAD_COLOR)
-
-    def close(self) -> None:
-        self._rest = iter(())
+    rate_hz = capture.get(cv2.CAP_PROP_FPS)
+    sane = math.isfinite(rate_hz) and 0 < rate_hz <= MAX_VIDEO_HZ
+    return Frames(images(), capture.backend, rate_hz if sane else None)
 
 
 def natural(path: Path) -> list[tuple[int, str]]:
@@ -92,24 +64,21 @@ def natural(path: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part.lower()) for part in parts]
 
 
-def open_frames(path: Path) -> FrameReader:
-    """Reader of the video, folder or image at `path`.
+def open_frames(path: Path) -> Frames:
+    """The images of the video, folder or image at `path`.
 
     Raises:
         NodeError: missing, or nothing that can be shown.
     """
-    if path.is_dir():
-        images = [
-            file
-            for file in sorted(path.iterdir(), key=natural)
-            if file.is_file() and cv2.haveImageReader(str(file))
-        ]
-        if not images:
-            raise NodeError(f"there is no image in the folder {path}")
-        return ImageFiles(images)
     if not path.exists():
         raise NodeError(f"there is no file or folder {path}; waiting until it exists")
-    return ImageFiles([path]) if cv2.haveImageReader(str(path)) else VideoFile(path)
+    if path.is_file() and not cv2.haveImageReader(str(path)):
+        return open_video(path)
+    files = sorted(path.iterdir(), key=natural) if path.is_dir() else [path]
+    images = [str(file) for file in files if file.is_file() and cv2.haveImageReader(str(file))]
+    if not images:
+        raise NodeError(f"there is no image in the folder {path}")
+    return Frames(partial(cv2.imread, image, cv2.IMREAD_COLOR) for image in images)
 
 
 class FileSource:
@@ -126,7 +95,8 @@ class FileSource:
     def __init__(self, path: str, rate_hz: float, loop: bool) -> None:
         self._path = Path(path).expanduser()
         self._rate_hz, self._loop = rate_hz, loop
-        self._frames: FrameReader | None = None
+        self._frames: Frames | None = None
+        self._image: Callable[[], Pixels | None] | None = None
         self._identity: tuple[int, int] = (0, 0)
         self._next_s = self._look_s = 0.0
         self._period_s = 1.0 / rate_hz
@@ -156,23 +126,22 @@ class FileSource:
         return time.monotonic_ns() if self._step() else None
 
     def retrieve(self) -> Pixels | None:
-        return None if self._frames is None else self._frames.image()
+        return None if self._image is None else self._image()
 
     def close(self) -> None:
         if self._frames is not None:
-            self._frames.close()
-            self._frames = None
+            self._frames.images.close()
+            self._frames = self._image = None
 
     def _step(self) -> bool:
-        if self._frames is not None and self._frames.step():
-            return True
-        if not self._loop:
-            return False
-        self.close()
-        self._frames = open_frames(self._path)
-        if not self._frames.step():
-            raise NodeError(f"there is no image in {self._path}")
-        return True
+        self._image = None if self._frames is None else next(self._frames.images, None)
+        if self._image is None and self._loop:
+            self.close()
+            self._frames = open_frames(self._path)
+            self._image = next(self._frames.images, None)
+            if self._image is None:
+                raise NodeError(f"there is no image in {self._path}")
+        return self._image is not None
 
     def _file_identity(self) -> tuple[int, int]:
         try:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from vla_zenoh import keys as key_names
-from vla_zenoh.bus.buffers import CallbackRing, ReceivedSample, ZenohRing
+from vla_zenoh.bus.buffers import CallbackRing, ReceivedSample, ZenohRing, header_of
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import MAX_MESSAGE_BYTES
 from vla_zenoh.codec import settings
@@ -120,7 +120,7 @@ class CommandInputs:
         worker = key_names.last_chunk(str(arrival.sample.key_expr))
         owner = self._peer_monitor.owner(worker)
         try:
-            header = self._node.header(arrival)
+            header = header_of(arrival.sample)
         except CodecError as error:
             self._node.reject(error.reason, f"delta/{worker}: {error}")
             return None

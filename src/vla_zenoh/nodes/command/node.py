@@ -7,7 +7,6 @@ import math
 import sys
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -86,14 +85,10 @@ class CommandNode:
             (keys.speed, lambda: f"{commander.task.speed_percent:g}"),
             (keys.active, lambda: "true" if commander.task.active else "false"),
         ):
-            self.node.serve(key, self._text_reply(key, value))
+            self.node.serve(key, lambda query, key=key, value=value: query.reply(key, value()))
         self.node.serve(
             keys.task, lambda query: query.reply(keys.task, records.encode(commander.task))
         )
-
-    @staticmethod
-    def _text_reply(key: str, value: Callable[[], str]) -> Callable[[zenoh.Query], None]:
-        return lambda query: query.reply(key, value().encode())
 
     # -- running ------------------------------------------------------------------------------
     def run(self, stop: threading.Event) -> None:
@@ -135,7 +130,8 @@ class CommandNode:
         now_ns = self.node.clock.wall_at(tick.nominal_ns)
         inputs = self._inputs.poll(now_ns)
         inputs.settings = [*inputs.settings, *extra]
-        limit = max(1, int(self.node.profile.timing.command_timeout_s * self._hz))
+        timing = self.node.profile.timing
+        limit = max(1, int(timing.command_timeout_s * timing.command_hz))
         out = self.commander.step(inputs, now_ns, min(tick.periods, limit))
         self._publish(out, now_ns)
         if any(event.kind == "transition" for event in out.events):
@@ -155,10 +151,6 @@ class CommandNode:
         if why is not None:
             self.node.counters["command.latch_failed"] += 1
             self.node.emit(Event("error", "fault", "latch", why))
-
-    @property
-    def _hz(self) -> float:
-        return self.node.profile.timing.command_hz
 
     def _publish(self, out: Outputs, now_ns: int) -> None:
         if out.pose is not None:

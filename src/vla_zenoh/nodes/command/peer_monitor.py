@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from vla_zenoh import keys as key_names
-from vla_zenoh.bus.buffers import ReceivedSample, ZenohRing
+from vla_zenoh.bus.buffers import ReceivedSample, ZenohRing, header_of
 from vla_zenoh.bus.clock import HostId
 from vla_zenoh.bus.node import Node
 from vla_zenoh.control.preflight import PeerSnapshot
@@ -48,7 +48,7 @@ class PeerMonitor:
         self._next_clocks_s = 0.0
         self._statuses = node.subscribe(node.keys.all_status, ZenohRing(STATUSES_A_TICK))
         self._new_specs = node.subscribe(node.keys.all_specs, ZenohRing(SPECS_A_TICK))
-        node.on_alive(self._on_alive)
+        node.on_tokens(node.keys.all_alive, self._on_alive)
         node.on_tokens(node.keys.all_holding, self._on_holding)
         self._robot_node = node.profile.robot.driver
 
@@ -198,7 +198,7 @@ class PeerMonitor:
         """The node or worker by the sample's key, and the header; None: it is rejected."""
         key = str(arrival.sample.key_expr)
         try:
-            return key_names.last_chunk(key), self._node.header(arrival)
+            return key_names.last_chunk(key), header_of(arrival.sample)
         except CodecError as error:
             short = self._node.keys.short(key)
             self._node.reject(error.reason, f"{short}: {error}", short)

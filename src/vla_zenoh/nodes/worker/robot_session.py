@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import zenoh
 
-from vla_zenoh.bus.buffers import CallbackRing, LatestSample, bytes_of
+from vla_zenoh.bus.buffers import CallbackRing, LatestSample, bytes_of, header_of
 from vla_zenoh.bus.metrics import Percentiles, RateMeter
 from vla_zenoh.bus.node import Node
 from vla_zenoh.codec import image as image_codec
@@ -177,7 +177,7 @@ class RobotSession:
         arrival, writer = received
         sample = arrival.sample
         try:
-            header = self.node.header(arrival)
+            header = header_of(sample)
             writer.check(header, arrival.mono_ns)
             payload = bytes_of(sample.payload, MAX_IMAGE_BYTES)
             if self._jpeg:

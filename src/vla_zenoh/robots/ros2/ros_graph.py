@@ -196,8 +196,7 @@ class RosGraph:
         """Subscribe to a topic; its samples go to `buffer`."""
         key, _ = self._declare(Endpoint(EntityRole.SUBSCRIBER, name, kind, qos))
         self.buffers.append(buffer)
-        handler = zenoh.handlers.Callback(buffer, indirect=False)
-        self._declared.append(self.session.declare_subscriber(key, handler))
+        self._declared.append(buffer.subscribe(self.session, key))
         return buffer
 
     def publisher(self, name: str, kind: str, qos: Qos = DEFAULT) -> RosPublisher:

@@ -1,0 +1,221 @@
+"""Checks of a profile's robot: kinematics, simulated world, Python class, ROS 2 messages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from vla_zenoh import resources
+from vla_zenoh.errors import (
+    MissingExtraError,
+    ProfileError,
+    RecordError,
+    ResourceError,
+    VlaZenohError,
+    nearest,
+)
+from vla_zenoh.policy.loader import inspect_robot
+from vla_zenoh.profile import POSE_JOINTS, Profile
+from vla_zenoh.profile.section import Place
+
+LONG_BRAKE_S = 2.5
+"""`up` ends a robot's node 2.8 s after Ctrl-C, less the time until the node gets the signal.
+See `STOP_ORDER` in `vla_zenoh.runtime.supervisor`."""
+SIM = "sim:"
+
+
+class ProfileFault(NamedTuple):
+    """A fault.
+
+    Args:
+        place: in the profile.
+        why: continues ``PLACE: ``.
+        node: the node that fails, as kind or worker; "": no computer can run this profile.
+        other: place that contradicts it, and is named where only that is in the checked file.
+    """
+
+    place: Place
+    why: str
+    node: str = ""
+    other: Place | None = None
+
+
+# -- command node -----------------------------------------------------------------------------
+def arm(profile: Profile, name: str, host: str | None) -> Iterator[ProfileFault]:
+    """The arm as the command node makes it."""
+    place = ("robot", "description")
+    try:
+        from vla_zenoh.control.limits import into_workspace
+        from vla_zenoh.control.reachability import make_reachability_filter
+
+        reach = make_reachability_filter(profile)
+    except (ResourceError, MissingExtraError) as error:
+        yield ProfileFault(place, str(error), "command")
+        return
+    except ImportError as error:
+        yield ProfileFault(("robot",), f"its joints and links were not checked: {error}", "command")
+        return
+    except (ProfileError, RecordError) as error:
+        yield ProfileFault(("robot",), str(error))
+        return
+    except ValueError as error:  # from Pinocchio, for a file that is no URDF
+        yield ProfileFault(place, f"{profile.robot.description!r} cannot be read: {error}")
+        return
+    kinematics = reach.kinematics
+    home_rad = kinematics.ordered(profile.robot.arm_joints, profile.robot.home_rad)
+    for index, joint in enumerate(kinematics.arm_joints):
+        low, high = float(kinematics.lower_rad[index]), float(kinematics.upper_rad[index])
+        if not low <= home_rad[index] <= high:
+            yield ProfileFault(
+                ("robot", "home_rad"),
+                f"puts {joint} at {home_rad[index]:.3g} rad, its range is {low:.3g} to {high:.3g}",
+            )
+            return
+    at_m = kinematics.forward(home_rad).position_m
+    _, outside_m = into_workspace(profile.limits, at_m)
+    if profile.robot.driver == "sim" and outside_m > profile.limits.step_m:
+        where = ", ".join(f"{value:.3f}" for value in at_m)
+        box = profile.limits.workspace
+        yield ProfileFault(
+            ("robot", "home_rad"),
+            f"with robot.home_rad the TCP is at ({where}) m, {outside_m:.3f} m outside "
+            f"limits.workspace x {box.x_m} y {box.y_m} z {box.z_m}: the simulated arm starts there "
+            "and could not be activated",
+            other=("limits", "workspace"),
+        )
+
+
+def joints_advice(profile: Profile) -> Iterator[str]:
+    """Advice for an arm with too few joints for any pose."""
+    joints = len(profile.robot.arm_joints)
+    if joints >= POSE_JOINTS:
+        return
+    try:
+        from vla_zenoh.control.policy_check import immovable_axes
+        from vla_zenoh.kinematics.kinematics import make_kinematics
+
+        kinematics = make_kinematics(profile)
+    except (ImportError, ValueError, VlaZenohError):
+        return  # `arm` says so
+    home_rad = kinematics.ordered(profile.robot.arm_joints, profile.robot.home_rad)
+    axes = ", ".join(immovable_axes(kinematics.jacobian(home_rad))) or "none"
+    yield (
+        f"robot.arm_joints: {joints} joints cannot reach every pose, as six can. At home the TCP "
+        f"cannot move along or about these axes alone: {axes}. Steps of a model along them are "
+        "shortened to nothing, activation is rejected while its newest chunk asks for one, and "
+        "models with absolute poses or joint positions are rejected altogether"
+    )
+
+
+# -- robot node -------------------------------------------------------------------------------
+def simulator(profile: Profile, name: str, host: str | None) -> Iterator[ProfileFault]:
+    """The world as the simulator makes it."""
+    simulated = any(camera.source.startswith(SIM) for camera in profile.cameras.values())
+    running = {kind for part in profile.hosts.values() for kind in part.nodes}
+    if profile.robot.driver != "sim" or not running & ({"sim", "camera"} if simulated else {"sim"}):
+        return
+    try:
+        from vla_zenoh.simulation.appearance import AppearanceSwitcher
+        from vla_zenoh.simulation.scene import scene_file
+        from vla_zenoh.simulation.world import build_world
+    except ImportError as error:
+        yield ProfileFault(
+            ("robot", "driver"), f"is sim: {MissingExtraError(str(error.name), 'sim')}"
+        )
+        return
+    try:
+        scene_file(profile.sim.scene)
+    except ResourceError as error:
+        yield ProfileFault(("sim", "scene"), str(error), "sim")
+        yield ProfileFault(("sim", "scene"), str(error), "camera" if simulated else "sim")
+        return
+    try:
+        resources.robot_urdf(profile.robot.description)
+        world = build_world(profile)
+    except MissingExtraError:
+        return  # `arm` says so
+    except (ResourceError, RecordError) as error:
+        if Path(profile.robot.description).name in str(error) or "description" in str(error):
+            yield from _not_simulated(profile, error)
+        else:
+            yield ProfileFault(("sim",), str(error))
+        return
+    try:
+        AppearanceSwitcher(world.model).apply(0, profile.sim.vary)
+    except ResourceError as error:
+        yield ProfileFault(("sim", "vary"), str(error))
+    known = [world.model.camera(index).name for index in range(world.model.ncam)]
+    for camera, settings in profile.cameras.items():
+        view = settings.source.removeprefix(SIM)
+        if settings.source.startswith(SIM) and view not in known:
+            yield ProfileFault(
+                ("cameras", camera, "source"),
+                f"scene {profile.sim.scene!r} has no camera {view!r}{nearest(view, known)} "
+                f"Known: {', '.join(known)}",
+            )
+
+
+def _not_simulated(profile: Profile, error: VlaZenohError) -> Iterator[ProfileFault]:
+    from vla_zenoh.control.reachability import make_reachability_filter
+
+    try:
+        urdf = resources.robot_urdf(profile.robot.description)
+        make_reachability_filter(profile)
+    except (ValueError, VlaZenohError):
+        return  # `arm` says so
+    yield ProfileFault(
+        ("robot", "description"),
+        f"the simulator (robot.driver: sim) cannot build {urdf.name}: {error}. It simulates the "
+        "Franka Panda (extends: panda_sim); a real arm of another kind has driver arm or ros2",
+        other=("robot", "driver"),
+    )
+
+
+def robot_file(profile: Profile, name: str, host: str | None) -> Iterator[ProfileFault]:
+    """The class in `arm.file`, which is not made: that may move something."""
+    if profile.arm is None or profile.robot.driver != "arm":
+        return
+    path = Path(profile.arm.file).expanduser()
+    if not path.is_file():
+        yield ProfileFault(("arm", "file"), f"there is no file {profile.arm.file}", "arm")
+        return
+    try:
+        inspect_robot(path, profile.arm.options)
+    except VlaZenohError as error:
+        yield ProfileFault(("arm",), str(error), "arm")
+
+
+def ros2(profile: Profile, name: str, host: str | None) -> Iterator[ProfileFault]:
+    """Messages of the node ros2."""
+    if profile.ros2 is None:
+        return
+    try:
+        from vla_zenoh.robots.ros2.driver import Ros2Driver
+
+        driver = Ros2Driver(profile)
+        output = getattr(profile.ros2, f"{profile.robot.command}_command")
+        if driver.has_arm and output is not None:
+            driver.writing(output)
+    except ImportError as error:
+        why = str(MissingExtraError(str(error.name), "ros2"))
+        yield ProfileFault(("ros2",), why, "ros2")
+    except ProfileError as error:
+        yield ProfileFault(("ros2",), str(error), "ros2" if "cannot be read" in str(error) else "")
+
+
+def braking_advice(profile: Profile) -> Iterator[str]:
+    """Advice where `up` would end the robot's node while it still brakes."""
+    if profile.robot.driver == "sim":
+        return
+    try:
+        from vla_zenoh.guard.arm_guard import max_braking_time_s
+    except ImportError:
+        return  # `arm` has already said so
+    brake_s = max_braking_time_s(profile)
+    if brake_s > LONG_BRAKE_S:
+        yield (
+            f"limits: braking from full speed may take {brake_s:.1f} s, but `vla-zenoh up` ends "
+            "the robot's node within 3 s of Ctrl-C: lower the velocity, or raise acceleration and "
+            "jerk"
+        )
