@@ -9,6 +9,7 @@ import pytest
 from arm_rig import activate
 from panda_arm import ARM_JOINTS, HOME_RAD, panda
 
+from vla_zenoh.control.limits import workspace_corners
 from vla_zenoh.control.reachability import make_reachability_filter
 from vla_zenoh.kinematics.ik import pose_error
 from vla_zenoh.lab.lockstep import Lockstep
@@ -125,10 +126,8 @@ def test_joints_go_through_a_wrist_singularity() -> None:
 def test_random_smooth_motions_end_where_they_were_asked_to(seed: int) -> None:
     rng, arm, here_rad = np.random.default_rng(seed), Arm(), HOME_RAD
     kinematics = panda()
-    box = np.array(
-        [PROFILE.limits.workspace.x_m, PROFILE.limits.workspace.y_m, PROFILE.limits.workspace.z_m]
-    )
-    errors = []
+    low, high = workspace_corners(PROFILE.limits)
+    errors: list[float] = []
     while len(errors) < 5:
         goal_rad = HOME_RAD + rng.uniform(-0.4, 0.4, 7)
         place = kinematics.forward(goal_rad).position_m

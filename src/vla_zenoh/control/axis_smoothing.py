@@ -305,7 +305,7 @@ class AxisSmoother:
         """The same for m axes: (m, k), with `way` (m,) and `limits` (3, m)."""
         size = len(way)
         motion = np.array([self._state.velocity[axes], self._state.acceleration[axes]])
-        line = _line(way, *motion, self._pace)
+        line = _line(way, motion[0], motion[1], self._pace)
         if line is not None:
             return (line[:, None], [1.0]) if line.any() else (np.zeros((size, 0)), [])
         length = norm3(way) if size == 3 else float(np.linalg.norm(way))

@@ -17,13 +17,14 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Generator, Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from vla_zenoh.control.actions import step_joints, step_pose, step_width
+from vla_zenoh.control.actions import covered_step, step_joints, step_width
+from vla_zenoh.control.chunk_plan import ChunkPlan, StepBounding
 from vla_zenoh.control.chunk_validation import (
     ROUNDING,
     Lease,
@@ -42,8 +43,9 @@ from vla_zenoh.control.limits import (
     keep_slowdown,
 )
 from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan
+from vla_zenoh.control.pose_history import PoseHistory
 from vla_zenoh.control.reachability import BoundedStep, ReachabilityFilter
-from vla_zenoh.kinematics.so3 import Pose, interpolate, pose_distance
+from vla_zenoh.kinematics.so3 import interpolate, pose_distance
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import ActionChunk, Cause, FloatArray, Stamped, Task
@@ -58,81 +60,6 @@ LOOK_AHEAD = 8
 """Steps bounded before they are due."""
 BEHIND_S = 0.3
 """At the end of an approach the arm is up to this late."""
-
-
-@dataclass(slots=True)
-class ChunkPlan(Plan):
-    """The plan of a chunk, computed and bounded step by step.
-
-    Args:
-        action: the meaning of the numbers of a step.
-        steps: (n, D).
-        base: W_0, the goal that the first step starts from.
-        approaches: one of its targets is further away than a step.
-        announced: that has been reported.
-        first_step_ns: time that its first step has to approach its target; -1: a whole step.
-        evaluations: evaluations of the arm spent on it.
-        hits: limits that acted on it, each once by name and place, in path order.
-        reported: number of those that have been reported.
-        current: the step being bounded.
-    """
-
-    action: ActionSpec = field(kw_only=True)
-    steps: FloatArray = field(kw_only=True)
-    base: Goal = field(kw_only=True)
-    approaches: bool = False
-    announced: bool = False
-    first_step_ns: int = -1
-    evaluations: int = 0
-    hits: list[LimitHit] = field(default_factory=list)
-    reported: int = 0
-    current: _StepBounding | None = None
-
-    @property
-    def step_start(self) -> Goal:
-        """The goal that the next step to be bounded starts from."""
-        return self.goals[self.bounded - 1] if self.bounded else self.base
-
-    @property
-    def shifted_goal(self) -> Goal | None:
-        """The end of that step, where the leash has shifted it since it was computed."""
-        return self.goals[self.bounded] if self.bounded < self.computed else None
-
-    def add_hits(self, hits: Iterable[LimitHit]) -> None:
-        """Keep the hits that are new by name and place."""
-        for hit in hits:
-            if all(hit.name != known.name or hit.where != known.where for known in self.hits):
-                self.hits.append(hit)
-
-    def unreported_hits(self) -> list[LimitHit]:
-        """The hits added since the last call."""
-        hits, self.reported = self.hits[self.reported :], len(self.hits)
-        return hits
-
-
-@dataclass(slots=True)
-class _StepBounding:
-    """A step while it is bounded.
-
-    Args:
-        start: the goal it starts from.
-        shifted: its end, where that was computed before.
-        target: its end within the limits of a step.
-        width_m: of the gripper.
-        hits: limits that acted so far.
-        cut: m and rad that they cut off.
-        slowdown: of an approach.
-        search: bounds it by the arm's kinematics, in pieces; None: there are no kinematics.
-    """
-
-    start: Goal
-    shifted: Goal | None
-    target: Pose
-    width_m: float
-    hits: list[LimitHit] = field(default_factory=list)
-    cut: float = 0.0
-    slowdown: Slowdown | None = None
-    search: Generator[None, None, BoundedStep | BoundedJoints] | None = None
 
 
 class ChunkOutcome(NamedTuple):
@@ -170,6 +97,9 @@ class ChunkPlanner:
         if reach is not None:
             self.joint_bounds = JointBounds(profile, reach.kinematics, reach.barriers)
         self._pace = profile.composition.pace
+        self._gap_ns = round(profile.timing.state_timeout_s * 1e9)
+        self.measured = PoseHistory()
+        """Where chunks anchored at the measured pose begin."""
         self._queue: deque[Stamped[ActionChunk]] = deque()
         self._pending: tuple[Stamped[ActionChunk], ChunkPlan] | None = None
         self.budget = math.ceil(EVALUATIONS_1_S / profile.timing.command_hz)
@@ -269,6 +199,11 @@ class ChunkPlanner:
         observed_ns = record.observation_stamp_ns
         previous = timeline.in_force(observed_ns)
         base = previous.goal_at(observed_ns)
+        if action.anchor == "measured":
+            pose = self.measured.at(observed_ns, self._gap_ns)
+            if pose is None:
+                return _not_measured(self._gap_ns)
+            base = Goal(pose, base.width_m)
         steps = np.asarray(record.steps[:count], np.float64)
         if action.space == "joint":
             steps = self._in_chain_order(action, steps)
@@ -291,7 +226,7 @@ class ChunkPlanner:
             soonest=(action.pace if self._pace == "spec" else self._pace) == "soonest",
             action=action,
             steps=steps,
-            base=Goal(base.pose, base.width_m, _joints(base, near), near.slowdown, base.arm),
+            base=replace(base, joints_rad=_joints(base, near), slowdown=near.slowdown),
         )
         if count < len(record.steps):
             plan.add_hits(
@@ -340,8 +275,8 @@ class ChunkPlanner:
         for ahead in (0, LOOK_AHEAD):
             for plan in chunks:
                 due = plan.due_index(now_ns)
-                if plan.action.kind == "absolute" and plan.bounded > due:
-                    plan.computed = plan.bounded  # the leash does not shift absolute poses
+                if plan.action.targets and plan.bounded > due:
+                    plan.computed = plan.bounded  # the leash does not shift targets
                 until = min(due + 1 + ahead, len(plan.goals))
                 while plan.bounded < until and self._bound_step(plan) is not None:
                     pass
@@ -379,26 +314,37 @@ class ChunkPlanner:
             slower = step.slowdown
         most_s = self._limits.lead_m / self._limits.translation.velocity_m_s
         slower = keep_slowdown(step.start.slowdown, slower, plan.dt_ns / 1e9, most_s)
+        state = step.response
+        if state is not None and hits and step.shifted is None:
+            state = state.stopped(step.asked, pose)
         arm = self._reach.kinematics if self._reach and plan.action.space == "joint" else None
-        plan.goals[index] = Goal(pose, step.width_m, joints_rad, slower, arm)
+        plan.goals[index] = Goal(pose, step.width_m, joints_rad, slower, state, arm)
         plan.bounded, plan.current = index + 1, None
         plan.add_hits(hits)
         return hits
 
-    def _begin_step(self, plan: ChunkPlan) -> _StepBounding:
+    def _begin_step(self, plan: ChunkPlan) -> StepBounding:
         """The next step of `plan` within the limits of a step."""
         if plan.action.space == "joint":
             return self._begin_joint_step(plan)
         start, shifted = plan.step_start, plan.shifted_goal
         if shifted is not None:
-            step = _StepBounding(
-                start, shifted, shifted.pose, shifted.width_m, slowdown=shifted.slowdown
+            step = StepBounding(
+                start,
+                shifted,
+                shifted.pose,
+                shifted.pose,
+                shifted.width_m,
+                slowdown=shifted.slowdown,
+                response=shifted.response,
             )
         else:
             numbers = plan.steps[plan.bounded]
-            asked = step_pose(plan.action, numbers, start.pose)
+            asked, response = covered_step(
+                plan.action, numbers, start.pose, plan.base.pose, start.response
+            )
             slower: Slowdown | None = None
-            if plan.action.kind == "absolute":
+            if plan.action.targets:
                 full_s = full_speed_s(self._limits, start.pose, asked)
                 part, slower = self._approach(plan, *pose_distance(start.pose, asked), full_s)
                 asked = interpolate(start.pose, asked, part) if slower else asked
@@ -406,7 +352,7 @@ class ChunkPlanner:
             pose, acted = bound_step(self._limits, start.pose, asked)
             cut = sum(pose_distance(pose, asked)) if acted else 0.0
             width_m = start.width_m if width_m is None else width_m
-            step = _StepBounding(start, None, pose, width_m, acted, cut, slower)
+            step = StepBounding(start, None, asked, pose, width_m, acted, cut, slower, response)
         if self._reach is not None:
             dt_s = plan.dt_ns / 1e9
             step.search = self._reach.bound_in_pieces(
@@ -421,7 +367,7 @@ class ChunkPlanner:
         columns = [action.joints.index(name) for name in self._reach.kinematics.arm_joints]
         return np.concatenate([steps[:, columns], steps[:, action.arm_size :]], axis=1)
 
-    def _begin_joint_step(self, plan: ChunkPlan) -> _StepBounding:
+    def _begin_joint_step(self, plan: ChunkPlan) -> StepBounding:
         """The same of a step in joint space."""
         bounds, start, shifted = self.joint_bounds, plan.step_start, plan.shifted_goal
         assert bounds is not None
@@ -433,11 +379,12 @@ class ChunkPlanner:
             asked_rad, width_m, slower = shifted.joints_rad, shifted.width_m, shifted.slowdown
         else:
             numbers = plan.steps[plan.bounded]
-            asked_rad = step_joints(plan.action, numbers, start_rad)
+            base_rad = start_rad if plan.base.joints_rad is None else plan.base.joints_rad
+            asked_rad = step_joints(plan.action, numbers, start_rad, base_rad)
             way_rad = asked_rad - start_rad
             far_m = pose_distance(start.pose, bounds.kinematics.forward(asked_rad))[0]
             far_rad = float(np.abs(way_rad).max())
-            if plan.action.kind == "absolute":
+            if plan.action.targets:
                 full_s = bounds.full_speed_s(start_rad, asked_rad)
                 part, slower = self._approach(plan, far_m, far_rad, full_s)
             else:
@@ -454,7 +401,7 @@ class ChunkPlanner:
             width_m = step_width(plan.action, numbers, start.width_m, self._max_width_m)
             width_m = start.width_m if width_m is None else width_m
         asked = bounds.kinematics.forward(asked_rad)
-        step = _StepBounding(start, shifted, asked, width_m, acted, slowdown=slower)
+        step = StepBounding(start, shifted, asked, asked, width_m, acted, slowdown=slower)
         self._reach.cost = 1
         step.search = bounds.bound_in_pieces(start_rad, asked_rad)
         next(step.search)
@@ -482,6 +429,15 @@ class ChunkPlanner:
         has_ns = plan.dt_ns if plan.bounded or plan.first_step_ns < 0 else plan.first_step_ns
         part = min(has_ns / 1e9 / needed_s, 1 / steps)
         return part, Slowdown(APPROACH, share, far, step, "", BEHIND_S)
+
+
+def _not_measured(gap_ns: int) -> Rejection:
+    """Its anchor is not known."""
+    return Rejection(
+        "not_measured",
+        f"the arm's pose was not measured within {gap_ns / 1e9:g} s before its observation, which "
+        "the first step is added to (anchor: measured)",
+    )
 
 
 OVERTAKEN = Rejection("overtaken", "a newer chunk came before it was planned", quiet=True)

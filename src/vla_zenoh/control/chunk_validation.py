@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vla_zenoh.control.actions import rotation_of, step_pose, step_width
+from vla_zenoh.control.actions import as_deltas, rotation_of, step_pose, step_width
 from vla_zenoh.control.limits import bound_step, workspace_corners
 from vla_zenoh.control.plan_timeline import Goal
 from vla_zenoh.errors import RecordError, SpecError
@@ -176,9 +176,11 @@ def validate_steps(
                 rotation_of(action, rotations[index])
     except RecordError as error:
         return Rejection("meaning", str(error))
-    lengths_m = steps[:, :3] * action.position_scale_m
     if action.kind == "absolute":
-        return _validate_targets(lengths_m, limits)
+        return _validate_targets(steps[:, :3] * action.position_scale_m, limits)
+    action, steps = as_deltas(action, steps)
+    rotations = steps[:, 3 : 3 + ROTATION_SIZE[action.rotation]]
+    lengths_m = steps[:, :3] * action.position_scale_m
     if action.rotation == "quaternion":
         most_rad = 2.0 * np.arccos(np.clip(np.abs(rotations[:, 3]) - ROUNDING, 0.0, 1.0))
     else:  # three angles, or one: together at most as large as this
@@ -201,11 +203,12 @@ def validate_steps(
 
 def _validate_joints(action: ActionSpec, steps: FloatArray, limits: Limits) -> Rejection | None:
     """Why joints are too far for radians."""
-    most_rad = REJECT_FACTOR * limits.step_rad if action.kind == "delta" else FURTHEST_RAD
-    largest = float(np.abs(steps[:, : action.arm_size]).max())
+    scale = action.dt_s if action.kind == "velocity" else 1.0
+    most_rad = FURTHEST_RAD if action.targets else REJECT_FACTOR * limits.step_rad
+    largest = scale * float(np.abs(steps[:, : action.arm_size]).max())
     if largest <= most_rad:
         return None
-    what = "a step" if action.kind == "delta" else "a target"
+    what = "a target" if action.targets else "a step"
     why = f"{what} of a joint of {largest:.4g} rad, at most {most_rad:.4g}; are these radians?"
     return Rejection("step_rad", why, largest, most_rad)
 

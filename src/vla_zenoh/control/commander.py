@@ -195,6 +195,7 @@ class Commander:
             self._peers = inputs.peers
         if inputs.pose is not None:
             self.pose = inputs.pose
+            self._planner.measured.add(inputs.pose)
             self.contact.update_pose(inputs.pose)
             self._retreat.measure(pose_of(inputs.pose.record))
         if inputs.joint is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -445,7 +446,7 @@ class MotionPipeline:
         """
         if not isinstance(mover, JointPath) or goal.joints_rad is None or goal.arm is None:
             pose, hits = leash(self._limits, goal.pose, _ahead(mover.motion, ahead_s))
-            return Leashed(Goal(pose, goal.width_m, slowdown=goal.slowdown), hits)
+            return Leashed(replace(goal, pose=pose, joints_rad=None), hits)
         state, most_rad = mover.state, self._limits.lead_rad
         way = goal.joints_rad - state.position - ahead_s * state.velocity
         far_rad = float(np.abs(way).max())

@@ -2,11 +2,15 @@
 
 A chunk whose observation was taken at ``t_o`` asks for waypoints ``W_1 .. W_H``::
 
-    W_0 = G(t_o)                   what was asked for until the observation was taken
-    W_k = W_(k-1) o step_k         k = 1 .. H
+    W_0 = G(t_o)                   what was asked for until the observation was taken,
+                                   or the measured pose, see `ActionSpec.anchor`
+    W_k = W_(k-1) o step_k         k = 1 .. H; or W_0 o step_k, see `ActionSpec.relative_to`
     in force at t: W_k, k = floor((t - t_o) / dt) + 1, at least 1 and at most H
 
     G(t) = W_s, s = (t - t_o) / dt, at least 1 and at most H, between two waypoints interpolated
+
+Where a controller covers only a part of each step, its response is what is interpolated, and its
+rate is part of W and G. Between chunks it stands still, as a simulator does during inference.
 
 ``G`` is the same function of every earlier plan. A plan is in force from the moment its chunk was
 *published*: an observation taken later shows its effect, so the next delta stands on top of it; one
@@ -33,6 +37,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from vla_zenoh.control.controller_response import Response, between
 from vla_zenoh.control.limits import Slowdown, into_workspace
 from vla_zenoh.kinematics.so3 import Pose, interpolate, orthonormal
 from vla_zenoh.profile import Limits
@@ -95,6 +100,7 @@ class Goal:
         width_m: of the gripper.
         joints_rad: (n,) a joint solution of the pose; None: not computed.
         slowdown: why the arm moves there slower than at full speed.
+        response: state there of a controller that covers only a part of each step; None: without.
         arm: where joints are asked for, in chain order: the kinematics that make `pose` of them.
     """
 
@@ -102,15 +108,19 @@ class Goal:
     width_m: float
     joints_rad: FloatArray | None = None
     slowdown: Slowdown | None = None
+    response: Response | None = None
     arm: Kinematics | None = None
 
-    def between(self, coming: Goal, share: float) -> Goal:
-        """The goal after `share` of the way to `coming`, in the space that is asked for there."""
+    def between(self, coming: Goal, share: float, dt_s: float = 0.0) -> Goal:
+        """The goal after `share` of a step of `dt_s` to `coming`, in the space asked for there."""
         width_m = self.width_m + share * (coming.width_m - self.width_m)
-        if coming.arm is None or coming.joints_rad is None or self.joints_rad is None:
+        if coming.arm is not None and coming.joints_rad is not None and self.joints_rad is not None:
+            way_rad = coming.joints_rad - self.joints_rad
+            return joint_goal(coming.arm, self.joints_rad + share * way_rad, width_m)
+        if coming.response is None or dt_s == 0.0:
             return Goal(interpolate(self.pose, coming.pose, share), width_m)
-        way_rad = coming.joints_rad - self.joints_rad
-        return joint_goal(coming.arm, self.joints_rad + share * way_rad, width_m)
+        pose, state = between(self.pose, coming.pose, coming.response, dt_s, share)
+        return Goal(pose, width_m, response=state)
 
     def shifted(self, old: Goal, new: Goal, limits: Limits) -> Goal:
         """This goal after what moves `old` to `new`, within the workspace box."""
@@ -122,14 +132,15 @@ class Goal:
         way_m = new.pose.position_m - old.pose.position_m
         turn = old.pose.rotation.T @ new.pose.rotation
         inside, _ = into_workspace(limits, self.pose.position_m + way_m, self.pose.position_m)
-        return Goal(Pose(inside, orthonormal(self.pose.rotation @ turn)), self.width_m)
+        moved = Pose(inside, orthonormal(self.pose.rotation @ turn))
+        return Goal(moved, self.width_m, response=self.response)
 
 
 def joint_goal(
     arm: Kinematics, joints_rad: FloatArray, width_m: float, slowdown: Slowdown | None = None
 ) -> Goal:
     """The goal of these joints (n,) in chain order."""
-    return Goal(arm.forward(joints_rad), width_m, joints_rad, slowdown, arm)
+    return Goal(arm.forward(joints_rad), width_m, joints_rad, slowdown, arm=arm)
 
 
 @dataclass(slots=True)
@@ -192,7 +203,8 @@ class Plan:
             return self.goals[0]
         if done >= self.bounded or part_ns == 0:
             return self.goals[min(done, self.bounded) - 1]
-        return self.goals[done - 1].between(self.goals[done], part_ns / self.dt_ns)
+        dt_s = self.dt_ns / 1e9
+        return self.goals[done - 1].between(self.goals[done], part_ns / self.dt_ns, dt_s)
 
     def steps_until(self, t_ns: int) -> float:
         """Steps of the episode asked for until `t_ns`, including parts of one."""

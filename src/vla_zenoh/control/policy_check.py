@@ -14,12 +14,11 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_zenoh.control.actions import GRIPPER_SLACK, GRIPPER_SLACK_M
+from vla_zenoh.control.actions import GRIPPER_SLACK, GRIPPER_SLACK_M, Steps, as_deltas
 from vla_zenoh.policy import ROTATION_SIZE, ActionSpec, ModelSpec
 from vla_zenoh.profile import POSE_JOINTS, REACH_M, REJECT_FACTOR, Limits, Profile
 from vla_zenoh.types import QUATERNION_NORM_TOLERANCE
 
-Steps = NDArray[np.float32]
 BINARY_SPAN = 2.0
 """A number further than this from the threshold is not a choice of two but another quantity."""
 Level = Literal["error", "warning", "note"]
@@ -112,34 +111,41 @@ def chunk_errors(
         yield from (error("gripper_range", why) for why in beyond_gripper(spec, width, max_width_m))
     if spec.space == "joint":
         return
-    longest_m, most_rad = largest_step(spec, steps)
     rotation = steps[:, 3 : 3 + ROTATION_SIZE[spec.rotation]].astype(np.float64)
+    if spec.rotation == "quaternion":
+        norms = np.linalg.norm(rotation, axis=1)
+        worst = float(norms[np.argmax(np.abs(norms - 1.0))])
+        if abs(worst - 1.0) > QUATERNION_NORM_TOLERANCE:
+            yield error("quaternion", f"a quaternion of norm {worst:.4g}, wanted 1")
+            return
+    longest_m, most_rad = largest_step(spec, steps)
     if spec.kind == "absolute" and longest_m > REACH_M:
         yield error(
             "position_units",
             f"a pose {longest_m:.4g} m from the base, no arm here reaches over {REACH_M:g} m; are "
             f"these metres? position_scale_m is {spec.position_scale_m:g}",
         )
-    if spec.kind == "delta" and longest_m > REJECT_FACTOR * limits.step_m:
+    if spec.kind != "absolute" and longest_m > REJECT_FACTOR * limits.step_m:
         yield error(
             "position_units",
             f"a step of {longest_m:.4g} m, over {REJECT_FACTOR:g} times the limit of "
             f"{limits.step_m:g} m; are these metres, and was the output unnormalised? "
             f"position_scale_m is {spec.position_scale_m:g}",
         )
-    if spec.rotation == "quaternion":
-        yield from _quaternion(spec, rotation, limits)
-    elif spec.kind == "absolute" and float(np.abs(rotation).max()) > 2 * math.pi:
+    if spec.rotation == "quaternion" and not spec.targets:
+        yield from _quaternion(rotation, limits)
+    elif spec.targets and float(np.abs(rotation).max()) > 2 * math.pi:
         yield error(
             "rotation_units",
             f"an angle of {float(np.abs(rotation).max()):.4g}, more than a turn; give radians",
         )
-    elif spec.kind == "delta" and most_rad > REJECT_FACTOR * limits.step_rad:
+    elif spec.kind != "absolute" and most_rad > REJECT_FACTOR * limits.step_rad:
         yield _too_far_a_turn(most_rad, limits)
 
 
 def largest_step(spec: ActionSpec, steps: Steps) -> tuple[float, float]:
-    """Largest length (m) and angle (rad) among the steps."""
+    """Largest length (m) and angle (rad) from one step to the next; of absolute poses their own."""
+    spec, steps = as_deltas(spec, steps)
     position_m = steps[:, :3].astype(np.float64) * spec.position_scale_m
     rotation = steps[:, 3 : 3 + ROTATION_SIZE[spec.rotation]].astype(np.float64)
     angles = (
@@ -158,18 +164,11 @@ def _too_far_a_turn(most_rad: float, limits: Limits) -> Finding:
     )
 
 
-def _quaternion(
-    spec: ActionSpec, rotation: NDArray[np.float64], limits: Limits
-) -> Iterator[Finding]:
-    norms = np.linalg.norm(rotation, axis=1)
-    worst = float(norms[np.argmax(np.abs(norms - 1.0))])
-    if abs(worst - 1.0) > QUATERNION_NORM_TOLERANCE:
-        yield error("quaternion", f"a quaternion of norm {worst:.4g}, wanted 1")
-        return
+def _quaternion(rotation: NDArray[np.float64], limits: Limits) -> Iterator[Finding]:
     largest, swapped = (
         2 * math.acos(min(float(np.abs(rotation[:, index]).min()), 1.0)) for index in (3, 0)
     )
-    if spec.kind == "absolute" or largest <= REJECT_FACTOR * limits.step_rad:
+    if largest <= REJECT_FACTOR * limits.step_rad:
         return
     if swapped <= REJECT_FACTOR * limits.step_rad:
         yield error(
@@ -261,8 +260,9 @@ def beyond_joints(
         jacobian: (6, n) of the TCP in base axes, linear first.
         rotation: (3, 3) of the TCP, for deltas in its frame.
     """
-    if spec.space == "joint" or spec.kind != "delta" or jacobian.shape[1] >= POSE_JOINTS:
+    if spec.space == "joint" or spec.kind == "absolute" or jacobian.shape[1] >= POSE_JOINTS:
         return []
+    spec, steps = as_deltas(spec, steps)
     asked = np.zeros(6)
     asked[:3] = steps[:, :3].sum(axis=0) * spec.position_scale_m
     asked[3:] = steps[:, 3:6].sum(axis=0) * (2.0 if spec.rotation == "quaternion" else 1.0)

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_zenoh.errors import SpecError
 from vla_zenoh.policy import ROTATION_SIZE, ActionSpec, ActionSteps, Observation, Policy
 
 REMEMBERED_LATENCIES = 10
@@ -59,11 +60,20 @@ class ChunkPrefix:
 
     Args:
         policy: the model.
+
+    Raises:
+        SpecError: it takes the prefix, and its steps are relative to the start of their chunk.
     """
 
     def __init__(self, policy: Policy) -> None:
         self._policy, self._action = policy, policy.spec.action
         self._takes = bool(getattr(policy, "takes_committed", False))
+        if self._takes and self._action.relative_to == "start":
+            raise SpecError(
+                "the steps in execution have another start than the next chunk, so a model that "
+                "takes them cannot answer relative_to: start; let it answer relative_to: previous, "
+                "or absolute poses"
+            )
         self._latencies_s: deque[float] = deque(maxlen=REMEMBERED_LATENCIES)
         self._last: tuple[int, int, NDArray[np.float32]] | None = None
 

@@ -34,8 +34,10 @@ StatePart = Literal["joint", "pose", "gripper"]
 Resize = Literal["none", "stretch", "pad", "crop"]
 Frame = Literal["base", "tcp"]
 Rotation = Literal["rpy", "rotvec", "quaternion"]
-MotionKind = Literal["delta", "absolute"]
+MotionKind = Literal["delta", "absolute", "velocity"]
 ActionSpace = Literal["tcp", "joint"]
+Anchor = Literal["goal", "measured"]
+RelativeTo = Literal["previous", "start"]
 GripperSemantics = Literal["none", "delta_m", "absolute_m", "open_fraction", "binary"]
 
 ROTATION_SIZE: Mapping[Rotation, int] = {"rpy": 3, "rotvec": 3, "quaternion": 4}
@@ -62,7 +64,7 @@ def _no_joints(kind: Any) -> Any:
     if isinstance(kind, str) and "joint" in kind:
         raise ValueError(
             f"{kind!r} is no kind of action; joints are declared as space='joint' with "
-            "joints=(names in the order of the columns) and kind='absolute' or 'delta'"
+            "joints=(names in the order of the columns) and kind='absolute', 'delta' or 'velocity'"
         )
     return kind
 
@@ -119,6 +121,21 @@ class ObservationSpec(_Spec):
         return self
 
 
+class ControllerSpec(_Spec):
+    """A controller that covers only a part of a delta within a step, as robosuite's OSC does.
+
+    Its goal is the delta on where the arm is when the step begins, and the arm moves there as
+    ``x'' = kp (goal - x) - 2 damping_ratio sqrt(kp) x'`` for `ActionSpec.dt_s`.
+
+    Args:
+        kp: stiffness per unit of mass, 1/s^2, of translation and rotation.
+        damping_ratio: 1: critically damped.
+    """
+
+    kp: float = Field(gt=0, le=10_000)
+    damping_ratio: float = Field(default=1.0, ge=0.1, le=10)
+
+
 class ActionSpec(_Spec):
     """What the numbers of a chunk mean: ``[x y z | rotation | gripper]`` in each of H steps.
 
@@ -128,14 +145,21 @@ class ActionSpec(_Spec):
     Args:
         horizon: H, steps in a chunk (at most; a shorter chunk is allowed).
         dt_s: duration of one step.
-        kind: ``delta`` adds to the goal, ``absolute`` is the goal.
+        kind: ``delta`` adds to the goal, ``absolute`` is the goal, ``velocity`` is a delta per
+            second (m/s and rad/s, for `dt_s`).
         space: ``tcp`` poses of the TCP; ``joint`` positions of the arm's joints.
         joints: names of the joints, in the order of the columns.
-        frame: axes of a delta: the robot's ``base`` or the ``tcp`` at that moment. An absolute pose
-            is always in the base frame.
+        frame: axes of a delta or velocity: the robot's ``base`` or the ``tcp`` at that moment. An
+            absolute pose is always in the base frame.
+        anchor: pose or joints that a chunk of deltas or velocities begins at: the ``goal`` in force
+            at its observation, or those ``measured`` then.
+        relative_to: each delta is added to the ``previous`` step, or every one of a chunk to its
+            ``start``, which is the anchor (UMI; openpi's DeltaActions).
+        controller: of the data, where that covers only a part of each delta; None: steps are
+            covered whole.
         rotation: ``rpy`` extrinsic x, y, z in rad; ``rotvec`` axis times angle in rad;
             ``quaternion`` x, y, z, w.
-        position_scale_m: metres of one unit of x, y, z.
+        position_scale_m: metres (m/s of a velocity) of one unit of x, y, z.
         gripper: ``none`` no such number; ``delta_m`` added to the width; ``absolute_m`` the width;
             ``open_fraction`` 0 shut to 1 open; ``binary`` above or below `gripper_threshold`.
         gripper_open_is_high: polarity of ``open_fraction`` and ``binary``: True: a large value
@@ -150,6 +174,9 @@ class ActionSpec(_Spec):
     dt_s: float = Field(gt=0, le=60)
     kind: Annotated[MotionKind, BeforeValidator(_no_joints)] = "delta"
     frame: Frame = "base"
+    anchor: Anchor = "goal"
+    relative_to: RelativeTo = "previous"
+    controller: ControllerSpec | None = None
     rotation: Rotation = "rpy"
     position_scale_m: float = Field(default=1.0, gt=0, le=10)
     gripper: GripperSemantics = "absolute_m"
@@ -183,12 +210,52 @@ class ActionSpec(_Spec):
             raise ValueError("joints are named, and space is 'tcp'; set space: joint")
         return self
 
+    @property
+    def targets(self) -> bool:
+        """Each step is a pose of its own, and no sum of the steps before it."""
+        return self.kind == "absolute" or self.relative_to == "start"
+
     @model_validator(mode="after")
     def _absolute_is_in_base(self) -> ActionSpec:
-        if self.space == "joint" and self.frame != "base":
-            raise ValueError("joints have no frame; leave frame out")
-        if self.kind == "absolute" and self.frame != "base":
+        if self.space == "joint" and (self.frame != "base" or self.controller is not None):
+            raise ValueError("joints have no frame and no controller; leave out both")
+        if self.kind != "absolute":
+            return self
+        if self.frame != "base":
             raise ValueError("an absolute pose is given in the base frame; set frame: base")
+        if self.anchor != "goal" or self.relative_to != "previous":
+            raise ValueError(
+                "an absolute pose is added to nothing; leave out anchor and relative_to, or set "
+                "kind: delta"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _velocity_is_integrated(self) -> ActionSpec:
+        if self.kind != "velocity":
+            return self
+        if self.space == "tcp" and self.rotation != "rotvec":
+            raise ValueError("an angular velocity is a vector in rad/s; set rotation: rotvec")
+        if self.relative_to != "previous":
+            raise ValueError(
+                "each velocity continues where the step before it ended; set relative_to: previous"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _controller_adds_to_its_own_state(self) -> ActionSpec:
+        if self.controller is None:
+            return self
+        if self.kind != "delta" or self.frame != "base" or self.relative_to != "previous":
+            raise ValueError(
+                "a controller covers deltas in the base frame, one after the other; set kind: "
+                "delta, frame: base, relative_to: previous, or leave out controller"
+            )
+        if self.anchor != "goal":
+            raise ValueError(
+                "a controller adds each delta to where its own response is, which the goal "
+                "follows; set anchor: goal"
+            )
         return self
 
 

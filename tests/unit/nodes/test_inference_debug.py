@@ -30,7 +30,7 @@ def seen(**fields: Any) -> InferenceDebug:
     given: dict[str, Any] = {
         "worker": "openvla",
         "chunk_seq": 7,
-        "spec_hash": "724d0c938d8c3e6d",
+        "spec_hash": "68bc1fea58b3f857",
         "episode": 2,
         "observation_stamp_ns": 10**18,
         "prompt": "put the red brick in the box",

@@ -34,7 +34,7 @@ SPEC = ModelSpec(
     ),
     action=ActionSpec(horizon=1, dt_s=0.2, gripper="binary"),
 )
-SPEC_HASH = "724d0c938d8c3e6d"
+SPEC_HASH = "68bc1fea58b3f857"
 """Pinned: workers and command nodes of different builds must agree on it."""
 
 
@@ -94,6 +94,9 @@ OTHER_VALUES: dict[tuple[str, ...], list[Any]] = {
     ("action", "dt_s"): [0.1, 0.25],
     ("action", "kind"): ["absolute"],
     ("action", "frame"): ["tcp"],
+    ("action", "anchor"): ["measured"],
+    ("action", "relative_to"): ["start"],
+    ("action", "controller"): [{"kp": 150.0}, {"kp": 80.0}, {"kp": 150.0, "damping_ratio": 0.7}],
     ("action", "rotation"): ["rotvec", "quaternion"],
     ("action", "position_scale_m"): [0.01],
     ("action", "gripper"): ["none", "delta_m", "absolute_m", "open_fraction"],

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import pairwise
 
 import numpy as np
 
+from vla_zenoh.control.actions import chunk_poses
 from vla_zenoh.control.policy_check import (
     Finding,
     Steps,
@@ -16,12 +18,14 @@ from vla_zenoh.control.policy_check import (
     outside_workspace_m,
     spec_errors,
 )
+from vla_zenoh.kinematics.so3 import Pose, pose_distance
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec
 from vla_zenoh.profile import POSE_JOINTS, REACH_M, REJECT_FACTOR, Limits, Profile
 
 SHAPE_TOLERANCE = 0.02
 """An image may be stretched by this share of its aspect ratio without a note."""
 ROUNDING = 1e-6
+ORIGIN = Pose(np.zeros(3), np.eye(3))
 
 
 def warning(name: str, why: str) -> Finding:
@@ -100,7 +104,7 @@ def _timing(profile: Profile, spec: ModelSpec, rate_hz: float) -> Iterator[Findi
 
 
 def _robot(profile: Profile, spec: ModelSpec, worker: str) -> Iterator[Finding]:
-    if spec.action.kind == "delta" and len(profile.robot.arm_joints) < POSE_JOINTS:
+    if spec.action.kind != "absolute" and len(profile.robot.arm_joints) < POSE_JOINTS:
         yield warning(
             "too_few_joints",
             f"{few_joints(profile)}: steps that it has no joint for are shortened, to nothing at "
@@ -155,6 +159,10 @@ def _targets(spec: ActionSpec, steps: Steps, limits: Limits) -> Iterator[Finding
 
 def _steps(spec: ActionSpec, steps: Steps, limits: Limits) -> Iterator[Finding]:
     longest_m, most_rad = largest_step(spec, steps)
+    if spec.controller is not None:  # the arm covers less than that
+        poses = [ORIGIN, *chunk_poses(spec, steps, ORIGIN)]
+        ways = [pose_distance(before, after) for before, after in pairwise(poses)]
+        longest_m, most_rad = map(max, zip(*ways, strict=True))
     for step, unit, most, speed in (
         (longest_m, "m", limits.step_m, limits.translation.velocity_m_s),
         (most_rad, "rad", limits.step_rad, limits.rotation.velocity_rad_s),

@@ -151,7 +151,7 @@ def _rows(report: CheckReport) -> list[tuple[str, str]]:
         (
             "outputs",
             f"up to {action.horizon} x {action.dimension}, {action.dt_s:g} s each: {action.kind} "
-            f"{action.frame} {action.rotation}, gripper {action.gripper}"
+            f"{action.frame} {action.rotation}{_added_to(action)}, gripper {action.gripper}"
             + (f", normalisation {action.normalisation}" if action.normalisation else ""),
         ),
     ]
@@ -185,12 +185,24 @@ def _rows(report: CheckReport) -> list[tuple[str, str]]:
     ]
 
 
+def _added_to(action: ActionSpec) -> str:
+    """What its deltas are added to, where that is not the default."""
+    out = "" if action.anchor == "goal" else ", from the measured pose"
+    out += "" if action.relative_to == "previous" else ", all from the start of the chunk"
+    if action.controller is not None:
+        gains = action.controller
+        out += f", by a controller of kp {gains.kp:g} and damping ratio {gains.damping_ratio:g}"
+    return out
+
+
 def _columns(action: ActionSpec) -> list[str]:
     """Name and unit of each number of a step."""
-    unit = "m" if action.position_scale_m == 1.0 else f"* {action.position_scale_m:g} m"
+    per = "/s" if action.kind == "velocity" else ""
+    scale = "" if action.position_scale_m == 1.0 else f"* {action.position_scale_m:g} "
+    unit = f"{scale}m{per}"
     rotations = {
         "rpy": ("roll rad", "pitch rad", "yaw rad"),
-        "rotvec": ("rx rad", "ry rad", "rz rad"),
+        "rotvec": (f"rx rad{per}", f"ry rad{per}", f"rz rad{per}"),
         "quaternion": ("qx", "qy", "qz", "qw"),
     }
     names = [*(f"{axis} {unit}" for axis in "xyz"), *rotations[action.rotation]]

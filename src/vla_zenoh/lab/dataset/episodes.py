@@ -8,11 +8,12 @@ the next one arrived, frames without motion fill the gap, so all frames are `dt_
 from __future__ import annotations
 
 from bisect import bisect_right
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_zenoh.control.actions import as_deltas
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.evaluation.activations import activations, obeyed_chunks
 from vla_zenoh.lab.recording.run import RecordedSample, Run
@@ -102,7 +103,7 @@ def episodes_of(run: Run, worker: str | None = None) -> list[RecordedEpisode]:
         ]
         if not chunks or worker not in (None, whose):
             continue
-        spec = _spec_of(run, chunks)
+        spec, chunks = _one_by_one(_spec_of(run, chunks), chunks)
         frames = _frames(run, spec.action, chunks, until_ns)
         out.append(RecordedEpisode(run, whose, spec, since_ns, until_ns, frames))
     return out
@@ -122,6 +123,20 @@ def _spec_of(run: Run, chunks: list[RecordedSample]) -> ModelSpec:
             "one activation"
         )
     return specs[0]
+
+
+def _one_by_one(
+    spec: ModelSpec, chunks: list[RecordedSample]
+) -> tuple[ModelSpec, list[RecordedSample]]:
+    """Chunks whose steps mean something one by one, also apart from the start of their chunk."""
+    if spec.action.relative_to == "previous":
+        return spec, chunks
+    action, out = spec.action, []
+    for chunk in chunks:
+        action, steps = as_deltas(spec.action, chunk.record.steps)
+        record = replace(chunk.record, steps=steps.astype(np.float32))
+        out.append(chunk._replace(record=record))
+    return spec.model_copy(update={"action": action}), out
 
 
 def _frames(run: Run, spec: ActionSpec, chunks: list[RecordedSample], until_ns: int) -> list[Frame]:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vla_zenoh.control.actions import step_pose, step_width
+from vla_zenoh.control.actions import chunk_poses, step_width
 from vla_zenoh.errors import RecordError
 from vla_zenoh.kinematics.so3 import Pose, interpolate, log3, pose_of
 from vla_zenoh.lab.recording.run import Run, nearest
@@ -123,10 +123,9 @@ def requested_path(
     Raises:
         RecordError: a step that does not fit the spec.
     """
-    poses, widths_m = [start.pose], [start.width_m]
+    poses, widths_m = [start.pose, *chunk_poses(spec, chunk.steps, start.pose)], [start.width_m]
     for step in chunk.steps:
         width_m = step_width(spec, step, widths_m[-1], max_width_m)
-        poses.append(step_pose(spec, step, poses[-1]))
         widths_m.append(widths_m[-1] if width_m is None else width_m)
     return RequestedPath(spec.dt_s, poses, None if spec.gripper == "none" else widths_m)
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import rerun as rr
 
-from vla_zenoh.control.actions import step_pose
+from vla_zenoh.control.actions import chunk_poses
 from vla_zenoh.control.plan_timeline import Goal, Plan
 from vla_zenoh.errors import RecordError
 from vla_zenoh.kinematics.so3 import Pose, rotation_from_quat
@@ -139,15 +139,15 @@ class Scene:
         Raises:
             RecordError: a step that does not fit the spec.
         """
-        start = self._start_of(chunk)
+        measured = spec.action.anchor == "measured"
+        start = self._measured if measured else self._start_of(chunk)
         if start is None:
             return
-        action, before, goals = spec.action, start, []
+        action = spec.action
         for step in chunk.steps:
             if len(step) != action.dimension:
                 raise RecordError(f"a step has {len(step)} numbers, its spec {action.dimension}")
-            before = step_pose(action, np.asarray(step, np.float64), before)
-            goals.append(Goal(before, 0.0))
+        goals = [Goal(pose, 0.0) for pose in chunk_poses(action, chunk.steps, start)]
         dt_ns = max(int(action.dt_s * 1e9), 1)
         self._plans[chunk.worker] = Plan(stamp_ns, chunk.observation_stamp_ns, dt_ns, goals)
         self._ribbons[chunk.worker] = stamp_ns

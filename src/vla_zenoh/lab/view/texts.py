@@ -148,10 +148,13 @@ def _first_step(seen: InferenceDebug, spec: ModelSpec | None) -> str:
         return "first step " + " ".join(f"{value:+.4f}" for value in step)
     action, scale_mm = spec.action, spec.action.position_scale_m * 1e3
     rows = ["| first step | x | y | z |", "|---|---|---|---|"]
-    rows.append("| mm | " + " | ".join(f"{value * scale_mm:+.1f}" for value in step[:3]) + " |")
+    per = "/s" if action.kind == "velocity" else ""
+    rows.append(
+        f"| mm{per} | " + " | ".join(f"{value * scale_mm:+.1f}" for value in step[:3]) + " |"
+    )
     turn = [float(value) for value in step[3 : action.dimension - (action.gripper != "none")]]
     if len(turn) == 3:
-        rows.append("| mrad | " + " | ".join(f"{value * 1e3:+.1f}" for value in turn) + " |")
+        rows.append(f"| mrad{per} | " + " | ".join(f"{value * 1e3:+.1f}" for value in turn) + " |")
     text = "\n".join(rows)
     if action.gripper != "none":
         text += f"\n\ngripper {float(step[-1]):+.3f} ({action.gripper.replace('_', ' ')})"
