@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from vla_zenoh.interop.ros2.topics import header, pose
 
 from benchmarks.codec.other_cdr import MODULES, OtherCdr
 from vla_zenoh.codec import records
@@ -15,6 +14,7 @@ from vla_zenoh.codec.image import decode_jpeg, decode_raw, encode_jpeg, encode_r
 from vla_zenoh.interop.ros2 import table
 from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.interop.ros2.samples import Stamp
+from vla_zenoh.interop.ros2.topics import header, pose
 from vla_zenoh.types import ActionChunk, Image, JointState, PoseCommand
 
 HEIGHT, WIDTH = 480, 640

@@ -120,11 +120,12 @@ def chunk_poses(spec: ActionSpec, steps: Steps, start: Pose) -> list[Pose]:
     return poses
 
 
-def as_deltas(spec: ActionSpec, steps: Steps) -> tuple[ActionSpec, Steps]:
+def as_deltas(spec: ActionSpec, steps: Steps) -> tuple[ActionSpec, FloatArray]:
     """The same chunk as deltas that are each added to the step before, with the spec of them.
 
     A chunk of deltas on the previous step, or of absolute poses, is returned as it is.
     """
+    steps = np.asarray(steps, np.float64)
     if spec.kind == "velocity":
         size = 3 + ROTATION_SIZE[spec.rotation]
         scaled = np.concatenate([steps[:, :size] * spec.dt_s, steps[:, size:]], axis=1)

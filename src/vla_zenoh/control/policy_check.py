@@ -146,8 +146,8 @@ def chunk_errors(
 def largest_step(spec: ActionSpec, steps: Steps) -> tuple[float, float]:
     """Largest length (m) and angle (rad) from one step to the next; of absolute poses their own."""
     spec, steps = as_deltas(spec, steps)
-    position_m = steps[:, :3].astype(np.float64) * spec.position_scale_m
-    rotation = steps[:, 3 : 3 + ROTATION_SIZE[spec.rotation]].astype(np.float64)
+    position_m = steps[:, :3] * spec.position_scale_m
+    rotation = steps[:, 3 : 3 + ROTATION_SIZE[spec.rotation]]
     angles = (
         2 * np.arccos(np.clip(np.abs(rotation[:, 3]), 0.0, 1.0))
         if spec.rotation == "quaternion"
