@@ -287,7 +287,8 @@ class AxisSmoother:
         One, if the motion is already along `way`. Otherwise those of each group: the line and the
         directions beside it if the motion there is small, or the axes.
         """
-        whole = _line(way, *self._state[1:], self._pace)
+        _, velocity, acceleration = self._state
+        whole = _line(way, velocity, acceleration, self._pace)
         if whole is not None:
             return whole[:, None], [1.0]
         columns: list[FloatArray] = []

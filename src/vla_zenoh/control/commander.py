@@ -449,7 +449,8 @@ class Commander:
     # -- supervision --------------------------------------------------------------------------
     def _measure(self) -> None:
         if self.pose is not None:
-            self._motion.measure(self.pose.record, self.pose.received_ns)
+            joint = self.joint.record if self.joint else None
+            self._motion.measure(self.pose.record, joint, self.pose.received_ns)
 
     def _supervise(self, now_ns: int) -> None:
         if self.pose is not None:

@@ -128,7 +128,7 @@ class MotionPipeline:
         self._back: Pose | None = None
         self._slowed_by: set[str] = set()
         self._smoother: Smoother | None = None
-        self._standing: tuple[Pose, int] | None = None
+        self._standing: tuple[Pose, FloatArray | None, int] | None = None
         self._measured_ns = 0
         self._timings: list[StepTiming] = []
         """Of poses, and of joints."""
@@ -279,7 +279,7 @@ class MotionPipeline:
         least, most = np.minimum(low, actual.position_m), np.maximum(high, actual.position_m)
         return Pose(np.clip(rest.position_m, least, most), rest.rotation)
 
-    def measure(self, measured: PoseState, received_ns: int) -> None:
+    def measure(self, measured: PoseState, joint: JointState | None, received_ns: int) -> None:
         """Track whether the robot still moves while the stream stands.
 
         A record that is repeated does not show that the robot stands.
@@ -288,8 +288,9 @@ class MotionPipeline:
             self._standing = None
             return
         held = held_pose(measured)
-        if self._standing is None or max(pose_distance(held, self._standing[0])) > SETTLED:
-            self._standing = held, received_ns
+        held_rad = None if self._joints is None or joint is None else self._held_joints(joint)
+        if self._standing is None or max(_apart(held, held_rad, *self._standing[:2])) > SETTLED:
+            self._standing = held, held_rad, received_ns
         self._measured_ns = received_ns
 
     def unsettled(self) -> list[str]:
@@ -299,19 +300,20 @@ class MotionPipeline:
         """
         if self._standing is None or self._mover is None:
             return []
-        held, since_ns = self._standing
-        apart_m, apart_rad = pose_distance(self._mover.motion.pose, held)
-        if self._near(apart_m, apart_rad) or self._measured_ns - since_ns > SETTLED_NS:
+        held, held_rad, since_ns = self._standing
+        apart = _apart(held, held_rad, self._mover.motion.pose, self.joints_rad)
+        if self._near(*apart) or self._measured_ns - since_ns > SETTLED_NS:
             return []
+        joints = "" if held_rad is None else f", its joints {apart[2]:.3f} rad"
         return [
-            f"the robot is still {apart_m:.3f} m and {apart_rad:.3f} rad from its last command; "
-            f"activate again in {LINGER_NS / 1e9:g} s"
+            f"the robot is still {apart[0]:.3f} m and {apart[1]:.3f} rad from its last "
+            f"command{joints}; activate again in {LINGER_NS / 1e9:g} s"
         ]
 
     @staticmethod
-    def _near(apart_m: float, apart_rad: float) -> bool:
+    def _near(apart_m: float, apart_rad: float, joint_rad: float = 0.0) -> bool:
         """The robot holds the streamed pose: to restart there would be a step in the stream."""
-        return apart_m <= HELD_M and apart_rad <= HELD_RAD
+        return apart_m <= HELD_M and apart_rad <= HELD_RAD and joint_rad <= HELD_JOINT_RAD
 
     def _held_joints(self, joint: JointState) -> FloatArray:
         """Joint set-points of the robot's controller, or the measured joints."""
@@ -579,6 +581,16 @@ class MotionPipeline:
             state.value,
             self._cause,
         )
+
+
+def _apart(
+    pose: Pose, joints_rad: FloatArray | None, other: Pose, others_rad: FloatArray | None
+) -> tuple[float, float, float]:
+    """Distance of two poses in m and rad, and of the joints in rad where both are known."""
+    joint_rad = 0.0
+    if joints_rad is not None and others_rad is not None:
+        joint_rad = float(np.abs(joints_rad - others_rad).max())
+    return *pose_distance(pose, other), joint_rad
 
 
 def _ahead(motion: Motion, dt_s: float) -> Pose:

@@ -405,6 +405,26 @@ def test_a_robot_that_swings_past_its_last_command_is_not_activated_before_it_st
     rig.assert_smooth()
 
 
+def test_a_robot_whose_joints_swing_past_their_last_command_is_not_activated_then() -> None:
+    of = override(load_profile("panda_sim"), {"robot": {"command": "joint"}})
+    kinematics = make_reachability_filter(of).kinematics
+    rig = Rig(of, reach=make_reachability_filter(of))
+    rig.stand_at(kinematics, np.array(of.robot.home_rad))
+    rig.activate()
+    rig.put("active", False)
+    out = rig.tick(chunks=[rig.chunk([[0.0] * 7])])
+    assert out.joint is not None
+    for away_rad in (0.012, 0.01, 0.008):  # the first joint turns, the TCP is not seen to move
+        rig.joints_rad = out.joint.position_rad + away_rad * np.eye(7)[0]
+        rig.tick()
+    rig.put("active", True)
+    assert rig.state == "inactive"
+    assert "its joints 0.008 rad" in rig.commander.why
+    rig.run(0.15)
+    rig.put("active", True)
+    assert rig.state == "active"
+
+
 def test_a_repeated_state_does_not_show_that_the_robot_stands() -> None:
     rig = moving_rig()
     rig.put("active", False)
