@@ -501,7 +501,7 @@ class Commander:
             self._change(Trigger.LOSE, str(error))
             return
         motion.measured_rad, commanded_rad = measured_rad, motion.joints_rad
-        hit = monitor.update(measured_rad, commanded_rad, now_ns)
+        hit = monitor.update(measured_rad, commanded_rad, now_ns, in_joints=motion.in_joints)
         motion.joint_slowdown = monitor.slowdown
         reach.set_elbow(measured_rad if commanded_rad is None else commanded_rad)
         if hit is not None:

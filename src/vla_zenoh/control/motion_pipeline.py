@@ -109,7 +109,7 @@ class MotionPipeline:
         self._path: JointPath | None = None
         if planner.joint_bounds is not None:
             self._path = JointPath(profile, planner.joint_bounds)
-        self._in_joints = False
+        self.in_joints = False
         """Goals in force are joints, and `_path` moves to them."""
         self.gripper = GripperArbiter(profile.robot.gripper)
         self.timeline: GoalTimeline | None = None
@@ -141,12 +141,12 @@ class MotionPipeline:
     @property
     def _mover(self) -> Smoother | JointPath | None:
         """What moves the arm: the smoother of poses, or of joints; None before any activation."""
-        return self._path if self._in_joints else self._smoother
+        return self._path if self.in_joints else self._smoother
 
     @property
     def at_rest(self) -> bool:
         """The commanded motion stands still."""
-        still = self._in_joints or self._joints is None or self._joints.at_rest
+        still = self.in_joints or self._joints is None or self._joints.at_rest
         return self._mover is None or (self._mover.at_rest and still)
 
     @property
@@ -159,14 +159,14 @@ class MotionPipeline:
         """(n,) joints commanded, None where poses are."""
         if self._joints is None:
             return None
-        if self._in_joints and self._path is not None:
+        if self.in_joints and self._path is not None:
             return self._path.state.position
         return self._joints.position_rad
 
     @property
     def stuck(self) -> str:
         """Why commanded joints will not reach the pose, empty while they follow."""
-        return "" if self._joints is None or self._in_joints else self._joints.stuck
+        return "" if self._joints is None or self.in_joints else self._joints.stuck
 
     @property
     def failures(self) -> int:
@@ -226,7 +226,7 @@ class MotionPipeline:
         self.gripper.restart(width_m)
         # The goal of a blocked arm is where it is. Otherwise a brake continues, and the goal is
         # where it ends.
-        if not self._in_joints or self._path is None:
+        if not self.in_joints or self._path is None:
             goal = Goal(actual if blocked else self._resting_pose(self._smoother, actual), width_m)
         else:
             arm, rest_rad = self._path.kinematics, self._path.braked()
@@ -246,7 +246,7 @@ class MotionPipeline:
     def _use_joints(self) -> None:
         """Go on in joint space, from the present motion; it brakes until there is a target."""
         path, smoother, reach = self._path, self._smoother, self._reach
-        if self._in_joints or path is None or smoother is None or reach is None:
+        if self.in_joints or path is None or smoother is None or reach is None:
             return
         if self._joints is not None:
             state = self._joints.state
@@ -259,19 +259,19 @@ class MotionPipeline:
             most = path.box[:2]
             state = AxisState(joints_rad, *np.clip(rates, -most, most))
         path.resume(state)
-        self._in_joints, self.goal = True, None
+        self.in_joints, self.goal = True, None
 
     def _use_poses(self) -> None:
         """Go on with poses, from the present motion; it brakes until there is a target."""
         path, smoother = self._path, self._smoother
-        if not self._in_joints or path is None or smoother is None:
+        if not self.in_joints or path is None or smoother is None:
             return
         most = smoother.box[1]
         pose, twist, change = path.motion
         smoother.brake_from(Motion(pose, twist, np.clip(change, -most, most)))
         if self._joints is not None:
             self._joints.resume(path.state)
-        self._in_joints, self.goal = False, None
+        self.in_joints, self.goal = False, None
 
     def _resting_pose(self, smoother: Smoother, actual: Pose) -> Pose:
         """Where a brake will end, inside the box or no further outside than the arm is."""
@@ -365,7 +365,7 @@ class MotionPipeline:
         failures = self.failures
         # A stream that begins must begin at rest: no ticks are made up for.
         for _ in range(ticks if went_on else 1):
-            if self._in_joints and self._path is not None:
+            if self.in_joints and self._path is not None:
                 self._path.tick()
             elif self._joints is None:
                 self._smoother.tick()
@@ -434,7 +434,7 @@ class MotionPipeline:
                 goal = self._shorten(plans, goal, short, now_ns)
             events += self._slow_down(slower)
             shares = self._shares(mover, goal, timeline.plan, task, overdue_ns, now_ns)
-            hard = self._slowing and (self._joints is None or self._in_joints)
+            hard = self._slowing and (self._joints is None or self.in_joints)
             enough = _move(mover, goal, shares, hard=hard)
             self._slowing &= not (enough and _within(mover, self._override))
             self.goal = goal
@@ -482,7 +482,7 @@ class MotionPipeline:
             way = mover.way_to(goal) if joints else mover.way_to(goal.pose)
             velocity, _ = mover.axis_rates()
             index, left_s = plan.index_at(now_ns), (overdue_ns - now_ns) / 1e9
-            share = self._timings[self._in_joints].share(
+            share = self._timings[self.in_joints].share(
                 plan, index, now_ns, 1.0 / task.rate_hz, left_s, way, velocity
             )
             speed = min(speed, share)

@@ -5,15 +5,19 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pytest
 from command_rig import Rig
 from panda_arm import ARM_JOINTS, HOME_RAD
 
+from vla_zenoh.control.commander import Setting
+from vla_zenoh.control.joint_space import JointBounds
+from vla_zenoh.control.limits import workspace_corners
 from vla_zenoh.control.reachability import make_reachability_filter
 from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh.types import FloatArray, JointCommand
 
 EXACT_RAD = 1e-6
-LIMIT_RTOL = 1e-6
+BOX_M = 1e-3
 
 
 def panda(command: str = "joint") -> Profile:
@@ -58,8 +62,6 @@ class Joints:
         return [float(joints_rad[ARM_JOINTS.index(name)]) for name in self.names]
 
     def activate(self) -> None:
-        from vla_zenoh.control.commander import Setting
-
         self.tick(chunks=[self.rig.chunk([self.columns(self.joints_rad)])])
         self.tick(Setting("active", True))
         assert self.rig.state == "active", self.rig.commander.why
@@ -77,6 +79,30 @@ class Joints:
             self.tick(chunks=[self.rig.chunk([self.columns(joints_rad)] * 8)])
             self.run(0.4)
 
+    def assert_within_limits(self) -> None:
+        """Joints as finite differences, the box, and the distances of every command."""
+        bounds = JointBounds(
+            self.profile, self.kinematics, make_reachability_filter(self.profile).barriers
+        )
+        dt_s = self.rig.period_ns / 1e9
+        orders = [
+            np.array([command[n] for command in map(_numbers, self.joints)]) for n in range(3)
+        ]
+        for order, limit in zip(orders, bounds.motion, strict=True):
+            rates = np.abs(np.diff(order, axis=0)) / dt_s
+            assert (rates <= limit * (1 + 1e-4)).all()
+        low, high = workspace_corners(self.profile.limits)
+        for joints_rad in orders[0][::5]:
+            place = self.kinematics.forward(joints_rad).position_m
+            assert (place >= low - BOX_M).all()
+            assert (place <= high + BOX_M).all()
+            left_m = bounds.barriers.collisions.distances(joints_rad) - bounds.barriers.stop[1:]
+            assert left_m.min() > -BOX_M
+
+
+def _numbers(command: JointCommand) -> tuple[FloatArray, FloatArray, FloatArray]:
+    return command.position_rad, command.velocity_rad_s, command.acceleration_rad_s2
+
 
 def test_absolute_joints_are_reached_exactly() -> None:
     arm = Joints()
@@ -86,3 +112,45 @@ def test_absolute_joints_are_reached_exactly() -> None:
     arm.settle(goal_rad)
     assert arm.rig.state == "active"
     assert np.abs(arm.joints_rad - goal_rad).max() < EXACT_RAD
+
+
+@pytest.mark.parametrize("kind", ["absolute", "delta"])
+def test_no_limit_is_broken_whatever_the_policy_asks(kind: str) -> None:
+    rng, arm = np.random.default_rng(0), Joints(kind=kind)
+    arm.activate()
+    for _ in range(14):
+        rows = (HOME_RAD + rng.uniform(-1.2, 1.2, (1, 7))) * np.ones((8, 1))
+        if kind == "delta":
+            rows = rng.uniform(-0.15, 0.15, (1, 7)) * np.ones((8, 1))
+        arm.tick(chunks=[arm.rig.chunk(rows)])
+        arm.run(float(rng.choice([0.05, 0.2, 0.5])))
+    arm.tick(Setting("active", False))
+    arm.run(1.2)
+    assert arm.rig.commander.at_rest
+    arm.assert_within_limits()
+
+
+def test_columns_are_mapped_by_the_names_of_the_joints() -> None:
+    arm = Joints(names=ARM_JOINTS[::-1])
+    arm.activate()
+    goal_rad = HOME_RAD + [0.1, 0.05, -0.1, 0.05, 0.1, 0.05, -0.1]
+    arm.settle(goal_rad)
+    assert np.abs(arm.joints_rad - goal_rad).max() < EXACT_RAD
+
+
+def test_a_worker_with_other_joints_is_rejected_by_their_names() -> None:
+    arm = Joints(names=("elbow", *ARM_JOINTS[1:]))
+    arm.rig.tick(chunks=[arm.rig.chunk([HOME_RAD])])
+    arm.tick(Setting("active", True))
+    assert arm.rig.state == "inactive"
+    assert "its joints are elbow, panda_joint2" in arm.rig.commander.why
+
+
+def test_a_robot_that_takes_poses_gets_those_of_the_joints() -> None:
+    arm = Joints("pose")
+    arm.activate()
+    goal_rad = HOME_RAD + [0.2, 0.05, -0.2, 0.05, 0.1, 0.05, -0.2]
+    goal = arm.kinematics.forward(goal_rad)
+    arm.settle(goal_rad)
+    assert np.abs(arm.rig.position_m - goal.position_m).max() < EXACT_RAD
+    arm.rig.assert_smooth()

@@ -34,7 +34,7 @@ SPEC = ModelSpec(
     ),
     action=ActionSpec(horizon=1, dt_s=0.2, gripper="binary"),
 )
-SPEC_HASH = "68bc1fea58b3f857"
+SPEC_HASH = "7f27aed900060800"
 """Pinned: workers and command nodes of different builds must agree on it."""
 
 
