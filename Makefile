@@ -7,7 +7,7 @@ SECONDS ?= 60
 MINUTES ?= 60
 BIN := .venv/bin
 READY := .venv/.ready
-SUITE := not slow and not models and not ros2
+SUITE := not slow and not models and not ros2 and not franka
 # Real arms brake when their computer stands still for a tenth of a second, and so do those of the tests: one that
 # fails in real time is tried once more, and told in the summary.
 AGAIN := --reruns 1 -r fEsR
@@ -15,7 +15,7 @@ AGAIN := --reruns 1 -r fEsR
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test slow fuzz fuzz-motion soak test-ros2 test-models check format bench bench-faults bench-ros2 build docs ros2-bridge clean
+.PHONY: help setup demo test slow fuzz fuzz-motion soak test-ros2 test-franka test-models check format bench bench-faults bench-ros2 build docs ros2-bridge clean
 
 help: ## Show this list
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z0-9-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
@@ -37,7 +37,7 @@ test: $(READY) ## Run the tests
 	$(BIN)/python -m pytest $(AGAIN) -m "$(SUITE) and realtime" $(ARGS) || [ $$? = 5 ]
 
 slow: $(READY) ## Run the tests that take long, too, and search for new examples
-	HYPOTHESIS_PROFILE=searching $(BIN)/python -m pytest -m "not models" $(ARGS)
+	HYPOTHESIS_PROFILE=searching $(BIN)/python -m pytest -m "not models and not franka" $(ARGS)
 
 fuzz: $(READY) ## Feed every reader of foreign bytes with nonsense; SECONDS=600 for longer
 	$(BIN)/python tests/fuzz/fuzz.py --seconds $(SECONDS) $(ARGS)
@@ -51,11 +51,15 @@ soak: $(READY) ## Run the whole chain with random faults; MINUTES=3 for a short 
 test-ros2: $(READY) ros2-bridge ## Run the tests with a real ROS 2 bridge and a DDS robot
 	$(BIN)/python -m pytest $(AGAIN) -m ros2 $(ARGS)
 
+test-franka: $(READY) ## Run the tests of the driver franka against franka-sim, in an environment of its own
+	$(BIN)/python scripts/test_franka.py $(AGAIN) $(ARGS)
+
 test-models: $(READY) ## Run the tests of OpenVLA and LeRobot, each in its environment (12 GB, once)
 	$(BIN)/python scripts/test_models.py $(ARGS)
 
+# Without a cache: ruff's does not notice a module of ours that is gone.
 check: $(READY) ## Lint, format and types, as CI does
-	$(BIN)/ruff check .
+	$(BIN)/ruff check --no-cache .
 	$(BIN)/ruff format --check .
 	$(BIN)/basedpyright
 

@@ -66,7 +66,7 @@ class Replay:
 
     def _stand(self) -> np.ndarray:
         last = self._chunks[-1][-1:].copy()
-        if self.spec.action.kind == "delta":
+        if self.spec.action.kind != "absolute":
             rotation_is_quaternion = self.spec.action.rotation == "quaternion"
             gripper = last[0, -1] if self.spec.action.gripper not in ("none", "delta_m") else 0.0
             last[:] = 0.0

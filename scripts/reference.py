@@ -257,6 +257,7 @@ REASONS = {
     "no_attachment": "rmw_zenoh: no attachment",
     "no_gripper": "gripper command for an arm without a gripper",
     "no_header": "no header in the attachment",
+    "not_measured": "chunk: it begins at the measured pose, and none was measured shortly before",
     "out_of_order": "older than the one before",
     "outlived": "gripper command from before a stop",
     "oversize": "larger than the limit of its kind",

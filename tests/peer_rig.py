@@ -30,7 +30,13 @@ ENVIRONMENT_S = 300
 # openpi-client does not name typing-extensions, which it imports.
 OPENPI_CLIENT = ("openpi-client==0.1.2", "typing-extensions")
 JSON_NUMPY = ("json-numpy==2.1.1",)
-_PLAIN = {"rotation": "rpy", "clip": "", "position_scale_m": "1", "rotation_scale_rad": "1"}
+_PLAIN = {
+    "rotation": "rpy",
+    "clip": "",
+    "position_scale_m": "1",
+    "rotation_scale_rad": "1",
+    "controller": "none",
+}
 _SMALL = {"size": "64x64", "dt_s": "0.1", "horizon": "4", "timeout_s": "1"}
 _NO_WRIST = {
     "openpi": "observation/wrist_image=",

@@ -169,7 +169,7 @@ WRONG: list[tuple[str, str]] = [
     ),
     (
         "robot: {driver: ros}",
-        "wants 'sim', 'ros2' or 'arm'; did you mean 'ros2'? (given: 'ros')",
+        "wants 'sim', 'ros2', 'franka' or 'arm'; did you mean 'ros2'? (given: 'ros')",
     ),
     ("robot: {tcp_frame: ''}", "robot.tcp_frame: must not be empty"),
     (

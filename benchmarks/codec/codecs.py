@@ -11,10 +11,10 @@ import numpy as np
 from benchmarks.codec.other_cdr import MODULES, OtherCdr
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import decode_jpeg, decode_raw, encode_jpeg, encode_raw, raw_schema
-from vla_zenoh.interop.ros2 import table
 from vla_zenoh.interop.ros2.messages import Messages
+from vla_zenoh.interop.ros2.readers import READERS, read
 from vla_zenoh.interop.ros2.samples import Stamp
-from vla_zenoh.interop.ros2.topics import header, pose
+from vla_zenoh.interop.ros2.writers import POSE_STAMPED, header, pose_writer
 from vla_zenoh.types import ActionChunk, Image, JointState, PoseCommand
 
 HEIGHT, WIDTH = 480, 640
@@ -63,16 +63,15 @@ def cases(distribution: str = "jazzy") -> list[Case]:
     picture = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
     smooth = np.tile(np.arange(WIDTH, dtype=np.uint8)[None, :, None], (HEIGHT, 1, 3))
     stamp = Stamp(1_700_000_000_000_000_000, "panda_link0")
-    write_pose = pose.writer(np.zeros(ARM))
     pictures = {
         "height": HEIGHT,
         "width": WIDTH,
         "step": 3 * WIDTH,
         "data": picture.ravel(),
-        "header": header.write(messages, stamp),
+        "header": header(messages, stamp),
     }
     states = {
-        "header": header.write(messages, stamp),
+        "header": header(messages, stamp),
         "name": list(JOINTS),
         "position": np.zeros(ARM),
         "velocity": np.zeros(ARM),
@@ -82,8 +81,10 @@ def cases(distribution: str = "jazzy") -> list[Case]:
         ("Image rgb8 640x480", messages.new("sensor_msgs/msg/Image", encoding="rgb8", **pictures)),
         ("Image bgr8 640x480", messages.new("sensor_msgs/msg/Image", encoding="bgr8", **pictures)),
         ("JointState", messages.new("sensor_msgs/msg/JointState", **states)),
-        ("PoseStamped", write_pose(messages, pose.STAMPED, _POSE, stamp)),
-        ("CartesianImpedanceGoal", write_pose(messages, GOAL, _POSE, stamp)),
+        *(
+            (name, pose_writer(messages, kind, np.zeros(ARM))(_POSE, stamp))
+            for name, kind in (("PoseStamped", POSE_STAMPED), ("CartesianImpedanceGoal", GOAL))
+        ),
     )
     return [*_own(picture, smooth), *(_ros(name, m, messages, others) for name, m in ros)]
 
@@ -121,16 +122,11 @@ def _record(record: Any) -> Case:
     )
 
 
-_READ = {reading.type for reading in table.READINGS}
-
-
 def _ros(name: str, message: Any, messages: Messages, others: list[tuple[str, OtherCdr]]) -> Case:
     kind, payload = message.__msgtype__, messages.encode(message)
 
     def decode() -> Any:
-        return (
-            table.read(messages, kind, payload) if kind in _READ else messages.decode(kind, payload)
-        )
+        return (read if kind in READERS else Messages.decode)(messages, kind, payload)
 
     return Case(
         f"ROS {name}",

@@ -16,7 +16,7 @@ from typing import Any
 from vla_zenoh.codec import message
 from vla_zenoh.errors import CodecError, PeerError
 from vla_zenoh.interop.field_mapping import FieldMapping
-from vla_zenoh.interop.presets import OSC, STATE8, Presets
+from vla_zenoh.interop.presets import ADDED, OSC, STATE8, Presets
 from vla_zenoh.types import shown
 
 PORT = 8000
@@ -30,6 +30,7 @@ _OWN = {
     "size": "",
     "resize": "none",
     "action": "delta",
+    **ADDED,
     "rotation": "rpy",
     "gripper": "absolute_m",
     "dt_s": "0.1",
@@ -163,4 +164,14 @@ def mismatches(metadata: Mapping[str, Any], mapping: FieldMapping) -> list[str]:
     return out
 
 
-_MEANING = ("kind", "frame", "rotation", "gripper", "gripper_open_is_high", "dt_s")
+_MEANING = (
+    "kind",
+    "frame",
+    "anchor",
+    "relative_to",
+    "controller",
+    "rotation",
+    "gripper",
+    "gripper_open_is_high",
+    "dt_s",
+)

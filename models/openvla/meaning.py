@@ -9,7 +9,7 @@ from vla_zenoh_model_openvla.statistics import AXES, Range
 
 from vla_zenoh.errors import WorkerError
 from vla_zenoh.interop.action_semantics import ActionSemantics, read_action_semantics
-from vla_zenoh.interop.presets import OSC
+from vla_zenoh.interop.presets import ADDED, OSC
 
 USUAL: Mapping[str, str] = {
     "action": "delta",
@@ -19,12 +19,13 @@ USUAL: Mapping[str, str] = {
 }
 """What OpenVLA's own data sets were converted to: metres and radians."""
 DATA: Mapping[str, Mapping[str, str]] = {
-    "bridge_orig": {"dt_s": "0.2"},
+    "bridge_orig": {**ADDED, "dt_s": "0.2"},
     "fractal20220817_data": {"dt_s": "0.333333"},
     "libero": OSC,
 }
 """What is known of data sets, by how their names begin. LIBERO's statistics are in the units of its
-controller. Of others `dt_s` is asked for: a delta at another rate is another speed."""
+controller. Of others `dt_s` is asked for (a delta at another rate is another speed), and what a
+delta is added to."""
 LONGEST_STEP_M = 0.5
 """No arm goes further in a step of its data: numbers that do are no metres."""
 

@@ -57,6 +57,8 @@ class Reading:
         fault: why the robot does not move (emergency stop, reflex, protective stop). The arm is
             stopped until the fault is gone and an operator has published ``reset``. Report it
             however brief it is, and also where nothing else is new.
+        mode: the robot's own word for why it follows no commands though it is well (it is guided by
+            hand, a recovery runs). The arm is not activated in it; empty: it is ready.
         measured_ns: time of the measurement by `time.monotonic_ns`; None: now. Set it where a
             library caches the newest state: otherwise a dead link looks like an arm at rest.
     """
@@ -69,18 +71,22 @@ class Reading:
     holding: bool = False
     wrench: ArrayLike | None = None
     fault: str = ""
+    mode: str = ""
     measured_ns: int | None = None
 
 
 @runtime_checkable
 class Robot(Protocol):
-    """A robot. `read` and `move` are required, ``connect``, ``grip`` and ``close`` optional.
+    """A robot. `read` and `move` are required, the other methods named here are optional.
 
     One thread calls all of them, ``timing.command_hz`` times a second; a call must return within a
     fraction of that period. Code that waits for the robot needs a thread of its own.
 
     ``connect()`` runs once before the first reading, and may take long.
     ``grip(width_m, speed_m_s, force_n)`` starts a motion to an absolute opening, and returns.
+    ``recover()`` runs when a person published ``reset``: begin to clear the robot's errors, and
+    return. A robot that has it clears none by itself.
+    ``status()`` gives figures for the node's status, name -> number, text or list.
     ``close()`` runs at the end, when the arm stands, also after a ``connect()`` that failed.
 
     An exception ends the node, after it braked the motion by further calls of `move`, unless those

@@ -30,6 +30,9 @@ CONFIG: dict[str, Any] = {
 WRIST = "observation.images.gripper_cam=camera:wrist"
 ACTION_OPTIONS = {
     "action": "delta",
+    "anchor": "goal",
+    "relative_to": "previous",
+    "controller": "none",
     "rotation": "rpy",
     "gripper": "open_fraction",
     "gripper_open": "high",
@@ -54,6 +57,12 @@ def test_the_spec_says_what_the_options_say(tmp_path: Path) -> None:
     assert not spec.observation.prompt
     assert (spec.action.horizon, spec.action.dt_s) == (50, 0.05)
     assert (spec.action.frame, spec.action.gripper_open_is_high) == ("tcp", False)
+
+
+def test_a_chunk_relative_to_its_observation_is_declared_so(tmp_path: Path) -> None:
+    umi = {"relative_to": "start", "anchor": "measured", "controller": "", "frame": "tcp"}
+    action = make(tmp_path, **umi).spec.action
+    assert (action.relative_to, action.anchor, action.controller) == ("start", "measured", None)
 
 
 def test_numbers_are_read_in_the_units_and_bounds_that_are_told(tmp_path: Path) -> None:
@@ -126,7 +135,10 @@ def test_a_policy_that_plans_by_itself_gives_one_step(
 @pytest.mark.parametrize(
     ("options", "match"),
     [
-        ({"action": ""}, r"--set action=\(delta or absolute or joint_delta or joint_position\)"),
+        ({"action": ""}, r"--set action=\(delta or absolute or velocity or joint_delta"),
+        ({"relative_to": ""}, r"--set relative_to=\(previous or start: is a delta added"),
+        ({"anchor": "tcp"}, "anchor is 'tcp', allowed: goal, measured"),
+        ({"action": "velocity"}, "set rotation: rotvec"),
         ({"kind": "delta"}, r"no option 'kind'; known: action, frame"),
         ({"rotation": "euler"}, r"rotation is 'euler', allowed: rpy, rotvec, quat_xyzw, quat_wxyz"),
         ({"gripper": ""}, r"--set gripper=\(none or .* open_fraction"),

@@ -224,6 +224,8 @@ def test_liberos_numbers_are_those_of_its_controller(tmp_path: Path, key: str) -
         True,
         0.05,
     )
+    assert action.controller is not None
+    assert (action.controller.kp, action.controller.damping_ratio) == (150.0, 1.0)
     rows = vars(policy)["_range"].expand([[1.0, -1.0, 0.0, 1.0, -1.0, 0.0, 0.7]])
     wanted = [[0.05 * 0.9375, -0.05 * 0.9375, 0, 0.15, -0.1, 0.025, 0.7]]
     np.testing.assert_allclose(steps_of(policy, rows), wanted, atol=ATOL)
@@ -238,14 +240,18 @@ def test_the_native_worker_and_the_server_of_the_same_weights_ask_for_the_same(
     rows = np.array([[0.5, -0.25, 0.125, 0.1, -0.2, 0.3, 1.0]])
     theirs = served.mapping.steps(rows, example_observation(served.spec))
     np.testing.assert_allclose(steps_of(native, rows), theirs, atol=ATOL)
+    assert native.spec.action.controller == served.spec.action.controller
     assert native.spec.action.rotation == served.spec.action.rotation
     assert native.spec.action.dt_s == served.spec.action.dt_s
+
+
+ADDED = {"anchor": "goal", "relative_to": "previous", "controller": "none"}
 
 
 def test_data_of_ones_own_may_mean_something_else(tmp_path: Path) -> None:
     folder = write(tmp_path / "a", statistics={"mine": {"action": BRIDGE}})
     told = {"position_scale_m": "0.001", "frame": "tcp", "rotation": "rotvec", "dt_s": "0.1"}
-    policy = make(folder, **told, gripper_open="low")
+    policy = make(folder, **told, **ADDED, gripper_open="low")
     action = policy.spec.action
     assert (action.frame, action.rotation) == ("tcp", "rotvec")
     assert not action.gripper_open_is_high
@@ -263,9 +269,9 @@ def test_statistics_that_are_no_metres_are_refused_until_somebody_says_what_they
     with pytest.raises(
         WorkerError, match=r"steps of 0\.938, which are no metres.*position_scale_m"
     ):
-        make(folder, dt_s="0.05")
+        make(folder, **ADDED, dt_s="0.05")
     units = {"position_scale_m": "0.05", "rotation_scale_rad": "0.5", "rotation": "rotvec"}
-    policy = make(folder, **units, dt_s="0.05")
+    policy = make(folder, **units, **ADDED, dt_s="0.05")
     np.testing.assert_allclose(steps_of(policy, [[1.0] * 7]), [[0.05] * 3 + [0.5] * 3 + [1]])
 
 
@@ -277,6 +283,10 @@ def test_statistics_that_are_no_metres_are_refused_until_somebody_says_what_they
         ({"gripper": "none"}, r"7 numbers, position 3 \+ rpy 3 are 6"),
         ({"horizon": "2"}, "horizon is 2; the model's chunks have 1"),
         ({"action": "absolute"}, r"not that of data set 'mine', so the meaning .*--set rotation="),
+        ({"controller": ""}, r"--set controller=\(none, or KP:DAMPING_RATIO"),
+        ({"controller": "150"}, "wanted none, or KP:DAMPING_RATIO as 150:1"),
+        ({"controller": "150:1", "frame": "tcp"}, "deltas in the base frame"),
+        ({"anchor": ""}, r"--set anchor=\(goal or measured"),
         ({"scale_m": "1"}, r"no option 'scale_m'; known: action, frame"),
     ],
 )
@@ -285,7 +295,7 @@ def test_a_meaning_that_cannot_be_is_named(
 ) -> None:
     folder = write(tmp_path / "a", statistics={"mine": {"action": BRIDGE}})
     with pytest.raises(WorkerError, match=match):
-        make(folder, **{"dt_s": "0.1", **told})
+        make(folder, **{"dt_s": "0.1", **ADDED, **told})
 
 
 @pytest.mark.parametrize("key", ["", "brigde_orig"])
@@ -296,7 +306,7 @@ def test_a_missing_or_wrong_unnorm_key_lists_those_there_are(tmp_path: Path, key
 
 def test_statistics_beside_the_weights_replace_those_of_the_base_model(tmp_path: Path) -> None:
     folder = write(tmp_path / "a", statistics={"mine": {"action": BRIDGE}})
-    assert make(folder, dt_s="0.1").spec.action.normalisation == "mine"
+    assert make(folder, **ADDED, dt_s="0.1").spec.action.normalisation == "mine"
     with pytest.raises(WorkerError, match=r"'bridge_orig' is not in .*dataset_statistics.json"):
         make(folder, unnorm_key="bridge_orig", dt_s="0.1")
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import importlib
 import importlib.util
 import re
 import shutil
@@ -73,6 +75,35 @@ def test_ci_runs_what_people_run() -> None:
     lines = (ROOT / ".ci" / "run").read_text().splitlines()
     assert "make check test test-ros2 build" in lines
     assert lines[-1].startswith("make soak MINUTES=3 ")
+
+
+def test_what_is_imported_from_the_package_is_there() -> None:
+    """Of programs that no other test starts, and of models in environments of their own, too."""
+    wrong = []
+    for folder in ("benchmarks", "examples", "models", "reliability", "scripts", "sim", "tests"):
+        for path in (ROOT / folder).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text())):
+                if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(
+                    "vla_zenoh."
+                ):
+                    assert node.module
+                    wrong += [
+                        f"{path.relative_to(ROOT)}:{node.lineno}: {node.module}.{alias.name}"
+                        for alias in node.names
+                        if not is_there(node.module, alias.name)
+                    ]
+    assert not wrong, wrong
+
+
+def is_there(module: str, name: str) -> bool:
+    try:
+        if hasattr(importlib.import_module(module), name):
+            return True
+        importlib.import_module(f"{module}.{name}")
+    except ModuleNotFoundError as error:
+        # A library of an extra that is not installed says nothing about the name.
+        return not (error.name or "").startswith("vla_zenoh")
+    return True
 
 
 def test_what_pip_was_told_is_said_to_uv(bootstrap: ModuleType, tmp_path: Path) -> None:

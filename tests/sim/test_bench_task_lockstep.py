@@ -73,7 +73,7 @@ def test_why_a_model_cannot_be_made_is_told_by_the_first_that_asks(
     (tmp_path / "nod.py").write_text(text)
     plan = TaskPlan("nod", 1, SEED)
     profile = _with_bricks(load_profile("panda_sim"), "nod", [], str(tmp_path / "nod.py"))
-    task_lockstep._begin(profile, plan, options, None, None)
+    task_lockstep._prepare(profile, plan, options, None, None)
     with pytest.raises(NodeError, match=told):
         task_lockstep._one(next(plan.requests()))
 

@@ -104,7 +104,7 @@ class Turns:
 
     @property
     def arm(self) -> Any:
-        return cast("PythonDriver", self.node.driver)._robot
+        return cast("PythonDriver", self.node.driver).robot
 
     def wait(self) -> Tick:
         self.mono_ns += round(self.period_s * 1e9)

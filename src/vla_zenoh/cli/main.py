@@ -73,6 +73,10 @@ COMMANDS: Mapping[str, Mapping[str, str | Group]] = {
         "check": "lab.cli.check:check",
         "doctor": "lab.cli.doctor:doctor",
         "profile": "lab.cli.profile:profile_app",
+        "robot": Group(
+            "Compare a robot with its profile.",
+            {"check": "lab.cli.robot_check:robot_check"},
+        ),
         "secure": "lab.cli.secure:secure_app",
         "dataset": "lab.cli.dataset:dataset_app",
         "bench": Group(

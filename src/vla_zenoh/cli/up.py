@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import getpass
 import json
 import logging
 import logging.handlers
@@ -34,10 +35,13 @@ from vla_zenoh.resources import is_path
 from vla_zenoh.runtime.launch import Host, choose_host, host_lock
 from vla_zenoh.runtime.parent_watch import DETAIL, FATAL
 from vla_zenoh.runtime.process import die_with_parent, stop_on_signals
+from vla_zenoh.runtime.systemd_unit import systemd_unit
 
 LOG_BYTES = 10 * 1024 * 1024
 COLOURS = ("cyan", "magenta", "green", "yellow", "blue", "bright_cyan", "bright_magenta")
 CHECK_PATIENCE_S = 60.0
+KEPT = ("VLA_ZENOH_PATH", "XDG_CONFIG_HOME", "XDG_STATE_HOME")
+"""Variables that a systemd unit sets as they are."""
 
 
 def up(
@@ -61,6 +65,9 @@ def up(
         ),
     ] = None,
     as_json: JsonOption = False,
+    print_unit: Annotated[
+        bool, typer.Option("--print-unit", help="Print a systemd unit that does this, and end.")
+    ] = False,
 ) -> None:
     """Start and supervise all nodes of this host. Ctrl-C brakes the arm, then ends them.
 
@@ -68,6 +75,16 @@ def up(
     """
     loaded = effective_profile(profile, connect, listen)
     name, _ = choose_host(loaded, host)
+    if print_unit:
+        words = [sys.executable, "-m", "vla_zenoh", "up", absolute(profile), "--host", name]
+        for option, values in (("--connect", connect), ("--listen", listen), ("--also", also)):
+            words += [word for value in values or () for word in (option, value)]
+        words += ["--dry-run"] * dry_run + ["--verbose"] * verbose + ["--json"] * as_json
+        words += ["--log-dir", str(log_dir.absolute())] if log_dir else []
+        kept = {key: os.environ[key] for key in KEPT if key in os.environ}
+        what = f"robot {loaded.robot.name}, host {name}"
+        print(systemd_unit(what, words, getpass.getuser(), kept), end="")
+        return
     once = host_lock(loaded, name)
     once.take()  # says at once who runs already; the host takes it again
     once.release()
@@ -111,6 +128,11 @@ def up(
         running.serve(stop)
         tell("up", "braking the arm, then ending every node")
     tell("up", "all nodes have ended")
+
+
+def absolute(profile: str) -> str:
+    """A profile's name, or its path from any folder."""
+    return str(profile_file(profile).absolute()) if is_path(profile) else profile
 
 
 def default_log_folder() -> Path:

@@ -383,6 +383,11 @@ class AxisSmoother:
         paces = self._pace_of(limits) ** np.array([1.0, 2.0, 3.0])
         with np.errstate(divide="ignore"):
             along = (limits[:, :, None] / np.abs(basis)).min(axis=1) * np.array(parts)
+            # On a line the axis that needs most jerk decides: the others have to stay with it.
+            most = (limits[2] / self.box[2])[:, None] * (basis != 0.0)
+            jerk = (self.box[2][:, None] / np.abs(basis)).min(axis=0)
+            jerk *= np.maximum(most.max(axis=0), TINY)
+        along[2] = jerk * parts
         along /= paces[:, None]
         velocity, acceleration = velocity @ basis / paces[0], acceleration @ basis / paces[1]
         velocity[np.abs(velocity) < QUIET[1]] = 0.0

@@ -42,13 +42,22 @@ from vla_zenoh.control.limits import (
     full_speed_s,
     keep_slowdown,
 )
-from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan
-from vla_zenoh.control.pose_history import PoseHistory
+from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan, joint_goal
 from vla_zenoh.control.reachability import BoundedStep, ReachabilityFilter
-from vla_zenoh.kinematics.so3 import interpolate, pose_distance
+from vla_zenoh.control.state_history import StateHistory
+from vla_zenoh.errors import RecordError
+from vla_zenoh.kinematics.so3 import interpolate, pose_distance, pose_of
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import ActionChunk, Cause, FloatArray, Stamped, Task
+from vla_zenoh.types import (
+    ActionChunk,
+    Cause,
+    FloatArray,
+    JointState,
+    PoseState,
+    Stamped,
+    Task,
+)
 
 MAX_QUEUED = 4
 """Of a burst of chunks only the newest few are kept; the newest valid one is executed."""
@@ -98,8 +107,9 @@ class ChunkPlanner:
             self.joint_bounds = JointBounds(profile, reach.kinematics, reach.barriers)
         self._pace = profile.composition.pace
         self._gap_ns = round(profile.timing.state_timeout_s * 1e9)
-        self.measured = PoseHistory()
+        self.poses: StateHistory[PoseState] = StateHistory()
         """Where chunks anchored at the measured pose begin."""
+        self.joints: StateHistory[JointState] = StateHistory()
         self._queue: deque[Stamped[ActionChunk]] = deque()
         self._pending: tuple[Stamped[ActionChunk], ChunkPlan] | None = None
         self.budget = math.ceil(EVALUATIONS_1_S / profile.timing.command_hz)
@@ -200,10 +210,10 @@ class ChunkPlanner:
         previous = timeline.in_force(observed_ns)
         base = previous.goal_at(observed_ns)
         if action.anchor == "measured":
-            pose = self.measured.at(observed_ns, self._gap_ns)
-            if pose is None:
+            measured = self._measured(action, observed_ns, base.width_m)
+            if measured is None:
                 return _not_measured(self._gap_ns)
-            base = Goal(pose, base.width_m)
+            base = measured
         steps = np.asarray(record.steps[:count], np.float64)
         if action.space == "joint":
             steps = self._in_chain_order(action, steps)
@@ -244,6 +254,24 @@ class ChunkPlanner:
                     previous.steps_before + len(previous.goals), previous.steps_total
                 )
         return plan
+
+    def _measured(self, action: ActionSpec, t_ns: int, width_m: float) -> Goal | None:
+        """Where the arm was measured at `t_ns`, in the space of the actions; None: it was not."""
+        if action.space == "joint" and self._reach is not None:
+            states, arm = self.joints.around(t_ns, self._gap_ns), self._reach.kinematics
+            if states is None:
+                return None
+            try:
+                before_rad, after_rad = (arm.joints_of(state) for state in states[:2])
+            except RecordError:
+                return None
+            return joint_goal(arm, before_rad + states[2] * (after_rad - before_rad), width_m)
+        found = self.poses.around(t_ns, self._gap_ns)
+        if found is None:
+            return None
+        before, after, share = found
+        pose = pose_of(before)
+        return Goal(interpolate(pose, pose_of(after), share) if share else pose, width_m)
 
     # -- bound --------------------------------------------------------------------------------
     def bound(self, plan: ChunkPlan, now_ns: int) -> Rejection | bool:
@@ -367,19 +395,26 @@ class ChunkPlanner:
         columns = [action.joints.index(name) for name in self._reach.kinematics.arm_joints]
         return np.concatenate([steps[:, columns], steps[:, action.arm_size :]], axis=1)
 
+    def _joints_at(self, goal: Goal) -> FloatArray:
+        """(n,) those asked for, or those of the pose asked for, with the arm's present elbow."""
+        if goal.arm is not None and goal.joints_rad is not None:
+            return goal.joints_rad
+        assert self._reach is not None
+        return self._reach.joints_at(goal.pose)
+
     def _begin_joint_step(self, plan: ChunkPlan) -> StepBounding:
         """The same of a step in joint space."""
         bounds, start, shifted = self.joint_bounds, plan.step_start, plan.shifted_goal
         assert bounds is not None
         assert self._reach is not None
-        start_rad = self._reach.joints_rad if start.joints_rad is None else start.joints_rad
+        start_rad = self._joints_at(start)
         slower: Slowdown | None = None
         acted: list[LimitHit] = []
         if shifted is not None and shifted.joints_rad is not None:
             asked_rad, width_m, slower = shifted.joints_rad, shifted.width_m, shifted.slowdown
         else:
             numbers = plan.steps[plan.bounded]
-            base_rad = start_rad if plan.base.joints_rad is None else plan.base.joints_rad
+            base_rad = self._joints_at(plan.base)
             asked_rad = step_joints(plan.action, numbers, start_rad, base_rad)
             way_rad = asked_rad - start_rad
             far_m = pose_distance(start.pose, bounds.kinematics.forward(asked_rad))[0]
@@ -435,7 +470,7 @@ def _not_measured(gap_ns: int) -> Rejection:
     """Its anchor is not known."""
     return Rejection(
         "not_measured",
-        f"the arm's pose was not measured within {gap_ns / 1e9:g} s before its observation, which "
+        f"the arm was not measured within {gap_ns / 1e9:g} s before its observation, which "
         "the first step is added to (anchor: measured)",
     )
 

@@ -195,11 +195,12 @@ class Commander:
             self._peers = inputs.peers
         if inputs.pose is not None:
             self.pose = inputs.pose
-            self._planner.measured.add(inputs.pose)
+            self._planner.poses.add(inputs.pose)
             self.contact.update_pose(inputs.pose)
             self._retreat.measure(pose_of(inputs.pose.record))
         if inputs.joint is not None:
             self.joint = inputs.joint
+            self._planner.joints.add(inputs.joint)
             self.contact.update_joints(inputs.joint)
         if inputs.gripper is not None:
             self.gripper_state = inputs.gripper
@@ -500,7 +501,7 @@ class Commander:
         except RecordError as error:
             self._change(Trigger.LOSE, str(error))
             return
-        motion.measured_rad, commanded_rad = measured_rad, motion.joints_rad
+        commanded_rad = motion.joints_rad
         hit = monitor.update(measured_rad, commanded_rad, now_ns, in_joints=motion.in_joints)
         motion.joint_slowdown = monitor.slowdown
         reach.set_elbow(measured_rad if commanded_rad is None else commanded_rad)

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vla_zenoh.control.axis_smoothing import FULL, AxisSmoother, AxisState, Shares
+from vla_zenoh.control.axis_smoothing import FULL, AxisSmoother, Shares
 from vla_zenoh.control.barriers import Barriers
 from vla_zenoh.control.limits import (
     LimitHit,
@@ -217,13 +217,6 @@ class JointPath(AxisSmoother):
     def stand(self, position: FloatArray) -> None:
         super().stand(position)
         self._follow()
-
-    def resume(self, state: AxisState) -> None:
-        """Brake from the state of another motion."""
-        self.stand(state.position)
-        self._state = state
-        self._follow()
-        self.brake(FULL)
 
     def target(self, goal: Goal, shares: Shares = FULL, *, all_to_stop: bool = False) -> bool:
         """Move to the joints of `goal`, or as near as the bounds allow; see `move_to`."""

@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 
 from vla_zenoh.control.aggregate import PlanAggregator
-from vla_zenoh.control.axis_smoothing import AxisState
 from vla_zenoh.control.chunk_planner import ChunkPlanner
 from vla_zenoh.control.commander_io import limit_events, make_event
 from vla_zenoh.control.contact import Contact
@@ -62,6 +61,8 @@ SAME_WIDTH_M = 0.005
 HELD_M, HELD_RAD = 0.002, 0.01
 """A robot that holds a pose this near to the stream follows it: the stream continues."""
 HELD_JOINT_RAD = 0.004
+SAME_POSE = 1e-6
+"""m and rad: joints whose TCP is this near to a pose have it."""
 SETTLED, SETTLED_NS = 5e-4, 100_000_000
 """A robot that moves by less than this, in m and rad, for this long stands."""
 
@@ -110,7 +111,10 @@ class MotionPipeline:
         if planner.joint_bounds is not None:
             self._path = JointPath(profile, planner.joint_bounds)
         self.in_joints = False
-        """Goals in force are joints, and `_path` moves to them."""
+        """The arm moves in joints, by `_path`."""
+        self._changing = False
+        """It brakes, because the goals in force are joints and it moves in poses, or vice versa."""
+        self._no_joints = ""
         self.gripper = GripperArbiter(profile.robot.gripper)
         self.timeline: GoalTimeline | None = None
         self.goal: Goal | None = None
@@ -132,8 +136,6 @@ class MotionPipeline:
         self._measured_ns = 0
         self._timings: list[StepTiming] = []
         """Of poses, and of joints."""
-        self.measured_rad: FloatArray | None = None
-        """(n,) newest joints."""
         self._cause: Cause | None = None
         self._rest_since_ns: int | None = None
 
@@ -165,8 +167,10 @@ class MotionPipeline:
 
     @property
     def stuck(self) -> str:
-        """Why commanded joints will not reach the pose, empty while they follow."""
-        return "" if self._joints is None or self.in_joints else self._joints.stuck
+        """Why the arm will not get where it was asked to, empty while it follows."""
+        if self._joints is None or self.in_joints:
+            return self._no_joints
+        return self._no_joints or self._joints.stuck
 
     @property
     def failures(self) -> int:
@@ -197,12 +201,15 @@ class MotionPipeline:
         self._slowed_by.clear()
         self.joint_slowdown = None
         self.retreat.end()
+        measured_rad: FloatArray | None = None
         if self._reach is not None and joint is not None:
-            self.measured_rad = self._reach.kinematics.joints_of(joint)
-            self._reach.reset(self.measured_rad)
-        self._use_poses()
+            measured_rad = self._reach.kinematics.joints_of(joint)
+            self._reach.reset(measured_rad)
         actual, start = pose_of(measured), held_pose(measured)
         standing = not self.streaming or self.at_rest
+        if standing:
+            self._enter(joints=False)
+        self._no_joints, self._changing = "", False
         if self._smoother is None:
             # Commanded joints have distance constraints of their own.
             inside = workspace_corners(self._limits) if self._joints is None else None
@@ -220,8 +227,8 @@ class MotionPipeline:
             if standing and not (self.streaming and apart_rad <= HELD_JOINT_RAD):
                 self._joints.restart(held_rad)
             self._joints.keep_elbow()
-        if in_joints:
-            self._use_joints()
+        if in_joints and standing:
+            self._enter(joints=True)
         width_m = self._width_to_keep(gripper)
         self.gripper.restart(width_m)
         # The goal of a blocked arm is where it is. Otherwise a brake continues, and the goal is
@@ -230,8 +237,8 @@ class MotionPipeline:
             goal = Goal(actual if blocked else self._resting_pose(self._smoother, actual), width_m)
         else:
             arm, rest_rad = self._path.kinematics, self._path.braked()
-            there_rad = self.measured_rad if blocked else rest_rad
-            goal = joint_goal(arm, rest_rad if there_rad is None else there_rad, width_m)
+            there_rad = measured_rad if blocked and measured_rad is not None else rest_rad
+            goal = joint_goal(arm, there_rad, width_m)
         self._restart_timing()
         if self.timeline is None:
             self.timeline = GoalTimeline(goal, now_ns)
@@ -243,35 +250,30 @@ class MotionPipeline:
         for timing in self._timings:
             timing.restart()
 
-    def _use_joints(self) -> None:
-        """Go on in joint space, from the present motion; it brakes until there is a target."""
+    def _enter(self, *, joints: bool) -> None:
+        """Act in joints or in poses from now on; only while the arm stands."""
         path, smoother, reach = self._path, self._smoother, self._reach
-        if self.in_joints or path is None or smoother is None or reach is None:
+        if joints is self.in_joints or path is None or smoother is None or reach is None:
             return
-        if self._joints is not None:
-            state = self._joints.state
+        self.goal = None
+        if not joints:
+            smoother.reset(path.motion.pose)
+            if self._joints is not None:
+                self._joints.restart(path.state.position)
+        elif self._joints is not None:
+            path.stand(self._joints.position_rad)
         else:
-            (pose, twist, change), arm = smoother.motion, reach.kinematics
-            near_rad = self.measured_rad
-            joints_rad = reach.nearest(pose, reach.joints_rad if near_rad is None else near_rad)
-            jacobian = arm.jacobian(joints_rad)
-            rates = np.linalg.lstsq(jacobian, np.stack([twist, change], axis=1), rcond=1e-3)[0].T
-            most = path.box[:2]
-            state = AxisState(joints_rad, *np.clip(rates, -most, most))
-        path.resume(state)
-        self.in_joints, self.goal = True, None
-
-    def _use_poses(self) -> None:
-        """Go on with poses, from the present motion; it brakes until there is a target."""
-        path, smoother = self._path, self._smoother
-        if not self.in_joints or path is None or smoother is None:
-            return
-        most = smoother.box[1]
-        pose, twist, change = path.motion
-        smoother.brake_from(Motion(pose, twist, np.clip(change, -most, most)))
-        if self._joints is not None:
-            self._joints.resume(path.state)
-        self.in_joints, self.goal = False, None
+            pose = smoother.motion.pose
+            path.stand(reach.joints_at(pose))
+            apart = pose_distance(path.motion.pose, pose)
+            if max(apart) > SAME_POSE:
+                self._no_joints = (
+                    f"no joints were found for the commanded pose: {apart[0]:.4f} m and "
+                    f"{apart[1]:.4f} rad are left"
+                )
+                return
+        self.in_joints = joints
+        self._restart_timing()
 
     def _resting_pose(self, smoother: Smoother, actual: Pose) -> Pose:
         """Where a brake will end, inside the box or no further outside than the arm is."""
@@ -370,7 +372,7 @@ class MotionPipeline:
             elif self._joints is None:
                 self._smoother.tick()
             else:
-                active = state is State.ACTIVE and self._override > 0.0
+                active = state is State.ACTIVE and self._override > 0.0 and not self._changing
                 braking = not active and self._back is None
                 self._joints.tick(self._smoother, braking=braking, elbow=active)
         if self._path is not None:
@@ -413,13 +415,13 @@ class MotionPipeline:
         plans = self._aggregator.plans(timeline, now_ns)
         events = limit_events(self._planner.bound_due(plans, now_ns))
         goal = self._aggregator.goal(plans, now_ns)
-        if goal.arm is None:
-            self._use_poses()
-        else:
-            self._use_joints()
+        joints = goal.arm is not None
+        if self.at_rest:
+            self._enter(joints=joints)
+        self._changing = joints is not self.in_joints
         mover = self._mover
         assert mover is not None
-        if self._override == 0.0:
+        if self._override == 0.0 or self._changing:
             self._pause(mover)
             return events
         slowed = self._slowing and _within(mover, self._override)
@@ -459,7 +461,7 @@ class MotionPipeline:
         return Leashed(short, [LimitHit("lead_rad", far_rad, most_rad)])
 
     def _pause(self, mover: Smoother | JointPath) -> None:
-        """Stop on the path, to continue from there when the override allows it again."""
+        """Stop on the path, to continue from there later."""
         if self._joints is None or isinstance(mover, JointPath):
             mover.brake(FULL)
         else:
@@ -529,7 +531,7 @@ class MotionPipeline:
             self.retreat.end()
         back, event = self.retreat.step(mover.motion.pose, now_ns, at_rest=self.at_rest)
         if back is not None and isinstance(mover, JointPath) and self._smoother is not None:
-            self._use_poses()
+            self._enter(joints=False)
             mover = self._smoother
         if back is None:
             self._brake(mover, timeline, now_ns)

@@ -78,6 +78,11 @@ def spec_errors(profile: Profile, spec: ModelSpec) -> Iterator[Finding]:
                 f"has {', '.join(profile.robot.arm_joints)}: name these, in the order of the "
                 "model's columns",
             )
+        if profile.robot.command == "pose" and len(profile.robot.arm_joints) < POSE_JOINTS:
+            yield error(
+                "too_few_joints",
+                f"{few_joints(profile)}, and its robot takes poses: set robot.command to joint",
+            )
     elif spec.action.kind == "absolute" and len(profile.robot.arm_joints) < POSE_JOINTS:
         yield error(
             "too_few_joints",

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vla_zenoh.control.axis_smoothing import AxisState, Shares
+from vla_zenoh.control.axis_smoothing import Shares
 from vla_zenoh.control.barriers import Barriers, DistanceConstraints
 from vla_zenoh.control.joint_follower import FollowSettings, JointFollower, JointMotion
 from vla_zenoh.control.joint_space import followed_shares
@@ -99,16 +99,6 @@ class PoseToJoint:
         self.keep_elbow()
         self.pace = 1.0
         """Rate of the pose's time, 0 to 1."""
-
-    @property
-    def state(self) -> AxisState:
-        """The present state of the joints."""
-        return AxisState(*self._now[:2], self._acceleration)
-
-    def resume(self, state: AxisState) -> None:
-        """Continue from the state of another motion of the joints."""
-        self.restart(state.position)
-        self._now = JointMotion(*state)
 
     def keep_elbow(self) -> None:
         """Start an activation: the posture is that of the present joints, or home."""

@@ -57,6 +57,9 @@ REVERSAL = 0.15
 """Share of the jerk that the difference leaves unused. Where the commanded path's jerk reverses
 within a tick, a third-order finite difference weighs its parts unevenly: by up to 1/8 of the jerk
 more than the mean that is known here."""
+GIVES_WAY = (BRAKE_MARGIN - ORDINARY - SLACK - REVERSAL) / ORDINARY
+"""How fast the acceleration of the difference goes back where that of the commanded path begins to
+rise, as a share of how fast this does."""
 GRID = 8
 
 Reference = TypeVar("Reference")
@@ -299,6 +302,8 @@ class ReferenceGovernor(Generic[Reference]):
         self._known = self._taken[1:] * self._own[1:]
         left = BRAKE_MARGIN - self._taken
         left[2] -= REVERSAL
+        # The commanded path may begin to accelerate: the difference, which has less jerk, gives way.
+        left[1] -= (1.0 - GIVES_WAY) * np.maximum(1.0 - taken[1], 0.0)
         left = np.maximum(left, LEAST)
         velocity, acceleration, jerk = left * self._own * self._axis
         cramped = _jerk(way, LONG_S) > (BRAKE_MARGIN - ORDINARY) * self._own[2] * self._axis

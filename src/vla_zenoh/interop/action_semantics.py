@@ -2,9 +2,13 @@
 
 The same options serve policy servers, LeRobot checkpoints and OpenVLA checkpoints::
 
-    action     delta, absolute (of the TCP); joint_delta, joint_position (become absolute poses
-               by the arm's forward kinematics)
-    frame      base, tcp: axes of a delta
+    action     delta, absolute, velocity (of the TCP); joint_delta, joint_position (become absolute
+               poses by the arm's forward kinematics)
+    frame      base, tcp: axes of a delta or velocity
+    anchor     goal, measured: the pose that a chunk of deltas or velocities begins at
+    relative_to  previous, start: what each delta of a chunk is added to
+    controller none, or KP:DAMPING_RATIO of the data's controller, where that covers only a part of
+               each delta (robosuite's and LIBERO's: 150:1)
     rotation   rpy, rotvec, quat_xyzw, quat_wxyz
     clip       numbers of the arm are clipped to [-clip, clip] first; empty: never
     position_scale_m, rotation_scale_rad, joint_scale_rad   one unit of the numbers
@@ -31,7 +35,16 @@ from pydantic import ValidationError
 
 from vla_zenoh.errors import MissingExtraError, SpecError, describe_faults
 from vla_zenoh.kinematics.so3 import quat_from_rotation
-from vla_zenoh.policy import ActionSpec, Frame, GripperSemantics, Rotation
+from vla_zenoh.policy import (
+    ActionSpec,
+    Anchor,
+    ControllerSpec,
+    Frame,
+    GripperSemantics,
+    MotionKind,
+    RelativeTo,
+    Rotation,
+)
 from vla_zenoh.policy.model_options import number, one_of, whole_number
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import JointState
@@ -77,12 +90,15 @@ def poses_of(
     return forward(measured, rows_rad)
 
 
-Action = Literal["delta", "absolute", "joint_delta", "joint_position"]
+Action = Literal["delta", "absolute", "velocity", "joint_delta", "joint_position"]
 ForeignRotation = Literal["rpy", "rotvec", "quat_xyzw", "quat_wxyz"]
 
 ACTION_OPTIONS: Mapping[str, str] = {
     "action": "",
     "frame": "base",
+    "anchor": "",
+    "relative_to": "",
+    "controller": "",
     "rotation": "",
     "clip": "",
     "position_scale_m": "1",
@@ -95,11 +111,19 @@ ACTION_OPTIONS: Mapping[str, str] = {
     "horizon": "",
 }
 """Every option with its default; empty: no default, except for `clip`."""
+ADDED_TO = ("anchor", "relative_to", "controller")
+"""What deltas are added to, and how much of them is covered."""
+NO_CONTROLLER = "none"
 OPEN = ("high", "low")
 QUATERNION_SLACK = 0.1
 """A quaternion this far from unit length is normalised; further off it is rejected."""
 _ASKED: Mapping[str, str] = {
     "action": " or ".join(get_args(Action)),
+    "controller": "none, or KP:DAMPING_RATIO where the data's controller covers only a part of a "
+    "step: 150:1 for robosuite and LIBERO",
+    "relative_to": "previous or start: is a delta added to the step before it, or to the start of "
+    "its chunk?",
+    "anchor": "goal or measured: what does a chunk begin at?",
     "rotation": " or ".join(get_args(ForeignRotation)),
     "gripper": " or ".join(get_args(GripperSemantics)),
     "gripper_open": "high or low: is the gripper open where its number is large?",
@@ -219,6 +243,8 @@ def read_action_semantics(
         ("action", get_args(Action)),
         ("rotation", get_args(ForeignRotation)),
         ("frame", get_args(Frame)),
+        ("anchor", get_args(Anchor)),
+        ("relative_to", get_args(RelativeTo)),
         ("gripper", get_args(GripperSemantics)),
         ("gripper_open", OPEN),
     ):
@@ -244,6 +270,7 @@ def _ask_for_missing(chosen: Mapping[str, str], why: str) -> None:
     wanted = set(_ASKED)
     if _of_joints(chosen["action"]):
         wanted -= {"rotation"}
+    wanted -= _not_asked(chosen)
     if chosen["gripper"] not in ("", "open_fraction", "binary"):
         wanted -= {"gripper_open"}
     missing = [name for name in _ASKED if name in wanted and not chosen[name]]
@@ -254,6 +281,36 @@ def _ask_for_missing(chosen: Mapping[str, str], why: str) -> None:
         )
 
 
+def _not_asked(chosen: Mapping[str, str]) -> set[str]:
+    """Options of `ADDED_TO` that have one meaning only, by the others."""
+    if chosen["action"] == "velocity":
+        return {"controller", "relative_to"}
+    if chosen["action"] != "delta":
+        return set(ADDED_TO)
+    if chosen["controller"] not in ("", NO_CONTROLLER):
+        return {"anchor", "relative_to"}
+    if chosen["relative_to"] == "start":
+        return {"controller"}
+    return {"relative_to"} if chosen["horizon"] == "1" else set()  # a single step has one start
+
+
+def read_controller(text: str) -> ControllerSpec | None:
+    """The controller that an option names: ``none``, or ``KP:DAMPING_RATIO``.
+
+    Raises:
+        SpecError: it is neither.
+    """
+    if text in ("", NO_CONTROLLER):
+        return None
+    kp, colon, ratio = text.partition(":")
+    if not colon:
+        raise SpecError(f"controller is {text!r}; wanted none, or KP:DAMPING_RATIO as 150:1")
+    with as_spec_error():
+        return ControllerSpec(
+            kp=number("controller", kp), damping_ratio=number("controller", ratio)
+        )
+
+
 def _spec(chosen: Mapping[str, str], rotation: str, normalisation: str | None) -> ActionSpec:
     action = chosen["action"]
     quaternion = rotation.startswith("quat")
@@ -261,8 +318,11 @@ def _spec(chosen: Mapping[str, str], rotation: str, normalisation: str | None) -
         return ActionSpec(
             horizon=whole_number("horizon", chosen["horizon"]),
             dt_s=number("dt_s", chosen["dt_s"]),
-            kind="delta" if action == "delta" else "absolute",
+            kind=cast(MotionKind, "absolute" if _of_joints(action) else action),
             frame=cast(Frame, "base" if _of_joints(action) else chosen["frame"]),
+            anchor=cast(Anchor, chosen["anchor"] or "goal"),
+            relative_to=cast(RelativeTo, chosen["relative_to"] or "previous"),
+            controller=read_controller(chosen["controller"]),
             rotation="quaternion" if quaternion else cast(Rotation, rotation),
             gripper=cast(GripperSemantics, chosen["gripper"]),
             gripper_open_is_high=chosen["gripper_open"] != "low",

@@ -1,13 +1,14 @@
 """Options for the robots and data sets that published policies were trained on.
 
 Not converted: the origin of the model's world (LIBERO's is not the robot's base), the rotation of
-its tool frame against ours, the framing of its images, and that the controllers of
-LIBERO and DROID put a step on where the arm is measured, of which it then covers a part: here a
-step is put on the goal, and all of it is carried out.
+its tool frame against ours, and the framing of its images.
+
+LIBERO's controller covers a part of each step only, and here the arm moves about as far:
+`ActionSpec.controller`. BridgeData's arm adds each step to its last target.
 
 Sources: openpi's examples for DROID and LIBERO, DROID's own joint velocity control (one unit is 0.2
-rad a step), robosuite's OSC_POSE controller (one unit is 0.05 m or 0.5 rad a step), GR00T's LIBERO
-and SimplerEnv evaluation, OpenVLA's data statistics for BridgeData V2.
+rad a step), robosuite's OSC_POSE controller (one unit is 0.05 m or 0.5 rad a step, kp 150, damping
+ratio 1), GR00T's LIBERO and SimplerEnv evaluation, OpenVLA's data statistics for BridgeData V2.
 """
 
 from __future__ import annotations
@@ -23,9 +24,14 @@ OSC = {
     "clip": "1",
     "position_scale_m": "0.05",
     "rotation_scale_rad": "0.5",
+    "anchor": "goal",
+    "relative_to": "previous",
+    "controller": "150:1",
     "dt_s": "0.05",
 }
 """LIBERO's controller."""
 OPENS_AT_1 = {"gripper": "binary", "gripper_open": "high"}
 """As data for OpenVLA and GR00T was converted to; LIBERO's environment takes -1 for open."""
-BRIDGE = {"action": "delta", "rotation": "rpy", "dt_s": "0.2", **OPENS_AT_1}
+ADDED = {"anchor": "goal", "relative_to": "previous", "controller": "none"}
+"""Each step is added to the one before it, and all of it is carried out."""
+BRIDGE = {"action": "delta", **ADDED, "rotation": "rpy", "dt_s": "0.2", **OPENS_AT_1}

@@ -36,6 +36,7 @@ class Kinematics:
         arm_joints: in any order.
         finger_joints: locked where the hand is widest.
         base_frame: poses are given in this link, which must not move; None: the URDF's root.
+        joint_range_rad: narrows the range of each of `arm_joints`; empty: as the URDF has it.
         finger_ends: where that is; None: at their upper limit, which needs joints that slide.
 
     Raises:
@@ -52,6 +53,7 @@ class Kinematics:
         *,
         base_frame: str | None = None,
         finger_ends: JointEnds | None = None,
+        joint_range_rad: Sequence[tuple[float, float]] = (),
     ) -> None:
         self.urdf = urdf
         self.full_model: Any = pin.buildModelFromUrdf(str(urdf))
@@ -75,6 +77,12 @@ class Kinematics:
         self.lower_rad: FloatArray = np.array(self.model.lowerPositionLimit)
         self.upper_rad: FloatArray = np.array(self.model.upperPositionLimit)
         self.velocity_rad_s: FloatArray = np.array(self.model.upperVelocityLimit)
+        if joint_range_rad:
+            lower, upper = (
+                self.ordered(arm_joints, ends) for ends in zip(*joint_range_rad, strict=True)
+            )
+            self.lower_rad = np.maximum(self.lower_rad, lower)
+            self.upper_rad = np.minimum(self.upper_rad, upper)
         for index, name in enumerate(self.arm_joints):
             if not (
                 self.lower_rad[index] < self.upper_rad[index] and self.velocity_rad_s[index] > 0
@@ -157,6 +165,7 @@ def make_kinematics(profile: Profile) -> Kinematics:
         robot.finger_joints,
         base_frame=robot.base_frame,
         finger_ends=robot.gripper.joint_ends,
+        joint_range_rad=robot.joint_range_rad,
     )
 
 

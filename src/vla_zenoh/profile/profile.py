@@ -13,7 +13,7 @@ from vla_zenoh import keys
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.keys import NODE_KINDS, Keys
 from vla_zenoh.profile.limits import Limits
-from vla_zenoh.profile.robot import ArmProfile, Options, RobotProfile
+from vla_zenoh.profile.robot import ArmProfile, FrankaProfile, Options, RobotProfile
 from vla_zenoh.profile.ros2 import JOINT_COMMANDS, Ros2Gripper, Ros2Profile
 from vla_zenoh.profile.schema import (
     SIMULATED,
@@ -75,6 +75,7 @@ class Profile(Section):
         options: worker -> options of its model as ``--set`` gives them, name -> text.
         ros2: required for a robot or camera of ROS 2.
         arm: required for a robot that is driven by a Python file.
+        franka: required for a Franka arm over FCI.
     """
 
     name: Name
@@ -97,6 +98,7 @@ class Profile(Section):
     )
     ros2: Ros2Profile | None = None
     arm: ArmProfile | None = None
+    franka: FrankaProfile | None = None
 
     @property
     def keys(self) -> Keys:
@@ -166,6 +168,8 @@ def _robot(profile: Profile) -> Iterator[Fault]:
         yield ("ros2",), "is missing: robot.driver is ros2"
     if profile.robot.driver == "arm" and profile.arm is None:
         yield ("arm",), "is missing: robot.driver is arm. Name the Python file, as arm: {file: ...}"
+    if profile.robot.driver == "franka" and profile.franka is None:
+        yield ("franka",), "is missing: robot.driver is franka. Give franka: {address: ...}"
     joints = len(profile.robot.arm_joints)
     for name, values in profile.limits.joint:
         if len(values) not in (1, joints):
@@ -286,7 +290,7 @@ def _hosts(profile: Profile) -> Iterator[Fault]:
         yield from _unknown((*place, "cameras"), host.cameras or (), "cameras", profile.cameras)
         yield from _unknown((*place, "workers"), host.workers or (), "workers", profile.workers)
         for kind in ("sim", "arm"):
-            if kind in host.nodes and profile.robot.driver != kind:
+            if kind in host.nodes and profile.robot.node != kind:
                 yield (*place, "nodes"), f"has {kind}, and robot.driver is {profile.robot.driver}"
         if "ros2" in host.nodes and profile.ros2 is None:
             yield (*place, "nodes"), "has ros2, which needs a section ros2"

@@ -1,4 +1,4 @@
-"""Section ``robot`` of a profile: kinematics, driver and gripper."""
+"""Sections ``robot``, ``arm`` and ``franka`` of a profile: kinematics, driver and gripper."""
 
 from __future__ import annotations
 
@@ -85,13 +85,16 @@ class RobotProfile(Section):
 
     Args:
         name: part of every key.
-        driver: ``sim``: simulator; ``ros2``: controllers of a ROS 2 robot; ``arm``: Python file.
+        driver: ``sim``: simulator; ``ros2``: controllers of a ROS 2 robot; ``franka``: a Franka arm
+            over FCI; ``arm``: Python file. The node of the last two is ``arm``.
         command: set-points of the arm: ``pose`` of the TCP, for a Cartesian impedance controller,
             or ``joint`` positions.
         description: path of the URDF, or ``example-robot-data:`` and a path in that package.
         base_frame: link in which all poses are expressed.
         tcp_frame: link whose pose is controlled.
         arm_joints: in the order of every list of joint values in the profile.
+        joint_range_rad: lower and upper end for each of arm_joints, within those of the
+            description; empty: those.
         finger_joints: of the gripper; their states give its width. Prismatic ones add up to it; for
             revolute ones `gripper` defines where they are open and shut.
         home_rad: joint positions of the simulated arm after a reset.
@@ -101,16 +104,24 @@ class RobotProfile(Section):
     """
 
     name: Name
-    driver: Literal["sim", "ros2", "arm"] = "sim"
+    driver: Literal["sim", "ros2", "franka", "arm"] = "sim"
     command: Literal["pose", "joint"] = "pose"
     description: Word
     base_frame: Word
     tcp_frame: Word
     arm_joints: Words = Field(min_length=1)
+    joint_range_rad: tuple[Annotated[tuple[float, float], Field(strict=False)], ...] = Field(
+        default=(), strict=False
+    )
     finger_joints: Words = ()
     home_rad: tuple[float, ...] = Field(strict=False)
     posture: Literal["start", "home"] = "start"
     gripper: GripperProfile = GripperProfile()
+
+    @property
+    def node(self) -> str:
+        """Kind of the node that drives it."""
+        return "arm" if self.driver == "franka" else self.driver
 
     @model_validator(mode="after")
     def _joints_fit(self) -> RobotProfile:
@@ -118,6 +129,14 @@ class RobotProfile(Section):
         if len(self.home_rad) != len(self.arm_joints):
             why = f"has {len(self.home_rad)} angles for {len(self.arm_joints)} arm_joints"
             faults.append((("home_rad",), why))
+        if self.joint_range_rad and len(self.joint_range_rad) != len(self.arm_joints):
+            why = f"has {len(self.joint_range_rad)} pairs for {len(self.arm_joints)} arm_joints"
+            faults.append((("joint_range_rad",), why))
+        faults += [
+            (("joint_range_rad", str(index)), f"is [{low:g}, {high:g}]: give the lower end first")
+            for index, (low, high) in enumerate(self.joint_range_rad)
+            if low >= high
+        ]
         faults += [
             (("home_rad", str(index)), f"is {angle:g}: more than a turn; give radians")
             for index, angle in enumerate(self.home_rad)
@@ -155,3 +174,75 @@ class ArmProfile(Section):
 
     file: Word
     options: Options = Field(default_factory=dict)
+
+
+Stiffness = Annotated[float, Field(gt=0, le=3000)]
+Threshold = Annotated[float, Field(gt=0, le=100)]
+_SEVEN = Field(strict=False, min_length=7, max_length=7)
+
+
+class FrankaLoad(Section):
+    """What the flange carries beyond the end effector that is set in Desk.
+
+    Args:
+        mass_kg: its mass.
+        centre_m: its centre of mass in the flange's frame.
+        inertia_kg_m2: about that centre, in the flange's axes: xx, yy, zz, xy, xz, yz.
+    """
+
+    mass_kg: float = Field(default=0.0, ge=0, le=7)
+    centre_m: tuple[float, float, float] = Field(default=(0.0, 0.0, 0.0), strict=False)
+    inertia_kg_m2: tuple[float, float, float, float, float, float] = Field(
+        default=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0), strict=False
+    )
+
+
+class FrankaProfile(Section):
+    """A Franka arm; all of it is set before the first motion.
+
+    The arm is a spring around its set-point, with critical damping about the commanded velocity.
+
+    Args:
+        address: of the robot's control box.
+        fci: version of the interface: 10 for an FR3, 5 for a Panda.
+        realtime: ``enforce``: its 1 kHz loop needs a real-time kernel; ``ignore``: for a simulator.
+        stiffness_n_m: of the TCP, with robot.command: pose.
+        stiffness_nm_rad: of its rotation.
+        joint_stiffness_nm_rad: of joint 1 to 7, with robot.command: joint.
+        posture_stiffness_nm_rad: with which the elbow keeps its place, with robot.command: pose.
+        collision_force_n: external force at the TCP that makes the robot end a motion (reflex);
+            above limits.contact.force_stop_n, at which the arm retreats instead.
+        collision_torque_nm: external torque about the TCP that does.
+        collision_joint_nm: external torque of joint 1 to 7 that does.
+        load: beyond the end effector of Desk.
+        hand: the robot has a Franka Hand.
+    """
+
+    address: Word
+    fci: Literal[5, 10] = 10
+    realtime: Literal["enforce", "ignore"] = "enforce"
+    stiffness_n_m: Stiffness = 2000.0
+    stiffness_nm_rad: float = Field(default=150.0, gt=0, le=300)
+    joint_stiffness_nm_rad: Annotated[tuple[Stiffness, ...], _SEVEN] = (
+        600.0,
+        600.0,
+        600.0,
+        600.0,
+        250.0,
+        150.0,
+        50.0,
+    )
+    posture_stiffness_nm_rad: float = Field(default=10.0, ge=0, le=100)
+    collision_force_n: Threshold = 60.0
+    collision_torque_nm: Threshold = 30.0
+    collision_joint_nm: Annotated[tuple[Threshold, ...], _SEVEN] = (
+        40.0,
+        40.0,
+        36.0,
+        36.0,
+        32.0,
+        28.0,
+        24.0,
+    )
+    load: FrankaLoad = FrankaLoad()
+    hand: bool = True

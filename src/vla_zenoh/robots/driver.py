@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import threading
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
-from vla_zenoh.bus.clock import FixedRate, Tick
-from vla_zenoh.bus.node import Node
+from vla_zenoh.bus.clock import Clock, FixedRate, Tick
 from vla_zenoh.errors import NodeError
 from vla_zenoh.guard.arm_guard import Measured
 from vla_zenoh.kinematics.so3 import Pose, quat_from_rotation
 from vla_zenoh.profile import Profile
-from vla_zenoh.robots.command_follower import CommandFollower
 from vla_zenoh.types import (
+    Event,
     FloatArray,
     GripperCommand,
     GripperState,
@@ -27,7 +27,9 @@ from vla_zenoh.types import (
 from vla_zenoh.types.commands import JointReference, PoseReference
 
 if TYPE_CHECKING:
+    from vla_zenoh.bus.node import Node
     from vla_zenoh.kinematics.kinematics import Kinematics
+    from vla_zenoh.robots.command_follower import CommandFollower
 
 STREAMING = "streaming"
 """State in the commands that a driver sends: the guard has already judged that of the writer."""
@@ -58,6 +60,39 @@ class DriverStatus(NamedTuple):
     ages_s: Mapping[str, float] = {}
     rates_hz: Mapping[str, float] = {}
     latency_ms: Mapping[str, tuple[float, float]] = {}
+
+
+class Reporter(Protocol):
+    """What a driver reports to; a `vla_zenoh.bus.node.Node` publishes it."""
+
+    clock: Clock
+    counters: Counter[str]
+
+    def emit(self, event: Event) -> None:
+        """Report an event."""
+        ...
+
+    def reject(self, reason: str, why: str, about: str = "") -> None:
+        """Count and report a rejection, see `vla_zenoh.bus.node.Node.reject`."""
+        ...
+
+
+class Report:
+    """A `Reporter` of a driver that is on no bus: keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.clock = Clock()
+        self.counters: Counter[str] = Counter()
+        self.events: list[Event] = []
+
+    def emit(self, event: Event) -> None:
+        """Keep an event."""
+        self.events.append(event)
+
+    def reject(self, reason: str, why: str, about: str = "") -> None:
+        """Count a rejection, and keep its event."""
+        self.counters[f"refused.{reason}"] += 1
+        self.emit(Event("warning", "refusal", reason, why))
 
 
 class SteppedNode(Protocol):
@@ -107,7 +142,9 @@ class RobotDriver(ABC):
         gripper_mode: mode of the gripper state while the arm is ready.
         no_gripper: why gripper commands are rejected; empty: the robot has a gripper.
         away: reason to reject commands, one word, while the robot cannot be moved.
+        recovers: `recover` does something.
         silent_why, stalled_hint: sentences for the events of these states.
+        report: gets counters, events and rejections; the node, once there is one.
     """
 
     name = ""
@@ -119,12 +156,14 @@ class RobotDriver(ABC):
     gripper_mode = "ready"
     no_gripper = ""
     away = ""
+    recovers = False
     silent_why = stalled_hint = ""
 
     def __init__(self, profile: Profile) -> None:
         self.profile = profile
         self.period_s = 1.0 / profile.timing.command_hz
         self.modes: tuple[str, ...] = (profile.robot.command,)
+        self.report: Reporter = Report()
 
     # -- required -----------------------------------------------------------------------------
     @abstractmethod
@@ -141,13 +180,20 @@ class RobotDriver(ABC):
 
     # -- optional -----------------------------------------------------------------------------
     def attach(self, node: Node, follower: CommandFollower | None) -> None:
-        """The node is on the bus; `follower` is None where there is no arm."""
+        """The node is on the bus; `follower` is None where there is no arm.
+
+        Only a driver with keys of its own overrides it.
+        """
+        self.report = node
 
     def connect(self) -> None:
         """Connect to the robot before the loop starts; it may take long."""
 
     def grip(self, command: GripperCommand, now_ns: int) -> None:
         """Start a gripper motion."""
+
+    def recover(self) -> None:
+        """Begin to clear the robot's errors: a person asked for it with ``reset``."""
 
     def poll(self, mono_ns: int) -> None:
         """Begin a tick: handle other inputs than commands."""

@@ -14,9 +14,11 @@ import time
 
 import zenoh
 
+from vla_zenoh.bus.buffers import CallbackRing
 from vla_zenoh.bus.clock import Tick
 from vla_zenoh.bus.metrics import RateMeter
 from vla_zenoh.bus.node import Node
+from vla_zenoh.codec.settings import MAX_SETTING_BYTES
 from vla_zenoh.errors import NodeError
 from vla_zenoh.guard.arm_guard import max_braking_time_s
 from vla_zenoh.robots.arm import Arm
@@ -30,6 +32,7 @@ FAILURES = 3
 LEAST_S, SLACK_S = 1.0, 0.2
 """The last brake may take this long at least, and this much longer than the limits allow."""
 MAX_REASON = 300
+CONNECTING_S = 0.2
 WATCH_S = 0.05
 
 
@@ -49,6 +52,9 @@ class RobotNode:
         node = self.node = Node(driver.name, driver.profile, session)
         self.arm = Arm(node, driver) if driver.has_arm else None
         driver.attach(node, self.arm.follower if self.arm is not None else None)
+        self._resets: CallbackRing | None = None
+        if driver.recovers:
+            self._resets = node.subscribe(node.keys.reset, CallbackRing(4, MAX_SETTING_BYTES))
         self._rate = RateMeter()
         self._realtime = False
         self._watched_s = 0.0
@@ -64,7 +70,7 @@ class RobotNode:
         driver = self.driver
         sys.setswitchinterval(driver.switch_interval_s)
         try:
-            driver.connect()
+            self._connect()
             gc.collect()
             gc.freeze()
             if driver.lockstep:
@@ -75,6 +81,23 @@ class RobotNode:
         finally:
             self._close()
             gc.unfreeze()  # so that the interpreter frees everything at its end
+
+    def _connect(self) -> None:
+        """Connect the driver, and report so: a node that does not would count as hung."""
+        self.node.publish_status("connecting", now=True)
+        done = threading.Event()
+
+        def report() -> None:
+            while not done.wait(CONNECTING_S):
+                self.node.publish_status("connecting")
+
+        reporter = threading.Thread(target=report, name="connecting", daemon=True)
+        reporter.start()
+        try:
+            self.driver.connect()
+        finally:
+            done.set()
+            reporter.join()
 
     def _close(self) -> None:
         try:
@@ -114,6 +137,8 @@ class RobotNode:
         if tick.periods > 1:
             self.node.counters[f"{self.node.name}.missed_ticks"] += tick.periods - 1
         mono_ns = tick.nominal_ns
+        if self._resets is not None and self._resets.drain():
+            self.driver.recover()
         self.driver.poll(mono_ns)
         if self.arm is not None:
             now_ns = mono_ns if self.driver.lockstep else self.node.clock.wall_at(mono_ns)

@@ -1,73 +1,64 @@
-"""Driver of a robot in a Python file: a class with `read` and `move`, see `vla_zenoh.robot`."""
+"""Driver of a robot that is a Python class with `read` and `move`, see `vla_zenoh.robot`.
+
+The class is in a file of the profile, or one of ours: a Franka arm.
+"""
 
 from __future__ import annotations
 
 import operator
-import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from vla_zenoh.bus.metrics import RateMeter
-from vla_zenoh.bus.node import Node
 from vla_zenoh.errors import NodeError, ProfileError, in_words
 from vla_zenoh.interop.python_reading import MAX_WORDS, Fault, PythonReading
 from vla_zenoh.policy.loader import make_robot
 from vla_zenoh.profile import Profile
 from vla_zenoh.robot import Reading
-from vla_zenoh.robots.command_follower import CommandFollower
 from vla_zenoh.robots.driver import DriverStatus, Measurement, RobotDriver, command_of
 from vla_zenoh.sanitize import one_line
 from vla_zenoh.types import Event, GripperCommand
 from vla_zenoh.types.commands import JointReference, PoseReference
 
-CONNECTING_S = 0.2
 FUTURE_NS = 100_000_000
 
 
 class PythonDriver(RobotDriver):
-    """The robot class in the file that the profile names in ``arm.file``.
+    """The robot class that the profile names: in ``arm.file``, or built in.
 
-    What the class raises becomes a `NodeError` with the names of file and method.
+    What the class raises becomes a `NodeError` with the names of class and method.
 
     Args:
-        profile: the effective profile, with its section arm.
+        profile: the effective profile.
 
     Raises:
-        ProfileError: the section arm is missing.
+        ProfileError: the section of the robot is missing.
         WorkerError: the file is missing, or has no robot class.
+        MissingExtraError: the library of a built-in class is missing.
     """
 
     name = "arm"
 
     def __init__(self, profile: Profile) -> None:
         super().__init__(profile)
-        if profile.arm is None:
-            raise ProfileError(
-                f"profile {profile.name!r} has no section arm, which names a Python file: "
-                "arm: {file: my_arm.py}, with robot.driver: arm"
-            )
-        path = Path(profile.arm.file).expanduser()
-        self._robot = make_robot(path, profile.arm.options)
-        self._file = path.name
+        self.robot, self._called = make_arm(profile)
         self._reading = PythonReading(profile, self.kinematics)
         self._fault = Fault()
         self._rate = RateMeter()
         self._asked_m = profile.robot.gripper.max_width_m
         self._width_m: float | None = None
+        self._held = False
+        self.recovers = self._method("recover") is not None
         if self._method("grip") is None:
-            self.no_gripper = f"{self._file} has no method grip"
-        self.silent_why = f"{self._file}: read gives nothing new"
-        self.stalled_hint = f"; does {self._file} wait for something?"
-
-    def attach(self, node: Node, follower: CommandFollower | None) -> None:
-        """Keep the node."""
-        self._node = node
+            self.no_gripper = f"{self._called} has no method grip"
+        self.silent_why = f"{self._called}: read gives nothing new"
+        self.stalled_hint = f"; does {self._called} wait for something?"
 
     # -- calls --------------------------------------------------------------------------------
     def _method(self, name: str) -> Callable[..., Any] | None:
-        method = getattr(self._robot, name, None)
+        method = getattr(self.robot, name, None)
         return method if callable(method) else None
 
     def _call(self, name: str, *given: Any) -> Any:
@@ -78,24 +69,15 @@ class PythonDriver(RobotDriver):
             return method(*given)
         except Exception as error:
             words = one_line(in_words(error), MAX_WORDS)
-            raise NodeError(f"{self._file}: {name}: {words}") from error
+            raise NodeError(f"{self._called}: {name}: {words}") from error
 
     def connect(self) -> None:
-        """Connect; the status says so meanwhile, since a silent node would count as hung."""
-        self._node.publish_status("connecting", now=True)
-        done = threading.Event()
+        """Connect."""
+        self._call("connect")
 
-        def report() -> None:
-            while not done.wait(CONNECTING_S):
-                self._node.publish_status("connecting")
-
-        reporter = threading.Thread(target=report, name="connecting", daemon=True)
-        reporter.start()
-        try:
-            self._call("connect")
-        finally:
-            done.set()
-            reporter.join()
+    def recover(self) -> None:
+        """Begin to clear the robot's errors."""
+        self._call("recover")
 
     def read(self, mono_ns: int) -> Measurement | None:
         """The robot's newest reading; an invalid one is rejected, but its fault counts."""
@@ -104,30 +86,46 @@ class PythonDriver(RobotDriver):
             return None
         if not isinstance(reading, Reading):
             given = type(reading).__name__
-            raise NodeError(f"{self._file}: read gave {given}, wanted a Reading")
+            raise NodeError(f"{self._called}: read gave {given}, wanted a Reading")
         if self._fault.say(reading.fault, mono_ns):
             self.fault = self._fault.words
-            self.away = "fault" if self.fault else ""
             if self.fault:
-                self._node.emit(Event("error", "fault", "robot_fault", self.fault))
+                self.report.emit(Event("error", "fault", "robot_fault", self.fault))
+        self._set_mode(one_line(reading.mode, MAX_WORDS) or "ready")
+        self.away = "fault" if self.fault else "not_ready" if self.gripper_mode != "ready" else ""
         try:
             measured_ns = _measured_ns(reading)
             if measured_ns == self.measured_ns:
                 return None  # the same again: the robot is slower than this loop
-            stamp_ns = self._node.clock.wall_at(measured_ns)
+            stamp_ns = self.report.clock.wall_at(measured_ns)
             valid = self._reading.take(reading, stamp_ns, self._asked_m)
         except (TypeError, ValueError) as error:
             reason = getattr(error, "reason", "invalid")
-            self._node.reject(reason, f"{self._file}: read: {one_line(error, MAX_WORDS)}")
+            self.report.reject(reason, f"{self._called}: read: {one_line(error, MAX_WORDS)}")
             return None
         self.measured_ns, self._width_m = measured_ns, valid.gripper.width_m
+        self._set_held(valid.gripper.holding, released=valid.gripper.moving)
         self._rate.tick()
         return Measurement(*valid)
+
+    def _set_mode(self, mode: str) -> None:
+        if mode != self.gripper_mode:
+            level = "info" if mode == "ready" else "warning"
+            self.report.emit(Event(level, "transition", f"robot:{self.gripper_mode}->{mode}"))
+            self.gripper_mode = mode
+
+    def _set_held(self, holding: bool, *, released: bool) -> None:
+        if holding and not self._held:
+            self.report.emit(Event("info", "notice", "grasped", f"{self._width_m:.3f} m apart"))
+        elif self._held and not holding and not released:
+            why = "the gripper holds nothing any more, and was not told to let go"
+            self.report.emit(Event("warning", "notice", "object_lost", why))
+        self._held = holding
 
     def move(self, reference: PoseReference | JointReference, now_ns: int) -> None:
         """Give the robot its set-point."""
         self._call("move", command_of(reference, self.profile.robot.arm_joints))
-        self._node.counters["arm.commands_given"] += 1
+        self.report.counters["arm.commands_given"] += 1
 
     def grip(self, command: GripperCommand, now_ns: int) -> None:
         """Ask for an opening."""
@@ -139,12 +137,32 @@ class PythonDriver(RobotDriver):
         self._call("close")
 
     def status(self) -> DriverStatus:
-        """File, fault and width."""
+        """Class, fault, width, and what the robot adds."""
         width_m = self._asked_m if self._width_m is None else self._width_m
         return DriverStatus(
-            {"file": self._file, "fault": self.fault, "width_m": width_m},
+            {
+                "arm": self._called,
+                "fault": self.fault,
+                "width_m": width_m,
+                **(self._call("status") or {}),
+            },
             rates_hz={"readings": self._rate.rate_hz},
         )
+
+
+def make_arm(profile: Profile) -> tuple[Any, str]:
+    """The robot of a profile, and its name in messages."""
+    if profile.robot.driver == "franka":
+        from vla_zenoh.robots.franka.arm import FrankaArm  # its library is an extra
+
+        return FrankaArm(profile), "franka"
+    if profile.arm is None:
+        raise ProfileError(
+            f"profile {profile.name!r} has no section arm, which names a Python file: "
+            "arm: {file: my_arm.py}, with robot.driver: arm"
+        )
+    path = Path(profile.arm.file).expanduser()
+    return make_robot(path, profile.arm.options), path.name
 
 
 def _measured_ns(reading: Reading) -> int:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,13 +25,27 @@ from vla_zenoh.keys import Kind
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import Profile
 from vla_zenoh.robots.command_follower import CommandFollower
-from vla_zenoh.robots.driver import DriverStatus, Measurement, Pace, RobotDriver, SteppedNode
-from vla_zenoh.simulation.world import STEP_NS, build_world
+from vla_zenoh.robots.driver import (
+    DriverStatus,
+    Measurement,
+    Pace,
+    Reporter,
+    RobotDriver,
+    SteppedNode,
+)
+from vla_zenoh.simulation.world import STEP_NS, World, build_world
 from vla_zenoh.types import FloatArray, GripperCommand, ObjectPoses, SceneState
 from vla_zenoh.types.commands import JointReference, PoseReference
 
 CATCH_UP_NS = 50_000_000
-SCENE_HZ, OBJECTS_HZ, SUBSCRIBERS_HZ = 60.0, 10.0, 4.0
+
+
+def _every(rate_hz: float) -> int:
+    """Steps of the simulation between two events of this rate."""
+    return max(1, round(1e9 / STEP_NS / rate_hz))
+
+
+SCENE_EVERY, OBJECTS_EVERY, LOOK_EVERY = _every(60.0), _every(10.0), _every(4.0)
 MAX_LOCKSTEP_NS = 60_000_000_000
 MAX_STEP_BYTES = 1024
 WATCH_S = 0.2
@@ -59,31 +74,35 @@ class SimDriver(RobotDriver):
         self.lockstep = lockstep
         self.modes, self.period_s = ("pose", "joint"), STEP_NS / 1e9
         self._ticks = self._stamp_ns = 0
-        self._scene_wanted = self._objects_wanted = self._was_reset = False
+        self._was_reset = False
         self._newest: Measurement | None = None
         self._step_lock = threading.Lock()
-        self._state_every, self._scene_every, self._objects_every, self._look_every = (
-            max(1, round(1e9 / STEP_NS / rate_hz))
-            for rate_hz in (profile.timing.state_hz, SCENE_HZ, OBJECTS_HZ, SUBSCRIBERS_HZ)
+        self._state_every = _every(profile.timing.state_hz)
+        self._keys: _SimKeys | None = None
+        position_m, rotation = self.world.tcp()
+        zeros = np.zeros(6)
+        self._reference: PoseReference | JointReference = PoseReference(
+            position_m, rotation, zeros, zeros
         )
 
     def attach(self, node: Node, follower: CommandFollower | None) -> None:
         """Subscribe to resets, and publish the scene."""
+        super().attach(node, follower)
         assert follower is not None
         assert follower.reference is not None
-        keys = node.keys
         self._node, self._follower, self._reference = node, follower, follower.reference
-        self._resets = node.subscribe(keys.sim_reset, CallbackRing(4, settings.MAX_SETTING_BYTES))
-        self._scene = node.declare_publisher(keys.sim_scene, Kind.STATE)
-        self._objects = node.declare_publisher(keys.sim_objects, Kind.TELEMETRY)
+        self._keys = _SimKeys(node)
 
     # -- one millisecond ----------------------------------------------------------------------
     def poll(self, mono_ns: int) -> None:
         """Carry out resets."""
-        for arrival in self._resets.drain():
-            seed = self._node.decode_text(_decode_seed, arrival)
-            if seed is not None:
-                self._reset(seed.value)
+        for seed in self._keys.resets() if self._keys else ():
+            if self._follower.following and not self.fault:
+                why = "sim/reset: the arm is being commanded; deactivate first"
+                self.report.reject("reset_refused", why)
+            else:
+                self.reset(seed)
+                self._follower.restart()
 
     def move(self, reference: PoseReference | JointReference, now_ns: int) -> None:
         """Set the reference and the stamp of the next step."""
@@ -106,8 +125,9 @@ class SimDriver(RobotDriver):
                     self.world.tick(self._reference)
             except NodeError as error:
                 self.fault = str(error)
-                self._node.reject("simulation_fault", self.fault)
-        self._publish_scene(self._stamp_ns)
+                self.report.reject("simulation_fault", self.fault)
+        if self._keys is not None:
+            self._keys.publish(self.world, self._ticks, self._stamp_ns)
         return None if self._ticks % self._state_every else self._measure(self._stamp_ns)
 
     def _measure(self, stamp_ns: int) -> Measurement:
@@ -123,31 +143,11 @@ class SimDriver(RobotDriver):
         )
         return self._newest
 
-    def _publish_scene(self, stamp_ns: int) -> None:
-        if self._ticks % self._look_every == 0:
-            self._scene_wanted = self._scene.has_subscribers
-            self._objects_wanted = self._objects.has_subscribers
-        if self._scene_wanted and self._ticks % self._scene_every == 0:
-            scene = SceneState(self.profile.sim.scene, self.world.qpos(), self.world.seed)
-            self._scene.publish(scene, stamp_wall_ns=stamp_ns)
-        if self._objects_wanted and self._ticks % self._objects_every == 0:
-            objects = self.world.objects()
-            poses = ObjectPoses(
-                tuple(objects),
-                np.array([position_m for position_m, _ in objects.values()]).reshape(-1, 3),
-                np.array([quat_xyzw for _, quat_xyzw in objects.values()]).reshape(-1, 4),
-            )
-            self._objects.publish(poses, stamp_wall_ns=stamp_ns)
-
-    def _reset(self, seed: int | None) -> None:
-        if self._follower.following and not self.fault:
-            why = "sim/reset: the arm is being commanded; deactivate first"
-            self._node.reject("reset_refused", why)
-            return
+    def reset(self, seed: int | None) -> None:
+        """Put arm and objects where they begin; `seed` None: that of the profile."""
         self.world.reset(self.profile.sim.seed if seed is None else seed)
         self.fault = ""
-        self._follower.restart()
-        self._node.counters["sim.resets"] += 1
+        self.report.counters["sim.resets"] += 1
         self._was_reset = True
 
     def status_changed(self) -> bool:
@@ -169,7 +169,7 @@ class SimDriver(RobotDriver):
     # -- time ---------------------------------------------------------------------------------
     def pace(self) -> Pace:
         """Ticks of 1 ms that keep to the clock."""
-        return RealTimePace(self._node)
+        return RealTimePace(self.report)
 
     def serve_lockstep(self, node: SteppedNode, stop: threading.Event) -> None:
         """Publish the first state, and answer ``sim/step`` until `stop` is set."""
@@ -191,7 +191,7 @@ class SimDriver(RobotDriver):
             if not 0 < duration_ns <= MAX_LOCKSTEP_NS or duration_ns % STEP_NS:
                 raise CodecError("invalid", f"ns: wanted a multiple of {STEP_NS}, at most 60 s")
         except CodecError as error:
-            self._node.reject(error.reason, f"sim/step: {error}")
+            self.report.reject(error.reason, f"sim/step: {error}")
             query.reply_err(str(error).encode())
             return
         world = self.world
@@ -209,26 +209,62 @@ class SimDriver(RobotDriver):
     # -- status -------------------------------------------------------------------------------
     def status(self) -> DriverStatus:
         """Scene, command mode and fault."""
-        self._node.counters["sim.torque_saturated"] = self.world.saturated
+        self.report.counters["sim.torque_saturated"] = self.world.saturated
         return DriverStatus(
             {
                 "scene": self.profile.sim.scene,
-                "command": self._follower.mode,
+                "command": self._follower.mode if self._keys else self.profile.robot.command,
                 "lockstep": self.lockstep,
                 "fault": self.fault,
             }
         )
 
 
+class _SimKeys:
+    """Keys that only the simulator has: resets in, scene and objects out."""
+
+    def __init__(self, node: Node) -> None:
+        keys = node.keys
+        self._node, self._scene_name = node, node.profile.sim.scene
+        self._resets = node.subscribe(keys.sim_reset, CallbackRing(4, settings.MAX_SETTING_BYTES))
+        self._scene = node.declare_publisher(keys.sim_scene, Kind.STATE)
+        self._objects = node.declare_publisher(keys.sim_objects, Kind.TELEMETRY)
+        self._scene_wanted = self._objects_wanted = False
+
+    def resets(self) -> Iterator[int | None]:
+        """Seeds of the resets that arrived; None: that of the profile."""
+        for arrival in self._resets.drain():
+            seed = self._node.decode_text(_decode_seed, arrival)
+            if seed is not None:
+                yield seed.value
+
+    def publish(self, world: World, ticks: int, stamp_ns: int) -> None:
+        """Publish what is due and has subscribers, after `ticks` steps."""
+        if ticks % LOOK_EVERY == 0:
+            self._scene_wanted = self._scene.has_subscribers
+            self._objects_wanted = self._objects.has_subscribers
+        if self._scene_wanted and ticks % SCENE_EVERY == 0:
+            scene = SceneState(self._scene_name, world.qpos(), world.seed)
+            self._scene.publish(scene, stamp_wall_ns=stamp_ns)
+        if self._objects_wanted and ticks % OBJECTS_EVERY == 0:
+            objects = world.objects()
+            poses = ObjectPoses(
+                tuple(objects),
+                np.array([position_m for position_m, _ in objects.values()]).reshape(-1, 3),
+                np.array([quat_xyzw for _, quat_xyzw in objects.values()]).reshape(-1, 4),
+            )
+            self._objects.publish(poses, stamp_wall_ns=stamp_ns)
+
+
 class RealTimePace:
     """Ticks of 1 ms on the monotonic clock; late ones follow each other at once.
 
     Args:
-        node: its counters get the late ticks and the time given up.
+        report: its counters get the late ticks and the time given up.
     """
 
-    def __init__(self, node: Node) -> None:
-        self._counters = node.counters
+    def __init__(self, report: Reporter) -> None:
+        self._counters = report.counters
         self._counters["sim.overruns"] = 0
         self._next_ns = time.monotonic_ns()
 

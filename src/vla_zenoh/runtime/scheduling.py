@@ -11,6 +11,9 @@ from contextlib import contextmanager
 
 LOOP_PRIORITY, LINK_PRIORITY = 40, 30
 """SCHED_FIFO priorities: no link thread may preempt a control loop."""
+INNER_PRIORITY = 45
+"""Of a robot's own loop inside a driver's library, which is faster than ours."""
+TASKS = "/proc/self/task"
 NICENESS = -10
 SET_TIMER_SLACK, GET_TIMER_SLACK = 29, 30  # PR_SET_TIMERSLACK and PR_GET_TIMERSLACK of prctl(2)
 
@@ -52,6 +55,25 @@ def realtime_thread() -> Iterator[bool]:
             yield granted
     finally:
         _timer_slack(slack_ns)
+
+
+@contextmanager
+def realtime_children() -> Iterator[None]:
+    """Ask for SCHED_FIFO for the threads that a library starts while the caller is in here.
+
+    They inherit nothing from a `realtime_thread`.
+    """
+    before = set(_tasks())
+    yield
+    for task in set(_tasks()) - before:
+        try:
+            os.sched_setscheduler(task, os.SCHED_FIFO, os.sched_param(INNER_PRIORITY))
+        except (OSError, AttributeError):  # not allowed, over already, or not Linux
+            return
+
+
+def _tasks() -> list[int]:
+    return [int(name) for name in os.listdir(TASKS)] if os.path.isdir(TASKS) else []
 
 
 @contextmanager

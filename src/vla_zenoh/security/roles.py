@@ -94,7 +94,7 @@ TABLE = (
     # Every role that may stop the arm may slow it down.
     _stream("slower", {OPERATOR}, {COMMAND, OPERATOR, VIEWER}),
     _stream("stop", {OPERATOR}, {COMMAND, OPERATOR, VIEWER}),
-    _stream("reset", {OPERATOR}, {COMMAND, OPERATOR, VIEWER}),
+    _stream("reset", {OPERATOR}, {COMMAND, ROBOT, OPERATOR, VIEWER}),
     Row(
         "task",
         put=frozenset({COMMAND, REPLAY}),

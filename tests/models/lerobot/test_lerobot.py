@@ -34,6 +34,9 @@ ATOL = 1e-6
 """Metres and radians, of float32."""
 ACTION_OPTIONS = {
     "action": "delta",
+    "anchor": "goal",
+    "relative_to": "previous",
+    "controller": "none",
     "rotation": "rpy",
     "gripper": "open_fraction",
     "gripper_open": "high",

@@ -236,6 +236,7 @@ def fault(node: ast.AST, rich: set[str]) -> str:
 PRINTS = {
     "cli/main.py": "the version",
     "cli/plain.py": "lines made printable there",
+    "cli/up.py": "a systemd unit as a file",
     "cli/nodes.py": "the profile's name, for a program that waits for it",
     "lab/cli/profile.py": "a profile as a file",
     "lab/cli/bridge_config.py": "a bridge's configuration as a file",

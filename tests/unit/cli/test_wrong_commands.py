@@ -32,7 +32,7 @@ WRONG: list[tuple[str, int, str]] = [
     (
         "demo --profile nosuch",
         FAILED,
-        "error: no profile called 'nosuch'. Known: panda_bricks, pan",
+        "error: no profile called 'nosuch'. Known: fr3, panda_bricks, pan",
     ),
     (
         "demo --profile panda_sin",
@@ -42,7 +42,7 @@ WRONG: list[tuple[str, int, str]] = [
     (
         "up nosuch",
         FAILED,
-        "error: no profile called 'nosuch'. Known: panda_bricks, panda_ros2, pan",
+        "error: no profile called 'nosuch'. Known: fr3, panda_bricks, panda_fci, panda_ros2, pan",
     ),
     ("up ./absent.yaml", FAILED, "error: there is no file or folder './absent.yaml'"),
     ("up --listen x", FAILED, "session.listen.0: 'x' is not an endpoint: write tcp/HOST:PORT"),

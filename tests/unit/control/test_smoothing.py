@@ -385,6 +385,19 @@ def test_an_axis_at_one_percent_of_the_speed_brakes_however_often_its_goal_is_re
     assert np.abs(often.motion.pose.position_m - goal.position_m).max() < AT_GOAL[0] / 10
 
 
+@pytest.mark.parametrize("ticks", range(2, 9))
+def test_on_a_line_the_axis_that_needs_most_jerk_decides_and_no_axis_gets_too_fast(
+    ticks: int,
+) -> None:
+    most_m_s, line = 0.005, np.array([0.6034308, 0.3442121, -0.7192978])
+    limits = MotionLimits((most_m_s, 2.0, 20.0), LIMITS.rotation)
+    motion = Smoother(START, DT_S, limits)
+    for part_m, shares, many in ((0.002, Shares(), ticks), (-0.001, Shares(0.5, 1.0, 0.3), 60)):
+        motion.target(Pose(START.position_m + part_m * line, START.rotation), shares)
+        for _ in range(many):
+            assert np.abs(motion.tick().twist[:3]).max() <= most_m_s * (1 + LIMIT_RTOL)
+
+
 def test_an_arm_that_goes_back_over_its_start_slowly_stays_on_its_line() -> None:
     motion, slow = smoother(), Shares(0.02, 0.01, 0.001)
     line = np.array([-0.39, 0.9, 0.156]) / norm3(np.array([-0.39, 0.9, 0.156]))

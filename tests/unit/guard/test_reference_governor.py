@@ -30,8 +30,10 @@ def standing(*value: float) -> JointReference:
     return JointReference.at_rest(np.array(value))
 
 
-def governor(axes: int = 1, dt_s: float = DT_S) -> ReferenceGovernor[JointReference]:
-    velocity, acceleration, jerk = (np.full(axes, BRAKE_MARGIN * limit) for limit in OWN)
+def governor(
+    axes: int = 1, dt_s: float = DT_S, own: FloatArray = OWN
+) -> ReferenceGovernor[JointReference]:
+    velocity, acceleration, jerk = (np.full(axes, BRAKE_MARGIN * limit) for limit in own)
     limits = GovernorLimits(velocity, acceleration, jerk, np.ones(axes), np.ones(axes))
     return ReferenceGovernor(JointSpace(), standing(*[0.0] * axes), dt_s, limits)
 
@@ -110,6 +112,29 @@ def test_beside_a_path_whose_jerk_reverses_within_a_tick_no_difference_exceeds_t
         path[tick + 3] = side.motion.position_rad
     third = np.diff(path, 3, axis=0) / DT_S**3
     assert np.abs(third).max() <= BRAKE_MARGIN * jerk * (1 + RTOL)
+
+
+@given(step=st.floats(0.005, 0.05), begin=st.integers(5, 400), way=st.sampled_from([-1.0, 1.0]))
+@settings(max_examples=60, deadline=None)
+def test_beside_a_path_that_begins_to_accelerate_no_difference_exceeds_the_acceleration(
+    step: float, begin: int, way: float
+) -> None:
+    velocity, acceleration, jerk = own = np.array([0.5, 2.0, 200.0])
+    side = governor(own=own)
+    path = np.zeros(603)
+    for tick in range(600):
+        # As fast as may be from rest to the path's velocity limit.
+        after_s = max(tick + 1 - begin, 0.0) * DT_S
+        ramp_s, lasts_s = acceleration / jerk, velocity / acceleration
+        told = np.zeros(3)
+        for sign, at_s in ((1, 0.0), (-1, ramp_s), (-1, lasts_s), (1, lasts_s + ramp_s)):
+            since_s = max(after_s - at_s, 0.0)
+            told += [sign * way * jerk / math.factorial(n) * since_s**n for n in (3, 2, 1)]
+        told[0] += step
+        side.follow(JointReference(*told[:, None]), steady=tick > 0)
+        path[tick + 3] = side.motion.position_rad[0]
+    second = np.diff(path, 2) / DT_S**2
+    assert np.abs(second).max() <= BRAKE_MARGIN * acceleration * (1 + RTOL)
 
 
 @given(st.floats(-1e-15, 1e-15))

@@ -204,7 +204,7 @@ def test_an_answer_of_another_form_is_refused_by_name(answer: Any, why: str) -> 
         ({"map": "a=posture"}, "no part of the state is called 'posture'; there are: joint"),
         ({"map": "a=kamera:front"}, "a source is camera:NAME"),
         ({"map": "a=x,a=y"}, "twice"),
-        ({"action": "velocity"}, "allowed: delta, absolute, joint_delta, joint_position"),
+        ({"action": "twist"}, "allowed: delta, absolute, velocity, joint_delta, joint_position"),
         ({"rotation": "euler"}, "allowed: rpy, rotvec"),
         ({"gripper": "maybe"}, "gripper"),
         ({"gripper_open": "left"}, "allowed: high, low"),

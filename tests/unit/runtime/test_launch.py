@@ -45,7 +45,8 @@ def test_nodes_start_from_the_router_on_and_the_robot_stops_after_what_drives_it
 def test_every_kind_of_node_may_stand_in_a_profile_and_every_robot_driver_is_one() -> None:
     assert set(get_args(NodeKind)) == set(NODE_KINDS)
     robots = {kind for kind, traits in NODE_KINDS.items() if traits.role == "robot"}
-    assert robots == set(get_args(RobotProfile.model_fields["driver"].annotation))
+    drivers = get_args(RobotProfile.model_fields["driver"].annotation)
+    assert robots == {RobotProfile.model_construct(driver=name).node for name in drivers}
 
 
 def test_every_kind_of_node_has_a_command() -> None:

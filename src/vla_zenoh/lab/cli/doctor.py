@@ -77,6 +77,10 @@ def doctor(
         findings = list(examine(needs, functools.partial(try_zenoh, session)))
         if loaded is not None:
             findings += robot(loaded, host)
+            if loaded.franka is not None:
+                from vla_zenoh.lab.doctor.fci import fci_host
+
+                findings += fci_host(loaded, host)
             findings += access(
                 loaded,
                 dt.datetime.now(dt.UTC),

@@ -55,9 +55,9 @@ def _placement(profile: Profile) -> Iterator[str]:
         yield "hosts: none runs the command node; nothing will move"
     if "sim" not in running and profile.robot.driver == "sim":
         yield "hosts: none runs the simulator, and robot.driver is sim"
-    for driver in ("ros2", "arm"):
-        if driver not in running and profile.robot.driver == driver:
-            yield f"hosts: none runs the node {driver}, and robot.driver is {driver}"
+    for node in ("ros2", "arm"):
+        if node not in running and profile.robot.node == node:
+            yield f"hosts: none runs the node {node}, and robot.driver is {profile.robot.driver}"
     for what, known, used in (
         (
             "cameras",

@@ -50,7 +50,7 @@ class PeerMonitor:
         self._new_specs = node.subscribe(node.keys.all_specs, ZenohRing(SPECS_A_TICK))
         node.on_tokens(node.keys.all_alive, self._on_alive)
         node.on_tokens(node.keys.all_holding, self._on_holding)
-        self._robot_node = node.profile.robot.driver
+        self._robot_node = node.profile.robot.node
 
     def _on_alive(self, name: str, alive: bool) -> None:
         with self._lock:

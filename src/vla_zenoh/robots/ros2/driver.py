@@ -90,6 +90,7 @@ class Ros2Driver(RobotDriver):
             SessionError: ros2.connect does not answer.
             SecurityError: it is reached by TLS, and this node's certificate is missing.
         """
+        super().attach(node, follower)
         profile, ros2 = self.profile, self._ros2
         self._node, self._follower, session = node, follower, node.session
         if ros2.connect is not None:

@@ -1,0 +1,36 @@
+"""vla-zenoh robot check: connect to a robot, read it, and compare it with its profile."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from vla_zenoh.cli.options import DEFAULT_PROFILE, JsonOption, effective_profile
+from vla_zenoh.cli.output import fail, print_json, progress
+from vla_zenoh.lab.cli.doctor import show
+from vla_zenoh.lab.doctor.fci import fci_arm
+
+
+def robot_check(
+    profile: Annotated[
+        str, typer.Argument(help="Profile of the robot, by name or path.", metavar="NAME")
+    ] = DEFAULT_PROFILE,
+    as_json: JsonOption = False,
+) -> None:
+    """Connect to a Franka arm, read it, and compare it with its profile. Moves nothing.
+
+    Its kinematics against the profile's description, its joint ranges and limits against the
+    profile's. No other program may be connected to the arm. Exits with 1 if something is wrong.
+    """
+    loaded = effective_profile(profile)
+    if loaded.robot.driver != "franka":
+        fail(f"profile {loaded.name} has robot.driver: {loaded.robot.driver}; this checks franka")
+    with progress("reading the robot"):
+        findings = list(fci_arm(loaded))
+    if as_json:
+        print_json(findings)
+    else:
+        show(findings)
+    if any(finding.level == "fail" for finding in findings):
+        raise typer.Exit(1)

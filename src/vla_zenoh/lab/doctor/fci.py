@@ -1,0 +1,272 @@
+"""Checks of a host that drives a Franka arm, and of the arm itself."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vla_zenoh.errors import MissingExtraError, NodeError, how_to_install
+from vla_zenoh.kinematics.kinematics import Kinematics, make_kinematics
+from vla_zenoh.kinematics.so3 import Pose, pose_distance
+from vla_zenoh.lab.doctor.finding import HostFinding, Level
+from vla_zenoh.profile import Profile
+from vla_zenoh.profile.robot import FrankaProfile
+from vla_zenoh.robots.franka.arm import FrankaArm, error_names
+from vla_zenoh.robots.franka.published import BY_FCI, JOINTS, flange_pose
+
+REALTIME_KERNEL = Path("/sys/kernel/realtime")
+NETWORK = Path("/sys/class/net")
+LIBRARY = "franky-control"
+FITS = {5: ((0, 9), (0, 10)), 10: ((0, 18), None)}
+"""FCI version -> oldest libfranka that speaks it, first that does not."""
+HIGHEST_PRIORITY = 99
+PINGS, PING_S, PING_TIMEOUT_S = 50, 0.02, 10
+MOST_MS = 1.0
+"""A cycle of the robot."""
+LOOKS = 200
+APART_M, APART_RAD = 1e-3, 2e-3
+
+
+# -- the host ---------------------------------------------------------------------------------
+def fci_host(profile: Profile, host: str | None = None) -> Iterator[HostFinding]:
+    """What the 1 kHz loop of a Franka arm needs of this computer; nothing for other robots."""
+    hosts = [profile.hosts[host]] if host is not None else list(profile.hosts.values())
+    if profile.franka is None or profile.robot.driver != "franka":
+        return
+    if any("arm" in part.nodes for part in hosts):
+        yield library(profile.franka)
+        yield kernel(profile.franka)
+        yield priority(profile.franka)
+        yield network_card(profile.franka)
+        yield round_trip(profile.franka)
+
+
+def library(franka: FrankaProfile) -> HostFinding:
+    """franky is installed, on a libfranka that speaks the version of the profile."""
+    name = "FCI: library"
+    try:
+        found = metadata.distribution(LIBRARY)
+    except metadata.PackageNotFoundError:
+        return HostFinding(name, "fail", f"no {LIBRARY}", how_to_install("franka"))
+    files = [Path(str(file)).name for file in found.files or ()]
+    versions = [
+        match[1] for file in files if (match := re.match(r"libfranka.*\.so\.([\d.]+)$", file))
+    ]
+    text = f"{LIBRARY} {found.version}, libfranka {versions[0] if versions else 'unknown'}"
+    oldest, first_unfit = FITS[franka.fci]
+    numbers = tuple(map(int, versions[0].split("."))) if versions else oldest
+    if numbers < oldest or (first_unfit is not None and numbers >= first_unfit):
+        wanted = ".".join(map(str, oldest)) + (" or newer" if first_unfit is None else "")
+        advice = f"FCI {franka.fci} needs a franky built with libfranka {wanted}"
+        return HostFinding(name, "fail", text, advice)
+    return HostFinding(name, "ok", f"{text}, for FCI {franka.fci}")
+
+
+def kernel(franka: FrankaProfile, flag: Path = REALTIME_KERNEL) -> HostFinding:
+    """The kernel is a real-time one."""
+    release = os.uname().release
+    if flag.exists() and flag.read_text().strip() == "1":
+        return HostFinding("FCI: kernel", "ok", f"{release}, real time")
+    return HostFinding(
+        "FCI: kernel",
+        _level(franka),
+        f"{release} is no real-time kernel; the robot ends a motion after 20 lost cycles",
+        "install a kernel with PREEMPT_RT",
+    )
+
+
+def priority(franka: FrankaProfile) -> HostFinding:
+    """This user may use the priority that libfranka takes (tried, and undone)."""
+    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(HIGHEST_PRIORITY))
+    except OSError:
+        advice = f"allow this user rtprio {HIGHEST_PRIORITY} and memlock unlimited (limits.conf)"
+        found = f"SCHED_FIFO {HIGHEST_PRIORITY} is not permitted"
+        return HostFinding("FCI: priority", _level(franka), found, advice)
+    os.sched_setscheduler(0, policy, parameters)
+    return HostFinding("FCI: priority", "ok", f"SCHED_FIFO {HIGHEST_PRIORITY} is permitted")
+
+
+def network_card(franka: FrankaProfile, folder: Path = NETWORK) -> HostFinding:
+    """The way to the robot is a cable of 1 Gbit/s."""
+    name, address = "FCI: network card", franka.address
+    route = _output("ip", "-o", "route", "get", address)
+    match = re.search(r"\bdev (\S+)", route)
+    if match is None:
+        advice = "plug the robot into a card of its own, with an address in the robot's network"
+        return HostFinding(name, "warn", f"no route to {address} found", advice)
+    card = match[1]
+    if card == "lo":
+        return HostFinding(name, "ok", f"{address} is this computer: a simulator")
+    if (folder / card / "wireless").exists():
+        return HostFinding(name, "fail", f"{card} is wireless", "use a cable to the control box")
+    try:
+        speed = int((folder / card / "speed").read_text())
+    except (OSError, ValueError):
+        return HostFinding(name, "warn", f"{card}, of unknown speed", "it should be 1 Gbit/s")
+    if speed < 1000:
+        return HostFinding(name, "warn", f"{card}, {speed} Mbit/s", "use 1 Gbit/s, without a hub")
+    return HostFinding(name, "ok", f"{card}, {speed} Mbit/s")
+
+
+def round_trip(franka: FrankaProfile) -> HostFinding:
+    """Packets to the robot and back take less than one of its cycles."""
+    name, address = "FCI: round trip", franka.address
+    if shutil.which("ping") is None:
+        return HostFinding(name, "warn", "not measured: no ping", "sudo apt install iputils-ping")
+    said = _output("ping", "-q", "-c", str(PINGS), "-i", str(PING_S), "-W", "1", address)
+    match = re.search(r"= [\d.]+/([\d.]+)/([\d.]+)/", said)
+    if match is None:
+        return HostFinding(name, "fail", f"{address} does not answer", "is the control box on?")
+    mean_ms, most_ms = float(match[1]), float(match[2])
+    found = f"mean {mean_ms:.2f} ms, largest {most_ms:.2f} ms of {PINGS}"
+    if most_ms >= MOST_MS:
+        advice = "a card of its own, no switch, no power saving (ethtool --set-eee), a quiet host"
+        return HostFinding(name, "warn", f"{found}; a cycle is {MOST_MS:g} ms", advice)
+    return HostFinding(name, "ok", found)
+
+
+def _level(franka: FrankaProfile) -> Level:
+    return "fail" if franka.realtime == "enforce" else "warn"
+
+
+def _output(*command: str) -> str:
+    try:
+        done = subprocess.run(
+            command, capture_output=True, text=True, check=False, timeout=PING_TIMEOUT_S
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return done.stdout
+
+
+# -- the arm ----------------------------------------------------------------------------------
+def fci_arm(profile: Profile) -> Iterator[HostFinding]:
+    """Connect to the arm, read it and compare it with the profile; moves and sets nothing."""
+    assert profile.franka is not None
+    try:
+        arm = FrankaArm(profile)
+        arm.connect()
+    except (NodeError, MissingExtraError) as error:
+        yield HostFinding("connection", "fail", str(error), "see `vla-zenoh doctor --profile`")
+        return
+    try:
+        robot = arm.robot
+        yield HostFinding("connection", "ok", f"{profile.franka.address}, FCI {profile.franka.fci}")
+        yield _state(robot)
+        yield _readings(robot)
+        yield _flange(robot)
+        if profile.franka.fci >= BY_FCI[10].fci:  # an older one sends no description
+            yield from _description(robot.model_urdf, profile)
+        yield _limits(profile)
+    finally:
+        arm.close()
+
+
+def _state(robot: Any) -> HostFinding:
+    state = robot.state
+    mode, errors = state.robot_mode.name, error_names(state.current_errors)
+    found = f"mode {mode}" + (f", errors {', '.join(errors)}" if errors else "")
+    if mode == "Idle" and not errors:
+        return HostFinding("state", "ok", found)
+    advice = "unlock the joints and activate FCI in Desk; a reflex ends with `vla-zenoh reset`"
+    return HostFinding("state", "warn", found, advice)
+
+
+def _readings(robot: Any) -> HostFinding:
+    times = [robot.state.time.to_msec() for _ in range(LOOKS)]
+    lost = int(np.maximum(np.diff(times) - 1, 0).sum())
+    found = f"{LOOKS} states in {times[-1] - times[0]} ms of the robot, {lost} lost"
+    if lost > LOOKS // 20:
+        return HostFinding("readings", "warn", found, "see `FCI: round trip` of vla-zenoh doctor")
+    return HostFinding("readings", "ok", found)
+
+
+def _flange(robot: Any) -> HostFinding:
+    """The robot's own flange is where Franka's published kinematics puts it."""
+    state = robot.state
+    own = state.O_T_EE.matrix @ np.linalg.inv(state.F_T_EE.matrix)
+    ours = flange_pose(np.array(state.q))
+    return _apart("flange", "published kinematics", _pose(own), _pose(ours))
+
+
+def _description(urdf: str, profile: Profile) -> Iterator[HostFinding]:
+    """The robot's own description against that of the profile."""
+    joints = re.findall(r'<joint name="([^"]*joint[1-7])"', urdf)
+    links = re.findall(r'<link name="([^"]*link8)"', urdf)
+    if len(joints) != JOINTS or not links:
+        yield HostFinding("description", "warn", "the robot's URDF has other joints than expected")
+        return
+    with tempfile.NamedTemporaryFile("w", suffix=".urdf") as file:
+        file.write(urdf)
+        file.flush()
+        own = Kinematics(Path(file.name), links[0], joints)
+    ours, random = make_kinematics(profile), np.random.default_rng(0)
+    tool = _tool(ours)
+    worst = Pose(np.zeros(3), np.eye(3)), Pose(np.zeros(3), np.eye(3))
+    for _ in range(LOOKS):
+        joints_rad = random.uniform(ours.lower_rad, ours.upper_rad)
+        there = _pose(_matrix(ours.forward(joints_rad)) @ np.linalg.inv(tool))
+        pair = own.forward(joints_rad), there
+        worst = max(worst, pair, key=lambda poses: pose_distance(*poses)[0])
+    yield _apart("description", f"the robot's own, in {LOOKS} poses", *worst)
+    beyond = np.flatnonzero(
+        (ours.lower_rad < own.lower_rad - 1e-6) | (ours.upper_rad > own.upper_rad + 1e-6)
+    )
+    if beyond.size:
+        names = ", ".join(ours.arm_joints[joint] for joint in beyond)
+        advice = "narrow robot.joint_range_rad"
+        yield HostFinding("joint ranges", "fail", f"beyond the robot's: {names}", advice)
+    else:
+        yield HostFinding("joint ranges", "ok", "within the robot's own")
+
+
+def _limits(profile: Profile) -> HostFinding:
+    assert profile.franka is not None
+    published = BY_FCI[profile.franka.fci]
+    above = [
+        f"limits.joint.{name}"
+        for name in ("velocity_rad_s", "acceleration_rad_s2", "jerk_rad_s3")
+        if np.any(np.array(profile.limits.joint.of(name, JOINTS)) > getattr(published, name))
+    ]
+    for section in ("translation", "rotation"):
+        values = [value for _, value in getattr(profile.limits, section)]
+        if np.any(np.array(values) > getattr(published, section)):
+            above.append(f"limits.{section}")
+    if above:
+        return HostFinding("limits", "fail", f"above the published ones: {', '.join(above)}")
+    return HostFinding("limits", "ok", f"within those published for FCI {profile.franka.fci}")
+
+
+def _tool(ours: Kinematics) -> np.ndarray:
+    """(4, 4): our TCP in the frame of the flange."""
+    middle_rad = (ours.lower_rad + ours.upper_rad) / 2
+    return np.linalg.inv(flange_pose(middle_rad)) @ _matrix(ours.forward(middle_rad))
+
+
+def _apart(name: str, of: str, own: Pose, ours: Pose) -> HostFinding:
+    apart_m, apart_rad = pose_distance(own, ours)
+    found = f"{1e3 * apart_m:.2f} mm and {1e3 * apart_rad:.2f} mrad from {of}"
+    if apart_m > APART_M or apart_rad > APART_RAD:
+        return HostFinding(name, "fail", found, "is it another arm, or another description?")
+    return HostFinding(name, "ok", found)
+
+
+def _pose(matrix: np.ndarray) -> Pose:
+    return Pose(matrix[:3, 3], matrix[:3, :3])
+
+
+def _matrix(pose: Pose) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = pose.rotation, pose.position_m
+    return matrix

@@ -1,0 +1,1 @@
+"""Franka arms over the Franka Control Interface (FCI), without ROS."""

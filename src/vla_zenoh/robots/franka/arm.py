@@ -1,0 +1,304 @@
+"""A Franka arm: follows set-points as a spring, by franky's 1 kHz torque loop on libfranka.
+
+The 1 kHz loop is C++ and reads the newest set-point, with velocity and acceleration, in each
+cycle; Python is never in it. It runs while set-points arrive; at rest the robot's own controller
+holds the arm.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Mapping
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+
+from vla_zenoh.errors import MissingExtraError, NodeError, in_words
+from vla_zenoh.kinematics.kinematics import make_kinematics
+from vla_zenoh.kinematics.so3 import exp3, log3, quat_from_rotation, rotation_from_quat
+from vla_zenoh.profile import Profile
+from vla_zenoh.profile.robot import FrankaLoad
+from vla_zenoh.robot import Command, Reading
+from vla_zenoh.robots.franka.hand import Hand
+from vla_zenoh.robots.franka.published import flange_pose
+from vla_zenoh.runtime.scheduling import realtime_children
+from vla_zenoh.types import FloatArray, JointCommand
+
+REST_S = 1.0
+"""The loop ends when there was no set-point for this long."""
+CLOSE_S = 1.0
+TRIM_S, LONGEST_S = 0.5, 0.02
+TRIM_M, TRIM_RAD, TRIM_JOINT_RAD = 0.004, 0.015, 0.005
+"""What is left of a set-point by friction in the joints is integrated, up to these."""
+READY = frozenset({"Idle", "Move"})
+STOPPED = frozenset({"Reflex", "UserStopped"})
+"""Robot modes that are a fault. In the others the robot is well, but follows no commands."""
+
+
+class FrankaArm:
+    """The arm of a profile with a section franka; see `vla_zenoh.robot.Robot`."""
+
+    def __init__(self, profile: Profile) -> None:
+        assert profile.franka is not None
+        self._profile, self._settings = profile, profile.franka
+        self._franky = load_franky()
+        self._kinematics = make_kinematics(profile)
+        self._robot: Any = None
+        self._hand: Hand | None = None
+        self._motion: Any = None
+        self._trim: FloatArray = np.zeros(0)
+        self._configured = self._was_in_control = False
+        self._ended = ""
+        self._time: Any = None
+        self._measured_ns = self._moved_ns = 0
+        self._state: Any = None
+        self._recovery: threading.Thread | None = None
+
+    # -- connection ---------------------------------------------------------------------------
+    def connect(self) -> None:
+        """Connect to the control box, and to the hand.
+
+        Raises:
+            NodeError: it does not answer, or speaks another version of the interface.
+        """
+        franky, address = self._franky, self._settings.address
+        enforce = self._settings.realtime == "enforce"
+        realtime = franky.RealtimeConfig.Enforce if enforce else franky.RealtimeConfig.Ignore
+        try:
+            self._robot = franky.Robot(address, realtime_config=realtime)
+            self._hand = Hand(franky.Gripper(address)) if self._settings.hand else None
+        except franky.IncompatibleVersionException as error:
+            raise NodeError(
+                f"{address}: {in_words(error)}. The profile has franka.fci: {self._settings.fci}; "
+                "a Panda needs a franky built with libfranka 0.9"
+            ) from error
+        except franky.Exception as error:
+            raise NodeError(
+                f"{address}: {in_words(error)}. Are the joints unlocked, and is FCI activated in "
+                "Desk? Is no other program connected?"
+            ) from error
+        self._update(self._robot.state)
+
+    def close(self) -> None:
+        """End the loop and disconnect."""
+        if self._hand is not None:
+            self._hand.close()
+        if self._robot is not None and self._robot.is_in_control:
+            self._robot.move(self._franky.TorqueStopMotion(), asynchronous=True)
+            self._robot.join_motion(CLOSE_S)
+        self._robot = self._hand = None
+
+    def _configure(self) -> None:
+        """Set what the profile says of load, tool and collisions; only an arm at rest takes it."""
+        settings, robot = self._settings, self._robot
+        torque = list(settings.collision_joint_nm)
+        force = [settings.collision_force_n] * 3 + [settings.collision_torque_nm] * 3
+        robot.set_collision_behavior(torque, torque, force, force)
+        robot.set_load(
+            settings.load.mass_kg, list(settings.load.centre_m), inertia_rows(settings.load)
+        )
+        hand = np.linalg.inv(self._state.F_T_NE.matrix) @ self.flange_to_tcp()
+        robot.set_ee(list(hand.T.ravel()))
+        robot.set_k(list(np.eye(4).ravel()))
+        self._configured = True
+
+    def flange_to_tcp(self) -> FloatArray:
+        """(4, 4): the TCP of the profile in the frame of the flange, by its description."""
+        home_rad = np.array(self._profile.robot.home_rad)
+        tcp = np.eye(4)
+        pose = self._kinematics.forward(
+            self._kinematics.ordered(self._profile.robot.arm_joints, home_rad)
+        )
+        tcp[:3, :3], tcp[:3, 3] = pose.rotation, pose.position_m
+        return np.linalg.inv(flange_pose(home_rad)) @ tcp
+
+    # -- state --------------------------------------------------------------------------------
+    def read(self) -> Reading:
+        """The newest state; an arm that stands is also sent its settings, or released."""
+        robot = self._robot
+        in_control = robot.is_in_control
+        if self._was_in_control and not in_control:
+            self._ended = self._why_ended()
+        self._was_in_control = in_control
+        if in_control and time.monotonic_ns() - self._moved_ns > REST_S * 1e9:
+            self._release()
+        self._update(robot.state)
+        state, mode = self._state, self._state.robot_mode.name
+        if mode == "Idle" and not self._configured:
+            self._configure()
+        hand = self._hand.state() if self._hand is not None else None
+        return Reading(
+            state.q,
+            state.dq,
+            state.tau_ext_hat_filtered,
+            width_m=None if hand is None else hand.width_m,
+            moving=hand is not None and hand.moving,
+            holding=hand is not None and hand.holding,
+            wrench=state.O_F_ext_hat_K,
+            fault=self._fault(mode),
+            mode="" if mode in READY | STOPPED else mode,
+            measured_ns=self._measured_ns,
+        )
+
+    def _update(self, state: Any) -> None:
+        if state.time != self._time:  # the same again: the robot is silent
+            self._time, self._measured_ns = state.time, time.monotonic_ns()
+        self._state = state
+
+    def _fault(self, mode: str) -> str:
+        names = error_names(self._state.current_errors) or error_names(
+            self._state.last_motion_errors
+        )
+        if mode == "Reflex":
+            return f"Reflex: {', '.join(names) or self._ended or 'no error named'}"
+        if mode == "UserStopped":
+            return "UserStopped: the user stop or the enabling device stopped the arm"
+        if self._hand is not None and self._hand.fault:
+            return f"hand: {self._hand.fault}"
+        return self._ended
+
+    def _why_ended(self) -> str:
+        """Why the loop ended by itself; empty: it was released."""
+        self._motion = None
+        try:
+            self._robot.poll_motion()
+        except self._franky.Exception as error:
+            return in_words(error)
+        return ""
+
+    def status(self) -> Mapping[str, Any]:
+        """Robot mode, errors and quality of the connection."""
+        state = self._state
+        return {
+            "robot_mode": state.robot_mode.name,
+            "errors": error_names(state.current_errors),
+            "last_motion_errors": error_names(state.last_motion_errors),
+            "control_command_success_rate": float(state.control_command_success_rate),
+            "tau_j_nm": [round(float(torque), 2) for torque in state.tau_J],
+            "in_control": self._was_in_control,
+            "configured": self._configured,
+            "hand_failed": "" if self._hand is None else self._hand.failed,
+        }
+
+    # -- motion -------------------------------------------------------------------------------
+    def move(self, command: Command) -> None:
+        """Give the loop its set-point, and start it where it does not run."""
+        if self._ended or not self._configured:
+            return  # reported as a fault; only `recover` ends it
+        now_ns = time.monotonic_ns()
+        elapsed_s = min((now_ns - self._moved_ns) / 1e9, LONGEST_S)
+        self._moved_ns = now_ns
+        starts = self._motion is None
+        if starts:
+            self._motion, elapsed_s = self._new_motion(), 0.0
+            self._trim = np.zeros(7 if isinstance(command, JointCommand) else 6)
+        self._motion.set_reference(self._reference(command, elapsed_s / TRIM_S))
+        if starts:
+            with realtime_children():
+                self._robot.move(self._motion, asynchronous=True)
+            self._was_in_control = True
+
+    def _new_motion(self) -> Any:
+        franky, settings = self._franky, self._settings
+        if self._profile.robot.command == "joint":
+            return franky.JointImpedanceTrackingMotion(
+                stiffness=list(settings.joint_stiffness_nm_rad)
+            )
+        posture = franky.PostureTask(self._state.q, settings.posture_stiffness_nm_rad)
+        return franky.CartesianImpedanceTrackingMotion(
+            translational_stiffness=settings.stiffness_n_m,
+            rotational_stiffness=settings.stiffness_nm_rad,
+            posture_task=posture,
+        )
+
+    def _reference(self, command: Command, share: float) -> Any:
+        """The set-point for the loop, trimmed by `share` of what is left of it."""
+        franky, state = self._franky, self._state
+        if isinstance(command, JointCommand):
+            self._trim = np.clip(
+                self._trim + share * (command.position_rad - state.q),
+                -TRIM_JOINT_RAD,
+                TRIM_JOINT_RAD,
+            )
+            return franky.JointReference(command.position_rad + self._trim, command.velocity_rad_s)
+        rotation = rotation_from_quat(command.quat_xyzw)
+        measured = state.O_T_EE.matrix
+        left = np.concatenate(
+            (command.position_m - measured[:3, 3], log3(rotation @ measured[:3, :3].T))
+        )
+        trim = self._trim + share * left
+        self._trim = np.concatenate((_bounded(trim[:3], TRIM_M), _bounded(trim[3:], TRIM_RAD)))
+        twist, acceleration = command.twist, command.acceleration
+        return franky.CartesianReference(
+            franky.Affine(
+                command.position_m + self._trim[:3],
+                quat_from_rotation(exp3(self._trim[3:]) @ rotation),
+            ),
+            franky.Twist(twist[:3], twist[3:]),
+            franky.TwistAcceleration(acceleration[:3], acceleration[3:]),
+        )
+
+    def _release(self) -> None:
+        """Let the robot's own controller hold the arm, which stands."""
+        if self._motion is not None:
+            self._motion = None
+            self._robot.move(self._franky.TorqueStopMotion(), asynchronous=True)
+
+    def recover(self) -> None:
+        """Clear the robot's errors, in a thread: it may take seconds."""
+        if self._recovery is None or not self._recovery.is_alive():
+            self._recovery = threading.Thread(target=self._recover, name="recovery", daemon=True)
+            self._recovery.start()
+
+    def _recover(self) -> None:
+        mode = self._state.robot_mode.name
+        if mode != "Reflex" and not self._ended:
+            return
+        try:
+            if mode == "Reflex":
+                self._robot.recover_from_errors()
+        except self._franky.Exception as error:
+            self._ended = f"recovery: {in_words(error)}"
+        else:
+            self._ended = ""
+
+    # -- the hand -----------------------------------------------------------------------------
+    def grip(self, width_m: float, speed_m_s: float, force_n: float) -> None:
+        """Move the fingers: closing grasps with `force_n`."""
+        if self._hand is not None:
+            self._hand.ask(width_m, speed_m_s, force_n)
+
+    @property
+    def robot(self) -> Any:
+        """franky's robot, once connected."""
+        return self._robot
+
+
+def _bounded(vector: FloatArray, most: float) -> FloatArray:
+    """`vector` (3,), shortened to a length of `most`."""
+    return vector * min(1.0, most / max(float(np.linalg.norm(vector)), 1e-12))
+
+
+def load_franky() -> Any:
+    """The library.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    try:
+        return import_module("franky")
+    except ImportError as error:
+        raise MissingExtraError("franky", "franka") from error
+
+
+def error_names(errors: Any) -> list[str]:
+    """Franka's names of the errors that are set."""
+    return [name for name in dir(errors) if not name.startswith("_") and getattr(errors, name)]
+
+
+def inertia_rows(load: FrankaLoad) -> list[float]:
+    """The (3, 3) inertia of a load, its nine numbers."""
+    xx, yy, zz, xy, xz, yz = load.inertia_kg_m2
+    return [xx, xy, xz, xy, yy, yz, xz, yz, zz]

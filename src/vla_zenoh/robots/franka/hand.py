@@ -1,0 +1,137 @@
+"""The Franka Hand: moves and grasps in threads of its own; the newest request wins."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any, NamedTuple
+
+from vla_zenoh.errors import in_words
+
+CLEARLY_M = 0.002
+"""A smaller change of the width closes nothing, and fingers this much apart hold something."""
+SHUT_M, STROKE_M = 0.005, 0.08
+WAIT_S = 0.02
+JOIN_S = 0.3
+RETRY_S = 0.5
+NO_STOP_S = 2.0
+"""A hand that has not ended a motion this long after it was told to is asked again."""
+
+
+class GripRequest(NamedTuple):
+    """A request of the gripper: opening, speed and force."""
+
+    width_m: float
+    speed_m_s: float
+    force_n: float
+
+
+class HandState(NamedTuple):
+    """Newest state of the hand."""
+
+    width_m: float
+    moving: bool
+    holding: bool
+
+
+class Hand:
+    """Runs the motions of a hand.
+
+    The library's calls wait for the fingers, so they run here. A request that comes while one is
+    carried out ends it; those in between are dropped.
+
+    Args:
+        gripper: franky's.
+
+    Attributes:
+        fault: why the hand does not answer; empty: it does.
+        failed: why the last motion that failed did.
+    """
+
+    def __init__(self, gripper: Any) -> None:
+        self._gripper: Any = gripper
+        self._newest: GripRequest | None = None
+        self._running: GripRequest | None = None
+        self._changed, self._end = threading.Condition(), threading.Event()
+        self.fault = self.failed = ""
+        self._read()
+        self._threads = [
+            threading.Thread(target=body, name=f"hand {name}", daemon=True)
+            for name, body in (("motions", self._run), ("state", self._watch))
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def ask(self, width_m: float, speed_m_s: float, force_n: float) -> None:
+        """Replace the newest request; returns at once."""
+        with self._changed:
+            self._newest = GripRequest(width_m, speed_m_s, force_n)
+            self._changed.notify()
+
+    def state(self) -> HandState:
+        """The newest state, at once."""
+        moving = self._running is not None or self._newest is not None
+        return HandState(self._width_m, moving, self._grasped and not moving)
+
+    def close(self) -> None:
+        """End the threads; what the fingers hold they keep."""
+        self._end.set()
+        with self._changed:
+            self._changed.notify()
+        for thread in self._threads:
+            thread.join(JOIN_S)
+        self._gripper = None  # the hand serves one client
+
+    # -- threads ------------------------------------------------------------------------------
+    def _watch(self) -> None:
+        while not self._end.is_set():
+            try:
+                self._read()
+            except Exception as error:
+                self.fault = in_words(error)
+                self._end.wait(RETRY_S)
+                continue
+            self.fault = ""
+
+    def _run(self) -> None:
+        while not self._end.is_set():
+            with self._changed:
+                self._changed.wait_for(lambda: self._newest is not None or self._end.is_set())
+                self._running, self._newest = self._newest, None
+            if self._running is not None:
+                self._carry_out(self._running)
+            self._running = None
+
+    def _carry_out(self, request: GripRequest) -> None:
+        """Move until the fingers arrive, or a newer request ends it.
+
+        A grasp closes until the fingers meet resistance, whatever its width: it is for fingers that
+        are to shut, and for those that something kept from getting where they were sent.
+        """
+        closes = request.width_m < self._width_m - CLEARLY_M
+        try:
+            if not (closes and request.width_m < SHUT_M):
+                self._wait(self._gripper.move_async(request.width_m, request.speed_m_s))
+                self._read()
+                closes = closes and self._width_m > request.width_m + CLEARLY_M
+            if closes and not self._superseded():
+                # Succeeds on whatever is between the fingers, whose thickness nobody knows.
+                self._wait(self._gripper.grasp_async(*request, STROKE_M, STROKE_M))
+        except Exception as error:  # a motion that was ended raises; the state says where it stands
+            if not self._superseded():
+                self.failed = in_words(error)
+
+    def _wait(self, motion: Any) -> None:
+        stop_s = -NO_STOP_S
+        while not motion.wait(WAIT_S):
+            if self._superseded() and time.monotonic() - stop_s > NO_STOP_S:
+                stop_s = time.monotonic()
+                self._gripper.stop_async()
+        motion.get()
+
+    def _read(self) -> None:
+        state = self._gripper.state  # waits for the next one
+        self._width_m, self._grasped = float(state.width), bool(state.is_grasped)
+
+    def _superseded(self) -> bool:
+        return self._newest is not None or self._end.is_set()

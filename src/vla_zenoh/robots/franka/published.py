@@ -1,0 +1,98 @@
+"""What Franka publishes about its arms: kinematics, joint ranges and limits.
+
+Source: "Robot and interface specifications" of the Franka Control Interface documentation. Both
+arms have the same kinematics.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from vla_zenoh.types import FloatArray
+
+JOINTS = 7
+_TURN = math.pi / 2
+CRAIG = (
+    # a (m), d (m), alpha (rad)
+    (0.0, 0.333, 0.0),
+    (0.0, 0.0, -_TURN),
+    (0.0, 0.316, _TURN),
+    (0.0825, 0.0, _TURN),
+    (-0.0825, 0.384, -_TURN),
+    (0.0, 0.0, _TURN),
+    (0.088, 0.0, _TURN),
+)
+"""Denavit-Hartenberg parameters of joint 1 to 7, in Craig's convention."""
+FLANGE_M = 0.107
+"""From the frame of joint 7 to the flange, along z."""
+
+
+@dataclass(frozen=True)
+class Published:
+    """Limits of one kind of arm, joint 1 to 7.
+
+    Args:
+        fci: version of the interface that the robot speaks.
+        lower_rad: lower ends of the joint ranges.
+        upper_rad: upper ends.
+        velocity_rad_s: of the joints; the FR3's are smaller near the ends of the ranges.
+        acceleration_rad_s2: of the joints.
+        jerk_rad_s3: of the joints.
+        translation: of the end effector: m/s, m/s^2, m/s^3.
+        rotation: of the end effector: rad/s, rad/s^2, rad/s^3.
+        torque_nm: of the joints.
+    """
+
+    fci: int
+    lower_rad: tuple[float, ...]
+    upper_rad: tuple[float, ...]
+    velocity_rad_s: tuple[float, ...]
+    acceleration_rad_s2: tuple[float, ...]
+    jerk_rad_s3: tuple[float, ...]
+    translation: tuple[float, float, float]
+    rotation: tuple[float, float, float]
+    torque_nm: tuple[float, ...] = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)
+
+
+PANDA = Published(
+    fci=5,
+    lower_rad=(-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973),
+    upper_rad=(2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973),
+    velocity_rad_s=(2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61),
+    acceleration_rad_s2=(15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0),
+    jerk_rad_s3=(7500.0, 3750.0, 5000.0, 6250.0, 7500.0, 10000.0, 10000.0),
+    translation=(1.7, 13.0, 6500.0),
+    rotation=(2.5, 25.0, 12500.0),
+)
+FR3 = Published(
+    fci=10,
+    lower_rad=(-2.7437, -1.7837, -2.9007, -3.0421, -2.8065, 0.5445, -3.0159),
+    upper_rad=(2.7437, 1.7837, 2.9007, -0.1518, 2.8065, 4.5169, 3.0159),
+    velocity_rad_s=(2.62, 2.62, 2.62, 2.62, 5.26, 4.18, 5.26),
+    acceleration_rad_s2=(10.0,) * JOINTS,
+    jerk_rad_s3=(5000.0,) * JOINTS,
+    translation=(3.0, 9.0, 4500.0),
+    rotation=(2.5, 17.0, 8500.0),
+)
+BY_FCI: Mapping[int, Published] = {limits.fci: limits for limits in (PANDA, FR3)}
+
+
+def flange_pose(position_rad: FloatArray) -> FloatArray:
+    """(4, 4): the flange in the base frame, with the joints at `position_rad` (7,)."""
+    pose = np.eye(4)
+    for (a, d, alpha), theta in zip(CRAIG, position_rad, strict=True):
+        ct, st, ca, sa = math.cos(theta), math.sin(theta), math.cos(alpha), math.sin(alpha)
+        pose = pose @ np.array(
+            [
+                [ct, -st, 0.0, a],
+                [st * ca, ct * ca, -sa, -d * sa],
+                [st * sa, ct * sa, ca, d * ca],
+                [0.0, 0.0, 0.0, 1.0],
+            ]
+        )
+    pose[:3, 3] += FLANGE_M * pose[:3, 2]
+    return pose

@@ -1,0 +1,75 @@
+"""The systemd unit by which a computer runs ``vla-zenoh up`` from boot on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+STOP_S = 15
+"""`up` brakes the arm and ends its nodes in 3 s; a stuck one is killed after this."""
+RT_PRIORITY = 50
+"""What nodes that move an arm may ask for."""
+
+UNIT = """\
+[Unit]
+Description=vla-zenoh: {what}
+Wants=network-online.target
+After=network-online.target
+
+[Service]
+Type=exec
+User={user}
+{environment}ExecStart={command}
+# The first signal goes to `up` alone: it brakes the arm, then ends every node.
+KillMode=mixed
+KillSignal=SIGTERM
+TimeoutStopSec={stop_s}
+Restart=on-failure
+RestartSec=5
+LimitRTPRIO={priority}
+LimitMEMLOCK=infinity
+NoNewPrivileges=yes
+
+[Install]
+WantedBy=multi-user.target
+"""
+
+
+def systemd_unit(
+    what: str, command: Sequence[str], user: str, environment: Mapping[str, str]
+) -> str:
+    """Text of the unit.
+
+    Args:
+        what: its description.
+        command: absolute path of the program, and its arguments.
+        user: whom it runs as.
+        environment: variables that the program needs.
+
+    Raises:
+        ValueError: a word that no unit can hold.
+    """
+    lines = "".join(
+        f"Environment={_quoted(f'{name}={value}')}\n" for name, value in environment.items()
+    )
+    words = " ".join(_quoted(word.replace("$", "$$")) for word in command)
+    return UNIT.format(
+        what=_line(what),
+        user=_line(user),
+        environment=lines,
+        command=words,
+        stop_s=STOP_S,
+        priority=RT_PRIORITY,
+    )
+
+
+def _line(text: str) -> str:
+    """Text without specifiers (systemd.unit(5))."""
+    if not text.isprintable():
+        raise ValueError(f"{text!r} has characters that a systemd unit cannot hold")
+    return text.replace("%", "%%")
+
+
+def _quoted(word: str) -> str:
+    """A word as systemd.syntax(7) quotes it."""
+    escaped = _line(word).replace("\\", "\\\\").replace('"', '\\"')
+    return escaped if escaped and not set(escaped) & set(" \t\"'\\;") else f'"{escaped}"'

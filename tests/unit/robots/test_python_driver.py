@@ -1,0 +1,175 @@
+"""A robot in a Python file, driven without a bus."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vla_zenoh.errors import NodeError
+from vla_zenoh.interop.python_reading import FAULT_NS
+from vla_zenoh.profile import load_profile
+from vla_zenoh.robots.driver import Report
+from vla_zenoh.robots.python_driver import PythonDriver
+from vla_zenoh.types import Event, GripperCommand, JointCommand
+from vla_zenoh.types.commands import JointReference
+
+ARM = """
+from vla_zenoh.robot import Reading
+
+
+class MyArm:
+    def __init__(self):
+        self.calls, self.said = [], {}
+
+    def read(self):
+        if "raises" in self.said:
+            raise OSError("the cable is out")
+        return Reading(**{"position_rad": [0, -0.0439, 0, -2.627, 0, 2.583, 0.785], **self.said})
+
+    def move(self, command):
+        self.calls.append(command)
+"""
+MORE = """
+    def connect(self):
+        self.calls.append("connect")
+
+    def grip(self, width_m, speed_m_s, force_n):
+        self.calls.append((width_m, speed_m_s, force_n))
+
+    def recover(self):
+        self.calls.append("recover")
+
+    def status(self):
+        return {"temperature_c": 40}
+
+    def close(self):
+        self.calls.append("close")
+"""
+PROFILE = """
+extends: panda_sim
+robot: {driver: arm, command: joint}
+arm: {file: my_arm.py}
+cameras: {front: null, wrist: null}
+hosts: {here: {nodes: [router, arm, command, worker]}}
+"""
+MS_NS = 1_000_000
+
+
+class Rig:
+    """A driver, its arm, and what it reported."""
+
+    def __init__(self, folder: Path, arm: str) -> None:
+        (folder / "my_arm.py").write_text(arm)
+        (folder / "lab.yaml").write_text(PROFILE)
+        self.driver = PythonDriver(load_profile(str(folder / "lab.yaml")))
+        assert isinstance(self.driver.report, Report)
+        self.report = self.driver.report
+        self.now_ns = 10**12
+
+    @property
+    def calls(self) -> list[Any]:
+        return self.driver.robot.calls
+
+    def read(self, **said: Any) -> Any:
+        self.now_ns += FAULT_NS
+        self.driver.robot.said = said
+        return self.driver.read(self.now_ns)
+
+    def told(self, what: str) -> list[Event]:
+        return [event for event in self.report.events if event.what == what]
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Rig:
+    return Rig(tmp_path, ARM + MORE)
+
+
+@pytest.fixture
+def plain(tmp_path: Path) -> Rig:
+    return Rig(tmp_path, ARM)
+
+
+def test_a_reading_becomes_a_measurement(rig: Rig) -> None:
+    measurement = rig.read(width_m=0.03, wrench=[1, 2, 3, 0, 0, 0])
+    assert measurement.joints.names == rig.driver.profile.robot.arm_joints
+    np.testing.assert_allclose(measurement.pose.wrench[:3], [1, 2, 3])
+    assert measurement.gripper.width_m == 0.03
+
+
+def test_a_set_point_reaches_the_arm_as_a_command(rig: Rig) -> None:
+    rad = np.full(7, 0.1)
+    rig.driver.move(JointReference(rad, rad / 2, rad / 4), 0)
+    (command,) = rig.calls
+    assert isinstance(command, JointCommand)
+    np.testing.assert_array_equal(command.velocity_rad_s, rad / 2)
+    assert rig.report.counters["arm.commands_given"] == 1
+
+
+def test_an_invalid_reading_is_rejected_and_its_fault_counts(rig: Rig) -> None:
+    assert rig.read(position_rad=[float("nan")] * 7, fault="the user stop is pressed") is None
+    assert rig.driver.fault == "the user stop is pressed"
+    assert rig.driver.away == "fault"
+    assert rig.report.counters["refused.invalid"] == 1
+    assert rig.told("robot_fault")[0].why == "the user stop is pressed"
+    rig.read()
+    assert (rig.driver.fault, rig.driver.away) == ("", "")
+
+
+def test_the_same_measurement_twice_is_one(rig: Rig) -> None:
+    assert rig.read(measured_ns=5) is not None
+    assert rig.read(measured_ns=5) is None
+
+
+def test_what_the_class_raises_names_file_and_method(rig: Rig) -> None:
+    with pytest.raises(NodeError, match=r"my_arm.py: read: .*the cable is out"):
+        rig.read(raises=True)
+
+
+def test_a_robot_in_another_mode_takes_no_commands_and_says_so(rig: Rig) -> None:
+    rig.read()
+    rig.read(mode="Guiding")
+    assert (rig.driver.gripper_mode, rig.driver.away) == ("Guiding", "not_ready")
+    rig.read()
+    assert (rig.driver.gripper_mode, rig.driver.away) == ("ready", "")
+    assert len(rig.told("robot:ready->Guiding")) == len(rig.told("robot:Guiding->ready")) == 1
+
+
+def test_a_grasp_and_the_loss_of_the_object_are_told_once(rig: Rig) -> None:
+    for _ in range(3):
+        rig.read(width_m=0.04, holding=True)
+    assert len(rig.told("grasped")) == 1
+    for _ in range(3):
+        rig.read(width_m=0.0, holding=False)
+    assert len(rig.told("object_lost")) == 1
+
+
+def test_letting_go_is_no_loss(rig: Rig) -> None:
+    rig.read(width_m=0.04, holding=True)
+    rig.read(width_m=0.05, holding=False, moving=True)
+    rig.read(width_m=0.08, holding=False)
+    assert not rig.told("object_lost")
+
+
+def test_optional_methods_are_called(rig: Rig) -> None:
+    driver = rig.driver
+    assert driver.recovers
+    assert not driver.no_gripper
+    driver.connect()
+    driver.grip(GripperCommand(0.02, 0.1, 5.0), 0)
+    driver.recover()
+    driver.close()
+    assert rig.calls == ["connect", (0.02, 0.1, 5.0), "recover", "close"]
+    assert driver.status().detail["temperature_c"] == 40
+    assert driver.status().detail["width_m"] == 0.02  # none was measured: that of the command
+
+
+def test_they_may_be_missing(plain: Rig) -> None:
+    driver = plain.driver
+    driver.connect()
+    driver.recover()
+    driver.close()
+    assert not driver.recovers
+    assert driver.no_gripper == "my_arm.py has no method grip"
