@@ -44,8 +44,12 @@ class PerfectArm:
         """Least and greatest position of every arm joint, (n,) each."""
         return self._kinematics.lower_rad, self._kinematics.upper_rad
 
-    def tick(self, reference: PoseReference) -> None:
-        """A millisecond: the TCP is there, and the joints follow without their elbow."""
+    def tick(self, reference: PoseReference | JointReference) -> None:
+        """A millisecond: TCP or joints are there; the TCP's joints follow without their elbow."""
+        if isinstance(reference, JointReference):
+            self._joints, self._rates = reference.position_rad, reference.velocity_rad_s
+            self._pose = self._kinematics.forward(self._joints)
+            return
         pose, jacobian = self._kinematics.pose_and_jacobian(self._joints)
         turn = log3(reference.rotation @ pose.rotation.T)
         apart = np.concatenate([reference.position_m - pose.position_m, turn])
@@ -55,11 +59,6 @@ class PerfectArm:
         self._pose = self._pose._replace(
             position_m=reference.position_m, rotation=reference.rotation
         )
-
-    def tick_joint(self, reference: JointReference) -> None:
-        """A millisecond: the joints are there."""
-        self._joints, self._rates = reference.position_rad, reference.velocity_rad_s
-        self._pose = self._kinematics.forward(self._joints)
 
     def joint_state(self) -> JointState:
         """Measured."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -44,7 +46,8 @@ def stop(
     """Measure how long `vla-zenoh stop` takes at 0.2 m/s, on an idle and on a busy computer.
 
     From the start of the process to the sample on the key, to the transition in the command node,
-    to the measured arm at rest.
+    to the measured arm at rest. The robot, the command and the busy processes are in sessions of
+    their own, as of three terminals.
     """
     profile = own_address(effective_profile("panda_sim"))
     profile = override(
@@ -119,7 +122,10 @@ class _Lab:
         client.pop_events()
         self._sample_s, began_s = 0.0, time.time()
         typed = subprocess.Popen(
-            self._typed("stop"), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+            self._typed("stop"),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
         )
         stopped_s = self._until("a transition", self._stopped_s, PATIENCE_S)
         self._until(
@@ -172,14 +178,13 @@ class _Lab:
 @contextmanager
 def _busy(count: int) -> Iterator[None]:
     """So many processes that compute without end."""
-    words = [sys.executable, "-c", "while True: pass"]
-    running = [subprocess.Popen(words) for _ in range(count)]
+    words = ["sh", "-c", 'for _ in "$@"; do while :; do :; done & done; wait', "sh", *"x" * count]
+    running = subprocess.Popen(words, start_new_session=True)
     try:
         yield
     finally:
-        for process in running:
-            process.kill()
-            process.wait()
+        os.killpg(running.pid, signal.SIGKILL)
+        running.wait()
 
 
 if __name__ == "__main__":

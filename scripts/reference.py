@@ -25,7 +25,7 @@ from typer.main import get_command
 import vla_zenoh
 from vla_zenoh.cli.help import examples
 from vla_zenoh.cli.main import app
-from vla_zenoh.keys import Keys
+from vla_zenoh.keys import KEY_PATHS
 from vla_zenoh.profile import Profile
 from vla_zenoh.security.roles import TABLE
 
@@ -167,30 +167,31 @@ def keys_page() -> str:
         "without certificates they are not checked."
     )
     rows = ["| key | payload | published by | read by |", "|---|---|---|---|"]
-    table = {row.member: row for row in TABLE}
-    for name, member in inspect.getmembers_static(Keys):
-        if name not in table:
-            continue
-        if isinstance(member, property):
-            text, doc = getattr(Keys("ROBOT", "ROOT"), name), member.__doc__
-        elif inspect.isfunction(member):
-            parameters = list(inspect.signature(member).parameters)[1:]
-            marks = [f"X{number}X" for number in range(len(parameters))]
-            text, doc = getattr(Keys("ROBOT", "ROOT"), name)(*marks), member.__doc__
-            for mark, parameter in zip(marks, parameters, strict=True):
-                text = text.replace(mark, f"<{parameter}>")
-        else:
-            continue
-        text = text.removeprefix("ROOT/ROBOT/")
-        row = table[name]
+    for row in sorted(TABLE, key=lambda row: row.member):
+        path = KEY_PATHS[row.member]
+        text = path.path.replace("{", "<").replace("}", ">")
         writers = sorted(r.value for r in (row.put | row.announce | row.answer))
         readers = sorted(r.value for r in (row.subscribe | row.ask | row.watch))
-        about = " ".join((doc or "").split()).replace("|", "\\|")
+        about = path.payload.replace("|", "\\|")
         rows.append(f"| `{text}` | {about} | {', '.join(writers)} | {', '.join(readers)} |")
     return "\n\n".join([*out, "\n".join(rows)]) + "\n"
 
 
 # -- commands -----------------------------------------------------------------------------------
+VARIABLES = {
+    "VLA_ZENOH_PROFILE": "the profile of every command that names none, as `--profile`; not of "
+    "`demo` and `bench`, which simulate a robot of their own",
+    "VLA_ZENOH_CONNECT": "where the router is, as `--connect`: `tcp/10.0.0.2:7447`",
+    "VLA_ZENOH_LISTEN": "where the router of `up` and `node router` listens, as `--listen`",
+    "VLA_ZENOH_HOST": "which host of the profile this computer is, as `--host`; see "
+    "[Security](../how-to/security.md)",
+    "VLA_ZENOH_PATH": "folders with `profiles/`, `models/` and `sim/` of your own, separated "
+    "by `:`; their contents are found by name: `vla-zenoh up ur5`",
+    "VLA_ZENOH_RENDERER": "`egl` or `raycast`, where `sim.renderer` is `auto`",
+    "VLA_ZENOH_API_KEY": "of `lab serve-openpi`, as `--api-key`",
+}
+
+
 def commands_of(command: Any, path: str) -> Iterator[tuple[str, Any]]:
     """A command and those under it."""
     if hasattr(command, "commands"):
@@ -229,6 +230,9 @@ def cli_page() -> str:
         wanted = path.split()
         found = [text for words, text in examples() if words[: len(wanted)] == wanted]
         out.append("```sh\n" + "\n".join(found) + "\n```")
+    rows = ["| variable | sets |", "|---|---|"]
+    rows += [f"| `{name}` | {text} |" for name, text in VARIABLES.items()]
+    out += ["## Environment variables", "\n".join(rows)]
     return "\n\n".join(out) + "\n"
 
 
@@ -367,8 +371,9 @@ def counters_page() -> str:
     rows += [f"| `{name}` | {text} |" for name, text in sorted(COUNTERS.items())]
     out.append("\n".join(rows))
     out.append(
-        "## Rejected messages\n\n`refused.<reason>` counts messages that were rejected. On the "
-        "command node chunks are counted as `refused.<reason>` too; on a robot node `pose_`, "
+        "## Rejected messages\n\n`refused.<reason>` counts messages that were rejected. Of chunks "
+        "`superseded`, `before_activation`, `unknown_worker` and `overtaken` belong to normal "
+        "operation: the command node counts them as `skipped.<reason>`. On a robot node `pose_`, "
         "`joint_` or `gripper_` stands before the reason of a command."
     )
     rows = ["| reason | why |", "|---|---|"]

@@ -18,6 +18,7 @@ import zenoh
 
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.keys import Keys
+from vla_zenoh.lab.certificates.lab_certificates import LabCertificates
 from vla_zenoh.lab.doctor.access_check import (
     REPLY_S,
     identities_of_all,
@@ -28,7 +29,6 @@ from vla_zenoh.lab.doctor.access_check import (
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.session import SecurityProfile
 from vla_zenoh.security.identity import Identity, Role
-from vla_zenoh.security.lab_certificates import LabCertificates
 from vla_zenoh.security.roles import Act
 from vla_zenoh.security.rules import EVERY_MESSAGE, access_control
 

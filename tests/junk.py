@@ -13,8 +13,7 @@ import zenoh
 from chain import Chain
 
 from vla_zenoh.codec import message, records
-from vla_zenoh.keys import SCHEMA, Keys
-from vla_zenoh.security.roles import key_members
+from vla_zenoh.keys import KEY_PATHS, SCHEMA, Keys
 from vla_zenoh.types import Event, GripperCommand, Header, JointCommand, Task
 
 HUGE = bytes(2_000_000)
@@ -76,9 +75,11 @@ class Junk(NamedTuple):
 def all_keys(keys: Keys) -> dict[str, str]:
     """Every key of the table by its name there, with names of parts that exist."""
     out: dict[str, str] = {}
-    for name, parameters in key_members().items():
+    for name, path in KEY_PATHS.items():
         member = getattr(keys, name)
-        out[name] = member(*(NAMES[part] for part in parameters)) if parameters else member
+        out[name] = (
+            member(*(NAMES[part] for part in path.parameters)) if path.parameters else member
+        )
     return out
 
 

@@ -113,8 +113,5 @@ class OwnArm:
             time.sleep(max(0, next_ns - time.monotonic_ns()) / 1e9)
             with self._lock:
                 target = self._target or target
-                if isinstance(target, JointReference):
-                    world.tick_joint(target)
-                else:
-                    world.tick(target)
+                world.tick(target)
                 self._state = (world.joint_state(), world.gripper_state(), time.monotonic_ns())

@@ -71,6 +71,7 @@ class OpenPi(Adapter):
         self._connection: ClientConnection | None = None
         self._until_closed = ExitStack()
         self._session: str | None = None
+        self._takes_reset = self._vllm
 
     def _connect(self) -> list[str]:
         if self._connection is not None:
@@ -93,11 +94,12 @@ class OpenPi(Adapter):
         seconds = struct.pack("ll", int(self.timeout_s), int(self.timeout_s % 1 * 1e6))
         connection.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, seconds)
         metadata = wire.read_metadata(connection.recv(self.timeout_s))
+        self._takes_reset = self._vllm or wire.SPEC in metadata
         return wire.mismatches(metadata, self.mapping)
 
     def _ask(self, fields: dict[str, Any], *, begins: bool) -> Any:
-        if self._vllm and begins:
-            self._session = uuid.uuid4().hex
+        if begins and self._takes_reset:
+            self._session = uuid.uuid4().hex if self._vllm else None
             wire.read_reset(self._call(wire.reset_request()))
         return wire.read_answer(self._call(wire.request(fields, self._session)))
 

@@ -74,7 +74,7 @@ def request(fields: Mapping[str, Any], session: str | None = None) -> bytes:
 
 
 def reset_request() -> bytes:
-    """An episode begins; vllm-omni only."""
+    """An episode begins; for vllm-omni and servers of ours."""
     return message.pack({"endpoint": "reset"})
 
 

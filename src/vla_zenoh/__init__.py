@@ -38,14 +38,7 @@ if TYPE_CHECKING:
     )
     from vla_zenoh.profile import Profile, load_profile
     from vla_zenoh.robot import Command, Reading, Robot
-    from vla_zenoh.types import (
-        ActionChunk,
-        GripperState,
-        Image,
-        JointState,
-        PoseState,
-        Stamped,
-    )
+    from vla_zenoh.types import ActionChunk, GripperState, Image, JointState, PoseState, Stamped
 
 _MODULES = {
     "bus.remote_robot": ("RemoteRobot", "connect"),

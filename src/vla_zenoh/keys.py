@@ -2,13 +2,13 @@
 in ``interop/ros2/keys.py``.
 
 A key is ``{root}/{robot}/...``: `Keys` makes the keys of one robot, `Kind` chooses the quality of
-service. The members below are the whole wire protocol.
+service. `KEY_PATHS` is the whole wire protocol.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
@@ -52,6 +52,38 @@ def key_chunk(name: str, what: str) -> str:
     return name
 
 
+class KeyPath:
+    """A key of a robot, or with ``*`` an expression of several; `Keys` makes its text.
+
+    Args:
+        path: below the robot; parameters are in braces.
+        payload: what is published or asked there.
+    """
+
+    def __init__(self, path: str, payload: str = "") -> None:
+        self.path, self.payload = path, payload
+        self.parameters = tuple(re.findall(r"{(\w+)}", path))
+
+    def text(self, keys: Keys, *parts: str) -> str:
+        """The whole key with `parts` in place of its parameters; they may be ``*``."""
+        own = self.path.format(**dict(zip(self.parameters, parts, strict=True)))
+        return f"{keys.root}/{keys.robot}/{own}"
+
+
+class _Key(KeyPath):
+    def __get__(self, keys: Keys, owner: object = None) -> str:
+        return self.text(keys)
+
+
+class _KeyOf(KeyPath):
+    def __get__(self, keys: Keys, owner: object = None) -> Callable[..., str]:
+        def named(*parts: str) -> str:
+            checked = map(key_chunk, parts, [f"{name} name" for name in self.parameters])
+            return self.text(keys, *checked)
+
+        return named
+
+
 @dataclass(frozen=True, slots=True)
 class Keys:
     """The keys of one robot.
@@ -69,216 +101,110 @@ class Keys:
         for part in self.root.split("/"):
             key_chunk(part, "root")
 
-    def _at(self, *parts: str) -> str:
-        return "/".join((self.root, self.robot, *parts))
-
     # -- streams of the robot side ------------------------------------------------------------
-    def camera_raw(self, camera: str) -> str:
-        """Pixels, C-contiguous RGB uint8 (H, W, 3); published while there are subscribers."""
-        return self._at("camera", key_chunk(camera, "camera name"), "raw")
-
-    def camera_jpeg(self, camera: str) -> str:
-        """A plain JPEG file, encoding image/jpeg; published while there are subscribers."""
-        return self._at("camera", key_chunk(camera, "camera name"), "jpeg")
-
-    def camera_fitted(self, camera: str, form: str) -> str:
-        """A JPEG as a model wants it, made where the camera is; see `size_variant`."""
-        return self._at(
-            "camera", key_chunk(camera, "camera name"), "fitted", key_chunk(form, "form")
-        )
-
-    @property
-    def state_joint(self) -> str:
-        """`JointState`."""
-        return self._at("state", "joint")
-
-    @property
-    def state_pose(self) -> str:
-        """`PoseState`, with the stamp and seq of the `JointState` it belongs to."""
-        return self._at("state", "pose")
-
-    @property
-    def state_gripper(self) -> str:
-        """`GripperState`, with the same stamp and seq."""
-        return self._at("state", "gripper")
+    camera_raw = _KeyOf(
+        "camera/{camera}/raw",
+        "Pixels, C-contiguous RGB uint8 (H, W, 3); published while there are subscribers.",
+    )
+    camera_jpeg = _KeyOf(
+        "camera/{camera}/jpeg",
+        "A plain JPEG file, encoding image/jpeg; published while there are subscribers.",
+    )
+    camera_fitted = _KeyOf(
+        "camera/{camera}/fitted/{form}",
+        "A JPEG in the form a model's spec asks for (``224x224-pad``), made where the camera is.",
+    )
+    state_joint = _Key("state/joint", "`JointState`.")
+    state_pose = _Key(
+        "state/pose", "`PoseState`, with the stamp and seq of the `JointState` it belongs to."
+    )
+    state_gripper = _Key("state/gripper", "`GripperState`, with the same stamp and seq.")
 
     # -- settings: plain text, any client may put ---------------------------------------------
-    @property
-    def prompt(self) -> str:
-        """Plain UTF-8 text."""
-        return self._at("prompt")
-
-    @property
-    def active(self) -> str:
-        """true / false, also 1/0, on/off. ``true while NAME``: as long as `holding` NAME is."""
-        return self._at("active")
-
-    def holding(self, holder: str) -> str:
-        """Liveliness token of a deadman: the arm stays active while it is there."""
-        return self._at("holding", key_chunk(holder, "holder"))
-
-    @property
-    def worker(self) -> str:
-        """Name of the worker whose chunks are carried out."""
-        return self._at("worker")
-
-    @property
-    def rate(self) -> str:
-        """Chunks per second, a plain number."""
-        return self._at("rate")
-
-    @property
-    def speed(self) -> str:
-        """Speed override, 0 to 100 percent of the planned speed: ``30`` or ``30 %``."""
-        return self._at("speed")
-
-    @property
-    def slower(self) -> str:
-        """As `speed`, but it can only lower it: for every role that may stop the arm."""
-        return self._at("slower")
-
-    @property
-    def stop(self) -> str:
-        """Anything: latched emergency stop."""
-        return self._at("stop")
-
-    @property
-    def reset(self) -> str:
-        """Anything: clears the emergency stop."""
-        return self._at("reset")
+    prompt = _Key("prompt", "Plain UTF-8 text.")
+    active = _Key(
+        "active",
+        "true / false, also 1/0, on/off. ``true while NAME``: as long as `holding` NAME is.",
+    )
+    holding = _KeyOf(
+        "holding/{holder}", "Liveliness token of a deadman: the arm stays active while it is there."
+    )
+    worker = _Key("worker", "Name of the worker whose chunks are carried out.")
+    rate = _Key("rate", "Chunks per second, a plain number.")
+    speed = _Key(
+        "speed", "Speed override, 0 to 100 percent of the planned speed: ``30`` or ``30 %``."
+    )
+    slower = _Key(
+        "slower", "As `speed`, but it can only lower it: for every role that may stop the arm."
+    )
+    stop = _Key("stop", "Anything: latched emergency stop.")
+    reset = _Key("reset", "Anything: clears the emergency stop.")
 
     # -- model workers ------------------------------------------------------------------------
-    @property
-    def task(self) -> str:
-        """`Task`: the settings as the command node agreed to them; workers follow it."""
-        return self._at("task")
-
-    def delta(self, worker: str) -> str:
-        """`ActionChunk` of one worker: the delta key."""
-        return self._at("delta", key_chunk(worker, "worker name"))
-
-    def spec(self, worker: str) -> str:
-        """The worker's `ModelSpec`, once a second and on request."""
-        return self._at("spec", key_chunk(worker, "worker name"))
-
-    def seen(self, worker: str, camera: str) -> str:
-        """JPEG of exactly the image the model was given; published while there are subscribers."""
-        return self._at("seen", key_chunk(worker, "worker name"), key_chunk(camera, "camera name"))
-
-    def seen_record(self, worker: str) -> str:
-        """`InferenceDebug`: prompt, raw output and steps of the same inference."""
-        return self._at("seen", key_chunk(worker, "worker name"))
+    task = _Key(
+        "task", "`Task`: the settings as the command node agreed to them; workers follow it."
+    )
+    delta = _KeyOf("delta/{worker}", "`ActionChunk` of one worker: the delta key.")
+    spec = _KeyOf("spec/{worker}", "The worker's `ModelSpec`, once a second and on request.")
+    seen = _KeyOf(
+        "seen/{worker}/{camera}",
+        "JPEG of exactly the image the model was given; published while there are subscribers.",
+    )
+    seen_record = _KeyOf(
+        "seen/{worker}", "`InferenceDebug`: prompt, raw output and steps of the same inference."
+    )
 
     # -- command node -------------------------------------------------------------------------
-    @property
-    def command_pose(self) -> str:
-        """`PoseCommand` at a fixed rate. The command node is its only writer."""
-        return self._at("command", "pose")
-
-    @property
-    def command_joint(self) -> str:
-        """`JointCommand`, in place of poses if the profile's robot is commanded by joints."""
-        return self._at("command", "joint")
-
-    @property
-    def command_gripper(self) -> str:
-        """`GripperCommand`, newest wins."""
-        return self._at("command", "gripper")
+    command_pose = _Key(
+        "command/pose", "`PoseCommand` at a fixed rate. The command node is its only writer."
+    )
+    command_joint = _Key(
+        "command/joint",
+        "`JointCommand`, in place of poses if the profile's robot is commanded by joints.",
+    )
+    command_gripper = _Key("command/gripper", "`GripperCommand`, newest wins.")
 
     # -- every node ---------------------------------------------------------------------------
-    def status(self, node: str) -> str:
-        """`NodeStatus`, 2 Hz and on change."""
-        return self._at("status", key_chunk(node, "node name"))
-
-    def event(self, node: str) -> str:
-        """`Event`."""
-        return self._at("event", key_chunk(node, "node name"))
-
-    def alive(self, node: str) -> str:
-        """Liveliness token."""
-        return self._at("alive", key_chunk(node, "node name"))
-
-    def clock(self, node: str) -> str:
-        """Query for the four stamps of NTP: the reply has its times of arrival and reply."""
-        return self._at("clock", key_chunk(node, "node name"))
+    status = _KeyOf("status/{node}", "`NodeStatus`, 2 Hz and on change.")
+    event = _KeyOf("event/{node}", "`Event`.")
+    alive = _KeyOf("alive/{node}", "Liveliness token.")
+    clock = _KeyOf(
+        "clock/{node}",
+        "Query for the four stamps of NTP: the reply has its times of arrival and reply.",
+    )
 
     # -- the simulator's own ------------------------------------------------------------------
-    @property
-    def sim_scene(self) -> str:
-        """`SceneState`: all generalised positions, for renderers."""
-        return self._at("sim", "scene")
-
-    @property
-    def sim_objects(self) -> str:
-        """`ObjectPoses`: true poses of all free objects, for measuring success."""
-        return self._at("sim", "objects")
-
-    @property
-    def sim_reset(self) -> str:
-        """Empty, or a seed as plain text: the arm goes home, objects are placed again."""
-        return self._at("sim", "reset")
-
-    @property
-    def sim_step(self) -> str:
-        """Query in lockstep mode: advance by so many nanoseconds, reply with the state."""
-        return self._at("sim", "step")
+    sim_scene = _Key("sim/scene", "`SceneState`: all generalised positions, for renderers.")
+    sim_objects = _Key(
+        "sim/objects", "`ObjectPoses`: true poses of all free objects, for measuring success."
+    )
+    sim_reset = _Key(
+        "sim/reset", "Empty, or a seed as plain text: the arm goes home, objects are placed again."
+    )
+    sim_step = _Key(
+        "sim/step", "Query in lockstep mode: advance by so many nanoseconds, reply with the state."
+    )
 
     # -- selectors ----------------------------------------------------------------------------
-    @property
-    def all_keys(self) -> str:
-        """All keys of this robot."""
-        return self._at("**")
-
-    @property
-    def without_images(self) -> tuple[str, ...]:
-        """The same without pictures; two-part keys that are added later are among them, too."""
-        return (self._at("*"), self._at("*", "*"))
+    all_keys = _Key("**")
+    all_raw_images = _Key("camera/*/raw")
+    all_deltas = _Key("delta/*")
+    all_specs = _Key("spec/*")
+    all_seen = _Key("seen/*/*")
+    all_seen_of = _KeyOf("seen/{worker}/*")
+    all_seen_records = _Key("seen/*")
+    all_status = _Key("status/*")
+    all_events = _Key("event/*")
+    all_alive = _Key("alive/*")
+    all_holding = _Key("holding/*")
 
     @property
     def without_raw_images(self) -> tuple[str, ...]:
-        """The same with JPEG alone: who listens to raw pictures makes cameras send 1 MB each."""
-        return (*self.without_images, self._at("camera", "*", "jpeg"), self._at("seen", "*", "*"))
+        """All keys, of images JPEG alone: a subscriber to raw ones makes cameras send 1 MB each.
 
-    @property
-    def all_raw_images(self) -> str:
-        """The raw pictures of every camera."""
-        return self._at("camera", "*", "raw")
-
-    @property
-    def all_deltas(self) -> str:
-        return self._at("delta", "*")
-
-    @property
-    def all_specs(self) -> str:
-        return self._at("spec", "*")
-
-    @property
-    def all_seen(self) -> str:
-        return self._at("seen", "*", "*")
-
-    @property
-    def all_seen_records(self) -> str:
-        return self._at("seen", "*")
-
-    def all_seen_of(self, worker: str) -> str:
-        """The pictures of one worker."""
-        return self._at("seen", key_chunk(worker, "worker name"), "*")
-
-    @property
-    def all_status(self) -> str:
-        return self._at("status", "*")
-
-    @property
-    def all_events(self) -> str:
-        return self._at("event", "*")
-
-    @property
-    def all_alive(self) -> str:
-        return self._at("alive", "*")
-
-    @property
-    def all_holding(self) -> str:
-        return self._at("holding", "*")
+        Keys of one or two parts that are added later are among them, too.
+        """
+        return tuple(map(self.full, ("*", "*/*", "camera/*/jpeg", "seen/*/*")))
 
     @property
     def all_robots(self) -> str:
@@ -291,15 +217,15 @@ class Keys:
 
     def full(self, key: str) -> str:
         """The way back of `short`; what begins with the root is taken as whole already."""
-        return key if key.startswith(f"{self.root}/") else self._at(key)
+        return key if key.startswith(f"{self.root}/") else f"{self.root}/{self.robot}/{key}"
 
     def group(self, key: str) -> str:
         """The first part below the robot: ``camera``, ``state``, ``prompt``; of others nothing."""
-        return self.short(key).split("/", 1)[0] if key.startswith(self._at("")) else ""
+        return self.short(key).split("/")[0] if self.short(key) != key else ""
 
     def on(self, other: Keys, key: str) -> str:
         """The key of `other` that says what `key` says of this robot."""
-        return other._at(self.short(key))
+        return other.full(self.short(key))
 
     @staticmethod
     def of(key: str, root: str) -> Keys | None:
@@ -311,6 +237,14 @@ class Keys:
             return Keys(robot, root)
         except ProfileError:
             return None
+
+
+KEY_PATHS: Mapping[str, KeyPath] = {
+    name: path
+    for name, path in vars(Keys).items()
+    if isinstance(path, KeyPath) and "*" not in path.path
+}
+"""Member of `Keys` -> its path, of all that are one key: the whole wire protocol."""
 
 
 def last_chunk(key: str) -> str:

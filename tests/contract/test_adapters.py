@@ -26,7 +26,8 @@ from peer_rig import (
 )
 
 from vla_zenoh.errors import PeerError, SpecError, WorkerError
-from vla_zenoh.policy import Observation, Policy, check_steps, example_observation
+from vla_zenoh.lab.check.examples import example_observation
+from vla_zenoh.policy import Observation, Policy, check_steps
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import JointState

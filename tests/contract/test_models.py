@@ -17,14 +17,8 @@ from vla_zenoh.control.actions import step_pose
 from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan
 from vla_zenoh.errors import SpecError, WorkerError
 from vla_zenoh.kinematics.so3 import Pose
-from vla_zenoh.policy import (
-    ActionSpec,
-    ActionSteps,
-    ModelSpec,
-    Policy,
-    check_steps,
-    example_observation,
-)
+from vla_zenoh.lab.check.examples import example_observation
+from vla_zenoh.policy import ActionSpec, ActionSteps, ModelSpec, Policy, check_steps
 from vla_zenoh.policy.loader import find_model, make_policy
 
 MODELS = resources.names("models")

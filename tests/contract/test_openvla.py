@@ -13,7 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vla_zenoh.errors import SpecError, WorkerError
-from vla_zenoh.policy import Policy, example_observation
+from vla_zenoh.lab.check.examples import example_observation
+from vla_zenoh.policy import Policy
 from vla_zenoh.policy.loader import find_model, import_model, make_policy
 
 MODEL = import_model(find_model("openvla"))

@@ -6,104 +6,24 @@ import os
 import signal
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from camera_rig import free_endpoint
-from chain import CHAIN_PATIENCE_S, Chain, running_chain
-from franka_rig import Simulator, simulator
+from franka_lab import REACHED_M, REACHED_RAD, Lab, running_lab
 
-from vla_zenoh.kinematics.so3 import held_pose, pose_distance, pose_of
+from vla_zenoh.kinematics.so3 import pose_distance, pose_of
 from vla_zenoh.policy.scripted_motions import STEP_RAD
 
-REACHED_M, REACHED_RAD = 1e-3, 2e-3
-SETTLE_S, AGAIN_S = 3.0, 30.0
-PROFILE = """
-extends: fr3
-franka: {{address: 127.0.0.1, realtime: ignore{franka}}}
-robot: {{command: {command}}}
-limits: {{workspace: {{z_m: [0.012, 0.95]}}}}
-task: {{prompt: hold, rate_hz: 10, worker: scripted}}
-session: {{listen: [{endpoint}], connect: [{endpoint}]}}
-timing: {{command_timeout_s: {patience_s[command]}, state_timeout_s: {patience_s[state]}}}
-"""
+AGAIN_S = 30.0
 
 pytestmark = pytest.mark.timeout(200)
 
 
-@dataclass
-class Lab:
-    """The chain, and the simulator that it drives."""
-
-    chain: Chain
-    robot: Simulator
-
-    def share(self, since: int) -> str:
-        """The figures to read beside a result."""
-        rate = self.chain.detail("control_command_success_rate", "arm")
-        return (
-            f"simulator at {self.robot.realtime_share(since):.2f} of real time, "
-            f"control_command_success_rate {rate}, load {os.getloadavg()[0]:.1f}"
-        )
-
-    def way(self, prompt: str, steps: int) -> tuple[float, float]:
-        """Carry out a prompt; how far set-point and measured TCP are apart at its end."""
-        chain = self.chain
-        chain.client.set_prompt("hold")
-        chain.wait_still()
-        chain.client.set_prompt(f"HARD: {prompt} x{steps}")
-        chain.until(
-            f"{steps} steps are carried out",
-            lambda: chain.detail("policy_done") and chain.detail("accepted_steps") >= steps,
-            40.0,
-        )
-        chain.wait_still()
-        return self.apart()
-
-    def apart(self) -> tuple[float, float]:
-        """The smallest distance within `SETTLE_S`: friction is integrated away."""
-        end_s, found = time.monotonic() + SETTLE_S, (np.inf, np.inf)
-        while time.monotonic() < end_s:
-            state = self.chain.measured()
-            found = min(found, pose_distance(pose_of(state), held_pose(state)))
-            time.sleep(0.05)
-        return found
-
-    def fault(self) -> str:
-        return self.chain.detail("fault", "arm") or ""
-
-    def go_on(self) -> None:
-        """What a person does: reset until the robot is well, and activate."""
-        chain = self.chain
-
-        def cleared() -> bool:
-            if chain.state() in ("fault", "stopped"):
-                chain.client.publish(chain.client.keys.reset, "")
-                time.sleep(0.3)
-            return chain.state() == "inactive" and not self.fault()
-
-        chain.until("the fault is cleared", cleared, AGAIN_S)
-        chain.activate_when_ready()
-
-
 @pytest.fixture(scope="module", params=["pose", "joint"])
 def running(request: pytest.FixtureRequest, tmp_path_factory: Any) -> Iterator[Lab]:
-    folder: Path = tmp_path_factory.mktemp("fr3")
-    profile = folder / "lab.yaml"
-    profile.write_text(
-        PROFILE.format(
-            endpoint=free_endpoint(),
-            command=request.param,
-            franka=", hand: false",
-            patience_s=CHAIN_PATIENCE_S,
-        )
-    )
-    with simulator("--no-gripper") as robot, running_chain(folder, profile_file=profile) as chain:
-        chain.recorder.only = {"state": "arm#", "command": "command#"}
-        yield Lab(chain, robot)
+    with running_lab(tmp_path_factory.mktemp("fr3"), request.param) as lab:
+        yield lab
 
 
 @pytest.fixture

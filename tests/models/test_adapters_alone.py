@@ -19,7 +19,7 @@ CODE = """
 import importlib.util, json, sys
 from vla_zenoh.errors import PeerError
 from vla_zenoh.policy.loader import find_model, make_policy
-from vla_zenoh.policy import example_observation
+from vla_zenoh.lab.check.examples import example_observation
 
 policy = make_policy(find_model(sys.argv[1]), json.loads(sys.argv[2]))
 policy.load()

@@ -15,6 +15,7 @@ import pytest
 
 from vla_zenoh import resources
 from vla_zenoh.errors import WorkerError
+from vla_zenoh.lab.check.examples import example_observation
 from vla_zenoh.lab.lockstep import Lockstep
 from vla_zenoh.lab.tasks import (
     HELD_OUT,
@@ -27,7 +28,7 @@ from vla_zenoh.lab.tasks import (
     draw_episode,
     phrase,
 )
-from vla_zenoh.policy import ActionSteps, Policy, check_steps, example_observation
+from vla_zenoh.policy import ActionSteps, Policy, check_steps
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import load_profile
 from vla_zenoh.simulation.render import Renderer

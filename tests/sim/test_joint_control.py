@@ -43,20 +43,21 @@ def follow_joints(
     world: World, references: Iterator[JointReference]
 ) -> tuple[JointReference, float]:
     """Run; the last reference at rest, and the largest error of any joint."""
-    reference, worst_rad = world.hold_joint_reference(), 0.0
+    reference, worst_rad = resting(world), 0.0
     for reference in references:
-        world.tick_joint(reference)
+        world.tick(reference)
         error = world.joint_state().position_rad - reference.position_rad
         worst_rad = max(worst_rad, float(np.abs(error).max()))
     return JointReference.at_rest(reference.position_rad), worst_rad
 
 
+def resting(world: World) -> JointReference:
+    return JointReference.at_rest(world.joint_state().position_rad)
+
+
 def hold(world: World, reference: PoseReference | JointReference, duration_s: float) -> None:
     for _ in range(round(duration_s / STEP_S)):
-        if isinstance(reference, JointReference):
-            world.tick_joint(reference)
-        else:
-            world.tick(reference)
+        world.tick(reference)
 
 
 def moved_while(
@@ -102,7 +103,7 @@ def test_the_state_tells_the_joints_that_are_held() -> None:
     state = world.joint_state()
     assert np.array_equal(state.reference_rad, state.position_rad)
     reference = JointReference.at_rest(np.array(HOME_RAD) + 0.01)
-    world.tick_joint(reference)
+    world.tick(reference)
     assert np.array_equal(world.joint_state().reference_rad, reference.position_rad)
     world.tick(world.hold_reference())
     state = world.joint_state()
@@ -113,7 +114,7 @@ def test_the_reference_pose_is_where_the_held_joints_put_the_tcp() -> None:
     world = make_world()
     path = list(swing(np.array(HOME_RAD), SWING_RAD, 0.5))
     for reference in path:
-        world.tick_joint(reference)
+        world.tick(reference)
     before = world.qpos()
     state = world.pose_state(path[-1])
     assert np.array_equal(before, world.qpos())
@@ -134,7 +135,7 @@ def test_the_arm_does_not_move_when_joints_take_over_from_a_pose(
     for reference in line(start, (0.1, 0.15, 0.2), 1.5):
         world.tick(reference)
     hold(world, still(reference), waits_s)
-    moved_m, moved_rad = moved_while(world, world.hold_joint_reference(), 1.0)
+    moved_m, moved_rad = moved_while(world, resting(world), 1.0)
     assert moved_m < CHANGE_LIMIT_M
     assert moved_rad < CHANGE_LIMIT_RAD
 
@@ -164,9 +165,9 @@ def loaded_world() -> World:
 @pytest.mark.parametrize("first", ["pose", "joint"])
 def test_a_load_is_carried_on_by_the_law_that_takes_over(first: str) -> None:
     world = loaded_world()
-    pose, joints = world.hold_reference(), world.hold_joint_reference()
+    pose, joints = world.hold_reference(), resting(world)
     hold(world, pose if first == "pose" else joints, SETTLE_S)
-    heres = (world.hold_reference(), world.hold_joint_reference())
+    heres = (world.hold_reference(), resting(world))
     here = heres[1] if first == "pose" else heres[0]
     moved_m, moved_rad = moved_while(world, here, 1.0)
     assert moved_m < CHANGE_LIMIT_M

@@ -23,8 +23,9 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from vla_zenoh.errors import PeerError, SpecError
+from vla_zenoh.lab.check.examples import example_observation
 from vla_zenoh.lab.serve.served_policy import make_served_policy
-from vla_zenoh.policy import ModelSpec, example_observation
+from vla_zenoh.policy import ModelSpec
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import load_profile
 
@@ -164,6 +165,21 @@ def test_our_own_adapter_drives_our_own_server() -> None:
         other = make_policy(find_model("openpi"), {**settings, "gripper": "absolute_m"})
         with pytest.raises(PeerError, match="its gripper is 'delta_m', 'absolute_m' is set"):
             other.infer(seen)
+
+
+def test_a_new_episode_of_our_adapter_is_one_of_our_server() -> None:
+    """A fixed number of steps, done in shadow mode, is done again after an activation."""
+    with serving("--worker", "scripted") as port:
+        settings = {"url": f"ws://127.0.0.1:{port}", "preset": "own", "gripper": "delta_m"}
+        policy: Any = make_policy(find_model("openpi"), settings)
+        seen = example_observation(policy.spec, prompt="HARD: go up x1")
+        try:
+            up_m = [policy.infer(seen).steps[0][2] for _ in range(2)]
+            policy.reset()
+            up_m += [policy.infer(seen).steps[0][2] for _ in range(2)]
+        finally:
+            policy.close()
+    np.testing.assert_allclose(up_m, [STEP_M, 0, STEP_M, 0], atol=ATOL_M)
 
 
 @pytest.mark.slow

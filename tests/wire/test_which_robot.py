@@ -22,10 +22,10 @@ from typer.testing import CliRunner, Result
 from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.cli.main import app
+from vla_zenoh.lab.certificates.lab_certificates import LabCertificates
 from vla_zenoh.nodes.command.node import CommandNode
 from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh.runtime.router import run_router
-from vla_zenoh.security.lab_certificates import LabCertificates
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(120)]
 

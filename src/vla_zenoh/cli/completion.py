@@ -65,15 +65,15 @@ def prompts(context: Any) -> Iterable[str]:
 
 def keys(context: Any) -> Iterable[str]:
     """Keys of the robot, below ``<root>/<robot>/``."""
+    from vla_zenoh.keys import KEY_PATHS
+
     profile = _profile(context)
     found = profile.keys
-    members = vars(type(found)).items()
-    named = [getattr(found, name) for name, kind in members if isinstance(kind, property)]
+    named = [path.text(found) for path in KEY_PATHS.values() if not path.parameters]
     named += map(found.camera_jpeg, profile.cameras)
     for worker in profile.workers:
         named += [found.delta(worker), found.spec(worker), found.seen_record(worker)]
-    words = [found.short(word) for word in named if isinstance(word, str)]
-    return [word for word in words if "*" not in word]
+    return map(found.short, named)
 
 
 class Candidate(NamedTuple):

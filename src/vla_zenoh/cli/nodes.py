@@ -93,7 +93,7 @@ def ros2(node: NodeOptions) -> None:
 
 @options
 def arm(node: NodeOptions) -> None:
-    """Drive an arm with the Python driver that the profile names in `arm.file`."""
+    """Drive an arm with a Python class: that of `arm.file` in the profile, or a Franka's."""
     from vla_zenoh.robots.python_driver import PythonDriver
 
     _run_robot(node, "arm", PythonDriver)

@@ -50,7 +50,7 @@ def decode_raw(payload: bytes, schema: str) -> Image:
     if match is None:
         raise CodecError("malformed", f"raw image schema {shown(schema)}, wanted rgb8;HEIGHTxWIDTH")
     height, width = int(match[1]), int(match[2])
-    _check_size(height, width)
+    check_size(height, width)
     if len(payload) != height * width * 3:
         raise CodecError("truncated", f"{len(payload)} bytes for an rgb8 image of {height}x{width}")
     return Image(np.frombuffer(payload, np.uint8).reshape(height, width, 3))
@@ -63,7 +63,7 @@ def encode_jpeg(image: Image, quality: int = DEFAULT_JPEG_QUALITY) -> bytes:
         CodecError: the picture is larger than `decode_jpeg` reads.
     """
     height, width, _ = image.rgb.shape
-    _check_size(height, width)
+    check_size(height, width)
     ok, data = cv2.imencode(
         ".jpg", cv2.cvtColor(image.rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality]
     )
@@ -84,7 +84,7 @@ def decode_jpeg(payload: bytes) -> Image:
         raise CodecError("malformed", "not a JPEG file")
     if payload.rstrip(b"\0")[-2:] != b"\xff\xd9":
         raise CodecError("truncated", "a JPEG file without its end")
-    _check_size(*_jpeg_size(payload))
+    check_size(*_jpeg_size(payload))
     try:
         bgr = cv2.imdecode(np.frombuffer(payload, np.uint8), cv2.IMREAD_COLOR)
     except cv2.error as error:
@@ -96,7 +96,12 @@ def decode_jpeg(payload: bytes) -> Image:
     return Image(rgb)
 
 
-def _check_size(height: int, width: int) -> None:
+def check_size(height: int, width: int) -> None:
+    """Make sure that an image of this size may be decoded.
+
+    Raises:
+        CodecError: it has no pixels, or too many.
+    """
     sides_fit = 1 <= height <= MAX_SIDE and 1 <= width <= MAX_SIDE
     if not sides_fit or height * width > MAX_PIXELS:
         raise CodecError(

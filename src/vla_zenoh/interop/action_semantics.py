@@ -41,9 +41,7 @@ from vla_zenoh.policy import (
     ControllerSpec,
     Frame,
     GripperSemantics,
-    MotionKind,
     RelativeTo,
-    Rotation,
 )
 from vla_zenoh.policy.model_options import number, one_of, whole_number
 from vla_zenoh.profile import Profile
@@ -114,18 +112,26 @@ ACTION_OPTIONS: Mapping[str, str] = {
 ADDED_TO = ("anchor", "relative_to", "controller")
 """What deltas are added to, and how much of them is covered."""
 NO_CONTROLLER = "none"
-OPEN = ("high", "low")
 QUATERNION_SLACK = 0.1
 """A quaternion this far from unit length is normalised; further off it is rejected."""
+_ALLOWED: Mapping[str, tuple[str, ...]] = {
+    "action": get_args(Action),
+    "rotation": get_args(ForeignRotation),
+    "frame": get_args(Frame),
+    "anchor": get_args(Anchor),
+    "relative_to": get_args(RelativeTo),
+    "gripper": get_args(GripperSemantics),
+    "gripper_open": ("high", "low"),
+}
 _ASKED: Mapping[str, str] = {
-    "action": " or ".join(get_args(Action)),
+    "action": " or ".join(_ALLOWED["action"]),
     "controller": "none, or KP:DAMPING_RATIO where the data's controller covers only a part of a "
     "step: 150:1 for robosuite and LIBERO",
     "relative_to": "previous or start: is a delta added to the step before it, or to the start of "
     "its chunk?",
     "anchor": "goal or measured: what does a chunk begin at?",
-    "rotation": " or ".join(get_args(ForeignRotation)),
-    "gripper": " or ".join(get_args(GripperSemantics)),
+    "rotation": " or ".join(_ALLOWED["rotation"]),
+    "gripper": " or ".join(_ALLOWED["gripper"]),
     "gripper_open": "high or low: is the gripper open where its number is large?",
     "dt_s": "seconds of a step, 1 / fps of the data",
     "horizon": "how many steps of an answer are taken",
@@ -239,41 +245,32 @@ def read_action_semantics(
     if other:
         known = {name: value for name, value in known.items() if name == "horizon"}
     chosen = {**ACTION_OPTIONS, **known, **given, "action": action}
-    for name, allowed in (
-        ("action", get_args(Action)),
-        ("rotation", get_args(ForeignRotation)),
-        ("frame", get_args(Frame)),
-        ("anchor", get_args(Anchor)),
-        ("relative_to", get_args(RelativeTo)),
-        ("gripper", get_args(GripperSemantics)),
-        ("gripper_open", OPEN),
-    ):
+    for name, allowed in _ALLOWED.items():
         if chosen[name]:
             one_of(name, chosen[name], allowed)
     _ask_for_missing(chosen, f"action={action} is not that of {whose}, so " if other else "")
-    joints = _of_joints(action)
-    rotation = "quat_xyzw" if joints else chosen["rotation"]
+    if _of_joints(action):  # become poses
+        chosen |= {"rotation": "quat_xyzw", "frame": "base"}
+    position, rotation, joint = (
+        number(name, chosen[name])
+        for name in ("position_scale_m", "rotation_scale_rad", "joint_scale_rad")
+    )
     return ActionSemantics(
-        spec=_spec(chosen, rotation, normalisation),
+        spec=_spec(chosen, normalisation),
         action=cast(Action, action),
-        rotation=cast(ForeignRotation, rotation),
+        rotation=cast(ForeignRotation, chosen["rotation"]),
         clip=number("clip", chosen["clip"] or "0"),
-        scales=(
-            number("position_scale_m", chosen["position_scale_m"]),
-            number("rotation_scale_rad", chosen["rotation_scale_rad"]),
-            number("joint_scale_rad", chosen["joint_scale_rad"]),
-        ),
+        scales=(position, rotation, joint),
     )
 
 
 def _ask_for_missing(chosen: Mapping[str, str], why: str) -> None:
-    wanted = set(_ASKED)
+    known = _not_asked(chosen)
     if _of_joints(chosen["action"]):
-        wanted -= {"rotation"}
-    wanted -= _not_asked(chosen)
+        known |= {"rotation"}
     if chosen["gripper"] not in ("", "open_fraction", "binary"):
-        wanted -= {"gripper_open"}
-    missing = [name for name in _ASKED if name in wanted and not chosen[name]]
+        known |= {"gripper_open"}
+    missing = [name for name in _ASKED if name not in known and not chosen[name]]
     if missing:
         raise SpecError(
             f"{why}the meaning of the numbers is missing: "
@@ -311,25 +308,24 @@ def read_controller(text: str) -> ControllerSpec | None:
         )
 
 
-def _spec(chosen: Mapping[str, str], rotation: str, normalisation: str | None) -> ActionSpec:
-    action = chosen["action"]
-    quaternion = rotation.startswith("quat")
+def _spec(chosen: Mapping[str, str], normalisation: str | None) -> ActionSpec:
+    rotation, threshold = chosen["rotation"], chosen["gripper_threshold"]
     with as_spec_error():
-        return ActionSpec(
-            horizon=whole_number("horizon", chosen["horizon"]),
-            dt_s=number("dt_s", chosen["dt_s"]),
-            kind=cast(MotionKind, "absolute" if _of_joints(action) else action),
-            frame=cast(Frame, "base" if _of_joints(action) else chosen["frame"]),
-            anchor=cast(Anchor, chosen["anchor"] or "goal"),
-            relative_to=cast(RelativeTo, chosen["relative_to"] or "previous"),
-            controller=read_controller(chosen["controller"]),
-            rotation="quaternion" if quaternion else cast(Rotation, rotation),
-            gripper=cast(GripperSemantics, chosen["gripper"]),
-            gripper_open_is_high=chosen["gripper_open"] != "low",
-            gripper_threshold=number(
-                "gripper_threshold", chosen["gripper_threshold"], least=-math.inf
-            ),
-            normalisation=normalisation,
+        return ActionSpec.model_validate(
+            {
+                "horizon": whole_number("horizon", chosen["horizon"]),
+                "dt_s": number("dt_s", chosen["dt_s"]),
+                "kind": "absolute" if _of_joints(chosen["action"]) else chosen["action"],
+                "frame": chosen["frame"],
+                "anchor": chosen["anchor"] or "goal",
+                "relative_to": chosen["relative_to"] or "previous",
+                "controller": read_controller(chosen["controller"]),
+                "rotation": "quaternion" if rotation.startswith("quat") else rotation,
+                "gripper": chosen["gripper"],
+                "gripper_open_is_high": chosen["gripper_open"] != "low",
+                "gripper_threshold": number("gripper_threshold", threshold, least=-math.inf),
+                "normalisation": normalisation,
+            }
         )
 
 

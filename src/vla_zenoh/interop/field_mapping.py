@@ -19,7 +19,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, cast
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +38,6 @@ from vla_zenoh.policy import (
     ModelSpec,
     Observation,
     ObservationSpec,
-    Resize,
     StatePart,
 )
 from vla_zenoh.policy.state_vector import parts_of, read_parts, state_vector
@@ -254,23 +253,15 @@ def read_field_mapping(
 def _observation(
     fields: Mapping[str, FieldSource], chosen: Mapping[str, str], joints: bool
 ) -> ObservationSpec:
-    size = read_size(chosen["size"])
+    form: dict[str, Any] = {"colour": chosen["colour"]}
+    if size := read_size(chosen["size"]):
+        form |= {"width": size[0], "height": size[1], "resize": chosen["resize"]}
     parts = {part for source in fields.values() for part in parts_of(source.parts)}
     parts |= {"joint"} if joints else set()
-    order: tuple[StatePart, ...] = ("joint", "pose", "gripper")
     cameras = dict.fromkeys(source.camera for source in fields.values() if source.camera)
     return ObservationSpec(
-        cameras=tuple(
-            CameraSpec(
-                camera=camera,
-                width=size[0] if size else None,
-                height=size[1] if size else None,
-                resize=cast(Resize, chosen["resize"] if size else "none"),
-                colour=cast(Literal["rgb", "bgr"], chosen["colour"]),
-            )
-            for camera in cameras
-        ),
-        state=tuple(part for part in order if part in parts),
+        cameras=tuple(CameraSpec(camera=camera, **form) for camera in cameras),
+        state=tuple(part for part in get_args(StatePart) if part in parts),
         prompt=any(source.prompt for source in fields.values()),
     )
 

@@ -20,7 +20,6 @@ from vla_zenoh.policy.spec import (
     Rotation,
     StatePart,
     check_steps,
-    example_observation,
     reset_of,
     takes_robot,
 )
@@ -45,7 +44,6 @@ __all__ = [
     "Rotation",
     "StatePart",
     "check_steps",
-    "example_observation",
     "reset_of",
     "takes_robot",
 ]

@@ -412,33 +412,3 @@ def check_steps(spec: ActionSpec, steps: ArrayLike) -> NDArray[np.float32]:
     if not np.isfinite(array).all():
         raise SpecError("steps hold NaN or infinity", "not_finite")
     return array
-
-
-def example_observation(
-    spec: ModelSpec, *, prompt: str = "put the red brick in the box"
-) -> Observation:
-    """A valid observation of the declared form, gray images and an arm at rest: for dry runs.
-
-    It has the parts of the state that the spec asks for, and no others.
-    """
-    asked = spec.observation.state
-    images = {
-        camera.camera: np.full((camera.height or 480, camera.width or 640, 3), 128, np.uint8)
-        for camera in spec.observation.cameras
-    }
-    zeros = np.zeros(7)
-    return Observation(
-        stamp_wall_ns=0,
-        seq=0,
-        task=Task(episode=0, active=False, prompt=prompt, worker=spec.name, rate_hz=5.0),
-        images=images,
-        joint=JointState(tuple(f"joint{i}" for i in range(1, 8)), zeros, zeros, zeros)
-        if "joint" in asked
-        else None,
-        pose=PoseState(np.array([0.45, 0.0, 0.3]), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(6))
-        if "pose" in asked
-        else None,
-        gripper=GripperState(width_m=0.08, moving=False, holding=False)
-        if "gripper" in asked
-        else None,
-    )

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field
 
-from vla_zenoh.profile.section import Range, Section, reject
+from vla_zenoh.profile.section import Fault, Range, Section
 
 
 def _one_for_all(value: Any) -> Any:
@@ -100,11 +101,6 @@ class RotationLimits(Section):
     jerk_rad_s3: float = Field(default=60.0, gt=0, le=12500)
 
 
-def _values(section: Section, *pairs: tuple[str, str]) -> list[tuple[str, Any, str, Any]]:
-    """Each pair of fields with their values, as (name, value, name, value)."""
-    return [(a, getattr(section, a), b, getattr(section, b)) for a, b in pairs]
-
-
 class ReachLimits(Section):
     """Limits of goals by the arm's kinematics; see `vla_zenoh.control.reachability`.
 
@@ -131,21 +127,13 @@ class ReachLimits(Section):
     table_slow_m: float = Field(default=0.002, ge=0, le=0.3)
     table_stop_m: float = Field(default=0.001, ge=0, le=0.3)
 
-    @model_validator(mode="after")
-    def _a_stop_lies_behind_its_slow(self) -> ReachLimits:
-        reject(
-            [
-                ((stop,), f"is {at:g}, which must not be above {slow} ({before:g})")
-                for slow, before, stop, at in _values(
-                    self,
-                    ("singularity_slow", "singularity_stop"),
-                    ("collision_slow_m", "collision_stop_m"),
-                    ("table_slow_m", "table_stop_m"),
-                )
-                if at > before
-            ]
-        )
-        return self
+    def contradictions(self) -> Iterator[Fault]:
+        """A stop that lies before its slow."""
+        for name in ("singularity{}", "collision{}_m", "table{}_m"):
+            slow, stop = name.format("_slow"), name.format("_stop")
+            before, at = getattr(self, slow), getattr(self, stop)
+            if at > before:
+                yield (stop,), f"is {at:g}, which must not be above {slow} ({before:g})"
 
 
 class ContactLimits(Section):
@@ -173,21 +161,13 @@ class ContactLimits(Section):
     effort_stop_nm: float | None = Field(default=None, gt=0, le=200)
     retreat_m_s: float = Field(default=0.15, gt=0, le=0.5)
 
-    @model_validator(mode="after")
-    def _a_stop_lies_above_its_slow(self) -> ContactLimits:
-        reject(
-            [
-                ((slow,), f"is {before}, which must be below {stop} ({at})")
-                for slow, before, stop, at in _values(
-                    self,
-                    ("force_slow_n", "force_stop_n"),
-                    ("torque_slow_nm", "torque_stop_nm"),
-                    ("effort_slow_nm", "effort_stop_nm"),
-                )
-                if before is not None and (at is None or before >= at)
-            ]
-        )
-        return self
+    def contradictions(self) -> Iterator[Fault]:
+        """A stop that does not lie above its slow."""
+        for name in ("force{}_n", "torque{}_nm", "effort{}_nm"):
+            slow, stop = name.format("_slow"), name.format("_stop")
+            before, at = getattr(self, slow), getattr(self, stop)
+            if before is not None and (at is None or before >= at):
+                yield (slow,), f"is {before}, which must be below {stop} ({at})"
 
 
 class Limits(Section):
@@ -232,15 +212,9 @@ class Limits(Section):
     tracking_rad: float = Field(default=0.3, gt=0, le=1.0)
     elbow_rad: float = Field(default=0.35, gt=0, le=1.5)
 
-    @model_validator(mode="after")
-    def _a_step_fits_the_leash(self) -> Limits:
-        reject(
-            [
-                ((step,), f"is {value:g}, longer than the leash {lead} ({limit:g})")
-                for step, value, lead, limit in _values(
-                    self, ("step_m", "lead_m"), ("step_rad", "lead_rad")
-                )
-                if value > limit
-            ]
-        )
-        return self
+    def contradictions(self) -> Iterator[Fault]:
+        """A step that is longer than the leash."""
+        for step, lead in (("step_m", "lead_m"), ("step_rad", "lead_rad")):
+            value, limit = getattr(self, step), getattr(self, lead)
+            if value > limit:
+                yield (step,), f"is {value:g}, longer than the leash {lead} ({limit:g})"

@@ -14,12 +14,7 @@ from vla_zenoh.errors import ProfileError
 from vla_zenoh.profile import yaml_text
 from vla_zenoh.profile.profile import Profile
 from vla_zenoh.profile.section import Lines, Place, explain
-from vla_zenoh.resources import (
-    ROBOT_DATA_PREFIX,
-    extended_profile,
-    is_path,
-    profile_file,
-)
+from vla_zenoh.resources import ROBOT_DATA_PREFIX, extended_profile, is_path, profile_file
 
 MAX_EXTENDS = 8
 REPLACED_WHOLE = {("hosts",)}

@@ -7,14 +7,14 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field
 
 from vla_zenoh import keys
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.keys import NODE_KINDS, Keys
 from vla_zenoh.profile.limits import Limits
 from vla_zenoh.profile.robot import ArmProfile, FrankaProfile, Options, RobotProfile
-from vla_zenoh.profile.ros2 import JOINT_COMMANDS, Ros2Gripper, Ros2Profile
+from vla_zenoh.profile.ros2 import JOINT_COMMANDS, Ros2Camera, Ros2Gripper, Ros2Profile
 from vla_zenoh.profile.schema import (
     SIMULATED,
     CameraProfile,
@@ -32,7 +32,6 @@ from vla_zenoh.profile.section import (
     Section,
     Text,
     Word,
-    reject,
     unknown_name,
 )
 from vla_zenoh.profile.session import (
@@ -105,21 +104,16 @@ class Profile(Section):
         """The keys of this profile's robot."""
         return Keys(self.robot.name, self.root)
 
-    @model_validator(mode="after")
-    def _sections_are_consistent(self) -> Profile:
-        reject(
-            [
-                *_robot(self),
-                *_cameras(self),
-                *_ros2(self),
-                *_task(self),
-                *_serves(self),
-                *_unknown(("models",), self.models, "workers", self.workers),
-                *_unknown(("options",), self.options, "workers", self.workers),
-                *_hosts(self),
-            ]
-        )
-        return self
+    def contradictions(self) -> Iterator[Fault]:
+        """Sections that do not go together."""
+        yield from _robot(self)
+        yield from _cameras(self)
+        yield from _ros2(self)
+        yield from _task(self)
+        yield from _serves(self)
+        yield from _unknown(("models",), self.models, "workers", self.workers)
+        yield from _unknown(("options",), self.options, "workers", self.workers)
+        yield from _hosts(self)
 
     # -- which node runs where ----------------------------------------------------------------
     def cameras_of(self, host: HostProfile) -> tuple[str, ...]:
@@ -133,8 +127,17 @@ class Profile(Section):
         return tuple(
             name
             for name in self.cameras_of(host)
-            if name not in self.cameras or not self.cameras[name].source.startswith("ros2:")
+            if name not in self.cameras or not self.cameras[name].from_ros2
         )
+
+    def ros2_cameras(self) -> dict[str, Ros2Camera]:
+        """Camera -> its topic, of all that come from ROS 2."""
+        named = self.ros2.cameras if self.ros2 is not None else {}
+        return {
+            name: named.get(name) or Ros2Camera(topic=camera.source.removeprefix("ros2:"))
+            for name, camera in self.cameras.items()
+            if camera.from_ros2
+        }
 
     def workers_of(self, host: HostProfile) -> tuple[str, ...]:
         """Names of the workers that run on `host`."""
@@ -156,9 +159,7 @@ class Profile(Section):
         for host, part in self.hosts.items():
             for camera in self.cameras_of(part):
                 servers[camera] = self.node_name(host, "camera")
-        from_ros2 = (
-            name for name, camera in self.cameras.items() if camera.source.startswith("ros2:")
-        )
+        from_ros2 = (name for name, camera in self.cameras.items() if camera.from_ros2)
         return servers | dict.fromkeys(from_ros2, "ros2")
 
 
@@ -182,9 +183,9 @@ def _robot(profile: Profile) -> Iterator[Fault]:
 def _cameras(profile: Profile) -> Iterator[Fault]:
     for name, camera in profile.cameras.items():
         place = ("cameras", name, "source")
-        if camera.source.startswith("ros2:") and profile.ros2 is None:
+        if camera.from_ros2 and profile.ros2 is None:
             yield place, f"is {camera.source!r}, which needs a section ros2"
-        if camera.source.startswith("ros2:") and camera.fit_for_workers:
+        if camera.from_ros2 and camera.fit_for_workers:
             yield ("cameras", name, "fit_for_workers"), "cannot be done for a camera of ROS 2"
         if camera.source.startswith("sim:") and profile.robot.driver != "sim":
             yield (
@@ -317,10 +318,7 @@ def _hosts(profile: Profile) -> Iterator[Fault]:
         if len(hosts) > 1:
             why = NODE_KINDS[name].only_one if what == "nodes" else "each key has one writer"
             hint = "" if what == "nodes" else f". List on each host which {what} it runs"
-            yield (
-                ("hosts", hosts[-1], what),
-                f"{name} runs on {' and '.join(hosts)}: {why}{hint}",
-            )
+            yield (("hosts", hosts[-1], what), f"{name} runs on {' and '.join(hosts)}: {why}{hint}")
 
 
 def _endpoints(profile: Profile, name: str, host: HostProfile) -> Iterator[Fault]:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import Annotated, Literal, NamedTuple
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field
 
-from vla_zenoh.profile.section import Name, Section, Text, Word, Words, reject
+from vla_zenoh.profile.section import Fault, Name, Section, Text, Word, Words
 
 POSE_JOINTS = 6
 """Joints that an arm needs at least to reach every pose in its workspace."""
@@ -57,27 +58,23 @@ class GripperProfile(Section):
             return JointEnds(self.joint_open_m, self.joint_shut_m, "m")
         return None
 
-    @model_validator(mode="after")
-    def _ends_fit(self) -> GripperProfile:
+    def contradictions(self) -> Iterator[Fault]:
+        """Ends of a finger joint that do not make one joint."""
         turning = (("joint_open_rad", self.joint_open_rad), ("joint_shut_rad", self.joint_shut_rad))
         sliding = (("joint_open_m", self.joint_open_m), ("joint_shut_m", self.joint_shut_m))
-        faults = [
-            ((name,), f"is {angle:g}: more than a turn; give radians")
-            for name, angle in turning
-            if angle is not None and abs(angle) > 2 * math.pi
-        ]
+        for name, angle in turning:
+            if angle is not None and abs(angle) > 2 * math.pi:
+                yield (name,), f"is {angle:g}: more than a turn; give radians"
         for pair in (turning, sliding):
             (_, at_open), (_, at_shut) = pair
             if (at_open is None) != (at_shut is None):
                 missing, given = pair if at_open is None else pair[::-1]
-                faults.append(((given[0],), f"needs {missing[0]} beside it"))
+                yield (given[0],), f"needs {missing[0]} beside it"
             elif at_open is not None and at_open == at_shut:
-                faults.append(((pair[1][0],), f"is that of {pair[0][0]}: nothing would move"))
+                yield (pair[1][0],), f"is that of {pair[0][0]}: nothing would move"
         if all(any(value is not None for _, value in pair) for pair in (turning, sliding)):
             why = "is for a joint that slides, joint_open_rad for one that turns: give one of them"
-            faults.append((("joint_open_m",), why))
-        reject(faults)
-        return self
+            yield ("joint_open_m",), why
 
 
 class RobotProfile(Section):
@@ -123,35 +120,26 @@ class RobotProfile(Section):
         """Kind of the node that drives it."""
         return "arm" if self.driver == "franka" else self.driver
 
-    @model_validator(mode="after")
-    def _joints_fit(self) -> RobotProfile:
-        faults = []
-        if len(self.home_rad) != len(self.arm_joints):
-            why = f"has {len(self.home_rad)} angles for {len(self.arm_joints)} arm_joints"
-            faults.append((("home_rad",), why))
-        if self.joint_range_rad and len(self.joint_range_rad) != len(self.arm_joints):
-            why = f"has {len(self.joint_range_rad)} pairs for {len(self.arm_joints)} arm_joints"
-            faults.append((("joint_range_rad",), why))
-        faults += [
-            (("joint_range_rad", str(index)), f"is [{low:g}, {high:g}]: give the lower end first")
-            for index, (low, high) in enumerate(self.joint_range_rad)
-            if low >= high
-        ]
-        faults += [
-            (("home_rad", str(index)), f"is {angle:g}: more than a turn; give radians")
-            for index, angle in enumerate(self.home_rad)
-            if abs(angle) > 2 * math.pi
-        ]
-        shared = sorted(set(self.arm_joints) & set(self.finger_joints))
-        if shared:
-            faults.append((("finger_joints",), f"repeats arm_joints: {', '.join(shared)}"))
+    def contradictions(self) -> Iterator[Fault]:
+        """Lists that do not fit the arm's joints, and values in other units."""
+        joints = len(self.arm_joints)
+        if len(self.home_rad) != joints:
+            yield ("home_rad",), f"has {len(self.home_rad)} angles for {joints} arm_joints"
+        if self.joint_range_rad and len(self.joint_range_rad) != joints:
+            why = f"has {len(self.joint_range_rad)} pairs for {joints} arm_joints"
+            yield ("joint_range_rad",), why
+        for index, (low, high) in enumerate(self.joint_range_rad):
+            if low >= high:
+                why = f"is [{low:g}, {high:g}]: give the lower end first"
+                yield ("joint_range_rad", str(index)), why
+        for index, angle in enumerate(self.home_rad):
+            if abs(angle) > 2 * math.pi:
+                yield ("home_rad", str(index)), f"is {angle:g}: more than a turn; give radians"
+        if shared := sorted(set(self.arm_joints) & set(self.finger_joints)):
+            yield ("finger_joints",), f"repeats arm_joints: {', '.join(shared)}"
         if self.gripper.dead_band_m >= self.gripper.max_width_m:
-            why = (
-                f"must be less than max_width_m ({self.gripper.max_width_m:g}): nothing would move"
-            )
-            faults.append((("gripper", "dead_band_m"), why))
-        reject(faults)
-        return self
+            width = f"max_width_m ({self.gripper.max_width_m:g})"
+            yield ("gripper", "dead_band_m"), f"must be less than {width}: nothing would move"
 
 
 def _option(value: str) -> str:
@@ -179,6 +167,8 @@ class ArmProfile(Section):
 Stiffness = Annotated[float, Field(gt=0, le=3000)]
 Threshold = Annotated[float, Field(gt=0, le=100)]
 _SEVEN = Field(strict=False, min_length=7, max_length=7)
+Stiffnesses = Annotated[tuple[Stiffness, ...], _SEVEN]
+Thresholds = Annotated[tuple[Threshold, ...], _SEVEN]
 
 
 class FrankaLoad(Section):
@@ -223,26 +213,10 @@ class FrankaProfile(Section):
     realtime: Literal["enforce", "ignore"] = "enforce"
     stiffness_n_m: Stiffness = 2000.0
     stiffness_nm_rad: float = Field(default=150.0, gt=0, le=300)
-    joint_stiffness_nm_rad: Annotated[tuple[Stiffness, ...], _SEVEN] = (
-        600.0,
-        600.0,
-        600.0,
-        600.0,
-        250.0,
-        150.0,
-        50.0,
-    )
+    joint_stiffness_nm_rad: Stiffnesses = (600.0, 600.0, 600.0, 600.0, 250.0, 150.0, 50.0)
     posture_stiffness_nm_rad: float = Field(default=10.0, ge=0, le=100)
     collision_force_n: Threshold = 60.0
     collision_torque_nm: Threshold = 30.0
-    collision_joint_nm: Annotated[tuple[Threshold, ...], _SEVEN] = (
-        40.0,
-        40.0,
-        36.0,
-        36.0,
-        32.0,
-        28.0,
-        24.0,
-    )
+    collision_joint_nm: Thresholds = (40.0, 40.0, 36.0, 36.0, 32.0, 28.0, 24.0)
     load: FrankaLoad = FrankaLoad()
     hand: bool = True

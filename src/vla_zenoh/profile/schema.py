@@ -2,19 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field
 
-from vla_zenoh.profile.section import (
-    Distinct,
-    Name,
-    Names,
-    Section,
-    Text,
-    Word,
-    reject,
-)
+from vla_zenoh.profile.section import Distinct, Fault, Name, Names, Section, Text, Word
 from vla_zenoh.profile.session import Endpoints
 
 NodeKind = Literal["router", "sim", "ros2", "arm", "camera", "command", "worker"]
@@ -72,20 +65,17 @@ class Timing(Section):
     max_clock_step_s: float = Field(default=0.05, gt=0, le=1)
     max_clock_offset_s: float = Field(default=0.1, gt=0, le=1)
 
-    @model_validator(mode="after")
-    def _timeouts_span_periods(self) -> Timing:
-        reject(
-            [
-                ((name,), f"is {wait_s:g}, less than {MIN_PERIODS} periods of {rate} ({rate_hz:g})")
-                for name, wait_s, rate, rate_hz in (
-                    ("command_timeout_s", self.command_timeout_s, "command_hz", self.command_hz),
-                    ("watchdog_s", self.watchdog_s, "command_hz", self.command_hz),
-                    ("state_timeout_s", self.state_timeout_s, "state_hz", self.state_hz),
-                )
-                if wait_s * rate_hz < MIN_PERIODS - 1e-9
-            ]
-        )
-        return self
+    def contradictions(self) -> Iterator[Fault]:
+        """A timeout that does not span enough periods."""
+        for name, rate in (
+            ("command_timeout_s", "command_hz"),
+            ("watchdog_s", "command_hz"),
+            ("state_timeout_s", "state_hz"),
+        ):
+            wait_s, rate_hz = getattr(self, name), getattr(self, rate)
+            if wait_s * rate_hz < MIN_PERIODS - 1e-9:
+                why = f"is {wait_s:g}, less than {MIN_PERIODS} periods of {rate} ({rate_hz:g})"
+                yield (name,), why
 
 
 class Composition(Section):
@@ -162,6 +152,11 @@ class CameraProfile(Section):
     fit_for_workers: bool = False
     loop: bool = True
     check: CameraCheck = CameraCheck()
+
+    @property
+    def from_ros2(self) -> bool:
+        """The node ros2 publishes it, and no camera node."""
+        return self.source.startswith("ros2:")
 
 
 class SimProfile(Section):

@@ -5,9 +5,9 @@ from __future__ import annotations
 import types
 import typing
 from collections.abc import Iterable, Sequence
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from vla_zenoh import keys
 from vla_zenoh.errors import ProfileError, describe_fault, nearest
@@ -31,23 +31,23 @@ class Section(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
 
+    def contradictions(self) -> Iterable[Fault]:
+        """Values that are valid by themselves but contradict each other, for subclasses."""
+        return ()
+
+    @model_validator(mode="after")
+    def _is_consistent(self) -> Self:
+        if faults := tuple(self.contradictions()):
+            raise InconsistentSections(faults)
+        return self
+
 
 class InconsistentSections(ValueError):
-    """Values that are valid by themselves but contradict each other.
-
-    Args:
-        faults: (place below the section that raises this, sentence).
-    """
+    """Contradictions of a section; places are below it."""
 
     def __init__(self, faults: Sequence[Fault]) -> None:
         self.faults = tuple(faults)
         super().__init__("; ".join(f"{'.'.join(fault[0])} {fault[1]}" for fault in faults))
-
-
-def reject(faults: Sequence[Fault]) -> None:
-    """Raise `InconsistentSections` if there are faults."""
-    if faults:
-        raise InconsistentSections(faults)
 
 
 def _key_part(value: str) -> str:
@@ -79,9 +79,7 @@ Range = Annotated[tuple[float, float], Field(strict=False), AfterValidator(_orde
 Distinct = AfterValidator(_differ)
 
 
-NOT_MADE = {
-    "depth": "cameras give colour images only; depth is not read.",
-}
+NOT_MADE = {"depth": "cameras give colour images only; depth is not read."}
 """Key that looks like a slip of another one but is a wish -> what there is."""
 _NO_VALUE_SHOWN = {"missing", "extra_forbidden", "too_long", "too_short", "value_error"}
 

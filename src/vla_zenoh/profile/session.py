@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import ipaddress
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field
 
 from vla_zenoh.errors import nearest
-from vla_zenoh.profile.section import Distinct, Name, Section, Word, reject
+from vla_zenoh.profile.section import Distinct, Fault, Name, Section, Word
 
 IP_PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws")
 FILE_PROTOCOLS = ("unixsock-stream",)
@@ -80,7 +80,7 @@ def host_of(endpoint: str) -> str:
 
 def endpoint_faults(
     endpoints: Sequence[str], session: SessionProfile, *, listen: bool
-) -> list[tuple[int, str]]:
+) -> Iterator[tuple[int, str]]:
     """(index, sentence) for endpoints that contradict the session's security or links.
 
     Args:
@@ -88,25 +88,22 @@ def endpoint_faults(
         session: the session section.
         listen: a router listens on them; otherwise nodes connect to them.
     """
-    out: list[tuple[int, str]] = []
     for index, endpoint in enumerate(endpoints):
         protocol = endpoint.partition("/")[0]
         trusted = protocol in TRUSTED_PROTOCOLS
         if session.security is not None and not trusted:
             why = f"{protocol} verifies no certificate, but there is a section security: write tls/"
-            out.append((index, why))
+            yield index, why
         elif session.security is None and trusted:
-            why = f"{protocol} needs certificates: make them with `vla-zenoh secure init`"
-            out.append((index, why))
+            yield index, f"{protocol} needs certificates: make them with `vla-zenoh secure init`"
         elif listen and not (trusted or session.insecure or is_loopback(endpoint)):
-            why = (
+            yield (
+                index,
                 "lets anyone on that network command the robot. Make certificates with "
-                "`vla-zenoh secure init`, or listen on 127.0.0.1, or set insecure: true"
+                "`vla-zenoh secure init`, or listen on 127.0.0.1, or set insecure: true",
             )
-            out.append((index, why))
         if session.separate_links and not _has_a_second(endpoint):
-            out.append((index, "separate_links needs PROTOCOL/HOST:PORT, and the next port too"))
-    return out
+            yield index, "separate_links needs PROTOCOL/HOST:PORT, and the next port too"
 
 
 def ends_at(target: str, listening: str) -> bool:
@@ -164,24 +161,17 @@ class SessionProfile(Section):
     security: SecurityProfile | None = None
     insecure: bool = False
 
-    @model_validator(mode="after")
-    def _endpoints_are_usable(self) -> SessionProfile:
-        faults = []
+    def contradictions(self) -> Iterator[Fault]:
+        """Endpoints that cannot be used, or not with this security."""
         if not self.connect:
-            faults.append((("connect",), "is empty: nodes need a router, as tcp/10.0.0.2:7447"))
+            yield ("connect",), "is empty: nodes need a router, as tcp/10.0.0.2:7447"
         if not self.listen:
-            faults.append((("listen",), "is empty: the router needs an address, as tcp/[::]:7447"))
-        faults += [
-            (("connect", str(index)), "port 0 leads nowhere")
-            for index, endpoint in enumerate(self.connect)
-            if address_of(endpoint).endswith(":0")
-        ]
+            yield ("listen",), "is empty: the router needs an address, as tcp/[::]:7447"
+        for index, endpoint in enumerate(self.connect):
+            if address_of(endpoint).endswith(":0"):
+                yield ("connect", str(index)), "port 0 leads nowhere"
         for name, endpoints in (("connect", self.connect), ("listen", self.listen)):
-            faults += [
-                ((name, str(index)), why)
-                for index, why in endpoint_faults(endpoints, self, listen=name == "listen")
-            ]
+            for index, why in endpoint_faults(endpoints, self, listen=name == "listen"):
+                yield (name, str(index)), why
         if self.security is not None and self.insecure:
-            faults.append((("insecure",), "is true, beside a section security: leave one out"))
-        reject(faults)
-        return self
+            yield ("insecure",), "is true, beside a section security: leave one out"

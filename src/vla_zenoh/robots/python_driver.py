@@ -13,11 +13,11 @@ from typing import Any
 
 from vla_zenoh.bus.metrics import RateMeter
 from vla_zenoh.errors import NodeError, ProfileError, in_words
-from vla_zenoh.interop.python_reading import MAX_WORDS, Fault, PythonReading
 from vla_zenoh.policy.loader import make_robot
 from vla_zenoh.profile import Profile
 from vla_zenoh.robot import Reading
 from vla_zenoh.robots.driver import DriverStatus, Measurement, RobotDriver, command_of
+from vla_zenoh.robots.python_reading import MAX_WORDS, Fault, PythonReading
 from vla_zenoh.sanitize import one_line
 from vla_zenoh.types import Event, GripperCommand
 from vla_zenoh.types.commands import JointReference, PoseReference
@@ -98,15 +98,17 @@ class PythonDriver(RobotDriver):
             if measured_ns == self.measured_ns:
                 return None  # the same again: the robot is slower than this loop
             stamp_ns = self.report.clock.wall_at(measured_ns)
-            valid = self._reading.take(reading, stamp_ns, self._asked_m)
+            measured = self._reading.take(reading, stamp_ns, self._asked_m)
         except (TypeError, ValueError) as error:
             reason = getattr(error, "reason", "invalid")
             self.report.reject(reason, f"{self._called}: read: {one_line(error, MAX_WORDS)}")
             return None
-        self.measured_ns, self._width_m = measured_ns, valid.gripper.width_m
-        self._set_held(valid.gripper.holding, released=valid.gripper.moving)
+        gripper = measured.gripper
+        assert gripper is not None
+        self.measured_ns, self._width_m = measured_ns, gripper.width_m
+        self._set_held(gripper.holding, released=gripper.moving)
         self._rate.tick()
-        return Measurement(*valid)
+        return measured
 
     def _set_mode(self, mode: str) -> None:
         if mode != self.gripper_mode:

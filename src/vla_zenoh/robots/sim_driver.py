@@ -79,11 +79,7 @@ class SimDriver(RobotDriver):
         self._step_lock = threading.Lock()
         self._state_every = _every(profile.timing.state_hz)
         self._keys: _SimKeys | None = None
-        position_m, rotation = self.world.tcp()
-        zeros = np.zeros(6)
-        self._reference: PoseReference | JointReference = PoseReference(
-            position_m, rotation, zeros, zeros
-        )
+        self._reference: PoseReference | JointReference = self.world.hold_reference()
 
     def attach(self, node: Node, follower: CommandFollower | None) -> None:
         """Subscribe to resets, and publish the scene."""
@@ -119,10 +115,7 @@ class SimDriver(RobotDriver):
         self.measured_ns = mono_ns
         if not self.fault:
             try:
-                if isinstance(self._reference, JointReference):
-                    self.world.tick_joint(self._reference)
-                else:
-                    self.world.tick(self._reference)
+                self.world.tick(self._reference)
             except NodeError as error:
                 self.fault = str(error)
                 self.report.reject("simulation_fault", self.fault)

@@ -39,9 +39,9 @@ def outlook(security: SecurityProfile, now: dt.datetime) -> ExpiryOutlook:
         now: UTC.
     """
     try:
-        from vla_zenoh.security.lab_certificates import LabCertificates
+        from vla_zenoh.security.certificates import CheckedStore
 
-        store = LabCertificates(security.folder)
+        store = CheckedStore(security.folder)
         entries = store.entries(now, store.this_host(security.host))
     except MissingExtraError as error:  # using certificates needs no library to read them
         return ExpiryOutlook(unknown=f"the expiry of certificates cannot be checked here: {error}")

@@ -129,7 +129,7 @@ def _people(profile: Profile) -> tuple[str, ...]:
 
 def _nodes(profile: Profile, host: str) -> list[Identity]:
     part = profile.hosts[host]
-    from_ros2 = tuple(n for n, c in profile.cameras.items() if c.source.startswith("ros2:"))
+    from_ros2 = tuple(n for n, c in profile.cameras.items() if c.from_ros2)
     found: list[Identity] = []
     for kind in part.nodes:
         role = Role(NODE_KINDS[kind].role)

@@ -5,13 +5,12 @@ A key of `keys.py` without a row here is allowed to no role; a test checks that 
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
 from itertools import product
 
-from vla_zenoh.keys import Keys
+from vla_zenoh.keys import KEY_PATHS, Keys
 from vla_zenoh.security.identity import Identity, Role
 
 _, ROBOT, CAMERA, WORKER, COMMAND, OPERATOR, VIEWER, REPLAY, _ = Role
@@ -21,9 +20,6 @@ SPEAKERS = NODES | {OPERATOR, REPLAY}
 RECORDER = "recorder"
 """Nodes that an operator may run: they only subscribe, and publish their status."""
 NOBODY: frozenset[Role] = frozenset()
-
-_ANY = "any"
-"""Stands for `*` while a key is made: a key's parts may not be that."""
 
 
 class Act(Enum):
@@ -123,23 +119,8 @@ TABLE = (
     Row("sim_step", answer=frozenset({ROBOT}), ask=frozenset({OPERATOR})),
 )
 
-NO_KEYS = ("short", "full", "group", "on")
-"""Members of `Keys` that give text and no key of their own."""
 OWN = frozenset({Act.PUT, Act.ANSWER, Act.ANNOUNCE})
 """Acts that a node may do in its own name only."""
-
-
-def key_members() -> dict[str, tuple[str, ...]]:
-    """Every member of `Keys` that makes one key -> its parameters. Selectors are left out."""
-    out: dict[str, tuple[str, ...]] = {}
-    for name, value in vars(Keys).items():
-        make = value.fget if isinstance(value, property) else value
-        if name.startswith(("_", "all_")) or name in NO_KEYS or not inspect.isfunction(make):
-            continue
-        signature = inspect.signature(make)
-        if signature.return_annotation == "str":
-            out[name] = tuple(signature.parameters)[1:]
-    return out
 
 
 def expressions(keys: Keys, member: str, identity: Identity, act: Act) -> Iterator[str]:
@@ -151,13 +132,9 @@ def expressions(keys: Keys, member: str, identity: Identity, act: Act) -> Iterat
         identity: of the node or operator.
         act: in its own name only if it is in `OWN`.
     """
-    parameters = key_members()[member]
-    if not parameters:
-        yield str(getattr(keys, member))
-        return
-    choices = [_choices(name, identity, act) for name in parameters]
-    for chosen in product(*choices):
-        yield _with_stars(keys, member, chosen)
+    path = KEY_PATHS[member]
+    for parts in product(*(_choices(name, identity, act) for name in path.parameters)):
+        yield path.text(keys, *parts)
 
 
 def _choices(parameter: str, identity: Identity, act: Act) -> tuple[str, ...]:
@@ -172,23 +149,6 @@ def _choices(parameter: str, identity: Identity, act: Act) -> tuple[str, ...]:
     if parameter == "camera":  # a worker shows what it saw of any camera
         return ("*",) if identity.role is Role.WORKER else identity.cameras
     return ()
-
-
-def _with_stars(keys: Keys, member: str, chosen: tuple[str, ...]) -> str:
-    make = getattr(keys, member)
-    fixed = [_ANY if part == "*" else part for part in chosen]
-    key, parts = str(make(*fixed)), list(chosen)
-    if "*" not in parts:
-        return key
-    # Parameters stand in a key in their order, each once: take them from behind.
-    chunks = key.split("/")
-    at = len(chunks) - 1
-    for part, text in zip(reversed(parts), reversed(fixed), strict=True):
-        while chunks[at] != text:
-            at -= 1
-        chunks[at] = part
-        at -= 1
-    return "/".join(chunks)
 
 
 @dataclass(frozen=True, slots=True)

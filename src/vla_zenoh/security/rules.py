@@ -64,11 +64,10 @@ def access_control(profiles: Iterable[Profile]) -> dict[str, Any]:
             name = identity.common_name
             subjects[name] = {"id": name, "cert_common_names": [name]}
             own = of_subject.setdefault(name, [])
-            for rule in _rules(identity, profile.keys):
-                if rule["id"] not in rules:
-                    rules[rule["id"]] = rule
-                if rule["id"] not in own:
-                    own.append(rule["id"])
+            for made in _rules(identity, profile.keys):
+                rules.setdefault(made["id"], made)
+                if made["id"] not in own:
+                    own.append(made["id"])
     return {
         "enabled": True,
         "default_permission": "deny",
@@ -80,7 +79,7 @@ def access_control(profiles: Iterable[Profile]) -> dict[str, Any]:
 
 def _rules(identity: Identity, keys: Keys) -> list[dict[str, Any]]:
     if identity.role is Role.ROUTER:
-        return [_rule("router", (IN, OUT), EVERY_MESSAGE, ["**"])]
+        return [rule("router", (IN, OUT), EVERY_MESSAGE, ["**"])]
     granted: dict[tuple[str, str], dict[str, None]] = {}
     for right in rights(keys, identity):
         for flow, message in MESSAGES[right.act]:
@@ -95,7 +94,7 @@ def _rules(identity: Identity, keys: Keys) -> list[dict[str, Any]]:
                 granted[flow, message][keys.all_robots] = None
     who = f"{keys.root}/{keys.robot}:{identity.common_name}"
     return [
-        _rule(f"{who}:{flow}:{message}", (flow,), (message,), list(found))
+        rule(f"{who}:{flow}:{message}", (flow,), (message,), list(found))
         for (flow, message), found in granted.items()
     ]
 
@@ -120,9 +119,10 @@ def wide(keys: Keys, identity: Identity) -> list[str]:
     return [f"{group}/*" for group, may in groups.items() if may and group != top]
 
 
-def _rule(
+def rule(
     name: str, flows: Sequence[str], messages: Sequence[str], keys: Sequence[str]
 ) -> dict[str, Any]:
+    """A rule of Zenoh that allows `messages` on `keys`."""
     return {
         "id": name,
         "messages": list(messages),

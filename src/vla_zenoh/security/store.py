@@ -7,7 +7,8 @@
     FOLDER/HOST/NODE.pem, .key    certificate and key of each node and operator of the host
     FOLDER/.this_host             name of the HOST that this computer is; not copied
 
-Private keys are readable by their owner only. `lab_certificates` makes and checks certificates.
+Private keys are readable by their owner only. `certificates` checks, and
+`vla_zenoh.lab.certificates` makes them.
 """
 
 from __future__ import annotations

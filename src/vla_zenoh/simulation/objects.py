@@ -13,7 +13,7 @@ A scene declares in its MJCF where an object may stand::
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from itertools import combinations
 from typing import NamedTuple
 
 import mujoco
@@ -173,7 +173,10 @@ def draw_places(model: mujoco.MjModel, seed: int, *, distractors: bool = False) 
             }
             if _apart(beside | drawn, radii, gap_m):
                 return drawn
-        raise _no_room(wanted, gap_m)
+        raise ResourceError(
+            f"no room for {', '.join(wanted)} in their regions with {gap_m:g} m between them; "
+            f"make the regions of the scene larger or {GAP} smaller"
+        )
 
     places = draw(regions, fixed)
     if distractors:
@@ -183,18 +186,8 @@ def draw_places(model: mujoco.MjModel, seed: int, *, distractors: bool = False) 
     return places
 
 
-def _no_room(names: Collection[str], gap_m: float) -> ResourceError:
-    return ResourceError(
-        f"no room for {', '.join(names)} in their regions with {gap_m:g} m between them; "
-        f"make the regions of the scene larger or {GAP} smaller"
-    )
-
-
 def _apart(places: dict[str, Place], radii: dict[str, float], gap_m: float) -> bool:
-    names = list(places)
-    for index, name in enumerate(names):
-        for other in names[:index]:
-            a, b = places[name], places[other]
-            if math.hypot(a.x_m - b.x_m, a.y_m - b.y_m) < radii[name] + radii[other] + gap_m:
-                return False
-    return True
+    return all(
+        math.hypot(a.x_m - b.x_m, a.y_m - b.y_m) >= radii[one] + radii[other] + gap_m
+        for (one, a), (other, b) in combinations(places.items(), 2)
+    )

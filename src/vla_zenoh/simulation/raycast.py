@@ -235,10 +235,7 @@ def _smooth_cells(geom: NDArray[np.int32], normal: FloatArray) -> NDArray[np.boo
     first = (slice(None, -1), slice(None, -1))
     smooth = np.ones((geom.shape[0] - 1, geom.shape[1] - 1), dtype=bool)
     for row, column in ((0, 1), (1, 0), (1, 1)):
-        other = (
-            slice(row, geom.shape[0] - 1 + row),
-            slice(column, geom.shape[1] - 1 + column),
-        )
+        other = (slice(row, geom.shape[0] - 1 + row), slice(column, geom.shape[1] - 1 + column))
         turn = np.einsum("ijk,ijk->ij", normal[first], normal[other])
         smooth &= (geom[first] == geom[other]) & ((turn > SMOOTH_COSINE) | (geom[first] < 0))
     return smooth

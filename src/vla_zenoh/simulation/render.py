@@ -17,7 +17,7 @@ import sys
 from collections.abc import Collection
 from dataclasses import dataclass
 from types import TracebackType
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,9 @@ from vla_zenoh.simulation.robot_model import RobotModel
 
 if TYPE_CHECKING:
     import mujoco
+
+    from vla_zenoh.simulation.opengl import OpenGlCanvas
+    from vla_zenoh.simulation.raycast import RaycastCanvas
 
 VARIABLE = "VLA_ZENOH_RENDERER"
 EGL, RAYCAST = "egl", "raycast"
@@ -104,22 +107,6 @@ def why_no_opengl() -> str:
         return ""
     errors = done.stderr.strip().splitlines()
     return errors[-1] if errors else f"rendering a test image exited with code {done.returncode}"
-
-
-class Canvas(Protocol):
-    """Renders the cameras of one model."""
-
-    def draw(self, data: mujoco.MjData, camera: str, width: int, height: int) -> NDArray[np.uint8]:
-        """(height, width, 3) RGB; positions in `data` are up to date."""
-        ...
-
-    def refresh(self) -> None:
-        """Colours, lights or cameras of the model have changed."""
-        ...
-
-    def close(self) -> None:
-        """Free resources."""
-        ...
 
 
 class Renderer:
@@ -218,7 +205,7 @@ class Renderer:
         mujoco.mj_camlight(self._model, self._data)
 
 
-def _canvas(name: str, model: mujoco.MjModel) -> Canvas:
+def _canvas(name: str, model: mujoco.MjModel) -> OpenGlCanvas | RaycastCanvas:
     if name == RAYCAST:
         from vla_zenoh.simulation.raycast import RaycastCanvas
 

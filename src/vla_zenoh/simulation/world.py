@@ -18,11 +18,7 @@ from vla_zenoh.simulation.cartesian_impedance import (
     ImpedanceGains,
     ImpedanceOutput,
 )
-from vla_zenoh.simulation.joint_impedance import (
-    JointGains,
-    JointImpedance,
-    JointImpedanceOutput,
-)
+from vla_zenoh.simulation.joint_impedance import JointGains, JointImpedance, JointImpedanceOutput
 from vla_zenoh.simulation.objects import SimulatedObjects
 from vla_zenoh.simulation.robot_model import RobotModel
 from vla_zenoh.simulation.scene import STEP_S, build_model, read_pose_vector, write_pose_vector
@@ -36,7 +32,7 @@ WRENCH_FILTER_S = 0.01
 
 
 class World:
-    """A scene with a robot under impedance control, of its TCP (`tick`) or joints (`tick_joint`).
+    """A scene with a robot under impedance control of its TCP or joints, as `tick` is given.
 
     At rest either law takes over from the other with the same torque; a change between them in
     motion jolts the arm.
@@ -88,9 +84,7 @@ class World:
             period_s=STEP_S,
         )
         self._joint_controller = JointImpedance(
-            JointGains(),
-            effort_nm=self._arm.effort_limit_nm,
-            period_s=STEP_S,
+            JointGains(), effort_nm=self._arm.effort_limit_nm, period_s=STEP_S
         )
         self._active_law: CartesianImpedance | JointImpedance | None = None
         self._held_rad: FloatArray | None = None
@@ -121,31 +115,20 @@ class World:
         mujoco.mj_forward(model, data)
         self._fresh = True
 
-    def tick(self, reference: PoseReference) -> None:
-        """Step by one millisecond towards a TCP reference.
+    def tick(self, reference: PoseReference | JointReference) -> None:
+        """Step by one millisecond towards a reference of the TCP or the joints.
 
         Raises:
             NodeError: the simulation diverged; `reset` makes it usable again.
         """
         mujoco.mj_step1(self.model, self._data)
-        state = self._switch_to(self._controller)
-        self._held_rad = None
-        self._apply(self._controller.torque(reference, state), reference)
-
-    def tick_joint(self, reference: JointReference) -> None:
-        """Step by one millisecond towards a joint reference.
-
-        Raises:
-            NodeError: the simulation diverged; `reset` makes it usable again.
-        """
-        mujoco.mj_step1(self.model, self._data)
-        state = self._switch_to(self._joint_controller)
-        self._held_rad = reference.position_rad
-        self._apply(self._joint_controller.torque(reference, state), reference)
-
-    def hold_joint_reference(self) -> JointReference:
-        """Reference at the measured joints, at rest."""
-        return JointReference.at_rest(self._arm.position_rad)
+        if isinstance(reference, JointReference):
+            self._held_rad, law = reference.position_rad, self._joint_controller
+            output = law.torque(reference, self._switch_to(law))
+        else:
+            self._held_rad, law = None, self._controller
+            output = law.torque(reference, self._switch_to(law))
+        self._apply(output, reference)
 
     def hold_reference(self) -> PoseReference:
         """Reference at the measured TCP, at rest."""
@@ -184,7 +167,7 @@ class World:
     def joint_state(self) -> JointState:
         """Arm joints; the effort is that of the motors.
 
-        The reference is that of `tick_joint`; under Cartesian control the measured position.
+        The reference is that of the joints; under Cartesian control the measured position.
         """
         arm = self._arm
         return JointState(

@@ -15,7 +15,7 @@ pytest.importorskip("torch", reason="needs OpenVLA's environment: make test-mode
 import torch
 
 from vla_zenoh.errors import SpecError, WorkerError
-from vla_zenoh.policy import example_observation
+from vla_zenoh.lab.check.examples import example_observation
 from vla_zenoh.policy.loader import find_model, make_policy
 
 pytestmark = pytest.mark.models

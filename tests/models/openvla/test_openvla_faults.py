@@ -17,7 +17,7 @@ from safetensors.torch import load_file, save_file
 from tiny_openvla import FIRST_ACTION, Parts
 
 from vla_zenoh.errors import SpecError, WorkerError
-from vla_zenoh.policy import example_observation
+from vla_zenoh.lab.check.examples import example_observation
 from vla_zenoh.policy.loader import find_model, make_policy
 
 pytestmark = pytest.mark.models

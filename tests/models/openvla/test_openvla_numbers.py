@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from PIL import Image
 from tiny_openvla import BRIDGE, Parts
 
-from vla_zenoh.policy import Observation, check_steps, example_observation
+from vla_zenoh.lab.check.examples import example_observation
+from vla_zenoh.policy import Observation, check_steps
 from vla_zenoh.policy.loader import find_model, make_policy
 
 pytestmark = pytest.mark.models

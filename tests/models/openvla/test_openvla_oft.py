@@ -20,7 +20,8 @@ from tiny_openvla import BRIDGE, TEXT, Parts
 from torch import Tensor, nn
 
 from vla_zenoh.errors import SpecError, WorkerError
-from vla_zenoh.policy import check_steps, example_observation
+from vla_zenoh.lab.check.examples import example_observation
+from vla_zenoh.policy import check_steps
 from vla_zenoh.policy.loader import find_model, make_policy
 
 pytestmark = pytest.mark.models

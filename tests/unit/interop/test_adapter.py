@@ -11,7 +11,7 @@ from model_wires import openpi
 
 from vla_zenoh.errors import PeerError, SpecError
 from vla_zenoh.interop.adapter import FIRST_S, LONGEST_S, Adapter
-from vla_zenoh.policy import example_observation
+from vla_zenoh.lab.check.examples import example_observation
 
 STEP = [[0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]]
 SOON_S = 0.05

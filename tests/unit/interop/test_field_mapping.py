@@ -17,8 +17,9 @@ from vla_zenoh.interop.adapter import FIRST_S, LONGEST_S, Backoff
 from vla_zenoh.interop.field_mapping import DEFAULTS, FieldMapping, read_columns, read_field_mapping
 from vla_zenoh.interop.presets import Presets
 from vla_zenoh.kinematics.so3 import exp3, quat_from_rotation
+from vla_zenoh.lab.check.examples import example_observation
 from vla_zenoh.lab.serve import openpi_frames
-from vla_zenoh.policy import Observation, example_observation
+from vla_zenoh.policy import Observation
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import GripperState, JointState, PoseState
 

@@ -13,17 +13,16 @@ import zenoh
 from typer.testing import CliRunner
 
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.interop.ros2.graph import camera_topics
 from vla_zenoh.interop.ros2.keys import Ros2Dds
+from vla_zenoh.lab.certificates.bridge import bridge_locks, bridges
+from vla_zenoh.lab.certificates.lab_certificates import LabCertificates
 from vla_zenoh.lab.cli.profile import profile_app
 from vla_zenoh.lab.cli.secure import secure_app
 from vla_zenoh.lab.doctor.access_rules import Passage, allows, passages
 from vla_zenoh.lab.profile.ros2_bridge import bridge_command, bridge_config, bridge_text
 from vla_zenoh.profile import Profile, load_profile
-from vla_zenoh.security import authority as ca
-from vla_zenoh.security.bridge import bridge_locks, bridges
+from vla_zenoh.security import certificates
 from vla_zenoh.security.identity import Role
-from vla_zenoh.security.lab_certificates import LabCertificates
 from vla_zenoh.security.roles import Act
 
 RUNNER = CliRunner()
@@ -134,7 +133,7 @@ def test_cameras_alone_let_through_no_command(tmp_path: Path) -> None:
     found = allowed(profile)
     assert found.pop("publishers") == ["/camera/realsense2_camera/color/image_raw"]
     assert not any(found.values())
-    assert list(camera_topics(profile)) == ["front"]
+    assert list(profile.ros2_cameras()) == ["front"]
 
 
 def test_a_name_is_meant_as_a_whole_and_to_the_letter(tmp_path: Path) -> None:
@@ -230,7 +229,7 @@ def test_a_bridge_on_another_computer_gets_a_certificate_and_serves_the_node_alo
     written = yaml.safe_load(file.read_text())
     assert written["ros2"] == {"connect": ["tls/10.0.0.5:7450"]}
     folder = tmp_path / "certificates" / "robot"
-    made = ca.read((folder / "bridge.pem").read_bytes())
+    made = certificates.read((folder / "bridge.pem").read_bytes())
     assert (made.common_name, made.addresses) == ("bridge@robot", ("10.0.0.5",))
 
     done = RUNNER.invoke(profile_app, ["bridge-config", "--profile", str(file)])

@@ -9,9 +9,17 @@ from hypothesis import strategies as st
 from vla_zenoh.errors import CodecError, ProfileError
 from vla_zenoh.interop.ros2 import attachment as attachments
 from vla_zenoh.interop.ros2.attachment import Attachment
-from vla_zenoh.interop.ros2.keys import Endpoint, EntityRole, RmwZenoh, Ros2Dds, parts_of
+from vla_zenoh.interop.ros2.keys import (
+    COMMAND,
+    DEFAULT,
+    SENSOR,
+    Endpoint,
+    EntityRole,
+    RmwZenoh,
+    Ros2Dds,
+    parts_of,
+)
 from vla_zenoh.interop.ros2.names import dds_type
-from vla_zenoh.interop.ros2.qos import COMMAND, DEFAULT, SENSOR
 
 HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 ZID = "f9980ee0495eaafb3e38f0d19e2eae12"

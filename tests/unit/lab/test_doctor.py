@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import shutil
 import socket
+import subprocess
 import threading
 from pathlib import Path
 
@@ -29,6 +32,7 @@ from vla_zenoh.lab.doctor.computer import (
     shared_memory,
     video_devices,
 )
+from vla_zenoh.lab.doctor.fci import network_card
 from vla_zenoh.lab.doctor.software import (
     MODULES,
     libraries,
@@ -41,6 +45,7 @@ from vla_zenoh.lab.doctor.software import (
 )
 from vla_zenoh.lab.doctor.software import renderer_finding as judge_backend
 from vla_zenoh.profile import SessionProfile, load_profile
+from vla_zenoh.profile.robot import FrankaProfile
 from vla_zenoh.simulation.render import Backend
 
 TIBIBYTE_MIB = 1024 * 1024
@@ -369,3 +374,19 @@ def test_a_robot_that_is_not_here_fails_the_host_that_commands_it_alone(tmp_path
     assert list(robot(lab, "gpu")) == []
     (found,) = robot(load_profile("panda_sim"))
     assert found.level == "ok"
+
+
+@pytest.mark.skipif(shutil.which("ip") is None, reason="needs the program ip")
+def test_a_network_card_that_reports_no_speed_is_of_unknown_speed(tmp_path: Path) -> None:
+    """Linux writes -1 there, where there is no cable or a driver does not know."""
+    address = "192.0.2.1"
+    route = subprocess.run(
+        ["ip", "-o", "route", "get", address], capture_output=True, text=True, check=False
+    )
+    card = re.search(r"\bdev (\S+)", route.stdout)
+    if card is None or card[1] == "lo":
+        pytest.skip("no route to a network")
+    (tmp_path / card[1]).mkdir()
+    (tmp_path / card[1] / "speed").write_text("-1\n")
+    finding = network_card(FrankaProfile(address=address), tmp_path)
+    assert (finding.level, finding.found) == ("warn", f"{card[1]}, of unknown speed")

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from vla_zenoh.control.actions import step_pose, step_width
 from vla_zenoh.errors import MissingExtraError, NodeError
 from vla_zenoh.kinematics.so3 import Pose
+from vla_zenoh.lab.check.examples import example_observation
 from vla_zenoh.lab.teleop.keyboard import (
     ACTIVATE,
     HOLD_S,
@@ -36,7 +37,7 @@ from vla_zenoh.lab.teleop.policy import (
     without_dead_zone,
 )
 from vla_zenoh.lab.teleop.sticks import Gamepad, SpaceMouse
-from vla_zenoh.policy import Observation, check_steps, example_observation
+from vla_zenoh.policy import Observation, check_steps
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import GripperState
 

@@ -15,6 +15,7 @@ from pydantic import BaseModel, ValidationError
 from random_records import model_specs
 
 from vla_zenoh.errors import SpecError
+from vla_zenoh.lab.check.examples import example_observation
 from vla_zenoh.policy import (
     ROTATION_SIZE,
     ActionSpec,
@@ -23,7 +24,6 @@ from vla_zenoh.policy import (
     Observation,
     ObservationSpec,
     check_steps,
-    example_observation,
 )
 
 SPEC = ModelSpec(

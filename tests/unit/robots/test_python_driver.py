@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from vla_zenoh.errors import NodeError
-from vla_zenoh.interop.python_reading import FAULT_NS
 from vla_zenoh.profile import load_profile
 from vla_zenoh.robots.driver import Report
 from vla_zenoh.robots.python_driver import PythonDriver
+from vla_zenoh.robots.python_reading import FAULT_NS
 from vla_zenoh.types import Event, GripperCommand, JointCommand
 from vla_zenoh.types.commands import JointReference
 

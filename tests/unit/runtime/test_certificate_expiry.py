@@ -11,6 +11,7 @@ import pytest
 
 from vla_zenoh.cli import status_table
 from vla_zenoh.cli.output import Screen
+from vla_zenoh.lab.certificates.lab_certificates import LabCertificates
 from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh.profile.session import SecurityProfile
 from vla_zenoh.runtime import launch
@@ -22,7 +23,6 @@ from vla_zenoh.runtime.certificate_expiry import (
     outlook,
 )
 from vla_zenoh.security.identity import Identity, Role
-from vla_zenoh.security.lab_certificates import LabCertificates
 from vla_zenoh.types import NodeStatus
 
 NOW = dt.datetime(2026, 3, 1, 12, tzinfo=dt.UTC)

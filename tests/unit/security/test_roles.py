@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.keys import NODE_KINDS, Keys, covers
+from vla_zenoh.keys import KEY_PATHS, NODE_KINDS, Keys, covers
 from vla_zenoh.lab.doctor.access_rules import Passage, allows, missing, passages
 from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh.security.identity import (
@@ -18,7 +18,7 @@ from vla_zenoh.security.identity import (
     identities,
     identities_of,
 )
-from vla_zenoh.security.roles import TABLE, Act, Right, expressions, key_members, rights
+from vla_zenoh.security.roles import TABLE, Act, Right, expressions, rights
 from vla_zenoh.security.rules import access_control, wide
 
 KEYS = Keys("panda")
@@ -47,7 +47,7 @@ def who(lab: Profile, common_name: str) -> Identity:
 
 
 def test_every_key_has_a_row_in_the_table_of_roles() -> None:
-    assert sorted(row.member for row in TABLE) == sorted(key_members())
+    assert sorted(row.member for row in TABLE) == sorted(KEY_PATHS)
 
 
 def test_every_kind_of_node_has_a_role() -> None:

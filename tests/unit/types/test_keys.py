@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import re
 
 import pytest
@@ -11,45 +10,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.keys import DEFAULT_ROOT, MAX_CHUNK, Keys, key_chunk, last_chunk
+from vla_zenoh.keys import DEFAULT_ROOT, KEY_PATHS, MAX_CHUNK, Keys, key_chunk, last_chunk
 
 MAX_SENTENCE = 1000  # characters of an error message
 
 KEYS = Keys("panda")
-SELECTORS = (
-    "all_keys",
-    "all_deltas",
-    "all_specs",
-    "all_seen",
-    "all_seen_records",
-    "all_status",
-    "all_events",
-    "all_alive",
-    "all_holding",
-    "all_robots",
-    "without_images",
-    "without_raw_images",
-)
-NO_KEYS = ("short", "of", "on", "all_seen_of", "group", "full")
-"""Methods that give something else than one key."""
 GOOD_CHUNKS = st.from_regex(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,20}", fullmatch=True)
 
 
 def fixed_keys(keys: Keys) -> dict[str, str]:
-    """Every key that needs no name, by the name of its property."""
-    members = inspect.getmembers(Keys, lambda member: isinstance(member, property))
-    return {name: getattr(keys, name) for name, _ in members if name not in SELECTORS}
+    """Every key that needs no name, by the name of its member."""
+    return {n: getattr(keys, n) for n, path in KEY_PATHS.items() if not path.parameters}
 
 
 def named_keys(keys: Keys, name: str) -> dict[str, str]:
     """Every key that takes names, made with `name`."""
-    made: dict[str, str] = {}
-    for method, function in inspect.getmembers(Keys, inspect.isfunction):
-        if method.startswith("_") or method in NO_KEYS:
-            continue
-        count = len(inspect.signature(function).parameters) - 1
-        made[method] = getattr(keys, method)(*[name] * count)
-    return made
+    named = {n: len(path.parameters) for n, path in KEY_PATHS.items() if path.parameters}
+    return {member: getattr(keys, member)(*[name] * count) for member, count in named.items()}
 
 
 def test_there_are_keys_of_both_sorts() -> None:

@@ -6,8 +6,8 @@ status, ...) is made here, so that their hashes are those of the real thing.
 
 from __future__ import annotations
 
-from importlib.resources import files
-from importlib.resources.abc import Traversable
+import re
+from pathlib import Path
 from typing import Any
 
 from rosbags.typesys import TypesysError, get_types_from_msg
@@ -16,7 +16,7 @@ from vla_zenoh.errors import ProfileError
 from vla_zenoh.interop.ros2.names import split_type
 
 SEPARATOR = "---"
-_SUFFIXES = ("msg", "srv", "action")
+_SUFFIXES = (".msg", ".srv", ".action")
 _PARTS = {"srv": ("_Request", "_Response"), "action": ("_Goal", "_Result", "_Feedback")}
 
 Definitions = dict[str, Any]
@@ -25,19 +25,12 @@ Definitions = dict[str, Any]
 
 def shipped() -> dict[str, str]:
     """Type -> text of every definition in the folder ``text`` beside this module."""
-    found: dict[str, str] = {}
-    root = files("vla_zenoh.interop.ros2").joinpath("text")
-    for package in _folders(root):
-        for room in _folders(package):
-            for file in room.iterdir():
-                name, _, suffix = file.name.partition(".")
-                if suffix in _SUFFIXES:
-                    found[f"{package.name}/{room.name}/{name}"] = file.read_text("utf-8")
-    return found
-
-
-def _folders(folder: Traversable) -> list[Traversable]:
-    return sorted((entry for entry in folder.iterdir() if entry.is_dir()), key=lambda f: f.name)
+    root = Path(__file__).parent / "text"
+    return {
+        file.relative_to(root).with_suffix("").as_posix(): file.read_text("utf-8")
+        for file in sorted(root.glob("*/*/*"))
+        if file.suffix in _SUFFIXES
+    }
 
 
 def parse(kind: str, text: str) -> Definitions:
@@ -54,7 +47,7 @@ def parse(kind: str, text: str) -> Definitions:
     if room == "msg":
         return _message(package, room, name, text)
     suffixes = _PARTS[room]
-    parts = _split(text)
+    parts = [f"{part}\n" for part in re.split(rf"(?m)^\s*{SEPARATOR}\s*$", text)]
     if len(parts) != len(suffixes):
         raise ProfileError(
             f"{kind}: has {len(parts)} parts; wanted {len(suffixes)}, with a line {SEPARATOR} "
@@ -66,16 +59,6 @@ def parse(kind: str, text: str) -> Definitions:
     if room == "action":
         found |= _around_action(kind)
     return found
-
-
-def _split(text: str) -> list[str]:
-    parts: list[list[str]] = [[]]
-    for line in text.splitlines():
-        if line.strip() == SEPARATOR:
-            parts.append([])
-        else:
-            parts[-1].append(line)
-    return ["\n".join(part) + "\n" for part in parts]
 
 
 def _message(package: str, room: str, name: str, text: str) -> Definitions:

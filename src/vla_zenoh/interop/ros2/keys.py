@@ -9,14 +9,42 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
-from typing import Protocol
 
 from vla_zenoh.interop.ros2.names import dds_type, get_result_of, send_goal_of
-from vla_zenoh.interop.ros2.qos import DEFAULT, Qos
 
 CANCEL_GOAL = "action_msgs/srv/CancelGoal"
 _SLASH_OF_BRIDGES = "§"
 _SLASH_OF_RMW = "%"
+
+
+@dataclass(frozen=True, slots=True)
+class Qos:
+    """The used part of a ROS 2 QoS profile; history is always the last `depth`.
+
+    Args:
+        depth: samples kept.
+        reliable: they must arrive.
+    """
+
+    depth: int = 10
+    reliable: bool = True
+
+    def as_ros2dds(self, type_hash: str | None) -> str:
+        """As in the bridge's tokens: key-less, DDS's numbers, and the hash as user data."""
+        text = f":{int(self.reliable)}:0:0,{self.depth}"
+        return text if type_hash is None else f"{text}:typehash={type_hash};"
+
+    def as_rmw_zenoh(self) -> str:
+        """As in rmw_zenoh's tokens: what is the default (reliable, volatile) is left out."""
+        reliability = "" if self.reliable else "2"
+        return f"{reliability}::,{self.depth}:,:,:,,"
+
+
+DEFAULT = Qos()
+SENSOR = Qos(depth=5, reliable=False)
+"""rclcpp's SensorDataQoS: matches both reliable and best-effort publishers."""
+COMMAND = Qos(depth=1)
+"""Setpoints: reliable, so that it matches every subscriber; the newest replaces older ones."""
 
 
 class EntityRole(Enum):
@@ -46,26 +74,6 @@ class Endpoint:
     qos: Qos = DEFAULT
 
 
-class Wire(Protocol):
-    """How the ROS side names and announces endpoints."""
-
-    def key(self, endpoint: Endpoint) -> str:
-        """The key of its samples or queries."""
-        ...
-
-    def token(self, endpoint: Endpoint, number: int) -> str:
-        """The liveliness token that makes it seen; `number` differs for every endpoint."""
-        ...
-
-    def node_token(self) -> str:
-        """That of the node itself."""
-        ...
-
-    def others(self) -> str:
-        """Key expression of the tokens of all other nodes or bridges."""
-        ...
-
-
 def parts_of(action: Endpoint) -> dict[str, Endpoint]:
     """The services an action client uses: send_goal, get_result and cancel_goal."""
     at = f"{action.name}/_action"
@@ -89,11 +97,11 @@ class Ros2Dds:
     type_hash: Callable[[str], str] | None
 
     def key(self, endpoint: Endpoint) -> str:
-        """See `Wire`."""
+        """The key of its samples or queries."""
         return endpoint.name.removeprefix("/")
 
     def token(self, endpoint: Endpoint, number: int) -> str:
-        """See `Wire`; an action has one for all its parts."""
+        """The liveliness token that makes it seen; an action has one for all its parts."""
         kind, key = endpoint.type, self.key(endpoint)
         chunks = ["@", self.session_id, "@ros2_lv", endpoint.role.value]
         chunks += [text.replace("/", _SLASH_OF_BRIDGES) for text in (key, kind)]
@@ -107,7 +115,7 @@ class Ros2Dds:
         return f"@/{self.session_id}/@ros2_lv"
 
     def others(self) -> str:
-        """Those of bridges."""
+        """Key expression of the tokens of all bridges."""
         return "@/*/@ros2_lv"
 
 
@@ -128,13 +136,13 @@ class RmwZenoh:
     type_hash: Callable[[str], str]
 
     def key(self, endpoint: Endpoint) -> str:
-        """See `Wire`."""
+        """The key of its samples or queries."""
         kind = endpoint.type
         name = endpoint.name.strip("/")
         return f"{self.domain}/{name}/{dds_type(kind)}/{self.type_hash(kind)}"
 
     def token(self, endpoint: Endpoint, number: int) -> str:
-        """See `Wire`; an action is announced by its parts."""
+        """The liveliness token that makes it seen; each endpoint has another `number`."""
         return "/".join(
             (
                 self._at(number, endpoint.role.value),
@@ -146,14 +154,18 @@ class RmwZenoh:
         )
 
     def node_token(self) -> str:
-        """See `Wire`."""
+        """Liveliness token of the node itself."""
         return self._at(0, "NN")
 
     def others(self) -> str:
-        """Those of nodes."""
+        """Key expression of the tokens of all nodes."""
         return f"@ros2_lv/{self.domain}/*/*/*/NN/**"
 
     def _at(self, number: int, role: str) -> str:
         enclave = namespace = _SLASH_OF_RMW
         start = f"@ros2_lv/{self.domain}/{self.session_id}/0/{number}/{role}"
         return f"{start}/{enclave}/{namespace}/{self.node}"
+
+
+Wire = Ros2Dds | RmwZenoh
+"""How the ROS side names and announces endpoints."""

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_zenoh.codec.image import MAX_JPEG_BYTES, MAX_PIXELS, MAX_SIDE, decode_jpeg
+from vla_zenoh.codec.image import MAX_JPEG_BYTES, check_size, decode_jpeg
 from vla_zenoh.errors import CodecError
 from vla_zenoh.interop.ros2.messages import MAX_MESSAGE_BYTES, MAX_PICTURE_BYTES, Messages
 from vla_zenoh.interop.ros2.samples import SECOND_NS, Joints, RosImage, Wrench
@@ -90,7 +90,7 @@ def _image(message: Any) -> RosImage:
             + (". This one holds distances, which no model here takes" if deep else ""),
         )
     height, width, step = message.height, message.width, message.step
-    _check_size(height, width)
+    check_size(height, width)
     if step < width * channels:
         raise CodecError("invalid", f"rows of {step} bytes for {width} pixels {message.encoding}")
     data = np.asarray(message.data, np.uint8)
@@ -122,7 +122,7 @@ def _png(payload: bytes) -> NDArray[np.uint8]:
     if len(payload) > MAX_JPEG_BYTES:
         raise CodecError("oversize", f"a PNG of {len(payload)} bytes, at most {MAX_JPEG_BYTES}")
     width, height = (int.from_bytes(payload[at : at + 4], "big") for at in (16, 20))
-    _check_size(height, width)
+    check_size(height, width)
     try:
         bgr = cv2.imdecode(np.frombuffer(payload, np.uint8), cv2.IMREAD_COLOR)
     except cv2.error as error:
@@ -130,11 +130,6 @@ def _png(payload: bytes) -> NDArray[np.uint8]:
     if bgr is None:
         raise CodecError("malformed", "not a PNG file that can be decoded")
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB, dst=bgr), np.uint8)
-
-
-def _check_size(height: int, width: int) -> None:
-    if not (0 < height <= MAX_SIDE and 0 < width <= MAX_SIDE and height * width <= MAX_PIXELS):
-        raise CodecError("invalid", f"an image of {height}x{width}")
 
 
 def _text(message: Any) -> str:

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_zenoh.policy import CameraSpec, ModelSpec, Observation, example_observation
+from vla_zenoh.policy import CameraSpec, ModelSpec, Observation
 from vla_zenoh.policy.observation import prepare_image
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import GripperState, Image, JointState, PoseState
+from vla_zenoh.types import GripperState, Image, JointState, PoseState, Task
 
 PROMPTS = (
     "put the red brick in the box",
@@ -175,3 +175,33 @@ class ExampleMaker:
             position = np.array(self.profile.robot.home_rad)
         zeros = np.zeros(len(names))
         return JointState(names, position, zeros, zeros)
+
+
+def example_observation(
+    spec: ModelSpec, *, prompt: str = "put the red brick in the box"
+) -> Observation:
+    """A valid observation of the declared form, gray images and an arm at rest: for dry runs.
+
+    It has the parts of the state that the spec asks for, and no others.
+    """
+    asked = spec.observation.state
+    images = {
+        camera.camera: np.full((camera.height or 480, camera.width or 640, 3), 128, np.uint8)
+        for camera in spec.observation.cameras
+    }
+    zeros = np.zeros(7)
+    return Observation(
+        stamp_wall_ns=0,
+        seq=0,
+        task=Task(episode=0, active=False, prompt=prompt, worker=spec.name, rate_hz=5.0),
+        images=images,
+        joint=JointState(tuple(f"joint{i}" for i in range(1, 8)), zeros, zeros, zeros)
+        if "joint" in asked
+        else None,
+        pose=PoseState(np.array([0.45, 0.0, 0.3]), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(6))
+        if "pose" in asked
+        else None,
+        gripper=GripperState(width_m=0.08, moving=False, holding=False)
+        if "gripper" in asked
+        else None,
+    )

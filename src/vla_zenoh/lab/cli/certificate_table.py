@@ -7,7 +7,7 @@ import datetime as dt
 from rich.text import Text
 
 from vla_zenoh.cli.output import console, new_table, styled
-from vla_zenoh.security.lab_certificates import Entry
+from vla_zenoh.security.certificates import Entry
 
 
 def print_certificates(entries: list[Entry], now: dt.datetime) -> None:

@@ -15,6 +15,15 @@ from vla_zenoh.cli.options import DEFAULT_PROFILE, HostOption, JsonOption, Profi
 from vla_zenoh.cli.output import console, errors, fail, print_json
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import SecurityError, VlaZenohError
+from vla_zenoh.lab.certificates.authority import AUTHORITY_DAYS, CERTIFICATE_DAYS
+from vla_zenoh.lab.certificates.bridge import bridges
+from vla_zenoh.lab.certificates.lab_certificates import LabCertificates, unused_certificates
+from vla_zenoh.lab.certificates.secure_profile import (
+    moved_hosts,
+    profile_text,
+    serving_addresses,
+    with_operator,
+)
 from vla_zenoh.lab.cli.addresses import is_own
 from vla_zenoh.lab.cli.certificate_table import certificate_row, print_certificates
 from vla_zenoh.lab.cli.output_path import ForceOption, output_file
@@ -22,17 +31,7 @@ from vla_zenoh.lab.cli.secure_copying import copy_commands
 from vla_zenoh.profile import Profile, load_profile, profile_file
 from vla_zenoh.profile.session import DEFAULT_FOLDER
 from vla_zenoh.resources import is_path
-from vla_zenoh.security.authority import AUTHORITY_DAYS, CERTIFICATE_DAYS
-from vla_zenoh.security.bridge import bridges
 from vla_zenoh.security.identity import PEOPLE, Role, identities, identities_of, operator_identities
-from vla_zenoh.security.lab_certificates import LabCertificates
-from vla_zenoh.security.secure_profile import (
-    moved_hosts,
-    profile_text,
-    serving_addresses,
-    with_operator,
-)
-from vla_zenoh.security.unused_certificates import unused_certificates
 
 secure_app = typer.Typer(
     help="Certificates for a lab, so that only its hosts connect, with the rights of their roles.",

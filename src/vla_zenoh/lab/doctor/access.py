@@ -10,15 +10,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from vla_zenoh.errors import MissingExtraError, SecurityError, VlaZenohError
+from vla_zenoh.lab.certificates.bridge import NODE as BRIDGE
+from vla_zenoh.lab.certificates.lab_certificates import unused_certificates
 from vla_zenoh.lab.doctor.finding import HostFinding
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.session import is_loopback
-from vla_zenoh.security.bridge import NODE as BRIDGE
 from vla_zenoh.security.identity import Identity
-from vla_zenoh.security.unused_certificates import unused_certificates
 
 if TYPE_CHECKING:
-    from vla_zenoh.security.lab_certificates import Entry
+    from vla_zenoh.security.certificates import Entry
 
 SHOWN_FAULTS = 6
 SERVERS = ("router", BRIDGE)
@@ -62,9 +62,9 @@ def access(
         yield _without(profile)
         return
     try:
-        from vla_zenoh.security.lab_certificates import LabCertificates
+        from vla_zenoh.security.certificates import CheckedStore
 
-        store = LabCertificates(security.folder)
+        store = CheckedStore(security.folder)
         host = store.this_host(security.host)
         entries = store.entries(now, host)
     except (MissingExtraError, SecurityError) as error:

@@ -18,10 +18,11 @@ from vla_zenoh.errors import MissingExtraError, NodeError, how_to_install
 from vla_zenoh.kinematics.kinematics import Kinematics, make_kinematics
 from vla_zenoh.kinematics.so3 import Pose, pose_distance
 from vla_zenoh.lab.doctor.finding import HostFinding, Level
+from vla_zenoh.lab.doctor.franka_limits import BY_FCI, JOINTS
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.robot import FrankaProfile
 from vla_zenoh.robots.franka.arm import FrankaArm, error_names
-from vla_zenoh.robots.franka.published import BY_FCI, JOINTS, flange_pose
+from vla_zenoh.robots.franka.flange import flange_pose
 
 REALTIME_KERNEL = Path("/sys/kernel/realtime")
 NETWORK = Path("/sys/class/net")
@@ -113,6 +114,8 @@ def network_card(franka: FrankaProfile, folder: Path = NETWORK) -> HostFinding:
     try:
         speed = int((folder / card / "speed").read_text())
     except (OSError, ValueError):
+        speed = -1
+    if speed <= 0:  # Linux writes -1 where it is not known
         return HostFinding(name, "warn", f"{card}, of unknown speed", "it should be 1 Gbit/s")
     if speed < 1000:
         return HostFinding(name, "warn", f"{card}, {speed} Mbit/s", "use 1 Gbit/s, without a hub")

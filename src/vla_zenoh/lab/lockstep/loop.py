@@ -38,7 +38,6 @@ from vla_zenoh.types import (
     Stamped,
     Task,
 )
-from vla_zenoh.types.commands import JointReference
 
 if TYPE_CHECKING:
     from vla_zenoh.simulation.world import World
@@ -158,11 +157,7 @@ class Lockstep:
         if self.now_ns >= self._next_command_ns:
             self._next_command_ns += round(1e9 / self.profile.timing.command_hz)
             self._command()
-        reference = self.guard.tick(self.wall_ns(SIM))
-        if isinstance(reference, JointReference):
-            self.world.tick_joint(reference)
-        else:
-            self.world.tick(reference)
+        self.world.tick(self.guard.tick(self.wall_ns(SIM)))
 
     def _measure(self) -> Measured:
         state = self.world.joint_state()

@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.interop.ros2.graph import endpoints
 from vla_zenoh.interop.ros2.keys import EntityRole
+from vla_zenoh.lab.profile.ros2_endpoints import endpoints
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.ros2 import Ros2Profile
 from vla_zenoh.profile.session import (

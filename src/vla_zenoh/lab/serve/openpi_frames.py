@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Final
 
 from vla_zenoh.codec import message
 from vla_zenoh.errors import CodecError, PeerError
@@ -15,6 +15,8 @@ HEALTH_PATH = "/healthz"
 MAX_BYTES = message.MAX_PAYLOAD_BYTES
 SPEC = "vla_zenoh_action"
 """Where a server of ours says what its actions mean."""
+RESET: Final = {"endpoint": "reset"}
+"""Request that starts an episode, as vllm-omni takes it."""
 
 
 def metadata(action: ActionSpec, names: Mapping[str, str]) -> bytes:
@@ -57,3 +59,8 @@ def answer(actions: Any, infer_ms: float, previous_ms: float | None) -> bytes:
     if previous_ms is not None:
         timing["prev_total_ms"] = previous_ms
     return message.pack({"actions": actions, "server_timing": timing})
+
+
+def reset_done() -> bytes:
+    """Reply to `RESET`."""
+    return message.pack({"status": "reset"})

@@ -1,7 +1,7 @@
 """Serves one of our models to openpi clients over WebSocket, without Zenoh.
 
 It serves one client at a time, as a model may keep state; a second client is rejected. A new
-connection or a new prompt starts an episode.
+connection, a new prompt or a reset starts an episode.
 """
 
 from __future__ import annotations
@@ -99,6 +99,10 @@ class OpenPiServer:
             try:
                 self._seq += 1
                 given = openpi_frames.read_observation(frame)
+                if given == openpi_frames.RESET:
+                    prompt = None
+                    connection.send(openpi_frames.reset_done())
+                    continue
                 observation = self._offer.observe(given, time.time_ns(), self._seq)
                 if observation.prompt != prompt:
                     prompt = observation.prompt

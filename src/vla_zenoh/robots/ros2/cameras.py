@@ -10,8 +10,8 @@ from vla_zenoh.bus.buffers import LatestSample, ReceivedSample
 from vla_zenoh.bus.node import Node
 from vla_zenoh.errors import CodecError
 from vla_zenoh.interop.joint_reading import StampFilter
+from vla_zenoh.interop.ros2.keys import SENSOR
 from vla_zenoh.interop.ros2.messages import MAX_PICTURE_BYTES, Messages
-from vla_zenoh.interop.ros2.qos import SENSOR
 from vla_zenoh.interop.ros2.readers import read
 from vla_zenoh.interop.ros2.samples import RosImage
 from vla_zenoh.nodes.camera.camera_publisher import OK, CameraPublisher, resize

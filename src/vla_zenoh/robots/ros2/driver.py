@@ -19,9 +19,8 @@ from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import ProfileError, RecordError
 from vla_zenoh.interop.joint_reading import pose_state
-from vla_zenoh.interop.ros2.graph import camera_topics
+from vla_zenoh.interop.ros2.keys import COMMAND
 from vla_zenoh.interop.ros2.messages import Messages
-from vla_zenoh.interop.ros2.qos import COMMAND
 from vla_zenoh.interop.ros2.samples import Stamp
 from vla_zenoh.interop.ros2.writers import Write, joint_writer, pose_writer
 from vla_zenoh.profile import Profile, SessionProfile
@@ -106,7 +105,7 @@ class Ros2Driver(RobotDriver):
             self._declare_output(graph)
         self._cameras = [
             Camera(camera, topic, node, graph, read_messages(ros2), self._emit, self._reject)
-            for camera, topic in camera_topics(profile).items()
+            for camera, topic in profile.ros2_cameras().items()
         ]
         self._services = None
         if ros2.services is not None:

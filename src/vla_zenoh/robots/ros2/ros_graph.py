@@ -15,9 +15,17 @@ from vla_zenoh.bus.buffers import CallbackRing, LatestSample, bytes_of
 from vla_zenoh.errors import CodecError
 from vla_zenoh.interop.ros2 import attachment as attachments
 from vla_zenoh.interop.ros2.attachment import Attachment
-from vla_zenoh.interop.ros2.keys import Endpoint, EntityRole, RmwZenoh, Ros2Dds, Wire, parts_of
+from vla_zenoh.interop.ros2.keys import (
+    DEFAULT,
+    Endpoint,
+    EntityRole,
+    Qos,
+    RmwZenoh,
+    Ros2Dds,
+    Wire,
+    parts_of,
+)
 from vla_zenoh.interop.ros2.messages import Messages
-from vla_zenoh.interop.ros2.qos import DEFAULT, Qos
 from vla_zenoh.profile.ros2 import Ros2Profile
 
 Buffer = TypeVar("Buffer", LatestSample, CallbackRing)
@@ -62,10 +70,7 @@ class ServiceClient:
         self._seq = itertools.count(1)
 
     def call(
-        self,
-        request: bytes,
-        done: Callable[[bytes | None], None],
-        timeout_s: float | None = None,
+        self, request: bytes, done: Callable[[bytes | None], None], timeout_s: float | None = None
     ) -> None:
         """Call the service; `done` is called once, on Zenoh's thread.
 

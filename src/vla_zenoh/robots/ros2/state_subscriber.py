@@ -11,8 +11,8 @@ from vla_zenoh.bus.metrics import RateMeter
 from vla_zenoh.bus.node import Node
 from vla_zenoh.errors import CodecError
 from vla_zenoh.interop.joint_reading import JointReading
+from vla_zenoh.interop.ros2.keys import SENSOR
 from vla_zenoh.interop.ros2.messages import Messages
-from vla_zenoh.interop.ros2.qos import SENSOR
 from vla_zenoh.interop.ros2.readers import JOINT_STATE, WRENCH, read
 from vla_zenoh.interop.ros2.robot_clock import RobotClock
 from vla_zenoh.interop.ros2.samples import Wrench

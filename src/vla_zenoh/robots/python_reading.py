@@ -2,39 +2,19 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 from vla_zenoh.interop.joint_reading import JointReading, pose_state
 from vla_zenoh.interop.ros2.samples import Joints
 from vla_zenoh.kinematics.kinematics import Kinematics
-from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import Profile
 from vla_zenoh.robot import Reading, numbers
+from vla_zenoh.robots.driver import Measurement
 from vla_zenoh.sanitize import one_line
-from vla_zenoh.types import FloatArray, GripperState, JointState, PoseState
+from vla_zenoh.types import FloatArray, GripperState
 
 MAX_WORDS = 300
 FAULT_NS = 200_000_000
 """A fault lasts at least this long: only the newest state is used, and a single one could be
 missed."""
-
-
-class ValidReading(NamedTuple):
-    """A validated reading.
-
-    Args:
-        stamp_ns: when it was measured, wall clock.
-        joints: of the arm.
-        tcp: by our kinematics.
-        pose: the same with twist and wrench; without a reference.
-        gripper: ready and without faults.
-    """
-
-    stamp_ns: int
-    joints: JointState
-    tcp: Pose
-    pose: PoseState
-    gripper: GripperState
 
 
 class PythonReading:
@@ -49,7 +29,7 @@ class PythonReading:
         self._names = profile.robot.arm_joints
         self._state = JointReading(profile, kinematics)
 
-    def take(self, reading: Reading, stamp_ns: int, asked_m: float) -> ValidReading:
+    def take(self, reading: Reading, stamp_ns: int, asked_m: float) -> Measurement:
         """All of it, or nothing.
 
         Args:
@@ -79,7 +59,7 @@ class PythonReading:
         taken = self._state.take(joints, stamp_ns)
         assert taken is not None
         tcp, twist = self._state.tcp()
-        return ValidReading(stamp_ns, taken, tcp, pose_state(tcp, twist, wrench, None), gripper)
+        return Measurement(stamp_ns, taken, tcp, pose_state(tcp, twist, wrench, None), gripper)
 
 
 class Fault:

@@ -12,7 +12,7 @@ from typing import Any
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.session import TRUSTED_PROTOCOLS, host_of, is_loopback
 from vla_zenoh.security.identity import Identity, Role
-from vla_zenoh.security.rules import EVERY_MESSAGE, IN, OUT
+from vla_zenoh.security.rules import EVERY_MESSAGE, IN, OUT, rule
 from vla_zenoh.security.store import AUTHORITY
 
 NODE, USER = "bridge", "ros2"
@@ -63,15 +63,7 @@ def bridge_locks(profile: Profile, folder: Path) -> dict[str, Any]:
         "access_control": {
             "enabled": True,
             "default_permission": "deny",
-            "rules": [
-                {
-                    "id": USER,
-                    "messages": list(EVERY_MESSAGE),
-                    "flows": [IN, OUT],
-                    "permission": "allow",
-                    "key_exprs": list(KEYS),
-                }
-            ],
+            "rules": [rule(USER, (IN, OUT), EVERY_MESSAGE, KEYS)],
             "subjects": [{"id": USER, "cert_common_names": names}],
             "policies": [{"rules": [USER], "subjects": [USER]}],
         },

@@ -10,20 +10,7 @@ from vla_zenoh.interop.ros2.keys import Endpoint, EntityRole
 from vla_zenoh.interop.ros2.readers import JOINT_STATE, TEXT, WRENCH
 from vla_zenoh.interop.ros2.services import PROMPT_TOPIC, SERVICES, STATUS_TOPIC
 from vla_zenoh.profile import Profile
-from vla_zenoh.profile.ros2 import GRIPPER_ACTIONS, Ros2Camera, Ros2Gripper, Ros2Profile
-
-SOURCE = "ros2:"
-"""Prefix of a camera source that is a ROS topic."""
-
-
-def camera_topics(profile: Profile) -> dict[str, Ros2Camera]:
-    """Camera -> its topic, of all that come from ROS 2."""
-    named = profile.ros2.cameras if profile.ros2 is not None else {}
-    return {
-        name: named.get(name) or Ros2Camera(topic=camera.source.removeprefix(SOURCE))
-        for name, camera in profile.cameras.items()
-        if camera.source.startswith(SOURCE)
-    }
+from vla_zenoh.profile.ros2 import GRIPPER_ACTIONS, Ros2Gripper, Ros2Profile
 
 
 def endpoints(profile: Profile) -> tuple[Endpoint, ...]:
@@ -35,7 +22,7 @@ def endpoints(profile: Profile) -> tuple[Endpoint, ...]:
     if ros2 is None:
         return ()
     found = [
-        Endpoint(EntityRole.SUBSCRIBER, c.topic, c.type) for c in camera_topics(profile).values()
+        Endpoint(EntityRole.SUBSCRIBER, c.topic, c.type) for c in profile.ros2_cameras().values()
     ]
     if profile.robot.driver == "ros2":
         found += _arm(ros2, profile.robot.command)

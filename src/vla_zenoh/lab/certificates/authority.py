@@ -1,4 +1,4 @@
-"""Certificate authority of a lab: issues certificates and reads them. Bytes in, bytes out.
+"""Certificate authority of a lab: issues certificates. Bytes in, bytes out.
 
 X.509 version 3 (RFC 5280), keys on the curve P-256, ECDSA signatures with SHA-256, which every TLS
 library accepts. Certificates of routers may serve and connect, all others only connect, so a stolen
@@ -9,72 +9,30 @@ from __future__ import annotations
 
 import datetime as dt
 import ipaddress
-import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from typing import NamedTuple
 
-from vla_zenoh.errors import MissingExtraError, SecurityError
+from vla_zenoh.errors import SecurityError
+from vla_zenoh.security.certificates import load_pair  # first: says how to install cryptography
 
-try:
-    from cryptography import x509
-    from cryptography.exceptions import InvalidSignature
-    from cryptography.hazmat.primitives import hashes, serialization
-    from cryptography.hazmat.primitives.asymmetric import ec
-    from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
-except ImportError as error:  # nodes that only use their certificates do without it
-    raise MissingExtraError("cryptography", "secure") from error
+# isort: split
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 AUTHORITY_DAYS, CERTIFICATE_DAYS = 3650, 365
-WARN_DAYS = 30
-"""A certificate that expires within this time should be renewed."""
 BACKDATE = dt.timedelta(minutes=10)
 """Certificates are valid from a little earlier: the clocks of a lab's hosts differ."""
 MAX_COMMON_NAME = 64
 """Of RFC 5280, ub-common-name."""
 
 
-@dataclass(frozen=True, slots=True)
-class KeyPair:
+class KeyPair(NamedTuple):
     """A certificate and its private key, as PEM text."""
 
     certificate: bytes
     key: bytes
-
-
-@dataclass(frozen=True, slots=True)
-class Certificate:
-    """Contents of a certificate.
-
-    Args:
-        common_name: of its subject.
-        not_before: valid from, UTC.
-        not_after: valid until, UTC.
-        addresses: host names and IP addresses that it is valid for as a server.
-    """
-
-    common_name: str
-    not_before: dt.datetime
-    not_after: dt.datetime
-    addresses: tuple[str, ...]
-
-    def days_left(self, now: dt.datetime) -> int:
-        """Whole days until it expires; negative if it has."""
-        return math.floor((self.not_after - now) / dt.timedelta(days=1))
-
-    def fault(self, now: dt.datetime) -> str:
-        """Why it is invalid at `now`; empty if it is valid."""
-        if now < self.not_before:
-            return f"is not valid before {self.not_before:%Y-%m-%d %H:%M} UTC (is the clock right?)"
-        if now > self.not_after:
-            return f"expired on {self.not_after:%Y-%m-%d}; renew it"
-        return ""
-
-    def warning(self, now: dt.datetime) -> str:
-        """Warning of an expiry within `WARN_DAYS`; empty if there is none."""
-        left = self.days_left(now)
-        if self.fault(now) or left >= WARN_DAYS:
-            return ""
-        return f"ends in {left} day{'s' if left != 1 else ''}; renew it"
 
 
 def make_authority(name: str, now: dt.datetime, days: int = AUTHORITY_DAYS) -> KeyPair:
@@ -112,7 +70,7 @@ def issue(
     Raises:
         SecurityError: invalid name or address, or an authority that is invalid or expired.
     """
-    signer, signer_key = _load(authority)
+    signer, signer_key = load_pair(*authority)
     end = signer.not_valid_after_utc
     if now > end:
         raise SecurityError(f"the lab's authority expired on {end:%Y-%m-%d}: make a new one")
@@ -127,57 +85,6 @@ def issue(
     signed_with = x509.AuthorityKeyIdentifier.from_issuer_public_key(signer_key.public_key())
     builder = builder.add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
     return _signed(builder.add_extension(signed_with, critical=False), key, signer_key)
-
-
-def read(pem: bytes) -> Certificate:
-    """Contents of a certificate.
-
-    Raises:
-        SecurityError: not a certificate.
-    """
-    try:
-        found = x509.load_pem_x509_certificate(pem)
-        extensions = found.extensions
-    except ValueError as error:
-        raise SecurityError(f"is not a certificate: {error}") from error
-    names = found.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
-    try:
-        addresses = extensions.get_extension_for_class(x509.SubjectAlternativeName).value
-    except x509.ExtensionNotFound:
-        addresses = ()
-    return Certificate(
-        str(names[0].value) if names else "",
-        found.not_valid_before_utc,
-        found.not_valid_after_utc,
-        tuple(str(address.value) for address in addresses),
-    )
-
-
-def signed_by(pem: bytes, authority: bytes) -> bool:
-    """Whether `authority` signed the certificate `pem`.
-
-    Raises:
-        SecurityError: one of them is not a certificate.
-    """
-    try:
-        found, signer = map(x509.load_pem_x509_certificate, (pem, authority))
-    except ValueError as error:
-        raise SecurityError(f"is not a certificate: {error}") from error
-    try:
-        found.verify_directly_issued_by(signer)
-    except (ValueError, TypeError, InvalidSignature):
-        return False
-    return True
-
-
-def key_fits(pair: KeyPair) -> bool:
-    """Whether the private key belongs to the certificate.
-
-    Raises:
-        SecurityError: one of them cannot be read.
-    """
-    certificate, key = _load(pair)
-    return certificate.public_key() == key.public_key()
 
 
 def _address(address: str) -> x509.GeneralName:
@@ -245,14 +152,3 @@ def _signed(
             serialization.NoEncryption(),
         ),
     )
-
-
-def _load(pair: KeyPair) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
-    try:
-        certificate = x509.load_pem_x509_certificate(pair.certificate)
-        key = serialization.load_pem_private_key(pair.key, password=None)
-    except (ValueError, TypeError) as error:
-        raise SecurityError(f"cannot be read as certificate and private key: {error}") from error
-    if not isinstance(key, ec.EllipticCurvePrivateKey):
-        raise SecurityError("the private key is not one of an elliptic curve, as we make them")
-    return certificate, key

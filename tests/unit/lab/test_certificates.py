@@ -13,13 +13,13 @@ from cryptography.x509.oid import ExtendedKeyUsageOID
 from typer.testing import CliRunner
 
 from vla_zenoh.errors import SecurityError
+from vla_zenoh.lab.certificates import authority as ca
+from vla_zenoh.lab.certificates.lab_certificates import LabCertificates, unused_certificates
+from vla_zenoh.lab.certificates.secure_profile import moved_hosts, profile_text, with_operator
 from vla_zenoh.lab.cli.secure import secure_app
 from vla_zenoh.profile import load_profile, override
-from vla_zenoh.security import authority as ca
+from vla_zenoh.security import certificates
 from vla_zenoh.security.identity import Identity, Role, operator_identities
-from vla_zenoh.security.lab_certificates import LabCertificates
-from vla_zenoh.security.secure_profile import moved_hosts, profile_text, with_operator
-from vla_zenoh.security.unused_certificates import unused_certificates
 
 NOW = dt.datetime(2026, 3, 1, 12, tzinfo=dt.UTC)
 ROUTER = Identity(Role.ROUTER, "router", "robot")
@@ -42,21 +42,21 @@ def store(tmp_path: Path) -> LabCertificates:
 # -- certificates -----------------------------------------------------------------------------
 def test_a_certificate_says_whose_it_is_and_who_signed_it(authority: ca.KeyPair) -> None:
     made = ca.issue(authority, "worker-scripted@gpu", NOW)
-    found = ca.read(made.certificate)
+    found = certificates.read(made.certificate)
     assert found.common_name == "worker-scripted@gpu"
     raw = x509.load_pem_x509_certificate(made.certificate)
     assert raw.issuer.rfc4514_string() == "CN=test lab"
     assert not raw.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
     assert found.days_left(NOW) == ca.CERTIFICATE_DAYS
-    assert ca.signed_by(made.certificate, authority.certificate)
-    assert ca.key_fits(made)
-    assert not ca.key_fits(ca.KeyPair(made.certificate, authority.key))
+    assert certificates.signed_by(made.certificate, authority.certificate)
+    assert certificates.key_fits(*made)
+    assert not certificates.key_fits(made.certificate, authority.key)
 
 
 def test_another_authority_of_the_same_name_signed_something_else(authority: ca.KeyPair) -> None:
     other = ca.make_authority("test lab", NOW)
     made = ca.issue(other, "operator@desk", NOW)
-    assert not ca.signed_by(made.certificate, authority.certificate)
+    assert not certificates.signed_by(made.certificate, authority.certificate)
 
 
 def usages(pem: bytes) -> list[x509.ObjectIdentifier]:
@@ -66,16 +66,16 @@ def usages(pem: bytes) -> list[x509.ObjectIdentifier]:
 
 def test_only_a_router_may_serve(authority: ca.KeyPair) -> None:
     router = ca.issue(authority, "router@robot", NOW, addresses=["10.0.0.2", "robot.lab", "::1"])
-    assert ca.read(router.certificate).addresses == ("10.0.0.2", "robot.lab", "::1")
+    assert certificates.read(router.certificate).addresses == ("10.0.0.2", "robot.lab", "::1")
     assert ExtendedKeyUsageOID.SERVER_AUTH in usages(router.certificate)
     worker = ca.issue(authority, "worker-scripted@gpu", NOW)
     assert usages(worker.certificate) == [ExtendedKeyUsageOID.CLIENT_AUTH]
-    assert ca.read(worker.certificate).addresses == ()
+    assert certificates.read(worker.certificate).addresses == ()
 
 
 def test_nothing_outlives_the_authority() -> None:
     short = ca.make_authority("test lab", NOW, days=10)
-    assert ca.read(ca.issue(short, "a@b", NOW).certificate).days_left(NOW) == 10
+    assert certificates.read(ca.issue(short, "a@b", NOW).certificate).days_left(NOW) == 10
     with pytest.raises(SecurityError, match="authority expired on 2026-03-11: make a new one"):
         ca.issue(short, "a@b", NOW + dt.timedelta(days=11))
 
@@ -94,7 +94,7 @@ def test_nothing_outlives_the_authority() -> None:
 def test_the_end_of_a_certificate_is_told_in_time(
     authority: ca.KeyPair, days: int, fault: str, warning: str
 ) -> None:
-    found = ca.read(ca.issue(authority, "a@b", NOW).certificate)
+    found = certificates.read(ca.issue(authority, "a@b", NOW).certificate)
     then = NOW + dt.timedelta(days=days)
     assert found.fault(then) == fault
     assert found.warning(then) == warning
@@ -109,7 +109,7 @@ def test_a_name_that_no_certificate_can_hold_is_refused(authority: ca.KeyPair) -
 
 def test_what_is_no_certificate_is_refused() -> None:
     with pytest.raises(SecurityError, match="not a certificate"):
-        ca.read(b"hello")
+        certificates.read(b"hello")
 
 
 # -- the folder -------------------------------------------------------------------------------

@@ -1,48 +1,26 @@
-"""Makes and checks the certificates of a lab. Nothing is overwritten unless requested.
-
-Needs the library ``cryptography``; nodes that only use their certificates do not, see `store`.
-"""
+"""Makes the certificates of a lab. Nothing is overwritten unless requested."""
 
 from __future__ import annotations
 
 import datetime as dt
 import os
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable
 from pathlib import Path
 
 from vla_zenoh.errors import SecurityError
-from vla_zenoh.security import authority as ca
-from vla_zenoh.security.authority import Certificate, KeyPair
-from vla_zenoh.security.identity import Identity, Role
-from vla_zenoh.security.store import AUTHORITY, THIS_HOST, Files, Store, open_to_others
+from vla_zenoh.lab.certificates import authority as ca
+from vla_zenoh.lab.certificates.authority import KeyPair
+from vla_zenoh.lab.certificates.bridge import bridges
+from vla_zenoh.profile import Profile
+from vla_zenoh.security.certificates import CheckedStore, Entry, read, read_file
+from vla_zenoh.security.identity import Identity, Role, identities
+from vla_zenoh.security.store import AUTHORITY, THIS_HOST, Files, open_to_others
 
 KEY_MODE = 0o600
 FOLDER_MODE = 0o700
 
 
-@dataclass(frozen=True, slots=True)
-class Entry:
-    """A certificate in the folder.
-
-    Args:
-        host: empty: the authority itself.
-        node: or ``operator``, ``viewer``, ``ca``.
-        path: of the certificate.
-        certificate: its contents; None if it cannot be read.
-        faults: why it is unusable or unsafe.
-        warning: of its expiry.
-    """
-
-    host: str
-    node: str
-    path: Path
-    certificate: Certificate | None
-    faults: tuple[str, ...]
-    warning: str
-
-
-class LabCertificates(Store):
+class LabCertificates(CheckedStore):
     """Folder of a lab's certificates and keys, to make and to check them."""
 
     def make_authority(self, lab: str, now: dt.datetime) -> Path:
@@ -113,12 +91,12 @@ class LabCertificates(Store):
             )
         if fault := open_to_others(key):
             raise SecurityError(f"{fault}. Anyone who read it can issue certificates of this lab")
-        return KeyPair(_read(certificate), _read(key))
+        return KeyPair(read_file(certificate), read_file(key))
 
     def _served(self, identity: Identity) -> tuple[str, ...]:
         """Addresses in the existing certificate; they are recorded nowhere else."""
         try:
-            return ca.read(_read(self.files(identity.host, identity.node).certificate)).addresses
+            return read(read_file(self.files(identity.host, identity.node).certificate)).addresses
         except SecurityError:
             return ()
 
@@ -152,53 +130,6 @@ class LabCertificates(Store):
         _write(path, f"{host}\n".encode(), 0o644)
         return path
 
-    def entries(self, now: dt.datetime, host: str | None = None) -> list[Entry]:
-        """All certificates, or those of one host, with their faults."""
-        own = self.folder / f"{AUTHORITY}.pem"
-        out = [self._entry(own, own, "", now)] if own.exists() and host is None else []
-        for name in self.hosts():
-            if host is None or name == host:
-                paths = sorted((self.folder / name).glob("*.pem"))
-                signer = self.folder / name / f"{AUTHORITY}.pem"
-                out += [self._entry(path, signer, name, now) for path in paths if path != signer]
-        return out
-
-    def _entry(self, path: Path, signer: Path, host: str, now: dt.datetime) -> Entry:
-        node, found, warning = path.stem, None, ""
-        faults: list[str] = []
-        try:
-            pem = _read(path)
-            found = ca.read(pem)
-            faults += [fault] if (fault := found.fault(now)) else []
-            warning = found.warning(now)
-            if not ca.signed_by(pem, _read(signer)):
-                faults.append("was signed by another authority")
-            if host and found.common_name != f"{node}@{host}":
-                faults.append(f"is about {found.common_name!r}")
-            faults += self._key_faults(path, host)
-        except SecurityError as error:
-            faults.append(str(error))
-        return Entry(host, node, path, found, tuple(faults), warning)
-
-    @staticmethod
-    def _key_faults(path: Path, host: str) -> Iterator[str]:
-        key = path.with_suffix(".key")
-        if not key.exists():
-            if host:
-                yield f"{key.name} is not there"
-            return
-        if fault := open_to_others(key):
-            yield fault
-        if not ca.key_fits(KeyPair(_read(path), _read(key))):
-            yield f"{key.name} belongs to another certificate"
-
-
-def _read(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise SecurityError(f"{path} cannot be read: {error.strerror}") from error
-
 
 def _write(path: Path, content: bytes, mode: int) -> None:
     """Write a file atomically; it has its mode from the start."""
@@ -212,3 +143,26 @@ def _write(path: Path, content: bytes, mode: int) -> None:
         beside.replace(path)
     except OSError as error:
         raise SecurityError(f"{path} cannot be written: {error.strerror}") from error
+
+
+def unused_certificates(profile: Profile, entries: Iterable[Entry]) -> dict[Path, str]:
+    """Certificates whose traffic the router drops: file -> what to do.
+
+    There are some after a role was reduced or a node was removed from the profile.
+
+    Args:
+        profile: secured.
+        entries: of its folder.
+    """
+    security = profile.session.security
+    people = security.people if security is not None else {}
+    known = {one.common_name for one in (*identities(profile), *bridges(profile))}
+    out: dict[Path, str] = {}
+    for entry in entries:
+        if entry.host and f"{entry.node}@{entry.host}" not in known:
+            role = people.get(entry.host)
+            given = f", where people at {entry.host} are {role}" if role is not None else ""
+            out[entry.path] = (
+                f"is not known to profile {profile.name}{given}: delete it here and on {entry.host}"
+            )
+    return out

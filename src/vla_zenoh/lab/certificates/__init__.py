@@ -1,0 +1,1 @@
+"""Makes the certificates of a lab, and the profile that uses them."""

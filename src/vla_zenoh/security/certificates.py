@@ -1,0 +1,210 @@
+"""Reads and checks the certificates of a computer.
+
+Needs the library ``cryptography``; nodes that only use their certificates do without it, see
+`store`. `vla_zenoh.lab.certificates` makes them.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from vla_zenoh.errors import MissingExtraError, SecurityError
+from vla_zenoh.security.store import AUTHORITY, Store, open_to_others
+
+try:
+    from cryptography import x509
+    from cryptography.exceptions import InvalidSignature
+    from cryptography.hazmat.primitives import serialization
+    from cryptography.hazmat.primitives.asymmetric import ec
+    from cryptography.x509.oid import NameOID
+except ImportError as error:
+    raise MissingExtraError("cryptography", "secure") from error
+
+WARN_DAYS = 30
+"""A certificate that expires within this time should be renewed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Certificate:
+    """Contents of a certificate.
+
+    Args:
+        common_name: of its subject.
+        not_before: valid from, UTC.
+        not_after: valid until, UTC.
+        addresses: host names and IP addresses that it is valid for as a server.
+    """
+
+    common_name: str
+    not_before: dt.datetime
+    not_after: dt.datetime
+    addresses: tuple[str, ...]
+
+    def days_left(self, now: dt.datetime) -> int:
+        """Whole days until it expires; negative if it has."""
+        return math.floor((self.not_after - now) / dt.timedelta(days=1))
+
+    def fault(self, now: dt.datetime) -> str:
+        """Why it is invalid at `now`; empty if it is valid."""
+        if now < self.not_before:
+            return f"is not valid before {self.not_before:%Y-%m-%d %H:%M} UTC (is the clock right?)"
+        if now > self.not_after:
+            return f"expired on {self.not_after:%Y-%m-%d}; renew it"
+        return ""
+
+    def warning(self, now: dt.datetime) -> str:
+        """Warning of an expiry within `WARN_DAYS`; empty if there is none."""
+        left = self.days_left(now)
+        if self.fault(now) or left >= WARN_DAYS:
+            return ""
+        return f"ends in {left} day{'s' if left != 1 else ''}; renew it"
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A certificate in the folder.
+
+    Args:
+        host: empty: the authority itself.
+        node: or ``operator``, ``viewer``, ``ca``.
+        path: of the certificate.
+        certificate: its contents; None if it cannot be read.
+        faults: why it is unusable or unsafe.
+        warning: of its expiry.
+    """
+
+    host: str
+    node: str
+    path: Path
+    certificate: Certificate | None
+    faults: tuple[str, ...]
+    warning: str
+
+
+class CheckedStore(Store):
+    """Folder of a lab's certificates and keys, to check them."""
+
+    def entries(self, now: dt.datetime, host: str | None = None) -> list[Entry]:
+        """All certificates, or those of one host, with their faults."""
+        own = self.folder / f"{AUTHORITY}.pem"
+        out = [self._entry(own, own, "", now)] if own.exists() and host is None else []
+        for name in self.hosts():
+            if host is None or name == host:
+                paths = sorted((self.folder / name).glob("*.pem"))
+                signer = self.folder / name / f"{AUTHORITY}.pem"
+                out += [self._entry(path, signer, name, now) for path in paths if path != signer]
+        return out
+
+    def _entry(self, path: Path, signer: Path, host: str, now: dt.datetime) -> Entry:
+        node, found, warning = path.stem, None, ""
+        faults: list[str] = []
+        try:
+            pem = read_file(path)
+            found = read(pem)
+            faults += [fault] if (fault := found.fault(now)) else []
+            warning = found.warning(now)
+            if not signed_by(pem, read_file(signer)):
+                faults.append("was signed by another authority")
+            if host and found.common_name != f"{node}@{host}":
+                faults.append(f"is about {found.common_name!r}")
+            faults += self._key_faults(path, host)
+        except SecurityError as error:
+            faults.append(str(error))
+        return Entry(host, node, path, found, tuple(faults), warning)
+
+    @staticmethod
+    def _key_faults(path: Path, host: str) -> Iterator[str]:
+        key = path.with_suffix(".key")
+        if not key.exists():
+            if host:
+                yield f"{key.name} is not there"
+            return
+        if fault := open_to_others(key):
+            yield fault
+        if not key_fits(read_file(path), read_file(key)):
+            yield f"{key.name} belongs to another certificate"
+
+
+def read(pem: bytes) -> Certificate:
+    """Contents of a certificate.
+
+    Raises:
+        SecurityError: not a certificate.
+    """
+    try:
+        found = x509.load_pem_x509_certificate(pem)
+        extensions = found.extensions
+    except ValueError as error:
+        raise SecurityError(f"is not a certificate: {error}") from error
+    names = found.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
+    try:
+        addresses = extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    except x509.ExtensionNotFound:
+        addresses = ()
+    return Certificate(
+        str(names[0].value) if names else "",
+        found.not_valid_before_utc,
+        found.not_valid_after_utc,
+        tuple(str(address.value) for address in addresses),
+    )
+
+
+def signed_by(pem: bytes, authority: bytes) -> bool:
+    """Whether `authority` signed the certificate `pem`.
+
+    Raises:
+        SecurityError: one of them is not a certificate.
+    """
+    try:
+        found, signer = map(x509.load_pem_x509_certificate, (pem, authority))
+    except ValueError as error:
+        raise SecurityError(f"is not a certificate: {error}") from error
+    try:
+        found.verify_directly_issued_by(signer)
+    except (ValueError, TypeError, InvalidSignature):
+        return False
+    return True
+
+
+def key_fits(certificate: bytes, key: bytes) -> bool:
+    """Whether the private key belongs to the certificate, both as PEM text.
+
+    Raises:
+        SecurityError: one of them cannot be read.
+    """
+    found, private = load_pair(certificate, key)
+    return found.public_key() == private.public_key()
+
+
+def load_pair(
+    certificate: bytes, key: bytes
+) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
+    """A certificate and a private key of PEM text.
+
+    Raises:
+        SecurityError: one of them cannot be read.
+    """
+    try:
+        found = x509.load_pem_x509_certificate(certificate)
+        private = serialization.load_pem_private_key(key, password=None)
+    except (ValueError, TypeError) as error:
+        raise SecurityError(f"cannot be read as certificate and private key: {error}") from error
+    if not isinstance(private, ec.EllipticCurvePrivateKey):
+        raise SecurityError("the private key is not one of an elliptic curve, as we make them")
+    return found, private
+
+
+def read_file(path: Path) -> bytes:
+    """Content of a file.
+
+    Raises:
+        SecurityError: it cannot be read.
+    """
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise SecurityError(f"{path} cannot be read: {error.strerror}") from error
