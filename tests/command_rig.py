@@ -261,3 +261,20 @@ class Rig:
 def quat_of(rotvec: Sequence[float]) -> np.ndarray:
     """Tool down, then turned by `rotvec` in the base frame."""
     return quat_from_rotation(exp3(np.array(rotvec)) @ rotation_from_quat(DOWN))
+
+
+def lone_chunk(steps: Any, observed_ns: int = START_NS) -> Stamped[ActionChunk]:
+    """A chunk for a planner alone, received when its observation was taken."""
+    record = ActionChunk(
+        worker=WORKER,
+        spec_hash="",
+        episode=1,
+        observation_stamp_ns=observed_ns,
+        observation_seq=0,
+        valid_until_ns=observed_ns + 10**9,
+        steps=np.asarray(steps, np.float32),
+        observed_ns=observed_ns,
+        inference_start_ns=observed_ns,
+        inference_end_ns=observed_ns,
+    )
+    return Stamped(Header(observed_ns, 1, SOURCE), record, observed_ns)

@@ -104,7 +104,7 @@ def main(port: int, variant: str) -> None:
             packed = msgpack.packb(answer, default=lambda value: encode(value, variant == "n1.5"))
             assert packed is not None
             socket.send(packed)
-        except Exception as error:
+        except Exception as error:  # any fault of a request is its answer
             failed = msgpack.packb({"error": str(error)})
             assert failed is not None
             socket.send(failed)

@@ -69,7 +69,7 @@ async def openpi(connection: server.ServerConnection) -> None:
             before_s = time.monotonic() - began_s
         except ConnectionClosed:
             return
-        except Exception:
+        except Exception:  # any fault of a request is its answer
             await connection.send(traceback.format_exc())
             await connection.close(1011, "Internal server error.")
             return
@@ -91,7 +91,7 @@ async def vllm(connection: server.ServerConnection) -> None:
             assert reset
             assert asked["session_id"]
             await connection.send(packb(policy.actions(asked["prompt"])))
-        except Exception:
+        except Exception:  # any fault of a request is its answer
             await connection.send(packb({"type": "error", "message": "Internal inference error"}))
 
 

@@ -61,7 +61,7 @@ class Handler(BaseHTTPRequestHandler):
             assert self.path == "/act", self.path
             answer = dumps(predict(body, self.variant))
         except Exception:
-            answer = '"error"'  # as published: status 200
+            answer = '"error"'  # as published: status 200, whatever the fault
         out = answer.encode()
         self.send_response(200)
         self.send_header("Content-Type", "application/json")

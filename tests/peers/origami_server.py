@@ -81,7 +81,7 @@ def process(operation: str, asked: dict[str, Any]) -> dict[str, Any]:
             "actions": infer(asked["observation"]),
             "server_timing": {"infer_ms": 1.0},
         }
-    except Exception as failed:
+    except Exception as failed:  # any fault of a request is its answer
         error = {"code": "INFERENCE_FAILED", "message": repr(failed), "retryable": False}
         return {**answer, "error": error}
 

@@ -19,12 +19,10 @@ class RateMeter:
     def __init__(self, window_s: float = 2.0) -> None:
         self._window_s = window_s
         self._times: deque[float] = deque(maxlen=4096)
-        self.total = 0
 
     def tick(self) -> None:
         """Count one event."""
         self._times.append(time.monotonic())
-        self.total += 1
 
     @property
     def rate_hz(self) -> float:
@@ -53,20 +51,19 @@ class Percentiles:
 
     def summary(self) -> tuple[float, float] | None:
         """(p50, p95), None without values."""
-        if not self._values:
-            return None
-        ordered = sorted(self._values)
-        last = len(ordered) - 1
-        return ordered[round(0.5 * last)], ordered[round(0.95 * last)]
+        found = self._at(0.5, 0.95)
+        return (found[0], found[1]) if found else None
 
     def spread(self) -> dict[str, float]:
         """p50, p95, p99 and max; empty without values."""
-        if not self._values:
-            return {}
+        found = self._at(0.5, 0.95, 0.99, 1.0)
+        names = ("p50", "p95", "p99", "max")
+        return {name: round(value, 1) for name, value in zip(names, found, strict=False)}
+
+    def _at(self, *shares: float) -> list[float]:
+        """The value below which each share of them lies; empty without values."""
         ordered = sorted(self._values)
-        last = len(ordered) - 1
-        shares = {"p50": 0.5, "p95": 0.95, "p99": 0.99, "max": 1.0}
-        return {name: round(ordered[round(share * last)], 1) for name, share in shares.items()}
+        return [ordered[round(share * (len(ordered) - 1))] for share in shares if ordered]
 
 
 LINKS_PERIOD_S = 5.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, TypeVar
 
 from vla_zenoh import keys
@@ -39,8 +39,7 @@ def decode(kind: type[Record], payload: bytes) -> Record:
             the record refuses: NaN, wrong shape, out of range).
     """
     _check_length(kind, payload)
-    data = message.unpack(payload)
-    return from_map(kind, data)
+    return from_map(kind, message.unpack(payload))
 
 
 def from_map(kind: type[Record], data: Any) -> Record:
@@ -93,7 +92,9 @@ def _record(kind: type[Record], data: Mapping[Any, Any]) -> Record:
     ]
     if missing:
         raise CodecError("malformed", f"{kind.__name__} lacks {', '.join(missing)}")
-    values = {name: _convert(name, value) for name, value in data.items()}
+    values = dict(data)
+    if "cause" in values:
+        values["cause"] = _cause(values["cause"])
     try:
         return kind(**values)
     except RecordError as error:
@@ -110,14 +111,6 @@ def _cause(value: Any) -> Any:
     from vla_zenoh.types import Cause  # brings numpy
 
     return _record(Cause, value)
-
-
-_CONVERTERS: dict[str, Callable[[Any], Any]] = {"cause": _cause}
-
-
-def _convert(name: str, value: Any) -> Any:
-    converter = _CONVERTERS.get(name)
-    return converter(value) if converter else value
 
 
 MAX_HEADER_BYTES = 1024

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command_rig import DOWN, MS, START_M, START_NS, Rig, profile
+from command_rig import DOWN, MS, START_M, START_NS, Rig, lone_chunk, profile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -17,7 +17,7 @@ from vla_zenoh.control.plan_timeline import Goal, GoalTimeline
 from vla_zenoh.kinematics.so3 import Pose, angle_between, exp3, log3, rotation_from_quat
 from vla_zenoh.policy import ActionSpec, ControllerSpec
 from vla_zenoh.profile.limits import Workspace
-from vla_zenoh.types import ActionChunk, FloatArray, Header, Stamped
+from vla_zenoh.types import FloatArray
 
 ATOL = 1e-9
 START = Pose(np.array([0.45, -0.1, 0.3]), exp3(np.array([2.8, 0.3, -0.5])))
@@ -175,25 +175,9 @@ WIDE = profile(
 )
 
 
-def chunk_at(observed_ns: int, steps: Any) -> Stamped[ActionChunk]:
-    record = ActionChunk(
-        worker="w",
-        spec_hash="",
-        episode=1,
-        observation_stamp_ns=observed_ns,
-        observation_seq=0,
-        valid_until_ns=observed_ns + 10**9,
-        steps=np.asarray(steps, np.float32),
-        observed_ns=observed_ns,
-        inference_start_ns=observed_ns,
-        inference_end_ns=observed_ns,
-    )
-    return Stamped(Header(observed_ns, 1, "w"), record, observed_ns)
-
-
 def plan_of(action: ActionSpec, timeline: GoalTimeline, observed_ns: int, steps: Any) -> ChunkPlan:
     planner = ChunkPlanner(WIDE, None)
-    plan = planner.plan(chunk_at(observed_ns, steps), action, timeline)
+    plan = planner.plan(lone_chunk(steps, observed_ns), action, timeline)
     assert isinstance(plan, ChunkPlan), plan
     while plan.bounded < len(plan.goals):
         planner.begin_tick()
@@ -235,7 +219,7 @@ def test_a_wall_takes_the_speed_of_a_response_but_not_that_along_it() -> None:
     of = profile(limits={"workspace": box, "step_m": 0.2})
     planner, timeline = ChunkPlanner(of, None), GoalTimeline(Goal(START, 0.08), START_NS)
     rows = osc_steps([[1.0, 1.0, 0, 0, 0, 0]] * 10 + [[-0.5, 0, 0, 0, 0, 0]] * 2)
-    plan = planner.plan(chunk_at(START_NS, rows), spec(**OSC), timeline)
+    plan = planner.plan(lone_chunk(rows), spec(**OSC), timeline)
     assert isinstance(plan, ChunkPlan), plan
     while plan.bounded < len(plan.goals):
         planner.begin_tick()

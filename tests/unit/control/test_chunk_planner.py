@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command_rig import DOWN, START_M, START_NS, WORKER, Rig, model_spec, profile, quat_of
+from command_rig import DOWN, START_M, START_NS, Rig, lone_chunk, model_spec, profile, quat_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from panda_arm import HOME_RAD, panda, tool_down_at
@@ -19,7 +19,7 @@ from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.kinematics.ik import Approach
 from vla_zenoh.kinematics.so3 import Pose, angle_between, norm3, rotation_from_quat
 from vla_zenoh.profile import Limits, Profile, ReachLimits
-from vla_zenoh.types import ActionChunk, FloatArray, Header, Stamped
+from vla_zenoh.types import FloatArray
 
 EXACT = 1e-12
 AT_GOAL_M = 1e-6
@@ -69,22 +69,6 @@ def arm_rig(of: Profile | None = None, reach: ReachabilityFilter = IN_PIECES, **
     return rig
 
 
-def chunk_of(steps: Any) -> Stamped[ActionChunk]:
-    record = ActionChunk(
-        worker=WORKER,
-        spec_hash="",
-        episode=1,
-        observation_stamp_ns=START_NS,
-        observation_seq=0,
-        valid_until_ns=START_NS + 10**9,
-        steps=np.asarray(steps, np.float32),
-        observed_ns=START_NS,
-        inference_start_ns=START_NS,
-        inference_end_ns=START_NS,
-    )
-    return Stamped(Header(START_NS, 1, "worker"), record, START_NS)
-
-
 def whole_plan(
     of: Profile, reach: ReachabilityFilter, budget: int, steps: Any, **action: Any
 ) -> ChunkPlan:
@@ -94,7 +78,7 @@ def whole_plan(
     planner.budget = budget
     timeline = GoalTimeline(Goal(START, 0.08), START_NS)
     spec = model_spec(**{**FAST_STEPS, **action}).action
-    plan = planner.plan(chunk_of(steps), spec, timeline)
+    plan = planner.plan(lone_chunk(steps), spec, timeline)
     assert isinstance(plan, ChunkPlan), plan
     ready: Any = False
     while not ready:

@@ -6,7 +6,7 @@ import json
 import os
 from collections import deque
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,7 +16,7 @@ from rich.console import RenderableType
 
 from vla_zenoh.cli.options import JsonOption
 from vla_zenoh.cli.output import console, errors, print_json
-from vla_zenoh.lab.cli.output_path import ForceOption, output_file
+from vla_zenoh.lab.cli.output_path import ForceOption, if_wanted, output_file
 
 if TYPE_CHECKING:
     from vla_zenoh.profile import Profile
@@ -35,14 +35,9 @@ class ResultOptions:
     force: ForceOption = False
     as_json: JsonOption = False
 
-    @contextmanager
-    def open(self) -> Iterator[Path | None]:
+    def open(self) -> AbstractContextManager[Path | None]:
         """The file to write, if one is wanted; see `output_file`."""
-        if self.output is None:
-            yield None
-        else:
-            with output_file(self.output, force=self.force) as part:
-                yield part
+        return if_wanted(output_file, self.output, force=self.force)
 
     def show(self, result: Any, *tables: RenderableType) -> None:
         """Print `result` as JSON if that is wanted, else `tables`."""
@@ -85,7 +80,7 @@ def kept_rows(options: ResultOptions) -> Iterator[Rows]:
             yield rows
         except Interrupted:
             raise typer.Exit(130) from None
-        except Exception:
+        except Exception:  # whatever it is, it goes on after the log lines
             errors().print("\n".join(rows.lines[-LAST_LINES:]), style="dim")
             raise
         finally:
@@ -108,7 +103,7 @@ def up_with_last_lines(host: Host, lines: Collection[str]) -> Iterator[Host]:
         with host as running:
             try:
                 yield running
-            except Exception:
+            except Exception:  # whatever it is, it goes on
                 failed_at += lines  # before the nodes end
                 raise
     except Interrupted:

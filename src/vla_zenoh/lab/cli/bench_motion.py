@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -24,7 +23,7 @@ from vla_zenoh.cli.options import (
 from vla_zenoh.cli.output import console, print_json, progress_bars
 from vla_zenoh.lab.bench.motion import PROTOCOL, STEPS, Conditions, MotionCase
 from vla_zenoh.lab.cli.bench_file import running_nodes, write_json
-from vla_zenoh.lab.cli.output_path import ForceOption, output_folder
+from vla_zenoh.lab.cli.output_path import ForceOption, if_wanted, output_folder
 from vla_zenoh.profile import Profile
 
 if TYPE_CHECKING:
@@ -175,8 +174,7 @@ def motion(
     from vla_zenoh.lab.cli.bench_motion_tables import motion_table
     from vla_zenoh.runtime.process import stop_on_signals
 
-    saving = nullcontext() if output is None else output_folder(output, force=force)
-    with saving as folder:
+    with if_wanted(output_folder, output, force=force) as folder:
         stop = stop_on_signals()
         run = _Run(effective_profile(profile), measured, folder, stop)
         try:

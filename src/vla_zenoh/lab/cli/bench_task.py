@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,7 +23,7 @@ from vla_zenoh.cli.options import (
 from vla_zenoh.cli.output import console, new_table, print_json, progress_bars
 from vla_zenoh.lab.bench.task import BASELINES, SCENE, TaskPlan, TaskScore
 from vla_zenoh.lab.cli.bench_file import running_nodes, write_json
-from vla_zenoh.lab.cli.output_path import ForceOption, output_folder, require_free_folder
+from vla_zenoh.lab.cli.output_path import ForceOption, if_wanted, output_folder, require_free_folder
 from vla_zenoh.lab.tasks import FAMILIES, LIMIT_S
 from vla_zenoh.policy.loader import find_model
 from vla_zenoh.profile import Profile, override
@@ -87,14 +87,9 @@ class TaskOutput:
     force: ForceOption = False
     as_json: JsonOption = False
 
-    @contextmanager
-    def open(self) -> Iterator[Path | None]:
+    def open(self) -> AbstractContextManager[Path | None]:
         """The folder to fill, if one is wanted; see `output_folder`."""
-        if self.output is None:
-            yield None
-        else:
-            with output_folder(self.output, force=self.force) as part:
-                yield part
+        return if_wanted(output_folder, self.output, force=self.force)
 
 
 def _write(folder: Path | None, score: TaskScore) -> None:

@@ -87,12 +87,7 @@ def doctor(
                 functools.partial(_check_access, loaded, rules, also or ()),
                 functools.partial(try_identity, loaded),
             )
-    if as_json:
-        print_json(findings)
-    else:
-        show(findings)
-    if any(finding.level == "fail" for finding in findings):
-        raise typer.Exit(1)
+    report(findings, as_json=as_json)
 
 
 def _check_access(profile: Profile, rules: Path | None, also: Sequence[str]) -> list[AccessVerdict]:
@@ -100,8 +95,21 @@ def _check_access(profile: Profile, rules: Path | None, also: Sequence[str]) -> 
     return check_access(profile, None if rules is None else read_access(rules), others)
 
 
-def show(findings: list[HostFinding]) -> None:
-    """Print a table of findings and their counts."""
+def report(findings: list[HostFinding], *, as_json: bool) -> None:
+    """Print findings, as JSON or as a table with their counts.
+
+    Raises:
+        typer.Exit: something will not work.
+    """
+    if as_json:
+        print_json(findings)
+    else:
+        _show(findings)
+    if any(finding.level == "fail" for finding in findings):
+        raise typer.Exit(1)
+
+
+def _show(findings: list[HostFinding]) -> None:
     table = new_table("what", "", "found and what to do")
     for column in table.columns[:2]:
         column.no_wrap = True

@@ -19,7 +19,7 @@ from vla_zenoh.cli.output import console, errors, fail, new_table
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.codec.image import decode_jpeg
 from vla_zenoh.errors import CodecError
-from vla_zenoh.lab.cli.output_path import ForceOption, output_folder
+from vla_zenoh.lab.cli.output_path import ForceOption, if_wanted, output_folder
 from vla_zenoh.lab.inference_views import InferenceDebugSubscriber, InferenceView
 from vla_zenoh.policy import MAX_CAMERAS
 from vla_zenoh.runtime.process import stop_on_signals
@@ -60,9 +60,8 @@ def inspect(
     live = console().is_terminal and not as_json
     if not live and seconds is None and count is None:
         count = 1
-    saving = nullcontext() if output is None else output_folder(output, force=force)
     received = 0
-    with saving as part, target.client() as client:
+    with if_wanted(output_folder, output, force=force) as part, target.client() as client:
         stop = stop_on_signals()
         subscriber = InferenceDebugSubscriber(client.session, client.keys, worker)
         began_s = time.monotonic()

@@ -10,10 +10,10 @@ import errno
 import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from itertools import count
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -97,6 +97,13 @@ def output_folder(
             older = place.rename(_new(Path.mkdir, place.with_name(f"{place.name}.old")))
             errors().print(f"the folder that was {path} is now {older}", soft_wrap=True)
         part.rename(place)
+
+
+def if_wanted(
+    output: Callable[..., AbstractContextManager[Path]], path: Path | None, **settings: Any
+) -> AbstractContextManager[Path | None]:
+    """`output_file` or `output_folder` at `path`; None where no output is wanted."""
+    return nullcontext() if path is None else output(path, **settings)
 
 
 def require_free_folder(path: Path, *, force: bool = False, inputs: Iterable[Path] = ()) -> None:

@@ -7,8 +7,8 @@ from typing import Annotated
 import typer
 
 from vla_zenoh.cli.options import DEFAULT_PROFILE, JsonOption, effective_profile
-from vla_zenoh.cli.output import fail, print_json, progress
-from vla_zenoh.lab.cli.doctor import show
+from vla_zenoh.cli.output import fail, progress
+from vla_zenoh.lab.cli.doctor import report
 from vla_zenoh.lab.doctor.fci import fci_arm
 
 
@@ -28,9 +28,4 @@ def robot_check(
         fail(f"profile {loaded.name} has robot.driver: {loaded.robot.driver}; this checks franka")
     with progress("reading the robot"):
         findings = list(fci_arm(loaded))
-    if as_json:
-        print_json(findings)
-    else:
-        show(findings)
-    if any(finding.level == "fail" for finding in findings):
-        raise typer.Exit(1)
+    report(findings, as_json=as_json)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -17,7 +17,7 @@ from vla_zenoh.cli.output import errors, fail, progress
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import MissingExtraError, OutputError, ProfileError, counted
 from vla_zenoh.lab.cli.loopback import require_loopback
-from vla_zenoh.lab.cli.output_path import ForceOption, output_file
+from vla_zenoh.lab.cli.output_path import ForceOption, if_wanted, output_file
 from vla_zenoh.lab.view.viewer import Viewer, open_server, open_window
 from vla_zenoh.profile import Profile, read_profile
 from vla_zenoh.runtime.process import run_node, stop_on_signals
@@ -138,12 +138,7 @@ def view(
     except ImportError as error:
         raise MissingExtraError("rerun", "view") from error
     inputs = [] if file is None else [file]
-    saving = (
-        nullcontext()
-        if output.output is None
-        else output_file(output.output, force=output.force, inputs=inputs)
-    )
-    with saving as part:
+    with if_wanted(output_file, output.output, force=output.force, inputs=inputs) as part:
         if file is None:
             _live(target.load(), output, part, seconds)
         else:
