@@ -199,11 +199,12 @@ class Commander:
             self._peers = inputs.peers
         if inputs.pose is not None:
             self.pose = inputs.pose
-            self._planner.measured.add(inputs.pose, FUTURE_NS)
+            self._planner.poses.add(inputs.pose, FUTURE_NS)
             self.contact.update_pose(inputs.pose)
             self._retreat.measure(pose_of(inputs.pose.record))
         if inputs.joint is not None:
             self.joint = inputs.joint
+            self._planner.joints.add(inputs.joint, FUTURE_NS)
             self.contact.update_joints(inputs.joint)
         if inputs.gripper is not None:
             self.gripper_state = inputs.gripper
@@ -313,11 +314,18 @@ class Commander:
         self.lease = lease
         self.deadman.begin(holder)
         self.contact.begin()
-        self._planner.measured.restart(self.pose)
+        self._planner.restart(self.pose, self.joint)
         self._resumed_ns = 0
         measured, joint = self.pose.record, self.joint.record if self.joint else None
         blocked = self._watchdog.begin(held_pose(measured), pose_of(measured))
-        self._motion.anchor(measured, self.gripper_state.record, joint, now_ns, blocked=blocked)
+        self._motion.anchor(
+            measured,
+            self.gripper_state.record,
+            joint,
+            now_ns,
+            blocked=blocked,
+            in_joints=lease.spec.action.space == "joint",
+        )
         held = f", while {holder!r} holds it" if holder else ""
         what = f"activated with worker {self.task.worker!r}{held}"
         self._change(Trigger.ACTIVATE, "; ".join([what, *self._ended_before()])[:MAX_TEXT])
@@ -358,6 +366,12 @@ class Commander:
                 reasons += reasons_by_joints(
                     self.profile, worker, spec, chunk.record, self.reach.kinematics, self.joint
                 )
+        spec = self._peers.specs.get(worker)
+        if self.reach is None and spec is not None and spec.action.space == "joint":
+            reasons.append(
+                f"worker {worker!r} acts in joints, which needs the robot's kinematics: set "
+                "robot.description, robot.tcp_frame and robot.arm_joints in the profile"
+            )
         if self.joint is not None and self.pose is not None:
             writers = {self.joint.header.source, self.pose.header.source}
             if len(writers) > 1:
@@ -517,7 +531,7 @@ class Commander:
             self._change(Trigger.LOSE, str(error))
             return
         commanded_rad = motion.joints_rad
-        hit = monitor.update(measured_rad, commanded_rad, now_ns)
+        hit = monitor.update(measured_rad, commanded_rad, now_ns, in_joints=motion.in_joints)
         motion.joint_slowdown = monitor.slowdown
         reach.set_elbow(measured_rad if commanded_rad is None else commanded_rad)
         if hit is not None:

@@ -35,12 +35,16 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from vla_zenoh.control.controller_response import Response, between
 from vla_zenoh.control.limits import Slowdown, into_workspace
 from vla_zenoh.kinematics.so3 import Pose, interpolate, orthonormal
 from vla_zenoh.profile import Limits
 from vla_zenoh.types import Cause, FloatArray
+
+if TYPE_CHECKING:
+    from vla_zenoh.kinematics.kinematics import Kinematics
 
 HISTORY_NS = 15_000_000_000
 """Observations are rejected long before they are this old."""
@@ -92,7 +96,7 @@ WALL_CLOCK = PlanClock()
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """A waypoint: TCP pose and gripper width.
+    """A waypoint: TCP pose, or joints, and gripper width.
 
     Args:
         pose: of the TCP.
@@ -100,6 +104,7 @@ class Goal:
         joints_rad: (n,) a joint solution of the pose; None: not computed.
         slowdown: why the arm moves there slower than at full speed.
         response: state there of a controller that covers only a part of each step; None: without.
+        arm: where joints are asked for, in chain order: the kinematics that make `pose` of them.
     """
 
     pose: Pose
@@ -107,6 +112,38 @@ class Goal:
     joints_rad: FloatArray | None = None
     slowdown: Slowdown | None = None
     response: Response | None = None
+    arm: Kinematics | None = None
+
+    def between(self, coming: Goal, share: float, dt_s: float = 0.0) -> Goal:
+        """The goal after `share` of a step of `dt_s` to `coming`, in the space asked for there."""
+        width_m = self.width_m + share * (coming.width_m - self.width_m)
+        if coming.arm is not None and coming.joints_rad is not None and self.joints_rad is not None:
+            way_rad = coming.joints_rad - self.joints_rad
+            return joint_goal(coming.arm, self.joints_rad + share * way_rad, width_m)
+        if coming.response is None or dt_s == 0.0:
+            return Goal(interpolate(self.pose, coming.pose, share), width_m)
+        pose, state = between(self.pose, coming.pose, coming.response, dt_s, share)
+        return Goal(pose, width_m, response=state)
+
+    def shifted(self, old: Goal, new: Goal, limits: Limits) -> Goal:
+        """This goal after what moves `old` to `new`, within the workspace box."""
+        if self.arm is not None and self.joints_rad is not None:
+            assert old.joints_rad is not None
+            assert new.joints_rad is not None
+            way_rad = new.joints_rad - old.joints_rad
+            return joint_goal(self.arm, self.joints_rad + way_rad, self.width_m)
+        way_m = new.pose.position_m - old.pose.position_m
+        turn = old.pose.rotation.T @ new.pose.rotation
+        inside, _ = into_workspace(limits, self.pose.position_m + way_m, self.pose.position_m)
+        moved = Pose(inside, orthonormal(self.pose.rotation @ turn))
+        return Goal(moved, self.width_m, response=self.response)
+
+
+def joint_goal(
+    arm: Kinematics, joints_rad: FloatArray, width_m: float, slowdown: Slowdown | None = None
+) -> Goal:
+    """The goal of these joints (n,) in chain order."""
+    return Goal(arm.forward(joints_rad), width_m, joints_rad, slowdown, arm=arm)
 
 
 @dataclass(slots=True)
@@ -175,13 +212,8 @@ class Plan:
             return self.goals[0]
         if done >= self.bounded or part_ns == 0:
             return self.goals[min(done, self.bounded) - 1]
-        last, coming, share = self.goals[done - 1], self.goals[done], part_ns / self.dt_ns
-        width_m = last.width_m + share * (coming.width_m - last.width_m)
-        if coming.response is None:
-            return Goal(interpolate(last.pose, coming.pose, share), width_m)
         dt_s = self.dt_ns / 1e9
-        pose, state = between(last.pose, coming.pose, coming.response, dt_s, share)
-        return Goal(pose, width_m, response=state)
+        return self.goals[done - 1].between(self.goals[done], part_ns / self.dt_ns, dt_s)
 
     def steps_until(self, t_ns: int) -> float:
         """Steps of the episode asked for until `t_ns`, including parts of one."""
@@ -201,29 +233,16 @@ class Plan:
         """Plan time from `t_ns` to the end of the last step."""
         return max(len(self.goals) * self.dt_ns - self.elapsed_ns(t_ns), 0)
 
-    def shift(self, index: int, way_m: FloatArray, turn: FloatArray, limits: Limits) -> None:
-        """Shift the goals from `index` on, within the workspace box.
-
-        Args:
-            index: of the first goal to shift.
-            way_m: (3,) translation in the base frame.
-            turn: (3, 3) rotation in the TCP frame.
-            limits: with the box.
-        """
+    def shift(self, index: int, old: Goal, new: Goal, limits: Limits) -> None:
+        """Shift the goals from `index` on as from `old` to `new`, within the workspace box."""
         # They are elsewhere than checked: bounded again when due. Goal 0 has none before it.
         self.bounded = min(self.bounded, max(index, 1))
         for later in range(index, self.computed):
-            goal = self.goals[later]
-            inside, _ = into_workspace(limits, goal.pose.position_m + way_m, goal.pose.position_m)
-            turned = orthonormal(goal.pose.rotation @ turn)
-            moved = Pose(inside, turned)
-            self.goals[later] = Goal(moved, goal.width_m, response=goal.response)
+            self.goals[later] = self.goals[later].shifted(old, new, limits)
 
     def shift_rest(self, index: int, goal: Goal, limits: Limits) -> None:
         """Replace goal `index`, and shift the later ones with it."""
-        old = self.goals[index].pose
-        way_m = goal.pose.position_m - old.position_m
-        self.shift(index + 1, way_m, old.rotation.T @ goal.pose.rotation, limits)
+        self.shift(index + 1, self.goals[index], goal, limits)
         self.goals[index] = goal
 
 

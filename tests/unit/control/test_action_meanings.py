@@ -17,11 +17,11 @@ from vla_zenoh.control.chunk_planner import ChunkPlan, ChunkPlanner
 from vla_zenoh.control.commander import Setting
 from vla_zenoh.control.controller_response import respond
 from vla_zenoh.control.plan_timeline import Goal, GoalTimeline
-from vla_zenoh.control.pose_history import PoseHistory
+from vla_zenoh.control.state_history import StateHistory
 from vla_zenoh.kinematics.so3 import Pose, angle_between, exp3, log3, rotation_from_quat
 from vla_zenoh.policy import ActionSpec, ControllerSpec
 from vla_zenoh.profile.limits import Workspace
-from vla_zenoh.types import FloatArray
+from vla_zenoh.types import FloatArray, PoseState
 
 ATOL = 1e-9
 START = Pose(np.array([0.45, -0.1, 0.3]), exp3(np.array([2.8, 0.3, -0.5])))
@@ -356,12 +356,12 @@ def test_after_the_clock_was_set_back_a_measured_anchor_is_where_the_arm_is(back
 
 def test_a_pose_from_the_future_says_nothing_about_the_past() -> None:
     rig = Rig(dt_s=0.2, anchor="measured")
-    history = PoseHistory()
+    history: StateHistory[PoseState] = StateHistory()
     pose = rig.pose_state()
     history.restart(pose)
     ahead_ns = pose.received_ns + 1_000_000_000
     history.add(replace(pose, header=replace(pose.header, stamp_wall_ns=ahead_ns)), 20_000_000)
-    assert history.at(ahead_ns, 20_000_000) is None
+    assert history.around(ahead_ns, 20_000_000) is None
 
 
 @given(

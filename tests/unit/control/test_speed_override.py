@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from command_rig import Rig, profile
+from joint_rig import Joints, panda
+from panda_arm import HOME_RAD
 
 from vla_zenoh.control.commander import Setting
 
@@ -126,3 +128,22 @@ def test_at_speed_zero_the_gripper_waits() -> None:
     rig.put("speed", 100.0)
     rig.run(0.2)
     assert len(rig.widths_m) == sent + 1
+
+
+@pytest.mark.parametrize("command", ["joint", "pose"])
+def test_after_a_pause_joints_wait_for_a_new_chunk_as_poses_do(command: str) -> None:
+    arm = Joints(panda(command))
+    arm.activate()
+    goal_rad = HOME_RAD + [0.5, 0, -0.2, 0, 0.2, 0, 0]
+    arm.send(*(HOME_RAD + share * (goal_rad - HOME_RAD) for share in np.linspace(0, 1, 17)[1:]))
+    arm.run(0.6)
+    arm.tick(Setting("speed", 0.0))
+    arm.run(2.0)
+    stands_m = arm.places_m[-1]
+    assert 1e-3 < np.abs(arm.joints_rad - HOME_RAD).max() < 0.49
+    arm.tick(Setting("speed", 100.0))
+    arm.run(0.5)
+    assert arm.rig.state == "active"
+    np.testing.assert_allclose(arm.places_m[-1], stands_m, atol=1e-4)
+    arm.send(goal_rad)
+    arm.settle(goal_rad)
