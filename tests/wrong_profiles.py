@@ -454,7 +454,7 @@ CHECKED: list[tuple[str, str]] = [
     (
         model("joints.py"),
         "A cannot be made: ActionSpec is wrong: horizon: wants a whole number (given: '8'); kind: "
-        "'joint_position' is not an action of a model file: wants 'delta', 'absolute' or",
+        "'joint_position' is no kind of action; joints are declared as space='joint' with",
     ),
     (
         model("needs.py"),

@@ -47,7 +47,7 @@ class Reading:
         position_rad: (n,) of the joints, in the order of ``robot.arm_joints``; m for prismatic
             joints.
         velocity_rad_s: (n,); None: not measured, computed from differences of the position.
-        effort_nm: (n,); None: not measured, zero. Where it is the external torque alone, set
+        effort_nm: (n,); None: not measured. Where it is the external torque alone, set
             ``limits.contact.effort_stop_nm`` to have it monitored.
         width_m: opening of the gripper; None: not measured, that of the last command is assumed.
         moving: the gripper moves.

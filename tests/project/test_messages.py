@@ -110,7 +110,7 @@ def test_a_value_that_is_wrong_is_shown() -> None:
 def test_joints_as_an_action_are_answered_by_what_to_do() -> None:
     with pytest.raises(ValidationError) as caught:
         ActionSpec(horizon=1, dt_s=0.1, kind="joint_position")  # pyright: ignore
-    assert "make_forward" in in_words(caught.value)
+    assert "declared as space='joint' with joints=" in in_words(caught.value)
     with pytest.raises(ValidationError) as caught:
         ObservationSpec(state=("joints",))  # pyright: ignore[reportArgumentType]
     assert "did you mean 'joint'?" in in_words(caught.value)

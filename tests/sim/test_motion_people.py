@@ -141,10 +141,14 @@ def test_activated_during_or_after_the_robots_own_brake_it_does_not_jump(wait_s:
 
 def test_activated_away_from_where_its_controller_holds_it_the_arm_is_not_pulled() -> None:
     loop = begin("0 0.01 0")
-    x_m, y_m, z_m = path_m(loop)[-1]
-    loop.world.place("box", (x_m, y_m + 0.25, z_m + 0.05))
+    loop.put("active", False)
+    loop.run(0.5)
     # It feels nothing, and is stopped before it is led back.
     loop.tamper = changed(PoseState, wrench=None)
+    loop.run(0.1)
+    activate(loop)
+    x_m, y_m, z_m = path_m(loop)[-1]
+    loop.world.place("box", (x_m, y_m + 0.25, z_m + 0.05))
     assert loop.run_until(lambda: loop.commander.state.value != "active", 3.0)
     loop.put("stop")
     loop.run(1.0)

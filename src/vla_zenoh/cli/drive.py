@@ -108,6 +108,8 @@ def _inactive(client: Client, activated: Task) -> str:
     status = client.status("command")
     if status is None or status.state in ("active", "holding"):
         return ""
+    if not status.detail.get("at_rest"):  # it brakes or retreats, which ends with the deadman
+        return ""
     episode = status.detail.get("episode")
     if not isinstance(episode, int) or episode < activated.episode:  # from before the activation
         return ""

@@ -70,6 +70,25 @@ def step_pose(spec: ActionSpec, step: FloatArray, before: Pose, start: Pose | No
     return Pose(before.position_m + translation, orthonormal(rotation @ before.rotation))
 
 
+def step_joints(
+    spec: ActionSpec, step: FloatArray, before_rad: FloatArray, start_rad: FloatArray
+) -> FloatArray:
+    """The joints (n,) that a step (D,) asks for.
+
+    Args:
+        spec: the meaning of the numbers.
+        step: (D,).
+        before_rad: (n,) end of the step before.
+        start_rad: (n,) anchor of the chunk.
+    """
+    numbers = np.asarray(step[: spec.arm_size], dtype=np.float64)
+    if spec.kind == "absolute":
+        return numbers
+    if spec.kind == "velocity":
+        return before_rad + numbers * spec.dt_s
+    return (start_rad if spec.relative_to == "start" else before_rad) + numbers
+
+
 def covered_step(
     spec: ActionSpec, step: FloatArray, before: Pose, start: Pose, state: Response | None
 ) -> tuple[Pose, Response | None]:

@@ -26,12 +26,13 @@ Low-Cost Hardware", RSS 2023 (temporal ensembling; m = 0.01 there).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from vla_zenoh.control.limits import slowest
-from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan
-from vla_zenoh.kinematics.so3 import Pose, exp3, interpolate, log3, norm3, orthonormal
+from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan, joint_goal
+from vla_zenoh.kinematics.so3 import Pose, exp3, log3, norm3, orthonormal
 from vla_zenoh.profile import Composition
 from vla_zenoh.types import FloatArray
 
@@ -71,25 +72,16 @@ class PlanAggregator:
         if len(plans) == 1:
             return waypoints[0]
         if self._mode == "blend":
-            mixed = waypoints[0].pose
+            mixed = waypoints[0]
             for older, plan, waypoint in zip(plans, plans[1:], waypoints[1:], strict=False):
-                mixed = interpolate(mixed, waypoint.pose, self._weight(older, plan, now_ns))
-            return Goal(
-                mixed,
-                waypoints[-1].width_m,
-                slowdown=slowest(*(goal.slowdown for goal in waypoints)),
-            )
+                mixed = mixed.between(waypoint, self._weight(older, plan, now_ns))
+            return _with_rest(mixed, waypoints)
         same = len(waypoints) == len(self._waypoints) and all(
             ours is theirs for ours, theirs in zip(waypoints, self._waypoints, strict=True)
         )
         if self._mean is None or not same:
             self._waypoints = waypoints
-            pose = mean_pose([goal.pose for goal in waypoints], self._weights[: len(waypoints)])
-            self._mean = Goal(
-                pose,
-                waypoints[-1].width_m,
-                slowdown=slowest(*(goal.slowdown for goal in waypoints)),
-            )
+            self._mean = _with_rest(mean_goal(waypoints, self._weights), waypoints)
         return self._mean
 
     def _blended(self, timeline: GoalTimeline, now_ns: int) -> list[Plan]:
@@ -110,6 +102,21 @@ class PlanAggregator:
             return 1.0
         s = max(elapsed_ns, 0) / window_ns
         return s**3 * (10.0 - 15.0 * s + 6.0 * s * s)
+
+
+def _with_rest(mixed: Goal, waypoints: Sequence[Goal]) -> Goal:
+    """A mix of `waypoints`, with the newest width and the least speed of them."""
+    slower = slowest(*(goal.slowdown for goal in waypoints))
+    return replace(mixed, width_m=waypoints[-1].width_m, slowdown=slower)
+
+
+def mean_goal(goals: Sequence[Goal], weights: FloatArray) -> Goal:
+    """Weighted mean of goals, in the space that the last of them is asked for in."""
+    last, weights = goals[-1], weights[: len(goals)]
+    joints = [goal.joints_rad for goal in goals if goal.joints_rad is not None]
+    if last.arm is None or len(joints) < len(goals):
+        return Goal(mean_pose([goal.pose for goal in goals], weights), last.width_m)
+    return joint_goal(last.arm, weights / weights.sum() @ np.array(joints), last.width_m)
 
 
 def mean_pose(poses: Sequence[Pose], weights: FloatArray) -> Pose:

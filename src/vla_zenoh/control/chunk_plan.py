@@ -6,6 +6,7 @@ from collections.abc import Generator, Iterable
 from dataclasses import dataclass, field
 
 from vla_zenoh.control.controller_response import Response
+from vla_zenoh.control.joint_space import BoundedJoints
 from vla_zenoh.control.limits import LimitHit, Slowdown
 from vla_zenoh.control.plan_timeline import Goal, Plan
 from vla_zenoh.control.reachability import BoundedStep
@@ -90,4 +91,4 @@ class StepBounding:
     cut: float = 0.0
     slowdown: Slowdown | None = None
     response: Response | None = None
-    search: Generator[None, None, BoundedStep] | None = None
+    search: Generator[None, None, BoundedStep | BoundedJoints] | None = None

@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vla_zenoh.control.actions import covered_step, step_width
+from vla_zenoh.control.actions import covered_step, step_joints, step_width
 from vla_zenoh.control.chunk_plan import ChunkPlan, StepBounding
 from vla_zenoh.control.chunk_validation import (
     ROUNDING,
@@ -32,6 +32,7 @@ from vla_zenoh.control.chunk_validation import (
     validate_chunk,
     validate_steps,
 )
+from vla_zenoh.control.joint_space import BoundedJoints, JointBounds
 from vla_zenoh.control.limits import (
     APPROACH,
     LEAST,
@@ -41,13 +42,22 @@ from vla_zenoh.control.limits import (
     full_speed_s,
     keep_slowdown,
 )
-from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan
-from vla_zenoh.control.pose_history import PoseHistory
+from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan, joint_goal
 from vla_zenoh.control.reachability import BoundedStep, ReachabilityFilter
-from vla_zenoh.kinematics.so3 import Pose, interpolate, pose_distance
+from vla_zenoh.control.state_history import StateHistory
+from vla_zenoh.errors import RecordError
+from vla_zenoh.kinematics.so3 import interpolate, pose_distance, pose_of
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import ActionChunk, Cause, FloatArray, Stamped, Task
+from vla_zenoh.types import (
+    ActionChunk,
+    Cause,
+    FloatArray,
+    JointState,
+    PoseState,
+    Stamped,
+    Task,
+)
 
 MAX_QUEUED = 4
 """Of a burst of chunks only the newest few are kept; the newest valid one is executed."""
@@ -92,15 +102,24 @@ class ChunkPlanner:
         self._max_age_s = profile.timing.max_observation_age_s
         self._max_width_m = profile.robot.gripper.max_width_m
         self._reach = reach
+        self.joint_bounds: JointBounds | None = None
+        if reach is not None:
+            self.joint_bounds = JointBounds(profile, reach.kinematics, reach.barriers)
         self._pace = profile.composition.pace
         self._gap_ns = round(profile.timing.state_timeout_s * 1e9)
-        self.measured = PoseHistory()
+        self.poses: StateHistory[PoseState] = StateHistory()
         """Where chunks anchored at the measured pose begin."""
+        self.joints: StateHistory[JointState] = StateHistory()
         self._queue: deque[Stamped[ActionChunk]] = deque()
         self._pending: tuple[Stamped[ActionChunk], ChunkPlan] | None = None
         self.budget = math.ceil(EVALUATIONS_1_S / profile.timing.command_hz)
         """Evaluations of the arm per tick."""
         self._left = self.budget
+
+    def restart(self, pose: Stamped[PoseState], joint: Stamped[JointState] | None) -> None:
+        """Start an activation: nothing that was measured before counts."""
+        self.poses.restart(pose)
+        self.joints.restart(joint)
 
     def begin_tick(self) -> None:
         """Renew the budget of evaluations."""
@@ -196,11 +215,13 @@ class ChunkPlanner:
         previous = timeline.in_force(observed_ns)
         base = previous.goal_at(observed_ns)
         if action.anchor == "measured":
-            pose = self.measured.at(observed_ns, self._gap_ns)
-            if pose is None:
+            measured = self._measured(action, observed_ns, base.width_m)
+            if measured is None:
                 return _not_measured(self._gap_ns)
-            base = Goal(pose, base.width_m)
+            base = measured
         steps = np.asarray(record.steps[:count], np.float64)
+        if action.space == "joint":
+            steps = self._in_chain_order(action, steps)
         rejection = validate_steps(action, steps, base, self._limits, self._max_width_m)
         if rejection is not None:
             return rejection
@@ -238,6 +259,24 @@ class ChunkPlanner:
                     previous.steps_before + len(previous.goals), previous.steps_total
                 )
         return plan
+
+    def _measured(self, action: ActionSpec, t_ns: int, width_m: float) -> Goal | None:
+        """Where the arm was measured at `t_ns`, in the space of the actions; None: it was not."""
+        if action.space == "joint" and self._reach is not None:
+            states, arm = self.joints.around(t_ns, self._gap_ns), self._reach.kinematics
+            if states is None:
+                return None
+            try:
+                before_rad, after_rad = (arm.joints_of(state) for state in states[:2])
+            except RecordError:
+                return None
+            return joint_goal(arm, before_rad + states[2] * (after_rad - before_rad), width_m)
+        found = self.poses.around(t_ns, self._gap_ns)
+        if found is None:
+            return None
+        before, after, share = found
+        pose = pose_of(before)
+        return Goal(interpolate(pose, pose_of(after), share) if share else pose, width_m)
 
     # -- bound --------------------------------------------------------------------------------
     def bound(self, plan: ChunkPlan, now_ns: int) -> Rejection | bool:
@@ -285,7 +324,7 @@ class ChunkPlanner:
             or step.shifted is not plan.shifted_goal
         ):
             step = plan.current = self._begin_step(plan)
-        found: BoundedStep | None = None
+        found: BoundedStep | BoundedJoints | None = None
         while step.search is not None and found is None:
             if self._left <= 0 or self._reach is None:
                 return None
@@ -311,13 +350,16 @@ class ChunkPlanner:
         state = step.response
         if state is not None and hits and step.shifted is None:
             state = state.stopped(step.asked, pose)
-        plan.goals[index] = Goal(pose, step.width_m, joints_rad, slower, state)
+        arm = self._reach.kinematics if self._reach and plan.action.space == "joint" else None
+        plan.goals[index] = Goal(pose, step.width_m, joints_rad, slower, state, arm)
         plan.bounded, plan.current = index + 1, None
         plan.add_hits(hits)
         return hits
 
     def _begin_step(self, plan: ChunkPlan) -> StepBounding:
         """The next step of `plan` within the limits of a step."""
+        if plan.action.space == "joint":
+            return self._begin_joint_step(plan)
         start, shifted = plan.step_start, plan.shifted_goal
         if shifted is not None:
             step = StepBounding(
@@ -336,7 +378,9 @@ class ChunkPlanner:
             )
             slower: Slowdown | None = None
             if plan.action.targets:
-                asked, slower = self._approach(plan, start.pose, asked)
+                full_s = full_speed_s(self._limits, start.pose, asked)
+                part, slower = self._approach(plan, *pose_distance(start.pose, asked), full_s)
+                asked = interpolate(start.pose, asked, part) if slower else asked
             width_m = step_width(plan.action, numbers, start.width_m, self._max_width_m)
             pose, acted = bound_step(self._limits, start.pose, asked)
             cut = sum(pose_distance(pose, asked)) if acted else 0.0
@@ -350,13 +394,70 @@ class ChunkPlanner:
             next(step.search)  # up to its first evaluation
         return step
 
-    def _approach(self, plan: ChunkPlan, start: Pose, target: Pose) -> tuple[Pose, Slowdown | None]:
-        """The end of a step to an absolute target, and its slowdown: a far target is approached."""
+    def _in_chain_order(self, action: ActionSpec, steps: FloatArray) -> FloatArray:
+        """Steps (n, D) of joints with their columns in the order of the kinematics."""
+        assert self._reach is not None
+        columns = [action.joints.index(name) for name in self._reach.kinematics.arm_joints]
+        return np.concatenate([steps[:, columns], steps[:, action.arm_size :]], axis=1)
+
+    def _joints_at(self, goal: Goal) -> FloatArray:
+        """(n,) those asked for, or those of the pose asked for, with the arm's present elbow."""
+        if goal.arm is not None and goal.joints_rad is not None:
+            return goal.joints_rad
+        assert self._reach is not None
+        return self._reach.joints_at(goal.pose)
+
+    def _begin_joint_step(self, plan: ChunkPlan) -> StepBounding:
+        """The same of a step in joint space."""
+        bounds, start, shifted = self.joint_bounds, plan.step_start, plan.shifted_goal
+        assert bounds is not None
+        assert self._reach is not None
+        start_rad = self._joints_at(start)
+        slower: Slowdown | None = None
+        acted: list[LimitHit] = []
+        if shifted is not None and shifted.joints_rad is not None:
+            asked_rad, width_m, slower = shifted.joints_rad, shifted.width_m, shifted.slowdown
+        else:
+            numbers = plan.steps[plan.bounded]
+            base_rad = self._joints_at(plan.base)
+            asked_rad = step_joints(plan.action, numbers, start_rad, base_rad)
+            way_rad = asked_rad - start_rad
+            far_m = pose_distance(start.pose, bounds.kinematics.forward(asked_rad))[0]
+            far_rad = float(np.abs(way_rad).max())
+            if plan.action.targets:
+                full_s = bounds.full_speed_s(start_rad, asked_rad)
+                part, slower = self._approach(plan, far_m, far_rad, full_s)
+            else:
+                parts = {"step_m": (far_m, self._limits.step_m)}
+                parts["step_rad"] = far_rad, self._limits.step_rad
+                acted = [
+                    LimitHit(name, far, most)
+                    for name, (far, most) in parts.items()
+                    if far > most * (1 + ROUNDING)
+                ]
+                part = min((hit.limit / hit.value for hit in acted), default=1.0)
+            if part < 1.0:
+                asked_rad = start_rad + part * way_rad
+            width_m = step_width(plan.action, numbers, start.width_m, self._max_width_m)
+            width_m = start.width_m if width_m is None else width_m
+        asked = bounds.kinematics.forward(asked_rad)
+        step = StepBounding(start, shifted, asked, asked, width_m, acted, slowdown=slower)
+        self._reach.cost = 1
+        step.search = bounds.bound_in_pieces(start_rad, asked_rad)
+        next(step.search)
+        return step
+
+    def _approach(
+        self, plan: ChunkPlan, far_m: float, far_rad: float, full_s: float
+    ) -> tuple[float, Slowdown | None]:
+        """The part of a step to an absolute target that is taken, and its slowdown.
+
+        A target further away than a step is approached.
+        """
         limits = self._limits
-        far_m, far_rad = pose_distance(start, target)
         steps = max(far_m / limits.step_m, far_rad / limits.step_rad)
         if steps <= 1 + ROUNDING:
-            return target, None
+            return 1.0, None
         in_m = far_m / limits.step_m >= far_rad / limits.step_rad
         far, step, unit = (far_m, limits.step_m, "m") if in_m else (far_rad, limits.step_rad, "rad")
         plan.approaches = True
@@ -364,18 +465,17 @@ class ChunkPlanner:
             plan.announced = True
             plan.add_hits([LimitHit(APPROACH, far, step, where=unit)])
         needed_s = max(far_m / limits.approach_m_s, far_rad / limits.approach_rad_s)
-        full_s = full_speed_s(limits, start, target)
         share = min(max(full_s / needed_s, LEAST), 1.0)
         has_ns = plan.dt_ns if plan.bounded or plan.first_step_ns < 0 else plan.first_step_ns
         part = min(has_ns / 1e9 / needed_s, 1 / steps)
-        return interpolate(start, target, part), Slowdown(APPROACH, share, far, step, "", BEHIND_S)
+        return part, Slowdown(APPROACH, share, far, step, "", BEHIND_S)
 
 
 def _not_measured(gap_ns: int) -> Rejection:
     """Its anchor is not known."""
     return Rejection(
         "not_measured",
-        f"the arm's pose was not measured within {gap_ns / 1e9:g} s before its observation, which "
+        f"the arm was not measured within {gap_ns / 1e9:g} s before its observation, which "
         "the first step is added to (anchor: measured)",
     )
 

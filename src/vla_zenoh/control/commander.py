@@ -27,6 +27,7 @@ from vla_zenoh.control.limits import Slowdown
 from vla_zenoh.control.motion_pipeline import MotionPipeline
 from vla_zenoh.control.plan_timeline import EpisodeProgress, Goal, Plan
 from vla_zenoh.control.preflight import (
+    CLOCK_TOLERANCE_S,
     PeerSnapshot,
     reasons_by_joints,
     reasons_not_to_activate,
@@ -46,6 +47,9 @@ from vla_zenoh.types import (
     Stamped,
     Task,
 )
+
+FUTURE_NS = round(CLOCK_TOLERANCE_S * 1e9)
+"""A pose that is stamped later than it arrived by more than this says nothing about the past."""
 
 __all__ = ["Commander", "Inputs", "Outputs", "Setting"]
 
@@ -88,7 +92,8 @@ class Commander:
         self._load_known = True
         self._watchdog = Watchdog(profile)
         self._joint_monitor = None if reach is None else JointMonitor(profile, reach)
-        self._speed_changed = False
+        self._stopped_ns = 0
+        """When the last emergency stop was put, by the router's clock."""
         self._out = Outputs()
 
     # -- one tick -----------------------------------------------------------------------------
@@ -107,6 +112,8 @@ class Commander:
         stopped = any(setting.name == "stop" for setting in inputs.settings)
         if stopped:
             self._change(Trigger.STOP, "emergency stop")
+            put_ns = [s.put_ns for s in inputs.settings if s.name == "stop" and s.put_ns]
+            self._stopped_ns = max([self._stopped_ns, *put_ns])
         for setting in inputs.settings:
             self._apply_setting(setting, now_ns, stopped)
         self._planner.begin_tick()
@@ -114,16 +121,13 @@ class Commander:
             self._submit_chunk(chunk, now_ns)
         self._plan_chunks(now_ns)
         self._supervise(now_ns)
-        if not inputs.chunks:  # planning them is work enough for one tick
+        if not inputs.chunks or self._monitor_late(now_ns):  # planning them is work enough
             self._monitor_joints(now_ns)
         overdue_ns = self._watchdog.deadline_ns
         planned, events = self._motion.advance(self.state, self.task, overdue_ns, now_ns, ticks)
         self._out.events += events
         if not planned:
             self._change(Trigger.FAULT, "no trajectory could be computed; braked")
-        if self._speed_changed and self._motion.timeline is not None:
-            self._speed_changed = False
-            self._expect_next(self._motion.timeline.plan, now_ns)
         if self.state is State.ACTIVE and self._motion.timeline is not None:
             self.progress.update(self._motion.timeline, self.task.episode, now_ns)
         if not self.dry_run:
@@ -146,8 +150,8 @@ class Commander:
 
     @property
     def at_rest(self) -> bool:
-        """The commanded motion stands still."""
-        return self._motion.at_rest
+        """The commanded motion stands still, and will."""
+        return self._motion.at_rest and not self.retreating
 
     @property
     def streaming(self) -> bool:
@@ -195,11 +199,12 @@ class Commander:
             self._peers = inputs.peers
         if inputs.pose is not None:
             self.pose = inputs.pose
-            self._planner.measured.add(inputs.pose)
+            self._planner.poses.add(inputs.pose, FUTURE_NS)
             self.contact.update_pose(inputs.pose)
             self._retreat.measure(pose_of(inputs.pose.record))
         if inputs.joint is not None:
             self.joint = inputs.joint
+            self._planner.joints.add(inputs.joint, FUTURE_NS)
             self.contact.update_joints(inputs.joint)
         if inputs.gripper is not None:
             self.gripper_state = inputs.gripper
@@ -211,10 +216,17 @@ class Commander:
 
     def _apply_setting(self, setting: Setting, now_ns: int, stopped: bool) -> None:
         name, value = setting.name, setting.value
-        if stopped and (name == "reset" or (name == "active" and value is not False)):
-            # Their order within a tick is not known: the stop wins.
-            self._reject_setting(name, ["an emergency stop came at the same time"])
-            return
+        if name == "reset" or (name == "active" and value is not False):
+            if stopped:
+                # Their order within a tick is not known: the stop wins.
+                self._reject_setting(name, ["an emergency stop came at the same time"])
+                return
+            if setting.put_ns is not None and setting.put_ns <= self._stopped_ns:
+                late = (
+                    "it was put before the last emergency stop and arrived after it; put it again"
+                )
+                self._reject_setting(name, [late])
+                return
         try:
             self._set(name, value, now_ns)
         except RecordError as error:
@@ -235,11 +247,12 @@ class Commander:
                 raise RecordError(
                     f"{value:g} % is more than {now}; use the setting speed to go faster"
                 )
-            self.task = replace(self.task, speed_percent=value)
-            self._speed_changed = True
+            if value != self.task.speed_percent:
+                self._change_speed(value, now_ns)
         elif name == "active" and (value is True or isinstance(value, str)):
             self._activate(now_ns, "" if value is True else value)
         elif name == "active" and value is False:
+            self._retreat.end()
             self._change(Trigger.DEACTIVATE, DEACTIVATED)
         elif name == "reset":
             self._reset()
@@ -257,6 +270,17 @@ class Commander:
             self._ended = ""
         if self.state in OBEYING:
             self._watchdog.expect_first(now_ns, self.task.rate_hz, self.task.speed)
+
+    def _change_speed(self, percent: float, now_ns: int) -> None:
+        before = self.task.speed
+        self.task = replace(self.task, speed_percent=percent)
+        self._watchdog.override_changed(now_ns, before, self.task.speed)
+        # The scene may have changed during a pause: the rest of an old chunk is not carried out.
+        oldest_ns = now_ns - int(self.profile.timing.max_observation_age_s * 1e9)
+        if not before and self._motion.forget_plan(oldest_ns, now_ns):
+            self._resumed_ns = now_ns
+            self._watchdog.expect_first(now_ns, self.task.rate_hz, self.task.speed)
+            self._emit("info", "notice", "paused", "waits for a chunk that is newer than the pause")
 
     def _change_worker(self, worker: str, now_ns: int) -> None:
         if self.state in OBEYING:
@@ -283,17 +307,25 @@ class Commander:
         lease, reasons = self._preflight(self.task.worker, now_ns)
         reasons += self.deadman.reasons_against(holder, self._peers.holders)
         self._measure()
-        reasons += self._motion.unsettled()
+        reasons += self._motion.unsettled() + self.contact.missing
         if lease is None or self.pose is None or self.gripper_state is None or reasons:
             self._reject_setting("activate", reasons + self._ended_before())
             return
         self.lease = lease
         self.deadman.begin(holder)
         self.contact.begin()
+        self._planner.restart(self.pose, self.joint)
         self._resumed_ns = 0
         measured, joint = self.pose.record, self.joint.record if self.joint else None
         blocked = self._watchdog.begin(held_pose(measured), pose_of(measured))
-        self._motion.anchor(measured, self.gripper_state.record, joint, now_ns, blocked=blocked)
+        self._motion.anchor(
+            measured,
+            self.gripper_state.record,
+            joint,
+            now_ns,
+            blocked=blocked,
+            in_joints=lease.spec.action.space == "joint",
+        )
         held = f", while {holder!r} holds it" if holder else ""
         what = f"activated with worker {self.task.worker!r}{held}"
         self._change(Trigger.ACTIVATE, "; ".join([what, *self._ended_before()])[:MAX_TEXT])
@@ -334,6 +366,12 @@ class Commander:
                 reasons += reasons_by_joints(
                     self.profile, worker, spec, chunk.record, self.reach.kinematics, self.joint
                 )
+        spec = self._peers.specs.get(worker)
+        if self.reach is None and spec is not None and spec.action.space == "joint":
+            reasons.append(
+                f"worker {worker!r} acts in joints, which needs the robot's kinematics: set "
+                "robot.description, robot.tcp_frame and robot.arm_joints in the profile"
+            )
         if self.joint is not None and self.pose is not None:
             writers = {self.joint.header.source, self.pose.header.source}
             if len(writers) > 1:
@@ -431,7 +469,7 @@ class Commander:
 
     def _expect_next(self, plan: Plan, now_ns: int) -> None:
         rate_hz, speed = self.task.rate_hz, self.task.speed
-        self._watchdog.expect_next(max(plan.end_ns, now_ns), rate_hz, now_ns, speed)
+        self._watchdog.expect_next(plan.left_ns(now_ns), now_ns, rate_hz, speed)
 
     # -- supervision --------------------------------------------------------------------------
     def _measure(self) -> None:
@@ -443,7 +481,9 @@ class Commander:
         if self.pose is not None:
             self._watchdog.measure(self._motion.commanded, pose_of(self.pose.record))
         self._measure()
-        if self._retreat.busy and not self._may_retreat(now_ns):
+        if self._retreat.busy and (
+            not self._may_retreat(now_ns) or self.deadman.lost(self._peers.holders)
+        ):
             self._retreat.end()
         if self.state not in OBEYING:
             return
@@ -455,7 +495,7 @@ class Commander:
         )
         if not lost and self.streaming and not self.dry_run:
             lost = self._obstructed()
-        lost = lost or self._motion.stuck or self._joints_lost(now_ns)
+        lost = lost or self.contact.lost or self._motion.stuck or self._joints_lost(now_ns)
         if not lost and self._watchdog.given_up(now_ns):
             lost = f"held for {self.profile.timing.max_hold_s:g} s without a fresh chunk"
         lost = lost or self.deadman.lost(self._peers.holders)
@@ -474,6 +514,9 @@ class Commander:
             return ""
         return f"robot state lost: joints {silent_s:.3f} s old, at most {patience_s:g} s"
 
+    def _monitor_late(self, now_ns: int) -> bool:
+        return self._joint_monitor is not None and self._joint_monitor.late(now_ns)
+
     def _monitor_joints(self, now_ns: int) -> None:
         """Slow the arm down, or brake it, if its measured joints come too near to a bound."""
         monitor, reach, motion = self._joint_monitor, self.reach, self._motion
@@ -488,7 +531,7 @@ class Commander:
             self._change(Trigger.LOSE, str(error))
             return
         commanded_rad = motion.joints_rad
-        hit = monitor.update(measured_rad, commanded_rad, now_ns)
+        hit = monitor.update(measured_rad, commanded_rad, now_ns, in_joints=motion.in_joints)
         motion.joint_slowdown = monitor.slowdown
         reach.set_elbow(measured_rad if commanded_rad is None else commanded_rad)
         if hit is not None:

@@ -32,10 +32,12 @@ class Setting(NamedTuple):
         name: prompt, active, worker, rate, speed, slower, stop, reset or lose.
         value: of ``active`` a text is the name of the deadman, the client that holds the arm
             active.
+        put_ns: when it was put, by the router's clock; None: unknown.
     """
 
     name: str
     value: str | bool | float | None = None
+    put_ns: int | None = None
 
 
 @dataclass(slots=True)

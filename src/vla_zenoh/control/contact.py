@@ -124,6 +124,7 @@ class Contact:
         )
         self._wants_effort = limits.effort_stop_nm is not None
         self._active = False
+        self._begun: list[_LoadFilter] = []
         self._pose_ns = self._joint_ns = 0
 
     # -- measurements -------------------------------------------------------------------------
@@ -141,14 +142,17 @@ class Contact:
 
     def update_joints(self, state: Stamped[JointState]) -> None:
         """Add the newest joints; used if a limit of the profile says that efforts are external."""
-        if self._wants_effort:
+        effort_nm = state.record.effort_nm
+        if effort_nm is None:
+            self._effort.known = False
+        elif self._wants_effort:
             dt_s = _passed_s(self._joint_ns, state.header.stamp_wall_ns)
             self._joint_ns = state.header.stamp_wall_ns
-            self._effort.update(state.record.effort_nm.tolist(), dt_s, drifts=self._active)
+            self._effort.update(effort_nm.tolist(), dt_s, drifts=self._active)
 
     def begin(self) -> None:
         """Start an activation: the present load is not a contact."""
-        self._active = True
+        self._active, self._begun = True, self._kinds
         for kind in self._kinds:
             kind.zero()
 
@@ -161,6 +165,24 @@ class Contact:
     def known(self) -> bool:
         """The robot measures external loads."""
         return bool(self._kinds)
+
+    @property
+    def lost(self) -> str:
+        """Which load the robot measured when the activation began and does not now."""
+        for kind in self._begun:
+            if not kind.known:
+                return f"the robot no longer measures {kind.name}, which limits.contact needs"
+        return ""
+
+    @property
+    def missing(self) -> list[str]:
+        """Reasons against an activation: loads with a limit of the profile, not measured."""
+        if not self._wants_effort or self._effort.known:
+            return []
+        return [
+            "limits.contact.effort_stop_nm is set, and the robot reports no joint efforts; take "
+            "the limit out, or let the robot report its external joint torques"
+        ]
 
     @property
     def force_n(self) -> float | None:

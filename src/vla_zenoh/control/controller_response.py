@@ -126,10 +126,15 @@ def _motion(
     """Displacement and rate (6,) after `t_s`."""
     w, zw = math.sqrt(controller.kp), controller.damping_ratio * math.sqrt(controller.kp)
     s = cmath.sqrt(zw * zw - w * w)
-    decay = math.exp(-zw * t_s)
-    cosh, sinh = cmath.cosh(s * t_s).real, t_s if s == 0 else (cmath.sinh(s * t_s) / s).real
-    moved = way + decay * (-way * cosh + (rate - zw * way) * sinh)
-    return moved, decay * (rate * cosh - (zw * rate - w * w * way) * sinh)
+    # exp(-z w t) cosh(s t) and exp(-z w t) sinh(s t) / s, without the overflow of a large s t.
+    slow, fast = cmath.exp((s - zw) * t_s), cmath.exp(-(s + zw) * t_s)
+    cosh = (slow + fast).real / 2
+    if abs(s) * t_s < 1e-3:
+        sinh = math.exp(-zw * t_s) * t_s * (1 + (s * t_s) ** 2 / 6).real
+    else:
+        sinh = ((slow - fast) / (2 * s)).real
+    moved = way - way * cosh + (rate - zw * way) * sinh
+    return moved, rate * cosh - (zw * rate - w * w * way) * sinh
 
 
 def _after(before: Pose, moved: FloatArray) -> Pose:

@@ -69,8 +69,17 @@ class JointMonitor:
         """The slowdown of the arm, None for full speed."""
         return slowest(self._bound_slowdown, self._elbow_slowdown)
 
+    def late(self, now_ns: int) -> bool:
+        """A check has been due for as long as it takes to become due again."""
+        return now_ns >= self._next_ns + PERIOD_NS // 2
+
     def update(
-        self, measured_rad: FloatArray, commanded_rad: FloatArray | None, now_ns: int
+        self,
+        measured_rad: FloatArray,
+        commanded_rad: FloatArray | None,
+        now_ns: int,
+        *,
+        in_joints: bool = False,
     ) -> LimitHit | None:
         """Check the bounds and the elbow in turn, one of them every half `PERIOD_NS`.
 
@@ -78,6 +87,7 @@ class JointMonitor:
             measured_rad: (n,) in chain order.
             commanded_rad: (n,) joint commands; None: poses are commanded.
             now_ns: time of this tick.
+            in_joints: joints are asked for, to which a singularity does not matter.
 
         Returns:
             the bound for which the arm has to brake, None without one.
@@ -87,13 +97,15 @@ class JointMonitor:
         self._next_ns = now_ns + PERIOD_NS // 2
         self._elbow_next = not self._elbow_next
         if self._elbow_next:
-            return self._bounds(measured_rad)
+            return self._bounds(measured_rad, in_joints=in_joints)
         return self._elbow(measured_rad, commanded_rad)
 
-    def _bounds(self, measured_rad: FloatArray) -> LimitHit | None:
+    def _bounds(self, measured_rad: FloatArray, *, in_joints: bool) -> LimitHit | None:
         kinematics, barriers = self._reach.kinematics, self._reach.barriers
         ends = np.minimum(measured_rad - kinematics.lower_rad, kinematics.upper_rad - measured_rad)
         left = barriers.at(measured_rad, kinematics.jacobian(measured_rad))
+        if in_joints:
+            left[0] = np.inf
         left = np.concatenate([ends - self._stop[: len(ends)], left])
         before = left if self._edge is None else self._edge
         self._edge = np.minimum(np.maximum(before, left), left + self._band)

@@ -17,14 +17,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from vla_zenoh.control.smoothing import ROTATION_BOX
 from vla_zenoh.kinematics.so3 import Pose, exp3, log3, norm3, orthonormal
-from vla_zenoh.profile import REJECT_FACTOR, Limits
+from vla_zenoh.profile import REJECT_FACTOR, Limits, Profile
 from vla_zenoh.types import FloatArray
+
+if TYPE_CHECKING:
+    from vla_zenoh.kinematics.kinematics import Kinematics
 
 APPROACH = "approach"
 """Name of the slowdown towards a target that is further away than a step."""
@@ -42,6 +45,20 @@ class JointMotionLimits(NamedTuple):
     velocity_rad_s: FloatArray
     acceleration_rad_s2: FloatArray
     jerk_rad_s3: FloatArray
+
+
+def joint_motion_limits(profile: Profile, kinematics: Kinematics) -> JointMotionLimits:
+    """Those of a profile in chain order; its velocities bound the shares of the URDF's."""
+    robot = profile.robot
+    # The joints of the kinematics are in chain order, the profile's in its own.
+    velocity, acceleration, jerk = (
+        kinematics.ordered(robot.arm_joints, profile.limits.joint.of(name, kinematics.size))
+        for name in ("velocity_rad_s", "acceleration_rad_s2", "jerk_rad_s3")
+    )
+    share = float(np.min(velocity / kinematics.velocity_rad_s))
+    return JointMotionLimits(
+        np.minimum(velocity, share * kinematics.velocity_rad_s), acceleration, jerk
+    )
 
 
 class LimitHit(NamedTuple):

@@ -13,15 +13,17 @@ from vla_zenoh.control.chunk_planner import ChunkPlanner
 from vla_zenoh.control.commander_io import limit_events, make_event
 from vla_zenoh.control.contact import Contact
 from vla_zenoh.control.gripper_arbiter import GripperArbiter
+from vla_zenoh.control.joint_space import JointPath
 from vla_zenoh.control.limits import (
     APPROACH,
+    LimitHit,
     Slowdown,
     into_workspace,
     leash,
     slowest,
     workspace_corners,
 )
-from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan
+from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan, joint_goal
 from vla_zenoh.control.pose_to_joint import PoseToJoint
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.retreat import Retreat
@@ -33,7 +35,6 @@ from vla_zenoh.kinematics.so3 import (
     Pose,
     exp3,
     held_pose,
-    log3,
     pose_distance,
     pose_of,
     quat_from_rotation,
@@ -60,8 +61,17 @@ SAME_WIDTH_M = 0.005
 HELD_M, HELD_RAD = 0.002, 0.01
 """A robot that holds a pose this near to the stream follows it: the stream continues."""
 HELD_JOINT_RAD = 0.004
+SAME_POSE = 1e-6
+"""m and rad: joints whose TCP is this near to a pose have it."""
 SETTLED, SETTLED_NS = 5e-4, 100_000_000
 """A robot that moves by less than this, in m and rad, for this long stands."""
+
+
+class Leashed(NamedTuple):
+    """A goal on the leash, and the limits that acted."""
+
+    goal: Goal
+    hits: list[LimitHit]
 
 
 class MotionCommands(NamedTuple):
@@ -97,6 +107,14 @@ class MotionPipeline:
             if reach is None:
                 raise ProfileError("robot.command is joint, which needs the robot's kinematics")
             self._joints = PoseToJoint(profile, reach.kinematics, reach.barriers)
+        self._path: JointPath | None = None
+        if planner.joint_bounds is not None:
+            self._path = JointPath(profile, planner.joint_bounds)
+        self.in_joints = False
+        """The arm moves in joints, by `_path`."""
+        self._changing = False
+        """It brakes, because the goals in force are joints and it moves in poses, or vice versa."""
+        self._no_joints = ""
         self.gripper = GripperArbiter(profile.robot.gripper)
         self.timeline: GoalTimeline | None = None
         self.goal: Goal | None = None
@@ -116,36 +134,48 @@ class MotionPipeline:
         self._smoother: Smoother | None = None
         self._standing: tuple[Pose, FloatArray | None, int] | None = None
         self._measured_ns = 0
-        self._timing: StepTiming | None = None
+        self._timings: list[StepTiming] = []
+        """Of poses, and of joints."""
         self._cause: Cause | None = None
         self._rest_since_ns: int | None = None
 
     # -- state --------------------------------------------------------------------------------
     @property
+    def _mover(self) -> Smoother | JointPath | None:
+        """What moves the arm: the smoother of poses, or of joints; None before any activation."""
+        return self._path if self.in_joints else self._smoother
+
+    @property
     def at_rest(self) -> bool:
         """The commanded motion stands still."""
-        still = self._joints is None or self._joints.at_rest
-        return self._smoother is None or (self._smoother.at_rest and still)
+        still = self.in_joints or self._joints is None or self._joints.at_rest
+        return self._mover is None or (self._mover.at_rest and still)
 
     @property
     def commanded(self) -> Pose | None:
         """The pose streamed last, None while nothing is streamed."""
-        return self._smoother.motion.pose if self._smoother and self.streaming else None
+        return self._mover.motion.pose if self._mover and self.streaming else None
 
     @property
     def joints_rad(self) -> FloatArray | None:
         """(n,) joints commanded, None where poses are."""
-        return None if self._joints is None else self._joints.position_rad
+        if self._joints is None:
+            return None
+        if self.in_joints and self._path is not None:
+            return self._path.state.position
+        return self._joints.position_rad
 
     @property
     def stuck(self) -> str:
-        """Why commanded joints will not reach the pose, empty while they follow."""
-        return "" if self._joints is None else self._joints.stuck
+        """Why the arm will not get where it was asked to, empty while it follows."""
+        if self._joints is None or self.in_joints:
+            return self._no_joints
+        return self._no_joints or self._joints.stuck
 
     @property
     def failures(self) -> int:
         """Times Ruckig found no trajectory and the arm braked instead."""
-        return self._smoother.failures if self._smoother else 0
+        return sum(mover.failures for mover in (self._smoother, self._path) if mover)
 
     # -- activation ---------------------------------------------------------------------------
     def anchor(
@@ -156,6 +186,7 @@ class MotionPipeline:
         now_ns: int,
         *,
         blocked: bool,
+        in_joints: bool = False,
     ) -> None:
         """Start at the set-point of the robot's controller, so that nothing jumps.
 
@@ -165,19 +196,27 @@ class MotionPipeline:
             joint: newest joints.
             now_ns: time of this tick.
             blocked: the arm is far from its controller's set-point.
+            in_joints: the actions are joints.
         """
         self._slowed_by.clear()
         self.joint_slowdown = None
         self.retreat.end()
+        measured_rad: FloatArray | None = None
         if self._reach is not None and joint is not None:
-            self._reach.reset(self._reach.kinematics.joints_of(joint))
+            measured_rad = self._reach.kinematics.joints_of(joint)
+            self._reach.reset(measured_rad)
         actual, start = pose_of(measured), held_pose(measured)
         standing = not self.streaming or self.at_rest
+        if standing:
+            self._enter(joints=False)
+        self._no_joints, self._changing = "", False
         if self._smoother is None:
             # Commanded joints have distance constraints of their own.
             inside = workspace_corners(self._limits) if self._joints is None else None
             self._smoother = Smoother(start, self._dt_s, motion_limits(self._limits), inside)
-            self._timing = StepTiming(self._smoother.box)
+            self._timings = [
+                StepTiming(mover.box) for mover in (self._smoother, self._path) if mover
+            ]
         elif standing and not (
             self.streaming and self._near(*pose_distance(self._smoother.motion.pose, start))
         ):
@@ -188,18 +227,59 @@ class MotionPipeline:
             if standing and not (self.streaming and apart_rad <= HELD_JOINT_RAD):
                 self._joints.restart(held_rad)
             self._joints.keep_elbow()
+        if in_joints and standing:
+            self._enter(joints=True)
         width_m = self._width_to_keep(gripper)
         self.gripper.restart(width_m)
         # The goal of a blocked arm is where it is. Otherwise a brake continues, and the goal is
         # where it ends.
-        goal = Goal(actual if blocked else self._resting_pose(self._smoother, actual), width_m)
-        assert self._timing is not None
-        self._timing.restart()
+        goal = self._resting_goal(actual, width_m)
+        if blocked and goal.arm is None:
+            goal = Goal(actual, width_m)
+        elif blocked and self._path is not None and measured_rad is not None:
+            goal = joint_goal(self._path.kinematics, measured_rad, width_m)
+        self._restart_timing()
         if self.timeline is None:
             self.timeline = GoalTimeline(goal, now_ns)
         else:
             self.timeline.restart(goal, now_ns)
         self.goal = None if blocked else goal
+
+    def _restart_timing(self) -> None:
+        for timing in self._timings:
+            timing.restart()
+
+    def _enter(self, *, joints: bool) -> None:
+        """Act in joints or in poses from now on; only while the arm stands."""
+        path, smoother, reach = self._path, self._smoother, self._reach
+        if joints is self.in_joints or path is None or smoother is None or reach is None:
+            return
+        self.goal = None
+        if not joints:
+            smoother.reset(path.motion.pose)
+            if self._joints is not None:
+                self._joints.restart(path.state.position)
+        elif self._joints is not None:
+            path.stand(self._joints.position_rad)
+        else:
+            pose = smoother.motion.pose
+            path.stand(reach.joints_at(pose))
+            apart = pose_distance(path.motion.pose, pose)
+            if max(apart) > SAME_POSE:
+                self._no_joints = (
+                    f"no joints were found for the commanded pose: {apart[0]:.4f} m and "
+                    f"{apart[1]:.4f} rad are left"
+                )
+                return
+        self.in_joints = joints
+        self._restart_timing()
+
+    def _resting_goal(self, actual: Pose, width_m: float) -> Goal:
+        """Where a brake will end, no further outside the box than the arm is."""
+        assert self._smoother is not None
+        if self.in_joints and self._path is not None:
+            return joint_goal(self._path.kinematics, self._path.braked(), width_m)
+        return Goal(self._resting_pose(self._smoother, actual), width_m)
 
     def _resting_pose(self, smoother: Smoother, actual: Pose) -> Pose:
         """Where a brake will end, inside the box or no further outside than the arm is."""
@@ -226,10 +306,10 @@ class MotionPipeline:
 
         A robot that has braked by itself stands elsewhere: a new stream begins there.
         """
-        if self._standing is None or self._smoother is None:
+        if self._standing is None or self._mover is None:
             return []
         held, held_rad, since_ns = self._standing
-        apart = _apart(held, held_rad, self._smoother.motion.pose, self.joints_rad)
+        apart = _apart(held, held_rad, self._mover.motion.pose, self.joints_rad)
         if self._near(*apart) or self._measured_ns - since_ns > SETTLED_NS:
             return []
         joints = "" if held_rad is None else f", its joints {apart[2]:.3f} rad"
@@ -282,23 +362,28 @@ class MotionPipeline:
         self._set_override(task.speed, self.timeline, now_ns)
         if state is State.ACTIVE:
             self._cause = self.timeline.plan.cause
-            events = self._follow(self._smoother, self.timeline, task, overdue_ns, now_ns, ticks)
+            events = self._follow(self.timeline, task, overdue_ns, now_ns, ticks)
         else:
             self._cause = None
-            events = self._retreat_or_brake(self._smoother, self.timeline, state, now_ns)
+            mover = self._mover or self._smoother
+            events = self._retreat_or_brake(mover, self.timeline, state, now_ns)
         went_on, self.streaming = self.streaming, self._must_stream(state, now_ns)
         if not self.streaming:
             return True, events
-        failures = self._smoother.failures
+        failures = self.failures
         # A stream that begins must begin at rest: no ticks are made up for.
         for _ in range(ticks if went_on else 1):
-            if self._joints is None:
+            if self.in_joints and self._path is not None:
+                self._path.tick()
+            elif self._joints is None:
                 self._smoother.tick()
             else:
-                active = state is State.ACTIVE and self._override > 0.0
+                active = state is State.ACTIVE and self._override > 0.0 and not self._changing
                 braking = not active and self._back is None
                 self._joints.tick(self._smoother, braking=braking, elbow=active)
-        return self._smoother.failures == failures, events
+        if self._path is not None:
+            events += limit_events(self._path.taken_hits())
+        return self.failures == failures, events
 
     def commands(
         self, state: State, now_ns: int, gripper: Stamped[GripperState] | None
@@ -307,13 +392,31 @@ class MotionPipeline:
         if not self.streaming or self._smoother is None:
             return MotionCommands()
         pose = joint = width = None
-        if self._joints is not None:
-            joint = self._joints.command(state.value, self._cause)
+        mover = self._mover or self._smoother
+        if self._joints is None:
+            pose = self._pose_command(mover.motion, state)
+        elif isinstance(mover, JointPath):
+            joint = mover.command(state.value, self._cause)
         else:
-            pose = self._pose_command(self._smoother.motion, state)
-        if state is State.ACTIVE:
+            joint = self._joints.command(state.value, self._cause)
+        if state is State.ACTIVE and self._override > 0.0:
             width = self.gripper.step(now_ns, gripper)
         return MotionCommands(pose, joint, width)
+
+    def forget_plan(self, oldest_ns: int, now_ns: int) -> bool:
+        """Stand where the arm is, if the plan's observation was taken before `oldest_ns`."""
+        timeline, mover = self.timeline, self._mover
+        if timeline is None or mover is None:
+            return False
+        cause = timeline.plan.cause
+        if cause is None or cause.observation_stamp_ns >= oldest_ns:
+            return False
+        self._hold(timeline, mover.motion.pose, now_ns)
+        return True
+
+    def _hold(self, timeline: GoalTimeline, actual: Pose, now_ns: int) -> None:
+        timeline.hold(self._resting_goal(actual, timeline.at(now_ns).width_m), now_ns)
+        self._restart_timing()
 
     def _set_override(self, override: float, timeline: GoalTimeline, now_ns: int) -> None:
         """Let plan time pass at the speed override, and replan the motion to the goal."""
@@ -324,7 +427,6 @@ class MotionPipeline:
 
     def _follow(
         self,
-        smoother: Smoother,
         timeline: GoalTimeline,
         task: Task,
         overdue_ns: int,
@@ -334,12 +436,17 @@ class MotionPipeline:
         plans = self._aggregator.plans(timeline, now_ns)
         events = limit_events(self._planner.bound_due(plans, now_ns))
         goal = self._aggregator.goal(plans, now_ns)
-        if self._override == 0.0:
-            self._pause(smoother)
+        joints = goal.arm is not None
+        if self.at_rest:
+            self._enter(joints=joints)
+        self._changing = joints is not self.in_joints
+        mover = self._mover
+        assert mover is not None
+        if self._override == 0.0 or self._changing:
+            self._pause(mover)
             return events
-        slowed = self._slowing and _within(smoother, self._override)
-        # The leash starts at the pose of this tick: the arm may be moving away from the last one.
-        pose, hits = leash(self._limits, goal.pose, _ahead(smoother.motion, ticks * self._dt_s))
+        slowed = self._slowing and _within(mover, self._override)
+        short, hits = self._on_leash(mover, goal, ticks * self._dt_s)
         slower = slowest(goal.slowdown, self.contact_slowdown, self.joint_slowdown)
         slowed |= (slower.share if slower else 1.0) != self.speed
         if goal is not self.goal or hits or slowed:
@@ -347,28 +454,45 @@ class MotionPipeline:
                 if goal is not self.goal:
                     name, value, limit = hits[0][:3]
                     events.append(make_event("warning", "limit", name, "leash", value, limit))
-                goal = self._shorten(plans, goal, pose, now_ns)
+                goal = self._shorten(plans, goal, short, now_ns)
             events += self._slow_down(slower)
-            shares = self._shares(smoother, goal.pose, timeline.plan, task, overdue_ns, now_ns)
-            hard = self._slowing and self._joints is None
-            enough = smoother.target(goal.pose, shares, all_to_stop=hard)
-            self._slowing &= not (enough and _within(smoother, self._override))
+            shares = self._shares(mover, goal, timeline.plan, task, overdue_ns, now_ns)
+            hard = self._slowing and (self._joints is None or self.in_joints)
+            enough = _move(mover, goal, shares, hard=hard)
+            self._slowing &= not (enough and _within(mover, self._override))
             self.goal = goal
             self.gripper.request(goal.width_m)
         return events
 
-    def _pause(self, smoother: Smoother) -> None:
-        """Stop on the path, to continue from there when the override allows it again."""
-        if self._joints is None:
-            smoother.brake(FULL)
+    def _on_leash(self, mover: Smoother | JointPath, goal: Goal, ahead_s: float) -> Leashed:
+        """`goal`, or a nearer one that is no further ahead than the leash allows.
+
+        The leash starts where the arm is in this tick: it may be moving away from the last goal.
+        """
+        if not isinstance(mover, JointPath) or goal.joints_rad is None or goal.arm is None:
+            pose, hits = leash(self._limits, goal.pose, _ahead(mover.motion, ahead_s))
+            return Leashed(replace(goal, pose=pose, joints_rad=None), hits)
+        state, most_rad = mover.state, self._limits.lead_rad
+        way = goal.joints_rad - state.position - ahead_s * state.velocity
+        far_rad = float(np.abs(way).max())
+        if far_rad <= most_rad:
+            return Leashed(goal, [])
+        short_rad = goal.joints_rad - (1.0 - most_rad / far_rad) * way
+        short = joint_goal(goal.arm, short_rad, goal.width_m, goal.slowdown)
+        return Leashed(short, [LimitHit("lead_rad", far_rad, most_rad)])
+
+    def _pause(self, mover: Smoother | JointPath) -> None:
+        """Stop on the path, to continue from there later."""
+        if self._joints is None or isinstance(mover, JointPath):
+            mover.brake(FULL)
         else:
-            self._joints.brake(smoother)
+            self._joints.brake(mover)
         self.goal = None
 
     def _shares(
         self,
-        smoother: Smoother,
-        goal: Pose,
+        mover: Smoother | JointPath,
+        goal: Goal,
         plan: Plan,
         task: Task,
         overdue_ns: int,
@@ -377,27 +501,27 @@ class MotionPipeline:
         """Shares of the limits that the arm has on the way to a goal."""
         override, speed = self._override, self.speed * self._override
         if not plan.soonest:
-            assert self._timing is not None
-            here, twist, _ = smoother.motion
-            body = here.rotation.T
-            way = np.concatenate([goal.position_m - here.position_m, log3(body @ goal.rotation)])
-            velocity = np.concatenate([twist[:3], body @ twist[3:]])
+            joints = isinstance(mover, JointPath)
+            way = mover.way_to(goal) if joints else mover.way_to(goal.pose)
+            velocity, _ = mover.axis_rates()
             index, left_s = plan.index_at(now_ns), (overdue_ns - now_ns) / 1e9
-            share = self._timing.share(
+            share = self._timings[self.in_joints].share(
                 plan, index, now_ns, 1.0 / task.rate_hz, left_s, way, velocity
             )
             speed = min(speed, share)
         # The same motion in more time: acceleration scales with the square of the override, jerk
         # with the cube. Until a faster arm has slowed down it brakes as hard as it may.
-        slow = _within(smoother, override)
+        slow = _within(mover, override)
         most = Shares(1.0, override**2, override**3) if slow else FULL
-        return self._within_joints(smoother, goal, Shares(speed, most.acceleration, most.jerk))
+        return self._followed(mover, goal, Shares(speed, most.acceleration, most.jerk))
 
-    def _within_joints(self, smoother: Smoother, goal: Pose, shares: Shares) -> Shares:
-        """`shares`, reduced to what commanded joints can follow."""
+    def _followed(self, mover: Smoother | JointPath, goal: Goal, shares: Shares) -> Shares:
+        """`shares`, reduced to what commanded joints can follow, or the TCP of a joint motion."""
+        if isinstance(mover, JointPath):
+            return Shares(*map(min, mover.shares(goal), shares))
         if self._joints is None:
             return shares
-        joints = self._joints.shares(smoother.motion, goal, smoother.box)
+        joints = self._joints.shares(mover.motion, goal.pose, mover.box)
         return Shares(*map(min, joints, shares))
 
     def _slow_down(self, slower: Slowdown | None) -> list[Event]:
@@ -409,52 +533,51 @@ class MotionPipeline:
         why = f"slower{slower.at}"
         return [make_event("info", "limit", slower.name, why, slower.value, slower.limit)]
 
-    def _shorten(self, plans: Sequence[Plan], goal: Goal, pose: Pose, now_ns: int) -> Goal:
+    def _shorten(self, plans: Sequence[Plan], goal: Goal, cut: Goal, now_ns: int) -> Goal:
         """Shift all later goals by what the leash cut off, or the cut part would come back.
 
         A shifted goal lies between bounded goals.
         """
-        cut = replace(goal, pose=pose, joints_rad=None)
         if len(plans) == 1:
             plans[0].shift_rest(plans[0].index_at(now_ns), cut, self._limits)
             return cut
-        way_m = pose.position_m - goal.pose.position_m
-        turn = goal.pose.rotation.T @ pose.rotation
         for plan in plans:
-            plan.shift(plan.index_at(now_ns), way_m, turn, self._limits)
+            plan.shift(plan.index_at(now_ns), goal, cut, self._limits)
         return cut
 
     def _retreat_or_brake(
-        self, smoother: Smoother, timeline: GoalTimeline, state: State, now_ns: int
+        self, mover: Smoother | JointPath, timeline: GoalTimeline, state: State, now_ns: int
     ) -> list[Event]:
         if state is not State.INACTIVE:
             self.retreat.end()
-        back, event = self.retreat.step(smoother.motion.pose, now_ns, at_rest=self.at_rest)
+        back, event = self.retreat.step(mover.motion.pose, now_ns, at_rest=self.at_rest)
+        if back is not None and isinstance(mover, JointPath) and self._smoother is not None:
+            self._enter(joints=False)
+            mover = self._smoother
         if back is None:
-            self._brake(smoother, timeline, now_ns)
+            self._brake(mover, timeline, now_ns)
         elif back is not self._back:
             # Whatever the speed override: an arm in contact has to come free.
             inside_m, _ = into_workspace(
-                self._limits, back.position_m, smoother.motion.pose.position_m
+                self._limits, back.position_m, mover.motion.pose.position_m
             )
-            inside = Pose(inside_m, back.rotation)
-            smoother.target(
-                inside, self._within_joints(smoother, inside, Shares(self.retreat.speed))
-            )
+            inside = Goal(Pose(inside_m, back.rotation), 0.0)
+            speed = self._followed(mover, inside, Shares(self.retreat.speed))
+            _move(mover, inside, speed)
         self._back = back
         return [] if event is None else [event]
 
-    def _brake(self, smoother: Smoother, timeline: GoalTimeline, now_ns: int) -> None:
+    def _brake(self, mover: Smoother | JointPath, timeline: GoalTimeline, now_ns: int) -> None:
         """Stop, and move the goal to where the arm stops, so that nothing pulls it further."""
-        if self._joints is None:
-            smoother.brake()
+        if isinstance(mover, JointPath):
+            mover.brake(FULL)  # on the path, which is known to be free
+        elif self._joints is None:
+            mover.brake()
         else:
-            self._joints.brake(smoother)
+            self._joints.brake(mover)
         self.goal = None
-        if timeline.plan.cause is not None and smoother.at_rest:
-            timeline.hold(Goal(smoother.motion.pose, timeline.at(now_ns).width_m), now_ns)
-            if self._timing is not None:
-                self._timing.restart()
+        if timeline.plan.cause is not None and mover.at_rest:
+            self._hold(timeline, mover.motion.pose, now_ns)
 
     def _must_stream(self, state: State, now_ns: int) -> bool:
         if state in OBEYING or self.retreat.busy or not self.at_rest:
@@ -495,12 +618,17 @@ def _ahead(motion: Motion, dt_s: float) -> Pose:
     return Pose(position_m + way[:3], exp3(way[3:]) @ rotation)
 
 
-def _within(smoother: Smoother, override: float) -> bool:
+def _move(mover: Smoother | JointPath, goal: Goal, shares: Shares, *, hard: bool = False) -> bool:
+    """Move to `goal`; whether the shares suffice."""
+    if isinstance(mover, JointPath):
+        return mover.target(goal, shares, all_to_stop=hard)
+    return mover.target(goal.pose, shares, all_to_stop=hard)
+
+
+def _within(mover: Smoother | JointPath, override: float) -> bool:
     """Whether the arm moves as slowly as it would at this override, and will continue so."""
-    most = smoother.box * override ** np.array([[1.0], [2.0], [3.0]])
-    (_, rotation), *motion = smoother.motion
-    # The limits of rotation apply to axes that turn with the arm.
-    speed, change = (np.abs(np.append(part[:3], rotation.T @ part[3:])) for part in motion)
+    most = mover.box * override ** np.array([[1.0], [2.0], [3.0]])
+    speed, change = (np.abs(rates) for rates in mover.axis_rates())
     return bool(
         (change <= most[1] * 1.001).all()
         and (speed + change**2 / (2 * most[2]) <= most[0] * 1.001).all()

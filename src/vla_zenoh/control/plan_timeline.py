@@ -34,7 +34,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from vla_zenoh.control.controller_response import Response, between
 from vla_zenoh.control.limits import Slowdown, into_workspace
@@ -42,20 +43,26 @@ from vla_zenoh.kinematics.so3 import Pose, interpolate, orthonormal
 from vla_zenoh.profile import Limits
 from vla_zenoh.types import Cause, FloatArray
 
+if TYPE_CHECKING:
+    from vla_zenoh.kinematics.kinematics import Kinematics
+
 HISTORY_NS = 15_000_000_000
 """Observations are rejected long before they are this old."""
-OVERRIDES_NS = 600_000_000_000
-"""How long changes of the override are remembered; a slow plan lasts long."""
 FOREVER_NS = 1 << 62
 WHOLE_STEP = 1e-6
 """Parts of steps that add up to one within this are a whole step."""
 
 
 class PlanClock:
-    """Plan time as a function of wall time (both ns): its rate is the speed override."""
+    """Plan time as a function of wall time (both ns): its rate is the speed override.
 
-    def __init__(self) -> None:
-        self._marks: list[tuple[int, int, float]] = [(0, 0, 1.0)]
+    Args:
+        override: from the beginning on.
+        now_ns: of the beginning, at which plan time is wall time.
+    """
+
+    def __init__(self, override: float = 1.0, now_ns: int = 0) -> None:
+        self._marks: list[tuple[int, int, float]] = [(now_ns, now_ns, override)]
 
     @property
     def override(self) -> float:
@@ -65,7 +72,7 @@ class PlanClock:
     def set(self, override: float, now_ns: int) -> None:
         """Set the rate of plan time from `now_ns` on."""
         self._marks.append((now_ns, self.at(now_ns), override))
-        while len(self._marks) > 1 and self._marks[1][0] < now_ns - OVERRIDES_NS:
+        while len(self._marks) > 1 and self._marks[1][0] < now_ns - HISTORY_NS:
             del self._marks[0]
 
     def at(self, wall_ns: int) -> int:
@@ -89,7 +96,7 @@ WALL_CLOCK = PlanClock()
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """A waypoint: TCP pose and gripper width.
+    """A waypoint: TCP pose, or joints, and gripper width.
 
     Args:
         pose: of the TCP.
@@ -97,6 +104,7 @@ class Goal:
         joints_rad: (n,) a joint solution of the pose; None: not computed.
         slowdown: why the arm moves there slower than at full speed.
         response: state there of a controller that covers only a part of each step; None: without.
+        arm: where joints are asked for, in chain order: the kinematics that make `pose` of them.
     """
 
     pose: Pose
@@ -104,6 +112,38 @@ class Goal:
     joints_rad: FloatArray | None = None
     slowdown: Slowdown | None = None
     response: Response | None = None
+    arm: Kinematics | None = None
+
+    def between(self, coming: Goal, share: float, dt_s: float = 0.0) -> Goal:
+        """The goal after `share` of a step of `dt_s` to `coming`, in the space asked for there."""
+        width_m = self.width_m + share * (coming.width_m - self.width_m)
+        if coming.arm is not None and coming.joints_rad is not None and self.joints_rad is not None:
+            way_rad = coming.joints_rad - self.joints_rad
+            return joint_goal(coming.arm, self.joints_rad + share * way_rad, width_m)
+        if coming.response is None or dt_s == 0.0:
+            return Goal(interpolate(self.pose, coming.pose, share), width_m)
+        pose, state = between(self.pose, coming.pose, coming.response, dt_s, share)
+        return Goal(pose, width_m, response=state)
+
+    def shifted(self, old: Goal, new: Goal, limits: Limits) -> Goal:
+        """This goal after what moves `old` to `new`, within the workspace box."""
+        if self.arm is not None and self.joints_rad is not None:
+            assert old.joints_rad is not None
+            assert new.joints_rad is not None
+            way_rad = new.joints_rad - old.joints_rad
+            return joint_goal(self.arm, self.joints_rad + way_rad, self.width_m)
+        way_m = new.pose.position_m - old.pose.position_m
+        turn = old.pose.rotation.T @ new.pose.rotation
+        inside, _ = into_workspace(limits, self.pose.position_m + way_m, self.pose.position_m)
+        moved = Pose(inside, orthonormal(self.pose.rotation @ turn))
+        return Goal(moved, self.width_m, response=self.response)
+
+
+def joint_goal(
+    arm: Kinematics, joints_rad: FloatArray, width_m: float, slowdown: Slowdown | None = None
+) -> Goal:
+    """The goal of these joints (n,) in chain order."""
+    return Goal(arm.forward(joints_rad), width_m, joints_rad, slowdown, arm=arm)
 
 
 @dataclass(slots=True)
@@ -142,14 +182,20 @@ class Plan:
     computed: int = -1
     clock: PlanClock = WALL_CLOCK
     soonest: bool = False
+    _start_ns: int = field(init=False)  # in plan time
 
     def __post_init__(self) -> None:
+        self.run_on(self.clock)
         if self.bounded < 0:
             self.bounded = self.computed = len(self.goals)
 
+    def run_on(self, clock: PlanClock) -> None:
+        """Run on this clock, which remembers the time of the observation now, and not for long."""
+        self.clock, self._start_ns = clock, clock.at(self.start_ns)
+
     def elapsed_ns(self, t_ns: int) -> int:
         """Plan time from the observation to `t_ns`."""
-        return self.clock.at(t_ns) - self.clock.at(self.start_ns)
+        return self.clock.at(t_ns) - self._start_ns
 
     def due_index(self, t_ns: int) -> int:
         """Index of the step that is due at `t_ns`."""
@@ -166,13 +212,8 @@ class Plan:
             return self.goals[0]
         if done >= self.bounded or part_ns == 0:
             return self.goals[min(done, self.bounded) - 1]
-        last, coming, share = self.goals[done - 1], self.goals[done], part_ns / self.dt_ns
-        width_m = last.width_m + share * (coming.width_m - last.width_m)
-        if coming.response is None:
-            return Goal(interpolate(last.pose, coming.pose, share), width_m)
         dt_s = self.dt_ns / 1e9
-        pose, state = between(last.pose, coming.pose, coming.response, dt_s, share)
-        return Goal(pose, width_m, response=state)
+        return self.goals[done - 1].between(self.goals[done], part_ns / self.dt_ns, dt_s)
 
     def steps_until(self, t_ns: int) -> float:
         """Steps of the episode asked for until `t_ns`, including parts of one."""
@@ -186,32 +227,22 @@ class Plan:
     @property
     def end_ns(self) -> int:
         """End of the last step, at the present override."""
-        end_ns = self.clock.at(self.start_ns) + len(self.goals) * self.dt_ns
-        return self.clock.wall_at(end_ns)
+        return self.clock.wall_at(self._start_ns + len(self.goals) * self.dt_ns)
 
-    def shift(self, index: int, way_m: FloatArray, turn: FloatArray, limits: Limits) -> None:
-        """Shift the goals from `index` on, within the workspace box.
+    def left_ns(self, t_ns: int) -> int:
+        """Plan time from `t_ns` to the end of the last step."""
+        return max(len(self.goals) * self.dt_ns - self.elapsed_ns(t_ns), 0)
 
-        Args:
-            index: of the first goal to shift.
-            way_m: (3,) translation in the base frame.
-            turn: (3, 3) rotation in the TCP frame.
-            limits: with the box.
-        """
+    def shift(self, index: int, old: Goal, new: Goal, limits: Limits) -> None:
+        """Shift the goals from `index` on as from `old` to `new`, within the workspace box."""
         # They are elsewhere than checked: bounded again when due. Goal 0 has none before it.
         self.bounded = min(self.bounded, max(index, 1))
         for later in range(index, self.computed):
-            goal = self.goals[later]
-            inside, _ = into_workspace(limits, goal.pose.position_m + way_m, goal.pose.position_m)
-            turned = orthonormal(goal.pose.rotation @ turn)
-            moved = Pose(inside, turned)
-            self.goals[later] = Goal(moved, goal.width_m, response=goal.response)
+            self.goals[later] = self.goals[later].shifted(old, new, limits)
 
     def shift_rest(self, index: int, goal: Goal, limits: Limits) -> None:
         """Replace goal `index`, and shift the later ones with it."""
-        old = self.goals[index].pose
-        way_m = goal.pose.position_m - old.position_m
-        self.shift(index + 1, way_m, old.rotation.T @ goal.pose.rotation, limits)
+        self.shift(index + 1, self.goals[index], goal, limits)
         self.goals[index] = goal
 
 
@@ -234,6 +265,7 @@ class GoalTimeline:
 
     def restart(self, goal: Goal, now_ns: int) -> None:
         """Drop all plans and stand at `goal`."""
+        self.clock = PlanClock(self.clock.override, now_ns)
         self._plans.clear()
         self.hold(goal, now_ns)
 
@@ -241,7 +273,8 @@ class GoalTimeline:
         """Put `plan` in force, not before the newest plan and not after now."""
         earliest = self._plans[-1].effective_ns if self._plans else plan.effective_ns
         plan.effective_ns = max(earliest, min(plan.effective_ns, now_ns))
-        plan.arrival_ns, plan.clock = now_ns, self.clock
+        plan.arrival_ns = now_ns
+        plan.run_on(self.clock)
         self._plans.append(plan)
         while len(self._plans) > 1 and self._plans[1].effective_ns < now_ns - HISTORY_NS:
             del self._plans[0]

@@ -69,11 +69,25 @@ def spec_errors(profile: Profile, spec: ModelSpec) -> Iterator[Finding]:
                 f"camera {wanted.camera!r} gives an image every {1 / camera.rate_hz:.2f} s, the "
                 f"spec allows none older than {spec.observation.max_age_s:g} s",
             )
-    if spec.action.kind == "absolute" and len(profile.robot.arm_joints) < POSE_JOINTS:
+    if spec.action.space == "joint":
+        wanted, given = set(profile.robot.arm_joints), set(spec.action.joints)
+        if wanted != given:
+            yield error(
+                "joint_names",
+                f"its joints are {', '.join(spec.action.joints)}; robot {profile.robot.name!r} "
+                f"has {', '.join(profile.robot.arm_joints)}: name these, in the order of the "
+                "model's columns",
+            )
+        if profile.robot.command == "pose" and len(profile.robot.arm_joints) < POSE_JOINTS:
+            yield error(
+                "too_few_joints",
+                f"{few_joints(profile)}, and its robot takes poses: set robot.command to joint",
+            )
+    elif spec.action.kind == "absolute" and len(profile.robot.arm_joints) < POSE_JOINTS:
         yield error(
             "too_few_joints",
-            f"{few_joints(profile)}: it cannot go straight from one absolute pose to the next, "
-            "also where joint positions were made into poses; use a model whose action is delta",
+            f"{few_joints(profile)}: it cannot go straight from one absolute pose to the next; "
+            "use a model whose actions are joints (space joint) or deltas",
         )
 
 
@@ -97,6 +111,11 @@ def chunk_errors(
         limits: of the robot.
         max_width_m: of its gripper.
     """
+    width = steps[:, -1].astype(np.float64)
+    if spec.gripper != "binary":  # any number is a valid choice of two
+        yield from (error("gripper_range", why) for why in beyond_gripper(spec, width, max_width_m))
+    if spec.space == "joint":
+        return
     rotation = steps[:, 3 : 3 + ROTATION_SIZE[spec.rotation]].astype(np.float64)
     if spec.rotation == "quaternion":
         norms = np.linalg.norm(rotation, axis=1)
@@ -127,9 +146,6 @@ def chunk_errors(
         )
     elif spec.kind != "absolute" and most_rad > REJECT_FACTOR * limits.step_rad:
         yield _too_far_a_turn(most_rad, limits)
-    width = steps[:, -1].astype(np.float64)
-    if spec.gripper != "binary":  # any number is a valid choice of two
-        yield from (error("gripper_range", why) for why in beyond_gripper(spec, width, max_width_m))
 
 
 def largest_step(spec: ActionSpec, steps: Steps) -> tuple[float, float]:
@@ -211,7 +227,9 @@ def joints_as_pose(
         limits: of the robot.
     """
     count = len(joints_rad)
-    if spec.kind != "absolute" or spec.dimension not in (count, count + 1):
+    if spec.space == "joint" or spec.kind != "absolute":
+        return []
+    if spec.dimension not in (count, count + 1):
         return []
     first = steps[:, :count].astype(np.float64)
     outside_m = outside_workspace_m(spec, steps, limits)
@@ -227,8 +245,8 @@ def joints_as_pose(
         error(
             "joints_as_pose",
             f"declared as absolute poses (x, y, z, {spec.rotation}), but {like}, and a step has as "
-            f"many numbers as this arm has joints: these are joint positions. Turn them into poses "
-            "of the TCP, as vla_zenoh.interop.action_semantics.make_forward does",
+            "many numbers as this arm has joints: these are joint positions. Declare them as "
+            "space='joint' with joints=(the arm's joint names, in the order of the columns)",
         )
     ]
 
@@ -247,7 +265,7 @@ def beyond_joints(
         jacobian: (6, n) of the TCP in base axes, linear first.
         rotation: (3, 3) of the TCP, for deltas in its frame.
     """
-    if spec.kind == "absolute" or jacobian.shape[1] >= POSE_JOINTS:
+    if spec.space == "joint" or spec.kind == "absolute" or jacobian.shape[1] >= POSE_JOINTS:
         return []
     spec, steps = as_deltas(spec, steps)
     asked = np.zeros(6)

@@ -11,10 +11,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from vla_zenoh.control.axis_smoothing import Shares
 from vla_zenoh.control.barriers import Barriers, DistanceConstraints
 from vla_zenoh.control.joint_follower import FollowSettings, JointFollower, JointMotion
-from vla_zenoh.control.limits import JointMotionLimits, into_workspace
-from vla_zenoh.control.smoothing import FULL, Motion, Shares, Smoother
+from vla_zenoh.control.joint_space import followed_shares
+from vla_zenoh.control.limits import into_workspace, joint_motion_limits
+from vla_zenoh.control.smoothing import Motion, Smoother
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import Pose, exp3, log3, pose_distance
 from vla_zenoh.profile import Profile
@@ -48,8 +50,6 @@ CREEPING, STUCK_S = 0.05, 0.5
 """A pose that advances at less than this pace for this long will not be reached."""
 OUTSIDE_M = 1e-3
 """An arm further outside the box than this started there, and is led in."""
-LEAST_SHARE = 0.02
-NOTHING = 1e-9
 DAMPING = 1e-5
 
 
@@ -66,16 +66,10 @@ class PoseToJoint:
         self, profile: Profile, kinematics: Kinematics, barriers: Barriers | None = None
     ) -> None:
         robot, limits = profile.robot, profile.limits
-        size = len(robot.arm_joints)
-        # The follower's joints are in chain order, the profile's in its own.
-        velocity, acceleration, jerk = (
-            kinematics.ordered(robot.arm_joints, limits.joint.of(name, size))
-            for name in ("velocity_rad_s", "acceleration_rad_s2", "jerk_rad_s3")
-        )
         self._kinematics = kinematics
+        self.limits = joint_motion_limits(profile, kinematics)
+        velocity, acceleration, jerk = self.limits
         share = float(np.min(velocity / kinematics.velocity_rad_s))
-        velocity = np.minimum(velocity, share * kinematics.velocity_rad_s)
-        self._limits = JointMotionLimits(velocity, acceleration, jerk)
         home_rad = kinematics.ordered(robot.arm_joints, robot.home_rad)
         self._home_rad = home_rad if robot.posture == "home" else None
         settings = FollowSettings(
@@ -124,21 +118,10 @@ class PoseToJoint:
         (position_m, rotation), twist, _ = motion
         turn = log3(rotation.T @ goal.rotation)
         ways = np.concatenate([goal.position_m - position_m, turn])
-        length = float(np.linalg.norm(ways))
-        if length < NOTHING:
-            return FULL
-        # All axes move together, as fast as the slowest one.
-        rates = (box / np.maximum(np.abs(ways), NOTHING)).min(axis=1)
-        now = float(np.linalg.norm(twist)) / length
         joint_ways, bends = self._ways(np.concatenate([ways[:3], rotation @ turn]))
-        limits = np.array(ROOM)[:, None] * np.array(self._limits)
-        needed = np.maximum(rates[:, None] * joint_ways, NOTHING)
-        velocity, _, jerk = (limits / needed).min(axis=1)
-        fastest = min(rates[0] * velocity, float(np.min(np.sqrt(bend * limits[1] / bends))))
-        reached = min(fastest, (now * now + rates[1]) ** 0.5)
-        left = np.maximum(limits[1] - bends * reached * reached, (1 - bend) * limits[1])
-        parts = np.clip([fastest / rates[0], (left / needed[1]).min(), jerk], LEAST_SHARE, 1.0)
-        return Shares(*(float(part) for part in parts))
+        limits = np.array(ROOM)[:, None] * np.array(self.limits)
+        speed = float(np.linalg.norm(twist))
+        return followed_shares(ways, box, speed, joint_ways, bends, limits, bend)
 
     def _ways(self, way: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Joint displacements (n,) of a displacement (6,) of the TCP, and their change (n,).
@@ -153,7 +136,7 @@ class PoseToJoint:
             found.append(jacobian.T @ np.linalg.solve(square, way))
             joints = joints + found[-1] / (PLACES - 1)
         bends = np.abs(np.diff(found, axis=0)).max(axis=0) * (PLACES - 1)
-        return np.abs(found).max(axis=0), np.maximum(bends, NOTHING)
+        return np.abs(found).max(axis=0), bends
 
     def brake(self, smoother: Smoother) -> None:
         """Bring the pose to rest as fast as the joints can."""

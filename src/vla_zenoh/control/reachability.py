@@ -47,6 +47,7 @@ SOLVER_ITERATIONS = 12
 EFFORT = 5
 """Iterations of the solver per evaluation; one with more counts as several."""
 SAME_POSE = 1e-9
+NEWTON_STEPS = 8
 
 
 class BoundedStep(NamedTuple):
@@ -156,6 +157,17 @@ class ReachabilityFilter:
         """Joints (n,) for `pose`, solved from `joints_rad` (n,); None without a solution."""
         found = self._solver.approach(pose, joints_rad, bounded=False)
         return found.joints_rad if found.solved else None
+
+    def joints_at(self, pose: Pose) -> FloatArray:
+        """Joints (n,) of `pose`, or as near to it as they get, with the robot's elbow."""
+        measured_rad = self._measured_rad
+        joints_rad = self._here.joints_rad if measured_rad is None else measured_rad
+        for _ in range(NEWTON_STEPS):
+            here, jacobian = self.kinematics.pose_and_jacobian(joints_rad)
+            joints_rad = (
+                joints_rad + np.linalg.lstsq(jacobian, pose_error(pose, here), rcond=1e-3)[0]
+            )
+        return joints_rad
 
     @property
     def joints_rad(self) -> FloatArray:

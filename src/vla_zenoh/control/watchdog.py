@@ -31,23 +31,44 @@ class Watchdog:
         self._excused = (0.0, 0.0)
         self.deadline_ns = 0
         """When the next chunk is overdue."""
+        self._left_ns, self._patience_ns = 0.0, 0
 
     # -- chunks -------------------------------------------------------------------------------
     def expect_first(self, now_ns: int, rate_hz: float, speed: float = 1.0) -> None:
         """Set the deadline of the first chunk of an episode that begins at `now_ns`."""
-        self._expect(now_ns, rate_hz, speed, FIRST_CHUNK_PATIENCE_S)
+        self._expect(0, now_ns, rate_hz, speed, FIRST_CHUNK_PATIENCE_S)
 
-    def expect_next(self, end_ns: int, rate_hz: float, now_ns: int, speed: float = 1.0) -> None:
-        """Set the deadline after a chunk that ends at `end_ns`, or at ``max_open_loop_s``."""
-        open_loop_ns = int(self._timing.max_open_loop_s * 1e9 / speed) if speed else 0
-        self._expect(min(end_ns, now_ns + open_loop_ns), rate_hz, speed)
+    def expect_next(self, left_ns: int, now_ns: int, rate_hz: float, speed: float = 1.0) -> None:
+        """Set the deadline after a chunk with `left_ns` of plan time, or ``max_open_loop_s``."""
+        open_loop_ns = int(self._timing.max_open_loop_s * 1e9)
+        self._expect(min(left_ns, open_loop_ns), now_ns, rate_hz, speed)
 
-    def _expect(self, end_ns: int, rate_hz: float, speed: float, extra_s: float = 0.0) -> None:
+    def _expect(
+        self, left_ns: int, now_ns: int, rate_hz: float, speed: float, extra_s: float = 0.0
+    ) -> None:
         """One period at the requested rate later, plus the watchdog; never at override 0."""
-        period_s = 1.0 / rate_hz / speed if speed else 0.0
-        self.deadline_ns = end_ns + int((period_s + self._timing.watchdog_s + extra_s) * 1e9)
-        if not speed:
-            self.deadline_ns = NEVER_NS
+        self._left_ns = left_ns + 1e9 / rate_hz
+        self._patience_ns = int((self._timing.watchdog_s + extra_s) * 1e9)
+        self._set_deadline(now_ns, speed)
+
+    def override_changed(self, now_ns: int, before: float, speed: float) -> None:
+        """Keep the plan time that is left until the deadline; a pause stops it.
+
+        Args:
+            now_ns: when the speed override changed.
+            before: the override until then, 0 to 1.
+            speed: the override from then on.
+        """
+        if before:
+            left_ns = self.deadline_ns - self._patience_ns - now_ns
+            self._left_ns = left_ns * before if left_ns > 0 else left_ns
+        self._set_deadline(now_ns, speed)
+
+    def _set_deadline(self, now_ns: int, speed: float) -> None:
+        self.deadline_ns = NEVER_NS
+        if speed:
+            left_ns = self._left_ns / speed if self._left_ns > 0 else self._left_ns
+            self.deadline_ns = now_ns + round(left_ns) + self._patience_ns
 
     def overdue(self, now_ns: int) -> bool:
         """The next chunk is overdue."""

@@ -302,7 +302,7 @@ class ReferenceGovernor(Generic[Reference]):
         self._known = self._taken[1:] * self._own[1:]
         left = BRAKE_MARGIN - self._taken
         left[2] -= REVERSAL
-        # The commanded path may begin to accelerate: the difference, which has less jerk, gives way.
+        # The commanded path may begin to accelerate: the difference has less jerk, and gives way.
         left[1] -= (1.0 - GIVES_WAY) * np.maximum(1.0 - taken[1], 0.0)
         left = np.maximum(left, LEAST)
         velocity, acceleration, jerk = left * self._own * self._axis

@@ -1,7 +1,7 @@
 """Converts a robot's joint states to our joint, pose and gripper states.
 
 Positions have to be finite, new, and possible for this arm. Missing velocities are differentiated,
-missing efforts are zero.
+missing efforts are None.
 """
 
 from __future__ import annotations
@@ -130,13 +130,13 @@ class JointReading:
         velocity = (position - self._joints.position_rad) / elapsed_s
         return np.clip(velocity, -self._fastest_rad_s, self._fastest_rad_s)
 
-    def _effort(self, joints: Joints, at: list[int]) -> FloatArray:
-        """Efforts are not used for control, and ros2_control publishes NaN if it has none."""
+    def _effort(self, joints: Joints, at: list[int]) -> FloatArray | None:
+        """Efforts of the arm; ros2_control publishes NaN if it has none."""
         effort = None if joints.effort is None else joints.effort[at]
         if effort is not None and np.isfinite(effort).all():
             return effort
         self.efforts_missing += 1
-        return np.zeros(len(at))
+        return None
 
     def _take_fingers(self, joints: Joints, places: dict[str, int], stamp_ns: int) -> None:
         at = [places[name] for name in self._finger_names if name in places]

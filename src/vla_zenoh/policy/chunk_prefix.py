@@ -135,14 +135,15 @@ def rest_of(spec: ActionSpec, steps: NDArray[np.float32], had: float) -> NDArray
         return steps[whole:].copy()
     first, second = steps[whole:-1].astype(np.float64), steps[whole + 1 :].astype(np.float64)
     turn = slice(3, 3 + ROTATION_SIZE[spec.rotation])
-    if spec.rotation == "quaternion":
+    turns = spec.space == "tcp"
+    if turns and spec.rotation == "quaternion":
         near = np.sign(np.sum(first[:, turn] * second[:, turn], axis=1, keepdims=True))
         second[:, turn] *= np.where(near < 0, -1.0, 1.0)
-    elif spec.kind == "absolute":
+    elif turns and spec.kind == "absolute":
         away = second[:, turn] - first[:, turn]
         second[:, turn] = first[:, turn] + (away + math.pi) % (2 * math.pi) - math.pi
     mixed = (1.0 - share) * first + share * second
-    if spec.rotation == "quaternion":
+    if turns and spec.rotation == "quaternion":
         mixed[:, turn] /= np.linalg.norm(mixed[:, turn], axis=1, keepdims=True)
     if spec.gripper not in ("none", "delta_m"):
         mixed[:, -1] = first[:, -1]

@@ -35,6 +35,7 @@ Resize = Literal["none", "stretch", "pad", "crop"]
 Frame = Literal["base", "tcp"]
 Rotation = Literal["rpy", "rotvec", "quaternion"]
 MotionKind = Literal["delta", "absolute", "velocity"]
+ActionSpace = Literal["tcp", "joint"]
 Anchor = Literal["goal", "measured"]
 RelativeTo = Literal["previous", "start"]
 GripperSemantics = Literal["none", "delta_m", "absolute_m", "open_fraction", "binary"]
@@ -42,7 +43,7 @@ GripperSemantics = Literal["none", "delta_m", "absolute_m", "open_fraction", "bi
 ROTATION_SIZE: Mapping[Rotation, int] = {"rpy": 3, "rotvec": 3, "quaternion": 4}
 
 
-MAX_CAMERAS = 16
+MAX_CAMERAS = MAX_JOINTS = 16
 
 Text = Annotated[str, Field(min_length=1, max_length=128)]
 
@@ -62,9 +63,8 @@ class _Spec(BaseModel):
 def _no_joints(kind: Any) -> Any:
     if isinstance(kind, str) and "joint" in kind:
         raise ValueError(
-            f"{kind!r} is not an action of a model file: wants 'delta', 'absolute' or 'velocity' "
-            "of the TCP. Turn joint positions into poses with "
-            "vla_zenoh.interop.action_semantics.make_forward, and declare them as 'absolute'"
+            f"{kind!r} is no kind of action; joints are declared as space='joint' with "
+            "joints=(names in the order of the columns) and kind='absolute', 'delta' or 'velocity'"
         )
     return kind
 
@@ -139,15 +139,20 @@ class ControllerSpec(_Spec):
 class ActionSpec(_Spec):
     """What the numbers of a chunk mean: ``[x y z | rotation | gripper]`` in each of H steps.
 
+    In joint space ``[joint 1 .. joint n | gripper]``, in rad (m for a joint that slides): the arm
+    follows the joints themselves, and `frame`, `rotation` and `position_scale_m` mean nothing.
+
     Args:
         horizon: H, steps in a chunk (at most; a shorter chunk is allowed).
         dt_s: duration of one step.
         kind: ``delta`` adds to the goal, ``absolute`` is the goal, ``velocity`` is a delta per
             second (m/s and rad/s, for `dt_s`).
+        space: ``tcp`` poses of the TCP; ``joint`` positions of the arm's joints.
+        joints: names of the joints, in the order of the columns.
         frame: axes of a delta or velocity: the robot's ``base`` or the ``tcp`` at that moment. An
             absolute pose is always in the base frame.
-        anchor: pose that a chunk of deltas or velocities begins at: the ``goal`` in force at its
-            observation, or the ``measured`` pose of the arm then.
+        anchor: pose or joints that a chunk of deltas or velocities begins at: the ``goal`` in force
+            at its observation, or those ``measured`` then.
         relative_to: each delta is added to the ``previous`` step, or every one of a chunk to its
             ``start``, which is the anchor (UMI; openpi's DeltaActions).
         controller: of the data, where that covers only a part of each delta; None: steps are
@@ -180,11 +185,30 @@ class ActionSpec(_Spec):
     gripper_threshold: Annotated[float, AfterValidator(lambda value: value + 0.0)] = 0.5
     normalisation: Text | None = None
     pace: Literal["steady", "soonest"] = "steady"
+    space: ActionSpace = "tcp"
+    joints: Annotated[tuple[Text, ...], AfterValidator(_differ)] = Field(
+        default=(), max_length=MAX_JOINTS, strict=False
+    )
+
+    @property
+    def arm_size(self) -> int:
+        """Numbers of the arm in one step; that of the gripper follows."""
+        return len(self.joints) if self.joints else 3 + ROTATION_SIZE[self.rotation]
 
     @property
     def dimension(self) -> int:
         """D: numbers in one step."""
-        return 3 + ROTATION_SIZE[self.rotation] + (self.gripper != "none")
+        return self.arm_size + (self.gripper != "none")
+
+    @model_validator(mode="after")
+    def _joints_are_named(self) -> ActionSpec:
+        if self.space == "joint" and not self.joints:
+            raise ValueError(
+                "space 'joint' needs joints: the names of the arm's joints in column order"
+            )
+        if self.joints and self.space != "joint":
+            raise ValueError("joints are named, and space is 'tcp'; set space: joint")
+        return self
 
     @property
     def targets(self) -> bool:
@@ -193,6 +217,8 @@ class ActionSpec(_Spec):
 
     @model_validator(mode="after")
     def _absolute_is_in_base(self) -> ActionSpec:
+        if self.space == "joint" and (self.frame != "base" or self.controller is not None):
+            raise ValueError("joints have no frame and no controller; leave out both")
         if self.kind != "absolute":
             return self
         if self.frame != "base":
@@ -208,7 +234,7 @@ class ActionSpec(_Spec):
     def _velocity_is_integrated(self) -> ActionSpec:
         if self.kind != "velocity":
             return self
-        if self.rotation != "rotvec":
+        if self.space == "tcp" and self.rotation != "rotvec":
             raise ValueError("an angular velocity is a vector in rad/s; set rotation: rotvec")
         if self.relative_to != "previous":
             raise ValueError(

@@ -30,7 +30,8 @@ class JointState:
         velocity_rad_s: (n,) measured.
         effort_nm: (n,) what the motors apply: of the simulator and of ROS 2's joint states all of
             it, the arm's own weight included. A robot class may tell the external torque in its
-            place, and its profile then bounds it (``limits.contact.effort_stop_nm``).
+            place, and its profile then bounds it (``limits.contact.effort_stop_nm``). None where
+            the robot does not measure it.
         reference_rad: (n,) positions the robot's controller holds right now, or None where it
             holds none, or the robot does not tell.
     """
@@ -38,18 +39,17 @@ class JointState:
     names: tuple[str, ...]
     position_rad: FloatArray
     velocity_rad_s: FloatArray
-    effort_nm: FloatArray
+    effort_nm: FloatArray | None
     reference_rad: FloatArray | None = None
 
     def __post_init__(self) -> None:
         names = joint_names(self.names)
         set_field(self, "names", names)
-        for name in ("position_rad", "velocity_rad_s", "effort_nm"):
+        for name in ("position_rad", "velocity_rad_s"):
             set_field(self, name, vector(name, getattr(self, name), len(names)))
-        if self.reference_rad is not None:
-            set_field(
-                self, "reference_rad", vector("reference_rad", self.reference_rad, len(names))
-            )
+        for name in ("effort_nm", "reference_rad"):
+            if getattr(self, name) is not None:
+                set_field(self, name, vector(name, getattr(self, name), len(names)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,11 +14,14 @@ from hypothesis import strategies as st
 
 from vla_zenoh.control.actions import as_deltas, chunk_poses
 from vla_zenoh.control.chunk_planner import ChunkPlan, ChunkPlanner
+from vla_zenoh.control.commander import Setting
+from vla_zenoh.control.controller_response import respond
 from vla_zenoh.control.plan_timeline import Goal, GoalTimeline
+from vla_zenoh.control.state_history import StateHistory
 from vla_zenoh.kinematics.so3 import Pose, angle_between, exp3, log3, rotation_from_quat
 from vla_zenoh.policy import ActionSpec, ControllerSpec
 from vla_zenoh.profile.limits import Workspace
-from vla_zenoh.types import FloatArray
+from vla_zenoh.types import FloatArray, PoseState
 
 ATOL = 1e-9
 START = Pose(np.array([0.45, -0.1, 0.3]), exp3(np.array([2.8, 0.3, -0.5])))
@@ -327,3 +331,55 @@ def test_twenty_steps_of_osc_move_the_arm_as_far_in_any_chunks(
     assert wanted_m[0] == pytest.approx(0.077, abs=1e-4)
     assert rig.moved_m() == pytest.approx(wanted_m, abs=1e-6)
     rig.assert_smooth()
+
+
+@pytest.mark.parametrize("back_s", [0.06, 1.5, 3600.0])
+def test_after_the_clock_was_set_back_a_measured_anchor_is_where_the_arm_is(back_s: float) -> None:
+    rig = Rig(dt_s=0.2, anchor="measured")
+    rig.activate()
+    rig.run(0.3)
+    for _ in range(8):
+        rig.send([[0.04, 0, 0, 0, 0, 0, 0]] * 5, observed_ago_s=0.05)
+        rig.run(0.2)
+    rig.now_ns -= round(back_s * 1e9)
+    rig.tick(Setting("lose", "the wall clock was set"))
+    rig.run(0.5)
+    stands_m = rig.position_m.copy()
+    rig.activate()
+    rig.run(0.1)
+    rig.refused.clear()
+    rig.send([[0, 0, 0.001, 0, 0, 0, 0]], observed_ago_s=0.05)
+    rig.run(1.0)
+    assert not rig.refused
+    np.testing.assert_allclose(rig.position_m - stands_m, [0, 0, 0.001], atol=1e-6)
+
+
+def test_a_pose_from_the_future_says_nothing_about_the_past() -> None:
+    rig = Rig(dt_s=0.2, anchor="measured")
+    history: StateHistory[PoseState] = StateHistory()
+    pose = rig.pose_state()
+    history.restart(pose)
+    ahead_ns = pose.received_ns + 1_000_000_000
+    history.add(replace(pose, header=replace(pose.header, stamp_wall_ns=ahead_ns)), 20_000_000)
+    assert history.around(ahead_ns, 20_000_000) is None
+
+
+@given(
+    kp=st.floats(1.0, 1e4),
+    ratio=st.floats(0.1, 10.0),
+    dt_s=st.floats(1e-3, 60.0),
+)
+def test_every_controller_that_can_be_declared_has_a_finite_response_that_ends_at_its_goal(
+    kp: float, ratio: float, dt_s: float
+) -> None:
+    controller = ControllerSpec(kp=kp, damping_ratio=ratio)
+    way_m = np.array([0.05, 0.0, 0.0])
+    pose, state = respond(controller, way_m, None, dt_s, START, None)
+    assert np.isfinite(pose.position_m).all()
+    assert np.isfinite(state.rate).all()
+    gone_m = (pose.position_m - START.position_m)[0]
+    overshoot = 1.0 + math.exp(-math.pi * min(ratio, 0.999) / math.sqrt(1 - min(ratio, 0.999) ** 2))
+    assert -1e-12 <= gone_m <= 0.05 * overshoot + 1e-9
+    slowest = math.sqrt(kp) * (ratio - math.sqrt(max(ratio**2 - 1, 0.0)))
+    if slowest * dt_s > 20.0:
+        assert gone_m == pytest.approx(0.05, abs=1e-6)

@@ -1051,3 +1051,37 @@ def test_source_is_the_one_of_the_spec() -> None:
     rig.activate()
     assert rig.commander.lease is not None
     assert rig.commander.lease.source == SOURCE
+
+
+def test_what_was_put_before_a_stop_and_arrives_after_it_is_rejected() -> None:
+    rig = Rig()
+    rig.activate()
+    rig.tick(Setting("stop", put_ns=2_000))
+    for name, value in (("reset", None), ("active", True)):
+        rig.tick(Setting(name, value, put_ns=1_000))
+        assert rig.state == "stopped"
+    assert "before the last emergency stop" in rig.events[-1].why
+    rig.run(1.0)
+    rig.tick(Setting("reset", put_ns=3_000))
+    assert rig.state == "inactive"
+    rig.tick(Setting("active", True, put_ns=1_500))
+    assert rig.state == "inactive"
+
+
+def test_the_measured_joints_are_monitored_however_many_chunks_arrive() -> None:
+    of = profile()
+    reach = make_reachability_filter(of)
+    rig = Rig(of, reach=reach)
+    rig.stand_at(reach.kinematics, reach.joints_rad.copy())
+    for _ in range(3):
+        rig.tick()
+    rig.activate()
+    rig.run(0.2)
+    rig.joints_of_shadow = False
+    start_rad, end_rad = reach.joints_rad.copy(), reach.kinematics.upper_rad[0] - 1e-3
+    for tick in range(100):
+        rig.joints_rad = start_rad.copy()
+        rig.joints_rad[0] += (end_rad - start_rad[0]) * tick / 99
+        rig.tick(chunks=[rig.chunk([[0.0] * 7], seq=0)])
+    assert rig.state == "inactive"
+    assert "the measured arm is too near to a bound" in rig.commander.why

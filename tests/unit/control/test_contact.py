@@ -173,3 +173,29 @@ def test_efforts_count_only_where_a_limit_says_that_they_are_external() -> None:
 def test_a_slow_that_is_not_below_its_stop_is_refused(limits: dict[str, float]) -> None:
     with pytest.raises(ValidationError, match="must be below"):
         ContactLimits(**limits)
+
+
+def test_a_load_that_is_no_longer_measured_ends_the_activation_by_name() -> None:
+    arm = active()
+    assert not arm.contact.lost
+    arm.says(None)
+    assert "contact_force" in arm.contact.lost
+    arm.contact.begin()
+    assert not arm.contact.lost
+
+
+def test_an_activation_needs_the_efforts_that_the_profile_limits() -> None:
+    arm = active(effort_slow_nm=5.0, effort_stop_nm=10.0)
+    (reason,) = arm.contact.missing
+    assert "effort_stop_nm" in reason
+    arm.strains(0.0, 0.0, s=0.1)
+    assert not arm.contact.missing
+    arm.contact.begin()
+    state = JointState(JOINTS, np.zeros(2), np.zeros(2), None)
+    arm.contact.update_joints(Stamped(Header(arm.now_ns, 1, "sim-1"), state, arm.now_ns))
+    assert "contact_effort" in arm.contact.lost
+    assert arm.contact.missing
+
+
+def test_efforts_without_a_limit_are_not_needed() -> None:
+    assert not active().contact.missing

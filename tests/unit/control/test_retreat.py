@@ -184,6 +184,37 @@ def test_a_stop_ends_it_at_once() -> None:
     rig.assert_smooth()
 
 
+def retreating_rig() -> Walled:
+    """An arm that anna held active, and that is on its way back from a wall."""
+    rig = Walled(np.array([1.0, 0, 0]), 0.05)
+    rig.peers = replace(rig.peers, holders=frozenset({"anna"}))
+    rig.tick(chunks=[rig.chunk([[0.0] * 7])])
+    rig.put("active", "anna")
+    while rig.state == "active":
+        rig.send([[0.04, 0, 0, 0, 0, 0, 0]])
+        rig.run(0.096)
+    rig.brake()
+    rig.run(0.2)
+    assert np.abs(rig.commands[-1].twist).max() > STANDING_M_S
+    assert not rig.commander.at_rest
+    return rig
+
+
+def test_to_deactivate_ends_it() -> None:
+    rig = retreating_rig()
+    rig.put("active", False)
+    assert still_after_the_brake(rig)
+    assert rig.commander.at_rest
+    rig.assert_smooth()
+
+
+def test_it_ends_when_the_client_that_held_the_arm_active_is_gone() -> None:
+    rig = retreating_rig()
+    rig.peers = replace(rig.peers, holders=frozenset())
+    assert still_after_the_brake(rig)
+    rig.assert_smooth()
+
+
 def test_an_activation_takes_over_from_it_without_a_jump() -> None:
     rig = Walled(np.array([1.0, 0, 0]), 0.05, told=False)
     rig.push(0.04)

@@ -226,7 +226,8 @@ def test_a_lower_speed_is_taken_at_once_and_held() -> None:
 
 
 def test_at_speed_zero_the_arm_stands_and_stays_active_and_goes_on_to_the_same_goal() -> None:
-    rig = Rig(profile(timing={"watchdog_s": 5.0, "max_open_loop_s": 60.0}), horizon=16, dt_s=0.1)
+    timing = {"watchdog_s": 5.0, "max_open_loop_s": 60.0, "max_observation_age_s": 5.0}
+    rig = Rig(profile(timing=timing), horizon=16, dt_s=0.1)
     rig.activate()
     begun_m = rig.position_m
     rig.send([[0.02, 0.0, 0.0, 0, 0, 0, 0]] * 10)

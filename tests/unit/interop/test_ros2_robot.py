@@ -145,11 +145,11 @@ def test_two_messages_stamped_at_nearly_one_time_do_not_make_an_arm_infinitely_f
     assert (np.abs(state.velocity_rad_s) <= BEYOND * panda().velocity_rad_s).all()
 
 
-def test_efforts_that_are_missing_count_as_zero(arm: JointReading) -> None:
+def test_efforts_that_are_missing_are_unknown(arm: JointReading) -> None:
     for number, effort in enumerate((None, np.full(9, math.nan)), 1):
         state = arm.take(joints(effort=effort), number)
         assert state is not None
-        assert not state.effort_nm.any()
+        assert state.effort_nm is None
         assert arm.efforts_missing == number
 
 

@@ -34,7 +34,7 @@ SPEC = ModelSpec(
     ),
     action=ActionSpec(horizon=1, dt_s=0.2, gripper="binary"),
 )
-SPEC_HASH = "68bc1fea58b3f857"
+SPEC_HASH = "7f27aed900060800"
 """Pinned: workers and command nodes of different builds must agree on it."""
 
 
@@ -108,7 +108,19 @@ OTHER_VALUES: dict[tuple[str, ...], list[Any]] = {
 
 
 def test_every_declared_value_has_another_one_here() -> None:
-    assert set(meanings(SPEC)) == set(OTHER_VALUES)
+    assert set(meanings(SPEC)) == {*OTHER_VALUES, ("action", "space"), ("action", "joints")}
+
+
+def test_joints_and_their_order_are_meanings_of_their_own() -> None:
+    def named(*joints: str) -> ModelSpec:
+        return ModelSpec.from_dict(
+            replaced(
+                replaced(SPEC.to_dict(), ("action", "space"), "joint"), ("action", "joints"), joints
+            )
+        )
+
+    hashes = {SPEC.hash, named("a", "b").hash, named("b", "a").hash, named("a").hash}
+    assert len(hashes) == 4
 
 
 @pytest.mark.parametrize("place", OTHER_VALUES, ids=".".join)

@@ -104,7 +104,8 @@ def _timing(profile: Profile, spec: ModelSpec, rate_hz: float) -> Iterator[Findi
 
 
 def _robot(profile: Profile, spec: ModelSpec, worker: str) -> Iterator[Finding]:
-    if spec.action.kind != "absolute" and len(profile.robot.arm_joints) < POSE_JOINTS:
+    few = len(profile.robot.arm_joints) < POSE_JOINTS
+    if spec.action.space == "tcp" and spec.action.kind != "absolute" and few:
         yield warning(
             "too_few_joints",
             f"{few_joints(profile)}: steps that it has no joint for are shortened, to nothing at "
@@ -135,7 +136,9 @@ def check_chunk(
         max_width_m: of its gripper.
     """
     found = list(chunk_errors(spec, steps, limits, max_width_m))
-    if spec.kind == "absolute":
+    if spec.space == "joint":
+        pass
+    elif spec.kind == "absolute":
         found += _targets(spec, steps, limits)
     else:
         found += _steps(spec, steps, limits)

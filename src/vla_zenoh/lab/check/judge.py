@@ -97,7 +97,8 @@ def behaviour(
     """
     found = _polarity(action, answers)
     # The first three numbers of every rotation, x, y, z of a quaternion too, are zero for none.
-    moves = any(np.any(np.abs(steps[:, :6]) > ALIKE) for _, steps in answers)
+    size = action.arm_size if action.space == "joint" else 6
+    moves = any(np.any(np.abs(steps[:, :size]) > ALIKE) for _, steps in answers)
     if action.kind != "absolute" and not moves:
         found.append(
             note("stands_still", "no example made it move; try --prompt with one it knows")

@@ -151,7 +151,8 @@ def _rows(report: CheckReport) -> list[tuple[str, str]]:
         (
             "outputs",
             f"up to {action.horizon} x {action.dimension}, {action.dt_s:g} s each: {action.kind} "
-            f"{action.frame} {action.rotation}{_added_to(action)}, gripper {action.gripper}"
+            + ("of joints" if action.space == "joint" else f"{action.frame} {action.rotation}")
+            + f"{_added_to(action)}, gripper {action.gripper}"
             + (f", normalisation {action.normalisation}" if action.normalisation else ""),
         ),
     ]
@@ -198,6 +199,9 @@ def _added_to(action: ActionSpec) -> str:
 def _columns(action: ActionSpec) -> list[str]:
     """Name and unit of each number of a step."""
     per = "/s" if action.kind == "velocity" else ""
+    gripper = ["gripper"] if action.gripper != "none" else []
+    if action.space == "joint":
+        return [*(f"{name} rad{per}" for name in action.joints), *gripper]
     scale = "" if action.position_scale_m == 1.0 else f"* {action.position_scale_m:g} "
     unit = f"{scale}m{per}"
     rotations = {
@@ -206,7 +210,7 @@ def _columns(action: ActionSpec) -> list[str]:
         "quaternion": ("qx", "qy", "qz", "qw"),
     }
     names = [*(f"{axis} {unit}" for axis in "xyz"), *rotations[action.rotation]]
-    return [*names, *(["gripper"] if action.gripper != "none" else [])]
+    return [*names, *gripper]
 
 
 def _inputs(report: CheckReport) -> str:

@@ -167,7 +167,7 @@ def hold(spec: ActionSpec, last: NDArray[np.float32]) -> NDArray[np.float32]:
         out = last.copy()
     else:
         out = np.zeros_like(last)
-        if spec.rotation == "quaternion":
+        if spec.space == "tcp" and spec.rotation == "quaternion":
             out[2 + ROTATION_SIZE["quaternion"]] = 1.0
     if spec.gripper == "delta_m":
         out[-1] = 0.0

@@ -123,6 +123,8 @@ def requested_path(
     Raises:
         RecordError: a step that does not fit the spec.
     """
+    if spec.space == "joint":
+        raise RecordError("actions in joints are no poses, which are what is compared")
     poses, widths_m = [start.pose, *chunk_poses(spec, chunk.steps, start.pose)], [start.width_m]
     for step in chunk.steps:
         width_m = step_width(spec, step, widths_m[-1], max_width_m)

@@ -98,7 +98,8 @@ def _pose_array(fields: Mapping[str, Any]) -> list[Any]:
 
 def _joint_state(fields: Mapping[str, Any]) -> list[Any]:
     names = ("position_rad", "velocity_rad_s", "effort_nm")
-    arrays = (np.ascontiguousarray(fields.get(name, ()), np.float64) for name in names)
+    values = (() if fields.get(name) is None else fields[name] for name in names)
+    arrays = (np.ascontiguousarray(value, np.float64) for value in values)
     return [list(fields["names"]), *arrays]
 
 

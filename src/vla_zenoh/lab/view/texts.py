@@ -146,6 +146,9 @@ def _first_step(seen: InferenceDebug, spec: ModelSpec | None) -> str:
     step = seen.steps[0]
     if spec is None or len(step) != spec.action.dimension:
         return "first step " + " ".join(f"{value:+.4f}" for value in step)
+    if spec.action.space == "joint":
+        arm = zip(spec.action.joints, step.tolist(), strict=False)
+        return "first step " + ", ".join(f"{name} {value:+.4f}" for name, value in arm)
     action, scale_mm = spec.action, spec.action.position_scale_m * 1e3
     rows = ["| first step | x | y | z |", "|---|---|---|---|"]
     per = "/s" if action.kind == "velocity" else ""

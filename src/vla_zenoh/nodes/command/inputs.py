@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from operator import itemgetter
 from typing import Any
 
 from vla_zenoh import keys as key_names
@@ -95,24 +96,20 @@ class CommandInputs:
         Without timestamps only the order on each key is kept.
         """
         arrivals = [
-            (name, decode, arrival)
+            (_put_ns(arrival), name, decode, arrival)
             for name, buffer, decode in self._settings
             for arrival in buffer.drain()
         ]
-        stamps = [
-            stamp.get_time() for *_, arrival in arrivals if (stamp := arrival.sample.timestamp)
-        ]
-        if len(stamps) == len(arrivals):
-            order = sorted(range(len(arrivals)), key=stamps.__getitem__)
-            arrivals = [arrivals[index] for index in order]
+        if all(put_ns is not None for put_ns, *_ in arrivals):
+            arrivals.sort(key=itemgetter(0))
         put: list[Setting] = []
-        for name, decode, arrival in arrivals:
+        for put_ns, name, decode, arrival in arrivals:
             if name in ("stop", "reset"):
-                put.append(Setting(name))
+                put.append(Setting(name, put_ns=put_ns))
                 continue
             value = self._node.decode_text(decode, arrival)
             if value is not None:
-                put.append(Setting(name, value))
+                put.append(Setting(name, value, put_ns))
         return put
 
     def _chunk(self, arrival: ReceivedSample) -> Stamped[ActionChunk] | None:
@@ -165,3 +162,9 @@ class CommandInputs:
             return []
         self._node.reject("clock_step", f"the wall clock was set by {step_s:+.3f} s")
         return [Setting("lose", f"the wall clock was set by {step_s:+.3f} s")]
+
+
+def _put_ns(arrival: ReceivedSample) -> int | None:
+    """When the router first saw a sample, on its clock."""
+    stamp = arrival.sample.timestamp
+    return None if stamp is None else round(stamp.get_time().timestamp() * 1e9)

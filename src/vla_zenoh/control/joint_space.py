@@ -1,0 +1,336 @@
+"""Actions in joint space: steps of the joints within their bounds, and the smoothed motion.
+
+A step is bounded on the joints that it asks for: ends of the joints' ranges and faces of the
+workspace box stop the motion across them and leave that along them; near the arm itself or the
+table a step is shortened as in `vla_zenoh.control.reachability`. A singularity does not matter.
+
+The TCP of a straight motion of the joints goes along a curve. So the box is checked in between too,
+and the velocity and acceleration of the TCP are bounded by their shares of the joints' limits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from typing import NamedTuple
+
+import numpy as np
+
+from vla_zenoh.control.axis_smoothing import FULL, AxisSmoother, Shares
+from vla_zenoh.control.barriers import Barriers
+from vla_zenoh.control.limits import (
+    LimitHit,
+    Slowdown,
+    full_speed_s,
+    into_workspace,
+    joint_motion_limits,
+    workspace_corners,
+)
+from vla_zenoh.control.plan_timeline import Goal
+from vla_zenoh.control.smoothing import ROTATION_BOX, Motion, motion_limits
+from vla_zenoh.kinematics.kinematics import Kinematics
+from vla_zenoh.kinematics.so3 import Pose, norm3
+from vla_zenoh.profile import Profile
+from vla_zenoh.types import Cause, FloatArray, JointCommand
+
+HALVINGS = 7
+INSIDE_M = 0.002
+"""A step ends this far inside the box, so that the curve to its end stays in it."""
+CORRECTIONS = 4
+"""Newton steps that bring a TCP back into the box."""
+PLACES = np.array([0.25, 0.5, 0.75, 1.0])
+"""Places of a motion at which it is checked."""
+ROUNDING = 1e-6
+NEARER_M = 5e-4
+"""m by which a motion may come nearer than a stop: goals are bounded step by step."""
+CHECK_TICKS = 4
+ROOM = np.array([[0.95], [0.8], [0.8]])
+"""Parts of the TCP's velocity, acceleration and jerk that a straight motion is planned with."""
+BEND = 0.5
+"""Part of the acceleration that the curve of the TCP may take."""
+LEAST_SHARE = 0.02
+NOTHING = 1e-9
+PEEK_RAD = 1e-4
+
+
+class BoundedJoints(NamedTuple):
+    """A step within what the arm can do; as `vla_zenoh.control.reachability.BoundedStep`."""
+
+    pose: Pose
+    hits: list[LimitHit]
+    joints_rad: FloatArray
+    slowdown: Slowdown | None
+
+
+class JointBounds:
+    """Bounds of steps and motions of the joints. Independent of time.
+
+    Args:
+        profile: workspace box, limits of the joints and margin of their ranges.
+        kinematics: of the arm.
+        barriers: its distances to itself and the table.
+    """
+
+    def __init__(self, profile: Profile, kinematics: Kinematics, barriers: Barriers) -> None:
+        self.limits, self.kinematics, self.barriers = profile.limits, kinematics, barriers
+        self.motion = joint_motion_limits(profile, kinematics)
+        margin_rad = self.limits.reach.joint_margin_rad
+        self.lower_rad = kinematics.lower_rad + margin_rad
+        self.upper_rad = kinematics.upper_rad - margin_rad
+
+    def full_speed_s(self, start_rad: FloatArray, end_rad: FloatArray) -> float:
+        """Time (s) of a motion between two joints (n,) at full speed of joints and TCP."""
+        joints_s = float(np.max(np.abs(end_rad - start_rad) / self.motion.velocity_rad_s))
+        start, end = self.kinematics.forward(start_rad), self.kinematics.forward(end_rad)
+        return max(joints_s, full_speed_s(self.limits, start, end))
+
+    def bound_in_pieces(
+        self, start_rad: FloatArray, asked_rad: FloatArray
+    ) -> Generator[None, None, BoundedJoints]:
+        """The end of a step from `start_rad` (n,) towards `asked_rad` (n,), in pieces.
+
+        Yields before every evaluation of the distances.
+        """
+        kinematics, barriers = self.kinematics, self.barriers
+        target_rad, hits = self._into_ranges(start_rad, asked_rad)
+        yield
+        before = self._barriers_at(start_rad)
+        floor = barriers.floor(before)
+        yield
+        after, found = self._try(start_rad, target_rad, floor)
+        low, high = 0.0, 1.0
+        if found is not None:
+            whole, after = target_rad, before
+            for _ in range(HALVINGS):
+                middle = 0.5 * (low + high)
+                part_rad = start_rad + middle * (whole - start_rad)
+                yield
+                end, hit = self._try(start_rad, part_rad, floor)
+                if hit is None:
+                    low, after = middle, end
+                else:
+                    high, found = middle, hit
+            hits = [found, *hits]
+            target_rad = start_rad + low * (whole - start_rad)
+        slower = barriers.slowdown(before, after)
+        return BoundedJoints(kinematics.forward(target_rad), hits, target_rad, slower)
+
+    def _barriers_at(self, joints_rad: FloatArray) -> FloatArray:
+        """Barriers of the distances; a singularity is none."""
+        left_m = self.barriers.collisions.distances(joints_rad) - self.barriers.stop[1:]
+        return np.concatenate([[np.inf], left_m])
+
+    def _into_ranges(
+        self, start_rad: FloatArray, asked_rad: FloatArray
+    ) -> tuple[FloatArray, list[LimitHit]]:
+        """The nearest joints within their ranges and with the TCP inside the box, and the hits."""
+        hits: list[LimitHit] = []
+        lower, upper = np.minimum(self.lower_rad, start_rad), np.maximum(self.upper_rad, start_rad)
+        target_rad = np.clip(asked_rad, lower, upper)
+        joint = int(np.argmax(np.abs(asked_rad - target_rad)))
+        if abs(asked_rad[joint] - target_rad[joint]) > ROUNDING:
+            asked, bound = float(asked_rad[joint]), float(target_rad[joint])
+            name = self.kinematics.arm_joints[joint]
+            hits.append(LimitHit("joint_limit", asked, bound, where=name))
+        low, high = workspace_corners(self.limits)
+        start_m = self.kinematics.forward(start_rad).position_m
+        low, high = np.minimum(low + INSIDE_M, start_m), np.maximum(high - INSIDE_M, start_m)
+        outside_m = 0.0
+        for _ in range(CORRECTIONS):
+            pose, jacobian = self.kinematics.pose_and_jacobian(target_rad)
+            back_m = np.clip(pose.position_m, low, high) - pose.position_m
+            away_m = norm3(back_m)
+            if away_m < ROUNDING:
+                break
+            outside_m = max(outside_m, away_m)
+            rows = jacobian[:3]
+            step = rows.T @ np.linalg.solve(rows @ rows.T + ROUNDING * np.eye(3), back_m)
+            target_rad = np.clip(target_rad + step, lower, upper)
+        if outside_m > INSIDE_M:
+            hits.append(LimitHit("workspace", outside_m, 0.0))
+        return target_rad, hits
+
+    def _try(
+        self, start_rad: FloatArray, end_rad: FloatArray, floor: FloatArray
+    ) -> tuple[FloatArray, LimitHit | None]:
+        """Barriers at the end of a step, and the limit that forbids it."""
+        after = self._barriers_at(end_rad)
+        hit = self.box_hit(start_rad, end_rad)
+        short = after - floor
+        index = int(np.argmin(short[1:])) + 1 if len(short) > 1 else 0
+        if hit is None and short[index] < 0:
+            stop = float(self.barriers.stop[index])
+            value, limit = float(after[index]) + stop, float(floor[index]) + stop
+            hit = LimitHit(
+                self.barriers.names[index], value, limit, where=self.barriers.where(index)
+            )
+        return after, hit
+
+    def box_hit(self, start_rad: FloatArray, end_rad: FloatArray) -> LimitHit | None:
+        """The face of the box that the straight motion between two joints would cross."""
+        start_m = self.kinematics.forward(start_rad).position_m
+        for place in PLACES:
+            between_rad = start_rad + place * (end_rad - start_rad)
+            at_m = self.kinematics.forward(between_rad).position_m
+            _, outside_m = into_workspace(self.limits, at_m, start_m)
+            if outside_m > ROUNDING:
+                return LimitHit("workspace", outside_m, 0.0)
+        return None
+
+    def ahead_hit(self, start_rad: FloatArray, end_rad: FloatArray) -> LimitHit | None:
+        """The bound that the straight motion between two joints would violate."""
+        hit = self.box_hit(start_rad, end_rad)
+        if hit is not None or np.array_equal(start_rad, end_rad):
+            return hit
+        before, after = self._barriers_at(start_rad), self._barriers_at(end_rad)
+        short = after - np.minimum(before, 0.0) + NEARER_M
+        index = int(np.argmin(short))
+        if short[index] >= 0:
+            return None
+        stop = float(self.barriers.stop[index])
+        return LimitHit(
+            self.barriers.names[index],
+            float(after[index]) + stop,
+            stop,
+            where=self.barriers.where(index),
+        )
+
+
+class JointPath(AxisSmoother):
+    """Smooth motion of the joints themselves, with the motion of their TCP.
+
+    Args:
+        profile: limits, rate.
+        bounds: of the arm.
+    """
+
+    def __init__(self, profile: Profile, bounds: JointBounds) -> None:
+        self.kinematics, self._bounds = bounds.kinematics, bounds
+        self._names = bounds.kinematics.arm_joints
+        tcp = motion_limits(profile.limits)
+        box = [[move] * 3 + [turn * ROTATION_BOX] * 3 for move, turn in zip(*tcp, strict=True)]
+        self._tcp_box = np.array(box)
+        self._ticks = 0
+        self._hits: list[LimitHit] = []
+        home_rad = self.kinematics.ordered(profile.robot.arm_joints, profile.robot.home_rad)
+        super().__init__(home_rad, 1.0 / profile.timing.command_hz, np.array(bounds.motion))
+
+    def stand(self, position: FloatArray) -> None:
+        super().stand(position)
+        self._follow()
+
+    def target(self, goal: Goal, shares: Shares = FULL, *, all_to_stop: bool = False) -> bool:
+        """Move to the joints of `goal`, or as near as the bounds allow; see `move_to`."""
+        assert goal.joints_rad is not None
+        here_rad, end_rad = self.state.position, goal.joints_rad
+        hit = self._bounds.ahead_hit(here_rad, end_rad)
+        if hit is not None:
+            self._hits.append(hit)
+            low, high = 0.0, 1.0
+            for _ in range(HALVINGS):
+                middle = 0.5 * (low + high)
+                found = self._bounds.ahead_hit(here_rad, here_rad + middle * (end_rad - here_rad))
+                low, high = (low, middle) if found else (middle, high)
+            end_rad = here_rad + low * (end_rad - here_rad)
+        return self.move_to(end_rad, shares, all_to_stop=all_to_stop)
+
+    def tick(self, pace: float = 1.0) -> Motion:
+        """Advance by `pace` of a tick; brakes where the motion would come too near to a bound."""
+        self._ticks += 1
+        if self._ticks % CHECK_TICKS == 0 and not self.braking and not self.at_rest:
+            hit = self._bounds.ahead_hit(self.state.position, self._stop_rad())
+            if hit is not None:
+                self._hits.append(hit)
+                self.brake(FULL)
+        if self.advance(pace):
+            self._follow()
+        return self.motion
+
+    def _stop_rad(self) -> FloatArray:
+        """Where (n,) a stop that begins at the next check would end at the latest."""
+        position, velocity, acceleration = self.state
+        _, most, jerk = self.box
+        ramp_s = np.abs(acceleration) / jerk
+        fast = velocity + 0.5 * acceleration * ramp_s
+        stop_s = float(np.max(np.abs(fast) / most + most / jerk + ramp_s))
+        return position + (CHECK_TICKS * self._dt_s + 0.5 * stop_s) * fast
+
+    def _follow(self) -> None:
+        """Compute the motion of the TCP."""
+        joints_rad, velocity, acceleration = self.state
+        pose, jacobian = self.kinematics.pose_and_jacobian(joints_rad)
+        change = jacobian @ acceleration
+        fastest = float(np.abs(velocity).max())
+        if fastest > 0.0:
+            peek_s = PEEK_RAD / fastest
+            ahead, behind = (
+                self.kinematics.jacobian(joints_rad + sign * peek_s * velocity)
+                for sign in (1.0, -1.0)
+            )
+            change += (ahead - behind) @ velocity / (2 * peek_s)
+        self.motion = Motion(pose, jacobian @ velocity, change)
+
+    def taken_hits(self) -> list[LimitHit]:
+        """Limits that acted since the last call."""
+        hits, self._hits = self._hits, []
+        return hits
+
+    # -- as a pose's motion is asked ----------------------------------------------------------
+    def way_to(self, goal: Goal) -> FloatArray:
+        """(n,) from the commanded joints to those of `goal`."""
+        assert goal.joints_rad is not None
+        return goal.joints_rad - self.state.position
+
+    def axis_rates(self) -> tuple[FloatArray, FloatArray]:
+        """(n,) velocity and acceleration of the joints."""
+        return self.state[1:]
+
+    def shares(self, goal: Goal) -> Shares:
+        """Shares of the joints' limits with which the TCP keeps its own on the way to a goal."""
+        way_rad = self.way_to(goal)
+        places = [self.state.position + place * way_rad for place in (0.0, 0.5, 1.0)]
+        ways = [self.kinematics.jacobian(place) @ way_rad for place in places]
+        bends = 2 * np.abs(np.diff(ways, axis=0)).max(axis=0)
+        now = float(np.linalg.norm(self.state.velocity))
+        return followed_shares(
+            way_rad, self.box, now, np.abs(ways).max(axis=0), bends, ROOM * self._tcp_box, BEND
+        )
+
+    def command(self, state: str, cause: Cause | None) -> JointCommand:
+        """The joint command of this tick."""
+        return JointCommand(self._names, *self.state, state=state, cause=cause)
+
+
+def followed_shares(
+    ways: FloatArray,
+    box: FloatArray,
+    speed: float,
+    other_ways: FloatArray,
+    bends: FloatArray,
+    limits: FloatArray,
+    bend: float,
+) -> Shares:
+    """Shares of the limits of a straight motion that another space can follow.
+
+    Args:
+        ways: (n,) of the axes.
+        box: (3, n) limits of their velocity, acceleration and jerk.
+        speed: norm of their present velocity.
+        other_ways: (m,) of the other space, for the whole motion in one unit of time.
+        bends: (m,) change of them along it.
+        limits: (3, m) of the other space.
+        bend: part of its acceleration that the curvature may take.
+    """
+    length = float(np.linalg.norm(ways))
+    if length < NOTHING:
+        return FULL
+    # All axes move together, as fast as the slowest one.
+    rates = (box / np.maximum(np.abs(ways), NOTHING)).min(axis=1)
+    now = speed / length
+    bends = np.maximum(bends, NOTHING)
+    needed = np.maximum(rates[:, None] * other_ways, NOTHING)
+    velocity, _, jerk = (limits / needed).min(axis=1)
+    fastest = min(rates[0] * velocity, float(np.min(np.sqrt(bend * limits[1] / bends))))
+    reached = min(fastest, (now * now + rates[1]) ** 0.5)
+    left = np.maximum(limits[1] - bends * reached * reached, (1 - bend) * limits[1])
+    parts = np.clip([fastest / rates[0], (left / needed[1]).min(), jerk], LEAST_SHARE, 1.0)
+    return Shares(*(float(part) for part in parts))

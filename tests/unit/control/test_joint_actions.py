@@ -1,0 +1,245 @@
+"""Actions in joint space: what a policy asks of the joints is what the joints do."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from joint_rig import Joints, panda, so101
+from panda_arm import ARM_JOINTS, HOME_RAD
+
+from vla_zenoh.control.commander import Setting
+from vla_zenoh.kinematics.ik import pose_error
+from vla_zenoh.kinematics.kinematics import Kinematics
+from vla_zenoh.types import FloatArray
+
+EXACT_RAD = 1e-6
+
+
+def test_absolute_joints_are_reached_exactly() -> None:
+    arm = Joints()
+    arm.activate()
+    goal_rad = HOME_RAD + [0.3, 0.1, -0.3, 0.1, 0.2, 0.1, -0.4]
+    arm.follow(HOME_RAD + np.linspace(0, 1, 31)[1:, None] * (goal_rad - HOME_RAD))
+    arm.settle(goal_rad)
+    assert arm.rig.state == "active"
+    assert np.abs(arm.joints_rad - goal_rad).max() < EXACT_RAD
+
+
+@pytest.mark.parametrize("kind", ["absolute", "delta"])
+def test_no_limit_is_broken_whatever_the_policy_asks(kind: str) -> None:
+    rng, arm = np.random.default_rng(0), Joints(kind=kind)
+    arm.activate()
+    for _ in range(14):
+        rows = (HOME_RAD + rng.uniform(-1.2, 1.2, (1, 7))) * np.ones((8, 1))
+        if kind == "delta":
+            rows = rng.uniform(-0.15, 0.15, (1, 7)) * np.ones((8, 1))
+        arm.send(*rows)
+        arm.run(float(rng.choice([0.05, 0.2, 0.5])))
+    arm.tick(Setting("active", False))
+    arm.run(1.2)
+    assert arm.rig.commander.at_rest
+    arm.assert_within_limits()
+
+
+def test_columns_are_mapped_by_the_names_of_the_joints() -> None:
+    arm = Joints(names=ARM_JOINTS[::-1])
+    arm.activate()
+    goal_rad = HOME_RAD + [0.1, 0.05, -0.1, 0.05, 0.1, 0.05, -0.1]
+    arm.settle(goal_rad)
+    assert np.abs(arm.joints_rad - goal_rad).max() < EXACT_RAD
+
+
+def test_a_worker_with_other_joints_is_rejected_by_their_names() -> None:
+    arm = Joints(names=("elbow", *ARM_JOINTS[1:]))
+    arm.send(HOME_RAD)
+    arm.tick(Setting("active", True))
+    assert arm.rig.state == "inactive"
+    assert "its joints are elbow, panda_joint2" in arm.rig.commander.why
+
+
+def test_a_robot_that_takes_poses_gets_those_of_the_joints() -> None:
+    arm = Joints(panda("pose"))
+    arm.activate()
+    goal_rad = HOME_RAD + [0.2, 0.05, -0.2, 0.05, 0.1, 0.05, -0.2]
+    goal = arm.kinematics.forward(goal_rad)
+    arm.settle(goal_rad)
+    assert np.abs(arm.rig.position_m - goal.position_m).max() < EXACT_RAD
+    arm.rig.assert_smooth()
+
+
+def swivelled(kinematics: Kinematics, swivel: float) -> FloatArray:
+    """Joints with the TCP of home, and the elbow turned about it by a motion of the null space."""
+    joints = HOME_RAD.copy()
+    home = kinematics.forward(HOME_RAD)
+    for _ in range(400):
+        pose, jacobian = kinematics.pose_and_jacobian(joints)
+        _, _, rows = np.linalg.svd(jacobian)
+        null = rows[-1] * np.sign(rows[-1][0])
+        back = np.linalg.lstsq(jacobian, pose_error(home, pose), rcond=None)[0]
+        joints = joints + back + null * (swivel / 400)
+    return joints
+
+
+def test_an_elbow_swivels_as_asked_with_the_tcp_at_rest() -> None:
+    arm = Joints()
+    goal_rad = swivelled(arm.kinematics, 0.9)
+    assert np.abs(goal_rad - HOME_RAD).max() > 0.4
+    arm.activate()
+    arm.go(goal_rad, 4.0)
+    assert np.abs(arm.joints_rad - goal_rad).max() < EXACT_RAD
+    arm.assert_within_limits()
+
+
+def test_fifty_random_smooth_motions_end_where_they_were_asked_to() -> None:
+    rng, arm = np.random.default_rng(1), Joints()
+    arm.activate()
+    errors: list[float] = []
+    while len(errors) < 50:
+        goal_rad = HOME_RAD + rng.uniform(-0.4, 0.4, 7)
+        if not arm.is_free(goal_rad):
+            continue
+        arm.go(goal_rad, float(rng.uniform(2.0, 3.0)))
+        errors.append(float(np.abs(arm.joints_rad - goal_rad).max()))
+    assert max(errors) < 1e-3, (errors, arm.hits())
+    arm.assert_within_limits()
+
+
+@pytest.mark.parametrize("rate_hz", [2.0, 5.0, 15.0])
+def test_joint_deltas_are_carried_out_whole_however_often_the_model_is_asked(
+    rate_hz: float,
+) -> None:
+    """DROID: steps of 1/15 s, each added to the last."""
+    arm = Joints(kind="delta", dt_s=1 / 15)
+    arm.activate()
+    step_rad = np.array([0.02, 0.0, 0.0, 0.012, 0.0, 0.008, 0.0])
+    first_ns = last_ns = 0
+    for _ in range(round(1.5 * rate_hz)):
+        first_ns = first_ns or arm.rig.now_ns
+        last_ns = arm.rig.now_ns
+        arm.send(*[step_rad] * 8)
+        arm.run(1 / rate_hz - arm.rig.period_ns / 1e9)
+    arm.run(1.5)
+    steps = (last_ns - first_ns) / 1e9 * 15 + 8  # the last chunk runs on to its end
+    covered = (arm.joints_rad - HOME_RAD)[step_rad > 0] / (steps * step_rad[step_rad > 0])
+    assert (covered > 0.98).all(), covered
+    assert (covered < 1.02).all(), covered
+
+
+def test_deltas_of_a_chunk_may_all_be_relative_to_its_start() -> None:
+    arm = Joints(kind="delta", relative_to="start")
+    arm.activate()
+    arm.send(*([0.02 * n, 0, 0, 0, 0, 0, 0] for n in range(1, 6)))
+    arm.run(2.0)
+    assert arm.joints_rad - HOME_RAD == pytest.approx([0.1, 0, 0, 0, 0, 0, 0], abs=EXACT_RAD)
+
+
+def test_velocities_of_the_joints_last_as_long_as_their_steps() -> None:
+    arm = Joints(kind="velocity")
+    arm.activate()
+    arm.send(*[[0, 0, 0, 0.2, 0, 0, 0]] * 5)
+    arm.run(2.0)
+    assert arm.joints_rad - HOME_RAD == pytest.approx([0, 0, 0, 0.1, 0, 0, 0], abs=EXACT_RAD)
+
+
+def test_a_chunk_anchored_at_the_measured_joints_begins_where_they_were_observed() -> None:
+    arm = Joints(kind="delta", anchor="measured", relative_to="start")
+    arm.activate()
+    arm.send(*[[0.1, 0, 0, 0, 0, 0, 0]] * 5)
+    arm.run(0.3)  # it moves
+    seen_rad = arm.joints_rad.copy()
+    assert 0.005 < seen_rad[0] < 0.095
+    arm.run(0.1)
+    arm.send(*[[0, 0.05, 0, 0, 0, 0, 0]] * 5, observed_ago_s=0.1)
+    arm.run(2.0)
+    assert arm.joints_rad - seen_rad == pytest.approx([0, 0.05, 0, 0, 0, 0, 0], abs=2e-3)
+
+
+# -- bounds ---------------------------------------------------------------------------------------
+def test_a_goal_beyond_a_joint_s_range_ends_at_its_margin_and_is_told() -> None:
+    arm = Joints()
+    arm.activate()
+    margin_rad = arm.profile.limits.reach.joint_margin_rad
+    end_rad = HOME_RAD.copy()
+    end_rad[6] = arm.kinematics.upper_rad[6] + 0.2
+    arm.settle(end_rad, 8.0)
+    assert arm.rig.state == "active", arm.rig.commander.why
+    assert arm.joints_rad[6] == pytest.approx(arm.kinematics.upper_rad[6] - margin_rad, abs=1e-6)
+    assert "joint_limit" in arm.hits()
+    arm.settle(HOME_RAD, 8.0)
+    assert arm.joints_rad == pytest.approx(HOME_RAD, abs=EXACT_RAD)
+
+
+def test_an_arm_that_begins_within_the_margin_of_a_range_only_leaves_it() -> None:
+    arm = Joints()
+    near_rad = HOME_RAD.copy()
+    near_rad[6] = arm.kinematics.upper_rad[6] - 0.03
+    arm.at(near_rad)
+    arm.activate()
+    nearer_rad = near_rad + [0, 0, 0, 0, 0, 0, 0.02]
+    arm.settle(nearer_rad, 1.0)
+    assert arm.rig.state == "active", arm.rig.commander.why
+    assert arm.joints_rad == pytest.approx(near_rad, abs=EXACT_RAD)
+    assert "joint_limit" in arm.hits()
+    away_rad = near_rad - [0, 0, 0, 0, 0, 0, 0.3]
+    arm.settle(away_rad)
+    assert arm.joints_rad == pytest.approx(away_rad, abs=EXACT_RAD)
+
+
+def test_joints_slide_along_the_workspace_box_and_are_told() -> None:
+    arm = Joints()
+    arm.activate()
+    low_rad = HOME_RAD + [0.3, 0.45, 0, 0, 0, 0, 0]  # below the table, and to the side
+    arm.settle(low_rad, 4.0)
+    assert arm.rig.state == "active", arm.rig.commander.why
+    assert "workspace" in arm.hits()
+    place = arm.kinematics.forward(arm.joints_rad).position_m
+    assert place[2] < arm.profile.limits.workspace.z_m[0] + 0.01
+    assert arm.joints_rad[0] > 0.15
+    arm.assert_within_limits()
+    arm.settle(HOME_RAD, 4.0)
+    assert arm.joints_rad == pytest.approx(HOME_RAD, abs=EXACT_RAD)
+
+
+def test_an_arm_slows_down_and_ends_before_it_touches_itself() -> None:
+    limits = {"workspace": {"x_m": [-0.6, 0.75], "z_m": [0.012, 0.9]}}
+    arm = Joints(panda(limits=limits))
+    arm.activate()
+    folded_rad = np.array([0.0, -0.6, 0.0, -3.0, 0.0, 0.2, 0.785])
+    arm.settle(folded_rad, 8.0)
+    assert arm.hits() & {"self_collision", "self"}, arm.hits()
+    arm.assert_within_limits()
+    arm.settle(HOME_RAD, 8.0)
+    assert arm.joints_rad == pytest.approx(HOME_RAD, abs=EXACT_RAD)
+
+
+# -- five joints ----------------------------------------------------------------------------------
+def test_an_arm_of_five_joints_follows_twenty_five_motions_of_its_joints() -> None:
+    rng, arm = np.random.default_rng(2), Joints(so101())
+    arm.activate()
+    errors: list[float] = []
+    while len(errors) < 25:
+        goal_rad = arm.home_rad + rng.uniform(-0.7, 0.7, 5)
+        if not arm.is_free(goal_rad):
+            continue
+        arm.go(goal_rad, float(rng.choice([1.5, 2.5])))
+        errors.append(float(np.abs(arm.joints_rad - goal_rad).max()))
+    assert arm.rig.state == "active", arm.rig.commander.why
+    assert max(errors) < 1e-3, (errors, arm.hits())
+
+
+@pytest.mark.parametrize(
+    ("action", "why"),
+    [
+        ({"space": "tcp", "joints": (), "rotation": "rotvec"}, "5 arm joints"),
+        ({}, "its robot takes poses"),
+    ],
+)
+def test_what_five_joints_cannot_do_is_rejected_by_name(action: dict[str, Any], why: str) -> None:
+    command = "joint" if action else "pose"
+    arm = Joints(so101(command), **action)
+    arm.send([0.0] * arm.rig.spec.action.dimension)
+    arm.tick(Setting("active", True))
+    assert arm.rig.state == "inactive"
+    assert why in arm.rig.commander.why
