@@ -36,7 +36,15 @@ def main() -> int:
     simulator.append("python")
     subprocess.run([*simulator, "-c", "import franka_sim"], env=environ, check=True)
     environ.setdefault("FRANKA_SIM", shlex.join(simulator))
-    command = [sys.executable, "-m", "pytest", "-m", "franka", "tests/franka", *sys.argv[1:]]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-m",
+        "franka and not slow",
+        "tests/franka",
+        *sys.argv[1:],
+    ]
     return subprocess.run(command, cwd=ROOT, env=environ, check=False).returncode
 
 

@@ -1,6 +1,6 @@
 """The thesis's ten prompts on an FR3 that speaks FCI; the simulator judges.
 
-    .venv/bin/python scripts/test_franka.py -s tests/franka/test_prompts.py
+    .venv/bin/python scripts/test_franka.py -s -m slow -k test_prompts
 
 An inference takes 140 ms, more or less by 30 %. Each prompt is carried out there and back.
 """
