@@ -10,7 +10,7 @@ and the velocity and acceleration of the TCP are bounded by their shares of the 
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Generator, Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +25,7 @@ from vla_zenoh.control.limits import (
     joint_motion_limits,
     workspace_corners,
 )
-from vla_zenoh.control.plan_timeline import Goal
+from vla_zenoh.control.plan_timeline import Goal, joint_goal
 from vla_zenoh.control.smoothing import ROTATION_BOX, Motion, motion_limits
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import Pose, norm3
@@ -39,6 +39,10 @@ CORRECTIONS = 4
 """Newton steps that bring a TCP back into the box."""
 PLACES = np.array([0.25, 0.5, 0.75, 1.0])
 """Places of a motion at which it is checked."""
+PARTS = (1.0, 0.5, 0.25, 0.125)
+"""Of the way to a goal in the box that are tried, the longest on the leash first."""
+STOP_PLACES = np.linspace(0.125, 1.0, 8)
+"""Parts of the time of a stop at which it is checked."""
 ROUNDING = 1e-6
 NEARER_M = 5e-4
 """m by which a motion may come nearer than a stop: goals are bounded step by step."""
@@ -91,7 +95,7 @@ class JointBounds:
         Yields before every evaluation of the distances.
         """
         kinematics, barriers = self.kinematics, self.barriers
-        target_rad, hits = self._into_ranges(start_rad, asked_rad)
+        target_rad, hits = self.into_ranges(start_rad, asked_rad)
         yield
         before = self._barriers_at(start_rad)
         floor = barriers.floor(before)
@@ -119,7 +123,7 @@ class JointBounds:
         left_m = self.barriers.collisions.distances(joints_rad) - self.barriers.stop[1:]
         return np.concatenate([[np.inf], left_m])
 
-    def _into_ranges(
+    def into_ranges(
         self, start_rad: FloatArray, asked_rad: FloatArray
     ) -> tuple[FloatArray, list[LimitHit]]:
         """The nearest joints within their ranges and with the TCP inside the box, and the hits."""
@@ -168,9 +172,12 @@ class JointBounds:
     def box_hit(self, start_rad: FloatArray, end_rad: FloatArray) -> LimitHit | None:
         """The face of the box that the straight motion between two joints would cross."""
         start_m = self.kinematics.forward(start_rad).position_m
-        for place in PLACES:
-            between_rad = start_rad + place * (end_rad - start_rad)
-            at_m = self.kinematics.forward(between_rad).position_m
+        return self.face_hit(start_m, start_rad + PLACES[:, None] * (end_rad - start_rad))
+
+    def face_hit(self, start_m: FloatArray, places_rad: Iterable[FloatArray]) -> LimitHit | None:
+        """The face of the box that a TCP at `start_m` crosses at any of these joints (n,)."""
+        for joints_rad in places_rad:
+            at_m = self.kinematics.forward(joints_rad).position_m
             _, outside_m = into_workspace(self.limits, at_m, start_m)
             if outside_m > ROUNDING:
                 return LimitHit("workspace", outside_m, 0.0)
@@ -179,8 +186,12 @@ class JointBounds:
     def ahead_hit(self, start_rad: FloatArray, end_rad: FloatArray) -> LimitHit | None:
         """The bound that the straight motion between two joints would violate."""
         hit = self.box_hit(start_rad, end_rad)
-        if hit is not None or np.array_equal(start_rad, end_rad):
-            return hit
+        return self.distance_hit(start_rad, end_rad) if hit is None else hit
+
+    def distance_hit(self, start_rad: FloatArray, end_rad: FloatArray) -> LimitHit | None:
+        """The distance that would be too small at the end of a motion between two joints."""
+        if np.array_equal(start_rad, end_rad):
+            return None
         before, after = self._barriers_at(start_rad), self._barriers_at(end_rad)
         short = after - np.minimum(before, 0.0) + NEARER_M
         index = int(np.argmin(short))
@@ -218,6 +229,38 @@ class JointPath(AxisSmoother):
         super().stand(position)
         self._follow()
 
+    def leash(self, goal: Goal, most_rad: float, ahead_s: float) -> tuple[Goal, list[LimitHit]]:
+        """`goal`, or a nearer one on the leash and inside the box, and the limits that acted.
+
+        A part of the way between two joints inside the box may be outside, and so may their mean.
+        """
+        assert goal.joints_rad is not None
+        here_rad, goal_rad = self.state.position, goal.joints_rad
+        from_rad = here_rad + ahead_s * self.state.velocity
+        hits: list[LimitHit] = []
+        far_rad = float(np.abs(goal_rad - from_rad).max())
+        if far_rad > most_rad:
+            hits.append(LimitHit("lead_rad", far_rad, most_rad))
+            goal_rad = from_rad + most_rad / far_rad * (goal_rad - from_rad)
+            goal = joint_goal(self.kinematics, goal_rad, goal.width_m, goal.slowdown)
+        outside_m = self._outside_m(goal)
+        if outside_m <= ROUNDING:
+            return goal, hits
+        hits.append(LimitHit("workspace", outside_m, 0.0))
+        inside_rad, _ = self._bounds.into_ranges(here_rad, goal_rad)
+        for share in PARTS:
+            part_rad = here_rad + share * (inside_rad - here_rad)
+            near = joint_goal(self.kinematics, part_rad, goal.width_m, goal.slowdown)
+            on_leash = np.abs(part_rad - from_rad).max() <= most_rad + ROUNDING
+            if on_leash and self._outside_m(near) <= ROUNDING:
+                return near, hits
+        return joint_goal(self.kinematics, here_rad, goal.width_m, goal.slowdown), hits
+
+    def _outside_m(self, goal: Goal) -> float:
+        """How far outside the box a goal is, or further outside than the arm."""
+        here_m = self.motion.pose.position_m
+        return into_workspace(self._bounds.limits, goal.pose.position_m, here_m)[1]
+
     def target(self, goal: Goal, shares: Shares = FULL, *, all_to_stop: bool = False) -> bool:
         """Move to the joints of `goal`, or as near as the bounds allow; see `move_to`."""
         assert goal.joints_rad is not None
@@ -237,13 +280,39 @@ class JointPath(AxisSmoother):
         """Advance by `pace` of a tick; brakes where the motion would come too near to a bound."""
         self._ticks += 1
         if self._ticks % CHECK_TICKS == 0 and not self.braking and not self.at_rest:
-            hit = self._bounds.ahead_hit(self.state.position, self._stop_rad())
+            self._brake_at(self._bounds.distance_hit(self.state.position, self._stop_rad()))
+        before = self._state
+        moves = self.advance(pace)
+        if moves and not self.braking:
+            hit = self._stop_hit()
             if hit is not None:
-                self._hits.append(hit)
-                self.brake(FULL)
-        if self.advance(pace):
+                self._state = before  # a stop from there was found to end inside
+                self._brake_at(hit)
+                self.advance(pace)
+        if moves:
             self._follow()
         return self.motion
+
+    def brake(self, shares: Shares | None = FULL) -> None:
+        """Come to rest on the way that `tick` has checked, whatever the shares."""
+        super().brake(FULL)
+
+    def _brake_at(self, hit: LimitHit | None) -> None:
+        if hit is not None:
+            self._hits.append(hit)
+            self.brake()
+
+    def _stop_hit(self) -> LimitHit | None:
+        """The face of the box that a stop from the present state would cross.
+
+        The stop is no straight line of the joints where they do not all move in proportion.
+        """
+        stop = self._stop(self.box, together=True)
+        if stop is None:
+            return None
+        times_s = stop.duration_s * STOP_PLACES
+        stop_rad = [stop.at(float(time_s)).position for time_s in times_s]
+        return self._bounds.face_hit(self.motion.pose.position_m, stop_rad)
 
     def _stop_rad(self) -> FloatArray:
         """Where (n,) a stop that begins at the next check would end at the latest."""

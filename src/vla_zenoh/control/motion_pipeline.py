@@ -469,17 +469,10 @@ class MotionPipeline:
 
         The leash starts where the arm is in this tick: it may be moving away from the last goal.
         """
-        if not isinstance(mover, JointPath) or goal.joints_rad is None or goal.arm is None:
+        if not isinstance(mover, JointPath):
             pose, hits = leash(self._limits, goal.pose, _ahead(mover.motion, ahead_s))
             return Leashed(replace(goal, pose=pose, joints_rad=None), hits)
-        state, most_rad = mover.state, self._limits.lead_rad
-        way = goal.joints_rad - state.position - ahead_s * state.velocity
-        far_rad = float(np.abs(way).max())
-        if far_rad <= most_rad:
-            return Leashed(goal, [])
-        short_rad = goal.joints_rad - (1.0 - most_rad / far_rad) * way
-        short = joint_goal(goal.arm, short_rad, goal.width_m, goal.slowdown)
-        return Leashed(short, [LimitHit("lead_rad", far_rad, most_rad)])
+        return Leashed(*mover.leash(goal, self._limits.lead_rad, ahead_s))
 
     def _pause(self, mover: Smoother | JointPath) -> None:
         """Stop on the path, to continue from there later."""

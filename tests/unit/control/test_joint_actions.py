@@ -10,6 +10,7 @@ from joint_rig import Joints, panda, so101
 from panda_arm import ARM_JOINTS, HOME_RAD
 
 from vla_zenoh.control.commander import Setting
+from vla_zenoh.control.limits import workspace_corners
 from vla_zenoh.kinematics.ik import pose_error
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.types import FloatArray
@@ -243,3 +244,24 @@ def test_what_five_joints_cannot_do_is_rejected_by_name(action: dict[str, Any], 
     arm.tick(Setting("active", True))
     assert arm.rig.state == "inactive"
     assert why in arm.rig.commander.why
+
+
+@pytest.mark.parametrize("mode", ["replace", "ensemble"])
+def test_the_goal_stays_inside_the_box_when_the_leash_cuts_it_or_plans_are_averaged(
+    mode: str,
+) -> None:
+    arm = Joints(panda(composition={"mode": mode}), kind="delta")
+    low, high = workspace_corners(arm.profile.limits)
+    rng, worst_m = np.random.default_rng(3), 0.0
+    arm.activate()
+    for _ in range(40):
+        arm.send(*(rng.uniform(-0.3, 0.3, (1, 7)) * np.ones((8, 1))))
+        for _ in range(40):
+            arm.tick()
+            goal = arm.rig.commander.goal
+            if goal is not None:
+                at_m = goal.pose.position_m
+                worst_m = max(worst_m, float(np.abs(at_m - np.clip(at_m, low, high)).max()))
+    assert arm.rig.state == "active", arm.rig.commander.why
+    assert worst_m < 1e-4
+    arm.assert_within_limits()
