@@ -48,7 +48,7 @@ from vla_zenoh.control.state_history import StateHistory
 from vla_zenoh.errors import RecordError
 from vla_zenoh.kinematics.so3 import interpolate, pose_distance, pose_of
 from vla_zenoh.policy import ActionSpec
-from vla_zenoh.profile import Profile
+from vla_zenoh.profile import REJECT_FACTOR, Profile
 from vla_zenoh.types import (
     ActionChunk,
     Cause,
@@ -219,10 +219,16 @@ class ChunkPlanner:
             if measured is None:
                 return _not_measured(self._gap_ns)
             base = measured
+        if action.space == "joint" and base.arm is None:
+            # Once: the elbow of a pose is that of the moment.
+            assert self._reach is not None
+            base = joint_goal(self._reach.kinematics, self._joints_at(base), base.width_m)
         steps = np.asarray(record.steps[:count], np.float64)
         if action.space == "joint":
             steps = self._in_chain_order(action, steps)
         rejection = validate_steps(action, steps, base, self._limits, self._max_width_m)
+        if rejection is None and action.space == "joint" and action.targets:
+            rejection = self._far_out_of_range(action, steps, base)
         if rejection is not None:
             return rejection
         # Between two waypoints the joints and the speed are about those of the coming one.
@@ -259,6 +265,26 @@ class ChunkPlanner:
                     previous.steps_before + len(previous.goals), previous.steps_total
                 )
         return plan
+
+    def _far_out_of_range(
+        self, action: ActionSpec, steps: FloatArray, base: Goal
+    ) -> Rejection | None:
+        """Why joint targets (n, D) in chain order are too far outside their ranges to be meant."""
+        assert self.joint_bounds is not None
+        bounds, base_rad = self.joint_bounds, self._joints_at(base)
+        asked_rad = np.array([step_joints(action, step, base_rad, base_rad) for step in steps])
+        away_rad = np.maximum(bounds.lower_rad - asked_rad, asked_rad - bounds.upper_rad)
+        step, joint = np.unravel_index(int(np.argmax(away_rad)), away_rad.shape)
+        most_rad = REJECT_FACTOR * self._limits.step_rad
+        if away_rad[step, joint] <= most_rad:
+            return None
+        name, at_rad = bounds.kinematics.arm_joints[joint], asked_rad[step, joint]
+        why = (
+            f"a target of {name} at {at_rad:.4g} rad, whose range is {bounds.lower_rad[joint]:.4g} "
+            f"to {bounds.upper_rad[joint]:.4g}: are these radians, and from the zero and in the "
+            "direction of the arm's description?"
+        )
+        return Rejection("joint_limit", why, float(away_rad[step, joint]), most_rad)
 
     def _measured(self, action: ActionSpec, t_ns: int, width_m: float) -> Goal | None:
         """Where the arm was measured at `t_ns`, in the space of the actions; None: it was not."""

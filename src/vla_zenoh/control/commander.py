@@ -475,7 +475,10 @@ class Commander:
     def _measure(self) -> None:
         if self.pose is not None:
             joint = self.joint.record if self.joint else None
-            self._motion.measure(self.pose.record, joint, self.pose.received_ns)
+            try:
+                self._motion.measure(self.pose.record, joint, self.pose.received_ns)
+            except RecordError as error:  # joints of another arm
+                self._change(Trigger.LOSE, str(error))
 
     def _supervise(self, now_ns: int) -> None:
         if self.pose is not None:

@@ -219,6 +219,11 @@ class ActionSpec(_Spec):
     def _absolute_is_in_base(self) -> ActionSpec:
         if self.space == "joint" and (self.frame != "base" or self.controller is not None):
             raise ValueError("joints have no frame and no controller; leave out both")
+        if self.space == "joint" and self.position_scale_m != 1.0:
+            raise ValueError(
+                "position_scale_m scales x, y and z, which joints have not; leave it out, and "
+                "give joints in rad (prismatic ones in m)"
+            )
         if self.kind != "absolute":
             return self
         if self.frame != "base":

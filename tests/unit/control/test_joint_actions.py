@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from command_rig import WORKER, model_spec
 from joint_rig import Joints, panda, so101
 from panda_arm import ARM_JOINTS, HOME_RAD
 
@@ -13,7 +15,7 @@ from vla_zenoh.control.commander import Setting
 from vla_zenoh.control.limits import workspace_corners
 from vla_zenoh.kinematics.ik import pose_error
 from vla_zenoh.kinematics.kinematics import Kinematics
-from vla_zenoh.types import FloatArray
+from vla_zenoh.types import FloatArray, JointState, Stamped
 
 EXACT_RAD = 1e-6
 
@@ -265,3 +267,77 @@ def test_the_goal_stays_inside_the_box_when_the_leash_cuts_it_or_plans_are_avera
     assert arm.rig.state == "active", arm.rig.commander.why
     assert worst_m < 1e-4
     arm.assert_within_limits()
+
+
+@pytest.mark.parametrize("relative_to", ["start", "previous"])
+def test_a_joint_worker_that_takes_over_from_poses_moves_as_far_as_it_asks(
+    relative_to: str,
+) -> None:
+    arm = Joints(panda(), kind="delta", relative_to=relative_to)
+    poses = model_spec("poses", gripper="none")
+    peers = arm.rig.peers
+    alive = peers.alive | {"worker-poses"}
+    arm.rig.peers = replace(
+        peers,
+        alive=alive,
+        same_host=alive,
+        specs={**peers.specs, "poses": poses},
+        spec_sources={**peers.spec_sources, "poses": "worker-poses-1"},
+    )
+
+    def rest() -> None:
+        arm.tick(chunks=[arm.rig.chunk([[0.0] * 6], worker="poses", spec_hash=poses.hash)])
+
+    rest()
+    arm.tick(Setting("worker", "poses"))
+    rest()
+    arm.tick(Setting("active", True))
+    assert arm.rig.state == "active", arm.rig.commander.why
+    rest()
+    arm.run(0.2)
+    arm.send([0.0] * 7)
+    arm.tick(Setting("worker", WORKER))
+    assert arm.rig.commander.task.worker == WORKER, arm.rig.commander.why
+    arm.run(0.1)
+    start_rad = arm.joints_rad.copy()
+    swivel = np.linalg.svd(arm.kinematics.jacobian(start_rad))[2][-1]
+    counts = range(1, 17) if relative_to == "start" else [1] * 16
+    arm.send(*(0.06 * count * swivel for count in counts))
+    arm.run(3.5)
+    np.testing.assert_allclose(arm.joints_rad, start_rad + 0.96 * swivel, atol=1e-4)
+
+
+@pytest.mark.parametrize("command", ["joint", "pose"])
+@pytest.mark.parametrize("how", ["renamed", "fewer"])
+def test_joints_of_another_arm_end_the_activation(command: str, how: str) -> None:
+    arm = Joints(panda(command))
+    arm.activate()
+    arm.run(0.3)
+    told = arm.rig.joint_state
+
+    def other() -> Stamped[JointState]:
+        state = told()
+        record = state.record
+        names, count = [*record.names[:-1], "other"], len(record.names)
+        if how == "fewer":
+            names, count = names[:-1], count - 1
+        zeros = np.zeros(count)
+        given = JointState(tuple(names), record.position_rad[:count], zeros, zeros)
+        return replace(state, record=given)
+
+    arm.rig.joint_state = other
+    for _ in range(20):
+        arm.tick()
+    assert arm.rig.state == "inactive"
+    assert "wanted once each" in arm.rig.commander.why
+
+
+def test_targets_in_degrees_are_rejected_with_the_joint_and_its_range() -> None:
+    arm = Joints(so101())
+    arm.activate()
+    start_rad = arm.joints_rad.copy()
+    arm.send(*[arm.columns(np.array([5.0, -9.0, 11.0, 4.0, 2.0]))] * 8)
+    arm.run(1.0)
+    assert arm.rig.refused == {"joint_limit": 1}
+    assert any("are these radians" in event.why for event in arm.rig.events)
+    np.testing.assert_allclose(arm.joints_rad, start_rad, atol=1e-6)

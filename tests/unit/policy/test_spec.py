@@ -300,3 +300,8 @@ def test_an_example_is_what_the_spec_asks_for(spec: ModelSpec) -> None:
 @given(st.text(st.characters(exclude_categories=("Cs",)), max_size=50))
 def test_an_example_has_the_prompt_it_was_given(prompt: str) -> None:
     assert example_observation(SPEC, prompt=prompt).prompt == prompt
+
+
+def test_joints_have_no_scale_of_positions() -> None:
+    with pytest.raises(ValueError, match="give joints in rad"):
+        ActionSpec(horizon=1, dt_s=0.1, space="joint", joints=("a",), position_scale_m=0.01745)
