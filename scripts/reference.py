@@ -255,6 +255,7 @@ REASONS = {
     "future": "chunk: its observation is from the future",
     "holder": "more deadman tokens than are kept",
     "invalid": "NaN, or a value that the record does not allow",
+    "joint_limit": "chunk: a joint target that is far outside its range",
     "malformed": "the payload does not decode",
     "meaning": "chunk: numbers that its spec does not allow",
     "more_workers": "more workers than are kept",
