@@ -51,6 +51,10 @@ from vla_zenoh.types import (
 FUTURE_NS = round(CLOCK_TOLERANCE_S * 1e9)
 """A pose that is stamped later than it arrived by more than this says nothing about the past."""
 
+LATE_NS = 10_000_000_000
+"""A setting that was put before a stop arrives at most this long after it. Stamps that say so later
+are those of a clock that was set."""
+
 __all__ = ["Commander", "Inputs", "Outputs", "Setting"]
 
 
@@ -92,8 +96,8 @@ class Commander:
         self._load_known = True
         self._watchdog = Watchdog(profile)
         self._joint_monitor = None if reach is None else JointMonitor(profile, reach)
-        self._stopped_ns = 0
-        """When the last emergency stop was put, by the router's clock."""
+        self._stop_put_ns = self._stop_came_ns = 0
+        """Of the last emergency stop: when it was put, by the router's clock, and its tick."""
         self._out = Outputs()
 
     # -- one tick -----------------------------------------------------------------------------
@@ -113,7 +117,7 @@ class Commander:
         if stopped:
             self._change(Trigger.STOP, "emergency stop")
             put_ns = [s.put_ns for s in inputs.settings if s.name == "stop" and s.put_ns]
-            self._stopped_ns = max([self._stopped_ns, *put_ns])
+            self._stop_put_ns, self._stop_came_ns = max(put_ns, default=0), now_ns
         for setting in inputs.settings:
             self._apply_setting(setting, now_ns, stopped)
         self._planner.begin_tick()
@@ -221,7 +225,8 @@ class Commander:
                 # Their order within a tick is not known: the stop wins.
                 self._reject_setting(name, ["an emergency stop came at the same time"])
                 return
-            if setting.put_ns is not None and setting.put_ns <= self._stopped_ns:
+            overtaken = setting.put_ns is not None and setting.put_ns <= self._stop_put_ns
+            if overtaken and 0 <= now_ns - self._stop_came_ns < LATE_NS:
                 late = (
                     "it was put before the last emergency stop and arrived after it; put it again"
                 )

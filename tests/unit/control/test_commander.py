@@ -1068,6 +1068,17 @@ def test_what_was_put_before_a_stop_and_arrives_after_it_is_rejected() -> None:
     assert rig.state == "inactive"
 
 
+def test_a_router_whose_clock_was_set_back_does_not_keep_an_arm_stopped() -> None:
+    rig = Rig()
+    rig.tick(Setting("stop", put_ns=2_000_000_000))
+    rig.run(1.0)
+    rig.tick(Setting("reset", put_ns=1_000))
+    assert rig.state == "stopped"
+    rig.run(10.0)
+    rig.tick(Setting("reset", put_ns=2_000))
+    assert rig.state == "inactive"
+
+
 def test_the_measured_joints_are_monitored_however_many_chunks_arrive() -> None:
     of = profile()
     reach = make_reachability_filter(of)
