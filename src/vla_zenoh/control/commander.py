@@ -282,7 +282,8 @@ class Commander:
         self._watchdog.override_changed(now_ns, before, self.task.speed)
         # The scene may have changed during a pause: the rest of an old chunk is not carried out.
         oldest_ns = now_ns - int(self.profile.timing.max_observation_age_s * 1e9)
-        if not before and self._motion.forget_plan(oldest_ns, now_ns):
+        paused = self.state in OBEYING and not before
+        if paused and self._motion.forget_plan(oldest_ns, now_ns):
             self._resumed_ns = now_ns
             self._watchdog.expect_first(now_ns, self.task.rate_hz, self.task.speed)
             self._emit("info", "notice", "paused", "waits for a chunk that is newer than the pause")
