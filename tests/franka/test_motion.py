@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from chain import command_line
 from franka_lab import REACHED_M, REACHED_RAD, Lab, running_lab
 
 from vla_zenoh.kinematics.so3 import pose_distance, pose_of
@@ -103,10 +104,16 @@ def test_an_arm_node_that_stands_still_in_motion_is_a_reflex_that_only_a_person_
     lab.chain.until("the reflex is told", lambda: "communication_constraints" in lab.fault())
     assert any("communication_constraints_violation" in line for line in lab.robot.aborts(since))
     assert lab.chain.state() in ("fault", "inactive")
+    lab.chain.until("the robot has braked", lambda: not lab.chain.moves())
     there = lab.chain.measured().position_m
     time.sleep(1.5)
     np.testing.assert_allclose(lab.chain.measured().position_m, there, atol=1e-3)
     assert lab.fault()
+    once = command_line("reset", profile=lab.chain.profile_file)
+    assert once.returncode == 0, once.stderr
+    lab.chain.until(
+        "nothing is latched", lambda: (lab.fault(), lab.chain.state()) == ("", "inactive")
+    )
     lab.go_on()
     since = len(lab.robot.lines)
     lab.way("go up", 3)

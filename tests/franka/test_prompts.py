@@ -7,8 +7,6 @@ An inference takes 140 ms, more or less by 30 %. Each prompt is carried out ther
 
 from __future__ import annotations
 
-import random
-import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -28,8 +26,6 @@ PAIRS = (
 )
 STEPS = 4
 WIDTH_M = 0.004
-STREAM_S = 50.0
-BRAKE_S = 1.5
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 
@@ -59,14 +55,18 @@ def test_ten_prompts_move_the_arm_there_and_back_without_a_reflex(lab: Lab, rate
             before = pose_of(lab.chain.measured())
             worst = np.maximum(worst, lab.way(prompt, STEPS))
             gone_m, gone_rad = pose_distance(before, pose_of(lab.chain.measured()))
-            asked = STEPS * (STEP_M if HARD[prompt].axis < 3 else STEP_RAD)
-            gone = gone_m if HARD[prompt].axis < 3 else gone_rad
-            assert gone == pytest.approx(asked, abs=2 * REACHED_RAD), lab.share(since)
+            if HARD[prompt].axis < 3:
+                assert gone_m == pytest.approx(STEPS * STEP_M, abs=2 * REACHED_M), lab.share(since)
+            else:
+                asked_rad = pytest.approx(STEPS * STEP_RAD, abs=2 * REACHED_RAD)
+                assert gone_rad == asked_rad, lab.share(since)
         apart_m, _ = pose_distance(start, pose_of(lab.chain.measured()))
         assert apart_m < 2 * REACHED_M
     for prompt, width_m in (("close gripper x1", 0.03), ("open gripper x1", 0.08)):
         lab.chain.client.set_prompt(f"HARD: {prompt}")
-        lab.chain.until("the hand is there", lambda w=width_m: abs(lab.widths_m[-1] - w) < WIDTH_M)
+        lab.chain.until(
+            "the hand is there", lambda w=width_m: abs(lab.hand[-1].width_m - w) < WIDTH_M
+        )
     assert not lab.robot.aborts(since), lab.share(since)
     assert not lab.fault()
     print(
@@ -74,34 +74,3 @@ def test_ten_prompts_move_the_arm_there_and_back_without_a_reflex(lab: Lab, rate
     )
     assert worst[0] < REACHED_M
     assert worst[1] < REACHED_RAD
-
-
-@pytest.mark.parametrize("seed", [1, 2])
-def test_random_prompts_rates_stops_and_resets_are_no_reflex(lab: Lab, seed: int) -> None:
-    rng, since, chain = random.Random(seed), len(lab.robot.lines), lab.chain
-    chain.settle()
-    chain.activate_when_ready()
-    end_s, stops = time.monotonic() + STREAM_S, []
-    while time.monotonic() < end_s:
-        what = rng.random()
-        if what < 0.6:
-            prompt = rng.choice([p for pair in PAIRS for p in pair])
-            chain.client.set_prompt(f"HARD: {prompt} within 0.1")
-        elif what < 0.75:
-            chain.client.set_rate(rng.choice([1.0, 2.0, 5.0, 10.0]))
-        elif what < 0.85:
-            chain.client.publish(chain.client.keys.speed, str(rng.choice([10, 50, 100])))
-        else:
-            stop_ns = time.time_ns()
-            chain.client.stop() if what < 0.92 else chain.client.deactivate()
-            chain.wait_still()
-            stops.append(chain.recorder.track(stop_ns - 10**8).time_to_stand_s(stop_ns))
-            lab.go_on()
-            chain.recorder.forget()
-        time.sleep(rng.uniform(0.05, 2.0))
-    assert not lab.robot.aborts(since), lab.share(since)
-    print(
-        f"\nseed {seed}: {len(stops)} stops, {max(stops, default=0):.2f} s at most;",
-        lab.share(since),
-    )
-    assert max(stops, default=0.0) < BRAKE_S

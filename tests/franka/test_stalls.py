@@ -1,4 +1,4 @@
-"""The driver whose caller stands still: where the arm comes to rest, and who holds it."""
+"""The driver whose caller stands still, or asks for too much: where the arm rests, who holds it."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import pytest
 from camera_rig import until
 from franka_rig import Simulator, simulator
 
+from vla_zenoh.kinematics.so3 import exp3, quat_from_rotation
 from vla_zenoh.profile import load_profile
 from vla_zenoh.robots.franka.arm import REST_S, FrankaArm
 from vla_zenoh.types import FloatArray, JointCommand, PoseCommand
@@ -22,7 +23,8 @@ BEYOND_M, BEYOND_RAD = 3e-3, 6e-3
 SILENT_S = 0.8
 KNOWN_S = 0.3
 """After this the state has the tool that was set."""
-JOINT = 3
+JOINT, WRIST = 3, 4
+FAR_S, FAR_RAD = 1.5, 0.4
 PROFILE = """
 extends: fr3
 franka: {{address: 127.0.0.1, realtime: ignore, hand: false}}
@@ -96,6 +98,31 @@ def test_an_arm_whose_caller_stands_still_comes_to_rest_at_its_last_set_point(
         beyond, allowed = np.array(state.q) - given, BEYOND_RAD
     print(f"\n{1e3 * np.abs(beyond).max():.1f} mm or mrad beyond its set-point")
     assert np.abs(beyond).max() < allowed
+    assert not robot.aborts(since)
+
+
+def test_a_set_point_that_is_far_off_is_no_reflex(robot: Simulator, arm: FrankaArm) -> None:
+    since, state = len(robot.lines), arm.robot.state
+    begun_s = time.monotonic()
+    while time.monotonic() - begun_s < FAR_S:
+        arm.read()
+        command: Any
+        if arm._profile.robot.command == "pose":
+            position = np.array(state.O_T_EE.translation)
+            turned = exp3(np.array([FAR_RAD, 0.0, 0.0])) @ state.O_T_EE.matrix[:3, :3]
+            quat = quat_from_rotation(turned)
+            still = np.zeros(6)
+            command = PoseCommand(position, quat, still, still, position, quat, "streaming")
+        else:
+            wanted = np.array(state.q)
+            wanted[WRIST] += FAR_RAD
+            names = arm._profile.robot.arm_joints
+            command = JointCommand(names, wanted, np.zeros(7), np.zeros(7), "streaming")
+        arm.move(command)
+        time.sleep(TICK_S)
+    assert arm.robot.is_in_control, robot.aborts(since)
+    moved = np.linalg.norm(np.array(arm.robot.state.q) - np.array(state.q))
+    assert moved > FAR_RAD / 4
     assert not robot.aborts(since)
 
 

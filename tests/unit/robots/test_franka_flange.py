@@ -51,6 +51,22 @@ def test_joint_ranges_are_within_the_published_ones(profile: Profile, published:
     assert np.all(kinematics.upper_rad <= np.array(published.upper_rad) + EXACT_RAD)
 
 
+def test_braking_before_an_end_of_a_range_stays_below_the_velocity_allowed_there(
+    profile: Profile, published: Published
+) -> None:
+    margin_rad = profile.limits.reach.joint_margin_rad
+    limits, kinematics = profile.limits.joint, make_kinematics(profile)
+    spare_rad = margin_rad + np.minimum(
+        kinematics.lower_rad - published.lower_rad, published.upper_rad - kinematics.upper_rad
+    )
+    before_rad = np.linspace(0, 0.5, 501)
+    for joint, (offset, deceleration) in enumerate(published.near_end):
+        ours = np.sqrt(2 * limits.of("acceleration_rad_s2", 7)[joint] * before_rad)
+        ours = np.minimum(ours, limits.of("velocity_rad_s", 7)[joint])
+        allowed = np.sqrt(2 * deceleration * (before_rad + spare_rad[joint])) - offset
+        assert np.all(ours <= allowed), joint + 1
+
+
 def test_home_is_inside_them(profile: Profile, published: Published) -> None:
     margin_rad = profile.limits.reach.joint_margin_rad
     assert np.all(np.array(published.lower_rad) + margin_rad < profile.robot.home_rad)

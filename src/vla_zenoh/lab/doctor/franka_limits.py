@@ -25,6 +25,9 @@ class Published:
         translation: of the end effector: m/s, m/s^2, m/s^3.
         rotation: of the end effector: rad/s, rad/s^2, rad/s^3.
         torque_nm: of the joints.
+        near_end: offset (rad/s) and deceleration (rad/s^2) of each joint: a joint this far from an
+            end of its range (rad) may move at ``sqrt(2 * deceleration * far) - offset``, no more;
+            empty: everywhere at `velocity_rad_s`.
     """
 
     fci: int
@@ -36,6 +39,7 @@ class Published:
     translation: tuple[float, float, float]
     rotation: tuple[float, float, float]
     torque_nm: tuple[float, ...] = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)
+    near_end: tuple[tuple[float, float], ...] = ()
 
 
 PANDA = Published(
@@ -57,5 +61,14 @@ FR3 = Published(
     jerk_rad_s3=(5000.0,) * JOINTS,
     translation=(3.0, 9.0, 4500.0),
     rotation=(2.5, 17.0, 8500.0),
+    near_end=(
+        (0.30, 6.0),
+        (0.20, 2.585),
+        (0.20, 3.5),
+        (0.30, 4.0),
+        (0.35, 17.0),
+        (0.35, 5.5),
+        (0.35, 17.0),
+    ),
 )
 BY_FCI: Mapping[int, Published] = {limits.fci: limits for limits in (PANDA, FR3)}

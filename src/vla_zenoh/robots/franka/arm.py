@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import replace
 from importlib import import_module
 from typing import Any
 
@@ -24,15 +26,20 @@ from vla_zenoh.profile.robot import FrankaLoad
 from vla_zenoh.robot import Command, Reading
 from vla_zenoh.robots.franka.flange import flange_pose
 from vla_zenoh.robots.franka.hand import Hand
+from vla_zenoh.robots.franka.trim import Trim
 from vla_zenoh.runtime.scheduling import realtime_children
 from vla_zenoh.types import FloatArray, JointCommand
 
 REST_S = 1.0
 """The loop ends when there was no set-point for this long."""
 CLOSE_S = 1.0
-TRIM_S, LONGEST_S = 0.5, 0.02
-TRIM_M, TRIM_RAD, TRIM_JOINT_RAD = 0.004, 0.015, 0.005
-"""What is left of a set-point by friction in the joints is integrated, up to these."""
+CONNECT_S = 10.0
+MOST_TCP_NM, MOST_POSTURE_NM = 6.0, 2.0
+"""What the spring at the TCP, and that of the elbow, turn with: the wrist's joints have 12 Nm."""
+MOST_JOINT_NM = np.array([40.0, 40.0, 40.0, 40.0, 9.0, 9.0, 9.0])
+"""What the springs of the joints turn with."""
+LONGEST_S = 0.02
+"""Between two set-points, for the trim."""
 READY = frozenset({"Idle", "Move"})
 STOPPED = frozenset({"Reflex", "UserStopped"})
 """Robot modes that are a fault. In the others the robot is well, but follows no commands."""
@@ -49,7 +56,9 @@ class FrankaArm:
         self._robot: Any = None
         self._hand: Hand | None = None
         self._motion: Any = None
-        self._trim: FloatArray = np.zeros(0)
+        self._command: Any = None
+        self._led = False
+        self._trim = Trim(6)
         self._configured = self._was_in_control = False
         self._ended = ""
         self._time: Any = None
@@ -58,7 +67,6 @@ class FrankaArm:
         self._recovery: threading.Thread | None = None
         self._timeout_s = profile.timing.command_timeout_s
         self._referring, self._closed = threading.Lock(), threading.Event()
-        self._velocity_kept = False
 
     # -- connection ---------------------------------------------------------------------------
     def connect(self) -> None:
@@ -70,9 +78,15 @@ class FrankaArm:
         franky, address = self._franky, self._settings.address
         enforce = self._settings.realtime == "enforce"
         realtime = franky.RealtimeConfig.Enforce if enforce else franky.RealtimeConfig.Ignore
+
+        def reach() -> Any:
+            return franky.Robot(address, realtime_config=realtime)
+
         try:
-            self._robot = franky.Robot(address, realtime_config=realtime)
-            self._hand = Hand(franky.Gripper(address)) if self._settings.hand else None
+            self._robot = _in_time(reach, f"{address}: connecting")
+            if self._settings.hand:
+                gripper = _in_time(lambda: franky.Gripper(address), f"{address}: the hand")
+                self._hand = Hand(gripper)
         except franky.IncompatibleVersionException as error:
             raise NodeError(
                 f"{address}: {in_words(error)}. The profile has franka.fci: {self._settings.fci}; "
@@ -84,7 +98,7 @@ class FrankaArm:
                 "Desk? Is no other program connected?"
             ) from error
         self._update(self._robot.state)
-        threading.Thread(target=self._drop_velocity, name="set-point", daemon=True).start()
+        threading.Thread(target=self._hold, name="hold", daemon=True).start()
 
     def close(self) -> None:
         """End the loop and disconnect."""
@@ -122,16 +136,27 @@ class FrankaArm:
 
     # -- state --------------------------------------------------------------------------------
     def read(self) -> Reading:
-        """The newest state; an arm that stands is also sent its settings, or released."""
+        """The newest state; an arm that stands is also sent its settings, or released.
+
+        Raises:
+            NodeError: the robot does not answer any more.
+        """
         robot = self._robot
-        in_control = robot.is_in_control
+        try:
+            with self._referring:
+                in_control, state = robot.is_in_control, robot.state
+        except RuntimeError as error:  # of libfranka's network, too
+            raise NodeError(
+                f"the robot fell silent ({in_words(error)}). Is its cable plugged in, and FCI "
+                "active? The node starts again and connects; the arm waits to be activated"
+            ) from error
         if self._was_in_control and not in_control:
             self._ended = self._why_ended()
         self._was_in_control = in_control
         if in_control and time.monotonic_ns() - self._moved_ns > REST_S * 1e9:
             self._release()
-        self._update(robot.state)
-        state, mode = self._state, self._state.robot_mode.name
+        self._update(state)
+        mode = state.robot_mode.name
         if mode == "Idle" and not self._configured:
             self._configure()
         hand = self._hand.state() if self._hand is not None else None
@@ -200,36 +225,33 @@ class FrankaArm:
         starts = self._motion is None
         if starts:
             self._motion, elapsed_s = self._new_motion(), 0.0
-            self._trim = np.zeros(7 if isinstance(command, JointCommand) else 6)
-        reference = self._reference(command, elapsed_s / TRIM_S)
+            self._trim = Trim(7 if isinstance(command, JointCommand) else 6)
         with self._referring:
-            self._motion.set_reference(reference)
-            self._velocity_kept = True
+            self._motion.set_reference(self._reference(command, self._state, elapsed_s))
+            self._command, self._led = command, True
         if starts:
             with realtime_children():
                 self._robot.move(self._motion, asynchronous=True)
             self._was_in_control = True
 
-    def _drop_velocity(self) -> None:
-        """Tell the loop to rest at its set-point when the next one is overdue: a thread.
+    def _hold(self) -> None:
+        """Lead the arm to rest at its last set-point while the next one is overdue: a thread.
 
         The loop keeps a set-point with its velocity, and the spring would lead the arm beyond it.
         """
-        franky = self._franky
-        while not self._closed.wait(self._timeout_s / 4):
-            if not (self._velocity_kept and self._overdue):
+        period_s = self._timeout_s / 4
+        while not self._closed.wait(period_s):
+            if self._motion is None or not self._overdue:
                 continue
-            with self._referring:
-                motion = self._motion
-                if motion is None or not self._overdue:
+            with self._referring, suppress(RuntimeError):  # `read` will tell what failed
+                motion, robot = self._motion, self._robot
+                if motion is None or robot is None or not self._overdue:
                     continue
-                reference = motion.get_reference()
-                motion.set_reference(
-                    franky.JointReference(reference.q)
-                    if isinstance(reference, franky.JointReference)
-                    else franky.CartesianReference(reference.target)
-                )
-                self._velocity_kept = False
+                if robot.is_in_control:
+                    if self._led:  # what friction took in motion pushes beyond the set-point now
+                        self._led, self._trim = False, self._trim.emptied()
+                    still = at_rest(self._command)
+                    motion.set_reference(self._reference(still, robot.state, period_s))
 
     @property
     def _overdue(self) -> bool:
@@ -241,35 +263,36 @@ class FrankaArm:
             return franky.JointImpedanceTrackingMotion(
                 stiffness=list(settings.joint_stiffness_nm_rad)
             )
-        posture = franky.PostureTask(self._state.q, settings.posture_stiffness_nm_rad)
+        posture = franky.PostureTask(
+            self._state.q, settings.posture_stiffness_nm_rad, max_torque=MOST_POSTURE_NM
+        )
         return franky.CartesianImpedanceTrackingMotion(
             translational_stiffness=settings.stiffness_n_m,
             rotational_stiffness=settings.stiffness_nm_rad,
+            translational_error_clip=[settings.collision_force_n / settings.stiffness_n_m] * 3,
+            rotational_error_clip=[MOST_TCP_NM / settings.stiffness_nm_rad] * 3,
             posture_task=posture,
         )
 
-    def _reference(self, command: Command, share: float) -> Any:
-        """The set-point for the loop, trimmed by `share` of what is left of it."""
-        franky, state = self._franky, self._state
+    def _reference(self, command: Command, state: Any, elapsed_s: float) -> Any:
+        """The set-point for the loop, trimmed."""
+        franky = self._franky
         if isinstance(command, JointCommand):
-            self._trim = np.clip(
-                self._trim + share * (command.position_rad - state.q),
-                -TRIM_JOINT_RAD,
-                TRIM_JOINT_RAD,
-            )
-            return franky.JointReference(command.position_rad + self._trim, command.velocity_rad_s)
+            left = command.position_rad - state.q
+            most = MOST_JOINT_NM / self._settings.joint_stiffness_nm_rad
+            ahead = np.clip(left + self._trim.update(left, elapsed_s), -most, most)
+            return franky.JointReference(state.q + ahead, command.velocity_rad_s)
         rotation = rotation_from_quat(command.quat_xyzw)
         measured = state.O_T_EE.matrix
         left = np.concatenate(
             (command.position_m - measured[:3, 3], log3(rotation @ measured[:3, :3].T))
         )
-        trim = self._trim + share * left
-        self._trim = np.concatenate((_bounded(trim[:3], TRIM_M), _bounded(trim[3:], TRIM_RAD)))
+        trim = self._trim.update(left, elapsed_s)
         twist, acceleration = command.twist, command.acceleration
         return franky.CartesianReference(
             franky.Affine(
-                command.position_m + self._trim[:3],
-                quat_from_rotation(exp3(self._trim[3:]) @ rotation),
+                command.position_m + trim[:3],
+                quat_from_rotation(exp3(trim[3:]) @ rotation),
             ),
             franky.Twist(twist[:3], twist[3:]),
             franky.TwistAcceleration(acceleration[:3], acceleration[3:]),
@@ -311,9 +334,37 @@ class FrankaArm:
         return self._robot
 
 
-def _bounded(vector: FloatArray, most: float) -> FloatArray:
-    """`vector` (3,), shortened to a length of `most`."""
-    return vector * min(1.0, most / max(float(np.linalg.norm(vector)), 1e-12))
+def at_rest(command: Command) -> Command:
+    """The same set-point, without velocity and acceleration."""
+    if isinstance(command, JointCommand):
+        still = np.zeros_like(command.velocity_rad_s)
+        return replace(command, velocity_rad_s=still, acceleration_rad_s2=still)
+    return replace(command, twist=np.zeros(6), acceleration=np.zeros(6))
+
+
+def _in_time(make: Callable[[], Any], what: str) -> Any:
+    """What `make` returns or raises; the library itself waits for ever.
+
+    Raises:
+        NodeError: it took longer than `CONNECT_S`.
+    """
+    done: list[Any] = []
+    failed: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            done.append(make())
+        except BaseException as error:
+            failed.append(error)
+
+    thread = threading.Thread(target=run, name="connection", daemon=True)
+    thread.start()
+    thread.join(CONNECT_S)
+    if failed:
+        raise failed[0]
+    if not done:
+        raise NodeError(f"{what}: no answer within {CONNECT_S:g} s; restart its control box?")
+    return done[0]
 
 
 def load_franky() -> Any:
