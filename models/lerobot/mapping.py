@@ -8,7 +8,7 @@ from typing import Any
 
 from vla_zenoh.errors import WorkerError
 from vla_zenoh.interop.field_mapping import FieldSource, read_map, read_size
-from vla_zenoh.policy.model_options import read_json, whole_number
+from vla_zenoh.policy.model_options import one_of, read_json, whole_number
 from vla_zenoh.policy.state_vector import read_state
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
@@ -24,6 +24,8 @@ GO_WITHOUT = frozenset({"pi0", "pi05", "smolvla", "xvla"})
 OF_BASE = frozenset({"pi0", "pi05", "smolvla"})
 """Fine-tuned, their config still has the pictures and the state of the published weights, whatever
 the data had; they bring pictures to their own size."""
+RTC = frozenset({"pi0", "pi05", "smolvla"})
+"""Policies that LeRobot conditions on the steps in execution."""
 REMOTE_CODE = frozenset({"gaussian_actor", "groot", "pi0_fast"})
 """LeRobot runs code from a model hub for these."""
 
@@ -171,6 +173,26 @@ def _trained_state(folder: Path) -> int | None:
 def one_by_one(config: Mapping[str, Any]) -> bool:
     """Policies that look at several observations, or average chunks, plan by themselves."""
     return config.get("n_obs_steps", 1) > 1 or config.get("temporal_ensemble_coeff") is not None
+
+
+def takes_prefix(config: Mapping[str, Any], told: str) -> bool:
+    """Whether the policy is given the steps in execution.
+
+    Args:
+        config: of the policy.
+        told: ``on`` or ``off``.
+
+    Raises:
+        SpecError: `told` is neither.
+        WorkerError: LeRobot has no real-time chunking for this policy.
+    """
+    one_of("rtc", told, ("on", "off"))
+    if told == "on" and (config["type"] not in RTC or one_by_one(config)):
+        raise WorkerError(
+            f"rtc=on: LeRobot has real-time chunking for {', '.join(sorted(RTC))}, which answer "
+            f"with chunks, and this is a {config['type']!r}; leave rtc out"
+        )
+    return told == "on"
 
 
 def horizon(config: Mapping[str, Any], told: str) -> int:

@@ -37,10 +37,11 @@ from vla_zenoh_model_lerobot.mapping import (
     pictures,
     read_config,
     state_parts,
+    takes_prefix,
 )
 
 from vla_zenoh.errors import SpecError, WorkerError, in_words
-from vla_zenoh.interop.action_semantics import Forward, make_forward, read_action_semantics
+from vla_zenoh.interop.action_semantics import read_action_semantics
 from vla_zenoh.policy import (
     ActionSteps,
     CameraSpec,
@@ -49,6 +50,7 @@ from vla_zenoh.policy import (
     ObservationSpec,
     Resize,
 )
+from vla_zenoh.policy.chunk_prefix import Committed
 from vla_zenoh.policy.model_options import checkpoint_folder, one_of
 from vla_zenoh.policy.state_vector import parts_of, state_vector
 from vla_zenoh.profile import load_profile
@@ -67,6 +69,8 @@ class LeRobot:
         resize: how a picture of another size becomes one of this.
         device: as torch names it; ``auto``: a GPU where there is one.
         profile: of the robot: its gripper, and its arm.
+        rtc: ``on``: a pi0, pi0.5 or SmolVLA continues the steps in execution, by LeRobot's own
+            real-time chunking with the weights of the paper.
         meaning: of the actions, see vla_zenoh/interop/action_semantics.py. `horizon` defaults to
             the number of steps that the policy was made to execute.
     """
@@ -80,22 +84,25 @@ class LeRobot:
         resize: str = "none",
         device: str = "auto",
         profile: str = "panda_sim",
+        rtc: str = "off",
         **meaning: str,
     ) -> None:
         self._folder = checkpoint_folder(checkpoint)
         config = read_config(self._folder)
         kind = config["type"]
         self._one_by_one = one_by_one(config)
+        self.takes_committed = takes_prefix(config, rtc)
         steps = 1 if self._one_by_one else horizon(config, meaning.get("horizon", ""))
-        self._meaning = read_action_semantics({**meaning, "horizon": str(steps)})
         one_of("resize", resize, get_args(Resize))
-        self._profile = load_profile(profile)
-        self._max_width_m = self._profile.robot.gripper.max_width_m
+        robot = load_profile(profile).robot
+        self._max_width_m = robot.gripper.max_width_m
+        self._meaning = read_action_semantics(
+            {**meaning, "horizon": str(steps)}, joints=robot.arm_joints
+        )
         inputs = features(self._folder, config, "input_features")
         self._pictures = pictures(inputs, map, kind)
-        joints = len(self._profile.robot.arm_joints)
-        self._state = state_parts(self._folder, kind, inputs, state, joints)
-        self._check_action(config, joints)
+        self._state = state_parts(self._folder, kind, inputs, state, len(robot.arm_joints))
+        self._check_action(config)
         self._device = device
         cameras: list[CameraSpec] = []
         for camera, (_, shape) in self._pictures.items():
@@ -103,24 +110,22 @@ class LeRobot:
             wide, high = given or (None, None)
             how = resize if given else "none"
             cameras.append(CameraSpec(camera=camera, width=wide, height=high, resize=how))
-        seen = (*parts_of(self._state), *(("joint",) if self._meaning.needs_joints else ()))
         self.spec = ModelSpec(
             name="lerobot",
             observation=ObservationSpec(
                 cameras=tuple(cameras),
-                state=tuple(dict.fromkeys(seen)),
+                state=tuple(dict.fromkeys(parts_of(self._state))),
                 prompt=kind not in WITHOUT_WORDS,
             ),
             action=self._meaning.spec,
         )
-        self._forward: Forward | None = None
         self.policy: Any = None
         self._before: Any = None
         self._after: Any = None
 
-    def _check_action(self, config: Mapping[str, Any], joints: int) -> None:
+    def _check_action(self, config: Mapping[str, Any]) -> None:
         shape = features(self._folder, config, "output_features").get(ACTION)
-        parts = self._meaning.parts(joints)
+        parts = self._meaning.parts()
         if shape != (sum(parts.values()),):
             wanted = " + ".join(f"{name} {count}" for name, count in parts.items())
             raise WorkerError(
@@ -154,6 +159,8 @@ class LeRobot:
             # All weights are in the directory: none are fetched to be overwritten.
             if hasattr(config, "pretrained_backbone_weights"):
                 config.pretrained_backbone_weights = None
+            if self.takes_committed:
+                config.rtc_config = _rtc_config(self.spec.action.horizon)  # pyright: ignore
             self.policy = get_policy_class(config.type).from_pretrained(
                 self._folder, config=config, strict=True
             )
@@ -165,8 +172,6 @@ class LeRobot:
             )
         except Exception as error:  # LeRobot raises whatever its libraries do
             raise WorkerError(f"LeRobot cannot load {self._folder}: {in_words(error)}") from error
-        if self._meaning.needs_joints:
-            self._forward = make_forward(self._profile)
         bad = [n for n, w in self.policy.named_parameters() if not torch.isfinite(w).all()]
         if bad:
             raise WorkerError(f"weight {bad[0]} in {self._folder} holds NaN or infinity")
@@ -178,8 +183,10 @@ class LeRobot:
             if part is not None:
                 part.reset()
 
-    def infer(self, observation: Observation) -> ActionSteps:
+    def infer(self, observation: Observation, committed: Committed | None = None) -> ActionSteps:
         """The next chunk by LeRobot's own pipelines and policy.
+
+        The pipeline that scales observations scales the steps in execution too, as in training.
 
         Raises:
             SpecError: the policy answers with something else than its config says.
@@ -194,7 +201,10 @@ class LeRobot:
         }
         if self._state:
             given[STATE] = state_vector(self._state, observation, self._max_width_m)
-        with torch.inference_mode():
+        if committed is not None:
+            given[ACTION] = self._meaning.rows(committed.steps).astype(np.float32)
+        # LeRobot's guidance takes a gradient, which inference mode cannot.
+        with torch.no_grad() if self.takes_committed else torch.inference_mode():
             device = torch.device(self.policy.config.device)
             batch = self._before(
                 prepare_observation_for_inference(given, device, observation.prompt)
@@ -202,7 +212,14 @@ class LeRobot:
             if self._one_by_one:
                 wanted = self.policy.select_action(batch)[:, None]
             else:
-                chunk = self.policy.predict_action_chunk(batch)
+                prefix: dict[str, Any] = {}
+                if committed is not None:
+                    prefix = {
+                        "prev_chunk_left_over": batch.pop(ACTION),
+                        "inference_delay": committed.frozen,
+                        "execution_horizon": len(committed.steps),
+                    }
+                chunk = self.policy.predict_action_chunk(batch, **prefix)
                 if chunk.ndim != 3:
                     raise SpecError(f"the policy's chunk has shape {tuple(chunk.shape)}")
                 wanted = chunk[:, : self.spec.action.horizon]
@@ -210,4 +227,12 @@ class LeRobot:
             steps = torch.cat([self._after(step) for step in wanted.unbind(1)])
         raw = {"normalised": wanted[0].float().cpu().tolist()}
         rows = steps.double().cpu().numpy()
-        return ActionSteps(self._meaning.steps(rows, observation.joint, self._forward), raw=raw)
+        return ActionSteps(self._meaning.steps(rows), raw=raw)
+
+
+def _rtc_config(horizon: int) -> Any:
+    from lerobot.configs import RTCAttentionSchedule
+    from lerobot.policies.rtc.configuration_rtc import RTCConfig
+
+    schedule = RTCAttentionSchedule.EXP  # equation 5 of the paper
+    return RTCConfig(prefix_attention_schedule=schedule, execution_horizon=horizon)

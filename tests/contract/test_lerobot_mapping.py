@@ -13,6 +13,7 @@ import pytest
 from vla_zenoh.errors import WorkerError
 from vla_zenoh.policy import Policy
 from vla_zenoh.policy.loader import find_model, make_policy
+from vla_zenoh.profile import load_profile
 
 ATOL = 1e-12
 CONFIG: dict[str, Any] = {
@@ -121,6 +122,16 @@ def test_a_picture_that_lerobot_makes_up_is_asked_of_no_camera(tmp_path: Path) -
     assert [c.camera for c in spec.observation.cameras] == ["camera1", "camera2", "camera3"]
 
 
+@pytest.mark.parametrize("kind", ["pi0", "pi05", "smolvla"])
+def test_a_flow_policy_takes_the_steps_in_execution_where_it_is_told_to(
+    tmp_path: Path, kind: str
+) -> None:
+    config = {**CONFIG, "type": kind}
+    without: Any = make(tmp_path, config)
+    told: Any = make(tmp_path, config, rtc="on")
+    assert (without.takes_committed, told.takes_committed) == (False, True)
+
+
 def test_a_policy_that_reads_words_asks_for_a_prompt(tmp_path: Path) -> None:
     assert make(tmp_path, {**CONFIG, "type": "smolvla"}).spec.observation.prompt
 
@@ -156,6 +167,8 @@ def test_a_policy_that_plans_by_itself_gives_one_step(
         ({"map": "observation.images.front=joint"}, r"front is a picture, so .*=camera:NAME"),
         ({"horizon": "101"}, r"horizon is 101; the policy's chunks have 100"),
         ({"horizon": "many"}, r"horizon is 'many'"),
+        ({"rtc": "maybe"}, r"rtc is 'maybe'"),
+        ({"rtc": "on"}, r"real-time chunking for pi0, pi05, smolvla, .* this is a 'act'"),
         ({"rotation": "quat_xyzw"}, r"actions have shape \(7,\); .* are \(8,\)"),
         ({"gripper": "none"}, r"actions have shape \(7,\); .* are \(6,\)"),
     ],
@@ -167,14 +180,18 @@ def test_an_option_that_does_not_fit_is_named(
         make(tmp_path, **options)
 
 
-@pytest.mark.parametrize("action", ["joint_position", "joint_delta"])
-def test_joint_actions_become_poses_by_the_joints_that_are_measured(
-    tmp_path: Path, action: str
+@pytest.mark.parametrize(
+    ("action", "kind"),
+    [("joint_position", "absolute"), ("joint_delta", "delta"), ("joint_velocity", "velocity")],
+)
+def test_joint_actions_are_those_of_the_profile_s_arm(
+    tmp_path: Path, action: str, kind: str
 ) -> None:
     joints = {**CONFIG, "output_features": {"action": {"type": "ACTION", "shape": [8]}}}
-    spec = make(tmp_path, joints, action=action, rotation="").spec
-    assert (spec.action.kind, spec.action.rotation) == ("absolute", "quaternion")
-    assert spec.observation.state == ("joint", "gripper")
+    made = make(tmp_path, joints, action=action, rotation="", joint_scale_rad="1")
+    spec = made.spec.action
+    assert (spec.space, spec.kind) == ("joint", kind)
+    assert spec.joints == load_profile("panda_sim").robot.arm_joints
 
 
 SIX_JOINTS = """
@@ -199,7 +216,7 @@ def test_an_arm_with_six_joints_has_a_state_of_six(tmp_path: Path) -> None:
 def test_joints_of_another_arm_are_refused_with_the_reason(tmp_path: Path) -> None:
     joints = {**CONFIG, "output_features": {"action": {"type": "ACTION", "shape": [14]}}}
     with pytest.raises(WorkerError, match=r"joints 7 \+ gripper 1 are \(8,\)"):
-        make(tmp_path, joints, action="joint_position")
+        make(tmp_path, joints, action="joint_position", joint_scale_rad="1")
     with pytest.raises(WorkerError, match=r"position 3 \+ rpy 3 \+ gripper 1 are \(7,\)"):
         make(tmp_path, joints)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,15 +20,16 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.policies.factory import make_pre_post_processors
+from lerobot.policies.rtc.modeling_rtc import RTCProcessor
 from safetensors.torch import load_file, save_file
 
 from vla_zenoh.errors import WorkerError
-from vla_zenoh.interop.action_semantics import make_forward
 from vla_zenoh.lab.check.examples import example_observation
 from vla_zenoh.policy import check_steps
+from vla_zenoh.policy.chunk_prefix import Committed
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import load_profile
-from vla_zenoh.types import GripperState, JointState, PoseState
+from vla_zenoh.types import GripperState, PoseState
 
 pytestmark = pytest.mark.models
 
@@ -138,19 +140,15 @@ def test_actions_are_in_the_units_of_the_data(whole: Path) -> None:
     np.testing.assert_allclose(np.asarray(answer.steps), wanted, atol=1e-5)
 
 
-def test_joints_become_the_poses_they_lead_to(tmp_path: Path) -> None:
-    profile = load_profile("panda_sim")
-    home_rad = profile.robot.home_rad
+def test_joints_are_given_on_as_the_policy_says_them(tmp_path: Path) -> None:
+    home_rad = load_profile("panda_sim").robot.home_rad
     mean = torch.tensor([*home_rad, 0.5])
     tiny_act.write(tmp_path / "act", {"mean": mean, "std": torch.full((8,), 0.05)})
-    policy = loaded(tmp_path / "act", action="joint_position", rotation="")
-    none = np.zeros(7)
-    joint = JointState(profile.robot.arm_joints, np.array(home_rad), none, none)
-    seen = replace(looking(policy, 0), joint=joint)
+    policy = loaded(tmp_path / "act", action="joint_position", joint_scale_rad="1", rotation="")
+    seen = looking(policy, 0)
     steps = check_steps(policy.spec.action, policy.infer(seen).steps)
     own = lerobots_own(tmp_path / "act", seen, tiny_act.STEPS)
-    wanted = make_forward(profile)(joint, own[:, :7].astype(float))
-    np.testing.assert_allclose(steps, np.hstack([wanted, own[:, 7:]]), atol=ATOL)
+    np.testing.assert_allclose(steps, own, atol=ATOL)
 
 
 def test_picture_and_state_both_matter(whole: Path) -> None:
@@ -222,3 +220,58 @@ def test_a_policy_without_pipelines_says_how_to_get_them(folder: Path) -> None:
     (folder / "policy_postprocessor.json").unlink()
     with pytest.raises(WorkerError, match=r"holds no policy_postprocessor.json; .*migrate_policy"):
         loaded(folder)
+
+
+class Flow:
+    """A flow towards one chunk, conditioned by LeRobot's own real-time chunking."""
+
+    def __init__(self, config: Any, rtc: Any, horizon: int, columns: int) -> None:
+        self.config, self._rtc = config, RTCProcessor(rtc)
+        self._shape = (1, horizon, columns)
+
+    def predict_action_chunk(
+        self,
+        batch: dict[str, Any],
+        prev_chunk_left_over: Any = None,
+        inference_delay: int = 0,
+        execution_horizon: int | None = None,
+    ) -> torch.Tensor:
+        assert batch.get("action") is None
+        x, count = torch.zeros(self._shape) + 2.0, 10  # as pi0, pi0.5 and SmolVLA
+        for index in range(count):
+            time = 1.0 - index / count
+            x = (
+                x
+                - self._rtc.denoise_step(
+                    x_t=x,
+                    prev_chunk_left_over=prev_chunk_left_over,
+                    inference_delay=inference_delay,
+                    time=time,
+                    original_denoise_step_partial=lambda noisy, time=time: noisy / time,
+                    execution_horizon=execution_horizon,
+                ).detach()
+                / count
+            )
+        return x
+
+
+def test_the_steps_in_execution_come_back_from_lerobots_real_time_chunking(whole: Path) -> None:
+    policy = loaded(whole)
+    free = policy.infer(looking(policy, 1)).steps
+    horizon, columns = free.shape
+    policy.takes_committed = True
+    policy.policy = Flow(
+        policy.policy.config, model_module(policy)._rtc_config(horizon), horizon, columns
+    )
+    planned = policy.infer(looking(policy, 1)).steps
+    wanted = (planned + 0.1).astype(np.float32)[: horizon - 1]
+    frozen = 2
+    found = policy.infer(looking(policy, 1), committed=Committed(wanted, frozen)).steps
+    # The flow itself is sure of its own chunk, 0.1 away. The guidance of the last of ten steps has
+    # the weight 9.11, a tenth of which is added, so 91 % of the way are gone.
+    np.testing.assert_allclose(found[:frozen], planned[:frozen] + 0.0911, atol=1e-3)
+    np.testing.assert_allclose(found[-1], planned[-1], atol=1e-4)  # nothing is committed there
+
+
+def model_module(policy: Any) -> Any:
+    return sys.modules[type(policy).__module__]
