@@ -1,0 +1,1 @@
+"""Manipulation benchmarks of others as robots: a contract, episodes over the keys, results."""

@@ -1,0 +1,291 @@
+"""Runs a benchmark in an environment of its own: a child process, and the parent's end of it.
+
+Requests and outcomes are lines of JSON on the child's stdin and stdout; what libraries print there
+goes to stderr. Only that child imports the benchmark's packages.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from threading import Thread
+from typing import Any, TextIO
+
+import numpy as np
+
+from vla_zenoh.bus.session import open_session
+from vla_zenoh.codec.image import encode_jpeg
+from vla_zenoh.errors import NodeError, VlaZenohError, WorkerError, in_words
+from vla_zenoh.lab.benchmark.asked_worker import AskedWorker
+from vla_zenoh.lab.benchmark.contract import Benchmark, BenchmarkTask, make_benchmark
+from vla_zenoh.lab.benchmark.episode import replay_episode, run_episode
+from vla_zenoh.lab.benchmark.episode_clock import (
+    EpisodeConditions,
+    EpisodeOutcome,
+    EpisodeRequest,
+)
+from vla_zenoh.policy.loader import ModelFile, find_model
+from vla_zenoh.profile import as_robot, load_profile
+from vla_zenoh.resources import BENCHMARKS
+from vla_zenoh.runtime.environments import environment_command
+from vla_zenoh.runtime.parent_watch import PARENT_VARIABLE, die_with_parent
+from vla_zenoh.types import Image
+
+ANSWER_PATIENCE_S = 300.0
+FRAME_HZ = 10
+LAST_LINES = 20
+
+
+class BenchmarkLost(NodeError):
+    """The child process ended in the middle of a request."""
+
+
+@dataclass(frozen=True, slots=True)
+class BenchmarkSetting:
+    """What a child needs to run episodes.
+
+    Args:
+        benchmark: name or path of its file.
+        options: of its constructor.
+        profile_file: of the robot, with the address of the router.
+        worker: name of the worker to ask.
+        conditions: of every episode.
+    """
+
+    benchmark: str
+    options: Mapping[str, str] = field(default_factory=dict)
+    profile_file: str = ""
+    worker: str = ""
+    conditions: EpisodeConditions = field(default_factory=EpisodeConditions)
+
+    @property
+    def file(self) -> ModelFile:
+        """The benchmark's file.
+
+        Raises:
+            ResourceError: there is none.
+        """
+        return find_model(self.benchmark, BENCHMARKS)
+
+
+class BenchmarkProcess:
+    """A benchmark in a process of its own.
+
+    Args:
+        setting: likewise.
+        robot: in whose keys it runs.
+        python: interpreter of a prepared environment; None: the file's header is obeyed.
+
+    Raises:
+        WorkerError: its environment cannot be made.
+    """
+
+    def __init__(self, setting: BenchmarkSetting, robot: str, python: str | None = None) -> None:
+        file = setting.file
+        extra = "control" if setting.conditions.mode == "command" else ""
+        lacks = file.missing() or (extra and not _has("ruckig"))
+        command = [sys.executable]
+        if python is not None:
+            command = [python]
+        elif lacks:
+            command = [*environment_command(file, extra=extra), "python"]
+        given = json.dumps({**asdict(setting), "benchmark": str(file.path), "robot": robot})
+        self._process = subprocess.Popen(
+            [*command, "-m", "vla_zenoh.lab.benchmark.process", given],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, PARENT_VARIABLE: str(os.getpid())},
+        )
+        self.last_lines: deque[str] = deque(maxlen=LAST_LINES)
+        assert self._process.stderr is not None
+        Thread(target=self._log, args=(self._process.stderr,), daemon=True).start()
+
+    @property
+    def pid(self) -> int:
+        """Of the child; where uv stands between, that of uv."""
+        return self._process.pid
+
+    def describe(self, suite: str | None = None) -> dict[str, Any]:
+        """Suites, tasks of one of them, cameras, action, and versions of packages.
+
+        Raises:
+            NodeError: there is no such suite.
+        """
+        return self._call({"do": "describe", "suite": suite})
+
+    def run(self, request: EpisodeRequest) -> EpisodeOutcome:
+        """Run an episode.
+
+        Raises:
+            BenchmarkLost: the child ended.
+            NodeError: the benchmark or the worker failed.
+        """
+        return _outcome(self._call({"do": "run", **asdict(request)}))
+
+    def replay(
+        self, request: EpisodeRequest, actions: np.ndarray, camera: str, folder: Path
+    ) -> EpisodeOutcome:
+        """Carry out recorded steps, and draw the pictures of a video into `folder`.
+
+        Args:
+            request: whose steps they are.
+            actions: (n, D), every step.
+            camera: empty: nothing is drawn.
+            folder: for the pictures.
+
+        Raises:
+            BenchmarkLost: the child ended.
+            NodeError: the benchmark failed.
+        """
+        file = folder / "actions.npy"
+        np.save(file, actions)
+        given = {"do": "replay", **asdict(request), "actions": str(file)}
+        return _outcome(self._call({**given, "camera": camera, "folder": str(folder)}))
+
+    def close(self) -> None:
+        """End the child."""
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.close()
+            self._process.wait(10)
+        except (OSError, subprocess.TimeoutExpired):
+            self._process.kill()
+            self._process.wait()
+
+    def _call(self, request: Mapping[str, Any]) -> dict[str, Any]:
+        assert self._process.stdin is not None and self._process.stdout is not None
+        try:
+            self._process.stdin.write(json.dumps(request) + "\n")
+            self._process.stdin.flush()
+            line = self._process.stdout.readline()
+        except OSError:
+            line = ""
+        if not line:
+            self._process.wait()
+            said = "\n".join(self.last_lines)
+            raise BenchmarkLost(f"the benchmark's process ended: {said or 'it said nothing'}")
+        answer: dict[str, Any] = json.loads(line)
+        if "error" in answer:
+            raise NodeError(answer["error"])
+        return answer
+
+    def _log(self, stream: TextIO) -> None:
+        for line in stream:
+            self.last_lines.append(line.rstrip())
+
+
+def _outcome(answer: Mapping[str, Any]) -> EpisodeOutcome:
+    actions = [np.asarray(each, np.float64) for each in answer["actions"]]
+    return EpisodeOutcome(**{**answer, "actions": actions})
+
+
+def _has(package: str) -> bool:
+    try:
+        version(package)
+    except PackageNotFoundError:
+        return False
+    return True
+
+
+class _Child:
+    def __init__(self, given: dict[str, Any]) -> None:
+        self._robot = given.pop("robot")
+        conditions = EpisodeConditions(**given.pop("conditions"))
+        self._setting = BenchmarkSetting(conditions=conditions, **given)
+        self.benchmark: Benchmark = make_benchmark(self._setting.file, self._setting.options)
+        self._worker: AskedWorker | None = None
+
+    def answer(self, request: dict[str, Any]) -> dict[str, Any]:
+        do = request.pop("do")
+        if do == "describe":
+            return self._describe(request["suite"])
+        folder, camera = request.pop("folder", ""), request.pop("camera", "")
+        file = request.pop("actions", "")
+        wanted = EpisodeRequest(**{**request, "task": BenchmarkTask(**request["task"])})
+        if do == "run":
+            found = run_episode(self.benchmark, wanted, self._asked(), self._setting.conditions)
+        else:
+            every = max(1, round(1 / FRAME_HZ / self.benchmark.action.dt_s))
+            steps = np.load(file)
+
+            def look(step: int) -> None:
+                if camera and (step % every == 0 or step == len(steps)):
+                    picture = self.benchmark.observe([camera]).images[camera]
+                    jpeg = encode_jpeg(Image(np.ascontiguousarray(picture)))
+                    (Path(folder) / f"{step:06d}.jpg").write_bytes(jpeg)
+
+            found = replay_episode(self.benchmark, wanted, list(steps), look)
+        actions = [each.tolist() for each in found.actions]
+        return {**found.to_dict(), "actions": actions}
+
+    def _asked(self) -> AskedWorker:
+        if self._worker is None:
+            profile = as_robot(load_profile(self._setting.profile_file), self._robot)
+            session = open_session(profile.session, wait_s=10.0)
+            name = self._setting.worker
+            self._worker = AskedWorker(profile, session, name, ANSWER_PATIENCE_S)
+            known = self.benchmark.cameras
+            wanted = [one.camera for one in self._worker.spec.observation.cameras]
+            if missing := [each for each in wanted if each not in known]:
+                raise WorkerError(
+                    f"model {self._worker.spec.name!r} needs the cameras {', '.join(missing)}; "
+                    f"the benchmark has: {', '.join(known)}"
+                )
+        return self._worker
+
+    def _describe(self, suite: str | None) -> dict[str, Any]:
+        found = self.benchmark
+        suite = suite or found.suites[0]
+        if suite not in found.suites:
+            raise WorkerError(f"there is no suite {suite!r}; known: {', '.join(found.suites)}")
+        versions = {name: version(name) for name in found.packages if _has(name)}
+        return {
+            "suites": list(found.suites),
+            "suite": suite,
+            "tasks": [asdict(task) for task in found.tasks(suite)],
+            "cameras": {name: list(size) for name, size in found.cameras.items()},
+            "dt_s": found.action.dt_s,
+            "action": found.action.model_dump(mode="json"),
+            "versions": {**versions, "python": sys.version.split()[0]},
+        }
+
+
+def main() -> None:
+    """The child: answers requests until its stdin ends."""
+    die_with_parent()
+    os.environ.setdefault("MUJOCO_GL", "egl")  # no display
+    with os.fdopen(os.dup(1), "w") as out:
+        os.dup2(2, 1)  # libraries print what is no answer
+        sys.stdout = sys.stderr
+        try:
+            child: _Child | None = _Child(json.loads(sys.argv[1]))
+            broken = ""
+        except (Exception, SystemExit) as error:
+            child, broken = None, _said(error)
+        for line in sys.stdin:
+            if child is None:
+                answer: dict[str, Any] = {"error": broken}
+            else:
+                try:
+                    answer = child.answer(json.loads(line))
+                except Exception as error:
+                    answer = {"error": _said(error)}
+            print(json.dumps(answer), file=out, flush=True)
+    os._exit(0)  # threads of a benchmark's library may keep the process alive
+
+
+def _said(error: BaseException) -> str:
+    return str(error) if isinstance(error, VlaZenohError) else in_words(error)
+
+
+if __name__ == "__main__":
+    main()

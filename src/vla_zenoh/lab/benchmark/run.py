@@ -1,0 +1,204 @@
+"""Runs the episodes of a benchmark, several at once."""
+
+from __future__ import annotations
+
+import queue
+import tempfile
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Protocol
+
+from vla_zenoh.errors import NodeError
+from vla_zenoh.lab.benchmark.episode_clock import EpisodeOutcome, EpisodeRequest
+from vla_zenoh.lab.benchmark.process import BenchmarkLost, BenchmarkProcess, BenchmarkSetting
+from vla_zenoh.lab.cli.bench_file import running_nodes
+from vla_zenoh.lab.cli.loopback import free_port
+from vla_zenoh.profile import load_profile, override, to_yaml
+from vla_zenoh.profile.profile import Profile
+
+ATTEMPTS = 3
+POLL_S = 0.2
+Ended = tuple[EpisodeRequest, EpisodeOutcome]
+
+
+class Does(Protocol):
+    """Where an episode is run."""
+
+    def run(self, request: EpisodeRequest) -> EpisodeOutcome: ...
+
+    def close(self) -> None: ...
+
+
+@dataclass(frozen=True, slots=True)
+class BenchmarkStage:
+    """What runs episodes: a benchmark, and a worker that is started beside it or is there.
+
+    Args:
+        setting: of the benchmark.
+        worker_options: ``name=value`` of the model.
+        worker_model: path of the model, if that was given.
+        worker_python: interpreter of a prepared environment of the model.
+        benchmark_python: the same of the benchmark.
+        connect: endpoint of a router with a worker that runs already; empty: both are started.
+    """
+
+    setting: BenchmarkSetting
+    worker_options: tuple[str, ...] = ()
+    worker_model: str = ""
+    worker_python: str | None = None
+    benchmark_python: str | None = None
+    connect: str = ""
+
+
+def robots(processes: int) -> list[str]:
+    """Names of the robots that a run has; a worker that runs elsewhere has to serve them."""
+    return [f"sim{index}" for index in range(processes)]
+
+
+def bench_profile(stage: BenchmarkStage, processes: int) -> Profile:
+    """The profile of the robots of a run: no arm, a router and one worker."""
+    worker = stage.setting.worker
+    base = load_profile("panda_sim")
+    profile = override(
+        base,
+        {
+            "name": "benchmark",
+            "robot": {"name": robots(processes)[0]},
+            "cameras": dict.fromkeys(base.cameras),
+            "workers": [worker],
+            "models": {worker: stage.worker_model} if stage.worker_model else {},
+            "serves": {worker: robots(processes)},
+            "task": {"worker": worker},
+            "hosts": {"here": {"nodes": ["router", "worker"]}},
+        },
+    )
+    if stage.connect:
+        return override(profile, {"session": {"connect": [stage.connect]}})
+    here = [f"tcp/127.0.0.1:{free_port()}"]
+    return override(profile, {"session": {"connect": here, "listen": here}})
+
+
+class LocalRun:
+    """Episodes in processes of this computer, all of which ask one worker.
+
+    Args:
+        stage: what to run.
+        processes: at once.
+        log: file for what the worker says; None: it is not kept.
+    """
+
+    def __init__(self, stage: BenchmarkStage, processes: int, log: Path | None = None) -> None:
+        self._stage, self._processes, self._log = stage, processes, log
+        self._stack = ExitStack()
+        self._file = ""
+
+    def __enter__(self) -> LocalRun:
+        stage = self._stage
+        if not stage.setting.worker:  # recorded steps need none
+            return self
+        profile = bench_profile(stage, self._processes)
+        if not stage.connect:
+            arguments = ["--python", stage.worker_python] if stage.worker_python else []
+            nodes = running_nodes(
+                profile,
+                self._log,
+                worker_options={stage.setting.worker: stage.worker_options},
+                worker_arguments=arguments,
+            )
+            profile = self._stack.enter_context(nodes).profile
+        folder = self._stack.enter_context(tempfile.TemporaryDirectory(prefix="vla-zenoh-"))
+        self._file = f"{folder}/benchmark.yaml"
+        Path(self._file).write_text(to_yaml(profile), "utf-8")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def place(self, index: int) -> BenchmarkProcess:
+        """A new process for the robot of this number."""
+        setting = replace(self._stage.setting, profile_file=self._file)
+        name = robots(self._processes)[index]
+        return BenchmarkProcess(setting, name, self._stage.benchmark_python)
+
+    def run(self, requests: Sequence[EpisodeRequest], stop: threading.Event) -> Iterator[Ended]:
+        """Every episode as it ends.
+
+        Raises:
+            NodeError: benchmark or worker failed, or an episode lost its process three times.
+        """
+        makers = [lambda index=index: self.place(index) for index in range(self._processes)]
+        yield from run_at_places(makers, requests, stop)
+
+
+def run_at_places(
+    makers: Sequence[Callable[[], Does]],
+    requests: Sequence[EpisodeRequest],
+    stop: threading.Event,
+) -> Iterator[Ended]:
+    """Share episodes out; one that loses its place is begun again at a new one.
+
+    Args:
+        makers: each makes a place.
+        requests: in order.
+        stop: set by Ctrl-C; what has not ended is left out.
+
+    Raises:
+        NodeError: an episode failed, or lost its place three times.
+    """
+    waiting: queue.SimpleQueue[EpisodeRequest] = queue.SimpleQueue()
+    ended: queue.SimpleQueue[Ended | Exception] = queue.SimpleQueue()
+    for request in requests:
+        waiting.put(request)
+    places: dict[int, Does] = {}
+    over = threading.Event()
+
+    def work(index: int) -> None:
+        try:
+            while not over.is_set():
+                request = waiting.get_nowait()
+                ended.put((request, _at_a_place(makers[index], places, index, request)))
+        except queue.Empty:
+            place = places.pop(index, None)  # another one may wait for its computer
+            if place is not None:
+                place.close()
+        except Exception as error:
+            ended.put(error)
+
+    threads = [
+        threading.Thread(target=work, args=(index,), daemon=True) for index in range(len(makers))
+    ]
+    for thread in threads:
+        thread.start()
+    try:
+        left = len(requests)
+        while left and not stop.is_set():
+            try:
+                found = ended.get(timeout=POLL_S)
+            except queue.Empty:
+                continue
+            if isinstance(found, Exception):
+                raise found
+            left -= 1
+            yield found
+    finally:
+        over.set()
+        for place in list(places.values()):
+            place.close()
+
+
+def _at_a_place(
+    make: Callable[[], Does], places: dict[int, Does], index: int, request: EpisodeRequest
+) -> EpisodeOutcome:
+    for attempt in range(1, ATTEMPTS + 1):
+        if index not in places:
+            places[index] = make()
+        try:
+            return replace(places[index].run(request), attempts=attempt)
+        except BenchmarkLost as error:
+            places.pop(index).close()
+            if attempt == ATTEMPTS:
+                raise NodeError(f"{request.key}: {attempt} attempts, the last: {error}") from error
+    raise AssertionError

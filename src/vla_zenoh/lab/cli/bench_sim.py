@@ -1,0 +1,378 @@
+"""vla-zenoh bench sim: success rates on manipulation benchmarks of others."""
+
+from __future__ import annotations
+
+import tempfile
+import threading
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.progress import TimeRemainingColumn
+
+from vla_zenoh import __version__
+from vla_zenoh.cli.options import JsonOption, ModelOptions, model_options, options
+from vla_zenoh.cli.output import console, errors, new_table, print_json, progress_bars
+from vla_zenoh.errors import ResourceError
+from vla_zenoh.lab.benchmark.contract import BenchmarkTask
+from vla_zenoh.lab.benchmark.episode_clock import (
+    EpisodeConditions,
+    EpisodeOutcome,
+    EpisodeRequest,
+    Mode,
+)
+from vla_zenoh.lab.benchmark.journal import PLAN, RunJournal, actions_file, read_episodes, read_json
+from vla_zenoh.lab.benchmark.process import BenchmarkProcess, BenchmarkSetting
+from vla_zenoh.lab.benchmark.result import summary, write_page, write_videos
+from vla_zenoh.lab.benchmark.run import BenchmarkStage, Does, LocalRun, run_at_places
+from vla_zenoh.lab.cli.bench_file import write_json
+from vla_zenoh.lab.cli.output_path import check_folder
+
+REPLAY = "replay"
+DRAWN = "front"
+
+
+@dataclass(frozen=True)
+class BenchmarkEpisodes:
+    """Options for what is run."""
+
+    suite: Annotated[
+        str | None, typer.Option("--suite", help="Of the benchmark; default: its first.")
+    ] = None
+    tasks: Annotated[
+        str | None, typer.Option("--tasks", help="Numbers and names: 0-9,door-open-v3.")
+    ] = None
+    episodes: Annotated[
+        int, typer.Option("--episodes", "-n", min=1, max=100_000, help="Of every task.")
+    ] = 10
+    first: Annotated[
+        int, typer.Option("--first", min=0, help="Index of the first initial state, or seed.")
+    ] = 0
+    mode: Annotated[
+        Mode,
+        typer.Option(
+            "--mode",
+            help="native: the environment waits for the model. live: its clock runs on, the arm "
+            "stands meanwhile. command: it runs on, through our command node.",
+        ),
+    ] = "native"
+    delay_ms: Annotated[
+        float | None,
+        typer.Option(
+            "--delay",
+            min=0,
+            max=10_000,
+            help="Virtual ms of an inference in live and command; default: what it took.",
+        ),
+    ] = None
+    replan: Annotated[
+        int, typer.Option("--replan", min=0, help="Steps to carry out of each chunk; 0: all.")
+    ] = 0
+
+    @property
+    def conditions(self) -> EpisodeConditions:
+        """Of every episode."""
+        if self.mode == "native" and self.delay_ms:
+            raise typer.BadParameter("--delay: in native mode no time passes; add --mode live")
+        return EpisodeConditions(self.mode, self.delay_ms, self.replan)
+
+    def requests(self, about: dict[str, Any]) -> list[EpisodeRequest]:
+        """Every episode, task by task.
+
+        Args:
+            about: what the benchmark says of itself.
+        """
+        known = [BenchmarkTask(**task) for task in about["tasks"]]
+        chosen = known if self.tasks is None else _chosen(self.tasks, known)
+        last = self.first + self.episodes
+        for task in chosen:
+            if task.episodes and last > task.episodes:
+                raise typer.BadParameter(
+                    f"--episodes: {task.name} has {task.episodes} initial states"
+                )
+        return [
+            EpisodeRequest(about["suite"], task, index)
+            for task in chosen
+            for index in range(self.first, last)
+        ]
+
+
+@dataclass(frozen=True)
+class BenchmarkPlace:
+    """Options for where it runs."""
+
+    processes: Annotated[
+        int, typer.Option("--processes", min=1, max=256, help="Environments at once, one worker.")
+    ] = 1
+    ray: Annotated[
+        str | None,
+        typer.Option("--ray", help="Address of a Ray cluster that runs them, each with a worker."),
+    ] = None
+    connect: Annotated[
+        str,
+        typer.Option(
+            "--connect", help="Router of a worker that runs already, serving robots sim0, sim1, ..."
+        ),
+    ] = ""
+    benchmark_python: Annotated[
+        str | None,
+        typer.Option("--benchmark-python", help="Interpreter of the benchmark's environment."),
+    ] = None
+
+
+@dataclass(frozen=True)
+class BenchmarkOutput:
+    """Options for where the result goes."""
+
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            help="Folder for result.json, index.html, steps and videos; a run that was ended goes "
+            "on there.",
+        ),
+    ] = None
+    videos: Annotated[
+        int, typer.Option("--videos", min=0, help="Of failures, at most, with --output.")
+    ] = 5
+    as_json: JsonOption = False
+
+
+@options
+def sim(
+    benchmark: Annotated[str, typer.Argument(help="Name of a benchmark, or path to its file.")],
+    episodes: BenchmarkEpisodes,
+    place: BenchmarkPlace,
+    model: ModelOptions,
+    output: BenchmarkOutput,
+    worker: Annotated[
+        str | None, typer.Option("--worker", "-w", help="Name of a model, or path to one.")
+    ] = None,
+    benchmark_settings: Annotated[
+        list[str] | None,
+        typer.Option("--benchmark-set", help="Option of the benchmark as name=value; repeatable."),
+    ] = None,
+    replay: Annotated[
+        Path | None,
+        typer.Option("--replay", help="Folder of a run whose steps are carried out again."),
+    ] = None,
+    list_tasks: Annotated[
+        bool, typer.Option("--list", help="Print suites, tasks of --suite, cameras and action.")
+    ] = False,
+) -> None:
+    """Measure how often a model succeeds on a manipulation benchmark, by the published protocol.
+
+    The environment is a robot behind the usual keys, in an environment of its own; the worker is
+    any worker. Without --worker it needs --replay or --list.
+    """
+    from vla_zenoh.runtime.process import stop_on_signals
+
+    chosen = None if worker is None or place.connect else model.choose(None, worker)
+    name = REPLAY if replay else chosen.name if chosen else worker or ""
+    if not name and not list_tasks:
+        raise typer.BadParameter("give --worker NAME, --replay DIR or --list")
+    setting = BenchmarkSetting(
+        benchmark,
+        model_options(benchmark_settings or []),
+        worker="" if replay or list_tasks else name,
+        conditions=episodes.conditions,
+    )
+    if output.output is not None:
+        check_folder(output.output, begun=(output.output / PLAN).exists())
+    stage = BenchmarkStage(
+        setting,
+        tuple(model.settings or ()),
+        str(chosen.model.path) if chosen else "",
+        model.python,
+        place.benchmark_python,
+        place.connect,
+    )
+    teller = BenchmarkProcess(setting, "", place.benchmark_python)
+    try:
+        about = teller.describe(episodes.suite)
+        if list_tasks:
+            print_json(about)
+            return
+        requests = episodes.requests(about)
+        plan = {
+            "benchmark": setting.file.name,
+            "benchmark_options": dict(setting.options),
+            "suite": requests[0].suite,
+            "worker": name,
+            "model": name,
+            "options": dict(chosen.options) if chosen else {},
+            **asdict(setting.conditions),
+            "tasks": list(dict.fromkeys(each.task.name for each in requests)),
+            "first": episodes.first,
+            "episodes": episodes.episodes,
+            "max_steps": {each.task.name: each.task.max_steps for each in requests},
+            "dt_s": about["dt_s"],
+            "versions": {"vla-zenoh": __version__, **about["versions"]},
+        }
+        journal = RunJournal(output.output, plan)
+        stop = stop_on_signals()
+        try:
+            left = [each for each in requests if each.key not in journal.ended]
+            if left:
+                _run(stage, place, replay, left, journal, stop, len(requests))
+        finally:
+            result = _result(requests, journal, replay)
+            if result["all"]:
+                print_json(result) if output.as_json else _print(result)
+            if output.output is not None and result["all"]:
+                write_json(output.output / "result.json", result)
+                write_page(output.output, result)
+        if stop.is_set():
+            raise typer.Exit(130)
+        if output.output is not None and replay is None:
+            _videos(output, teller, requests, journal, about)
+            write_page(output.output, result)
+    finally:
+        teller.close()
+
+
+def _run(
+    stage: BenchmarkStage,
+    place: BenchmarkPlace,
+    replay: Path | None,
+    left: Sequence[EpisodeRequest],
+    journal: RunJournal,
+    stop: threading.Event,
+    total: int,
+) -> None:
+    with progress_bars(44) as bars:
+        bars.columns = (*bars.columns, TimeRemainingColumn())
+        bar = bars.add_task("starting", total=total, completed=total - len(left))
+        for request, outcome in _outcomes(stage, place, replay, left, journal, stop):
+            journal.add(request, outcome)
+            done = sum(each.success for each in journal.ended.values())
+            word = "done" if outcome.success else outcome.failure
+            bars.update(
+                bar,
+                completed=len(journal.ended),
+                description=f"{done} of {len(journal.ended)} done; {request.task.name[:18]} {word}",
+            )
+
+
+def _outcomes(
+    stage: BenchmarkStage,
+    place: BenchmarkPlace,
+    replay: Path | None,
+    left: Sequence[EpisodeRequest],
+    journal: RunJournal,
+    stop: threading.Event,
+) -> Iterator[tuple[EpisodeRequest, EpisodeOutcome]]:
+    if place.ray is not None:
+        from vla_zenoh.lab.benchmark.ray_place import RayPlace, connect_ray
+
+        if replay is not None or place.connect:
+            raise typer.BadParameter("--ray: not with --replay or --connect")
+        ray = connect_ray(place.ray)
+        yield from run_at_places([lambda: RayPlace(stage, ray)] * place.processes, left, stop)
+        return
+    log = journal.folder / "nodes.log" if journal.folder is not None else None
+    with LocalRun(stage, place.processes, log) as run:
+        if replay is None:
+            yield from run.run(left, stop)
+            return
+        folder = replay
+        makers = [lambda i=i: _Replay(run.place(i), folder) for i in range(place.processes)]
+        yield from run_at_places(makers, left, stop)
+
+
+class _Replay(Does):
+    """Carries out recorded steps in place of asking a model."""
+
+    def __init__(self, place: BenchmarkProcess, folder: Path) -> None:
+        self._place, self._folder = place, folder
+
+    def run(self, request: EpisodeRequest) -> EpisodeOutcome:
+        file = actions_file(self._folder, request)
+        if not file.exists():
+            raise ResourceError(f"{self._folder} has no steps of {request.key}")
+        with tempfile.TemporaryDirectory(prefix="vla-zenoh-") as folder:
+            return self._place.replay(request, np.load(file), "", Path(folder))
+
+    def close(self) -> None:
+        self._place.close()
+
+
+def _result(
+    requests: Sequence[EpisodeRequest], journal: RunJournal, replay: Path | None
+) -> dict[str, Any]:
+    ended = [journal.ended[each.key] for each in requests if each.key in journal.ended]
+    result = summary(journal.plan, ended)
+    if replay is not None:
+        before = read_episodes(replay)
+        pairs = [(before.get(f"{e.suite}/{e.task}/{e.episode}"), e) for e in ended]
+        result["same_end"] = sum(bool(a and a.end and a.end == b.end) for a, b in pairs)
+        result["replayed"] = read_json(replay / PLAN)["worker"]
+    return result
+
+
+def _videos(
+    output: BenchmarkOutput,
+    teller: BenchmarkProcess,
+    requests: Sequence[EpisodeRequest],
+    journal: RunJournal,
+    about: dict[str, Any],
+) -> None:
+    failed = [
+        (each, journal.ended[each.key])
+        for each in requests
+        if each.key in journal.ended and not journal.ended[each.key].success
+    ]
+    if output.output is None or not about["cameras"]:
+        return
+    camera = DRAWN if DRAWN in about["cameras"] else next(iter(about["cameras"]))
+    for file in write_videos(output.output, teller, failed, camera, output.videos):
+        errors().print(f"{file}", soft_wrap=True)
+
+
+def _chosen(text: str, known: Sequence[BenchmarkTask]) -> list[BenchmarkTask]:
+    """Tasks by numbers, ranges and names."""
+    names = {task.name: task for task in known}
+    out: dict[str, BenchmarkTask] = {}
+    for part in text.split(","):
+        low, dash, high = part.strip().partition("-")
+        if part.strip() in names:
+            found = [names[part.strip()]]
+        elif low.isdigit() and (high.isdigit() or not dash):
+            found = list(known[int(low) : int(high or low) + 1])
+        else:
+            found = []
+        if not found:
+            raise typer.BadParameter(
+                f"--tasks {part!r}: 0 to {len(known) - 1}, or a name; --list prints them"
+            )
+        out |= {task.name: task for task in found}
+    return list(out.values())
+
+
+def _print(result: dict[str, Any]) -> None:
+    title = f"{result['benchmark']} {result['suite']}, {result['worker']}, {result['mode']}"
+    title += f", {result['delay_ms']:g} ms" if result["delay_ms"] else ""
+    columns = ("", "done", "of", "rate", "95 %", "steps p50", "failures")
+    table = new_table(*columns, title=title, left=("", "failures"))
+    for name, row in [("all", result), *result["by_task"].items()]:
+        low, high = row["wilson_95"]
+        steps = row["steps_to_success_p50"]
+        table.add_row(
+            name,
+            str(row["successes"]),
+            str(row["episodes"]),
+            f"{row['success_rate']:.1%}",
+            f"{low:.1%}..{high:.1%}",
+            f"{steps:g}" if steps is not None else "",
+            ", ".join(f"{why} {count}" for why, count in row["failures"].items()),
+        )
+    console().print(table)
+    if result["begun_again"]:
+        console().print(f"{result['begun_again']} episodes were begun again")
+    if "same_end" in result:
+        same, of = result["same_end"], len(result["all"])
+        console().print(f"{same} of {of} ended in the same state, bit by bit, as when recorded")
