@@ -31,6 +31,8 @@ from vla_zenoh.policy import (
     Observation,
     ObservationSpec,
 )
+from vla_zenoh.policy.chunk_prefix import Committed
+from vla_zenoh.policy.model_options import one_of
 from vla_zenoh.types import PoseState
 
 FloatArray = NDArray[np.float64]
@@ -43,6 +45,8 @@ FRONT, WRIST = (128, 96), (96, 72)
 STEP_M, STEP_RAD = 0.045, 0.18
 """A waypoint further from the one before is approached in several steps."""
 WIDTH_STEP_M = 0.08
+MOVED = [0, 1, 2, 5]
+"""Columns of a step that move the hand: along x, y, z and about the vertical."""
 LOW_M, UP_M, PUSH_WAY_M = 0.035, 0.05, 0.105
 """See `expert`."""
 AT_REST_M_S = 0.004
@@ -120,9 +124,13 @@ class Brick:
     Args:
         weights: folder with graph and manifest; empty: beside this file.
         threads: of the inference.
+        prefix: ``on``: a chunk begins with the steps in execution that cannot change any more, and
+            goes on as the network learned to from such steps.
     """
 
-    def __init__(self, weights: str = "", threads: str = "2") -> None:
+    def __init__(self, weights: str = "", threads: str = "2", prefix: str = "off") -> None:
+        one_of("prefix", prefix, ("on", "off"))
+        self.takes_committed = prefix == "on"
         self.spec = ModelSpec(
             name="brick",
             observation=ObservationSpec(
@@ -167,35 +175,50 @@ class Brick:
         self._prompt = ""
         self._asked: tuple[int, FloatArray] | None = None
 
-    def infer(self, observation: Observation) -> ActionSteps:
-        """The next chunk."""
+    def infer(self, observation: Observation, committed: Committed | None = None) -> ActionSteps:
+        """The next chunk; it begins with the frozen steps, and the network goes on from there."""
         if observation.prompt != self._prompt:
             # A push that was made belongs to the task that was.
             self._prompt, self._hand = observation.prompt, None
         hand = self._hand = self._follow(observation)
-        waypoints = self.think(observation, hand)
         goal = self._goal(observation, hand)
+        start = np.append(hand.position_m, hand.yaw_rad)
+        frozen = np.zeros((0, 7)) if committed is None else committed.steps[: committed.frozen]
+        given = np.zeros((HORIZON, 6), np.float32)
+        given[: len(frozen), :4] = goal - start + np.cumsum(frozen[:, MOVED], axis=0)
+        given[: len(frozen), 4] = frozen[:, 6] > 0
+        given[: len(frozen), 5] = 1.0
+        waypoints = self.think(observation, hand, given)
         steps = np.zeros((HORIZON, 7))
         if waypoints.understood:
-            start = np.append(hand.position_m, hand.yaw_rad)
-            before = goal
+            steps[: len(frozen)] = frozen
+            before = goal + frozen[:, MOVED].sum(axis=0)
             for row, (offset, opened) in enumerate(
                 zip(waypoints.offset, waypoints.opened, strict=True)
             ):
+                if row < len(frozen):
+                    continue
                 step = start + offset - before
                 step[3] = (step[3] + math.pi) % (2 * math.pi) - math.pi
                 step[:3] *= min(1.0, STEP_M / max(float(np.linalg.norm(step[:3])), 1e-9))
                 step[3] = min(max(step[3], -STEP_RAD), STEP_RAD)
                 before = before + step
-                steps[row, :3], steps[row, 5] = step[:3], step[3]
+                steps[row, MOVED] = step
                 steps[row, 6] = WIDTH_STEP_M if opened else -WIDTH_STEP_M
         if observation.task.active:
-            goals = goal + np.cumsum(steps[:, [0, 1, 2, 5]], axis=0)
+            goals = goal + np.cumsum(steps[:, MOVED], axis=0)
             self._asked = (observation.stamp_wall_ns, goals)
         return ActionSteps(steps.astype(np.float32))
 
-    def think(self, observation: Observation, hand: Hand) -> Waypoints:
-        """What to do, as the network says."""
+    def think(self, observation: Observation, hand: Hand, given: FloatArray) -> Waypoints:
+        """What to do, as the network says.
+
+        Args:
+            observation: now.
+            hand: now.
+            given: (H, 6) waypoints that cannot change any more, as in `Waypoints`, relative to the
+                hand: the offset, 1 for open, and 1 for a row that is given.
+        """
         if self._session is None:
             self.load()
         feed = {
@@ -203,6 +226,7 @@ class Brick:
             "front": observation.images["front"][None],
             "wrist": observation.images["wrist"][None],
             "hand": hand.numbers()[None].astype(np.float32),
+            "given": given[None].astype(np.float32),
         }
         offset, opened, understood = self._session.run(["offset", "opened", "understood"], feed)
         return Waypoints(offset[0].astype(np.float64), opened[0] > 0.5, bool(understood[0] > 0.5))

@@ -8,7 +8,9 @@ import shutil
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,16 +27,18 @@ from vla_zenoh.lab.tasks import (
     TaskEpisode,
     TaskJudge,
     Verdict,
+    brick,
     draw_episode,
     phrase,
 )
 from vla_zenoh.policy import ActionSteps, Policy, check_steps
+from vla_zenoh.policy.chunk_prefix import Committed
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import load_profile
 from vla_zenoh.simulation.render import Renderer
 from vla_zenoh.simulation.robot_model import RobotModel
 from vla_zenoh.simulation.world import World, build_world
-from vla_zenoh.types import Image, ObjectPoses
+from vla_zenoh.types import Image, ObjectPoses, PoseState
 
 FOLDER = resources.find("models", "brick")
 PROFILE = "panda_bricks"
@@ -46,6 +50,7 @@ STILL_M = 1e-4
 WALK_STEPS, WALK_STEP_M = 300, 0.02
 MANY = 12
 ENOUGH = 11
+FROZEN = 3
 
 
 @dataclass(slots=True)
@@ -214,6 +219,50 @@ def test_a_push_that_was_made_is_forgotten_with_another_prompt(policy: Policy) -
             policy.infer(replace(observation, pose=replace(observation.pose, position_m=place)))
             low = [low[-1]]
         assert policy._hand.swept_m == pytest.approx(swept_m)  # pyright: ignore
+
+
+# -- the steps in execution ----------------------------------------------------------------------
+
+
+def test_a_chunk_that_goes_on_from_given_steps_is_nearer_to_the_teacher_than_one_that_does_not(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(FOLDER / "training"))
+    monkeypatch.delitem(sys.modules, "expert", raising=False)
+    from expert import Hand, Point, foretell  # pyright: ignore[reportMissingImports]
+
+    made: Any = make_policy(find_model("brick"), {"prefix": "on"})
+    think = made.think
+    off_m: dict[bool, list[float]] = {True: [], False: []}
+    for seed, told in product(range(SEED, SEED + 6), off_m):
+        stage.world.reset(seed)
+        stage.renderer.set_qpos(stage.world.qpos())
+        objects, position_m = stage.world.objects(), stage.world.tcp()[0]
+        seen = {
+            each.camera: stage.renderer.render(each.camera, each.width, each.height)
+            for each in made.spec.observation.cameras
+        }
+        observation = example_observation(made.spec, prompt="put the red brick in the box")
+        assert observation.pose is not None
+        pose = PoseState(position_m, observation.pose.quat_xyzw, np.zeros(6))
+        gripper = stage.world.gripper_state()
+        observation = replace(observation, images=seen, pose=pose, gripper=gripper)
+        made.reset()
+        blue = replace(observation.task, prompt="put the blue brick in the box")
+        other = made.infer(replace(observation, task=blue)).steps
+        made.reset()
+        monkeypatch.setattr(made, "think", lambda o, h, g, told=told: think(o, h, g * told))
+        steps = made.infer(observation, committed=Committed(other[:-1], FROZEN)).steps
+        np.testing.assert_array_equal(steps[:FROZEN], other[:FROZEN])
+        hand = Hand(*position_m.tolist(), 0.0, gripper.width_m)
+        ends = np.cumsum(other[:FROZEN][:, [0, 1, 2, 5]], axis=0)
+        opened = (other[:FROZEN, 6] > 0).tolist()
+        rows = [(*end, float(o)) for end, o in zip(ends.tolist(), opened, strict=True)]
+        red, box = (Point(*objects[name][0].tolist()) for name in (brick("red"), "box"))
+        taught = np.array(foretell("put", hand, red, box, "", rows))
+        way = np.cumsum(steps[:, :3], axis=0)
+        off_m[told].append(float(np.linalg.norm(way - taught[:, :3], axis=1)[FROZEN:].mean()))
+    assert np.mean(off_m[True]) < 0.7 * np.mean(off_m[False]), off_m
 
 
 # -- what it is made of --------------------------------------------------------------------------

@@ -64,7 +64,7 @@ def situations(count: int, seed: int, processes: int) -> dict[str, Tensor]:
     seeds = [(seed, 0xB11D, number) for number in range(-(-count // BLIND))]
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
         parts = list(pool.map(partial(blind, BLIND), seeds))
-    return {key: torch.from_numpy(np.concatenate([p[key] for p in parts])) for key in NUMBERS}
+    return {key: torch.from_numpy(np.concatenate([p[key] for p in parts])) for key in parts[0]}
 
 
 def truth(batch: dict[str, Tensor]) -> Scene:

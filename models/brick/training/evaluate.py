@@ -79,11 +79,13 @@ def teachers(hand: Hand) -> TeacherHand:
     return TeacherHand(*hand.position_m.tolist(), hand.yaw_rad, hand.width_m, hand.swept_m, down)
 
 
-def taught(world: World, order: Order, hand: Hand) -> np.ndarray:
+def taught(world: World, order: Order, hand: Hand, given: np.ndarray) -> np.ndarray:
     """(H, 5) what the teacher would do."""
     now = teachers(hand)
     goal = point(world, brick(order.onto) if order.onto else "box")
-    way = foretell(order.family, now, point(world, brick(order.target)), goal, order.direction)
+    committed = [tuple(row[:5].tolist()) for row in given if row[5]]
+    target = point(world, brick(order.target))
+    way = foretell(order.family, now, target, goal, order.direction, committed)
     return np.array(way)
 
 
@@ -117,37 +119,39 @@ class Stage:
 class Teacher(Brick):
     """The teacher as a policy: it sees true poses in place of pictures."""
 
-    def __init__(self, world: World, order: Order) -> None:
-        super().__init__()
+    def __init__(self, world: World, order: Order, prefix: str) -> None:
+        super().__init__(prefix=prefix)
         self._world, self._order = world, order
 
     def load(self) -> None:
         """Nothing to load."""
 
-    def think(self, observation: Observation, hand: Hand) -> Waypoints:
+    def think(self, observation: Observation, hand: Hand, given: np.ndarray) -> Waypoints:
         """As the teacher says."""
         if self._order.family == "stay":
             return Waypoints(np.zeros((HORIZON, 4)), np.zeros(HORIZON, bool), False)
-        way = taught(self._world, self._order, hand)
+        way = taught(self._world, self._order, hand, given)
         return Waypoints(way[:, :4], way[:, 4] > 0.5, True)
 
 
 class Watched(Brick):
     """The policy, with every situation noted down."""
 
-    def __init__(self, weights: str, stage: Stage, order: Order, collect: bool) -> None:
-        super().__init__(weights=weights, threads="1")
+    def __init__(
+        self, weights: str, stage: Stage, order: Order, collect: bool, prefix: str
+    ) -> None:
+        super().__init__(weights=weights, threads="1", prefix=prefix)
         self._stage, self._order, self._collect = stage, order, collect
         self._random = np.random.default_rng(stage.world.seed)
         self.seen: list[tuple[Observation, Hand]] = []
         self.samples: list[dict[str, np.ndarray]] = []
 
-    def think(self, observation: Observation, hand: Hand) -> Waypoints:
+    def think(self, observation: Observation, hand: Hand, given: np.ndarray) -> Waypoints:
         """As the network says."""
         self.seen.append((observation, hand))
         if self._collect and self._order.family != "stay":
             self._note(observation, hand)
-        return super().think(observation, hand)
+        return super().think(observation, hand, given)
 
     def _note(self, observation: Observation, hand: Hand) -> None:
         world = self._stage.world
@@ -181,9 +185,9 @@ def run(stage: Stage, args: argparse.Namespace, seed: int, family: str) -> Outco
     else:
         episode = draw_episode(seed, before, family=family, held_out=args.held_out)
     policy: Brick = (
-        Teacher(world, episode.order)
+        Teacher(world, episode.order, args.prefix)
         if args.teacher
-        else Watched(args.weights, stage, episode.order, args.collect is not None)
+        else Watched(args.weights, stage, episode.order, args.collect is not None, args.prefix)
     )
     delays = Delays(inference_s=args.delay, camera_hz=args.camera_hz)
     picture = None if args.teacher else stage.picture
@@ -230,6 +234,7 @@ def main() -> None:
     parser.add_argument("--held-out", action="store_true", help="wordings never trained with")
     parser.add_argument("--vary", default="", help="all, or names with commas between")
     parser.add_argument("--delay", type=float, default=0.0, help="s of one inference")
+    parser.add_argument("--prefix", default="off", choices=["on", "off"], help="see model.Brick")
     parser.add_argument("--rate", type=float, default=5.0, help="inferences per second")
     parser.add_argument("--camera-hz", type=float, default=10.0)
     parser.add_argument("--limit", type=float, default=LIMIT_S, help="s for one episode")

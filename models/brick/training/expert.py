@@ -8,6 +8,7 @@ learner sees make small errors in what it does; it never waits for a time that n
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -242,10 +243,19 @@ def follow(hand: Hand, goal: Hand, share: float) -> Hand:
     )
 
 
+Row = tuple[float, float, float, float, float]
+"""A waypoint: x, y, z, yaw relative to the hand at the start, and 1 for an open gripper."""
+
+
 def foretell(
-    family: str, hand: Hand, target: Point, goal: Point, direction: str
-) -> list[tuple[float, float, float, float, float]]:
-    """The next `HORIZON` waypoints: x, y, z, yaw relative to the hand now, and 1 for open.
+    family: str,
+    hand: Hand,
+    target: Point,
+    goal: Point,
+    direction: str,
+    committed: Sequence[Row] = (),
+) -> list[Row]:
+    """The next `HORIZON` waypoints; the first ones are those committed, and it goes on from there.
 
     What is wished is asked of where the hand will be, not of the waypoint it was sent to: it is a
     smoothed arm, and what is decided of a corner it has not reached cuts that corner. A push is
@@ -256,9 +266,20 @@ def foretell(
     """
     begin, way, out = hand, hand, []
     share = 1.0 if family == "push" else FOLLOWS
-    for _ in range(HORIZON):
+    for index in range(HORIZON):
         wished = wish(family, hand, target, goal, direction)
-        way = advance(way, hand, wished)
+        if index < len(committed):
+            x, y, z, yaw, opened = committed[index]
+            way = replace(
+                way,
+                x_m=begin.x_m + x,
+                y_m=begin.y_m + y,
+                z_m=begin.z_m + z,
+                yaw_rad=begin.yaw_rad + yaw,
+            )
+            wished = wished._replace(opened=opened > 0.5)
+        else:
+            way = advance(way, hand, wished)
         after = follow(hand, way, share)
         if is_held(hand, target) and not wished.opened:
             target = Point(

@@ -24,12 +24,12 @@ import numpy as np
 import onnx
 import onnxruntime
 import torch
-from net import HAND, Policy
+from net import HAND, HORIZON, Policy
 from phrases import vocabulary
 from safetensors.torch import load_file
 from worker import FOLDER, FRONT, GRAPH, MANIFEST, MAX_WORDS, WRIST
 
-INPUTS = ("tokens", "front", "wrist", "hand")
+INPUTS = ("tokens", "front", "wrist", "hand", "given")
 OUTPUTS = ("offset", "opened", "understood", "bricks", "box")
 TOLERANCE = 1e-4
 """Between PyTorch and onnxruntime, in the outputs' own units (m, rad, probability)."""
@@ -40,12 +40,16 @@ def inputs(random: np.random.Generator, words: int) -> dict[str, np.ndarray]:
     """Any input of the right form."""
     tokens = random.integers(1, words, (1, MAX_WORDS))
     tokens[0, random.integers(1, MAX_WORDS) :] = 0
-    return {
+    found = {
         "tokens": tokens.astype(np.int64),
         "front": random.integers(0, 256, (1, FRONT[1], FRONT[0], 3), dtype=np.uint8),
         "wrist": random.integers(0, 256, (1, WRIST[1], WRIST[0], 3), dtype=np.uint8),
         "hand": random.normal(size=(1, HAND)).astype(np.float32),
     }
+    given = 0.1 * random.normal(size=(1, HORIZON, 6)).astype(np.float32)
+    given[..., 5] = np.arange(HORIZON) < random.integers(HORIZON)
+    given[..., :5] *= given[..., 5:]
+    return found | {"given": given}
 
 
 def strip(graph: Path) -> None:

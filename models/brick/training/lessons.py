@@ -178,6 +178,24 @@ def teach_will(
     teach(net.will, steps, WILL_RATE, lesson, "will", average=True)
 
 
+def teach_going_on(net: Policy, every: dict[str, Tensor], steps: int, seed: int) -> None:
+    """Teach what to do after waypoints that cannot change any more; `Will.think` is done.
+
+    Training-time action conditioning: K. Black, A. Z. Ren, M. Equi, S. Levine, "Training-Time
+    Action Conditioning for Efficient Real-Time Chunking", 2025, arXiv 2512.05964. Only what comes
+    after the given waypoints is taught.
+    """
+    random = np.random.default_rng((seed, 80))
+
+    def lesson(_: int) -> dict[str, Tensor]:
+        rows = torch.from_numpy(random.integers(0, len(every["hand"]), WILL_BATCH))
+        batch = {key: value[rows] for key, value in every.items()}
+        moved, grip = will_loss(net, blurred(truth(batch)), batch, going_on=True)
+        return {"moved": moved, "grip": GRIP_WEIGHT * grip}
+
+    teach(net.will.go_on, steps, WILL_RATE, lesson, "going on", average=True)
+
+
 def blurred(real: Scene) -> Scene:
     """With errors like those of the eyes: larger far away, now and then much larger than usual."""
     count = len(real.box)
@@ -211,22 +229,32 @@ def _in_turn(count: int, size: int) -> Iterator[np.ndarray]:
         yield np.arange(begin, min(begin + size, count))
 
 
-def will_loss(net: Policy, scene: Scene, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+def will_loss(
+    net: Policy, scene: Scene, batch: dict[str, Tensor], *, going_on: bool = False
+) -> tuple[Tensor, Tensor]:
     """L1 of the waypoints, cross entropy of the gripper, under one order of each sample."""
     rows = torch.arange(len(scene.box))
     # The first order is the one that the situation was drawn for.
     pick = torch.randint(batch["orders"].shape[1], (len(rows),))
     pick = torch.where(torch.rand(len(rows)) < 0.5, 0, pick)
-    orders, way = batch["orders"][rows, pick].long(), batch["way"][rows, pick]
+    orders = batch["orders"][rows, pick].long()
+    way = batch["way_on" if going_on else "way"][rows, pick]
+    given, weights = None, torch.tensor(STEP_WEIGHTS).expand(len(rows), -1)
+    if going_on:
+        given = batch["given"][rows, pick]
+        given = torch.cat([given[..., :3] / UNIT_M, given[..., 3:]], -1)
+        count = given[..., 5].sum(1).long()
+        # The first one that is free has the weight of the first.
+        after = torch.arange(weights.shape[1]) - count[:, None]
+        weights = weights.gather(1, after.clamp(min=0)) * (after >= 0)
     hand = batch["hand"] + torch.randn_like(batch["hand"]) * torch.tensor(HAND_NOISE)
     kind = F.one_hot(orders[:, 0], len(KINDS)).float()
     target = F.one_hot(orders[:, 1], BRICKS).float()
     onto = F.one_hot(orders[:, 2].clamp(min=0), BRICKS).float() * (orders[:, 2:] >= 0)
-    offset, opened = net.will(scene, hand, kind, target, onto)
+    offset, opened = net.will(scene, hand, kind, target, onto, given)
     wanted = torch.cat([way[..., :3] / UNIT_M, way[..., 3:4]], -1)
-    weights = torch.tensor(STEP_WEIGHTS)
     # In the first step the smallest mistakes count most: relative to how far it goes.
     scale = 1.0 / (wanted[..., :3].norm(dim=-1, keepdim=True) + 0.15)
-    moved = ((offset - wanted).abs() * weights[:, None] * scale).mean()
+    moved = ((offset - wanted).abs() * weights[..., None] * scale).mean()
     wrong = F.binary_cross_entropy_with_logits(opened, way[..., 4], reduction="none")
     return moved, (wrong * weights).mean()

@@ -343,6 +343,13 @@ class Will(nn.Module):
             nn.Linear(inside, 256), nn.ReLU(), nn.Linear(256, 256), nn.ReLU(), nn.Linear(256, 256),
             nn.ReLU(), nn.Linear(256, HORIZON * 5),
         )  # fmt: skip
+        inside += 256 + 6 * HORIZON + 5 + 6 + 3 + 6 + 1
+        self.go_on = nn.Sequential(
+            nn.Linear(inside, 176), nn.ReLU(), nn.Linear(176, 176), nn.ReLU(),
+            nn.Linear(176, HORIZON * 5),
+        )  # fmt: skip
+        nn.init.zeros_(self.go_on[-1].weight)
+        nn.init.zeros_(self.go_on[-1].bias)
         for name, value in (
             ("ahead", AHEAD),
             ("edges", [edge for _, edge, _ in EDGES]),
@@ -351,7 +358,13 @@ class Will(nn.Module):
             self.register_buffer(name, torch.tensor(value), persistent=False)
 
     def forward(
-        self, scene: Scene, hand: Tensor, kind: Tensor, target: Tensor, onto: Tensor
+        self,
+        scene: Scene,
+        hand: Tensor,
+        kind: Tensor,
+        target: Tensor,
+        onto: Tensor,
+        given: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Offsets (B, H, 4) in `UNIT_M` (rad) and logits (B, H) of an open gripper.
 
@@ -361,6 +374,8 @@ class Will(nn.Module):
             kind: (B, 6) one of them 1.
             target: (B, 4) likewise.
             onto: (B, 4) likewise, or all 0.
+            given: (B, H, 6) as in `model.Brick.think`, but in `UNIT_M`: what `go_on` changes what
+                was thought by; None: nothing is given.
         """
         put, stack = kind[:, :1], kind[:, 1:2]
         push = 1 - put - stack
@@ -388,7 +403,21 @@ class Will(nn.Module):
         edges = torch.cat([values[name] for name, _, _ in EDGES], 1)
         numbers += [torch.tanh((edges - self.edges) / self.widths)]
         numbers += [hand[:, 2:], near, square.abs().amax(1, keepdim=True)]
-        out = self.think(torch.cat(numbers, 1)).view(-1, HORIZON, 5)
+        inside = torch.cat(numbers, 1)
+        thought = self.think[:-1](inside)
+        out = self.think[-1](thought).view(-1, HORIZON, 5)
+        if given is not None:
+            there = given[..., 5:]
+            xy = turned(given[..., :2], there_cos[:, None], -there_sin[:, None])
+            rows = torch.cat([xy, given[..., 2:4], 2 * given[..., 4:5] - 1], -1) * there
+            # The last of them is where it goes on from.
+            end = (there.sum(1, keepdim=True).long() - 1).clamp(min=0)
+            last = rows.gather(1, end.expand(-1, 1, 5))[:, 0]
+            left = moved[:, :3] - last[:, :3]
+            numbers = [rows.flatten(1), there[..., 0], last, *fine(last[:, :3])]
+            numbers += [left, *fine(left), asinh(left[:, :2].norm(dim=1, keepdim=True) / 0.1)]
+            more = self.go_on(torch.cat([thought, inside, *numbers], 1))
+            out = out + (more * there[:, 0]).view(-1, HORIZON, 5)
         xy = turned(out[..., :2], there_cos[:, None], there_sin[:, None])
         return torch.cat([xy, out[..., 2:4]], -1), out[..., 4]
 
@@ -401,9 +430,11 @@ class Policy(nn.Module):
         self.eyes, self.reader, self.will = Eyes(), Reader(words), Will()
 
     def forward(
-        self, tokens: Tensor, front: Tensor, wrist: Tensor, hand: Tensor
+        self, tokens: Tensor, front: Tensor, wrist: Tensor, hand: Tensor, given: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """See `model.Brick.think`; pictures (B, h, w, 3) uint8.
+
+        Rows that are given come back as anything: the worker keeps them.
 
         Returns:
             offset (B, H, 4) m and rad, opened (B, H), understood (B,), and what it believes: bricks
@@ -417,8 +448,9 @@ class Policy(nn.Module):
         target = F.one_hot(target.argmax(1), BRICKS).float()
         onto = F.one_hot(onto.argmax(1), BRICKS).float() * kind[:, 1:2]
         scene = self.eyes(normal(front), normal(wrist), hand)
-        offset, opened = self.will(scene, hand, kind, target, onto)
         metres = torch.tensor([UNIT_M, UNIT_M, UNIT_M, 1.0])
+        rows = torch.cat([given[..., :4] / metres, given[..., 4:]], -1)
+        offset, opened = self.will(scene, hand, kind, target, onto, rows)
         believed = scene.bricks * torch.tensor([UNIT_M, UNIT_M, UNIT_M, 1.0, 1.0])
         return offset * metres, torch.sigmoid(opened), understood, believed, scene.box * UNIT_M
 

@@ -6,10 +6,11 @@
 
     python train.py DATA OUT [--processes 2]
 
-Reads words, sees how bricks are turned, sees where everything is, learns what to do of all that:
-each is a stage, ``OUT/<stage>.safetensors`` has all weights after it, and it goes on after the last
-one that is there. ``OUT/policy.safetensors`` has the weights after all. With several processes the
-eyes are taught with one thread in each.
+Reads words, sees how bricks are turned, sees where everything is, learns what to do of all that,
+and how to go on from waypoints that cannot change any more: each is a stage,
+``OUT/<stage>.safetensors`` has all weights after it, and it goes on after the last one that is
+there. ``OUT/policy.safetensors`` has the weights after all. With several processes the eyes are
+taught with one thread in each.
 """
 
 from __future__ import annotations
@@ -20,12 +21,12 @@ from pathlib import Path
 import torch
 from data import Data, situations
 from eyes import teach_eyes
-from lessons import teach_reader, teach_turn, teach_will
+from lessons import teach_going_on, teach_reader, teach_turn, teach_will
 from net import Policy
 from phrases import vocabulary
 from safetensors.torch import load_file, save_file
 
-STAGES = ("reader", "turn", "eyes", "will")
+STAGES = ("reader", "turn", "eyes", "will", "going_on")
 
 
 def teach(net: Policy, stage: str, args: argparse.Namespace) -> None:
@@ -36,9 +37,12 @@ def teach(net: Policy, stage: str, args: argparse.Namespace) -> None:
         teach_turn(net, Data(args.data), args.turn_steps, args.seed)
     elif stage == "eyes":
         teach_eyes(net, args)
-    else:
+    elif stage == "will":
         every = situations(args.situations, args.seed, args.processes)
         teach_will(net, every, Data(args.data), args.will_steps, args.seed)
+    else:
+        every = situations(args.situations, args.seed, args.processes)
+        teach_going_on(net, every, args.going_on_steps, args.seed)
 
 
 def main() -> None:
@@ -49,6 +53,7 @@ def main() -> None:
     parser.add_argument("--turn-steps", type=int, default=2500)
     parser.add_argument("--eyes-steps", type=int, default=2000)
     parser.add_argument("--will-steps", type=int, default=12_000)
+    parser.add_argument("--going-on-steps", type=int, default=12_000)
     parser.add_argument("--situations", type=int, default=150_000, help="without pictures")
     parser.add_argument("--rate", type=float, default=1.5e-3, help="greatest, of the eyes")
     parser.add_argument("--batch", type=int, default=48, help="pictures per process and step")
