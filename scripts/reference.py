@@ -26,7 +26,9 @@ import vla_zenoh
 from vla_zenoh.cli.help import examples
 from vla_zenoh.cli.main import app
 from vla_zenoh.keys import KEY_PATHS
-from vla_zenoh.profile import Profile
+from vla_zenoh.kinematics.kinematics import make_kinematics
+from vla_zenoh.lab.doctor.franka_limits import BY_FCI, JOINTS
+from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.security.roles import TABLE
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -383,11 +385,68 @@ def counters_page() -> str:
     return "\n\n".join(out) + "\n"
 
 
+# -- limits of Franka arms ----------------------------------------------------------------------
+FRANKA = "fr3", "panda_fci"
+
+
+def franka_limits(profile: Profile) -> Iterator[tuple[str, str, str]]:
+    """Each limit of an arm: its name, what Franka publishes, and what the profile allows."""
+    assert profile.franka is not None
+    published, ours = BY_FCI[profile.franka.fci], make_kinematics(profile)
+    for index in range(JOINTS):
+        yield (
+            f"range of joint {index + 1}, rad",
+            f"{published.lower_rad[index]:g} ... {published.upper_rad[index]:g}",
+            f"{ours.lower_rad[index]:g} ... {ours.upper_rad[index]:g}",
+        )
+    for name in ("velocity_rad_s", "acceleration_rad_s2", "jerk_rad_s3"):
+        allowed = profile.limits.joint.of(name, JOINTS)
+        for index, bound in enumerate(getattr(published, name)):
+            what = f"{name.split('_')[0]} of joint {index + 1}, {_unit(name)}"
+            yield what, f"{bound:g}", f"{allowed[index]:g}"
+    for section in ("translation", "rotation"):
+        given = getattr(profile.limits, section)
+        for bound, (name, value) in zip(getattr(published, section), given, strict=True):
+            what = f"{name.split('_')[0]} of the TCP's {section}, {_unit(name)}"
+            yield what, f"{bound:g}", f"{value:g}"
+
+
+def franka_limits_page() -> str:
+    """What Franka publishes beside what the profiles allow."""
+    fr3, panda = (list(franka_limits(load_profile(name))) for name in FRANKA)
+    out = ["# Limits of Franka arms", MADE.strip()]
+    out.append(
+        'What Franka publishes ("Robot and interface specifications" of the documentation of '
+        "the Franka Control Interface), and what the profiles `fr3` and `panda_fci` allow. An arm "
+        "whose commands come late brakes at up to twice the profile's limits, and the profile's "
+        "limits of the TCP are per axis: what comes out stays below Franka's. Where the FR3 "
+        "allows a joint less speed near an end of its range, braking at the profile's limits "
+        "stays below that, too (`tests/unit/robots/test_franka_flange.py` checks all of it)."
+    )
+    head = ["limit", "FR3, published", "`fr3`", "Panda, published", "`panda_fci`"]
+    rows = [[*row, *more[1:]] for row, more in zip(fr3, panda, strict=True)]
+    cells = [head, ["---"] * len(head), *rows]
+    out.append("\n".join(f"| {' | '.join(row)} |" for row in cells))
+    return "\n\n".join(out) + "\n"
+
+
+def _unit(name: str) -> str:
+    return {
+        "velocity_rad_s": "rad/s",
+        "acceleration_rad_s2": "rad/s²",
+        "jerk_rad_s3": "rad/s³",
+        "velocity_m_s": "m/s",
+        "acceleration_m_s2": "m/s²",
+        "jerk_m_s3": "m/s³",
+    }[name]
+
+
 PAGE_OF = {
     "profile.md": profile_page,
     "keys.md": keys_page,
     "cli.md": cli_page,
     "counters.md": counters_page,
+    "franka-limits.md": franka_limits_page,
 }
 
 

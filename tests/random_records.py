@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from hypothesis import strategies as st
@@ -16,6 +16,7 @@ from vla_zenoh.policy import (
     CameraSpec,
     ModelSpec,
     ObservationSpec,
+    StatePart,
 )
 from vla_zenoh.types import (
     ActionChunk,
@@ -32,6 +33,7 @@ from vla_zenoh.types import (
     ObjectPoses,
     PoseCommand,
     PoseState,
+    PrivilegedState,
     SceneState,
     Task,
 )
@@ -177,7 +179,7 @@ cameras = st.builds(
 observation_specs = st.builds(
     ObservationSpec,
     cameras=st.lists(cameras, max_size=3, unique_by=lambda camera: camera.camera).map(tuple),
-    state=st.lists(st.sampled_from(["joint", "pose", "gripper"]), unique=True).map(tuple),
+    state=st.lists(st.sampled_from(get_args(StatePart)), unique=True).map(tuple),
     prompt=st.booleans(),
     max_skew_s=st.floats(0.001, 10),
     max_age_s=st.floats(0.001, 10),
@@ -235,6 +237,7 @@ RECORDS: dict[type, st.SearchStrategy[Any]] = {
         st.none() | finite,
         st.integers(1, 2**63 - 1),
     ),
+    PrivilegedState: st.builds(PrivilegedState, maps(st.integers(0, 40).flatmap(vectors))),
     SceneState: st.builds(SceneState, texts, st.integers(0, 40).flatmap(vectors)),
     ObjectPoses: object_poses(),
     ModelSpec: model_specs,
@@ -278,4 +281,6 @@ def same(one: Any, other: Any) -> bool:
         return type(one) is type(other) and all(
             same(getattr(one, name), getattr(other, name)) for name in one.__dataclass_fields__
         )
+    if isinstance(one, dict) and isinstance(other, dict):
+        return one.keys() == other.keys() and all(same(one[name], other[name]) for name in one)
     return type(one) is type(other) and one == other

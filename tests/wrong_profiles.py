@@ -111,6 +111,10 @@ WRONG: list[tuple[str, str]] = [
         "limits.reach.collision_stop_m: is 0.02, which must not be above collision_slow_m",
     ),
     (
+        "limits: {reach: {keep_out: {post: {centre_m: [0.5, 0, 0]}}}}",
+        "limits.reach.keep_out.post: has no shape; give one of box_m, radius_m, normal",
+    ),
+    (
         "timing:\n  command_hz: 50\n  command_timeout_s: 0.05",
         "lab.yaml:4: timing.command_timeout_s: is 0.05, less than 3 periods of command_hz (50)",
     ),
@@ -169,7 +173,8 @@ WRONG: list[tuple[str, str]] = [
     ),
     (
         "robot: {driver: ros}",
-        "wants 'sim', 'ros2', 'franka' or 'arm'; did you mean 'ros2'? (given: 'ros')",
+        "wants 'sim', 'ros2', 'franka', 'ur', 'lerobot' or 'arm'; did you mean 'ros2'? "
+        "(given: 'ros')",
     ),
     ("robot: {tcp_frame: ''}", "robot.tcp_frame: must not be empty"),
     (
@@ -367,7 +372,11 @@ def model(file: str, options: str = "") -> str:
 
 CHECKED: list[tuple[str, str]] = [
     # Valid by themselves: `up` would start, and lose a node or refuse every activation.
-    ("sim: {scene: kitchen}", "lab.yaml:2: sim.scene: no scene called 'kitchen'. Known: bricks, t"),
+    ("sim: {scene: kitchen}", "lab.yaml:2: sim.scene: no scene called 'kitchen'. Known: bricks, d"),
+    (
+        "limits: {reach: {keep_out: {post: {centre_m: [0.45, 0, 0.3], radius_m: 0.1}}}}",
+        "lab.yaml:2: limits.reach.keep_out.post: panda_link7 is -0.118 m from the keep-out 'post'",
+    ),
     ("sim: {scene: brick}", "sim.scene: no scene called 'brick'; did you mean 'bricks'? Known"),
     ("sim: {vary: [table]}", "lab.yaml:2: sim.vary: the scene has no material"),
     (

@@ -26,6 +26,7 @@ from peer_rig import (
 )
 
 from vla_zenoh.errors import PeerError, SpecError, WorkerError
+from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.lab.check.examples import example_observation
 from vla_zenoh.policy import Observation, Policy, check_steps
 from vla_zenoh.policy.loader import find_model, make_policy
@@ -41,7 +42,10 @@ PATIENCE_S = 8.0
 BACK_OFF_S = 2.0
 UP_RAD = 0.03
 LIBERO = {"preset": "libero"}
-JOINTS = {"action": "joint_delta", "gripper": "none", "dt_s": "0.1"}
+JOINTS = {
+    **{"action": "joint_delta", "anchor": "goal", "relative_to": "previous"},
+    **{"joint_scale_rad": "1", "gripper": "none", "dt_s": "0.1"},
+}
 ADAPTERS = ("openpi", "groot", "openvla_rest", "origami")
 
 
@@ -107,11 +111,19 @@ def refusal(policy: Policy, prompt: str) -> PeerError:
 
 
 def height_m(policy: Policy, steps: np.ndarray[Any, Any]) -> float:
-    """How far the first step goes up: joints lead to poses, told apart from home."""
-    if policy.spec.action.kind == "delta":
+    """How far the first step goes up; with joints, from those of `hold`."""
+    action = policy.spec.action
+    if action.space == "tcp":
         return float(steps[0, 2])
-    still = answer(policy, "hold")
-    return float(steps[0, 2] - still[0, 2])
+    profile = load_profile("panda_sim")
+    kinematics = make_kinematics(profile)
+    here_rad = np.array(profile.robot.home_rad) * (action.kind == "delta")
+    still = here_rad + answer(policy, "hold")[0, : action.arm_size]
+    up, home = (
+        kinematics.forward(kinematics.ordered(action.joints, joints)).position_m[2]
+        for joints in (here_rad + steps[0, : action.arm_size], still)
+    )
+    return float(up - home)
 
 
 @pytest.mark.parametrize("name", in_full(*KINDS, quick=ADAPTERS))
@@ -120,7 +132,7 @@ def test_an_adapter_and_its_server_understand_each_other_and_recover_from_every_
 ) -> None:
     with asked(name) as (_, policy):
         up, down, still = (answer(policy, prompt) for prompt in ("up", "down", "hold"))
-        if policy.spec.action.kind == "delta":
+        if policy.spec.action.space == "tcp":
             assert height_m(policy, up) == pytest.approx(STEP_M, abs=ATOL_M)
             assert height_m(policy, down) == pytest.approx(-STEP_M, abs=ATOL_M)
             assert np.abs(still[:, :6]).max() < ATOL_M
@@ -283,7 +295,7 @@ def test_an_answer_with_another_questions_number_is_refused() -> None:
         pytest.param("groot_n15", {"map": "state.x="}, "wants state x", marks=pytest.mark.slow),
         pytest.param(
             "origami",
-            {"action": "joint_delta", "gripper": "none"},
+            JOINTS,
             "action=joint_delta is set",
             marks=pytest.mark.slow,
         ),

@@ -20,13 +20,19 @@ from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.lab.check.examples import example_observation
 from vla_zenoh.policy import ActionSpec, ActionSteps, ModelSpec, Policy, check_steps
 from vla_zenoh.policy.loader import find_model, make_policy
+from vla_zenoh.profile import load_profile
+from vla_zenoh.types import JointState
 
 MODELS = resources.names("models")
 ELSEWHERE = {"groot", "lerobot", "openpi", "openvla", "openvla_rest", "origami"}
 """They need weights, or a server: tested with those, by themselves."""
-HERE = [name for name in MODELS if name not in ELSEWHERE]
+EXPERTS = {"libero_privileged", "metaworld_expert", "ogbench_expert", "so101_expert"}
+"""They need their benchmark and its state."""
+HERE = [name for name in MODELS if name not in ELSEWHERE | EXPERTS]
 HEAVY = ("torch", "tensorflow", "jax", "zenoh", "mujoco")
 PROMPTS = {"scripted": "HARD: go up"}
+PROFILES = {"scripted_pick": "so101_sim"}
+"""Of workers that act for one arm."""
 ATOL = 1e-7
 
 
@@ -55,6 +61,11 @@ def make(name: str, recorded: Path) -> Policy:
 
 def looked_at(policy: Policy, name: str, *, active: bool = True) -> Any:
     seen = example_observation(policy.spec, prompt=PROMPTS.get(name, "hold"))
+    if name in PROFILES:
+        robot = load_profile(PROFILES[name]).robot
+        home = np.array(robot.home_rad)
+        still = np.zeros_like(home)
+        seen = replace(seen, joint=JointState(robot.arm_joints, home, still, still))
     return replace(seen, task=replace(seen.task, active=active))
 
 

@@ -148,6 +148,7 @@ READ: dict[str, Any] = {
         "action_horizon": 1,
         "observation": {"a": "b"},
         openpi.SPEC: SERVED.model_dump(mode="json"),
+        openpi_frames.TAKES_COMMITTED: False,
     },
     "openpi request": {"image": np.zeros((2, 2, 3), np.uint8), "prompt": "up"},
     "groot": {"x": ACTIONS},

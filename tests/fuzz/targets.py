@@ -213,6 +213,7 @@ def examples() -> dict[type, Any]:
         _spec(),
         t.NodeStatus("n", "active", "h", 1, 2, {"a": 1.0}, {}, {"l": (1.0, 2.0)}, {"c": 1}, {}),
         t.Event("info", "notice", "loaded", "in 1 s"),
+        t.PrivilegedState({"block": three}),
         t.SceneState("table", np.zeros(9)),
         t.ObjectPoses(("red",), np.zeros((1, 3)), down[None]),
         t.InferenceDebug(

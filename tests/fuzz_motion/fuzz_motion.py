@@ -64,7 +64,8 @@ def run(family: str, seed: int, ticks: int = TICKS) -> Run:
 def command(one: Run, ticks: int) -> str:
     """What repeats a run."""
     return (
-        f"python tests/fuzz_motion/fuzz_motion.py --case {one.family.replace(' ', '-')} "
+        "PYTHONPATH=tests python tests/fuzz_motion/fuzz_motion.py "
+        f"--case {one.family.replace(' ', '-')} "
         f"--seed {one.seed} --runs 1 --ticks {ticks}"
     )
 
@@ -144,12 +145,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=1, help="of the first run")
     parser.add_argument("--ticks", type=int, default=TICKS, help="of one run")
     known = sorted({name.replace(" ", "-") for name in CYCLE})
-    parser.add_argument("--case", choices=known, help="only this family")
+    parser.add_argument("--case", choices=known, action="append", help="only this family, or these")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="at a time")
     options = parser.parse_args(arguments)
     if options.ticks < LEAST_TICKS or options.jobs < 1:
         parser.error(f"--ticks has to be {LEAST_TICKS} at least and --jobs 1")
-    families = (options.case.replace("-", " "),) if options.case else CYCLE
+    families = tuple(name.replace("-", " ") for name in options.case or CYCLE)
     jobs: Iterator[tuple[str, int, int]] = (
         (families[n % len(families)], seed, options.ticks)
         for n, seed in enumerate(itertools.count(options.seed))

@@ -13,6 +13,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+from other_arms import so101, ur5
 
 from vla_zenoh.kinematics.kinematics import Kinematics, make_kinematics
 from vla_zenoh.kinematics.so3 import Pose, exp3, log3, quat_from_rotation
@@ -55,7 +56,13 @@ EXTREMES: dict[str, dict[str, Any]] = {
     },
 }
 """Changes of the shipped profile; where there are none the box is made in `make_case`."""
-FAMILIES = ("pose", "joint", "net", "pose", "extreme", "joint net", "pose", "reach")
+OTHER_ARMS = {"five joints": so101, "six joints": ur5}
+IN_JOINTS = ("seven joints", *OTHER_ARMS)
+"""Policies that act in joints, by those of the arm."""
+FAMILIES = (
+    *("pose", "joint", "net", "pose", "extreme", "joint net", "pose", "reach"),
+    *IN_JOINTS,
+)
 """What seeds go through, one after the other. ``reach``: poses bounded by the arm's kinematics."""
 
 
@@ -108,21 +115,31 @@ class Case:
     random: random.Random = field(repr=False, default_factory=random.Random)
 
     @property
+    def arm(self) -> Kinematics:
+        """Of the arm."""
+        return kinematics(self.family)
+
+    @property
+    def in_joints(self) -> bool:
+        """The policy acts in joints."""
+        return self.spec.action.space == "joint"
+
+    @property
     def joint(self) -> bool:
         """Joints are commanded."""
         return self.profile.robot.command == "joint"
 
 
 @cache
-def base_profile() -> Profile:
-    """The shipped simulated arm."""
-    return load_profile("panda_sim")
+def base_profile(family: str = "") -> Profile:
+    """Of the family's arm: the shipped simulated one unless the family names another."""
+    return OTHER_ARMS[family]() if family in OTHER_ARMS else load_profile("panda_sim")
 
 
 @cache
-def kinematics() -> Kinematics:
+def kinematics(family: str = "") -> Kinematics:
     """Of that arm."""
-    return make_kinematics(base_profile())
+    return make_kinematics(base_profile(family))
 
 
 def make_case(family: str, seed: int) -> Case:
@@ -130,7 +147,7 @@ def make_case(family: str, seed: int) -> Case:
     rng = random.Random(zlib.crc32(f"{family} {seed}".encode()))
     extreme = rng.choice(sorted(EXTREMES)) if family == "extreme" else ""
     changes: dict[str, Any] = dict(EXTREMES.get(extreme, {}))
-    if family.startswith("joint"):
+    if family.startswith("joint") or family in IN_JOINTS:
         changes["robot"] = {"command": "joint"}
     joint = changes.get("robot") is not None
     mode = rng.choice(["replace", "replace", "blend", "ensemble"])
@@ -148,7 +165,7 @@ def make_case(family: str, seed: int) -> Case:
             **changes.get("limits", {}),
             "workspace": _box(start.position_m, rng.choice([0.01, 0.03, 0.1])),
         }
-    profile = override(base_profile(), changes)
+    profile = override(base_profile(family), changes)
     kind, frame = rng.choice([("delta", "base"), ("delta", "tcp"), ("absolute", "base")])
     rotation = rng.choice(["rpy", "rotvec", "quaternion"])
     spec = ModelSpec(
@@ -161,7 +178,9 @@ def make_case(family: str, seed: int) -> Case:
             frame=frame,
             rotation=rotation,
             gripper="none",
-        ),
+        )
+        if family not in IN_JOINTS
+        else _joint_action(rng, kinematics(family).arm_joints),
     )
     hz = profile.timing.command_hz
     return Case(
@@ -177,6 +196,18 @@ def make_case(family: str, seed: int) -> Case:
         lag_s=rng.choice([0.0, 0.0, 0.0, 0.02, 0.05]),
         network=_network(rng) if family.endswith("net") else Network(),
         random=rng,
+    )
+
+
+def _joint_action(rng: random.Random, joints: tuple[str, ...]) -> ActionSpec:
+    return ActionSpec(
+        horizon=64,
+        dt_s=rng.choice([0.02, 0.05, 0.1, 0.2]),
+        space="joint",
+        joints=joints,
+        kind=rng.choice(["absolute", "delta", "velocity"]),
+        anchor="goal",
+        gripper="none",
     )
 
 
@@ -212,6 +243,7 @@ class Actions:
         self._case, self._rng = case, case.random
         self.style = "zero"
         self._way, self._turn = np.zeros(3), np.zeros(3)
+        self._joint_way: np.ndarray | None = None
 
     def change(self) -> None:
         """Take another style, or another heading."""
@@ -287,6 +319,27 @@ class Actions:
             else:
                 rows.append([*way[:3], *_numbers(action.rotation, turned)])
         return rows
+
+    def joint_steps(self, here_rad: np.ndarray) -> np.ndarray:
+        """One chunk of joints, (H, n); `here_rad` are those of the goal it begins at."""
+        rng, action, size = self._rng, self._case.spec.action, len(here_rad)
+        count = rng.choice([1, 1, 2, 4, 8, 16, 64])
+        if self.style == "absurd":
+            return np.full((count, size), rng.choice([1e30, -3e38, 50]))
+        most_rad = min(rng.choice([0.02, 0.2, 0.5, 1.0, 2.0]) * action.dt_s, 0.3)
+        if self.style in ("zero", "tiny"):
+            most_rad = 0.0 if self.style == "zero" else 1e-9
+        if rng.random() < 0.3 or self._joint_way is None:
+            way = np.array([rng.gauss(0.0, 1.0) for _ in range(size)])
+            if self.style in ("axis", "push", "turn"):
+                way *= np.arange(size) == rng.randrange(size)
+            self._joint_way = way / np.abs(way).max()
+        ways = np.tile(most_rad * self._joint_way, (count, 1))
+        if self.style in ("walk", "jitter"):
+            ways *= np.array([[rng.gauss(0.0, 1.0) for _ in range(size)] for _ in range(count)])
+        if action.kind == "absolute":
+            return here_rad + np.cumsum(ways, axis=0)
+        return ways / (action.dt_s if action.kind == "velocity" else 1.0)
 
     def _direction(self) -> np.ndarray:
         way = np.array([self._rng.gauss(0.0, 1.0) for _ in range(3)])

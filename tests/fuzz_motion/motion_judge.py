@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from motion_case import Case, kinematics
+from motion_case import Case
 from motion_rig import HAS_SPEED, Tick, Trace
 from numpy.typing import NDArray
 
@@ -140,7 +140,12 @@ class Judge:
         most = joint_motion_limits(self._case.profile)
         moved = np.diff(position, axis=0)
         self._differences("joint", moved, velocity, acceleration, most, np.abs, JOINT_JERK - 1.0)
-        places = [kinematics().forward(joints) for joints in position]
+        arm = self._case.arm
+        beyond = np.maximum(arm.lower_rad - position, position - arm.upper_rad).max(axis=1)
+        self._tell("joint beyond its range", beyond, 1e-9, "rad")
+        if self._case.in_joints:
+            self._joint_goals(position)
+        places = [arm.forward(joints) for joints in position]
         self._position_m = np.array([place.position_m for place in places])
         self._rotation = np.array([place.rotation for place in places])
         self._box("command outside the box", self._position_m)
@@ -154,6 +159,16 @@ class Judge:
             stands = np.array([t.percent == 0.0 for t in self._told])
             moves = np.where(stands, np.maximum(speed - JOINT_REST, 0.0), 0.0)
             self._slower(moves, stands, needed_s)
+
+    def _joint_goals(self, position: Array) -> None:
+        """A goal of joints is on the leash."""
+        sizes = np.zeros(len(self._told))
+        late_s = np.diff(self._time_s, prepend=self._time_s[:1])
+        for i, tick in enumerate(self._told):
+            if tick.goal_rad is not None and tick.state == "active":
+                ahead_rad = float(np.abs(tick.goal_rad - position[i]).max())
+                sizes[i] = ahead_rad - self._limits.lead_rad - 3.0 * late_s[i]
+        self._tell("goal leads: joints", sizes, LEAD_RAD, "rad over")
 
     def _differences(
         self,
@@ -241,6 +256,8 @@ class Judge:
         self._box("goal outside the box", whole_m)
         ahead_m = np.linalg.norm(goal_m - self._position_m[where], axis=1)
         turn = log_of(np.einsum("nij,nkj->nik", goal_rotation, self._rotation[where]))
+        if self._case.in_joints:
+            return  # its leash is on the joints
         lag = self._case.joint
         # Where a late tick takes the arm is foreseen with the acceleration it had.
         late_s = np.diff(self._time_s, prepend=self._time_s[:1])[where]

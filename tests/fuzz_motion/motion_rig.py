@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
-from motion_case import WORKER, Actions, Case, base_profile, kinematics
+from motion_case import WORKER, Actions, Case
 
 from vla_zenoh.control.commander import Commander, Inputs, Setting
 from vla_zenoh.control.preflight import PeerSnapshot
@@ -66,6 +66,7 @@ class Tick(NamedTuple):
         anchored: the arm was activated in it.
         record: the command, None: nothing was streamed.
         goal: the goal in force, None: none is.
+        goal_rad: joints that it asks for, None: it is a pose.
         percent: of the speed, in force.
         retreats: the arm is led back from what blocked it.
     """
@@ -76,6 +77,7 @@ class Tick(NamedTuple):
     anchored: bool
     record: Any
     goal: Pose | None
+    goal_rad: Any
     percent: float
     retreats: bool
 
@@ -105,9 +107,9 @@ class Rig:
         profile = case.profile
         self.case, self._rng = case, case.random
         self.trace = Trace()
-        reach = make_reachability_filter(profile, kinematics()) if case.reach else None
-        self._kinematics = kinematics() if case.reach else None
-        self._joints = np.array(base_profile().robot.home_rad)
+        reach = make_reachability_filter(profile, case.arm) if case.reach else None
+        self._kinematics = case.arm if case.reach else None
+        self._joints = np.array(profile.robot.home_rad)
         self._measured = self._held = case.start
         if self._kinematics is not None:
             away = [self._rng.uniform(-0.2, 0.2) for _ in self._joints]
@@ -115,7 +117,7 @@ class Rig:
             self._measured = self._held = self._kinematics.forward(self._joints)
         self._held_joints, self._rates = self._joints, np.zeros(len(self._joints))
         self.commander = Commander(profile, reach=reach)
-        known = kinematics()
+        known = case.arm
         self.guard = make_arm_guard(
             profile, self._measure, (known.lower_rad, known.upper_rad), 1.0 / case.guard_hz
         )
@@ -203,6 +205,7 @@ class Rig:
                 before not in OBEYING and state in OBEYING,
                 record,
                 goal.pose if goal is not None else None,
+                goal.joints_rad if goal is not None and goal.arm is not None else None,
                 float(getattr(self.commander.task, "speed_percent", 100.0)),
                 self.commander.retreating,
             )
@@ -339,7 +342,12 @@ class Rig:
         if self.commander.state.value not in OBEYING:
             return
         goal = self.commander.goal
-        chunk = self._chunk(self._actions.steps(goal.pose if goal else self._held))
+        if self.case.in_joints:
+            asked_rad = goal.joints_rad if goal is not None else None
+            here_rad = self._held_joints if asked_rad is None else asked_rad
+            chunk = self._chunk(self._actions.joint_steps(here_rad))
+        else:
+            chunk = self._chunk(self._actions.steps(goal.pose if goal else self._held))
         (self._heap if at < self._heap_until else chunks).append(chunk)
 
     def _chunk(self, steps: np.ndarray, *, sound: bool = False) -> Stamped[ActionChunk]:
@@ -382,7 +390,11 @@ class Rig:
             if state in ("stopped", "fault"):
                 settings.append(Setting("reset"))
             elif not self._offered:
-                chunks.append(self._chunk(self._actions.standing(self._held), sound=True))
+                absolute = self.case.spec.action.kind == "absolute"
+                still = self._joints[None] * absolute
+                if not self.case.in_joints:
+                    still = self._actions.standing(self._held)
+                chunks.append(self._chunk(still, sound=True))
                 self._offered = True
             else:
                 settings.append(Setting("active", True))

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import pytest
 from fuzz_motion import CYCLE, command, run, told
+from motion_case import IN_JOINTS
 
 TICKS, JOINT_TICKS = 10_000, 6_000
 """Kinematics take their time."""
-SLOW = ("joint", "joint net", "reach")
+SLOW = ("joint", "joint net", "reach", *IN_JOINTS)
 SEEDS = {family: range(101, 101 + 2 * CYCLE.count(family)) for family in dict.fromkeys(CYCLE)}
 
 

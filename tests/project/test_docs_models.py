@@ -167,7 +167,7 @@ def test_the_adapter_asks_its_server_and_finds_it_again(tmp_path: Path) -> None:
     with socketserver.TCPServer(("127.0.0.1", 0), Up) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         options = {"port": str(server.server_address[1])}
-        policy: Any = make_policy(find_model(str(written(tmp_path, "lines.py", 3))), options)
+        policy: Any = make_policy(find_model(str(written(tmp_path, "lines.py", 4))), options)
 
         def asked(prompt: str) -> Any:
             return policy.infer(example_observation(policy.spec, prompt=prompt)).steps
@@ -255,6 +255,6 @@ def test_its_checkpoints_are_told_what_they_need_to_be_told() -> None:
         meaning = {name: value for name, value in told.items() if name in ACTION_OPTIONS}
         assert set(told) - set(meaning) <= parameters(model), (model, told)
         if model == "lerobot":
-            assert read_action_semantics({"horizon": "1", **meaning})
+            assert read_action_semantics({"horizon": "1", **meaning}, joints=("one", "two"))
             assert read_parts(told["state"])
             read_map(told.get("map", ""))

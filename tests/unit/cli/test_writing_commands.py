@@ -27,6 +27,7 @@ READ = {
     "dataset stats folder",
     "bench compare a",
     "bench compare b",
+    "bench sim replay",
     "lab trial setups",
     "lab compare file",
     "profile bridge-config certificates",  # a name on another computer
@@ -65,6 +66,7 @@ WRITERS = {
     "bench motion": Writer("bench motion", "out"),
     "bench command": Writer("bench command", "out.json"),
     "bench task": Writer("bench task --model hold", "out"),
+    "bench sim": Writer("bench sim metaworld --worker scripted", "out"),
     "lab trial": Writer("lab trial --workers a --prompt go", "out"),
     "lab inspect": Writer("lab inspect", "out"),
     "secure init": Writer(
@@ -79,9 +81,10 @@ MORE = {
     "bench task": Writer("bench task --model hold --lockstep", "out"),
 }
 """The same commands in another mode."""
+CONTINUE = ("lab trial", "bench sim", "delay")
+"""Their output is filled by several calls."""
+CONTINUING = [WRITERS[name] for name in CONTINUE if name in WRITERS]
 CASES = [*WRITERS.values(), *MORE.values()]
-CONTINUES = "lab trial"
-"""Its folder is filled by several calls."""
 
 
 def commands(root: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
@@ -160,7 +163,7 @@ def test_options_mean_the_same_in_every_command(name: str, command: Any) -> None
         assert options["--json"].is_flag
     if "--output" in options:
         assert options["-o"] is options["--output"]
-        assert "--force" in options or name == CONTINUES
+        assert "--force" in options or name in CONTINUE
         assert "--json" in options or name == "view"
     assert not {"--out", "--save", "--html", "--csv"} & set(options)
 
@@ -176,14 +179,14 @@ def test_what_exists_is_not_overwritten(writer: Writer, here: Path) -> None:
         (path / "run.mcap").write_text("a night's work")
     said = refusal(writer, str(path))
     assert f"{path} exists" in said
-    assert "--force" in said or writer == WRITERS[CONTINUES]
+    assert "--force" in said or writer in CONTINUING
 
 
 @pytest.mark.parametrize("writer", CASES, ids=lambda each: each.words)
 def test_a_folder_is_no_file_and_a_file_no_folder(writer: Writer, here: Path) -> None:
     path = here / writer.name
     path.mkdir() if path.suffix else path.write_text("mine")
-    more = () if writer == WRITERS[CONTINUES] else ("--force",)
+    more = () if writer in CONTINUING else ("--force",)
     assert f"{path} is not a " in refusal(writer, str(path), *more)
 
 

@@ -66,7 +66,7 @@ WRONG: list[tuple[str, int, str]] = [
     (
         "worker nosuch",
         FAILED,
-        "error: no model called 'nosuch'. Known: brick, groot, lerobot, open",
+        "error: no model called 'nosuch'. Known: brick, groot, lerobot, libero_privileged, meta",
     ),
     ("worker scriptd", FAILED, "error: no model called 'scriptd'; did you mean 'scripted'? Known"),
     ("worker ./absent.py", FAILED, "error: there is no file or folder './absent.py'"),
@@ -120,7 +120,11 @@ WRONG: list[tuple[str, int, str]] = [
     ("view /absent.mcap", FAILED, "error: /absent.mcap cannot be read: No such file or directory"),
     ("bench compare /a /b", FAILED, "error: /a cannot be read: No such file or directory"),
     ("bench task --model nosuch", FAILED, "error: no model called 'nosuch'. Known: brick, groot,"),
-    ("check nosuch", FAILED, "error: no model called 'nosuch'. Known: brick, groot, lerobot, open"),
+    (
+        "check nosuch",
+        FAILED,
+        "error: no model called 'nosuch'. Known: brick, groot, lerobot, libero_privileged, meta",
+    ),
     (
         "check scripted --runs 0",
         USAGE,

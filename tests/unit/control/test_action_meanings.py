@@ -50,6 +50,32 @@ def assert_same(poses: list[Pose], wanted: list[FloatArray]) -> None:
     np.testing.assert_allclose([matrix(pose) for pose in poses], wanted, atol=ATOL)
 
 
+JOINTS = tuple(f"joint{number}" for number in range(1, 7))
+STATE_RAD = np.array([0.3, -0.5, 0.1, -1.8, 0.2, 1.1])
+
+
+def joint_columns(kind: str, relative_to: str, steps: FloatArray) -> FloatArray:
+    """Joints that a chunk reaches from `STATE_RAD`, as deltas on the step before."""
+    action = spec(space="joint", joints=JOINTS, kind=kind, relative_to=relative_to, dt_s=0.25)
+    plain, rows = as_deltas(action, steps)
+    assert (plain.space, plain.joints, plain.relative_to) == ("joint", JOINTS, "previous")
+    return rows if kind == "absolute" else STATE_RAD + np.cumsum(rows, axis=0)
+
+
+@given(chunks)
+def test_joints_of_a_chunk_are_those_of_their_sources(steps: FloatArray) -> None:
+    # openpi's AbsoluteActions adds the state to every row, DROID's delta the row before; a velocity
+    # lasts for the duration of its step.
+    for kind, relative_to, wanted in (
+        ("delta", "start", STATE_RAD + steps),
+        ("delta", "previous", STATE_RAD + np.cumsum(steps, axis=0)),
+        ("velocity", "previous", STATE_RAD + 0.25 * np.cumsum(steps, axis=0)),
+        ("absolute", "previous", steps),
+    ):
+        reached = joint_columns(kind, relative_to, steps)
+        np.testing.assert_allclose(reached, wanted, atol=ATOL, err_msg=f"{kind} {relative_to}")
+
+
 # -- references -----------------------------------------------------------------------------------
 @given(chunks)
 def test_umi_puts_every_pose_of_a_chunk_on_the_pose_of_the_observation(steps: FloatArray) -> None:

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 from command_rig import WORKER, model_spec
-from joint_rig import Joints, panda, so101
+from joint_rig import Joints, panda
+from other_arms import so101
 from panda_arm import ARM_JOINTS, HOME_RAD
 
 from vla_zenoh.control.commander import Setting
@@ -217,6 +218,22 @@ def test_an_arm_slows_down_and_ends_before_it_touches_itself() -> None:
     assert arm.joints_rad == pytest.approx(HOME_RAD, abs=EXACT_RAD)
 
 
+POST = {"centre_m": [0.3, 0.35, 0.3], "box_m": [0.1, 0.1, 0.8]}
+
+
+def test_joints_slow_down_and_end_before_a_link_enters_what_it_keeps_out_of() -> None:
+    arm = Joints(panda(limits={"reach": {"keep_out": {"post": POST}}}))
+    arm.activate()
+    behind_rad = HOME_RAD + [1.3, 0, 0, 0, 0, 0, 0]  # the post is on the way there
+    arm.settle(behind_rad, 6.0)
+    assert arm.rig.state == "active", arm.rig.commander.why
+    assert "keep_out" in arm.hits()
+    assert 0.1 < arm.joints_rad[0] < 0.8
+    arm.assert_within_limits()
+    arm.settle(HOME_RAD, 6.0)
+    assert arm.joints_rad == pytest.approx(HOME_RAD, abs=EXACT_RAD)
+
+
 # -- five joints ----------------------------------------------------------------------------------
 def test_an_arm_of_five_joints_follows_twenty_five_motions_of_its_joints() -> None:
     rng, arm = np.random.default_rng(2), Joints(so101())
@@ -341,3 +358,30 @@ def test_targets_in_degrees_are_rejected_with_the_joint_and_its_range() -> None:
     assert arm.rig.refused == {"joint_limit": 1}
     assert any("are these radians" in event.why for event in arm.rig.events)
     np.testing.assert_allclose(arm.joints_rad, start_rad, atol=1e-6)
+
+
+DEGREES = np.array([5.0, -9.0, 11.0, 4.0, 2.0])
+
+
+@pytest.mark.parametrize(
+    ("action", "row", "why"),
+    [
+        ({}, DEGREES, "not sane: joint_limit: a target of elbow_flex at 11 rad"),
+        ({}, 57.0 * DEGREES, "not sane: joint_units: a target of a joint of 627 rad"),
+        ({"kind": "delta"}, DEGREES, "not sane: joint_units: a step of a joint of 11 rad"),
+        ({"kind": "velocity"}, 5 * DEGREES, "not sane: joint_units: a step of a joint of 5.5 rad"),
+        (
+            {"kind": "delta", "relative_to": "start"},
+            DEGREES,
+            "not sane: joint_limit: a target of elbow_flex at 11.6 rad",
+        ),
+    ],
+)
+def test_joints_that_cannot_be_radians_are_a_reason_against_an_activation(
+    action: dict[str, Any], row: FloatArray, why: str
+) -> None:
+    arm = Joints(so101(), **action)
+    arm.send(row)
+    arm.tick(Setting("active", True))
+    assert arm.rig.state == "inactive"
+    assert why in arm.rig.commander.why

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from joint_rig import panda
+import pytest
+from joint_rig import Joints, panda
 from panda_arm import HOME_RAD
 
 from vla_zenoh.control.joint_space import JointBounds, JointPath
@@ -12,8 +13,10 @@ from vla_zenoh.control.plan_timeline import joint_goal
 from vla_zenoh.control.reachability import make_reachability_filter
 from vla_zenoh.types import FloatArray
 
+BOX = workspace_corners(panda().limits)
 OUTSIDE_M = 1e-4
 LEAD_RAD = 0.6
+PASSED_RAD = 1e-6
 
 
 def made_path() -> JointPath:
@@ -25,7 +28,7 @@ def made_path() -> JointPath:
 
 
 def outside_m(position_m: FloatArray) -> float:
-    low, high = workspace_corners(panda().limits)
+    low, high = BOX
     return float(np.linalg.norm(position_m - np.clip(position_m, low, high)))
 
 
@@ -37,7 +40,7 @@ def test_a_goal_that_the_leash_cuts_stays_inside_the_box_and_on_the_leash() -> N
         if outside_m(path.motion.pose.position_m) > 0.0:
             continue
         asked = joint_goal(path.kinematics, path.state.position + rng.uniform(-1.5, 1.5, 7), 0.0)
-        goal, hits = path.leash(asked, LEAD_RAD, 0.004)
+        goal, hits = path.leash(asked, 0.004)
         assert goal.joints_rad is not None
         assert outside_m(goal.pose.position_m) < OUTSIDE_M
         assert np.abs(goal.joints_rad - path.state.position).max() < LEAD_RAD + 1e-5
@@ -51,9 +54,77 @@ def test_commands_stay_inside_the_box_whenever_the_goal_changes() -> None:
     worst_m = 0.0
     for _ in range(400):
         asked = joint_goal(path.kinematics, HOME_RAD + rng.uniform(-1.0, 1.0, 7), 0.0)
-        path.target(path.leash(asked, LEAD_RAD, 0.0)[0])
+        path.target(path.leash(asked, 0.0)[0])
         if rng.random() < 0.2:
             path.brake()
         for _ in range(int(rng.integers(1, 60))):
             worst_m = max(worst_m, outside_m(path.tick().pose.position_m))
     assert worst_m < OUTSIDE_M
+
+
+def test_a_stop_passes_no_joint_s_targets() -> None:
+    """Joints that do not move in proportion stop one by one; none waits for another."""
+    rng = np.random.default_rng(2)
+    path = made_path()
+    worst_rad = 0.0
+    for _ in range(100):
+        path.stand(HOME_RAD)
+        low = high = HOME_RAD
+        for _ in range(int(rng.integers(1, 5))):
+            target = HOME_RAD + 0.6 - rng.choice([0.0, 0.0, 0.3, 1.2], 7) * rng.random(7)
+            low, high = np.minimum(low, target), np.maximum(high, target)
+            path.move_to(target)
+            for _ in range(int(rng.integers(5, 120))):
+                path.advance(1.0)
+        end = path.braked()
+        worst_rad = max(worst_rad, float(np.maximum(low - end, end - high).max()))
+    assert worst_rad < PASSED_RAD
+
+
+def test_joints_that_braked_before_a_bound_go_on_when_the_way_is_free() -> None:
+    """A new goal makes the way bend towards a bound; at rest the straight way may be free."""
+    rng, path = np.random.default_rng(1), made_path()
+    braked = 0
+    for _ in range(80):
+        path.stand(HOME_RAD)
+        for _ in range(2):
+            asked = joint_goal(path.kinematics, HOME_RAD + rng.uniform(-1.0, 1.0, 7), 0.0)
+            goal = path.leash(asked, 0.0)[0]
+            path.taken_hits()
+            path.target(goal)
+            for _ in range(int(rng.integers(5, 60))):
+                path.tick()
+        still = 0
+        while still < 2:
+            path.tick()
+            still = still + 1 if path.at_rest else 0
+        if not path.taken_hits():
+            continue
+        braked += 1
+        assert goal.joints_rad is not None
+        here_rad = path.state.position
+        if path._bounds.ahead_hit(here_rad, goal.joints_rad) is None:
+            assert np.abs(here_rad - goal.joints_rad).max() < PASSED_RAD
+    assert braked > 5
+
+
+@pytest.mark.parametrize("height_m", [0.02, 0.3])
+def test_a_far_target_is_approached_no_faster_than_the_limit_along_the_whole_curve(
+    height_m: float,
+) -> None:
+    """Half a turn of the base: the TCP's way is 1.5 times the distance of its ends, and more."""
+    box = {"x_m": [-0.9, 0.9], "y_m": [-0.9, 0.9], "z_m": [0.02, 1.0]}
+    arm = Joints(panda(limits={"workspace": box}))
+    start_rad = arm.home_rad.copy()
+    start_rad[[0, 1]] = -2.6, height_m
+    arm.at(start_rad)
+    arm.activate()
+    goal_rad = start_rad.copy()
+    goal_rad[0] = 2.6
+    begun = len(arm.places_m)
+    for _ in range(4):
+        arm.send(*[arm.columns(goal_rad)] * 8)
+        arm.run(0.4)
+    speed = np.diff(np.array(arm.places_m[begun:]), axis=0) * 1e9 / arm.rig.period_ns
+    most_m_s = arm.profile.limits.approach_m_s
+    assert 0.9 * most_m_s < np.linalg.norm(speed, axis=1).max() < 1.001 * most_m_s

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import itertools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from panda_arm import HOME_RAD, moved, panda, tool_down_at
+from pydantic import ValidationError
 
 from vla_zenoh.control.limits import SLOWEST, LimitHit
 from vla_zenoh.control.reachability import ReachabilityFilter
-from vla_zenoh.errors import RecordError
+from vla_zenoh.errors import ProfileError, RecordError
 from vla_zenoh.kinematics.collision import TABLE, CollisionModel
 from vla_zenoh.kinematics.kinematics import smallest_singular_value
 from vla_zenoh.kinematics.so3 import Pose, angle_between, log3
@@ -37,6 +38,7 @@ NAMES = {
     "singularity",
     "self_collision",
     "table_distance",
+    "keep_out",
 }
 FORWARD, BACK, LEFT, UP, DOWN = np.array(
     [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, -1]], float
@@ -50,7 +52,7 @@ SHADOW = ReachabilityFilter(KINEMATICS, HOME_RAD, known_good_rad=[HOME_RAD])
 MIDDLE_RAD = tool_down_at(KINEMATICS, 0.45, 0.0, 0.4)
 
 
-def limits(**reach: float | None) -> Limits:
+def limits(**reach: Any) -> Limits:
     return Limits(reach=ReachLimits.model_validate(reach))
 
 
@@ -185,6 +187,53 @@ def test_without_a_table_the_arm_may_go_below_it() -> None:
         assert hits == []
     assert pose.position_m[2] < 0
     assert shadow.margins.table_m == np.inf
+
+
+KEEP_OUTS = {
+    "box": {"centre_m": [0.7, 0, 0.4], "box_m": [0.1, 0.4, 0.8]},
+    "turned box": {"centre_m": [0.7, 0, 0.4], "box_m": [0.4, 0.1, 0.8], "yaw_rad": np.pi / 2},
+    "sphere": {"centre_m": [0.8, 0, 0.3], "radius_m": 0.15},
+    "wall": {"centre_m": [0.65, 0, 0], "normal": [-2, 0, 0]},
+}
+HAND_M = 0.0316
+"""Half the thickness of the hand, forwards of the TCP that points down."""
+
+
+@pytest.mark.parametrize("shape", KEEP_OUTS.values(), ids=list(KEEP_OUTS))
+def test_no_link_enters_what_the_arm_keeps_out_of(shape: dict[str, Any]) -> None:
+    kept_out = limits(keep_out={"post": shape})
+    shadow = ReachabilityFilter(KINEMATICS, HOME_RAD, kept_out, known_good_rad=[HOME_RAD])
+    pose, hits = KINEMATICS.forward(HOME_RAD), []
+    for _ in range(40):
+        pose, hits = shadow.bound(pose, moved(pose, STEP_M * FORWARD, STILL))
+    assert hits[0].name == "keep_out"
+    assert hits[0].where.endswith(" and post")
+    stop_m = kept_out.reach.collision_stop_m
+    assert stop_m - DISTANCE_NOISE_M <= shadow.margins.keep_out_m < stop_m + 2e-3
+    assert "post" in shadow.margins.keep_out_pair
+    assert pose.position_m[0] < 0.65 - stop_m - HAND_M + 0.01
+
+
+def test_a_keep_out_around_the_arm_at_home_is_an_error_with_its_name_and_the_link() -> None:
+    inside = limits(keep_out={"post": {"centre_m": [0.45, 0, 0.3], "radius_m": 0.1}})
+    with pytest.raises(ProfileError, match=r"panda_.* m from the keep-out 'post' with"):
+        ReachabilityFilter(KINEMATICS, HOME_RAD, inside, known_good_rad=[HOME_RAD])
+
+
+@pytest.mark.parametrize(
+    ("shape", "said"),
+    [
+        ({}, "has no shape; give one of box_m, radius_m, normal"),
+        ({"radius_m": 0.1, "normal": [0, 0, 1]}, "has radius_m and normal; give one of"),
+        ({"normal": [0, 0, 0]}, "is zero; give a direction"),
+        ({"radius_m": 0.1, "yaw_rad": 1.0}, "turns a box; this is none"),
+        ({"box_m": [0.1, 0.0, 0.1]}, "greater than 0"),
+        ({"radius_m": 450.0}, "less than or equal to 3"),
+    ],
+)
+def test_a_keep_out_that_is_no_shape_is_rejected(shape: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValidationError, match=said):
+        limits(keep_out={"post": {"centre_m": [0.5, 0, 0], **shape}})
 
 
 @pytest.mark.parametrize("axis", [ROLL, PITCH])

@@ -135,5 +135,6 @@ def test_what_does_not_fit_is_named_and_nothing_is_asked() -> None:
 
 
 def test_joints_are_refused_where_an_adapter_does_not_read_them() -> None:
+    told = {"action": "joint_position", "joint_scale_rad": "1"}
     with pytest.raises(SpecError, match="joints are not read by this adapter"):
-        Wired(lambda: STEP, action="joint_delta", gripper="none", dt_s="0.1")
+        Wired(lambda: STEP, **told, gripper="none", dt_s="0.1")

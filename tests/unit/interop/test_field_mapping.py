@@ -12,7 +12,6 @@ from model_wires import groot, openpi, openvla_rest, origami
 from vla_zenoh.errors import PeerError, SpecError
 from vla_zenoh.interop import action_semantics as meaning
 from vla_zenoh.interop import field_mapping
-from vla_zenoh.interop.action_semantics import make_forward
 from vla_zenoh.interop.adapter import FIRST_S, LONGEST_S, Backoff
 from vla_zenoh.interop.field_mapping import DEFAULTS, FieldMapping, read_columns, read_field_mapping
 from vla_zenoh.interop.presets import Presets
@@ -41,7 +40,8 @@ ALL: dict[str, tuple[Presets, str]] = {
 def layout(
     presets: Presets = openpi.PRESETS, /, preset: str = "libero", **options: str
 ) -> FieldMapping:
-    return read_field_mapping("x", presets, preset, options, max_width_m=WIDTH_M)
+    joints = load_profile("panda_sim").robot.arm_joints
+    return read_field_mapping("x", presets, preset, options, max_width_m=WIDTH_M, joints=joints)
 
 
 def seen(of: FieldMapping, rotvec: Any = (0.1, -0.2, 0.3), width_m: float = 0.06) -> Observation:
@@ -93,7 +93,7 @@ def test_every_preset_makes_a_spec_and_a_question(name: str) -> None:
 def test_one_unit_of_libero_is_5_cm_and_half_a_radian_and_more_is_clipped() -> None:
     of = layout()
     answer = {"actions": np.array([[1, -0.5, 0, 0, 0.5, 0, -1], [9, 0, 0, 0, 0, -9, 1]])}
-    steps = of.steps(answer, seen(of))
+    steps = of.steps(answer)
     expected = [[0.05, -0.025, 0, 0, 0.25, 0, -1], [0.05, 0, 0, 0, 0, -0.5, 1]]
     np.testing.assert_allclose(steps, expected, atol=ATOL)
     action = of.spec.action
@@ -108,67 +108,98 @@ def test_one_unit_of_libero_is_5_cm_and_half_a_radian_and_more_is_clipped() -> N
 def test_what_the_server_said_is_kept_for_people() -> None:
     of = layout()
     answer = np.array([[1.0, 0, 0, 0, 0, 0, -1]])
-    result = of.read(answer, seen(of))
+    result = of.read(answer)
     assert result.raw == {"first_step": answer[0].tolist()}
-    np.testing.assert_array_equal(result.steps, of.steps(answer, seen(of)))
+    np.testing.assert_array_equal(result.steps, of.steps(answer))
 
 
-def test_joint_deltas_add_up_from_the_measured_joints_and_become_poses() -> None:
+def test_joint_deltas_stay_joint_deltas_in_the_units_of_the_arm() -> None:
     of = layout(preset="droid")
-    observation, forward = seen(of), make_forward(load_profile("panda_sim"))
-    assert observation.joint is not None
     answer = np.zeros((3, 8))
     answer[:, 1], answer[:, 7] = 0.5, 1.0
-    steps = of.steps({"actions": answer}, observation, forward)
-    assert steps.shape == (3, 8)
-    turned = observation.joint.position_rad + np.outer([1, 2, 3], [0, 0.1, 0, 0, 0, 0, 0])
-    np.testing.assert_allclose(steps[:, :7], forward(observation.joint, turned), atol=ATOL)
-    assert (of.spec.action.kind, of.spec.action.rotation) == ("absolute", "quaternion")
-    assert not of.spec.action.gripper_open_is_high
+    np.testing.assert_allclose(of.steps({"actions": answer}), [[0, 0.1, 0, 0, 0, 0, 0, 1]] * 3)
+    action = of.spec.action
+    assert (action.space, action.kind, action.anchor) == ("joint", "delta", "goal")
+    assert action.joints == load_profile("panda_sim").robot.arm_joints
+    assert not action.gripper_open_is_high
 
 
-def test_joints_in_another_order_lead_to_the_same_poses() -> None:
-    of = layout(preset="droid")
-    observation, forward = seen(of), make_forward(load_profile("panda_sim"))
-    joint = observation.joint
-    assert joint is not None
-    turned = replace(
-        observation,
-        joint=JointState(joint.names[::-1], joint.position_rad[::-1], np.zeros(7), np.zeros(7)),
-    )
-    answer = np.random.default_rng(0).uniform(-1, 1, (4, 8))
-    flipped = np.concatenate([answer[:, 6::-1], answer[:, 7:]], axis=1)
-    np.testing.assert_allclose(
-        of.steps(answer, observation, forward), of.steps(flipped, turned, forward), atol=ATOL
-    )
+def test_joint_velocities_are_asked_for_their_start_only() -> None:
+    told = {"action": "joint_velocity", "gripper": "none", "dt_s": "0.1", "horizon": "8"}
+    told |= {"joint_scale_rad": "1"}
+    with pytest.raises(SpecError, match=r"is missing: --set anchor=\("):
+        layout(preset="none", map=MINE["map"], **told)
+    of = layout(preset="none", map=MINE["map"], anchor="goal", **told)
+    assert (of.spec.action.space, of.spec.action.kind) == ("joint", "velocity")
+
+
+@pytest.mark.parametrize(
+    ("ends", "number", "fraction"),
+    [("0:100", 25.0, 0.25), ("0:1.7", 1.7, 1.0), ("1.0:-0.5", 1.0, 0.0), ("1.0:-0.5", -0.5, 1.0)],
+)
+def test_a_gripper_among_the_joints_of_an_action_is_a_fraction_of_its_range(
+    ends: str, number: float, fraction: float
+) -> None:
+    """LeRobot's SO-101: joints in degrees, and the gripper in percent, or in rad."""
+    told = {**MINE, "joint_scale_rad": "0.0174533", "gripper_range": ends, "gripper_open": ""}
+    of = layout(preset="none", **told)
+    (step,) = of.steps({"actions": np.array([[90.0, *[0.0] * 6, number]])})
+    np.testing.assert_allclose(step, [np.pi / 2, *[0.0] * 6, fraction], atol=1e-5)
+    assert of.spec.action.gripper_open_is_high
+
+
+@pytest.mark.parametrize(
+    ("told", "why"),
+    [
+        ({"gripper_range": "0:100"}, "in place of gripper_open"),
+        ({"gripper_range": "5", "gripper_open": ""}, "wanted SHUT:OPEN"),
+        ({"gripper_range": "5:5", "gripper_open": ""}, "wanted SHUT:OPEN"),
+        ({"joint_scale_rad": "1,0.001"}, "2 numbers for 7 joints"),
+    ],
+)
+def test_a_range_or_scale_that_cannot_be_is_rejected(told: dict[str, str], why: str) -> None:
+    with pytest.raises(SpecError, match=why):
+        layout(preset="none", **{**MINE, **told})
+
+
+def test_each_joint_may_have_a_unit_of_its_own() -> None:
+    scales = ",".join(["0.001", *["1"] * 6])
+    of = layout(preset="none", **{**MINE, "joint_scale_rad": scales})
+    (step,) = of.steps({"actions": np.array([[250.0, *[0.5] * 6, 0.0]])})
+    np.testing.assert_allclose(step, [0.25, *[0.5] * 6, 0.0], atol=1e-6)
+
+
+def test_what_a_joint_delta_is_added_to_is_not_guessed() -> None:
+    told = {"action": "joint_delta", "gripper": "none", "dt_s": "0.1", "horizon": "8"}
+    with pytest.raises(SpecError, match=r"--set relative_to=\(.*--set anchor=\("):
+        layout(preset="none", map=MINE["map"], **told)
 
 
 def test_origami_takes_the_columns_of_one_arm() -> None:
     of = layout(origami.PRESETS, "north_right")
-    observation, forward = seen(of), make_forward(load_profile("panda_sim"))
+    observation = seen(of)
     state = of.request(observation)["observation/state"]
     assert observation.joint is not None
     assert state.shape == (65,)
     np.testing.assert_allclose(state[29:36], observation.joint.position_rad, atol=ATOL_F32)
-    poses = of.steps(state[None].astype(float), observation, forward)
-    home = forward(observation.joint, observation.joint.position_rad[None])
-    np.testing.assert_allclose(poses, home, atol=1e-5)
+    joints_rad = of.steps(state[None].astype(float))
+    np.testing.assert_allclose(joints_rad, [observation.joint.position_rad], atol=1e-5)
 
 
 def test_a_quaternion_may_begin_with_w() -> None:
     of = layout(**ABSOLUTE, rotation="quat_wxyz")
     answer = np.array([[0.4, 0, 0.3, 2**-0.5, 2**-0.5, 0, 0, 1]])
-    steps = of.steps(answer, seen(of))
+    steps = of.steps(answer)
     np.testing.assert_allclose(steps, [[0.4, 0, 0.3, 2**-0.5, 0, 0, 2**-0.5, 1]], atol=ATOL)
     with pytest.raises(PeerError, match="quaternion of norm"):
-        of.steps(np.array([[0.4, 0, 0.3, 0.1, 0, 0, 0, 1]]), seen(of))
+        of.steps(np.array([[0.4, 0, 0.3, 0.1, 0, 0, 0, 1]]))
 
 
 def test_named_parts_stand_side_by_side_whatever_their_shape() -> None:
     of = layout(groot.PRESETS, "bridge", keys="move,gripper", horizon="3")
     move = np.arange(24.0).reshape(1, 4, 6) / 100
     for grip in (np.ones((1, 4, 1)), np.ones((4, 1)), np.ones(4)):
-        steps = of.steps({"move": move, "gripper": grip, "more": "x"}, seen(of))
+        steps = of.steps({"move": move, "gripper": grip, "more": "x"})
         assert steps.shape == (3, 7)
         np.testing.assert_allclose(steps[:, :6], move[0, :3], atol=ATOL)
 
@@ -190,7 +221,7 @@ def test_named_parts_stand_side_by_side_whatever_their_shape() -> None:
 def test_an_answer_of_another_form_is_refused_by_name(answer: Any, why: str) -> None:
     of = layout()
     with pytest.raises(PeerError, match=why) as raised:
-        of.steps(answer, seen(of))
+        of.steps(answer)
     assert raised.value.reason == "peer_reply"
 
 
@@ -229,6 +260,7 @@ def test_an_option_that_cannot_be_is_refused_and_says_what_can(
 MINE = {
     "map": "image=camera:front, state=joint+gripper_open, prompt=prompt",
     "action": "joint_position",
+    "joint_scale_rad": "1",
     "gripper": "open_fraction",
     "gripper_open": "high",
     "dt_s": "0.05",
@@ -240,15 +272,15 @@ MINE = {
 def test_a_server_of_ones_own_is_told_with_every_option_and_no_name_of_a_preset() -> None:
     of = layout(preset="none", **MINE)
     assert set(of.fields) == {"image", "state", "prompt"}
-    observation, forward = seen(of), make_forward(load_profile("panda_sim"))
-    assert observation.joint is not None
-    home_rad = observation.joint.position_rad
-    steps = of.steps({"actions": np.array([[*home_rad, 0.25]])}, observation, forward)
-    pose = forward(observation.joint, home_rad[None])[0]
-    np.testing.assert_allclose(steps, [[*pose, 0.25]], atol=ATOL)
+    home_rad = load_profile("panda_sim").robot.home_rad
+    steps = of.steps({"actions": np.array([[*home_rad, 0.25]])})
+    np.testing.assert_allclose(steps, [[*home_rad, 0.25]], atol=ATOL)
+    assert (of.spec.action.space, of.spec.action.kind) == ("joint", "absolute")
 
 
-@pytest.mark.parametrize("name", ["action", "gripper", "gripper_open", "dt_s", "horizon"])
+@pytest.mark.parametrize(
+    "name", ["action", "joint_scale_rad", "gripper", "gripper_open", "dt_s", "horizon"]
+)
 def test_of_a_server_of_ones_own_no_meaning_is_guessed(name: str) -> None:
     with pytest.raises(SpecError, match=rf"the meaning of the numbers is missing: --set {name}=\("):
         layout(preset="none", **{k: v for k, v in MINE.items() if k != name})
@@ -257,17 +289,13 @@ def test_of_a_server_of_ones_own_no_meaning_is_guessed(name: str) -> None:
 
 
 def test_another_action_than_the_presets_keeps_nothing_of_what_it_says_of_numbers() -> None:
-    told = {"gripper": "none", "dt_s": "0.1"}
-    observed = seen(layout(preset="droid"))
-    assert observed.joint is not None
-    home_rad, forward = observed.joint.position_rad, make_forward(load_profile("panda_sim"))
-    wanted = forward(observed.joint, home_rad[None])
+    told = {"joint_scale_rad": "1", "gripper": "none", "dt_s": "0.1"}
+    home_rad = np.array(load_profile("panda_sim").robot.home_rad)
     for preset in ("libero", "droid"):  # LIBERO's clip, DROID's 0.2 rad to the unit
         of = layout(preset=preset, action="joint_position", **told)
-        steps = of.steps(home_rad[None].astype(float), observed, forward)
-        np.testing.assert_allclose(steps, wanted, atol=ATOL)
+        np.testing.assert_allclose(of.steps(home_rad[None]), home_rad[None], atol=ATOL)
     of = layout(action="absolute", rotation="rpy", **told)
-    steps = of.steps(np.array([[0.5, 0, 0.3, 0, 0, 2.0]]), seen(of))
+    steps = of.steps(np.array([[0.5, 0, 0.3, 0, 0, 2.0]]))
     np.testing.assert_allclose(steps, [[0.5, 0, 0.3, 0, 0, 2.0]], atol=ATOL)
     with pytest.raises(
         SpecError, match="joint_position is not that of preset droid, so the meaning"

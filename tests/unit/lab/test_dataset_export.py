@@ -17,10 +17,10 @@ from dataset_rig import write_run as make_run
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.dataset.episodes import episodes_of, fps_of, hold
 from vla_zenoh.lab.dataset.feature_statistics import Colours, of_numbers
-from vla_zenoh.lab.dataset.features import action_names
+from vla_zenoh.lab.dataset.features import action_names, usual_state
 from vla_zenoh.lab.dataset.lerobot import export
 from vla_zenoh.lab.dataset.openvla import openvla_statistics
-from vla_zenoh.lab.recording.run import load_run
+from vla_zenoh.lab.recording.run import Run, load_run
 from vla_zenoh.policy.state_vector import read_parts
 from vla_zenoh.types import JointState
 
@@ -185,11 +185,49 @@ def test_the_state_of_an_arm_has_as_many_joints_as_it_was_recorded_with(
     info = json.loads((tmp_path / "six" / "meta" / "info.json").read_text())
     state = info["features"]["observation.state"]
     assert state["shape"] == [13]
-    assert state["names"][5:7] == ["joint6", "joint1_deg"]
+    assert state["names"][5:7] == ["j5", "j0_deg"]
     rows = pq.read_table(next((tmp_path / "six" / "data").rglob("*.parquet")))
     first = rows.column("observation.state")[0].as_py()
     np.testing.assert_allclose(first[:6], np.arange(6) / 10, atol=STATE_ATOL)
     np.testing.assert_allclose(first[6:12], np.rad2deg(np.arange(6) / 10), rtol=STATE_ATOL)
+
+
+JOINTS = ("shoulder", "elbow", "wrist")
+
+
+def joint_run(folder: Path, **action: str) -> Run:
+    """A run whose worker acts in joints, with the joints it was recorded with."""
+    of = spec(space="joint", joints=JOINTS, rotation="rotvec", **action)
+    run = load_run(make_run(folder / "joints.mcap", of=of))
+    joint = JointState(JOINTS, np.array([0.1, 0.2, 0.3]), np.zeros(3), None)
+    return replace(run, joints=[heard._replace(record=joint) for heard in run.poses])
+
+
+def test_actions_of_joints_are_exported_as_joints_with_the_names_of_the_arm(tmp_path: Path) -> None:
+    episodes = episodes_of(joint_run(tmp_path, kind="absolute"))
+    assert usual_state(episodes) == "joint+gripper_m"
+    export(tmp_path / "out", episodes, [], read_parts(usual_state(episodes)))
+    info = json.loads((tmp_path / "out" / "meta" / "info.json").read_text())
+    assert info["features"]["action"]["names"] == [*JOINTS, "gripper_open_fraction"]
+    assert info["features"]["observation.state"]["names"] == [*JOINTS, "gripper_m"]
+    rows = pq.read_table(next((tmp_path / "out" / "data").rglob("*.parquet")))
+    actions = np.array([row.as_py() for row in rows.column("action")], np.float32)
+    for number in range(2):
+        wanted = np.concatenate([steps_of(number, chunk, 4)[:USED] for chunk in range(CHUNKS)])
+        np.testing.assert_array_equal(actions[20 * number : 20 * number + 20], wanted)
+
+
+def test_joint_deltas_on_the_start_of_their_chunk_become_deltas_on_the_step_before(
+    tmp_path: Path,
+) -> None:
+    first, *_ = episodes_of(joint_run(tmp_path, kind="delta", relative_to="start"))
+    assert first.spec.action.relative_to == "previous"
+    assert (first.spec.action.space, first.spec.action.joints) == ("joint", JOINTS)
+    raw = steps_of(0, 0, 4)
+    for index, wanted in enumerate((raw[0], raw[1] - raw[0])):
+        action = first.frames[index].action
+        np.testing.assert_allclose(action[:3], wanted[:3], atol=1e-7)
+        assert action[3] == raw[index, 3], "the gripper is no delta"
 
 
 def test_what_cannot_become_a_dataset_is_named(run_file: Path, tmp_path: Path) -> None:

@@ -43,6 +43,7 @@ from vla_zenoh.types import (
     ObjectPoses,
     PoseCommand,
     PoseState,
+    PrivilegedState,
     SceneState,
     Task,
 )
@@ -54,6 +55,7 @@ KEY_OF: dict[type, str] = {
     JointState: KEYS.state_joint,
     PoseState: KEYS.state_pose,
     GripperState: KEYS.state_gripper,
+    PrivilegedState: KEYS.state_privileged,
     PoseCommand: KEYS.command_pose,
     JointCommand: KEYS.command_joint,
     GripperCommand: KEYS.command_gripper,

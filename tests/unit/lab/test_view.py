@@ -242,6 +242,22 @@ def test_a_shape_that_rerun_cannot_draw_is_named() -> None:
         archetype_of(shape)
 
 
+def test_what_the_arm_keeps_out_of_is_drawn_where_it_is(tmp_path: Path) -> None:
+    shapes = {
+        "post": {"centre_m": [0.4, 0.5, 0.4], "box_m": [0.1, 0.2, 0.8], "yaw_rad": math.pi / 2},
+        "lamp": {"centre_m": [0.3, 0.0, 1.1], "radius_m": 0.15},
+        "wall": {"centre_m": [-0.5, 0.0, 0.0], "normal": [1, 0, 0]},
+    }
+    profile = override(BARE, {"limits": {"reach": {"keep_out": shapes}}})
+    show = RerunLogger(profile, stream := stream_to(tmp_path / "a.rrd"))
+    show.close()
+    stream.disconnect()
+    shown = Shown(tmp_path / "a.rrd")
+    assert "Boxes3D:half_sizes" in shown.static("world/keep_out/post")
+    assert "Ellipsoids3D:half_sizes" in shown.static("world/keep_out/lamp")
+    assert "Boxes3D:half_sizes" in shown.static("world/keep_out/wall")
+
+
 def test_without_a_description_all_else_is_shown(tmp_path: Path) -> None:
     show, shown = heard(tmp_path, *run())
     assert show.rejected == {}

@@ -274,6 +274,9 @@ def test_steps_that_break_the_contract_are_refused(steps: Any, said: str) -> Non
 
 
 # -- example ----------------------------------------------------------------------------------
+STATE_PARTS = ("joint", "pose", "gripper", "privileged")
+
+
 def holds(spec: ModelSpec, observation: Observation) -> bool:
     wanted = spec.observation
     return (
@@ -283,8 +286,7 @@ def holds(spec: ModelSpec, observation: Observation) -> bool:
             and observation.images[c.camera].dtype == np.uint8
             for c in wanted.cameras
         )
-        and {p for p in ("joint", "pose", "gripper") if getattr(observation, p) is not None}
-        == set(wanted.state)
+        and {p for p in STATE_PARTS if getattr(observation, p) is not None} == set(wanted.state)
     )
 
 

@@ -8,7 +8,8 @@ import pytest
 
 from vla_zenoh import resources
 from vla_zenoh.simulation.cartesian_impedance import ArmDynamics, CartesianImpedance, ImpedanceGains
-from vla_zenoh.simulation.joint_impedance import JointGains, JointImpedance
+from vla_zenoh.simulation.joint_impedance import JointImpedance
+from vla_zenoh.simulation.robot_model import JointGains
 from vla_zenoh.types import FloatArray
 from vla_zenoh.types.commands import JointReference, PoseReference
 

@@ -1,0 +1,110 @@
+"""Arms of 1 to 16 joints that turn or slide: what a policy asks of them is what they do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from joint_rig import Joints
+from made_arm import SLIDE_M, made_arm
+
+from vla_zenoh.control.commander import Setting
+from vla_zenoh.errors import ProfileError
+
+EXACT = 1e-6
+MIXED = "sztytzsx"
+"""A lift, two joints that turn, and a slide at the end."""
+
+
+@pytest.mark.parametrize("chain", ["sx", "tz", MIXED, "sx" + "tytz" * 7 + "ty"])
+def test_joints_of_any_number_and_kind_are_reached_exactly(tmp_path: Path, chain: str) -> None:
+    arm = Joints(made_arm(tmp_path, chain, 0.15 if len(chain) < 20 else 0.05))
+    arm.activate()
+    away = np.where(arm.kinematics.slides, 0.08, 0.15) * (-1) ** np.arange(arm.kinematics.size)
+    goal = arm.joints_rad + away
+    arm.follow(arm.home_rad + np.linspace(0, 1, 21)[1:, None] * away)
+    arm.settle(goal)
+    assert arm.rig.state == "active", arm.rig.commander.why
+    assert np.abs(arm.joints_rad - goal).max() < EXACT, arm.hits()
+    arm.assert_within_limits()
+    arm.assert_tcp_within()
+
+
+def test_deltas_of_a_joint_that_slides_are_metres(tmp_path: Path) -> None:
+    arm = Joints(made_arm(tmp_path, MIXED), kind="delta")
+    arm.activate()
+    arm.send(*[[0.01, 0.0, 0.0, -0.01]] * 5)
+    arm.run(2.0)
+    assert arm.joints_rad - arm.home_rad == pytest.approx([0.05, 0, 0, -0.05], abs=EXACT)
+
+
+def test_a_joint_that_slides_keeps_its_own_margin_in_metres(tmp_path: Path) -> None:
+    arm = Joints(made_arm(tmp_path, MIXED))
+    arm.activate()
+    end = arm.home_rad.copy()
+    end[0] = SLIDE_M + 0.05
+    arm.settle(end, 6.0)
+    margin_m = arm.profile.limits.reach.joint_margin_m
+    assert arm.joints_rad[0] == pytest.approx(SLIDE_M - margin_m, abs=EXACT)
+    assert "joint_limit" in arm.hits()
+
+
+def test_a_far_target_of_a_joint_that_slides_is_approached_in_metres_per_second(
+    tmp_path: Path,
+) -> None:
+    arm = Joints(made_arm(tmp_path, MIXED))
+    start = arm.home_rad.copy()
+    start[0] = 0.05
+    arm.at(start)
+    arm.activate()
+    far = start + [0.4, 0, 0, 0]
+    arm.settle(far, 2.4)
+    fastest = max(abs(command.velocity_rad_s[0]) for command in arm.joints)
+    most = arm.profile.limits.approach_m_s
+    arm.settle(far, 4.0)
+    assert 0.9 * most < fastest < 1.01 * most
+    assert arm.joints_rad == pytest.approx(far, abs=EXACT)
+
+
+def test_its_goal_is_on_a_leash_of_metres(tmp_path: Path) -> None:
+    arm = Joints(made_arm(tmp_path, MIXED), kind="delta", dt_s=0.02)
+    arm.activate()
+    ahead = []
+    for _ in range(4):
+        arm.send(*[[0.02, 0.0, 0.0, 0.0]] * 8)
+        for _ in range(40):
+            arm.tick()
+            goal = arm.rig.commander.goal
+            if goal is not None and goal.joints_rad is not None:
+                ahead.append(abs(goal.joints_rad[0] - arm.joints_rad[0]))
+    assert max(ahead) < arm.profile.limits.lead_m + 1e-3
+    assert "lead_m" in arm.hits()
+
+
+def test_millimetres_are_rejected_with_the_joint_and_its_unit(tmp_path: Path) -> None:
+    arm = Joints(made_arm(tmp_path, MIXED))
+    arm.send([5.0, 0.1, 0.1, 0.25])
+    arm.tick(Setting("active", True))
+    assert arm.rig.state == "inactive"
+    assert "a target of joint1 at 5 m, whose range is 0.01 to 0.49" in arm.rig.commander.why
+
+
+def test_a_measured_joint_that_slides_away_from_its_command_ends_the_activation(
+    tmp_path: Path,
+) -> None:
+    """0.12 m is little for a joint that turns, in radians."""
+    arm = Joints(made_arm(tmp_path, MIXED))
+    arm.activate()
+    arm.run(0.2)
+    arm.rig.blocked = True
+    pushed = arm.joints_rad + [0.0, 0.0, 0.0, 0.12]
+    arm.at(pushed)
+    for _ in range(100):
+        arm.tick()
+    assert arm.rig.state == "inactive"
+
+
+def test_an_arm_has_sixteen_joints_at_most(tmp_path: Path) -> None:
+    with pytest.raises(ProfileError, match="arm_joints"):
+        made_arm(tmp_path, "ty" * 17)
