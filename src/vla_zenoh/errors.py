@@ -51,7 +51,15 @@ class CodecError(VlaZenohError, ValueError):
 
 
 class ProfileError(VlaZenohError, ValueError):
-    """A profile file is wrong."""
+    """A profile file is wrong.
+
+    Attributes:
+        place: keys from the top of the profile down to what is wrong, where the message has none.
+    """
+
+    def __init__(self, message: str, place: tuple[str, ...] = ()) -> None:
+        super().__init__(message)
+        self.place = place
 
 
 class SpecError(VlaZenohError, ValueError):

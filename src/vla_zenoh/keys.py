@@ -119,6 +119,9 @@ class Keys:
         "state/pose", "`PoseState`, with the stamp and seq of the `JointState` it belongs to."
     )
     state_gripper = _Key("state/gripper", "`GripperState`, with the same stamp and seq.")
+    state_privileged = _Key(
+        "state/privileged", "`PrivilegedState` of a simulated benchmark, for reference policies."
+    )
 
     # -- settings: plain text, any client may put ---------------------------------------------
     prompt = _Key("prompt", "Plain UTF-8 text.")

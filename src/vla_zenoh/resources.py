@@ -12,8 +12,14 @@ from pathlib import Path
 from vla_zenoh.errors import MissingExtraError, ProfileError, ResourceError, nearest
 
 PROFILE_SUFFIXES = (".yaml", ".yml")
-KINDS = {"models": (".py", ""), "profiles": PROFILE_SUFFIXES, "sim": ("",)}
-ONE = {"models": "model", "profiles": "profile", "sim": "scene"}
+BENCHMARKS = "sim/benchmarks"
+KINDS = {
+    "models": (".py", ""),
+    "profiles": PROFILE_SUFFIXES,
+    "sim": ("",),
+    BENCHMARKS: (".py",),
+}
+ONE = {"models": "model", "profiles": "profile", "sim": "scene", BENCHMARKS: "benchmark"}
 SEARCH_PATH_VARIABLE = "VLA_ZENOH_PATH"
 ROBOT_DATA_PREFIX = "example-robot-data:"
 
@@ -42,7 +48,7 @@ def names(kind: str) -> list[str]:
     found: set[str] = set()
     for folder in folders(kind):
         for entry in folder.iterdir():
-            if entry.name.startswith((".", "_")):
+            if entry.name.startswith((".", "_")) or f"{kind}/{entry.name}" in KINDS:
                 continue
             if entry.is_dir() and "" in KINDS[kind]:
                 found.add(entry.name)
@@ -173,8 +179,14 @@ def _robot_data() -> Path | None:
 
 
 def meshes_of(urdf: Path) -> Path:
-    """The collision meshes beside a URDF of the usual layout (``../meshes/collision``)."""
-    folder = urdf.parent.parent / "meshes" / "collision"
-    if not folder.is_dir():
-        raise ResourceError(f"no collision meshes for {urdf.name}: {folder} is not a folder")
-    return folder
+    """The collision meshes beside a URDF: ``../meshes/collision``, or ``../meshes/<its name>``.
+
+    Raises:
+        ResourceError: neither is a folder.
+    """
+    folders = [urdf.parent.parent / "meshes" / name for name in ("collision", urdf.stem)]
+    for folder in folders:
+        if folder.is_dir():
+            return folder
+    wanted = " nor ".join(str(folder) for folder in folders)
+    raise ResourceError(f"no collision meshes for {urdf.name}: neither {wanted} is a folder")

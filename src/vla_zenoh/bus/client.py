@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 Value = TypeVar("Value")
 POLL_S, HOLD_PATIENCE_S = 0.02, 1.0
+RESET_AGAIN_S = 0.3
 MAX_EVENTS, MAX_REFUSALS = 4096, 256
 MAX_EVENT_BYTES = 64 * 1024
 MAX_WHAT, MAX_WHY = 128, 1000
@@ -67,6 +68,7 @@ class Client:
         self._refusals: deque[tuple[float, Event]] = deque(maxlen=MAX_REFUSALS)
         self._subscriptions: list[Any] = []
         self._token: Any = None
+        self._reset_s = 0.0
 
     def subscribe(self) -> Client:
         """Subscribe to status, events, liveliness and the task; returns the client."""
@@ -168,7 +170,27 @@ class Client:
 
     def reset(self) -> None:
         """Clear a latched emergency stop or fault; the arm stays inactive."""
+        self._reset_s = time.monotonic()
         self.publish(self.keys.reset, "reset")
+
+    def cleared(self) -> bool:
+        """Whether no stop and no fault is latched any more; to be polled after `reset`.
+
+        A robot that recovers on a reset still reports its fault when the command node gets that
+        reset and rejects it: it is put again as soon as no node reports a fault.
+        """
+        status = self.status("command")
+        if status is None or status.state not in ("", "stopped", "fault"):
+            return status is not None
+        late = time.monotonic() - self._reset_s > RESET_AGAIN_S
+        if late and status.state == "fault" and not self._faulty():
+            self.reset()
+        return False
+
+    def _faulty(self) -> bool:
+        """A robot reports a fault."""
+        found = self.snapshot().items()
+        return any(s.state == "fault" for name, (s, _, _) in found if name != "command")
 
     # -- settings -----------------------------------------------------------------------------
     def publish(self, key: str, text: str) -> None:

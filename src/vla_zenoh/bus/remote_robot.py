@@ -101,7 +101,11 @@ class RemoteRobot(Client):
             SessionError: the command node did not confirm it within `timeout_s`.
         """
         self.publish(self.keys.stop, "stop")
-        self._confirm("stop", lambda state: state == "stopped", timeout_s)
+        self._confirm("stop", self._stopped, timeout_s)
+
+    def _stopped(self) -> bool:
+        status = self.status("command")
+        return status is not None and status.state == "stopped"
 
     def reset(self, timeout_s: float = TIMEOUT_S) -> None:
         """Clear an emergency stop or a fault. The arm stays inactive.
@@ -109,15 +113,11 @@ class RemoteRobot(Client):
         Raises:
             SessionError: it was not cleared within `timeout_s`; says why.
         """
-        self.publish(self.keys.reset, "reset")
-        self._confirm("reset", lambda state: state not in ("", "stopped", "fault"), timeout_s)
+        super().reset()
+        self._confirm("reset", self.cleared, timeout_s)
 
-    def _confirm(self, what: str, done: Callable[[str], bool], timeout_s: float) -> None:
-        def state() -> str:
-            status = self.status("command")
-            return status.state if status is not None else ""
-
-        if not self.wait_for(lambda: done(state()), timeout_s):
+    def _confirm(self, what: str, done: Callable[[], bool], timeout_s: float) -> None:
+        if not self.wait_for(done, timeout_s):
             why = f": {self.latch_reason()}" if self.latch_reason() else ""
             raise SessionError(f"{what}: the command node did not confirm it{why}")
 

@@ -249,7 +249,7 @@ def reset(
     """Clear an emergency stop or a fault. The arm stays inactive."""
     with target.operator("reset") as client:
         client.reset()
-        if not _reaches(client, lambda: _state(client) not in ("", "stopped", "fault")):
+        if not _reaches(client, client.cleared):
             status = client.status("command")
             if status is None or "command" not in client.alive:
                 _fail(target, client, "reset", "answer")

@@ -85,6 +85,7 @@ COMMANDS: Mapping[str, Mapping[str, str | Group]] = {
                 "motion": "lab.cli.bench_motion:motion",
                 "command": "lab.cli.bench_command:command",
                 "task": "lab.cli.bench_task:task",
+                "sim": "lab.cli.bench_sim:sim",
                 "compare": "lab.cli.bench_compare:compare",
             },
         ),

@@ -93,8 +93,16 @@ def ros2(node: NodeOptions) -> None:
 
 @options
 def arm(node: NodeOptions) -> None:
-    """Drive an arm with a Python class: that of `arm.file` in the profile, or a Franka's."""
-    from vla_zenoh.robots.python_driver import PythonDriver
+    """Drive an arm with a Python class: that of `arm.file` in the profile, or a built-in one.
+
+    A file with a PEP 723 header runs in an environment of its own; a robot of LeRobot does.
+    """
+    from vla_zenoh.policy.loader import find_model
+    from vla_zenoh.robots.python_driver import PythonDriver, file_of
+    from vla_zenoh.runtime.environments import run_in_own_environment
+
+    if (path := file_of(node.load())) is not None:
+        run_in_own_environment(find_model(str(path)), None, extra="control")
 
     _run_robot(node, "arm", PythonDriver)
 

@@ -9,9 +9,9 @@ ways, nothing is ever unpickled, and sizes are checked before memory is taken.
 from __future__ import annotations
 
 import itertools
-import math
 import re
 from collections.abc import Callable
+from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any
 
 import msgpack
@@ -48,6 +48,14 @@ _SCALARS: dict[str, tuple[type, ...]] = {
 }
 
 
+@cache
+def _numpy() -> Any:
+    """numpy, loaded with the first array: a command that only puts text needs none."""
+    import numpy
+
+    return numpy
+
+
 def _malformed(why: str) -> CodecError:
     return CodecError("malformed", why)
 
@@ -76,12 +84,15 @@ def unpack(payload: bytes) -> Any:
         raise CodecError(
             "oversize", f"payload of {len(payload)} bytes, at most {MAX_PAYLOAD_BYTES} are read"
         )
-    count = count_containers()
+    of_map, of_list = _from_map, None
+    if len(payload) > MAX_CONTAINERS:  # fewer bytes cannot hold more; a hook costs time
+        count = of_list = count_containers()
+        of_map = lambda found: _from_map(count(found))  # noqa: E731
     try:
         value = msgpack.unpackb(
             payload,
-            object_hook=lambda found: _from_map(count(found)),
-            list_hook=count,
+            object_hook=of_map,
+            list_hook=of_list,
             ext_hook=_refuse_extension,
             raw=False,
             strict_map_key=True,
@@ -116,12 +127,16 @@ def count_containers(error: Callable[[str], Exception] = _malformed) -> Callable
     return hook
 
 
+_LEAVES = frozenset({bool, bytes, float, int, str, type(None)})
+
+
 def _check_plain(value: Any, depth: int) -> None:
     if isinstance(value, (dict, list)):
         if depth == 0:
             raise CodecError("malformed", f"nested deeper than {MAX_DEPTH}")
         for item in value.values() if isinstance(value, dict) else value:
-            _check_plain(item, depth - 1)
+            if type(item) not in _LEAVES:
+                _check_plain(item, depth - 1)
     elif isinstance(value, msgpack.Timestamp):
         raise CodecError("malformed", "msgpack timestamps are not carried; use nanoseconds")
 
@@ -131,8 +146,7 @@ def _refuse_extension(code: int, data: bytes) -> Any:
 
 
 def _to_map(value: Any) -> dict[bytes, Any]:
-    import numpy as np
-
+    np = _numpy()
     if isinstance(value, np.ndarray):
         _check_kind(value.dtype)
         return {
@@ -156,15 +170,19 @@ def _from_map(value: dict[Any, Any]) -> Any:
 
 
 def _array(value: dict[Any, Any]) -> np.ndarray[Any, Any]:
-    import numpy as np
-
+    np = _numpy()
     dtype = _dtype(value)
     data, shape = value.get(b"data"), value.get(b"shape")
     if not isinstance(data, bytes) or not isinstance(shape, list):
         raise CodecError("malformed", "an array needs bytes 'data' and a list 'shape'")
-    if len(shape) > MAX_DIMENSIONS or not all(type(n) is int and n >= 0 for n in shape):
+    if len(shape) > MAX_DIMENSIONS:
         raise CodecError("malformed", f"an array with shape {shown(shape)}")
-    if math.prod(shape) * dtype.itemsize != len(data):
+    entries = 1
+    for count in shape:
+        if type(count) is not int or count < 0:
+            raise CodecError("malformed", f"an array with shape {shown(shape)}")
+        entries *= count
+    if entries * dtype.itemsize != len(data):
         raise CodecError(
             "malformed", f"an array of {dtype} {shown(tuple(shape))} cannot have {len(data)} bytes"
         )
@@ -172,12 +190,12 @@ def _array(value: dict[Any, Any]) -> np.ndarray[Any, Any]:
         points = np.frombuffer(data, dtype=np.dtype(np.uint32).newbyteorder(dtype.byteorder))
         if int(points.max()) > _LAST_CODE_POINT:
             raise CodecError("malformed", "an array of text with characters that do not exist")
-    return np.frombuffer(data, dtype=dtype).reshape(shape)
+    array = np.frombuffer(data, dtype=dtype)
+    return array if len(shape) == 1 else array.reshape(shape)
 
 
 def _scalar(value: dict[Any, Any]) -> np.generic:
-    import numpy as np
-
+    np = _numpy()
     dtype, data = _dtype(value), value.get(b"data")
     if type(data) not in _SCALARS[dtype.kind]:
         raise CodecError("malformed", f"a numpy scalar {dtype} of a {type(data).__name__}")
@@ -189,12 +207,17 @@ def _scalar(value: dict[Any, Any]) -> np.generic:
 
 
 def _dtype(value: dict[Any, Any]) -> np.dtype[Any]:
-    import numpy as np
-
     name = value.get(b"dtype")
-    if not isinstance(name, str) or not _DTYPE.fullmatch(name):
+    if not isinstance(name, str):
         raise CodecError("malformed", f"an array with dtype {shown(name)} is not carried")
-    return np.dtype(name)
+    return _dtype_of(name)
+
+
+@lru_cache(maxsize=64)
+def _dtype_of(name: str) -> np.dtype[Any]:
+    if not _DTYPE.fullmatch(name):
+        raise CodecError("malformed", f"an array with dtype {shown(name)} is not carried")
+    return _numpy().dtype(name)
 
 
 def _check_kind(dtype: np.dtype[Any]) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, TypeVar
+from functools import cache
+from typing import Any, NamedTuple, TypeVar
 
 from vla_zenoh import keys
 from vla_zenoh.codec import message
@@ -66,37 +67,52 @@ def _check_length(kind: type, payload: bytes) -> None:
         )
 
 
+class _Layout(NamedTuple):
+    """Names of a record's fields."""
+
+    names: tuple[str, ...]
+    known: frozenset[str]
+    required: tuple[str, ...]
+
+
+@cache
+def _layout(kind: type) -> _Layout:
+    fields = dataclasses.fields(kind)
+    names = tuple(field.name for field in fields)
+    missing = dataclasses.MISSING
+    required = tuple(
+        field.name
+        for field in fields
+        if field.default is missing and field.default_factory is missing
+    )
+    return _Layout(names, frozenset(names), required)
+
+
 def _fields(record: Any) -> dict[str, Any]:
     out: dict[str, Any] = {}
-    for field in dataclasses.fields(record):
-        value = getattr(record, field.name)
-        if dataclasses.is_dataclass(value):
-            value = _fields(value)
-        elif isinstance(value, Mapping):
+    for name in _layout(type(record)).names:
+        value = getattr(record, name)
+        if isinstance(value, Mapping):
             value = dict(value)
-        out[field.name] = value
+        elif hasattr(value, "__dataclass_fields__"):
+            value = _fields(value)
+        out[name] = value
     return out
 
 
 def _record(kind: type[Record], data: Mapping[Any, Any]) -> Record:
-    fields = {field.name: field for field in dataclasses.fields(kind)}  # pyright: ignore
-    unknown = sorted(shown(name) for name in data if name not in fields)
-    if unknown:
-        raise CodecError("malformed", f"{kind.__name__} has no field {', '.join(unknown[:8])}")
-    missing = [
-        name
-        for name, field in fields.items()
-        if name not in data
-        and field.default is dataclasses.MISSING
-        and field.default_factory is dataclasses.MISSING
-    ]
-    if missing:
-        raise CodecError("malformed", f"{kind.__name__} lacks {', '.join(missing)}")
-    values = dict(data)
-    if "cause" in values:
-        values["cause"] = _cause(values["cause"])
+    layout = _layout(kind)
+    if data.keys() != layout.known:
+        unknown = sorted(shown(name) for name in data if name not in layout.known)
+        if unknown:
+            raise CodecError("malformed", f"{kind.__name__} has no field {', '.join(unknown[:8])}")
+        missing = [name for name in layout.required if name not in data]
+        if missing:
+            raise CodecError("malformed", f"{kind.__name__} lacks {', '.join(missing)}")
+    if data.get("cause") is not None:
+        data = {**data, "cause": _cause(data["cause"])}
     try:
-        return kind(**values)
+        return kind(**data)
     except RecordError as error:
         raise CodecError("invalid", f"{kind.__name__}: {error}") from error
     except (TypeError, ValueError, AttributeError, OverflowError) as error:
@@ -104,8 +120,6 @@ def _record(kind: type[Record], data: Mapping[Any, Any]) -> Record:
 
 
 def _cause(value: Any) -> Any:
-    if value is None:
-        return None
     if not isinstance(value, dict):
         raise CodecError("malformed", "cause is a map or nothing")
     from vla_zenoh.types import Cause  # brings numpy

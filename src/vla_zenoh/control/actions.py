@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 
 import numpy as np
@@ -21,6 +22,8 @@ from vla_zenoh.policy import ROTATION_SIZE, ActionSpec, Frame
 from vla_zenoh.types import FloatArray, unit_quaternion
 
 Steps = NDArray[np.float32] | NDArray[np.float64]
+FURTHEST_RAD = 4 * math.pi
+"""No joint has a target further from zero; degrees are."""
 GRIPPER_SLACK = 0.25
 """A fraction outside [0, 1] by up to this is rounding of a model, and clipped."""
 GRIPPER_SLACK_M = 0.05
@@ -127,11 +130,16 @@ def as_deltas(spec: ActionSpec, steps: Steps) -> tuple[ActionSpec, FloatArray]:
     """
     steps = np.asarray(steps, np.float64)
     if spec.kind == "velocity":
-        size = 3 + ROTATION_SIZE[spec.rotation]
+        size = spec.arm_size
         scaled = np.concatenate([steps[:, :size] * spec.dt_s, steps[:, size:]], axis=1)
         return spec.model_copy(update={"kind": "delta"}), scaled
     if spec.relative_to == "previous":
         return spec, steps
+    if spec.space == "joint":
+        size = spec.arm_size
+        rows = np.diff(steps[:, :size], axis=0, prepend=np.zeros((1, size)))
+        changed = {"relative_to": "previous"}
+        return spec.model_copy(update=changed), np.concatenate([rows, steps[:, size:]], axis=1)
     origin = Pose(np.zeros(3), np.eye(3))
     poses = [origin, *chunk_poses(spec, steps, origin)]
     rows = [
@@ -140,7 +148,7 @@ def as_deltas(spec: ActionSpec, steps: Steps) -> tuple[ActionSpec, FloatArray]:
         for into, turn in [_relative(spec.frame, before, after)]
     ]
     changed = {"relative_to": "previous", "rotation": "rotvec", "position_scale_m": 1.0}
-    size = 3 + ROTATION_SIZE[spec.rotation]
+    size = spec.arm_size
     return spec.model_copy(update=changed), np.concatenate([rows, steps[:, size:]], axis=1)
 
 

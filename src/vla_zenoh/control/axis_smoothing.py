@@ -288,7 +288,7 @@ class AxisSmoother:
         directions beside it if the motion there is small, or the axes.
         """
         _, velocity, acceleration = self._state
-        whole = _line(way, velocity, acceleration, self._pace)
+        whole = line_of(way, velocity, acceleration, self._pace)
         if whole is not None:
             return whole[:, None], [1.0]
         columns: list[FloatArray] = []
@@ -306,7 +306,7 @@ class AxisSmoother:
         """The same for m axes: (m, k), with `way` (m,) and `limits` (3, m)."""
         size = len(way)
         motion = np.array([self._state.velocity[axes], self._state.acceleration[axes]])
-        line = _line(way, motion[0], motion[1], self._pace)
+        line = line_of(way, motion[0], motion[1], self._pace)
         if line is not None:
             return (line[:, None], [1.0]) if line.any() else (np.zeros((size, 0)), [])
         length = norm3(way) if size == 3 else float(np.linalg.norm(way))
@@ -508,7 +508,7 @@ def _across(along: FloatArray) -> FloatArray:
     return np.stack([across, cross3(along, across)])
 
 
-def _line(
+def line_of(
     way: FloatArray, velocity: FloatArray, acceleration: FloatArray, pace: float
 ) -> FloatArray | None:
     """The direction of a motion on a straight line through its target, None if it is on none.

@@ -1,4 +1,4 @@
-"""Barriers and distance constraints of an arm: singularity, self-collision, table, workspace."""
+"""Barriers and distance constraints of an arm: singularity, collisions, keep-outs, workspace."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vla_zenoh.control.limits import LimitHit, Slowdown, slowdown, workspace_corners
-from vla_zenoh.kinematics.collision import TABLE, CollisionModel
+from vla_zenoh.kinematics.collision import CollisionModel
 from vla_zenoh.kinematics.kinematics import Kinematics, smallest_singular_value
 from vla_zenoh.profile import Limits, ReachLimits
 from vla_zenoh.types import FloatArray
@@ -32,6 +32,8 @@ class Margins(NamedTuple):
         self_pair: the two links.
         table_m: smallest distance to the table, inf without one.
         table_link: the link.
+        keep_out_m: smallest distance to a keep-out, inf without one.
+        keep_out_pair: the link and the keep-out.
     """
 
     joint_rad: float
@@ -41,13 +43,15 @@ class Margins(NamedTuple):
     self_pair: str
     table_m: float
     table_link: str
+    keep_out_m: float
+    keep_out_pair: str
 
 
 class Barriers:
     """Values that must not become negative: singular value and distances, each minus its stop.
 
     Barrier 0 is the singular value, the others are pairs that may touch: the arm and itself, the
-    arm and the table; hand and fingers to the table have a stop of their own.
+    table and the keep-outs; hand and fingers to the table have a stop of their own.
 
     Args:
         kinematics: of the arm.
@@ -61,6 +65,7 @@ class Barriers:
 
     Raises:
         ResourceError: the URDF's collision shapes cannot be loaded.
+        ProfileError: a known configuration touches a keep-out.
     """
 
     def __init__(
@@ -76,12 +81,13 @@ class Barriers:
             touching_m=limits.collision_stop_m,
             table_z_m=limits.table_z_m,
             known_good_rad=known_good_rad,
+            keep_out=limits.keep_out,
         )
         pairs = self.collisions.pairs
-        hand = np.array([pair.second == TABLE and pair.is_hand for pair in pairs], dtype=bool)
-        self.names = ["singularity"] + [
-            "table_distance" if pair.second == TABLE else "self_collision" for pair in pairs
-        ]
+        hand = np.array(
+            [pair.limit == "table_distance" and pair.is_hand for pair in pairs], dtype=bool
+        )
+        self.names = ["singularity", *(pair.limit for pair in pairs)]
         stops_m = np.where(hand, limits.table_stop_m, limits.collision_stop_m)
         slows_m = np.where(hand, limits.table_slow_m, limits.collision_slow_m)
         self.stop = np.array([limits.singularity_stop, *stops_m])
@@ -108,7 +114,7 @@ class Barriers:
         if index == 0:
             return ""
         pair = self.collisions.pairs[index - 1]
-        return pair.first if pair.second == TABLE else str(pair)
+        return pair.first if pair.limit == "table_distance" else str(pair)
 
     def slowdown(self, before: FloatArray, after: FloatArray) -> Slowdown | None:
         """The slowdown of a step from barriers `before` to `after`, None for full speed."""
@@ -120,7 +126,9 @@ class Barriers:
         room = np.minimum(joints_rad - kinematics.lower_rad, kinematics.upper_rad - joints_rad)
         tightest = int(np.argmin(room))
         values = barriers + self.stop
-        nearest = {"self_collision": (np.inf, ""), "table_distance": (np.inf, "")}
+        nearest: dict[str, tuple[float, str]] = dict.fromkeys(
+            ("self_collision", "table_distance", "keep_out"), (np.inf, "")
+        )
         for index, value in enumerate(values[1:], start=1):
             name = self.names[index]
             nearest[name] = min(nearest[name], (float(value), self.where(index)))
@@ -130,6 +138,7 @@ class Barriers:
             float(values[0]),
             *nearest["self_collision"],
             *nearest["table_distance"],
+            *nearest["keep_out"],
         )
 
 
@@ -137,9 +146,9 @@ class DistanceConstraints:
     """Linear constraints on joint velocities: the faces of the TCP's box, and distances of the arm.
 
     Each constraint is a row ``g`` (n,) in m/rad and the distance left in m: joint velocities ``qd``
-    reduce it at the rate ``g qd``. Distances of the arm to itself and to the table are computed
-    every few ticks and linear in between; their slope is the relative velocity of the two nearest
-    points along the line between them.
+    reduce it at the rate ``g qd``. Distances of the arm to itself, the table and keep-outs are
+    computed every few ticks and linear in between; their slope is the relative velocity of the two
+    nearest points along the line between them.
 
     Args:
         limits: with the box of the TCP.

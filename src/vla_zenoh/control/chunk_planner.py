@@ -48,7 +48,7 @@ from vla_zenoh.control.state_history import StateHistory
 from vla_zenoh.errors import RecordError
 from vla_zenoh.kinematics.so3 import interpolate, pose_distance, pose_of
 from vla_zenoh.policy import ActionSpec
-from vla_zenoh.profile import REJECT_FACTOR, Profile
+from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     ActionChunk,
     Cause,
@@ -225,10 +225,12 @@ class ChunkPlanner:
             base = joint_goal(self._reach.kinematics, self._joints_at(base), base.width_m)
         steps = np.asarray(record.steps[:count], np.float64)
         if action.space == "joint":
-            steps = self._in_chain_order(action, steps)
+            assert self.joint_bounds is not None
+            steps = self.joint_bounds.in_chain_order(action, steps)
         rejection = validate_steps(action, steps, base, self._limits, self._max_width_m)
         if rejection is None and action.space == "joint" and action.targets:
-            rejection = self._far_out_of_range(action, steps, base)
+            assert self.joint_bounds is not None
+            rejection = self.joint_bounds.far_out_of_range(action, steps, self._joints_at(base))
         if rejection is not None:
             return rejection
         # Between two waypoints the joints and the speed are about those of the coming one.
@@ -265,26 +267,6 @@ class ChunkPlanner:
                     previous.steps_before + len(previous.goals), previous.steps_total
                 )
         return plan
-
-    def _far_out_of_range(
-        self, action: ActionSpec, steps: FloatArray, base: Goal
-    ) -> Rejection | None:
-        """Why joint targets (n, D) in chain order are too far outside their ranges to be meant."""
-        assert self.joint_bounds is not None
-        bounds, base_rad = self.joint_bounds, self._joints_at(base)
-        asked_rad = np.array([step_joints(action, step, base_rad, base_rad) for step in steps])
-        away_rad = np.maximum(bounds.lower_rad - asked_rad, asked_rad - bounds.upper_rad)
-        step, joint = np.unravel_index(int(np.argmax(away_rad)), away_rad.shape)
-        most_rad = REJECT_FACTOR * self._limits.step_rad
-        if away_rad[step, joint] <= most_rad:
-            return None
-        name, at_rad = bounds.kinematics.arm_joints[joint], asked_rad[step, joint]
-        why = (
-            f"a target of {name} at {at_rad:.4g} rad, whose range is {bounds.lower_rad[joint]:.4g} "
-            f"to {bounds.upper_rad[joint]:.4g}: are these radians, and from the zero and in the "
-            "direction of the arm's description?"
-        )
-        return Rejection("joint_limit", why, float(away_rad[step, joint]), most_rad)
 
     def _measured(self, action: ActionSpec, t_ns: int, width_m: float) -> Goal | None:
         """Where the arm was measured at `t_ns`, in the space of the actions; None: it was not."""
@@ -420,12 +402,6 @@ class ChunkPlanner:
             next(step.search)  # up to its first evaluation
         return step
 
-    def _in_chain_order(self, action: ActionSpec, steps: FloatArray) -> FloatArray:
-        """Steps (n, D) of joints with their columns in the order of the kinematics."""
-        assert self._reach is not None
-        columns = [action.joints.index(name) for name in self._reach.kinematics.arm_joints]
-        return np.concatenate([steps[:, columns], steps[:, action.arm_size :]], axis=1)
-
     def _joints_at(self, goal: Goal) -> FloatArray:
         """(n,) those asked for, or those of the pose asked for, with the arm's present elbow."""
         if goal.arm is not None and goal.joints_rad is not None:
@@ -448,10 +424,9 @@ class ChunkPlanner:
             base_rad = self._joints_at(plan.base)
             asked_rad = step_joints(plan.action, numbers, start_rad, base_rad)
             way_rad = asked_rad - start_rad
-            far_m = pose_distance(start.pose, bounds.kinematics.forward(asked_rad))[0]
-            far_rad = float(np.abs(way_rad).max())
+            far_m, far_rad = bounds.ways(start_rad, way_rad)
             if plan.action.targets:
-                full_s = bounds.full_speed_s(start_rad, asked_rad)
+                full_s = bounds.full_speed_s(way_rad)
                 part, slower = self._approach(plan, far_m, far_rad, full_s)
             else:
                 parts = {"step_m": (far_m, self._limits.step_m)}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -11,6 +10,7 @@ import numpy as np
 from vla_zenoh.control.actions import as_deltas, rotation_of, step_pose, step_width
 from vla_zenoh.control.limits import bound_step, workspace_corners
 from vla_zenoh.control.plan_timeline import Goal
+from vla_zenoh.control.policy_check import beyond_radians
 from vla_zenoh.errors import RecordError, SpecError
 from vla_zenoh.policy import ROTATION_SIZE, ActionSpec, ModelSpec, check_steps
 from vla_zenoh.profile import REJECT_FACTOR, Limits
@@ -18,8 +18,6 @@ from vla_zenoh.types import QUATERNION_NORM_TOLERANCE, ActionChunk, FloatArray, 
 
 FUTURE_TOLERANCE_NS = 50_000_000
 ROUNDING = 1e-6
-FURTHEST_RAD = 4 * math.pi
-"""No joint turns further."""
 SOURCE_CHARS = 60
 
 
@@ -169,7 +167,8 @@ def validate_steps(
         for step in steps if action.gripper != "none" else ():
             step_width(action, step, start.width_m, max_width_m)
         if action.space == "joint":
-            return _validate_joints(action, steps, limits)
+            beyond = beyond_radians(action, steps, limits)
+            return None if beyond is None else Rejection("step_rad", *beyond)
         if action.rotation == "quaternion":
             off = np.abs(np.linalg.norm(rotations, axis=1) - 1.0)
             for index in (off > 0.9 * QUATERNION_NORM_TOLERANCE).nonzero()[0]:
@@ -199,18 +198,6 @@ def validate_steps(
                     hit.limit,
                 )
     return None
-
-
-def _validate_joints(action: ActionSpec, steps: FloatArray, limits: Limits) -> Rejection | None:
-    """Why joints are too far for radians."""
-    scale = action.dt_s if action.kind == "velocity" else 1.0
-    most_rad = FURTHEST_RAD if action.targets else REJECT_FACTOR * limits.step_rad
-    largest = scale * float(np.abs(steps[:, : action.arm_size]).max())
-    if largest <= most_rad:
-        return None
-    what = "a target" if action.targets else "a step"
-    why = f"{what} of a joint of {largest:.4g} rad, at most {most_rad:.4g}; are these radians?"
-    return Rejection("step_rad", why, largest, most_rad)
 
 
 def _validate_targets(positions_m: FloatArray, limits: Limits) -> Rejection | None:

@@ -363,14 +363,15 @@ class Commander:
             now_ns,
             self.task.rate_hz,
         )
-        if self.reach is not None and self.pose is not None:
+        bounds = self._planner.joint_bounds
+        if bounds is not None and self.pose is not None:
             reasons += joint_state_faults(
-                self.profile, self.reach.kinematics, self.joint, self.pose, now_ns
+                self.profile, bounds.kinematics, self.joint, self.pose, now_ns
             )
             spec = self._peers.specs.get(worker)
             if spec is not None and chunk is not None and self.joint is not None:
                 reasons += reasons_by_joints(
-                    self.profile, worker, spec, chunk.record, self.reach.kinematics, self.joint
+                    self.profile, worker, spec, chunk.record, bounds, self.joint
                 )
         spec = self._peers.specs.get(worker)
         if self.reach is None and spec is not None and spec.action.space == "joint":

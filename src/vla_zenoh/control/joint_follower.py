@@ -72,7 +72,7 @@ class FollowSettings:
         acceleration_rad_s2: of every joint, one number or one per joint.
         jerk_rad_s3: of every joint; the default has no noticeable effect.
         velocity_share: part of the URDF's joint velocities that is used.
-        joint_margin_rad: kept from both ends of every joint's range.
+        joint_margin_rad: kept from both ends of every joint's range, one number or one per joint.
         posture_1_s: rate at which a redundant arm goes to its posture.
         posture_rad_s: greatest speed of that.
         damped_below: singular value s0 below which the inverse is damped.
@@ -84,7 +84,7 @@ class FollowSettings:
     acceleration_rad_s2: float | tuple[float, ...] = 10.0
     jerk_rad_s3: float | tuple[float, ...] = 1e6
     velocity_share: float = 1.0
-    joint_margin_rad: float = 0.05
+    joint_margin_rad: float | tuple[float, ...] = 0.05
     posture_1_s: float = 1.0
     posture_rad_s: float = 0.2
     damped_below: float = 0.03
@@ -149,8 +149,8 @@ class JointFollower:
             )
         self._back_1_s = BACK_JERK * float(np.min(self.jerk_rad_s3 / self.acceleration_rad_s2))
         self.velocity_rad_s = settings.velocity_share * kinematics.velocity_rad_s
-        self.lower_rad = kinematics.lower_rad + settings.joint_margin_rad
-        self.upper_rad = kinematics.upper_rad - settings.joint_margin_rad
+        self.lower_rad = kinematics.lower_rad + np.array(settings.joint_margin_rad)
+        self.upper_rad = kinematics.upper_rad - np.array(settings.joint_margin_rad)
 
     def step(
         self, now: JointMotion, target: Pose, twist: FloatArray, dt_s: float

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vla_zenoh.control.limits import SLOWEST, LimitHit, Slowdown, slowest
+from vla_zenoh.control.limits import SLOWEST, LimitHit, Slowdown, joint_margins, slowest
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.errors import VlaZenohError
 from vla_zenoh.kinematics.kinematics import Kinematics
@@ -43,14 +43,15 @@ class JointMonitor:
     """
 
     def __init__(self, profile: Profile, reach: ReachabilityFilter) -> None:
-        self._reach, self._elbow_limit_rad = reach, profile.limits.elbow_rad
-        barriers, joints = reach.barriers, reach.kinematics.size
-        margin_rad = profile.limits.reach.joint_margin_rad
-        distances = len(barriers.stop) - 1
-        self._stop = np.concatenate([np.full(joints, margin_rad), barriers.stop])
-        self._slow = np.concatenate([np.full(joints, 2 * margin_rad), barriers.slow])
-        self._past = _each(joints, distances, PAST_MARGIN * margin_rad, PAST_SINGULAR, PAST_M)
-        self._band = _each(joints, distances, BAND_RAD, BAND_SINGULAR, BAND_M)
+        self._reach = reach
+        barriers, slides = reach.barriers, reach.kinematics.slides
+        limits = profile.limits
+        self._elbow_limits = np.where(slides, limits.tracking_m, limits.elbow_rad)
+        margins, distances = joint_margins(limits.reach, reach.kinematics), len(barriers.stop) - 1
+        self._stop = np.concatenate([margins, barriers.stop])
+        self._slow = np.concatenate([2 * margins, barriers.slow])
+        self._past = _each(PAST_MARGIN * margins, distances, PAST_SINGULAR, PAST_M)
+        self._band = _each(np.where(slides, BAND_M, BAND_RAD), distances, BAND_SINGULAR, BAND_M)
         self.reset()
 
     def reset(self) -> None:
@@ -133,8 +134,8 @@ class JointMonitor:
         if expected_rad is None:
             return None
         apart_rad = np.abs(measured_rad - expected_rad)
-        worst = int(np.argmax(apart_rad))
-        self.elbow_rad, limit_rad = float(apart_rad[worst]), self._elbow_limit_rad
+        worst = int(np.argmax(apart_rad / self._elbow_limits))
+        self.elbow_rad, limit_rad = float(apart_rad[worst]), float(self._elbow_limits[worst])
         where = self._reach.kinematics.arm_joints[worst]
         if self.elbow_rad > 2 * limit_rad:
             return LimitHit("elbow_rad", self.elbow_rad, 2 * limit_rad, where=where)
@@ -151,9 +152,9 @@ class JointMonitor:
 
 
 def _each(
-    joints: int, distances: int, of_joint: float, of_singular: float, of_distance: float
+    of_joints: FloatArray, distances: int, of_singular: float, of_distance: float
 ) -> FloatArray:
-    return np.array([of_joint] * joints + [of_singular] + [of_distance] * distances)
+    return np.concatenate([of_joints, [of_singular], [of_distance] * distances])
 
 
 def _slowdown(name: str, share: float, value: float, limit: float, where: str) -> Slowdown | None:

@@ -10,18 +10,21 @@ and the velocity and acceleration of the TCP are bounded by their shares of the 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Generator, Iterable
 from typing import NamedTuple
 
 import numpy as np
 
-from vla_zenoh.control.axis_smoothing import FULL, AxisSmoother, Shares
+from vla_zenoh.control.actions import step_joints
+from vla_zenoh.control.axis_smoothing import FULL, AxisSmoother, Shares, line_of
 from vla_zenoh.control.barriers import Barriers
+from vla_zenoh.control.chunk_validation import Rejection
 from vla_zenoh.control.limits import (
     LimitHit,
     Slowdown,
-    full_speed_s,
     into_workspace,
+    joint_margins,
     joint_motion_limits,
     workspace_corners,
 )
@@ -29,7 +32,8 @@ from vla_zenoh.control.plan_timeline import Goal, joint_goal
 from vla_zenoh.control.smoothing import ROTATION_BOX, Motion, motion_limits
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import Pose, norm3
-from vla_zenoh.profile import Profile
+from vla_zenoh.policy import ActionSpec
+from vla_zenoh.profile import REJECT_FACTOR, Profile
 from vla_zenoh.types import Cause, FloatArray, JointCommand
 
 HALVINGS = 7
@@ -43,7 +47,10 @@ PARTS = (1.0, 0.5, 0.25, 0.125)
 """Of the way to a goal in the box that are tried, the longest on the leash first."""
 STOP_PLACES = np.linspace(0.125, 1.0, 8)
 """Parts of the time of a stop at which it is checked."""
+ARC_RAD = 0.25
+"""A motion is taken apart into pieces of this length to see how fast its TCP moves."""
 ROUNDING = 1e-6
+NAMED = {"rad": "radians", "m": "metres"}
 NEARER_M = 5e-4
 """m by which a motion may come nearer than a stop: goals are bounded step by step."""
 CHECK_TICKS = 4
@@ -77,15 +84,63 @@ class JointBounds:
     def __init__(self, profile: Profile, kinematics: Kinematics, barriers: Barriers) -> None:
         self.limits, self.kinematics, self.barriers = profile.limits, kinematics, barriers
         self.motion = joint_motion_limits(profile, kinematics)
-        margin_rad = self.limits.reach.joint_margin_rad
+        margin_rad = joint_margins(self.limits.reach, kinematics)
         self.lower_rad = kinematics.lower_rad + margin_rad
         self.upper_rad = kinematics.upper_rad - margin_rad
 
-    def full_speed_s(self, start_rad: FloatArray, end_rad: FloatArray) -> float:
-        """Time (s) of a motion between two joints (n,) at full speed of joints and TCP."""
-        joints_s = float(np.max(np.abs(end_rad - start_rad) / self.motion.velocity_rad_s))
-        start, end = self.kinematics.forward(start_rad), self.kinematics.forward(end_rad)
-        return max(joints_s, full_speed_s(self.limits, start, end))
+    def _of_each(self, turning: float, sliding: float) -> FloatArray:
+        """(n,) a limit of joints that turn, and one of those that slide."""
+        return np.where(self.kinematics.slides, sliding, turning)
+
+    def ways(self, start_rad: FloatArray, way_rad: FloatArray) -> tuple[float, float]:
+        """Lengths of a straight motion: of the TCP or a sliding joint, m, of others, rad."""
+        slides = self.kinematics.slides
+        turned_rad = float(np.abs(way_rad[~slides]).max(initial=0.0))
+        slid_m = float(np.abs(way_rad[slides]).max(initial=0.0))
+        return max(self.curve_m(start_rad, way_rad, turned_rad), slid_m), turned_rad
+
+    def leashes(self) -> FloatArray:
+        """(n,) how far each joint's goal may be ahead."""
+        return self._of_each(self.limits.lead_rad, self.limits.lead_m)
+
+    def full_speed_s(self, way_rad: FloatArray) -> float:
+        """Time (s) of a straight motion by `way_rad` (n,) at full speed of the joints."""
+        return float(np.max(np.abs(way_rad) / self.motion.velocity_rad_s))
+
+    def curve_m(self, start_rad: FloatArray, way_rad: FloatArray, turned_rad: float) -> float:
+        """Length (m) of the TCP's curve, were all of it as fast as its fastest piece.
+
+        No less than its length, and much more than the distance of its ends where joints turn far.
+        """
+        pieces = 1 + int(turned_rad / ARC_RAD)
+        places = (np.arange(pieces) + 0.5) / pieces
+        jacobian = self.kinematics.jacobian
+        return max(norm3((jacobian(start_rad + place * way_rad) @ way_rad)[:3]) for place in places)
+
+    def in_chain_order(self, action: ActionSpec, steps: FloatArray) -> FloatArray:
+        """Steps (n, D) of joints with their columns in the order of the kinematics."""
+        columns = [action.joints.index(name) for name in self.kinematics.arm_joints]
+        return np.concatenate([steps[:, columns], steps[:, action.arm_size :]], axis=1)
+
+    def far_out_of_range(
+        self, action: ActionSpec, steps: FloatArray, base_rad: FloatArray
+    ) -> Rejection | None:
+        """Why targets (n, D) in chain order are too far outside their ranges to be meant."""
+        asked_rad = np.array([step_joints(action, step, base_rad, base_rad) for step in steps])
+        away_rad = np.maximum(self.lower_rad - asked_rad, asked_rad - self.upper_rad)
+        mosts = REJECT_FACTOR * self._of_each(self.limits.step_rad, self.limits.step_m)
+        step, joint = np.unravel_index(int(np.argmax(away_rad / mosts)), away_rad.shape)
+        most_rad = float(mosts[joint])
+        if away_rad[step, joint] <= most_rad:
+            return None
+        name, at_rad = self.kinematics.arm_joints[joint], asked_rad[step, joint]
+        unit = self.kinematics.unit(int(joint))
+        why = (
+            f"a target of {name} at {at_rad:.4g} {unit}, whose range is "
+            f"{self.lower_rad[joint]:.4g} to {self.upper_rad[joint]:.4g}: are these {NAMED[unit]}, "
+            "and from the zero and in the direction of the arm's description?"
+        )
+        return Rejection("joint_limit", why, float(away_rad[step, joint]), most_rad)
 
     def bound_in_pieces(
         self, start_rad: FloatArray, asked_rad: FloatArray
@@ -220,16 +275,21 @@ class JointPath(AxisSmoother):
         tcp = motion_limits(profile.limits)
         box = [[move] * 3 + [turn * ROTATION_BOX] * 3 for move, turn in zip(*tcp, strict=True)]
         self._tcp_box = np.array(box)
+        self._leashes = bounds.leashes()
         self._ticks = 0
         self._hits: list[LimitHit] = []
+        self._asked: tuple[Goal, Shares, bool]
+        self._held = False
+        """It braked before a bound, on the way to what was asked for last."""
         home_rad = self.kinematics.ordered(profile.robot.arm_joints, profile.robot.home_rad)
         super().__init__(home_rad, 1.0 / profile.timing.command_hz, np.array(bounds.motion))
 
     def stand(self, position: FloatArray) -> None:
         super().stand(position)
+        self._held = False
         self._follow()
 
-    def leash(self, goal: Goal, most_rad: float, ahead_s: float) -> tuple[Goal, list[LimitHit]]:
+    def leash(self, goal: Goal, ahead_s: float) -> tuple[Goal, list[LimitHit]]:
         """`goal`, or a nearer one on the leash and inside the box, and the limits that acted.
 
         A part of the way between two joints inside the box may be outside, and so may their mean.
@@ -238,10 +298,14 @@ class JointPath(AxisSmoother):
         here_rad, goal_rad = self.state.position, goal.joints_rad
         from_rad = here_rad + ahead_s * self.state.velocity
         hits: list[LimitHit] = []
-        far_rad = float(np.abs(goal_rad - from_rad).max())
-        if far_rad > most_rad:
-            hits.append(LimitHit("lead_rad", far_rad, most_rad))
-            goal_rad = from_rad + most_rad / far_rad * (goal_rad - from_rad)
+        leashes = self._leashes
+        ahead = np.abs(goal_rad - from_rad) / leashes
+        joint = int(np.argmax(ahead))
+        if ahead[joint] > 1.0:
+            name = "lead_m" if self.kinematics.slides[joint] else "lead_rad"
+            most = float(leashes[joint])
+            hits.append(LimitHit(name, float(ahead[joint]) * most, most))
+            goal_rad = from_rad + (goal_rad - from_rad) / ahead[joint]
             goal = joint_goal(self.kinematics, goal_rad, goal.width_m, goal.slowdown)
         outside_m = self._outside_m(goal)
         if outside_m <= ROUNDING:
@@ -251,7 +315,7 @@ class JointPath(AxisSmoother):
         for share in PARTS:
             part_rad = here_rad + share * (inside_rad - here_rad)
             near = joint_goal(self.kinematics, part_rad, goal.width_m, goal.slowdown)
-            on_leash = np.abs(part_rad - from_rad).max() <= most_rad + ROUNDING
+            on_leash = (np.abs(part_rad - from_rad) <= leashes + ROUNDING).all()
             if on_leash and self._outside_m(near) <= ROUNDING:
                 return near, hits
         return joint_goal(self.kinematics, here_rad, goal.width_m, goal.slowdown), hits
@@ -264,6 +328,7 @@ class JointPath(AxisSmoother):
     def target(self, goal: Goal, shares: Shares = FULL, *, all_to_stop: bool = False) -> bool:
         """Move to the joints of `goal`, or as near as the bounds allow; see `move_to`."""
         assert goal.joints_rad is not None
+        self._asked, self._held = (goal, shares, all_to_stop), False
         here_rad, end_rad = self.state.position, goal.joints_rad
         hit = self._bounds.ahead_hit(here_rad, end_rad)
         if hit is not None:
@@ -279,11 +344,14 @@ class JointPath(AxisSmoother):
     def tick(self, pace: float = 1.0) -> Motion:
         """Advance by `pace` of a tick; brakes where the motion would come too near to a bound."""
         self._ticks += 1
+        if self._held and self.at_rest:
+            self._go_on()
         if self._ticks % CHECK_TICKS == 0 and not self.braking and not self.at_rest:
-            self._brake_at(self._bounds.distance_hit(self.state.position, self._stop_rad()))
+            stop_rad = self.state.position + self._stop_way(CHECK_TICKS * self._dt_s)
+            self._brake_at(self._bounds.distance_hit(self.state.position, stop_rad))
         before = self._state
         moves = self.advance(pace)
-        if moves and not self.braking:
+        if moves and not self.braking and not self._stops_inside(pace):
             hit = self._stop_hit()
             if hit is not None:
                 self._state = before  # a stop from there was found to end inside
@@ -294,39 +362,68 @@ class JointPath(AxisSmoother):
         return self.motion
 
     def brake(self, shares: Shares | None = FULL) -> None:
-        """Come to rest on the way that `tick` has checked, whatever the shares."""
-        super().brake(FULL)
+        """Come to rest as `tick` has checked it, whatever the shares."""
+        self._held = False
+        super().brake(FULL if self._is_straight() else None)
+
+    def _is_straight(self) -> bool:
+        """The joints move in proportion, so that a stop can end on their straight line.
+
+        Where they do not, each stops by itself: one that waited for another to stop would pass its
+        target.
+        """
+        return line_of(np.zeros(len(self.state.position)), *self.state[1:], 1.0) is not None
 
     def _brake_at(self, hit: LimitHit | None) -> None:
         if hit is not None:
             self._hits.append(hit)
             self.brake()
+            self._held = True
+
+    def _go_on(self) -> None:
+        """Move on after a brake before a bound, if the straight way to the goal is free."""
+        goal, shares, all_to_stop = self._asked
+        assert goal.joints_rad is not None
+        self._held = False
+        if self._bounds.ahead_hit(self.state.position, goal.joints_rad) is None:
+            self.target(goal, shares, all_to_stop=all_to_stop)
 
     def _stop_hit(self) -> LimitHit | None:
         """The face of the box that a stop from the present state would cross.
 
         The stop is no straight line of the joints where they do not all move in proportion.
         """
-        stop = self._stop(self.box, together=True)
+        stop = self._stop(self.box, together=self._is_straight())
         if stop is None:
             return None
         times_s = stop.duration_s * STOP_PLACES
         stop_rad = [stop.at(float(time_s)).position for time_s in times_s]
         return self._bounds.face_hit(self.motion.pose.position_m, stop_rad)
 
-    def _stop_rad(self) -> FloatArray:
-        """Where (n,) a stop that begins at the next check would end at the latest."""
-        position, velocity, acceleration = self.state
+    def _stops_inside(self, pace: float) -> bool:
+        """Whether the TCP is too far from every face of the box for a stop to cross one."""
+        low, high = workspace_corners(self._bounds.limits)
+        place = self.motion.pose.position_m
+        room_m = float(np.minimum(place - low, high - place).min())
+        way = np.abs(self._stop_way(pace * self._dt_s))
+        # The TCP is further from an axis by at most its own way.
+        return float(way @ self._levers) * math.exp(float(way.sum())) < room_m
+
+    def _stop_way(self, ahead_s: float) -> FloatArray:
+        """How far (n,) a stop that begins in `ahead_s` goes at most."""
+        _, velocity, acceleration = self.state
         _, most, jerk = self.box
         ramp_s = np.abs(acceleration) / jerk
-        fast = velocity + 0.5 * acceleration * ramp_s
-        stop_s = float(np.max(np.abs(fast) / most + most / jerk + ramp_s))
-        return position + (CHECK_TICKS * self._dt_s + 0.5 * stop_s) * fast
+        later = velocity + 0.5 * acceleration * ramp_s
+        fast = np.where(np.abs(later) > np.abs(velocity), later, velocity)
+        stop_s = float(np.max(0.5 * (np.abs(later) / most + most / jerk) + ramp_s))
+        return (ahead_s + stop_s) * fast
 
     def _follow(self) -> None:
         """Compute the motion of the TCP."""
         joints_rad, velocity, acceleration = self.state
         pose, jacobian = self.kinematics.pose_and_jacobian(joints_rad)
+        self._levers = np.sqrt((jacobian[:3] ** 2).sum(axis=0))
         change = jacobian @ acceleration
         fastest = float(np.abs(velocity).max())
         if fastest > 0.0:

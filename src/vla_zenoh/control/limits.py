@@ -23,7 +23,7 @@ import numpy as np
 
 from vla_zenoh.control.smoothing import ROTATION_BOX
 from vla_zenoh.kinematics.so3 import Pose, exp3, log3, norm3, orthonormal
-from vla_zenoh.profile import REJECT_FACTOR, Limits, Profile
+from vla_zenoh.profile import REJECT_FACTOR, Limits, Profile, ReachLimits
 from vla_zenoh.types import FloatArray
 
 if TYPE_CHECKING:
@@ -61,17 +61,23 @@ def joint_motion_limits(profile: Profile, kinematics: Kinematics) -> JointMotion
     )
 
 
+def joint_margins(limits: ReachLimits, kinematics: Kinematics) -> FloatArray:
+    """(n,) kept from both ends of every joint's range, rad, of a joint that slides m."""
+    return np.where(kinematics.slides, limits.joint_margin_m, limits.joint_margin_rad)
+
+
 class LimitHit(NamedTuple):
     """A limit that acted.
 
     Args:
         name: ``step_m``, ``step_rad``, ``workspace``, ``lead_m``, ``lead_rad``; from the arm's
             kinematics ``reach``, ``joint_limit``, ``joint_velocity``, ``singularity``,
-            ``self_collision``, ``table_distance``.
+            ``self_collision``, ``table_distance``, ``keep_out``.
         value: the value asked for.
         limit: the value allowed.
         fatal: too far beyond the limit to be shortened.
-        where: the joint, the two links, or the link over the table; empty for the whole arm.
+        where: the joint, the two links, the link over the table, or link and keep-out; empty for
+            the whole arm.
     """
 
     name: str

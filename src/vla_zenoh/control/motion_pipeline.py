@@ -472,7 +472,7 @@ class MotionPipeline:
         if not isinstance(mover, JointPath):
             pose, hits = leash(self._limits, goal.pose, _ahead(mover.motion, ahead_s))
             return Leashed(replace(goal, pose=pose, joints_rad=None), hits)
-        return Leashed(*mover.leash(goal, self._limits.lead_rad, ahead_s))
+        return Leashed(*mover.leash(goal, ahead_s))
 
     def _pause(self, mover: Smoother | JointPath) -> None:
         """Stop on the path, to continue from there later."""

@@ -14,7 +14,13 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_zenoh.control.actions import GRIPPER_SLACK, GRIPPER_SLACK_M, Steps, as_deltas
+from vla_zenoh.control.actions import (
+    FURTHEST_RAD,
+    GRIPPER_SLACK,
+    GRIPPER_SLACK_M,
+    Steps,
+    as_deltas,
+)
 from vla_zenoh.policy import ROTATION_SIZE, ActionSpec, ModelSpec
 from vla_zenoh.profile import POSE_JOINTS, REACH_M, REJECT_FACTOR, Limits, Profile
 from vla_zenoh.types import QUATERNION_NORM_TOLERANCE
@@ -115,6 +121,9 @@ def chunk_errors(
     if spec.gripper != "binary":  # any number is a valid choice of two
         yield from (error("gripper_range", why) for why in beyond_gripper(spec, width, max_width_m))
     if spec.space == "joint":
+        beyond = beyond_radians(spec, steps, limits)
+        if beyond is not None:
+            yield error("joint_units", beyond[0])
         return
     rotation = steps[:, 3 : 3 + ROTATION_SIZE[spec.rotation]].astype(np.float64)
     if spec.rotation == "quaternion":
@@ -159,6 +168,20 @@ def largest_step(spec: ActionSpec, steps: Steps) -> tuple[float, float]:
         else np.linalg.norm(rotation, axis=1)
     )
     return float(np.linalg.norm(position_m, axis=1).max()), float(angles.max())
+
+
+def beyond_radians(
+    spec: ActionSpec, steps: Steps, limits: Limits
+) -> tuple[str, float, float] | None:
+    """Why joints (H, D) are too far for radians, with the largest number and the most allowed."""
+    scale = spec.dt_s if spec.kind == "velocity" else 1.0
+    most_rad = FURTHEST_RAD if spec.targets else REJECT_FACTOR * limits.step_rad
+    largest = scale * float(np.abs(steps[:, : spec.arm_size]).max())
+    if largest <= most_rad:
+        return None
+    what = "a target" if spec.targets else "a step"
+    why = f"{what} of a joint of {largest:.4g} rad, at most {most_rad:.4g}; are these radians?"
+    return why, largest, most_rad
 
 
 def _too_far_a_turn(most_rad: float, limits: Limits) -> Finding:

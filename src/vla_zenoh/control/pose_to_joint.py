@@ -15,7 +15,7 @@ from vla_zenoh.control.axis_smoothing import Shares
 from vla_zenoh.control.barriers import Barriers, DistanceConstraints
 from vla_zenoh.control.joint_follower import FollowSettings, JointFollower, JointMotion
 from vla_zenoh.control.joint_space import followed_shares
-from vla_zenoh.control.limits import into_workspace, joint_motion_limits
+from vla_zenoh.control.limits import into_workspace, joint_margins, joint_motion_limits
 from vla_zenoh.control.smoothing import Motion, Smoother
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import Pose, exp3, log3, pose_distance
@@ -76,7 +76,7 @@ class PoseToJoint:
             acceleration_rad_s2=tuple(acceleration.tolist()),
             jerk_rad_s3=tuple(jerk.tolist()),
             velocity_share=min(share, 1.0),
-            joint_margin_rad=limits.reach.joint_margin_rad,
+            joint_margin_rad=tuple(joint_margins(limits.reach, kinematics).tolist()),
             singularity_stop=limits.reach.singularity_stop,
         )
         self._bounds = limits

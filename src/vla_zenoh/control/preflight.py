@@ -7,11 +7,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from vla_zenoh.control import policy_check
+from vla_zenoh.control.joint_space import JointBounds
 from vla_zenoh.control.limits import into_workspace
 from vla_zenoh.errors import RecordError, SpecError
 from vla_zenoh.keys import worker_node
-from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.ntp import ClockOffset
 from vla_zenoh.policy import ModelSpec, check_steps
 from vla_zenoh.profile import Profile
@@ -107,7 +109,7 @@ def reasons_by_joints(
     worker: str,
     spec: ModelSpec,
     chunk: ActionChunk,
-    kinematics: Kinematics,
+    bounds: JointBounds,
     joint: Stamped[JointState],
 ) -> list[str]:
     """Reasons against a worker whose newest chunk is not for the joints of this arm.
@@ -117,18 +119,25 @@ def reasons_by_joints(
         worker: the worker that gets the lease.
         spec: its spec.
         chunk: its newest chunk.
-        kinematics: of the arm.
+        bounds: of the arm.
         joint: newest joint state.
     """
+    kinematics = bounds.kinematics
     try:
         joints_rad = kinematics.joints_of(joint.record)
         steps = check_steps(spec.action, chunk.steps)
     except (RecordError, SpecError):
         return []  # there is a reason for it already
     found = policy_check.joints_as_pose(spec.action, steps, joints_rad, profile.limits)
+    if spec.action.targets and set(spec.action.joints) == set(kinematics.arm_joints):
+        given = bounds.in_chain_order(spec.action, steps.astype(np.float64))
+        far = bounds.far_out_of_range(spec.action, given, joints_rad)
+        found += [] if far is None else [policy_check.error("joint_limit", far.why)]
     here, jacobian = kinematics.pose_and_jacobian(joints_rad)
     axes = policy_check.beyond_joints(spec.action, steps, jacobian, here.rotation)
-    reasons = [f"worker {worker!r}: its newest chunk is not sane: {why}" for _, _, why in found]
+    reasons = [
+        f"worker {worker!r}: its newest chunk is not sane: {name}: {why}" for _, name, why in found
+    ]
     if axes:
         reasons.append(
             f"worker {worker!r} asks for motion that the {len(joints_rad)} joints of robot "

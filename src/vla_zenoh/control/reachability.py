@@ -28,7 +28,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vla_zenoh.control.barriers import Barriers, Margins
-from vla_zenoh.control.limits import LEAST, SLOWEST, LimitHit, Slowdown, full_speed_s
+from vla_zenoh.control.limits import (
+    LEAST,
+    SLOWEST,
+    LimitHit,
+    Slowdown,
+    full_speed_s,
+    joint_margins,
+)
 from vla_zenoh.errors import RecordError
 from vla_zenoh.kinematics.ik import TOLERANCE_M, Approach, InverseKinematics, pose_error
 from vla_zenoh.kinematics.kinematics import Kinematics, make_kinematics
@@ -119,7 +126,7 @@ class ReachabilityFilter:
         self._solver = InverseKinematics(
             kinematics,
             posture_rad,
-            joint_margin_rad=limits.reach.joint_margin_rad,
+            joint_margin_rad=joint_margins(limits.reach, kinematics),
             max_iterations=SOLVER_ITERATIONS,
         )
         self._follow_posture = posture_rad is None

@@ -2,18 +2,21 @@
 
 The same options serve policy servers, LeRobot checkpoints and OpenVLA checkpoints::
 
-    action     delta, absolute, velocity (of the TCP); joint_delta, joint_position (become absolute
-               poses by the arm's forward kinematics)
+    action     delta, absolute, velocity (of the TCP); joint_delta, joint_position, joint_velocity
     frame      base, tcp: axes of a delta or velocity
-    anchor     goal, measured: the pose that a chunk of deltas or velocities begins at
+    anchor     goal, measured: the pose or joints that a chunk of deltas or velocities begins at
     relative_to  previous, start: what each delta of a chunk is added to
     controller none, or KP:DAMPING_RATIO of the data's controller, where that covers only a part of
                each delta (robosuite's and LIBERO's: 150:1)
     rotation   rpy, rotvec, quat_xyzw, quat_wxyz
     clip       numbers of the arm are clipped to [-clip, clip] first; empty: never
-    position_scale_m, rotation_scale_rad, joint_scale_rad   one unit of the numbers
+    position_scale_m, rotation_scale_rad   one unit of the numbers of a pose, default 1
+    joint_scale_rad    one unit of the numbers of joints: 1 for radians, 0.0174533 for degrees; or
+               one for each joint, with commas, m for a joint that slides
     gripper    none, delta_m, absolute_m, open_fraction, binary
     gripper_open       high, low: which end of binary and open_fraction is open
+    gripper_range      SHUT:OPEN, the numbers of open_fraction where it is shut and open, in place
+               of gripper_open: 0:100 of LeRobot's SO-101, whose gripper is one of the joints
     gripper_threshold  of binary
     dt_s       duration of a step
     horizon    largest number of steps used from an answer
@@ -24,17 +27,16 @@ Missing options are an error, never guessed: a wrong guess moves a robot.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Literal, cast, get_args
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from vla_zenoh.errors import MissingExtraError, SpecError, describe_faults
-from vla_zenoh.kinematics.so3 import quat_from_rotation
+from vla_zenoh.errors import SpecError, describe_faults
 from vla_zenoh.policy import (
     ActionSpec,
     Anchor,
@@ -44,51 +46,13 @@ from vla_zenoh.policy import (
     RelativeTo,
 )
 from vla_zenoh.policy.model_options import number, one_of, whole_number
-from vla_zenoh.profile import Profile
-from vla_zenoh.types import JointState
 
-Forward = Callable[[JointState, NDArray[np.float64]], NDArray[np.float64]]
-"""Measured joints and (H, n) joint positions in their order -> (H, 7) position and quat_xyzw."""
-
-
-def make_forward(profile: Profile) -> Forward:
-    """Forward kinematics of the profile's arm.
-
-    Raises:
-        MissingExtraError: Pinocchio is not installed.
-        ResourceError: the robot's description is not there.
-        ProfileError: frames or joints that the description does not have.
-    """
-    try:
-        from vla_zenoh.kinematics.kinematics import make_kinematics
-    except ImportError as error:
-        raise MissingExtraError(error.name or "pinocchio", "control") from error
-    kinematics = make_kinematics(profile)
-
-    def forward(measured: JointState, joints_rad: NDArray[np.float64]) -> NDArray[np.float64]:
-        poses = [kinematics.forward(kinematics.ordered(measured.names, row)) for row in joints_rad]
-        return np.array([[*pose.position_m, *quat_from_rotation(pose.rotation)] for pose in poses])
-
-    return forward
-
-
-def poses_of(
-    rows_rad: NDArray[np.float64], measured: JointState, forward: Forward, *, deltas: bool
-) -> NDArray[np.float64]:
-    """TCP poses (H, 7) of joint positions: position and quat_xyzw.
-
-    Args:
-        rows_rad: (H, n) joints of each step, in the order of the measured ones.
-        measured: joints of the observation.
-        forward: kinematics of the arm.
-        deltas: each row is added to the previous one, the first to the measured joints.
-    """
-    if deltas:
-        rows_rad = measured.position_rad + np.cumsum(rows_rad, axis=0)
-    return forward(measured, rows_rad)
-
-
-Action = Literal["delta", "absolute", "velocity", "joint_delta", "joint_position"]
+Action = Literal["delta", "absolute", "velocity", "joint_delta", "joint_position", "joint_velocity"]
+_JOINT_KINDS: Mapping[str, str] = {
+    "joint_delta": "delta",
+    "joint_position": "absolute",
+    "joint_velocity": "velocity",
+}
 ForeignRotation = Literal["rpy", "rotvec", "quat_xyzw", "quat_wxyz"]
 
 ACTION_OPTIONS: Mapping[str, str] = {
@@ -101,14 +65,15 @@ ACTION_OPTIONS: Mapping[str, str] = {
     "clip": "",
     "position_scale_m": "1",
     "rotation_scale_rad": "1",
-    "joint_scale_rad": "1",
+    "joint_scale_rad": "",
     "gripper": "",
     "gripper_open": "",
+    "gripper_range": "",
     "gripper_threshold": "0.5",
     "dt_s": "",
     "horizon": "",
 }
-"""Every option with its default; empty: no default, except for `clip`."""
+"""Every option with its default; empty: no default, except for `clip` and `gripper_range`."""
 ADDED_TO = ("anchor", "relative_to", "controller")
 """What deltas are added to, and how much of them is covered."""
 NO_CONTROLLER = "none"
@@ -131,6 +96,7 @@ _ASKED: Mapping[str, str] = {
     "its chunk?",
     "anchor": "goal or measured: what does a chunk begin at?",
     "rotation": " or ".join(_ALLOWED["rotation"]),
+    "joint_scale_rad": "1 if the joints' numbers are radians, 0.0174533 if they are degrees",
     "gripper": " or ".join(_ALLOWED["gripper"]),
     "gripper_open": "high or low: is the gripper open where its number is large?",
     "dt_s": "seconds of a step, 1 / fps of the data",
@@ -147,43 +113,42 @@ class ActionSemantics:
         action: kind of the arm's numbers.
         rotation: their representation of rotations, if they are poses.
         clip: bound of the arm's raw numbers; 0: none.
-        scales: (position, rotation, joint) one unit in m, rad, rad.
+        scales: (position, rotation) one unit in m, rad.
+        gripper_range: the gripper's number where it is shut, and open, which are 0 and 1 then.
+        joint_scales: one unit of all joints, or of each, in rad, of a joint that slides in m.
     """
 
     spec: ActionSpec
     action: Action
     rotation: ForeignRotation
     clip: float
-    scales: tuple[float, float, float]
+    scales: tuple[float, float]
+    joint_scales: tuple[float, ...] = (1.0,)
+    gripper_range: tuple[float, float] = (0.0, 1.0)
 
     @property
     def needs_joints(self) -> bool:
-        """Whether its numbers are joints, which need forward kinematics."""
-        return _of_joints(self.action)
+        """Whether its numbers are joints."""
+        return self.spec.space == "joint"
 
-    def parts(self, joints: int) -> dict[str, int]:
-        """Parts of a row in order, with their sizes, for an arm with `joints`."""
+    def parts(self) -> dict[str, int]:
+        """Parts of a row in order, with their sizes."""
         turns = 4 if self.rotation.startswith("quat") else 3
-        arm = {"joints": joints} if self.needs_joints else {"position": 3, self.rotation: turns}
+        arm = {"position": 3, self.rotation: turns}
+        if self.needs_joints:
+            arm = {"joints": len(self.spec.joints)}
         return arm if self.spec.gripper == "none" else {**arm, "gripper": 1}
 
-    def steps(
-        self,
-        rows: NDArray[np.float64],
-        joint: JointState | None = None,
-        forward: Forward | None = None,
-    ) -> NDArray[np.float64]:
+    def steps(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
         """Action steps (H, D) as `spec` declares them.
 
         Args:
             rows: (H, C), laid out as in `parts`.
-            joint: measured joints of the observation; for joints.
-            forward: kinematics of the arm; for joints.
 
         Raises:
             SpecError: wrong number of columns, or a quaternion without unit length.
         """
-        parts = self.parts(0 if joint is None else len(joint.names))
+        parts = self.parts()
         if rows.shape[1] != sum(parts.values()):
             wanted = " + ".join(f"{name} {count}" for name, count in parts.items())
             raise SpecError(
@@ -191,15 +156,26 @@ class ActionSemantics:
                 "shape",
             )
         arm, gripper = np.split(rows, [rows.shape[1] - ("gripper" in parts)], axis=1)
+        shut, opened = self.gripper_range
+        gripper = (gripper - shut) / (opened - shut)
         if self.clip:
             arm = arm.clip(-self.clip, self.clip)
-        if not self.needs_joints:
-            return np.concatenate([arm[:, :3] * self.scales[0], self._turns(arm), gripper], axis=1)
-        assert joint is not None
-        assert forward is not None
-        deltas = self.action == "joint_delta"
-        poses = poses_of(arm * self.scales[2], joint, forward, deltas=deltas)
-        return np.concatenate([poses, gripper], axis=1)
+        if self.needs_joints:
+            return np.concatenate([arm * np.array(self.joint_scales), gripper], axis=1)
+        return np.concatenate([arm[:, :3] * self.scales[0], self._turns(arm), gripper], axis=1)
+
+    def rows(self, steps: NDArray[Any]) -> NDArray[np.float64]:
+        """The inverse of `steps`: action steps (K, D) as the policy's own numbers (K, C)."""
+        split = steps.shape[1] - (self.spec.gripper != "none")
+        arm, gripper = np.split(steps.astype(np.float64), [split], axis=1)
+        if self.needs_joints:
+            return np.concatenate([arm / np.array(self.joint_scales), gripper], axis=1)
+        turns = arm[:, 3:]
+        if self.rotation.startswith("quat"):
+            turns = np.roll(turns, 0 if self.rotation == "quat_xyzw" else 1, axis=1)
+        else:
+            turns = turns / self.scales[1]
+        return np.concatenate([arm[:, :3] / self.scales[0], turns, gripper], axis=1)
 
     def _turns(self, arm: NDArray[np.float64]) -> NDArray[np.float64]:
         rotation = arm[:, 3:]
@@ -211,15 +187,12 @@ class ActionSemantics:
         return np.roll(rotation / norm, 0 if self.rotation == "quat_xyzw" else -1, axis=1)
 
 
-def _of_joints(action: str) -> bool:
-    return action in ("joint_delta", "joint_position")
-
-
 def read_action_semantics(
     given: Mapping[str, str],
     known: Mapping[str, str] | None = None,
     whose: str = "",
     *,
+    joints: Sequence[str] = (),
     normalisation: str | None = None,
 ) -> ActionSemantics:
     """The semantics that options define.
@@ -229,6 +202,7 @@ def read_action_semantics(
         known: options of a preset or data set; `given` overrides them. If `given` has another
             `action`, only the `horizon` of them is kept.
         whose: owner of `known`, for messages.
+        joints: names of the arm's, in the order of the columns of an action of joints.
         normalisation: for the spec.
 
     Raises:
@@ -249,26 +223,36 @@ def read_action_semantics(
         if chosen[name]:
             one_of(name, chosen[name], allowed)
     _ask_for_missing(chosen, f"action={action} is not that of {whose}, so " if other else "")
-    if _of_joints(action):  # become poses
-        chosen |= {"rotation": "quat_xyzw", "frame": "base"}
-    position, rotation, joint = (
-        number(name, chosen[name])
-        for name in ("position_scale_m", "rotation_scale_rad", "joint_scale_rad")
+    if action in _JOINT_KINDS:
+        chosen |= {"rotation": "rotvec", "frame": "base"}
+    position, rotation = (
+        number(name, chosen[name]) for name in ("position_scale_m", "rotation_scale_rad")
     )
+    given_scales = (chosen["joint_scale_rad"] or "1").split(",")
+    joint_scales = tuple(number("joint_scale_rad", text.strip()) for text in given_scales)
+    if len(joint_scales) not in (1, len(joints)):
+        raise SpecError(
+            f"joint_scale_rad has {len(joint_scales)} numbers for {len(joints)} joints: give one "
+            "for all of them, or one each"
+        )
     return ActionSemantics(
-        spec=_spec(chosen, normalisation),
+        spec=_spec(chosen, joints, normalisation),
         action=cast(Action, action),
         rotation=cast(ForeignRotation, chosen["rotation"]),
         clip=number("clip", chosen["clip"] or "0"),
-        scales=(position, rotation, joint),
+        scales=(position, rotation),
+        joint_scales=joint_scales,
+        gripper_range=_gripper_range(chosen),
     )
 
 
 def _ask_for_missing(chosen: Mapping[str, str], why: str) -> None:
     known = _not_asked(chosen)
-    if _of_joints(chosen["action"]):
-        known |= {"rotation"}
-    if chosen["gripper"] not in ("", "open_fraction", "binary"):
+    if chosen["action"] in _JOINT_KINDS:
+        known |= {"rotation", "controller"}
+    else:
+        known |= {"joint_scale_rad"}
+    if chosen["gripper"] not in ("", "open_fraction", "binary") or chosen["gripper_range"]:
         known |= {"gripper_open"}
     missing = [name for name in _ASKED if name not in known and not chosen[name]]
     if missing:
@@ -278,11 +262,31 @@ def _ask_for_missing(chosen: Mapping[str, str], why: str) -> None:
         )
 
 
+def _gripper_range(chosen: Mapping[str, str]) -> tuple[float, float]:
+    """The gripper's number where it is shut, and where it is open."""
+    text = chosen["gripper_range"]
+    if not text:
+        return 0.0, 1.0
+    if chosen["gripper"] != "open_fraction" or chosen["gripper_open"]:
+        raise SpecError(
+            "gripper_range goes with gripper=open_fraction, in place of gripper_open: leave out "
+            "one of them"
+        )
+    shut, colon, opened = text.partition(":")
+    ends = (
+        [number("gripper_range", end, least=-math.inf) for end in (shut, opened)] if colon else []
+    )
+    if len(ends) != 2 or ends[0] == ends[1]:
+        raise SpecError(f"gripper_range is {text!r}; wanted SHUT:OPEN, two numbers as 0:100")
+    return ends[0], ends[1]
+
+
 def _not_asked(chosen: Mapping[str, str]) -> set[str]:
     """Options of `ADDED_TO` that have one meaning only, by the others."""
-    if chosen["action"] == "velocity":
+    kind = _JOINT_KINDS.get(chosen["action"], chosen["action"])
+    if kind == "velocity":
         return {"controller", "relative_to"}
-    if chosen["action"] != "delta":
+    if kind != "delta":
         return set(ADDED_TO)
     if chosen["controller"] not in ("", NO_CONTROLLER):
         return {"anchor", "relative_to"}
@@ -308,14 +312,19 @@ def read_controller(text: str) -> ControllerSpec | None:
         )
 
 
-def _spec(chosen: Mapping[str, str], normalisation: str | None) -> ActionSpec:
+def _spec(
+    chosen: Mapping[str, str], joints: Sequence[str], normalisation: str | None
+) -> ActionSpec:
+    action = chosen["action"]
     rotation, threshold = chosen["rotation"], chosen["gripper_threshold"]
     with as_spec_error():
         return ActionSpec.model_validate(
             {
                 "horizon": whole_number("horizon", chosen["horizon"]),
                 "dt_s": number("dt_s", chosen["dt_s"]),
-                "kind": "absolute" if _of_joints(chosen["action"]) else chosen["action"],
+                "kind": _JOINT_KINDS.get(action, action),
+                "space": "joint" if action in _JOINT_KINDS else "tcp",
+                "joints": tuple(joints) if action in _JOINT_KINDS else (),
                 "frame": chosen["frame"],
                 "anchor": chosen["anchor"] or "goal",
                 "relative_to": chosen["relative_to"] or "previous",

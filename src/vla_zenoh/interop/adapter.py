@@ -12,7 +12,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 from vla_zenoh.errors import PeerError, SpecError
-from vla_zenoh.interop.action_semantics import Forward, make_forward
 from vla_zenoh.interop.field_mapping import read_field_mapping
 from vla_zenoh.interop.presets import Presets
 from vla_zenoh.policy import ActionSteps, ModelSpec, Observation
@@ -97,19 +96,19 @@ class Adapter(ABC):
                 f"timeout_s is {timeout_s!r}, wanted {MIN_TIMEOUT_S:g} to {MAX_TIMEOUT_S:g}: "
                 "a late answer is useless"
             )
-        self._profile = load_profile(profile)
+        robot = load_profile(profile).robot
         self.mapping = read_field_mapping(
             name,
             presets,
             preset,
             mapping,
-            max_width_m=self._profile.robot.gripper.max_width_m,
+            max_width_m=robot.gripper.max_width_m,
+            joints=robot.arm_joints,
             normalisation=normalisation,
         )
         if self.mapping.semantics.needs_joints and not self.joints:
             raise SpecError("action: joints are not read by this adapter; use delta or absolute")
         self.spec: ModelSpec = self.mapping.spec
-        self._forward: Forward | None = None
         self._clock_s, self._backoff = clock_s, Backoff()
         self._begins = True
 
@@ -143,11 +142,6 @@ class Adapter(ABC):
         self.reset()  # the next connection starts an episode
 
     # -- called by the worker -----------------------------------------------------------------
-    def load(self) -> None:
-        """Load the kinematics if needed; the first observation connects to the server."""
-        if self.mapping.semantics.needs_joints:
-            self._forward = make_forward(self._profile)
-
     def reset(self) -> None:
         """Start an episode; a server that supports it gets the reset with the next request."""
         self._begins = True
@@ -162,7 +156,7 @@ class Adapter(ABC):
         if wait_s > 0:
             raise PeerError("peer_gone", f"{self.where} was lost; retrying in {wait_s:.1f} s")
         try:
-            return self.mapping.read(self._answer(observation), observation, self._forward)
+            return self.mapping.read(self._answer(observation))
         except Exception as error:  # after any failure, nothing left on the wire may be read
             self._drop(answers=isinstance(error, PeerError) and error.reason in ANSWERED)
             reported = self._as_peer_error(error)

@@ -17,7 +17,7 @@ For the meaning of the numbers see `vla_zenoh.interop.action_semantics`.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, get_args
 
@@ -28,7 +28,6 @@ from vla_zenoh.errors import PeerError, SpecError
 from vla_zenoh.interop.action_semantics import (
     ACTION_OPTIONS,
     ActionSemantics,
-    Forward,
     as_spec_error,
     read_action_semantics,
 )
@@ -82,11 +81,9 @@ class FieldMapping:
     max_width_m: float
 
     @property
-    def width(self) -> int | None:
-        """Columns of an answer; None if they depend on the number of joints."""
-        if self.columns is not None:
-            return len(self.columns)
-        return None if self.semantics.needs_joints else sum(self.semantics.parts(0).values())
+    def width(self) -> int:
+        """Columns of an answer that are used."""
+        return sum(self.semantics.parts().values()) if self.columns is None else len(self.columns)
 
     # -- out ----------------------------------------------------------------------------------
     def request(self, observation: Observation) -> dict[str, Any]:
@@ -138,29 +135,23 @@ class FieldMapping:
             raise PeerError("peer_reply", "the answer holds NaN or infinity")
         return rows[: self.spec.action.horizon]
 
-    def read(
-        self, answer: Any, observation: Observation, forward: Forward | None = None
-    ) -> ActionSteps:
+    def read(self, answer: Any) -> ActionSteps:
         """Action steps of an answer, with its first row as raw output for debugging."""
         first = self.gather(answer)[0].tolist()
-        return ActionSteps(self.steps(answer, observation, forward), raw={"first_step": first})
+        return ActionSteps(self.steps(answer), raw={"first_step": first})
 
-    def steps(
-        self, answer: Any, observation: Observation, forward: Forward | None = None
-    ) -> NDArray[np.float64]:
+    def steps(self, answer: Any) -> NDArray[np.float64]:
         """Action steps (H, D) as `spec` declares them.
 
         Args:
             answer: see `gather`.
-            observation: of the request; joint deltas start from its joints.
-            forward: kinematics, if the answers are joints.
 
         Raises:
             PeerError: see `gather`; also a wrong number of columns.
         """
         rows = self.gather(answer)
         try:
-            return self.semantics.steps(rows, observation.joint, forward)
+            return self.semantics.steps(rows)
         except SpecError as error:
             hint = "; choose them with columns=" if error.reason == "shape" else ""
             raise PeerError("peer_reply", f"{error}{hint}") from error
@@ -206,6 +197,7 @@ def read_field_mapping(
     options: Mapping[str, str],
     *,
     max_width_m: float,
+    joints: Sequence[str] = (),
     normalisation: str | None = None,
 ) -> FieldMapping:
     """The mapping that a preset and options define.
@@ -216,6 +208,7 @@ def read_field_mapping(
         preset: name of the preset.
         options: of the user; they override the preset.
         max_width_m: of our gripper.
+        joints: names of our arm's.
         normalisation: for the spec.
 
     Raises:
@@ -237,9 +230,11 @@ def read_field_mapping(
         raise SpecError("map is empty: give the content of each field of a request, as NAME=SOURCE")
     given = {name: value for name, value in options.items() if name in ACTION_OPTIONS}
     whose = f"preset {preset}"
-    semantics = read_action_semantics(given, presets[preset], whose, normalisation=normalisation)
+    semantics = read_action_semantics(
+        given, presets[preset], whose, joints=joints, normalisation=normalisation
+    )
     with as_spec_error():
-        observation = _observation(fields, chosen, semantics.needs_joints)
+        observation = _observation(fields, chosen)
     return FieldMapping(
         fields=fields,
         spec=ModelSpec(name=name, observation=observation, action=semantics.spec),
@@ -250,14 +245,11 @@ def read_field_mapping(
     )
 
 
-def _observation(
-    fields: Mapping[str, FieldSource], chosen: Mapping[str, str], joints: bool
-) -> ObservationSpec:
+def _observation(fields: Mapping[str, FieldSource], chosen: Mapping[str, str]) -> ObservationSpec:
     form: dict[str, Any] = {"colour": chosen["colour"]}
     if size := read_size(chosen["size"]):
         form |= {"width": size[0], "height": size[1], "resize": chosen["resize"]}
     parts = {part for source in fields.values() for part in parts_of(source.parts)}
-    parts |= {"joint"} if joints else set()
     cameras = dict.fromkeys(source.camera for source in fields.values() if source.camera)
     return ObservationSpec(
         cameras=tuple(CameraSpec(camera=camera, **form) for camera in cameras),

@@ -1,4 +1,4 @@
-"""Distances of the arm to itself and to the table.
+"""Distances of the arm to itself, to the table and to what it keeps out of.
 
 Every link is the convex hull of its collision shapes. The pairs of links to check are found once,
 by sampling the joint space: pairs that are always near are neighbours by construction, pairs that
@@ -9,7 +9,7 @@ the shapes: adjacent, never and default in MoveIt's setup assistant.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,8 +17,10 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from vla_zenoh.errors import ResourceError
+from vla_zenoh.errors import ProfileError, ResourceError
 from vla_zenoh.kinematics.kinematics import Kinematics
+from vla_zenoh.kinematics.so3 import rotation_from_rpy
+from vla_zenoh.profile import KeepOut
 from vla_zenoh.types import FloatArray
 
 SAMPLES = 1000
@@ -32,12 +34,14 @@ class CollisionPair(NamedTuple):
 
     Args:
         first: a link.
-        second: another link, or ``table``.
+        second: another link, ``table``, or the name of a keep-out.
+        limit: ``self_collision``, ``table_distance`` or ``keep_out``.
         is_hand: `first` moves with the last joint of the arm.
     """
 
     first: str
     second: str
+    limit: str
     is_hand: bool
 
     def __str__(self) -> str:
@@ -45,7 +49,7 @@ class CollisionPair(NamedTuple):
 
 
 class CollisionModel:
-    """Distances between the links of an arm, and to the table.
+    """Distances between the links of an arm, to the table, and to keep-outs.
 
     Args:
         kinematics: of the arm; its other joints are locked.
@@ -53,9 +57,12 @@ class CollisionModel:
         touching_m: distances below this are a collision.
         table_z_m: height of the table in the base frame; None: no table.
         known_good_rad: configurations (n,) that are known to be free.
+        keep_out: name -> shape in the base frame. Every link that moves keeps out, wherever it was
+            sampled.
 
     Raises:
         ResourceError: the URDF's collision shapes cannot be loaded, or there are none.
+        ProfileError: a known configuration touches a keep-out.
     """
 
     def __init__(
@@ -66,25 +73,27 @@ class CollisionModel:
         touching_m: float,
         table_z_m: float | None = None,
         known_good_rad: Sequence[FloatArray] = (),
+        keep_out: Mapping[str, KeepOut] | None = None,
     ) -> None:
         self._model, self._data = kinematics.model, kinematics.model.createData()
         self._geometry: Any = _one_hull_a_link(kinematics)
         if table_z_m is not None:
             self._geometry.addGeometryObject(_table(kinematics, table_z_m))
+        links = len(self._geometry.geometryObjects) - (table_z_m is not None)
         pairs = _pairs_that_move(self._geometry)
         distances = self._sample(kinematics, pairs)
         good = self._at(known_good_rad, pairs)
         wanted = (distances.max(axis=0) > near_m) & (distances.min(axis=0) < near_m + NEVER_SPARE_M)
         if len(good):
             wanted &= good.min(axis=0) > touching_m
-        self._use([pair for pair, keep in zip(pairs, wanted, strict=True) if keep])
+        used = [pair for pair, keep in zip(pairs, wanted, strict=True) if keep]
+        apart = self._add_keep_outs(kinematics, keep_out or {}, links)
+        self._require_apart(apart, known_good_rad, touching_m)
+        self._use([*used, *apart])
         last = kinematics.model.njoints - 1
         self.pairs: tuple[CollisionPair, ...] = tuple(
-            CollisionPair(first.name, second.name, first.parentJoint == last)
-            for first, second in (
-                (self._geometry.geometryObjects[p.first], self._geometry.geometryObjects[p.second])
-                for p in self._geometry.collisionPairs
-            )
+            self._pair(first, second, last, keep_out=index >= len(used))
+            for index, (first, second) in enumerate([*used, *apart])
         )
 
     def distances(self, joints_rad: FloatArray) -> FloatArray:
@@ -120,6 +129,43 @@ class CollisionModel:
                 arm_m = np.array(point) - self._data.oMi[joint].translation
                 found[row] += sign * (normal @ (jacobian[:3] - pin.skew(arm_m) @ jacobian[3:]))
         return found
+
+    def _pair(self, first: int, second: int, last: int, *, keep_out: bool) -> CollisionPair:
+        link, other = (self._geometry.geometryObjects[index] for index in (first, second))
+        limit = "table_distance" if other.name == TABLE else "self_collision"
+        is_hand = link.parentJoint == last
+        return CollisionPair(link.name, other.name, "keep_out" if keep_out else limit, is_hand)
+
+    def _add_keep_outs(
+        self, kinematics: Kinematics, keep_out: Mapping[str, KeepOut], links: int
+    ) -> list[tuple[int, int]]:
+        """Add shapes; their pairs with each of the first `links` objects that move."""
+        pairs: list[tuple[int, int]] = []
+        for name, shape in keep_out.items():
+            added = self._geometry.addGeometryObject(_keep_out(kinematics, name, shape))
+            pairs += [
+                (link, added)
+                for link in range(links)
+                if self._geometry.geometryObjects[link].parentJoint
+            ]
+        return pairs
+
+    def _require_apart(
+        self,
+        pairs: list[tuple[int, int]],
+        known_good_rad: Sequence[FloatArray],
+        touching_m: float,
+    ) -> None:
+        for distances in self._at(known_good_rad, pairs) if pairs else ():
+            nearest = int(np.argmin(distances))
+            if distances[nearest] <= touching_m:
+                link, shape = (self._geometry.geometryObjects[i].name for i in pairs[nearest])
+                raise ProfileError(
+                    f"{link} is {distances[nearest]:.3f} m from the keep-out {shape!r} with the "
+                    f"arm at home, and must be over {touching_m:g} m (collision_stop_m) away; "
+                    "move the keep-out, make it smaller, or give another home_rad",
+                    ("limits", "reach", "keep_out", shape),
+                )
 
     def _use(self, pairs: Sequence[tuple[int, int]]) -> None:
         self._geometry.removeAllCollisionPairs()
@@ -234,6 +280,20 @@ def _table(kinematics: Kinematics, table_z_m: float) -> Any:
     placement = kinematics.base_placement * pin.SE3(np.eye(3), np.array([0.0, 0.0, table_z_m]))
     half_space = coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0)
     return pin.GeometryObject(TABLE, 0, 0, placement, half_space)
+
+
+def _keep_out(kinematics: Kinematics, name: str, shape: KeepOut) -> Any:
+    turn = np.eye(3)
+    if shape.box_m is not None:
+        solid = coal.Box(np.array(shape.box_m))
+        turn = rotation_from_rpy(np.array([0.0, 0.0, shape.yaw_rad]))
+    elif shape.radius_m is not None:
+        solid = coal.Sphere(shape.radius_m)
+    else:
+        normal = np.array(shape.normal)
+        solid = coal.Halfspace(normal / np.linalg.norm(normal), 0.0)
+    placement = kinematics.base_placement * pin.SE3(turn, np.array(shape.centre_m))
+    return pin.GeometryObject(name, 0, 0, placement, solid)
 
 
 def _pairs_that_move(geometry: Any) -> list[tuple[int, int]]:

@@ -77,7 +77,7 @@ class InverseKinematics:
     Args:
         kinematics: of the arm.
         posture_rad: (n,) where a redundant arm prefers to be; None: the middle of its ranges.
-        joint_margin_rad: kept from both ends of every joint's range.
+        joint_margin_rad: kept from both ends of every joint's range, one number or (n,).
         max_iterations: after which there is no solution.
 
     Raises:
@@ -89,7 +89,7 @@ class InverseKinematics:
         kinematics: Kinematics,
         posture_rad: ArrayLike | None = None,
         *,
-        joint_margin_rad: float = 0.05,
+        joint_margin_rad: float | FloatArray = 0.05,
         max_iterations: int = 40,
     ) -> None:
         self.kinematics, self._max_iterations = kinematics, max_iterations
@@ -97,7 +97,7 @@ class InverseKinematics:
         self.upper_rad = kinematics.upper_rad - joint_margin_rad
         if np.any(self.lower_rad >= self.upper_rad):
             name = kinematics.arm_joints[int(np.argmin(self.upper_rad - self.lower_rad))]
-            raise RecordError(f"joint_margin_rad {joint_margin_rad:g} leaves {name!r} no range")
+            raise RecordError(f"joint_margin_rad {joint_margin_rad} leaves {name!r} no range")
         middle = 0.5 * (self.lower_rad + self.upper_rad)
         self.posture_rad = middle if posture_rad is None else np.array(posture_rad, dtype=float)
         if self.posture_rad.shape != (kinematics.size,):

@@ -1,5 +1,7 @@
 """Forward kinematics and Jacobian of an arm, from its URDF.
 
+A joint that slides has metres where one that turns has radians; names say ``rad``.
+
 One object serves one thread: it keeps Pinocchio's work space. Joint vectors are in the order of
 `Kinematics.arm_joints`, which is the order along the chain, whatever order a profile or a
 `JointState` lists them in; `Kinematics.ordered` and `Kinematics.joints_of` sort them.
@@ -69,6 +71,10 @@ class Kinematics:
         )
         self.data: Any = self.model.createData()
         self.arm_joints: tuple[str, ...] = tuple(self.model.names)[1:]
+        self.slides = np.array(
+            [_slides(joint) for joint in list(self.model.joints)[1:]], dtype=bool
+        )
+        """(n,) joints that slide: their positions are m."""
         self._tcp = _frame(self.model, urdf, tcp_frame)
         self.base_placement = _base_placement(self.model, self.data, urdf, base_frame)
         self._base_turn: FloatArray | None = None
@@ -87,15 +93,20 @@ class Kinematics:
             if not (
                 self.lower_rad[index] < self.upper_rad[index] and self.velocity_rad_s[index] > 0
             ):
+                unit = self.unit(index)
                 raise ProfileError(
                     f"joint {name!r} of {urdf.name} has no room to move: its <limit> needs "
-                    "lower < upper (rad) and velocity > 0 (rad/s)"
+                    f"lower < upper ({unit}) and velocity > 0 ({unit}/s)"
                 )
 
     @property
     def size(self) -> int:
         """Number of arm joints, n."""
         return len(self.arm_joints)
+
+    def unit(self, index: int) -> str:
+        """Of the positions of joint `index`: rad, or m where it slides."""
+        return "m" if self.slides[index] else "rad"
 
     # -- joints -------------------------------------------------------------------------------
     def ordered(self, names: Sequence[str], values: ArrayLike) -> FloatArray:
@@ -135,6 +146,7 @@ class Kinematics:
         jacobian = pin.computeFrameJacobian(
             self.model, self.data, joints_rad, self._tcp, pin.LOCAL_WORLD_ALIGNED
         )
+        jacobian = jacobian.reshape(6, -1)  # Pinocchio gives that of one joint as (6,)
         return jacobian if self._base_turn is None else self._base_turn @ jacobian
 
     def pose_and_jacobian(self, joints_rad: FloatArray) -> tuple[Pose, FloatArray]:
@@ -206,13 +218,17 @@ def _locked(
     return position
 
 
+def _slides(joint: Any) -> bool:
+    return joint.shortname().startswith("JointModelP")
+
+
 def _wide_open(model: Any, joint: Any, called: str, ends: JointEnds | None) -> float:
     """Position of a finger joint at which the hand is widest, m or rad."""
     lower = float(model.lowerPositionLimit[joint.idx_q])
     upper = float(model.upperPositionLimit[joint.idx_q])
     if joint.nq != 1 or not (math.isfinite(lower) and math.isfinite(upper)):
         raise ProfileError(f"finger joint {called} has no limits to open and to shut at")
-    unit = "m" if joint.shortname().startswith("JointModelP") else "rad"
+    unit = "m" if _slides(joint) else "rad"
     if ends is None and unit == "m":
         return upper
     way = f"it goes from {lower:g} to {upper:g} {unit}"

@@ -79,14 +79,18 @@ def _this_python_is(wanted: str) -> bool:
     return True
 
 
-def find_model(name: str) -> ModelFile:
+def find_model(name: str, kind: str = "models") -> ModelFile:
     """The model `name`, which may be a path to a file or a folder with a model.py.
+
+    Args:
+        name: its name or path.
+        kind: of the file, see `vla_zenoh.resources`; a benchmark is found by the same rules.
 
     Raises:
         ResourceError: not found.
         WorkerError: invalid header.
     """
-    path = resources.find("models", name)
+    path = resources.find(kind, name)
     if path.is_dir():
         path = path / ENTRY_FILE
         if not path.is_file():
@@ -205,6 +209,16 @@ def make_policy(
             "and a method `infer(observation)`"
         )
     return policy
+
+
+def make_by_method(file: ModelFile, named: str, method: str, options: Mapping[str, str]) -> Any:
+    """Construct the only class with `method` of a file, or the one that `named` names there.
+
+    Raises:
+        WorkerError: the file fails to import, has no such class, or rejects the options.
+    """
+    maker = _maker(import_model(file), file.path, named, method)
+    return _made(maker, file.path, getattr(maker, "__name__", named), options)
 
 
 def make_robot(path: Path, options: Mapping[str, str] | None = None) -> Robot:

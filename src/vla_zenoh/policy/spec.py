@@ -28,9 +28,9 @@ from pydantic import (
 )
 
 from vla_zenoh.errors import SpecError, describe_faults
-from vla_zenoh.types import GripperState, JointState, PoseState, Task
+from vla_zenoh.types import GripperState, JointState, PoseState, PrivilegedState, Task
 
-StatePart = Literal["joint", "pose", "gripper"]
+StatePart = Literal["joint", "pose", "gripper", "privileged"]
 Resize = Literal["none", "stretch", "pad", "crop"]
 Frame = Literal["base", "tcp"]
 Rotation = Literal["rpy", "rotvec", "quaternion"]
@@ -330,6 +330,7 @@ class Observation:
         joint: arm joints, where asked for.
         pose: TCP pose, where asked for.
         gripper: gripper state, where asked for.
+        privileged: what a simulated benchmark knows, where asked for; no real robot tells it.
         task: prompt, episode and rate.
         robot: whose it is, for a model that serves several and remembers something of each.
     """
@@ -341,6 +342,7 @@ class Observation:
     joint: JointState | None = None
     pose: PoseState | None = None
     gripper: GripperState | None = None
+    privileged: PrivilegedState | None = None
     robot: str = ""
 
     @property

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
         REJECT_FACTOR,
         ContactLimits,
         JointLimits,
+        KeepOut,
         Limits,
         ReachLimits,
     )
@@ -39,6 +40,7 @@ __all__ = [
     "HostProfile",
     "JointEnds",
     "JointLimits",
+    "KeepOut",
     "Limits",
     "Profile",
     "ReachLimits",

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from vla_zenoh.profile.section import Fault, Range, Section
+from vla_zenoh.profile.section import Fault, Name, Range, Section
 
 
 def _one_for_all(value: Any) -> Any:
@@ -45,6 +45,8 @@ class JointLimits(Section):
     The largest of each row is the upper bound. The defaults are half the velocity, 30 % of the
     acceleration and 5 % of the jerk of the row's smallest, for every joint; the Panda's own profile
     has the same shares joint by joint.
+
+    A joint that slides has m/s, m/s^2 and m/s^3.
 
     Args:
         velocity_rad_s: of the commanded motion.
@@ -101,11 +103,51 @@ class RotationLimits(Section):
     jerk_rad_s3: float = Field(default=60.0, gt=0, le=12500)
 
 
+Edge = Annotated[float, Field(gt=0, le=2 * REACH_M)]
+Coordinate = Annotated[float, Field(ge=-REACH_M, le=REACH_M)]
+Point = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(strict=False)]
+Edges = Annotated[tuple[Edge, Edge, Edge], Field(strict=False)]
+Direction = Annotated[tuple[float, float, float], Field(strict=False)]
+
+
+class KeepOut(Section):
+    """A box, sphere or half-space in the base frame that no link may enter: one of the three.
+
+    The arm and its hand slow down at ``collision_slow_m`` from it and stop at ``collision_stop_m``.
+
+    Args:
+        centre_m: of the box or sphere; of a half-space, a point of its plane.
+        box_m: edges of a box along x, y and z, before it is turned.
+        yaw_rad: of the box, about z.
+        radius_m: of a sphere.
+        normal: of a plane, pointing to the side where the arm may be; of any length.
+    """
+
+    centre_m: Point
+    box_m: Edges | None = None
+    yaw_rad: float = Field(default=0.0, ge=-6.3, le=6.3)
+    radius_m: float | None = Field(default=None, gt=0, le=REACH_M)
+    normal: Direction | None = None
+
+    def contradictions(self) -> Iterator[Fault]:
+        """Not one shape, or a plane without a direction."""
+        shapes = {"box_m": self.box_m, "radius_m": self.radius_m, "normal": self.normal}
+        given = [name for name, value in shapes.items() if value is not None]
+        if len(given) != 1:
+            had = f"has {' and '.join(given)}" if given else "has no shape"
+            yield (), f"{had}; give one of {', '.join(shapes)}"
+        if self.normal is not None and not any(self.normal):
+            yield ("normal",), "is zero; give a direction, as [0, 1, 0]"
+        if self.yaw_rad and self.box_m is None:
+            yield ("yaw_rad",), "turns a box; this is none"
+
+
 class ReachLimits(Section):
     """Limits of goals by the arm's kinematics; see `vla_zenoh.control.reachability`.
 
     Args:
-        joint_margin_rad: kept from both ends of every joint's range.
+        joint_margin_rad: kept from both ends of the range of every joint that turns.
+        joint_margin_m: of every joint that slides.
         singularity_slow: smallest singular value of the Jacobian below which the arm slows down and
             shortens steps.
         singularity_stop: lower bound of that singular value.
@@ -116,9 +158,11 @@ class ReachLimits(Section):
         table_slow_m: distance of hand and fingers to the table below which the arm slows down; they
             work close to it.
         table_stop_m: lower bound of that distance.
+        keep_out: name -> what the arm keeps out of: a camera's post, a wall, a person's side.
     """
 
     joint_margin_rad: float = Field(default=0.05, ge=0, le=0.5)
+    joint_margin_m: float = Field(default=0.01, ge=0, le=0.1)
     singularity_slow: float = Field(default=0.05, ge=0, le=0.5)
     singularity_stop: float = Field(default=0.015, ge=0, le=0.5)
     collision_slow_m: float = Field(default=0.05, ge=0, le=0.3)
@@ -126,6 +170,7 @@ class ReachLimits(Section):
     table_z_m: float | None = Field(default=0.0, ge=-2, le=2)
     table_slow_m: float = Field(default=0.002, ge=0, le=0.3)
     table_stop_m: float = Field(default=0.001, ge=0, le=0.3)
+    keep_out: dict[Name, KeepOut] = Field(default_factory=dict, max_length=32)
 
     def contradictions(self) -> Iterator[Fault]:
         """A stop that lies before its slow."""
@@ -192,7 +237,8 @@ class Limits(Section):
             blocked: it brakes, and the goal returns to the measured pose.
         tracking_rad: leash: largest angle between the two.
         elbow_rad: largest deviation of a measured joint from where it is expected at the same TCP
-            pose; beyond it the arm slows down, at twice that it brakes.
+            pose; beyond it the arm slows down, at twice that it brakes. Of a joint that slides,
+            tracking_m.
     """
 
     workspace: Workspace = Workspace()

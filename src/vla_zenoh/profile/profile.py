@@ -13,7 +13,14 @@ from vla_zenoh import keys
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.keys import NODE_KINDS, Keys
 from vla_zenoh.profile.limits import Limits
-from vla_zenoh.profile.robot import ArmProfile, FrankaProfile, Options, RobotProfile
+from vla_zenoh.profile.robot import (
+    ArmProfile,
+    FrankaProfile,
+    LeRobotProfile,
+    Options,
+    RobotProfile,
+    UrProfile,
+)
 from vla_zenoh.profile.ros2 import JOINT_COMMANDS, Ros2Camera, Ros2Gripper, Ros2Profile
 from vla_zenoh.profile.schema import (
     SIMULATED,
@@ -75,6 +82,8 @@ class Profile(Section):
         ros2: required for a robot or camera of ROS 2.
         arm: required for a robot that is driven by a Python file.
         franka: required for a Franka arm over FCI.
+        ur: required for a UR arm over RTDE.
+        lerobot: required for a robot class of LeRobot.
     """
 
     name: Name
@@ -98,6 +107,8 @@ class Profile(Section):
     ros2: Ros2Profile | None = None
     arm: ArmProfile | None = None
     franka: FrankaProfile | None = None
+    ur: UrProfile | None = None
+    lerobot: LeRobotProfile | None = None
 
     @property
     def keys(self) -> Keys:
@@ -171,6 +182,12 @@ def _robot(profile: Profile) -> Iterator[Fault]:
         yield ("arm",), "is missing: robot.driver is arm. Name the Python file, as arm: {file: ...}"
     if profile.robot.driver == "franka" and profile.franka is None:
         yield ("franka",), "is missing: robot.driver is franka. Give franka: {address: ...}"
+    if profile.robot.driver == "ur" and profile.ur is None:
+        yield ("ur",), "is missing: robot.driver is ur. Give ur: {address: ...}"
+    if profile.robot.driver == "lerobot":
+        yield from _lerobot(profile)
+    if profile.robot.driver in ("ur", "lerobot") and profile.robot.command != "joint":
+        yield ("robot", "command"), f"must be joint: robot.driver is {profile.robot.driver}"
     joints = len(profile.robot.arm_joints)
     for name, values in profile.limits.joint:
         if len(values) not in (1, joints):
@@ -178,6 +195,18 @@ def _robot(profile: Profile) -> Iterator[Fault]:
                 ("limits", "joint", name),
                 f"has {len(values)} numbers for {joints} arm_joints: give one for all, or one each",
             )
+
+
+def _lerobot(profile: Profile) -> Iterator[Fault]:
+    found, joints = profile.lerobot, profile.robot.arm_joints
+    if found is None:
+        yield ("lerobot",), "is missing: robot.driver is lerobot. Give lerobot: {port: .., id: ..}"
+        return
+    for name in ("motors", "zero_deg"):
+        given = getattr(found, name)
+        if given and len(given) != len(joints):
+            yield ("lerobot", name), f"has {len(given)} entries for {len(joints)} arm_joints"
+    yield from _unknown(("lerobot", "reversed"), found.reversed, "robot.arm_joints", joints)
 
 
 def _cameras(profile: Profile) -> Iterator[Fault]:

@@ -1,4 +1,4 @@
-"""Sections ``robot``, ``arm`` and ``franka`` of a profile: kinematics, driver and gripper."""
+"""Section ``robot`` of a profile, and those of arms: kinematics, driver and gripper."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from pydantic import AfterValidator, Field
 
 from vla_zenoh.profile.section import Fault, Name, Section, Text, Word, Words
 
+MAX_JOINTS = 16
+"""Joints that an arm has at most."""
 POSE_JOINTS = 6
 """Joints that an arm needs at least to reach every pose in its workspace."""
 
@@ -83,7 +85,8 @@ class RobotProfile(Section):
     Args:
         name: part of every key.
         driver: ``sim``: simulator; ``ros2``: controllers of a ROS 2 robot; ``franka``: a Franka arm
-            over FCI; ``arm``: Python file. The node of the last two is ``arm``.
+            over FCI; ``ur``: a UR arm over RTDE; ``lerobot``: a robot class of LeRobot; ``arm``:
+            Python file. The node of the last four is ``arm``.
         command: set-points of the arm: ``pose`` of the TCP, for a Cartesian impedance controller,
             or ``joint`` positions.
         description: path of the URDF, or ``example-robot-data:`` and a path in that package.
@@ -91,7 +94,7 @@ class RobotProfile(Section):
         tcp_frame: link whose pose is controlled.
         arm_joints: in the order of every list of joint values in the profile.
         joint_range_rad: lower and upper end for each of arm_joints, within those of the
-            description; empty: those.
+            description; empty: those. m for a joint that slides, here and in home_rad.
         finger_joints: of the gripper; their states give its width. Prismatic ones add up to it; for
             revolute ones `gripper` defines where they are open and shut.
         home_rad: joint positions of the simulated arm after a reset.
@@ -101,7 +104,7 @@ class RobotProfile(Section):
     """
 
     name: Name
-    driver: Literal["sim", "ros2", "franka", "arm"] = "sim"
+    driver: Literal["sim", "ros2", "franka", "ur", "lerobot", "arm"] = "sim"
     command: Literal["pose", "joint"] = "pose"
     description: Word
     base_frame: Word
@@ -118,11 +121,13 @@ class RobotProfile(Section):
     @property
     def node(self) -> str:
         """Kind of the node that drives it."""
-        return "arm" if self.driver == "franka" else self.driver
+        return self.driver if self.driver in ("sim", "ros2") else "arm"
 
     def contradictions(self) -> Iterator[Fault]:
         """Lists that do not fit the arm's joints, and values in other units."""
         joints = len(self.arm_joints)
+        if joints > MAX_JOINTS:
+            yield ("arm_joints",), f"has {joints} joints: at most {MAX_JOINTS} are commanded"
         if len(self.home_rad) != joints:
             yield ("home_rad",), f"has {len(self.home_rad)} angles for {joints} arm_joints"
         if self.joint_range_rad and len(self.joint_range_rad) != joints:
@@ -220,3 +225,56 @@ class FrankaProfile(Section):
     collision_joint_nm: Thresholds = (40.0, 40.0, 36.0, 36.0, 32.0, 28.0, 24.0)
     load: FrankaLoad = FrankaLoad()
     hand: bool = True
+
+
+class UrProfile(Section):
+    """A UR arm over RTDE; tool, payload and watchdog are set before the first motion.
+
+    Args:
+        address: of the control box.
+        lookahead_s: of ``servoj``: the robot smooths its set-points over this time.
+        gain: of ``servoj``: how hard it follows them.
+        tcp_m: where robot.tcp_frame is in the frame of the robot's flange.
+        tcp_rotvec: its rotation there, as a rotation vector.
+        payload_kg: mass that the flange carries.
+        payload_centre_m: its centre of mass in the frame of the flange.
+        watchdog_hz: the robot stops its program when it hears less often from this computer.
+    """
+
+    address: Word
+    lookahead_s: float = Field(default=0.1, ge=0.03, le=0.2)
+    gain: float = Field(default=300.0, ge=100, le=2000)
+    tcp_m: tuple[float, float, float] = Field(default=(0.0, 0.0, 0.0), strict=False)
+    tcp_rotvec: tuple[float, float, float] = Field(default=(0.0, 0.0, 0.0), strict=False)
+    payload_kg: float = Field(default=0.0, ge=0, le=50)
+    payload_centre_m: tuple[float, float, float] = Field(default=(0.0, 0.0, 0.0), strict=False)
+    watchdog_hz: float = Field(default=5.0, ge=1, le=50)
+
+
+class LeRobotProfile(Section):
+    """A robot class of LeRobot, calibrated by LeRobot's own program.
+
+    Args:
+        robot: LeRobot's name of it: ``so101_follower``, ``so100_follower``, ``koch_follower``.
+        port: serial port of its motors.
+        id: under which it was calibrated.
+        calibration_dir: folder of the calibration; empty: LeRobot's own.
+        units: of its joints: ``degrees``, or ``normalised``: -100 to 100 from one end of
+            robot.joint_range_rad (else of the description) to the other.
+        motors: of each of robot.arm_joints; empty: they have the same names.
+        zero_deg: angle by LeRobot at which each joint of the description is 0; empty: 0 for each.
+        reversed: arm_joints that turn against the description.
+        gripper: its motor, 0 to 100; empty: there is none.
+        limp_at_end: the motors let go when the node ends, and the arm falls.
+    """
+
+    robot: Name = "so101_follower"
+    port: Word
+    id: Name
+    calibration_dir: Text = ""
+    units: Literal["degrees", "normalised"] = "degrees"
+    motors: Words = ()
+    zero_deg: tuple[float, ...] = Field(default=(), strict=False)
+    reversed: Words = ()
+    gripper: Text = "gripper"
+    limp_at_end: bool = False

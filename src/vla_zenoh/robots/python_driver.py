@@ -1,6 +1,6 @@
 """Driver of a robot that is a Python class with `read` and `move`, see `vla_zenoh.robot`.
 
-The class is in a file of the profile, or one of ours: a Franka arm.
+The class is in a file of the profile, or one of ours: a Franka arm, a UR, a robot of LeRobot.
 """
 
 from __future__ import annotations
@@ -153,12 +153,30 @@ class PythonDriver(RobotDriver):
         )
 
 
+def file_of(profile: Profile) -> Path | None:
+    """File whose header may ask for an environment of its own."""
+    if profile.robot.driver == "lerobot":
+        return Path(__file__).with_name("lerobot_arm.py")
+    if profile.robot.driver == "arm" and profile.arm is not None:
+        path = Path(profile.arm.file).expanduser()
+        return path if path.is_file() else None  # `make_arm` says that it is missing
+    return None
+
+
 def make_arm(profile: Profile) -> tuple[Any, str]:
     """The robot of a profile, and its name in messages."""
     if profile.robot.driver == "franka":
         from vla_zenoh.robots.franka.arm import FrankaArm  # its library is an extra
 
         return FrankaArm(profile), "franka"
+    if profile.robot.driver == "ur":
+        from vla_zenoh.robots.ur_arm import UrArm
+
+        return UrArm(profile), "ur"
+    if profile.robot.driver == "lerobot":
+        from vla_zenoh.robots.lerobot_arm import LeRobotArm
+
+        return LeRobotArm(profile), "lerobot"
     if profile.arm is None:
         raise ProfileError(
             f"profile {profile.name!r} has no section arm, which names a Python file: "

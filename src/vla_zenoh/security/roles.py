@@ -81,6 +81,7 @@ TABLE = (
     _stream("state_joint", {ROBOT}, {WORKER, COMMAND, OPERATOR, VIEWER}),
     _stream("state_pose", {ROBOT}, {WORKER, COMMAND, OPERATOR, VIEWER}),
     _stream("state_gripper", {ROBOT}, {WORKER, COMMAND, OPERATOR, VIEWER}),
+    _stream("state_privileged", {ROBOT}, {WORKER, OPERATOR, VIEWER}),
     _setting("prompt"),
     _setting("active"),
     Row("holding", announce=frozenset({OPERATOR}), watch=frozenset({COMMAND})),

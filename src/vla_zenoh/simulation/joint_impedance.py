@@ -19,13 +19,13 @@ payload that the model lacks.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.simulation.cartesian_impedance import ArmDynamics
+from vla_zenoh.simulation.robot_model import JointGains
 from vla_zenoh.types import FloatArray
 from vla_zenoh.types.commands import JointReference
 
@@ -42,28 +42,6 @@ class JointImpedanceOutput(NamedTuple):
     torque_nm: FloatArray
     error_rad: FloatArray
     saturated: bool
-
-
-@dataclass(frozen=True, slots=True)
-class JointGains:
-    """Gains of the law, per joint from the base outwards.
-
-    By default it follows within a milliradian; a blocked joint exerts at most 40 Nm. A longer arm
-    repeats the last number, a shorter one ignores the surplus.
-
-    Args:
-        stiffness_nm_rad: K.
-        damping_ratio: zeta, 1 is critical.
-        integral_1_s: ki, 0 switches integral action off.
-        max_integral_nm: bound of the integral torque.
-        max_error_rad: largest stretch of the spring, which bounds the torque of a blocked joint.
-    """
-
-    stiffness_nm_rad: tuple[float, ...] = (600.0, 600.0, 600.0, 600.0, 250.0, 150.0, 50.0)
-    damping_ratio: float = 1.0
-    integral_1_s: float = 4.0
-    max_integral_nm: tuple[float, ...] = (10.0, 10.0, 10.0, 10.0, 4.0, 4.0, 2.0)
-    max_error_rad: float = 0.05
 
 
 class JointImpedance:

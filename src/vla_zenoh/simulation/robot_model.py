@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+
+from vla_zenoh.profile import RobotProfile
 
 Rgba = tuple[float, float, float, float]
 Vector3 = tuple[float, float, float]
@@ -29,6 +31,31 @@ class MountedCamera:
     fovy_rad: float
 
 
+@dataclass(frozen=True, slots=True)
+class JointGains:
+    """Gains of the joint impedance controller, per joint from the base outwards.
+
+    By default it follows within a milliradian; a blocked joint exerts at most 40 Nm. A longer arm
+    repeats the last number, a shorter one ignores the surplus.
+
+    Args:
+        stiffness_nm_rad: K.
+        damping_ratio: zeta, 1 is critical.
+        integral_1_s: ki, 0 switches integral action off.
+        max_integral_nm: bound of the integral torque.
+        max_error_rad: largest stretch of the spring, which bounds the torque of a blocked joint.
+    """
+
+    stiffness_nm_rad: tuple[float, ...] = (600.0, 600.0, 600.0, 600.0, 250.0, 150.0, 50.0)
+    damping_ratio: float = 1.0
+    integral_1_s: float = 4.0
+    max_integral_nm: tuple[float, ...] = (10.0, 10.0, 10.0, 10.0, 4.0, 4.0, 2.0)
+    max_error_rad: float = 0.05
+
+
+PANDA_GAINS = JointGains()
+
+
 def _panda_wrist() -> MountedCamera:
     return MountedCamera(
         name="wrist",
@@ -42,15 +69,22 @@ def _panda_wrist() -> MountedCamera:
 
 @dataclass(frozen=True, slots=True)
 class RobotModel:
-    """An arm with a two-finger parallel gripper.
+    """An arm with a gripper of parallel fingers, or of one jaw that turns.
 
-    Kinematics, inertia, joint limits and effort limits are those of the URDF, without armature: so
-    Pinocchio and MuJoCo compute the same dynamics.
+    Kinematics, inertia and joint limits are those of the URDF.
 
     Args:
         description: the URDF, see `vla_zenoh.resources.robot_urdf`.
+        mesh_grid_m: details of the meshes smaller than this are merged, for a description whose
+            meshes have too many faces to draw; None: they stay as they are.
         arm_joints: the joints under torque control, base to tip.
-        finger_joints: two prismatic joints; the opening is their sum.
+        armature_kg_m2: inertia of each motor, seen through its gear. Without it Pinocchio and
+            MuJoCo compute the same dynamics.
+        effort_nm: limit of every joint; None: that of the URDF.
+        gains: of the joint impedance controller.
+        finger_joints: the opening is ``finger_scale_m`` times the sum of their positions.
+        finger_scale_m: opening per metre of a joint that slides or radian of one that turns.
+        max_width_m: largest opening.
         finger_links: links whose geoms touch the object.
         tcp_link: link whose frame is the TCP.
         camera: the camera mounted on the robot, or None.
@@ -62,9 +96,15 @@ class RobotModel:
     """
 
     description: str = "example-robot-data:panda_description/urdf/panda.urdf"
+    mesh_grid_m: float | None = None
     arm_joints: tuple[str, ...] = tuple(f"panda_joint{i}" for i in range(1, 8))
-    finger_joints: tuple[str, str] = ("panda_finger_joint1", "panda_finger_joint2")
-    finger_links: tuple[str, str] = ("panda_leftfinger", "panda_rightfinger")
+    armature_kg_m2: float = 0.0
+    effort_nm: float | None = None
+    gains: JointGains = PANDA_GAINS
+    finger_joints: tuple[str, ...] = ("panda_finger_joint1", "panda_finger_joint2")
+    finger_scale_m: float = 1.0
+    max_width_m: float = 0.08
+    finger_links: tuple[str, ...] = ("panda_leftfinger", "panda_rightfinger")
     tcp_link: str = "panda_hand_tcp"
     camera: MountedCamera | None = field(default_factory=_panda_wrist)
     gripper_stiffness_n_m: float = 4000.0
@@ -78,3 +118,48 @@ class RobotModel:
         ("panda_rightfinger", (0.16, 0.17, 0.19, 1.0)),
     )
     colour: Rgba = (0.88, 0.89, 0.90, 1.0)
+
+
+SO101 = RobotModel(
+    description="example-robot-data:so_arm_description/urdf/so101.urdf",
+    mesh_grid_m=0.002,
+    arm_joints=("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll"),
+    # The motors are geared 345 : 1; the URDF has neither their inertia nor their stall torque.
+    armature_kg_m2=0.028,
+    effort_nm=2.9,
+    gains=JointGains(
+        stiffness_nm_rad=(60.0, 60.0, 60.0, 40.0, 40.0),
+        max_integral_nm=(1.5, 1.5, 1.5, 1.0, 1.0),
+    ),
+    finger_joints=("gripper",),
+    finger_links=("gripper_link", "moving_jaw_so101_v1_link"),
+    tcp_link="gripper_frame_link",
+    camera=MountedCamera(
+        name="wrist",
+        link="gripper_link",
+        position_m=(0.0, -0.075, -0.01),
+        look_at_m=(-0.005, 0.0, -0.105),
+        up=(0.0, 1.0, 0.0),
+        fovy_rad=1.2,
+    ),
+    gripper_stiffness_n_m=1500.0,
+    gripper_damping_ns_m=40.0,
+    colours=(("moving_jaw_so101_v1_link", (0.35, 0.36, 0.38, 1.0)),),
+    colour=(0.90, 0.90, 0.88, 1.0),
+)
+
+
+def robot_model(robot: RobotProfile) -> RobotModel:
+    """The robot of a profile: the SO-101, else with camera, gripper and colours of a Panda."""
+    found = SO101 if robot.description == SO101.description else RobotModel()
+    ends = robot.gripper.joint_ends
+    found = replace(
+        found,
+        description=robot.description,
+        arm_joints=robot.arm_joints,
+        tcp_link=robot.tcp_frame,
+    )
+    if ends is None:
+        return found
+    width_m = robot.gripper.max_width_m
+    return replace(found, finger_scale_m=width_m / (ends.open - ends.shut), max_width_m=width_m)

@@ -12,6 +12,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from vla_zenoh import resources
 from vla_zenoh.errors import RecordError, ResourceError
@@ -101,7 +102,12 @@ def _robot_spec(robot: RobotModel, joint_friction_nm: float) -> mujoco.MjSpec:
     spec = mujoco.MjSpec.from_file(str(urdf))
     meshes = resources.meshes_of(urdf)
     for mesh in spec.meshes:
-        mesh.file = str(meshes / Path(mesh.file).name)
+        file = meshes / Path(mesh.file).name
+        if robot.mesh_grid_m is None:
+            mesh.file = str(file)
+        else:
+            vertices, faces = coarse_stl(file, robot.mesh_grid_m)
+            mesh.file, mesh.uservert, mesh.userface = "", vertices.ravel(), faces.ravel()
     # Fusing would merge the TCP and the base into their parents and lose their frames.
     spec.compiler.fusestatic = False
     for light in list(spec.lights):
@@ -122,7 +128,8 @@ def _robot_spec(robot: RobotModel, joint_friction_nm: float) -> mujoco.MjSpec:
         equality.solref = STIFF_SOLREF
     for name in robot.arm_joints:
         _named(spec.joint(name), "joint", name, [joint.name for joint in spec.joints])
-        spec.joint(name).frictionloss = joint_friction_nm
+        joint = spec.joint(name)
+        joint.frictionloss, joint.armature = joint_friction_nm, robot.armature_kg_m2
 
     links = [body.name for body in spec.bodies]
     tcp = _named(spec.body(robot.tcp_link), "link", robot.tcp_link, links)
@@ -132,6 +139,19 @@ def _robot_spec(robot: RobotModel, joint_friction_nm: float) -> mujoco.MjSpec:
         _add_camera(link, robot.camera)
     _add_actuators(spec, robot)
     return spec
+
+
+def coarse_stl(file: Path, grid_m: float) -> tuple[FloatArray, NDArray[np.int32]]:
+    """Vertices (n, 3) and faces (m, 3) of a binary STL, with one vertex in each cell of a grid."""
+    triangle = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", "<u2")])
+    corners = np.fromfile(file, triangle, offset=84)["corners"].reshape(-1, 3)
+    _, cell = np.unique(np.round(corners / grid_m).astype(np.int64), axis=0, return_inverse=True)
+    cell = cell.ravel()
+    total = [np.bincount(cell, corners[:, axis]) for axis in range(3)]
+    vertices = np.column_stack(total) / np.bincount(cell)[:, None]
+    faces = cell.reshape(-1, 3).astype(np.int32)
+    a, b, c = faces.T
+    return vertices, np.unique(faces[(a != b) & (b != c) & (c != a)], axis=0)
 
 
 def _named(element: Any, kind: str, name: str, known: list[str]) -> Any:
@@ -157,6 +177,8 @@ def _add_camera(link: mujoco.MjsBody, camera: MountedCamera) -> None:
 def _add_actuators(spec: mujoco.MjSpec, robot: RobotModel) -> None:
     for name in robot.arm_joints:
         limit = spec.joint(name).actfrcrange  # the URDF's effort limit
+        if robot.effort_nm is not None:
+            limit = (-robot.effort_nm, robot.effort_nm)
         spec.add_actuator(
             name=name,
             trntype=mujoco.mjtTrn.mjTRN_JOINT,
@@ -166,7 +188,7 @@ def _add_actuators(spec: mujoco.MjSpec, robot: RobotModel) -> None:
         )
     width = spec.add_tendon(name=GRIPPER)
     for name in robot.finger_joints:
-        width.wrap_joint(name, 1.0)
+        width.wrap_joint(name, robot.finger_scale_m)
     # A servo of the opening; its whole force acts on either finger.
     stiffness, damping = robot.gripper_stiffness_n_m, robot.gripper_damping_ns_m
     spec.add_actuator(

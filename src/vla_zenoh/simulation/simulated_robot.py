@@ -125,7 +125,7 @@ class SimulatedArm:
 
 
 class SimulatedGripper:
-    """Two fingers with a width servo: the set width runs at a speed, under a bounded force.
+    """Fingers with a width servo: the set width runs at a speed, under a bounded force.
 
     Args:
         model: the scene with the robot in it.
@@ -138,14 +138,15 @@ class SimulatedGripper:
         fingers = [model.joint(PREFIX + name) for name in robot.finger_joints]
         self._q = [int(joint.qposadr[0]) for joint in fingers]
         self._dofs = [int(joint.dofadr[0]) for joint in fingers]
-        self._open_m = [float(joint.range[1]) for joint in fingers]
+        self._scale_m, self._max_width_m = robot.finger_scale_m, robot.max_width_m
+        # Each opens as far as the others.
+        self._open = self._max_width_m / self._scale_m / len(fingers)
         self._actuator = int(model.actuator(PREFIX + GRIPPER).id)
-        self._max_width_m = sum(self._open_m)
         self._hold_at(self._max_width_m)
 
     def open(self) -> None:
         """Put the fingers at their widest, as after a reset."""
-        self._data.qpos[self._q] = self._open_m
+        self._data.qpos[self._q] = self._open
         self._hold_at(self._max_width_m)
 
     def stand(self) -> None:
@@ -209,10 +210,8 @@ class SimulatedGripper:
         return self._measured_m - self._set_m > HELD_MARGIN_M and not self._moving
 
     def _opening(self) -> tuple[float, float]:
-        left, right = self._q
-        left_dof, right_dof = self._dofs
-        q, v = self._data.qpos, self._data.qvel
-        return float(q[left] + q[right]), float(v[left_dof] + v[right_dof])
+        q, v = self._data.qpos[self._q].sum(), self._data.qvel[self._dofs].sum()
+        return float(q) * self._scale_m, float(v) * self._scale_m
 
     def _bound_force(self, force_n: float) -> None:
         limit_n = min(force_n, MAX_FORCE_N)

@@ -18,9 +18,9 @@ from vla_zenoh.simulation.cartesian_impedance import (
     ImpedanceGains,
     ImpedanceOutput,
 )
-from vla_zenoh.simulation.joint_impedance import JointGains, JointImpedance, JointImpedanceOutput
+from vla_zenoh.simulation.joint_impedance import JointImpedance, JointImpedanceOutput
 from vla_zenoh.simulation.objects import SimulatedObjects
-from vla_zenoh.simulation.robot_model import RobotModel
+from vla_zenoh.simulation.robot_model import RobotModel, robot_model
 from vla_zenoh.simulation.scene import STEP_S, build_model, read_pose_vector, write_pose_vector
 from vla_zenoh.simulation.simulated_robot import SimulatedArm, SimulatedGripper
 from vla_zenoh.types import FloatArray, GripperState, JointState, PoseState, vector
@@ -84,7 +84,7 @@ class World:
             period_s=STEP_S,
         )
         self._joint_controller = JointImpedance(
-            JointGains(), effort_nm=self._arm.effort_limit_nm, period_s=STEP_S
+            robot.gains, effort_nm=self._arm.effort_limit_nm, period_s=STEP_S
         )
         self._active_law: CartesianImpedance | JointImpedance | None = None
         self._held_rad: FloatArray | None = None
@@ -300,14 +300,9 @@ def build_world(profile: Profile) -> World:
     Raises:
         ResourceError: scene or robot description are missing.
     """
-    robot = RobotModel(
-        description=profile.robot.description,
-        arm_joints=profile.robot.arm_joints,
-        tcp_link=profile.robot.tcp_frame,
-    )
     return World(
         profile.sim.scene,
-        robot,
+        robot_model(profile.robot),
         home_rad=profile.robot.home_rad,
         joint_friction_nm=profile.sim.joint_friction_nm,
         seed=profile.sim.seed,

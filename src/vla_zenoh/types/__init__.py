@@ -40,6 +40,7 @@ if TYPE_CHECKING:
         JointState,
         ObjectPoses,
         PoseState,
+        PrivilegedState,
         SceneState,
     )
     from vla_zenoh.types.stream import Header, Stamped
@@ -64,6 +65,7 @@ __all__ = [
     "ObjectPoses",
     "PoseCommand",
     "PoseState",
+    "PrivilegedState",
     "SceneState",
     "Stamped",
     "Task",

@@ -75,6 +75,8 @@ def unit_quaternion(name: str, value: ArrayLike) -> FloatArray:
     norm = math.hypot(*array.tolist())
     if abs(norm - 1.0) > QUATERNION_NORM_TOLERANCE:
         raise RecordError(f"{name} has norm {norm:.6g}, wanted a unit quaternion x, y, z, w")
+    if norm == 1.0:
+        return array
     array = array / norm
     array.setflags(write=False)
     return array

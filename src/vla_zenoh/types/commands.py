@@ -98,6 +98,8 @@ class PoseCommand:
 class JointCommand:
     """Where the joints have to be now, with feed-forward; all arrays have one entry per name.
 
+    In rad, of a joint that slides in m.
+
     Args:
         names: of the arm's joints, in any order.
         position_rad: (n,).

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,7 @@ from vla_zenoh.errors import RecordError
 from vla_zenoh.types.arrays import FloatArray, numbers, unit_quaternion, vector
 from vla_zenoh.types.checks import (
     boolean,
+    entries,
     integer,
     joint_names,
     number,
@@ -23,6 +25,8 @@ from vla_zenoh.types.checks import (
 @dataclass(frozen=True, slots=True, eq=False)
 class JointState:
     """Arm joints, without the fingers: all arrays have one entry per name.
+
+    In rad and Nm, of a joint that slides in m and N.
 
     Args:
         names: of the joints.
@@ -118,6 +122,21 @@ class GripperState:
         set_field(self, "holding", boolean("holding", self.holding))
         text("mode", self.mode, 128)
         set_field(self, "faults", texts("faults", self.faults, 512))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PrivilegedState:
+    """What only a simulation can know: true poses, the observation of a benchmark's own expert.
+
+    Args:
+        values: name -> its numbers, (n,) each.
+    """
+
+    values: Mapping[str, FloatArray]
+
+    def __post_init__(self) -> None:
+        given = entries("values", self.values)
+        set_field(self, "values", {name: vector(name, part, None) for name, part in given.items()})
 
 
 @dataclass(frozen=True, slots=True, eq=False)

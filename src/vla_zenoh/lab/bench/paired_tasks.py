@@ -1,4 +1,4 @@
-"""Paired comparison of two runs of `bench task` over the same layouts.
+"""Paired comparison of two runs of `bench task` or `bench sim` over the same layouts.
 
 Most of the noise in a success rate comes from the layouts. Pairing episodes with the same task in
 the same layout cancels it, so that far fewer episodes tell two policies apart.
@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
 
 from vla_zenoh.errors import RecordError, describe_fault
 from vla_zenoh.lab.statistics import Paired, paired
@@ -20,6 +20,7 @@ ALPHA = 0.05
 """Significance level, as in the intervals at 95 %."""
 CONDITIONS = (
     "mode",
+    "replan",
     "profile",
     "vary",
     "held_out",
@@ -41,8 +42,8 @@ class _Read(BaseModel):
 class PairedOutcome(_Read):
     """Outcome of one episode in a result file."""
 
-    seed: int
-    family: str
+    seed: int = Field(validation_alias=AliasChoices("seed", "episode"))
+    family: str = Field(validation_alias=AliasChoices("family", "task"))
     target: str = ""
     onto: str = ""
     direction: str = ""
@@ -57,19 +58,20 @@ class PairedOutcome(_Read):
 
 
 class TaskResultFile(_Read):
-    """Result file of `vla-zenoh bench task`."""
+    """Result file of `vla-zenoh bench task` or `bench sim`."""
 
     model: str
     options: dict[str, str]
-    scene: str
+    scene: str = Field(validation_alias=AliasChoices("scene", "suite"))
     mode: str
-    profile: str
-    vary: tuple[str, ...]
-    held_out: bool
-    prompt: str | None
+    replan: int = 0
+    profile: str = ""
+    vary: tuple[str, ...] = ()
+    held_out: bool = False
+    prompt: str | None = None
     delay_ms: float
-    rate_hz: float | None
-    limit_s: float
+    rate_hz: float | None = None
+    limit_s: float = 0.0
     all: tuple[PairedOutcome, ...]
 
     def by_task(self) -> dict[Task, PairedOutcome]:
@@ -99,7 +101,9 @@ def read_run(content: bytes, where: str) -> TaskResultFile:
         fault = error.errors(include_url=False)[0]
         place = ".".join(map(str, fault["loc"]))
         why = f"{place} {describe_fault(fault)}" if place else describe_fault(fault)
-        raise RecordError(f"{where} is no result of `vla-zenoh bench task`: {why}") from error
+        raise RecordError(
+            f"{where} is no result of `vla-zenoh bench task` or `bench sim`: {why}"
+        ) from error
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,7 +183,7 @@ def compare(a: TaskResultFile, b: TaskResultFile, differ: Collection[str] = ()) 
     """
     if a.scene != b.scene:
         raise RecordError(
-            f"A was run in the scene {a.scene}, B in {b.scene}: a seed lays them out differently, "
+            f"A was run in {a.scene}, B in {b.scene}: a seed lays them out differently, "
             "so no layout is in both"
         )
     others = {name: pair for name, pair in differing(a, b).items() if name not in differ}

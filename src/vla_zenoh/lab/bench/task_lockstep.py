@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -182,6 +183,7 @@ class _Loaded:
 
     def __init__(self, policy: Policy) -> None:
         self.spec: ModelSpec = policy.spec
+        self.takes_committed = bool(getattr(policy, "takes_committed", False))
         self._policy = policy
         self.took_ms: list[float] = []
         with _model_errors("cannot be loaded"):
@@ -191,10 +193,10 @@ class _Loaded:
         with _model_errors("cannot be reset"):
             (reset_of(self._policy) or (lambda: None))()
 
-    def infer(self, observation: Observation) -> ActionSteps:
+    def infer(self, observation: Observation, **committed: Any) -> ActionSteps:
         began_s = time.perf_counter()
         with _model_errors("failed"):
-            result = self._policy.infer(observation)
+            result = self._policy.infer(observation, **committed)
         self.took_ms.append((time.perf_counter() - began_s) * 1e3)
         return result if isinstance(result, ActionSteps) else ActionSteps(result)
 

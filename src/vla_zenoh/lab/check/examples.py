@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from vla_zenoh.policy import CameraSpec, ModelSpec, Observation
 from vla_zenoh.policy.observation import prepare_image
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import GripperState, Image, JointState, PoseState, Task
+from vla_zenoh.types import GripperState, Image, JointState, PoseState, PrivilegedState, Task
 
 PROMPTS = (
     "put the red brick in the box",
@@ -204,4 +204,5 @@ def example_observation(
         gripper=GripperState(width_m=0.08, moving=False, holding=False)
         if "gripper" in asked
         else None,
+        privileged=PrivilegedState({}) if "privileged" in asked else None,
     )

@@ -137,7 +137,7 @@ def check_chunk(
     """
     found = list(chunk_errors(spec, steps, limits, max_width_m))
     if spec.space == "joint":
-        pass
+        found += _joint_steps(spec, steps, limits)
     elif spec.kind == "absolute":
         found += _targets(spec, steps, limits)
     else:
@@ -157,6 +157,31 @@ def _targets(spec: ActionSpec, steps: Steps, limits: Limits) -> Iterator[Finding
             "workspace",
             f"a pose {outside_m:.3f} m outside the workspace x {box.x_m} y {box.y_m} "
             f"z {box.z_m}: is it in the base frame?",
+        )
+
+
+def _joint_steps(spec: ActionSpec, steps: Steps, limits: Limits) -> Iterator[Finding]:
+    """As `_steps`, of the joint that is fastest for its limit."""
+    joints = np.asarray(steps[:, : spec.arm_size], np.float64)
+    if spec.kind == "velocity":
+        joints = joints * spec.dt_s
+    elif spec.targets:
+        joints = np.diff(joints, axis=0)
+    ways = np.abs(joints).max(axis=0, initial=0.0)
+    if (not spec.targets) and ways.max() > limits.step_rad * (1 + ROUNDING):
+        if ways.max() > REJECT_FACTOR * limits.step_rad:
+            return  # an error
+        yield warning(
+            "step_limit",
+            f"a step of a joint of {ways.max():.4g} rad, the limit is {limits.step_rad:g} rad",
+        )
+    least_rad_s = min(limits.joint.velocity_rad_s)
+    fastest_rad_s = float(ways.max()) / spec.dt_s
+    if fastest_rad_s > least_rad_s * (1 + 1e-3):
+        yield warning(
+            "speed_limit",
+            f"a joint moves by {ways.max():.4g} rad in {spec.dt_s:g} s, {fastest_rad_s:.3g} rad/s; "
+            f"the slowest joint's limit is {least_rad_s:g}: the arm may come later than asked",
         )
 
 

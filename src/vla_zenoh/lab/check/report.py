@@ -24,6 +24,7 @@ MEANINGS: Mapping[str, str] = {
     "dtype": "steps that are not numbers",
     "not_finite": "NaN or infinity among the steps",
     "position_units": "steps too long to be metres",
+    "joint_units": "joints too far to be radians",
     "rotation_units": "rotations too large to be radians",
     "joints_as_pose": "joint positions that the spec declares as poses",
     "too_few_joints": "the arm has fewer joints than a pose of the TCP needs",

@@ -20,7 +20,10 @@ DISAGREEMENTS = 10
 
 
 def compare(
-    a: Annotated[Path, typer.Argument(help="Result of `bench task`: folder or JSON.", metavar="A")],
+    a: Annotated[
+        Path,
+        typer.Argument(help="Result of `bench task` or `sim`: folder or JSON.", metavar="A"),
+    ],
     b: Annotated[Path, typer.Argument(help="Another one.", metavar="B")],
     differ: Annotated[
         list[str] | None,
@@ -33,7 +36,7 @@ def compare(
     tasks: Annotated[bool, typer.Option("--tasks", help="A row per task, too.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare two runs of `bench task` on the layouts that both have.
+    """Compare two runs of `bench task` or `bench sim` on the layouts that both have.
 
     Exits with 3 if B is worse than A (p below 0.05), with 1 if the runs cannot be compared, else
     with 0.

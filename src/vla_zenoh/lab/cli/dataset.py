@@ -31,8 +31,13 @@ def export(
         typer.Option("--camera", help="Only this camera; repeatable. Default: all recorded ones."),
     ] = None,
     state: Annotated[
-        str, typer.Option("--state", help="Parts of the state, as in the worker lerobot.")
-    ] = "position+rpy+gripper_m",
+        str | None,
+        typer.Option(
+            "--state",
+            help="Parts of the state, as in the worker lerobot. Default: position+rpy+gripper_m; "
+            "for actions of joints joint+gripper_m.",
+        ),
+    ] = None,
     successful: Annotated[
         bool, typer.Option("--successful", help="Only episodes known to be successful.")
     ] = False,
@@ -41,12 +46,13 @@ def export(
 ) -> None:
     """Export a LeRobotDataset v3.0 with one episode per activation of a worker."""
     from vla_zenoh.lab.dataset.episodes import episodes_of
+    from vla_zenoh.lab.dataset.features import usual_state
     from vla_zenoh.lab.dataset.lerobot import export as write
     from vla_zenoh.lab.dataset.success import succeeded
     from vla_zenoh.lab.recording.run import load_run
     from vla_zenoh.policy.state_vector import read_parts
 
-    parts, files = read_parts(state), _files(runs)
+    parts, files = read_parts(state) if state else None, _files(runs)
     episodes, seen, workers, failed = [], None, set[str](), 0
     with (
         output_folder(output, force=force, inputs=files) as part,
@@ -79,7 +85,7 @@ def export(
             part,
             episodes,
             cameras or sorted(seen or ()),
-            parts,
+            parts or read_parts(usual_state(episodes)),
             lambda doing: status.update(f"writing {doing} ({counted(len(episodes), 'episode')})"),
         )
     written = written._replace(folder=output)

@@ -11,7 +11,7 @@ from rich.text import Text
 
 from vla_zenoh.cli.output import console, new_table, print_json, styled
 from vla_zenoh.errors import ResourceError, nearest
-from vla_zenoh.lab.bench.task import DemoPlan, TaskOutcome, is_judged
+from vla_zenoh.lab.bench.task import SCENE, DemoPlan, TaskOutcome, is_judged
 from vla_zenoh.lab.bench.task_runner import TaskRunner
 from vla_zenoh.lab.bench.task_sheet import sheet
 from vla_zenoh.lab.cli.demo_options import DemoOptions
@@ -39,6 +39,8 @@ def run_task_demo(prompts: list[str], seed: int, profile: str, given: DemoOption
     folder = run_folder(given.output)
     with open_stage(profile, folder, force=given.force) as stage:
         loaded = stage.profile
+        if not prompts and loaded.sim.scene != SCENE:
+            prompts = [loaded.task.prompt]
         plan = DemoPlan(
             loaded.task.worker,
             len(prompts) or ROUNDS,

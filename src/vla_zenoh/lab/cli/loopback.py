@@ -30,7 +30,7 @@ def own_address(profile: Profile) -> Profile:
         profile = override(profile, {"session": {**plain, "connect": local, "listen": local}})
     try:
         open_session(profile.session).close()
-        endpoints = (f"tcp/127.0.0.1:{_free_port()}",)
+        endpoints = (f"tcp/127.0.0.1:{free_port()}",)
         errors().print("a router already answers at the profile's address; using another port")
     except SessionError:
         endpoints = profile.session.connect
@@ -38,7 +38,8 @@ def own_address(profile: Profile) -> Profile:
     return override(profile, {"session": {**plain, "connect": here, "listen": here}})
 
 
-def _free_port() -> int:
+def free_port() -> int:
+    """A TCP port that nothing listens on now."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])

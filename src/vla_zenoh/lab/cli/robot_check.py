@@ -10,6 +10,7 @@ from vla_zenoh.cli.options import DEFAULT_PROFILE, JsonOption, effective_profile
 from vla_zenoh.cli.output import fail, progress
 from vla_zenoh.lab.cli.doctor import report
 from vla_zenoh.lab.doctor.fci import fci_arm
+from vla_zenoh.lab.doctor.ur import ur_arm
 
 
 def robot_check(
@@ -18,14 +19,17 @@ def robot_check(
     ] = DEFAULT_PROFILE,
     as_json: JsonOption = False,
 ) -> None:
-    """Connect to a Franka arm, read it, and compare it with its profile. Moves nothing.
+    """Connect to a Franka or UR arm, read it, and compare it with its profile. Moves nothing.
 
-    Its kinematics against the profile's description, its joint ranges and limits against the
-    profile's. No other program may be connected to the arm. Exits with 1 if something is wrong.
+    Its kinematics against the profile's description; of a Franka also joint ranges and limits
+    against the profile's, and no other program may be connected to it. Exits with 1 if something is
+    wrong.
     """
     loaded = effective_profile(profile)
-    if loaded.robot.driver != "franka":
-        fail(f"profile {loaded.name} has robot.driver: {loaded.robot.driver}; this checks franka")
+    check = {"franka": fci_arm, "ur": ur_arm}.get(loaded.robot.driver)
+    if check is None:
+        driver = loaded.robot.driver
+        fail(f"profile {loaded.name} has robot.driver: {driver}; this checks franka and ur")
     with progress("reading the robot"):
-        findings = list(fci_arm(loaded))
+        findings = list(check(loaded))
     report(findings, as_json=as_json)

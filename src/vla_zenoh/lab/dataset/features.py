@@ -15,7 +15,6 @@ from vla_zenoh.policy import ActionSpec, Observation
 from vla_zenoh.policy.state_vector import parts_of, state_vector
 from vla_zenoh.types import Task
 
-DEFAULT_STATE = "position+rpy+gripper_m"
 STATE, ACTION, PICTURE = "observation.state", "action", "observation.images."
 NAMES = {
     "position": ["x", "y", "z"],
@@ -30,29 +29,33 @@ NEAR_NS = 100_000_000
 """Largest distance in time between a frame and its state."""
 
 
-def state_names(parts: Sequence[str], joints: int) -> list[str]:
+def state_names(parts: Sequence[str], joints: Sequence[str]) -> list[str]:
     """Names of the numbers of a state.
 
     Args:
         parts: of the state.
-        joints: how many the arm has.
+        joints: names of the arm's joints.
     """
-    of_arm = {
-        "joint": [f"joint{index}" for index in range(1, joints + 1)],
-        "joint_deg": [f"joint{index}_deg" for index in range(1, joints + 1)],
-    }
+    of_arm = {"joint": [*joints], "joint_deg": [f"{name}_deg" for name in joints]}
     return [name for part in parts for name in {**NAMES, **of_arm}.get(part, [part])]
 
 
-def joints_of(episode: RecordedEpisode) -> int:
-    """Number of recorded arm joints; 0 without joint states."""
-    return len(episode.run.joints[0].record.names) if episode.run.joints else 0
+def joints_of(episode: RecordedEpisode) -> tuple[str, ...]:
+    """Names of the recorded arm joints; none without joint states."""
+    return episode.run.joints[0].record.names if episode.run.joints else ()
 
 
 def action_names(spec: ActionSpec) -> list[str]:
     """Names of the numbers of a step."""
     gripper = [] if spec.gripper == "none" else [f"gripper_{spec.gripper}"]
-    return [*NAMES["position"], *NAMES[spec.rotation], *gripper]
+    arm = spec.joints if spec.space == "joint" else [*NAMES["position"], *NAMES[spec.rotation]]
+    return [*arm, *gripper]
+
+
+def usual_state(episodes: Sequence[RecordedEpisode]) -> str:
+    """Parts of the state that go with the actions: joints with joints, else the pose."""
+    joints = bool(episodes) and episodes[0].spec.action.space == "joint"
+    return "joint+gripper_m" if joints else "position+rpy+gripper_m"
 
 
 def states_of(episode: RecordedEpisode, parts: Sequence[str]) -> NDArray[np.float32]:

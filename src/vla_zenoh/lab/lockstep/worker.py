@@ -17,6 +17,7 @@ from vla_zenoh.types import (
     Image,
     JointState,
     PoseState,
+    PrivilegedState,
     Stamped,
     Task,
 )
@@ -25,6 +26,7 @@ STATE_KINDS: dict[str, type[Any]] = {
     "joint": JointState,
     "pose": PoseState,
     "gripper": GripperState,
+    "privileged": PrivilegedState,
 }
 
 

@@ -15,7 +15,7 @@ from vla_zenoh.errors import (
     VlaZenohError,
     nearest,
 )
-from vla_zenoh.policy.loader import inspect_robot
+from vla_zenoh.policy.loader import find_model, inspect_robot
 from vla_zenoh.profile import POSE_JOINTS, Profile
 from vla_zenoh.profile.section import Place
 
@@ -56,7 +56,10 @@ def arm(profile: Profile, name: str, host: str | None) -> Iterator[ProfileFault]
     except ImportError as error:
         yield ProfileFault(("robot",), f"its joints and links were not checked: {error}", "command")
         return
-    except (ProfileError, RecordError) as error:
+    except ProfileError as error:
+        yield ProfileFault(error.place or ("robot",), str(error))
+        return
+    except RecordError as error:
         yield ProfileFault(("robot",), str(error))
         return
     except ValueError as error:  # from Pinocchio, for a file that is no URDF
@@ -181,6 +184,8 @@ def robot_file(profile: Profile, name: str, host: str | None) -> Iterator[Profil
         yield ProfileFault(("arm", "file"), f"there is no file {profile.arm.file}", "arm")
         return
     try:
+        if find_model(str(path)).missing():
+            return  # its header asks for an environment of its own, in which the node looks
         inspect_robot(path, profile.arm.options)
     except VlaZenohError as error:
         yield ProfileFault(("arm",), str(error), "arm")

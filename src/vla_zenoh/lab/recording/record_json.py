@@ -97,9 +97,15 @@ def _array_types(kind: type) -> dict[str, np.dtype[Any]]:
 def _with_arrays(kind: type, fields: dict[str, Any]) -> dict[str, Any]:
     types = _array_types(kind)
     return {
-        name: np.array(value, types[name]) if name in types and value is not None else value
+        name: _array(value, types[name]) if name in types and value is not None else value
         for name, value in fields.items()
     }
+
+
+def _array(value: Any, dtype: np.dtype[Any]) -> Any:
+    if isinstance(value, dict):  # of a field that maps names to arrays
+        return {name: np.array(part, dtype) for name, part in value.items()}
+    return np.array(value, dtype)
 
 
 def _dumps(value: dict[str, Any]) -> str:

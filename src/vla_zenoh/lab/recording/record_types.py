@@ -17,6 +17,7 @@ from vla_zenoh.types import (
     ObjectPoses,
     PoseCommand,
     PoseState,
+    PrivilegedState,
     SceneState,
     Task,
 )
@@ -25,6 +26,7 @@ RECORDS: tuple[type, ...] = (
     JointState,
     PoseState,
     GripperState,
+    PrivilegedState,
     PoseCommand,
     JointCommand,
     GripperCommand,
@@ -49,6 +51,7 @@ class RecordTypes:
             keys.state_joint: JointState,
             keys.state_pose: PoseState,
             keys.state_gripper: GripperState,
+            keys.state_privileged: PrivilegedState,
             keys.command_pose: PoseCommand,
             keys.command_joint: JointCommand,
             keys.command_gripper: GripperCommand,

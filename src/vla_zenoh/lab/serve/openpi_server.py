@@ -90,7 +90,9 @@ class OpenPiServer:
             self._busy.release()
 
     def _serve(self, connection: ServerConnection) -> None:
-        connection.send(openpi_frames.metadata(self._policy.spec.action, self._offer.described()))
+        takes = bool(getattr(self._policy, "takes_committed", False))
+        action, names = self._policy.spec.action, self._offer.described()
+        connection.send(openpi_frames.metadata(action, names, takes_committed=takes))
         prompt: str | None = None
         previous_ms: float | None = None
         while True:
@@ -107,9 +109,11 @@ class OpenPiServer:
                 if observation.prompt != prompt:
                     prompt = observation.prompt
                     (reset_of(self._policy) or (lambda: None))()
-                result: Any = self._policy.infer(observation)
+                committed = openpi_frames.read_committed(given, action)
+                extra: dict[str, Any] = {"committed": committed} if takes else {}
+                result: Any = self._policy.infer(observation, **extra)
                 steps = result.steps if isinstance(result, ActionSteps) else result
-                actions = check_steps(self._policy.spec.action, steps)
+                actions = check_steps(action, steps)
             except Exception as error:  # sent to the client as openpi does; it may reconnect
                 why = error if isinstance(error, (PeerError, SpecError)) else repr(error)
                 self._log.warning("request rejected: %s", why)

@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
+import pinocchio as pin
 import rerun as rr
 
 from vla_zenoh.control.actions import chunk_poses
@@ -15,7 +16,7 @@ from vla_zenoh.kinematics.so3 import Pose, rotation_from_quat
 from vla_zenoh.lab.view import paths
 from vla_zenoh.lab.view.robot_model import RobotMeshes
 from vla_zenoh.policy import ModelSpec
-from vla_zenoh.profile import Profile
+from vla_zenoh.profile import KeepOut, Profile
 from vla_zenoh.types import ActionChunk, FloatArray, ObjectPoses
 
 TRAIL_NS = 6_000_000_000
@@ -33,6 +34,9 @@ OBJECT_COLOURS = {
     "blue": (120, 170, 255),
     "yellow": (250, 220, 90),
 }
+KEEP_OUT_COLOUR = (220, 60, 60, 60)
+PLANE_M = 1.0
+"""Edge of the piece of a plane that is drawn."""
 OTHER_OBJECT = (225, 228, 235)
 REACH_M = 0.3
 """An object this far outside of the workspace is not the robot's concern."""
@@ -68,6 +72,28 @@ class PoseTrail:
         )
 
 
+def _drawn(shape: KeepOut) -> rr.Boxes3D | rr.Ellipsoids3D:
+    """A keep-out; a half-space as a piece of its plane."""
+    centres, colors = [shape.centre_m], [KEEP_OUT_COLOUR]
+    fill = rr.components.FillMode.Solid
+    if shape.radius_m is not None:
+        return rr.Ellipsoids3D(
+            centers=centres, half_sizes=[[shape.radius_m] * 3], colors=colors, fill_mode=fill
+        )
+    up = np.array([0.0, 0.0, 1.0])
+    edges = shape.box_m or (PLANE_M, PLANE_M, 0.001)
+    turn = pin.Quaternion(pin.AngleAxis(shape.yaw_rad, up))
+    if shape.normal is not None:
+        turn = pin.Quaternion.FromTwoVectors(up, np.array(shape.normal))
+    return rr.Boxes3D(
+        centers=centres,
+        sizes=[edges],
+        quaternions=[turn.coeffs()],
+        colors=colors,
+        fill_mode=fill,
+    )
+
+
 class Scene:
     """Logs the 3-D view in the base frame of the robot, at the current time of a Rerun stream.
 
@@ -96,6 +122,8 @@ class Scene:
         self._reach = low - REACH_M, high + REACH_M
         box = rr.Boxes3D(mins=[low], sizes=[high - low], colors=[(120, 130, 150, 70)], radii=0.001)
         log(f"{paths.WORLD}/workspace", box, static=True)
+        for name, shape in profile.limits.reach.keep_out.items():
+            log(f"{paths.WORLD}/keep_out/{name}", _drawn(shape), static=True)
 
     # -- robot and poses ----------------------------------------------------------------------
     def joints(self, names: Sequence[str], positions: FloatArray) -> None:

@@ -305,4 +305,7 @@ class CommandStatus:
             "singular_value": round(room.singular_value, 4),
             "self_distance_m": round(room.self_m, 4) if math.isfinite(room.self_m) else None,
             "table_distance_m": round(room.table_m, 4) if math.isfinite(room.table_m) else None,
+            "keep_out_distance_m": round(room.keep_out_m, 4)
+            if math.isfinite(room.keep_out_m)
+            else None,
         }

@@ -33,6 +33,7 @@ from vla_zenoh.types import (
     Image,
     JointState,
     PoseState,
+    PrivilegedState,
     Stamped,
     Task,
 )
@@ -48,6 +49,7 @@ STATE_KINDS: dict[str, type[Any]] = {
     "joint": JointState,
     "pose": PoseState,
     "gripper": GripperState,
+    "privileged": PrivilegedState,
 }
 
 
@@ -97,6 +99,7 @@ class RobotSession:
             "joint": keys.state_joint,
             "pose": keys.state_pose,
             "gripper": keys.state_gripper,
+            "privileged": keys.state_privileged,
         }
         self._state_buffers = {
             part: node.subscribe(state_keys[part], CallbackRing(256, SMALL_BYTES))
