@@ -43,7 +43,7 @@ fuzz: $(READY) ## Feed every reader of foreign bytes with nonsense; SECONDS=600 
 	$(BIN)/python tests/fuzz/fuzz.py --seconds $(SECONDS) $(ARGS)
 
 fuzz-motion: $(READY) ## Fuzz command node and guard with a perfect arm; MINUTES=10 for less
-	$(BIN)/python tests/fuzz_motion/fuzz_motion.py --minutes $(MINUTES) $(ARGS)
+	PYTHONPATH=tests $(BIN)/python tests/fuzz_motion/fuzz_motion.py --minutes $(MINUTES) $(ARGS)
 
 soak: $(READY) ## Run the whole chain with random faults; MINUTES=3 for a short one
 	$(BIN)/python reliability/soak/soak.py --minutes $(MINUTES) $(ARGS)

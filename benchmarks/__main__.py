@@ -8,6 +8,8 @@ import typer
 
 from benchmarks.chain.cli import chain
 from benchmarks.codec.cli import codec
+from benchmarks.delay import delay
+from benchmarks.deployment import deployment
 from benchmarks.load.cli import load
 from benchmarks.openvla import openvla
 from benchmarks.stop import stop
@@ -21,7 +23,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-for command in (chain, codec, load, openvla, stop, thesis):
+for command in (chain, codec, delay, deployment, load, openvla, stop, thesis):
     app.command()(command)
 
 if __name__ == "__main__":

@@ -37,12 +37,16 @@ HEAP, HEAP_S = 64, 1.0
 
 
 class Scenario(NamedTuple):
-    """A policy: the step (6,) m and rad that it asks for at a time (s); the table's height (m)."""
+    """A policy: the step that it asks for at a time (s); the table's height (m).
+
+    A step is (6,) m and rad of the TCP, or with `of_joints` (7,) rad.
+    """
 
     name: str
     step: Callable[[float], tuple[float, ...]]
     heap: bool = False
     table_z_m: float = 0.0
+    of_joints: bool = False
 
 
 def _peers(t_s: float) -> tuple[float, ...]:
@@ -53,6 +57,14 @@ def _down(t_s: float) -> tuple[float, ...]:
     return (0.002 * np.cos(t_s), 0.0, -0.006, 0.0, 0.0, 0.0)
 
 
+def _swing(t_s: float) -> tuple[float, ...]:
+    return tuple(0.008 * np.cos(t_s + joint) for joint in range(7))
+
+
+def _lower(t_s: float) -> tuple[float, ...]:
+    return (0.004 * np.cos(t_s), 0.01, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
 SCENARIOS = (
     Scenario("free space", _peers),
     Scenario("at the table", _down, table_z_m=0.1),
@@ -60,6 +72,9 @@ SCENARIOS = (
     Scenario("stretched (singularity)", lambda _: (0.002, 0.01, 0.01, 0.0, 0.0, 0.0)),
     Scenario("a heap, free space", _peers, heap=True),
     Scenario("a heap, at the table", _down, heap=True, table_z_m=0.1),
+    Scenario("joints, free space", _swing, of_joints=True),
+    Scenario("joints, at the workspace box", _lower, of_joints=True),
+    Scenario("joints, at the table", _lower, table_z_m=0.1, of_joints=True),
 )
 
 
@@ -75,7 +90,14 @@ class Player:
         self.spec = ModelSpec(
             name=WORKER,
             observation=ObservationSpec(cameras=(CameraSpec(camera="front"),)),
-            action=ActionSpec(horizon=HORIZON, dt_s=DT_S, rotation="rotvec", gripper="none"),
+            action=ActionSpec(
+                horizon=HORIZON,
+                dt_s=DT_S,
+                rotation="rotvec",
+                gripper="none",
+                space="joint" if scenario.of_joints else "tcp",
+                joints=self.kinematics.arm_joints if scenario.of_joints else (),
+            ),
         )
         nodes = frozenset({"sim", "camera", f"worker-{WORKER}"})
         self.peers = PeerSnapshot(
@@ -173,12 +195,15 @@ def main() -> None:
     arguments.add_argument("--duration-s", type=float, default=5.0, help="of every scenario")
     arguments.add_argument("--runs", type=int, default=5, help="of which the least counts")
     arguments.add_argument("--command", choices=("pose", "joint", "both"), default="both")
+    arguments.add_argument("--only", default="", help="scenarios whose name has this")
     given = arguments.parse_args()
     print(f"{platform.processor() or platform.machine()}, Python {platform.python_version()}")
     base = load_profile("panda_sim")
     for command in ("pose", "joint") if given.command == "both" else (given.command,):
         robot = base.robot.model_copy(update={"command": command})
         for scenario in SCENARIOS:
+            if given.only not in scenario.name:
+                continue
             reach = base.limits.reach.model_copy(update={"table_z_m": scenario.table_z_m})
             limits = base.limits.model_copy(update={"reach": reach})
             profile = base.model_copy(update={"robot": robot, "limits": limits})

@@ -1,6 +1,6 @@
 # /// script
 # requires-python = ">=3.11"
-# dependencies = ["numpy", "websockets>=15", "pin>=4", "example-robot-data>=6"]
+# dependencies = ["numpy", "websockets>=15"]
 # ///
 """Queries a policy server with openpi's protocol.
 
@@ -16,12 +16,15 @@ import uuid
 from contextlib import ExitStack, suppress
 from typing import Any
 
+import numpy as np
 from vla_zenoh_model_openpi import wire
 from websockets.exceptions import WebSocketException
 from websockets.protocol import State
 from websockets.sync.client import ClientConnection, connect
 
 from vla_zenoh.interop.adapter import Adapter
+from vla_zenoh.policy import ActionSteps, Observation
+from vla_zenoh.policy.chunk_prefix import Committed
 from vla_zenoh.policy.model_options import address, one_of
 
 CLOSE_S = 0.1
@@ -72,6 +75,11 @@ class OpenPi(Adapter):
         self._until_closed = ExitStack()
         self._session: str | None = None
         self._takes_reset = self._vllm
+        # Of single columns of an answer, the row that they came from cannot be made.
+        whole = self.mapping.columns is None
+        self.takes_committed = whole and self.spec.action.relative_to != "start"
+        self._server_takes = False
+        self._committed: Committed | None = None
 
     def _connect(self) -> list[str]:
         if self._connection is not None:
@@ -95,12 +103,26 @@ class OpenPi(Adapter):
         connection.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, seconds)
         metadata = wire.read_metadata(connection.recv(self.timeout_s))
         self._takes_reset = self._vllm or wire.SPEC in metadata
+        self._server_takes = metadata.get(wire.TAKES_COMMITTED) is True
         return wire.mismatches(metadata, self.mapping)
+
+    def infer(self, observation: Observation, committed: Committed | None = None) -> ActionSteps:
+        """Query the server; one of ours whose model takes the steps in execution gets them.
+
+        Raises:
+            PeerError: no usable answer; says why.
+        """
+        self._committed = committed
+        return super().infer(observation)
 
     def _ask(self, fields: dict[str, Any], *, begins: bool) -> Any:
         if begins and self._takes_reset:
             self._session = uuid.uuid4().hex if self._vllm else None
             wire.read_reset(self._call(wire.reset_request()))
+        committed = self._committed
+        if committed is not None and self._server_takes:
+            steps = self.mapping.semantics.rows(committed.steps).astype(np.float32)
+            fields = {**fields, wire.COMMITTED: {"steps": steps, "frozen": committed.frozen}}
         return wire.read_answer(self._call(wire.request(fields, self._session)))
 
     def _call(self, request: bytes) -> bytes | str:

@@ -25,6 +25,10 @@ MAX_BYTES = message.MAX_PAYLOAD_BYTES
 MAX_ERROR = 400
 SPEC = "vla_zenoh_action"
 """Where a server of ours says what its actions mean."""
+TAKES_COMMITTED = "vla_zenoh_takes_committed"
+"""Where a server of ours says that its model takes the steps in execution."""
+COMMITTED = "vla_zenoh_committed"
+"""Field of an observation: the steps in execution, in the numbers of the server's answers."""
 
 _OWN = {
     "size": "",
@@ -52,6 +56,8 @@ PRESETS: Presets = {
         "observation/wrist_image_left=camera:wrist, observation/joint_position=joint, "
         "observation/gripper_position=gripper_closed, prompt=prompt",
         "action": "joint_delta",
+        "anchor": "goal",
+        "relative_to": "previous",
         "joint_scale_rad": "0.2",
         "clip": "1",
         "gripper": "binary",

@@ -46,10 +46,10 @@ def data_meaning(told: Mapping[str, str], key: str, trained: Range, chunk: int) 
     """
     data = next((known for begin, known in DATA.items() if key.startswith(begin)), {})
     known = {**USUAL, **data, "horizon": str(chunk)}
-    found = read_action_semantics(told, known, f"data set {key!r}", normalisation=key)
-    if found.needs_joints:
+    if told.get("action", "").startswith("joint"):
         raise WorkerError("action: joints are not read by this worker; use delta or absolute")
-    parts = found.parts(0)
+    found = read_action_semantics(told, known, f"data set {key!r}", normalisation=key)
+    parts = found.parts()
     if sum(parts.values()) != AXES:
         wanted = " + ".join(f"{name} {count}" for name, count in parts.items())
         raise WorkerError(f"an action has {AXES} numbers, {wanted} are {sum(parts.values())}")

@@ -1,11 +1,11 @@
 # /// script
 # requires-python = ">=3.11"
-# dependencies = ["numpy", "eclipse-zenoh>=1.9,<2", "pin>=4", "example-robot-data>=6"]
+# dependencies = ["numpy", "eclipse-zenoh>=1.9,<2"]
 # ///
 """Queries a policy by origami-zenoh-v1: Zenoh queries through the router of the policy.
 
-An answer must carry the number of its request. The policy's actions are joints, which become poses
-by the kinematics of the profile's arm.
+An answer must carry the number of its request. The policy's actions are joint positions in the
+order of the profile's `robot.arm_joints`.
 """
 
 from __future__ import annotations

@@ -31,6 +31,7 @@ PRESETS: Presets = {
         "resize": "stretch",
         "columns": "29:36",
         "action": "joint_position",
+        "joint_scale_rad": "1",
         "gripper": "none",
         "dt_s": "0.1",
         "horizon": "25",

@@ -1,0 +1,1 @@
+"""Our response of a controller beside robosuite's own controller."""
