@@ -38,10 +38,13 @@ class History:
         """The entry whose stamp is nearest."""
         if not self.entries:
             return None
-        stamps = [entry.header.stamp_wall_ns for entry in self.entries]
-        right = bisect_left(stamps, stamp_ns)
+        right = bisect_left(self.entries, stamp_ns, key=_stamp_ns)
         around = self.entries[max(right - 1, 0) : right + 1]
         return min(around, key=lambda entry: abs(entry.header.stamp_wall_ns - stamp_ns))
+
+
+def _stamp_ns(entry: Stamped[Any]) -> int:
+    return entry.header.stamp_wall_ns
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +127,7 @@ def assemble(
 
 
 def _oldest(entries: Sequence[Stamped[Any]]) -> Stamped[Any] | None:
-    return min(entries, key=lambda entry: entry.header.stamp_wall_ns, default=None)
+    return min(entries, key=_stamp_ns, default=None)
 
 
 def size_variant(spec: CameraSpec) -> str | None:

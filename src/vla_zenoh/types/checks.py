@@ -54,6 +54,8 @@ def number(name: str, value: Any, minimum: float = -math.inf, maximum: float = m
 
 def integer(name: str, value: Any, minimum: int = 0, maximum: int = 2**63 - 1) -> int:
     """An int within ``[minimum, maximum]``."""
+    if type(value) is int and minimum <= value <= maximum:
+        return value
     if isinstance(value, bool) or not (isinstance(value, int) or is_numpy(value, "integer")):
         raise RecordError(f"{name} is not a whole number: {shown(value)}")
     if not minimum <= value <= maximum:
