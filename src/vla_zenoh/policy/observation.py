@@ -182,7 +182,8 @@ def _scale(rgb: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]
 
 def make_chunk(
     worker: str,
-    spec: ModelSpec,
+    spec_hash: str,
+    dt_s: float,
     observation: Observation,
     answer: ActionSteps,
     *,
@@ -195,7 +196,8 @@ def make_chunk(
 
     Args:
         worker: its name.
-        spec: of its model.
+        spec_hash: of its model.
+        dt_s: duration of a step.
         observation: that was answered.
         answer: with checked steps.
         patience_s: how long the chunk is valid after its last step.
@@ -204,10 +206,10 @@ def make_chunk(
         end_ns: end of inference, wall clock.
     """
     steps = np.asarray(answer.steps)
-    valid_ns = int(len(steps) * spec.action.dt_s * 1e9) + int(patience_s * 1e9)
+    valid_ns = int(len(steps) * dt_s * 1e9) + int(patience_s * 1e9)
     return ActionChunk(
         worker=worker,
-        spec_hash=spec.hash,
+        spec_hash=spec_hash,
         episode=observation.task.episode,
         observation_stamp_ns=observation.stamp_wall_ns,
         observation_seq=observation.seq,
