@@ -15,6 +15,7 @@ import hashlib
 import json
 import math
 import re
+import unicodedata
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -38,7 +39,7 @@ from vla_zenoh.types import PoseState
 FloatArray = NDArray[np.float64]
 
 FOLDER = Path(__file__).parent
-GRAPH, MANIFEST = "brick.onnx", "weights.json"
+GRAPH, WORDS, MANIFEST = "brick.onnx", "words.txt", "weights.json"
 HORIZON, DT_S = 8, 0.1
 FRONT, WRIST = (128, 96), (96, 72)
 """Width and height of the pictures."""
@@ -50,8 +51,12 @@ MOVED = [0, 1, 2, 5]
 LOW_M, UP_M, PUSH_WAY_M = 0.035, 0.05, 0.105
 """See `expert`."""
 AT_REST_M_S = 0.004
-MAX_WORDS = 24
+MAX_PIECES, MAX_LETTERS = 32, 400
 PAD, UNKNOWN = 0, 1
+KINDS = ("put", "stack", "left", "right", "away", "closer")
+COLOURS = ("red", "blue", "green", "yellow")
+SURE = 0.9
+"""A prompt that is a task with less probability is none."""
 
 
 class Waypoints(NamedTuple):
@@ -61,11 +66,13 @@ class Waypoints(NamedTuple):
         offset: (H, 4) x, y, z in m along the base axes and a turn about the vertical in rad.
         opened: (H,) the gripper has to be open.
         understood: the prompt is a task; else the arm stays.
+        order: what was read: ``put red``, ``stack red blue``, ``left red``.
     """
 
     offset: FloatArray
     opened: NDArray[np.bool_]
     understood: bool
+    order: str
 
 
 @dataclass(slots=True)
@@ -105,17 +112,37 @@ class Hand:
 
 
 def words_of(prompt: str) -> list[str]:
-    """The prompt as words: small letters, nothing but letters and apostrophes."""
-    return re.findall(r"[a-z']+", prompt.lower())
+    """The prompt as words, numbers and marks, in small letters without accents."""
+    plain = unicodedata.normalize("NFKD", prompt.lower())
+    plain = "".join(letter for letter in plain if not unicodedata.combining(letter))
+    return re.findall(r"[a-z]+|[0-9]+|[^a-z0-9\s]", plain)
 
 
 def tokens_of(prompt: str, vocabulary: dict[str, int]) -> NDArray[np.int64]:
-    """(1, MAX_WORDS) numbers of the words; a prompt that is too long is one unknown word."""
-    words = words_of(prompt)
-    numbers = [vocabulary.get(word, UNKNOWN) for word in words]
-    if not numbers or len(numbers) > MAX_WORDS:
+    """(1, MAX_PIECES) numbers of the pieces of its words; a prompt that is too long is unknown.
+
+    Args:
+        prompt: any text.
+        vocabulary: piece -> number; one that does not begin a word begins with ``##``. A word is
+            cut into the longest pieces from its beginning (WordPiece: Schuster and Nakajima, 2012).
+    """
+    numbers: list[int] = []
+    for word in words_of(prompt[:MAX_LETTERS]):
+        found, begin = [], 0
+        while begin < len(word):
+            for end in range(len(word), begin, -1):
+                number = vocabulary.get("##" * (begin > 0) + word[begin:end])
+                if number is not None:
+                    break
+            else:
+                found = [UNKNOWN]
+                break
+            found.append(number)
+            begin = end
+        numbers += found
+    if not numbers or len(numbers) > MAX_PIECES or len(prompt) > MAX_LETTERS:
         numbers = [UNKNOWN]
-    return np.array([numbers + [PAD] * (MAX_WORDS - len(numbers))], np.int64)
+    return np.array([numbers + [PAD] * (MAX_PIECES - len(numbers))], np.int64)
 
 
 class Brick:
@@ -167,7 +194,8 @@ class Brick:
         self._session = onnxruntime.InferenceSession(
             graph, options, providers=["CPUExecutionProvider"]
         )
-        self._vocabulary = {word: index + 2 for index, word in enumerate(manifest["words"])}
+        words = checked(self._folder, WORDS, manifest["sha256"]).decode().split()
+        self._vocabulary = {word: index + 2 for index, word in enumerate(words)}
 
     def reset(self) -> None:
         """Forget what was asked for and how the hand moved."""
@@ -208,7 +236,8 @@ class Brick:
         if observation.task.active:
             goals = goal + np.cumsum(steps[:, MOVED], axis=0)
             self._asked = (observation.stamp_wall_ns, goals)
-        return ActionSteps(steps.astype(np.float32))
+        read = waypoints.order if waypoints.understood else "no task"
+        return ActionSteps(steps.astype(np.float32), raw={"read": read})
 
     def think(self, observation: Observation, hand: Hand, given: FloatArray) -> Waypoints:
         """What to do, as the network says.
@@ -228,8 +257,15 @@ class Brick:
             "hand": hand.numbers()[None].astype(np.float32),
             "given": given[None].astype(np.float32),
         }
-        offset, opened, understood = self._session.run(["offset", "opened", "understood"], feed)
-        return Waypoints(offset[0].astype(np.float64), opened[0] > 0.5, bool(understood[0] > 0.5))
+        outputs = ["offset", "opened", "understood", "order"]
+        offset, opened, understood, (order,) = self._session.run(outputs, feed)
+        kind, target, onto = KINDS[order[0]], COLOURS[order[1]], COLOURS[order[2]]
+        return Waypoints(
+            offset[0].astype(np.float64),
+            opened[0] > 0.5,
+            bool(understood[0] > SURE),
+            f"{kind} {target} {onto}" if kind == "stack" else f"{kind} {target}",
+        )
 
     def _follow(self, observation: Observation) -> Hand:
         pose, gripper = observation.pose, observation.gripper
@@ -277,7 +313,7 @@ def yaw_of(pose: PoseState) -> float:
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """What belongs to the weights: their sha256 and the words they know.
+    """What belongs to the weights: the sha256 of each file.
 
     Raises:
         WorkerError: it is not there, or not readable.

@@ -172,6 +172,46 @@ def test_every_wording_is_understood(policy: Policy, wordings: dict) -> None:
     assert missed == []
 
 
+def held_out(name: str) -> list[str]:
+    return (FOLDER / "training" / name).read_text("utf-8").splitlines()
+
+
+def read(policy: Policy, prompt: str) -> str:
+    """What it takes a prompt for."""
+    policy.reset()  # pyright: ignore[reportAttributeAccessIssue]
+    result = policy.infer(example_observation(policy.spec, prompt=prompt))
+    assert isinstance(result, ActionSteps)
+    assert result.raw is not None
+    return str(result.raw["read"])
+
+
+@pytest.mark.parametrize(
+    ("name", "count", "right", "wrong"),
+    [("held_out.txt", 300, 0.95, 0.01), ("final.txt", 60, 0, 0)],
+)
+def test_free_wordings_that_were_never_taught_are_read(
+    policy: Policy, name: str, count: int, right: float, wrong: float
+) -> None:
+    meant = [line.split(": ", 1) for line in held_out(name)]
+    found = [read(policy, sentence) for _, sentence in meant]
+    assert len(found) >= count
+    as_meant = [one == meaning for one, (meaning, _) in zip(found, meant, strict=True)]
+    otherwise = [one != "no task" and not ok for one, ok in zip(found, as_meant, strict=True)]
+    assert np.mean(as_meant) >= right
+    assert np.mean(otherwise) <= wrong
+
+
+@pytest.mark.parametrize(
+    ("name", "count", "still"), [("held_out_no_task.txt", 120, 0.98), ("final_no_task.txt", 40, 0)]
+)
+def test_nonsense_and_negation_that_were_never_taught_do_nothing(
+    policy: Policy, name: str, count: int, still: float
+) -> None:
+    found = [read(policy, sentence) for sentence in held_out(name)]
+    assert len(found) >= count
+    assert np.mean([one == "no task" for one in found]) >= still
+
+
 @pytest.mark.parametrize(
     "prompt", ["", "!!", "x" * 4000, "put " * 40, "put the rot brick in Kiste"]
 )
@@ -271,14 +311,14 @@ def test_a_chunk_that_goes_on_from_given_steps_is_nearer_to_the_teacher_than_one
 def test_the_weights_are_small_and_are_those_of_the_manifest() -> None:
     manifest = json.loads((FOLDER / "weights.json").read_text())
     files = {FOLDER / name: sha256 for name, sha256 in manifest["sha256"].items()}
-    assert {file.suffix for file in files} == {".onnx", ".safetensors"}
+    assert {file.suffix for file in files} == {".onnx", ".safetensors", ".txt"}
     assert sum(file.stat().st_size for file in files) < MAX_WEIGHTS_BYTES
     for file, sha256 in files.items():
         assert hashlib.sha256(file.read_bytes()).hexdigest() == sha256
 
 
 def test_changed_weights_are_refused_with_both_sums(tmp_path: Path) -> None:
-    for name in ("brick.onnx", "weights.json"):
+    for name in ("brick.onnx", "words.txt", "weights.json"):
         shutil.copy(FOLDER / name, tmp_path / name)
     graph = tmp_path / "brick.onnx"
     graph.write_bytes(graph.read_bytes()[:-1] + b"x")
@@ -288,18 +328,9 @@ def test_changed_weights_are_refused_with_both_sums(tmp_path: Path) -> None:
         changed.load()  # pyright: ignore[reportAttributeAccessIssue]
 
 
-@pytest.mark.parametrize("missing", ["brick.onnx", "weights.json"])
+@pytest.mark.parametrize("missing", ["brick.onnx", "words.txt", "weights.json"])
 def test_a_file_that_is_missing_is_named(tmp_path: Path, missing: str) -> None:
-    for name in {"brick.onnx", "weights.json"} - {missing}:
+    for name in {"brick.onnx", "words.txt", "weights.json"} - {missing}:
         shutil.copy(FOLDER / name, tmp_path / name)
     with pytest.raises(WorkerError, match=missing):
         make_policy(find_model("brick"), {"weights": str(tmp_path)}).load()  # pyright: ignore
-
-
-def test_the_words_of_the_manifest_are_those_it_is_taught(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(FOLDER / "training"))
-    for name in ("model", "expert", "states", "phrases"):
-        monkeypatch.delitem(sys.modules, name, raising=False)
-    from phrases import vocabulary  # pyright: ignore[reportMissingImports]
-
-    assert json.loads((FOLDER / "weights.json").read_text())["words"] == vocabulary()
