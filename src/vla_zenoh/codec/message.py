@@ -49,11 +49,11 @@ _SCALARS: dict[str, tuple[type, ...]] = {
 
 
 @cache
-def _numpy() -> Any:
+def numpy() -> Any:
     """numpy, loaded with the first array: a command that only puts text needs none."""
-    import numpy
+    import numpy as loaded
 
-    return numpy
+    return loaded
 
 
 def _malformed(why: str) -> CodecError:
@@ -146,7 +146,7 @@ def _refuse_extension(code: int, data: bytes) -> Any:
 
 
 def _to_map(value: Any) -> dict[bytes, Any]:
-    np = _numpy()
+    np = numpy()
     if isinstance(value, np.ndarray):
         _check_kind(value.dtype)
         return {
@@ -170,7 +170,7 @@ def _from_map(value: dict[Any, Any]) -> Any:
 
 
 def _array(value: dict[Any, Any]) -> np.ndarray[Any, Any]:
-    np = _numpy()
+    np = numpy()
     dtype = _dtype(value)
     data, shape = value.get(b"data"), value.get(b"shape")
     if not isinstance(data, bytes) or not isinstance(shape, list):
@@ -195,7 +195,7 @@ def _array(value: dict[Any, Any]) -> np.ndarray[Any, Any]:
 
 
 def _scalar(value: dict[Any, Any]) -> np.generic:
-    np = _numpy()
+    np = numpy()
     dtype, data = _dtype(value), value.get(b"data")
     if type(data) not in _SCALARS[dtype.kind]:
         raise CodecError("malformed", f"a numpy scalar {dtype} of a {type(data).__name__}")
@@ -217,7 +217,7 @@ def _dtype(value: dict[Any, Any]) -> np.dtype[Any]:
 def _dtype_of(name: str) -> np.dtype[Any]:
     if not _DTYPE.fullmatch(name):
         raise CodecError("malformed", f"an array with dtype {shown(name)} is not carried")
-    return _numpy().dtype(name)
+    return numpy().dtype(name)
 
 
 def _check_kind(dtype: np.dtype[Any]) -> None:

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from functools import cache
+from functools import cache, lru_cache
+from struct import Struct
 from typing import Any, NamedTuple, TypeVar
+
+import msgpack
 
 from vla_zenoh import keys
 from vla_zenoh.codec import message
@@ -26,8 +29,7 @@ def encode(record: Any) -> bytes:
         CodecError: larger than `MAX_RECORD_BYTES`, which every receiver rejects.
     """
     to_dict = getattr(record, "to_dict", None)  # of a ModelSpec
-    fields = _fields(record) if to_dict is None else to_dict()
-    payload = message.pack(fields)
+    payload = b"".join(_pieces(record)) if to_dict is None else message.pack(to_dict())
     _check_length(type(record), payload)
     return payload
 
@@ -40,7 +42,15 @@ def decode(kind: type[Record], payload: bytes) -> Record:
             the record refuses: NaN, wrong shape, out of range).
     """
     _check_length(kind, payload)
-    return from_map(kind, message.unpack(payload))
+    frame = _frames.get((kind, len(payload)))
+    if frame is not None:
+        pieces = frame.split.unpack(payload)
+        if pieces[::2] == frame.constants:
+            return frame.record if len(pieces) == 1 else _refilled(frame, pieces[1::2])
+    record = from_map(kind, message.unpack(payload))
+    if kind.__name__ in _STREAMED:
+        _keep_frame(record, payload)
+    return record
 
 
 def from_map(kind: type[Record], data: Any) -> Record:
@@ -68,8 +78,9 @@ def _check_length(kind: type, payload: bytes) -> None:
 
 
 class _Layout(NamedTuple):
-    """Names of a record's fields."""
+    """Names of a record's fields, and the first bytes of its map."""
 
+    head: bytes
     names: tuple[str, ...]
     known: frozenset[str]
     required: tuple[str, ...]
@@ -85,19 +96,90 @@ def _layout(kind: type) -> _Layout:
         for field in fields
         if field.default is missing and field.default_factory is missing
     )
-    return _Layout(names, frozenset(names), required)
+    head = msgpack.Packer().pack_map_header(len(names))
+    return _Layout(head, names, frozenset(names), required)
 
 
-def _fields(record: Any) -> dict[str, Any]:
-    out: dict[str, Any] = {}
-    for name in _layout(type(record)).names:
+def _pieces(record: Any) -> list[bytes]:
+    """The bytes of a record: every second piece is the numbers of a vector of float64."""
+    layout, pieces = _layout(type(record)), list[bytes]()
+    before = layout.head
+    for name in layout.names:
         value = getattr(record, name)
-        if isinstance(value, Mapping):
-            value = dict(value)
-        elif hasattr(value, "__dataclass_fields__"):
-            value = _fields(value)
-        out[name] = value
-    return out
+        if getattr(value, "ndim", 0) == 1 and len(value) and value.dtype.str == _FLOATS:
+            opening, closing = _around_vector(name, len(value))
+            pieces += before + opening, value.tobytes()
+            before = closing
+        elif value is None or type(value) is str or hasattr(value, "__dataclass_fields__"):
+            before += _repeated(name, value)
+        else:
+            value = dict(value) if isinstance(value, Mapping) else value
+            before += message.pack(name) + message.pack(value)
+    pieces.append(before)
+    return pieces
+
+
+_FLOATS = "<f8"
+
+
+@lru_cache(maxsize=256)
+def _around_vector(name: str, count: int) -> tuple[bytes, bytes]:
+    """What `message.pack` writes before and after the numbers of a field that is a vector."""
+    data = b"\xff" * (8 * count)
+    form = {b"__ndarray__": True, b"data": data, b"dtype": _FLOATS, b"shape": (count,)}
+    opening, _, closing = message.pack({name: form})[1:].partition(data)
+    return opening, closing
+
+
+@lru_cache(maxsize=64)
+def _repeated(name: str, value: Any) -> bytes:
+    """A field that is the same in many records: text, nothing, or a record."""
+    packed = message.pack(value) if value is None or type(value) is str else encode(value)
+    return message.pack(name) + packed
+
+
+class _Frame(NamedTuple):
+    """All but the numbers in the bytes of a record: the same in the next one of its stream.
+
+    Args:
+        split: divides the bytes like `_pieces`.
+        constants: the pieces that are no numbers.
+        record: it was read from such bytes.
+        vectors: names of the fields that are numbers.
+    """
+
+    split: Struct
+    constants: tuple[bytes, ...]
+    record: Any
+    vectors: tuple[str, ...]
+
+
+_STREAMED = {"GripperState", "JointCommand", "JointState", "PoseCommand", "PoseState"}
+"""Records that come in every tick. To read their maps and lists takes most of the time."""
+_MAX_FRAMES = 64
+_frames: dict[tuple[type, int], _Frame] = {}
+
+
+def _keep_frame(record: Any, payload: bytes) -> None:
+    """Remember how `payload` is divided, if it is written as we would."""
+    pieces = _pieces(record)
+    split = Struct("".join(f"{len(piece)}s" for piece in pieces))
+    constants = tuple(pieces[::2])
+    if split.size != len(payload) or split.unpack(payload)[::2] != constants:
+        return
+    if len(_frames) >= _MAX_FRAMES:
+        _frames.clear()
+    names = _layout(type(record)).names
+    vectors = tuple(name for name in names if getattr(getattr(record, name), "ndim", 0))
+    _frames[type(record), len(payload)] = _Frame(split, constants, record, vectors)
+
+
+def _refilled(frame: _Frame, numbers: tuple[bytes, ...]) -> Any:
+    """A record like that of the frame with other numbers, checked like any other."""
+    kind, frombuffer = type(frame.record), message.numpy().frombuffer
+    fields = {name: getattr(frame.record, name) for name in _layout(kind).names}
+    fields.update(zip(frame.vectors, map(frombuffer, numbers), strict=True))
+    return _made(kind, fields)
 
 
 def _record(kind: type[Record], data: Mapping[Any, Any]) -> Record:
@@ -111,6 +193,10 @@ def _record(kind: type[Record], data: Mapping[Any, Any]) -> Record:
             raise CodecError("malformed", f"{kind.__name__} lacks {', '.join(missing)}")
     if data.get("cause") is not None:
         data = {**data, "cause": _cause(data["cause"])}
+    return _made(kind, data)
+
+
+def _made(kind: type[Record], data: Mapping[Any, Any]) -> Record:
     try:
         return kind(**data)
     except RecordError as error:

@@ -175,7 +175,8 @@ class MotionPipeline:
     @property
     def failures(self) -> int:
         """Times Ruckig found no trajectory and the arm braked instead."""
-        return sum(mover.failures for mover in (self._smoother, self._path) if mover)
+        smoother, path = self._smoother, self._path
+        return (smoother.failures if smoother else 0) + (path.failures if path else 0)
 
     # -- activation ---------------------------------------------------------------------------
     def anchor(
@@ -471,7 +472,7 @@ class MotionPipeline:
         """
         if not isinstance(mover, JointPath):
             pose, hits = leash(self._limits, goal.pose, _ahead(mover.motion, ahead_s))
-            return Leashed(replace(goal, pose=pose, joints_rad=None), hits)
+            return Leashed(replace(goal, pose=pose, joints_rad=None) if hits else goal, hits)
         return Leashed(*mover.leash(goal, ahead_s))
 
     def _pause(self, mover: Smoother | JointPath) -> None:

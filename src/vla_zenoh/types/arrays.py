@@ -12,6 +12,7 @@ from vla_zenoh.errors import RecordError
 from vla_zenoh.types.checks import shown
 
 FloatArray = NDArray[np.float64]
+_FLOAT64 = np.dtype(np.float64)
 
 QUATERNION_NORM_TOLERANCE = 1e-3
 MAX_VECTOR = 10_000
@@ -46,11 +47,12 @@ def vector(name: str, value: ArrayLike, size: int | None) -> FloatArray:
         raise RecordError(f"{name} has shape {array.shape}, wanted {wanted}")
     if len(array) > MAX_VECTOR:
         raise RecordError(f"{name} has {len(array)} numbers, at most {MAX_VECTOR} are allowed")
-    array = np.array(array, dtype=np.float64, order="C")
+    if type(array.base) is not bytes or array.dtype is not _FLOAT64:  # bytes never change
+        array = np.array(array, dtype=np.float64, order="C")
+        array.setflags(write=False)
     # Records are made at every tick: on a few numbers this is five times as fast as numpy.
     if not all(map(math.isfinite, array.tolist())):
         raise RecordError(f"{name} is not finite: {shown(array.tolist())}")
-    array.setflags(write=False)
     return array
 
 
