@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache, lru_cache
 from struct import Struct
 from typing import Any, NamedTuple, TypeVar
@@ -46,7 +46,7 @@ def decode(kind: type[Record], payload: bytes) -> Record:
     if frame is not None:
         pieces = frame.split.unpack(payload)
         if pieces[::2] == frame.constants:
-            return frame.record if len(pieces) == 1 else _refilled(frame, pieces[1::2])
+            return _refilled(kind, frame, pieces[1::2])
     record = from_map(kind, message.unpack(payload))
     if kind.__name__ in _STREAMED:
         _keep_frame(record, payload)
@@ -101,7 +101,7 @@ def _layout(kind: type) -> _Layout:
 
 
 def _pieces(record: Any) -> list[bytes]:
-    """The bytes of a record: every second piece is the numbers of a vector of float64."""
+    """The bytes of a record: every second piece is a float, or those of a vector of float64."""
     layout, pieces = _layout(type(record)), list[bytes]()
     before = layout.head
     for name in layout.names:
@@ -110,6 +110,9 @@ def _pieces(record: Any) -> list[bytes]:
             opening, closing = _around_vector(name, len(value))
             pieces += before + opening, value.tobytes()
             before = closing
+        elif type(value) is float:
+            pieces += before + _float_name(name), _FLOAT.pack(value)
+            before = b""
         elif value is None or type(value) is str or hasattr(value, "__dataclass_fields__"):
             before += _repeated(name, value)
         else:
@@ -119,7 +122,13 @@ def _pieces(record: Any) -> list[bytes]:
     return pieces
 
 
-_FLOATS = "<f8"
+_FLOAT, _FLOATS = Struct(">d"), "<f8"
+"""As msgpack writes a number, and as `message.pack` writes those of an array."""
+
+
+@cache
+def _float_name(name: str) -> bytes:
+    return message.pack(name) + message.pack(0.0)[:1]
 
 
 @lru_cache(maxsize=256)
@@ -144,14 +153,14 @@ class _Frame(NamedTuple):
     Args:
         split: divides the bytes like `_pieces`.
         constants: the pieces that are no numbers.
-        record: it was read from such bytes.
-        vectors: names of the fields that are numbers.
+        fields: of a record that was read from such bytes.
+        numbers: names of the fields that are floats or vectors, and how each is read.
     """
 
     split: Struct
     constants: tuple[bytes, ...]
-    record: Any
-    vectors: tuple[str, ...]
+    fields: dict[str, Any]
+    numbers: tuple[tuple[str, Callable[[bytes], Any]], ...]
 
 
 _STREAMED = {"GripperState", "JointCommand", "JointState", "PoseCommand", "PoseState"}
@@ -170,15 +179,24 @@ def _keep_frame(record: Any, payload: bytes) -> None:
     if len(_frames) >= _MAX_FRAMES:
         _frames.clear()
     names = _layout(type(record)).names
-    vectors = tuple(name for name in names if getattr(getattr(record, name), "ndim", 0))
-    _frames[type(record), len(payload)] = _Frame(split, constants, record, vectors)
+    values = [(name, getattr(record, name)) for name in names]
+    numbers = [
+        (name, _float if type(value) is float else message.numpy().frombuffer)
+        for name, value in values
+        if type(value) is float or hasattr(value, "ndim")
+    ]
+    _frames[type(record), len(payload)] = _Frame(split, constants, dict(values), tuple(numbers))
 
 
-def _refilled(frame: _Frame, numbers: tuple[bytes, ...]) -> Any:
+def _float(number: bytes) -> float:
+    return _FLOAT.unpack(number)[0]
+
+
+def _refilled(kind: type[Record], frame: _Frame, pieces: tuple[bytes, ...]) -> Record:
     """A record like that of the frame with other numbers, checked like any other."""
-    kind, frombuffer = type(frame.record), message.numpy().frombuffer
-    fields = {name: getattr(frame.record, name) for name in _layout(kind).names}
-    fields.update(zip(frame.vectors, map(frombuffer, numbers), strict=True))
+    fields = frame.fields.copy()
+    for (name, read), piece in zip(frame.numbers, pieces, strict=True):
+        fields[name] = read(piece)
     return _made(kind, fields)
 
 

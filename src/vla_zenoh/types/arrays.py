@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vla_zenoh.errors import RecordError
-from vla_zenoh.types.checks import shown
+from vla_zenoh.types.checks import set_field, shown
 
 FloatArray = NDArray[np.float64]
+Record = TypeVar("Record")
 _FLOAT64 = np.dtype(np.float64)
 
 QUATERNION_NORM_TOLERANCE = 1e-3
@@ -50,8 +51,10 @@ def vector(name: str, value: ArrayLike, size: int | None) -> FloatArray:
     if type(array.base) is not bytes or array.dtype is not _FLOAT64:  # bytes never change
         array = np.array(array, dtype=np.float64, order="C")
         array.setflags(write=False)
-    # Records are made at every tick: on a few numbers this is five times as fast as numpy.
-    if not all(map(math.isfinite, array.tolist())):
+    # Records are made at every tick: on a few numbers this is ten times as fast as numpy. The sum
+    # of finite numbers may overflow.
+    values = array.tolist()
+    if not math.isfinite(sum(values)) and not all(map(math.isfinite, values)):
         raise RecordError(f"{name} is not finite: {shown(array.tolist())}")
     return array
 
@@ -82,3 +85,21 @@ def unit_quaternion(name: str, value: ArrayLike) -> FloatArray:
     array = array / norm
     array.setflags(write=False)
     return array
+
+
+def computed(kind: type[Record], *values: Any) -> Record:
+    """A record of values that this program has just computed, all in their final form.
+
+    Only whether vectors are finite is checked, and they are not copied: a record for every tick.
+
+    Raises:
+        RecordError: a vector is not finite.
+    """
+    record = object.__new__(kind)
+    for name, value in zip(kind.__match_args__, values, strict=True):  # pyright: ignore
+        if isinstance(value, np.ndarray):
+            if not math.isfinite(sum(value.tolist())):
+                return kind(*values)
+            value.setflags(write=False)
+        set_field(record, name, value)
+    return record
