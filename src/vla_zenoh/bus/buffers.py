@@ -195,11 +195,9 @@ class CallbackRing(SampleBuffer):
     def drain(self) -> list[ReceivedSample]:
         """All samples, oldest first."""
         drained: list[ReceivedSample] = []
-        while True:
-            try:
-                drained.append(self._arrivals.popleft())
-            except IndexError:
-                return drained
+        while self._arrivals:
+            drained.append(self._arrivals.popleft())
+        return drained
 
 
 class ZenohRing(SampleBuffer):

@@ -204,7 +204,8 @@ class Slowdown(NamedTuple):
 
 def slowest(*reasons: Slowdown | None) -> Slowdown | None:
     """The slowdown with the least share, None without any."""
-    return min((r for r in reasons if r is not None), key=lambda r: r.share, default=None)
+    given = [reason for reason in reasons if reason is not None]
+    return min(given, key=lambda reason: reason.share) if given else None
 
 
 def slowdown(

@@ -101,6 +101,8 @@ class CommandInputs:
             for name, buffer, decode in self._settings
             for arrival in buffer.drain()
         ]
+        if not arrivals:
+            return []
         if all(put_ns is not None for put_ns, *_ in arrivals):
             arrivals.sort(key=itemgetter(0))
         put: list[Setting] = []
