@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any
 
 import msgpack
@@ -17,6 +18,7 @@ from random_records import RECORDS, headers, refusal, same
 from vla_zenoh import types
 from vla_zenoh.codec import message, records
 from vla_zenoh.errors import CodecError
+from vla_zenoh.keys import SCHEMA
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.types import (
     Event,
@@ -346,6 +348,25 @@ def test_a_header_comes_back_as_it_was(written: Any) -> None:
 def test_arbitrary_attachments_are_refused_or_read(attachment: bytes) -> None:
     error = refusal(records.decode_header, attachment)
     assert error is None or error.reason in HEADER_REASONS
+
+
+@given(headers)
+def test_a_header_is_plain_msgpack_for_any_reader(written: Any) -> None:
+    fields = {"schema": SCHEMA, **dataclasses.asdict(written)}
+    assert message.unpack(records.encode_header(written)) == fields
+    assert records.decode_header(message.pack(fields)) == written
+
+
+@given(headers, st.data())
+def test_a_spoilt_header_is_read_as_msgpack_or_not(written: Any, data: st.DataObject) -> None:
+    payload = bytearray(records.encode_header(written))
+    at = data.draw(st.integers(0, len(payload) - 1))
+    payload[at : at + data.draw(st.integers(0, 2))] = data.draw(st.binary(max_size=3))
+    with suppress(CodecError):
+        read = records.decode_header(bytes(payload))
+        found = message.unpack(bytes(payload))
+        assert {name: found[name] for name in dataclasses.asdict(read)} == dataclasses.asdict(read)
+        assert found["schema"] == SCHEMA
 
 
 @given(headers, st.data())
