@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -49,11 +49,11 @@ _SCALARS: dict[str, tuple[type, ...]] = {
 
 
 @cache
-def numpy() -> Any:
+def _numpy() -> Any:
     """numpy, loaded with the first array: a command that only puts text needs none."""
-    import numpy as loaded
+    import numpy
 
-    return loaded
+    return numpy
 
 
 def _malformed(why: str) -> CodecError:
@@ -146,7 +146,7 @@ def _refuse_extension(code: int, data: bytes) -> Any:
 
 
 def _to_map(value: Any) -> dict[bytes, Any]:
-    np = numpy()
+    np = _numpy()
     if isinstance(value, np.ndarray):
         _check_kind(value.dtype)
         return {
@@ -163,14 +163,19 @@ def _to_map(value: Any) -> dict[bytes, Any]:
 
 def _from_map(value: dict[Any, Any]) -> Any:
     if b"__ndarray__" in value:
-        return _array(value)
+        return array_of(value)
     if b"__npgeneric__" in value:
         return _scalar(value)
     return value
 
 
-def _array(value: dict[Any, Any]) -> np.ndarray[Any, Any]:
-    np = numpy()
+def array_of(value: Mapping[Any, Any]) -> np.ndarray[Any, Any]:
+    """The array of a map with the *bytes* keys ``data``, ``dtype`` and ``shape``.
+
+    Raises:
+        CodecError: they do not fit.
+    """
+    np = _numpy()
     dtype = _dtype(value)
     data, shape = value.get(b"data"), value.get(b"shape")
     if not isinstance(data, bytes) or not isinstance(shape, list):
@@ -195,7 +200,7 @@ def _array(value: dict[Any, Any]) -> np.ndarray[Any, Any]:
 
 
 def _scalar(value: dict[Any, Any]) -> np.generic:
-    np = numpy()
+    np = _numpy()
     dtype, data = _dtype(value), value.get(b"data")
     if type(data) not in _SCALARS[dtype.kind]:
         raise CodecError("malformed", f"a numpy scalar {dtype} of a {type(data).__name__}")
@@ -206,7 +211,7 @@ def _scalar(value: dict[Any, Any]) -> np.generic:
         raise CodecError("malformed", f"a numpy scalar {dtype}: {error}") from error
 
 
-def _dtype(value: dict[Any, Any]) -> np.dtype[Any]:
+def _dtype(value: Mapping[Any, Any]) -> np.dtype[Any]:
     name = value.get(b"dtype")
     if not isinstance(name, str):
         raise CodecError("malformed", f"an array with dtype {shown(name)} is not carried")
@@ -217,7 +222,7 @@ def _dtype(value: dict[Any, Any]) -> np.dtype[Any]:
 def _dtype_of(name: str) -> np.dtype[Any]:
     if not _DTYPE.fullmatch(name):
         raise CodecError("malformed", f"an array with dtype {shown(name)} is not carried")
-    return numpy().dtype(name)
+    return _numpy().dtype(name)
 
 
 def _check_kind(dtype: np.dtype[Any]) -> None:

@@ -171,6 +171,8 @@ _frames: dict[tuple[type, int], _Frame] = {}
 
 def _keep_frame(record: Any, payload: bytes) -> None:
     """Remember how `payload` is divided, if it is written as we would."""
+    from numpy import frombuffer
+
     pieces = _pieces(record)
     split = Struct("".join(f"{len(piece)}s" for piece in pieces))
     constants = tuple(pieces[::2])
@@ -181,7 +183,7 @@ def _keep_frame(record: Any, payload: bytes) -> None:
     names = _layout(type(record)).names
     values = [(name, getattr(record, name)) for name in names]
     numbers = [
-        (name, _float if type(value) is float else message.numpy().frombuffer)
+        (name, _float if type(value) is float else frombuffer)
         for name, value in values
         if type(value) is float or hasattr(value, "ndim")
     ]
