@@ -4,7 +4,7 @@
 # ///
 """Queries a policy server with openpi's protocol.
 
-vllm-omni speaks it too, and ``vla-zenoh lab serve-openpi``.
+vllm-omni speaks it too, and ``vla-zenoh lab serve``.
 """
 
 from __future__ import annotations

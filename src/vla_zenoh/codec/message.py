@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -163,13 +163,18 @@ def _to_map(value: Any) -> dict[bytes, Any]:
 
 def _from_map(value: dict[Any, Any]) -> Any:
     if b"__ndarray__" in value:
-        return _array(value)
+        return array_of(value)
     if b"__npgeneric__" in value:
         return _scalar(value)
     return value
 
 
-def _array(value: dict[Any, Any]) -> np.ndarray[Any, Any]:
+def array_of(value: Mapping[Any, Any]) -> np.ndarray[Any, Any]:
+    """The array of a map with the *bytes* keys ``data``, ``dtype`` and ``shape``.
+
+    Raises:
+        CodecError: they do not fit.
+    """
     np = _numpy()
     dtype = _dtype(value)
     data, shape = value.get(b"data"), value.get(b"shape")
@@ -206,7 +211,7 @@ def _scalar(value: dict[Any, Any]) -> np.generic:
         raise CodecError("malformed", f"a numpy scalar {dtype}: {error}") from error
 
 
-def _dtype(value: dict[Any, Any]) -> np.dtype[Any]:
+def _dtype(value: Mapping[Any, Any]) -> np.dtype[Any]:
     name = value.get(b"dtype")
     if not isinstance(name, str):
         raise CodecError("malformed", f"an array with dtype {shown(name)} is not carried")

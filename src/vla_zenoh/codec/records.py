@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
-from functools import cache
+from collections.abc import Callable, Mapping
+from functools import cache, lru_cache
+from struct import Struct
 from typing import Any, NamedTuple, TypeVar
+
+import msgpack
 
 from vla_zenoh import keys
 from vla_zenoh.codec import message
@@ -26,8 +29,7 @@ def encode(record: Any) -> bytes:
         CodecError: larger than `MAX_RECORD_BYTES`, which every receiver rejects.
     """
     to_dict = getattr(record, "to_dict", None)  # of a ModelSpec
-    fields = _fields(record) if to_dict is None else to_dict()
-    payload = message.pack(fields)
+    payload = b"".join(_pieces(record)) if to_dict is None else message.pack(to_dict())
     _check_length(type(record), payload)
     return payload
 
@@ -40,7 +42,15 @@ def decode(kind: type[Record], payload: bytes) -> Record:
             the record refuses: NaN, wrong shape, out of range).
     """
     _check_length(kind, payload)
-    return from_map(kind, message.unpack(payload))
+    frame = _frames.get((kind, len(payload)))
+    if frame is not None:
+        pieces = frame.split.unpack(payload)
+        if pieces[::2] == frame.constants:
+            return _refilled(kind, frame, pieces[1::2])
+    record = from_map(kind, message.unpack(payload))
+    if kind.__name__ in _STREAMED:
+        _keep_frame(record, payload)
+    return record
 
 
 def from_map(kind: type[Record], data: Any) -> Record:
@@ -68,8 +78,9 @@ def _check_length(kind: type, payload: bytes) -> None:
 
 
 class _Layout(NamedTuple):
-    """Names of a record's fields."""
+    """Names of a record's fields, and the first bytes of its map."""
 
+    head: bytes
     names: tuple[str, ...]
     known: frozenset[str]
     required: tuple[str, ...]
@@ -85,19 +96,110 @@ def _layout(kind: type) -> _Layout:
         for field in fields
         if field.default is missing and field.default_factory is missing
     )
-    return _Layout(names, frozenset(names), required)
+    head = msgpack.Packer().pack_map_header(len(names))
+    return _Layout(head, names, frozenset(names), required)
 
 
-def _fields(record: Any) -> dict[str, Any]:
-    out: dict[str, Any] = {}
-    for name in _layout(type(record)).names:
+def _pieces(record: Any) -> list[bytes]:
+    """The bytes of a record: every second piece is a float, or those of a vector of float64."""
+    layout, pieces = _layout(type(record)), list[bytes]()
+    before = layout.head
+    for name in layout.names:
         value = getattr(record, name)
-        if isinstance(value, Mapping):
-            value = dict(value)
-        elif hasattr(value, "__dataclass_fields__"):
-            value = _fields(value)
-        out[name] = value
-    return out
+        if getattr(value, "ndim", 0) == 1 and len(value) and value.dtype.str == _FLOATS:
+            opening, closing = _around_vector(name, len(value))
+            pieces += before + opening, value.tobytes()
+            before = closing
+        elif type(value) is float:
+            pieces += before + _float_name(name), _FLOAT.pack(value)
+            before = b""
+        elif value is None or type(value) is str or hasattr(value, "__dataclass_fields__"):
+            before += _repeated(name, value)
+        else:
+            value = dict(value) if isinstance(value, Mapping) else value
+            before += message.pack(name) + message.pack(value)
+    pieces.append(before)
+    return pieces
+
+
+_FLOAT, _FLOATS = Struct(">d"), "<f8"
+"""As msgpack writes a number, and as `message.pack` writes those of an array."""
+
+
+@cache
+def _float_name(name: str) -> bytes:
+    return message.pack(name) + message.pack(0.0)[:1]
+
+
+@lru_cache(maxsize=256)
+def _around_vector(name: str, count: int) -> tuple[bytes, bytes]:
+    """What `message.pack` writes before and after the numbers of a field that is a vector."""
+    data = b"\xff" * (8 * count)
+    form = {b"__ndarray__": True, b"data": data, b"dtype": _FLOATS, b"shape": (count,)}
+    opening, _, closing = message.pack({name: form})[1:].partition(data)
+    return opening, closing
+
+
+@lru_cache(maxsize=64)
+def _repeated(name: str, value: Any) -> bytes:
+    """A field that is the same in many records: text, nothing, or a record."""
+    packed = message.pack(value) if value is None or type(value) is str else encode(value)
+    return message.pack(name) + packed
+
+
+class _Frame(NamedTuple):
+    """All but the numbers in the bytes of a record: the same in the next one of its stream.
+
+    Args:
+        split: divides the bytes like `_pieces`.
+        constants: the pieces that are no numbers.
+        fields: of a record that was read from such bytes.
+        numbers: names of the fields that are floats or vectors, and how each is read.
+    """
+
+    split: Struct
+    constants: tuple[bytes, ...]
+    fields: dict[str, Any]
+    numbers: tuple[tuple[str, Callable[[bytes], Any]], ...]
+
+
+_STREAMED = {"GripperState", "JointCommand", "JointState", "PoseCommand", "PoseState"}
+"""Records that come in every tick. To read their maps and lists takes most of the time."""
+_MAX_FRAMES = 64
+_frames: dict[tuple[type, int], _Frame] = {}
+
+
+def _keep_frame(record: Any, payload: bytes) -> None:
+    """Remember how `payload` is divided, if it is written as we would."""
+    from numpy import frombuffer
+
+    pieces = _pieces(record)
+    split = Struct("".join(f"{len(piece)}s" for piece in pieces))
+    constants = tuple(pieces[::2])
+    if split.size != len(payload) or split.unpack(payload)[::2] != constants:
+        return
+    if len(_frames) >= _MAX_FRAMES:
+        _frames.clear()
+    names = _layout(type(record)).names
+    values = [(name, getattr(record, name)) for name in names]
+    numbers = [
+        (name, _float if type(value) is float else frombuffer)
+        for name, value in values
+        if type(value) is float or hasattr(value, "ndim")
+    ]
+    _frames[type(record), len(payload)] = _Frame(split, constants, dict(values), tuple(numbers))
+
+
+def _float(number: bytes) -> float:
+    return _FLOAT.unpack(number)[0]
+
+
+def _refilled(kind: type[Record], frame: _Frame, pieces: tuple[bytes, ...]) -> Record:
+    """A record like that of the frame with other numbers, checked like any other."""
+    fields = frame.fields.copy()
+    for (name, read), piece in zip(frame.numbers, pieces, strict=True):
+        fields[name] = read(piece)
+    return _made(kind, fields)
 
 
 def _record(kind: type[Record], data: Mapping[Any, Any]) -> Record:
@@ -111,6 +213,10 @@ def _record(kind: type[Record], data: Mapping[Any, Any]) -> Record:
             raise CodecError("malformed", f"{kind.__name__} lacks {', '.join(missing)}")
     if data.get("cause") is not None:
         data = {**data, "cause": _cause(data["cause"])}
+    return _made(kind, data)
+
+
+def _made(kind: type[Record], data: Mapping[Any, Any]) -> Record:
     try:
         return kind(**data)
     except RecordError as error:

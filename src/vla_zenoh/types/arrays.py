@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vla_zenoh.errors import RecordError
-from vla_zenoh.types.checks import shown
+from vla_zenoh.types.checks import set_field, shown
 
 FloatArray = NDArray[np.float64]
+Record = TypeVar("Record")
+_FLOAT64 = np.dtype(np.float64)
 
 QUATERNION_NORM_TOLERANCE = 1e-3
 MAX_VECTOR = 10_000
@@ -48,10 +50,11 @@ def vector(name: str, value: ArrayLike, size: int | None) -> FloatArray:
         raise RecordError(f"{name} has shape {array.shape}, wanted {wanted}")
     if len(array) > MAX_VECTOR:
         raise RecordError(f"{name} has {len(array)} numbers, at most {MAX_VECTOR} are allowed")
-    array = np.array(array, dtype=np.float64, order="C")
+    if type(array.base) is not bytes or array.dtype is not _FLOAT64:  # bytes never change
+        array = np.array(array, dtype=np.float64, order="C")
+        array.setflags(write=False)
     if not is_finite(array):
         raise RecordError(f"{name} is not finite: {shown(array.tolist())}")
-    array.setflags(write=False)
     return array
 
 
@@ -80,7 +83,8 @@ def to_float32(array: NDArray[Any]) -> NDArray[np.float32]:
 def is_finite(array: NDArray[Any]) -> bool:
     """Whether no number of an array is NaN or infinite."""
     if array.size <= FEW:
-        return all(map(math.isfinite, array.ravel().tolist()))
+        values = array.tolist() if array.ndim == 1 else array.ravel().tolist()
+        return math.isfinite(sum(values)) or all(map(math.isfinite, values))  # a sum may overflow
     return bool(np.isfinite(array).all())
 
 
@@ -95,3 +99,21 @@ def unit_quaternion(name: str, value: ArrayLike) -> FloatArray:
     array = array / norm
     array.setflags(write=False)
     return array
+
+
+def computed(kind: type[Record], *values: Any) -> Record:
+    """A record of values that this program has just computed, all in their final form.
+
+    Only whether vectors are finite is checked, and they are not copied: a record for every tick.
+
+    Raises:
+        RecordError: a vector is not finite.
+    """
+    record = object.__new__(kind)
+    for name, value in zip(kind.__match_args__, values, strict=True):  # pyright: ignore
+        if isinstance(value, np.ndarray):
+            if not is_finite(value):
+                return kind(*values)
+            value.setflags(write=False)
+        set_field(record, name, value)
+    return record

@@ -37,6 +37,8 @@ def is_numpy(value: Any, *kinds: str) -> bool:
 
 def number(name: str, value: Any, minimum: float = -math.inf, maximum: float = math.inf) -> float:
     """A finite float within ``[minimum, maximum]``."""
+    if type(value) is float and minimum <= value <= maximum and math.isfinite(value):
+        return value
     if isinstance(value, bool) or not (
         isinstance(value, (int, float)) or is_numpy(value, "integer", "floating")
     ):
