@@ -32,8 +32,8 @@ from worker import FOLDER, FRONT, GRAPH, MANIFEST, MAX_PIECES, WORDS, WRIST
 INPUTS = ("tokens", "front", "wrist", "hand", "given")
 OUTPUTS = ("offset", "opened", "understood", "order", "bricks", "box")
 TOLERANCE, LOOSE = 1e-4, 1e-3
-"""Between PyTorch and onnxruntime, in the outputs' own units (m, rad, probability). The loose one is
-of what is a close thing in noise: turns of bricks, and what is understood of any pieces."""
+"""Between PyTorch and onnxruntime, in the outputs' own units (m, rad, probability). The loose one
+is of what is a close thing in noise: turns of bricks, and what is understood of any pieces."""
 TRIALS = 20
 
 

@@ -8,7 +8,8 @@ import numpy as np
 from states import draw_order
 from worker import MAX_PIECES, tokens_of
 
-from vla_zenoh.lab.tasks import COLOURS, DIRECTIONS, Order, phrase
+from vla_zenoh.lab.tasks import COLOURS, DIRECTIONS, HELD_OUT, NONSENSE, Order, phrase
+from vla_zenoh.lab.tasks.wording import DIRECTION_PHRASES
 
 KINDS = ("put", "stack", *DIRECTIONS)
 NO_TASK = len(KINDS)
@@ -310,7 +311,16 @@ class Phrases:
 
     def __init__(self, pieces: list[str]) -> None:
         self._numbers = {piece: index + 2 for index, piece in enumerate(pieces)}
-        self._held_out = {sentence.lower() for _, sentence in held_out()}
+        self._held_out = {sentence.lower() for _, sentence in held_out()} | {*NONSENSE}
+        self._held_out |= {
+            wording.format(x=x, y=y, d=d)
+            for wordings in HELD_OUT.values()
+            for wording in wordings
+            for x in COLOURS
+            for y in COLOURS
+            for ways in DIRECTION_PHRASES.values()
+            for d in ways
+        }
 
     def draw(self, random: np.random.Generator) -> tuple[str, int, int, int]:
         """Sentence, kind (`NO_TASK`: none), target and onto (-1: none)."""
