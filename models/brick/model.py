@@ -56,6 +56,13 @@ PAD, UNKNOWN = 0, 1
 KINDS = ("put", "stack", "left", "right", "away", "closer")
 COLOURS = ("red", "blue", "green", "yellow")
 SURE = 0.9
+NEGATION = re.compile(
+    r"\b(no|not|nto|nor|never|none|nobody|nothing|neither|without|cannot|instead)\b"
+    r"|\b(do|does|did|ca|could|wo|would|sha|should|must|need|is|are|was|were|have|has|had|may)"
+    r"\s?n\s?['’`]?t\b"
+)
+"""What makes of a task something else. A network that misreads one of these moves an arm that was
+told to stay, so it is not asked."""
 """A prompt that is a task with less probability is none."""
 
 
@@ -116,6 +123,11 @@ def words_of(prompt: str) -> list[str]:
     plain = unicodedata.normalize("NFKD", prompt.lower())
     plain = "".join(letter for letter in plain if not unicodedata.combining(letter))
     return re.findall(r"[a-z]+|[0-9]+|[^a-z0-9\s]", plain)
+
+
+def forbids(prompt: str) -> bool:
+    """Whether there is a negation anywhere in a prompt."""
+    return NEGATION.search(prompt.lower()) is not None
 
 
 def tokens_of(prompt: str, vocabulary: dict[str, int]) -> NDArray[np.int64]:
@@ -263,7 +275,7 @@ class Brick:
         return Waypoints(
             offset[0].astype(np.float64),
             opened[0] > 0.5,
-            bool(understood[0] > SURE),
+            bool(understood[0] > SURE) and not forbids(observation.prompt),
             f"{kind} {target} {onto}" if kind == "stack" else f"{kind} {target}",
         )
 

@@ -45,6 +45,13 @@ from vla_zenoh.types import Image, ObjectPoses, PoseState
 FOLDER = resources.find("models", "brick")
 BRICK: Any = import_model(find_model("brick"))
 HELD_OUT_FILES = ("held_out.txt", "held_out_no_task.txt", "final.txt", "final_no_task.txt")
+COMMANDS = (
+    "put the red brick in the box",
+    "stack the blue brick on the green brick",
+    "push the yellow brick to the left",
+    "push the green brick away",
+    "slide the red brick closer to you",
+)
 ORDERS = (
     Order("put", "green"),
     Order("stack", "blue", onto="red"),
@@ -196,7 +203,11 @@ def read(policy: Policy, prompt: str) -> str:
 
 @pytest.mark.parametrize(
     ("name", "count", "right", "wrong"),
-    [("held_out.txt", 300, 0.95, 0.01), ("final.txt", 60, 0.9, 0.02)],
+    [
+        ("held_out.txt", 300, 0.95, 0.01),
+        ("final.txt", 60, 0.9, 0.02),
+        ("independent.txt", 60, 0.95, 0.0),
+    ],
 )
 def test_free_wordings_that_were_never_taught_are_read(
     policy: Policy, name: str, count: int, right: float, wrong: float
@@ -212,7 +223,11 @@ def test_free_wordings_that_were_never_taught_are_read(
 
 @pytest.mark.parametrize(
     ("name", "count", "still"),
-    [("held_out_no_task.txt", 160, 0.98), ("final_no_task.txt", 40, 0.9)],
+    [
+        ("held_out_no_task.txt", 160, 0.98),
+        ("final_no_task.txt", 40, 0.9),
+        ("independent_no_task.txt", 47, 1.0),
+    ],
 )
 def test_nonsense_and_negation_that_were_never_taught_do_nothing(
     policy: Policy, name: str, count: int, still: float
@@ -220,6 +235,14 @@ def test_nonsense_and_negation_that_were_never_taught_do_nothing(
     found = [read(policy, sentence) for sentence in held_out(name)]
     assert len(found) >= count
     assert np.mean([one == "no task" for one in found]) >= still
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_negated_command_is_never_obeyed(policy: Policy, command: str) -> None:
+    negated = [form.format(command) for form in held_out("negated.txt")]
+    negated += [form.replace("'", "’").format(command) for form in held_out("negated.txt")]
+    assert read(policy, command) != "no task"
+    assert [one for one in negated if read(policy, one) != "no task"] == []
 
 
 @pytest.mark.parametrize(
