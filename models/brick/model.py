@@ -59,7 +59,7 @@ SURE = 0.9
 NEGATION = re.compile(
     r"\b(no|not|nto|nor|never|none|nobody|nothing|neither|without|cannot|instead)\b"
     r"|\b(do|does|did|ca|could|wo|would|sha|should|must|need|is|are|was|were|have|has|had|may)"
-    r"\s?n\s?['’`]?t\b"
+    r"\s?n\s?['\u2019`]?t\b"
 )
 """What makes of a task something else. A network that misreads one of these moves an arm that was
 told to stay, so it is not asked."""

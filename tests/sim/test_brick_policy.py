@@ -240,7 +240,7 @@ def test_nonsense_and_negation_that_were_never_taught_do_nothing(
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_negated_command_is_never_obeyed(policy: Policy, command: str) -> None:
     negated = [form.format(command) for form in held_out("negated.txt")]
-    negated += [form.replace("'", "’").format(command) for form in held_out("negated.txt")]
+    negated += [form.replace("'", "\u2019").format(command) for form in held_out("negated.txt")]
     assert read(policy, command) != "no task"
     assert [one for one in negated if read(policy, one) != "no task"] == []
 
