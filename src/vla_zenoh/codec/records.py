@@ -29,7 +29,10 @@ def encode(record: Any) -> bytes:
         CodecError: larger than `MAX_RECORD_BYTES`, which every receiver rejects.
     """
     to_dict = getattr(record, "to_dict", None)  # of a ModelSpec
-    payload = b"".join(_pieces(record)) if to_dict is None else message.pack(to_dict())
+    if type(record).__name__ in _STREAMED:
+        payload = b"".join(_pieces(record))
+    else:
+        payload = message.pack(_fields(record) if to_dict is None else to_dict())
     _check_length(type(record), payload)
     return payload
 
@@ -100,6 +103,17 @@ def _layout(kind: type) -> _Layout:
     return _Layout(head, names, frozenset(names), required)
 
 
+def _fields(record: Any) -> dict[str, Any]:
+    fields = {name: getattr(record, name) for name in _layout(type(record)).names}
+    return {
+        name: dict(value) if isinstance(value, Mapping) else value for name, value in fields.items()
+    }
+
+
+_STREAMED = {"GripperState", "JointCommand", "JointState", "PoseCommand", "PoseState"}
+"""Records that come in every tick: most of the time would go into their maps and lists."""
+
+
 def _pieces(record: Any) -> list[bytes]:
     """The bytes of a record: every second piece is a float, or those of a vector of float64."""
     layout, pieces = _layout(type(record)), list[bytes]()
@@ -116,7 +130,6 @@ def _pieces(record: Any) -> list[bytes]:
         elif value is None or type(value) is str or hasattr(value, "__dataclass_fields__"):
             before += _repeated(name, value)
         else:
-            value = dict(value) if isinstance(value, Mapping) else value
             before += message.pack(name) + message.pack(value)
     pieces.append(before)
     return pieces
@@ -163,8 +176,6 @@ class _Frame(NamedTuple):
     numbers: tuple[tuple[str, Callable[[bytes], Any]], ...]
 
 
-_STREAMED = {"GripperState", "JointCommand", "JointState", "PoseCommand", "PoseState"}
-"""Records that come in every tick. To read their maps and lists takes most of the time."""
 _MAX_FRAMES = 64
 _frames: dict[tuple[type, int], _Frame] = {}
 
