@@ -142,6 +142,7 @@ def ended(family: str, failure: str = "", time_s: float = 8.0) -> TaskOutcome:
         "put": Order("put", "red"),
         "stack": Order("stack", "red", onto="blue"),
         "push": Order("push", "red", direction="left"),
+        "stay": Order("stay"),
     }[family]
     verdict = Verdict(not failure, failure, time_s)
     task = TaskEpisode(SEED, order, "do it")
