@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from vla_zenoh.policy.loader import find_model, import_model
 
-for _name in ("groot", "openpi", "openvla_rest", "origami"):
+for _name in ("groot", "openpi", "openvla_rest", "origami", "xpolicylab"):
     import_model(find_model(_name))
 
 from vla_zenoh_model_groot import npy  # noqa: E402
@@ -12,5 +12,6 @@ from vla_zenoh_model_groot import wire as groot  # noqa: E402
 from vla_zenoh_model_openpi import wire as openpi  # noqa: E402
 from vla_zenoh_model_openvla_rest import wire as openvla_rest  # noqa: E402
 from vla_zenoh_model_origami import wire as origami  # noqa: E402
+from vla_zenoh_model_xpolicylab import wire as xpolicylab  # noqa: E402
 
-__all__ = ["groot", "npy", "openpi", "openvla_rest", "origami"]
+__all__ = ["groot", "npy", "openpi", "openvla_rest", "origami", "xpolicylab"]

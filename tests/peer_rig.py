@@ -30,6 +30,7 @@ ENVIRONMENT_S = 300
 # openpi-client does not name typing-extensions, which it imports.
 OPENPI_CLIENT = ("openpi-client==0.1.2", "typing-extensions")
 JSON_NUMPY = ("json-numpy==2.1.1",)
+MSGPACK_NUMPY = ("msgpack-numpy==0.4.8", "websockets>=15")
 _PLAIN = {
     "rotation": "rpy",
     "clip": "",
@@ -43,6 +44,7 @@ _NO_WRIST = {
     "groot": "video.wrist_image=",
     "oft": "wrist_image=",
     "origami": "observation/image/wrist_right=blank:224x224",
+    "xpolicylab": "vision/cam_wrist/color=",
 }
 
 
@@ -105,6 +107,17 @@ KINDS: Mapping[str, Kind] = {
         "http://127.0.0.1:PORT",
         {**_PLAIN, **_SMALL, "preset": "oft_libero", "map": _NO_WRIST["oft"]},
         "oft",
+    ),
+    "xpolicylab": Kind(
+        "xpolicylab",
+        "xpolicylab_server.py",
+        "ws://127.0.0.1:PORT",
+        {
+            **{"preset": "joint", "case": "pick", "joint_scale_rad": "1"},
+            **{"gripper": "binary", "gripper_open": "high", **_SMALL},
+            "map": f"{_NO_WRIST['xpolicylab']}, state/arm_joint_state=joint, "
+            "state/ee_joint_state=gripper_open",
+        },
     ),
     "origami": Kind(
         "origami",

@@ -17,6 +17,7 @@ import pytest
 from peer_rig import (
     JSON_NUMPY,
     KINDS,
+    MSGPACK_NUMPY,
     OPENPI_CLIENT,
     Server,
     free_port,
@@ -42,11 +43,12 @@ PATIENCE_S = 8.0
 BACK_OFF_S = 2.0
 UP_RAD = 0.03
 LIBERO = {"preset": "libero"}
+XPOLICYLAB = {"preset": "pose", "gripper": "absolute_m", "dt_s": "0.1", "horizon": "8"}
 JOINTS = {
     **{"action": "joint_delta", "anchor": "goal", "relative_to": "previous"},
     **{"joint_scale_rad": "1", "gripper": "none", "dt_s": "0.1"},
 }
-ADAPTERS = ("openpi", "groot", "openvla_rest", "origami")
+ADAPTERS = ("openpi", "groot", "openvla_rest", "origami", "xpolicylab")
 
 
 def in_full(*names: str, quick: Sequence[str]) -> list[Any]:
@@ -155,13 +157,18 @@ def test_an_adapter_and_its_server_understand_each_other_and_recover_from_every_
 @pytest.mark.parametrize(
     ("name", "packages"),
     [("openpi", OPENPI_CLIENT), ("vllm", OPENPI_CLIENT)]
-    + [(name, JSON_NUMPY) for name in ("openvla_rest", "openvla_text", "oft")],
+    + [(name, JSON_NUMPY) for name in ("openvla_rest", "openvla_text", "oft")]
+    + [("xpolicylab", MSGPACK_NUMPY)],
 )
 def test_a_server_that_encodes_by_the_peers_own_package_is_understood(
     name: str, packages: tuple[str, ...]
 ) -> None:
     with asked(name, python=python_with(*packages)) as (_, policy):
-        assert height_m(policy, answer(policy, "up")) == pytest.approx(STEP_M, abs=ATOL_M)
+        moved_m = height_m(policy, answer(policy, "up"))
+        if policy.spec.action.space == "tcp":
+            assert moved_m == pytest.approx(STEP_M, abs=ATOL_M)
+        else:
+            assert moved_m > 0.2 * UP_RAD
         assert refusal(policy, "up raise").reason == "peer_error"
 
 
@@ -219,7 +226,7 @@ def test_without_a_server_the_answer_is_that_nobody_is_there(name: str) -> None:
             assert refusal(policy, "up").reason == "peer_gone"
 
 
-@pytest.mark.parametrize("name", ["openpi", "groot", "openvla_rest"])
+@pytest.mark.parametrize("name", ["openpi", "groot", "openvla_rest", "xpolicylab"])
 def test_a_port_that_accepts_and_says_nothing_takes_no_more_than_the_time_out(name: str) -> None:
     kind = KINDS[name]
     with socket.create_server(("127.0.0.1", 0)) as mute:
@@ -275,15 +282,18 @@ def test_groots_pickles_are_refused() -> None:
         assert "pickles, which run code" in str(refusal(policy, "up"))
 
 
-def test_an_answer_with_another_questions_number_is_refused() -> None:
+@pytest.mark.parametrize(
+    ("name", "number"), [("origami", "request_id"), ("xpolicylab", "message_id")]
+)
+def test_an_answer_with_another_questions_number_is_refused(name: str, number: str) -> None:
     with (
-        reachable(replace(KINDS["origami"], variant="other")) as server,
-        made("origami", server.settings) as policy,
+        reachable(replace(KINDS[name], variant="other")) as server,
+        made(name, server.settings) as policy,
     ):
         until_s = time.monotonic() + PATIENCE_S
         while (error := refusal(policy, "up")).reason == "peer_gone":
             assert time.monotonic() < until_s
-        assert "request_id of the answer is 'another'" in str(error)
+        assert f"{number} of the answer is 'another'" in str(error)
 
 
 @pytest.mark.parametrize(
@@ -334,6 +344,12 @@ def test_what_the_server_says_of_itself_is_held_against_the_options(
         ("openvla_rest", {"url": "ftp://x"}, "http://HOST:PORT"),
         ("openvla_rest", {**LIBERO, "encoded": "perhaps"}, "yes, no"),
         ("origami", {"session_id": ""}, "session_id is empty"),
+        ("xpolicylab", {}, "preset is '', allowed: joint, pose, none"),
+        ("xpolicylab", XPOLICYLAB, "--set map=state/ee_joint_state="),
+        ("xpolicylab", {**XPOLICYLAB, "map": "vision=prompt"}, "'vision' is no value of its own"),
+        ("xpolicylab", {**XPOLICYLAB, "map": "state/=joint"}, "'state/' is no value of its own"),
+        ("xpolicylab", {"preset": "pose", "dt_s": "0.1"}, r"--set gripper=.*--set horizon="),
+        ("xpolicylab", {"preset": "joint", "dt_s": "0.1"}, r"--set joint_scale_rad="),
     ],
 )
 def test_an_option_that_cannot_be_is_refused_before_anything_runs(

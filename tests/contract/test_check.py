@@ -172,7 +172,7 @@ def test_every_finding_has_a_meaning() -> None:
 
 
 # -- what is shipped ------------------------------------------------------------------------------
-ADAPTERS = ("openpi", "groot", "openvla_rest", "origami")
+ADAPTERS = ("openpi", "groot", "openvla_rest", "origami", "xpolicylab")
 IN_ENVIRONMENTS_OF_THEIR_OWN = {"lerobot", "openvla"}
 """Checked by tests/models/test_*_chain.py."""
 OF_ONE_SCENE = {"scripted_pick"}

@@ -101,7 +101,7 @@ def assert_nothing_stale(chain: Chain, since_ns: int) -> None:
     assert moved > 0
 
 
-ADAPTERS = ("openpi", "groot", "openvla_rest", "origami")
+ADAPTERS = ("openpi", "groot", "openvla_rest", "origami", "xpolicylab")
 
 
 @pytest.mark.parametrize(
