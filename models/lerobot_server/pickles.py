@@ -100,7 +100,7 @@ def _run(stream: io.BytesIO, makers: Makers) -> Any:
         if text not in makers:
             raise PeerError(
                 "peer_reply",
-                f"the server's pickle names {shown(text)}, which is not allowed and was not "
+                f"the server's pickle names {text[:100]!r}, which is not allowed and was not "
                 f"run; allowed: {', '.join(makers)}",
             )
         return _Name(text)

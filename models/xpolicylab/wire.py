@@ -179,7 +179,9 @@ def read_actions(payload: Mapping[str, Any]) -> Any:
     if "actions" not in payload:
         raise PeerError("peer_reply", f"the answer has no actions; it has: {shown([*payload])}")
     steps = payload["actions"]
-    if not isinstance(steps, list) or not steps or not isinstance(steps[0], dict):
+    if isinstance(steps, list) and not steps:
+        raise PeerError("peer_reply", "the answer has no steps")
+    if not isinstance(steps, list) or not isinstance(steps[0], dict):
         return steps
     if not all(isinstance(step, dict) and step.keys() == steps[0].keys() for step in steps):
         raise PeerError("peer_reply", f"steps with other names than {shown([*steps[0]])}")
