@@ -16,6 +16,7 @@ import json
 import math
 import re
 import unicodedata
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -260,12 +261,17 @@ class Brick:
             given: (H, 6) waypoints that cannot change any more, as in `Waypoints`, relative to the
                 hand: the offset, 1 for open, and 1 for a row that is given.
         """
+        images = {name: observation.images[name][None] for name in ("front", "wrist")}
+        return self._run(observation.prompt, images, hand, given)
+
+    def _run(
+        self, prompt: str, images: Mapping[str, NDArray[np.uint8]], hand: Hand, given: FloatArray
+    ) -> Waypoints:
         if self._session is None:
             self.load()
         feed = {
-            "tokens": tokens_of(observation.prompt, self._vocabulary),
-            "front": observation.images["front"][None],
-            "wrist": observation.images["wrist"][None],
+            **images,
+            "tokens": tokens_of(prompt, self._vocabulary),
             "hand": hand.numbers()[None].astype(np.float32),
             "given": given[None].astype(np.float32),
         }
@@ -275,9 +281,19 @@ class Brick:
         return Waypoints(
             offset[0].astype(np.float64),
             opened[0] > 0.5,
-            bool(understood[0] > SURE) and not forbids(observation.prompt),
+            bool(understood[0] > SURE) and not forbids(prompt),
             f"{kind} {target} {onto}" if kind == "stack" else f"{kind} {target}",
         )
+
+    def read(self, prompt: str) -> str:
+        """What a prompt is taken for, as `Waypoints.order`; empty: for no task."""
+        nothing = {
+            "front": np.zeros((1, FRONT[1], FRONT[0], 3), np.uint8),
+            "wrist": np.zeros((1, WRIST[1], WRIST[0], 3), np.uint8),
+        }
+        given = np.zeros((HORIZON, 6))
+        found = self._run(prompt, nothing, Hand(np.zeros(3), 0.0, 0.0), given)
+        return found.order if found.understood else ""
 
     def _follow(self, observation: Observation) -> Hand:
         pose, gripper = observation.pose, observation.gripper

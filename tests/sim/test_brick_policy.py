@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 
 from vla_zenoh import resources
 from vla_zenoh.errors import WorkerError
+from vla_zenoh.lab.bench.task import DemoPlan, PromptedTask, order_of
 from vla_zenoh.lab.check.examples import example_observation
 from vla_zenoh.lab.lockstep import Lockstep
 from vla_zenoh.lab.tasks import (
@@ -235,6 +236,24 @@ def test_nonsense_and_negation_that_were_never_taught_do_nothing(
     found = [read(policy, sentence) for sentence in held_out(name)]
     assert len(found) >= count
     assert np.mean([one == "no task" for one in found]) >= still
+
+
+def test_what_it_reads_needs_no_pictures_and_is_a_goal(policy: Any) -> None:
+    assert order_of(policy.read("toss the red cube in the tray")) == Order("put", "red")
+    assert order_of(policy.read("pile blue onto red")) == Order("stack", "blue", onto="red")
+    pulled = Order("push", "green", direction="closer")
+    assert order_of(policy.read("pull the green one closer to you")) == pulled
+    assert order_of(policy.read("don't toss the red cube in the tray")) is None
+
+
+def test_a_demo_judges_free_wording_by_the_goal_that_was_read() -> None:
+    goal = Order("put", "red")
+    plan = DemoPlan("brick", 1, 1, prompts=("toss it", "go"), orders={"toss it": goal})
+    first, second = plan.requests()
+    assert isinstance(first, PromptedTask)
+    nowhere = ObjectPoses((), np.zeros((0, 3)), np.zeros((0, 4)))
+    assert first.draw(nowhere, held_out=False).order == goal
+    assert second.draw(nowhere, held_out=False).order == Order("stay")
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -153,8 +153,7 @@ def _value(value: Any) -> Any:
     if not isinstance(value, dict):
         return value
     if "__ndarray__" in value:
-        fields = ("data", "dtype", "shape")
-        return message.array_of({name.encode(): value.get(name) for name in fields})
+        return message.make_array(value.get("data"), value.get("dtype"), value.get("shape"))
     if "__image__" in value:
         return _image(value)
     return {name: _value(item) for name, item in value.items()}
