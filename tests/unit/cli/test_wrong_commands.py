@@ -66,7 +66,7 @@ WRONG: list[tuple[str, int, str]] = [
     (
         "worker nosuch",
         FAILED,
-        "error: no model called 'nosuch'. Known: brick, groot, lerobot, libero_privileged, meta",
+        "error: no model called 'nosuch'. Known: brick, groot, lerobot, lerobot_server",
     ),
     ("worker scriptd", FAILED, "error: no model called 'scriptd'; did you mean 'scripted'? Known"),
     ("worker ./absent.py", FAILED, "error: there is no file or folder './absent.py'"),
@@ -123,7 +123,7 @@ WRONG: list[tuple[str, int, str]] = [
     (
         "check nosuch",
         FAILED,
-        "error: no model called 'nosuch'. Known: brick, groot, lerobot, libero_privileged, meta",
+        "error: no model called 'nosuch'. Known: brick, groot, lerobot, lerobot_server",
     ),
     (
         "check scripted --runs 0",
