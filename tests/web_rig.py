@@ -6,18 +6,20 @@ import http.client
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 from camera_rig import PATIENCE_S, until
 from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import ClientConnection, connect
+from websockets.sync import client
+from websockets.sync.client import ClientConnection
 
 START_S, END_S = 30.0, 10.0
 BEAT_S = 0.1
@@ -63,17 +65,16 @@ class Site:
         finally:
             connection.close()
 
-    def socket(
+    def connect(
         self, path: str = "/control", *, origin: str | None = None, host: str | None = None
     ) -> ClientConnection:
         """A WebSocket as a browser opens it."""
-        return connect(
+        return client.connect(
             f"ws://{host or self.host}{path}",
             origin=origin or f"http://{self.host}",  # pyright: ignore[reportArgumentType]
             compression=None,
             proxy=None,
-            host="127.0.0.1",
-            port=self.port,
+            sock=socket.create_connection(("127.0.0.1", self.port), END_S),
             max_size=None,
         )
 
@@ -82,7 +83,8 @@ class Browser:
     """A page that is open: reads all the time, as a browser does, and beats while it holds."""
 
     def __init__(self, site: Site, token: str = OPERATOR) -> None:
-        self.connection = site.socket()
+        self._stack = ExitStack()
+        self.connection = self._stack.enter_context(site.connect())
         self.state: dict[str, Any] = {}
         self.heard: list[dict[str, Any]] = []
         self.closed = threading.Event()
@@ -169,9 +171,13 @@ class Browser:
 
         return until(f"the end of {what}", ended, PATIENCE_S)
 
+    def vanish(self) -> None:
+        """As a tab that is killed: no word of farewell."""
+        self.connection.socket.shutdown(socket.SHUT_RDWR)
+
     def close(self) -> None:
         self._holding.clear()
-        self.connection.close()
+        self._stack.close()
 
 
 @contextmanager
@@ -190,6 +196,8 @@ def serving(profile: Path, people: Path | None, *more: str) -> Iterator[Site]:
             port = int(line.rpartition(":")[2].partition("/")[0])
             until("it listens", lambda: _listens(process, port), START_S)
             yield Site(process, port)
+            if process.poll() == -signal.SIGKILL:  # the test did that
+                return
             assert process.poll() is None, process.stderr.read()
             process.send_signal(signal.SIGINT)
             assert process.wait(END_S) == 0, process.stderr.read()

@@ -56,9 +56,9 @@ def web(
     Stop, hold-to-run, prompt, cameras, the arm, latencies, log; /metrics for Prometheus. Each
     person has a token, and the rights of a viewer or operator.
     """
+    _require_tls(bind, certificate, key)
     from vla_zenoh.lab.web.serve import TlsFiles, serve_page
 
-    _require_tls(bind, certificate, key)
     tls = None if certificate is None or key is None else TlsFiles(certificate, key)
     profile = target.load()
     found = [Person("operator", "operator", secrets.token_urlsafe(24))]
