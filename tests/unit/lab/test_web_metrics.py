@@ -18,8 +18,8 @@ from vla_zenoh.profile import load_profile
 from vla_zenoh.types import ActionChunk, JointState, NodeStatus
 
 parser = pytest.importorskip("prometheus_client.openmetrics.parser", reason="needs the extra web")
-
-from vla_zenoh.lab.web.metrics import MAX_SERIES, exposition  # noqa: E402
+metrics = pytest.importorskip("vla_zenoh.lab.web.metrics", exc_type=ImportError)
+exposition, MAX_SERIES = metrics.exposition, metrics.MAX_SERIES
 
 ATOL_M = 2e-4
 """Lines are rounded to 0.1 mm."""

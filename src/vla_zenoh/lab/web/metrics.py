@@ -63,6 +63,7 @@ class _Families:
     def __init__(self) -> None:
         self.found: dict[str, Any] = {}
         self._series: Counter[str] = Counter()
+        self._labels: set[tuple[str, tuple[str, ...]]] = set()
         self.left_out = 0
 
     def add(
@@ -75,15 +76,19 @@ class _Families:
         unit: str = "",
     ) -> None:
         """Add one series of a family of this kind."""
+        values = tuple(one_line(value, MAX_LABEL) for value in labels.values())
         number = isinstance(value, (int, float))
-        if self._series[name] >= MAX_SERIES or not (number or kind is StateSetMetricFamily):
-            self.left_out += number
+        if not (number or kind is StateSetMetricFamily):
+            return
+        if self._series[name] >= MAX_SERIES or (name, values) in self._labels:  # cut to the same
+            self.left_out += 1
             return
         self._series[name] += 1
+        self._labels.add((name, values))
         if name not in self.found:
             more: dict[str, Any] = {} if kind is StateSetMetricFamily else {"unit": unit}
             self.found[name] = kind(f"{PREFIX}_{name}", text, labels=list(labels), **more)
-        self.found[name].add_metric([one_line(v, MAX_LABEL) for v in labels.values()], value)
+        self.found[name].add_metric(values, value)
 
 
 def _numbers(value: Any) -> Iterator[tuple[str, float]]:

@@ -82,7 +82,7 @@ class Pictures:
         keys = {name: self._key(name) for name in wanted - before}
         with self._lock:
             if len(self._streams.keys() | wanted) > MAX_STREAMS:
-                raise CodecError("too_many", f"at most {MAX_STREAMS} streams of pictures")
+                raise CodecError("malformed", f"at most {MAX_STREAMS} streams of pictures")
             for name, key in keys.items():
                 if name not in self._streams:
                     self._streams[name] = _Stream(self._session, key)
