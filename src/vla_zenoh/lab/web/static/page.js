@@ -45,13 +45,14 @@ function send(message) {
   return true;
 }
 
+const DONE = { hold: "active while you hold", activate: "active", prompt: "prompt set", worker: "model chosen", rate: "rate set", speed: "speed set", jog: "done" };
 const RECEIVE = {
   state: showState,
   nodes: showNodes,
   event: showEvent,
   welcome: enter,
   denied: (message) => askToken(message.why),
-  done: (message) => answer(message.text || `${message.what}: done`, [], "good"),
+  done: (message) => answer(message.text || DONE[message.what] || "done", [], "good"),
   failed: (message) => { if (message.what === "hold") endHold(); answer(message.why, message.reasons, "bad"); },
   rejected: (message) => answer(`${message.what}: ${message.why}`, [], "bad"),
   hold_ended: (message) => { if (message.press === press) endHold(message.why || "the hold ended: press again"); },
@@ -86,6 +87,7 @@ function enter(message) {
   if (!message.drives) $("hold-help").textContent = "A viewer may look. Stop at the robot, or ask an operator.";
   warn(message.insecure ? "Insecure profile: anyone on the network can command this robot." : "");
   $("arm-words").textContent = message.no_arm;
+  $("keep-out-legend").hidden = !Object.keys(message.surroundings.keep_out).length;
   $("events").replaceChildren();
   levels(message.levels || []);
   if (message.drives) watchPictures();
@@ -94,7 +96,7 @@ function enter(message) {
 function warn(text) { $("warning").hidden = !text; setText($("warning"), text); }
 
 function showLink() {
-  const silent = performance.now() - heardMs > SILENT_MS || !control;
+  const silent = performance.now() - heardMs > SILENT_MS || !control || !state.is;
   const late = !silent && state.silent_s > 2;
   setText($("link"), silent ? "NOT CONNECTED" : late ? "robot silent" : "connected");
   $("link").className = `badge ${silent || late ? "bad" : "good"}`;
@@ -117,7 +119,7 @@ function showState(message) {
   $("state").className = `badge ${level(message.state)}`;
   const task = message.task;
   if (task) {
-    setUnlessFocused("prompt", task.prompt);
+    if (!promptTyped) setUnlessFocused("prompt", task.prompt);
     setUnlessFocused("rate", String(task.rate_hz));
     if (document.activeElement !== $("speed")) { $("speed").value = task.speed_percent; setText($("speed-now"), `${task.speed_percent} %`); }
     options($("worker"), [...new Set([...message.workers, task.worker])], task.worker);
@@ -164,7 +166,9 @@ function answer(text, reasons, how) {
 }
 
 // -- requests -----------------------------------------------------------------------------
-$("prompt-form").addEventListener("submit", (event) => { event.preventDefault(); send({ do: "prompt", text: $("prompt").value }); $("prompt").blur(); });
+let promptTyped = false; // until it is set, the state does not overwrite it
+$("prompt").addEventListener("input", () => { promptTyped = true; });
+$("prompt-form").addEventListener("submit", (event) => { event.preventDefault(); send({ do: "prompt", text: $("prompt").value }); promptTyped = false; $("prompt").blur(); });
 $("worker").addEventListener("change", () => { send({ do: "worker", name: $("worker").value }); $("worker").blur(); });
 $("rate").addEventListener("change", () => { send({ do: "rate", hz: Number($("rate").value) }); $("rate").blur(); });
 $("speed").addEventListener("input", () => setText($("speed-now"), `${$("speed").value} %`));
@@ -223,7 +227,7 @@ function beginHold(way = NONE, grip = 0) {
   send({ do: "hold", press, tick });
   beatTimer = setInterval(beat, BEAT_MS);
   $("hold").classList.add("held");
-  setText($("hold"), "Running: let go to brake");
+  setText($("hold"), "Let go to brake");
 }
 function beat() { send({ do: "beat", press, tick, twist, opening }); }
 function endHold(why) {
@@ -235,7 +239,7 @@ function endHold(why) {
   send({ do: "release" });
   $("hold").classList.remove("held");
   setText($("hold"), "Hold to run");
-  if (why) answer(why, [], "bad");
+  answer(why || "", [], "bad");
 }
 function holdable(button, begin) {
   button.addEventListener("pointerdown", (event) => { event.preventDefault(); button.setPointerCapture(event.pointerId); begin(); });
@@ -283,13 +287,17 @@ function showRecording(message) {
 // -- pictures -----------------------------------------------------------------------------
 let offered = "", chosen = null;
 const shown = new Map();
+function title(name) { // seen/WORKER/CAMERA is what the model is given
+  const [kind, one, camera] = name.split("/");
+  return kind === "camera" ? one : `${camera} as ${one} sees it`;
+}
 function streams(seen) {
   const names = [...(welcome.cameras || []).map((name) => `camera/${name}`), ...seen];
   if (!welcome.drives || names.join() === offered) return;
   offered = names.join();
   if (chosen === null) chosen = new Set((welcome.cameras || []).map((name) => `camera/${name}`));
   $("streams").replaceChildren(...names.map((name) => {
-    const button = el("button", name.replace("camera/", "").replace("seen/", "seen by "), { type: "button" });
+    const button = el("button", title(name), { type: "button", className: "small" });
     button.setAttribute("aria-pressed", String(chosen.has(name)));
     button.addEventListener("click", () => {
       if (!chosen.delete(name)) chosen.add(name);
@@ -319,20 +327,24 @@ function watchPictures() {
 }
 function look() {
   for (const name of shown.keys()) if (!chosen.has(name)) { shown.get(name).figure.remove(); shown.delete(name); }
+  for (const name of chosen || []) picture(name);
   const wanted = document.hidden || chosen === null ? [] : [...chosen];
   if (pictures && pictures.readyState === WebSocket.OPEN) pictures.send(JSON.stringify({ do: "look", streams: wanted, hz: PICTURE_HZ }));
 }
 document.addEventListener("visibilitychange", look);
+function picture(name) {
+  if (shown.has(name)) return shown.get(name);
+  const canvas = el("canvas", null, { width: 640, height: 480 }), caption = el("figcaption", title(name));
+  canvas.setAttribute("role", "img");
+  canvas.setAttribute("aria-label", `picture of ${title(name)}`);
+  const figure = el("figure", null, {}, canvas, caption);
+  $("pictures").append(figure);
+  shown.set(name, { figure, canvas, caption, frames: 0, sinceMs: performance.now(), latency: [] });
+  return shown.get(name);
+}
 function draw(head, image) {
-  if (!shown.has(head.name)) {
-    const canvas = el("canvas"), caption = el("figcaption");
-    canvas.setAttribute("role", "img");
-    canvas.setAttribute("aria-label", `picture of ${head.name}`);
-    const figure = el("figure", null, {}, canvas, caption);
-    $("pictures").append(figure);
-    shown.set(head.name, { figure, canvas, caption, frames: 0, sinceMs: performance.now(), latency: [] });
-  }
-  const view = shown.get(head.name);
+  if (!chosen.has(head.name)) return;
+  const view = picture(head.name);
   if (view.canvas.width !== image.width || view.canvas.height !== image.height) { view.canvas.width = image.width; view.canvas.height = image.height; }
   view.canvas.getContext("2d").drawImage(image, 0, 0);
   view.frames += 1;
@@ -341,7 +353,7 @@ function draw(head, image) {
   if (took > 1000) {
     const sorted = view.latency.sort((a, b) => a - b);
     view.last = { hz: (1000 * view.frames) / took, ms: sorted[sorted.length >> 1] };
-    setText(view.caption, `${head.name.replace("camera/", "").replace("seen/", "seen by ")}: ${view.last.hz.toFixed(0)} Hz, ${view.last.ms} ms old`);
+    setText(view.caption, `${title(head.name)}: ${view.last.hz.toFixed(0)} Hz, ${view.last.ms} ms old`);
     view.frames = 0; view.sinceMs = performance.now(); view.latency = [];
   }
 }
@@ -454,7 +466,7 @@ function showEvent(event) {
 }
 
 // -- begin --------------------------------------------------------------------------------
-const given = location.hash.slice(1) || sessionStorage.getItem("token") || "";
+const given = decodeURIComponent(location.hash.slice(1)) || sessionStorage.getItem("token") || "";
 if (location.hash) history.replaceState(null, "", location.pathname); // the token stays out of the history
 if (given) useToken(given);
 else askToken("");
