@@ -109,8 +109,11 @@ def families(rows: Iterable[NodeRow], web: Mapping[str, int], pages: int) -> lis
     for row in rows:
         _of_node(out, row)
     for name, count in sorted(web.items()):
-        labels = {"what": name}
-        out.add(CounterMetricFamily, "web_events", "Messages and pictures.", labels, count)
+        labels, counter = {"what": name.removesuffix("_bytes")}, CounterMetricFamily
+        if name.endswith("_bytes"):
+            out.add(counter, "web_sent_bytes", "To pages.", labels, count, "bytes")
+        else:
+            out.add(counter, "web_events", "Messages and pictures.", labels, count)
     out.add(GaugeMetricFamily, "web_pages", "Open pages.", {}, pages)
     out.add(GaugeMetricFamily, "series_left_out", "Beyond the bound.", {}, out.left_out)
     return list(out.found.values())

@@ -61,6 +61,7 @@ STATE_S, NODES_S = 0.05, 1.0
 ENTER_S = 5.0
 DENIED_S = 0.5
 """A wrong token is answered this late."""
+STOP_AGAIN_S = 0.1
 MAX_PAGES, MAX_ANSWERS, MAX_NEWS = 32, 200, 300
 RATE_HZ, BURST = 50.0, 100.0
 """Requests of one page; a stop is always taken."""
@@ -121,7 +122,9 @@ class PageServer:
         self._looking = 0
         self.counters: Counter[str] = link.counters
         # Stops have threads of their own: those of other requests may all be waiting.
-        self._stops = ThreadPoolExecutor(4, thread_name_prefix="stop")
+        self._stops = ThreadPoolExecutor(2, thread_name_prefix="stop")
+        self._stopping: asyncio.Future[dict[str, Any]] | None = None
+        self._stop_s = 0.0
         self._tasks: set[asyncio.Task[Any]] = set()
         routes = [Route(path, self._file) for path in FILES]
         routes += [
@@ -373,8 +376,20 @@ class PageServer:
         self._begin(run())
 
     async def _stop(self, person: Person) -> dict[str, Any]:
-        """Stop the robot, and tell every page who did, and when it stood."""
+        """Stop the robot; all that are asked for while one is confirmed share its report."""
         self.counters["stop"] += 1
+        now_s = time.monotonic()
+        if self._stopping is None or self._stopping.done():
+            self._stopping = asyncio.ensure_future(self._stop_and_tell(person))
+        elif now_s - self._stop_s > STOP_AGAIN_S:  # somebody may have reset it meanwhile
+            self._stops.submit(self._link.client.stop)
+        else:
+            return await asyncio.shield(self._stopping)
+        self._stop_s = now_s
+        return await asyncio.shield(self._stopping)
+
+    async def _stop_and_tell(self, person: Person) -> dict[str, Any]:
+        """Stop the robot, and tell every page who did, and when it stood."""
         loop = asyncio.get_running_loop()
         report = await loop.run_in_executor(self._stops, self._link.stop)
         report = {"is": "stopped", "by": person.name, **report}
@@ -443,6 +458,7 @@ class PageServer:
                         "stamp_ms": picture.stamp_wall_ns // 1_000_000,
                     }
                     self.counters["picture"] += 1
+                    self.counters["picture_bytes"] += len(picture.jpeg)
                     await socket.send_bytes(json.dumps(head).encode() + b"\n" + picture.jpeg)
                 await asyncio.sleep(PICTURE_POLL_S)
 
