@@ -14,7 +14,14 @@ from chain import Chain
 
 from vla_zenoh.codec import message, records
 from vla_zenoh.keys import KEY_PATHS, SCHEMA, Keys
-from vla_zenoh.types import Event, GripperCommand, Header, JointCommand, Task
+from vla_zenoh.types import (
+    Event,
+    GripperCommand,
+    Header,
+    JointCommand,
+    PrivilegedState,
+    Task,
+)
 
 HUGE = bytes(2_000_000)
 STRANGER = "stranger#00000000"
@@ -22,6 +29,7 @@ STREAMS = (
     "state_joint",
     "state_pose",
     "state_gripper",
+    "state_privileged",
     "task",
     "delta",
     "spec",
@@ -51,6 +59,7 @@ SELDOM = {
     "command_gripper": GripperCommand(0.0, 0.1, 10.0),
     "command_joint": JointCommand(("a", "b"), np.ones(2), np.zeros(2), np.zeros(2), "active"),
     "event": Event("info", "notice", "nothing", "happened"),
+    "state_privileged": PrivilegedState({"expert": np.ones(39)}),
     "task": Task(1 << 60, True, "HARD: yaw left", "scripted", 100.0),
 }
 """Not written all the time: true but for their writer."""

@@ -10,10 +10,11 @@ import socket
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,7 @@ ENVIRONMENT_S = 300
 # openpi-client does not name typing-extensions, which it imports.
 OPENPI_CLIENT = ("openpi-client==0.1.2", "typing-extensions")
 JSON_NUMPY = ("json-numpy==2.1.1",)
+MSGPACK_NUMPY = ("msgpack-numpy==0.4.8", "websockets>=15")
 _PLAIN = {
     "rotation": "rpy",
     "clip": "",
@@ -43,6 +45,8 @@ _NO_WRIST = {
     "groot": "video.wrist_image=",
     "oft": "wrist_image=",
     "origami": "observation/image/wrist_right=blank:224x224",
+    "xpolicylab": "vision/cam_wrist/color=",
+    "lerobot_server": "observation.images.image2=",
 }
 
 
@@ -106,6 +110,27 @@ KINDS: Mapping[str, Kind] = {
         {**_PLAIN, **_SMALL, "preset": "oft_libero", "map": _NO_WRIST["oft"]},
         "oft",
     ),
+    "xpolicylab": Kind(
+        "xpolicylab",
+        "xpolicylab_server.py",
+        "ws://127.0.0.1:PORT",
+        {
+            **{"preset": "joint", "case": "pick", "joint_scale_rad": "1"},
+            **{"gripper": "binary", "gripper_open": "high", **_SMALL},
+            "map": f"{_NO_WRIST['xpolicylab']}, state/arm_joint_state=joint, "
+            "state/ee_joint_state=gripper_open",
+        },
+    ),
+    "lerobot_server": Kind(
+        "lerobot_server",
+        "lerobot_server.py",
+        "grpc://127.0.0.1:PORT",
+        {
+            **{"policy": "act", "checkpoint": "any", "preset": "libero", **_PLAIN, **_SMALL},
+            **{"gripper_open": "high", "gripper_threshold": "0.5"},
+            "map": _NO_WRIST["lerobot_server"],
+        },
+    ),
     "origami": Kind(
         "origami",
         "origami_server.py",
@@ -114,6 +139,7 @@ KINDS: Mapping[str, Kind] = {
     ),
 }
 """All of them move in metres and radians, so that a test knows how far; one camera."""
+ADAPTERS = tuple(dict.fromkeys(kind.model for kind in KINDS.values()))
 
 
 @dataclass
@@ -159,6 +185,24 @@ class Server:
             if process.poll() is None:
                 process.kill()
             process.wait(5)
+
+
+def of(*names: str, quick: Sequence[str] | None = None) -> list[Any]:
+    """Names of adapters or kinds, as parameters of a test.
+
+    Args:
+        names: of `KINDS`.
+        quick: those that are not for the slow tests alone; None: all.
+    """
+    no_grpc = pytest.mark.skipif(find_spec("grpc") is None, reason="there is no grpcio")
+    return [
+        pytest.param(
+            name,
+            marks=[no_grpc] * (KINDS[name].model == "lerobot_server")
+            + [pytest.mark.slow] * (quick is not None and name not in quick),
+        )
+        for name in names
+    ]
 
 
 @cache

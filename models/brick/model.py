@@ -15,6 +15,8 @@ import hashlib
 import json
 import math
 import re
+import unicodedata
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -38,7 +40,7 @@ from vla_zenoh.types import PoseState
 FloatArray = NDArray[np.float64]
 
 FOLDER = Path(__file__).parent
-GRAPH, MANIFEST = "brick.onnx", "weights.json"
+GRAPH, WORDS, MANIFEST = "brick.onnx", "words.txt", "weights.json"
 HORIZON, DT_S = 8, 0.1
 FRONT, WRIST = (128, 96), (96, 72)
 """Width and height of the pictures."""
@@ -50,8 +52,19 @@ MOVED = [0, 1, 2, 5]
 LOW_M, UP_M, PUSH_WAY_M = 0.035, 0.05, 0.105
 """See `expert`."""
 AT_REST_M_S = 0.004
-MAX_WORDS = 24
+MAX_PIECES, MAX_LETTERS = 32, 400
 PAD, UNKNOWN = 0, 1
+KINDS = ("put", "stack", "left", "right", "away", "closer")
+COLOURS = ("red", "blue", "green", "yellow")
+SURE = 0.9
+NEGATION = re.compile(
+    r"\b(no|not|nto|nor|never|none|nobody|nothing|neither|without|cannot|instead)\b"
+    r"|\b(do|does|did|ca|could|wo|would|sha|should|must|need|is|are|was|were|have|has|had|may)"
+    r"\s?n\s?['\u2019`]?t\b"
+)
+"""What makes of a task something else. A network that misreads one of these moves an arm that was
+told to stay, so it is not asked."""
+"""A prompt that is a task with less probability is none."""
 
 
 class Waypoints(NamedTuple):
@@ -61,11 +74,13 @@ class Waypoints(NamedTuple):
         offset: (H, 4) x, y, z in m along the base axes and a turn about the vertical in rad.
         opened: (H,) the gripper has to be open.
         understood: the prompt is a task; else the arm stays.
+        order: what was read: ``put red``, ``stack red blue``, ``left red``.
     """
 
     offset: FloatArray
     opened: NDArray[np.bool_]
     understood: bool
+    order: str
 
 
 @dataclass(slots=True)
@@ -105,17 +120,42 @@ class Hand:
 
 
 def words_of(prompt: str) -> list[str]:
-    """The prompt as words: small letters, nothing but letters and apostrophes."""
-    return re.findall(r"[a-z']+", prompt.lower())
+    """The prompt as words, numbers and marks, in small letters without accents."""
+    plain = unicodedata.normalize("NFKD", prompt.lower())
+    plain = "".join(letter for letter in plain if not unicodedata.combining(letter))
+    return re.findall(r"[a-z]+|[0-9]+|[^a-z0-9\s]", plain)
+
+
+def forbids(prompt: str) -> bool:
+    """Whether there is a negation anywhere in a prompt."""
+    return NEGATION.search(prompt.lower()) is not None
 
 
 def tokens_of(prompt: str, vocabulary: dict[str, int]) -> NDArray[np.int64]:
-    """(1, MAX_WORDS) numbers of the words; a prompt that is too long is one unknown word."""
-    words = words_of(prompt)
-    numbers = [vocabulary.get(word, UNKNOWN) for word in words]
-    if not numbers or len(numbers) > MAX_WORDS:
+    """(1, MAX_PIECES) numbers of the pieces of its words; a prompt that is too long is unknown.
+
+    Args:
+        prompt: any text.
+        vocabulary: piece -> number; one that does not begin a word begins with ``##``. A word is
+            cut into the longest pieces from its beginning (WordPiece: Schuster and Nakajima, 2012).
+    """
+    numbers: list[int] = []
+    for word in words_of(prompt[:MAX_LETTERS]):
+        found, begin = [], 0
+        while begin < len(word):
+            for end in range(len(word), begin, -1):
+                number = vocabulary.get("##" * (begin > 0) + word[begin:end])
+                if number is not None:
+                    break
+            else:
+                found = [UNKNOWN]
+                break
+            found.append(number)
+            begin = end
+        numbers += found
+    if not numbers or len(numbers) > MAX_PIECES or len(prompt) > MAX_LETTERS:
         numbers = [UNKNOWN]
-    return np.array([numbers + [PAD] * (MAX_WORDS - len(numbers))], np.int64)
+    return np.array([numbers + [PAD] * (MAX_PIECES - len(numbers))], np.int64)
 
 
 class Brick:
@@ -167,7 +207,8 @@ class Brick:
         self._session = onnxruntime.InferenceSession(
             graph, options, providers=["CPUExecutionProvider"]
         )
-        self._vocabulary = {word: index + 2 for index, word in enumerate(manifest["words"])}
+        words = checked(self._folder, WORDS, manifest["sha256"]).decode().split()
+        self._vocabulary = {word: index + 2 for index, word in enumerate(words)}
 
     def reset(self) -> None:
         """Forget what was asked for and how the hand moved."""
@@ -208,7 +249,8 @@ class Brick:
         if observation.task.active:
             goals = goal + np.cumsum(steps[:, MOVED], axis=0)
             self._asked = (observation.stamp_wall_ns, goals)
-        return ActionSteps(steps.astype(np.float32))
+        read = waypoints.order if waypoints.understood else "no task"
+        return ActionSteps(steps.astype(np.float32), raw={"read": read})
 
     def think(self, observation: Observation, hand: Hand, given: FloatArray) -> Waypoints:
         """What to do, as the network says.
@@ -219,17 +261,39 @@ class Brick:
             given: (H, 6) waypoints that cannot change any more, as in `Waypoints`, relative to the
                 hand: the offset, 1 for open, and 1 for a row that is given.
         """
+        images = {name: observation.images[name][None] for name in ("front", "wrist")}
+        return self._run(observation.prompt, images, hand, given)
+
+    def _run(
+        self, prompt: str, images: Mapping[str, NDArray[np.uint8]], hand: Hand, given: FloatArray
+    ) -> Waypoints:
         if self._session is None:
             self.load()
         feed = {
-            "tokens": tokens_of(observation.prompt, self._vocabulary),
-            "front": observation.images["front"][None],
-            "wrist": observation.images["wrist"][None],
+            **images,
+            "tokens": tokens_of(prompt, self._vocabulary),
             "hand": hand.numbers()[None].astype(np.float32),
             "given": given[None].astype(np.float32),
         }
-        offset, opened, understood = self._session.run(["offset", "opened", "understood"], feed)
-        return Waypoints(offset[0].astype(np.float64), opened[0] > 0.5, bool(understood[0] > 0.5))
+        outputs = ["offset", "opened", "understood", "order"]
+        offset, opened, understood, (order,) = self._session.run(outputs, feed)
+        kind, target, onto = KINDS[order[0]], COLOURS[order[1]], COLOURS[order[2]]
+        return Waypoints(
+            offset[0].astype(np.float64),
+            opened[0] > 0.5,
+            bool(understood[0] > SURE) and not forbids(prompt),
+            f"{kind} {target} {onto}" if kind == "stack" else f"{kind} {target}",
+        )
+
+    def read(self, prompt: str) -> str:
+        """What a prompt is taken for, as `Waypoints.order`; empty: for no task."""
+        nothing = {
+            "front": np.zeros((1, FRONT[1], FRONT[0], 3), np.uint8),
+            "wrist": np.zeros((1, WRIST[1], WRIST[0], 3), np.uint8),
+        }
+        given = np.zeros((HORIZON, 6))
+        found = self._run(prompt, nothing, Hand(np.zeros(3), 0.0, 0.0), given)
+        return found.order if found.understood else ""
 
     def _follow(self, observation: Observation) -> Hand:
         pose, gripper = observation.pose, observation.gripper
@@ -277,7 +341,7 @@ def yaw_of(pose: PoseState) -> float:
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """What belongs to the weights: their sha256 and the words they know.
+    """What belongs to the weights: the sha256 of each file.
 
     Raises:
         WorkerError: it is not there, or not readable.

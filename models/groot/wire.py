@@ -22,19 +22,18 @@ import json
 from collections.abc import Mapping
 from typing import Any, Literal
 
-import msgpack
 import numpy as np
 from vla_zenoh_model_groot import npy
 
-from vla_zenoh.codec.message import MAX_ITEMS, MAX_PAYLOAD_BYTES, count_containers
-from vla_zenoh.errors import PeerError
+from vla_zenoh.codec import message
+from vla_zenoh.errors import CodecError, PeerError
 from vla_zenoh.interop.field_mapping import FieldMapping
 from vla_zenoh.interop.presets import BRIDGE, OPENS_AT_1, OSC, Presets
 from vla_zenoh.types import shown
 
 Version = Literal["n1.5", "n1.6"]
 PORT = 5555
-MAX_BYTES = MAX_PAYLOAD_BYTES
+MAX_BYTES = message.MAX_PAYLOAD_BYTES
 VIDEO, STATE, ACTION = "video.", "state.", "action."
 _ARRAY, _CONFIG = "__ndarray_class__", "__ModalityConfig_class__"
 _PICKLES = (b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05", b"PK\x03\x04")
@@ -70,9 +69,7 @@ def pack(value: Any) -> bytes:
             return {_ARRAY: True, "as_npy": npy.dump(array)}
         raise TypeError(f"{type(array).__name__} has no form on GR00T's wire")
 
-    packed = msgpack.packb(value, default=as_map)
-    assert packed is not None
-    return packed
+    return message.pack(value, as_map)
 
 
 def unpack(payload: bytes) -> Any:
@@ -87,30 +84,10 @@ def unpack(payload: bytes) -> Any:
             "the server sends torch's or Python's pickles, which run code when they are read; they "
             "are never read: use a server that speaks msgpack (GR00T N1.5 or later)",
         )
-    if len(payload) > MAX_PAYLOAD_BYTES:
-        raise PeerError("peer_reply", f"an answer of {len(payload)} bytes")
-    count = count_containers(lambda why: PeerError("peer_reply", f"the answer holds {why}"))
     try:
-        return msgpack.unpackb(
-            payload,
-            object_hook=lambda found: _from_map(count(found)),
-            list_hook=count,
-            ext_hook=_reject_extension,
-            raw=False,
-            strict_map_key=True,
-            max_array_len=MAX_ITEMS,
-            max_map_len=MAX_ITEMS,
-        )
-    except PeerError:
-        raise
-    except (ValueError, TypeError, OverflowError, RecursionError) as error:
-        raise PeerError("peer_reply", f"the answer is not msgpack: {shown(str(error))}") from error
-    except msgpack.exceptions.UnpackException as error:
-        raise PeerError("peer_reply", f"the answer is not msgpack: {error}") from error
-
-
-def _reject_extension(code: int, data: bytes) -> Any:
-    raise PeerError("peer_reply", f"msgpack extension {code} ({len(data)} bytes) in the answer")
+        return message.unpack(payload, _from_map)
+    except CodecError as error:
+        raise PeerError("peer_reply", f"the answer cannot be read: {error}") from error
 
 
 def _from_map(value: dict[Any, Any]) -> Any:

@@ -4,30 +4,23 @@
 # ///
 """Queries a policy server with openpi's protocol.
 
-vllm-omni speaks it too, and ``vla-zenoh lab serve-openpi``.
+vllm-omni speaks it too, and ``vla-zenoh lab serve``.
 """
 
 from __future__ import annotations
 
-import socket
-import struct
 import time
 import uuid
-from contextlib import ExitStack, suppress
 from typing import Any
 
 import numpy as np
 from vla_zenoh_model_openpi import wire
-from websockets.exceptions import WebSocketException
-from websockets.protocol import State
-from websockets.sync.client import ClientConnection, connect
 
 from vla_zenoh.interop.adapter import Adapter
+from vla_zenoh.interop.websocket_client import WebSocketClient
 from vla_zenoh.policy import ActionSteps, Observation
 from vla_zenoh.policy.chunk_prefix import Committed
 from vla_zenoh.policy.model_options import address, one_of
-
-CLOSE_S = 0.1
 
 
 class OpenPi(Adapter):
@@ -44,7 +37,7 @@ class OpenPi(Adapter):
     """
 
     joints = True
-    lost = (OSError, WebSocketException)
+    lost = WebSocketClient.lost
 
     def __init__(
         self,
@@ -70,9 +63,8 @@ class OpenPi(Adapter):
         one_of("dialect", dialect, ("auto", "openpi", "vllm"))
         by_path = server.path == wire.VLLM_PATH
         self._vllm = by_path if dialect == "auto" else dialect == "vllm"
-        self._headers = {"Authorization": f"Api-Key {api_key}"} if api_key else None
-        self._connection: ClientConnection | None = None
-        self._until_closed = ExitStack()
+        headers = {"Authorization": f"Api-Key {api_key}"} if api_key else None
+        self._line = WebSocketClient(self.where, self.timeout_s, wire.MAX_BYTES, headers)
         self._session: str | None = None
         self._takes_reset = self._vllm
         # Of single columns of an answer, the row that they came from cannot be made.
@@ -82,26 +74,11 @@ class OpenPi(Adapter):
         self._committed: Committed | None = None
 
     def _connect(self) -> list[str]:
-        if self._connection is not None:
-            if self._connection.state is State.OPEN:
-                return []
-            self.close()  # the server closed it while idle
-        connection = self._connection = self._until_closed.enter_context(
-            connect(
-                self.where,
-                compression=None,
-                max_size=wire.MAX_BYTES,
-                additional_headers=self._headers,
-                proxy=None,
-                open_timeout=self.timeout_s,
-                close_timeout=CLOSE_S,
-                ping_interval=None,  # a server that infers does not answer pings
-            )
-        )
-        # A stopped server reads nothing, and sending would block forever.
-        seconds = struct.pack("ll", int(self.timeout_s), int(self.timeout_s % 1 * 1e6))
-        connection.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, seconds)
-        metadata = wire.read_metadata(connection.recv(self.timeout_s))
+        if self._line.is_open:
+            return []
+        self.close()  # the server may have closed it while idle
+        self._line.open()
+        metadata = wire.read_metadata(self._line.receive())
         self._takes_reset = self._vllm or wire.SPEC in metadata
         self._server_takes = metadata.get(wire.TAKES_COMMITTED) is True
         return wire.mismatches(metadata, self.mapping)
@@ -118,25 +95,14 @@ class OpenPi(Adapter):
     def _ask(self, fields: dict[str, Any], *, begins: bool) -> Any:
         if begins and self._takes_reset:
             self._session = uuid.uuid4().hex if self._vllm else None
-            wire.read_reset(self._call(wire.reset_request()))
+            wire.read_reset(self._line.call(wire.reset_request()))
         committed = self._committed
         if committed is not None and self._server_takes:
             steps = self.mapping.semantics.rows(committed.steps).astype(np.float32)
             fields = {**fields, wire.COMMITTED: {"steps": steps, "frozen": committed.frozen}}
-        return wire.read_answer(self._call(wire.request(fields, self._session)))
-
-    def _call(self, request: bytes) -> bytes | str:
-        assert self._connection is not None
-        self._connection.send(request)
-        return self._connection.recv(self.timeout_s)
+        return wire.read_answer(self._line.call(wire.request(fields, self._session)))
 
     def close(self) -> None:
         """Close the connection."""
         super().close()
-        connection, self._connection = self._connection, None
-        if connection is not None:
-            # Not the closing handshake, which waits for a server that may be stopped.
-            with suppress(OSError):
-                connection.socket.shutdown(socket.SHUT_RDWR)
-            with suppress(OSError, WebSocketException):
-                self._until_closed.close()
+        self._line.close()

@@ -97,6 +97,7 @@ class ClockOffsetFilter:
         self._window: deque[Exchange] = deque(maxlen=WINDOW)
         self._best: Exchange | None = None
         self._applied_ns = 0
+        self._applied_for: tuple[Exchange, int] | None = None
 
     def add(self, exchange: Exchange) -> bool:
         """Take one exchange; False: it cannot be, and is left out."""
@@ -133,6 +134,10 @@ class ClockOffsetFilter:
         best = self._best
         if best is None:
             return 0
+        # Nothing but these makes a difference: with its age an exchange only gets less certain.
+        if self._applied_for == (best, wall_minus_mono_ns):
+            return self._applied_ns
+        self._applied_for = best, wall_minus_mono_ns
         offset_ns = best.ahead_ns - wall_minus_mono_ns
         if _beyond(offset_ns / 1e9, self._bound_s):
             self._applied_ns = 0

@@ -7,19 +7,23 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 import pytest
 from peer_rig import (
+    ADAPTERS,
     JSON_NUMPY,
     KINDS,
+    MSGPACK_NUMPY,
     OPENPI_CLIENT,
     Server,
     free_port,
+    of,
     python_with,
     reachable,
     served,
@@ -42,16 +46,13 @@ PATIENCE_S = 8.0
 BACK_OFF_S = 2.0
 UP_RAD = 0.03
 LIBERO = {"preset": "libero"}
+LEROBOT = {**LIBERO, "horizon": "8"}
+LEROBOT_ACT = {**LEROBOT, "policy": "act", "checkpoint": "x"}
+XPOLICYLAB = {"preset": "pose", "gripper": "absolute_m", "dt_s": "0.1", "horizon": "8"}
 JOINTS = {
     **{"action": "joint_delta", "anchor": "goal", "relative_to": "previous"},
     **{"joint_scale_rad": "1", "gripper": "none", "dt_s": "0.1"},
 }
-ADAPTERS = ("openpi", "groot", "openvla_rest", "origami")
-
-
-def in_full(*names: str, quick: Sequence[str]) -> list[Any]:
-    """All of them with the slow tests, `quick` always."""
-    return [pytest.param(n, marks=() if n in quick else pytest.mark.slow) for n in names]
 
 
 @contextmanager
@@ -126,7 +127,7 @@ def height_m(policy: Policy, steps: np.ndarray[Any, Any]) -> float:
     return float(up - home)
 
 
-@pytest.mark.parametrize("name", in_full(*KINDS, quick=ADAPTERS))
+@pytest.mark.parametrize("name", of(*KINDS, quick=ADAPTERS))
 def test_an_adapter_and_its_server_understand_each_other_and_recover_from_every_fault(
     name: str,
 ) -> None:
@@ -155,17 +156,22 @@ def test_an_adapter_and_its_server_understand_each_other_and_recover_from_every_
 @pytest.mark.parametrize(
     ("name", "packages"),
     [("openpi", OPENPI_CLIENT), ("vllm", OPENPI_CLIENT)]
-    + [(name, JSON_NUMPY) for name in ("openvla_rest", "openvla_text", "oft")],
+    + [(name, JSON_NUMPY) for name in ("openvla_rest", "openvla_text", "oft")]
+    + [("xpolicylab", MSGPACK_NUMPY)],
 )
 def test_a_server_that_encodes_by_the_peers_own_package_is_understood(
     name: str, packages: tuple[str, ...]
 ) -> None:
     with asked(name, python=python_with(*packages)) as (_, policy):
-        assert height_m(policy, answer(policy, "up")) == pytest.approx(STEP_M, abs=ATOL_M)
+        moved_m = height_m(policy, answer(policy, "up"))
+        if policy.spec.action.space == "tcp":
+            assert moved_m == pytest.approx(STEP_M, abs=ATOL_M)
+        else:
+            assert moved_m > 0.2 * UP_RAD
         assert refusal(policy, "up raise").reason == "peer_error"
 
 
-@pytest.mark.parametrize("name", in_full(*ADAPTERS, "groot_n15", quick=("groot",)))
+@pytest.mark.parametrize("name", of(*ADAPTERS, "groot_n15", quick=("groot",)))
 def test_a_late_answer_is_never_taken_for_that_of_the_next_question(name: str) -> None:
     with asked(name, timeout_s="0.4") as (_, policy):
         up = answer(policy, "up")
@@ -185,7 +191,7 @@ def test_a_late_answer_is_never_taken_for_that_of_the_next_question(name: str) -
         np.testing.assert_allclose(answer(policy, "up"), up, atol=ATOL_M)
 
 
-@pytest.mark.parametrize("name", in_full(*ADAPTERS, quick=()))
+@pytest.mark.parametrize("name", of(*ADAPTERS, quick=()))
 def test_a_server_killed_and_started_again_is_found(name: str) -> None:
     with asked(name) as (server, policy):
         answer(policy, "up")
@@ -196,7 +202,7 @@ def test_a_server_killed_and_started_again_is_found(name: str) -> None:
         answer(policy, "up")
 
 
-@pytest.mark.parametrize("name", in_full(*ADAPTERS, quick=("openpi",)))
+@pytest.mark.parametrize("name", of(*ADAPTERS, quick=("openpi",)))
 def test_a_stopped_server_takes_no_more_than_the_time_out(name: str) -> None:
     with asked(name) as (server, policy):
         answer(policy, "up")
@@ -210,7 +216,7 @@ def test_a_stopped_server_takes_no_more_than_the_time_out(name: str) -> None:
         answer(policy, "up")
 
 
-@pytest.mark.parametrize("name", ADAPTERS)
+@pytest.mark.parametrize("name", of(*ADAPTERS))
 def test_without_a_server_the_answer_is_that_nobody_is_there(name: str) -> None:
     kind = KINDS[name]
     settings = {**kind.settings(free_port()), "timeout_s": "0.3"}
@@ -219,7 +225,7 @@ def test_without_a_server_the_answer_is_that_nobody_is_there(name: str) -> None:
             assert refusal(policy, "up").reason == "peer_gone"
 
 
-@pytest.mark.parametrize("name", ["openpi", "groot", "openvla_rest"])
+@pytest.mark.parametrize("name", of(*(name for name in ADAPTERS if name != "origami")))
 def test_a_port_that_accepts_and_says_nothing_takes_no_more_than_the_time_out(name: str) -> None:
     kind = KINDS[name]
     with socket.create_server(("127.0.0.1", 0)) as mute:
@@ -269,21 +275,67 @@ def test_a_connection_that_the_server_closed_while_idle_is_made_again_without_a_
         answer(policy, "up", patience_s=0.0)
 
 
+NEEDS_GRPC = pytest.mark.skipif(find_spec("grpc") is None, reason="there is no grpcio")
+
+
+@NEEDS_GRPC
+@pytest.mark.parametrize(
+    ("variant", "named"),
+    [
+        ("pickle", "names 'posix.system', which is not allowed and was not run"),
+        ("other", "it is that of another observation"),
+    ],
+)
+def test_an_answer_of_lerobots_server_that_is_none_is_refused(
+    variant: str, named: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    kind = replace(KINDS["lerobot_server"], variant=variant)
+    with served(kind) as server, made("lerobot_server", server.settings) as policy:
+        error = refusal(policy, "up")
+    assert (error.reason, named in str(error)) == ("peer_reply", True), error
+    assert "has run" not in capfd.readouterr().out
+
+
+@NEEDS_GRPC
+def test_a_server_that_loads_longer_than_an_answer_may_take_is_waited_for() -> None:
+    kind = replace(KINDS["lerobot_server"], variant="slow")
+    with served(kind) as server, made("lerobot_server", server.settings) as policy:
+        error = refusal(policy, "up")
+        assert (error.reason, "loads the policy" in str(error)) == ("peer_timeout", True), error
+        answer(policy, "up")
+        # Nothing but a new server loads it again.
+        with pytest.raises(PeerError, match="gave no actions"):
+            policy.infer(seen(policy, "up raise"))
+        answer(policy, "up", patience_s=1.0)
+
+
+@NEEDS_GRPC
+def test_what_lerobots_server_says_of_a_policy_that_it_cannot_load_is_told() -> None:
+    with served(KINDS["lerobot_server"]) as server:
+        settings = {**server.settings, "checkpoint": "nowhere"}
+        with made("lerobot_server", settings) as policy:
+            error = refusal(policy, "up")
+    assert (error.reason, "no such policy: nowhere" in str(error)) == ("peer_error", True), error
+
+
 def test_groots_pickles_are_refused() -> None:
     kind = replace(KINDS["groot"], variant="pickle")
     with served(kind) as server, made("groot", server.settings) as policy:
         assert "pickles, which run code" in str(refusal(policy, "up"))
 
 
-def test_an_answer_with_another_questions_number_is_refused() -> None:
+@pytest.mark.parametrize(
+    ("name", "number"), [("origami", "request_id"), ("xpolicylab", "message_id")]
+)
+def test_an_answer_with_another_questions_number_is_refused(name: str, number: str) -> None:
     with (
-        reachable(replace(KINDS["origami"], variant="other")) as server,
-        made("origami", server.settings) as policy,
+        reachable(replace(KINDS[name], variant="other")) as server,
+        made(name, server.settings) as policy,
     ):
         until_s = time.monotonic() + PATIENCE_S
         while (error := refusal(policy, "up")).reason == "peer_gone":
             assert time.monotonic() < until_s
-        assert "request_id of the answer is 'another'" in str(error)
+        assert f"{number} of the answer is 'another'" in str(error)
 
 
 @pytest.mark.parametrize(
@@ -334,6 +386,27 @@ def test_what_the_server_says_of_itself_is_held_against_the_options(
         ("openvla_rest", {"url": "ftp://x"}, "http://HOST:PORT"),
         ("openvla_rest", {**LIBERO, "encoded": "perhaps"}, "yes, no"),
         ("origami", {"session_id": ""}, "session_id is empty"),
+        ("lerobot_server", {}, "preset is '', allowed: libero, none"),
+        ("lerobot_server", LEROBOT, r"policy is '', allowed: act, diffusion"),
+        ("lerobot_server", {**LEROBOT, "policy": "act"}, "checkpoint is empty"),
+        (
+            "lerobot_server",
+            {**LEROBOT, "policy": "act", "checkpoint": "x", "load_s": "0"},
+            "load_s",
+        ),
+        ("lerobot_server", {**LEROBOT_ACT, "map": "image=camera:front"}, "'image' is not read by"),
+        (
+            "lerobot_server",
+            {**LEROBOT_ACT, "map": "observation.state="},
+            "observation.state is mis",
+        ),
+        ("lerobot_server", {"preset": "libero"}, "--set horizon="),
+        ("xpolicylab", {}, "preset is '', allowed: joint, pose, none"),
+        ("xpolicylab", XPOLICYLAB, "--set map=state/ee_joint_state="),
+        ("xpolicylab", {**XPOLICYLAB, "map": "vision=prompt"}, "'vision' is no value of its own"),
+        ("xpolicylab", {**XPOLICYLAB, "map": "state/=joint"}, "'state/' is no value of its own"),
+        ("xpolicylab", {"preset": "pose", "dt_s": "0.1"}, r"--set gripper=.*--set horizon="),
+        ("xpolicylab", {"preset": "joint", "dt_s": "0.1"}, r"--set joint_scale_rad="),
     ],
 )
 def test_an_option_that_cannot_be_is_refused_before_anything_runs(

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from chain import command_line
-from peer_rig import KINDS, free_port, reachable
+from peer_rig import ADAPTERS, KINDS, free_port, of, reachable
 
 from vla_zenoh import resources
 from vla_zenoh.lab.check import fit
@@ -172,7 +172,6 @@ def test_every_finding_has_a_meaning() -> None:
 
 
 # -- what is shipped ------------------------------------------------------------------------------
-ADAPTERS = ("openpi", "groot", "openvla_rest", "origami")
 IN_ENVIRONMENTS_OF_THEIR_OWN = {"lerobot", "openvla"}
 """Checked by tests/models/test_*_chain.py."""
 OF_ONE_SCENE = {"scripted_pick"}
@@ -219,9 +218,7 @@ def test_replay_keeps_its_contract(tmp_path: Path) -> None:
     passes("replay", file=str(tmp_path / "chunks.npz"))
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=() if n == "openpi" else pytest.mark.slow) for n in ADAPTERS]
-)
+@pytest.mark.parametrize("name", of(*ADAPTERS, quick=["openpi"]))
 def test_an_adapter_keeps_its_contract_with_its_server(name: str) -> None:
     with reachable(KINDS[name]) as server:
         passes(server.kind.model, **{**server.settings, "timeout_s": "5"})

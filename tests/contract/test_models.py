@@ -24,7 +24,16 @@ from vla_zenoh.profile import load_profile
 from vla_zenoh.types import JointState
 
 MODELS = resources.names("models")
-ELSEWHERE = {"groot", "lerobot", "openpi", "openvla", "openvla_rest", "origami"}
+ELSEWHERE = {
+    "groot",
+    "lerobot",
+    "lerobot_server",
+    "openpi",
+    "openvla",
+    "openvla_rest",
+    "origami",
+    "xpolicylab",
+}
 """They need weights, or a server: tested with those, by themselves."""
 EXPERTS = {"libero_privileged", "metaworld_expert", "ogbench_expert", "so101_expert"}
 """They need their benchmark and its state."""

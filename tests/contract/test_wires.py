@@ -6,6 +6,7 @@ import io
 import json
 import pickle
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import msgpack
@@ -14,7 +15,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from model_wires import groot, npy, openpi, openvla_rest, origami
+from model_wires import (
+    groot,
+    lerobot_server,
+    npy,
+    openpi,
+    openvla_rest,
+    origami,
+    pickles,
+    xpolicylab,
+)
 
 from vla_zenoh.errors import PeerError
 from vla_zenoh.interop.field_mapping import read_field_mapping
@@ -113,6 +123,19 @@ def test_an_array_of_openpi_has_byte_keys_and_one_of_groot_is_an_npy_file() -> N
 SERVED = ActionSpec(horizon=1, dt_s=0.1)
 ACTIONS = np.linspace(-1, 1, 14, dtype=np.float32).reshape(2, 7)
 MODALITY = {"__ModalityConfig_class__": True, "as_json": '{"modality_keys": ["x"]}'}
+OF_TORCH = Path(__file__).with_name("lerobot_actions.pickle")
+"""What lerobot 0.6.1 answers: `TimedAction`s with the numbers 7 to 11."""
+
+
+def xpolicylab_answer(payload: Any, **changes: Any) -> bytes:
+    asked = xpolicylab.request("infer", "1", xpolicylab.Place("e"), {"payload": payload})
+    frame = msgpack.unpackb(asked, strict_map_key=False)
+    frame |= {"message_type": "infer_result", "payload": frame["payload"]["payload"]}
+    packed = msgpack.packb({**frame, **changes})
+    assert packed is not None
+    return packed
+
+
 ANSWERS: dict[str, tuple[bytes, Callable[[bytes], Any]]] = {
     "openpi": (openpi_frames.answer(ACTIONS, 1.0, None), openpi.read_answer),
     "openpi metadata": (
@@ -140,6 +163,14 @@ ANSWERS: dict[str, tuple[bytes, Callable[[bytes], Any]]] = {
         ),
         lambda payload: origami.read_answer(payload, "infer", "1"),
     ),
+    "xpolicylab": (
+        xpolicylab_answer({"actions": [{"x": row} for row in ACTIONS], "latency_ms": 1.0}),
+        lambda frame: xpolicylab.read_actions(xpolicylab.read_answer(frame, "infer", "1")),
+    ),
+    "lerobot server": (
+        lerobot_server.policy_setup(OF_TORCH.read_bytes()),
+        lambda payload: lerobot_server.read_actions(payload, 7),
+    ),
 }
 READ: dict[str, Any] = {
     "openpi": {"actions": ACTIONS, "server_timing": {"infer_ms": 1.0}},
@@ -155,6 +186,9 @@ READ: dict[str, Any] = {
     "groot modalities": {"video": {"modality_keys": ["x"]}},
     "openvla": ACTIONS,
     "origami": ACTIONS,
+    "xpolicylab": {"x": ACTIONS},
+    # Of torch 2.11: single, double, bfloat16 and half floats, and a row with strides.
+    "lerobot server": np.array([[0.75, 1.0, 1.25]] * 5),
 }
 
 
@@ -273,6 +307,10 @@ def test_a_header_that_numpy_would_not_write_for_numbers_is_refused(header: str)
             origami.message.pack({"error": {"code": "X", "message": "no such key"}}),
         ),
         (
+            lambda frame: xpolicylab.read_answer(frame, "infer", "1"),
+            xpolicylab_answer({"code": "x", "message": "no such key"}, message_type="error"),
+        ),
+        (
             lambda body: openvla_rest.read_answer(422, body),
             b'{"detail": "no such key"}',
         ),
@@ -328,3 +366,184 @@ def test_groots_two_shapes() -> None:
     rows = np.zeros((1, 4, 1), np.float32)
     assert set(groot.read_actions(groot.pack([{"x": rows}, {}]))) == {"x"}
     assert set(groot.read_actions(groot.pack({"action.x": rows[0]}))) == {"x"}
+
+
+# -- XPolicyLab -----------------------------------------------------------------------------------
+def test_an_observation_of_xpolicylab_is_nested_by_its_names() -> None:
+    picture = np.zeros((2, 3, 3), np.uint8)
+    fields = {"vision/cam_head/color": picture, "state/ee_pose": ACTIONS[0], "instruction": "go"}
+    nested = {
+        "data_format_version": "v1.0",
+        "vision": {"cam_head": {"color": picture}},
+        "state": {"ee_pose": ACTIONS[0]},
+        "instruction": "go",
+    }
+    assert same(xpolicylab.observation(fields), nested)
+
+
+@pytest.mark.parametrize(
+    ("actions", "why"),
+    [
+        ([], "no steps"),
+        ([{"x": [1.0]}, {"y": [1.0]}], "other names"),
+        ([{"x": [1.0]}, {"x": [1.0, 2.0]}], "different sizes"),
+        ([{"x": [1.0]}, 3], "other names"),
+        ([{"x": ["far"]}], "not numbers"),
+        ([{"y": [1.0]}], "no 'x'"),
+        ([{"x": [float("inf")]}], "NaN or infinity"),
+        ("up", "not numbers"),
+        ([{"x": {b"nd": True, b"kind": b"O", b"type": "|O", b"data": b"x"}}], "kind b'O'"),
+        ([{"x": {b"nd": True, b"kind": b"", b"type": "|O", b"shape": [1], b"data": b"x"}}], "'|O'"),
+        (
+            [{"x": {b"nd": True, b"kind": b"", b"type": "<f8", b"shape": [9**9], b"data": b"x"}}],
+            "cannot have 1 bytes",
+        ),
+    ],
+)
+def test_steps_of_xpolicylab_that_are_none_are_refused(actions: Any, why: str) -> None:
+    frame = xpolicylab_answer({"actions": actions})
+    with pytest.raises(PeerError, match=why.replace("|O", r"\|O")) as raised:
+        NAMED.gather(xpolicylab.read_actions(xpolicylab.read_answer(frame, "infer", "1")))
+    assert raised.value.reason == "peer_reply"
+
+
+@pytest.mark.parametrize(
+    ("frame", "why"),
+    [
+        (xpolicylab_answer({}, message_id="2"), "message_id of the answer is '2'"),
+        (xpolicylab_answer({}, message_type="reset_result"), "is 'reset_result', not infer_result"),
+        (xpolicylab_answer(None), "no frame with a payload"),
+        (xpolicylab_answer({}), "has no actions"),
+    ],
+)
+def test_a_frame_of_xpolicylab_that_answers_something_else_is_refused(
+    frame: bytes, why: str
+) -> None:
+    with pytest.raises(PeerError, match=why):
+        xpolicylab.read_actions(xpolicylab.read_answer(frame, "infer", "1"))
+
+
+def test_a_text_frame_of_xpolicylab_is_refused() -> None:
+    with pytest.raises(PeerError, match="a text frame"):
+        xpolicylab.read_answer("hello", "hello", "1")
+
+
+# -- lerobot's pickles ----------------------------------------------------------------------------
+def called(name: str, arguments: bytes = b")") -> bytes:
+    module, _, last = name.rpartition(".")
+    return f"\x80\x03c{module}\n{last}\n".encode("latin-1") + arguments + b"R."
+
+
+@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
+def test_a_pickle_that_runs_code_is_refused_by_name_and_never_run(protocol: int) -> None:
+    with pytest.raises(
+        PeerError, match=r"which is not allowed and was not run|instruction"
+    ) as told:
+        pickles.read(pickle.dumps([Trap()], protocol))
+    assert not Trap.sprung
+    assert told.value.reason == "peer_reply"
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["os.system", "builtins.eval", "torch.load", "torch._utils._rebuild_parameter", "numpy.load"],
+)
+def test_a_name_that_is_not_allowed_is_told(name: str) -> None:
+    with pytest.raises(PeerError, match=f"names '{name}', which is not allowed"):
+        pickles.read(called(name))
+
+
+def test_numbers_of_a_storage_may_be_of_torchs_own_type_alone() -> None:
+    data = OF_TORCH.read_bytes().replace(b"DoubleStorage", b"StringStorage")
+    with pytest.raises(PeerError, match=r"names 'torch\.StringStorage'"):
+        pickles.read(data)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b".",
+        b"\x80\x04",
+        b"\x80\x03]q\x05.",
+        b"\x80\x03h\x00.",
+        b"\x80\x03(.",
+        b"\x80\x03K\x01K\x02.",
+        b"\x80\x03NQ.",
+        b"\x80\x03Nb.",
+        b"\x80\x03X\xff\xff\xff\x7fa.",
+        called("torch.storage._load_from_bytes", b"C\x02ab\x85"),
+        called("torch.storage._load_from_bytes"),
+        called("torch._utils._rebuild_tensor_v2"),
+        called("collections.OrderedDict", b"K\x01\x85"),
+        called(pickles.TIMED_ACTION)[:-1] + b"}(X\x01\x00\x00\x00aub}b.",
+    ],
+)
+def test_a_pickle_that_is_broken_or_something_else_is_refused(data: bytes) -> None:
+    with pytest.raises(PeerError):
+        lerobot_server.read_actions(lerobot_server.policy_setup(data), 7)
+
+
+def test_a_pickle_that_grows_while_it_is_read_is_refused() -> None:
+    # 64 tuples, each of two of the one before, whose hash nobody lives to see.
+    twice = b"".join(b"\x94(h%ch%ct" % (depth, depth) for depth in range(64))
+    with pytest.raises(PeerError, match="tuple where str belongs"):
+        pickles.read(b"\x80\x04})" + twice + b"Ns.")
+    with pytest.raises(PeerError, match="more than"):
+        pickles.read(b"\x80\x03" + b"N" * 300_000 + b".")
+
+
+def test_every_cut_of_an_answer_is_refused() -> None:
+    data = OF_TORCH.read_bytes()
+    for end in range(len(data)):
+        with pytest.raises(PeerError):
+            pickles.read(data[:end])
+
+
+def test_an_answer_to_another_observation_of_lerobots_server_is_refused() -> None:
+    payload = lerobot_server.policy_setup(OF_TORCH.read_bytes())
+    with pytest.raises(PeerError, match="has the number 7, not 8"):
+        lerobot_server.read_actions(payload, 8)
+
+
+@pytest.mark.parametrize("payload", [b"\x0a\x05ab", b"\x12\x01a", b"\x0a" + b"\xff" * 9])
+def test_what_is_no_message_of_lerobots_server_is_refused(payload: bytes) -> None:
+    with pytest.raises(PeerError, match="no Actions message"):
+        lerobot_server.read_actions(payload, 7)
+
+
+@settings(max_examples=EXAMPLES)
+@given(
+    st.recursive(
+        st.none()
+        | st.booleans()
+        | st.integers(-(2**31), 2**31 - 1)
+        | st.floats(allow_nan=False)
+        | st.text(max_size=8)
+        | st.binary(max_size=8),
+        lambda inner: (
+            st.lists(inner, max_size=4)
+            | st.tuples(inner, inner)
+            | st.dictionaries(st.text(max_size=8), inner, max_size=4)
+        ),
+    )
+)
+def test_what_is_written_for_lerobot_is_read_by_pythons_pickle(value: Any) -> None:
+    data = pickles.write(value)
+    assert pickle.loads(data) == value
+    assert pickles.read(data) == value
+
+
+def test_a_picture_written_for_lerobot_is_an_array_of_numpy() -> None:
+    picture = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
+    assert same(pickle.loads(pickles.write({"front": picture}))["front"], picture)
+
+
+@given(st.integers(0, 3 * lerobot_server.PART_BYTES))
+@settings(max_examples=5)
+def test_an_observation_for_lerobot_is_sent_in_parts(size: int) -> None:
+    parts = [*lerobot_server.observation_parts(bytes(size))]
+    assert all(len(part) < 4 * 1024 * 1024 for part in parts)
+    assert sum(len(part) for part in parts) >= size
+    states = [part[1] for part in parts]
+    assert states == ([1] + [2] * (len(parts) - 2) + [3])[-len(parts) :] if parts else size == 0

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from chain import MOVING_M_S, READY_PATIENCE_S, Chain, running_chain, write_profile
-from peer_rig import KINDS, Server, free_port
+from peer_rig import ADAPTERS, KINDS, Server, free_port, of
 
 BRAKE_S = 0.35
 """A jerk-limited stop from 0.1 m/s, and the arm's lag."""
@@ -101,12 +101,7 @@ def assert_nothing_stale(chain: Chain, since_ns: int) -> None:
     assert moved > 0
 
 
-ADAPTERS = ("openpi", "groot", "openvla_rest", "origami")
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=() if n == "openpi" else pytest.mark.slow) for n in ADAPTERS]
-)
+@pytest.mark.parametrize("name", of(*ADAPTERS, quick=["openpi"]))
 def test_a_killed_policy_server_brakes_the_arm_which_goes_on_when_it_is_there_again(
     name: str, tmp_path: Path
 ) -> None:
@@ -133,7 +128,7 @@ def test_a_killed_policy_server_brakes_the_arm_which_goes_on_when_it_is_there_ag
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ADAPTERS)
+@pytest.mark.parametrize("name", of(*ADAPTERS))
 def test_what_a_stopped_policy_server_answers_when_it_goes_on_is_not_obeyed(
     name: str, tmp_path: Path
 ) -> None:

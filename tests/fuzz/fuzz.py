@@ -28,7 +28,7 @@ except ImportError:
     )
 
 sys.path.append(str(Path(__file__).parents[1]))  # model_wires
-MODELS = ("groot", "openpi", "openvla_rest", "origami")
+MODELS = ("groot", "lerobot_server", "openpi", "openvla_rest", "origami", "xpolicylab")
 # What is imported here counts which of its branches are taken: that is what guides the fuzzer.
 with atheris.instrument_imports(
     include=["vla_zenoh", *(f"vla_zenoh_model_{name}" for name in MODELS), "mcap", "rosbags"],

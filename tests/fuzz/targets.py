@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import typer
-from model_wires import groot, npy, openpi, openvla_rest, origami
+from model_wires import groot, lerobot_server, npy, openpi, openvla_rest, origami, xpolicylab
 
 from vla_zenoh.bus.clock_sync import decode_stamps
 from vla_zenoh.cli import status_table as cli_status
@@ -46,6 +46,7 @@ from vla_zenoh.policy.scripted_motions import parse_scripted
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import Event, Header, InferenceDebug, NodeStatus
 
+OF_TORCH = Path(__file__).parents[1] / "contract" / "lerobot_actions.pickle"
 CORPUS = Path(__file__).parent / "corpus"
 """Inputs that once broke a reader, or nearly: a folder for each target."""
 
@@ -356,6 +357,26 @@ def _targets() -> Iterator[Target]:
         _peer_actions,
         peer,
         lambda: [groot.pack({"action.arm": np.zeros((2, 7))})],
+    )
+    yield Target(
+        "xpolicylab",
+        lambda data: xpolicylab.read_actions(xpolicylab.read_answer(data, "infer", "1")),
+        peer,
+        lambda: [
+            message.pack(
+                {
+                    "message_type": "infer_result",
+                    "message_id": "1",
+                    "payload": {"actions": [{"ee_pose": [0.0] * 7}]},
+                }
+            )
+        ],
+    )
+    yield Target(
+        "lerobot-server",
+        lambda data: lerobot_server.read_actions(data, 7),
+        peer,
+        lambda: [lerobot_server.policy_setup(OF_TORCH.read_bytes())],
     )
     yield Target("npy", npy.load, peer, lambda: [npy.dump(np.zeros((2, 3)))])
     yield Target(

@@ -14,9 +14,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from vla_zenoh import resources
 from vla_zenoh.errors import WorkerError
+from vla_zenoh.lab.bench.task import DemoPlan, PromptedTask, order_of
 from vla_zenoh.lab.check.examples import example_observation
 from vla_zenoh.lab.lockstep import Lockstep
 from vla_zenoh.lab.tasks import (
@@ -33,7 +36,7 @@ from vla_zenoh.lab.tasks import (
 )
 from vla_zenoh.policy import ActionSteps, Policy, check_steps
 from vla_zenoh.policy.chunk_prefix import Committed
-from vla_zenoh.policy.loader import find_model, make_policy
+from vla_zenoh.policy.loader import find_model, import_model, make_policy
 from vla_zenoh.profile import load_profile
 from vla_zenoh.simulation.render import Renderer
 from vla_zenoh.simulation.robot_model import RobotModel
@@ -41,10 +44,24 @@ from vla_zenoh.simulation.world import World, build_world
 from vla_zenoh.types import Image, ObjectPoses, PoseState
 
 FOLDER = resources.find("models", "brick")
+BRICK: Any = import_model(find_model("brick"))
+HELD_OUT_FILES = ("held_out.txt", "held_out_no_task.txt", "final.txt", "final_no_task.txt")
+COMMANDS = (
+    "put the red brick in the box",
+    "stack the blue brick on the green brick",
+    "push the yellow brick to the left",
+    "push the green brick away",
+    "slide the red brick closer to you",
+)
+ORDERS = (
+    Order("put", "green"),
+    Order("stack", "blue", onto="red"),
+    Order("push", "yellow", direction="closer"),
+)
 PROFILE = "panda_bricks"
 LIMIT_S, STAY_S = 20.0, 2.0
 CAMERA_SIZE = (320, 240)
-MAX_WEIGHTS_BYTES = 5_000_000
+MAX_WEIGHTS_BYTES = 9_000_000
 SEED = 5
 STILL_M = 1e-4
 WALK_STEPS, WALK_STEP_M = 300, 0.02
@@ -172,11 +189,114 @@ def test_every_wording_is_understood(policy: Policy, wordings: dict) -> None:
     assert missed == []
 
 
+def held_out(name: str) -> list[str]:
+    return (FOLDER / "training" / name).read_text("utf-8").splitlines()
+
+
+def read(policy: Policy, prompt: str) -> str:
+    """What it takes a prompt for."""
+    policy.reset()  # pyright: ignore[reportAttributeAccessIssue]
+    result = policy.infer(example_observation(policy.spec, prompt=prompt))
+    assert isinstance(result, ActionSteps)
+    assert result.raw is not None
+    return str(result.raw["read"])
+
+
+@pytest.mark.parametrize(
+    ("name", "count", "right", "wrong"),
+    [
+        ("held_out.txt", 300, 0.95, 0.01),
+        ("final.txt", 60, 0.9, 0.02),
+        ("independent.txt", 60, 0.95, 0.0),
+    ],
+)
+def test_free_wordings_that_were_never_taught_are_read(
+    policy: Policy, name: str, count: int, right: float, wrong: float
+) -> None:
+    meant = [line.split(": ", 1) for line in held_out(name)]
+    found = [read(policy, sentence) for _, sentence in meant]
+    assert len(found) >= count
+    as_meant = [one == meaning for one, (meaning, _) in zip(found, meant, strict=True)]
+    otherwise = [one != "no task" and not ok for one, ok in zip(found, as_meant, strict=True)]
+    assert np.mean(as_meant) >= right
+    assert np.mean(otherwise) <= wrong
+
+
+@pytest.mark.parametrize(
+    ("name", "count", "still"),
+    [
+        ("held_out_no_task.txt", 160, 0.98),
+        ("final_no_task.txt", 40, 0.9),
+        ("independent_no_task.txt", 47, 1.0),
+    ],
+)
+def test_nonsense_and_negation_that_were_never_taught_do_nothing(
+    policy: Policy, name: str, count: int, still: float
+) -> None:
+    found = [read(policy, sentence) for sentence in held_out(name)]
+    assert len(found) >= count
+    assert np.mean([one == "no task" for one in found]) >= still
+
+
+def test_what_it_reads_needs_no_pictures_and_is_a_goal(policy: Any) -> None:
+    assert order_of(policy.read("toss the red cube in the tray")) == Order("put", "red")
+    assert order_of(policy.read("pile blue onto red")) == Order("stack", "blue", onto="red")
+    pulled = Order("push", "green", direction="closer")
+    assert order_of(policy.read("pull the green one closer to you")) == pulled
+    assert order_of(policy.read("don't toss the red cube in the tray")) is None
+
+
+def test_a_demo_judges_free_wording_by_the_goal_that_was_read() -> None:
+    goal = Order("put", "red")
+    plan = DemoPlan("brick", 1, 1, prompts=("toss it", "go"), orders={"toss it": goal})
+    first, second = plan.requests()
+    assert isinstance(first, PromptedTask)
+    nowhere = ObjectPoses((), np.zeros((0, 3)), np.zeros((0, 4)))
+    assert first.draw(nowhere, held_out=False).order == goal
+    assert second.draw(nowhere, held_out=False).order == Order("stay")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_negated_command_is_never_obeyed(policy: Policy, command: str) -> None:
+    negated = [form.format(command) for form in held_out("negated.txt")]
+    negated += [form.replace("'", "\u2019").format(command) for form in held_out("negated.txt")]
+    assert read(policy, command) != "no task"
+    assert [one for one in negated if read(policy, one) != "no task"] == []
+
+
 @pytest.mark.parametrize(
     "prompt", ["", "!!", "x" * 4000, "put " * 40, "put the rot brick in Kiste"]
 )
 def test_odd_prompts_make_it_stay(policy: Policy, prompt: str) -> None:
     assert not understood(policy, prompt)
+
+
+def test_no_sentence_that_is_held_out_is_taught(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(FOLDER / "training"))
+    for name in ("model", "expert", "states", "worker", "phrases"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    from phrases import Phrases  # pyright: ignore[reportMissingImports]
+
+    phrases, random = Phrases([]), np.random.default_rng(3)
+    taught = {phrases.draw(random)[0] for _ in range(5000)}
+    kept = {line.partition(": ")[2] or line for name in HELD_OUT_FILES for line in held_out(name)}
+    kept |= {phrase(order, choice, held_out=True) for order in ORDERS for choice in range(100)}
+    assert not taught & {sentence.lower() for sentence in kept | {*NONSENSE}}
+
+
+@given(st.text(max_size=500))
+def test_any_text_becomes_as_many_numbers(prompt: str) -> None:
+    words = (FOLDER / "words.txt").read_text("utf-8").split()
+    tokens = BRICK.tokens_of(prompt, {word: index + 2 for index, word in enumerate(words)})
+    assert tokens.shape == (1, BRICK.MAX_PIECES)
+    assert tokens[0, 0] > 0
+    assert tokens.max() < len(words) + 2
+
+
+def test_an_unknown_word_is_cut_into_the_longest_pieces_from_its_beginning() -> None:
+    words = {"play": 2, "##ing": 3, "##i": 4, "'": 5, "s": 6}
+    assert BRICK.tokens_of("Playing, plaÿ's", words)[0, :6].tolist() == [2, 3, 1, 2, 5, 6]
+    assert BRICK.tokens_of("xplay " * 40, words)[0].tolist() == [1] + [0] * 31
 
 
 # -- what it remembers ---------------------------------------------------------------------------
@@ -271,14 +391,14 @@ def test_a_chunk_that_goes_on_from_given_steps_is_nearer_to_the_teacher_than_one
 def test_the_weights_are_small_and_are_those_of_the_manifest() -> None:
     manifest = json.loads((FOLDER / "weights.json").read_text())
     files = {FOLDER / name: sha256 for name, sha256 in manifest["sha256"].items()}
-    assert {file.suffix for file in files} == {".onnx", ".safetensors"}
+    assert {file.suffix for file in files} == {".onnx", ".safetensors", ".txt"}
     assert sum(file.stat().st_size for file in files) < MAX_WEIGHTS_BYTES
     for file, sha256 in files.items():
         assert hashlib.sha256(file.read_bytes()).hexdigest() == sha256
 
 
 def test_changed_weights_are_refused_with_both_sums(tmp_path: Path) -> None:
-    for name in ("brick.onnx", "weights.json"):
+    for name in ("brick.onnx", "words.txt", "weights.json"):
         shutil.copy(FOLDER / name, tmp_path / name)
     graph = tmp_path / "brick.onnx"
     graph.write_bytes(graph.read_bytes()[:-1] + b"x")
@@ -288,18 +408,9 @@ def test_changed_weights_are_refused_with_both_sums(tmp_path: Path) -> None:
         changed.load()  # pyright: ignore[reportAttributeAccessIssue]
 
 
-@pytest.mark.parametrize("missing", ["brick.onnx", "weights.json"])
+@pytest.mark.parametrize("missing", ["brick.onnx", "words.txt", "weights.json"])
 def test_a_file_that_is_missing_is_named(tmp_path: Path, missing: str) -> None:
-    for name in {"brick.onnx", "weights.json"} - {missing}:
+    for name in {"brick.onnx", "words.txt", "weights.json"} - {missing}:
         shutil.copy(FOLDER / name, tmp_path / name)
     with pytest.raises(WorkerError, match=missing):
         make_policy(find_model("brick"), {"weights": str(tmp_path)}).load()  # pyright: ignore
-
-
-def test_the_words_of_the_manifest_are_those_it_is_taught(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(FOLDER / "training"))
-    for name in ("model", "expert", "states", "phrases"):
-        monkeypatch.delitem(sys.modules, name, raising=False)
-    from phrases import vocabulary  # pyright: ignore[reportMissingImports]
-
-    assert json.loads((FOLDER / "weights.json").read_text())["words"] == vocabulary()

@@ -254,8 +254,10 @@ def test_a_player_reads_nothing_and_an_operator_plays_no_robot(lab: Lab) -> None
 
 
 def test_a_router_at_work_is_not_told_of_more_robots(lab: Lab) -> None:
-    words = ("up", str(lab.profile(HERE)), "--host", HERE, "--also", str(lab.profile("ghost")))
-    done = command_line(*words, profile=lab.profile(HERE), timeout_s=READY_PATIENCE_S)
+    another = lab.folder / "another.yaml"
+    another.write_text(f"extends: {HERE}\nrobot: {{name: another}}\n")
+    words = ("up", str(another), "--host", HERE, "--also", str(lab.profile("ghost")))
+    done = command_line(*words, profile=another, timeout_s=READY_PATIENCE_S)
     assert done.returncode == 1
     assert "cannot be told of other robots" in done.stderr
     assert "sim" in lab.chain.client.alive

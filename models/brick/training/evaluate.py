@@ -129,9 +129,9 @@ class Teacher(Brick):
     def think(self, observation: Observation, hand: Hand, given: np.ndarray) -> Waypoints:
         """As the teacher says."""
         if self._order.family == "stay":
-            return Waypoints(np.zeros((HORIZON, 4)), np.zeros(HORIZON, bool), False)
+            return Waypoints(np.zeros((HORIZON, 4)), np.zeros(HORIZON, bool), False, "")
         way = taught(self._world, self._order, hand, given)
-        return Waypoints(way[:, :4], way[:, 4] > 0.5, True)
+        return Waypoints(way[:, :4], way[:, 4] > 0.5, True, "")
 
 
 class Watched(Brick):

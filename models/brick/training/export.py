@@ -24,22 +24,23 @@ import numpy as np
 import onnx
 import onnxruntime
 import torch
+from encoder import pieces
 from net import HAND, HORIZON, Policy
-from phrases import vocabulary
 from safetensors.torch import load_file
-from worker import FOLDER, FRONT, GRAPH, MANIFEST, MAX_WORDS, WRIST
+from worker import FOLDER, FRONT, GRAPH, MANIFEST, MAX_PIECES, WORDS, WRIST
 
 INPUTS = ("tokens", "front", "wrist", "hand", "given")
-OUTPUTS = ("offset", "opened", "understood", "bricks", "box")
-TOLERANCE = 1e-4
-"""Between PyTorch and onnxruntime, in the outputs' own units (m, rad, probability)."""
+OUTPUTS = ("offset", "opened", "understood", "order", "bricks", "box")
+TOLERANCE, LOOSE = 1e-4, 1e-3
+"""Between PyTorch and onnxruntime, in the outputs' own units (m, rad, probability). The loose one
+is of what is a close thing in noise: turns of bricks, and what is understood of any pieces."""
 TRIALS = 20
 
 
 def inputs(random: np.random.Generator, words: int) -> dict[str, np.ndarray]:
     """Any input of the right form."""
-    tokens = random.integers(1, words, (1, MAX_WORDS))
-    tokens[0, random.integers(1, MAX_WORDS) :] = 0
+    tokens = random.integers(1, words, (1, MAX_PIECES))
+    tokens[0, random.integers(1, MAX_PIECES) :] = 0
     found = {
         "tokens": tokens.astype(np.int64),
         "front": random.integers(0, 256, (1, FRONT[1], FRONT[0], 3), dtype=np.uint8),
@@ -73,7 +74,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=FOLDER)
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
-    words = vocabulary()
+    words = pieces()
     net = Policy(len(words) + 2)
     net.load_state_dict(load_file(args.run / "policy.safetensors"))
     net.eval()
@@ -92,28 +93,30 @@ def main() -> None:
     )
     strip(graph)
     session = onnxruntime.InferenceSession(str(graph), providers=["CPUExecutionProvider"])
-    worst = 0.0
+    worst = dict.fromkeys(OUTPUTS, 0.0)
     for _ in range(TRIALS):
         feed = inputs(random, len(words) + 2)
         with torch.no_grad():
             wanted = net(*(torch.from_numpy(value) for value in feed.values()))
         got = session.run(list(OUTPUTS), feed)
-        worst = max(
-            worst, *(float(np.abs(w.numpy() - g).max()) for w, g in zip(wanted, got, strict=True))
-        )
-    if worst > TOLERANCE:
-        raise SystemExit(f"the graph differs from PyTorch by {worst:.2g}, allowed: {TOLERANCE:g}")
+        for name, one, other in zip(OUTPUTS, wanted, got, strict=True):
+            worst[name] = max(worst[name], float(np.abs(one.numpy() - other).max(initial=0)))
+    for name, off in worst.items():
+        allowed = LOOSE if name in ("understood", "bricks") else TOLERANCE
+        if off > allowed:
+            raise SystemExit(f"{name} differs from PyTorch by {off:.2g}, allowed: {allowed:g}")
     weights = args.out / "training" / "brick.safetensors"
     weights.parent.mkdir(exist_ok=True)
     shutil.copyfile(args.run / "policy.safetensors", weights)
+    (args.out / WORDS).write_text("\n".join(words) + "\n", "utf-8")
     sha256 = {
         str(p.relative_to(args.out)): hashlib.sha256(p.read_bytes()).hexdigest()
-        for p in (graph, weights)
+        for p in (graph, weights, args.out / WORDS)
     }
-    manifest = {"sha256": sha256, "words": words}
+    manifest = {"sha256": sha256}
     (args.out / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n", "utf-8")
     size = sum(p.stat().st_size for p in (graph, weights))
-    print(f"parity within {worst:.2g}; {size / 1e6:.2f} MB in {args.out}")
+    print(f"parity within {max(worst.values()):.2g}; {size / 1e6:.2f} MB in {args.out}")
 
 
 if __name__ == "__main__":

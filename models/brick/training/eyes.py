@@ -13,9 +13,9 @@ import torch
 import torch.distributed as dist
 import torch.multiprocessing as mp
 from data import Data, Weather, truth
+from encoder import pieces
 from lessons import Teller, follow, schedule
 from net import STRIDE, UNIT_M, Places, Policy, Scene, normal
-from phrases import vocabulary
 from torch import Tensor
 
 WEIGHTS = {"front": 0.15, "wrist": 0.2, "scene": 1.0}
@@ -123,7 +123,7 @@ def _learn(
     if many > 1:
         os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
         dist.init_process_group("gloo", rank=rank, world_size=many)
-    net = Policy(len(vocabulary()) + 2)
+    net = Policy(len(pieces()) + 2)
     net.load_state_dict(begin)
     looking = [p for n, p in net.eyes.named_parameters() if not n.startswith("turn.")]
     optimiser = torch.optim.AdamW(looking, args.rate, weight_decay=1e-4)
@@ -178,7 +178,7 @@ def _share(parameters: list[torch.nn.Parameter], many: int) -> None:
 @torch.no_grad()
 def validate(state: State, data: Data, seed: int) -> str:
     """How the mean of the weights does on shards it has not seen: mm off, median and 95 %."""
-    other = Policy(state.net.reader.words.num_embeddings)
+    other = Policy(len(state.net.reader.meaning))
     other.eyes.load_state_dict(state.mean)
     random = np.random.default_rng(seed)
     errors = []

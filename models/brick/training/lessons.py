@@ -10,14 +10,16 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from data import NUMBERS, Data, truth
-from net import BRICKS, KINDS, UNIT_M, Policy, Scene, cut_out, normal
+from encoder import embeddings, pieces
+from net import BRICKS, KINDS, MEANING, UNIT_M, Policy, Scene, cut_out, normal
 from phrases import NO_TASK, Phrases
 from torch import Tensor, nn
 
 SAY_S = 30.0
 LEAST_SHARE, WARM_STEPS = 0.01, 100
 AVERAGE = 0.998
-READER_POOL, READER_BATCH, READER_RATE = 60_000, 256, 3e-3
+READER_POOL, READER_BATCH, READER_RATE = 120_000, 192, 3e-3
+READER_NOISE = 0.3
 TURN_RATE, TURN_BATCH = 2e-3, 192
 WILL_RATE, WILL_BATCH, WILL_SEEN = 2e-3, 512, 256
 STEP_WEIGHTS = (1.6, 1.6, 1.4, 1.2, 1.0, 0.8, 0.6, 0.5)
@@ -94,15 +96,23 @@ def follow(mean: dict[str, Tensor], part: nn.Module, step: int, average: float) 
         mean[key].mul_(keep).add_(value, alpha=1 - keep)
 
 
-def teach_reader(net: Policy, words: list[str], steps: int, seed: int) -> None:
-    """Teach the words."""
-    phrases, random = Phrases(words), np.random.default_rng((seed, 77))
-    pool = [torch.from_numpy(each) for each in phrases.batch(random, READER_POOL)]
+def teach_reader(net: Policy, steps: int, seed: int) -> None:
+    """Teach to read: what matters of the pieces' embeddings, and their order."""
+    random = np.random.default_rng((seed, 77))
+    given, reader = embeddings(), net.reader
+    pool = [torch.from_numpy(each) for each in Phrases(pieces()).batch(random, READER_POOL)]
+    narrow = nn.Linear(given.shape[1], MEANING)
+
+    def meaning(rows: Tensor) -> Tensor:
+        return torch.tanh(narrow(rows))
 
     def lesson(_: int) -> dict[str, Tensor]:
         rows = torch.from_numpy(random.integers(0, len(pool[0]), READER_BATCH))
         tokens, kind, target, onto = (each[rows] for each in pool)
-        read = net.reader(tokens)
+        told = given[tokens]
+        # Words that are never heard here lie near some that are.
+        told = meaning(told + READER_NOISE * torch.randn_like(told))
+        read = reader.read(told * (tokens != 0)[..., None], tokens)
         task, stack = kind != NO_TASK, onto >= 0
         return {
             "kind": F.cross_entropy(read[0], kind),
@@ -110,7 +120,13 @@ def teach_reader(net: Policy, words: list[str], steps: int, seed: int) -> None:
             "onto": F.cross_entropy(read[2][stack], onto[stack]),
         }
 
-    teach(net.reader, steps, READER_RATE, lesson, "reader")
+    taught = nn.ModuleList([reader, narrow])
+    taught.train()
+    teach(taught, steps, READER_RATE, lesson, "reader")
+    taught.eval()
+    with torch.no_grad():
+        reader.meaning.copy_((127.0 * meaning(given)).round().to(torch.int8))
+        reader.meaning[0] = 0
 
 
 def teach_turn(net: Policy, data: Data, steps: int, seed: int) -> None:

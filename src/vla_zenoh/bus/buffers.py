@@ -54,8 +54,9 @@ def header_of(sample: zenoh.Sample) -> Header:
     Raises:
         CodecError: there is none that can be decoded.
     """
-    given = bytes_of(sample.attachment, records.MAX_HEADER_BYTES)
-    return records.decode_header(None if sample.attachment is None else given)
+    attachment = sample.attachment
+    given = None if attachment is None else bytes_of(attachment, records.MAX_HEADER_BYTES)
+    return records.decode_header(given)
 
 
 class ReceivedSample(NamedTuple):
@@ -194,11 +195,9 @@ class CallbackRing(SampleBuffer):
     def drain(self) -> list[ReceivedSample]:
         """All samples, oldest first."""
         drained: list[ReceivedSample] = []
-        while True:
-            try:
-                drained.append(self._arrivals.popleft())
-            except IndexError:
-                return drained
+        while self._arrivals:
+            drained.append(self._arrivals.popleft())
+        return drained
 
 
 class ZenohRing(SampleBuffer):

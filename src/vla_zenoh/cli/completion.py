@@ -103,7 +103,7 @@ COMPLETIONS: Mapping[str, Callable[[Any], Iterable[str]]] = {
     "keys": keys,
 }
 """What completes a parameter, by its name; of one command where its words stand before."""
-NO_HOST_OF_A_LAB = "lab serve-openpi.host"
+NO_HOST_OF_A_LAB = "lab serve.host"
 
 
 def add_completion(parameter: Any, command: str) -> None:

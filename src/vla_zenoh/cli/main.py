@@ -97,7 +97,7 @@ COMMANDS: Mapping[str, Mapping[str, str | Group]] = {
                 "compare": "lab.cli.compare:compare",
                 "inspect": "lab.cli.inspect:inspect",
                 "net": "lab.cli.net:net",
-                "serve-openpi": "lab.cli.serve_openpi:serve_openpi",
+                "serve": "lab.cli.serve:serve",
             },
         ),
     },

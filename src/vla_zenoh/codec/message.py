@@ -2,8 +2,9 @@
 
 An array is a map with the *bytes* keys ``__ndarray__``, ``data``, ``dtype``, ``shape``, a numpy
 scalar one with ``__npgeneric__``, ``data``, ``dtype``; this is what openpi-client writes, so its
-users' tools read our keys. Only arrays of bools, whole numbers, floats and text are carried both
-ways, nothing is ever unpickled, and sizes are checked before memory is taken.
+users' tools read our keys. Other systems' forms are read and written with hooks of their own. Only
+arrays of bools, whole numbers, floats and text are carried both ways, nothing is ever unpickled,
+and sizes are checked before memory is taken.
 """
 
 from __future__ import annotations
@@ -60,22 +61,30 @@ def _malformed(why: str) -> CodecError:
     return CodecError("malformed", why)
 
 
-def pack(value: Any) -> bytes:
+def pack(value: Any, to_map: Callable[[Any], Any] | None = None) -> bytes:
     """Encode maps, lists, text, numbers, bytes, numpy arrays and numpy scalars.
+
+    Args:
+        value: to encode.
+        to_map: form of an array, see `array_parts`; None: openpi's.
 
     Raises:
         CodecError: a value of another type.
     """
     try:
-        packed = msgpack.packb(value, default=_to_map, use_bin_type=True)
+        packed = msgpack.packb(value, default=to_map or _to_map, use_bin_type=True)
     except (TypeError, ValueError, OverflowError) as error:
         raise CodecError("unencodable", f"cannot be written as msgpack: {error}") from error
     assert packed is not None
     return packed
 
 
-def unpack(payload: bytes) -> Any:
+def unpack(payload: bytes, from_map: Callable[[dict[Any, Any]], Any] | None = None) -> Any:
     """Decode what `pack` (or openpi) wrote. Arrays are views into `payload` and read-only.
+
+    Args:
+        payload: to decode.
+        from_map: makes the array of a map that stands for one, see `make_array`; None: openpi's.
 
     Raises:
         CodecError: whatever else the bytes are.
@@ -84,10 +93,11 @@ def unpack(payload: bytes) -> Any:
         raise CodecError(
             "oversize", f"payload of {len(payload)} bytes, at most {MAX_PAYLOAD_BYTES} are read"
         )
-    of_map, of_list = _from_map, None
+    read = from_map or _from_map
+    of_map, of_list = read, None
     if len(payload) > MAX_CONTAINERS:  # fewer bytes cannot hold more; a hook costs time
         count = of_list = count_containers()
-        of_map = lambda found: _from_map(count(found))  # noqa: E731
+        of_map = lambda found: read(count(found))  # noqa: E731
     try:
         value = msgpack.unpackb(
             payload,
@@ -145,16 +155,21 @@ def _refuse_extension(code: int, data: bytes) -> Any:
     raise CodecError("malformed", f"msgpack extension {code} ({len(data)} bytes) is not carried")
 
 
+def array_parts(array: np.ndarray[Any, Any]) -> tuple[bytes, str, tuple[int, ...]]:
+    """Data, dtype and shape of an array, as every form of it has them.
+
+    Raises:
+        TypeError: it is of objects, of times or of long doubles.
+    """
+    _check_kind(array.dtype)
+    return array.tobytes(), array.dtype.str, array.shape
+
+
 def _to_map(value: Any) -> dict[bytes, Any]:
     np = _numpy()
     if isinstance(value, np.ndarray):
-        _check_kind(value.dtype)
-        return {
-            b"__ndarray__": True,
-            b"data": value.tobytes(),
-            b"dtype": value.dtype.str,
-            b"shape": value.shape,
-        }
+        data, dtype, shape = array_parts(value)
+        return {b"__ndarray__": True, b"data": data, b"dtype": dtype, b"shape": shape}
     if isinstance(value, np.generic):
         _check_kind(value.dtype)
         return {b"__npgeneric__": True, b"data": value.item(), b"dtype": value.dtype.str}
@@ -163,16 +178,20 @@ def _to_map(value: Any) -> dict[bytes, Any]:
 
 def _from_map(value: dict[Any, Any]) -> Any:
     if b"__ndarray__" in value:
-        return _array(value)
+        return make_array(value.get(b"data"), value.get(b"dtype"), value.get(b"shape"))
     if b"__npgeneric__" in value:
         return _scalar(value)
     return value
 
 
-def _array(value: dict[Any, Any]) -> np.ndarray[Any, Any]:
+def make_array(data: Any, dtype_name: Any, shape: Any) -> np.ndarray[Any, Any]:
+    """A read-only view of received bytes.
+
+    Raises:
+        CodecError: bytes, dtype and shape do not fit each other, or are something else.
+    """
     np = _numpy()
-    dtype = _dtype(value)
-    data, shape = value.get(b"data"), value.get(b"shape")
+    dtype = _dtype(dtype_name)
     if not isinstance(data, bytes) or not isinstance(shape, list):
         raise CodecError("malformed", "an array needs bytes 'data' and a list 'shape'")
     if len(shape) > MAX_DIMENSIONS:
@@ -196,7 +215,7 @@ def _array(value: dict[Any, Any]) -> np.ndarray[Any, Any]:
 
 def _scalar(value: dict[Any, Any]) -> np.generic:
     np = _numpy()
-    dtype, data = _dtype(value), value.get(b"data")
+    dtype, data = _dtype(value.get(b"dtype")), value.get(b"data")
     if type(data) not in _SCALARS[dtype.kind]:
         raise CodecError("malformed", f"a numpy scalar {dtype} of a {type(data).__name__}")
     try:
@@ -206,8 +225,7 @@ def _scalar(value: dict[Any, Any]) -> np.generic:
         raise CodecError("malformed", f"a numpy scalar {dtype}: {error}") from error
 
 
-def _dtype(value: dict[Any, Any]) -> np.dtype[Any]:
-    name = value.get(b"dtype")
+def _dtype(name: Any) -> np.dtype[Any]:
     if not isinstance(name, str):
         raise CodecError("malformed", f"an array with dtype {shown(name)} is not carried")
     return _dtype_of(name)

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
-from functools import cache
+from collections.abc import Callable, Mapping
+from functools import cache, lru_cache
+from struct import Struct
 from typing import Any, NamedTuple, TypeVar
+
+import msgpack
 
 from vla_zenoh import keys
 from vla_zenoh.codec import message
@@ -26,8 +29,10 @@ def encode(record: Any) -> bytes:
         CodecError: larger than `MAX_RECORD_BYTES`, which every receiver rejects.
     """
     to_dict = getattr(record, "to_dict", None)  # of a ModelSpec
-    fields = _fields(record) if to_dict is None else to_dict()
-    payload = message.pack(fields)
+    if type(record).__name__ in _STREAMED:
+        payload = b"".join(_pieces(record))
+    else:
+        payload = message.pack(_fields(record) if to_dict is None else to_dict())
     _check_length(type(record), payload)
     return payload
 
@@ -40,7 +45,15 @@ def decode(kind: type[Record], payload: bytes) -> Record:
             the record refuses: NaN, wrong shape, out of range).
     """
     _check_length(kind, payload)
-    return from_map(kind, message.unpack(payload))
+    frame = _frames.get((kind, len(payload)))
+    if frame is not None:
+        pieces = frame.split.unpack(payload)
+        if pieces[::2] == frame.constants:
+            return _refilled(kind, frame, pieces[1::2])
+    record = from_map(kind, message.unpack(payload))
+    if kind.__name__ in _STREAMED:
+        _keep_frame(record, payload)
+    return record
 
 
 def from_map(kind: type[Record], data: Any) -> Record:
@@ -68,8 +81,9 @@ def _check_length(kind: type, payload: bytes) -> None:
 
 
 class _Layout(NamedTuple):
-    """Names of a record's fields."""
+    """Names of a record's fields, and the first bytes of its map."""
 
+    head: bytes
     names: tuple[str, ...]
     known: frozenset[str]
     required: tuple[str, ...]
@@ -85,19 +99,118 @@ def _layout(kind: type) -> _Layout:
         for field in fields
         if field.default is missing and field.default_factory is missing
     )
-    return _Layout(names, frozenset(names), required)
+    head = msgpack.Packer().pack_map_header(len(names))
+    return _Layout(head, names, frozenset(names), required)
 
 
 def _fields(record: Any) -> dict[str, Any]:
-    out: dict[str, Any] = {}
-    for name in _layout(type(record)).names:
+    fields = {name: getattr(record, name) for name in _layout(type(record)).names}
+    return {
+        name: dict(value) if isinstance(value, Mapping) else value for name, value in fields.items()
+    }
+
+
+_STREAMED = {"GripperState", "JointCommand", "JointState", "PoseCommand", "PoseState"}
+"""Records that come in every tick: most of the time would go into their maps and lists."""
+
+
+def _pieces(record: Any) -> list[bytes]:
+    """The bytes of a record: every second piece is a float, or those of a vector of float64."""
+    layout, pieces = _layout(type(record)), list[bytes]()
+    before = layout.head
+    for name in layout.names:
         value = getattr(record, name)
-        if isinstance(value, Mapping):
-            value = dict(value)
-        elif hasattr(value, "__dataclass_fields__"):
-            value = _fields(value)
-        out[name] = value
-    return out
+        if getattr(value, "ndim", 0) == 1 and len(value) and value.dtype.str == _FLOATS:
+            opening, closing = _around_vector(name, len(value))
+            pieces += before + opening, value.tobytes()
+            before = closing
+        elif type(value) is float:
+            pieces += before + _float_name(name), _FLOAT.pack(value)
+            before = b""
+        elif value is None or type(value) is str or hasattr(value, "__dataclass_fields__"):
+            before += _repeated(name, value)
+        else:
+            before += message.pack(name) + message.pack(value)
+    pieces.append(before)
+    return pieces
+
+
+_FLOAT, _FLOATS = Struct(">d"), "<f8"
+"""As msgpack writes a number, and as `message.pack` writes those of an array."""
+
+
+@cache
+def _float_name(name: str) -> bytes:
+    return message.pack(name) + message.pack(0.0)[:1]
+
+
+@lru_cache(maxsize=256)
+def _around_vector(name: str, count: int) -> tuple[bytes, bytes]:
+    """What `message.pack` writes before and after the numbers of a field that is a vector."""
+    data = b"\xff" * (8 * count)
+    form = {b"__ndarray__": True, b"data": data, b"dtype": _FLOATS, b"shape": (count,)}
+    opening, _, closing = message.pack({name: form})[1:].partition(data)
+    return opening, closing
+
+
+@lru_cache(maxsize=64)
+def _repeated(name: str, value: Any) -> bytes:
+    """A field that is the same in many records: text, nothing, or a record."""
+    packed = message.pack(value) if value is None or type(value) is str else encode(value)
+    return message.pack(name) + packed
+
+
+class _Frame(NamedTuple):
+    """All but the numbers in the bytes of a record: the same in the next one of its stream.
+
+    Args:
+        split: divides the bytes like `_pieces`.
+        constants: the pieces that are no numbers.
+        fields: of a record that was read from such bytes.
+        numbers: names of the fields that are floats or vectors, and how each is read.
+    """
+
+    split: Struct
+    constants: tuple[bytes, ...]
+    fields: dict[str, Any]
+    numbers: tuple[tuple[str, Callable[[bytes], Any]], ...]
+
+
+_MAX_FRAMES = 64
+_frames: dict[tuple[type, int], _Frame] = {}
+
+
+def _keep_frame(record: Any, payload: bytes) -> None:
+    """Remember how `payload` is divided, if it is written as we would."""
+    from numpy import frombuffer
+
+    pieces = _pieces(record)
+    split = Struct("".join(f"{len(piece)}s" for piece in pieces))
+    constants = tuple(pieces[::2])
+    if split.size != len(payload) or split.unpack(payload)[::2] != constants:
+        return
+    if len(_frames) >= _MAX_FRAMES:
+        _frames.clear()
+    names = _layout(type(record)).names
+    values = [(name, getattr(record, name)) for name in names]
+    numbers = [
+        (name, _float if type(value) is float else frombuffer)
+        for name, value in values
+        if type(value) is float or hasattr(value, "ndim")
+    ]
+    _frames[type(record), len(payload)] = _Frame(split, constants, dict(values), tuple(numbers))
+
+
+def _float(number: bytes) -> float:
+    return _FLOAT.unpack(number)[0]
+
+
+def _refilled(kind: type[Record], frame: _Frame, pieces: tuple[bytes, ...]) -> Record:
+    """A record like that of the frame with other numbers, checked like any other."""
+    fields = frame.fields.copy()
+    for (name, read), piece in zip(frame.numbers, pieces, strict=True):
+        fields[name] = read(piece)
+    return _made(kind, fields)
 
 
 def _record(kind: type[Record], data: Mapping[Any, Any]) -> Record:
@@ -111,6 +224,10 @@ def _record(kind: type[Record], data: Mapping[Any, Any]) -> Record:
             raise CodecError("malformed", f"{kind.__name__} lacks {', '.join(missing)}")
     if data.get("cause") is not None:
         data = {**data, "cause": _cause(data["cause"])}
+    return _made(kind, data)
+
+
+def _made(kind: type[Record], data: Mapping[Any, Any]) -> Record:
     try:
         return kind(**data)
     except RecordError as error:
@@ -130,16 +247,53 @@ def _cause(value: Any) -> Any:
 MAX_HEADER_BYTES = 1024
 
 
+# A header of ours in msgpack: every sample carries one, so it is written and read by a short cut.
+# Its numbers always take eight bytes.
+_UINT64, _SHORT_TEXT = b"\xcf", 0xA0
+_SCHEMA = message.pack("schema") + message.pack(keys.SCHEMA)
+_START = b"\x84" + _SCHEMA + message.pack("stamp_wall_ns") + _UINT64
+_SEQ, _SOURCE = message.pack("seq") + _UINT64, message.pack("source")
+_STAMP_END = len(_START) + 8
+_SEQ_START = _STAMP_END + len(_SEQ)
+_SEQ_END = _SEQ_START + 8
+_SOURCE_START = _SEQ_END + len(_SOURCE)
+
+
 def encode_header(header: Header) -> bytes:
-    """Bytes of the attachment."""
-    return message.pack(
-        {
-            "schema": keys.SCHEMA,
-            "stamp_wall_ns": header.stamp_wall_ns,
-            "seq": header.seq,
-            "source": header.source,
-        }
+    """Bytes of the attachment: a map of ``schema``, ``stamp_wall_ns``, ``seq`` and ``source``."""
+    source = header.source.encode()
+    size = len(source)
+    return b"".join(
+        (
+            _START,
+            header.stamp_wall_ns.to_bytes(8, "big"),
+            _SEQ,
+            header.seq.to_bytes(8, "big"),
+            _SOURCE,
+            bytes((_SHORT_TEXT | size,)) if size < 32 else message.pack(header.source)[:-size],
+            source,
+        )
     )
+
+
+def _header_of_ours(attachment: bytes) -> Header | None:
+    """What `encode_header` wrote, if its source is short; None: something else."""
+    size = len(attachment) - _SOURCE_START - 1
+    if (
+        0 <= size < 32
+        and attachment[_SOURCE_START] == _SHORT_TEXT | size
+        and attachment[: len(_START)] == _START
+        and attachment[_STAMP_END:_SEQ_START] == _SEQ
+        and attachment[_SEQ_END:_SOURCE_START] == _SOURCE
+    ):
+        source = attachment[_SOURCE_START + 1 :]
+        if source.isascii():
+            return Header(
+                int.from_bytes(attachment[len(_START) : _STAMP_END], "big"),
+                int.from_bytes(attachment[_SEQ_START:_SEQ_END], "big"),
+                source.decode(),
+            )
+    return None
 
 
 def decode_header(attachment: bytes | None) -> Header:
@@ -153,6 +307,12 @@ def decode_header(attachment: bytes | None) -> Header:
         raise CodecError("no_header", "the sample has no attachment; streams carry a header there")
     if len(attachment) > MAX_HEADER_BYTES:
         raise CodecError("malformed", f"a header of {len(attachment)} bytes")
+    try:
+        header = _header_of_ours(attachment)
+    except RecordError as error:
+        raise CodecError("invalid", str(error)) from error
+    if header is not None:
+        return header
     data = message.unpack(attachment)
     if not isinstance(data, dict):
         raise CodecError("malformed", f"the header is a {type(data).__name__}, wanted a map")

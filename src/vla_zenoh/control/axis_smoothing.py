@@ -94,6 +94,7 @@ class _Plan:
         self, start: FloatArray, basis: FloatArray, path: Trajectory, pace: float = 1.0
     ) -> None:
         self._start, self._basis, self._path, self._pace = start, basis, path, pace
+        self._paced, self._paced_twice = pace * basis, pace * pace * basis
         self.duration_s: float = path.duration / pace
         self.end = start + basis @ path.at_time(path.duration)[0]
         """(n,) its end."""
@@ -111,12 +112,11 @@ class _Plan:
         if time_s >= self.duration_s:
             zeros = np.zeros(len(self.end))
             return AxisState(self.end, zeros, zeros)
-        pace, basis = self._pace, self._basis
-        position, velocity, acceleration = self._path.at_time(time_s * pace)
+        position, velocity, acceleration = self._path.at_time(time_s * self._pace)
         return AxisState(
-            self._start + basis @ position,
-            pace * (basis @ velocity),
-            pace * pace * (basis @ acceleration),
+            self._start + self._basis.dot(position),
+            self._paced.dot(velocity),
+            self._paced_twice.dot(acceleration),
         )
 
 
@@ -479,7 +479,7 @@ class AxisSmoother:
         if self._plan is None:
             return True
         velocity, acceleration = self._rates
-        if float(np.abs(velocity).max()) > REST_VELOCITY:
+        if max(map(abs, velocity.tolist())) > REST_VELOCITY:
             return False
         if self.braking:
             return float(np.abs(acceleration).max()) < 1e-3

@@ -312,16 +312,19 @@ class ChunkPlanner:
         Returns:
             limits that acted on them since the last call.
         """
-        chunks = [plan for plan in reversed(plans) if isinstance(plan, ChunkPlan)]
+        chunks = [
+            (plan, plan.due_index(now_ns))
+            for plan in reversed(plans)
+            if isinstance(plan, ChunkPlan)
+        ]
         for ahead in (0, LOOK_AHEAD):
-            for plan in chunks:
-                due = plan.due_index(now_ns)
+            for plan, due in chunks:
                 if plan.action.targets and plan.bounded > due:
                     plan.computed = plan.bounded  # the leash does not shift targets
                 until = min(due + 1 + ahead, len(plan.goals))
                 while plan.bounded < until and self._bound_step(plan) is not None:
                     pass
-        return [hit for plan in chunks for hit in plan.unreported_hits()]
+        return [hit for plan, _ in chunks for hit in plan.unreported_hits()]
 
     def _bound_step(self, plan: ChunkPlan) -> list[LimitHit] | None:
         """Limits that acted on the next step of `plan`; None: not bounded, the budget is spent."""

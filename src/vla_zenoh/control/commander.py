@@ -36,7 +36,7 @@ from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.states import DEACTIVATED, OBEYING, State, Trigger, after
 from vla_zenoh.control.watchdog import Deadman, Watchdog
 from vla_zenoh.errors import RecordError
-from vla_zenoh.kinematics.so3 import held_pose, pose_of
+from vla_zenoh.kinematics.so3 import Pose, held_pose, pose_of
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     MAX_TEXT,
@@ -83,6 +83,7 @@ class Commander:
         asked = profile.task
         self.task = Task(0, False, asked.prompt, asked.worker, asked.rate_hz, asked.speed_percent)
         self.pose: Stamped[PoseState] | None = None
+        self._measured: Pose | None = None  # of it
         self.joint: Stamped[JointState] | None = None
         self.gripper_state: Stamped[GripperState] | None = None
         self.lease: Lease | None = None
@@ -139,7 +140,7 @@ class Commander:
             self._out.pose, self._out.joint, self._out.gripper = commands
         if self.state is not state_before and self.task.active != (self.state in OBEYING):
             self.task = replace(self.task, active=self.state in OBEYING)
-        self._out.task_changed = self.task != task_before
+        self._out.task_changed = self.task is not task_before and self.task != task_before
         return self._out
 
     @property
@@ -205,7 +206,8 @@ class Commander:
             self.pose = inputs.pose
             self._planner.poses.add(inputs.pose, FUTURE_NS)
             self.contact.update_pose(inputs.pose)
-            self._retreat.measure(pose_of(inputs.pose.record))
+            self._measured = pose_of(inputs.pose.record)
+            self._retreat.measure(self._measured)
         if inputs.joint is not None:
             self.joint = inputs.joint
             self._planner.joints.add(inputs.joint, FUTURE_NS)
@@ -488,8 +490,8 @@ class Commander:
                 self._change(Trigger.LOSE, str(error))
 
     def _supervise(self, now_ns: int) -> None:
-        if self.pose is not None:
-            self._watchdog.measure(self._motion.commanded, pose_of(self.pose.record))
+        if self._measured is not None:
+            self._watchdog.measure(self._motion.commanded, self._measured)
         self._measure()
         if self._retreat.busy and (
             not self._may_retreat(now_ns) or self.deadman.lost(self._peers.holders)

@@ -67,6 +67,8 @@ class _LoadFilter:
         self._filtered: list[float] = []
         self._bias: list[float] = []
         self._start_bias: list[float] = []
+        self.value = 0.0
+        """The size of the load, in N or Nm."""
 
     def update(self, measured: Sequence[float], dt_s: float, *, drifts: bool) -> None:
         """Add a measurement, `dt_s` after the last one; `drifts`: let the bias follow."""
@@ -74,27 +76,30 @@ class _LoadFilter:
             self._filtered, self.known = list(measured), True
             self._bias = self._start_bias = [0.0] * len(measured)
         share = -math.expm1(-dt_s / FILTER_S)
-        self._filtered = [
+        filtered = self._filtered = [
             f + share * (t - f) for f, t in zip(self._filtered, measured, strict=True)
         ]
         if drifts and dt_s > 0:
             drift = dt_s / DRIFT_S
-            bias = [b + drift * (f - b) for b, f in zip(self._bias, self._filtered, strict=True)]
+            bias = [b + drift * (f - b) for b, f in zip(self._bias, filtered, strict=True)]
             self._bias = self._near(bias, self._start_bias)
+        self._measure()
 
     def zero(self) -> None:
         """Take the present load for the bias, as far as `slow`."""
         self._bias = self._start_bias = self._near(self._filtered, [0.0] * len(self._filtered))
+        self._measure()
 
     def _near(self, values: Sequence[float], middle: Sequence[float]) -> list[float]:
         apart = [v - m for v, m in zip(values, middle, strict=True)]
-        share = min(1.0, self.slow / max(self._size(apart), 1e-9))
+        size = self._size(apart)
+        if size <= self.slow:
+            return list(values)
+        share = self.slow / max(size, 1e-9)
         return [m + share * a for m, a in zip(middle, apart, strict=True)]
 
-    @property
-    def value(self) -> float:
-        """The size of the load, in N or Nm."""
-        return self._size([f - b for f, b in zip(self._filtered, self._bias, strict=True)])
+    def _measure(self) -> None:
+        self.value = self._size([f - b for f, b in zip(self._filtered, self._bias, strict=True)])
 
 
 def _length(values: Sequence[float]) -> float:
@@ -122,6 +127,7 @@ class Contact:
         self._effort = _LoadFilter(
             "contact_effort", "Nm", limits.effort_slow_nm, limits.effort_stop_nm, _greatest
         )
+        self._all = (self._force, self._torque, self._effort)
         self._wants_effort = limits.effort_stop_nm is not None
         self._active = False
         self._begun: list[_LoadFilter] = []
@@ -222,7 +228,7 @@ class Contact:
 
     @property
     def _kinds(self) -> list[_LoadFilter]:
-        return [kind for kind in (self._force, self._torque, self._effort) if kind.known]
+        return [kind for kind in self._all if kind.known]
 
 
 def _passed_s(before_ns: int, now_ns: int) -> float:

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from vla_zenoh.control.smoothing import ROTATION_BOX
-from vla_zenoh.kinematics.so3 import Pose, exp3, log3, norm3, orthonormal
+from vla_zenoh.kinematics.so3 import Pose, exp3, log3, norm3, orthonormal, pose_distance
 from vla_zenoh.profile import REJECT_FACTOR, Limits, Profile, ReachLimits
 from vla_zenoh.types import FloatArray
 
@@ -158,6 +158,9 @@ def into_workspace(
 def leash(limits: Limits, goal: Pose, commanded: Pose) -> tuple[Pose, list[LimitHit]]:
     """Keep the goal near the commanded pose, so that no backlog builds up."""
     hits: list[LimitHit] = []
+    apart_m, apart_rad = pose_distance(goal, commanded)
+    if apart_m <= limits.lead_m and apart_rad <= limits.lead_rad:
+        return goal, hits
     ahead = goal.position_m - commanded.position_m
     turn = log3(goal.rotation @ commanded.rotation.T)
     for name, vector, limit in (
@@ -201,7 +204,8 @@ class Slowdown(NamedTuple):
 
 def slowest(*reasons: Slowdown | None) -> Slowdown | None:
     """The slowdown with the least share, None without any."""
-    return min((r for r in reasons if r is not None), key=lambda r: r.share, default=None)
+    given = [reason for reason in reasons if reason is not None]
+    return min(given, key=lambda reason: reason.share) if given else None
 
 
 def slowdown(

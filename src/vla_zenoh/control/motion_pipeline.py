@@ -52,6 +52,7 @@ from vla_zenoh.types import (
     PoseState,
     Stamped,
     Task,
+    computed,
 )
 
 LINGER_NS = 500_000_000
@@ -175,7 +176,8 @@ class MotionPipeline:
     @property
     def failures(self) -> int:
         """Times Ruckig found no trajectory and the arm braked instead."""
-        return sum(mover.failures for mover in (self._smoother, self._path) if mover)
+        smoother, path = self._smoother, self._path
+        return (smoother.failures if smoother else 0) + (path.failures if path else 0)
 
     # -- activation ---------------------------------------------------------------------------
     def anchor(
@@ -469,10 +471,28 @@ class MotionPipeline:
 
         The leash starts where the arm is in this tick: it may be moving away from the last goal.
         """
-        if not isinstance(mover, JointPath):
-            pose, hits = leash(self._limits, goal.pose, _ahead(mover.motion, ahead_s))
-            return Leashed(replace(goal, pose=pose, joints_rad=None), hits)
-        return Leashed(*mover.leash(goal, ahead_s))
+        if isinstance(mover, JointPath):
+            return Leashed(*mover.leash(goal, ahead_s))
+        if self._well_within_leash(mover.motion, goal.pose, ahead_s):
+            return Leashed(goal, [])
+        pose, hits = leash(self._limits, goal.pose, _ahead(mover.motion, ahead_s))
+        return Leashed(replace(goal, pose=pose, joints_rad=None) if hits else goal, hits)
+
+    def _well_within_leash(self, motion: Motion, goal: Pose, ahead_s: float) -> bool:
+        """Whether the leash is long enough wherever the arm is by then; cheaper to see than where.
+
+        It moves no further than at its speed plus what the acceleration adds.
+        """
+        limits, (pose, twist, acceleration) = self._limits, motion
+        apart_m, apart_rad = pose_distance(goal, pose)
+        rates = [
+            abs(v) + ahead_s * abs(a)
+            for v, a in zip(twist.tolist(), acceleration.tolist(), strict=True)
+        ]
+        return (
+            apart_m + ahead_s * sum(rates[:3]) <= limits.lead_m
+            and apart_rad + ahead_s * sum(rates[3:]) <= limits.lead_rad
+        )
 
     def _pause(self, mover: Smoother | JointPath) -> None:
         """Stop on the path, to continue from there later."""
@@ -581,14 +601,17 @@ class MotionPipeline:
         return self.streaming and now_ns - self._rest_since_ns < LINGER_NS
 
     def _pose_command(self, motion: Motion, state: State) -> PoseCommand:
+        (position_m, rotation), twist, acceleration = motion
         goal = self.goal.pose if self.goal else motion.pose
-        return PoseCommand(
-            motion.pose.position_m,
-            quat_from_rotation(motion.pose.rotation),
-            motion.twist,
-            motion.acceleration,
+        quat_xyzw, goal_quat_xyzw = map(quat_from_rotation, (rotation, goal.rotation))
+        return computed(
+            PoseCommand,
+            position_m,
+            quat_xyzw,
+            twist,
+            acceleration,
             goal.position_m,
-            quat_from_rotation(goal.rotation),
+            goal_quat_xyzw,
             state.value,
             self._cause,
         )
@@ -608,7 +631,7 @@ def _ahead(motion: Motion, dt_s: float) -> Pose:
     """The pose of a motion `dt_s` later."""
     (position_m, rotation), twist, acceleration = motion
     way = dt_s * (twist + 0.5 * dt_s * acceleration)
-    return Pose(position_m + way[:3], exp3(way[3:]) @ rotation)
+    return Pose(position_m + way[:3], exp3(way[3:]).dot(rotation))
 
 
 def _move(mover: Smoother | JointPath, goal: Goal, shares: Shares, *, hard: bool = False) -> bool:

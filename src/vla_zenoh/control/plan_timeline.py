@@ -77,8 +77,12 @@ class PlanClock:
 
     def at(self, wall_ns: int) -> int:
         """Plan time at a wall time: of the last seconds, or later at the present override."""
-        marks = (mark for mark in reversed(self._marks) if mark[0] <= wall_ns)
-        since_ns, plan_ns, override = next(marks, self._marks[0])
+        for mark in reversed(self._marks):
+            if mark[0] <= wall_ns:
+                break
+        else:
+            mark = self._marks[0]
+        since_ns, plan_ns, override = mark
         passed_ns = wall_ns - since_ns
         return plan_ns + (passed_ns if override == 1.0 else round(override * passed_ns))
 

@@ -20,7 +20,7 @@ from vla_zenoh.control.smoothing import Motion, Smoother
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import Pose, exp3, log3, pose_distance
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import Cause, FloatArray, JointCommand
+from vla_zenoh.types import Cause, FloatArray, JointCommand, computed
 
 REST_RAD_S = 1e-5
 PULL_1_S = 25.0
@@ -235,7 +235,7 @@ class PoseToJoint:
     def command(self, state: str, cause: Cause | None) -> JointCommand:
         """The joint command of this tick."""
         motion = self._now
-        return JointCommand(self._names, *motion[:2], self._acceleration, state=state, cause=cause)
+        return computed(JointCommand, self._names, *motion[:2], self._acceleration, state, cause)
 
     @property
     def _acceleration(self) -> FloatArray:

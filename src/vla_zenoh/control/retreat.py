@@ -13,6 +13,7 @@ Without a measured wrench the contact cannot be seen: then it moves all of `RELI
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +22,7 @@ from vla_zenoh.control.commander_io import make_event
 from vla_zenoh.control.contact import Contact
 from vla_zenoh.kinematics.so3 import Pose, norm3, pose_distance
 from vla_zenoh.profile import Limits
-from vla_zenoh.types import Event, FloatArray
+from vla_zenoh.types import Event
 
 STEP_M = 0.005
 RELIEF_M = 0.02
@@ -46,12 +47,12 @@ class CommandTrail:
 
     def __init__(self) -> None:
         self._poses: list[Pose] = []
-        self._places: list[FloatArray] = []
+        self._places: list[list[float]] = []
 
     def add(self, pose: Pose) -> None:
         """Add a measured pose."""
         place = _place(pose)
-        if self._places and np.linalg.norm(self._places[-1] - place) < SPACE_M:
+        if self._places and math.dist(self._places[-1], place) < SPACE_M:
             return
         if self._places:
             apart = np.linalg.norm(np.array(self._places) - place, axis=1)
@@ -75,16 +76,17 @@ class CommandTrail:
         found: list[Pose] = []
         gone_m = 0.0
         for index in range(len(self._poses) - 2, -1, -1):
-            gone_m += float(np.linalg.norm(self._places[index] - self._places[index + 1]))
+            gone_m += math.dist(self._places[index], self._places[index + 1])
             if gone_m > way_m + SPACE_M / 2:
                 break
             found.append(self._poses[index])
         return found
 
 
-def _place(pose: Pose) -> FloatArray:
+def _place(pose: Pose) -> list[float]:
     # The Frobenius norm of a difference of rotations is sqrt(2) times their small angle.
-    return np.concatenate([pose.position_m, pose.rotation.ravel() * (RAD_AS_M / np.sqrt(2))])
+    turned = (pose.rotation * (RAD_AS_M / math.sqrt(2))).ravel()
+    return pose.position_m.tolist() + turned.tolist()
 
 
 class _Contact(NamedTuple):
@@ -189,11 +191,12 @@ class Retreat:
             return RetreatStep(None, make_event("warning", "notice", "retreat", why))
         on_m = norm3(measured.position_m - begun.measured.position_m)
         # It does not return to where a person has pushed it away from since.
-        into = _place(commanded) - _place(measured)
+        here = np.array(_place(measured))
+        into = _place(commanded) - here
         self._ahead = [
             pose
             for pose in (begun.measured, *self._trail.back(RELIEF_M))
-            if (_place(pose) - _place(measured)) @ into <= 0
+            if (_place(pose) - here) @ into <= 0
         ]
         speed_m_s = self.speed * self._limits.translation.velocity_m_s
         speed_rad_s = self.speed * self._limits.rotation.velocity_rad_s
@@ -207,7 +210,7 @@ class Retreat:
         start = _place(target)
         while self._ahead:
             target = self._ahead.pop(0)
-            if np.linalg.norm(_place(target) - start) >= step_m:
+            if math.dist(_place(target), start) >= step_m:
                 break
         self._target = target
         return target

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vla_zenoh.control.axis_smoothing import FULL, AxisSmoother, AxisState, Shares
-from vla_zenoh.kinematics.so3 import Pose, body_rates, exp3, log3, orthonormal
+from vla_zenoh.kinematics.so3 import Pose, body_rates, exp3, log3, orthonormal, spatial_rates
 from vla_zenoh.profile import Limits
 from vla_zenoh.types import FloatArray
 
@@ -149,9 +149,9 @@ class Smoother(AxisSmoother):
             return self.motion
         position, velocity, acceleration = self._state
         rotation = self._anchor @ exp3(position[3:])
-        spin, spin_change = body_rates(position[3:], velocity[3:], acceleration[3:])
+        spin, spin_change = spatial_rates(position[3:], velocity[3:], acceleration[3:])
         twist, change = velocity.copy(), acceleration.copy()
-        twist[3:], change[3:] = rotation @ spin, rotation @ spin_change
+        twist[3:], change[3:] = self._anchor @ spin, self._anchor @ spin_change
         self.motion = Motion(Pose(position[:3].copy(), rotation), twist, change)
         return self.motion
 

@@ -33,6 +33,7 @@ class _Pinocchio:
 pin = _Pinocchio()
 
 _ORIGIN = np.zeros(3)
+_AXES = range(3)
 
 
 class Pose(NamedTuple):
@@ -59,28 +60,42 @@ def rotation_from_rpy(rpy: FloatArray) -> FloatArray:
 
 def rotation_from_quat(quat_xyzw: FloatArray) -> FloatArray:
     """Rotation matrix of a quaternion x, y, z, w, which is normalised first."""
-    x, y, z, w = (float(value) for value in quat_xyzw)
-    quaternion = pin.Quaternion(w, x, y, z)
-    quaternion.normalize()
-    return quaternion.matrix()
-
-
-def _quaternion(rotation: FloatArray) -> Any:
-    # Not pin.Quaternion(rotation): that one keeps 80 bytes for ever, each time.
-    quaternion = pin.Quaternion(pin.SE3ToXYZQUAT(pin.SE3(rotation, _ORIGIN))[3:])
-    quaternion.normalize()
-    return quaternion
+    # Plain floats: this runs in every tick, and Pinocchio's quaternions cost twice as much.
+    x, y, z, w = quat_xyzw.tolist()
+    double = 2.0 / (x * x + y * y + z * z + w * w)
+    xs, ys, zs = x * double, y * double, z * double
+    xx, yy, zz, xy, xz, yz = x * xs, y * ys, z * zs, x * ys, x * zs, y * zs
+    xw, yw, zw = w * xs, w * ys, w * zs
+    return np.array(
+        (
+            (1.0 - yy - zz, xy - zw, xz + yw),
+            (xy + zw, 1.0 - xx - zz, yz - xw),
+            (xz - yw, yz + xw, 1.0 - xx - yy),
+        )
+    )
 
 
 def quat_from_rotation(rotation: FloatArray) -> FloatArray:
-    """Unit quaternion x, y, z, w with w >= 0."""
-    coefficients = np.array(_quaternion(rotation).coeffs(), dtype=np.float64)
-    return -coefficients if coefficients[3] < 0 else coefficients
+    """Unit quaternion x, y, z, w with w >= 0.
+
+    Its greatest component is computed first, of the diagonal, and divides the others.
+    """
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation.tolist()
+    if xx + yy + zz > 0.0:
+        q = (zy - yz, xz - zx, yx - xy, 1.0 + xx + yy + zz)
+    elif xx >= yy and xx >= zz:
+        q = (1.0 + xx - yy - zz, xy + yx, xz + zx, zy - yz)
+    elif yy >= zz:
+        q = (xy + yx, 1.0 - xx + yy - zz, yz + zy, xz - zx)
+    else:
+        q = (xz + zx, yz + zy, 1.0 - xx - yy + zz, yx - xy)
+    norm = math.copysign(math.hypot(*q), q[3])
+    return np.array([value / norm for value in q])
 
 
 def orthonormal(rotation: FloatArray) -> FloatArray:
     """A product of many rotation matrices without what rounding made of it."""
-    return _quaternion(rotation).matrix()
+    return rotation_from_quat(quat_from_rotation(rotation))
 
 
 def norm3(vector: FloatArray) -> float:
@@ -100,7 +115,8 @@ def _cross(a: Sequence[float], b: Sequence[float]) -> tuple[float, float, float]
 
 def angle_between(a: FloatArray, b: FloatArray) -> float:
     """Geodesic distance of two rotation matrices in rad."""
-    return norm3(log3(b @ a.T))
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = (b @ a.T).tolist()
+    return math.atan2(math.hypot(zy - yz, xz - zx, yx - xy), xx + yy + zz - 1.0)
 
 
 def pose_distance(a: Pose, b: Pose) -> tuple[float, float]:
@@ -168,18 +184,26 @@ def spatial_rates(
 
     Source: Sola, Deray, Atchuthan, "A micro Lie theory", 2018, eq. 145, differentiated.
     """
+    return _rates(rotvec, rate, rate_change, 1.0)
+
+
+def _rates(
+    rotvec: FloatArray, rate: FloatArray, rate_change: FloatArray, side: float
+) -> tuple[FloatArray, FloatArray]:
+    """`spatial_rates` with a `side` of 1, `body_rates` with -1, the sign of B."""
     r, r1, r2 = rotvec.tolist(), rate.tolist(), rate_change.tolist()
     squared = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
     along = r[0] * r1[0] + r[1] * r1[1] + r[2] * r1[2]
     b, c, b_rate, c_rate = _coefficients(squared)
-    b_rate, c_rate = b_rate * along, c_rate * along
-    p = _cross(r, r1)
-    q = _cross(r, p)
-    s = _cross(r, r2)
-    t, u = _cross(r, s), _cross(r1, p)
-    velocity = [r1[i] + b * p[i] + c * q[i] for i in range(3)]
+    b, b_rate, c_rate = side * b, side * b_rate * along, c_rate * along
+    # [a][b]x = b (a . x) - x (a . b) leaves two cross products.
+    p, s = _cross(r, r1), _cross(r, r2)
+    bends = r1[0] * r1[0] + r1[1] * r1[1] + r1[2] * r1[2]
+    bends += r[0] * r2[0] + r[1] * r2[1] + r[2] * r2[2]
+    own, of_r, of_r1 = 1.0 - c * squared, c * bends + c_rate * along, c_rate * squared + c * along
+    velocity = [own * r1[i] + b * p[i] + c * along * r[i] for i in _AXES]
     acceleration = [
-        r2[i] + b * s[i] + b_rate * p[i] + c_rate * q[i] + c * (t[i] + u[i]) for i in range(3)
+        own * r2[i] + b * s[i] + b_rate * p[i] + of_r * r[i] - of_r1 * r1[i] for i in _AXES
     ]
     return np.array(velocity), np.array(acceleration)
 
@@ -191,8 +215,7 @@ def body_rates(
 
     The right Jacobian is ``Jr(r) = Jl(-r)``.
     """
-    velocity, acceleration = spatial_rates(-rotvec, -rate, -rate_change)
-    return -velocity, -acceleration
+    return _rates(rotvec, rate, rate_change, -1.0)
 
 
 def rates_of(

@@ -38,10 +38,13 @@ class History:
         """The entry whose stamp is nearest."""
         if not self.entries:
             return None
-        stamps = [entry.header.stamp_wall_ns for entry in self.entries]
-        right = bisect_left(stamps, stamp_ns)
+        right = bisect_left(self.entries, stamp_ns, key=_stamp_ns)
         around = self.entries[max(right - 1, 0) : right + 1]
         return min(around, key=lambda entry: abs(entry.header.stamp_wall_ns - stamp_ns))
+
+
+def _stamp_ns(entry: Stamped[Any]) -> int:
+    return entry.header.stamp_wall_ns
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +127,7 @@ def assemble(
 
 
 def _oldest(entries: Sequence[Stamped[Any]]) -> Stamped[Any] | None:
-    return min(entries, key=lambda entry: entry.header.stamp_wall_ns, default=None)
+    return min(entries, key=_stamp_ns, default=None)
 
 
 def size_variant(spec: CameraSpec) -> str | None:
@@ -179,7 +182,8 @@ def _scale(rgb: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]
 
 def make_chunk(
     worker: str,
-    spec: ModelSpec,
+    spec_hash: str,
+    dt_s: float,
     observation: Observation,
     answer: ActionSteps,
     *,
@@ -192,7 +196,8 @@ def make_chunk(
 
     Args:
         worker: its name.
-        spec: of its model.
+        spec_hash: of its model.
+        dt_s: duration of a step.
         observation: that was answered.
         answer: with checked steps.
         patience_s: how long the chunk is valid after its last step.
@@ -201,10 +206,10 @@ def make_chunk(
         end_ns: end of inference, wall clock.
     """
     steps = np.asarray(answer.steps)
-    valid_ns = int(len(steps) * spec.action.dt_s * 1e9) + int(patience_s * 1e9)
+    valid_ns = int(len(steps) * dt_s * 1e9) + int(patience_s * 1e9)
     return ActionChunk(
         worker=worker,
-        spec_hash=spec.hash,
+        spec_hash=spec_hash,
         episode=observation.task.episode,
         observation_stamp_ns=observation.stamp_wall_ns,
         observation_seq=observation.seq,

@@ -9,6 +9,7 @@ than 0.1 m (or rad) from where it began, and again when it is back there. Source
 from __future__ import annotations
 
 import re
+from functools import lru_cache
 from typing import NamedTuple
 
 from vla_zenoh.errors import SpecError
@@ -84,6 +85,7 @@ class ScriptedPrompt(NamedTuple):
         return along if turn % 2 == 0 else leg - along
 
 
+@lru_cache(maxsize=64)
 def parse_scripted(prompt: str) -> ScriptedPrompt:
     """Read ``HARD: go up``, ``HARD: rol left x20`` (so spelt in the thesis too) or ``hold``.
 

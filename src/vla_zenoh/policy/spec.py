@@ -29,6 +29,7 @@ from pydantic import (
 
 from vla_zenoh.errors import SpecError, describe_faults
 from vla_zenoh.types import GripperState, JointState, PoseState, PrivilegedState, Task
+from vla_zenoh.types.arrays import is_finite, to_float32
 
 StatePart = Literal["joint", "pose", "gripper", "privileged"]
 Resize = Literal["none", "stretch", "pad", "crop"]
@@ -404,8 +405,7 @@ def check_steps(spec: ActionSpec, steps: ArrayLike) -> NDArray[np.float32]:
         raise SpecError(f"steps are not numbers: {error}", "dtype") from error
     if given.dtype.kind not in "iuf":
         raise SpecError(f"steps are not numbers but {given.dtype}", "dtype")
-    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, seen below
-        array = np.array(given, dtype=np.float32, order="C")
+    array = to_float32(given)
     if array.ndim == 1 and array.shape[0] == spec.dimension:
         array = array[None]
     if array.ndim != 2 or array.shape[1] != spec.dimension:
@@ -416,6 +416,6 @@ def check_steps(spec: ActionSpec, steps: ArrayLike) -> NDArray[np.float32]:
         raise SpecError(
             f"a chunk of {array.shape[0]} steps, the spec says 1 to {spec.horizon}", "horizon"
         )
-    if not np.isfinite(array).all():
+    if not is_finite(array):
         raise SpecError("steps hold NaN or infinity", "not_finite")
     return array

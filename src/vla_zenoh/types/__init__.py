@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from vla_zenoh.types.arrays import (
         QUATERNION_NORM_TOLERANCE,
         FloatArray,
+        computed,
         unit_quaternion,
         vector,
     )
@@ -69,6 +70,7 @@ __all__ = [
     "SceneState",
     "Stamped",
     "Task",
+    "computed",
     "shown",
     "unit_quaternion",
     "vector",

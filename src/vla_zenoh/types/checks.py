@@ -37,6 +37,8 @@ def is_numpy(value: Any, *kinds: str) -> bool:
 
 def number(name: str, value: Any, minimum: float = -math.inf, maximum: float = math.inf) -> float:
     """A finite float within ``[minimum, maximum]``."""
+    if type(value) is float and minimum <= value <= maximum and math.isfinite(value):
+        return value
     if isinstance(value, bool) or not (
         isinstance(value, (int, float)) or is_numpy(value, "integer", "floating")
     ):
@@ -54,6 +56,8 @@ def number(name: str, value: Any, minimum: float = -math.inf, maximum: float = m
 
 def integer(name: str, value: Any, minimum: int = 0, maximum: int = 2**63 - 1) -> int:
     """An int within ``[minimum, maximum]``."""
+    if type(value) is int and minimum <= value <= maximum:
+        return value
     if isinstance(value, bool) or not (isinstance(value, int) or is_numpy(value, "integer")):
         raise RecordError(f"{name} is not a whole number: {shown(value)}")
     if not minimum <= value <= maximum:

@@ -97,7 +97,7 @@ def test_words_are_completed(line: str, path: tuple[str, ...], name: str, word: 
 
 
 def test_the_address_of_a_policy_server_is_no_host_of_a_lab() -> None:
-    assert complete("", ("lab", "serve-openpi"), "host") == []
+    assert complete("", ("lab", "serve"), "host") == []
 
 
 def test_every_profile_option_and_key_is_completed() -> None:

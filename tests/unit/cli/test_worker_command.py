@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from vla_zenoh.cli.worker import worker
 from vla_zenoh.lab.cli.check import check
-from vla_zenoh.lab.cli.serve_openpi import serve_openpi
+from vla_zenoh.lab.cli.serve import serve
 from vla_zenoh.profile import load_profile
 from vla_zenoh.runtime.launch import node_commands
 from vla_zenoh.security.identity import identities
@@ -83,7 +83,7 @@ def test_check_knows_it_too_and_takes_the_profile_of_the_environment(
 
 def test_serve_knows_it_too(lab: str) -> None:
     assert "made with a=lab b=here" in said(
-        serve_openpi, "--worker", "low", "--set", "b=here", "--profile", lab
+        serve, "--worker", "low", "--set", "b=here", "--profile", lab
     )
 
 

@@ -142,6 +142,7 @@ def ended(family: str, failure: str = "", time_s: float = 8.0) -> TaskOutcome:
         "put": Order("put", "red"),
         "stack": Order("stack", "red", onto="blue"),
         "push": Order("push", "red", direction="left"),
+        "stay": Order("stay"),
     }[family]
     verdict = Verdict(not failure, failure, time_s)
     task = TaskEpisode(SEED, order, "do it")
@@ -218,7 +219,7 @@ def test_the_mark_of_a_row_tells_success_from_failure(failure: str, strongest: s
 
 
 def test_a_prompt_that_nobody_can_judge_has_neither_colour() -> None:
-    unknown = replace(ended("put"), prompt="make me a sandwich")
+    unknown = replace(ended("stay"), prompt="make me a sandwich")
     found = sheet([unknown])
     assert found is not None
     mark = decode_jpeg(found).rgb[:TITLE_HEIGHT, :TITLE_HEIGHT].reshape(-1, 3).astype(int)

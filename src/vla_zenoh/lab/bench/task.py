@@ -13,6 +13,7 @@ from vla_zenoh.errors import ResourceError
 from vla_zenoh.lab.statistics import wilson_95
 from vla_zenoh.lab.tasks import (
     COLOURS,
+    DIRECTIONS,
     FAMILIES,
     LIMIT_S,
     Order,
@@ -20,6 +21,7 @@ from vla_zenoh.lab.tasks import (
     draw_episode,
     draw_stay,
 )
+from vla_zenoh.lab.tasks.order import PUSH
 from vla_zenoh.lab.tasks.wording import is_nonsense, parse_prompt
 from vla_zenoh.policy.model_options import shown
 from vla_zenoh.types import ObjectPoses
@@ -247,13 +249,16 @@ class PromptedTask(TaskRequest):
 
     Args:
         prompt: as published.
+        order: what it is taken for; None: what its wording says.
     """
 
     prompt: str = ""
+    order: Order | None = None
 
     def draw(self, objects: ObjectPoses, *, held_out: bool) -> TaskEpisode:
         """The task of the prompt; an unknown prompt is judged as ``stay``."""
-        return TaskEpisode(self.seed, parse_prompt(self.prompt) or Order(STAY), self.prompt)
+        order = self.order or parse_prompt(self.prompt) or Order(STAY)
+        return TaskEpisode(self.seed, order, self.prompt)
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,14 +267,16 @@ class DemoPlan(TaskPlan):
 
     Args:
         prompts: one after the other; empty: one task of every family.
+        orders: prompt -> what it is taken for, of those in free wording.
     """
 
     prompts: tuple[str, ...] = ()
+    orders: Mapping[str, Order] = field(default_factory=dict)
 
     def requests(self) -> Iterator[TaskRequest]:
         """Every episode."""
         for prompt in self.prompts:
-            yield PromptedTask(self.seed, STAY, None, prompt)
+            yield PromptedTask(self.seed, STAY, None, prompt, self.orders.get(prompt))
         if not self.prompts:
             for family in FAMILIES:
                 yield TaskRequest(self.seed, family)
@@ -278,3 +285,11 @@ class DemoPlan(TaskPlan):
 def is_judged(prompt: str) -> bool:
     """The goal of `prompt` is known, so that it can be judged."""
     return parse_prompt(prompt) is not None or is_nonsense(prompt)
+
+
+def order_of(reading: str) -> Order | None:
+    """The goal of what the policy ``brick`` says it read, as ``stack red blue``; None: no task."""
+    kind, *colours = reading.split() or [""]
+    if kind in DIRECTIONS:
+        return Order(PUSH, colours[0], direction=kind)
+    return Order(kind, *colours[:1], onto="".join(colours[1:])) if colours else None

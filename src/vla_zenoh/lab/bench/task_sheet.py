@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.codec.image import decode_jpeg, encode_jpeg
-from vla_zenoh.lab.bench.task import TaskOutcome, is_judged
+from vla_zenoh.lab.bench.task import STAY, TaskOutcome, is_judged
 from vla_zenoh.types import Image
 
 FRAME_WIDTH, FRAME_HEIGHT, TITLE_HEIGHT, GAP = 560, 420, 56, 8
@@ -39,7 +39,8 @@ def _row(ended: TaskOutcome) -> Picture:
     assert ended.pictures is not None
     width, height = 2 * FRAME_WIDTH + 3 * GAP, TITLE_HEIGHT + FRAME_HEIGHT + GAP
     row = np.full((height, width, 3), PAPER, np.uint8)
-    judged = is_judged(ended.prompt) or not ended.success
+    told = ended.episode.order.family != STAY or is_judged(ended.prompt)
+    judged = told or not ended.success
     colour = GREY if not judged else GREEN if ended.success else RED
     _mark(row, colour, done=ended.success, judged=judged)
     word = "not judged" if not judged else ended.failure.replace("_", " ") or "done"

@@ -11,7 +11,7 @@ from rich.text import Text
 
 from vla_zenoh.cli.output import console, new_table, print_json, styled
 from vla_zenoh.errors import ResourceError, nearest
-from vla_zenoh.lab.bench.task import SCENE, DemoPlan, TaskOutcome, is_judged
+from vla_zenoh.lab.bench.task import SCENE, DemoPlan, TaskOutcome, is_judged, order_of
 from vla_zenoh.lab.bench.task_runner import TaskRunner
 from vla_zenoh.lab.bench.task_sheet import sheet
 from vla_zenoh.lab.cli.demo_options import DemoOptions
@@ -21,8 +21,10 @@ from vla_zenoh.lab.episode import Interrupted
 from vla_zenoh.lab.evaluation.result import TASKS
 from vla_zenoh.lab.tasks import COLOURS, DIRECTIONS, FAILURES, LIMIT_S, Order, phrase
 from vla_zenoh.lab.tasks.order import PUSH, PUT, STACK
+from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.sanitize import one_line, printable
 
+MODEL = "brick"
 ROUNDS = 3
 """Tasks without a prompt: one of every family."""
 
@@ -33,9 +35,7 @@ def run_task_demo(prompts: list[str], seed: int, profile: str, given: DemoOption
     Raises:
         ResourceError: a prompt cannot be judged; the message lists what can.
     """
-    for prompt in prompts:
-        if not is_judged(prompt):
-            raise ResourceError(_not_understood(prompt))
+    orders = {prompt: _free_wording(prompt) for prompt in prompts if not is_judged(prompt)}
     folder = run_folder(given.output)
     with open_stage(profile, folder, force=given.force) as stage:
         loaded = stage.profile
@@ -47,6 +47,7 @@ def run_task_demo(prompts: list[str], seed: int, profile: str, given: DemoOption
             seed,
             rate_hz=given.rate_hz,
             prompts=tuple(prompts),
+            orders=orders,
             limit_s=given.seconds or LIMIT_S,
         )
         ended, refused = _run(stage, plan)
@@ -97,6 +98,20 @@ def _run(stage: Stage, plan: DemoPlan) -> tuple[list[TaskOutcome], dict[str, int
             counted = refusals({n: found[0] for n, found in client.snapshot().items()})
             client.deactivate()
     return ended, counted
+
+
+def _free_wording(prompt: str) -> Order:
+    """The goal that the shipped policy reads in a prompt; it is judged by that.
+
+    Raises:
+        ResourceError: it reads none; lists what is known.
+    """
+    reading = make_policy(find_model(MODEL)).read(prompt)  # pyright: ignore[reportAttributeAccessIssue]
+    order = order_of(reading)
+    if order is None:
+        raise ResourceError(_not_understood(prompt))
+    console().print(styled(f"{one_line(prompt, 80)!r} is read as: {phrase(order, 0)}", "dim"))
+    return order
 
 
 def _not_understood(prompt: str) -> str:

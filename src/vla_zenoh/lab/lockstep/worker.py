@@ -105,7 +105,8 @@ class LockstepWorker:
         self._continuation.published(observation, steps, self._not_before_ns, obeyed=obeyed)
         return make_chunk(
             self.name,
-            self.spec,
+            self.spec.hash,
+            self.spec.action.dt_s,
             observation,
             ActionSteps(steps, answer.done),
             patience_s=self._patience_s,

@@ -32,7 +32,10 @@ MAX_RECORD_BYTES = 256 * 1024 * 1024
 SHOWN_TOPICS = 6
 _KINDS = {kind.__name__: kind for kind in RECORDS}
 _SCHEMAS = (ros2_messages.TEXT, ros2_messages.IMAGE, ros2_messages.JPEG_IMAGE)
-_BROKEN = (McapError, CRCValidationError, ZstdError, struct.error, ValueError, EOFError, KeyError)
+_BROKEN = (
+    *(McapError, CRCValidationError, ZstdError, struct.error),
+    *(ValueError, EOFError, KeyError, OverflowError),
+)
 
 
 class Recording:

@@ -4,14 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vla_zenoh.errors import PeerError, RecordError, SpecError
 from vla_zenoh.interop.field_mapping import FieldSource, read_map
 from vla_zenoh.lab.serve.state_parts import state_of
-from vla_zenoh.policy import ModelSpec, Observation
+from vla_zenoh.policy import (
+    ActionSteps,
+    ModelSpec,
+    Observation,
+    Policy,
+    check_steps,
+    reset_of,
+)
+from vla_zenoh.policy.chunk_prefix import Committed
 from vla_zenoh.policy.observation import prepare_image
 from vla_zenoh.policy.state_vector import ROTATIONS, parts_of, read_parts
 from vla_zenoh.types import GripperState, Image, JointState, PoseState, Task, shown
@@ -24,16 +33,37 @@ class ServedPolicy:
     """What a model can be asked, and under which names.
 
     Args:
-        spec: of the model.
+        policy: a loaded model.
         fields: name -> what it holds.
         joints: names of the arm's joints, in the order in which they are given.
         max_width_m: of the gripper.
     """
 
-    spec: ModelSpec
+    policy: Policy
     fields: Mapping[str, FieldSource]
     joints: tuple[str, ...]
     max_width_m: float
+
+    @property
+    def spec(self) -> ModelSpec:
+        """Of the model."""
+        return self.policy.spec
+
+    @property
+    def takes_committed(self) -> bool:
+        """Whether it takes the steps in execution."""
+        return bool(getattr(self.policy, "takes_committed", False))
+
+    def reset(self) -> None:
+        """Begin an episode."""
+        (reset_of(self.policy) or (lambda: None))()
+
+    def infer(self, observation: Observation, committed: Committed | None) -> NDArray[np.float32]:
+        """(H, D) the model's actions, checked."""
+        extra: dict[str, Any] = {"committed": committed} if self.takes_committed else {}
+        result: Any = self.policy.infer(observation, **extra)
+        steps = result.steps if isinstance(result, ActionSteps) else result
+        return check_steps(self.spec.action, steps)
 
     def described(self) -> dict[str, str]:
         """Name -> its content, as text."""
@@ -45,7 +75,7 @@ class ServedPolicy:
                 out[name] = "text" if source.prompt else "+".join(source.parts)
         return out
 
-    def observe(self, given: Mapping[str, Any], stamp_wall_ns: int, seq: int) -> Observation:
+    def observe(self, given: Mapping[str, Any], stamp_wall_ns: int) -> Observation:
         """An observation of what was given; names that are not asked for are passed over.
 
         Twists and joint velocities, which such a question does not hold, are zero.
@@ -75,7 +105,7 @@ class ServedPolicy:
                     state |= state_of(source.parts, numbers, len(self.joints), self.max_width_m)
             return Observation(
                 stamp_wall_ns=stamp_wall_ns,
-                seq=seq,
+                seq=0,
                 task=Task(0, True, prompt, self.spec.name, 1.0 / self.spec.action.dt_s),
                 images=images,
                 **self._state(state),
@@ -96,14 +126,33 @@ class ServedPolicy:
         return out
 
 
+class DefaultNames(NamedTuple):
+    """How clients name what nobody named otherwise.
+
+    Args:
+        camera: with a place for the name of the camera.
+        state: with a place for joint, pose or gripper.
+        prompt: the text.
+    """
+
+    camera: str = "observation/{}"
+    state: str = "observation/{}"
+    prompt: str = "prompt"
+
+
 def make_served_policy(
-    spec: ModelSpec, map_option: str, joints: tuple[str, ...], max_width_m: float
+    policy: Policy,
+    map_option: str,
+    joints: tuple[str, ...],
+    max_width_m: float,
+    names: DefaultNames = DefaultNames(),  # noqa: B008  # cannot be changed
 ) -> ServedPolicy:
-    """The offer of a model; `map_option` names things otherwise than ``observation/...``.
+    """The offer of a model; `map_option` names things otherwise than `names`.
 
     Raises:
         SpecError: what the model needs is not named, or named twice.
     """
+    spec = policy.spec
     fields = {name: source for name, source in read_map(map_option).items() if source is not None}
     own = list(fields.values())
     if any(source.blank for source in own):
@@ -111,7 +160,7 @@ def make_served_policy(
     named = {source.camera for source in own if source.camera}
     for camera in spec.observation.cameras:
         if camera.camera not in named:
-            fields[f"observation/{camera.camera}"] = FieldSource(camera=camera.camera)
+            fields[names.camera.format(camera.camera)] = FieldSource(camera=camera.camera)
     unknown = named - {camera.camera for camera in spec.observation.cameras}
     if unknown:
         raise SpecError(f"the model has no camera {', '.join(sorted(unknown))}")
@@ -119,11 +168,11 @@ def make_served_policy(
     for part in spec.observation.state:
         if part not in covered:
             parts = read_parts(_OF_PART[part])
-            fields[f"observation/{part}"] = FieldSource(parts=parts)
+            fields[names.state.format(part)] = FieldSource(parts=parts)
     _check_whole(spec, fields)
     if not any(source.prompt for source in own):
-        fields["prompt"] = FieldSource(prompt=True)
-    return ServedPolicy(spec, fields, joints, max_width_m)
+        fields[names.prompt] = FieldSource(prompt=True)
+    return ServedPolicy(policy, fields, joints, max_width_m)
 
 
 def _check_whole(spec: ModelSpec, fields: Mapping[str, FieldSource]) -> None:

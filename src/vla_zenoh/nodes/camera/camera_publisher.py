@@ -151,17 +151,16 @@ class CameraPublisher:
 
     def publish_rgb(self, rgb: NDArray[np.uint8], mono_ns: int, stamp_wall_ns: int) -> None:
         """Publish (H, W, 3) RGB of the profile's size on every stream that has subscribers."""
-        raw = self._raw.has_subscribers
-        fitted = self.fitted.due(mono_ns)
-        jpeg = self._jpeg.has_subscribers and self._jpeg_limiter.due(mono_ns)
-        if not (raw or jpeg or fitted):
-            return
-        image = Image(rgb)
-        if raw:
+        image, raw = Image(rgb), self._raw.has_subscribers
+        if raw:  # first: whoever is on this computer gets it without waiting for the others
             schema = zenoh.Encoding.ZENOH_BYTES.with_schema(raw_schema(image))
             self._raw.publish(
                 encode_raw(image), stamp_wall_ns=stamp_wall_ns, seq=self._seq, encoding=schema
             )
+        fitted = self.fitted.due(mono_ns)
+        jpeg = self._jpeg.has_subscribers and self._jpeg_limiter.due(mono_ns)
+        if not (raw or jpeg or fitted):
+            return
         if jpeg:
             # A thinned stream numbers its own images.
             thinned = self.profile.jpeg_rate_hz is not None

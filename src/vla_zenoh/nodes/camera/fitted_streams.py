@@ -147,6 +147,8 @@ class FittedStreams:
 
     def due(self, mono_ns: int) -> list[FittedStream]:
         """Streams that have a subscriber and are due for the image of this time."""
+        if not self._streams:
+            return []
         with self._lock:
             return [
                 one

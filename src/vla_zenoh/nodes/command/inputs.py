@@ -70,14 +70,15 @@ class CommandInputs:
         """Chunks dropped because they arrived faster than they were processed."""
         return self._chunks.dropped
 
-    def poll(self, now_ns: int) -> Inputs:
+    def poll(self, now_ns: int, *, news: bool = True) -> Inputs:
         """Everything received since the last call.
 
         Args:
             now_ns: nominal time of this tick on the node's wall clock.
+            news: read what other nodes say of themselves; that they are gone is seen at once.
         """
         settings_put = self._poll_settings()
-        peers = self._peer_monitor.update(now_ns)
+        peers = self._peer_monitor.update(now_ns, news=news)
         chunks = [self._chunk(arrival) for arrival in self._chunks.drain()]
         clock = self._check_clock()
         return Inputs(
@@ -100,6 +101,8 @@ class CommandInputs:
             for name, buffer, decode in self._settings
             for arrival in buffer.drain()
         ]
+        if not arrivals:
+            return []
         if all(put_ns is not None for put_ns, *_ in arrivals):
             arrivals.sort(key=itemgetter(0))
         put: list[Setting] = []

@@ -31,6 +31,8 @@ TASK_PERIOD_S = 0.2
 BRAKE_BEFORE_EXIT_S = 1.0
 SWITCH_INTERVAL_S = 5e-4
 MAX_WHY, MAX_LIMIT = 2000, 200
+CHORES_S = 0.02
+"""Period of what no motion depends on: status, queries of clocks, news of other nodes."""
 ACTING_S = 1.0
 """Limits that shorten steps act once for each chunk."""
 SPREAD_S = 8.0
@@ -74,6 +76,7 @@ class CommandNode:
         self._gripper_out = node.declare_publisher(keys.command_gripper, Kind.ORDER)
         self._task_out = node.declare_publisher(keys.task, Kind.CONTROL)
         self._last_task = 0.0
+        self._next_chores_ns = 0
         self._serve_settings()
 
     def _serve_settings(self) -> None:
@@ -128,7 +131,10 @@ class CommandNode:
     def _on_tick(self, extra: list[Setting], tick: Tick) -> None:
         began = time.perf_counter()
         now_ns = self.node.clock.wall_at(tick.nominal_ns)
-        inputs = self._inputs.poll(now_ns)
+        chores = tick.nominal_ns >= self._next_chores_ns
+        if chores:
+            self._next_chores_ns = tick.nominal_ns + round(CHORES_S * 1e9)
+        inputs = self._inputs.poll(now_ns, news=chores)
         inputs.settings = [*inputs.settings, *extra]
         timing = self.node.profile.timing
         limit = max(1, int(timing.command_timeout_s * timing.command_hz))
@@ -136,9 +142,10 @@ class CommandNode:
         self._publish(out, now_ns)
         if any(event.kind == "transition" for event in out.events):
             self._update_latch()
-        self._report_latch_failure()
         self._status.add_tick(now_ns, tick.stall_s, time.perf_counter() - began)
-        self._status.publish(out, self._inputs.chunks_dropped)
+        if chores or out.events or out.task_changed:
+            self._report_latch_failure()
+            self._status.publish(out, self._inputs.chunks_dropped)
 
     def _update_latch(self) -> None:
         if self._latch is None:

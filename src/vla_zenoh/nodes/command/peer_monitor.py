@@ -21,8 +21,8 @@ from vla_zenoh.types import Header, NodeStatus
 MAX_WORKERS, MAX_HOLDERS = 32, 32
 MAX_WHY = 300
 CLOCKS_PERIOD_S = 0.25
-STATUSES_A_TICK, SPECS_A_TICK = 8, 4
-"""More than our nodes publish: each does so twice a second."""
+STATUSES_AT_ONCE, SPECS_AT_ONCE = 8, 4
+"""More than our nodes publish between two updates: each does so twice a second."""
 
 
 class PeerMonitor:
@@ -46,8 +46,8 @@ class PeerMonitor:
         self._down: dict[str, str] = {}
         self._hosts: dict[str, HostId] = {}
         self._next_clocks_s = 0.0
-        self._statuses = node.subscribe(node.keys.all_status, ZenohRing(STATUSES_A_TICK))
-        self._new_specs = node.subscribe(node.keys.all_specs, ZenohRing(SPECS_A_TICK))
+        self._statuses = node.subscribe(node.keys.all_status, ZenohRing(STATUSES_AT_ONCE))
+        self._new_specs = node.subscribe(node.keys.all_specs, ZenohRing(SPECS_AT_ONCE))
         node.on_tokens(node.keys.all_alive, self._on_alive)
         node.on_tokens(node.keys.all_holding, self._on_holding)
         self._robot_node = node.profile.robot.node
@@ -77,13 +77,19 @@ class PeerMonitor:
             else:
                 self._node.counters["refused.holder"] += 1
 
-    def update(self, now_ns: int) -> PeerSnapshot | None:
-        """A new snapshot, or None if nothing changed."""
-        for arrival in self._statuses.drain():
-            self._receive_status(arrival, now_ns)
-        for arrival in self._new_specs.drain():
-            self._receive_spec(arrival)
-        self._track_clocks()
+    def update(self, now_ns: int, *, news: bool = True) -> PeerSnapshot | None:
+        """A new snapshot, or None if nothing changed.
+
+        Args:
+            now_ns: time of this tick.
+            news: read status and specs; the liveliness of nodes is known without.
+        """
+        if news:
+            for arrival in self._statuses.drain():
+                self._receive_status(arrival, now_ns)
+            for arrival in self._new_specs.drain():
+                self._receive_spec(arrival)
+            self._track_clocks()
         with self._lock:
             if not self._changed:
                 return None

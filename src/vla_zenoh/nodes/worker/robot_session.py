@@ -80,6 +80,7 @@ class RobotSession:
         self.robot = profile.robot.name
         node = self.node = Node(worker_node(name), profile, session, host=host)
         self.policy, self.name, self.spec = policy, name, policy.spec
+        self._spec_hash = policy.spec.hash
         self.prefix = ChunkPrefix(policy)
         keys = node.keys
         self._chunks = node.declare_publisher(keys.delta(name), Kind.ORDER)
@@ -258,7 +259,8 @@ class RobotSession:
         self._inference_ms.add((end_ns - start_ns) / 1e6)
         chunk = make_chunk(
             self.name,
-            self.spec,
+            self._spec_hash,
+            self.spec.action.dt_s,
             observation,
             ActionSteps(steps, done),
             patience_s=self.node.profile.timing.max_observation_age_s,
@@ -300,7 +302,7 @@ class RobotSession:
         inference = self._inference_ms.summary()
         detail: Mapping[str, Any] = {
             "complaint": self.complaint[:MAX_COMPLAINT].encode("utf-8", "replace").decode(),
-            "spec": self.spec.hash,
+            "spec": self._spec_hash,
             "episode": self._episode,
             "prompt": task.prompt if task else "",
             "obeyed": bool(task and task.active and task.worker == self.name),

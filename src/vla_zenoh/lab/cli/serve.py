@@ -1,11 +1,11 @@
-"""vla-zenoh lab serve-openpi: a model of ours for clients of openpi."""
+"""vla-zenoh lab serve: a model of ours for clients of openpi, or for the benchmarks of vla-eval."""
 
 from __future__ import annotations
 
 import logging
 import os
 import threading
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -18,15 +18,15 @@ from vla_zenoh.cli.options import (
 )
 from vla_zenoh.cli.output import console
 from vla_zenoh.lab.cli.loopback import require_loopback
-from vla_zenoh.lab.serve.openpi_frames import PORT
-from vla_zenoh.lab.serve.served_policy import make_served_policy
+from vla_zenoh.lab.serve import openpi_frames
+from vla_zenoh.lab.serve.served_policy import DefaultNames, make_served_policy
 from vla_zenoh.policy.loader import make_policy
 from vla_zenoh.runtime.environments import run_in_own_environment
 from vla_zenoh.runtime.process import stop_on_signals
 
 
 @options
-def serve_openpi(
+def serve(
     worker: Annotated[
         str,
         typer.Option(
@@ -35,18 +35,27 @@ def serve_openpi(
     ],
     model: ModelOptions,
     profile: ProfileOption = DEFAULT_PROFILE,
+    wire: Annotated[
+        Literal["openpi", "vla-eval"], typer.Option(help="Whose clients are served.")
+    ] = "openpi",
     names: Annotated[
         str, typer.Option("--map", help="Other names, as observation/image=camera:front,...")
     ] = "",
     host: Annotated[
         str, typer.Option(help="Address to listen on; a network's only with --api-key.")
     ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="0: any free one.")] = PORT,
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="0: any free one.")
+    ] = openpi_frames.PORT,
     api_key: Annotated[
         str, typer.Option(envvar="VLA_ZENOH_API_KEY", help="Key that clients must send.")
     ] = "",
+    execute: Annotated[
+        int,
+        typer.Option(min=0, help="vla-eval: steps of a chunk before the next one; 0: all of them."),
+    ] = 0,
 ) -> None:
-    """Serve a model of ours to clients of openpi, which drive the robot with it."""
+    """Serve a model of ours to clients of openpi, or to the benchmarks of vla-eval."""
     loaded = effective_profile(profile)
     if not api_key:
         require_loopback(
@@ -59,16 +68,34 @@ def serve_openpi(
         )
     robot, chosen = loaded.robot, model.choose(loaded, worker)
     run_in_own_environment(chosen.model, model.python, extra="serve")
-    from vla_zenoh.lab.serve.openpi_server import OpenPiServer
+    from vla_zenoh.lab.serve import vla_eval
+    from vla_zenoh.lab.serve.openpi_conversation import OpenPiConversation
+    from vla_zenoh.lab.serve.policy_server import PolicyServer
 
+    openpi = wire == "openpi"
     policy = make_policy(chosen.model, chosen.options, profile=profile)
-    offer = make_served_policy(policy.spec, names, robot.arm_joints, robot.gripper.max_width_m)
+    offer = make_served_policy(
+        policy,
+        names,
+        robot.arm_joints,
+        robot.gripper.max_width_m,
+        DefaultNames() if openpi else vla_eval.NAMES,
+    )
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     getattr(policy, "load", lambda: None)()
     stop = stop_on_signals()
-    server = OpenPiServer(policy, offer, host, port, api_key=api_key)
+    server = PolicyServer(
+        lambda: (
+            OpenPiConversation(offer) if openpi else vla_eval.VlaEvalConversation(offer, execute)
+        ),
+        host,
+        port,
+        health=openpi_frames.HEALTH_PATH if openpi else vla_eval.HEALTH_PATH,
+        max_bytes=openpi_frames.MAX_BYTES,
+        api_key=api_key,
+    )
     threading.Thread(target=server.serve_forever, daemon=True).start()
-    console().print(f"{chosen.name} for openpi's clients at ws://{host}:{server.port}")
+    console().print(f"{chosen.name} for {wire}'s clients at ws://{host}:{server.port}")
     for name, what in offer.described().items():
         console().print(f"  {name}: {what}", highlight=False)
     stop.wait()

@@ -1,0 +1,122 @@
+"""Serves one of our models over WebSocket, without Zenoh, in the form of somebody else's clients.
+
+It serves one client at a time, as a model may keep state; a second client is rejected.
+"""
+
+from __future__ import annotations
+
+import hmac
+import logging
+import threading
+from collections.abc import Callable
+from http import HTTPStatus
+from typing import Protocol
+
+from vla_zenoh.errors import MissingExtraError
+
+try:
+    from websockets.datastructures import Headers
+    from websockets.exceptions import ConnectionClosed
+    from websockets.http11 import Request, Response
+    from websockets.sync.server import Server, ServerConnection, serve
+except ImportError as error:
+    raise MissingExtraError(error.name or "websockets", "serve") from error
+
+INTERNAL_ERROR, TRY_AGAIN_LATER = 1011, 1013
+LOG = logging.getLogger("vla_zenoh.serve")
+
+
+class Conversation(Protocol):
+    """What is said on one connection."""
+
+    def greeting(self) -> bytes | None:
+        """The first frame, where the server begins."""
+        ...
+
+    def reply(self, frame: bytes | str) -> bytes | str | None:
+        """The answer to a frame; None: none. Text is the reason why the connection is closed."""
+        ...
+
+
+class PolicyServer:
+    """WebSocket server of one model.
+
+    Args:
+        converse: begins the conversation of a new connection.
+        host: address to listen on.
+        port: to listen on; 0: any.
+        health: path that answers whoever asks whether it is up.
+        max_bytes: of a frame.
+        api_key: required of clients; empty: none.
+    """
+
+    def __init__(
+        self,
+        converse: Callable[[], Conversation],
+        host: str,
+        port: int,
+        *,
+        health: str,
+        max_bytes: int,
+        api_key: str = "",
+    ) -> None:
+        self._converse, self._health, self._key = converse, health, api_key
+        self._busy = threading.Lock()
+        self._server: Server = serve(
+            self._handle,
+            host,
+            port,
+            compression=None,
+            max_size=max_bytes,
+            process_request=self._admit,
+        )
+        self.port: int = self._server.socket.getsockname()[1]
+
+    def serve_forever(self) -> None:
+        """Serve until `stop`."""
+        self._server.serve_forever()
+
+    def stop(self) -> None:
+        """Stop accepting clients."""
+        self._server.shutdown()
+
+    # -- connections --------------------------------------------------------------------------
+    def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
+        if request.path == self._health:
+            return connection.respond(HTTPStatus.OK, "OK\n")
+        if self._key and not _has_key(request.headers, self._key):
+            return connection.respond(HTTPStatus.UNAUTHORIZED, "wrong or no API key\n")
+        if self._busy.locked():
+            return connection.respond(
+                HTTPStatus.SERVICE_UNAVAILABLE, "another client is connected\n"
+            )
+        return None
+
+    def _handle(self, connection: ServerConnection) -> None:
+        if not self._busy.acquire(blocking=False):
+            connection.close(TRY_AGAIN_LATER, "another client is connected")
+            return
+        try:
+            self._serve(connection)
+        except ConnectionClosed:
+            pass
+        finally:
+            self._busy.release()
+
+    def _serve(self, connection: ServerConnection) -> None:
+        conversation = self._converse()
+        greeting = conversation.greeting()
+        if greeting is not None:
+            connection.send(greeting)
+        while True:
+            reply = conversation.reply(connection.recv())
+            if reply is not None:
+                connection.send(reply)
+            if isinstance(reply, str):
+                connection.close(INTERNAL_ERROR, "the reason is in the frame before")
+                return
+
+
+def _has_key(headers: Headers, key: str) -> bool:
+    given = headers.get("Authorization", "")
+    return hmac.compare_digest(given.encode(), f"Api-Key {key}".encode())
