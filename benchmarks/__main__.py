@@ -14,6 +14,7 @@ from benchmarks.load.cli import load
 from benchmarks.openvla import openvla
 from benchmarks.stop import stop
 from benchmarks.thesis.cli import thesis
+from benchmarks.web import web
 from vla_zenoh.cli.output import complain
 from vla_zenoh.errors import VlaZenohError
 
@@ -23,7 +24,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-for command in (chain, codec, delay, deployment, load, openvla, stop, thesis):
+for command in (chain, codec, delay, deployment, load, openvla, stop, thesis, web):
     app.command()(command)
 
 if __name__ == "__main__":

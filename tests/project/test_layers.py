@@ -76,9 +76,14 @@ ALLOWED = {
             "lab/trial/runner.py",
             "lab/view/listener.py",
             "lab/view/viewer.py",
+            "lab/web/hand.py",
+            "lab/web/pictures.py",
+            "lab/web/recordings.py",
+            "lab/web/robot_link.py",
         ),
         IO - NODE,
     ),
+    **dict.fromkeys(("lab/web/serve.py", "lab/web/server.py"), IO - NODE | {"asyncio"}),
 }
 HEAVY = ("zenoh", "typer", "torch", "mujoco", "matplotlib", "av", "pyarrow", "rerun")
 
@@ -205,6 +210,9 @@ OPTIONAL = (
     "zmq",
     "websockets",
     "rerun",
+    "starlette",
+    "uvicorn",
+    "prometheus_client",
 )
 
 

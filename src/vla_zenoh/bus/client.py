@@ -304,7 +304,8 @@ class Client:
 
     def release_deadman(self) -> None:
         """End the deadman's presence: the arm brakes if it is still active."""
-        token, self._token = self._token, None
+        with self._lock:  # several threads may let go
+            token, self._token = self._token, None
         if token is not None:
             token.undeclare()
 

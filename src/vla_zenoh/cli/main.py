@@ -59,6 +59,7 @@ COMMANDS: Mapping[str, Mapping[str, str | Group]] = {
         "speed": "cli.drive:speed",
         "stop": "cli.drive:stop",
         "reset": "cli.drive:reset",
+        "web": "lab.cli.web:web",
     },
     "Watch and record": {
         "status": "cli.status:status",

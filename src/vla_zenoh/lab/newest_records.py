@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 import zenoh
 
-from vla_zenoh.bus.buffers import LatestSample, bytes_of, header_of
+from vla_zenoh.bus.buffers import LatestSample, ReceivedSample, bytes_of, header_of
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, NodeError
 from vla_zenoh.types import Header
@@ -17,6 +17,11 @@ Record = TypeVar("Record")
 
 class StreamSlot(LatestSample):
     """The newest sample of a stream; reading does not consume it."""
+
+    @property
+    def arrival(self) -> ReceivedSample | None:
+        """The sample and its time of arrival; None before the first."""
+        return self._arrival
 
     @property
     def mono_s(self) -> float:

@@ -77,3 +77,14 @@ def test_a_model_is_not_served_to_a_network_without_a_key(tmp_path: Path) -> Non
     open_ = tmp_path / "open.yaml"
     open_.write_text("extends: panda_sim\nsession: {insecure: true}\n")
     assert "no_such_model" in said(*SERVE, "--host", "0.0.0.0", "--profile", str(open_))
+
+
+def test_the_page_is_not_served_to_a_network_without_tls(tmp_path: Path) -> None:
+    for address in ("0.0.0.0", "::", "10.0.0.2", "a-computer"):
+        why = said("web", "--bind", address)
+        assert "without TLS anyone on that network could read the tokens and drive" in why
+        assert "Give --certificate and --key" in why
+    file = tmp_path / "cert.pem"
+    assert "together" in said("web", "--bind", "0.0.0.0", "--certificate", str(file))
+    why = said("web", "--bind", "0.0.0.0", "--certificate", str(file), "--key", str(file))
+    assert "cert.pem is not there" in why

@@ -29,6 +29,9 @@ READ = {
     "bench compare b",
     "bench sim replay",
     "lab trial setups",
+    "web people",
+    "web certificate",
+    "web key",
     "lab compare file",
     "profile bridge-config certificates",  # a name on another computer
 }

@@ -1,0 +1,143 @@
+"""Who may use the page: people and their tokens, hosts and origins, rate limits. Pure."""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import ipaddress
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+from vla_zenoh.errors import ProfileError, SecurityError
+from vla_zenoh.keys import key_chunk
+from vla_zenoh.profile import yaml_text
+from vla_zenoh.security.store import open_to_others
+
+PageRole = Literal["operator", "viewer"]
+MIN_TOKEN = 16
+"""Characters: `openssl rand -hex 16` makes 32."""
+
+
+class Person(NamedTuple):
+    """A person who may use the page.
+
+    Args:
+        name: in messages and in the name of a deadman.
+        role: rights, as in `vla_zenoh.security.roles`.
+        token: secret.
+    """
+
+    name: str
+    role: PageRole
+    token: str
+
+
+class People:
+    """The people of a page, found by their tokens.
+
+    Args:
+        people: with different tokens.
+        most: role that nobody exceeds: that of the certificate with which the page is on the bus.
+    """
+
+    def __init__(self, people: Iterable[Person], most: PageRole = "operator") -> None:
+        self._people = [
+            (_digest(one.token), one if most == "operator" else one._replace(role=most))
+            for one in people
+        ]
+
+    def find(self, token: str) -> Person | None:
+        """Whose token this is; takes the same time whatever is wrong with it."""
+        given, found = _digest(token), None
+        for digest, person in self._people:
+            if hmac.compare_digest(digest, given):
+                found = person
+        return found
+
+
+def _digest(token: str) -> bytes:
+    return hashlib.sha256(token.encode("utf-8", "replace")).digest()
+
+
+def read_people(path: Path) -> list[Person]:
+    """People of a YAML file ``NAME: {role: operator, token: ...}``.
+
+    Raises:
+        SecurityError: it cannot be read, others can read it, or an entry is wrong; says which.
+    """
+    try:
+        if fault := open_to_others(path):
+            raise SecurityError(fault)
+        data, _ = yaml_text.read(path.read_bytes(), str(path))
+    except (OSError, ProfileError) as error:
+        raise SecurityError(f"--people {path}: {error}") from error
+    people: list[Person] = []
+    for name, entry in data.items():
+        fields = entry if isinstance(entry, dict) else {}
+        role, token = fields.get("role"), fields.get("token")
+        if fields.keys() != {"role", "token"} or role not in ("operator", "viewer"):
+            raise SecurityError(
+                f"{path}: {name}: write {{role: operator, token: ...}}; a role is operator or "
+                "viewer"
+            )
+        if not isinstance(token, str) or len(token) < MIN_TOKEN:
+            raise SecurityError(
+                f"{path}: {name}: the token needs {MIN_TOKEN} characters or more, in quotes; "
+                "`openssl rand -hex 16` makes one"
+            )
+        try:
+            people.append(Person(key_chunk(name, "person"), role, token))
+        except ProfileError as error:
+            raise SecurityError(f"{path}: {error}") from error
+    if not people:
+        raise SecurityError(f"{path} names nobody: write NAME: {{role: operator, token: ...}}")
+    if len({person.token for person in people}) < len(people):
+        raise SecurityError(f"{path}: two people have the same token")
+    return people
+
+
+def host_is_ours(host: str, names: Iterable[str]) -> bool:
+    """Whether the header ``Host`` names this server.
+
+    A name of somebody else's that was made to resolve to us (DNS rebinding) does not; an address
+    cannot be such a name.
+
+    Args:
+        host: with or without a port.
+        names: of this server, beside ``localhost``.
+    """
+    name = host.rpartition("]")[0].lstrip("[") if host.startswith("[") else host.partition(":")[0]
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return name.lower() in {"localhost", *(known.lower() for known in names)}
+    return True
+
+
+def origin_is_ours(origin: str, host: str, *, secure: bool) -> bool:
+    """Whether the header ``Origin`` says that the page itself asks, not a page of another site."""
+    return bool(host) and origin.lower() == f"http{'s' if secure else ''}://{host}".lower()
+
+
+class RateLimit:
+    """Limits how many messages are taken: `rate_hz` for long, `burst` at once.
+
+    Args:
+        rate_hz: of messages.
+        burst: messages.
+        now_s: monotonic.
+    """
+
+    def __init__(self, rate_hz: float, burst: float, now_s: float = 0.0) -> None:
+        self._rate_hz, self._burst = rate_hz, burst
+        self._left, self._at_s = burst, now_s
+
+    def take(self, now_s: float) -> bool:
+        """Whether one more is within the limit."""
+        self._left = min(self._burst, self._left + (now_s - self._at_s) * self._rate_hz)
+        self._at_s = now_s
+        if self._left < 1:
+            return False
+        self._left -= 1
+        return True

@@ -1,0 +1,106 @@
+"""The arm as lines in the base frame: its joints, chunk, workspace and keep-outs. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from vla_zenoh.control.actions import chunk_poses, step_joints
+from vla_zenoh.errors import RecordError
+from vla_zenoh.kinematics.kinematics import Kinematics
+from vla_zenoh.kinematics.so3 import Pose
+from vla_zenoh.policy import ModelSpec
+from vla_zenoh.profile import Profile
+from vla_zenoh.types import ActionChunk, FloatArray, JointState
+
+MAX_LINE = 60
+"""Points of a chunk that are drawn."""
+Line = list[list[float]]
+
+
+def rounded(points: FloatArray | Sequence[FloatArray]) -> Line:
+    """Points (n, 3) m as lists, to the tenth of a millimetre."""
+    return np.round(np.asarray(points, float), 4).tolist()
+
+
+def surroundings(profile: Profile) -> dict[str, Any]:
+    """What stays: workspace, table and keep-outs, m in the base frame."""
+    space, reach = profile.limits.workspace, profile.limits.reach
+    return {
+        "workspace": [list(space.x_m), list(space.y_m), list(space.z_m)],
+        "table_z_m": reach.table_z_m,
+        "keep_out": {
+            name: shape.model_dump(exclude_none=True) for name, shape in reach.keep_out.items()
+        },
+    }
+
+
+class ArmLines:
+    """Lines of the arm and of what it is about to do.
+
+    Args:
+        kinematics: of the arm; it is used by one thread.
+    """
+
+    def __init__(self, kinematics: Kinematics) -> None:
+        self._kinematics = kinematics
+
+    def links(self, joints_rad: FloatArray) -> Line:
+        """Base, joints and TCP at joint positions (n,), along the arm."""
+        kinematics = self._kinematics
+        tcp = kinematics.forward(joints_rad)
+        placements = list(kinematics.data.oMi)[1:]
+        joints = [kinematics.base_placement.actInv(each).translation for each in placements]
+        return rounded([np.zeros(3), *joints, tcp.position_m])
+
+    def links_of(self, state: JointState) -> Line:
+        """The same, measured.
+
+        Raises:
+            RecordError: it is not of this arm.
+        """
+        return self.links(self._kinematics.joints_of(state))
+
+    def tcp(self, names: Sequence[str], joints_rad: FloatArray) -> list[float]:
+        """Position of the TCP, m.
+
+        Raises:
+            RecordError: it is not of this arm.
+        """
+        pose = self._kinematics.forward(self._kinematics.ordered(names, joints_rad))
+        return rounded([pose.position_m])[0]
+
+    def chunk(
+        self, chunk: ActionChunk, spec: ModelSpec, start: Pose, state: JointState | None
+    ) -> Line:
+        """Path of the TCP that a chunk asks for.
+
+        Args:
+            chunk: of `spec`.
+            spec: of its worker.
+            start: where it begins, with poses.
+            state: where it begins, with joints; None: unknown.
+
+        Raises:
+            RecordError: it does not fit the spec.
+        """
+        action, steps = spec.action, chunk.steps[:MAX_LINE]
+        if steps.shape[1] != action.dimension:
+            raise RecordError(f"a step has {steps.shape[1]} numbers, not {action.dimension}")
+        if action.space == "tcp":
+            poses = chunk_poses(action, steps, start)
+            return rounded([start.position_m, *(pose.position_m for pose in poses)])
+        if state is None:
+            return []
+        first = self._kinematics.joints_of(state)
+        if set(action.joints) != set(self._kinematics.arm_joints):
+            raise RecordError("its joints are not those of the arm")
+        order = [action.joints.index(name) for name in self._kinematics.arm_joints]
+        before = anchor = first[np.argsort(order)]
+        line = [self._kinematics.forward(first).position_m]
+        for step in steps:
+            before = step_joints(action, np.asarray(step, np.float64), before, anchor)
+            line.append(self._kinematics.forward(before[order]).position_m)
+        return rounded(line)

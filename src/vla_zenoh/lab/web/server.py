@@ -1,0 +1,530 @@
+"""The server of the page: static files, two WebSockets for each page, ``/stop`` and ``/metrics``.
+
+``/control`` carries state and requests, ``/pictures`` pictures alone, so that a picture on a slow
+link holds up neither a stop nor the echo of a tick. A page proves who it is by a token in its first
+message: there is no cookie that a foreign page could make a browser send.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import time
+from collections import Counter, deque
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from vla_zenoh.errors import CodecError, MissingExtraError, VlaZenohError
+from vla_zenoh.lab.teleop.policy import OperatorInput
+from vla_zenoh.lab.web import metrics
+from vla_zenoh.lab.web.access import People, Person, RateLimit, host_is_ours, origin_is_ours
+from vla_zenoh.lab.web.arm import surroundings
+from vla_zenoh.lab.web.pictures import Pictures
+from vla_zenoh.lab.web.requests import Request, parse
+from vla_zenoh.lab.web.robot_link import RobotLink
+from vla_zenoh.lab.web.tables import node_table, noted_event
+
+try:
+    import uvicorn  # noqa: F401  # pyright: ignore[reportMissingImports]
+    from starlette.applications import Starlette  # pyright: ignore[reportMissingImports]
+    from starlette.requests import Request as HttpRequest  # pyright: ignore[reportMissingImports]
+    from starlette.responses import Response  # pyright: ignore[reportMissingImports]
+    from starlette.routing import Route, WebSocketRoute  # pyright: ignore[reportMissingImports]
+    from starlette.websockets import (  # pyright: ignore[reportMissingImports]
+        WebSocket,
+        WebSocketDisconnect,
+    )
+except ImportError as error:
+    raise MissingExtraError(error.name or "starlette", "web") from error
+
+STATIC = Path(__file__).parent / "static"
+FILES = {
+    "/": ("page.html", "text/html; charset=utf-8"),
+    "/page.js": ("page.js", "text/javascript; charset=utf-8"),
+    "/page.css": ("page.css", "text/css; charset=utf-8"),
+}
+HEADERS = {
+    "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "img-src 'self' blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'",
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+    "permissions-policy": "camera=(), microphone=(), geolocation=()",
+    "cache-control": "no-store",
+}
+STATE_S, NODES_S = 0.05, 1.0
+ENTER_S = 5.0
+DENIED_S = 0.5
+"""A wrong token is answered this late."""
+STOP_AGAIN_S = 0.1
+MAX_PAGES, MAX_ANSWERS, MAX_NEWS = 32, 200, 300
+RATE_HZ, BURST = 50.0, 100.0
+"""Requests of one page; a stop is always taken."""
+MAX_PICTURE_HZ, IN_FLIGHT, PICTURE_POLL_S = 30.0, 2, 0.01
+"""Pictures sent that a page has not drawn yet: with more, a slow one would see the past."""
+POLICY_VIOLATION, TRY_LATER = 1008, 1013
+OPERATORS_ONLY = "your token is a viewer's, which may look and nothing else"
+Send = Callable[[dict[str, Any]], None]
+
+
+class Page:
+    """One open page: what waits to be sent to it.
+
+    Args:
+        number: of its connection.
+        person: who it is.
+    """
+
+    def __init__(self, number: int, person: Person) -> None:
+        self.number, self.person = number, person
+        self.limit = RateLimit(RATE_HZ, BURST, time.monotonic())
+        self.complaints = RateLimit(5.0, 10.0, time.monotonic())
+        self.answers: deque[str] = deque(maxlen=MAX_ANSWERS)
+        self.busy = ""
+        self.changed = asyncio.Event()
+
+    @property
+    def drives(self) -> bool:
+        """Whether this person may drive."""
+        return self.person.role == "operator"
+
+    def tell(self, message: dict[str, Any]) -> None:
+        """Send a message as soon as the connection takes it; the oldest give way."""
+        self.answers.append(json.dumps(message))
+        self.changed.set()
+
+
+class PageServer:
+    """Application of the page of one robot.
+
+    Args:
+        link: to the robot.
+        people: who may use it.
+        names: of this server, for the header ``Host``.
+        secure: it is served by TLS.
+    """
+
+    def __init__(
+        self, link: RobotLink, people: People, names: Iterable[str], *, secure: bool
+    ) -> None:
+        self._link, self._people = link, people
+        self._names, self._secure = tuple(names), secure
+        self._pictures = Pictures(link.session, link.keys, link.profile.cameras)
+        self._pages: dict[int, Page] = {}
+        self._next = 0
+        self._news: deque[dict[str, Any]] = deque(maxlen=MAX_NEWS)
+        self._state = ""
+        self._looking = 0
+        self.counters: Counter[str] = link.counters
+        # Stops have threads of their own: those of other requests may all be waiting.
+        self._stops = ThreadPoolExecutor(2, thread_name_prefix="stop")
+        self._stopping: asyncio.Future[dict[str, Any]] | None = None
+        self._stop_s = 0.0
+        self._tasks: set[asyncio.Task[Any]] = set()
+        routes = [Route(path, self._file) for path in FILES]
+        routes += [
+            Route("/favicon.ico", lambda _: Response(status_code=204)),
+            Route("/metrics", self._metrics),
+            Route("/stop", self._stop_by_post, methods=["POST"]),
+            WebSocketRoute("/control", self._control),
+            WebSocketRoute("/pictures", self._show_pictures),
+        ]
+        self._application = Starlette(routes=routes, lifespan=self._lifespan)
+
+    # -- access -------------------------------------------------------------------------------
+    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+        """ASGI: rejects foreign hosts and origins before anything else."""
+        if scope["type"] not in ("http", "websocket"):
+            await self._application(scope, receive, send)
+            return
+        headers = {
+            name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]
+        }
+        host, origin = headers.get("host", ""), headers.get("origin", "")
+        why = ""
+        if not host_is_ours(host, self._names):
+            why = f"this server is not called {host[:100]!r}: start it with --name"
+        elif (scope["type"] == "websocket" or scope["method"] != "GET") and not origin_is_ours(
+            origin, host, secure=self._secure
+        ):
+            why = "another site's page must not use this one"
+        if not why:
+            await self._application(scope, receive, _with_headers(send))
+            return
+        self.counters["foreign"] += 1
+        if scope["type"] == "websocket":
+            await send({"type": "websocket.close", "code": POLICY_VIOLATION})
+            return
+        response = Response(f"{why}\n", 403, media_type="text/plain")
+        await response(scope, receive, _with_headers(send))
+
+    async def _person(self, token: str) -> Person | None:
+        person = self._people.find(token)
+        if person is None:
+            self.counters["denied"] += 1
+            await asyncio.sleep(DENIED_S)
+        return person
+
+    async def _bearer(self, request: HttpRequest) -> Person | None:
+        kind, _, token = request.headers.get("authorization", "").partition(" ")
+        return await self._person(token.strip() if kind.lower() == "bearer" else "")
+
+    # -- HTTP ---------------------------------------------------------------------------------
+    async def _file(self, request: HttpRequest) -> Response:
+        name, kind = FILES[request.url.path]
+        return Response((STATIC / name).read_bytes(), headers={"content-type": kind})
+
+    async def _metrics(self, request: HttpRequest) -> Response:
+        if await self._bearer(request) is None:
+            return Response("send a token of this page: Authorization: Bearer TOKEN\n", 401)
+        text = metrics.exposition(self._link.rows(), self.counters, len(self._pages))
+        return Response(text, headers={"content-type": metrics.CONTENT_TYPE_LATEST})
+
+    async def _stop_by_post(self, request: HttpRequest) -> Response:
+        """The way of a page whose WebSocket is broken."""
+        person = await self._bearer(request)
+        if person is None or person.role != "operator":
+            return Response(OPERATORS_ONLY if person else "no such token", 403)
+        return Response(json.dumps(await self._stop(person)), media_type="application/json")
+
+    # -- state --------------------------------------------------------------------------------
+    @contextlib.asynccontextmanager
+    async def _lifespan(self, _: Any) -> AsyncIterator[None]:
+        task = asyncio.create_task(self._watch())
+        try:
+            yield
+        finally:
+            task.cancel()
+            for page in list(self._pages):
+                self._link.release(page, gone=True)
+            self._stops.shutdown(wait=False)
+
+    async def _watch(self) -> None:
+        nodes_s = 0.0
+        while True:
+            now_s = time.monotonic()
+            self._link.poll()
+            for event in self._link.client.pop_events():
+                news = noted_event(*event)
+                self._news.append(news)
+                self._tell_all(news)
+            if self._pages:
+                state = {**self._link.state(), "arm": self._link.arm(), "pages": len(self._pages)}
+                self._state = json.dumps(state)[1:]
+                if now_s - nodes_s > NODES_S:
+                    nodes_s = now_s
+                    self._tell_all(self._node_message())
+                    self._tell_all({"is": "recording", **self._link.recordings.described()})
+                for page in self._pages.values():
+                    page.changed.set()
+            await asyncio.sleep(max(0.0, now_s + STATE_S - time.monotonic()))
+
+    def _node_message(self) -> dict[str, Any]:
+        return {"is": "nodes", **node_table(self._link.client), "counters": dict(self.counters)}
+
+    def _tell_all(self, message: dict[str, Any]) -> None:
+        for page in self._pages.values():
+            page.tell(message)
+
+    # -- the control socket -------------------------------------------------------------------
+    async def _enter(self, socket: WebSocket) -> Person | None:
+        """Who is there, by the first message."""
+        await socket.accept()
+        try:
+            request = parse(await asyncio.wait_for(_receive(socket), ENTER_S))
+            token = request.values["token"] if request.do == "enter" else ""
+        except (CodecError, TimeoutError):
+            token = ""
+        person = await self._person(token)
+        if person is None:
+            await socket.send_text(json.dumps({"is": "denied", "why": "no such token"}))
+            await socket.close(POLICY_VIOLATION)
+        return person
+
+    async def _control(self, socket: WebSocket) -> None:
+        sending = None
+        page = None
+        try:
+            person = await self._enter(socket)
+            if person is None:
+                return
+            if len(self._pages) >= MAX_PAGES:
+                await socket.close(TRY_LATER)
+                return
+            self._next += 1
+            page = self._pages[self._next] = Page(self._next, person)
+            self._welcome(page)
+            sending = asyncio.create_task(self._send_state(page, socket))
+            while True:
+                await self._read(page, await _receive(socket))
+        except (WebSocketDisconnect, RuntimeError):  # Starlette: sent after the end
+            pass
+        finally:
+            if page is not None:
+                self._link.release(page.number, gone=True)
+                del self._pages[page.number]
+            if sending is not None:
+                sending.cancel()
+
+    def _welcome(self, page: Page) -> None:
+        link = self._link
+        page.tell(
+            {
+                "is": "welcome",
+                "robot": link.keys.robot,
+                "person": page.person.name,
+                "drives": page.drives,
+                "cameras": self._pictures.cameras if page.drives else (),
+                "surroundings": surroundings(link.profile),
+                "no_arm": link.no_arm,
+                "insecure": link.profile.session.insecure,
+                "levels": link.hand.speeds_m_s,
+            }
+        )
+        for news in self._news:
+            page.tell(news)
+        page.tell(self._node_message())
+
+    async def _send_state(self, page: Page, socket: WebSocket) -> None:
+        with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+            while True:
+                await page.changed.wait()
+                page.changed.clear()
+                while page.answers:
+                    await socket.send_text(page.answers.popleft())
+                if not self._state:
+                    continue
+                tick, holds = int(time.monotonic() * 1e3), self._link.holds(page.number)
+                start = json.dumps({"is": "state", "tick": tick, "you_hold": holds})
+                await socket.send_text(f"{start[:-1]}, {self._state}")
+
+    async def _read(self, page: Page, text: str) -> None:
+        try:
+            request = parse(text)
+        except CodecError as error:
+            self._complain(page, "bad_message", str(error))
+            return
+        if not page.limit.take(time.monotonic()) and request.do != "stop":
+            self._complain(page, "too_fast", f"more than {RATE_HZ:g} messages per second")
+            return
+        self.counters["message"] += 1
+        if not page.drives:
+            self._complain(page, "not_allowed", OPERATORS_ONLY)
+            return
+        await self._obey(page, request)
+
+    def _complain(self, page: Page, what: str, why: str) -> None:
+        """Count a message that is not obeyed, and answer it, unless they are very many."""
+        self.counters[what] += 1
+        if page.complaints.take(time.monotonic()):
+            page.tell({"is": "rejected", "what": what, "why": why})
+
+    # -- requests -----------------------------------------------------------------------------
+    async def _obey(self, page: Page, request: Request) -> None:
+        link, values = self._link, request.values
+        if request.do == "stop":
+            self._begin(self._stop(page.person))
+        elif request.do == "hold":
+            self._press(page, values["press"], values["tick"])
+        elif request.do == "beat":
+            hand = OperatorInput(tuple(values["twist"]), values["opening"])
+            if not link.beat(page.number, values["press"], values["tick"], hand):
+                page.tell({"is": "hold_ended", "press": values["press"]})
+        elif request.do == "release":
+            link.release(page.number)
+        elif request.do in SETTINGS:
+            self._change(page, request.do, lambda: SETTINGS[request.do](link, values))
+        else:
+            self._complain(page, "bad_message", f"{request.do} is no request of this socket")
+
+    def _press(self, page: Page, press: int, tick_ms: int) -> None:
+        try:
+            self._link.press(page.number, press, tick_ms)
+        except VlaZenohError as error:
+            page.tell({"is": "hold_ended", "press": press, "why": str(error)})
+            return
+        name = page.person.name
+        self._change(page, "hold", lambda: self._link.activate_held(page.number, name), press)
+
+    def _change(self, page: Page, what: str, call: Callable[[], Any], press: int = 0) -> None:
+        """Run what waits for the robot on a thread, one at a time for a page, and tell its end."""
+        if page.busy:
+            self._complain(page, "busy", f"still waiting for {page.busy}")
+            if what == "hold":
+                self._link.release(page.number)
+            return
+        page.busy = what
+
+        async def run() -> None:
+            answer: dict[str, Any] = {"is": "done", "what": what, "press": press}
+            try:
+                found = await asyncio.to_thread(call)
+                if isinstance(found, str):
+                    answer["text"] = found
+            except VlaZenohError as error:
+                first, *reasons = str(error).split("\n  - ")
+                answer |= {"is": "failed", "why": first.rstrip(":"), "reasons": reasons}
+            finally:
+                page.busy = ""
+            page.tell(answer)
+
+        self._begin(run())
+
+    async def _stop(self, person: Person) -> dict[str, Any]:
+        """Stop the robot; all that are asked for while one is confirmed share its report."""
+        self.counters["stop"] += 1
+        now_s = time.monotonic()
+        if self._stopping is None or self._stopping.done():
+            self._stopping = asyncio.ensure_future(self._stop_and_tell(person))
+        elif now_s - self._stop_s > STOP_AGAIN_S:  # somebody may have reset it meanwhile
+            self._stops.submit(self._link.client.stop)
+        else:
+            return await asyncio.shield(self._stopping)
+        self._stop_s = now_s
+        return await asyncio.shield(self._stopping)
+
+    async def _stop_and_tell(self, person: Person) -> dict[str, Any]:
+        """Stop the robot, and tell every page who did, and when it stood."""
+        loop = asyncio.get_running_loop()
+        report = await loop.run_in_executor(self._stops, self._link.stop)
+        report = {"is": "stopped", "by": person.name, **report}
+        self._tell_all(report)
+        return report
+
+    def _begin(self, work: Awaitable[Any]) -> None:
+        task = asyncio.ensure_future(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    # -- the socket of pictures ---------------------------------------------------------------
+    async def _show_pictures(self, socket: WebSocket) -> None:
+        look = Look(time.monotonic())
+        sending = None
+        try:
+            person = await self._enter(socket)
+            if person is None:
+                return
+            if person.role != "operator":  # as `security.roles`: pictures show people
+                await socket.close(POLICY_VIOLATION)
+                return
+            if self._looking >= MAX_PAGES:
+                await socket.close(TRY_LATER)
+                return
+            self._looking += 1
+            try:
+                sending = asyncio.create_task(self._send_pictures(look, socket))
+                while True:
+                    self._read_look(look, await _receive(socket))
+            finally:
+                self._looking -= 1
+        except (WebSocketDisconnect, RuntimeError):
+            pass
+        finally:
+            if sending is not None:
+                sending.cancel()
+            self._pictures.change(look.streams, ())
+
+    def _read_look(self, look: Look, text: str) -> None:
+        try:
+            request = parse(text)
+            if not look.limit.take(time.monotonic()):
+                self.counters["too_fast"] += 1
+            elif request.do == "look":
+                self._pictures.change(look.streams, request.values["streams"])
+                look.streams = tuple(dict.fromkeys(request.values["streams"]))
+                look.period_s = 1 / min(max(request.values["hz"], 0.1), MAX_PICTURE_HZ)
+            elif request.do == "drawn":
+                look.drawn = max(look.drawn, min(request.values["frame"], look.sent))
+        except CodecError:
+            self.counters["bad_message"] += 1
+
+    async def _send_pictures(self, look: Look, socket: WebSocket) -> None:
+        """Send the newest picture of each stream, as fast as asked and as the page draws them."""
+        with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+            while True:
+                for name in look.due(time.monotonic(), self._pictures):
+                    picture = self._pictures.newest(name)
+                    if picture is None:
+                        continue
+                    look.sent += 1
+                    head = {
+                        "name": name,
+                        "frame": look.sent,
+                        "stamp_ms": picture.stamp_wall_ns // 1_000_000,
+                    }
+                    self.counters["picture"] += 1
+                    self.counters["picture_bytes"] += len(picture.jpeg)
+                    await socket.send_bytes(json.dumps(head).encode() + b"\n" + picture.jpeg)
+                await asyncio.sleep(PICTURE_POLL_S)
+
+
+class Look:
+    """What a page looks at.
+
+    Args:
+        now_s: monotonic.
+    """
+
+    def __init__(self, now_s: float) -> None:
+        self.streams: tuple[str, ...] = ()
+        self.period_s = 0.1
+        self.sent = self.drawn = 0
+        self.limit = RateLimit(4 * MAX_PICTURE_HZ, 100.0, now_s)
+        self._last: dict[str, tuple[int, float]] = {}
+
+    def due(self, now_s: float, pictures: Pictures) -> list[str]:
+        """Streams of which a newer picture may be sent now."""
+        found: list[str] = []
+        for name in self.streams:
+            room = self.sent + len(found) - self.drawn < IN_FLIGHT * len(self.streams)
+            count, sent_s = self._last.get(name, (0, -1e9))
+            newer = pictures.count(name)
+            if room and newer != count and now_s - sent_s >= self.period_s:
+                self._last[name] = (newer, now_s)
+                found.append(name)
+        return found
+
+
+async def _receive(socket: WebSocket) -> str:
+    """The next text of a browser.
+
+    Raises:
+        WebSocketDisconnect: it is gone.
+    """
+    message = await socket.receive()
+    if message["type"] == "websocket.disconnect":
+        raise WebSocketDisconnect(message.get("code") or 1006)
+    return message.get("text") or ""  # bytes are no request, and neither is ""
+
+
+def _with_headers(send: Any) -> Any:
+    """`send` with `HEADERS` on every response."""
+
+    async def sending(message: Any) -> None:
+        if message["type"] == "http.response.start":
+            more = [(name.encode(), value.encode()) for name, value in HEADERS.items()]
+            message = {**message, "headers": [*message.get("headers", ()), *more]}
+        await send(message)
+
+    return sending
+
+
+SETTINGS: dict[str, Callable[[RobotLink, Any], Any]] = {
+    "prompt": lambda link, given: link.client.set_prompt(given["text"]),
+    "worker": lambda link, given: link.client.set_worker(given["name"]),
+    "rate": lambda link, given: link.client.set_rate(given["hz"]),
+    "speed": lambda link, given: link.client.set_speed(given["percent"]),
+    "activate": lambda link, _: link.client.activate(),
+    "deactivate": lambda link, _: link.deactivate(),
+    "reset": lambda link, _: link.reset(),
+    "jog": lambda link, given: (
+        link.hand.take(given["frame"], given["level"]) if given["on"] else link.hand.give_back()
+    ),
+    "record": lambda link, given: link.record(given["on"], given["verdict"], given["note"]),
+}
+"""Request -> what changes the robot; it waits for the confirmation."""

@@ -1,0 +1,472 @@
+"use strict";
+// The page of one robot. Text of the robot only ever becomes textContent, never markup.
+
+const BEAT_MS = 100, SILENT_MS = 1000, POST_MS = 300, GIVE_UP_MS = 4000, PICTURE_HZ = 15, EVENTS = 200;
+const $ = (id) => document.getElementById(id);
+const AXES = ["x", "y", "z", "rx", "ry", "rz"];
+const NONE = [0, 0, 0, 0, 0, 0];
+
+let token = "", control = null, pictures = null;
+let state = {}, welcome = { drives: false }, heardMs = 0, tick = 0;
+let press = Math.floor(Math.random() * 1e6), holding = 0, beatTimer = 0, twist = NONE, opening = 0;
+let stopping = 0, stopTimer = 0;
+
+function el(tag, text, properties = {}, ...children) {
+  const made = Object.assign(document.createElement(tag), properties);
+  if (text !== null && text !== undefined) made.textContent = text;
+  made.append(...children);
+  return made;
+}
+const seconds = (value) => (value === null || value === undefined ? "?" : `${value.toFixed(2)} s`);
+const clock = (ms) => new Date(ms).toLocaleTimeString([], { hour12: false, hour: "2-digit", minute: "2-digit", second: "2-digit" });
+function setText(node, text) { if (node.textContent !== text) node.textContent = text; }
+
+// -- connection ---------------------------------------------------------------------------
+function socketTo(path) {
+  return new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}${path}`);
+}
+
+function connect() {
+  const socket = (control = socketTo("/control"));
+  socket.onopen = () => socket.send(JSON.stringify({ do: "enter", token }));
+  socket.onmessage = (event) => { heardMs = performance.now(); receive(JSON.parse(event.data)); };
+  socket.onclose = (event) => {
+    if (control !== socket) return;
+    control = null;
+    endHold();
+    showLink();
+    if (event.code !== 1008) setTimeout(connect, 1000);
+  };
+}
+
+function send(message) {
+  if (!control || control.readyState !== WebSocket.OPEN) return false;
+  control.send(JSON.stringify(message));
+  return true;
+}
+
+const DONE = { hold: "active while you hold", activate: "active", prompt: "prompt set", worker: "model chosen", rate: "rate set", speed: "speed set", jog: "done" };
+const RECEIVE = {
+  state: showState,
+  nodes: showNodes,
+  event: showEvent,
+  welcome: enter,
+  denied: (message) => askToken(message.why),
+  done: (message) => answer(message.text || DONE[message.what] || "done", [], "good"),
+  failed: (message) => { if (message.what === "hold") endHold(); answer(message.why, message.reasons, "bad"); },
+  rejected: (message) => answer(`${message.what}: ${message.why}`, [], "bad"),
+  hold_ended: (message) => { if (message.press === press) endHold(message.why || "the hold ended: press again"); },
+  stopped: showStopped,
+  recording: showRecording,
+};
+function receive(message) { (RECEIVE[message.is] || (() => {}))(message); }
+
+function askToken(why) {
+  sessionStorage.removeItem("token");
+  if (why) $("enter-why").textContent = `Not accepted: ${why}. The token is in the line that vla-zenoh web printed, or in its file of people.`;
+  if (!$("enter").open) $("enter").showModal();
+}
+$("enter").addEventListener("cancel", (event) => event.preventDefault());
+$("enter-form").addEventListener("submit", () => { useToken($("token").value.trim()); $("token").value = ""; });
+
+function useToken(given) {
+  token = given;
+  sessionStorage.setItem("token", token);
+  connect();
+}
+
+function enter(message) {
+  welcome = message;
+  document.title = `${message.robot} - vla-zenoh`;
+  $("robot").textContent = message.robot;
+  $("who").textContent = `${message.person}, ${message.drives ? "operator" : "viewer"}`;
+  for (const node of document.querySelectorAll(".drives")) node.disabled = !message.drives;
+  for (const node of document.querySelectorAll(".operator")) node.hidden = !message.drives;
+  $("stop").disabled = !message.drives;
+  $("look").hidden = !message.drives;
+  if (!message.drives) $("hold-help").textContent = "A viewer may look. Stop at the robot, or ask an operator.";
+  warn(message.insecure ? "Insecure profile: anyone on the network can command this robot." : "");
+  $("arm-words").textContent = message.no_arm;
+  $("keep-out-legend").hidden = !Object.keys(message.surroundings.keep_out).length;
+  $("events").replaceChildren();
+  levels(message.levels || []);
+  if (message.drives) watchPictures();
+}
+
+function warn(text) { $("warning").hidden = !text; setText($("warning"), text); }
+
+function showLink() {
+  const silent = performance.now() - heardMs > SILENT_MS || !control || !state.is;
+  const late = !silent && state.silent_s > 2;
+  setText($("link"), silent ? "NOT CONNECTED" : late ? "robot silent" : "connected");
+  $("link").className = `badge ${silent || late ? "bad" : "good"}`;
+  if (silent) setText($("stop-words"), "Not connected: this page stops nothing. Use the robot's own emergency stop.");
+  else if ($("stop-words").textContent.startsWith("Not connected")) setText($("stop-words"), "");
+}
+setInterval(showLink, 250);
+
+// -- state --------------------------------------------------------------------------------
+const GOOD = ["active", "inferring", "running", "routing", "ok"], BAD = ["stopped", "fault", "dead", "missing", "crashed"];
+const level = (word) => (GOOD.includes(word) ? "good" : BAD.includes(word) ? "bad" : "warn");
+const MODES = { sim: "SIM", dry_run: "DRY RUN", live: "LIVE", unknown: "MODE UNKNOWN" };
+
+function showState(message) {
+  state = message;
+  tick = message.tick;
+  setText($("mode"), MODES[message.mode] || message.mode);
+  $("mode").className = `badge ${message.mode === "live" ? "bad" : "quiet"}`;
+  setText($("state"), message.state);
+  $("state").className = `badge ${level(message.state)}`;
+  const task = message.task;
+  if (task) {
+    if (!promptTyped) setUnlessFocused("prompt", task.prompt);
+    setUnlessFocused("rate", String(task.rate_hz));
+    if (document.activeElement !== $("speed")) { $("speed").value = task.speed_percent; setText($("speed-now"), `${task.speed_percent} %`); }
+    options($("worker"), [...new Set([...message.workers, task.worker])], task.worker);
+  }
+  const arm = message.arm || {};
+  facts([
+    ["why", message.why],
+    ["held by", message.held_by ? (message.you_hold ? `${message.held_by} (you)` : message.held_by) : task && task.active ? "nobody: it runs without a hold" : "nobody"],
+    ["arm", `${message.at_rest === null ? "unknown" : message.at_rest ? "stands" : "moves"}, ${((arm.speed_m_s || 0) * 100).toFixed(1)} cm/s`],
+    ["gripper", arm.width_m === undefined ? "" : `${(arm.width_m * 1000).toFixed(0)} mm${arm.holding ? ", holds an object" : ""}`],
+    ["limits", message.limits.join("; ")],
+    ["pages", String(message.pages)],
+  ]);
+  $("take").setAttribute("aria-pressed", String(message.jog === true));
+  setText($("take"), message.jog ? "Hand back" : "Take the arm");
+  for (const button of $("pad").children) button.disabled = !message.jog;
+  streams(message.seen || []);
+  drawArm(arm);
+  if (stopping && message.state === "stopped") setText($("stop-words"), `${welcome.robot}: stopped, coming to rest`);
+  else if (message.state === "stopped" && !$("stop-words").textContent) setText($("stop-words"), `${welcome.robot} is stopped: ${message.why}`);
+}
+
+function setUnlessFocused(id, value) { if (document.activeElement !== $(id) && $(id).value !== value) $(id).value = value; }
+
+function options(select, names, chosen) {
+  if (document.activeElement === select) return;
+  if ([...select.options].map((one) => one.value).join() !== names.join())
+    select.replaceChildren(...names.map((name) => el("option", name, { value: name })));
+  if (select.value !== chosen) select.value = chosen;
+}
+
+function facts(pairs) {
+  const shown = pairs.filter(([, text]) => text);
+  const list = $("facts");
+  if (list.children.length !== 2 * shown.length)
+    list.replaceChildren(...shown.flatMap(() => [el("dt"), el("dd")]));
+  shown.forEach(([name, text], at) => { setText(list.children[2 * at], name); setText(list.children[2 * at + 1], text); });
+}
+
+function answer(text, reasons, how) {
+  const list = el("ul", null, {}, ...reasons.map((reason) => el("li", reason)));
+  $("answer").className = how;
+  $("answer").replaceChildren(el("span", text), ...(reasons.length ? [list] : []));
+}
+
+// -- requests -----------------------------------------------------------------------------
+let promptTyped = false; // until it is set, the state does not overwrite it
+$("prompt").addEventListener("input", () => { promptTyped = true; });
+$("prompt-form").addEventListener("submit", (event) => { event.preventDefault(); send({ do: "prompt", text: $("prompt").value }); promptTyped = false; $("prompt").blur(); });
+$("worker").addEventListener("change", () => { send({ do: "worker", name: $("worker").value }); $("worker").blur(); });
+$("rate").addEventListener("change", () => { send({ do: "rate", hz: Number($("rate").value) }); $("rate").blur(); });
+$("speed").addEventListener("input", () => setText($("speed-now"), `${$("speed").value} %`));
+$("speed").addEventListener("change", () => { send({ do: "speed", percent: Number($("speed").value) }); $("speed").blur(); });
+for (const name of ["activate", "deactivate", "reset"])
+  $(name).addEventListener("click", () => { answer(`${name}...`, [], "quiet"); send({ do: name }); });
+
+// -- stop ---------------------------------------------------------------------------------
+function stop() {
+  if (!welcome.drives) return;
+  endHold();
+  const began = (stopping = performance.now());
+  setText($("stop-words"), `stopping ${welcome.robot}...`);
+  const sent = send({ do: "stop" });
+  clearTimeout(stopTimer);
+  if (!sent) post(began);
+  else setTimeout(() => { if (stopping === began && state.state !== "stopped") post(began); }, POST_MS);
+  stopTimer = setTimeout(() => { if (stopping === began) unconfirmed(); }, GIVE_UP_MS);
+}
+function post(began) {
+  fetch("/stop", { method: "POST", headers: { Authorization: `Bearer ${token}` } })
+    .then((found) => found.json())
+    .then((report) => { if (stopping === began) showStopped(report); })
+    .catch(() => { if (stopping === began) unconfirmed(); });
+}
+function unconfirmed() {
+  stopping = 0;
+  setText($("stop-words"), `${welcome.robot} did NOT confirm the stop. Use the robot's own emergency stop.`);
+}
+function showStopped(report) {
+  const mine = stopping ? performance.now() - stopping : 0;
+  stopping = 0;
+  if (!report.stopped) { unconfirmed(); return; }
+  const stood = report.stands_s === null ? "but it was not seen to stand" :
+    `stood at ${clock(report.at_ms)}, ${seconds(mine ? mine / 1000 : report.stands_s)} after the ${mine ? "touch" : `stop by ${report.by}`}`;
+  setText($("stop-words"), `${report.robot} stopped: ${stood}. Reset clears it.`);
+  $("stop-words").dataset.standsMs = String(mine);
+}
+$("stop").addEventListener("pointerdown", (event) => { event.preventDefault(); stop(); });
+$("stop").addEventListener("keydown", (event) => { if (event.key === "Enter") stop(); });
+const typing = (node) => node.matches("input:not([type=range]), textarea, select");
+window.addEventListener("keydown", (event) => {
+  const enters = event.key === " " && (typing(event.target) || $("enter").open);
+  if (event.repeat || (event.key !== "Escape" && event.key !== " ") || enters) return;
+  event.preventDefault();
+  stop();
+}, true);
+
+// -- hold-to-run --------------------------------------------------------------------------
+function beginHold(way = NONE, grip = 0) {
+  twist = way;
+  opening = grip;
+  if (holding || !welcome.drives || !control) return;
+  press += 1;
+  holding = performance.now();
+  send({ do: "hold", press, tick });
+  beatTimer = setInterval(beat, BEAT_MS);
+  $("hold").classList.add("held");
+  setText($("hold"), "Let go to brake");
+}
+function beat() { send({ do: "beat", press, tick, twist, opening }); }
+function endHold(why) {
+  if (!holding) return;
+  holding = 0;
+  twist = NONE;
+  opening = 0;
+  clearInterval(beatTimer);
+  send({ do: "release" });
+  $("hold").classList.remove("held");
+  setText($("hold"), "Hold to run");
+  answer(why || "", [], "bad");
+}
+function holdable(button, begin) {
+  button.addEventListener("pointerdown", (event) => { event.preventDefault(); button.setPointerCapture(event.pointerId); begin(); });
+  for (const name of ["pointerup", "pointercancel", "lostpointercapture", "blur"]) button.addEventListener(name, () => endHold());
+  button.addEventListener("contextmenu", (event) => event.preventDefault());
+  button.addEventListener("keydown", (event) => { if (event.key === "Enter" && !event.repeat) begin(); });
+  button.addEventListener("keyup", (event) => { if (event.key === "Enter") endHold(); });
+}
+holdable($("hold"), () => beginHold());
+document.addEventListener("visibilitychange", () => { if (document.hidden) endHold(); });
+window.addEventListener("pagehide", () => endHold());
+window.addEventListener("blur", () => endHold());
+
+// -- by hand ------------------------------------------------------------------------------
+const WAYS = [["x+", "forward"], ["x-", "back"], ["y+", "left"], ["y-", "right"], ["z+", "up"], ["z-", "down"],
+  ["rx+", "roll +"], ["rx-", "roll -"], ["ry+", "pitch +"], ["ry-", "pitch -"], ["rz+", "yaw +"], ["rz-", "yaw -"]];
+for (const [way, name] of WAYS) {
+  const button = el("button", `${name} (${way})`, { disabled: true });
+  const at = AXES.indexOf(way.slice(0, -1)), size = way.endsWith("+") ? 1 : -1;
+  holdable(button, () => beginHold(NONE.map((_, axis) => (axis === at ? size : 0))));
+  $("pad").append(button);
+}
+for (const [name, size] of [["open gripper", 1], ["close gripper", -1]]) {
+  const button = el("button", name, { disabled: true });
+  holdable(button, () => beginHold(NONE, size));
+  $("pad").append(button);
+}
+function jog(on) { send({ do: "jog", on, frame: $("frame").value, level: Number($("level").value || 1) }); }
+function levels(given) {
+  $("level").replaceChildren(...given.map((speed, at) => el("option", `${(speed * 100).toFixed(0)} cm/s`, { value: at })));
+  $("level").value = "1";
+}
+$("take").addEventListener("click", () => jog(!state.jog));
+for (const id of ["frame", "level"]) $(id).addEventListener("change", () => { if (state.jog) jog(true); });
+
+// -- recording ----------------------------------------------------------------------------
+let recordingNow = false;
+$("record-start").addEventListener("click", () => send({ do: "record", on: !recordingNow, verdict: $("verdict").value, note: $("note").value }));
+function showRecording(message) {
+  recordingNow = message.on;
+  setText($("record-start"), message.on ? "Stop and keep" : "Record");
+  setText($("recording"), message.text);
+}
+
+// -- pictures -----------------------------------------------------------------------------
+let offered = "", chosen = null;
+const shown = new Map();
+function title(name) { // seen/WORKER/CAMERA is what the model is given
+  const [kind, one, camera] = name.split("/");
+  return kind === "camera" ? one : `${camera} as ${one} sees it`;
+}
+function streams(seen) {
+  const names = [...(welcome.cameras || []).map((name) => `camera/${name}`), ...seen];
+  if (!welcome.drives || names.join() === offered) return;
+  offered = names.join();
+  if (chosen === null) chosen = new Set((welcome.cameras || []).map((name) => `camera/${name}`));
+  $("streams").replaceChildren(...names.map((name) => {
+    const button = el("button", title(name), { type: "button", className: "small" });
+    button.setAttribute("aria-pressed", String(chosen.has(name)));
+    button.addEventListener("click", () => {
+      if (!chosen.delete(name)) chosen.add(name);
+      button.setAttribute("aria-pressed", String(chosen.has(name)));
+      look();
+    });
+    return button;
+  }));
+  look();
+}
+function watchPictures() {
+  const socket = (pictures = socketTo("/pictures"));
+  socket.binaryType = "arraybuffer";
+  socket.onopen = () => { socket.send(JSON.stringify({ do: "enter", token })); look(); };
+  socket.onclose = (event) => { if (pictures === socket && control && event.code !== 1008) setTimeout(watchPictures, 1000); };
+  socket.onmessage = async (event) => {
+    if (typeof event.data === "string") return;
+    const bytes = new Uint8Array(event.data), end = bytes.indexOf(10);
+    const head = JSON.parse(new TextDecoder().decode(bytes.subarray(0, end)));
+    try {
+      const image = await createImageBitmap(new Blob([bytes.subarray(end + 1)], { type: "image/jpeg" }));
+      draw(head, image);
+      image.close();
+    } catch { /* no picture: the next one may be */ }
+    if (socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify({ do: "drawn", frame: head.frame }));
+  };
+}
+function look() {
+  for (const name of shown.keys()) if (!chosen.has(name)) { shown.get(name).figure.remove(); shown.delete(name); }
+  for (const name of chosen || []) picture(name);
+  const wanted = document.hidden || chosen === null ? [] : [...chosen];
+  if (pictures && pictures.readyState === WebSocket.OPEN) pictures.send(JSON.stringify({ do: "look", streams: wanted, hz: PICTURE_HZ }));
+}
+document.addEventListener("visibilitychange", look);
+function picture(name) {
+  if (shown.has(name)) return shown.get(name);
+  const canvas = el("canvas", null, { width: 640, height: 480 }), caption = el("figcaption", title(name));
+  canvas.setAttribute("role", "img");
+  canvas.setAttribute("aria-label", `picture of ${title(name)}`);
+  const figure = el("figure", null, {}, canvas, caption);
+  $("pictures").append(figure);
+  shown.set(name, { figure, canvas, caption, frames: 0, sinceMs: performance.now(), latency: [] });
+  return shown.get(name);
+}
+function draw(head, image) {
+  if (!chosen.has(head.name)) return;
+  const view = picture(head.name);
+  if (view.canvas.width !== image.width || view.canvas.height !== image.height) { view.canvas.width = image.width; view.canvas.height = image.height; }
+  view.canvas.getContext("2d").drawImage(image, 0, 0);
+  view.frames += 1;
+  view.latency.push(Date.now() - head.stamp_ms);
+  const took = performance.now() - view.sinceMs;
+  if (took > 1000) {
+    const sorted = view.latency.sort((a, b) => a - b);
+    view.last = { hz: (1000 * view.frames) / took, ms: sorted[sorted.length >> 1] };
+    setText(view.caption, `${title(head.name)}: ${view.last.hz.toFixed(0)} Hz, ${view.last.ms} ms old`);
+    view.frames = 0; view.sinceMs = performance.now(); view.latency = [];
+  }
+}
+
+// -- the arm ------------------------------------------------------------------------------
+function drawArm(arm) {
+  const fixed = welcome.surroundings;
+  if (!fixed) return;
+  view($("side"), arm, fixed, 0, 2);
+  view($("top"), arm, fixed, 0, 1);
+  const at = arm.measured_m;
+  if (at && !welcome.no_arm) setText($("arm-words"), `TCP at x ${at[0].toFixed(3)}, y ${at[1].toFixed(3)}, z ${at[2].toFixed(3)} m in the base frame`);
+}
+function view(canvas, arm, fixed, across, up) {
+  const scale = window.devicePixelRatio || 1, size = Math.round(canvas.clientWidth * scale);
+  if (!size) return;
+  if (canvas.width !== size) canvas.width = canvas.height = size;
+  const style = getComputedStyle(document.documentElement), colour = (name) => style.getPropertyValue(`--${name}`);
+  const pen = canvas.getContext("2d"), box = fixed.workspace;
+  const points = [[0, 0, 0], [box[0][0], box[1][0], box[2][0]], [box[0][1], box[1][1], box[2][1]], ...(arm.links_m || [])];
+  const range = (axis) => [Math.min(...points.map((p) => p[axis])), Math.max(...points.map((p) => p[axis]))];
+  const [left, right] = range(across), [low, high] = range(up);
+  const zoom = (size * 0.9) / Math.max(right - left, high - low);
+  const X = (p) => size / 2 + zoom * (p[across] - (left + right) / 2), Y = (p) => size / 2 - zoom * (p[up] - (low + high) / 2);
+  pen.clearRect(0, 0, size, size);
+  pen.lineJoin = pen.lineCap = "round";
+  const line = (path, ink, width, dash = []) => {
+    pen.beginPath();
+    path.forEach((p, at) => (at ? pen.lineTo(X(p), Y(p)) : pen.moveTo(X(p), Y(p))));
+    Object.assign(pen, { strokeStyle: colour(ink), lineWidth: width * scale });
+    pen.setLineDash(dash.map((part) => part * scale));
+    pen.stroke();
+    pen.setLineDash([]);
+  };
+  const dot = (p, ink, radius, fill = true) => {
+    pen.beginPath();
+    pen.arc(X(p), Y(p), radius * scale, 0, 7);
+    Object.assign(pen, { fillStyle: colour(ink), strokeStyle: colour(ink), lineWidth: 2 * scale });
+    if (fill) pen.fill(); else pen.stroke();
+  };
+  const corner = (a, b) => { const p = [0, 0, 0]; p[across] = box[across][a]; p[up] = box[up][b]; return p; };
+  line([corner(0, 0), corner(1, 0), corner(1, 1), corner(0, 1), corner(0, 0)], "space", 1.5, [6, 5]);
+  if (up === 2 && fixed.table_z_m !== null) line([[left - 1, 0, fixed.table_z_m], [right + 1, 0, fixed.table_z_m]], "space", 1);
+  pen.globalAlpha = 0.35;
+  for (const shape of Object.values(fixed.keep_out)) keepOut(pen, shape, across, up, X, Y, zoom, colour("keep-out"));
+  pen.globalAlpha = 1;
+  if (arm.links_m) {
+    line(arm.links_m, "arm", 5);
+    for (const joint of arm.links_m.slice(0, -1)) dot(joint, "arm", 4);
+  }
+  if (arm.chunk_m && arm.chunk_m.length) {
+    line(arm.chunk_m, "chunk", 2.5);
+    for (const p of arm.chunk_m.slice(1)) dot(p, "chunk", 2);
+  }
+  if (arm.goal_m) dot(arm.goal_m, "goal", 8, false);
+  if (arm.command_m) dot(arm.command_m, "command", 5);
+  if (arm.measured_m) dot(arm.measured_m, "measured", 3);
+}
+function keepOut(pen, shape, across, up, X, Y, zoom, ink) {
+  const c = shape.centre_m;
+  pen.fillStyle = ink;
+  pen.beginPath();
+  if (shape.radius_m) pen.arc(X(c), Y(c), zoom * shape.radius_m, 0, 7);
+  else if (shape.box_m) {
+    const [a, b, h] = shape.box_m.map((edge) => edge / 2), turn = shape.yaw_rad || 0;
+    const corners = [[a, b], [-a, b], [-a, -b], [a, -b]].map(([x, y]) => [c[0] + x * Math.cos(turn) - y * Math.sin(turn), c[1] + x * Math.sin(turn) + y * Math.cos(turn)]);
+    const xs = corners.map((p) => p[0]);
+    const outline = up === 1 ? corners.map((p) => [...p, 0]) : [[Math.min(...xs), 0, c[2] - h], [Math.max(...xs), 0, c[2] - h], [Math.max(...xs), 0, c[2] + h], [Math.min(...xs), 0, c[2] + h]];
+    for (const p of outline) pen.lineTo(X(p), Y(p));
+  } else {
+    const n = shape.normal, size = Math.hypot(n[across], n[up]);
+    if (size < 0.05 * Math.hypot(...n)) return; // it is parallel to this view
+    const [nx, ny] = [n[across] / size, n[up] / size], far = 5;
+    for (const [along, deep] of [[far, 0], [-far, 0], [-far, far], [far, far]]) {
+      const p = [0, 0, 0];
+      p[across] = c[across] - ny * along - nx * deep;
+      p[up] = c[up] + nx * along - ny * deep;
+      pen.lineTo(X(p), Y(p));
+    }
+  }
+  pen.fill();
+}
+
+// -- nodes and log ------------------------------------------------------------------------
+const cells = (...texts) => texts.map((text) => (text instanceof Node ? el("td", null, {}, text) : el("td", text)));
+function showNodes(message) {
+  const pairs = (values, unit) => Object.entries(values).map(([name, value]) => `${name} ${value}${unit}`).join(", ");
+  $("node-rows").replaceChildren(...message.nodes.map((node) => el("tr", null, {}, ...cells(
+    node.name, el("span", node.state, { className: level(node.state) }), node.host, node.age_s === null ? "" : `${node.age_s} s`,
+    pairs(node.rates_hz, " Hz"), pairs(node.refused, ""), node.why))));
+  const stages = message.nodes.flatMap((node) => Object.entries(node.latency_ms).map(([stage, pair]) => [node.name, stage, ...pair]));
+  const most = Math.max(1, ...stages.map((row) => row[3]));
+  $("latency").replaceChildren(...stages.map(([node, stage, median, high]) => {
+    const bar = el("meter", null, { min: 0, max: most, value: median });
+    bar.setAttribute("aria-label", `${stage}, median`);
+    return el("tr", null, {}, ...cells(node, stage.replaceAll("_", " "), `${median} ms`, `${high} ms`, bar));
+  }));
+  const clocks = message.clocks.map((pair) => el("tr", null, {}, ...cells(pair.seen_from, pair.host, `${pair.round_trip_ms.toFixed(2)} ms`,
+    `${pair.offset_ms.toFixed(2)} ± ${pair.uncertainty_ms.toFixed(2)} ms`)));
+  $("clocks").replaceChildren(...(clocks.length ? clocks : [el("tr", null, {}, el("td", "all nodes run on one host", { colSpan: 4 }))]));
+  const down = Object.entries(message.hosts_down).map(([host, names]) => `Host ${host} does not run (${names.join(", ")}).`);
+  $("hosts-down").hidden = !down.length;
+  setText($("hosts-down"), down.join(" "));
+}
+function showEvent(event) {
+  const words = `${event.node}: ${event.what}${event.count > 1 ? ` (x${event.count})` : ""}${event.why ? `: ${event.why}` : ""}`;
+  const how = { error: "bad", warning: "warn" }[event.level] || "";
+  $("events").prepend(el("li", null, { className: how }, el("time", clock(event.at_ms)), words));
+  while ($("events").children.length > EVENTS) $("events").lastChild.remove();
+}
+
+// -- begin --------------------------------------------------------------------------------
+const given = decodeURIComponent(location.hash.slice(1)) || sessionStorage.getItem("token") || "";
+if (location.hash) history.replaceState(null, "", location.pathname); // the token stays out of the history
+if (given) useToken(given);
+else askToken("");

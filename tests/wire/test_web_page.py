@@ -1,0 +1,386 @@
+"""The page at a robot at work: its command as a process, browsers over real WebSockets."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import time
+from collections.abc import Iterator
+
+import pytest
+from camera_rig import PATIENCE_S, until
+from chain import READY_PATIENCE_S, Chain
+from web_rig import (
+    METRICS,
+    OPERATOR,
+    VIEWER,
+    Browser,
+    Site,
+    browsing,
+    serving,
+    write_people,
+)
+
+from vla_zenoh.lab.recording.reader import open_recording
+from vla_zenoh.lab.trial.verdict import verdict_in
+from vla_zenoh.lab.web.hold import HOLD_S
+
+pytest.importorskip("starlette", reason="needs the extra web")
+pytest.importorskip("uvicorn", reason="needs the extra web")
+parser = pytest.importorskip("prometheus_client.openmetrics.parser")
+
+from websockets.exceptions import ConnectionClosed, InvalidStatus  # noqa: E402
+
+GARBAGE = 10_000
+STILL_MM = 2.0
+BRAKE_S = 0.5
+"""A brake from the speed of these motions, on a busy computer."""
+
+
+@pytest.fixture(scope="module")
+def site(shared_chain: Chain, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
+    people = write_people(tmp_path_factory.mktemp("people"))
+    with serving(shared_chain.profile_file, people) as site:
+        yield site
+
+
+def hold_until_it_moves(chain: Chain, browser: Browser) -> None:
+    """Press, as a person does who tries again while something is not ready yet."""
+    chain.client.set_prompt("HARD: go up" if chain.height_m() < 0.42 else chain.down)
+    give_up_s = time.monotonic() + READY_PATIENCE_S
+    while True:
+        browser.heard.clear()
+        browser.hold()
+        ended = until("an answer", lambda: browser.answers("done") + browser.answers("failed"))
+        if ended[0]["is"] == "done":
+            break
+        assert time.monotonic() < give_up_s, ended
+        browser.let_go()
+    chain.until("it moves", chain.moves)
+
+
+def test_a_stop_of_the_page_says_which_robot_stood_when(chain: Chain, site: Site) -> None:
+    with browsing(site) as browser, browsing(site, VIEWER) as other:
+        hold_until_it_moves(chain, browser)
+        since_ns = time.time_ns()
+        browser.send(do="stop")
+        report = browser.wait("stopped")
+        assert chain.state() == "stopped"
+        assert report["robot"] == chain.profile.robot.name
+        assert report["by"] == "anna"
+        assert report["stopped"]
+        assert 0 < report["stopped_s"] <= report["stands_s"]
+        assert other.wait("stopped") == report
+        chain.wait_still()
+        assert chain.recorder.track(since_ns).time_to_stand_s(since_ns) <= report["stands_s"] + 0.1
+        assert browser.ask(do="activate")["is"] == "failed"
+        assert browser.ask(do="reset")["text"] == "cleared; inactive"
+        assert chain.state() == "inactive"
+
+
+def test_a_stop_goes_by_post_where_the_socket_is_broken(chain: Chain, site: Site) -> None:
+    ours = {"Origin": f"http://{site.host}", "Authorization": f"Bearer {OPERATOR}"}
+    status, _, body = site.ask("POST", "/stop", ours)
+    assert status == 200
+    assert json.loads(body)["stopped"]
+    assert chain.state() == "stopped"
+
+
+def test_nobody_else_stops_by_post(chain: Chain, site: Site) -> None:
+    ours = {"Origin": f"http://{site.host}", "Authorization": f"Bearer {OPERATOR}"}
+    for change in (
+        {"Authorization": "Bearer another"},
+        {"Authorization": ""},
+        {"Authorization": f"Bearer {VIEWER}"},
+        {"Origin": "http://evil.example"},
+        {"Origin": ""},
+        {"Host": "evil.example"},
+    ):
+        assert site.ask("POST", "/stop", {**ours, **change})[0] == 403, change
+    assert chain.state() == "inactive"
+
+
+def test_the_arm_runs_while_the_button_is_held_and_brakes_when_let_go(
+    chain: Chain, site: Site
+) -> None:
+    with browsing(site) as browser:
+        hold_until_it_moves(chain, browser)
+        until("the page says so", lambda: browser.state["you_hold"])
+        assert browser.state["held_by"].startswith("web-anna-")
+        time.sleep(2 * HOLD_S)  # echoes keep it
+        assert chain.state() == "active"
+        browser.let_go()
+        chain.until("inactive", lambda: chain.state() == "inactive")
+        chain.wait_still()
+        # A person let go: that is nothing to be told about at the next activation.
+        assert chain.detail("why") == "deactivated"
+
+
+def test_a_closed_tab_brakes_the_arm(chain: Chain, site: Site) -> None:
+    with browsing(site) as browser:
+        hold_until_it_moves(chain, browser)
+        since_ns = time.time_ns()
+        browser.vanish()
+        chain.until("inactive", lambda: chain.state() == "inactive")
+        chain.wait_still()
+        assert chain.recorder.track(since_ns).time_to_stand_s(since_ns) < HOLD_S + BRAKE_S
+
+
+def test_a_tablet_that_sleeps_brakes_the_arm(chain: Chain, site: Site) -> None:
+    with browsing(site) as browser:
+        hold_until_it_moves(chain, browser)
+        since_ns = time.time_ns()
+        browser.freeze()
+        chain.until("inactive", lambda: chain.state() == "inactive")
+        chain.wait_still()
+        assert chain.recorder.track(since_ns).time_to_stand_s(since_ns) < HOLD_S + BRAKE_S
+
+
+def test_echoes_that_a_network_kept_back_do_not_keep_the_arm_in_motion(
+    chain: Chain, site: Site
+) -> None:
+    with browsing(site) as browser:
+        hold_until_it_moves(chain, browser)
+        browser.echoes = False
+        browser.wait("hold_ended")
+        chain.until("inactive", lambda: chain.state() == "inactive")
+        browser.echoes = True  # the network is well again: the same press stays ended
+        time.sleep(2 * HOLD_S)
+        assert chain.state() == "inactive"
+
+
+def test_a_killed_server_brakes_the_arm(chain: Chain, site: Site) -> None:
+    people = write_people(chain.profile_file.parent)
+    with serving(chain.profile_file, people) as second:
+        browser = Browser(second)
+        hold_until_it_moves(chain, browser)
+        os.kill(second.process.pid, signal.SIGKILL)
+        second.process.wait()
+        chain.until("inactive", lambda: chain.state() == "inactive")
+    chain.wait_still()
+
+
+def test_only_one_page_holds(chain: Chain, site: Site) -> None:
+    with browsing(site) as one, browsing(site) as other:
+        hold_until_it_moves(chain, one)
+        other.hold()
+        assert other.wait("hold_ended", lambda m: m.get("why"))["why"] == (
+            "another page holds the arm"
+        )
+        other.let_go()
+        time.sleep(2 * HOLD_S)
+        assert chain.state() == "active"
+        one.let_go()
+
+
+def test_an_activation_is_rejected_with_every_reason_in_words(chain: Chain, site: Site) -> None:
+    with browsing(site) as browser:
+        assert browser.ask(do="prompt", text="dance")["is"] == "done"
+        assert browser.ask(do="worker", name="nobody")["is"] in ("done", "failed")
+        answer = browser.ask(do="activate")
+        assert answer["is"] == "failed"
+        assert answer["why"] == "activate rejected"
+        assert len(answer["reasons"]) >= 1
+        assert any("nobody" in reason for reason in answer["reasons"])
+
+
+def test_settings_of_the_page_are_those_of_the_robot(chain: Chain, site: Site) -> None:
+    with browsing(site) as browser:
+        for request, field, value in (
+            ({"do": "prompt", "text": "HARD: go up x5"}, "prompt", "HARD: go up x5"),
+            ({"do": "rate", "hz": 7}, "rate_hz", 7),
+            ({"do": "speed", "percent": 40}, "speed_percent", 40),
+        ):
+            assert browser.ask(**request)["is"] == "done"
+            until(f"the page shows {field}", lambda f=field, v=value: browser.state["task"][f] == v)
+        assert browser.ask(do="speed", percent=400)["is"] == "failed"
+
+
+def test_a_person_takes_the_arm_by_hand_and_gives_it_back(chain: Chain, site: Site) -> None:
+    with browsing(site) as browser:
+        assert browser.ask(do="jog", on=True, frame="base", level=2)["is"] == "done"
+        until("the page has the arm", lambda: browser.state["jog"])
+        before_m = chain.measured().position_m
+        browser.twist = [0.0, 0.0, 1.0 if before_m[2] < 0.42 else -1.0, 0.0, 0.0, 0.0]
+        hold_until_it_moves(chain, browser)
+        chain.until("it went", lambda: abs(chain.measured().position_m[2] - before_m[2]) > 0.02)
+        browser.let_go()
+        chain.wait_still()
+        assert abs(chain.measured().position_m[:2] - before_m[:2]).max() * 1e3 < STILL_MM
+        assert browser.ask(do="jog", on=False, frame="base", level=2)["is"] == "done"
+        until("the model has it", lambda: browser.state["task"]["worker"] == "scripted")
+
+
+def test_a_recording_ends_with_the_verdict_of_a_person(chain: Chain, site: Site) -> None:
+    with browsing(site) as browser:
+        begun = browser.ask(do="record", on=True, verdict="", note="")
+        assert begun["is"] == "done", begun
+        assert browser.ask(do="record", on=True, verdict="", note="")["is"] == "failed"
+        time.sleep(1.0)
+        ended = browser.ask(do="record", on=False, verdict="success", note="went well")
+        assert ended["is"] == "done", ended
+    (path,) = (chain.profile_file.parent / "runs").glob("web-*.mcap")
+    file = open_recording(path)
+    assert not list(file.entries(lambda _: False))  # what is told at the end is known there
+    assert verdict_in(file.ended, "scripted") == "success"
+    assert (file.ended or {})["trial"]["note"] == "went well"
+
+
+def test_pictures_come_newest_first_and_no_faster_than_they_are_drawn(
+    chain: Chain, site: Site
+) -> None:
+    with site.connect("/pictures") as socket:
+        socket.send(json.dumps({"do": "enter", "token": OPERATOR}))
+        socket.send(json.dumps({"do": "look", "streams": ["camera/front"], "hz": 20}))
+        first = socket.recv(PATIENCE_S)
+        assert isinstance(first, bytes)
+        head, _, jpeg = first.partition(b"\n")
+        assert json.loads(head)["name"] == "camera/front"
+        assert jpeg[:2] == b"\xff\xd8"
+        newest = json.loads(bytes(socket.recv(PATIENCE_S)).partition(b"\n")[0])
+        with pytest.raises(TimeoutError):  # nothing was drawn: two are on the way at most
+            socket.recv(1.0)
+        socket.send(json.dumps({"do": "drawn", "frame": 2}))
+        later = json.loads(bytes(socket.recv(PATIENCE_S)).partition(b"\n")[0])
+        assert later["stamp_ms"] > newest["stamp_ms"] + 500  # none that waited
+
+
+def test_what_the_model_sees_is_offered(chain: Chain, site: Site) -> None:
+    chain.client.set_worker("scripted")
+    with browsing(site) as browser:
+        until("streams", lambda: "seen" in browser.state and browser.state["seen"])
+        (name, *_) = browser.state["seen"]
+    with site.connect("/pictures") as socket:
+        socket.send(json.dumps({"do": "enter", "token": OPERATOR}))
+        socket.send(json.dumps({"do": "look", "streams": [name], "hz": 20}))
+        assert isinstance(socket.recv(PATIENCE_S), bytes)
+
+
+def test_a_viewer_looks_at_states_and_nothing_else(chain: Chain, site: Site) -> None:
+    with browsing(site, VIEWER) as viewer:
+        assert viewer.answers("welcome")[0]["cameras"] == []
+        for request in (
+            {"do": "prompt", "text": "HARD: go down"},
+            {"do": "activate"},
+            {"do": "stop"},
+            {"do": "speed", "percent": 5},
+        ):
+            viewer.heard.clear()
+            viewer.send(**request)
+            assert "viewer" in viewer.wait("rejected")["why"]
+        viewer.hold()
+        time.sleep(HOLD_S)
+        assert chain.state() == "inactive"
+        task = chain.client.task
+        assert task is not None
+        assert (task.prompt, task.speed_percent) == ("hold", 100)
+    with site.connect("/pictures") as socket:
+        socket.send(json.dumps({"do": "enter", "token": VIEWER}))
+        with pytest.raises(ConnectionClosed):
+            socket.recv(PATIENCE_S)
+
+
+def test_a_wrong_token_opens_nothing(chain: Chain, site: Site) -> None:
+    for path in ("/control", "/pictures"):
+        for first in (
+            {"do": "enter", "token": "another token altogether"},
+            {"do": "stop"},
+            "nonsense",
+        ):
+            with site.connect(path) as socket:
+                socket.send(json.dumps(first))
+                assert json.loads(socket.recv(PATIENCE_S))["is"] == "denied"
+                with pytest.raises(ConnectionClosed):
+                    socket.recv(PATIENCE_S)
+    assert chain.state() == "inactive"
+
+
+def test_pages_of_other_sites_and_other_names_are_turned_away(chain: Chain, site: Site) -> None:
+    for origin, host in (
+        ("http://evil.example", None),
+        ("null", None),
+        (f"https://{site.host}", None),
+        (f"http://evil.example:{site.port}", f"evil.example:{site.port}"),
+    ):
+        with pytest.raises(InvalidStatus), site.connect(origin=origin, host=host):
+            pass
+    assert site.ask("GET", "/", {"Host": "evil.example"})[0] == 403
+    assert site.ask("GET", "/", {"Host": f"localhost:{site.port}"})[0] == 200
+
+
+def test_the_page_asks_no_other_host_and_runs_no_inline_script(site: Site) -> None:
+    for path in ("/", "/page.js", "/page.css"):
+        status, headers, body = site.ask("GET", path)
+        assert status == 200
+        assert "default-src 'none'" in headers["content-security-policy"]
+        assert "unsafe" not in headers["content-security-policy"]
+        text = body.decode()
+        assert "http://" not in text
+        assert "https://" not in text
+        assert "innerHTML" not in text
+        assert "<script>" not in text
+        assert " style=" not in text
+
+
+@pytest.mark.slow
+def test_garbage_moves_nothing_and_ends_nothing(chain: Chain, site: Site) -> None:
+    chance = random.Random(7)
+    words = [
+        "", "{", "[]", "null", "1e999", '{"do": 1}', '{"do": "fly"}', '{"do": "prompt"}',
+        '{"do": "prompt", "text": "\\ud800"}', '{"do": "rate", "hz": NaN}',
+        '{"do": "rate", "hz": ' + "9" * 3000 + "}", "[" * 4000,
+        '{"do": "beat", "press": 1, "tick": 1e400, "twist": [9,0,0,0,0,0], "opening": 0}',
+        '{"do": "hold", "press": -1, "tick": 0}',
+        '{"do": "hold", "press": 1, "tick": 9007199254740991}',
+        '{"do": "look", "streams": ["../x"], "hz": 1}',
+    ]  # fmt: skip
+    with browsing(site) as browser:
+        for number in range(GARBAGE):
+            if number % 3 == 0:
+                browser.connection.send(chance.randbytes(chance.randrange(200)))
+            else:
+                browser.connection.send(chance.choice(words))
+        # In between, what is meant is obeyed.
+        time.sleep(1.0)
+        assert browser.ask(do="rate", hz=6)["is"] == "done"
+        counted = browser.wait("nodes", lambda m: m["counters"].get("bad_message", 0) >= GARBAGE)
+        assert counted["counters"]["bad_message"] < GARBAGE + 100
+        assert chain.state() == "inactive"
+        browser.connection.send("x" * 100_000)
+        until("too large a message ends its connection", browser.closed.is_set)
+    with browsing(site):  # another page is served as before
+        pass
+    assert chain.state() == "inactive"
+
+
+@pytest.mark.slow
+def test_a_stop_is_taken_in_the_middle_of_a_flood(chain: Chain, site: Site) -> None:
+    with browsing(site) as browser:
+        for _ in range(2000):
+            browser.send(do="deactivate")
+        browser.send(do="stop")
+        assert browser.wait("stopped")["stopped"]
+
+
+def test_metrics_are_openmetrics_and_want_a_token(chain: Chain, site: Site) -> None:
+    assert site.ask("GET", "/metrics")[0] == 401
+    chain.client.set_prompt("HARD: go up x3")
+    status, headers, body = site.ask("GET", "/metrics", {"Authorization": f"Bearer {METRICS}"})
+    assert status == 200
+    assert headers["content-type"].startswith("application/openmetrics-text")
+    families = {
+        family.name: family for family in parser.text_string_to_metric_families(body.decode())
+    }
+    alive = {s.labels["node"]: s.value for s in families["vla_zenoh_node_alive"].samples}
+    assert alive["command"] == alive["sim"] == 1
+    state = next(
+        s.labels["vla_zenoh_node_state"]
+        for s in families["vla_zenoh_node_state"].samples
+        if s.labels["node"] == "command" and s.value == 1
+    )
+    assert state == "inactive"
+    assert families["vla_zenoh_latency_seconds"].unit == "seconds"
+    assert families["vla_zenoh_web_events"].type == "counter"
+    assert len(body.splitlines()) < 3000
