@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Field
 from vla_zenoh.profile.section import Distinct, Fault, Name, Names, Section, Text, Word
 from vla_zenoh.profile.session import Endpoints
 
-NodeKind = Literal["router", "sim", "ros2", "arm", "camera", "command", "worker"]
+NodeKind = Literal["router", "sim", "ros2", "arm", "camera", "command", "worker", "primitives"]
 SIMULATED: tuple[NodeKind, ...] = ("router", "sim", "camera", "command", "worker")
 CAMERA_SOURCES = {
     "sim": "sim:CAMERA",
