@@ -61,6 +61,11 @@ class History:
             cut = min(cut, bisect_left(self.entries, kept_ns, key=_stamp_ns))
         del self.entries[: max(cut, len(self.entries) - self.most)]
 
+    @property
+    def newest_ns(self) -> int:
+        """Stamp of the newest; 0 without records."""
+        return _stamp_ns(self.entries[-1]) if self.entries else 0
+
     def at(self, stamp_ns: int) -> Any:
         """The record whose stamp is nearest; there must be one."""
         near = self.nearest(stamp_ns)

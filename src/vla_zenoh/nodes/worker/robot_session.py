@@ -134,10 +134,18 @@ class RobotSession:
 
     # -- observation --------------------------------------------------------------------------
     @property
-    def has_image(self) -> bool:
-        """Whether the first camera has an image that was not polled yet."""
-        first = next(iter((*self._cameras.values(), *self._depths.values())), None)
-        return first is not None and first.has_new
+    def has_images(self) -> bool:
+        """Whether an image was not polled yet, and every camera has one since the last chunk."""
+        streams = self._streams
+        received = (
+            *((camera, streams.images[name]) for name, camera in self._cameras.items()),
+            *((camera, streams.depth[name]) for name, camera in self._depths.items()),
+        )
+        new = [camera.has_new for camera, _ in received]
+        return any(new) and all(
+            fresh or one.newest_ns >= self._not_before_ns
+            for fresh, (_, one) in zip(new, received, strict=True)
+        )
 
     @property
     def needs_images(self) -> bool:
