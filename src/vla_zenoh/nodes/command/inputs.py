@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from operator import itemgetter
 from typing import Any
 
@@ -41,7 +42,10 @@ class CommandInputs:
         self._node = node
         keys = node.keys
         self._peer_monitor = PeerMonitor(node)
-        self._chunks = node.subscribe(keys.all_deltas, CallbackRing(CHUNKS))
+        self.chunk_arrival = threading.Event()
+        """Set when a chunk arrives."""
+        ring = CallbackRing(CHUNKS, arrival=self.chunk_arrival)
+        self._chunks = node.subscribe(keys.all_deltas, ring)
         self._pose_slot = node.subscribe(keys.state_pose, CallbackRing(STATES, SMALL_BYTES))
         self._gripper_slot = node.subscribe(keys.state_gripper, CallbackRing(STATES, SMALL_BYTES))
         self._joint_slot = node.subscribe(keys.state_joint, CallbackRing(STATES, SMALL_BYTES))
@@ -79,15 +83,18 @@ class CommandInputs:
         """
         settings_put = self._poll_settings()
         peers = self._peer_monitor.update(now_ns, news=news)
+        inputs = self.poll_streams(settings_put)
+        inputs.settings, inputs.peers = [*settings_put, *self._check_clock()], peers
+        return inputs
+
+    def poll_streams(self, settings_put: Sequence[Setting] = ()) -> Inputs:
+        """The chunks and states among them."""
         chunks = [self._chunk(arrival) for arrival in self._chunks.drain()]
-        clock = self._check_clock()
         return Inputs(
-            settings=[*settings_put, *clock],
             chunks=[chunk for chunk in chunks if chunk is not None],
             pose=self._state(PoseState, self._pose_slot),
             joint=self._joints(settings_put),
             gripper=self._state(GripperState, self._gripper_slot),
-            peers=peers,
         )
 
     def _poll_settings(self) -> list[Setting]:
@@ -144,7 +151,7 @@ class CommandInputs:
             newest = self._node.decode(kind, arrival, self._writers[kind]) or newest
         return newest
 
-    def _joints(self, settings_put: list[Setting]) -> Stamped[JointState] | None:
+    def _joints(self, settings_put: Sequence[Setting]) -> Stamped[JointState] | None:
         """The newest joints, at `JOINT_PERIOD_S`: decoding them is expensive."""
         requested = any(setting.name in ("active", "worker") for setting in settings_put)
         if not requested and time.monotonic() - self._last_joint < JOINT_PERIOD_S:
