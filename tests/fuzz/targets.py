@@ -38,7 +38,7 @@ from vla_zenoh.lab.evaluation.mcap_file import evaluate_run
 from vla_zenoh.lab.inference_views import InferenceView
 from vla_zenoh.lab.recording.record_json import record_from_json, record_to_json
 from vla_zenoh.lab.recording.record_types import RECORDS
-from vla_zenoh.lab.serve import openpi_frames
+from vla_zenoh.lab.serve import mcp, openpi_frames
 from vla_zenoh.lab.tasks.wording import parse_prompt
 from vla_zenoh.policy import ActionSpec, ModelSpec, ObservationSpec
 from vla_zenoh.policy.loader import find_model, make_policy
@@ -51,6 +51,7 @@ CORPUS = Path(__file__).parent / "corpus"
 """Inputs that once broke a reader, or nearly: a folder for each target."""
 
 
+MCP_TOOLS = mcp.tools(["front"], list(mcp.DESCRIPTIONS))
 MAX_SHOWN = 50_000
 """Characters that a few nodes may fill a screen with."""
 
@@ -374,6 +375,14 @@ def _targets() -> Iterator[Target]:
         "stamps", decode_stamps, codec, lambda: [message.pack({"heard_ns": 1, "said_ns": 2})]
     )
     # -- other systems
+    yield Target(
+        "mcp",
+        lambda data: mcp.read(data, MCP_TOOLS, "1"),
+        (),
+        lambda: [
+            b'{"jsonrpc": "2.0", "id": 1, "method": "tools/call", "params": {"name": "home"}}'
+        ],
+    )
     yield Target(
         "openpi",
         _all_of(openpi.read_metadata, openpi.read_answer, openpi_frames.read_observation),

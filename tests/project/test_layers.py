@@ -42,6 +42,7 @@ ALLOWED = {
     "runtime": IO - NODE,
     "nodes": IO - NODE,
     "lab/serve": frozenset({"time"}),
+    "lab/serve/mcp_server.py": IO - NODE,
     "lab/serve/policy_server.py": IO - NODE,
     "robots": IO - NODE,
     "simulation": frozenset({"mujoco"}),
