@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import cv2
@@ -71,7 +71,7 @@ def assemble(
         spec: what the model needs.
         task: prompt and episode.
         images: newest image of each camera.
-        states: part (``joint``, ``pose``, ``gripper``) -> its history.
+        states: what (``joint``, ``pose``, ``gripper``; see `state_names`) -> its history.
         not_before_ns: an observation from before this time is not wanted: it cannot show what the
             last chunk did.
         now_ns: wall clock.
@@ -84,12 +84,15 @@ def assemble(
     if wanted.prompt and not task.prompt:
         return NotReady("there is no prompt", waiting=True)
     missing = [f"camera {c.camera!r}" for c in wanted.cameras if c.camera not in images]
-    missing += [f"state/{p}" for p in wanted.state if p not in states or not states[p].entries]
+    named = state_names(spec)
+    missing += [
+        say for name, say in named.items() if name not in states or not states[name].entries
+    ]
     if missing:
         return NotReady(f"nothing received yet of {', '.join(missing)}")
     oldest = _oldest([images[camera.camera] for camera in wanted.cameras])
     if oldest is None and wanted.state:
-        oldest = _oldest([states[part].entries[-1] for part in wanted.state])
+        oldest = _oldest([states[name].entries[-1] for name in named])
     stamp_ns = oldest.header.stamp_wall_ns if oldest else now_ns
     seq = oldest.header.seq if oldest else 0
     age_s = (now_ns - stamp_ns) / 1e9
@@ -104,26 +107,38 @@ def assemble(
         )
     if stamp_ns < not_before_ns:
         return NotReady("no observation since the last chunk", waiting=True)
-    parts: dict[str, Any] = {}
-    for part in wanted.state:
-        near = states[part].nearest(stamp_ns)
+    found: dict[str, dict[str, Any]] = {part: {} for part in spec.parts}
+    for name, (part, what) in named.items():
+        near = states[name].nearest(stamp_ns)
         assert near is not None
         skew_s = abs(near.header.stamp_wall_ns - stamp_ns) / 1e9
         if skew_s > wanted.max_skew_s:
-            return NotReady(f"state/{part} is {skew_s:.3f} s apart from the images")
-        parts[part] = near.record
+            return NotReady(f"state/{name} is {skew_s:.3f} s apart from the images")
+        found[part][what] = near.record
     for camera in wanted.cameras:
         skew_s = (images[camera.camera].header.stamp_wall_ns - stamp_ns) / 1e9
         if skew_s > wanted.max_skew_s:
             return NotReady(f"camera {camera.camera!r} is {skew_s:.3f} s apart from the others")
-    return Observation(
+    whole = Observation(
         stamp_wall_ns=stamp_ns,
         seq=seq,
         task=task,
         robot=robot,
         images={c.camera: prepare_image(images[c.camera].record, c) for c in wanted.cameras},
-        **parts,
+        **found.pop("", {}),
     )
+    if not found:
+        return whole
+    return replace(whole, parts={part: replace(whole, **own) for part, own in found.items()})
+
+
+def state_names(spec: ModelSpec) -> dict[str, tuple[str, str]]:
+    """Every state that a model observes: name (``pose``, ``left/pose``) -> part and what."""
+    return {
+        f"{part}/{what}" if part else what: (part, what)
+        for part in spec.parts
+        for what in spec.observation.state
+    }
 
 
 def _oldest(entries: Sequence[Stamped[Any]]) -> Stamped[Any] | None:
