@@ -85,9 +85,7 @@ def assemble(
         return NotReady("there is no prompt", waiting=True)
     missing = [f"camera {c.camera!r}" for c in wanted.cameras if c.camera not in images]
     named = state_names(spec)
-    missing += [
-        say for name, say in named.items() if name not in states or not states[name].entries
-    ]
+    missing += [f"state/{n}" for n in named if n not in states or not states[n].entries]
     if missing:
         return NotReady(f"nothing received yet of {', '.join(missing)}")
     oldest = _oldest([images[camera.camera] for camera in wanted.cameras])
