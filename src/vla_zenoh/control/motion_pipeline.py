@@ -10,7 +10,7 @@ import numpy as np
 
 from vla_zenoh.control.aggregate import PlanAggregator
 from vla_zenoh.control.chunk_planner import ChunkPlanner
-from vla_zenoh.control.commander_io import limit_events, make_event
+from vla_zenoh.control.commander_io import MotionCommands, limit_events, make_event
 from vla_zenoh.control.contact import Contact
 from vla_zenoh.control.gripper_arbiter import GripperArbiter
 from vla_zenoh.control.joint_space import JointPath
@@ -44,9 +44,7 @@ from vla_zenoh.types import (
     Cause,
     Event,
     FloatArray,
-    GripperCommand,
     GripperState,
-    JointCommand,
     JointState,
     PoseCommand,
     PoseState,
@@ -73,14 +71,6 @@ class Leashed(NamedTuple):
 
     goal: Goal
     hits: list[LimitHit]
-
-
-class MotionCommands(NamedTuple):
-    """Commands of one tick, each None where there is none."""
-
-    pose: PoseCommand | None = None
-    joint: JointCommand | None = None
-    gripper: GripperCommand | None = None
 
 
 class MotionPipeline:
