@@ -2,7 +2,7 @@
 # requires-python = ">=3.11"
 # dependencies = ["numpy", "opencv-python-headless", "pin>=4", "example-robot-data>=6"]
 # ///
-"""Lifts a bar with both arms of ``panda_pair_sim``, in joints and without any learning.
+"""Lifts a bar with both arms of ``two_pandas_sim``, in joints and without any learning.
 
 It sees the bar by its colour in one picture from above, taken while both arms are home and out of
 the way, plans one path for both, and follows it blindly. Prompts::
@@ -112,7 +112,7 @@ class ScriptedPair:
 
     example_prompts = ("lift the bar", "hold")
 
-    def __init__(self, camera: str = "top", profile: str = "panda_pair_sim") -> None:
+    def __init__(self, camera: str = "top", profile: str = "two_pandas_sim") -> None:
         loaded = load_profile(profile)
         self._arms = {part: PairArm(loaded, part) for part in loaded.parts}
         self._camera = camera
@@ -166,7 +166,8 @@ class ScriptedPair:
                 self._lift(observation, home)
                 total_s = sum(segment.duration_s for segment in self._path)
         done = self._seen and self._time_s >= total_s
-        return ActionSteps([_at(self._path, time_s) for time_s in self._times_s(1)], done)
+        times_s = self._times_s(1)[: 1 if done else HORIZON]  # done is what the last step is
+        return ActionSteps([_at(self._path, time_s) for time_s in times_s], done)
 
     def _times_s(self, first: int) -> Vector:
         return self._time_s + DT_S * np.arange(first, HORIZON + 1)

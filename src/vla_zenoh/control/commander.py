@@ -28,12 +28,14 @@ from vla_zenoh.control.commander_io import (
 from vla_zenoh.control.contact import Contact
 from vla_zenoh.control.gripper_arbiter import GripperArbiter
 from vla_zenoh.control.limits import Slowdown
+from vla_zenoh.control.part_spacing import PartSpacing
 from vla_zenoh.control.plan_timeline import EpisodeProgress, Goal, Plan
 from vla_zenoh.control.preflight import PeerSnapshot, reasons_of_worker
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.states import DEACTIVATED, OBEYING, State, Trigger, after
 from vla_zenoh.control.watchdog import Deadman
 from vla_zenoh.errors import RecordError
+from vla_zenoh.kinematics.part_distance import Nearest
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     MAX_TEXT,
@@ -74,7 +76,7 @@ class Commander:
     ) -> None:
         self.profile = profile
         reaches = reach if isinstance(reach, Mapping) else {"": reach}
-        self.parts = tuple(
+        self.parts: tuple[CommandedPart, ...] = tuple(
             CommandedPart(profile.of_part(name), reaches.get(name)) for name in profile.part_names
         )
         self.dry_run = dry_run
@@ -88,6 +90,8 @@ class Commander:
         self._resumed_ns = 0
         self._peers = PeerSnapshot()
         self._latest: dict[str, Stamped[ActionChunk]] = {}
+        known = bool(profile.parts) and all(part.reach for part in self.parts)
+        self._spacing = PartSpacing(profile, self.parts) if known else None
         first = self.parts[0]
         # All parts have the same chunks at the same time: one queue, one deadline.
         self._planner, self._motion, self._watchdog = first.planner, first.motion, first.watchdog
@@ -124,6 +128,7 @@ class Commander:
         for part in self.parts:
             if not inputs.chunks or part.monitor_late(now_ns):  # planning them is work enough
                 self._monitor_joints(part, now_ns)
+        self._keep_apart(now_ns, ticks)
         overdue_ns, all_planned = self._watchdog.deadline_ns, True
         for part in self.parts:
             planned, events = part.motion.advance(self.state, self.task, overdue_ns, now_ns, ticks)
@@ -220,6 +225,11 @@ class Commander:
     def retreating(self) -> bool:
         """An arm retreats from what blocked it."""
         return any(part.retreat.busy for part in self.parts)
+
+    @property
+    def part_distance(self) -> Nearest | None:
+        """The nearest links of two parts where they are commanded; None: there is one part."""
+        return None if self._spacing is None else self._spacing.nearest
 
     @property
     def smoothing_failures(self) -> int:
@@ -511,6 +521,20 @@ class Commander:
             self._change(Trigger.LOSE, "; ".join(lost)[:MAX_TEXT])
         elif self._watchdog.overdue(now_ns):
             self._change(Trigger.STARVE, "no fresh chunk within the watchdog")
+
+    def _keep_apart(self, now_ns: int, ticks: int) -> None:
+        """Slow the parts down, or let all of them stand, before they come too near."""
+        if self._spacing is None:
+            return
+        moves = self.state is State.ACTIVE or self.retreating
+        ahead_s = ticks / self.profile.timing.command_hz
+        slowdown, hit = self._spacing.look(now_ns, ahead_s, moves=moves)
+        if hit is not None and not self._motion.held:
+            why = f"stand{hit.at}"
+            event = make_event("warning", "limit", hit.name, why, hit.value, hit.limit)
+            self._out.events.append(event)
+        for part in self.parts:
+            part.motion.part_slowdown, part.motion.held = slowdown, hit is not None
 
     def _monitor_joints(self, part: CommandedPart, now_ns: int) -> None:
         """Slow a part down, or brake, if its measured joints come too near to a bound."""

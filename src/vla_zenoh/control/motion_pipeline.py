@@ -118,6 +118,10 @@ class MotionPipeline:
         self.contact_slowdown: Slowdown | None = None
         self.joint_slowdown: Slowdown | None = None
         """Of the measured joints; both apply whatever the goal allows."""
+        self.part_slowdown: Slowdown | None = None
+        """Of the distance to another part of the robot."""
+        self.held = False
+        """The arm has to stand: another part is too near."""
         self.contact = Contact(profile.limits.contact)
         self.retreat = Retreat(profile.limits, self.contact)
         self._back: Pose | None = None
@@ -155,6 +159,25 @@ class MotionPipeline:
         if self.in_joints and self._path is not None:
             return self._path.state.position
         return self._joints.position_rad
+
+    def resting_rad(self, ahead_s: float) -> FloatArray:
+        """(n,) where commanded joints come to rest at most, were they to brake in `ahead_s`."""
+        assert self._joints is not None
+        if self.in_joints and self._path is not None:
+            path = self._path
+            return path.state.position + path.stop_way(ahead_s)
+        if self._smoother is None:
+            return self._joints.position_rad
+        return self._joints.resting_rad(self._smoother, ahead_s)
+
+    def wanted_rad(self, now_ns: int) -> FloatArray | None:
+        """(n,) joints of the goal in force, None where it has none."""
+        if self.timeline is None:
+            return None
+        goal = self.timeline.at(now_ns)
+        if goal.joints_rad is not None or self._reach is None:
+            return goal.joints_rad
+        return self._reach.joints_at(goal.pose)
 
     @property
     def stuck(self) -> str:
@@ -370,7 +393,8 @@ class MotionPipeline:
             elif self._joints is None:
                 self._smoother.tick()
             else:
-                active = state is State.ACTIVE and self._override > 0.0 and not self._changing
+                active = state is State.ACTIVE and self._override > 0.0
+                active = active and not self._changing and not self.held
                 braking = not active and self._back is None
                 self._joints.tick(self._smoother, braking=braking, elbow=active)
         if self._path is not None:
@@ -434,12 +458,14 @@ class MotionPipeline:
         self._changing = joints is not self.in_joints
         mover = self._mover
         assert mover is not None
-        if self._override == 0.0 or self._changing:
+        if self._override == 0.0 or self._changing or self.held:
             self._pause(mover)
             return events
         slowed = self._slowing and _within(mover, self._override)
         short, hits = self._on_leash(mover, goal, ticks * self._dt_s)
-        slower = slowest(goal.slowdown, self.contact_slowdown, self.joint_slowdown)
+        slower = slowest(
+            goal.slowdown, self.contact_slowdown, self.joint_slowdown, self.part_slowdown
+        )
         slowed |= (slower.share if slower else 1.0) != self.speed
         if goal is not self.goal or hits or slowed:
             if hits:
@@ -551,7 +577,7 @@ class MotionPipeline:
     def _retreat_or_brake(
         self, mover: Smoother | JointPath, timeline: GoalTimeline, state: State, now_ns: int
     ) -> list[Event]:
-        if state is not State.INACTIVE:
+        if state is not State.INACTIVE or self.held:
             self.retreat.end()
         back, event = self.retreat.step(mover.motion.pose, now_ns, at_rest=self.at_rest)
         if back is not None and isinstance(mover, JointPath) and self._smoother is not None:

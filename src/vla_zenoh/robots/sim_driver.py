@@ -122,8 +122,7 @@ class SimDriver(RobotDriver):
     def grip(self, command: GripperCommand, now_ns: int, part: str = "") -> None:
         """Open or close."""
         force_n = max(command.force_n, LEAST_FORCE_N)
-        gripper = self.world.parts[part].gripper
-        gripper.command(command.width_m, command.speed_m_s, force_n)
+        self.world.parts[part].set_gripper(command.width_m, command.speed_m_s, force_n)
 
     def read(self, mono_ns: int) -> Measurement | None:
         """Step the world; its state at multiples of the period of ``timing.state_hz``."""
@@ -156,7 +155,7 @@ class SimDriver(RobotDriver):
             arm.joint_state(),
             Pose(*arm.tcp()),
             arm.pose_state(self._references[part]),
-            arm.gripper.state(),
+            arm.gripper_state(),
         )
         return self._newest[part]
 
@@ -221,7 +220,7 @@ class SimDriver(RobotDriver):
                 found = {
                     "joint": records.encode(arm.joint_state()),
                     "pose": records.encode(arm.pose_state(self._references[part])),
-                    "gripper": records.encode(arm.gripper.state()),
+                    "gripper": records.encode(arm.gripper_state()),
                 }
                 state |= {part: found} if part else found
         query.reply(self._node.keys.sim_step, message.pack(state))

@@ -135,6 +135,18 @@ class SimulatedPart:
         """Lower and upper limit of every arm joint, (n,) each."""
         return self._arm.lower_rad.copy(), self._arm.upper_rad.copy()
 
+    def set_gripper(self, width_m: float, speed_m_s: float, force_n: float) -> None:
+        """Open or close to `width_m` at `speed_m_s`, pressing with at most `force_n` (N).
+
+        Raises:
+            RecordError: speed or force are not above zero.
+        """
+        self.gripper.command(width_m, speed_m_s, force_n)
+
+    def gripper_state(self) -> GripperState:
+        """Opening between the fingers, and whether they move or hold an object."""
+        return self.gripper.state()
+
     @property
     def wrench(self) -> FloatArray:
         """(6,) external contact wrench of the last step: N, Nm about the TCP, base axes.
@@ -289,12 +301,8 @@ class World:
         return self._first.hold_reference()
 
     def set_gripper(self, width_m: float, speed_m_s: float, force_n: float) -> None:
-        """Open or close to `width_m` at `speed_m_s`, pressing with at most `force_n` (N).
-
-        Raises:
-            RecordError: speed or force are not above zero.
-        """
-        self._first.gripper.command(width_m, speed_m_s, force_n)
+        """See `SimulatedPart.set_gripper`."""
+        self._first.set_gripper(width_m, speed_m_s, force_n)
 
     # -- measurements ------------------------------------------------------------------
 

@@ -250,7 +250,10 @@ class CommandStatus:
             if stamped is not None
         }
         of_parts = {part.name: _part_detail(part) for part in commander.parts}
-        several = {"parts": of_parts} if len(of_parts) > 1 else of_parts[""]
+        several = of_parts.get("", {"parts": of_parts})
+        near = commander.part_distance
+        if near is not None:
+            several["part_distance_m"] = round(near.distance_m, 4) if near.first else None
         latency = {name: meter.summary() for name, meter in self._latency.items()}
         self._node.counters["command.smoothing_failures"] = commander.smoothing_failures
         self._node.counters["command.gripper_timeouts"] = sum(
