@@ -1,12 +1,12 @@
-"""What a tick of the command node's mind costs, with a chunk and without.
+"""What a tick of the commander costs, with a chunk and without, and planning the chunk before it.
 
-The commander alone, with the kinematic shadow of the shipped arm and an arm that stands where it is
+The commander alone, with the kinematics of the shipped arm and an arm that stands where it is
 commanded: no session, no codec. Every scenario is played several times, tick for tick the same, and
-of every tick the least time counts, so that what else the computer does is left out as far as that
+of everything the least time counts, so that what else the computer does is left out as far as that
 can be.
 
 A chunk has 16 steps at 30 Hz and comes 10 times a second, 80 ms after its observation. `heap`: 64
-of them arrive in one tick, once a second.
+of them arrive before one tick, once a second.
 """
 
 from __future__ import annotations
@@ -115,6 +115,7 @@ class Player:
         self.position_m, self.quat_xyzw = pose.position_m, quat_from_rotation(pose.rotation)
         self.now_ns, self.seq = START_NS, 0
         self.period_ns = round(1e9 / profile.timing.command_hz)
+        self.tick([])
         self.tick([self.chunk(0.0)])
         self.tick([], Setting("active", True))
         if self.commander.state.value != "active":
@@ -140,8 +141,8 @@ class Player:
         header = Header(now_ns - round(ago_s * 1e9), self.seq, SOURCE)
         return Stamped(header, record, now_ns)
 
-    def tick(self, chunks: list[Stamped[ActionChunk]], *settings: Setting) -> int:
-        """One tick; the nanoseconds that it took."""
+    def tick(self, chunks: list[Stamped[ActionChunk]], *settings: Setting) -> tuple[int, int, int]:
+        """One tick; nanoseconds of planning before it, of itself, and of looking ahead after it."""
         self.now_ns += self.period_ns
         header = Header(self.now_ns, self.now_ns // self.period_ns, ARM)
         held = (self.position_m, self.quat_xyzw)
@@ -151,26 +152,31 @@ class Player:
         joint = JointState(self.kinematics.arm_joints, self.joints_rad, still, still)
         inputs = Inputs(
             settings,
-            chunks,
+            (),
             Stamped(header, pose, self.now_ns),
             Stamped(header, gripper, self.now_ns),
             self.peers,
             Stamped(header, joint, self.now_ns),
         )
         began_ns = time.perf_counter_ns()
+        if chunks:
+            self.commander.prepare(Inputs(chunks=chunks), self.now_ns)
+        planned_ns = time.perf_counter_ns()
         out = self.commander.step(inputs, self.now_ns)
-        spent_ns = time.perf_counter_ns() - began_ns
+        stepped_ns = time.perf_counter_ns()
+        self.commander.look_ahead(self.now_ns)
+        after_ns = time.perf_counter_ns() - stepped_ns
         if out.pose is not None:
             self.position_m, self.quat_xyzw = out.pose.position_m, out.pose.quat_xyzw
         if out.joint is not None:
             self.joints_rad = out.joint.position_rad
             at = self.kinematics.forward(self.joints_rad)
             self.position_m, self.quat_xyzw = at.position_m, quat_from_rotation(at.rotation)
-        return spent_ns
+        return planned_ns - began_ns, stepped_ns - planned_ns, after_ns
 
-    def play(self, duration_s: float) -> tuple[list[int], list[bool]]:
-        """Nanoseconds of every tick, and whether a chunk came with it."""
-        spent_ns: list[int] = []
+    def play(self, duration_s: float) -> tuple[list[tuple[int, int, int]], list[bool]]:
+        """The times of every tick, and whether a chunk came before it."""
+        spent_ns: list[tuple[int, int, int]] = []
         with_chunk: list[bool] = []
         period_s = HEAP_S if self.scenario.heap else PERIOD_S
         every = round(period_s * 1e9 / self.period_ns)
@@ -207,7 +213,7 @@ def main() -> None:
             reach = base.limits.reach.model_copy(update={"table_z_m": scenario.table_z_m})
             limits = base.limits.model_copy(update={"reach": reach})
             profile = base.model_copy(update={"robot": robot, "limits": limits})
-            runs: list[list[int]] = []
+            runs: list[list[tuple[int, int, int]]] = []
             with_chunk: list[bool] = []
             for _ in range(given.runs):
                 player = Player(profile, scenario)
@@ -219,8 +225,11 @@ def main() -> None:
             least_us = np.min(runs, axis=0) / 1e3
             chunky = np.array(with_chunk)
             print(f"{command}, {scenario.name}:  p50, p95, max us; ticks")
-            print(_row("with a chunk", least_us[chunky]))
-            print(_row("without", least_us[~chunky]))
+            planned_us, tick_us, after_us = least_us.T
+            print(_row("chunk planned", planned_us[chunky]))
+            print(_row("tick after it", tick_us[chunky]))
+            print(_row("any other tick", tick_us[~chunky]))
+            print(_row("steps after a tick", after_us))
 
 
 if __name__ == "__main__":

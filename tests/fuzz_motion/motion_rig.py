@@ -190,7 +190,11 @@ class Rig:
         if at >= self._silent_until:
             self._tell(at, inputs)
         followed, before = self.guard.following, self.commander.state.value
+        if inputs.chunks and at % 2:  # as the command node does with one that comes between ticks
+            self.commander.prepare(Inputs(chunks=inputs.chunks), self._now_ns)
+            inputs.chunks = ()
         out = self.commander.step(inputs, self._now_ns, periods)
+        self.commander.look_ahead(self._now_ns)
         state = self.commander.state.value
         for event in out.events:
             if event.what.endswith("->fault") and not event.why.startswith("the robot reports"):

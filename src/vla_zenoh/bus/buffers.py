@@ -175,10 +175,19 @@ class LatestSample(SampleBuffer):
 
 
 class CallbackRing(SampleBuffer):
-    """Keeps the newest `size` samples in order; older ones are dropped and counted."""
+    """Keeps the newest `size` samples in order; older ones are dropped and counted.
 
-    def __init__(self, size: int, limit: int = MAX_RECORD_BYTES) -> None:
+    Args:
+        size: samples.
+        limit: bytes of one.
+        arrival: set whenever a sample is added.
+    """
+
+    def __init__(
+        self, size: int, limit: int = MAX_RECORD_BYTES, arrival: threading.Event | None = None
+    ) -> None:
         super().__init__(limit)
+        self._arrival = arrival
         self._arrivals: deque[ReceivedSample] = deque(maxlen=size)
         self._size = size
         self._count = 0
@@ -191,6 +200,8 @@ class CallbackRing(SampleBuffer):
         if len(self._arrivals) == self._size:
             self.dropped += 1
         self._arrivals.append(ReceivedSample(sample, time.monotonic_ns(), self._count))
+        if self._arrival is not None:
+            self._arrival.set()
 
     def drain(self) -> list[ReceivedSample]:
         """All samples, oldest first."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
+import threading
 import time
 from functools import cache
 from pathlib import Path
@@ -87,6 +88,19 @@ class FixedRate:
         self._period_ns = round(1e9 / rate_hz)
         self._next_ns = time.monotonic_ns() + self._period_ns
         self._computed_ns = time.thread_time_ns()
+
+    @property
+    def next_ns(self) -> int:
+        """The next multiple, monotonic clock."""
+        return self._next_ns
+
+    def wait_for(self, arrival: threading.Event) -> bool:
+        """Wait for `arrival`, until the next multiple at the latest; whether it came, clears it."""
+        left_ns = self._next_ns - time.monotonic_ns()
+        if left_ns <= 0 or not arrival.wait(left_ns / 1e9):
+            return False
+        arrival.clear()
+        return True
 
     def wait(self) -> Tick:
         """Sleep until the next multiple."""

@@ -5,12 +5,14 @@
 3. `ChunkPlanner.bound` shortens each step to its limits and to what the arm can do.
 4. `ChunkPlanner.advance` does 2 and 3 with the newest chunk of the queue, and adds the plan to the
    `GoalTimeline`.
+5. `ChunkPlanner.bound_due` bounds the steps that follow, in time for them.
 
 The cost of one evaluation of the arm is known, their number per step is not: one in free space,
 about ten where a limit cuts. So every tick has a budget of evaluations. A plan comes into force as
-soon as the step that is due is bounded, in free space in the tick in which its chunk arrived. Then
-a few steps are bounded ahead. A step that is due before it is bounded waits: the one before it
-stays the goal. The plan does not depend on how the work is divided among ticks.
+soon as the step that is due is bounded, in free space before the tick after its arrival. A few
+steps are bounded ahead, after the commands of a tick were published. A step that is due before it
+is bounded waits: the one before it stays the goal. The plan does not depend on how the work is
+divided among ticks.
 """
 
 from __future__ import annotations
@@ -335,8 +337,8 @@ class ChunkPlanner:
                 return Rejection(acted[0].name, why, *acted[0][1:3])
         return True
 
-    def bound_due(self, plans: Sequence[Plan], now_ns: int) -> list[LimitHit]:
-        """Bound the steps of `plans` (the newest last) that are due, then those due next.
+    def bound_due(self, plans: Sequence[Plan], now_ns: int, ahead: int = 0) -> list[LimitHit]:
+        """Bound the steps of `plans` (the newest last) that are due, and `ahead` steps after them.
 
         Later goals move with what is cut off.
 
@@ -348,13 +350,12 @@ class ChunkPlanner:
             for plan in reversed(plans)
             if isinstance(plan, ChunkPlan)
         ]
-        for ahead in (0, LOOK_AHEAD):
-            for plan, due in chunks:
-                if plan.action.targets and plan.bounded > due:
-                    plan.computed = plan.bounded  # the leash does not shift targets
-                until = min(due + 1 + ahead, len(plan.goals))
-                while plan.bounded < until and self._bound_step(plan) is not None:
-                    pass
+        for plan, due in chunks:
+            if plan.action.targets and plan.bounded > due:
+                plan.computed = plan.bounded  # the leash does not shift targets
+            until = min(due + 1 + ahead, len(plan.goals))
+            while plan.bounded < until and self._bound_step(plan) is not None:
+                pass
         return [hit for plan, _ in chunks for hit in plan.unreported_hits()]
 
     def _bound_step(self, plan: ChunkPlan) -> list[LimitHit] | None:

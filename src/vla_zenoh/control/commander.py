@@ -98,8 +98,38 @@ class Commander:
         self._stop_put_ns = self._stop_came_ns = 0
         """Of the last emergency stop: when it was put, by the router's clock, and its tick."""
         self._out = Outputs()
+        self._prepared = False
 
     # -- one tick -----------------------------------------------------------------------------
+    def prepare(self, inputs: Inputs, next_ns: int) -> None:
+        """Plan chunks that came before the next tick, which has less to do then.
+
+        The commands are those that `step` computes if it gets these inputs; events and rejections
+        are among its outputs. At most once between two ticks.
+
+        Args:
+            inputs: chunks and states; settings and peers are left to `step`.
+            next_ns: `now_ns` of the next call of `step`.
+        """
+        self._update_states(inputs)
+        self._begin_planning()
+        self._prepared = True
+        for chunk in inputs.chunks:
+            self._submit_chunk(chunk, next_ns)
+        self._plan_chunks(next_ns)
+
+    def look_ahead(self, now_ns: int) -> None:
+        """Bound steps that are due later; to be called when the commands of a tick are published.
+
+        Without it they are bounded when they are due. Its events are among the next outputs.
+        """
+        for part in self.parts if self.state is State.ACTIVE else ():
+            self._out.events += part.tagged(part.motion.look_ahead(now_ns))
+
+    def _begin_planning(self) -> None:
+        for part in self.parts:
+            part.planner.begin_tick()
+
     def step(self, inputs: Inputs, now_ns: int, ticks: int = 1) -> Outputs:
         """Process the inputs of one tick.
 
@@ -109,7 +139,6 @@ class Commander:
             ticks: periods since the last call. More than one after a late wake-up: the motion is a
                 function of time, so the same trajectory is sampled later, no faster.
         """
-        self._out = Outputs()
         task_before, state_before = self.task, self.state
         self._update_states(inputs)
         stopped = any(setting.name == "stop" for setting in inputs.settings)
@@ -119,8 +148,9 @@ class Commander:
             self._stop_put_ns, self._stop_came_ns = max(put_ns, default=0), now_ns
         for setting in inputs.settings:
             self._apply_setting(setting, now_ns, stopped)
-        for part in self.parts:
-            part.planner.begin_tick()
+        if not self._prepared:
+            self._begin_planning()
+        self._prepared = False
         for chunk in inputs.chunks:
             self._submit_chunk(chunk, now_ns)
         self._plan_chunks(now_ns)
@@ -147,7 +177,8 @@ class Commander:
         if self.state is not state_before and self.task.active != (self.state in OBEYING):
             self.task = replace(self.task, active=self.state in OBEYING)
         self._out.task_changed = self.task is not task_before and self.task != task_before
-        return self._out
+        out, self._out = self._out, Outputs()
+        return out
 
     # -- of the first part, which a robot that is one arm has alone ----------------------------
     @property

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vla_zenoh.control.aggregate import PlanAggregator
-from vla_zenoh.control.chunk_planner import ChunkPlanner
+from vla_zenoh.control.chunk_planner import LOOK_AHEAD, ChunkPlanner
 from vla_zenoh.control.commander_io import MotionCommands, limit_events, make_event
 from vla_zenoh.control.contact import Contact
 from vla_zenoh.control.gripper_arbiter import GripperArbiter
@@ -357,6 +357,13 @@ class MotionPipeline:
         return min(max(gripper.width_m, 0.0), self._max_width_m)
 
     # -- one tick -----------------------------------------------------------------------------
+    def look_ahead(self, now_ns: int) -> list[Event]:
+        """Bound the steps after the one that is due, as far as the budget goes."""
+        if self.timeline is None:
+            return []
+        plans = self._aggregator.plans(self.timeline, now_ns)
+        return limit_events(self._planner.bound_due(plans, now_ns, LOOK_AHEAD))
+
     def advance(
         self, state: State, task: Task, overdue_ns: int, now_ns: int, ticks: int
     ) -> tuple[bool, list[Event]]:

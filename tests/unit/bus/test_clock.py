@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 
 import pytest
@@ -61,3 +62,14 @@ def test_the_time_asleep_is_that_of_the_kernel() -> None:
     )
     said_ns = max(clock.suspended_ns() for _ in range(TRIES))
     assert 0 <= most_ns - said_ns < READ_APART_NS
+
+
+def test_an_arrival_ends_the_wait_once_and_the_turn_is_at_its_time_all_the_same() -> None:
+    loop, arrival = FixedRate(1.0), threading.Event()
+    due_ns = loop.next_ns
+    arrival.set()
+    assert loop.wait_for(arrival)
+    assert time.monotonic_ns() < due_ns
+    assert not arrival.is_set()
+    assert not loop.wait_for(arrival)
+    assert loop.wait().nominal_ns == due_ns

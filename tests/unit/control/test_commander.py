@@ -1096,3 +1096,43 @@ def test_the_measured_joints_are_monitored_however_many_chunks_arrive() -> None:
         rig.tick(chunks=[rig.chunk([[0.0] * 7], seq=0)])
     assert rig.state == "inactive"
     assert "the measured arm is too near to a bound" in rig.commander.why
+
+
+@pytest.mark.parametrize("command", ["pose", "joint"])
+def test_a_chunk_planned_before_its_tick_gives_the_commands_that_the_tick_would(
+    command: str,
+) -> None:
+    of = profile(robot={"command": command})
+    moved: list[list[np.ndarray]] = []
+    for early in (False, True):
+        reach = make_reachability_filter(of)
+        rig = Rig(of, reach=reach)
+        rig.stand_at(reach.kinematics, reach.joints_rad.copy())
+        rig.joints_rad = None
+        rig.activate()
+        moved.append([])
+        for count in range(80):
+            chunks = []
+            if count % 10 == 0:
+                chunks = [rig.chunk([[0.004, 0.002, 0.003, 0, 0, 0.01, 0]] * 6)]
+            if early and chunks:
+                rig.commander.prepare(Inputs(chunks=chunks), rig.now_ns + rig.period_ns)
+                chunks = []
+            out = rig.tick(chunks=chunks)
+            record = out.pose or out.joint
+            assert record is not None
+            moved[-1].append(record.position_m if out.pose else record.position_rad)
+        assert rig.commander.progress.chunks == 8
+    np.testing.assert_array_equal(*moved)
+    assert np.linalg.norm(moved[0][-1] - moved[0][0]) > 0.01
+
+
+def test_of_a_chunk_planned_before_a_stop_nothing_is_carried_out() -> None:
+    rig = moving_rig()
+    before = rig.commander.progress.chunks
+    rig.commander.prepare(Inputs(chunks=[rig.chunk([UP])]), rig.now_ns + rig.period_ns)
+    assert rig.commander.progress.chunks == before + 1
+    rig.put("stop")
+    assert rig.state == "stopped"
+    rig.settle()
+    rig.assert_smooth()

@@ -113,6 +113,7 @@ class Lockstep:
         self._sent = 0
         self._seq: Counter[str] = Counter()
         self._inbox = Inputs([], [])
+        self._prepared = True  # as in the command node: after the first tick, once in each period
         self._next_command_ns = self._next_state_ns = self._next_picture_ns = START_NS
         self._publish_states()
 
@@ -198,6 +199,8 @@ class Lockstep:
         )
         inputs, self._inbox = self._inbox, Inputs([], [])
         out = self.commander.step(inputs, self.wall_ns(COMMAND))
+        self._prepared = False
+        self.commander.look_ahead(self.wall_ns(COMMAND))
         self._publish(out)
         position_m, rotation = self.world.tcp()
         self.trace.time_ns.append(self.now_ns)
@@ -325,7 +328,16 @@ class Lockstep:
             worker.take_task(self._at(worker.source, task))
 
     def _take_chunk(self, chunk: Stamped[ActionChunk]) -> None:
-        self._inbox.chunks = [*self._inbox.chunks, self._at(COMMAND, chunk)]
+        chunk = self._at(COMMAND, chunk)
+        if self._prepared:
+            self._inbox.chunks = [*self._inbox.chunks, chunk]
+            return
+        self._prepared, inbox = True, self._inbox
+        states = replace(inbox, settings=(), chunks=[chunk], peers=None)
+        inbox.pose = inbox.gripper = inbox.joint = None
+        inbox.parts = {}
+        left_ns = self._next_command_ns - self.now_ns
+        self.commander.prepare(states, self.wall_ns(COMMAND) + left_ns)
 
     def _take_pose_command(self, part: str, command: Stamped[PoseCommand]) -> None:
         refusal = self.guards[part].offer_pose(self._at(SIM, command), self.wall_ns(SIM))

@@ -53,7 +53,12 @@ ARM = {
     "keep_out_distance_m": ("keep_out_distance_meters", "meters", 1.0, "To the next keep-out."),
 }
 PERCENTILES = ("p50", "p95", "p99", "max")
-LOOP = {"tick_us": "command_tick", "late_us": "command_late", "pose_age_ms": "command_pose_age"}
+LOOP = {
+    "tick_us": "command_tick",
+    "chunk_us": "command_chunk",
+    "late_us": "command_late",
+    "pose_age_ms": "command_pose_age",
+}
 """Distributions in the detail of the command node -> name."""
 
 

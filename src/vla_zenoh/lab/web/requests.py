@@ -16,7 +16,7 @@ MAX_NUMBER = 1e9
 AXES = 6
 
 
-class Request(NamedTuple):
+class PageRequest(NamedTuple):
     """A checked request.
 
     Args:
@@ -88,10 +88,10 @@ FIELDS: Mapping[str, Mapping[str, Callable[[Any], bool]]] = {
     "look": {"streams": _streams, "hz": _number},
     "drawn": {"frame": _count},
 }
-"""Request -> its fields with their checks; all are required, and no others are allowed."""
+"""PageRequest -> its fields with their checks; all are required, and no others are allowed."""
 
 
-def parse(text: str) -> Request:
+def parse(text: str) -> PageRequest:
     """Read a message of a browser.
 
     Raises:
@@ -113,4 +113,4 @@ def parse(text: str) -> Request:
     for name, check in fields.items():
         if not check(found[name]):
             raise CodecError("malformed", f"{do}: {name} is {shown(found[name])}")
-    return Request(do, found)
+    return PageRequest(do, found)

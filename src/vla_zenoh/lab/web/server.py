@@ -23,7 +23,7 @@ from vla_zenoh.lab.web import metrics
 from vla_zenoh.lab.web.access import People, Person, RateLimit, host_is_ours, origin_is_ours
 from vla_zenoh.lab.web.arm import surroundings
 from vla_zenoh.lab.web.pictures import Pictures
-from vla_zenoh.lab.web.requests import Request, parse
+from vla_zenoh.lab.web.requests import PageRequest, parse
 from vla_zenoh.lab.web.robot_link import RobotLink
 from vla_zenoh.lab.web.tables import node_table, noted_event
 
@@ -325,7 +325,7 @@ class PageServer:
             page.tell({"is": "rejected", "what": what, "why": why})
 
     # -- requests -----------------------------------------------------------------------------
-    async def _obey(self, page: Page, request: Request) -> None:
+    async def _obey(self, page: Page, request: PageRequest) -> None:
         link, values = self._link, request.values
         if request.do == "stop":
             self._begin(self._stop(page.person))

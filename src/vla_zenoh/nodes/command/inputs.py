@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from operator import itemgetter
 from typing import Any
 
@@ -42,7 +43,10 @@ class CommandInputs:
         self._node = node
         keys = node.keys
         self._peer_monitor = PeerMonitor(node)
-        self._chunks = node.subscribe(keys.all_deltas, CallbackRing(CHUNKS))
+        self.chunk_arrival = threading.Event()
+        """Set when a chunk arrives."""
+        ring = CallbackRing(CHUNKS, arrival=self.chunk_arrival)
+        self._chunks = node.subscribe(keys.all_deltas, ring)
         names = node.profile.part_names
         self._parts = {name: _PartInputs(node, keys.of_part(name)) for name in names}
         self._settings: list[tuple[str, ZenohRing, Callable[[bytes], Any]]] = [
@@ -75,12 +79,15 @@ class CommandInputs:
         """
         settings_put = self._poll_settings()
         peers = self._peer_monitor.update(now_ns, news=news)
+        inputs = self.poll_streams(settings_put)
+        inputs.settings, inputs.peers = [*settings_put, *self._check_clock()], peers
+        return inputs
+
+    def poll_streams(self, settings_put: Sequence[Setting] = ()) -> Inputs:
+        """The chunks and states among them."""
         chunks = [self._chunk(arrival) for arrival in self._chunks.drain()]
-        clock = self._check_clock()
         inputs = Inputs(
-            settings=[*settings_put, *clock],
             chunks=[chunk for chunk in chunks if chunk is not None],
-            peers=peers,
         )
         requested = any(setting.name in ("active", "worker") for setting in settings_put)
         states = {name: part.poll(requested) for name, part in self._parts.items()}

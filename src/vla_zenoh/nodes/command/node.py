@@ -112,6 +112,8 @@ class CommandNode:
         loop = FixedRate(self.node.profile.timing.command_hz)
         give_up = 0.0
         while True:
+            if loop.wait_for(self._inputs.chunk_arrival):
+                self._prepare(loop.next_ns)
             tick = loop.wait()
             if tick.periods > 1:
                 self.node.counters["command.missed_ticks"] += tick.periods - 1
@@ -129,6 +131,12 @@ class CommandNode:
         why = f"the command loop stood still for {tick.stall_s:.3f} s"
         return [Setting("lose", f"{why}, {tick.computed_s:.3f} s of it computing")]
 
+    def _prepare(self, next_mono_ns: int) -> None:
+        """Plan a chunk as soon as it arrives, so that the next tick need not."""
+        began = time.perf_counter()
+        self.commander.prepare(self._inputs.poll_streams(), self.node.clock.wall_at(next_mono_ns))
+        self._status.add_preparation(time.perf_counter() - began)
+
     def _on_tick(self, extra: list[Setting], tick: Tick) -> None:
         began = time.perf_counter()
         now_ns = self.node.clock.wall_at(tick.nominal_ns)
@@ -144,6 +152,7 @@ class CommandNode:
         if any(event.kind == "transition" for event in out.events):
             self._update_latch()
         self._status.add_tick(now_ns, tick.stall_s, time.perf_counter() - began)
+        self.commander.look_ahead(now_ns)
         if chores or out.events or out.task_changed:
             self._report_latch_failure()
             self._status.publish(out, self._inputs.chunks_dropped)
@@ -208,6 +217,7 @@ class CommandStatus:
         self._latency = {stage: Percentiles(CHUNKS) for stage in LATENCY_STAGES}
         self._cost_us, self._late_us = Percentiles(ticks), Percentiles(ticks)
         self._pose_age_ms = Percentiles(ticks)
+        self._chunk_us = Percentiles(CHUNKS)
         self._rate = RateMeter()
         self._was_at_rest = True
         self._limits: dict[str, tuple[str, float]] = {}
@@ -223,6 +233,10 @@ class CommandStatus:
         self._late_us.add(late_s * 1e6)
         self._rate.tick()
         self._cost_us.add(cost_s * 1e6)
+
+    def add_preparation(self, cost_s: float) -> None:
+        """Add the planning of chunks between two ticks, which took `cost_s`."""
+        self._chunk_us.add(cost_s * 1e6)
 
     def add_chunk(self, cause: Cause) -> None:
         """Add the latencies of a chunk that came into force."""
@@ -280,6 +294,7 @@ class CommandStatus:
                 "tracking_mrad": _most(part.watchdog.tracking_rad for part in commander.parts),
                 "elbow_mrad": _most(part.elbow_rad for part in commander.parts),
                 "tick_us": self._cost_us.spread(),
+                "chunk_us": self._chunk_us.spread(),
                 "late_us": self._late_us.spread(),
                 "pose_age_ms": self._pose_age_ms.spread(),
                 "realtime": self.realtime,
