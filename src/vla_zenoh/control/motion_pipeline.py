@@ -35,6 +35,7 @@ from vla_zenoh.kinematics.so3 import (
     Pose,
     exp3,
     held_pose,
+    interpolate,
     pose_distance,
     pose_of,
     quat_from_rotation,
@@ -60,6 +61,8 @@ SAME_WIDTH_M = 0.005
 HELD_M, HELD_RAD = 0.002, 0.01
 """A robot that holds a pose this near to the stream follows it: the stream continues."""
 HELD_JOINT_RAD = 0.004
+HELD_LEAD_M, HELD_LEAD_RAD = 0.01, 0.02
+"""The goal of an arm that another part holds up leads it by this much at most."""
 SAME_POSE = 1e-6
 """m and rad: joints whose TCP is this near to a pose have it."""
 SETTLED, SETTLED_NS = 5e-4, 100_000_000
@@ -465,6 +468,8 @@ class MotionPipeline:
         self._changing = joints is not self.in_joints
         mover = self._mover
         assert mover is not None
+        if self.held:
+            self._cut_lead(mover, plans, goal, now_ns)
         if self._override == 0.0 or self._changing or self.held:
             self._pause(mover)
             return events
@@ -516,6 +521,24 @@ class MotionPipeline:
             apart_m + ahead_s * sum(rates[:3]) <= limits.lead_m
             and apart_rad + ahead_s * sum(rates[3:]) <= limits.lead_rad
         )
+
+    def _cut_lead(
+        self, mover: Smoother | JointPath, plans: Sequence[Plan], goal: Goal, now_ns: int
+    ) -> None:
+        """Keep the goal of an arm that has to stand close to it, so that it can be led back."""
+        if isinstance(mover, JointPath):
+            assert goal.joints_rad is not None
+            here_rad = mover.state.position
+            way_rad = goal.joints_rad - here_rad
+            share = HELD_LEAD_RAD / max(float(np.abs(way_rad).max()), HELD_LEAD_RAD)
+            cut = joint_goal(mover.kinematics, here_rad + share * way_rad, goal.width_m)
+        else:
+            here = mover.motion.pose
+            apart_m, apart_rad = pose_distance(here, goal.pose)
+            share = 1 / max(apart_m / HELD_LEAD_M, apart_rad / HELD_LEAD_RAD, 1.0)
+            cut = replace(goal, pose=interpolate(here, goal.pose, share), joints_rad=None)
+        if share < 1.0:
+            self._shorten(plans, goal, cut, now_ns)
 
     def _pause(self, mover: Smoother | JointPath) -> None:
         """Stop on the path, to continue from there later."""
