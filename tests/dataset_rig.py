@@ -18,6 +18,7 @@ from vla_zenoh.policy import ActionSpec, ModelSpec, ObservationSpec
 from vla_zenoh.types import (
     ActionChunk,
     Cause,
+    GripperCommand,
     GripperState,
     Header,
     Image,
@@ -124,3 +125,81 @@ def write_run(
         out.write(sample)
     out.finish({"dropped": {}, **(ended or {})})
     return path
+
+
+TELEOP_STEP_M, TELEOP_DT_S = 0.002, 0.05
+MIXED = ((500, 1500, "teacher"), (1500, 2500, "teleop"), (2500, 3500, "teacher"))
+"""Since and until when, ms, who leads an activation that a person takes over."""
+PERSON_WIDTH_M = 0.03
+
+
+def write_mixed_run(
+    path: Path, *, of: ModelSpec | None = None, ended: Mapping[str, Any] | None = None
+) -> Path:
+    """One activation in which a person takes the arm from the model and gives it back.
+
+    The person asks for `TELEOP_STEP_M` along y each `TELEOP_DT_S`; the model goes on in shadow. The
+    goal of a command is where all steps until then lead.
+    """
+    model = of or spec()
+    person = ModelSpec(
+        name="teleop",
+        observation=ObservationSpec(cameras=(), prompt=False),
+        action=ActionSpec(horizon=20, dt_s=TELEOP_DT_S, rotation="rotvec"),
+    )
+    samples = [
+        put(KEYS.spec("teacher"), model, 0, 0),
+        put(KEYS.spec("teleop"), person, 0, 0),
+    ]
+    begin_ms, end_ms = MIXED[0][0], MIXED[-1][1]
+    for number, (since_ms, until_ms, worker) in enumerate(MIXED):
+        for at_ms in range(since_ms, until_ms, 100):
+            task = Task(number + 1, True, PROMPTS[0], worker, 5.0)
+            samples.append(put(KEYS.task, task, at_ms, at_ms))
+        for at_ms in range(since_ms, until_ms, CHUNK_MS):
+            for whose, said in (("teacher", model), ("teleop", person)):
+                seen_ms, seq = at_ms + 5, at_ms // CHUNK_MS
+                seen_ns = ZERO_NS + seen_ms * MS
+                times = (seen_ns + MS, seen_ns + 2 * MS, seen_ns + 30 * MS)
+                steps = steps_of(number, seq, said.action.dimension)
+                made = ActionChunk(
+                    *(whose, said.hash, number + 1, seen_ns, seq, seen_ns + 10**9, steps),
+                    *times,
+                )
+                samples.append(put(KEYS.delta(whose), made, seen_ms + 31, seq))
+                if whose == worker:
+                    cause = Cause(
+                        *(whose, seq, seen_ns, *times, seen_ns + 31 * MS, seen_ns + 32 * MS)
+                    )
+                    samples.append(_command(cause, seen_ms + 33))
+    person_ms = (MIXED[1][0], MIXED[1][1])
+    for at_ms in range(begin_ms, end_ms, 10):
+        samples.append(_command(None, at_ms))
+    idle = Task(4, False, PROMPTS[0], "teacher", 5.0)
+    samples.append(put(KEYS.task, idle, end_ms, end_ms))
+    shut = GripperCommand(PERSON_WIDTH_M, 0.1, 10.0)
+    samples.append(put(KEYS.command_gripper, shut, sum(person_ms) / 2, 1))
+    for at_ms in range(0, end_ms + 500, 10):
+        pose = PoseState(np.array([0.4, 0.0, at_ms / 1e4]), DOWN, np.zeros(6))
+        samples.append(put(KEYS.state_pose, pose, at_ms, at_ms))
+        samples.append(put(KEYS.state_gripper, GripperState(0.05, False, False), at_ms, at_ms))
+    for number in range((end_ms + 500) // 50):
+        at_ns = ZERO_NS + 50 * number * MS
+        header = Header(at_ns, number, "camera#1")
+        key = KEYS.camera_jpeg("front")
+        samples.append(Sample(key, picture(number), JPEG, header, at_ns + MS))
+    out = RecordingWriter(path, KEYS, profile_yaml="", base_frame="base", began_ns=ZERO_NS)
+    for sample in sorted(samples, key=lambda each: each.received_ns):
+        out.write(sample)
+    out.finish({"dropped": {}, **(ended or {})})
+    return path
+
+
+def _command(cause: Cause | None, at_ms: float) -> Sample:
+    """With the goal as far along y as the person has asked for until then."""
+    since_ms, until_ms = MIXED[1][0], MIXED[1][1]
+    led_s = (min(max(at_ms, since_ms), until_ms) - since_ms) / 1e3
+    goal = np.array([0.4, TELEOP_STEP_M * led_s / TELEOP_DT_S, 0.3])
+    still = np.zeros(6)
+    command = PoseCommand(goal, DOWN, still, still, goal, DOWN, "active", cause)
+    return put(KEYS.command_pose, command, at_ms, round(at_ms))

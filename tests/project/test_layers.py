@@ -72,6 +72,7 @@ ALLOWED = {
             "lab/recording/recorder.py",
             "lab/recording/replay.py",
             "lab/recording/sample_queue.py",
+            "lab/teleop/leader_arm.py",
             "lab/teleop/node.py",
             "lab/trial/runner.py",
             "lab/view/listener.py",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 
 import numpy as np
 from camera_rig import until
@@ -10,6 +11,9 @@ from chain import READY_PATIENCE_S, Chain, command_line
 from teleop_rig import Screen, teleop
 
 from vla_zenoh.codec import records
+from vla_zenoh.lab.dataset.episodes import episodes_of
+from vla_zenoh.lab.recording.recorder import Recorder
+from vla_zenoh.lab.recording.run import load_run
 from vla_zenoh.lab.teleop.keyboard import END
 from vla_zenoh.types import GripperState
 
@@ -80,6 +84,64 @@ def test_it_takes_the_arm_from_a_model_in_motion_and_gives_it_back(chain: Chain)
         chain.until("it moves on", chain.moves)
         screen.type(b"x")
         chain.until("stopped", lambda: chain.state() == "stopped")
+
+
+def test_a_recording_of_a_takeover_has_the_chunks_of_both_and_says_who_led(
+    chain: Chain, tmp_path: Path
+) -> None:
+    recorder = Recorder(chain.profile, chain.session, tmp_path / "run.mcap", name="of-takeover")
+    recorder.start()
+    with teleop(chain) as screen:
+        chain.client.set_worker("scripted")
+        chain.move()
+        screen.type(b"\t")
+        chain.until("it is obeyed", lambda: chain.client.task.worker == "teleop")
+        height_m = chain.reference_m()[2]
+        screen.hold(b"r", lambda: chain.reference_m()[2] > height_m + MOVED_M)
+        chain.wait_still()
+        screen.type(b"\t")
+        chain.until("the model has it back", lambda: chain.client.task.worker == "scripted")
+        chain.until("it moves on", chain.moves)
+        assert chain.client.deactivate()
+    assert not recorder.close().failure
+    run = load_run(tmp_path / "run.mcap")
+    (episode,) = [each for each in episodes_of(run) if "teleop" in each.workers]
+    assert (episode.worker, episode.workers) == ("scripted", ["scripted", "teleop"])
+    ((since_ns, until_ns),) = [(a, b) for a, b, worker in episode.led if worker == "teleop"]
+    meanwhile = {
+        chunk.record.worker
+        for chunk in run.chunks
+        if since_ns < chunk.header.stamp_wall_ns < until_ns
+    }
+    assert meanwhile == {"scripted", "teleop"}, "the model goes on in shadow"
+    led = [frame.intervention for frame in episode.frames]
+    assert not led[0]
+    assert not led[-1]
+    up_m = sum(float(frame.action[2]) for frame in episode.frames if frame.intervention)
+    assert up_m > MOVED_M / 2
+
+
+def test_a_leader_arm_takes_the_arm_from_a_model_and_gives_it_back(
+    chain: Chain, tmp_path: Path
+) -> None:
+    go = tmp_path / "go"
+    leader = Path(__file__).parents[1] / "leader_arm.py"
+    with teleop(chain, "--leader", str(leader), "--set", f"go={go}") as screen:
+        chain.client.set_worker("scripted")
+        chain.move()
+        screen.type(b"\t")
+        chain.until("it is obeyed", lambda: chain.client.task.worker == "teleop")
+        chain.wait_still()
+        start_m = chain.reference_m()
+        go.write_text("")
+        chain.until("the arm follows", lambda: chain.reference_m()[1] > start_m[1] + MOVED_M)
+        go.write_text("gone")
+        chain.wait_still()
+        until("it is told", lambda: b"the cable is out" in screen.shown)
+        screen.type(b"\t")
+        chain.until("the model has it back", lambda: chain.client.task.worker == "scripted")
+        chain.until("it moves on", chain.moves)
+        assert chain.client.deactivate()
 
 
 def test_ctrl_c_in_motion_ends_it_stops_the_arm_and_restores_the_terminal(chain: Chain) -> None:

@@ -12,7 +12,18 @@ import pytest
 pytest.importorskip("lerobot", reason="needs LeRobot's environment: make test-models")
 sys.path.append(str(Path(__file__).parents[2]))  # what all tests share
 import torch
-from dataset_rig import CHUNK_MS, CHUNKS, DT_S, HEIGHT, PROMPTS, WIDTH, steps_of, write_run
+from dataset_rig import (
+    CHUNK_MS,
+    CHUNKS,
+    DT_S,
+    HEIGHT,
+    MIXED,
+    PROMPTS,
+    WIDTH,
+    steps_of,
+    write_mixed_run,
+    write_run,
+)
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from vla_zenoh.lab.dataset.episodes import episodes_of
@@ -76,6 +87,21 @@ def test_statistics_and_success_are_read(folder: Path) -> None:
     np.testing.assert_allclose(dataset.meta.stats["action"]["mean"], actions.mean(0), rtol=1e-9)
     assert dataset.meta.stats["observation.images.front"]["mean"].shape == (3, 1, 1)
     assert [episode["success"] for episode in dataset.meta.episodes] == [True, None]
+
+
+def test_who_led_is_a_column_of_every_frame(tmp_path: Path) -> None:
+    """Under the name and type that LeRobot's own rollouts with corrections have."""
+    episodes = episodes_of(load_run(write_mixed_run(tmp_path / "mixed.mcap")))
+    export(tmp_path / "mixed", episodes, ["front"], read_parts("position+rpy+gripper_m"))
+    dataset = opened(tmp_path / "mixed")
+    assert dataset.meta.features["intervention"]["dtype"] == "bool"
+    assert dataset.num_episodes == 1
+    each = len(dataset) // len(MIXED)
+    led = [bool(dataset[index]["intervention"]) for index in range(len(dataset))]
+    assert led == [False] * each + [True] * each + [False] * each
+    batch = next(iter(torch.utils.data.DataLoader(dataset, batch_size=len(dataset))))
+    assert batch["intervention"].sum() == each
+    assert list(dataset.meta.episodes[0]["tasks"]) == [PROMPTS[0]]
 
 
 def test_batches_are_made_and_one_episode_can_be_chosen(folder: Path) -> None:

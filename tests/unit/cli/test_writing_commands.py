@@ -29,6 +29,7 @@ READ = {
     "bench compare b",
     "bench sim replay",
     "lab trial setups",
+    "teleop leader",
     "web people",
     "web certificate",
     "web key",

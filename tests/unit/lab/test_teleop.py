@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vla_zenoh.control.actions import step_pose, step_width
-from vla_zenoh.errors import MissingExtraError, NodeError
-from vla_zenoh.kinematics.so3 import Pose
+from vla_zenoh.errors import MissingExtraError, NodeError, PeerError
+from vla_zenoh.kinematics.kinematics import make_kinematics
+from vla_zenoh.kinematics.so3 import Pose, quat_from_rotation, rotation_from_quat
 from vla_zenoh.lab.check.examples import example_observation
 from vla_zenoh.lab.teleop.keyboard import (
     ACTIVATE,
@@ -25,6 +27,8 @@ from vla_zenoh.lab.teleop.keyboard import (
     Keystroke,
     KeystrokeParser,
 )
+from vla_zenoh.lab.teleop.leader import LeaderPolicy, LeaderState
+from vla_zenoh.lab.teleop.leader_arm import LeaderArm
 from vla_zenoh.lab.teleop.policy import (
     DEAD_ZONE,
     DT_S,
@@ -36,10 +40,10 @@ from vla_zenoh.lab.teleop.policy import (
     combined,
     without_dead_zone,
 )
-from vla_zenoh.lab.teleop.sticks import Gamepad, SpaceMouse
+from vla_zenoh.lab.teleop.sticks import Button, Gamepad, SpaceMouse
 from vla_zenoh.policy import Observation, check_steps
-from vla_zenoh.profile import load_profile
-from vla_zenoh.types import GripperState
+from vla_zenoh.profile import load_profile, override
+from vla_zenoh.types import GripperState, JointState, PoseState
 
 ATOL = 1e-7
 """m and rad, of float32."""
@@ -160,6 +164,11 @@ def test_a_stick_is_zero_in_its_middle_and_never_beyond_its_end(value: float) ->
     assert abs(without_dead_zone(1.0)) == 1
 
 
+def test_a_button_counts_when_it_goes_down() -> None:
+    button = Button()
+    assert [button.pressed(down) for down in (False, True, True, False, True)] == [0, 1, 1, 1, 2]
+
+
 def test_two_hands_together_are_not_faster_than_one() -> None:
     both = combined(
         OperatorInput((1, 0, 0, 0, 0, 0), 1, 2), OperatorInput((1, -0.5, 0, 0, 0, 0), 0, 1)
@@ -276,6 +285,94 @@ def test_every_chunk_fits_what_is_declared(frame: str) -> None:
     person.read = OperatorInput((1, -1, 0.5, 0, 0, -1), 1, 5)
     for step in person.steps():
         assert step_width(person.policy.spec.action, step, 0.0, MAX_M) is not None
+
+
+# -- a leader arm --------------------------------------------------------------------------------
+class Led:
+    """A leader whose joints and gripper a test says, and the policy that follows it."""
+
+    def __init__(self, command: str = "joint") -> None:
+        self.profile = override(load_profile("panda_sim"), {"robot": {"command": command}})
+        self.now_s, self.here_rad = 10.0, np.array(self.profile.robot.home_rad)
+        self.states = [LeaderState(self.now_s, self.here_rad + 0.3, MAX_M)]
+        self.policy = LeaderPolicy(self.profile, "teleop", lambda: self.states, lambda: self.now_s)
+
+    def move(self, turned_rad: float, seconds: float, width_m: float = MAX_M) -> None:
+        before = self.states[-1]
+        for share in np.linspace(0, 1, 50)[1:]:
+            there = before.position_rad + share * turned_rad
+            self.states.append(LeaderState(before.time_s + share * seconds, there, width_m))
+        self.now_s = before.time_s + seconds
+
+    def steps(
+        self, *, worker: str = "teleop", rate_hz: float = 5.0, holding: bool = False
+    ) -> np.ndarray:
+        seen: Observation = example_observation(self.policy.spec)
+        task = replace(seen.task, active=True, worker=worker, rate_hz=rate_hz)
+        still = np.zeros(len(self.here_rad))
+        joint = JointState(self.profile.robot.arm_joints, self.here_rad, still, still)
+        here = make_kinematics(self.profile).forward(self.here_rad)
+        quat = quat_from_rotation(here.rotation)
+        pose = PoseState(here.position_m, quat, np.zeros(6))
+        gripper = GripperState(0.04, False, holding)
+        given = replace(seen, task=task, joint=joint, pose=pose, gripper=gripper)
+        return check_steps(self.policy.spec.action, self.policy.infer(given).steps)
+
+
+def test_to_take_over_by_a_leader_that_stands_elsewhere_asks_for_no_motion() -> None:
+    led = Led()
+    for worker in ("scripted", "teleop"):
+        steps = led.steps(worker=worker)
+        np.testing.assert_allclose(steps[:, :-1], np.tile(led.here_rad, (len(steps), 1)), atol=ATOL)
+    np.testing.assert_allclose(steps[:, -1], 0.04, atol=ATOL)
+
+
+def test_the_arm_goes_the_way_of_its_leader_from_the_takeover_on() -> None:
+    led = Led()
+    led.move(0.5, 1.0)
+    led.steps(worker="scripted")
+    led.move(0.2, 1.0)
+    led.steps()
+    led.move(0.1, 0.2)
+    steps = led.steps(rate_hz=5.0)[:, :-1] - led.here_rad
+    wanted = np.minimum(np.arange(1, len(steps) + 1) * DT_S / 0.2, 1.0) * 0.1
+    np.testing.assert_allclose(steps, np.tile(wanted[:, None], (1, steps.shape[1])), atol=1e-6)
+
+
+def test_an_arm_that_takes_poses_follows_the_tcp_of_its_leader() -> None:
+    led = Led("pose")
+    led.here_rad = led.states[0].position_rad
+    led.steps()
+    led.move(0.05, 0.2)
+    last = led.steps()[-1].astype(float)
+    there = make_kinematics(led.profile).forward(led.states[-1].position_rad)
+    np.testing.assert_allclose(last[:3], there.position_m, atol=1e-6)
+    turned = rotation_from_quat(last[3:7] / np.linalg.norm(last[3:7]))
+    np.testing.assert_allclose(turned, there.rotation, atol=1e-6)
+
+
+def test_the_gripper_follows_once_the_leaders_is_moved() -> None:
+    led = Led()
+    np.testing.assert_array_equal(led.steps(holding=True)[:, -1], 0.0)
+    led.move(0.0, 0.2, width_m=MAX_M - 0.005)
+    np.testing.assert_array_equal(led.steps(holding=True)[:, -1], 0.0)
+    led.move(0.0, 0.2, width_m=0.06)
+    np.testing.assert_allclose(led.steps(holding=True)[:, -1], 0.06, atol=ATOL)
+
+
+def test_a_leader_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+    file = tmp_path / "broken.py"
+    file.write_text(
+        "class Broken:\n"
+        "    def read(self): raise ConnectionError('the cable is out')\n"
+        "    def move(self, command): pass\n"
+    )
+    leader = LeaderArm(file, {}, 7)
+    try:
+        with pytest.raises(PeerError, match=r"leader broken.py: (the cable|it reads)"):
+            leader.path()
+    finally:
+        leader.close()
 
 
 # -- devices -------------------------------------------------------------------------------------

@@ -44,7 +44,7 @@ def test_only_what_a_person_called_a_success_is_exported_where_that_is_asked(
         assert succeeded(episode) is known
 
     out = tmp_path / "good"
-    words = ["export", str(tmp_path), "--output", str(out), "--successful", "--json"]
+    words = ["export", str(tmp_path), "--output", str(out), "--label", "success", "--json"]
     done = CliRunner().invoke(dataset_app, words)
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout)["episodes"] == 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import pytest
@@ -59,9 +60,8 @@ def test_a_part_has_what_the_profile_says_where_its_own_sections_say_nothing() -
     ],
 )
 def test_what_cannot_be_a_part_is_told_by_its_place(change: dict[str, Any], said: str) -> None:
-    with pytest.raises(ProfileError, match="") as raised:
+    with pytest.raises(ProfileError, match=re.escape(said)):
         override(PAIR, change)
-    assert said in str(raised.value)
 
 
 def test_one_part_alone_is_no_robot_of_parts() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from pathlib import Path
 from typing import Annotated
 
@@ -12,6 +13,7 @@ from vla_zenoh.cli.options import JsonOption
 from vla_zenoh.cli.output import console, errors, fail, print_json, progress
 from vla_zenoh.errors import RecordingError, counted, nearest
 from vla_zenoh.lab.cli.output_path import ForceOption, output_file, output_folder
+from vla_zenoh.lab.dataset.label import EpisodeLabel
 from vla_zenoh.lab.evaluation.evaluate import MCAP, recordings
 
 dataset_app = typer.Typer(
@@ -38,22 +40,31 @@ def export(
             "for actions of joints joint+gripper_m.",
         ),
     ] = None,
-    successful: Annotated[
-        bool, typer.Option("--successful", help="Only episodes known to be successful.")
-    ] = False,
+    labels: Annotated[
+        list[EpisodeLabel] | None,
+        typer.Option(
+            "--label",
+            help="Only episodes with this label; repeatable. Default: all but discarded ones.",
+        ),
+    ] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Export a LeRobotDataset v3.0 with one episode per activation of a worker."""
+    """Export a LeRobotDataset v3.0 with one episode per activation of a worker.
+
+    Where a person took the arm from a model and gave it back that is one episode of the model; the
+    column `intervention` says which frames the person led.
+    """
     from vla_zenoh.lab.dataset.episodes import episodes_of
     from vla_zenoh.lab.dataset.features import usual_state
     from vla_zenoh.lab.dataset.lerobot import export as write
-    from vla_zenoh.lab.dataset.success import succeeded
+    from vla_zenoh.lab.dataset.success import succeeded, verdict_of_person
     from vla_zenoh.lab.recording.run import load_run
     from vla_zenoh.policy.state_vector import read_parts
 
     parts, files = read_parts(state) if state else None, _files(runs)
-    episodes, seen, workers, failed = [], None, set[str](), 0
+    wanted = labels or [each for each in EpisodeLabel if each is not EpisodeLabel.DISCARDED]
+    episodes, seen, workers, left_out = [], None, set[str](), Counter[str]()
     with (
         output_folder(output, force=force, inputs=files) as part,
         progress("reading the recordings") as status,
@@ -67,9 +78,9 @@ def export(
             found = episodes_of(run, worker)
             for episode in found:
                 episode.success = succeeded(episode)
-            kept = [each for each in found if each.success or not successful]
-            episodes += kept
-            failed += len(found) - len(kept)
+                episode.discarded = verdict_of_person(episode) == "void"
+            episodes += [each for each in found if each.label in wanted]
+            left_out.update(each.label for each in found if each.label not in wanted)
             if found:
                 seen = set(run.picture_counts) if seen is None else seen & set(run.picture_counts)
         if worker is not None and worker not in workers:
@@ -78,9 +89,12 @@ def export(
                 f"no episode of worker {worker!r} is in the recordings{nearest(worker, workers)} "
                 f"Workers there: {known}"
             )
-        if failed and not episodes:
-            those = counted(failed, "episode")
-            fail(f"none of {those} is known to be successful; leave out --successful")
+        if left_out and not episodes:
+            those = ", ".join(f"{count} {label}" for label, count in left_out.items())
+            fail(
+                f"no episode has the label {' or '.join(wanted)}; there are: {those}. Choose "
+                "another --label"
+            )
         written = write(
             part,
             episodes,
@@ -92,10 +106,11 @@ def export(
     if as_json:
         print_json(written._asdict())
         return
-    known = "" if written.successes is None else f", {written.successes} known to be successful"
+    known = ", ".join(f"{count} {label}" for label, count in written.labels.items())
     console().print(
-        f"{written.folder}: {written.episodes} episodes{known}, {written.frames} frames at "
-        f"{written.fps} Hz, cameras {', '.join(written.cameras) or 'none'}, "
+        f"{written.folder}: {written.episodes} episodes ({known}), {written.frames} frames at "
+        f"{written.fps} Hz, {written.interventions} of them led by a person, "
+        f"cameras {', '.join(written.cameras) or 'none'}, "
         f"{counted(len(written.tasks), 'prompt')}"
     )
 

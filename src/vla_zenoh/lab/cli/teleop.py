@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 import zenoh
 
 from vla_zenoh.bus.session import open_session
-from vla_zenoh.cli.options import options
+from vla_zenoh.cli.options import model_options, options
 from vla_zenoh.cli.output import errors
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import SecurityError
@@ -25,6 +26,18 @@ def teleop(
         Literal["keyboard", "gamepad", "spacemouse"],
         typer.Option("--device", "-d", help="Input besides the keyboard, which always works."),
     ] = "keyboard",
+    leader: Annotated[
+        Path | None,
+        typer.Option(
+            "--leader",
+            help="Follow the joints of this arm: a Python file with a class of a robot (see "
+            "`vla_zenoh.robot`), of which only read() is called.",
+        ),
+    ] = None,
+    leader_options: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Option of the leader's class as name=value; repeatable."),
+    ] = None,
     frame: Annotated[
         Literal["base", "tcp"],
         typer.Option(help="Axes of the motion: robot base or TCP."),
@@ -34,9 +47,10 @@ def teleop(
 ) -> None:
     """Drive the arm by hand, as a worker whose model is you.
 
-    `vla-zenoh use teleop` (or Tab) selects it, also while a model moves the arm; it is recorded as
-    any worker is.
+    `vla-zenoh use teleop` (or Tab, Y of a gamepad, the second button of a SpaceMouse) selects it,
+    also while a model moves the arm; Tab again gives the arm back. It is recorded as any worker is.
     """
+    from vla_zenoh.lab.teleop.leader_arm import LeaderArm
     from vla_zenoh.lab.teleop.node import Teleop
     from vla_zenoh.lab.teleop.sticks import DEVICES
 
@@ -46,11 +60,24 @@ def teleop(
         if stick is not None:
             stack.callback(stick.close)
             errors().print(f"using {stick.name} and the keyboard")
+        arm = None
+        if leader is not None:
+            given = model_options(leader_options or [])
+            arm = LeaderArm(leader, given, len(loaded.robot.arm_joints))
+            stack.callback(arm.close)
+            errors().print(f"following {arm.name}")
 
         def run(session, stop) -> None:  # pyright: ignore  # as run_node gives them
             settings = _settings_session(loaded, stack)
             node = Teleop(
-                loaded, session, settings, name, device=stick, frame=frame, level=speed - 1
+                loaded,
+                session,
+                settings,
+                name,
+                device=stick,
+                frame=frame,
+                level=speed - 1,
+                leader=arm,
             )
             node.run(stop)
 

@@ -3,11 +3,14 @@
 A frame is one step of that worker's chunks: step k of a chunk belongs to the stamp of its
 observation plus k steps. Steps that a newer chunk replaced are left out. If a chunk ran out before
 the next one arrived, frames without motion fill the gap, so all frames are `dt_s` apart.
+
+Where a person took the arm from a model and gave it back, without a deactivation in between, that
+is one episode of the model. The frames that the person led are what the arm was commanded to do,
+in the numbers of the model's spec (`vla_zenoh.lab.dataset.corrections`).
 """
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -15,11 +18,16 @@ from numpy.typing import NDArray
 
 from vla_zenoh.control.actions import as_deltas
 from vla_zenoh.errors import RecordingError
+from vla_zenoh.lab.dataset.corrections import CommandedMotion
+from vla_zenoh.lab.dataset.label import EpisodeLabel
 from vla_zenoh.lab.evaluation.activations import activations, obeyed_chunks
-from vla_zenoh.lab.recording.run import RecordedSample, Run
+from vla_zenoh.lab.recording.run import RecordedSample, Run, newest
+from vla_zenoh.lab.teleop.policy import PERSON
 from vla_zenoh.policy import ROTATION_SIZE, ActionSpec, ModelSpec
 
 FPS_TOLERANCE = 0.01
+Span = tuple[int, int, str]
+"""Since and until when, wall ns, the arm obeyed which worker."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,25 +38,29 @@ class Frame:
         stamp_ns: wall clock.
         action: (D,) float32, with the meaning of the spec.
         prompt: in force at that time.
+        intervention: a person led the arm.
     """
 
     stamp_ns: int
     action: NDArray[np.float32]
     prompt: str
+    intervention: bool = False
 
 
 @dataclass(slots=True)
 class RecordedEpisode:
-    """An interval in which the arm obeyed one worker, as frames.
+    """An interval in which the arm obeyed one worker, and maybe a person, as frames.
 
     Args:
         run: the recorded run.
-        worker: the obeyed worker.
+        worker: the obeyed worker; the model, where a person took the arm from it.
         spec: of its actions.
         since_ns: start, wall clock.
         until_ns: end, wall clock.
         frames: oldest first.
+        led: who led when, oldest first.
         success: whether the task was done; None: unknown.
+        discarded: a person called it void.
     """
 
     run: Run
@@ -57,7 +69,23 @@ class RecordedEpisode:
     since_ns: int
     until_ns: int
     frames: list[Frame] = field(default_factory=list)
+    led: list[Span] = field(default_factory=list)
     success: bool | None = None
+    discarded: bool = False
+
+    @property
+    def label(self) -> EpisodeLabel:
+        """What came of it."""
+        if self.discarded:
+            return EpisodeLabel.DISCARDED
+        if self.success is None:
+            return EpisodeLabel.UNKNOWN
+        return EpisodeLabel.SUCCESS if self.success else EpisodeLabel.FAILURE
+
+    @property
+    def workers(self) -> list[str]:
+        """All that led, the first one first."""
+        return list(dict.fromkeys(worker for _, _, worker in self.led))
 
 
 def fps_of(spec: ActionSpec) -> int:
@@ -80,10 +108,11 @@ def episodes_of(run: Run, worker: str | None = None) -> list[RecordedEpisode]:
 
     Args:
         run: the recorded run.
-        worker: only episodes of this worker.
+        worker: only episodes of this worker; of a person's, only what the person led.
 
     Raises:
-        RecordingError: a chunk's spec is not in the recording.
+        RecordingError: a chunk's spec is not in the recording, or a person's motion cannot be told
+            in the numbers of the model's spec.
     """
     done = {
         (cause.worker, cause.chunk_seq, cause.observation_stamp_ns)
@@ -94,19 +123,81 @@ def episodes_of(run: Run, worker: str | None = None) -> list[RecordedEpisode]:
         for chunk in obeyed_chunks(run)
         if (chunk.record.worker, chunk.header.seq, chunk.record.observation_stamp_ns) in done
     ]
+    people = _people(run)
+    spans = [span for span in activations(run) if _within(span, carried_out)]
+    alone = worker in people
     out: list[RecordedEpisode] = []
-    for since_ns, until_ns, whose in activations(run):
-        chunks = [
-            chunk
-            for chunk in carried_out
-            if since_ns <= chunk.header.stamp_wall_ns < until_ns and chunk.record.worker == whose
-        ]
-        if not chunks or worker not in (None, whose):
-            continue
-        spec, chunks = _one_by_one(_spec_of(run, chunks), chunks)
-        frames = _frames(run, spec.action, chunks, until_ns)
-        out.append(RecordedEpisode(run, whose, spec, since_ns, until_ns, frames))
+    for led in [[span] for span in spans] if alone else together(spans, people):
+        whose = next((each for _, _, each in led if each not in people), led[0][2])
+        if worker in (None, whose):
+            out.append(_episode(run, whose, led, carried_out, people))
     return out
+
+
+def _people(run: Run) -> set[str]:
+    """Workers that are a person."""
+    known = {(chunk.record.worker, chunk.record.spec_hash) for chunk in run.chunks}
+    return {
+        worker for worker, spec in known if spec in run.specs and run.specs[spec].name == PERSON
+    }
+
+
+def _within(span: Span, chunks: list[RecordedSample]) -> list[RecordedSample]:
+    """Those of the worker and the time of a span."""
+    since_ns, until_ns, worker = span
+    return [
+        chunk
+        for chunk in chunks
+        if since_ns <= chunk.header.stamp_wall_ns < until_ns and chunk.record.worker == worker
+    ]
+
+
+def together(spans: list[Span], people: set[str]) -> list[list[Span]]:
+    """Spans of one model and the people who took the arm from it while it was active."""
+    out: list[list[Span]] = []
+    for span in spans:
+        if out and out[-1][-1][1] == span[0] and _goes_on(out[-1], span[2], people):
+            out[-1].append(span)
+        else:
+            out.append([span])
+    return out
+
+
+def _goes_on(led: list[Span], worker: str, people: set[str]) -> bool:
+    """Whether what `worker` leads next belongs to the same episode."""
+    models = {each for _, _, each in led} - people
+    if not models and worker in people:
+        return worker == led[-1][2]
+    return len(models | ({worker} - people)) <= 1
+
+
+def _episode(
+    run: Run, whose: str, led: list[Span], carried_out: list[RecordedSample], people: set[str]
+) -> RecordedEpisode:
+    own = [chunk for span in led if span[2] == whose for chunk in _within(span, carried_out)]
+    spec, own = _one_by_one(_spec_of(run, own), own)
+    mixed = any(worker != whose for _, _, worker in led)
+    motion = CommandedMotion(run, spec.action) if mixed else None
+    parts = [(span, _within(span, own)) for span in led]
+    begins = [
+        chunks[0].record.observation_stamp_ns if chunks else span[0] for span, chunks in parts
+    ]
+    ends = [*begins[1:], led[-1][1]]
+    frames: list[Frame] = []
+    dt_ns = round(spec.action.dt_s * 1e9)
+    for (span, chunks), begin_ns, end_ns in zip(parts, begins, ends, strict=True):
+        person = span[2] in people
+        if chunks:
+            last = span is led[-1]
+            frames += _frames(run, spec.action, chunks, end_ns, person=person, to_the_end=not last)
+        elif motion is not None:
+            since_ns = max(begin_ns, frames[-1].stamp_ns + dt_ns if frames else begin_ns)
+            stamps = [since_ns + dt_ns * at for at in range(round((end_ns - since_ns) / dt_ns))]
+            frames += [
+                Frame(at_ns, motion.action(at_ns, at_ns + dt_ns), _prompt(run, at_ns), person)
+                for at_ns in stamps
+            ]
+    return RecordedEpisode(run, whose, spec, led[0][0], led[-1][1], frames, led)
 
 
 def _spec_of(run: Run, chunks: list[RecordedSample]) -> ModelSpec:
@@ -139,9 +230,15 @@ def _one_by_one(
     return spec.model_copy(update={"action": action}), out
 
 
-def _frames(run: Run, spec: ActionSpec, chunks: list[RecordedSample], until_ns: int) -> list[Frame]:
-    stamps = [entry.header.stamp_wall_ns for entry in run.tasks]
-    prompts = [entry.record.prompt for entry in run.tasks]
+def _frames(
+    run: Run,
+    spec: ActionSpec,
+    chunks: list[RecordedSample],
+    until_ns: int,
+    *,
+    person: bool = False,
+    to_the_end: bool = False,
+) -> list[Frame]:
     dt_ns = round(spec.dt_s * 1e9)
     begins = [chunk.record.observation_stamp_ns for chunk in chunks]
     ends = [*begins[1:], until_ns]
@@ -149,16 +246,22 @@ def _frames(run: Run, spec: ActionSpec, chunks: list[RecordedSample], until_ns: 
     for chunk, begin_ns, end_ns in zip(chunks, begins, ends, strict=True):
         steps = chunk.record.steps
         count = max(round((end_ns - begin_ns) / dt_ns), 1)
-        if chunk is chunks[-1]:
+        if chunk is chunks[-1] and not to_the_end:
             count = min(count, len(steps))
         rest = hold(spec, steps[-1])
         for index in range(count):
             at_ns = begin_ns + index * dt_ns
             # A chunk's observation may be from just before the activation.
-            task = max(bisect_right(stamps, max(at_ns, chunk.header.stamp_wall_ns)) - 1, 0)
+            prompt = _prompt(run, max(at_ns, chunk.header.stamp_wall_ns))
             action = steps[index] if index < len(steps) else rest
-            out.append(Frame(at_ns, action, prompts[task]))
+            out.append(Frame(at_ns, action, prompt, person))
     return out
+
+
+def _prompt(run: Run, at_ns: int) -> str:
+    """In force at a time; before the first task, its own."""
+    task = newest(run.tasks, at_ns) or run.tasks[0]
+    return task.record.prompt
 
 
 def hold(spec: ActionSpec, last: NDArray[np.float32]) -> NDArray[np.float32]:

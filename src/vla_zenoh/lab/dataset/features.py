@@ -16,6 +16,8 @@ from vla_zenoh.policy.state_vector import parts_of, state_vector
 from vla_zenoh.types import Task
 
 STATE, ACTION, PICTURE = "observation.state", "action", "observation.images."
+INTERVENTION = "intervention"
+"""A person led the arm; the name that LeRobot's rollouts with corrections have."""
 NAMES = {
     "position": ["x", "y", "z"],
     "rpy": ["roll", "pitch", "yaw"],

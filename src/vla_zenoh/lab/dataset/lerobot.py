@@ -10,7 +10,8 @@ In addition ``meta/vla_zenoh.json`` holds the spec and the source of each episod
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,6 +24,7 @@ from vla_zenoh.lab.dataset.episodes import RecordedEpisode, fps_of
 from vla_zenoh.lab.dataset.feature_statistics import Colours
 from vla_zenoh.lab.dataset.features import (
     ACTION,
+    INTERVENTION,
     PICTURE,
     STATE,
     action_names,
@@ -46,6 +48,7 @@ VIDEOS, TASKS = f"videos/{{video_key}}/{PART}.mp4", "meta/tasks.parquet"
 INFO, STATS, OURS = "meta/info.json", "meta/stats.json", "meta/vla_zenoh.json"
 DATA_MB, VIDEO_MB = 100, 200
 """Sizes at which LeRobot starts another file when it appends to a dataset."""
+LED = ("since_ns", "until_ns", "worker")
 COUNTERS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 
 
@@ -60,6 +63,8 @@ class Written(NamedTuple):
         cameras: names of its cameras.
         tasks: all prompts.
         successes: number of successful episodes; None if unknown for all.
+        interventions: number of frames that a person led.
+        labels: number of episodes by label.
     """
 
     folder: Path
@@ -69,6 +74,8 @@ class Written(NamedTuple):
     cameras: tuple[str, ...]
     tasks: tuple[str, ...]
     successes: int | None
+    interventions: int
+    labels: Mapping[str, int]
 
 
 def export(
@@ -147,6 +154,8 @@ class _Dataset:
             self._cameras,
             tuple(self._tasks),
             sum(known) if known else None,
+            sum(int(each[INTERVENTION].sum()) for each in rows),
+            dict(Counter(episode.label.value for episode in self._episodes)),
         )
 
     def _place(self, pattern: str, number: int, **more: str) -> Path:
@@ -179,7 +188,7 @@ class _Dataset:
         numbers = {STATE: len(self._state_names), ACTION: self._spec.action.dimension}
         schema = pa.schema(
             [(name, pa.list_(pa.float32(), size)) for name, size in numbers.items()]
-            + [("timestamp", pa.float32())]
+            + [(INTERVENTION, pa.bool_()), ("timestamp", pa.float32())]
             + [(name, pa.int64()) for name in COUNTERS[1:]]
         )
         out, first = [], 0
@@ -192,6 +201,7 @@ class _Dataset:
                 rows: dict[str, NDArray[Any]] = {
                     STATE: states,
                     ACTION: np.array([frame.action for frame in episode.frames], np.float32),
+                    INTERVENTION: np.array([frame.intervention for frame in episode.frames]),
                     "timestamp": (np.arange(count) / self._fps).astype(np.float32),
                     "frame_index": np.arange(count),
                     "episode_index": np.full(count, number),
@@ -251,6 +261,7 @@ class _Dataset:
                 "meta/episodes/chunk_index": 0,
                 "meta/episodes/file_index": 0,
                 "success": episode.success,
+                "label": episode.label.value,
                 "worker": episode.worker,
                 "run": episode.run.path.name,
             }
@@ -310,6 +321,8 @@ class _Dataset:
                     "since_ns": episode.since_ns,
                     "until_ns": episode.until_ns,
                     "success": episode.success,
+                    "label": episode.label.value,
+                    "led": [dict(zip(LED, span, strict=True)) for span in episode.led],
                 }
                 for episode in self._episodes
             ],
@@ -341,7 +354,7 @@ class _Dataset:
             (ACTION, action_names(self._spec.action)),
         ):
             out[name] = {"dtype": "float32", "shape": [len(names)], "names": names}
-        for name in COUNTERS:
-            dtype = "float32" if name == "timestamp" else "int64"
+        for name in (INTERVENTION, *COUNTERS):
+            dtype = {INTERVENTION: "bool", "timestamp": "float32"}.get(name, "int64")
             out[name] = {"dtype": dtype, "shape": [1], "names": None}
         return out

@@ -7,10 +7,19 @@ from vla_zenoh.lab.dataset.episodes import RecordedEpisode
 from vla_zenoh.lab.recording.run import newest
 from vla_zenoh.lab.tasks.judge import SETTLED_S, TaskJudge
 from vla_zenoh.lab.tasks.wording import parse_prompt
-from vla_zenoh.lab.trial.verdict import verdict_in
+from vla_zenoh.lab.trial.verdict import Verdict, verdict_in
 
 AFTER_NS = int(1.2 * SETTLED_S * 1e9)
 """Time after the end in which a brick that was just released is judged."""
+
+
+def verdict_of_person(episode: RecordedEpisode) -> Verdict | None:
+    """Of the operator, on any worker that led the arm in it; None: there is none."""
+    for worker in (episode.worker, *episode.workers):
+        verdict = verdict_in(episode.run.file.ended, worker)
+        if verdict is not None:
+            return verdict
+    return None
 
 
 def succeeded(episode: RecordedEpisode) -> bool | None:
@@ -19,9 +28,9 @@ def succeeded(episode: RecordedEpisode) -> bool | None:
     It is unknown if the person called the episode void, or if there is no verdict of a person and
     the prompt changed or is no known task, or no true poses were recorded.
     """
-    verdict_of_person = verdict_in(episode.run.file.ended, episode.worker)
-    if verdict_of_person is not None:
-        return None if verdict_of_person == "void" else verdict_of_person == "success"
+    said = verdict_of_person(episode)
+    if said is not None:
+        return None if said == "void" else said == "success"
     prompts = {frame.prompt for frame in episode.frames}
     order = parse_prompt(prompts.pop()) if len(prompts) == 1 else None
     run = episode.run

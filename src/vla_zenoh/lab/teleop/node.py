@@ -15,7 +15,7 @@ from collections.abc import Callable
 import zenoh
 
 from vla_zenoh.bus.client import Client
-from vla_zenoh.errors import NodeError
+from vla_zenoh.errors import NodeError, PeerError
 from vla_zenoh.lab.teleop.keyboard import (
     ACTIVATE,
     BEGIN,
@@ -27,6 +27,8 @@ from vla_zenoh.lab.teleop.keyboard import (
     Keyboard,
     KeystrokeParser,
 )
+from vla_zenoh.lab.teleop.leader import LeaderPolicy
+from vla_zenoh.lab.teleop.leader_arm import LeaderArm
 from vla_zenoh.lab.teleop.policy import InputDevice, OperatorInput, TeleopPolicy, combined
 from vla_zenoh.nodes.worker.node import WorkerNode
 from vla_zenoh.policy import Frame
@@ -34,6 +36,7 @@ from vla_zenoh.profile import Profile
 from vla_zenoh.sanitize import one_line
 
 SHOW_PERIOD_S = 0.2
+DEVICE_S = 0.02
 
 
 class Teleop:
@@ -47,6 +50,7 @@ class Teleop:
         device: beside the keyboard.
         frame: axes of a step.
         level: initial speed, from 0.
+        leader: arm whose joints are followed, in place of keys and device that move.
 
     Raises:
         NodeError: no terminal, or a worker of this name is alive.
@@ -62,15 +66,21 @@ class Teleop:
         device: InputDevice | None = None,
         frame: Frame = "base",
         level: int = 2,
+        leader: LeaderArm | None = None,
     ) -> None:
         self._parser, self._keyboard = KeystrokeParser(), Keyboard(level)
         self._lock = threading.Lock()
         self._stop = threading.Event()
         self._device, self._name = device, name
+        self._stick, self._stick_lost = OperatorInput(), ""
         self._terminal = Terminal(self._read, self._terminal_gone)
-        self.policy = TeleopPolicy(
-            profile, name, self._input, lambda: self._keyboard.level, frame=frame
-        )
+        self.policy: TeleopPolicy | LeaderPolicy
+        if leader is not None:
+            self.policy = LeaderPolicy(profile, name, leader.path, time.monotonic)
+        else:
+            self.policy = TeleopPolicy(
+                profile, name, self._input, lambda: self._keyboard.level, frame=frame
+            )
         self.worker = WorkerNode(profile, session, self.policy, name)
         self._client = Client(profile, operator).subscribe() if operator is not None else None
         self._other_worker = profile.task.worker
@@ -82,13 +92,18 @@ class Teleop:
         with self._terminal as terminal:
             for line in LEGEND.splitlines():
                 terminal.print(line)
-            shown = threading.Thread(target=self._show_status, args=(terminal,), name="screen")
-            shown.start()
+            threads = [threading.Thread(target=self._show_status, args=(terminal,), name="screen")]
+            if self._device is not None:
+                reads = (self._device,)
+                threads.append(threading.Thread(target=self._read_device, args=reads))
+            for thread in threads:
+                thread.start()
             try:
                 self.worker.run(stop)
             finally:
                 stop.set()
-                shown.join()
+                for thread in threads:
+                    thread.join()
 
     # -- in -----------------------------------------------------------------------------------
     def _read(self, data: bytes) -> None:
@@ -107,7 +122,25 @@ class Teleop:
     def _input(self) -> OperatorInput:
         with self._lock:
             typed = self._keyboard.read(time.monotonic())
-        return typed if self._device is None else combined(typed, self._device.read())
+            stick, lost = self._stick, self._stick_lost
+        if lost:
+            raise PeerError("device_lost", lost)
+        return combined(typed, stick)
+
+    def _read_device(self, device: InputDevice) -> None:
+        """Read it more often than chunks are asked for: a short press counts."""
+        while not self._stop.wait(DEVICE_S):
+            before = self._stick.takeovers
+            try:
+                found = device.read()
+            except PeerError as error:
+                with self._lock:
+                    self._stick, self._stick_lost = OperatorInput(), str(error)
+                return
+            with self._lock:
+                self._stick = found
+            if found.takeovers != before:
+                self._execute(TAKE_OVER)
 
     def _execute(self, command: str) -> None:
         client = self._client
@@ -121,16 +154,22 @@ class Teleop:
             active = client.task is not None and client.task.active
             client.publish(client.keys.active, "false" if active else "true")
         elif command == TAKE_OVER:
+            self._note_who_leads(client)
             current = client.task.worker if client.task is not None else ""
-            if current != self._name:
-                self._other_worker = current or self._other_worker
             client.publish(
                 client.keys.worker, self._other_worker if current == self._name else self._name
             )
 
+    def _note_who_leads(self, client: Client) -> None:
+        """To give the arm back to, also where it was taken by ``vla-zenoh use``."""
+        if client.task is not None and client.task.worker != self._name:
+            self._other_worker = client.task.worker
+
     # -- out ----------------------------------------------------------------------------------
     def _show_status(self, terminal: Terminal) -> None:
         while not self._stop.wait(SHOW_PERIOD_S):
+            if self._client is not None:
+                self._note_who_leads(self._client)
             for node, _, event in self._client.pop_events() if self._client else ():
                 if event.level != "info" or event.kind == "transition":
                     self._lines.append(f"{node}: {event.what} {event.why}".rstrip())
@@ -139,22 +178,11 @@ class Teleop:
             terminal.show(self._status_line())
 
     def _status_line(self) -> str:
-        speed = self.policy.speeds[self._keyboard.level]
         task = self._client.task if self._client else None
         status = self._client.status("command") if self._client else None
         state = status.state if status else "no command node"
         whose = "?" if task is None else "you" if task.worker == self._name else task.worker
-        moving = " ".join(
-            f"{name}{value:+.1f}"
-            for name, value in zip(
-                ("x", "y", "z", "rx", "ry", "rz"), self.policy.last.twist, strict=True
-            )
-            if value
-        )
-        return one_line(
-            f"{state}, follows {whose} | {100 * speed.translation_m_s:g} cm/s, "
-            f"{speed.rotation_rad_s:.2g} rad/s | {moving or 'still'}"
-        )[:118]
+        return one_line(f"{state}, follows {whose} | {self.policy.describe()}")[:118]
 
 
 POLL_S = 0.2

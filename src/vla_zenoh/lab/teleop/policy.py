@@ -12,6 +12,8 @@ from vla_zenoh.policy import ActionSpec, ActionSteps, Frame, ModelSpec, Observat
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray, GripperState
 
+PERSON = "teleop"
+"""Name in the spec of every worker that is a person; what it leads is an intervention."""
 DT_S = 0.05
 HORIZON = 20
 """Steps at most: below one chunk per second the arm holds between chunks."""
@@ -23,6 +25,7 @@ OPENING_M_S = 0.04
 BELOW = 1 - 1e-6
 """Steps travel as float32, and rounding must not put one beyond the limit."""
 AXES = 6
+AXIS_NAMES = ("x", "y", "z", "rx", "ry", "rz")
 Twist = tuple[float, float, float, float, float, float]
 STILL: Twist = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 DEAD_ZONE = 0.08
@@ -36,11 +39,13 @@ class OperatorInput(NamedTuple):
         twist: x, y, z and the rotation about them, each a share of the selected speed in [-1, 1].
         opening: opens (1) or closes (-1) the gripper, in [-1, 1].
         toggles: count of open/close commands so far; only changes matter.
+        takeovers: count of commands to take the arm or give it back so far.
     """
 
     twist: Twist = STILL
     opening: float = 0.0
     toggles: int = 0
+    takeovers: int = 0
 
 
 class InputDevice(Protocol):
@@ -132,7 +137,7 @@ class TeleopPolicy:
         frame: Frame = "base",
     ) -> None:
         self.spec = ModelSpec(
-            name="teleop",
+            name=PERSON,
             observation=ObservationSpec(cameras=(), state=("pose", "gripper"), prompt=False),
             action=ActionSpec(
                 horizon=HORIZON,
@@ -162,7 +167,7 @@ class TeleopPolicy:
         active = observation.task.active and observation.task.worker == self._name
         if not active:
             wanted, self._width_m = wanted._replace(opening=0.0), None
-        width_m = _kept_width_m(gripper) if self._width_m is None else self._width_m
+        width_m = kept_width_m(gripper) if self._width_m is None else self._width_m
         if active and (wanted.toggles - before.toggles) % 2:
             width_m = 0.0 if width_m > self._max_width_m / 2 else self._max_width_m
         period_s = 1 / observation.rate_hz
@@ -184,6 +189,19 @@ class TeleopPolicy:
             steps, raw={"twist": list(wanted.twist), "speed_m_s": speed.translation_m_s}
         )
 
+    def describe(self) -> str:
+        """Speed and input, for a status line."""
+        speed = self.speeds[self._level()]
+        moving = " ".join(
+            f"{name}{value:+.1f}"
+            for name, value in zip(AXIS_NAMES, self.last.twist, strict=True)
+            if value
+        )
+        return (
+            f"{100 * speed.translation_m_s:g} cm/s, {speed.rotation_rad_s:.2g} rad/s | "
+            f"{moving or 'still'}"
+        )
+
 
 def _at_most_unit(direction: Sequence[float]) -> FloatArray:
     """`direction`, no longer than 1: two keys at once are not faster than one."""
@@ -191,5 +209,6 @@ def _at_most_unit(direction: Sequence[float]) -> FloatArray:
     return vector / max(float(np.linalg.norm(vector)), 1.0)
 
 
-def _kept_width_m(gripper: GripperState) -> float:
+def kept_width_m(gripper: GripperState) -> float:
+    """The width (m) that changes nothing: of a gripper that holds an object, shut."""
     return 0.0 if gripper.holding else max(gripper.width_m, 0.0)

@@ -12,11 +12,24 @@ MAX_READS = 64
 """A SpaceMouse sends states faster than they are read: only the newest counts."""
 
 
+class Button:
+    """Counts the presses of a button."""
+
+    def __init__(self) -> None:
+        self._count, self._was_down = 0, False
+
+    def pressed(self, down: bool) -> int:
+        """Presses so far, of a button that is up or down now."""
+        self._count += down and not self._was_down
+        self._was_down = down
+        return self._count
+
+
 class Gamepad:
     """The first gamepad that SDL knows.
 
     Left stick: x and y; right stick: z and about z; D-pad: about x and y; triggers: close and open
-    the gripper; A: toggle it.
+    the gripper; A: toggle it; Y: take the arm, and give it back.
 
     Raises:
         MissingExtraError: pygame-ce is not installed.
@@ -45,7 +58,7 @@ class Gamepad:
             )
         self._pad: Any = controller.Controller(known[0])
         self.name = str(self._pad.name)
-        self._toggles, self._was_down = 0, False
+        self._toggle, self._takeover = Button(), Button()
 
     def read(self) -> OperatorInput:
         """See `InputDevice`."""
@@ -63,9 +76,6 @@ class Gamepad:
         def button(number: int) -> float:
             return float(pad.get_button(number))
 
-        down = bool(pad.get_button(pygame.CONTROLLER_BUTTON_A))
-        self._toggles += down and not self._was_down
-        self._was_down = down
         twist = (
             -axis(pygame.CONTROLLER_AXIS_LEFTY),
             -axis(pygame.CONTROLLER_AXIS_LEFTX),
@@ -77,7 +87,12 @@ class Gamepad:
         )
         wider = axis(pygame.CONTROLLER_AXIS_TRIGGERLEFT)
         narrower = axis(pygame.CONTROLLER_AXIS_TRIGGERRIGHT)
-        return OperatorInput(clipped_twist(twist), wider - narrower, self._toggles)
+        return OperatorInput(
+            clipped_twist(twist),
+            wider - narrower,
+            self._toggle.pressed(bool(pad.get_button(pygame.CONTROLLER_BUTTON_A))),
+            self._takeover.pressed(bool(pad.get_button(pygame.CONTROLLER_BUTTON_Y))),
+        )
 
     def close(self) -> None:
         """See `InputDevice`."""
@@ -85,7 +100,9 @@ class Gamepad:
 
 
 class SpaceMouse:
-    """The first 3Dconnexion SpaceMouse; its first button toggles the gripper.
+    """The first 3Dconnexion SpaceMouse.
+
+    Its first button toggles the gripper, its second takes the arm and gives it back.
 
     Raises:
         MissingExtraError: pyspacemouse is not installed.
@@ -106,7 +123,7 @@ class SpaceMouse:
                 "out and use the keyboard"
             ) from error
         self.name = str(self._mouse.name)
-        self._toggles, self._was_down = 0, False
+        self._toggle, self._takeover = Button(), Button()
 
     def read(self) -> OperatorInput:
         """See `InputDevice`."""
@@ -119,12 +136,13 @@ class SpaceMouse:
                     break
         except Exception as error:
             raise PeerError("device_lost", f"{self.name} is gone: {in_words(error)}") from error
-        down = bool(state.buttons and state.buttons[0])
-        self._toggles += down and not self._was_down
-        self._was_down = down
+        first, second = (*map(bool, state.buttons or ()), False, False)[:2]
         axes = (state.x, state.y, state.z, state.roll, state.pitch, state.yaw)
         return OperatorInput(
-            clipped_twist([without_dead_zone(axis) for axis in axes]), 0.0, self._toggles
+            clipped_twist([without_dead_zone(axis) for axis in axes]),
+            0.0,
+            self._toggle.pressed(first),
+            self._takeover.pressed(second),
         )
 
     def close(self) -> None:

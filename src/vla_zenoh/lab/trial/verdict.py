@@ -90,5 +90,4 @@ def verdict_in(metadata: Mapping[str, Any] | None, worker: str) -> Verdict | Non
     fact = (metadata or {}).get(FACT)
     if not isinstance(fact, Mapping) or fact.get("worker") != worker:
         return None
-    verdict = fact.get("verdict")
-    return verdict if verdict in get_args(Verdict) else None
+    return next((each for each in get_args(Verdict) if each == fact.get("verdict")), None)

@@ -139,10 +139,14 @@ class RobotSession:
 
     # -- observation --------------------------------------------------------------------------
     @property
-    def has_image(self) -> bool:
-        """Whether the first camera has an image that was not polled yet."""
-        first = next(iter(self._cameras.values()), None)
-        return first is not None and first.has_new
+    def has_images(self) -> bool:
+        """Whether an image was not polled yet, and every camera has one since the last chunk."""
+        new = {name for name, camera in self._cameras.items() if camera.has_new}
+        return bool(new) and all(name in new or self._is_current(name) for name in self._cameras)
+
+    def _is_current(self, camera: str) -> bool:
+        image = self._images.get(camera)
+        return image is not None and image.header.stamp_wall_ns >= self._not_before_ns
 
     @property
     def needs_images(self) -> bool:

@@ -1,0 +1,134 @@
+"""A person's motion in the numbers of a model's spec.
+
+A person's chunks have numbers of their own (deltas of a terminal, joints of a leader arm). What
+they asked for is in the goals that the arm was commanded to reach: an action is the way from the
+goal at the beginning of a frame to that at its end, or that pose or those joints themselves.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_zenoh.errors import RecordingError
+from vla_zenoh.kinematics.so3 import (
+    Pose,
+    log3,
+    quat_from_rotation,
+    rotation_from_quat,
+)
+from vla_zenoh.lab.recording.run import Run, newest
+from vla_zenoh.policy import ActionSpec
+from vla_zenoh.policy.state_vector import rpy
+from vla_zenoh.types import FloatArray
+
+BINARY = 0.5
+"""How far from its threshold a binary gripper is told to be open or shut."""
+
+
+class CommandedMotion:
+    """What the arm was commanded to do, as actions.
+
+    Poses are the goals of the commands; where joints were commanded, the measured poses. Joints
+    are those commanded; where poses were commanded, the measured ones.
+
+    Args:
+        run: the recorded run.
+        spec: of the actions; deltas are added to the step before.
+
+    Raises:
+        RecordingError: such actions cannot be made of a motion.
+    """
+
+    def __init__(self, run: Run, spec: ActionSpec) -> None:
+        if spec.controller is not None:
+            raise RecordingError(
+                f"{run.path}: the model's spec says that a controller covers only a part of each "
+                "step, so a person's motion cannot be told in its numbers; export what each of "
+                "them led with --worker"
+            )
+        self._run, self._spec, self._max_width_m = run, spec, run.max_width_m
+        self._last_quat: FloatArray | None = None
+
+    def action(self, since_ns: int, until_ns: int) -> NDArray[np.float32]:
+        """(D,) the step from one time to another, wall ns.
+
+        Raises:
+            RecordingError: neither command nor state was recorded until then.
+        """
+        spec = self._spec
+        if spec.space == "joint":
+            arm = self._joints(until_ns)
+            if spec.kind != "absolute":
+                arm = arm - self._joints(since_ns)
+        else:
+            arm = self._way(self._pose(since_ns), self._pose(until_ns))
+        gripper = () if spec.gripper == "none" else (self._gripper(since_ns, until_ns),)
+        return np.array([*arm, *gripper], np.float32)
+
+    def _way(self, before: Pose, after: Pose) -> list[float]:
+        spec = self._spec
+        if spec.kind == "absolute":
+            moved, turn = after.position_m, after.rotation
+        elif spec.frame == "tcp":
+            into = before.rotation.T
+            moved, turn = into @ (after.position_m - before.position_m), into @ after.rotation
+        else:
+            moved = after.position_m - before.position_m
+            turn = after.rotation @ before.rotation.T
+        return [*(moved / spec.position_scale_m), *self._numbers(turn)]
+
+    def _numbers(self, turn: FloatArray) -> FloatArray | list[float]:
+        if self._spec.rotation == "rotvec":
+            return log3(turn)
+        quat = quat_from_rotation(turn)
+        if self._spec.rotation == "rpy":
+            return rpy(quat)
+        if self._last_quat is not None and quat @ self._last_quat < 0:
+            quat = -quat  # the same rotation
+        self._last_quat = quat
+        return quat
+
+    def _gripper(self, since_ns: int, until_ns: int) -> float:
+        spec, width_m = self._spec, self._width_m(until_ns)
+        if spec.gripper == "delta_m":
+            return width_m - self._width_m(since_ns)
+        if spec.gripper == "absolute_m":
+            return width_m
+        share = width_m / self._max_width_m
+        if not spec.gripper_open_is_high:
+            share = 1.0 - share
+        if spec.gripper == "open_fraction":
+            return share
+        return spec.gripper_threshold + (BINARY if share > 0.5 else -BINARY)
+
+    # -- what was recorded --------------------------------------------------------------------
+    def _pose(self, at_ns: int) -> Pose:
+        command = newest(self._run.commands, at_ns)
+        if command is not None:
+            goal = command.record
+            return Pose(goal.goal_position_m, rotation_from_quat(goal.goal_quat_xyzw))
+        state = newest(self._run.poses, at_ns)
+        if state is None:
+            raise self._missing("neither command/pose nor state/pose", at_ns)
+        return Pose(state.record.position_m, rotation_from_quat(state.record.quat_xyzw))
+
+    def _joints(self, at_ns: int) -> FloatArray:
+        found = newest(self._run.joint_commands, at_ns) or newest(self._run.joints, at_ns)
+        if found is None:
+            raise self._missing("neither command/joint nor state/joint", at_ns)
+        position = dict(zip(found.record.names, found.record.position_rad, strict=True))
+        return np.array([position[name] for name in self._spec.joints])
+
+    def _width_m(self, at_ns: int) -> float:
+        found = newest(self._run.gripper_commands, at_ns) or newest(self._run.grippers, at_ns)
+        if found is None:
+            raise self._missing("neither command/gripper nor state/gripper", at_ns)
+        return max(float(found.record.width_m), 0.0)
+
+    def _missing(self, what: str, at_ns: int) -> RecordingError:
+        since_s = (at_ns - self._run.began_ns) / 1e9
+        return RecordingError(
+            f"{self._run.path}: a person led the arm, and {what} was recorded until {since_s:.1f} "
+            "s, so what the person asked for is unknown; record all keys"
+        )
