@@ -129,6 +129,11 @@ class Keys:
         "camera/{camera}/jpeg",
         "A plain JPEG file, encoding image/jpeg; published while there are subscribers.",
     )
+    camera_depth = _KeyOf(
+        "camera/{camera}/depth",
+        "A PNG file of 16 bits; its encoding says the metres of a count "
+        "(``image/png;depth16;0.001``), 0 is not measured. Published while there are subscribers.",
+    )
     camera_fitted = _KeyOf(
         "camera/{camera}/fitted/{form}",
         "A JPEG in the form a model's spec asks for (``224x224-pad``), made where the camera is.",
@@ -171,6 +176,10 @@ class Keys:
     seen = _KeyOf(
         "seen/{worker}/{camera}",
         "JPEG of exactly the image the model was given; published while there are subscribers.",
+    )
+    seen_depth = _KeyOf(
+        "seen/{worker}/{camera}/depth",
+        "PNG of exactly the depth the model was given; published while there are subscribers.",
     )
     seen_record = _KeyOf(
         "seen/{worker}", "`InferenceDebug`: prompt, raw output and steps of the same inference."
@@ -226,7 +235,8 @@ class Keys:
 
         Keys of one or two parts that are added later are among them, too.
         """
-        return tuple(map(self.full, ("*", "*/*", "camera/*/jpeg", "seen/*/*")))
+        pictures = ("camera/*/jpeg", "camera/*/depth", "seen/*/*", "seen/*/*/depth")
+        return tuple(map(self.full, ("*", "*/*", *pictures)))
 
     def of_part(self, part: str) -> Keys:
         """The same keys with states and commands of `part`; ``*``: of every part."""

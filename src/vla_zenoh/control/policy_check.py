@@ -52,15 +52,26 @@ def error(name: str, why: str) -> Finding:
 # -- the spec -------------------------------------------------------------------------------------
 def spec_errors(profile: Profile, spec: ModelSpec) -> Iterator[Finding]:
     """Requirements of a spec that the profile does not meet."""
-    for wanted in spec.observation.cameras:
-        camera = profile.cameras.get(wanted.camera)
-        if camera is None:
+    seen = spec.observation
+    for name in seen.camera_names:
+        if name not in profile.cameras:
             yield error(
                 "camera",
-                f"needs camera {wanted.camera!r}, the profile has: "
+                f"needs camera {name!r}, the profile has: "
                 f"{', '.join(profile.cameras) or 'none'}; add it to cameras, or name another in "
                 "the model's options",
             )
+    for wanted in seen.depth:
+        camera = profile.cameras.get(wanted.camera)
+        if camera is not None and camera.depth_unit_m is None:
+            yield error(
+                "depth",
+                f"needs the depth of camera {wanted.camera!r}, which has none; set "
+                f"cameras.{wanted.camera}.depth_unit_m, if it measures depth",
+            )
+    for wanted in (*seen.cameras, *seen.depth):
+        camera = profile.cameras.get(wanted.camera)
+        if camera is None:
             continue
         gives, asks = f"{camera.width}x{camera.height}", f"{wanted.width}x{wanted.height}"
         if wanted.resize == "none" and wanted.width is not None and gives != asks:

@@ -310,8 +310,7 @@ def _cameras(profile: Profile, worker: str, peers: PeerSnapshot) -> list[str]:
     if spec is None:
         return []
     reasons: list[str] = []
-    for wanted in spec.observation.cameras:
-        camera = wanted.camera
+    for camera in spec.observation.camera_names:
         if camera not in profile.cameras:
             continue  # reported already, with the spec
         age_s = peers.camera_ages_s.get(camera, math.inf)
@@ -335,9 +334,9 @@ def _cameras(profile: Profile, worker: str, peers: PeerSnapshot) -> list[str]:
 def _clocks(profile: Profile, worker: str, peers: PeerSnapshot) -> list[str]:
     """Clocks with too large an offset, or an unknown one on another host."""
     spec = peers.specs.get(worker)
-    cameras = spec.observation.cameras if spec is not None else ()
+    cameras = spec.observation.camera_names if spec is not None else ()
     nodes = [peers.robot_node, worker_node(worker)]
-    nodes += [peers.camera_nodes[one.camera] for one in cameras if one.camera in peers.camera_nodes]
+    nodes += [peers.camera_nodes[name] for name in cameras if name in peers.camera_nodes]
     bound_s, reasons = profile.timing.max_clock_offset_s, []
     for node in dict.fromkeys(nodes):
         found = peers.clocks.get(node)

@@ -32,6 +32,7 @@ from pydantic import (
 from vla_zenoh.errors import SpecError, describe_faults
 from vla_zenoh.types import GripperState, JointState, PoseState, PrivilegedState, Task
 from vla_zenoh.types.arrays import is_finite, to_float32
+from vla_zenoh.types.states import MAX_DEPTH_UNIT_M, MIN_DEPTH_UNIT_M
 
 StatePart = Literal["joint", "pose", "gripper", "privileged"]
 Resize = Literal["none", "stretch", "pad", "crop"]
@@ -49,6 +50,9 @@ ROTATION_SIZE: Mapping[Rotation, int] = {"rpy": 3, "rotvec": 3, "quaternion": 4}
 MAX_CAMERAS = MAX_JOINTS = 16
 MAX_PARTS = 4
 
+LATER_FIELDS: Mapping[str, Any] = {"depth": ()}
+"""Fields of `ObservationSpec` that are written only where they differ from this."""
+
 Text = Annotated[str, Field(min_length=1, max_length=128)]
 
 
@@ -62,6 +66,13 @@ class _Spec(BaseModel):
     """Strict: neither ``"8"`` nor ``true`` is a number, so a slip is not read as a meaning."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
+
+
+def _check_size(width: int | None, height: int | None, resize: Resize) -> None:
+    if (width is None) != (height is None):
+        raise ValueError("give both width and height, or neither")
+    if resize != "none" and width is None:
+        raise ValueError(f"resize {resize!r} needs width and height")
 
 
 def _no_joints(kind: Any) -> Any:
@@ -93,10 +104,39 @@ class CameraSpec(_Spec):
 
     @model_validator(mode="after")
     def _size_goes_with_resize(self) -> CameraSpec:
-        if (self.width is None) != (self.height is None):
-            raise ValueError("give both width and height, or neither")
-        if self.resize != "none" and self.width is None:
-            raise ValueError(f"resize {self.resize!r} needs width and height")
+        _check_size(self.width, self.height, self.resize)
+        return self
+
+
+class DepthSpec(_Spec):
+    """One depth picture in the model's observation: distances along the camera's optical axis.
+
+    Args:
+        camera: name of the camera in the profile, whose ``depth_unit_m`` is set.
+        width: pixels the model is given; None: as they come.
+        height: pixels the model is given; None: as they come.
+        resize: how other sizes become this one, as of colour; each pixel is the nearest one, no
+            mean, and padding is `invalid`.
+        unit_m: metres of one count the model is given.
+        near_m: what is nearer becomes `invalid`.
+        far_m: what is further becomes `invalid`; None: no bound but that of 65535 counts.
+        invalid: count of a pixel that was not measured.
+    """
+
+    camera: Text
+    width: int | None = Field(default=None, ge=8, le=8192)
+    height: int | None = Field(default=None, ge=8, le=8192)
+    resize: Resize = "none"
+    unit_m: float = Field(default=0.001, ge=MIN_DEPTH_UNIT_M, le=MAX_DEPTH_UNIT_M)
+    near_m: float = Field(default=0.0, ge=0, le=1000)
+    far_m: float | None = Field(default=None, gt=0, le=1000)
+    invalid: Literal[0, 65535] = 0
+
+    @model_validator(mode="after")
+    def _size_goes_with_resize(self) -> DepthSpec:
+        _check_size(self.width, self.height, self.resize)
+        if self.far_m is not None and self.far_m <= self.near_m:
+            raise ValueError(f"far_m ({self.far_m:g}) must be more than near_m ({self.near_m:g})")
         return self
 
 
@@ -105,6 +145,7 @@ class ObservationSpec(_Spec):
 
     Args:
         cameras: may be empty.
+        depth: may be empty; a camera may be among both.
         state: which parts of the robot's state.
         prompt: the model needs a prompt that is not empty.
         max_skew_s: the parts of one observation may lie this far apart in time.
@@ -112,6 +153,7 @@ class ObservationSpec(_Spec):
     """
 
     cameras: tuple[CameraSpec, ...] = Field(default=(), max_length=MAX_CAMERAS, strict=False)
+    depth: tuple[DepthSpec, ...] = Field(default=(), max_length=MAX_CAMERAS, strict=False)
     state: Annotated[tuple[StatePart, ...], AfterValidator(_differ)] = Field(
         default=("pose", "gripper"), strict=False
     )
@@ -122,7 +164,23 @@ class ObservationSpec(_Spec):
     @model_validator(mode="after")
     def _one_picture_of_a_camera(self) -> ObservationSpec:
         _differ(tuple(camera.camera for camera in self.cameras))
+        _differ(tuple(camera.camera for camera in self.depth))
         return self
+
+    @model_serializer(mode="wrap")
+    def _senses_in_use(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        # So a model without these has the hash, and the spec on the wire, that it always had.
+        fields = serialize(self)
+        return {
+            name: value
+            for name, value in fields.items()
+            if name not in LATER_FIELDS or getattr(self, name) != LATER_FIELDS[name]
+        }
+
+    @property
+    def camera_names(self) -> tuple[str, ...]:
+        """Cameras that the model needs, for colour or depth, each once."""
+        return tuple(dict.fromkeys(one.camera for one in (*self.cameras, *self.depth)))
 
 
 class ControllerSpec(_Spec):
@@ -411,6 +469,7 @@ class Observation:
         stamp_wall_ns: capture time of its oldest image (of its state, without images).
         seq: number of that part.
         images: camera -> (H, W, 3) uint8 in the declared order and size.
+        depth: camera -> (H, W) uint16 in counts of the declared unit, and in the declared size.
         joint: arm joints, where asked for.
         pose: TCP pose, where asked for.
         gripper: gripper state, where asked for.
@@ -425,6 +484,7 @@ class Observation:
     seq: int
     task: Task
     images: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
+    depth: Mapping[str, NDArray[np.uint16]] = field(default_factory=dict)
     joint: JointState | None = None
     pose: PoseState | None = None
     gripper: GripperState | None = None

@@ -75,8 +75,10 @@ TABLE = (
     # Images show people, so a viewer does not see them.
     _stream("camera_raw", {CAMERA, ROBOT}, {WORKER, OPERATOR}),
     _stream("camera_jpeg", {CAMERA, ROBOT}, {WORKER, OPERATOR}),
+    _stream("camera_depth", {CAMERA, ROBOT}, {WORKER, OPERATOR}),
     _stream("camera_fitted", {CAMERA, ROBOT}, {WORKER, OPERATOR}),
     _stream("seen", {WORKER}, {OPERATOR}),
+    _stream("seen_depth", {WORKER}, {OPERATOR}),
     _stream("seen_record", {WORKER}, {OPERATOR}),
     _stream("state_joint", {ROBOT}, {WORKER, COMMAND, OPERATOR, VIEWER}),
     _stream("state_pose", {ROBOT}, {WORKER, COMMAND, OPERATOR, VIEWER}),

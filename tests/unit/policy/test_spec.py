@@ -86,6 +86,13 @@ CAMERAS = [{"camera": "front"}, {"camera": "wrist", "width": 64, "height": 64, "
 OTHER_VALUES: dict[tuple[str, ...], list[Any]] = {
     ("name",): ["other"],
     ("observation", "cameras"): [[], CAMERAS[:1], CAMERAS, CAMERAS[::-1]],
+    ("observation", "depth"): [
+        [{"camera": "front"}],
+        [{"camera": "front", "unit_m": 0.01}],
+        [{"camera": "front", "near_m": 0.1}],
+        [{"camera": "front", "far_m": 2.0}],
+        [{"camera": "front", "invalid": 65535}],
+    ],
     ("observation", "state"): [[], ["joint"], ["gripper", "pose"]],
     ("observation", "prompt"): [False],
     ("observation", "max_skew_s"): [0.05],

@@ -56,6 +56,6 @@ def test_parts_have_the_same_steps() -> None:
 
 def test_the_states_of_every_part_are_observed() -> None:
     seen = ObservationSpec(state=("joint", "gripper"))
-    names = state_names(ModelSpec(name="x", observation=seen, action=ALOHA))
+    names = state_names(seen, ModelSpec(name="x", action=ALOHA).parts)
     assert list(names) == ["left/joint", "left/gripper", "right/joint", "right/gripper"]
     assert names["right/gripper"] == ("right", "gripper")

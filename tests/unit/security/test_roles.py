@@ -98,6 +98,7 @@ def test_a_worker_writes_its_own_keys_only(lab: Profile) -> None:
         "spec/scripted",
         "seen/scripted",
         "seen/scripted/*",
+        "seen/scripted/*/depth",
         "status/worker-scripted",
         "event/worker-scripted",
     }
@@ -109,6 +110,7 @@ def test_an_operator_who_drives_by_hand_is_a_worker_like_any_other(lab: Profile)
         "spec/teleop",
         "seen/teleop",
         "seen/teleop/*",
+        "seen/teleop/*/depth",
         "status/worker-teleop",
         "event/worker-teleop",
     }
@@ -129,6 +131,7 @@ def test_a_camera_host_writes_its_own_cameras_only(lab: Profile) -> None:
     assert may(lab, "camera-eyes@eyes", Act.PUT) == {
         "camera/front/raw",
         "camera/front/jpeg",
+        "camera/front/depth",
         "camera/front/fitted/*",
         "status/camera-eyes",
         "event/camera-eyes",

@@ -240,6 +240,10 @@ class _Child:
                     f"model {self._worker.spec.name!r} needs the cameras {', '.join(missing)}; "
                     f"the benchmark has: {', '.join(known)}"
                 )
+            if self._worker.spec.observation.depth:
+                raise WorkerError(
+                    f"model {self._worker.spec.name!r} needs depth, which no benchmark gives"
+                )
         return self._worker
 
     def _describe(self, suite: str | None) -> dict[str, Any]:

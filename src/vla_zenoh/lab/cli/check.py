@@ -221,4 +221,12 @@ def _inputs(report: CheckReport) -> str:
         f"{c.colour}"
         for c in observation.cameras
     ]
-    return ", ".join([*cameras, *(f"state/{part}" for part in observation.state)]) or "none"
+    depths = [
+        f"depth of {d.camera} "
+        f"{f'{d.width}x{d.height} {d.resize}' if d.width else 'in its own size'} "
+        f"{d.unit_m * 1e3:g} mm a count"
+        for d in observation.depth
+    ]
+    return (
+        ", ".join([*cameras, *depths, *(f"state/{part}" for part in observation.state)]) or "none"
+    )

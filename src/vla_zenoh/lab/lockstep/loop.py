@@ -27,6 +27,7 @@ from vla_zenoh.policy import Policy
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     ActionChunk,
+    Depth,
     Event,
     GripperCommand,
     GripperState,
@@ -59,6 +60,7 @@ class Lockstep:
         policy: the model; its ``load`` is called here if it has one.
         delays: see `Delays`.
         picture: image of a camera, by name; None: small gray images.
+        depth: depth picture of a camera, by name; None: half a metre everywhere.
         reach: see `Commander`.
         dry_run: see `Commander`.
         seed: of the jitter.
@@ -73,6 +75,7 @@ class Lockstep:
         *,
         delays: Delays | None = None,
         picture: Callable[[str], Image] | None = None,
+        depth: Callable[[str], Depth] | None = None,
         reach: ReachabilityFilter | Mapping[str, ReachabilityFilter] | None = None,
         dry_run: bool = False,
         seed: int = 0,
@@ -108,7 +111,7 @@ class Lockstep:
         self.alive = {SIM, CAMERA, COMMAND, *(w.source for w in self.workers.values())}
         self.camera_faults: dict[str, str] = {}
         self._clock_ns: Counter[str] = Counter()
-        self._picture = picture or _gray
+        self._picture, self._depth = picture or _gray, depth or _half_a_metre
         self._arrivals: list[tuple[int, int, Callable[[], None]]] = []
         self._sent = 0
         self._seq: Counter[str] = Counter()
@@ -243,10 +246,13 @@ class Lockstep:
         self._seq[CAMERA] += 1
         header = Header(self.wall_ns(CAMERA), self._seq[CAMERA], CAMERA)
         arrival_ns = self.now_ns + round(self.delays.camera_s * 1e9)
-        seen = {c.camera for w in self.workers.values() for c in w.spec.observation.cameras}
-        for camera in sorted(seen):
+        wanted = [worker.spec.observation for worker in self.workers.values()]
+        for camera in sorted({one.camera for each in wanted for one in each.cameras}):
             picture = Stamped(header, self._picture(camera), arrival_ns)
             self._deliver(arrival_ns, partial(self._take_picture, camera, picture))
+        for camera in sorted({one.camera for each in wanted for one in each.depth}):
+            depth = Stamped(header, self._depth(camera), arrival_ns)
+            self._deliver(arrival_ns, partial(self._take_depth, camera, depth))
 
     # -- the wire -----------------------------------------------------------------------------
     def _send(
@@ -323,6 +329,10 @@ class Lockstep:
         for worker in self.workers.values():
             worker.take_picture(camera, self._at(worker.source, picture))
 
+    def _take_depth(self, camera: str, picture: Stamped[Depth]) -> None:
+        for worker in self.workers.values():
+            worker.take_depth(camera, self._at(worker.source, picture))
+
     def _take_task(self, task: Stamped[Task]) -> None:
         for worker in self.workers.values():
             worker.take_task(self._at(worker.source, task))
@@ -366,3 +376,7 @@ class Lockstep:
 
 def _gray(camera: str) -> Image:
     return Image(np.full((48, 64, 3), 128, np.uint8))
+
+
+def _half_a_metre(camera: str) -> Depth:
+    return Depth(np.full((48, 64), 500, np.uint16), 0.001)

@@ -9,10 +9,11 @@ from vla_zenoh.keys import worker_node
 from vla_zenoh.lab.lockstep.records import Delays
 from vla_zenoh.policy import ActionSteps, Policy, check_steps, reset_of
 from vla_zenoh.policy.chunk_prefix import ChunkPrefix
-from vla_zenoh.policy.observation import History, NotReady, assemble, make_chunk, state_names
+from vla_zenoh.policy.observation import NotReady, Streams, assemble, make_chunk, state_names
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     ActionChunk,
+    Depth,
     GripperState,
     Image,
     JointState,
@@ -43,9 +44,9 @@ class LockstepWorker:
         self.task: Task | None = None
         self._patience_s = profile.timing.max_observation_age_s
         self._delays, self._jitter = delays, jitter
-        self._images: dict[str, Stamped[Image]] = {}
-        self._names = {(part, what): name for name, (part, what) in state_names(self.spec).items()}
-        self._states = {name: History() for name in self._names.values()}
+        self._streams = Streams.of(self.spec.observation, self.spec.parts)
+        names = state_names(self.spec.observation, self.spec.parts)
+        self._names = {(part, what): name for name, (part, what) in names.items()}
         self._not_before_ns = self._due_ns = self._asked_ns = 0
         load = getattr(policy, "load", None)
         if callable(load):
@@ -66,11 +67,17 @@ class LockstepWorker:
         """Receive a state of a part of the robot; kept if the model's spec lists it."""
         for (of_part, what), name in self._names.items():
             if of_part == part and isinstance(state.record, STATE_KINDS[what]):
-                self._states[name].add(state)
+                self._streams.states[name].add(state)
 
     def take_picture(self, camera: str, picture: Stamped[Image]) -> None:
-        """Receive an image."""
-        self._images[camera] = picture
+        """Receive an image; kept if the model's spec lists it."""
+        if camera in self._streams.images:
+            self._streams.images[camera].add(picture)
+
+    def take_depth(self, camera: str, picture: Stamped[Depth]) -> None:
+        """Receive a depth picture; kept if the model's spec lists it."""
+        if camera in self._streams.depth:
+            self._streams.depth[camera].add(picture)
 
     def step(self, now_ns: int, wall_ns: int) -> ActionChunk | None:
         """Infer if a request is due and an observation is complete.
@@ -87,8 +94,7 @@ class LockstepWorker:
         observation = assemble(
             self.spec,
             self.task,
-            self._images,
-            self._states,
+            self._streams,
             not_before_ns=self._not_before_ns,
             now_ns=wall_ns,
         )

@@ -153,6 +153,8 @@ def make_served_policy(
         SpecError: what the model needs is not named, or named twice.
     """
     spec = policy.spec
+    if spec.observation.depth:
+        raise SpecError("the model needs depth, which is not among what is served")
     fields = {name: source for name, source in read_map(map_option).items() if source is not None}
     own = list(fields.values())
     if any(source.blank for source in own):

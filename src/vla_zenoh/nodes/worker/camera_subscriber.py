@@ -135,3 +135,13 @@ def subscribe_to_camera(
     rates_hz = (settings.rate_hz, settings.jpeg_rate_hz if jpeg else None) if settings else ()
     patience_s = max([PATIENCE_S, *(PERIODS / rate for rate in rates_hz if rate)])
     return CameraSubscriber(node, name, key, fallback, patience_s=patience_s, changed=changed)
+
+
+def subscribe_to_depth(camera: str, node: Node, changed: threading.Condition) -> CameraSubscriber:
+    """Subscribe to the depth stream of a camera, of which there is one.
+
+    Raises:
+        SessionError: the router does not answer at the port for images.
+    """
+    key = node.keys.camera_depth(camera)
+    return CameraSubscriber(node, camera, key, None, patience_s=PATIENCE_S, changed=changed)
