@@ -195,6 +195,13 @@ class Keys:
     )
     command_gripper = _PartKey("command/gripper", "`GripperCommand`, newest wins.")
 
+    # -- guarded primitives -------------------------------------------------------------------
+    primitive = _KeyOf(
+        "primitive/{primitive}",
+        "Query with a JSON request; one JSON reply when the arm stands, with the reason why it "
+        "does. Only where the node primitives runs.",
+    )
+
     # -- every node ---------------------------------------------------------------------------
     status = _KeyOf("status/{node}", "`NodeStatus`, 2 Hz and on change.")
     event = _KeyOf("event/{node}", "`Event`.")
@@ -228,6 +235,7 @@ class Keys:
     all_events = _Key("event/*")
     all_alive = _Key("alive/*")
     all_holding = _Key("holding/*")
+    all_primitives = _Key("primitive/*")
 
     @property
     def without_raw_images(self) -> tuple[str, ...]:
@@ -316,6 +324,10 @@ NO_DEADMAN_TOKEN = "is not there (a liveliness token on the key holding/NAME)"
 """Why a deadman is not accepted."""
 
 
+PRIMITIVES = "primitives"
+"""Kind of the node that answers on `Keys.primitive`, and its name as a worker."""
+
+
 def worker_node(worker: str) -> str:
     """Node name of a worker."""
     return f"worker-{worker}"
@@ -349,5 +361,6 @@ NODE_KINDS: Mapping[str, NodeTraits] = {
     "command": NodeTraits("command", 0.8, "the robot obeys one command node"),
     "camera": NodeTraits("camera", 0.8),
     "worker": NodeTraits("worker", 0.8),
+    "primitives": NodeTraits("worker", 0.8, "one primitive is carried out at a time"),
 }
 """Every kind of node, in the order in which `up` starts them."""

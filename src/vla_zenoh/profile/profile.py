@@ -11,7 +11,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, PrivateAttr, Valida
 
 from vla_zenoh import keys
 from vla_zenoh.errors import ProfileError, describe_fault
-from vla_zenoh.keys import NODE_KINDS, NOT_PARTS, Keys
+from vla_zenoh.keys import NODE_KINDS, NOT_PARTS, PRIMITIVES, Keys, worker_node
 from vla_zenoh.profile.limits import Limits
 from vla_zenoh.profile.robot import (
     ArmProfile,
@@ -198,6 +198,8 @@ class Profile(Section):
 
     def node_name(self, host: str, kind: str) -> str:
         """Name on the bus of the node of this kind on `host`; unique if several hosts run one."""
+        if kind == PRIMITIVES:  # its chunks are those of a worker
+            return worker_node(kind)
         hosts = [name for name, part in self.hosts.items() if kind in part.nodes]
         return kind if len(hosts) < 2 else f"{kind}-{host}"
 

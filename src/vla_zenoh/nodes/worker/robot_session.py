@@ -302,6 +302,14 @@ class RobotSession:
         self._debug.publish(observation, answer, steps, header, (end_ns - start_ns) / 1e6)
         return True
 
+    def adopt_spec(self) -> None:
+        """Publish the policy's spec after it changed the meaning of its actions.
+
+        To be called before a chunk that follows it. What is observed has to stay the same.
+        """
+        self.spec, self._spec_hash = self.policy.spec, self.policy.spec.hash
+        self._specs.publish(self.spec)
+
     def failed(self, error: Exception, reason: str = "") -> Literal[False]:
         """Count and report an inference that failed; the next one is due a little later."""
         if not reason:
