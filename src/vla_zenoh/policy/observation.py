@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -21,6 +21,7 @@ from vla_zenoh.policy import (
     ModelSpec,
     Observation,
     ObservationSpec,
+    StatePart,
 )
 from vla_zenoh.types import ActionChunk, Depth, Image, Stamped, Task
 from vla_zenoh.types.states import MAX_COUNT
@@ -86,6 +87,15 @@ class History:
         return min(around, key=lambda entry: abs(entry.header.stamp_wall_ns - stamp_ns))
 
 
+def state_names(
+    spec: ObservationSpec, parts: Sequence[str] = ("",)
+) -> dict[str, tuple[str, StatePart]]:
+    """Every state that is observed: name (``pose``, ``left/pose``) -> part and what."""
+    return {
+        f"{part}/{what}" if part else what: (part, what) for part in parts for what in spec.state
+    }
+
+
 @dataclass(frozen=True, slots=True)
 class Streams:
     """What a worker has received of the streams that its model observes.
@@ -93,7 +103,7 @@ class Streams:
     Args:
         images: camera -> its pictures.
         depth: camera -> its depth pictures.
-        states: part (``joint``, ``pose``, ``gripper``) -> its states.
+        states: what (``joint``, ``pose``, ``gripper``; see `state_names`) -> its states.
     """
 
     images: Mapping[str, History]
@@ -101,14 +111,14 @@ class Streams:
     states: Mapping[str, History]
 
     @staticmethod
-    def of(spec: ObservationSpec) -> Streams:
-        """Empty ones, which keep what an observation of this kind needs."""
+    def of(spec: ObservationSpec, parts: Sequence[str] = ("",)) -> Streams:
+        """Empty ones, which keep what an observation of this kind needs of these parts."""
         # A colour picture waits for the depth picture of the same moment.
         pictures = partial(History, 1, PAIR_S if spec.depth else 0.0, MAX_PICTURES)
         return Streams(
             {one.camera: pictures() for one in spec.cameras},
             {one.camera: pictures() for one in spec.depth},
-            {part: History() for part in spec.state},
+            {name: History() for name in state_names(spec, parts)},
         )
 
 
@@ -177,16 +187,23 @@ def assemble(
             skew_s = one.skew_s(stamp_ns)
             if skew_s > wanted.max_skew_s:
                 return NotReady(f"{name} is {skew_s:.3f} s apart from the {others}")
+    found: dict[str, dict[str, Any]] = {}
+    for name, one in streams.states.items():
+        part, _, what = name.rpartition("/")
+        found.setdefault(part, {})[what] = one.at(stamp_ns)
     images, depth = streams.images, streams.depth
-    return Observation(
+    whole = Observation(
         stamp_wall_ns=stamp_ns,
         seq=seq,
         task=task,
         robot=robot,
         images={c.camera: prepare_image(images[c.camera].at(stamp_ns), c) for c in wanted.cameras},
         depth={c.camera: prepare_depth(depth[c.camera].at(stamp_ns), c) for c in wanted.depth},
-        **{part: one.at(stamp_ns) for part, one in streams.states.items()},
+        **found.pop("", {}),
     )
+    if not found:
+        return whole
+    return replace(whole, parts={part: replace(whole, **own) for part, own in found.items()})
 
 
 def _oldest(entries: Sequence[Stamped[Any]]) -> Stamped[Any] | None:
