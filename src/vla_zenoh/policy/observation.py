@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -22,6 +22,7 @@ from vla_zenoh.policy import (
     Observation,
     ObservationSpec,
 )
+from vla_zenoh.policy.spec import STREAM_OF
 from vla_zenoh.types import ActionChunk, Depth, Image, Stamped, Task
 from vla_zenoh.types.states import MAX_COUNT
 
@@ -61,6 +62,11 @@ class History:
             cut = min(cut, bisect_left(self.entries, kept_ns, key=_stamp_ns))
         del self.entries[: max(cut, len(self.entries) - self.most)]
 
+    def first_since(self, stamp_ns: int) -> int:
+        """Stamp of the first sample that is not older; of the newest where all are."""
+        at = bisect_left(self.entries, stamp_ns, key=_stamp_ns)
+        return _stamp_ns(self.entries[min(at, len(self.entries) - 1)])
+
     @property
     def newest_ns(self) -> int:
         """Stamp of the newest; 0 without records."""
@@ -93,7 +99,7 @@ class Streams:
     Args:
         images: camera -> its pictures.
         depth: camera -> its depth pictures.
-        states: part (``joint``, ``pose``, ``gripper``) -> its states.
+        states: part whose records they are (``joint``, ``pose``, ``gripper``) -> its states.
     """
 
     images: Mapping[str, History]
@@ -104,12 +110,26 @@ class Streams:
     def of(spec: ObservationSpec) -> Streams:
         """Empty ones, which keep what an observation of this kind needs."""
         # A colour picture waits for the depth picture of the same moment.
-        pictures = partial(History, 1, PAIR_S if spec.depth else 0.0, MAX_PICTURES)
+        kept_s = PAIR_S if spec.depth or spec.history > 1 else 0.0
+        if spec.history > 1:
+            kept_s += spec.history_span_s + spec.max_skew_s
+        pictures = partial(History, 1, kept_s, MAX_PICTURES)
         return Streams(
             {one.camera: pictures() for one in spec.cameras},
             {one.camera: pictures() for one in spec.depth},
-            {part: History() for part in spec.state},
+            {part: History(keep_s=kept_s) for part in spec.state_streams},
         )
+
+    @property
+    def pictures(self) -> dict[str, History]:
+        """Images and depth by what messages call them."""
+        images = {f"camera {name!r}": one for name, one in self.images.items()}
+        return images | {f"depth of camera {name!r}": one for name, one in self.depth.items()}
+
+    @property
+    def named_states(self) -> dict[str, History]:
+        """States by what messages call them."""
+        return {f"state/{part}": one for part, one in self.states.items()}
 
 
 def _stamp_ns(entry: Stamped[Any]) -> int:
@@ -132,6 +152,7 @@ def assemble(
     not_before_ns: int,
     now_ns: int,
     robot: str = "",
+    episode_ns: int = 0,
 ) -> Observation | NotReady:
     """The newest observation that fits the spec, or why there is none.
 
@@ -143,6 +164,7 @@ def assemble(
             last chunk did.
         now_ns: wall clock.
         robot: whose observation it is.
+        episode_ns: when the episode began; what is older is not in its history.
 
     Raises:
         SpecError: an image does not have the size of the spec, see `prepare_image` and
@@ -151,9 +173,7 @@ def assemble(
     wanted = spec.observation
     if wanted.prompt and not task.prompt:
         return NotReady("there is no prompt", waiting=True)
-    pictures = {f"camera {name!r}": one for name, one in streams.images.items()}
-    pictures |= {f"depth of camera {name!r}": one for name, one in streams.depth.items()}
-    states = {f"state/{part}": one for part, one in streams.states.items()}
+    pictures, states = streams.pictures, streams.named_states
     missing = [name for name, one in (pictures | states).items() if not one.entries]
     if missing:
         return NotReady(f"nothing received yet of {', '.join(missing)}")
@@ -177,16 +197,72 @@ def assemble(
             skew_s = one.skew_s(stamp_ns)
             if skew_s > wanted.max_skew_s:
                 return NotReady(f"{name} is {skew_s:.3f} s apart from the {others}")
+    parts = _parts(wanted, streams, stamp_ns)
+    if isinstance(parts, NotReady):
+        return parts
+    now = Observation(stamp_wall_ns=stamp_ns, seq=seq, task=task, robot=robot, **parts)
+    if wanted.history == 1:
+        return now
+    before = _history(now, wanted, streams, episode_ns)
+    return before if isinstance(before, NotReady) else replace(now, history=before)
+
+
+def _parts(wanted: ObservationSpec, streams: Streams, stamp_ns: int) -> dict[str, Any] | NotReady:
+    """Fields of an observation: of each stream the sample that is nearest to a time."""
     images, depth = streams.images, streams.depth
-    return Observation(
-        stamp_wall_ns=stamp_ns,
-        seq=seq,
-        task=task,
-        robot=robot,
-        images={c.camera: prepare_image(images[c.camera].at(stamp_ns), c) for c in wanted.cameras},
-        depth={c.camera: prepare_depth(depth[c.camera].at(stamp_ns), c) for c in wanted.depth},
-        **{part: one.at(stamp_ns) for part, one in streams.states.items()},
-    )
+    found = {part: one.at(stamp_ns) for part, one in streams.states.items()}
+    measured = {
+        "wrench": ("wrench", found["pose"].wrench if "pose" in found else None),
+        "effort": ("effort_nm", found["joint"].effort_nm if "joint" in found else None),
+    }
+    parts: dict[str, Any] = {}
+    for part in wanted.state:
+        name, value = measured.get(part, (part, found.get(part)))
+        if value is None:
+            return NotReady(
+                f"state/{STREAM_OF[part]} holds no {name}: this robot does not measure it"
+            )
+        parts[name] = value
+    return parts | {
+        "images": {
+            c.camera: prepare_image(images[c.camera].at(stamp_ns), c) for c in wanted.cameras
+        },
+        "depth": {c.camera: prepare_depth(depth[c.camera].at(stamp_ns), c) for c in wanted.depth},
+    }
+
+
+def _history(
+    now: Observation, wanted: ObservationSpec, streams: Streams, episode_ns: int
+) -> tuple[Observation, ...] | NotReady:
+    """The observations before this one, oldest first, or why there are none."""
+    assert wanted.history_spacing_s is not None
+    named = streams.pictures | streams.named_states
+    leading = list((streams.pictures or streams.named_states).values())
+    first_ns = max(one.first_since(episode_ns) for one in leading)
+    most_s = min(wanted.max_skew_s, wanted.history_spacing_s / 2)
+    before: list[Observation] = []
+    for steps in range(wanted.history - 1, 0, -1):
+        ago_s = steps * wanted.history_spacing_s
+        at_ns = now.stamp_wall_ns - round(ago_s * 1e9)
+        if at_ns < first_ns and wanted.history_start == "wait":
+            return NotReady(f"the episode is younger than {ago_s:g} s", waiting=True)
+        # Never later than the observation itself, which may be the first one.
+        at_ns = min(max(at_ns, first_ns), now.stamp_wall_ns)
+        for name, one in named.items():
+            apart_s = one.skew_s(at_ns)
+            if apart_s > most_s:
+                return NotReady(
+                    f"history: {name} has nothing within {most_s:g} s of the time {ago_s:g} s "
+                    f"ago, the nearest is {apart_s:.3f} s away"
+                )
+        parts = _parts(wanted, streams, at_ns)
+        if isinstance(parts, NotReady):
+            return parts
+        lead = _oldest([near for one in leading if (near := one.nearest(at_ns))])
+        assert lead is not None
+        stamp_ns, seq = _stamp_ns(lead), lead.header.seq
+        before.append(Observation(stamp_ns, seq, now.task, robot=now.robot, **parts))
+    return tuple(before)
 
 
 def _oldest(entries: Sequence[Stamped[Any]]) -> Stamped[Any] | None:

@@ -214,7 +214,7 @@ class Lockstep:
         if self.guard.braking or self.guard.unheeded:
             gripper = replace(gripper, mode="braking" if self.guard.braking else "unheeded")
         self._send(SIM, gripper, self._take_gripper_state)
-        wanted = {part for w in self.workers.values() for part in w.spec.observation.state}
+        wanted = {part for w in self.workers.values() for part in w.spec.observation.state_streams}
         if self.commander.reach is not None or "joint" in wanted:
             self._send(SIM, self.world.joint_state(), self._take_joint_state)
 

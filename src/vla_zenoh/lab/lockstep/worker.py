@@ -45,7 +45,7 @@ class LockstepWorker:
         self._patience_s = profile.timing.max_observation_age_s
         self._delays, self._jitter = delays, jitter
         self._streams = Streams.of(self.spec.observation)
-        self._not_before_ns = self._due_ns = self._asked_ns = 0
+        self._not_before_ns = self._due_ns = self._asked_ns = self._episode_ns = 0
         load = getattr(policy, "load", None)
         if callable(load):
             load()
@@ -56,7 +56,7 @@ class LockstepWorker:
         if known is not None and known.requested_hz != self.task.requested_hz:
             self._due_ns = min(self._due_ns, self._asked_ns)
         if known is None or known.episode != self.task.episode:
-            self._not_before_ns = task.header.stamp_wall_ns
+            self._not_before_ns = self._episode_ns = task.header.stamp_wall_ns
             reset = reset_of(self.policy)
             if reset is not None:
                 reset()
@@ -95,6 +95,7 @@ class LockstepWorker:
             self._streams,
             not_before_ns=self._not_before_ns,
             now_ns=wall_ns,
+            episode_ns=self._episode_ns,
         )
         if isinstance(observation, NotReady):
             return None
