@@ -25,7 +25,7 @@ from vla_zenoh.bus.clock_sync import decode_stamps
 from vla_zenoh.cli import status_table as cli_status
 from vla_zenoh.cli.options import model_options, number_list
 from vla_zenoh.cli.output import Screen, plain_types
-from vla_zenoh.codec import image, message, records, settings
+from vla_zenoh.codec import image, message, primitives, records, settings
 from vla_zenoh.errors import CodecError, PeerError, ProfileError, SpecError, VlaZenohError
 from vla_zenoh.interop.ros2 import attachment, readers
 from vla_zenoh.interop.ros2.definitions import parse
@@ -349,6 +349,23 @@ def _targets() -> Iterator[Target]:
             codec,
             lambda words=words: [words],
         )
+    for name, asked in (
+        ("move_to", b'{"holder": "a", "position_m": [0.5, 0.1, 0.3]}'),
+        ("grip", b'{"holder": "a", "width_m": 0.03}'),
+        ("run", b'{"holder": "a", "worker": "w", "until": {"gripper": "closed"}}'),
+    ):
+        yield Target(
+            f"primitive-{name}",
+            partial(primitives.decode_request, name),
+            codec,
+            lambda asked=asked: [asked],
+        )
+    yield Target(
+        "primitive-answer",
+        primitives.decode_answer,
+        codec,
+        lambda: [primitives.Answer(True, "reached", position_m=(0.1, 0.2, 0.3)).encode()],
+    )
     yield Target("prompt", _prompt, codec, lambda: [b"HARD: go up x3", b"put the red brick down"])
     yield Target("depth", _depth, codec, _depths)
     yield Target("jpeg", image.decode_jpeg, codec, lambda: [image.encode_jpeg(_gray())])

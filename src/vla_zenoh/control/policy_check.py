@@ -93,12 +93,25 @@ def spec_errors(profile: Profile, spec: ModelSpec) -> Iterator[Finding]:
                 f"camera {wanted.camera!r} gives an image every {1 / camera.rate_hz:.2f} s, the "
                 f"spec allows none older than {spec.observation.max_age_s:g} s",
             )
-    if spec.action.space == "joint":
-        wanted, given = set(profile.robot.arm_joints), set(spec.action.joints)
+    if set(spec.parts) != set(profile.part_names):
+        names = [", ".join(filter(None, each)) for each in (spec.parts, profile.part_names)]
+        yield error(
+            "parts",
+            f"its columns are for {names[0] or 'one arm'}; robot {profile.robot.name!r} is "
+            f"{names[1] or 'one arm'}: name these in ActionSpec.of_parts",
+        )
+        return
+    for part in spec.parts:
+        yield from _action_errors(profile.of_part(part), spec.action.of(part))
+
+
+def _action_errors(profile: Profile, action: ActionSpec) -> Iterator[Finding]:
+    if action.space == "joint":
+        wanted, given = set(profile.robot.arm_joints), set(action.joints)
         if wanted != given:
             yield error(
                 "joint_names",
-                f"its joints are {', '.join(spec.action.joints)}; robot {profile.robot.name!r} "
+                f"its joints are {', '.join(action.joints)}; robot {profile.robot.name!r} "
                 f"has {', '.join(profile.robot.arm_joints)}: name these, in the order of the "
                 "model's columns",
             )
@@ -107,7 +120,7 @@ def spec_errors(profile: Profile, spec: ModelSpec) -> Iterator[Finding]:
                 "too_few_joints",
                 f"{few_joints(profile)}, and its robot takes poses: set robot.command to joint",
             )
-    elif spec.action.kind == "absolute" and len(profile.robot.arm_joints) < POSE_JOINTS:
+    elif action.kind == "absolute" and len(profile.robot.arm_joints) < POSE_JOINTS:
         yield error(
             "too_few_joints",
             f"{few_joints(profile)}: it cannot go straight from one absolute pose to the next; "

@@ -21,6 +21,7 @@ from vla_zenoh.policy import (
     ModelSpec,
     Observation,
     ObservationSpec,
+    StatePart,
 )
 from vla_zenoh.policy.spec import STREAM_OF
 from vla_zenoh.types import ActionChunk, Depth, Image, Stamped, Task
@@ -92,6 +93,17 @@ class History:
         return min(around, key=lambda entry: abs(entry.header.stamp_wall_ns - stamp_ns))
 
 
+def state_names(
+    spec: ObservationSpec, parts: Sequence[str] = ("",)
+) -> dict[str, tuple[str, StatePart]]:
+    """Every state that is received: name (``pose``, ``left/pose``) -> part and what."""
+    return {
+        f"{part}/{what}" if part else what: (part, what)
+        for part in parts
+        for what in spec.state_streams
+    }
+
+
 @dataclass(frozen=True, slots=True)
 class Streams:
     """What a worker has received of the streams that its model observes.
@@ -99,7 +111,7 @@ class Streams:
     Args:
         images: camera -> its pictures.
         depth: camera -> its depth pictures.
-        states: part whose records they are (``joint``, ``pose``, ``gripper``) -> its states.
+        states: record (``joint``, ``pose``, ``gripper``; see `state_names`) -> its states.
     """
 
     images: Mapping[str, History]
@@ -107,8 +119,8 @@ class Streams:
     states: Mapping[str, History]
 
     @staticmethod
-    def of(spec: ObservationSpec) -> Streams:
-        """Empty ones, which keep what an observation of this kind needs."""
+    def of(spec: ObservationSpec, parts: Sequence[str] = ("",)) -> Streams:
+        """Empty ones, which keep what an observation of this kind needs of these parts."""
         # A colour picture waits for the depth picture of the same moment.
         kept_s = PAIR_S if spec.depth or spec.history > 1 else 0.0
         if spec.history > 1:
@@ -117,7 +129,7 @@ class Streams:
         return Streams(
             {one.camera: pictures() for one in spec.cameras},
             {one.camera: pictures() for one in spec.depth},
-            {part: History(keep_s=kept_s) for part in spec.state_streams},
+            {name: History(keep_s=kept_s) for name in state_names(spec, parts)},
         )
 
     @property
@@ -197,38 +209,55 @@ def assemble(
             skew_s = one.skew_s(stamp_ns)
             if skew_s > wanted.max_skew_s:
                 return NotReady(f"{name} is {skew_s:.3f} s apart from the {others}")
-    parts = _parts(wanted, streams, stamp_ns)
-    if isinstance(parts, NotReady):
-        return parts
-    now = Observation(stamp_wall_ns=stamp_ns, seq=seq, task=task, robot=robot, **parts)
-    if wanted.history == 1:
+    now = _at(Observation(stamp_ns, seq, task, robot=robot), wanted, streams, stamp_ns)
+    if wanted.history == 1 or isinstance(now, NotReady):
         return now
     before = _history(now, wanted, streams, episode_ns)
     return before if isinstance(before, NotReady) else replace(now, history=before)
 
 
-def _parts(wanted: ObservationSpec, streams: Streams, stamp_ns: int) -> dict[str, Any] | NotReady:
-    """Fields of an observation: of each stream the sample that is nearest to a time."""
+def _at(
+    empty: Observation, wanted: ObservationSpec, streams: Streams, stamp_ns: int
+) -> Observation | NotReady:
+    """An observation of what is nearest to a time in each stream."""
     images, depth = streams.images, streams.depth
-    found = {part: one.at(stamp_ns) for part, one in streams.states.items()}
-    measured = {
-        "wrench": ("wrench", found["pose"].wrench if "pose" in found else None),
-        "effort": ("effort_nm", found["joint"].effort_nm if "joint" in found else None),
-    }
-    parts: dict[str, Any] = {}
-    for part in wanted.state:
-        name, value = measured.get(part, (part, found.get(part)))
-        if value is None:
-            return NotReady(
-                f"state/{STREAM_OF[part]} holds no {name}: this robot does not measure it"
-            )
-        parts[name] = value
-    return parts | {
-        "images": {
-            c.camera: prepare_image(images[c.camera].at(stamp_ns), c) for c in wanted.cameras
-        },
-        "depth": {c.camera: prepare_depth(depth[c.camera].at(stamp_ns), c) for c in wanted.depth},
-    }
+    records: dict[str, dict[str, Any]] = {}
+    for name, one in streams.states.items():
+        part, _, what = name.rpartition("/")
+        records.setdefault(part, {})[what] = one.at(stamp_ns)
+    found: dict[str, dict[str, Any]] = {}
+    for part, own in records.items():
+        given = _asked_for(wanted, own)
+        for name, value in given.items():
+            if value is None:
+                key = "/".join(filter(None, ("state", part, _HOLDER[name])))
+                return NotReady(f"{key} holds no {name}: this robot does not measure it")
+        found[part] = given
+    whole = replace(
+        empty,
+        images={c.camera: prepare_image(images[c.camera].at(stamp_ns), c) for c in wanted.cameras},
+        depth={c.camera: prepare_depth(depth[c.camera].at(stamp_ns), c) for c in wanted.depth},
+        **found.pop("", {}),
+    )
+    if not found:
+        return whole
+    return replace(whole, parts={part: replace(whole, **own) for part, own in found.items()})
+
+
+_HOLDER = {"wrench": "pose", "effort_nm": "joint"}
+"""Field of an observation that is a field of a record -> that record."""
+
+
+def _asked_for(wanted: ObservationSpec, records: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields of an observation out of the records of one arm; None: not measured."""
+    fields: dict[str, Any] = {}
+    for what in wanted.state:
+        if what in STREAM_OF:
+            name = "effort_nm" if what == "effort" else what
+            fields[name] = getattr(records[STREAM_OF[what]], name)
+        else:
+            fields[what] = records[what]
+    return fields
 
 
 def _history(
@@ -255,13 +284,14 @@ def _history(
                     f"history: {name} has nothing within {most_s:g} s of the time {ago_s:g} s "
                     f"ago, the nearest is {apart_s:.3f} s away"
                 )
-        parts = _parts(wanted, streams, at_ns)
-        if isinstance(parts, NotReady):
-            return parts
         lead = _oldest([near for one in leading if (near := one.nearest(at_ns))])
         assert lead is not None
         stamp_ns, seq = _stamp_ns(lead), lead.header.seq
-        before.append(Observation(stamp_ns, seq, now.task, robot=now.robot, **parts))
+        empty = Observation(stamp_ns, seq, now.task, robot=now.robot)
+        then = _at(empty, wanted, streams, at_ns)
+        if isinstance(then, NotReady):
+            return then
+        before.append(then)
     return tuple(before)
 
 

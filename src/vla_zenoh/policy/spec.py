@@ -55,6 +55,7 @@ ROTATION_SIZE: Mapping[Rotation, int] = {"rpy": 3, "rotvec": 3, "quaternion": 4}
 
 
 MAX_CAMERAS = MAX_JOINTS = 16
+MAX_PARTS = 4
 
 MAX_HISTORY, MAX_HISTORY_S = 16, 2.0
 """Observations in one inference, and the time from the first to the last of them."""
@@ -282,6 +283,8 @@ class ActionSpec(_Spec):
         pace: ``steady``: a step lasts `dt_s`, and the arm neither stops nor rushes between steps
             that come in time; ``soonest``: it goes to each goal as fast as its limits allow.
         normalisation: key of the statistics that the output was scaled with, for information.
+        parts: whose columns are whose, of a robot of several parts, in the order of the columns;
+            then what is said here besides `horizon` and `dt_s` means nothing. See `of_parts`.
     """
 
     horizon: int = Field(ge=1, le=1000)
@@ -303,6 +306,62 @@ class ActionSpec(_Spec):
     joints: Annotated[tuple[Text, ...], AfterValidator(_differ)] = Field(
         default=(), max_length=MAX_JOINTS, strict=False
     )
+    parts: tuple[PartAction, ...] = Field(default=(), max_length=MAX_PARTS, strict=False)
+
+    @staticmethod
+    def of_parts(parts: Mapping[str, ActionSpec]) -> ActionSpec:
+        """The actions of a robot of several parts: the columns of each, one after the other.
+
+        Raises:
+            ValueError: their `horizon` or `dt_s` differ.
+        """
+        first = next(iter(parts.values()))
+        each = tuple(PartAction(part=name, action=action) for name, action in parts.items())
+        return ActionSpec(horizon=first.horizon, dt_s=first.dt_s, parts=each)
+
+    def of(self, part: str) -> ActionSpec:
+        """What the columns of `part` mean; of a robot of one part, which has no name, all of it.
+
+        Raises:
+            SpecError: there are none.
+        """
+        if not part and not self.parts:
+            return self
+        for each in self.parts:
+            if each.part == part:
+                return each.action
+        named = ", ".join(each.part for each in self.parts) or "no part by name"
+        raise SpecError(f"the spec says nothing of part {part!r}; it names {named}", "parts")
+
+    def columns(self, part: str) -> slice:
+        """The columns of `part` in one step."""
+        begin = 0
+        for each in self.parts:
+            if each.part == part:
+                return slice(begin, begin + each.action.dimension)
+            begin += each.action.dimension
+        return slice(0, self.dimension)
+
+    @model_serializer(mode="wrap")
+    def _without_no_parts(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """As it always was where there are no parts, and with the same hash."""
+        plain = handler(self)
+        if not self.parts:
+            plain.pop("parts", None)
+        return plain
+
+    @model_validator(mode="after")
+    def _parts_go_together(self) -> ActionSpec:
+        _differ(tuple(each.part for each in self.parts))
+        for part, action in ((each.part, each.action) for each in self.parts):
+            if action.parts:
+                raise ValueError(f"part {part!r} has parts of its own; name all of them at the top")
+            if (action.horizon, action.dt_s) != (self.horizon, self.dt_s):
+                raise ValueError(
+                    f"part {part!r} has {action.horizon} steps of {action.dt_s:g} s, the chunk "
+                    f"{self.horizon} of {self.dt_s:g} s; all parts of a chunk have the same"
+                )
+        return self
 
     @property
     def arm_size(self) -> int:
@@ -312,6 +371,8 @@ class ActionSpec(_Spec):
     @property
     def dimension(self) -> int:
         """D: numbers in one step."""
+        if self.parts:
+            return sum(each.action.dimension for each in self.parts)
         return self.arm_size + (self.gripper != "none")
 
     @model_validator(mode="after")
@@ -378,12 +439,32 @@ class ActionSpec(_Spec):
         return self
 
 
+class PartAction(_Spec):
+    """What the columns of one part of a robot mean.
+
+    Args:
+        part: its name in the profile.
+        action: their meaning.
+    """
+
+    part: Text
+    action: ActionSpec
+
+
+ActionSpec.model_rebuild()
+
+
 class ModelSpec(_Spec):
     """Everything a command node has to know of a model before it obeys it."""
 
     name: Text
     observation: ObservationSpec = ObservationSpec()
     action: ActionSpec
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Names of the parts that it moves and observes; of one arm one empty name."""
+        return tuple(each.part for each in self.action.parts) or ("",)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain types, ready for the wire."""
@@ -452,6 +533,8 @@ class Observation:
         history: earlier observations, oldest first, `ObservationSpec.history` - 1 of them.
         task: prompt, episode and rate.
         robot: whose it is, for a model that serves several and remembers something of each.
+        parts: of a robot of several parts, name -> the same with the state of that part, all of one
+            time; the observation itself then has no joint, pose and gripper.
     """
 
     stamp_wall_ns: int
@@ -467,6 +550,7 @@ class Observation:
     wrench: FloatArray | None = None
     effort_nm: FloatArray | None = None
     history: tuple[Observation, ...] = ()
+    parts: Mapping[str, Observation] = field(default_factory=dict)
 
     @property
     def prompt(self) -> str:

@@ -11,7 +11,7 @@ from vla_zenoh.profile.section import Distinct, Fault, Name, Names, Section, Tex
 from vla_zenoh.profile.session import Endpoints
 from vla_zenoh.types.states import MAX_DEPTH_UNIT_M, MIN_DEPTH_UNIT_M
 
-NodeKind = Literal["router", "sim", "ros2", "arm", "camera", "command", "worker"]
+NodeKind = Literal["router", "sim", "ros2", "arm", "camera", "command", "worker", "primitives"]
 SIMULATED: tuple[NodeKind, ...] = ("router", "sim", "camera", "command", "worker")
 CAMERA_SOURCES = {
     "sim": "sim:CAMERA",

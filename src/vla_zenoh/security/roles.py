@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from enum import Enum
 from itertools import product
 
-from vla_zenoh.keys import KEY_PATHS, Keys
+from vla_zenoh.keys import KEY_PATHS, PRIMITIVES, Keys
 from vla_zenoh.security.identity import Identity, Role
 
 _, ROBOT, CAMERA, WORKER, COMMAND, OPERATOR, VIEWER, REPLAY, _ = Role
@@ -112,6 +112,7 @@ TABLE = (
     _stream("command_pose", {COMMAND}, {ROBOT, OPERATOR, VIEWER}),
     _stream("command_joint", {COMMAND}, {ROBOT, OPERATOR, VIEWER}),
     _stream("command_gripper", {COMMAND}, {ROBOT, OPERATOR, VIEWER}),
+    Row("primitive", answer=frozenset({WORKER}), ask=frozenset({OPERATOR})),
     Row("status", put=SPEAKERS, subscribe=frozenset({COMMAND}) | LOOKERS),
     Row("event", put=SPEAKERS, subscribe=frozenset({COMMAND}) | LOOKERS),
     Row("alive", announce=SPEAKERS, watch=NODES | LOOKERS | {REPLAY}),
@@ -147,6 +148,8 @@ def _choices(parameter: str, identity: Identity, act: Act) -> tuple[str, ...]:
         return (RECORDER if identity.role is OPERATOR else identity.node,)
     if parameter == "worker":
         return (identity.worker,) if identity.worker else ()
+    if parameter == "primitive":
+        return ("*",) if identity.worker == PRIMITIVES else ()
     if parameter in ("form", "holder"):
         return ("*",)
     if parameter == "camera":  # a worker shows what it saw of any camera

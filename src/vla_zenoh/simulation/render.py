@@ -14,7 +14,7 @@ import ctypes.util
 import os
 import subprocess
 import sys
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import TYPE_CHECKING
@@ -114,7 +114,7 @@ class Renderer:
 
     Args:
         scene: name or path of the scene, as the world's.
-        robot: the robot, as the world's.
+        robot: the robot or its parts, as the world's.
         backend: how to render; None: `choose_backend` chooses.
 
     Raises:
@@ -122,7 +122,9 @@ class Renderer:
         NodeError: the back end does not work here.
     """
 
-    def __init__(self, scene: str, robot: RobotModel, backend: Backend | None = None) -> None:
+    def __init__(
+        self, scene: str, robot: RobotModel | Sequence[RobotModel], backend: Backend | None = None
+    ) -> None:
         self.backend = choose_backend() if backend is None else backend
         # After the choice: with a bad MUJOCO_GL in the environment the import itself fails.
         import mujoco

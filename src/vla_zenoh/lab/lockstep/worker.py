@@ -9,7 +9,7 @@ from vla_zenoh.keys import worker_node
 from vla_zenoh.lab.lockstep.records import Delays
 from vla_zenoh.policy import ActionSteps, Policy, check_steps, reset_of
 from vla_zenoh.policy.chunk_prefix import ChunkPrefix
-from vla_zenoh.policy.observation import NotReady, Streams, assemble, make_chunk
+from vla_zenoh.policy.observation import NotReady, Streams, assemble, make_chunk, state_names
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     ActionChunk,
@@ -44,7 +44,9 @@ class LockstepWorker:
         self.task: Task | None = None
         self._patience_s = profile.timing.max_observation_age_s
         self._delays, self._jitter = delays, jitter
-        self._streams = Streams.of(self.spec.observation)
+        self._streams = Streams.of(self.spec.observation, self.spec.parts)
+        names = state_names(self.spec.observation, self.spec.parts)
+        self._names = {(part, what): name for name, (part, what) in names.items()}
         self._not_before_ns = self._due_ns = self._asked_ns = self._episode_ns = 0
         load = getattr(policy, "load", None)
         if callable(load):
@@ -61,11 +63,11 @@ class LockstepWorker:
             if reset is not None:
                 reset()
 
-    def take_state(self, state: Stamped[Any]) -> None:
-        """Receive a state; kept if the model's spec lists it."""
-        for part, history in self._streams.states.items():
-            if isinstance(state.record, STATE_KINDS[part]):
-                history.add(state)
+    def take_state(self, state: Stamped[Any], part: str = "") -> None:
+        """Receive a state of a part of the robot; kept if the model's spec lists it."""
+        for (of_part, what), name in self._names.items():
+            if of_part == part and isinstance(state.record, STATE_KINDS[what]):
+                self._streams.states[name].add(state)
 
     def take_picture(self, camera: str, picture: Stamped[Image]) -> None:
         """Receive an image; kept if the model's spec lists it."""

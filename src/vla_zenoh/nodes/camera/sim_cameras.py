@@ -20,7 +20,7 @@ from vla_zenoh.nodes.camera.camera_publisher import OK, CameraPublisher, pinhole
 from vla_zenoh.nodes.camera.source import STALL_S
 from vla_zenoh.profile import Profile
 from vla_zenoh.simulation.render import AUTO, Renderer, choose_backend
-from vla_zenoh.simulation.robot_model import robot_model
+from vla_zenoh.simulation.robot_model import robot_models
 from vla_zenoh.types import SceneState, Stamped
 
 RAYCAST = "raycast"
@@ -114,7 +114,7 @@ class SimCameras:
 
     def _make_renderer(self) -> Renderer:
         wanted = self._profile.sim.renderer
-        robot = robot_model(self._profile.robot)
+        robot = robot_models(self._profile)
         try:
             # "auto" leaves the choice to the environment variable, if it is set.
             backend = choose_backend(None if wanted == AUTO else wanted)

@@ -17,7 +17,7 @@ from vla_zenoh.codec import records
 from vla_zenoh.codec.image import MAX_IMAGE_BYTES
 from vla_zenoh.codec.records import SMALL_BYTES
 from vla_zenoh.errors import CodecError, PeerError, SpecError, in_words
-from vla_zenoh.keys import Kind, worker_node
+from vla_zenoh.keys import Keys, Kind, last_chunk, worker_node
 from vla_zenoh.nodes.worker.camera_subscriber import (
     STREAM_PATIENCE_S,
     CameraSubscriber,
@@ -34,6 +34,7 @@ from vla_zenoh.policy.observation import (
     Streams,
     assemble,
     make_chunk,
+    state_names,
 )
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
@@ -60,6 +61,15 @@ STATE_KINDS: dict[str, type[Any]] = {
     "gripper": GripperState,
     "privileged": PrivilegedState,
 }
+
+
+def _state_key(keys: Keys, what: str) -> str:
+    return {
+        "joint": keys.state_joint,
+        "pose": keys.state_pose,
+        "gripper": keys.state_gripper,
+        "privileged": keys.state_privileged,
+    }[what]
 
 
 class RobotSession:
@@ -112,21 +122,17 @@ class RobotSession:
             for one in self.spec.observation.depth
         }
         states = MAX_STATES if history_s else 256
-        state_keys = {
-            "joint": keys.state_joint,
-            "pose": keys.state_pose,
-            "gripper": keys.state_gripper,
-            "privileged": keys.state_privileged,
-        }
         self._state_buffers = {
-            part: node.subscribe(state_keys[part], CallbackRing(states, SMALL_BYTES))
-            for part in self.spec.observation.state_streams
+            name: node.subscribe(
+                _state_key(keys.of_part(part), what), CallbackRing(states, SMALL_BYTES)
+            )
+            for name, (part, what) in state_names(self.spec.observation, self.spec.parts).items()
         }
         self._task_writer = SingleWriterFilter(TASK_PATIENCE_S)
         self._state_writers = {
-            part: SingleWriterFilter(STREAM_PATIENCE_S) for part in self._state_buffers
+            name: SingleWriterFilter(STREAM_PATIENCE_S) for name in self._state_buffers
         }
-        self._streams = Streams.of(self.spec.observation)
+        self._streams = Streams.of(self.spec.observation, self.spec.parts)
         self._received_s: dict[CameraSubscriber, float] = {}
         self.task: Task | None = None
         self._task_received_s = -1e9
@@ -185,11 +191,12 @@ class RobotSession:
 
     def poll_states(self) -> None:
         """Decode the states received since the last call."""
-        for part, buffer in self._state_buffers.items():
+        for name, buffer in self._state_buffers.items():
+            kind = STATE_KINDS[last_chunk(name)]
             for arrival in buffer.drain():
-                state = self.node.decode(STATE_KINDS[part], arrival, self._state_writers[part])
+                state = self.node.decode(kind, arrival, self._state_writers[name])
                 if state is not None:
-                    self._streams.states[part].add(state)
+                    self._streams.states[name].add(state)
 
     def _set_task(self, task: Stamped[Task]) -> None:
         before, self.task, self._task_received_s = self.task, task.record, time.monotonic()
@@ -308,6 +315,14 @@ class RobotSession:
         self.prefix.published(observation, steps, header.stamp_wall_ns, obeyed=obeyed)
         self._debug.publish(observation, answer, steps, header, (end_ns - start_ns) / 1e6)
         return True
+
+    def adopt_spec(self) -> None:
+        """Publish the policy's spec after it changed the meaning of its actions.
+
+        To be called before a chunk that follows it. What is observed has to stay the same.
+        """
+        self.spec, self._spec_hash = self.policy.spec, self.policy.spec.hash
+        self._specs.publish(self.spec)
 
     def failed(self, error: Exception, reason: str = "") -> Literal[False]:
         """Count and report an inference that failed; the next one is due a little later."""
