@@ -38,7 +38,6 @@ from vla_zenoh.kinematics.so3 import Pose, pose_of, rotation_from_quat
 from vla_zenoh.nodes.primitives.endings import NEAR_RAD, Arrival, Ending, Gripped, RunEnding, Sight
 from vla_zenoh.nodes.primitives.policy import CHUNK_HZ, Target, TargetPolicy
 from vla_zenoh.nodes.worker.robot_session import RobotSession
-from vla_zenoh.policy import ActionSteps
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray
 
@@ -48,6 +47,7 @@ SPEC_LEAD_S = 0.1
 READY_S = 4.0
 """Spec, first chunk and deadman have to reach the command node before it activates."""
 AGAIN_S = 0.25
+ARRIVES_S = 0.05
 BRAKE_S = 5.0
 POSE_JOINTS = 6
 
@@ -93,7 +93,7 @@ class PrimitivesNode:
         self._worker.complaint = ""
         self._node, self._robot = self._worker.node, RemoteRobot(profile, session)
         self._robot.subscribe()
-        self._stop = threading.Event()
+        self._stop, self._published = threading.Event(), threading.Event()
         self._asked: queue.SimpleQueue[_Asked] = queue.SimpleQueue()
         self._current: _Asked | None = None
         self._lock = threading.Lock()
@@ -122,15 +122,26 @@ class PrimitivesNode:
         if observation is not None:
             clock = self._node.clock
             observed_ns = clock.wall_ns()
-            steps = self._policy.infer(observation)
+            target, steps = self._policy.target, self._policy.infer(observation)
             if self._policy.spec is not worker.spec:
                 worker.adopt_spec()
                 worker.due_s = now_s + SPEC_LEAD_S
                 return
             worker.due_s = max(worker.due_s + 1 / CHUNK_HZ, now_s)
             times_ns = observed_ns, observed_ns, clock.wall_ns()
-            worker.publish(observation, ActionSteps(steps.steps), times_ns, 1)
+            worker.publish(observation, steps, times_ns, 1)
+            with self._lock:
+                # An arm activated by a chunk to the target before would keep the spec of that.
+                if target is self._policy.target:
+                    self._published.set()
         worker.report()
+
+    def _aim(self, target: Target) -> None:
+        """Publish chunks to `target` from now on."""
+        with self._lock:
+            self._policy.target = target
+            self._published.clear()
+        self._worker.due_s = 0.0
 
     # -- queries ------------------------------------------------------------------------------
     def _on_query(self, query: zenoh.Query) -> None:
@@ -180,7 +191,7 @@ class PrimitivesNode:
         try:
             ending, target = self._prepare(request)
             with self._settings_kept(), self._stands_after():
-                self._policy.target = target
+                self._aim(target)
                 run = request if isinstance(request, Run) else None
                 self._activate(run.worker if run else PRIMITIVES, run and run.prompt, request)
                 reason, why = self._watch(ending, asked.since_s + request.timeout_s)
@@ -310,7 +321,7 @@ class PrimitivesNode:
             yield
         finally:
             self._robot.deactivate(BRAKE_S)
-            self._policy.target = Target()
+            self._aim(Target())
 
     def _activate(self, worker: str, prompt: str | None, request: Request) -> None:
         """Select `worker`, and activate the arm for as long as the client holds it."""
@@ -319,7 +330,8 @@ class PrimitivesNode:
         if prompt is not None:
             robot.set_prompt(prompt)
         if worker == PRIMITIVES:
-            time.sleep(2 * SPEC_LEAD_S)
+            self._published.wait(READY_S)
+            time.sleep(ARRIVES_S)
         while True:
             try:
                 robot.activate(holder=request.holder)
