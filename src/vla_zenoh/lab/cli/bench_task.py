@@ -46,7 +46,7 @@ class EpisodeOptions:
         str | None,
         typer.Option(
             "--family",
-            help="put, stack, push, stay (nonsense), or lift, of two arms; default: the first three.",
+            help="put, stack, push, stay (nonsense), lift (two arms); default: the first three.",
         ),
     ] = None
     delay_ms: Annotated[
