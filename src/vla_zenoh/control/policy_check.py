@@ -80,6 +80,13 @@ def spec_errors(profile: Profile, spec: ModelSpec) -> Iterator[Finding]:
                 f"camera {wanted.camera!r} sends {gives}, the spec asks for {asks} and says "
                 "resize: none",
             )
+        apart_s = min(seen.max_skew_s, (seen.history_spacing_s or math.inf) / 2)
+        if seen.history > 1 and apart_s * camera.rate_hz < 0.5:
+            yield error(
+                "history_rate",
+                f"camera {wanted.camera!r} gives an image every {1 / camera.rate_hz:.3f} s, the "
+                f"spec's history allows none further than {apart_s:g} s from its time",
+            )
         if spec.observation.max_age_s * camera.rate_hz < 1.0:
             yield error(
                 "camera_rate",

@@ -23,6 +23,7 @@ from vla_zenoh.policy import (
     ObservationSpec,
     StatePart,
 )
+from vla_zenoh.policy.spec import STREAM_OF
 from vla_zenoh.types import ActionChunk, Depth, Image, Stamped, Task
 from vla_zenoh.types.states import MAX_COUNT
 
@@ -62,6 +63,11 @@ class History:
             cut = min(cut, bisect_left(self.entries, kept_ns, key=_stamp_ns))
         del self.entries[: max(cut, len(self.entries) - self.most)]
 
+    def first_since(self, stamp_ns: int) -> int:
+        """Stamp of the first sample that is not older; of the newest where all are."""
+        at = bisect_left(self.entries, stamp_ns, key=_stamp_ns)
+        return _stamp_ns(self.entries[min(at, len(self.entries) - 1)])
+
     @property
     def newest_ns(self) -> int:
         """Stamp of the newest; 0 without records."""
@@ -90,9 +96,11 @@ class History:
 def state_names(
     spec: ObservationSpec, parts: Sequence[str] = ("",)
 ) -> dict[str, tuple[str, StatePart]]:
-    """Every state that is observed: name (``pose``, ``left/pose``) -> part and what."""
+    """Every state that is received: name (``pose``, ``left/pose``) -> part and what."""
     return {
-        f"{part}/{what}" if part else what: (part, what) for part in parts for what in spec.state
+        f"{part}/{what}" if part else what: (part, what)
+        for part in parts
+        for what in spec.state_streams
     }
 
 
@@ -103,7 +111,7 @@ class Streams:
     Args:
         images: camera -> its pictures.
         depth: camera -> its depth pictures.
-        states: what (``joint``, ``pose``, ``gripper``; see `state_names`) -> its states.
+        states: record (``joint``, ``pose``, ``gripper``; see `state_names`) -> its states.
     """
 
     images: Mapping[str, History]
@@ -114,12 +122,26 @@ class Streams:
     def of(spec: ObservationSpec, parts: Sequence[str] = ("",)) -> Streams:
         """Empty ones, which keep what an observation of this kind needs of these parts."""
         # A colour picture waits for the depth picture of the same moment.
-        pictures = partial(History, 1, PAIR_S if spec.depth else 0.0, MAX_PICTURES)
+        kept_s = PAIR_S if spec.depth or spec.history > 1 else 0.0
+        if spec.history > 1:
+            kept_s += spec.history_span_s + spec.max_skew_s
+        pictures = partial(History, 1, kept_s, MAX_PICTURES)
         return Streams(
             {one.camera: pictures() for one in spec.cameras},
             {one.camera: pictures() for one in spec.depth},
-            {name: History() for name in state_names(spec, parts)},
+            {name: History(keep_s=kept_s) for name in state_names(spec, parts)},
         )
+
+    @property
+    def pictures(self) -> dict[str, History]:
+        """Images and depth by what messages call them."""
+        images = {f"camera {name!r}": one for name, one in self.images.items()}
+        return images | {f"depth of camera {name!r}": one for name, one in self.depth.items()}
+
+    @property
+    def named_states(self) -> dict[str, History]:
+        """States by what messages call them."""
+        return {f"state/{part}": one for part, one in self.states.items()}
 
 
 def _stamp_ns(entry: Stamped[Any]) -> int:
@@ -142,6 +164,7 @@ def assemble(
     not_before_ns: int,
     now_ns: int,
     robot: str = "",
+    episode_ns: int = 0,
 ) -> Observation | NotReady:
     """The newest observation that fits the spec, or why there is none.
 
@@ -153,6 +176,7 @@ def assemble(
             last chunk did.
         now_ns: wall clock.
         robot: whose observation it is.
+        episode_ns: when the episode began; what is older is not in its history.
 
     Raises:
         SpecError: an image does not have the size of the spec, see `prepare_image` and
@@ -161,9 +185,7 @@ def assemble(
     wanted = spec.observation
     if wanted.prompt and not task.prompt:
         return NotReady("there is no prompt", waiting=True)
-    pictures = {f"camera {name!r}": one for name, one in streams.images.items()}
-    pictures |= {f"depth of camera {name!r}": one for name, one in streams.depth.items()}
-    states = {f"state/{part}": one for part, one in streams.states.items()}
+    pictures, states = streams.pictures, streams.named_states
     missing = [name for name, one in (pictures | states).items() if not one.entries]
     if missing:
         return NotReady(f"nothing received yet of {', '.join(missing)}")
@@ -187,16 +209,32 @@ def assemble(
             skew_s = one.skew_s(stamp_ns)
             if skew_s > wanted.max_skew_s:
                 return NotReady(f"{name} is {skew_s:.3f} s apart from the {others}")
-    found: dict[str, dict[str, Any]] = {}
+    now = _at(Observation(stamp_ns, seq, task, robot=robot), wanted, streams, stamp_ns)
+    if wanted.history == 1 or isinstance(now, NotReady):
+        return now
+    before = _history(now, wanted, streams, episode_ns)
+    return before if isinstance(before, NotReady) else replace(now, history=before)
+
+
+def _at(
+    empty: Observation, wanted: ObservationSpec, streams: Streams, stamp_ns: int
+) -> Observation | NotReady:
+    """An observation of what is nearest to a time in each stream."""
+    images, depth = streams.images, streams.depth
+    records: dict[str, dict[str, Any]] = {}
     for name, one in streams.states.items():
         part, _, what = name.rpartition("/")
-        found.setdefault(part, {})[what] = one.at(stamp_ns)
-    images, depth = streams.images, streams.depth
-    whole = Observation(
-        stamp_wall_ns=stamp_ns,
-        seq=seq,
-        task=task,
-        robot=robot,
+        records.setdefault(part, {})[what] = one.at(stamp_ns)
+    found: dict[str, dict[str, Any]] = {}
+    for part, own in records.items():
+        given = _asked_for(wanted, own)
+        for name, value in given.items():
+            if value is None:
+                key = "/".join(filter(None, ("state", part, _HOLDER[name])))
+                return NotReady(f"{key} holds no {name}: this robot does not measure it")
+        found[part] = given
+    whole = replace(
+        empty,
         images={c.camera: prepare_image(images[c.camera].at(stamp_ns), c) for c in wanted.cameras},
         depth={c.camera: prepare_depth(depth[c.camera].at(stamp_ns), c) for c in wanted.depth},
         **found.pop("", {}),
@@ -204,6 +242,57 @@ def assemble(
     if not found:
         return whole
     return replace(whole, parts={part: replace(whole, **own) for part, own in found.items()})
+
+
+_HOLDER = {"wrench": "pose", "effort_nm": "joint"}
+"""Field of an observation that is a field of a record -> that record."""
+
+
+def _asked_for(wanted: ObservationSpec, records: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields of an observation out of the records of one arm; None: not measured."""
+    fields: dict[str, Any] = {}
+    for what in wanted.state:
+        if what in STREAM_OF:
+            name = "effort_nm" if what == "effort" else what
+            fields[name] = getattr(records[STREAM_OF[what]], name)
+        else:
+            fields[what] = records[what]
+    return fields
+
+
+def _history(
+    now: Observation, wanted: ObservationSpec, streams: Streams, episode_ns: int
+) -> tuple[Observation, ...] | NotReady:
+    """The observations before this one, oldest first, or why there are none."""
+    assert wanted.history_spacing_s is not None
+    named = streams.pictures | streams.named_states
+    leading = list((streams.pictures or streams.named_states).values())
+    first_ns = max(one.first_since(episode_ns) for one in leading)
+    most_s = min(wanted.max_skew_s, wanted.history_spacing_s / 2)
+    before: list[Observation] = []
+    for steps in range(wanted.history - 1, 0, -1):
+        ago_s = steps * wanted.history_spacing_s
+        at_ns = now.stamp_wall_ns - round(ago_s * 1e9)
+        if at_ns < first_ns and wanted.history_start == "wait":
+            return NotReady(f"the episode is younger than {ago_s:g} s", waiting=True)
+        # Never later than the observation itself, which may be the first one.
+        at_ns = min(max(at_ns, first_ns), now.stamp_wall_ns)
+        for name, one in named.items():
+            apart_s = one.skew_s(at_ns)
+            if apart_s > most_s:
+                return NotReady(
+                    f"history: {name} has nothing within {most_s:g} s of the time {ago_s:g} s "
+                    f"ago, the nearest is {apart_s:.3f} s away"
+                )
+        lead = _oldest([near for one in leading if (near := one.nearest(at_ns))])
+        assert lead is not None
+        stamp_ns, seq = _stamp_ns(lead), lead.header.seq
+        empty = Observation(stamp_ns, seq, now.task, robot=now.robot)
+        then = _at(empty, wanted, streams, at_ns)
+        if isinstance(then, NotReady):
+            return then
+        before.append(then)
+    return tuple(before)
 
 
 def _oldest(entries: Sequence[Stamped[Any]]) -> Stamped[Any] | None:

@@ -30,11 +30,18 @@ from pydantic import (
 )
 
 from vla_zenoh.errors import SpecError, describe_faults
-from vla_zenoh.types import GripperState, JointState, PoseState, PrivilegedState, Task
+from vla_zenoh.types import (
+    FloatArray,
+    GripperState,
+    JointState,
+    PoseState,
+    PrivilegedState,
+    Task,
+)
 from vla_zenoh.types.arrays import is_finite, to_float32
 from vla_zenoh.types.states import MAX_DEPTH_UNIT_M, MIN_DEPTH_UNIT_M
 
-StatePart = Literal["joint", "pose", "gripper", "privileged"]
+StatePart = Literal["joint", "pose", "gripper", "privileged", "wrench", "effort"]
 Resize = Literal["none", "stretch", "pad", "crop"]
 Frame = Literal["base", "tcp"]
 Rotation = Literal["rpy", "rotvec", "quaternion"]
@@ -50,7 +57,18 @@ ROTATION_SIZE: Mapping[Rotation, int] = {"rpy": 3, "rotvec": 3, "quaternion": 4}
 MAX_CAMERAS = MAX_JOINTS = 16
 MAX_PARTS = 4
 
-LATER_FIELDS: Mapping[str, Any] = {"depth": ()}
+MAX_HISTORY, MAX_HISTORY_S = 16, 2.0
+"""Observations in one inference, and the time from the first to the last of them."""
+
+STREAM_OF: Mapping[StatePart, StatePart] = {"wrench": "pose", "effort": "joint"}
+"""Parts of the state that travel in the records of another one."""
+
+LATER_FIELDS: Mapping[str, Any] = {
+    "depth": (),
+    "history": 1,
+    "history_spacing_s": None,
+    "history_start": "repeat",
+}
 """Fields of `ObservationSpec` that are written only where they differ from this."""
 
 Text = Annotated[str, Field(min_length=1, max_length=128)]
@@ -146,10 +164,17 @@ class ObservationSpec(_Spec):
     Args:
         cameras: may be empty.
         depth: may be empty; a camera may be among both.
-        state: which parts of the robot's state.
+        state: which parts of the robot's state. ``wrench`` is what the surroundings exert on the
+            arm, ``effort`` what its joints apply; a robot that does not measure them cannot serve
+            this model.
         prompt: the model needs a prompt that is not empty.
         max_skew_s: the parts of one observation may lie this far apart in time.
         max_age_s: an older observation is not given to the model.
+        history: n, observations that the model is given: this one and n - 1 before it.
+        history_spacing_s: time from one to the next. A picture or state that is further than
+            `max_skew_s`, or half the spacing, from its time is not taken for it.
+        history_start: what stands for times before the episode: its first observation
+            (``repeat``), or nothing, and the model is not asked until there are n (``wait``).
     """
 
     cameras: tuple[CameraSpec, ...] = Field(default=(), max_length=MAX_CAMERAS, strict=False)
@@ -160,6 +185,34 @@ class ObservationSpec(_Spec):
     prompt: bool = True
     max_skew_s: float = Field(default=0.1, gt=0, le=10)
     max_age_s: float = Field(default=0.5, gt=0, le=10)
+    history: int = Field(default=1, ge=1, le=MAX_HISTORY)
+    history_spacing_s: float | None = Field(default=None, ge=0.01, le=MAX_HISTORY_S)
+    history_start: Literal["repeat", "wait"] = "repeat"
+
+    @model_validator(mode="after")
+    def _history_has_a_spacing(self) -> ObservationSpec:
+        if (self.history > 1) != (self.history_spacing_s is not None):
+            raise ValueError(
+                "history (more than 1) and history_spacing_s go together: give both, or neither"
+            )
+        if self.history_span_s > MAX_HISTORY_S + 1e-9:
+            raise ValueError(
+                f"{self.history} observations {self.history_spacing_s:g} s apart span "
+                f"{self.history_span_s:g} s, at most {MAX_HISTORY_S:g} s are kept"
+            )
+        if self.history > 1 and not (self.cameras or self.depth or self.state):
+            raise ValueError("there is nothing to have a history of: name cameras or state")
+        return self
+
+    @property
+    def history_span_s(self) -> float:
+        """Time from the first to the last observation of one inference."""
+        return (self.history - 1) * (self.history_spacing_s or 0.0)
+
+    @property
+    def state_streams(self) -> tuple[StatePart, ...]:
+        """Parts whose records hold all parts of the state."""
+        return tuple(dict.fromkeys(STREAM_OF.get(part, part) for part in self.state))
 
     @model_validator(mode="after")
     def _one_picture_of_a_camera(self) -> ObservationSpec:
@@ -474,6 +527,10 @@ class Observation:
         pose: TCP pose, where asked for.
         gripper: gripper state, where asked for.
         privileged: what a simulated benchmark knows, where asked for; no real robot tells it.
+        wrench: (6,) N and Nm that the surroundings exert on the arm, as in `PoseState`, where asked
+            for.
+        effort_nm: (n,) as in `JointState`, where asked for.
+        history: earlier observations, oldest first, `ObservationSpec.history` - 1 of them.
         task: prompt, episode and rate.
         robot: whose it is, for a model that serves several and remembers something of each.
         parts: of a robot of several parts, name -> the same with the state of that part, all of one
@@ -490,6 +547,9 @@ class Observation:
     gripper: GripperState | None = None
     privileged: PrivilegedState | None = None
     robot: str = ""
+    wrench: FloatArray | None = None
+    effort_nm: FloatArray | None = None
+    history: tuple[Observation, ...] = ()
     parts: Mapping[str, Observation] = field(default_factory=dict)
 
     @property

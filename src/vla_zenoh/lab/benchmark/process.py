@@ -240,9 +240,11 @@ class _Child:
                     f"model {self._worker.spec.name!r} needs the cameras {', '.join(missing)}; "
                     f"the benchmark has: {', '.join(known)}"
                 )
-            if self._worker.spec.observation.depth:
+            looks = self._worker.spec.observation
+            if looks.depth or looks.history > 1:
                 raise WorkerError(
-                    f"model {self._worker.spec.name!r} needs depth, which no benchmark gives"
+                    f"model {self._worker.spec.name!r} needs "
+                    f"{'depth' if looks.depth else 'a history'}, which no benchmark gives"
                 )
         return self._worker
 

@@ -141,7 +141,7 @@ class ExampleMaker:
         seq = 0 if again else self.seq
         self.seq = max(self.seq, seq + 1)
         seen = example_observation(self.spec, prompt=style.prompt)
-        return replace(
+        made = replace(
             seen,
             stamp_wall_ns=START_NS + seq * PERIOD_NS,
             seq=seq,
@@ -155,7 +155,15 @@ class ExampleMaker:
             gripper=GripperState(style.width_m, moving=False, holding=style.holding)
             if seen.gripper is not None
             else None,
+            effort_nm=self._joint().effort_nm if seen.effort_nm is not None else None,
+            history=(),
         )
+        # An arm that stood still and was looked at: earlier pictures are as this one.
+        earlier = (
+            replace(made, stamp_wall_ns=made.stamp_wall_ns + each.stamp_wall_ns)
+            for each in seen.history
+        )
+        return replace(made, history=tuple(earlier))
 
     def _images(self, style: ExampleStyle) -> Mapping[str, Picture]:
         out: dict[str, Picture] = {}
@@ -218,7 +226,7 @@ def example_observation(
         for one in spec.observation.depth
     }
     zeros = np.zeros(7)
-    return Observation(
+    seen = Observation(
         stamp_wall_ns=0,
         seq=0,
         task=Task(episode=0, active=False, prompt=prompt, worker=spec.name, rate_hz=5.0),
@@ -234,4 +242,10 @@ def example_observation(
         if "gripper" in asked
         else None,
         privileged=PrivilegedState({}) if "privileged" in asked else None,
+        wrench=np.zeros(6) if "wrench" in asked else None,
+        effort_nm=zeros if "effort" in asked else None,
     )
+    before = range(spec.observation.history - 1, 0, -1)
+    spacing_ns = round((spec.observation.history_spacing_s or 0.0) * 1e9)
+    earlier = tuple(replace(seen, stamp_wall_ns=-steps * spacing_ns) for steps in before)
+    return replace(seen, history=earlier)

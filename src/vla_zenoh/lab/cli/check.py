@@ -227,6 +227,10 @@ def _inputs(report: CheckReport) -> str:
         f"{d.unit_m * 1e3:g} mm a count"
         for d in observation.depth
     ]
-    return (
-        ", ".join([*cameras, *depths, *(f"state/{part}" for part in observation.state)]) or "none"
-    )
+    parts = ", ".join([*cameras, *depths, *(f"state/{part}" for part in observation.state)])
+    if observation.history > 1:
+        parts += (
+            f"; {observation.history} observations {observation.history_spacing_s:g} s apart, at "
+            f"the start of an episode: {observation.history_start}"
+        )
+    return parts or "none"

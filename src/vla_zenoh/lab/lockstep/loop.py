@@ -237,7 +237,8 @@ class Lockstep:
             if guard.braking or guard.unheeded:
                 gripper = replace(gripper, mode="braking" if guard.braking else "unheeded")
             self._send(SIM, gripper, partial(self._take_gripper_state, part), part=part)
-            wanted = {what for w in self.workers.values() for what in w.spec.observation.state}
+            looks = [worker.spec.observation for worker in self.workers.values()]
+            wanted = {what for each in looks for what in each.state_streams}
             if self.commander.reach is not None or "joint" in wanted:
                 joints = arm.joint_state()
                 self._send(SIM, joints, partial(self._take_joint_state, part), part=part)

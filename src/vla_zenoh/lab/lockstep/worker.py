@@ -47,7 +47,7 @@ class LockstepWorker:
         self._streams = Streams.of(self.spec.observation, self.spec.parts)
         names = state_names(self.spec.observation, self.spec.parts)
         self._names = {(part, what): name for name, (part, what) in names.items()}
-        self._not_before_ns = self._due_ns = self._asked_ns = 0
+        self._not_before_ns = self._due_ns = self._asked_ns = self._episode_ns = 0
         load = getattr(policy, "load", None)
         if callable(load):
             load()
@@ -58,7 +58,7 @@ class LockstepWorker:
         if known is not None and known.requested_hz != self.task.requested_hz:
             self._due_ns = min(self._due_ns, self._asked_ns)
         if known is None or known.episode != self.task.episode:
-            self._not_before_ns = task.header.stamp_wall_ns
+            self._not_before_ns = self._episode_ns = task.header.stamp_wall_ns
             reset = reset_of(self.policy)
             if reset is not None:
                 reset()
@@ -97,6 +97,7 @@ class LockstepWorker:
             self._streams,
             not_before_ns=self._not_before_ns,
             now_ns=wall_ns,
+            episode_ns=self._episode_ns,
         )
         if isinstance(observation, NotReady):
             return None

@@ -28,7 +28,14 @@ from vla_zenoh.nodes.worker.camera_subscriber import (
 from vla_zenoh.nodes.worker.inference_debug import InferenceDebugPublisher
 from vla_zenoh.policy import ActionSteps, Observation, Policy, check_steps, reset_of
 from vla_zenoh.policy.chunk_prefix import ChunkPrefix
-from vla_zenoh.policy.observation import NotReady, Streams, assemble, make_chunk, state_names
+from vla_zenoh.policy.observation import (
+    MAX_STATES,
+    NotReady,
+    Streams,
+    assemble,
+    make_chunk,
+    state_names,
+)
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     Depth,
@@ -103,18 +110,21 @@ class RobotSession:
             lambda query: query.reply(keys.spec(name), records.encode(self.spec)),
         )
         self._tasks = node.subscribe(keys.task, LatestSample(SMALL_BYTES))
-        self._jpeg = images == "jpeg"
+        self._jpeg, history_s = images == "jpeg", self.spec.observation.history_span_s
         self._cameras = {
-            one.camera: subscribe_to_camera(one, node, jpeg=self._jpeg, changed=changed)
+            one.camera: subscribe_to_camera(
+                one, node, jpeg=self._jpeg, changed=changed, history_s=history_s
+            )
             for one in self.spec.observation.cameras
         }
         self._depths = {
-            one.camera: subscribe_to_depth(one.camera, node, changed)
+            one.camera: subscribe_to_depth(one.camera, node, changed=changed, history_s=history_s)
             for one in self.spec.observation.depth
         }
+        states = MAX_STATES if history_s else 256
         self._state_buffers = {
             name: node.subscribe(
-                _state_key(keys.of_part(part), what), CallbackRing(256, SMALL_BYTES)
+                _state_key(keys.of_part(part), what), CallbackRing(states, SMALL_BYTES)
             )
             for name, (part, what) in state_names(self.spec.observation, self.spec.parts).items()
         }
@@ -127,7 +137,7 @@ class RobotSession:
         self.task: Task | None = None
         self._task_received_s = -1e9
         self._episode = -1
-        self._not_before_ns = 0
+        self._not_before_ns = self._episode_ns = 0
         self._rate = RateMeter(window_s=10.0)
         self._inference_ms = Percentiles(128)
         self._batch = 0
@@ -169,11 +179,14 @@ class RobotSession:
             (self._depths, self._streams.depth, _depth_of),
         ):
             for name, camera in cameras.items():
-                received = camera.pop()
-                picture = received and self._decode(name, received, decode)
-                if received is not None and picture is not None:
-                    streams[name].add(picture)
-                    self._received_s[camera] = received.arrival.mono_ns / 1e9
+                # Without a history there is one, the newest.
+                while (received := camera.pop()) is not None:
+                    picture = self._decode(name, received, decode)
+                    if picture is not None:
+                        streams[name].add(picture)
+                        self._received_s[camera] = received.arrival.mono_ns / 1e9
+                    if not self.spec.observation.history_span_s:
+                        break
         self.poll_states()
 
     def poll_states(self) -> None:
@@ -193,7 +206,7 @@ class RobotSession:
             return
         self._episode = task.record.episode
         # An observation from before the episode does not belong to it.
-        self._not_before_ns = task.header.stamp_wall_ns
+        self._not_before_ns = self._episode_ns = task.header.stamp_wall_ns
         reset = reset_of(self.policy, self.robot)
         if reset is not None:
             try:
@@ -245,6 +258,7 @@ class RobotSession:
                 not_before_ns=self._not_before_ns,
                 now_ns=self.node.clock.wall_ns(),
                 robot=self.robot,
+                episode_ns=self._episode_ns,
             )
         except ValueError as error:
             self.complaint = str(error)
