@@ -14,6 +14,7 @@ from vla_zenoh.cli.options import JsonOption, options
 from vla_zenoh.cli.output import console, errors, fail, print_json
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.cli.up import default_log_folder, rolling_folder
+from vla_zenoh.errors import counted
 from vla_zenoh.keys import ROLLING
 from vla_zenoh.runtime.process import run_node
 from vla_zenoh.sanitize import one_line
@@ -25,9 +26,9 @@ HEARD_S = 3.0
 @options
 def rolling(
     target: RobotTarget,
-    output: Annotated[
+    folder: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="Folder. Default: where `up` keeps its own."),
+        typer.Option("--folder", help="Of the record. Default: where `up` keeps its own."),
     ] = None,
     minutes: Annotated[
         float, typer.Option("--minutes", help="How much is kept.", min=0.1, max=1440)
@@ -44,13 +45,13 @@ def rolling(
     from vla_zenoh.lab.rolling.node import NICE, Limits, RollingRecord
 
     loaded = target.load()
-    folder = output or rolling_folder(default_log_folder(), loaded)
+    place = folder or rolling_folder(default_log_folder(), loaded)
     limits = Limits(keep_s=60 * minutes, max_bytes=megabytes * 1024 * 1024)
     with suppress(OSError):
         os.nice(NICE)
 
     def run(session, stop) -> None:  # pyright: ignore  # as run_node gives them
-        RollingRecord(loaded, session, folder, limits).run(stop)
+        RollingRecord(loaded, session, place, limits).run(stop)
 
     run_node(loaded, run, identity=None)
 
@@ -112,11 +113,13 @@ def audit(
         for fault in found.faults:
             errors().print(one_line(f"FAULT: {fault}"), style="red", markup=False)
         since = f", from number {found.first}: older ones were deleted" if found.first else ""
-        console().print(f"{found.lines} lines{since}; newest hash {found.head}", soft_wrap=True)
+        console().print(
+            f"{counted(found.lines, 'line')}{since}; newest hash {found.head}", soft_wrap=True
+        )
     if missing:
         fail(f"no line has the hash {head}: the log is another one, or its end was removed")
     if found.faults:
-        fail(f"the chain is broken in {len(found.faults)} places")
+        fail(f"the chain is broken in {counted(len(found.faults), 'place')}")
 
 
 def authors_of(entries: list[dict]) -> dict[str, str]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections import deque
+import time
+from collections import Counter, deque
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -12,7 +13,27 @@ import zenoh
 from vla_zenoh.bus.buffers import bytes_of
 from vla_zenoh.bus.clock import Clock
 
-MAX_PUTS, MAX_BYTES = 4096, 64 * 1024
+MAX_BYTES = 64 * 1024
+BURST, RATE_HZ = 256, 5.0
+"""Lines of one key at once, and per second in the long run: who floods one key hides nothing on
+another, and does not push out what the log has."""
+
+
+class Allowance:
+    """Lets so many through at once, and so many per second in the long run."""
+
+    def __init__(self) -> None:
+        self._left, self._at_s = float(BURST), time.monotonic()
+
+    def take(self) -> bool:
+        """Whether one more may pass."""
+        now_s = time.monotonic()
+        self._left = min(self._left + RATE_HZ * (now_s - self._at_s), BURST)
+        self._at_s = now_s
+        if self._left < 1:
+            return False
+        self._left -= 1
+        return True
 
 
 class Put(NamedTuple):
@@ -47,7 +68,8 @@ class AuditQueue:
         self._session, self._clock = session, clock
         self._lock = threading.Lock()
         self._puts: deque[Put] = deque()
-        self._lost = 0
+        self._allowances: dict[str, Allowance] = {}
+        self._lost: Counter[str] = Counter()
         self._subscribers: list[zenoh.Subscriber[None]] = []
 
     def subscribe(self, expressions: Iterable[str]) -> None:
@@ -62,18 +84,19 @@ class AuditQueue:
         source = sample.source_info
         client = "" if source is None else str(source.source_id.zid)
         deleted = sample.kind != zenoh.SampleKind.PUT
+        key = str(sample.key_expr)
         with self._lock:
-            if len(self._puts) >= MAX_PUTS:
-                self._lost += 1
+            if not self._allowances.setdefault(key, Allowance()).take():
+                self._lost[key] += 1
                 return
             now_ns = self._clock.wall_ns()
-            self._puts.append(Put(str(sample.key_expr), payload, size, deleted, client, now_ns))
+            self._puts.append(Put(key, payload, size, deleted, client, now_ns))
 
-    def take(self) -> tuple[list[Put], int]:
-        """All since the last call, and how many more there were than fit."""
+    def take(self) -> tuple[list[Put], Counter[str]]:
+        """All since the last call, and by key how many more there were than are let through."""
         with self._lock:
             taken, self._puts = list(self._puts), deque()
-            lost, self._lost = self._lost, 0
+            lost, self._lost = self._lost, Counter()
         return taken, lost
 
     def close(self) -> None:

@@ -32,7 +32,7 @@ from vla_zenoh.lab.recording.recorder import COMMIT_S, SWITCH_INTERVAL_S, WRITE_
 from vla_zenoh.lab.recording.sample_queue import SampleQueue
 from vla_zenoh.lab.recording.writer import RecordingWriter
 from vla_zenoh.lab.rolling.audit_log import PATTERN, AuditLog
-from vla_zenoh.lab.rolling.audit_queue import AuditQueue, Put
+from vla_zenoh.lab.rolling.audit_queue import Allowance, AuditQueue, Put
 from vla_zenoh.lab.rolling.ring import PART, Ring, delete_oldest_saved
 from vla_zenoh.profile import Profile, to_yaml
 from vla_zenoh.types import MAX_TEXT, Event, NodeStatus
@@ -51,6 +51,8 @@ AGAIN_S = 5.0
 KEPT_SAVED = 20
 """Automatically saved folders; those that somebody asked for are never deleted."""
 MAX_CLIENTS = 1024
+LOST_EVERY_S = 5.0
+"""Between two lines that say how many puts were not logged."""
 STOPS = ("->stopped", "->fault")
 REFUSED = "activate_refused"
 ENDED = "ended"
@@ -113,6 +115,9 @@ class RollingRecord:
         self._began_s = self._committed_s = self._try_s = 0.0
         self._seen_drops: Counter[str] = Counter()
         self._why = self._audit_why = ""
+        self._lost: Counter[str] = Counter()
+        self._lost_s = 0.0
+        self._allowed = Allowance()
         self._clients: dict[str, tuple[str, str, str]] = {}
         self._reasons: list[str] = []
         self._save_s, self._asked, self._refused_s = 0.0, False, -1e9
@@ -156,6 +161,7 @@ class RollingRecord:
         if self._reasons:
             self._save()
         self._finish_segment()
+        self._note_lost()
         self._add(ENDED)
         self._write_audit()
         self._log.close()
@@ -194,8 +200,15 @@ class RollingRecord:
                 self._note_event(put)
             else:
                 self._note_setting(name, put)
-        if lost:
-            self._add("lost", puts=lost)
+        self._lost.update(lost)
+        if self._lost and time.monotonic() - self._lost_s > LOST_EVERY_S:
+            self._note_lost()
+
+    def _note_lost(self) -> None:
+        self._lost_s = time.monotonic()
+        for key, count in self._lost.items():
+            self._add("lost", key=self.node.keys.short(key), puts=count)
+        self._lost.clear()
 
     def _note_setting(self, name: str, put: Put) -> None:
         text = put.payload[: 4 * MAX_TEXT].decode("utf-8", "replace")[:MAX_TEXT]
@@ -239,7 +252,7 @@ class RollingRecord:
                 continue
             certificate, address = map(str, told)
             known = (router, certificate, address)
-            if self._clients.get(number) != known:
+            if self._clients.get(number) != known and self._allowed.take():
                 self._clients[number] = known
                 self._add(
                     "client", client=number, certificate=certificate, address=address, by=router
@@ -317,6 +330,8 @@ class RollingRecord:
             self._writer.abandon()
             self._writer = None
             self._ring.add(self._path, time.monotonic() - self._began_s)
+        elif self._path.exists() and not self._path.stat().st_size:  # it could not even begin
+            self._path.unlink()
         self._ring.drop_oldest()
         self.node.counters["missed"] += samples
         self._try_s = time.monotonic() + AGAIN_S
