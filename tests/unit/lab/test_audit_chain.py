@@ -150,6 +150,14 @@ def test_lines_wait_for_a_disk_that_is_full(tmp_path: Path) -> None:
     assert [len(entry["facts"]["text"]) for entry in found.entries] == [6, 500, 5]
 
 
+def test_two_processes_do_not_write_one_log(tmp_path: Path) -> None:
+    log = AuditLog(tmp_path)
+    with pytest.raises(RecordingError, match="another rolling record writes into"):
+        AuditLog(tmp_path)
+    log.close()
+    AuditLog(tmp_path).close()
+
+
 # -- the command ----------------------------------------------------------------------------------
 def test_the_command_verifies_and_says_what_was_done(tmp_path: Path) -> None:
     filled(tmp_path, "one", "two", "three")

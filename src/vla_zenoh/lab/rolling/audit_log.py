@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -38,6 +39,7 @@ class AuditLog:
         self._pending: list[str] = []
         try:
             folder.mkdir(parents=True, exist_ok=True)
+            self._lock = _locked(folder)
             files = _files(folder)
             self._path = files[-1] if files else self._named()
             self._resume()
@@ -105,8 +107,23 @@ class AuditLog:
             old.unlink(missing_ok=True)
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the file, and leave the folder to others."""
         os.close(self._fd)
+        os.close(self._lock)
+
+
+def _locked(folder: Path) -> int:
+    """A lock of the folder: two logs in one would be no chain."""
+    lock = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(lock)
+        raise RecordingError(
+            f"another rolling record writes into {folder}: end it, or give this one another "
+            "--folder (`up`: another --log-dir, or --no-record)"
+        ) from error
+    return lock
 
 
 def _files(folder: Path) -> list[Path]:
