@@ -10,6 +10,7 @@ from benchmarks.chain.cli import chain
 from benchmarks.codec.cli import codec
 from benchmarks.delay import delay
 from benchmarks.deployment import deployment
+from benchmarks.depth import depth
 from benchmarks.load.cli import load
 from benchmarks.openvla import openvla
 from benchmarks.stop import stop
@@ -24,7 +25,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-for command in (chain, codec, delay, deployment, load, openvla, stop, thesis, web):
+for command in (chain, codec, delay, deployment, depth, load, openvla, stop, thesis, web):
     app.command()(command)
 
 if __name__ == "__main__":

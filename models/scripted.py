@@ -45,7 +45,8 @@ class Scripted:
     """See the module.
 
     Args:
-        camera: picture every request waits for, as a real model would; empty: none.
+        camera: picture every request waits for, as a real model would, or several
+            (``front,wrist``); empty: none.
         horizon: steps in one chunk.
         dt_s: duration of a step.
         delay_ms: pretend an inference takes this long.
@@ -62,7 +63,7 @@ class Scripted:
         delay_ms: str = "0",
         jitter: str = "0",
     ) -> None:
-        cameras = (CameraSpec(camera=camera),) if camera else ()
+        cameras = tuple(CameraSpec(camera=name) for name in camera.split(",") if name)
         self.spec = ModelSpec(
             name="scripted",
             observation=ObservationSpec(cameras=cameras, state=("pose", "gripper"), prompt=True),

@@ -241,6 +241,7 @@ def cli_page() -> str:
 # -- counters -----------------------------------------------------------------------------------
 REASONS = {
     "before_activation": "chunk: its observation is older than the activation",
+    "busy": "primitive: another one runs",
     "cameras": "`seen`: more cameras than a model may have",
     "clock_step": "the wall clock was set",
     "deleted": "a Zenoh `delete` on a key that takes puts",

@@ -202,7 +202,7 @@ WRONG: list[tuple[str, str]] = [
     (
         "hosts:\n  a:\n    nodes: [router, camer]",
         "lab.yaml:4: hosts.a.nodes.1: wants 'router', 'sim', 'ros2', 'arm', 'camera', "
-        "'command' or 'worker'; did you mean 'camera'?",
+        "'command', 'worker' or 'primitives'; did you mean 'camera'?",
     ),
     ("hosts: {a: {nodes: [sim, sim]}}", "hosts.a.nodes: sim: given more than once"),
     (

@@ -24,20 +24,33 @@ def chain(
         list[str] | None,
         typer.Option("--only", help="Measure this way alone; may be given more than once."),
     ] = None,
+    size: Annotated[
+        str, typer.Option("--size", metavar="WIDTHxHEIGHT", help="Of a picture.")
+    ] = "640x480",
+    cameras: Annotated[
+        int, typer.Option("--cameras", help="Pictures in a request.", min=1, max=3)
+    ] = 1,
+    pause: Annotated[
+        bool, typer.Option("--pause/--no-pause", help="12 to 20 ms from request to request.")
+    ] = True,
 ) -> None:
     """Measure picture to chunk and to pose command, beside other ways of serving a model.
 
-    Every way carries the same picture of 640x480 and seven floats back; the model takes no time.
+    Every way carries the same pictures and seven floats back; the model takes no time.
     All servers are processes on this computer, started and ended by turns.
     """
     from benchmarks.chain import report
     from benchmarks.chain.run import run
-    from benchmarks.chain.ways import WAYS, ServingWay
+    from benchmarks.chain.ways import WAYS, Load, ServingWay
 
     names = [way.name for way in WAYS]
     unknown = [name for name in only or () if name not in names]
     if unknown:
         raise typer.BadParameter(f"{unknown[0]!r} is not a way; there are: {', '.join(names)}")
+    sides = size.split("x")
+    if len(sides) != 2 or not all(s.isdecimal() and 16 <= int(s) <= 4096 for s in sides):
+        raise typer.BadParameter(f"--size {size!r} is not WIDTHxHEIGHT, 16 to 4096 pixels each")
+    load = Load(requests, (int(sides[0]), int(sides[1])), cameras, pause)
     ways = [way for way in WAYS if not only or way.name in only]
     with output.open() as file, progress_bars(44) as bars:
         turns = rounds * sum(not way.missing() for way in ways)
@@ -49,7 +62,7 @@ def chain(
             bars.update(bar, description=way.title, completed=begun)
             begun += 1
 
-        result = run(ways, rounds, requests, progress)
+        result = run(ways, rounds, load, progress)
         bars.update(bar, description="measured", completed=turns)
         write_json(file, result.to_dict())
     stages = report.stage_table(result)

@@ -1,4 +1,4 @@
-"""Zenoh alone: a picture there and seven floats back, with none of our records around them."""
+"""Zenoh alone: pictures there and seven floats back, with none of our records around them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import zenoh
 from numpy.typing import NDArray
 
-from benchmarks.peers import ACTION
+from benchmarks.peers import ACTION, Pictures
 from vla_zenoh.bus.buffers import LatestSample
 from vla_zenoh.bus.session import QOS, open_session
 from vla_zenoh.errors import NodeError
@@ -18,7 +18,8 @@ from vla_zenoh.keys import Kind
 from vla_zenoh.profile import SessionProfile
 from vla_zenoh.runtime.process import ROUTER_PATIENCE_S
 
-PICTURE_KEY, ANSWER_KEY = "vla-zenoh-bench/picture", "vla-zenoh-bench/answer"
+PICTURE_KEYS = tuple(f"vla-zenoh-bench/picture/{camera}" for camera in range(3))
+ANSWER_KEY = "vla-zenoh-bench/answer"
 TIMEOUT_S = 1.0
 POLL_S = 0.25
 
@@ -30,22 +31,27 @@ def session_at(endpoint: str, *, listen: bool) -> zenoh.Session:
     return open_session(SessionProfile(connect=(endpoint,)), wait_s=ROUTER_PATIENCE_S)
 
 
-def serve(endpoint: str, *, listen: bool, stop: threading.Event) -> None:
-    """Answer every picture until `stop` is set."""
+def serve(endpoint: str, cameras: int, *, listen: bool, stop: threading.Event) -> None:
+    """Answer every `cameras` pictures until `stop` is set."""
     answer = np.array(ACTION, np.float32).tobytes()
-    pictures = LatestSample()
+    changed = threading.Condition()
+    slots = [LatestSample(changed=changed) for _ in range(cameras)]
     with session_at(endpoint, listen=listen) as session:
         out = session.declare_publisher(ANSWER_KEY, **QOS[Kind.ORDER])
-        handler = zenoh.handlers.Callback(pictures, indirect=False)
-        subscriber = session.declare_subscriber(PICTURE_KEY, handler)
+        subscribers = [
+            session.declare_subscriber(key, zenoh.handlers.Callback(slot, indirect=False))
+            for key, slot in zip(PICTURE_KEYS, slots, strict=False)
+        ]
         while not stop.is_set():
-            if not pictures.wait(POLL_S):
-                continue
-            arrival = pictures.pop()
-            if arrival is not None:
+            with changed:
+                if not changed.wait_for(lambda: all(slot.has_new for slot in slots), POLL_S):
+                    continue
+            for arrival in [slot.pop() for slot in slots]:
+                assert arrival is not None
                 np.frombuffer(arrival.sample.payload.to_bytes(), np.uint8)
-                out.put(answer)
-        subscriber.undeclare()
+            out.put(answer)
+        for subscriber in subscribers:
+            subscriber.undeclare()
 
 
 class EchoClient:
@@ -53,14 +59,18 @@ class EchoClient:
 
     Args:
         endpoint: where the server or the router listens.
+        cameras: pictures in a request.
     """
 
-    def __init__(self, endpoint: str) -> None:
+    def __init__(self, endpoint: str, cameras: int) -> None:
         self._session = session_at(endpoint, listen=False)
         self._answers = LatestSample()
         handler = zenoh.handlers.Callback(self._answers, indirect=False)
         self._subscriber = self._session.declare_subscriber(ANSWER_KEY, handler)
-        self._out = self._session.declare_publisher(PICTURE_KEY, **QOS[Kind.FRAME])
+        self._outs = [
+            self._session.declare_publisher(key, **QOS[Kind.FRAME])
+            for key in PICTURE_KEYS[:cameras]
+        ]
 
     def await_server(self, timeout_s: float) -> None:
         """Wait until pictures are listened to.
@@ -69,19 +79,20 @@ class EchoClient:
             NodeError: nobody does.
         """
         give_up = time.monotonic() + timeout_s
-        while not self._out.matching_status.matching:  # pyright: ignore  # stub says bool
+        while not all(out.matching_status.matching for out in self._outs):  # pyright: ignore
             if time.monotonic() > give_up:
                 raise NodeError("the echo of the benchmark does not answer")
             time.sleep(0.01)
 
-    def request(self, rgb: NDArray[np.uint8]) -> NDArray[Any]:
-        """A picture there, seven floats back.
+    def request(self, pictures: Pictures) -> NDArray[Any]:
+        """Pictures there, seven floats back.
 
         Raises:
             TimeoutError: none came.
         """
         self._answers.pop()
-        self._out.put(rgb.tobytes())
+        for out, rgb in zip(self._outs, pictures, strict=True):
+            out.put(rgb.tobytes())
         if not self._answers.wait(TIMEOUT_S):
             raise TimeoutError
         arrival = self._answers.pop()

@@ -10,11 +10,9 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from types import TracebackType
 
-import numpy as np
-from numpy.typing import NDArray
-
 from benchmarks.chain import report
 from benchmarks.chain.process import Server, free_port
+from benchmarks.peers import Pictures
 from vla_zenoh.bus.buffers import CallbackRing, LatestSample
 from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.node import Node
@@ -25,7 +23,8 @@ from vla_zenoh.profile import HostProfile, Profile, load_profile
 from vla_zenoh.runtime.launch import Host
 from vla_zenoh.types import ActionChunk, PoseCommand, Stamped
 
-PROFILE, CAMERA, WORKER, PROMPT = "panda_sim", "front", "scripted", "hold"
+PROFILE, WORKER, PROMPT = "panda_sim", "scripted", "hold"
+CAMERAS = ("front", "left", "right")
 RATE_HZ = 100.0
 """Asked of the worker: the highest there is, so that it waits for the picture and nothing else."""
 READY_PATIENCE_S = 20.0
@@ -42,14 +41,25 @@ class Answer:
     figures_ms: dict[str, float]
 
 
-def bench_profile(command_hz: float) -> Profile:
-    """The shipped profile at an address of its own, with the nodes that are measured."""
+def bench_profile(command_hz: float, pictures: Pictures) -> Profile:
+    """The shipped profile at an address of its own, with the nodes that are measured.
+
+    Args:
+        command_hz: rate of the command node.
+        pictures: of the cameras that the model waits for.
+    """
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     data = load_profile(PROFILE).model_dump()
     data["session"].update(connect=(endpoint,), listen=(endpoint,))
     data["timing"]["command_hz"] = command_hz
     data["task"].update(prompt=PROMPT, worker=WORKER, rate_hz=RATE_HZ)
     data["workers"] = (WORKER,)
+    cameras = dict(zip(CAMERAS, pictures, strict=False))
+    data["cameras"] = {
+        name: {**data["cameras"]["front"], "height": rgb.shape[0], "width": rgb.shape[1]}
+        for name, rgb in cameras.items()
+    }
+    data["options"] = {WORKER: {"camera": ",".join(cameras)}}
     # A worker takes raw pictures where the host has the cameras, as here.
     here = HostProfile(nodes=("router", "camera", "command", "worker"))
     data["hosts"] = {"here": here.model_dump()}
@@ -61,13 +71,15 @@ class Chain:
 
     Args:
         command_hz: rate of the command node.
+        pictures: shown until the worker answers.
 
     Raises:
         NodeError: it does not come up.
     """
 
-    def __init__(self, command_hz: float) -> None:
-        self.profile = bench_profile(command_hz)
+    def __init__(self, command_hz: float, pictures: Pictures) -> None:
+        self.profile = bench_profile(command_hz, pictures)
+        self._first = pictures
         self._lines: list[str] = []
         self._up = ExitStack()
         self._host = Host(
@@ -105,9 +117,12 @@ class Chain:
         self._robot = self._up.enter_context(Server("robot", str(self._host.profile_file)))
         self._node = Node("camera", self.profile, session)
         self._up.callback(self._node.close)
-        camera = self.profile.cameras[CAMERA]
-        self._outlet = CameraPublisher(CAMERA, camera, "benchmark", self._node, self._node.emit)
-        self._outlet.set_state(OK)
+        self._outlets = {
+            name: CameraPublisher(name, camera, "benchmark", self._node, self._node.emit)
+            for name, camera in self.profile.cameras.items()
+        }
+        for outlet in self._outlets.values():
+            outlet.set_state(OK)
         keys = self._node.keys
         self._chunks = self._node.subscribe(keys.delta(WORKER), LatestSample())
         self._poses = self._node.subscribe(keys.command_pose, CallbackRing(4096))
@@ -115,12 +130,11 @@ class Chain:
 
     def _activate(self, client: Client) -> None:
         """Show pictures until the worker answers and the command node finds nothing to refuse."""
-        blank = np.zeros((480, 640, 3), np.uint8)
         give_up = time.monotonic() + READY_PATIENCE_S
         why = "the worker does not answer"
         while time.monotonic() < give_up:
             self._robot.check()
-            self._publish(blank)
+            self._publish(self._first)
             self._report()
             if not self._chunks.wait(0.1):
                 continue
@@ -143,24 +157,26 @@ class Chain:
 
     # -- one request --------------------------------------------------------------------------
     def _report(self) -> None:
-        self._node.publish_status(OK, detail={"cameras": {CAMERA: {"state": OK, "age_s": 0.0}}})
+        cameras = {name: {"state": OK, "age_s": 0.0} for name in self._outlets}
+        self._node.publish_status(OK, detail={"cameras": cameras})
 
-    def _publish(self, rgb: NDArray[np.uint8]) -> tuple[int, int]:
+    def _publish(self, pictures: Pictures) -> tuple[int, int]:
         """Returns when, on the monotonic and on the wall clock."""
         mono_ns, wall_ns = time.monotonic_ns(), self._node.clock.wall_ns()
-        self._outlet.captured(mono_ns)
-        self._outlet.publish_rgb(rgb, mono_ns, wall_ns)
+        for outlet, rgb in zip(self._outlets.values(), pictures, strict=True):
+            outlet.captured(mono_ns)
+            outlet.publish_rgb(rgb, mono_ns, wall_ns)
         return mono_ns, wall_ns
 
-    def request(self, rgb: NDArray[np.uint8]) -> Answer:
-        """Show a picture and follow it.
+    def request(self, pictures: Pictures) -> Answer:
+        """Show pictures and follow them.
 
         Raises:
             TimeoutError: no chunk or no pose command came of it.
         """
         self._poses.drain()
         self._chunks.pop()
-        began_ns, stamp_ns = self._publish(rgb)
+        began_ns, stamp_ns = self._publish(pictures)
         self._await_chunk(stamp_ns, began_ns)
         chunk_ns = time.monotonic_ns()
         time.sleep(self._period_s + TICK_MARGIN_S)

@@ -1,7 +1,7 @@
 """Processes of a benchmark: how its servers are started, watched, timed and ended.
 
 Run as a module it is such a process: ``peer NAME PORT``, ``router ENDPOINT``,
-``echo ENDPOINT listen|connect``, ``robot PROFILE_FILE`` or
+``echo ENDPOINT listen|connect CAMERAS``, ``robot PROFILE_FILE`` or
 ``follower PROFILE_FILE``.
 """
 
@@ -125,8 +125,8 @@ def main(arguments: list[str]) -> None:
     elif role == "echo":
         from benchmarks.chain.echo import serve
 
-        endpoint, how = rest
-        serve(endpoint, listen=how == "listen", stop=stop)
+        endpoint, how, cameras = rest
+        serve(endpoint, int(cameras), listen=how == "listen", stop=stop)
     elif role in ("robot", "follower"):
         from benchmarks.chain.robot import play_robot
 

@@ -9,7 +9,7 @@ from typing import Any
 from rich.table import Table
 
 from benchmarks.chain.rounds import Interval, Summary, summarise
-from benchmarks.chain.ways import REFERENCE, ServingWay
+from benchmarks.chain.ways import REFERENCE, Load, ServingWay
 from vla_zenoh.errors import how_to_install
 
 CHUNK, POSE, TICK_WAIT, ROUND_TRIP = "chunk", "pose", "tick_wait", "round_trip"
@@ -41,13 +41,13 @@ class Result:
         ways: in the order of the table.
         rounds: way -> slot, one map per round.
         machine: what it ran on.
-        requests: asked of every way in every round.
+        load: asked of every way in every round.
     """
 
     ways: Sequence[ServingWay]
     rounds: Sequence[Mapping[str, Interval]]
     machine: Mapping[str, Any]
-    requests: int
+    load: Load
 
     def summary(self, way: ServingWay, figure: str) -> Summary | None:
         """One line of the table."""
@@ -72,7 +72,7 @@ class Result:
         return {
             "machine": dict(self.machine),
             "rounds": len(self.rounds),
-            "requests": self.requests,
+            **asdict(self.load),
             "reference": f"{REFERENCE}.{CHUNK}",
             "ways": {way.name: self._way(way) for way in self.ways},
         }
@@ -92,7 +92,9 @@ class Result:
 
 def main_table(result: Result) -> Table:
     """The comparison."""
-    table = Table(title="One picture of 640x480 there, seven floats back. ms", header_style="bold")
+    load = result.load
+    what = f"{load.cameras} picture{'s' * (load.cameras > 1)} of {load.size[0]}x{load.size[1]}"
+    table = Table(title=f"{what} there, seven floats back. ms", header_style="bold")
     table.add_column("way", overflow="fold")
     for name in ("p50", "p95", "p99", "p50 by round", "CPU", "x ours"):
         table.add_column(name, justify="right", no_wrap=True)
@@ -140,10 +142,12 @@ def stage_table(result: Result) -> Table | None:
 def notes(result: Result) -> list[str]:
     """What has to be known to read the tables."""
     machine = result.machine
+    pace = "one every 12 to 20 ms at most"
+    if not result.load.pause:
+        pace = "without a pause; ours 100 a second, the highest rate of a worker"
     told = [
-        f"{len(result.rounds)} rounds of {result.requests} requests each, ways in turns, one every "
-        f"12 to 20 ms at most. {machine.get('cores', '?')} cores, load {machine.get('load', '?')} "
-        "at the start.",
+        f"{len(result.rounds)} rounds of {result.load.requests} requests each, ways in turns, "
+        f"{pace}. {machine.get('cores', '?')} cores, load {machine.get('load', '?')} at the start.",
         "A command node answers at its next tick: half a period on average, shown apart. The other "
         "ways end with the floats; what would follow to move an arm is not in them.",
         "CPU: of one request in all its processes, without what they take while nothing is asked.",

@@ -12,18 +12,16 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import Any, NamedTuple
 
-import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks import peers
 from benchmarks.chain import report
 from benchmarks.chain.echo import EchoClient
-from benchmarks.chain.our_chain import WORKER, Chain
+from benchmarks.chain.our_chain import RATE_HZ, WORKER, Chain
 from benchmarks.chain.process import START_PATIENCE_S, Server, free_port
 from benchmarks.chain.report import Result
 from benchmarks.chain.rounds import Interval
-from benchmarks.chain.ways import ServingWay
-from benchmarks.picture import noisy_picture
+from benchmarks.chain.ways import Load, ServingWay
 from vla_zenoh import __version__
 from vla_zenoh.errors import NodeError
 from vla_zenoh.keys import worker_node
@@ -36,7 +34,7 @@ WARM_UP = 20
 QUIET_S = 1.0
 MAX_LOST = 10
 
-Ask = Callable[[NDArray[np.uint8]], Mapping[str, float]]
+Ask = Callable[[peers.Pictures], Mapping[str, float]]
 
 
 class Running(NamedTuple):
@@ -56,38 +54,38 @@ class Running(NamedTuple):
 
 
 @contextmanager
-def _chain(way: ServingWay) -> Iterator[Running]:
-    with Chain(way.command_hz) as chain:
+def _chain(way: ServingWay, pictures: peers.Pictures) -> Iterator[Running]:
+    with Chain(way.command_hz, pictures) as chain:
         to_chunk = ("camera", "router", worker_node(WORKER))
         everybody = (*to_chunk, "command")
         parts = {
             report.CHUNK: to_chunk,
             report.POSE: everybody,
         }
-        yield Running(lambda rgb: chain.request(rgb).figures_ms, chain.cpu_s, parts, chain.rest)
+        yield Running(lambda them: chain.request(them).figures_ms, chain.cpu_s, parts, chain.rest)
 
 
 @contextmanager
-def _echo(way: ServingWay) -> Iterator[Running]:
+def _echo(way: ServingWay, pictures: peers.Pictures) -> Iterator[Running]:
     port = free_port()
-    endpoint = f"tcp/127.0.0.1:{port}"
+    endpoint, count = f"tcp/127.0.0.1:{port}", str(len(pictures))
     with ExitStack() as up:
         servers: dict[str, Server] = {}
         if way.routed:
             servers["router"] = up.enter_context(Server("router", endpoint))
             servers["router"].await_port(port)
-            servers["echo"] = up.enter_context(Server("echo", endpoint, "connect"))
+            servers["echo"] = up.enter_context(Server("echo", endpoint, "connect", count))
         else:
-            servers["echo"] = up.enter_context(Server("echo", endpoint, "listen"))
+            servers["echo"] = up.enter_context(Server("echo", endpoint, "listen", count))
             servers["echo"].await_port(port)
-        client = EchoClient(endpoint)
+        client = EchoClient(endpoint, len(pictures))
         up.callback(client.close)
         client.await_server(START_PATIENCE_S)
         yield _round_trips(client.request, servers)
 
 
 @contextmanager
-def _peer(way: ServingWay) -> Iterator[Running]:
+def _peer(way: ServingWay, _: peers.Pictures) -> Iterator[Running]:
     port = free_port()
     with Server("peer", way.name, str(port)) as server:
         server.await_port(port)
@@ -99,11 +97,11 @@ def _peer(way: ServingWay) -> Iterator[Running]:
 
 
 def _round_trips(
-    request: Callable[[NDArray[np.uint8]], NDArray[Any]], servers: Mapping[str, Server]
+    request: Callable[[peers.Pictures], NDArray[Any]], servers: Mapping[str, Server]
 ) -> Running:
-    def ask(rgb: NDArray[np.uint8]) -> dict[str, float]:
+    def ask(pictures: peers.Pictures) -> dict[str, float]:
         began_ns = time.monotonic_ns()
-        answer = request(rgb)
+        answer = request(pictures)
         took_ms = (time.monotonic_ns() - began_ns) / 1e6
         if len(answer) != len(peers.ACTION):
             raise NodeError(f"a server of the benchmark answers {answer!r}")
@@ -124,27 +122,31 @@ def _round_trips(
 _START = {"chain": _chain, "echo": _echo, "peer": _peer}
 
 
-def measure(way: ServingWay, requests: int, seed: int) -> Interval:
-    """Start one way, ask it `requests` times, end it.
+def measure(way: ServingWay, load: Load, seed: int) -> Interval:
+    """Start one way, ask it ``load.requests`` times, end it.
 
     Raises:
         NodeError: it does not start, dies, or leaves too many requests unanswered.
     """
-    rgb = noisy_picture()
+    pictures, requests = load.pictures(), load.requests
     draw = random.Random(seed)
+    pause_s = (0.0, 0.0) if way.kind != "chain" else (1 / RATE_HZ, 1 / RATE_HZ)
+    if load.pause:
+        pause_s = PERIOD_S
     figures: dict[str, list[float]] = defaultdict(list)
-    with _START[way.kind](way) as running:
+    with _START[way.kind](way, pictures) as running:
         for _ in range(WARM_UP):
-            _paced(running, rgb, draw)
+            _paced(running, pictures, draw.uniform(*pause_s))
         gc.collect()
         standing = _spent_in(running, lambda: time.sleep(QUIET_S))
-        _paced(running, rgb, draw)  # what waited in quiet is not the first to be measured
+        # What waited in quiet is not the first to be measured.
+        _paced(running, pictures, draw.uniform(*pause_s))
         lost = 0
 
         def ask_all() -> None:
             nonlocal lost
             for _ in range(requests):
-                got = _paced(running, rgb, draw)
+                got = _paced(running, pictures, draw.uniform(*pause_s))
                 if got is None:
                     lost += 1
                     if lost > MAX_LOST:
@@ -172,12 +174,12 @@ def _spent_in(running: Running, act: Callable[[], None]) -> dict[str, float]:
 
 
 def _paced(
-    running: Running, rgb: NDArray[np.uint8], draw: random.Random
+    running: Running, pictures: peers.Pictures, period_s: float
 ) -> Mapping[str, float] | None:
     """One request and the rest of its period; None when it was lost."""
-    next_s = time.monotonic() + draw.uniform(*PERIOD_S)
+    next_s = time.monotonic() + period_s
     try:
-        got = running.ask(rgb)
+        got = running.ask(pictures)
     except TimeoutError:
         running.check()
         return None
@@ -186,14 +188,14 @@ def _paced(
 
 
 def run(
-    ways: Sequence[ServingWay], rounds: int, requests: int, progress: Callable[[ServingWay], None]
+    ways: Sequence[ServingWay], rounds: int, load: Load, progress: Callable[[ServingWay], None]
 ) -> Result:
     """Measure all of `ways` that are installed, in turns.
 
     Args:
         ways: what to measure.
         rounds: how often each has its turn; the first one changes from round to round.
-        requests: in each turn.
+        load: of each turn.
         progress: called before each turn.
 
     Raises:
@@ -207,9 +209,9 @@ def run(
         slots: dict[str, Interval] = {}
         for way in installed[first:] + installed[:first]:
             progress(way)
-            slots[way.name] = measure(way, requests, seed=number)
+            slots[way.name] = measure(way, load, seed=number)
         done.append(slots)
-    return Result(ways, done, machine, requests)
+    return Result(ways, done, machine, load)
 
 
 def _machine() -> dict[str, Any]:

@@ -6,6 +6,9 @@ import importlib.util
 from dataclasses import dataclass
 from typing import Literal
 
+from benchmarks.peers import Pictures
+from benchmarks.picture import HEIGHT, WIDTH, noisy_picture
+
 Kind = Literal["chain", "echo", "peer"]
 
 
@@ -32,6 +35,27 @@ class ServingWay:
     def missing(self) -> tuple[str, ...]:
         """Modules that are not installed."""
         return tuple(name for name in self.modules if importlib.util.find_spec(name) is None)
+
+
+@dataclass(frozen=True, slots=True)
+class Load:
+    """What is asked of every way in a turn.
+
+    Args:
+        requests: their number.
+        size: width and height of a picture.
+        cameras: pictures in a request.
+        pause: from one request to the next; without it each follows the answer to the last.
+    """
+
+    requests: int = 100
+    size: tuple[int, int] = (WIDTH, HEIGHT)
+    cameras: int = 1
+    pause: bool = True
+
+    def pictures(self) -> Pictures:
+        """Those of a request."""
+        return [noisy_picture(*self.size)] * self.cameras
 
 
 WAYS = (

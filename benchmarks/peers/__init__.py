@@ -1,12 +1,13 @@
 """Other ways of serving a policy, each as it is commonly done: a server and its client.
 
 A module here has ``serve(port)``, which ends with its process, and ``Client(port)`` with
-``request(rgb)``, which returns the seven floats.
+``request(pictures)``, which returns the seven floats.
 """
 
 from __future__ import annotations
 
 import importlib
+from collections.abc import Sequence
 from typing import Any, Protocol, cast
 
 import numpy as np
@@ -19,11 +20,15 @@ ACTION = (0.01, 0.0, 0.0, 0.0, 0.0, 0.0, 0.04)
 PROMPT = "put the red brick in the box"
 
 
+Pictures = Sequence[NDArray[np.uint8]]
+"""(H, W, 3) of each camera, taken together."""
+
+
 class PeerClient(Protocol):
     """The asking end."""
 
-    def request(self, rgb: NDArray[np.uint8]) -> NDArray[Any]:
-        """A picture (H, W, 3) there, seven floats back."""
+    def request(self, pictures: Pictures) -> NDArray[Any]:
+        """Pictures there, seven floats back."""
         ...
 
     def close(self) -> None: ...

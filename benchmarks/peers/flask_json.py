@@ -13,7 +13,7 @@ import requests
 from numpy.typing import NDArray
 from werkzeug.serving import make_server
 
-from benchmarks.peers import ACTION, ADDRESS, PROMPT
+from benchmarks.peers import ACTION, ADDRESS, PROMPT, Pictures
 
 TIMEOUT_S = 10.0
 
@@ -26,14 +26,21 @@ def serve(port: int) -> None:
     @app.post("/act")
     def act() -> Any:
         asked = flask.request.get_json()
-        file = np.frombuffer(base64.b64decode(asked["image"]), np.uint8)
-        bgr = cv2.imdecode(file, cv2.IMREAD_COLOR)
-        if bgr is None:
-            return {"error": "not a picture"}, 400
-        cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+        for image in asked["images"]:
+            file = np.frombuffer(base64.b64decode(image), np.uint8)
+            bgr = cv2.imdecode(file, cv2.IMREAD_COLOR)
+            if bgr is None:
+                return {"error": "not a picture"}, 400
+            cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
         return {"action": list(ACTION)}
 
     make_server(ADDRESS, port, app, threaded=True).serve_forever()  # what app.run() does
+
+
+def _in_text(rgb: NDArray[np.uint8]) -> str:
+    """A PNG as base64."""
+    _, file = cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+    return base64.b64encode(file.tobytes()).decode()
 
 
 class Client:
@@ -42,11 +49,9 @@ class Client:
     def __init__(self, port: int) -> None:
         self._url = f"http://{ADDRESS}:{port}/act"
 
-    def request(self, rgb: NDArray[np.uint8]) -> NDArray[Any]:
-        """A picture there, seven floats back."""
-        _, file = cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
-        image = base64.b64encode(file.tobytes()).decode()
-        body = {"image": image, "instruction": PROMPT}
+    def request(self, pictures: Pictures) -> NDArray[Any]:
+        """Pictures there, seven floats back."""
+        body = {"images": list(map(_in_text, pictures)), "instruction": PROMPT}
         # A proxy that the environment names is not meant for this computer.
         proxies: Any = {"http": None}
         answer = requests.post(self._url, json=body, timeout=TIMEOUT_S, proxies=proxies)

@@ -13,7 +13,7 @@ from websockets.asyncio.server import serve as listen
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from benchmarks.peers import ACTION, ADDRESS, PROMPT, arrays
+from benchmarks.peers import ACTION, ADDRESS, PROMPT, Pictures, arrays
 
 
 async def _answer(connection: ServerConnection) -> None:
@@ -22,7 +22,7 @@ async def _answer(connection: ServerConnection) -> None:
     try:
         while True:
             asked = arrays.unpack(await connection.recv())  # pyright: ignore[reportArgumentType]
-            assert asked["observation/image"].ndim == 3
+            assert all(asked[name].ndim == 3 for name in asked if name.startswith("observation/"))
             await connection.send(arrays.pack({"actions": actions, "server_timing": {}}))
     except ConnectionClosed:
         return
@@ -49,9 +49,10 @@ class Client:
         )
         self._socket.recv()
 
-    def request(self, rgb: NDArray[np.uint8]) -> NDArray[Any]:
-        """A picture there, seven floats back."""
-        self._socket.send(arrays.pack({"observation/image": rgb, "prompt": PROMPT}))
+    def request(self, pictures: Pictures) -> NDArray[Any]:
+        """Pictures there, seven floats back."""
+        images = {f"observation/image_{number}": rgb for number, rgb in enumerate(pictures)}
+        self._socket.send(arrays.pack({**images, "prompt": PROMPT}))
         answer = arrays.unpack(self._socket.recv())  # pyright: ignore[reportArgumentType]
         return answer["actions"][0]
 

@@ -8,7 +8,7 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from benchmarks.peers import ACTION, ADDRESS, PROMPT, arrays
+from benchmarks.peers import ACTION, ADDRESS, PROMPT, Pictures, arrays
 
 TIMEOUT_MS = 10_000
 
@@ -20,7 +20,7 @@ def serve(port: int) -> None:
     actions = np.array([ACTION], np.float32)
     while True:
         asked = arrays.unpack(socket.recv())
-        assert asked["image"].ndim == 3
+        assert all(image.ndim == 3 for image in asked["images"])
         socket.send(arrays.pack({"actions": actions}))
 
 
@@ -33,9 +33,9 @@ class Client:
         self._socket.setsockopt(zmq.RCVTIMEO, TIMEOUT_MS)
         self._socket.connect(f"tcp://{ADDRESS}:{port}")
 
-    def request(self, rgb: NDArray[np.uint8]) -> NDArray[Any]:
-        """A picture there, seven floats back."""
-        self._socket.send(arrays.pack({"image": rgb, "prompt": PROMPT}))
+    def request(self, pictures: Pictures) -> NDArray[Any]:
+        """Pictures there, seven floats back."""
+        self._socket.send(arrays.pack({"images": list(pictures), "prompt": PROMPT}))
         return arrays.unpack(self._socket.recv())["actions"][0]
 
     def close(self) -> None:

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from vla_zenoh.bus.primitives import PrimitiveError
     from vla_zenoh.bus.remote_robot import RemoteRobot, connect
     from vla_zenoh.errors import (
         CodecError,
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
     from vla_zenoh.types import ActionChunk, GripperState, Image, JointState, PoseState, Stamped
 
 _MODULES = {
+    "bus.primitives": ("PrimitiveError",),
     "bus.remote_robot": ("RemoteRobot", "connect"),
     "errors": (
         "CodecError",
@@ -81,6 +83,7 @@ __all__ = [
     "ObservationSpec",
     "Policy",
     "PoseState",
+    "PrimitiveError",
     "Profile",
     "ProfileError",
     "Reading",

@@ -2,14 +2,15 @@
 in ``interop/ros2/keys.py``.
 
 A key is ``{root}/{robot}/...``: `Keys` makes the keys of one robot, `Kind` chooses the quality of
-service. `KEY_PATHS` is the whole wire protocol.
+service. `KEY_PATHS` is the whole wire protocol. A robot of several parts has states and commands of
+each: ``{root}/{robot}/{part}/state/pose``.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import NamedTuple
 
@@ -23,6 +24,8 @@ DEFAULT_ROOT = "vla"
 
 MAX_CHUNK = 64
 """Characters between two slashes."""
+
+ANY_PART = "*"
 
 _CHUNK = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
 
@@ -70,6 +73,17 @@ class KeyPath:
         return f"{keys.root}/{keys.robot}/{own}"
 
 
+class _PartKey(KeyPath):
+    """A key that every part of a robot has."""
+
+    def text(self, keys: Keys, *parts: str) -> str:
+        path = f"{keys.part}/{self.path}" if keys.part else self.path
+        return f"{keys.root}/{keys.robot}/{path}"
+
+    def __get__(self, keys: Keys, owner: object = None) -> str:
+        return self.text(keys)
+
+
 class _Key(KeyPath):
     def __get__(self, keys: Keys, owner: object = None) -> str:
         return self.text(keys)
@@ -91,13 +105,18 @@ class Keys:
     Args:
         robot: the robot's name.
         root: what stands before it, may hold slashes.
+        part: whose states and commands are meant, of a robot of several; ``*`` is any. Empty: the
+            robot has one part, without a name.
     """
 
     robot: str
     root: str = DEFAULT_ROOT
+    part: str = ""
 
     def __post_init__(self) -> None:
         key_chunk(self.robot, "robot name")
+        if self.part not in ("", ANY_PART):
+            key_chunk(self.part, "part name")
         for part in self.root.split("/"):
             key_chunk(part, "root")
 
@@ -110,15 +129,20 @@ class Keys:
         "camera/{camera}/jpeg",
         "A plain JPEG file, encoding image/jpeg; published while there are subscribers.",
     )
+    camera_depth = _KeyOf(
+        "camera/{camera}/depth",
+        "A PNG file of 16 bits; its encoding says the metres of a count "
+        "(``image/png;depth16;0.001``), 0 is not measured. Published while there are subscribers.",
+    )
     camera_fitted = _KeyOf(
         "camera/{camera}/fitted/{form}",
         "A JPEG in the form a model's spec asks for (``224x224-pad``), made where the camera is.",
     )
-    state_joint = _Key("state/joint", "`JointState`.")
-    state_pose = _Key(
+    state_joint = _PartKey("state/joint", "`JointState`.")
+    state_pose = _PartKey(
         "state/pose", "`PoseState`, with the stamp and seq of the `JointState` it belongs to."
     )
-    state_gripper = _Key("state/gripper", "`GripperState`, with the same stamp and seq.")
+    state_gripper = _PartKey("state/gripper", "`GripperState`, with the same stamp and seq.")
     state_privileged = _Key(
         "state/privileged", "`PrivilegedState` of a simulated benchmark, for reference policies."
     )
@@ -154,19 +178,30 @@ class Keys:
         "seen/{worker}/{camera}",
         "JPEG of exactly the image the model was given; published while there are subscribers.",
     )
+    seen_depth = _KeyOf(
+        "seen/{worker}/{camera}/depth",
+        "PNG of exactly the depth the model was given; published while there are subscribers.",
+    )
     seen_record = _KeyOf(
         "seen/{worker}", "`InferenceDebug`: prompt, raw output and steps of the same inference."
     )
 
     # -- command node -------------------------------------------------------------------------
-    command_pose = _Key(
+    command_pose = _PartKey(
         "command/pose", "`PoseCommand` at a fixed rate. The command node is its only writer."
     )
-    command_joint = _Key(
+    command_joint = _PartKey(
         "command/joint",
         "`JointCommand`, in place of poses if the profile's robot is commanded by joints.",
     )
-    command_gripper = _Key("command/gripper", "`GripperCommand`, newest wins.")
+    command_gripper = _PartKey("command/gripper", "`GripperCommand`, newest wins.")
+
+    # -- guarded primitives -------------------------------------------------------------------
+    primitive = _KeyOf(
+        "primitive/{primitive}",
+        "Query with a JSON request; one JSON reply when the arm stands, with the reason why it "
+        "does. Only where the node primitives runs.",
+    )
 
     # -- every node ---------------------------------------------------------------------------
     status = _KeyOf("status/{node}", "`NodeStatus`, 2 Hz and on change.")
@@ -201,6 +236,7 @@ class Keys:
     all_events = _Key("event/*")
     all_alive = _Key("alive/*")
     all_holding = _Key("holding/*")
+    all_primitives = _Key("primitive/*")
 
     @property
     def without_raw_images(self) -> tuple[str, ...]:
@@ -208,7 +244,12 @@ class Keys:
 
         Keys of one or two parts that are added later are among them, too.
         """
-        return tuple(map(self.full, ("*", "*/*", "camera/*/jpeg", "seen/*/*")))
+        pictures = ("camera/*/jpeg", "camera/*/depth", "seen/*/*", "seen/*/*/depth")
+        return tuple(map(self.full, ("*", "*/*", *pictures)))
+
+    def of_part(self, part: str) -> Keys:
+        """The same keys with states and commands of `part`; ``*``: of every part."""
+        return replace(self, part=part)
 
     @property
     def all_robots(self) -> str:
@@ -251,6 +292,12 @@ KEY_PATHS: Mapping[str, KeyPath] = {
 """Member of `Keys` -> its path, of all that are one key: the whole wire protocol."""
 
 
+PART_KEYS = frozenset(name for name, path in KEY_PATHS.items() if isinstance(path, _PartKey))
+"""Members of `Keys` that every part of a robot has."""
+NOT_PARTS = frozenset(path.path.split("/")[0] for path in KEY_PATHS.values())
+"""Names that no part may have: they follow the robot in other keys."""
+
+
 def last_chunk(key: str) -> str:
     """The last part of a key: the node, worker or camera it is about."""
     return key.rsplit("/", 1)[-1]
@@ -276,6 +323,10 @@ def _covers(wide: list[str], narrow: list[str]) -> bool:
 
 NO_DEADMAN_TOKEN = "is not there (a liveliness token on the key holding/NAME)"
 """Why a deadman is not accepted."""
+
+
+PRIMITIVES = "primitives"
+"""Kind of the node that answers on `Keys.primitive`, and its name as a worker."""
 
 
 def worker_node(worker: str) -> str:
@@ -315,5 +366,6 @@ NODE_KINDS: Mapping[str, NodeTraits] = {
     "command": NodeTraits("command", 0.8, "the robot obeys one command node"),
     "camera": NodeTraits("camera", 0.8),
     "worker": NodeTraits("worker", 0.8),
+    "primitives": NodeTraits("worker", 0.8, "one primitive is carried out at a time"),
 }
 """Every kind of node, in the order in which `up` starts them."""

@@ -25,7 +25,7 @@ from vla_zenoh.bus.clock_sync import decode_stamps
 from vla_zenoh.cli import status_table as cli_status
 from vla_zenoh.cli.options import model_options, number_list
 from vla_zenoh.cli.output import Screen, plain_types
-from vla_zenoh.codec import image, message, records, settings
+from vla_zenoh.codec import image, message, primitives, records, settings
 from vla_zenoh.errors import CodecError, PeerError, ProfileError, SpecError, VlaZenohError
 from vla_zenoh.interop.ros2 import attachment, readers
 from vla_zenoh.interop.ros2.definitions import parse
@@ -44,7 +44,7 @@ from vla_zenoh.policy import ActionSpec, ModelSpec, ObservationSpec
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.policy.scripted_motions import parse_scripted
 from vla_zenoh.profile import load_profile
-from vla_zenoh.types import Event, Header, InferenceDebug, NodeStatus
+from vla_zenoh.types import Depth, Event, Header, InferenceDebug, NodeStatus
 
 OF_TORCH = Path(__file__).parents[1] / "contract" / "lerobot_actions.pickle"
 CORPUS = Path(__file__).parent / "corpus"
@@ -91,6 +91,16 @@ class Target(NamedTuple):
 def _raw(data: bytes) -> Any:
     words, _, pixels = data.partition(b"\n")
     return image.decode_raw(pixels, words.decode("latin-1"))
+
+
+def _depth(data: bytes) -> Any:
+    words, _, file = data.partition(b"\n")
+    return image.decode_depth(file, words.decode("latin-1"))
+
+
+def _depths() -> list[bytes]:
+    depth = Depth(np.arange(64, dtype=np.uint16).reshape(8, 8) * 900, 0.001)
+    return [image.depth_schema(depth).encode() + b"\n" + image.encode_depth(depth)]
 
 
 @cache
@@ -339,7 +349,25 @@ def _targets() -> Iterator[Target]:
             codec,
             lambda words=words: [words],
         )
+    for name, asked in (
+        ("move_to", b'{"holder": "a", "position_m": [0.5, 0.1, 0.3]}'),
+        ("grip", b'{"holder": "a", "width_m": 0.03}'),
+        ("run", b'{"holder": "a", "worker": "w", "until": {"gripper": "closed"}}'),
+    ):
+        yield Target(
+            f"primitive-{name}",
+            partial(primitives.decode_request, name),
+            codec,
+            lambda asked=asked: [asked],
+        )
+    yield Target(
+        "primitive-answer",
+        primitives.decode_answer,
+        codec,
+        lambda: [primitives.Answer(True, "reached", position_m=(0.1, 0.2, 0.3)).encode()],
+    )
     yield Target("prompt", _prompt, codec, lambda: [b"HARD: go up x3", b"put the red brick down"])
+    yield Target("depth", _depth, codec, _depths)
     yield Target("jpeg", image.decode_jpeg, codec, lambda: [image.encode_jpeg(_gray())])
     yield Target("raw", _raw, codec, lambda: [b"rgb8;2x2\n" + bytes(12)])
     yield Target(

@@ -17,6 +17,7 @@ REASONS = {
         *("reasons_by_joints", "_robot", "_gripper", "_too_old", "_worker", "_spec", "_chunk"),
         *("_cameras", "_clocks"),
     },
+    "control/commanded_part.py": {"reasons_against"},
     "control/joint_monitor.py": {"joint_state_faults", "_elbow_is_not_held"},
     "control/watchdog.py": {"reasons_against"},
     "control/motion_pipeline.py": {"unsettled"},

@@ -181,13 +181,18 @@ class CallbackRing(SampleBuffer):
         size: samples.
         limit: bytes of one.
         arrival: set whenever a sample is added.
+        changed: notified whenever a sample is added; several buffers may share one.
     """
 
     def __init__(
-        self, size: int, limit: int = MAX_RECORD_BYTES, arrival: threading.Event | None = None
+        self,
+        size: int,
+        limit: int = MAX_RECORD_BYTES,
+        arrival: threading.Event | None = None,
+        changed: threading.Condition | None = None,
     ) -> None:
         super().__init__(limit)
-        self._arrival = arrival
+        self._arrival, self._changed = arrival, changed
         self._arrivals: deque[ReceivedSample] = deque(maxlen=size)
         self._size = size
         self._count = 0
@@ -202,6 +207,18 @@ class CallbackRing(SampleBuffer):
         self._arrivals.append(ReceivedSample(sample, time.monotonic_ns(), self._count))
         if self._arrival is not None:
             self._arrival.set()
+        if self._changed is not None:
+            with self._changed:
+                self._changed.notify_all()
+
+    @property
+    def has_new(self) -> bool:
+        """Whether there is a sample that was not popped."""
+        return bool(self._arrivals)
+
+    def pop(self) -> ReceivedSample | None:
+        """The oldest sample."""
+        return self._arrivals.popleft() if self._arrivals else None
 
     def drain(self) -> list[ReceivedSample]:
         """All samples, oldest first."""

@@ -247,13 +247,18 @@ class Client:
             self.keys.worker, worker, lambda task: task.worker == worker, "worker", timeout_s
         )
 
-    def activate(self, timeout_s: float = 3.0) -> Task:
+    def activate(self, timeout_s: float = 3.0, holder: str = "") -> Task:
         """Activate the arm, and wait until it is active.
+
+        Args:
+            timeout_s: how long to wait.
+            holder: another client, whose liveliness token on `Keys.holding` makes it the deadman.
 
         Raises:
             SessionError: rejected, with every reason.
         """
-        return self._activate("true", timeout_s)
+        text = encode_deadman_activation(holder).decode() if holder else "true"
+        return self._activate(text, timeout_s)
 
     def activate_with_deadman(self, what: str, timeout_s: float = 3.0) -> Task:
         """Activate the arm for as long as this process is alive and connected: as its deadman.

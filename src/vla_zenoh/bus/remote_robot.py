@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import zenoh
 
 from vla_zenoh.bus.buffers import LatestSample, ReceivedSample, bytes_of, header_of
 from vla_zenoh.bus.client import Client
+from vla_zenoh.bus.primitives import PrimitiveError, ask
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import MAX_IMAGE_BYTES, decode_jpeg, decode_raw
+from vla_zenoh.codec.primitives import DEFAULT_TIMEOUT_S, Answer
 from vla_zenoh.codec.records import MAX_RECORD_BYTES
 from vla_zenoh.errors import SessionError
 from vla_zenoh.profile import Profile, as_robot, load_profile, override
@@ -24,6 +26,11 @@ from vla_zenoh.types import (
     PoseState,
     Stamped,
 )
+
+
+def _list(numbers: Sequence[float] | None) -> list[float] | None:
+    return None if numbers is None else [float(number) for number in numbers]
+
 
 Record = TypeVar("Record")
 TIMEOUT_S = 2.0
@@ -93,6 +100,87 @@ class RemoteRobot(Client):
         schema = str(sample.sample.encoding).partition(";")[2]
         image = decode_jpeg(payload) if jpeg else decode_raw(payload, schema)
         return Stamped(header_of(sample.sample), image, sample.mono_ns)
+
+    def picture(self, camera: str, *, timeout_s: float = TIMEOUT_S) -> bytes:
+        """Next image of a camera as a JPEG file, otherwise as `image`."""
+        sample = self._next(self.keys.camera_jpeg(camera), MAX_IMAGE_BYTES, timeout_s)
+        return bytes_of(sample.sample.payload, MAX_IMAGE_BYTES)
+
+    # -- guarded primitives -------------------------------------------------------------------
+    def move_to(
+        self,
+        position_m: Sequence[float] | None = None,
+        quat_xyzw: Sequence[float] | None = None,
+        *,
+        joints_rad: Sequence[float] | Mapping[str, float] | None = None,
+        timeout_s: float = DEFAULT_TIMEOUT_S,
+    ) -> Answer:
+        """Move the TCP straight to a pose, or the joints to positions, and wait until it is there.
+
+        The arm moves only while this waits, at ``limits.approach_m_s`` at most, within all bounds
+        of the profile; a target that it cannot go to is rejected before it moves.
+
+        Args:
+            position_m: (3,) of the TCP in the base frame; None: as it is.
+            quat_xyzw: (4,) of the TCP; None: as it is.
+            joints_rad: all joints in the order of the profile, or some by name; in place of a pose.
+            timeout_s: then the arm is braked.
+
+        Raises:
+            PrimitiveError: it is not there; its `answer` says why, and where it stands.
+            SessionError: the node primitives does not answer.
+        """
+        joints = dict(joints_rad) if isinstance(joints_rad, Mapping) else _list(joints_rad)
+        target = {"position_m": _list(position_m), "quat_xyzw": _list(quat_xyzw)}
+        return self._primitive("move_to", timeout_s, joints_rad=joints, **target)
+
+    def home(self, timeout_s: float = DEFAULT_TIMEOUT_S) -> Answer:
+        """Move the joints to ``robot.home_rad`` of the profile; otherwise as `move_to`."""
+        return self._primitive("home", timeout_s)
+
+    def grip(
+        self,
+        width_m: float | Literal["open", "closed"],
+        timeout_s: float = DEFAULT_TIMEOUT_S,
+    ) -> Answer:
+        """Set the width of the gripper while the arm stands; otherwise as `move_to`.
+
+        Args:
+            width_m: between the fingers; ``closed``: until something is held.
+            timeout_s: then it ends.
+        """
+        return self._primitive("grip", timeout_s, width_m=width_m)
+
+    def run(
+        self,
+        worker: str,
+        until: Mapping[str, Any] | None = None,
+        *,
+        prompt: str | None = None,
+        timeout_s: float = DEFAULT_TIMEOUT_S,
+    ) -> Answer:
+        """Let a worker move the arm until a condition holds or the time is over.
+
+        Args:
+            worker: that moves it.
+            until: conditions, `vla_zenoh.codec.primitives.Until`: ``{"gripper": "closed"}``.
+            prompt: for the worker; None: the present one.
+            timeout_s: then the arm is braked.
+
+        Returns:
+            with the condition as its reason, or ``timeout``.
+
+        Raises:
+            PrimitiveError: it ended otherwise.
+            SessionError: the node primitives does not answer.
+        """
+        return self._primitive("run", timeout_s, worker=worker, prompt=prompt, until=until)
+
+    def _primitive(self, name: str, timeout_s: float, **fields: Any) -> Answer:
+        answer = ask(self, name, {**fields, "timeout_s": timeout_s}, who="script")
+        if answer.ok or (name == "run" and answer.reason == "timeout"):
+            return answer
+        raise PrimitiveError(name, answer)
 
     def stop(self, timeout_s: float = TIMEOUT_S) -> None:
         """Emergency stop: the arm brakes and stays stopped until `reset`.

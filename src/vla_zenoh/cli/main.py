@@ -47,6 +47,7 @@ COMMANDS: Mapping[str, Mapping[str, str | Group]] = {
                 "arm": "cli.nodes:arm",
                 "camera": "cli.nodes:camera",
                 "command": "cli.nodes:command",
+                "primitives": "cli.nodes:primitives",
             },
         ),
     },
@@ -59,6 +60,15 @@ COMMANDS: Mapping[str, Mapping[str, str | Group]] = {
         "speed": "cli.drive:speed",
         "stop": "cli.drive:stop",
         "reset": "cli.drive:reset",
+        "do": Group(
+            "Guarded motions: go to a pose, home, grip, run a model until something happens.",
+            {
+                "move-to": "cli.primitives:move_to",
+                "home": "cli.primitives:home",
+                "grip": "cli.primitives:grip",
+                "run": "cli.primitives:run",
+            },
+        ),
         "web": "lab.cli.web:web",
     },
     "Watch and record": {

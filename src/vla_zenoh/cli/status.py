@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import sys
-import time
 from typing import TYPE_CHECKING, Annotated
 
 from vla_zenoh.cli.node_rows import acting_limits, hosts_down, mode_of, node_rows
@@ -23,6 +22,7 @@ if TYPE_CHECKING:
     from vla_zenoh.cli.options import JsonOption
 
 LISTEN_S = 1.2
+"""A node publishes its status twice a second."""
 
 
 def status(
@@ -37,7 +37,7 @@ def status(
 
             show_live(client)
             return
-        time.sleep(LISTEN_S)
+        client.wait_for(lambda: _all_known(client), LISTEN_S)
         if as_json:
             print(json.dumps(_mapping(client), indent=2))
         else:
@@ -46,6 +46,12 @@ def status(
             show_once(client)
         if not client.snapshot():
             fail(target.no_node(client, "status"))
+
+
+def _all_known(robot: Client) -> bool:
+    """Whether every node that is there, or should be, has published its status."""
+    nodes = robot.alive | robot.expected.keys()
+    return bool(robot.alive) and nodes <= robot.snapshot().keys()
 
 
 def _mapping(robot: Client) -> dict[str, object]:

@@ -498,6 +498,25 @@ class AxisSmoother:
         self._state = AxisState(position, velocity, acceleration)
 
 
+def stop_way(
+    velocity: FloatArray, acceleration: FloatArray, box: FloatArray, ahead_s: float
+) -> FloatArray:
+    """How far (n,) a stop of all axes together that begins in `ahead_s` goes at most.
+
+    Args:
+        velocity: (n,) of the axes.
+        acceleration: (n,) of the axes.
+        box: (3, n) limits of velocity, acceleration and jerk.
+        ahead_s: until it begins.
+    """
+    _, most, jerk = box
+    ramp_s = np.abs(acceleration) / jerk
+    later = velocity + 0.5 * acceleration * ramp_s
+    fast = np.where(np.abs(later) > np.abs(velocity), later, velocity)
+    stop_s = float(np.max(0.5 * (np.abs(later) / most + most / jerk) + ramp_s))
+    return (ahead_s + stop_s) * fast
+
+
 def _across(along: FloatArray) -> FloatArray:
     """(n - 1, n) unit vectors across `along` (n,) and across each other."""
     if len(along) != 3:

@@ -93,11 +93,12 @@ class ChunkPlanner:
     """Turns action chunks into bounded plans on a timeline, within a budget per tick.
 
     Args:
-        profile: limits, and what happens to a step beyond them.
+        profile: limits, and what happens to a step beyond them; of a part of a robot of several.
         reach: bounds steps by the arm's kinematics; None: only step limits and workspace do.
     """
 
     def __init__(self, profile: Profile, reach: ReachabilityFilter | None) -> None:
+        self._part = profile.part
         self._limits = profile.limits
         self._rejecting = profile.limits.out_of_bounds == "refuse"
         self._open_loop_s = profile.timing.max_open_loop_s
@@ -113,7 +114,7 @@ class ChunkPlanner:
         """Where chunks anchored at the measured pose begin."""
         self.joints: StateHistory[JointState] = StateHistory()
         self._queue: deque[Stamped[ActionChunk]] = deque()
-        self._pending: tuple[Stamped[ActionChunk], ChunkPlan] | None = None
+        self._pending: tuple[Stamped[ActionChunk], list[ChunkPlan]] | None = None
         self.budget = math.ceil(EVALUATIONS_1_S / profile.timing.command_hz)
         """Evaluations of the arm per tick."""
         self._left = self.budget
@@ -158,57 +159,87 @@ class ChunkPlanner:
         episode: int | None,
         earliest_ns: int,
         now_ns: int,
+        beside: Sequence[tuple[ChunkPlanner, GoalTimeline]] = (),
     ) -> list[ChunkOutcome]:
         """Continue with the pending chunk, then with the newest of the queue.
 
         A chunk that arrived meanwhile stands on the pending one, so it is planned when that is in
-        force.
+        force. Of several parts the plans of all come into force at once, and what is rejected for
+        one is for all.
 
         Args:
             timeline: where plans are added.
-            action: the meaning of the numbers, by the lease.
+            action: the meaning of the numbers of all parts, by the lease.
             episode: the current one; None: the arm executes no chunks.
             earliest_ns: no plan comes into force before this time. An arm that holds stands, and so
                 do observations of it: the chunks of a burst after a pause replace each other.
             now_ns: wall time.
+            beside: planners and timelines of the other parts.
 
         Returns:
             chunks rejected, and chunks whose plan came into force, in this order of events.
         """
         outcomes: list[ChunkOutcome] = []
+        parts = [(self, timeline), *beside]
         while self._pending is not None or self._queue:
             if self._pending is None:
                 chunk = self._queue.pop()
-                plan = _superseded(chunk, episode) or self.plan(chunk, action, timeline)
-                if isinstance(plan, Rejection):
-                    outcomes.append(ChunkOutcome(chunk, plan))
+                rejection = _superseded(chunk, episode)
+                plans: list[ChunkPlan] = []
+                for planner, own in parts if rejection is None else ():
+                    plan = planner.plan(chunk, action, own)
+                    if isinstance(plan, Rejection):
+                        rejection = planner.tagged(plan)
+                        break
+                    plans.append(plan)
+                if rejection is not None:
+                    outcomes.append(ChunkOutcome(chunk, rejection))
                     continue
                 outcomes += [ChunkOutcome(older, OVERTAKEN) for older in self._queue]
                 self._queue.clear()
-                self._pending = chunk, plan
-            chunk, plan = self._pending
-            ready = _superseded(chunk, episode) or self.bound(plan, now_ns)
-            if ready is False:
+                self._pending = chunk, plans
+            chunk, plans = self._pending
+            rejection, ready = _superseded(chunk, episode), True
+            for (planner, _), plan in zip(parts, plans, strict=True):
+                bounded = rejection or planner.bound(plan, now_ns)
+                if isinstance(bounded, Rejection):
+                    rejection = rejection or planner.tagged(bounded)
+                ready = ready and bool(bounded)
+            if not ready:
                 break
             self._pending = None
-            if isinstance(ready, Rejection):
-                outcomes.append(ChunkOutcome(chunk, ready))
+            if rejection is not None:
+                outcomes.append(ChunkOutcome(chunk, rejection))
                 continue
-            plan.effective_ns = max(plan.effective_ns, earliest_ns)
-            timeline.add(plan, now_ns)
-            outcomes.append(ChunkOutcome(chunk, None, plan, plan.unreported_hits()))
+            hits: list[LimitHit] = []
+            for (planner, own), plan in zip(parts, plans, strict=True):
+                plan.effective_ns = max(plan.effective_ns, earliest_ns)
+                own.add(plan, now_ns)
+                hits += planner.tagged_hits(plan.unreported_hits())
+            outcomes.append(ChunkOutcome(chunk, None, plans[0], hits))
         return outcomes
+
+    def tagged(self, rejection: Rejection) -> Rejection:
+        """A rejection with the part that it is about."""
+        return rejection._replace(why=f"{self._part}: {rejection.why}") if self._part else rejection
+
+    def tagged_hits(self, hits: Sequence[LimitHit]) -> Sequence[LimitHit]:
+        """Limits that acted, with the part that they are about."""
+        if not self._part:
+            return hits
+        return [hit._replace(where=f"{self._part} {hit.where}".strip()) for hit in hits]
 
     # -- plan ---------------------------------------------------------------------------------
     def plan(
         self, chunk: Stamped[ActionChunk], action: ActionSpec, timeline: GoalTimeline
     ) -> ChunkPlan | Rejection:
-        """A plan of `chunk` on top of what was asked for when its observation was taken.
+        """A plan of the part's columns of `chunk` on top of what was asked for at its observation.
 
         None of its steps is computed yet, see `bound`. Steps later than ``timing.max_open_loop_s``
         are left out: the model has seen nothing of what the arm will meet by then.
         """
-        record = chunk.record
+        record, columns = chunk.record, action.columns(self._part)
+        action = action.of(self._part)
         count = len(record.steps)
         if count * action.dt_s > self._open_loop_s + ROUNDING:
             count = max(1, int((self._open_loop_s + ROUNDING) / action.dt_s))
@@ -225,7 +256,7 @@ class ChunkPlanner:
             # Once: the elbow of a pose is that of the moment.
             assert self._reach is not None
             base = joint_goal(self._reach.kinematics, self._joints_at(base), base.width_m)
-        steps = np.asarray(record.steps[:count], np.float64)
+        steps = np.asarray(record.steps[:count, columns], np.float64)
         if action.space == "joint":
             assert self.joint_bounds is not None
             steps = self.joint_bounds.in_chain_order(action, steps)

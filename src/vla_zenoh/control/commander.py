@@ -4,16 +4,20 @@
 clock, no thread and no session; the same inputs give the same outputs, in a test, in lockstep with
 a simulator and on the robot.
 
-This module handles state and settings. `ChunkPlanner` makes plans of chunks, `MotionPipeline`
-makes commands of plans, `Watchdog` and `JointMonitor` find reasons to brake.
+This module handles state and settings, which all parts of a robot have in common: one reason to
+brake, of whichever part, and all of them brake in that tick. `CommandedPart` has what each arm has
+of its own: `ChunkPlanner` makes plans of chunks, `MotionPipeline` makes commands of plans,
+`Watchdog` and `JointMonitor` find reasons to brake.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
-from vla_zenoh.control.chunk_planner import ChunkOutcome, ChunkPlanner
+from vla_zenoh.control.chunk_planner import ChunkOutcome
 from vla_zenoh.control.chunk_validation import Lease, Rejection
+from vla_zenoh.control.commanded_part import CommandedPart
 from vla_zenoh.control.commander_io import (
     Inputs,
     Outputs,
@@ -21,22 +25,17 @@ from vla_zenoh.control.commander_io import (
     limit_events,
     make_event,
 )
+from vla_zenoh.control.contact import Contact
 from vla_zenoh.control.gripper_arbiter import GripperArbiter
-from vla_zenoh.control.joint_monitor import JOINT_PATIENCE_S, JointMonitor, joint_state_faults
 from vla_zenoh.control.limits import Slowdown
-from vla_zenoh.control.motion_pipeline import MotionPipeline
+from vla_zenoh.control.part_spacing import PartSpacing
 from vla_zenoh.control.plan_timeline import EpisodeProgress, Goal, Plan
-from vla_zenoh.control.preflight import (
-    CLOCK_TOLERANCE_S,
-    PeerSnapshot,
-    reasons_by_joints,
-    reasons_not_to_activate,
-)
+from vla_zenoh.control.preflight import PeerSnapshot, reasons_of_worker
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.states import DEACTIVATED, OBEYING, State, Trigger, after
-from vla_zenoh.control.watchdog import Deadman, Watchdog
+from vla_zenoh.control.watchdog import Deadman
 from vla_zenoh.errors import RecordError
-from vla_zenoh.kinematics.so3 import Pose, held_pose, pose_of
+from vla_zenoh.kinematics.part_distance import Nearest
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     MAX_TEXT,
@@ -47,9 +46,6 @@ from vla_zenoh.types import (
     Stamped,
     Task,
 )
-
-FUTURE_NS = round(CLOCK_TOLERANCE_S * 1e9)
-"""A pose that is stamped later than it arrived by more than this says nothing about the past."""
 
 LATE_NS = 10_000_000_000
 """A setting that was put before a stop arrives at most this long after it. Stamps that say so later
@@ -63,8 +59,8 @@ class Commander:
 
     Args:
         profile: limits, timing and initial settings.
-        reach: bounds goals by the arm's kinematics; None: only the workspace box does, and joints
-            cannot be commanded.
+        reach: bounds goals by the arm's kinematics, of a robot of parts one for each; None: only
+            the workspace box does, and joints cannot be commanded.
         dry_run: compute everything, stream nothing.
 
     Raises:
@@ -72,31 +68,33 @@ class Commander:
     """
 
     def __init__(
-        self, profile: Profile, *, reach: ReachabilityFilter | None = None, dry_run: bool = False
+        self,
+        profile: Profile,
+        *,
+        reach: ReachabilityFilter | Mapping[str, ReachabilityFilter] | None = None,
+        dry_run: bool = False,
     ) -> None:
         self.profile = profile
-        self.reach = reach
+        reaches = reach if isinstance(reach, Mapping) else {"": reach}
+        self.parts: tuple[CommandedPart, ...] = tuple(
+            CommandedPart(profile.of_part(name), reaches.get(name)) for name in profile.part_names
+        )
         self.dry_run = dry_run
         self.state = State.INACTIVE
         self.why = "not activated yet"
         self._ended = ""  # why the last activation did, if nobody ended it
         asked = profile.task
         self.task = Task(0, False, asked.prompt, asked.worker, asked.rate_hz, asked.speed_percent)
-        self.pose: Stamped[PoseState] | None = None
-        self._measured: Pose | None = None  # of it
-        self.joint: Stamped[JointState] | None = None
-        self.gripper_state: Stamped[GripperState] | None = None
         self.lease: Lease | None = None
         self.progress, self.deadman = EpisodeProgress(), Deadman()
         self._resumed_ns = 0
         self._peers = PeerSnapshot()
         self._latest: dict[str, Stamped[ActionChunk]] = {}
-        self._planner = ChunkPlanner(profile, reach)
-        self._motion = MotionPipeline(profile, reach, self._planner)
-        self.contact, self._retreat = self._motion.contact, self._motion.retreat
-        self._load_known = True
-        self._watchdog = Watchdog(profile)
-        self._joint_monitor = None if reach is None else JointMonitor(profile, reach)
+        known = bool(profile.parts) and all(part.reach for part in self.parts)
+        self._spacing = PartSpacing(profile, self.parts) if known else None
+        first = self.parts[0]
+        # All parts have the same chunks at the same time: one queue, one deadline.
+        self._planner, self._motion, self._watchdog = first.planner, first.motion, first.watchdog
         self._stop_put_ns = self._stop_came_ns = 0
         """Of the last emergency stop: when it was put, by the router's clock, and its tick."""
         self._out = Outputs()
@@ -114,7 +112,7 @@ class Commander:
             next_ns: `now_ns` of the next call of `step`.
         """
         self._update_states(inputs)
-        self._planner.begin_tick()
+        self._begin_planning()
         self._prepared = True
         for chunk in inputs.chunks:
             self._submit_chunk(chunk, next_ns)
@@ -125,8 +123,12 @@ class Commander:
 
         Without it they are bounded when they are due. Its events are among the next outputs.
         """
-        if self.state is State.ACTIVE:
-            self._out.events += self._motion.look_ahead(now_ns)
+        for part in self.parts if self.state is State.ACTIVE else ():
+            self._out.events += part.tagged(part.motion.look_ahead(now_ns))
+
+    def _begin_planning(self) -> None:
+        for part in self.parts:
+            part.planner.begin_tick()
 
     def step(self, inputs: Inputs, now_ns: int, ticks: int = 1) -> Outputs:
         """Process the inputs of one tick.
@@ -147,29 +149,62 @@ class Commander:
         for setting in inputs.settings:
             self._apply_setting(setting, now_ns, stopped)
         if not self._prepared:
-            self._planner.begin_tick()
+            self._begin_planning()
         self._prepared = False
         for chunk in inputs.chunks:
             self._submit_chunk(chunk, now_ns)
         self._plan_chunks(now_ns)
         self._supervise(now_ns)
-        if not inputs.chunks or self._monitor_late(now_ns):  # planning them is work enough
-            self._monitor_joints(now_ns)
-        overdue_ns = self._watchdog.deadline_ns
-        planned, events = self._motion.advance(self.state, self.task, overdue_ns, now_ns, ticks)
-        self._out.events += events
-        if not planned:
+        for part in self.parts:
+            if not inputs.chunks or part.monitor_late(now_ns):  # planning them is work enough
+                self._monitor_joints(part, now_ns)
+        self._keep_apart(now_ns, ticks)
+        overdue_ns, all_planned = self._watchdog.deadline_ns, True
+        for part in self.parts:
+            planned, events = part.motion.advance(self.state, self.task, overdue_ns, now_ns, ticks)
+            self._out.events += part.tagged(events)
+            all_planned = all_planned and planned
+        if not all_planned:
             self._change(Trigger.FAULT, "no trajectory could be computed; braked")
         if self.state is State.ACTIVE and self._motion.timeline is not None:
             self.progress.update(self._motion.timeline, self.task.episode, now_ns)
-        if not self.dry_run:
-            commands = self._motion.commands(self.state, now_ns, self.gripper_state)
-            self._out.pose, self._out.joint, self._out.gripper = commands
+        for part in self.parts if not self.dry_run else ():
+            commands = part.motion.commands(self.state, now_ns, part.gripper_state)
+            if part.name:
+                self._out.parts[part.name] = commands
+            else:
+                self._out.pose, self._out.joint, self._out.gripper = commands
         if self.state is not state_before and self.task.active != (self.state in OBEYING):
             self.task = replace(self.task, active=self.state in OBEYING)
         self._out.task_changed = self.task is not task_before and self.task != task_before
         out, self._out = self._out, Outputs()
         return out
+
+    # -- of the first part, which a robot that is one arm has alone ----------------------------
+    @property
+    def reach(self) -> ReachabilityFilter | None:
+        """Bounds goals by the arm's kinematics."""
+        return self.parts[0].reach
+
+    @property
+    def pose(self) -> Stamped[PoseState] | None:
+        """Newest TCP pose."""
+        return self.parts[0].pose
+
+    @property
+    def joint(self) -> Stamped[JointState] | None:
+        """Newest joints."""
+        return self.parts[0].joint
+
+    @property
+    def gripper_state(self) -> Stamped[GripperState] | None:
+        """Newest state of the gripper."""
+        return self.parts[0].gripper_state
+
+    @property
+    def contact(self) -> Contact:
+        """Its external load."""
+        return self._motion.contact
 
     @property
     def goal(self) -> Goal | None:
@@ -182,21 +217,6 @@ class Commander:
         return self._motion.gripper
 
     @property
-    def at_rest(self) -> bool:
-        """The commanded motion stands still, and will."""
-        return self._motion.at_rest and not self.retreating
-
-    @property
-    def streaming(self) -> bool:
-        """Commands are being published."""
-        return self._motion.streaming
-
-    @property
-    def retreating(self) -> bool:
-        """The arm retreats from what blocked it."""
-        return self._retreat.busy
-
-    @property
     def speed(self) -> float:
         """Share of the speed limits in use; less than 1 near a bound."""
         return self._motion.speed
@@ -205,11 +225,6 @@ class Commander:
     def slower(self) -> Slowdown | None:
         """What slows the arm down near a bound; None: nothing, or it is not commanded."""
         return self._motion.slower if self._motion.streaming else None
-
-    @property
-    def smoothing_failures(self) -> int:
-        """Times Ruckig found no trajectory and the arm braked instead."""
-        return self._motion.failures
 
     @property
     def tracking_m(self) -> float:
@@ -224,29 +239,49 @@ class Commander:
     @property
     def elbow_rad(self) -> float:
         """Greatest distance of a measured joint from where it is expected, see `JointMonitor`."""
-        return 0.0 if self._joint_monitor is None else self._joint_monitor.elbow_rad
+        return self.parts[0].elbow_rad
+
+    # -- of all parts ---------------------------------------------------------------------------
+    @property
+    def at_rest(self) -> bool:
+        """The commanded motion stands still, and will."""
+        return all(part.motion.at_rest for part in self.parts) and not self.retreating
+
+    @property
+    def streaming(self) -> bool:
+        """Commands are being published."""
+        return any(part.motion.streaming for part in self.parts)
+
+    @property
+    def retreating(self) -> bool:
+        """An arm retreats from what blocked it."""
+        return any(part.retreat.busy for part in self.parts)
+
+    @property
+    def part_distance(self) -> Nearest | None:
+        """The nearest links of two parts where they are commanded; None: there is one part."""
+        return None if self._spacing is None else self._spacing.nearest
+
+    @property
+    def smoothing_failures(self) -> int:
+        """Times Ruckig found no trajectory and the arm braked instead."""
+        return sum(part.motion.failures for part in self.parts)
 
     # -- states and settings ------------------------------------------------------------------
     def _update_states(self, inputs: Inputs) -> None:
         if inputs.peers is not None:
             self._peers = inputs.peers
-        if inputs.pose is not None:
-            self.pose = inputs.pose
-            self._planner.poses.add(inputs.pose, FUTURE_NS)
-            self.contact.update_pose(inputs.pose)
-            self._measured = pose_of(inputs.pose.record)
-            self._retreat.measure(self._measured)
-        if inputs.joint is not None:
-            self.joint = inputs.joint
-            self._planner.joints.add(inputs.joint, FUTURE_NS)
-            self.contact.update_joints(inputs.joint)
-        if inputs.gripper is not None:
-            self.gripper_state = inputs.gripper
-            faults, mode = inputs.gripper.record.faults, inputs.gripper.record.mode
+        for part in self.parts:
+            states = inputs.of(part.name)
+            part.update(states)
+            if states.gripper is None:
+                continue
+            faults, mode = states.gripper.record.faults, states.gripper.record.mode
             if faults:
-                self._change(Trigger.FAULT, f"the robot reports: {'; '.join(faults)}")
+                why = f"the robot reports: {'; '.join(faults)}"
+                self._change(Trigger.FAULT, part.says(why))
             elif mode != "ready":
-                self._change(Trigger.LOSE, f"the robot is not ready but {mode!r}")
+                self._change(Trigger.LOSE, part.says(f"the robot is not ready but {mode!r}"))
 
     def _apply_setting(self, setting: Setting, now_ns: int, stopped: bool) -> None:
         name, value = setting.name, setting.value
@@ -287,7 +322,8 @@ class Commander:
         elif name == "active" and (value is True or isinstance(value, str)):
             self._activate(now_ns, "" if value is True else value)
         elif name == "active" and value is False:
-            self._retreat.end()
+            for part in self.parts:
+                part.retreat.end()
             self._change(Trigger.DEACTIVATE, DEACTIVATED)
         elif name == "reset":
             self._reset()
@@ -313,7 +349,8 @@ class Commander:
         # The scene may have changed during a pause: the rest of an old chunk is not carried out.
         oldest_ns = now_ns - int(self.profile.timing.max_observation_age_s * 1e9)
         paused = self.state in OBEYING and not before
-        if paused and self._motion.forget_plan(oldest_ns, now_ns):
+        forgotten = [part.motion.forget_plan(oldest_ns, now_ns) for part in self.parts if paused]
+        if any(forgotten):
             self._resumed_ns = now_ns
             self._watchdog.expect_first(now_ns, self.task.rate_hz, self.task.speed)
             self._emit("info", "notice", "paused", "waits for a chunk that is newer than the pause")
@@ -343,25 +380,17 @@ class Commander:
         lease, reasons = self._preflight(self.task.worker, now_ns)
         reasons += self.deadman.reasons_against(holder, self._peers.holders)
         self._measure()
-        reasons += self._motion.unsettled() + self.contact.missing
-        if lease is None or self.pose is None or self.gripper_state is None or reasons:
+        for part in self.parts:
+            reasons += map(part.says, part.motion.unsettled() + part.contact.missing)
+        known = all(part.pose and part.gripper_state for part in self.parts)
+        if lease is None or not known or reasons:
             self._reject_setting("activate", reasons + self._ended_before())
             return
         self.lease = lease
         self.deadman.begin(holder)
-        self.contact.begin()
-        self._planner.restart(self.pose, self.joint)
         self._resumed_ns = 0
-        measured, joint = self.pose.record, self.joint.record if self.joint else None
-        blocked = self._watchdog.begin(held_pose(measured), pose_of(measured))
-        self._motion.anchor(
-            measured,
-            self.gripper_state.record,
-            joint,
-            now_ns,
-            blocked=blocked,
-            in_joints=lease.spec.action.space == "joint",
-        )
+        for part in self.parts:
+            part.activate(lease, now_ns)
         held = f", while {holder!r} holds it" if holder else ""
         what = f"activated with worker {self.task.worker!r}{held}"
         self._change(Trigger.ACTIVATE, "; ".join([what, *self._ended_before()])[:MAX_TEXT])
@@ -381,38 +410,15 @@ class Commander:
             self._emit("info", "notice", "held", f"active from now on while {holder!r} holds it")
 
     def _preflight(self, worker: str, now_ns: int) -> tuple[Lease | None, list[str]]:
-        chunk = self._latest.get(worker)
-        reasons = reasons_not_to_activate(
-            self.profile,
-            worker,
-            self.task.prompt,
-            self._peers,
-            self.pose,
-            self.gripper_state,
-            chunk,
-            now_ns,
-            self.task.rate_hz,
+        chunk, spec = self._latest.get(worker), self._peers.specs.get(worker)
+        reasons: list[str] = []
+        for part in self.parts:
+            reasons += map(part.says, part.reasons_not_to_activate(self._peers, now_ns))
+        reasons += reasons_of_worker(
+            self.profile, worker, self.task.prompt, self._peers, chunk, now_ns, self.task.rate_hz
         )
-        bounds = self._planner.joint_bounds
-        if bounds is not None and self.pose is not None:
-            reasons += joint_state_faults(
-                self.profile, bounds.kinematics, self.joint, self.pose, now_ns
-            )
-            spec = self._peers.specs.get(worker)
-            if spec is not None and chunk is not None and self.joint is not None:
-                reasons += reasons_by_joints(
-                    self.profile, worker, spec, chunk.record, bounds, self.joint
-                )
-        spec = self._peers.specs.get(worker)
-        if self.reach is None and spec is not None and spec.action.space == "joint":
-            reasons.append(
-                f"worker {worker!r} acts in joints, which needs the robot's kinematics: set "
-                "robot.description, robot.tcp_frame and robot.arm_joints in the profile"
-            )
-        if self.joint is not None and self.pose is not None:
-            writers = {self.joint.header.source, self.pose.header.source}
-            if len(writers) > 1:
-                reasons.append(f"joints and pose have different writers: {', '.join(writers)}")
+        for part in self.parts:
+            reasons += map(part.says, part.reasons_against(worker, spec, chunk, now_ns))
         if reasons or chunk is None:
             return None, reasons
         spec = self._peers.specs[worker]
@@ -431,7 +437,8 @@ class Commander:
         self.state, self.why = State.STOPPED, why[:MAX_TEXT]
 
     def _reset(self) -> None:
-        faults = self.gripper_state.record.faults if self.gripper_state else ()
+        states = [part.gripper_state for part in self.parts if part.gripper_state]
+        faults = [fault for state in states for fault in state.record.faults]
         if self.state is State.FAULT and faults:
             self._reject_setting("reset", [f"the robot still reports: {'; '.join(faults)}"])
             return
@@ -443,7 +450,8 @@ class Commander:
             return
         old, self.state, self.why = self.state, new, why
         if new not in OBEYING:
-            self.contact.end()
+            for part in self.parts:
+                part.contact.end()
             if old in OBEYING:
                 self._ended = why if trigger is Trigger.LOSE else ""
         level = (
@@ -483,7 +491,9 @@ class Commander:
         episode = self.task.episode if self.state in OBEYING else None
         resumed_ns = now_ns if self.state is State.HOLDING else self._resumed_ns
         action = lease.spec.action
-        for outcome in self._planner.advance(timeline, action, episode, resumed_ns, now_ns):
+        others = self.parts[1:]
+        beside = [(part.planner, part.motion.timeline) for part in others if part.motion.timeline]
+        for outcome in self._planner.advance(timeline, action, episode, resumed_ns, now_ns, beside):
             self._report_outcome(outcome)
             if outcome.plan is not None:
                 self._resumed_ns = resumed_ns
@@ -510,111 +520,64 @@ class Commander:
 
     # -- supervision --------------------------------------------------------------------------
     def _measure(self) -> None:
-        if self.pose is not None:
-            joint = self.joint.record if self.joint else None
-            try:
-                self._motion.measure(self.pose.record, joint, self.pose.received_ns)
-            except RecordError as error:  # joints of another arm
-                self._change(Trigger.LOSE, str(error))
+        for part in self.parts:
+            why = part.measure()
+            if why:  # joints of another arm
+                self._change(Trigger.LOSE, part.says(why))
 
     def _supervise(self, now_ns: int) -> None:
-        if self._measured is not None:
-            self._watchdog.measure(self._motion.commanded, self._measured)
+        for part in self.parts:
+            part.track()
         self._measure()
-        if self._retreat.busy and (
-            not self._may_retreat(now_ns) or self.deadman.lost(self._peers.holders)
-        ):
-            self._retreat.end()
+        unheld = self.deadman.lost(self._peers.holders)
+        for part in self.parts:
+            part.end_retreat(self._peers, now_ns)
+            if part.retreat.busy and unheld:
+                part.retreat.end()
         if self.state not in OBEYING:
             return
-        assert self.pose is not None and self.gripper_state is not None and self.lease is not None
-        self._motion.contact_slowdown = self.contact.slowdown()
-        self._report_load_sensing()
-        lost = self._watchdog.lost(
-            self.pose, self.gripper_state, self._peers, self.task.worker, self.lease, now_ns
-        )
-        if not lost and self.streaming and not self.dry_run:
-            lost = self._obstructed()
-        lost = lost or self.contact.lost or self._motion.stuck or self._joints_lost(now_ns)
+        assert self.lease is not None
+        lost: list[str] = []
+        for part in self.parts:
+            why, events = part.lost(
+                self._peers, self.task.worker, self.lease, now_ns, moves=not self.dry_run
+            )
+            self._out.events += part.tagged(events)
+            lost += [part.says(why)] if why else []
         if not lost and self._watchdog.given_up(now_ns):
-            lost = f"held for {self.profile.timing.max_hold_s:g} s without a fresh chunk"
-        lost = lost or self.deadman.lost(self._peers.holders)
+            lost = [f"held for {self.profile.timing.max_hold_s:g} s without a fresh chunk"]
+        if not lost and unheld:
+            lost = [unheld]
         if lost:
-            self._change(Trigger.LOSE, lost)
+            self._change(Trigger.LOSE, "; ".join(lost)[:MAX_TEXT])
         elif self._watchdog.overdue(now_ns):
             self._change(Trigger.STARVE, "no fresh chunk within the watchdog")
 
-    def _joints_lost(self, now_ns: int) -> str:
-        """Why the measured joints, which are monitored, count as lost; empty while they arrive."""
-        if self._joint_monitor is None or self.joint is None:
-            return ""
-        silent_s = (now_ns - self.joint.received_ns) / 1e9
-        patience_s = self.profile.timing.state_timeout_s + JOINT_PATIENCE_S
-        if silent_s <= patience_s:
-            return ""
-        return f"robot state lost: joints {silent_s:.3f} s old, at most {patience_s:g} s"
-
-    def _monitor_late(self, now_ns: int) -> bool:
-        return self._joint_monitor is not None and self._joint_monitor.late(now_ns)
-
-    def _monitor_joints(self, now_ns: int) -> None:
-        """Slow the arm down, or brake it, if its measured joints come too near to a bound."""
-        monitor, reach, motion = self._joint_monitor, self.reach, self._motion
-        if monitor is None or reach is None or self.joint is None:
+    def _keep_apart(self, now_ns: int, ticks: int) -> None:
+        """Slow the parts down, or let all of them stand, before they come too near."""
+        if self._spacing is None:
             return
-        if self.state not in OBEYING or not self.streaming:
-            monitor.reset()
-            return
+        moves = self.state is State.ACTIVE or self.retreating
+        ahead_s = ticks / self.profile.timing.command_hz
+        slowdown, hit = self._spacing.look(now_ns, ahead_s, moves=moves)
+        if hit is not None and not self._motion.held:
+            why = f"stand{hit.at}"
+            event = make_event("warning", "limit", hit.name, why, hit.value, hit.limit)
+            self._out.events.append(event)
+        for part in self.parts:
+            part.motion.part_slowdown, part.motion.held = slowdown, hit is not None
+
+    def _monitor_joints(self, part: CommandedPart, now_ns: int) -> None:
+        """Slow a part down, or brake, if its measured joints come too near to a bound."""
         try:
-            measured_rad = reach.kinematics.joints_of(self.joint.record)
+            hit = part.monitor_joints(now_ns, obeying=self.state in OBEYING)
         except RecordError as error:
-            self._change(Trigger.LOSE, str(error))
+            self._change(Trigger.LOSE, part.says(str(error)))
             return
-        commanded_rad = motion.joints_rad
-        hit = monitor.update(measured_rad, commanded_rad, now_ns, in_joints=motion.in_joints)
-        motion.joint_slowdown = monitor.slowdown
-        reach.set_elbow(measured_rad if commanded_rad is None else commanded_rad)
         if hit is not None:
-            self._emit("warning", "limit", hit.name, f"braked{hit.at}", hit.value, hit.limit)
+            event = make_event(
+                "warning", "limit", hit.name, f"braked{hit.at}", hit.value, hit.limit
+            )
+            self._out.events += part.tagged([event])
             why = f"the measured arm is too near to a bound: {hit.name}{hit.at} is {hit.value:.3g}"
-            self._change(Trigger.LOSE, f"{why}, the limit is {hit.limit:.3g}")
-
-    def _obstructed(self) -> str:
-        """Why the arm is blocked or in contact, empty otherwise; it then brakes and retreats."""
-        commanded, overload = self._motion.commanded, self.contact.overload()
-        if overload is None:
-            why = self._watchdog.blocked()
-            # An arm without contact is not blocked: its state is stuck, or it was slowed down.
-            retreats = bool(why) and not (self.contact.known and self.contact.quiet)
-        else:
-            name, value, limit, unit = overload
-            self._emit("warning", "limit", name, "stopped", value, limit)
-            why = (
-                f"something presses against the arm: {name} {value:.1f} {unit}, "
-                f"at most {limit:g} {unit}; it is led back"
-            )
-            retreats = True
-        if retreats and commanded is not None:
-            self._retreat.begin(commanded)
-        return why
-
-    def _may_retreat(self, now_ns: int) -> bool:
-        """The robot is alive and ready, without faults, and publishes its state."""
-        pose, gripper = self.pose, self.gripper_state
-        if pose is None or gripper is None or self._watchdog.state_lost(pose, gripper, now_ns):
-            return False
-        alive = self._peers.robot_node in self._peers.alive
-        return alive and gripper.record.mode == "ready" and not gripper.record.faults
-
-    def _report_load_sensing(self) -> None:
-        if self.contact.known is self._load_known:
-            return
-        self._load_known = self.contact.known
-        if self._load_known:
-            self._emit("info", "notice", "contact_told", "the robot measures external loads")
-        else:
-            why = (
-                "the robot measures no external wrench: limits.contact has no effect, and a "
-                "blocked arm is detected by limits.tracking_m alone"
-            )
-            self._emit("warning", "notice", "contact_not_told", why)
+            self._change(Trigger.LOSE, part.says(f"{why}, the limit is {hit.limit:.3g}"))

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 from vla_zenoh.control.chunk_validation import Rejection
 from vla_zenoh.control.limits import APPROACH, LimitHit
@@ -40,6 +40,33 @@ class Setting(NamedTuple):
     put_ns: int | None = None
 
 
+class PartStates(Protocol):
+    """Newest states of one part since the last tick; None: none, or none decoded."""
+
+    @property
+    def pose(self) -> Stamped[PoseState] | None: ...
+    @property
+    def gripper(self) -> Stamped[GripperState] | None: ...
+    @property
+    def joint(self) -> Stamped[JointState] | None: ...
+
+
+class NewStates(NamedTuple):
+    """Newest states of one part, see `PartStates`."""
+
+    pose: Stamped[PoseState] | None = None
+    gripper: Stamped[GripperState] | None = None
+    joint: Stamped[JointState] | None = None
+
+
+class MotionCommands(NamedTuple):
+    """Commands of one tick to one part, each None where there is none."""
+
+    pose: PoseCommand | None = None
+    joint: JointCommand | None = None
+    gripper: GripperCommand | None = None
+
+
 @dataclass(slots=True)
 class Inputs:
     """Everything received since the last tick, oldest first.
@@ -51,6 +78,7 @@ class Inputs:
         gripper: newest gripper state, None: none since.
         peers: the other nodes; None: unchanged.
         joint: newest joints, None: none since, or none were decoded.
+        parts: the three of each part, where the robot has several; the ones above are None then.
     """
 
     settings: Sequence[Setting] = ()
@@ -59,6 +87,11 @@ class Inputs:
     gripper: Stamped[GripperState] | None = None
     peers: PeerSnapshot | None = None
     joint: Stamped[JointState] | None = None
+    parts: Mapping[str, PartStates] = field(default_factory=dict)
+
+    def of(self, part: str) -> PartStates:
+        """States of `part`; of no name: of the robot."""
+        return self.parts.get(part, NewStates()) if part else self
 
 
 @dataclass(slots=True)
@@ -69,6 +102,7 @@ class Outputs:
         pose: None while nothing is streamed, or where joints are commanded.
         joint: None while nothing is streamed, or where poses are commanded.
         gripper: None unless there is a new width to command.
+        parts: the three of each part, where the robot has several; the ones above are None then.
         task_changed: `Commander.task` differs from that of the last tick.
         events: in the order they happened.
         rejections: of chunks and settings; the caller counts them by reason.
@@ -82,6 +116,13 @@ class Outputs:
     events: list[Event] = field(default_factory=list)
     rejections: list[Rejection] = field(default_factory=list)
     accepted: Cause | None = None
+    parts: dict[str, MotionCommands] = field(default_factory=dict)
+
+    def of(self, part: str) -> MotionCommands:
+        """Commands to `part`; of no name: to the robot."""
+        if part:
+            return self.parts.get(part, MotionCommands())
+        return MotionCommands(self.pose, self.joint, self.gripper)
 
 
 def make_event(

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vla_zenoh.control.actions import step_joints
-from vla_zenoh.control.axis_smoothing import FULL, AxisSmoother, Shares, line_of
+from vla_zenoh.control.axis_smoothing import FULL, AxisSmoother, Shares, line_of, stop_way
 from vla_zenoh.control.barriers import Barriers
 from vla_zenoh.control.chunk_validation import Rejection
 from vla_zenoh.control.limits import (
@@ -347,7 +347,7 @@ class JointPath(AxisSmoother):
         if self._held and self.at_rest:
             self._go_on()
         if self._ticks % CHECK_TICKS == 0 and not self.braking and not self.at_rest:
-            stop_rad = self.state.position + self._stop_way(CHECK_TICKS * self._dt_s)
+            stop_rad = self.state.position + self.stop_way(CHECK_TICKS * self._dt_s)
             self._brake_at(self._bounds.distance_hit(self.state.position, stop_rad))
         before = self._state
         moves = self.advance(pace)
@@ -405,19 +405,13 @@ class JointPath(AxisSmoother):
         low, high = workspace_corners(self._bounds.limits)
         place = self.motion.pose.position_m
         room_m = float(np.minimum(place - low, high - place).min())
-        way = np.abs(self._stop_way(pace * self._dt_s))
+        way = np.abs(self.stop_way(pace * self._dt_s))
         # The TCP is further from an axis by at most its own way.
         return float(way @ self._levers) * math.exp(float(way.sum())) < room_m
 
-    def _stop_way(self, ahead_s: float) -> FloatArray:
+    def stop_way(self, ahead_s: float) -> FloatArray:
         """How far (n,) a stop that begins in `ahead_s` goes at most."""
-        _, velocity, acceleration = self.state
-        _, most, jerk = self.box
-        ramp_s = np.abs(acceleration) / jerk
-        later = velocity + 0.5 * acceleration * ramp_s
-        fast = np.where(np.abs(later) > np.abs(velocity), later, velocity)
-        stop_s = float(np.max(0.5 * (np.abs(later) / most + most / jerk) + ramp_s))
-        return (ahead_s + stop_s) * fast
+        return stop_way(*self.state[1:], self.box, ahead_s)
 
     def _follow(self) -> None:
         """Compute the motion of the TCP."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from vla_zenoh.control.aggregate import PlanAggregator
 from vla_zenoh.control.chunk_planner import LOOK_AHEAD, ChunkPlanner
-from vla_zenoh.control.commander_io import limit_events, make_event
+from vla_zenoh.control.commander_io import MotionCommands, limit_events, make_event
 from vla_zenoh.control.contact import Contact
 from vla_zenoh.control.gripper_arbiter import GripperArbiter
 from vla_zenoh.control.joint_space import JointPath
@@ -35,6 +35,7 @@ from vla_zenoh.kinematics.so3 import (
     Pose,
     exp3,
     held_pose,
+    interpolate,
     pose_distance,
     pose_of,
     quat_from_rotation,
@@ -44,9 +45,7 @@ from vla_zenoh.types import (
     Cause,
     Event,
     FloatArray,
-    GripperCommand,
     GripperState,
-    JointCommand,
     JointState,
     PoseCommand,
     PoseState,
@@ -62,6 +61,8 @@ SAME_WIDTH_M = 0.005
 HELD_M, HELD_RAD = 0.002, 0.01
 """A robot that holds a pose this near to the stream follows it: the stream continues."""
 HELD_JOINT_RAD = 0.004
+HELD_LEAD_M, HELD_LEAD_RAD = 0.01, 0.02
+"""The goal of an arm that another part holds up leads it by this much at most."""
 SAME_POSE = 1e-6
 """m and rad: joints whose TCP is this near to a pose have it."""
 SETTLED, SETTLED_NS = 5e-4, 100_000_000
@@ -73,14 +74,6 @@ class Leashed(NamedTuple):
 
     goal: Goal
     hits: list[LimitHit]
-
-
-class MotionCommands(NamedTuple):
-    """Commands of one tick, each None where there is none."""
-
-    pose: PoseCommand | None = None
-    joint: JointCommand | None = None
-    gripper: GripperCommand | None = None
 
 
 class MotionPipeline:
@@ -128,6 +121,10 @@ class MotionPipeline:
         self.contact_slowdown: Slowdown | None = None
         self.joint_slowdown: Slowdown | None = None
         """Of the measured joints; both apply whatever the goal allows."""
+        self.part_slowdown: Slowdown | None = None
+        """Of the distance to another part of the robot."""
+        self.held = False
+        """The arm has to stand: another part is too near."""
         self.contact = Contact(profile.limits.contact)
         self.retreat = Retreat(profile.limits, self.contact)
         self._back: Pose | None = None
@@ -165,6 +162,25 @@ class MotionPipeline:
         if self.in_joints and self._path is not None:
             return self._path.state.position
         return self._joints.position_rad
+
+    def resting_rad(self, ahead_s: float) -> FloatArray:
+        """(n,) where commanded joints come to rest at most, were they to brake in `ahead_s`."""
+        assert self._joints is not None
+        if self.in_joints and self._path is not None:
+            path = self._path
+            return path.state.position + path.stop_way(ahead_s)
+        if self._smoother is None:
+            return self._joints.position_rad
+        return self._joints.resting_rad(self._smoother, ahead_s)
+
+    def wanted_rad(self, now_ns: int) -> FloatArray | None:
+        """(n,) joints of the goal in force, None where it has none."""
+        if self.timeline is None:
+            return None
+        goal = self.timeline.at(now_ns)
+        if goal.joints_rad is not None or self._reach is None:
+            return goal.joints_rad
+        return self._reach.joints_at(goal.pose)
 
     @property
     def stuck(self) -> str:
@@ -387,7 +403,8 @@ class MotionPipeline:
             elif self._joints is None:
                 self._smoother.tick()
             else:
-                active = state is State.ACTIVE and self._override > 0.0 and not self._changing
+                active = state is State.ACTIVE and self._override > 0.0
+                active = active and not self._changing and not self.held
                 braking = not active and self._back is None
                 self._joints.tick(self._smoother, braking=braking, elbow=active)
         if self._path is not None:
@@ -451,12 +468,16 @@ class MotionPipeline:
         self._changing = joints is not self.in_joints
         mover = self._mover
         assert mover is not None
-        if self._override == 0.0 or self._changing:
+        if self.held:
+            self._cut_lead(mover, plans, goal, now_ns)
+        if self._override == 0.0 or self._changing or self.held:
             self._pause(mover)
             return events
         slowed = self._slowing and _within(mover, self._override)
         short, hits = self._on_leash(mover, goal, ticks * self._dt_s)
-        slower = slowest(goal.slowdown, self.contact_slowdown, self.joint_slowdown)
+        slower = slowest(
+            goal.slowdown, self.contact_slowdown, self.joint_slowdown, self.part_slowdown
+        )
         slowed |= (slower.share if slower else 1.0) != self.speed
         if goal is not self.goal or hits or slowed:
             if hits:
@@ -500,6 +521,24 @@ class MotionPipeline:
             apart_m + ahead_s * sum(rates[:3]) <= limits.lead_m
             and apart_rad + ahead_s * sum(rates[3:]) <= limits.lead_rad
         )
+
+    def _cut_lead(
+        self, mover: Smoother | JointPath, plans: Sequence[Plan], goal: Goal, now_ns: int
+    ) -> None:
+        """Keep the goal of an arm that has to stand close to it, so that it can be led back."""
+        if isinstance(mover, JointPath):
+            assert goal.joints_rad is not None
+            here_rad = mover.state.position
+            way_rad = goal.joints_rad - here_rad
+            share = HELD_LEAD_RAD / max(float(np.abs(way_rad).max()), HELD_LEAD_RAD)
+            cut = joint_goal(mover.kinematics, here_rad + share * way_rad, goal.width_m)
+        else:
+            here = mover.motion.pose
+            apart_m, apart_rad = pose_distance(here, goal.pose)
+            share = 1 / max(apart_m / HELD_LEAD_M, apart_rad / HELD_LEAD_RAD, 1.0)
+            cut = replace(goal, pose=interpolate(here, goal.pose, share), joints_rad=None)
+        if share < 1.0:
+            self._shorten(plans, goal, cut, now_ns)
 
     def _pause(self, mover: Smoother | JointPath) -> None:
         """Stop on the path, to continue from there later."""
@@ -568,7 +607,7 @@ class MotionPipeline:
     def _retreat_or_brake(
         self, mover: Smoother | JointPath, timeline: GoalTimeline, state: State, now_ns: int
     ) -> list[Event]:
-        if state is not State.INACTIVE:
+        if state is not State.INACTIVE or self.held:
             self.retreat.end()
         back, event = self.retreat.step(mover.motion.pose, now_ns, at_rest=self.at_rest)
         if back is not None and isinstance(mover, JointPath) and self._smoother is not None:

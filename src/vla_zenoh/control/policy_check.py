@@ -52,15 +52,26 @@ def error(name: str, why: str) -> Finding:
 # -- the spec -------------------------------------------------------------------------------------
 def spec_errors(profile: Profile, spec: ModelSpec) -> Iterator[Finding]:
     """Requirements of a spec that the profile does not meet."""
-    for wanted in spec.observation.cameras:
-        camera = profile.cameras.get(wanted.camera)
-        if camera is None:
+    seen = spec.observation
+    for name in seen.camera_names:
+        if name not in profile.cameras:
             yield error(
                 "camera",
-                f"needs camera {wanted.camera!r}, the profile has: "
+                f"needs camera {name!r}, the profile has: "
                 f"{', '.join(profile.cameras) or 'none'}; add it to cameras, or name another in "
                 "the model's options",
             )
+    for wanted in seen.depth:
+        camera = profile.cameras.get(wanted.camera)
+        if camera is not None and camera.depth_unit_m is None:
+            yield error(
+                "depth",
+                f"needs the depth of camera {wanted.camera!r}, which has none; set "
+                f"cameras.{wanted.camera}.depth_unit_m, if it measures depth",
+            )
+    for wanted in (*seen.cameras, *seen.depth):
+        camera = profile.cameras.get(wanted.camera)
+        if camera is None:
             continue
         gives, asks = f"{camera.width}x{camera.height}", f"{wanted.width}x{wanted.height}"
         if wanted.resize == "none" and wanted.width is not None and gives != asks:
@@ -69,18 +80,38 @@ def spec_errors(profile: Profile, spec: ModelSpec) -> Iterator[Finding]:
                 f"camera {wanted.camera!r} sends {gives}, the spec asks for {asks} and says "
                 "resize: none",
             )
+        apart_s = min(seen.max_skew_s, (seen.history_spacing_s or math.inf) / 2)
+        if seen.history > 1 and apart_s * camera.rate_hz < 0.5:
+            yield error(
+                "history_rate",
+                f"camera {wanted.camera!r} gives an image every {1 / camera.rate_hz:.3f} s, the "
+                f"spec's history allows none further than {apart_s:g} s from its time",
+            )
         if spec.observation.max_age_s * camera.rate_hz < 1.0:
             yield error(
                 "camera_rate",
                 f"camera {wanted.camera!r} gives an image every {1 / camera.rate_hz:.2f} s, the "
                 f"spec allows none older than {spec.observation.max_age_s:g} s",
             )
-    if spec.action.space == "joint":
-        wanted, given = set(profile.robot.arm_joints), set(spec.action.joints)
+    if set(spec.parts) != set(profile.part_names):
+        names = [", ".join(filter(None, each)) for each in (spec.parts, profile.part_names)]
+        yield error(
+            "parts",
+            f"its columns are for {names[0] or 'one arm'}; robot {profile.robot.name!r} is "
+            f"{names[1] or 'one arm'}: name these in ActionSpec.of_parts",
+        )
+        return
+    for part in spec.parts:
+        yield from _action_errors(profile.of_part(part), spec.action.of(part))
+
+
+def _action_errors(profile: Profile, action: ActionSpec) -> Iterator[Finding]:
+    if action.space == "joint":
+        wanted, given = set(profile.robot.arm_joints), set(action.joints)
         if wanted != given:
             yield error(
                 "joint_names",
-                f"its joints are {', '.join(spec.action.joints)}; robot {profile.robot.name!r} "
+                f"its joints are {', '.join(action.joints)}; robot {profile.robot.name!r} "
                 f"has {', '.join(profile.robot.arm_joints)}: name these, in the order of the "
                 "model's columns",
             )
@@ -89,7 +120,7 @@ def spec_errors(profile: Profile, spec: ModelSpec) -> Iterator[Finding]:
                 "too_few_joints",
                 f"{few_joints(profile)}, and its robot takes poses: set robot.command to joint",
             )
-    elif spec.action.kind == "absolute" and len(profile.robot.arm_joints) < POSE_JOINTS:
+    elif action.kind == "absolute" and len(profile.robot.arm_joints) < POSE_JOINTS:
         yield error(
             "too_few_joints",
             f"{few_joints(profile)}: it cannot go straight from one absolute pose to the next; "

@@ -11,12 +11,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from vla_zenoh.control.axis_smoothing import Shares
+from vla_zenoh.control.axis_smoothing import Shares, stop_way
 from vla_zenoh.control.barriers import Barriers, DistanceConstraints
 from vla_zenoh.control.joint_follower import FollowSettings, JointFollower, JointMotion
 from vla_zenoh.control.joint_space import followed_shares
 from vla_zenoh.control.limits import into_workspace, joint_margins, joint_motion_limits
 from vla_zenoh.control.smoothing import Motion, Smoother
+from vla_zenoh.kinematics.ik import pose_error
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import Pose, exp3, log3, pose_distance
 from vla_zenoh.profile import Profile
@@ -51,6 +52,10 @@ CREEPING, STUCK_S = 0.05, 0.5
 OUTSIDE_M = 1e-3
 """An arm further outside the box than this started there, and is led in."""
 DAMPING = 1e-5
+RESTING_STEPS = 2
+"""Newton steps to the joints of a resting pose."""
+ELBOW_S = 0.1
+"""An elbow that is let go moves on for about this long."""
 
 
 class PoseToJoint:
@@ -146,6 +151,28 @@ class PoseToJoint:
         way = BRAKE_S * twist
         ahead = Pose(position_m + way[:3], exp3(way[3:]) @ rotation)
         smoother.brake(self.shares(smoother.motion, ahead, smoother.box, bend=BRAKE_BEND))
+
+    def resting_rad(self, smoother: Smoother, ahead_s: float) -> FloatArray:
+        """(n,) about where the joints come to rest, were the arm to brake in `ahead_s`."""
+        joints, velocity = self._now[:2]
+        if smoother.at_rest and self.at_rest:
+            return joints
+        (position_m, rotation), twist, acceleration = smoother.motion
+        way = BRAKE_S * twist
+        ahead = Pose(position_m + way[:3], exp3(way[3:]) @ rotation)
+        shares = self.shares(smoother.motion, ahead, smoother.box, bend=BRAKE_BEND)
+        box = smoother.box * np.array(shares)[:, None]
+        way = stop_way(twist, acceleration, box, ahead_s)
+        rest = Pose(position_m + way[:3], exp3(way[3:]) @ rotation)
+        at_rest = joints
+        for _ in range(RESTING_STEPS):
+            here, jacobian = self._kinematics.pose_and_jacobian(at_rest)
+            square = jacobian @ jacobian.T + DAMPING * np.eye(6)
+            at_rest = at_rest + jacobian.T @ np.linalg.solve(square, pose_error(rest, here))
+        jacobian = self._kinematics.jacobian(joints)
+        square = jacobian @ jacobian.T + DAMPING * np.eye(6)
+        elbow = velocity - jacobian.T @ np.linalg.solve(square, jacobian @ velocity)
+        return at_rest + (ahead_s + ELBOW_S) * elbow
 
     def tick(self, smoother: Smoother, *, braking: bool = False, elbow: bool = True) -> None:
         """Advance `smoother` by one tick and follow its pose, or stop.

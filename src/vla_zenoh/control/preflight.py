@@ -94,8 +94,33 @@ def reasons_not_to_activate(
         rate_hz: chunks per second requested of the worker.
     """
     return [
-        *_robot(profile, peers, pose, now_ns),
-        *_gripper(profile, gripper, now_ns),
+        *reasons_of_part(profile, peers, pose, gripper, now_ns),
+        *reasons_of_worker(profile, worker, prompt, peers, chunk, now_ns, rate_hz),
+    ]
+
+
+def reasons_of_part(
+    profile: Profile,
+    peers: PeerSnapshot,
+    pose: Stamped[PoseState] | None,
+    gripper: Stamped[GripperState] | None,
+    now_ns: int,
+) -> list[str]:
+    """Those of `reasons_not_to_activate` that are about one arm and gripper."""
+    return [*_robot(profile, peers, pose, now_ns), *_gripper(profile, gripper, now_ns)]
+
+
+def reasons_of_worker(
+    profile: Profile,
+    worker: str,
+    prompt: str,
+    peers: PeerSnapshot,
+    chunk: Stamped[ActionChunk] | None,
+    now_ns: int,
+    rate_hz: float,
+) -> list[str]:
+    """Those of `reasons_not_to_activate` that are about the worker, for all parts of a robot."""
+    return [
         *_worker(worker, prompt, peers),
         *_spec(profile, worker, peers),
         *_chunk(profile, worker, peers, chunk, now_ns, rate_hz),
@@ -125,16 +150,17 @@ def reasons_by_joints(
     kinematics = bounds.kinematics
     try:
         joints_rad = kinematics.joints_of(joint.record)
-        steps = check_steps(spec.action, chunk.steps)
+        action = spec.action.of(profile.part)
+        steps = check_steps(spec.action, chunk.steps)[:, spec.action.columns(profile.part)]
     except (RecordError, SpecError):
         return []  # there is a reason for it already
-    found = policy_check.joints_as_pose(spec.action, steps, joints_rad, profile.limits)
-    if spec.action.targets and set(spec.action.joints) == set(kinematics.arm_joints):
-        given = bounds.in_chain_order(spec.action, steps.astype(np.float64))
-        far = bounds.far_out_of_range(spec.action, given, joints_rad)
+    found = policy_check.joints_as_pose(action, steps, joints_rad, profile.limits)
+    if action.targets and set(action.joints) == set(kinematics.arm_joints):
+        given = bounds.in_chain_order(action, steps.astype(np.float64))
+        far = bounds.far_out_of_range(action, given, joints_rad)
         found += [] if far is None else [policy_check.error("joint_limit", far.why)]
     here, jacobian = kinematics.pose_and_jacobian(joints_rad)
-    axes = policy_check.beyond_joints(spec.action, steps, jacobian, here.rotation)
+    axes = policy_check.beyond_joints(action, steps, jacobian, here.rotation)
     reasons = [
         f"worker {worker!r}: its newest chunk is not sane: {name}: {why}" for _, name, why in found
     ]
@@ -261,9 +287,19 @@ def _chunk(
         steps = check_steps(spec.action, chunk.record.steps)
     except SpecError as error:
         return [f"worker {worker!r}: its newest chunk is not sane: {error}"]
-    found = policy_check.chunk_errors(
-        spec.action, steps, profile.limits, profile.robot.gripper.max_width_m
-    )
+    try:
+        found = [
+            finding
+            for part in profile.part_names
+            for finding in policy_check.chunk_errors(
+                spec.action.of(part),
+                steps[:, spec.action.columns(part)],
+                profile.of_part(part).limits,
+                profile.of_part(part).robot.gripper.max_width_m,
+            )
+        ]
+    except SpecError:
+        return []  # reported with the spec
     return [
         f"worker {worker!r}: its newest chunk is not sane: {name}: {why}" for _, name, why in found
     ]
@@ -274,8 +310,7 @@ def _cameras(profile: Profile, worker: str, peers: PeerSnapshot) -> list[str]:
     if spec is None:
         return []
     reasons: list[str] = []
-    for wanted in spec.observation.cameras:
-        camera = wanted.camera
+    for camera in spec.observation.camera_names:
         if camera not in profile.cameras:
             continue  # reported already, with the spec
         age_s = peers.camera_ages_s.get(camera, math.inf)
@@ -299,9 +334,9 @@ def _cameras(profile: Profile, worker: str, peers: PeerSnapshot) -> list[str]:
 def _clocks(profile: Profile, worker: str, peers: PeerSnapshot) -> list[str]:
     """Clocks with too large an offset, or an unknown one on another host."""
     spec = peers.specs.get(worker)
-    cameras = spec.observation.cameras if spec is not None else ()
+    cameras = spec.observation.camera_names if spec is not None else ()
     nodes = [peers.robot_node, worker_node(worker)]
-    nodes += [peers.camera_nodes[one.camera] for one in cameras if one.camera in peers.camera_nodes]
+    nodes += [peers.camera_nodes[name] for name in cameras if name in peers.camera_nodes]
     bound_s, reasons = profile.timing.max_clock_offset_s, []
     for node in dict.fromkeys(nodes):
         found = peers.clocks.get(node)

@@ -144,7 +144,7 @@ class Watchdog:
         if lost:
             return lost
         needed = [peers.robot_node, worker_node(worker)]
-        cameras = [camera.camera for camera in lease.spec.observation.cameras]
+        cameras = lease.spec.observation.camera_names
         needed += [peers.camera_nodes.get(camera, "camera") for camera in cameras]
         for node in needed:
             if node not in peers.alive:

@@ -79,7 +79,7 @@ class CollisionModel:
         self._geometry: Any = _one_hull_a_link(kinematics)
         if table_z_m is not None:
             self._geometry.addGeometryObject(_table(kinematics, table_z_m))
-        links = len(self._geometry.geometryObjects) - (table_z_m is not None)
+        self._links = links = len(self._geometry.geometryObjects) - (table_z_m is not None)
         pairs = _pairs_that_move(self._geometry)
         distances = self._sample(kinematics, pairs)
         good = self._at(known_good_rad, pairs)
@@ -95,6 +95,13 @@ class CollisionModel:
             self._pair(first, second, last, keep_out=index >= len(used))
             for index, (first, second) in enumerate([*used, *apart])
         )
+
+    def links(self) -> Any:
+        """A geometry model of the arm's links alone, a hull each."""
+        alone = pin.GeometryModel()
+        for shape in list(self._geometry.geometryObjects)[: self._links]:
+            alone.addGeometryObject(shape)
+        return alone
 
     def distances(self, joints_rad: FloatArray) -> FloatArray:
         """(len(pairs),) m, negative where two things are inside each other."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import cv2
@@ -12,27 +14,75 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.errors import SpecError
-from vla_zenoh.policy import ActionSteps, CameraSpec, ModelSpec, Observation
-from vla_zenoh.types import ActionChunk, Image, Stamped, Task
+from vla_zenoh.policy import (
+    ActionSteps,
+    CameraSpec,
+    DepthSpec,
+    ModelSpec,
+    Observation,
+    ObservationSpec,
+    StatePart,
+)
+from vla_zenoh.policy.spec import STREAM_OF
+from vla_zenoh.types import ActionChunk, Depth, Image, Stamped, Task
+from vla_zenoh.types.states import MAX_COUNT
 
+MAX_STATES, MAX_PICTURES = 4096, 128
+PAIR_S = 0.15
+"""Colour and depth of one moment are published this much apart at most."""
+ROUNDING = 1e-6
 CLOCK_TOLERANCE_S = 0.05
 """An image may lie this far in the future before its clock counts as wrong."""
 
 
 @dataclass(slots=True)
 class History:
-    """The last states of one kind, oldest first, to find the one nearest to an image."""
+    """The last samples of one stream, oldest first, to find the one nearest to a time.
+
+    Args:
+        size: number of samples that are kept.
+        keep_s: samples this much older than the newest are kept as well.
+        most: number of samples in all.
+    """
 
     size: int = 128
+    keep_s: float = 0.0
+    most: int = MAX_STATES
     entries: list[Stamped[Any]] = field(default_factory=list)
 
     def add(self, entry: Stamped[Any]) -> None:
-        """Add a state; one older than the newest clears the history, as its writer restarted."""
+        """Add a sample; one older than the newest clears the history, as its writer restarted."""
         if self.entries and entry.header.stamp_wall_ns < self.entries[-1].header.stamp_wall_ns:
             self.entries.clear()
         self.entries.append(entry)
-        if len(self.entries) > 2 * self.size:
-            del self.entries[: -self.size]
+        if len(self.entries) < 2 * self.size:
+            return
+        cut = len(self.entries) - self.size
+        if self.keep_s > 0.0:
+            kept_ns = _stamp_ns(entry) - round(self.keep_s * 1e9)
+            cut = min(cut, bisect_left(self.entries, kept_ns, key=_stamp_ns))
+        del self.entries[: max(cut, len(self.entries) - self.most)]
+
+    def first_since(self, stamp_ns: int) -> int:
+        """Stamp of the first sample that is not older; of the newest where all are."""
+        at = bisect_left(self.entries, stamp_ns, key=_stamp_ns)
+        return _stamp_ns(self.entries[min(at, len(self.entries) - 1)])
+
+    @property
+    def newest_ns(self) -> int:
+        """Stamp of the newest; 0 without records."""
+        return _stamp_ns(self.entries[-1]) if self.entries else 0
+
+    def at(self, stamp_ns: int) -> Any:
+        """The record whose stamp is nearest; there must be one."""
+        near = self.nearest(stamp_ns)
+        assert near is not None
+        return near.record
+
+    def skew_s(self, stamp_ns: int) -> float:
+        """How far the stamp of that record is away; infinity without records."""
+        near = self.nearest(stamp_ns)
+        return math.inf if near is None else abs(_stamp_ns(near) - stamp_ns) / 1e9
 
     def nearest(self, stamp_ns: int) -> Stamped[Any] | None:
         """The entry whose stamp is nearest."""
@@ -41,6 +91,57 @@ class History:
         right = bisect_left(self.entries, stamp_ns, key=_stamp_ns)
         around = self.entries[max(right - 1, 0) : right + 1]
         return min(around, key=lambda entry: abs(entry.header.stamp_wall_ns - stamp_ns))
+
+
+def state_names(
+    spec: ObservationSpec, parts: Sequence[str] = ("",)
+) -> dict[str, tuple[str, StatePart]]:
+    """Every state that is received: name (``pose``, ``left/pose``) -> part and what."""
+    return {
+        f"{part}/{what}" if part else what: (part, what)
+        for part in parts
+        for what in spec.state_streams
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class Streams:
+    """What a worker has received of the streams that its model observes.
+
+    Args:
+        images: camera -> its pictures.
+        depth: camera -> its depth pictures.
+        states: record (``joint``, ``pose``, ``gripper``; see `state_names`) -> its states.
+    """
+
+    images: Mapping[str, History]
+    depth: Mapping[str, History]
+    states: Mapping[str, History]
+
+    @staticmethod
+    def of(spec: ObservationSpec, parts: Sequence[str] = ("",)) -> Streams:
+        """Empty ones, which keep what an observation of this kind needs of these parts."""
+        # A colour picture waits for the depth picture of the same moment.
+        kept_s = PAIR_S if spec.depth or spec.history > 1 else 0.0
+        if spec.history > 1:
+            kept_s += spec.history_span_s + spec.max_skew_s
+        pictures = partial(History, 1, kept_s, MAX_PICTURES)
+        return Streams(
+            {one.camera: pictures() for one in spec.cameras},
+            {one.camera: pictures() for one in spec.depth},
+            {name: History(keep_s=kept_s) for name in state_names(spec, parts)},
+        )
+
+    @property
+    def pictures(self) -> dict[str, History]:
+        """Images and depth by what messages call them."""
+        images = {f"camera {name!r}": one for name, one in self.images.items()}
+        return images | {f"depth of camera {name!r}": one for name, one in self.depth.items()}
+
+    @property
+    def named_states(self) -> dict[str, History]:
+        """States by what messages call them."""
+        return {f"state/{part}": one for part, one in self.states.items()}
 
 
 def _stamp_ns(entry: Stamped[Any]) -> int:
@@ -58,38 +159,37 @@ class NotReady:
 def assemble(
     spec: ModelSpec,
     task: Task,
-    images: Mapping[str, Stamped[Image]],
-    states: Mapping[str, History],
+    streams: Streams,
     *,
     not_before_ns: int,
     now_ns: int,
     robot: str = "",
+    episode_ns: int = 0,
 ) -> Observation | NotReady:
     """The newest observation that fits the spec, or why there is none.
 
     Args:
         spec: what the model needs.
         task: prompt and episode.
-        images: newest image of each camera.
-        states: part (``joint``, ``pose``, ``gripper``) -> its history.
+        streams: what was received.
         not_before_ns: an observation from before this time is not wanted: it cannot show what the
             last chunk did.
         now_ns: wall clock.
         robot: whose observation it is.
+        episode_ns: when the episode began; what is older is not in its history.
 
     Raises:
-        SpecError: an image does not have the size of the spec, see `prepare_image`.
+        SpecError: an image does not have the size of the spec, see `prepare_image` and
+            `prepare_depth`.
     """
     wanted = spec.observation
     if wanted.prompt and not task.prompt:
         return NotReady("there is no prompt", waiting=True)
-    missing = [f"camera {c.camera!r}" for c in wanted.cameras if c.camera not in images]
-    missing += [f"state/{p}" for p in wanted.state if p not in states or not states[p].entries]
+    pictures, states = streams.pictures, streams.named_states
+    missing = [name for name, one in (pictures | states).items() if not one.entries]
     if missing:
         return NotReady(f"nothing received yet of {', '.join(missing)}")
-    oldest = _oldest([images[camera.camera] for camera in wanted.cameras])
-    if oldest is None and wanted.state:
-        oldest = _oldest([states[part].entries[-1] for part in wanted.state])
+    oldest = _oldest([one.entries[-1] for one in (pictures or states).values()])
     stamp_ns = oldest.header.stamp_wall_ns if oldest else now_ns
     seq = oldest.header.seq if oldest else 0
     age_s = (now_ns - stamp_ns) / 1e9
@@ -104,26 +204,95 @@ def assemble(
         )
     if stamp_ns < not_before_ns:
         return NotReady("no observation since the last chunk", waiting=True)
-    parts: dict[str, Any] = {}
-    for part in wanted.state:
-        near = states[part].nearest(stamp_ns)
-        assert near is not None
-        skew_s = abs(near.header.stamp_wall_ns - stamp_ns) / 1e9
-        if skew_s > wanted.max_skew_s:
-            return NotReady(f"state/{part} is {skew_s:.3f} s apart from the images")
-        parts[part] = near.record
-    for camera in wanted.cameras:
-        skew_s = (images[camera.camera].header.stamp_wall_ns - stamp_ns) / 1e9
-        if skew_s > wanted.max_skew_s:
-            return NotReady(f"camera {camera.camera!r} is {skew_s:.3f} s apart from the others")
-    return Observation(
-        stamp_wall_ns=stamp_ns,
-        seq=seq,
-        task=task,
-        robot=robot,
-        images={c.camera: prepare_image(images[c.camera].record, c) for c in wanted.cameras},
-        **parts,
+    for names, others in ((states, "images"), (pictures, "others")):
+        for name, one in names.items():
+            skew_s = one.skew_s(stamp_ns)
+            if skew_s > wanted.max_skew_s:
+                return NotReady(f"{name} is {skew_s:.3f} s apart from the {others}")
+    now = _at(Observation(stamp_ns, seq, task, robot=robot), wanted, streams, stamp_ns)
+    if wanted.history == 1 or isinstance(now, NotReady):
+        return now
+    before = _history(now, wanted, streams, episode_ns)
+    return before if isinstance(before, NotReady) else replace(now, history=before)
+
+
+def _at(
+    empty: Observation, wanted: ObservationSpec, streams: Streams, stamp_ns: int
+) -> Observation | NotReady:
+    """An observation of what is nearest to a time in each stream."""
+    images, depth = streams.images, streams.depth
+    records: dict[str, dict[str, Any]] = {}
+    for name, one in streams.states.items():
+        part, _, what = name.rpartition("/")
+        records.setdefault(part, {})[what] = one.at(stamp_ns)
+    found: dict[str, dict[str, Any]] = {}
+    for part, own in records.items():
+        given = _asked_for(wanted, own)
+        for name, value in given.items():
+            if value is None:
+                key = "/".join(filter(None, ("state", part, _HOLDER[name])))
+                return NotReady(f"{key} holds no {name}: this robot does not measure it")
+        found[part] = given
+    whole = replace(
+        empty,
+        images={c.camera: prepare_image(images[c.camera].at(stamp_ns), c) for c in wanted.cameras},
+        depth={c.camera: prepare_depth(depth[c.camera].at(stamp_ns), c) for c in wanted.depth},
+        **found.pop("", {}),
     )
+    if not found:
+        return whole
+    return replace(whole, parts={part: replace(whole, **own) for part, own in found.items()})
+
+
+_HOLDER = {"wrench": "pose", "effort_nm": "joint"}
+"""Field of an observation that is a field of a record -> that record."""
+
+
+def _asked_for(wanted: ObservationSpec, records: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields of an observation out of the records of one arm; None: not measured."""
+    fields: dict[str, Any] = {}
+    for what in wanted.state:
+        if what in STREAM_OF:
+            name = "effort_nm" if what == "effort" else what
+            fields[name] = getattr(records[STREAM_OF[what]], name)
+        else:
+            fields[what] = records[what]
+    return fields
+
+
+def _history(
+    now: Observation, wanted: ObservationSpec, streams: Streams, episode_ns: int
+) -> tuple[Observation, ...] | NotReady:
+    """The observations before this one, oldest first, or why there are none."""
+    assert wanted.history_spacing_s is not None
+    named = streams.pictures | streams.named_states
+    leading = list((streams.pictures or streams.named_states).values())
+    first_ns = max(one.first_since(episode_ns) for one in leading)
+    most_s = min(wanted.max_skew_s, wanted.history_spacing_s / 2)
+    before: list[Observation] = []
+    for steps in range(wanted.history - 1, 0, -1):
+        ago_s = steps * wanted.history_spacing_s
+        at_ns = now.stamp_wall_ns - round(ago_s * 1e9)
+        if at_ns < first_ns and wanted.history_start == "wait":
+            return NotReady(f"the episode is younger than {ago_s:g} s", waiting=True)
+        # Never later than the observation itself, which may be the first one.
+        at_ns = min(max(at_ns, first_ns), now.stamp_wall_ns)
+        for name, one in named.items():
+            apart_s = one.skew_s(at_ns)
+            if apart_s > most_s:
+                return NotReady(
+                    f"history: {name} has nothing within {most_s:g} s of the time {ago_s:g} s "
+                    f"ago, the nearest is {apart_s:.3f} s away"
+                )
+        lead = _oldest([near for one in leading if (near := one.nearest(at_ns))])
+        assert lead is not None
+        stamp_ns, seq = _stamp_ns(lead), lead.header.seq
+        empty = Observation(stamp_ns, seq, now.task, robot=now.robot)
+        then = _at(empty, wanted, streams, at_ns)
+        if isinstance(then, NotReady):
+            return then
+        before.append(then)
+    return tuple(before)
 
 
 def _oldest(entries: Sequence[Stamped[Any]]) -> Stamped[Any] | None:
@@ -151,7 +320,7 @@ def prepare_image(image: Image, spec: CameraSpec) -> NDArray[np.uint8]:
     return rgb
 
 
-def _resize(rgb: NDArray[np.uint8], spec: CameraSpec) -> NDArray[np.uint8]:
+def _resize(rgb: NDArray[Any], spec: CameraSpec | DepthSpec) -> NDArray[Any]:
     assert spec.width is not None and spec.height is not None
     height, width = rgb.shape[:2]
     if (height, width) == (spec.height, spec.width):
@@ -166,7 +335,7 @@ def _resize(rgb: NDArray[np.uint8], spec: CameraSpec) -> NDArray[np.uint8]:
     fit = min if spec.resize == "pad" else max
     factor = fit(spec.width / width, spec.height / height)
     scaled = _scale(rgb, max(1, round(width * factor)), max(1, round(height * factor)))
-    out = np.zeros((spec.height, spec.width, 3), np.uint8)
+    out = np.zeros((spec.height, spec.width, *rgb.shape[2:]), rgb.dtype)
     top, left = (spec.height - scaled.shape[0]) // 2, (spec.width - scaled.shape[1]) // 2
     cut = scaled[max(-top, 0) :, max(-left, 0) :][: spec.height, : spec.width]
     top, left = max(top, 0), max(left, 0)
@@ -174,10 +343,32 @@ def _resize(rgb: NDArray[np.uint8], spec: CameraSpec) -> NDArray[np.uint8]:
     return out
 
 
-def _scale(rgb: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
+def _scale(rgb: NDArray[Any], width: int, height: int) -> NDArray[Any]:
     smaller = width < rgb.shape[1] or height < rgb.shape[0]
     method = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
-    return np.asarray(cv2.resize(rgb, (width, height), interpolation=method), np.uint8)
+    if rgb.ndim == 2:  # between an edge and what is behind it there is nothing half way
+        method = cv2.INTER_NEAREST_EXACT
+    return np.asarray(cv2.resize(rgb, (width, height), interpolation=method))
+
+
+def prepare_depth(depth: Depth, spec: DepthSpec) -> NDArray[np.uint16]:
+    """A depth picture in the size, unit and range of the spec, (H, W) in counts.
+
+    Raises:
+        SpecError: it has another size and the spec does not say how to resize it.
+    """
+    counts = depth.counts
+    if spec.width is not None and spec.height is not None:
+        counts = _resize(counts, spec)
+    whole = MAX_COUNT - (spec.invalid == MAX_COUNT)
+    far_m = whole * spec.unit_m if spec.far_m is None else spec.far_m
+    # The same unit goes through as it is, bit by bit.
+    scale = depth.unit_m / spec.unit_m
+    out = counts if scale == 1.0 else np.rint(counts * scale)
+    least = max(1, math.ceil(spec.near_m / spec.unit_m - ROUNDING))
+    most = min(whole, math.floor(far_m / spec.unit_m + ROUNDING))
+    good = (counts > 0) & (out >= least) & (out <= most)
+    return np.where(good, out, spec.invalid).astype(np.uint16)
 
 
 def make_chunk(

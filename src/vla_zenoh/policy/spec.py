@@ -23,15 +23,25 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
+    SerializerFunctionWrapHandler,
     ValidationError,
+    model_serializer,
     model_validator,
 )
 
 from vla_zenoh.errors import SpecError, describe_faults
-from vla_zenoh.types import GripperState, JointState, PoseState, PrivilegedState, Task
+from vla_zenoh.types import (
+    FloatArray,
+    GripperState,
+    JointState,
+    PoseState,
+    PrivilegedState,
+    Task,
+)
 from vla_zenoh.types.arrays import is_finite, to_float32
+from vla_zenoh.types.states import MAX_DEPTH_UNIT_M, MIN_DEPTH_UNIT_M
 
-StatePart = Literal["joint", "pose", "gripper", "privileged"]
+StatePart = Literal["joint", "pose", "gripper", "privileged", "wrench", "effort"]
 Resize = Literal["none", "stretch", "pad", "crop"]
 Frame = Literal["base", "tcp"]
 Rotation = Literal["rpy", "rotvec", "quaternion"]
@@ -45,6 +55,21 @@ ROTATION_SIZE: Mapping[Rotation, int] = {"rpy": 3, "rotvec": 3, "quaternion": 4}
 
 
 MAX_CAMERAS = MAX_JOINTS = 16
+MAX_PARTS = 4
+
+MAX_HISTORY, MAX_HISTORY_S = 16, 2.0
+"""Observations in one inference, and the time from the first to the last of them."""
+
+STREAM_OF: Mapping[StatePart, StatePart] = {"wrench": "pose", "effort": "joint"}
+"""Parts of the state that travel in the records of another one."""
+
+LATER_FIELDS: Mapping[str, Any] = {
+    "depth": (),
+    "history": 1,
+    "history_spacing_s": None,
+    "history_start": "repeat",
+}
+"""Fields of `ObservationSpec` that are written only where they differ from this."""
 
 Text = Annotated[str, Field(min_length=1, max_length=128)]
 
@@ -59,6 +84,13 @@ class _Spec(BaseModel):
     """Strict: neither ``"8"`` nor ``true`` is a number, so a slip is not read as a meaning."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
+
+
+def _check_size(width: int | None, height: int | None, resize: Resize) -> None:
+    if (width is None) != (height is None):
+        raise ValueError("give both width and height, or neither")
+    if resize != "none" and width is None:
+        raise ValueError(f"resize {resize!r} needs width and height")
 
 
 def _no_joints(kind: Any) -> Any:
@@ -90,10 +122,39 @@ class CameraSpec(_Spec):
 
     @model_validator(mode="after")
     def _size_goes_with_resize(self) -> CameraSpec:
-        if (self.width is None) != (self.height is None):
-            raise ValueError("give both width and height, or neither")
-        if self.resize != "none" and self.width is None:
-            raise ValueError(f"resize {self.resize!r} needs width and height")
+        _check_size(self.width, self.height, self.resize)
+        return self
+
+
+class DepthSpec(_Spec):
+    """One depth picture in the model's observation: distances along the camera's optical axis.
+
+    Args:
+        camera: name of the camera in the profile, whose ``depth_unit_m`` is set.
+        width: pixels the model is given; None: as they come.
+        height: pixels the model is given; None: as they come.
+        resize: how other sizes become this one, as of colour; each pixel is the nearest one, no
+            mean, and padding is `invalid`.
+        unit_m: metres of one count the model is given.
+        near_m: what is nearer becomes `invalid`.
+        far_m: what is further becomes `invalid`; None: no bound but that of 65535 counts.
+        invalid: count of a pixel that was not measured.
+    """
+
+    camera: Text
+    width: int | None = Field(default=None, ge=8, le=8192)
+    height: int | None = Field(default=None, ge=8, le=8192)
+    resize: Resize = "none"
+    unit_m: float = Field(default=0.001, ge=MIN_DEPTH_UNIT_M, le=MAX_DEPTH_UNIT_M)
+    near_m: float = Field(default=0.0, ge=0, le=1000)
+    far_m: float | None = Field(default=None, gt=0, le=1000)
+    invalid: Literal[0, 65535] = 0
+
+    @model_validator(mode="after")
+    def _size_goes_with_resize(self) -> DepthSpec:
+        _check_size(self.width, self.height, self.resize)
+        if self.far_m is not None and self.far_m <= self.near_m:
+            raise ValueError(f"far_m ({self.far_m:g}) must be more than near_m ({self.near_m:g})")
         return self
 
 
@@ -102,24 +163,77 @@ class ObservationSpec(_Spec):
 
     Args:
         cameras: may be empty.
-        state: which parts of the robot's state.
+        depth: may be empty; a camera may be among both.
+        state: which parts of the robot's state. ``wrench`` is what the surroundings exert on the
+            arm, ``effort`` what its joints apply; a robot that does not measure them cannot serve
+            this model.
         prompt: the model needs a prompt that is not empty.
         max_skew_s: the parts of one observation may lie this far apart in time.
         max_age_s: an older observation is not given to the model.
+        history: n, observations that the model is given: this one and n - 1 before it.
+        history_spacing_s: time from one to the next. A picture or state that is further than
+            `max_skew_s`, or half the spacing, from its time is not taken for it.
+        history_start: what stands for times before the episode: its first observation
+            (``repeat``), or nothing, and the model is not asked until there are n (``wait``).
     """
 
     cameras: tuple[CameraSpec, ...] = Field(default=(), max_length=MAX_CAMERAS, strict=False)
+    depth: tuple[DepthSpec, ...] = Field(default=(), max_length=MAX_CAMERAS, strict=False)
     state: Annotated[tuple[StatePart, ...], AfterValidator(_differ)] = Field(
         default=("pose", "gripper"), strict=False
     )
     prompt: bool = True
     max_skew_s: float = Field(default=0.1, gt=0, le=10)
     max_age_s: float = Field(default=0.5, gt=0, le=10)
+    history: int = Field(default=1, ge=1, le=MAX_HISTORY)
+    history_spacing_s: float | None = Field(default=None, ge=0.01, le=MAX_HISTORY_S)
+    history_start: Literal["repeat", "wait"] = "repeat"
+
+    @model_validator(mode="after")
+    def _history_has_a_spacing(self) -> ObservationSpec:
+        if (self.history > 1) != (self.history_spacing_s is not None):
+            raise ValueError(
+                "history (more than 1) and history_spacing_s go together: give both, or neither"
+            )
+        if self.history_span_s > MAX_HISTORY_S + 1e-9:
+            raise ValueError(
+                f"{self.history} observations {self.history_spacing_s:g} s apart span "
+                f"{self.history_span_s:g} s, at most {MAX_HISTORY_S:g} s are kept"
+            )
+        if self.history > 1 and not (self.cameras or self.depth or self.state):
+            raise ValueError("there is nothing to have a history of: name cameras or state")
+        return self
+
+    @property
+    def history_span_s(self) -> float:
+        """Time from the first to the last observation of one inference."""
+        return (self.history - 1) * (self.history_spacing_s or 0.0)
+
+    @property
+    def state_streams(self) -> tuple[StatePart, ...]:
+        """Parts whose records hold all parts of the state."""
+        return tuple(dict.fromkeys(STREAM_OF.get(part, part) for part in self.state))
 
     @model_validator(mode="after")
     def _one_picture_of_a_camera(self) -> ObservationSpec:
         _differ(tuple(camera.camera for camera in self.cameras))
+        _differ(tuple(camera.camera for camera in self.depth))
         return self
+
+    @model_serializer(mode="wrap")
+    def _senses_in_use(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        # So a model without these has the hash, and the spec on the wire, that it always had.
+        fields = serialize(self)
+        return {
+            name: value
+            for name, value in fields.items()
+            if name not in LATER_FIELDS or getattr(self, name) != LATER_FIELDS[name]
+        }
+
+    @property
+    def camera_names(self) -> tuple[str, ...]:
+        """Cameras that the model needs, for colour or depth, each once."""
+        return tuple(dict.fromkeys(one.camera for one in (*self.cameras, *self.depth)))
 
 
 class ControllerSpec(_Spec):
@@ -169,6 +283,8 @@ class ActionSpec(_Spec):
         pace: ``steady``: a step lasts `dt_s`, and the arm neither stops nor rushes between steps
             that come in time; ``soonest``: it goes to each goal as fast as its limits allow.
         normalisation: key of the statistics that the output was scaled with, for information.
+        parts: whose columns are whose, of a robot of several parts, in the order of the columns;
+            then what is said here besides `horizon` and `dt_s` means nothing. See `of_parts`.
     """
 
     horizon: int = Field(ge=1, le=1000)
@@ -190,6 +306,62 @@ class ActionSpec(_Spec):
     joints: Annotated[tuple[Text, ...], AfterValidator(_differ)] = Field(
         default=(), max_length=MAX_JOINTS, strict=False
     )
+    parts: tuple[PartAction, ...] = Field(default=(), max_length=MAX_PARTS, strict=False)
+
+    @staticmethod
+    def of_parts(parts: Mapping[str, ActionSpec]) -> ActionSpec:
+        """The actions of a robot of several parts: the columns of each, one after the other.
+
+        Raises:
+            ValueError: their `horizon` or `dt_s` differ.
+        """
+        first = next(iter(parts.values()))
+        each = tuple(PartAction(part=name, action=action) for name, action in parts.items())
+        return ActionSpec(horizon=first.horizon, dt_s=first.dt_s, parts=each)
+
+    def of(self, part: str) -> ActionSpec:
+        """What the columns of `part` mean; of a robot of one part, which has no name, all of it.
+
+        Raises:
+            SpecError: there are none.
+        """
+        if not part and not self.parts:
+            return self
+        for each in self.parts:
+            if each.part == part:
+                return each.action
+        named = ", ".join(each.part for each in self.parts) or "no part by name"
+        raise SpecError(f"the spec says nothing of part {part!r}; it names {named}", "parts")
+
+    def columns(self, part: str) -> slice:
+        """The columns of `part` in one step."""
+        begin = 0
+        for each in self.parts:
+            if each.part == part:
+                return slice(begin, begin + each.action.dimension)
+            begin += each.action.dimension
+        return slice(0, self.dimension)
+
+    @model_serializer(mode="wrap")
+    def _without_no_parts(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """As it always was where there are no parts, and with the same hash."""
+        plain = handler(self)
+        if not self.parts:
+            plain.pop("parts", None)
+        return plain
+
+    @model_validator(mode="after")
+    def _parts_go_together(self) -> ActionSpec:
+        _differ(tuple(each.part for each in self.parts))
+        for part, action in ((each.part, each.action) for each in self.parts):
+            if action.parts:
+                raise ValueError(f"part {part!r} has parts of its own; name all of them at the top")
+            if (action.horizon, action.dt_s) != (self.horizon, self.dt_s):
+                raise ValueError(
+                    f"part {part!r} has {action.horizon} steps of {action.dt_s:g} s, the chunk "
+                    f"{self.horizon} of {self.dt_s:g} s; all parts of a chunk have the same"
+                )
+        return self
 
     @property
     def arm_size(self) -> int:
@@ -199,6 +371,8 @@ class ActionSpec(_Spec):
     @property
     def dimension(self) -> int:
         """D: numbers in one step."""
+        if self.parts:
+            return sum(each.action.dimension for each in self.parts)
         return self.arm_size + (self.gripper != "none")
 
     @model_validator(mode="after")
@@ -265,12 +439,32 @@ class ActionSpec(_Spec):
         return self
 
 
+class PartAction(_Spec):
+    """What the columns of one part of a robot mean.
+
+    Args:
+        part: its name in the profile.
+        action: their meaning.
+    """
+
+    part: Text
+    action: ActionSpec
+
+
+ActionSpec.model_rebuild()
+
+
 class ModelSpec(_Spec):
     """Everything a command node has to know of a model before it obeys it."""
 
     name: Text
     observation: ObservationSpec = ObservationSpec()
     action: ActionSpec
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Names of the parts that it moves and observes; of one arm one empty name."""
+        return tuple(each.part for each in self.action.parts) or ("",)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain types, ready for the wire."""
@@ -328,23 +522,35 @@ class Observation:
         stamp_wall_ns: capture time of its oldest image (of its state, without images).
         seq: number of that part.
         images: camera -> (H, W, 3) uint8 in the declared order and size.
+        depth: camera -> (H, W) uint16 in counts of the declared unit, and in the declared size.
         joint: arm joints, where asked for.
         pose: TCP pose, where asked for.
         gripper: gripper state, where asked for.
         privileged: what a simulated benchmark knows, where asked for; no real robot tells it.
+        wrench: (6,) N and Nm that the surroundings exert on the arm, as in `PoseState`, where asked
+            for.
+        effort_nm: (n,) as in `JointState`, where asked for.
+        history: earlier observations, oldest first, `ObservationSpec.history` - 1 of them.
         task: prompt, episode and rate.
         robot: whose it is, for a model that serves several and remembers something of each.
+        parts: of a robot of several parts, name -> the same with the state of that part, all of one
+            time; the observation itself then has no joint, pose and gripper.
     """
 
     stamp_wall_ns: int
     seq: int
     task: Task
     images: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
+    depth: Mapping[str, NDArray[np.uint16]] = field(default_factory=dict)
     joint: JointState | None = None
     pose: PoseState | None = None
     gripper: GripperState | None = None
     privileged: PrivilegedState | None = None
     robot: str = ""
+    wrench: FloatArray | None = None
+    effort_nm: FloatArray | None = None
+    history: tuple[Observation, ...] = ()
+    parts: Mapping[str, Observation] = field(default_factory=dict)
 
     @property
     def prompt(self) -> str:

@@ -7,6 +7,8 @@ For model environments: numpy alone. Parts are joined by ``+``, as in ``position
     rpy, roll pitch yaw             its rotation: extrinsic x, y, z, rad
     rotvec, rx ry rz                its rotation: axis times angle, rad
     quat_xyzw, quat_wxyz            its rotation: unit quaternion with w >= 0
+    wrench                          external, at the TCP: force N, torque Nm, base axes
+    effort                          of the arm's joints, Nm
     gripper_m, fingers_m            opening, m; both fingers, +half and -half of it, m
     gripper_open, gripper_closed    0 shut to 1 open, and 0 open to 1 shut
     zero, zero*N                    N zeros, for what this robot does not have
@@ -41,6 +43,8 @@ PARTS: Mapping[str, tuple[StatePart | None, int | None]] = {
     "fingers_m": ("gripper", 2),
     "gripper_open": ("gripper", 1),
     "gripper_closed": ("gripper", 1),
+    "wrench": ("wrench", 6),
+    "effort": ("effort", None),
     "zero": (None, 1),
 }
 """Name -> which part of the robot's state it is taken from, and how many numbers it has; None: as
@@ -132,6 +136,10 @@ def state_vector(
             numbers = pose.position_m.tolist()
         elif pose is not None and whole in ROTATIONS:
             numbers = ROTATIONS[whole](pose.quat_xyzw)
+        elif name == "wrench" and observation.wrench is not None:
+            numbers = observation.wrench.tolist()
+        elif name == "effort" and observation.effort_nm is not None:
+            numbers = observation.effort_nm.tolist()
         elif gripper is not None and name in GRIPPERS:
             numbers = GRIPPERS[name](gripper.width_m, max_width_m)
         else:

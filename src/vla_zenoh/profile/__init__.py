@@ -24,8 +24,14 @@ if TYPE_CHECKING:
         read_profile,
         to_yaml,
     )
-    from vla_zenoh.profile.profile import Profile
-    from vla_zenoh.profile.robot import POSE_JOINTS, GripperProfile, JointEnds, RobotProfile
+    from vla_zenoh.profile.profile import PartProfile, Profile
+    from vla_zenoh.profile.robot import (
+        POSE_JOINTS,
+        GripperProfile,
+        JointEnds,
+        PartBase,
+        RobotProfile,
+    )
     from vla_zenoh.profile.schema import CameraProfile, Composition, HostProfile, Timing
     from vla_zenoh.profile.session import SessionProfile
 
@@ -42,6 +48,8 @@ __all__ = [
     "JointLimits",
     "KeepOut",
     "Limits",
+    "PartBase",
+    "PartProfile",
     "Profile",
     "ReachLimits",
     "RobotProfile",

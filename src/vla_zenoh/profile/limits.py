@@ -159,6 +159,8 @@ class ReachLimits(Section):
             work close to it.
         table_stop_m: lower bound of that distance.
         keep_out: name -> what the arm keeps out of: a camera's post, a wall, a person's side.
+        part_slow_m: distance of two parts of a robot below which both slow down.
+        part_stop_m: lower bound of that distance.
     """
 
     joint_margin_rad: float = Field(default=0.05, ge=0, le=0.5)
@@ -171,10 +173,12 @@ class ReachLimits(Section):
     table_slow_m: float = Field(default=0.002, ge=0, le=0.3)
     table_stop_m: float = Field(default=0.001, ge=0, le=0.3)
     keep_out: dict[Name, KeepOut] = Field(default_factory=dict, max_length=32)
+    part_slow_m: float = Field(default=0.12, ge=0, le=1)
+    part_stop_m: float = Field(default=0.03, ge=0.005, le=1)
 
     def contradictions(self) -> Iterator[Fault]:
         """A stop that lies before its slow."""
-        for name in ("singularity{}", "collision{}_m", "table{}_m"):
+        for name in ("singularity{}", "collision{}_m", "table{}_m", "part{}_m"):
             slow, stop = name.format("_slow"), name.format("_stop")
             before, at = getattr(self, slow), getattr(self, stop)
             if at > before:

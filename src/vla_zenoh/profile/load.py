@@ -190,14 +190,19 @@ def anchor(data: dict[str, Any], folder: Path) -> None:
 def paths_in(data: dict[str, Any]) -> Iterator[tuple[dict[str, Any], str, str]]:
     """Paths of files in `data`: (section, key, prefix of the path in the value).
 
-    These are ``robot.description``, ``arm.file``, ``ros2.messages.*``, paths in ``models.*``,
-    ``cameras.*.source`` of the form ``file:PATH``, and options of models and of the arm that start
-    with ``./`` or ``../``: of any other text only the model knows whether it is a path.
+    These are ``robot.description`` and that of parts, ``arm.file``, ``ros2.messages.*``, paths in
+    ``models.*``, ``cameras.*.source`` of the form ``file:PATH``, and options of models and of the
+    arm that start with ``./`` or ``../``: of any other text only the model knows whether it is one.
     """
     robot, arm, ros2 = (_map(data.get(name)) for name in ("robot", "arm", "ros2"))
     description = robot.get("description")
     if isinstance(description, str) and not description.startswith(ROBOT_DATA_PREFIX):
         yield robot, "description", ""
+    for part in map(_map, _map(data.get("parts")).values()):
+        described = _map(part.get("robot"))
+        description = described.get("description")
+        if isinstance(description, str) and not description.startswith(ROBOT_DATA_PREFIX):
+            yield described, "description", ""
     for camera in map(_map, _map(data.get("cameras")).values()):
         source = camera.get("source")
         if isinstance(source, str) and source.startswith(FILE_SOURCE):

@@ -5,19 +5,20 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field, PrivateAttr, ValidationError
 
 from vla_zenoh import keys
-from vla_zenoh.errors import ProfileError
-from vla_zenoh.keys import NODE_KINDS, Keys
+from vla_zenoh.errors import ProfileError, describe_fault
+from vla_zenoh.keys import NODE_KINDS, NOT_PARTS, PRIMITIVES, Keys, worker_node
 from vla_zenoh.profile.limits import Limits
 from vla_zenoh.profile.robot import (
     ArmProfile,
     FrankaProfile,
     LeRobotProfile,
     Options,
+    PartBase,
     RobotProfile,
     UrProfile,
 )
@@ -70,10 +71,26 @@ def _no_paths(names: Any) -> Any:
     return names
 
 
+class PartProfile(Section):
+    """One of several arms of a robot, each with its gripper.
+
+    Args:
+        base: where it stands, in the frame of the robot. Poses, workspace and table of a part are
+            in its own base frame.
+        robot: what differs from the section `robot` of the profile.
+        limits: what differs from its `limits`.
+    """
+
+    base: PartBase = PartBase()
+    robot: dict[str, Any] = Field(default_factory=dict)
+    limits: dict[str, Any] = Field(default_factory=dict)
+
+
 class Profile(Section):
     """Everything about one robot and its lab.
 
     Args:
+        parts: arms under one policy, by name; empty: the robot is one arm.
         workers: worker names; each is also the name of its model, unless `models` gives another.
         models: worker -> its model: a path, or the name of another model.
         serves: worker -> the robots it serves, this one among them and all of the same kind; a
@@ -90,6 +107,7 @@ class Profile(Section):
     about: Text = ""
     root: Annotated[Word, AfterValidator(_root)] = keys.DEFAULT_ROOT
     robot: RobotProfile
+    parts: dict[Name, PartProfile] = Field(default_factory=dict, max_length=4)
     limits: Limits = Limits()
     timing: Timing = Timing()
     composition: Composition = Composition()
@@ -109,15 +127,37 @@ class Profile(Section):
     franka: FrankaProfile | None = None
     ur: UrProfile | None = None
     lerobot: LeRobotProfile | None = None
+    _part: str = PrivateAttr("")
 
     @property
     def keys(self) -> Keys:
-        """The keys of this profile's robot."""
-        return Keys(self.robot.name, self.root)
+        """The keys of this profile's robot, or of its part."""
+        return Keys(self.robot.name, self.root, self._part)
+
+    @property
+    def part(self) -> str:
+        """The part that this profile is of; empty: the whole robot."""
+        return self._part
+
+    @property
+    def part_names(self) -> tuple[str, ...]:
+        """Names of the parts; of a robot that is one arm one empty name."""
+        return tuple(self.parts) or ("",)
+
+    def of_part(self, name: str) -> Profile:
+        """The profile of one part, as if it were a robot of its own; of no name: this one."""
+        if not name:
+            return self
+        part = self.parts[name]
+        robot, limits = _filled(self.robot, part.robot), _filled(self.limits, part.limits)
+        made = self.model_copy(update={"robot": robot, "limits": limits, "parts": {}})
+        made._part = name
+        return made
 
     def contradictions(self) -> Iterator[Fault]:
         """Sections that do not go together."""
         yield from _robot(self)
+        yield from _parts(self)
         yield from _cameras(self)
         yield from _ros2(self)
         yield from _task(self)
@@ -158,6 +198,8 @@ class Profile(Section):
 
     def node_name(self, host: str, kind: str) -> str:
         """Name on the bus of the node of this kind on `host`; unique if several hosts run one."""
+        if kind == PRIMITIVES:  # its chunks are those of a worker
+            return worker_node(kind)
         hosts = [name for name, part in self.hosts.items() if kind in part.nodes]
         return kind if len(hosts) < 2 else f"{kind}-{host}"
 
@@ -188,13 +230,71 @@ def _robot(profile: Profile) -> Iterator[Fault]:
         yield from _lerobot(profile)
     if profile.robot.driver in ("ur", "lerobot") and profile.robot.command != "joint":
         yield ("robot", "command"), f"must be joint: robot.driver is {profile.robot.driver}"
-    joints = len(profile.robot.arm_joints)
-    for name, values in profile.limits.joint:
+    yield from _joint_limits((), profile.robot, profile.limits)
+
+
+def _joint_limits(place: Place, robot: RobotProfile, limits: Limits) -> Iterator[Fault]:
+    joints = len(robot.arm_joints)
+    for name, values in limits.joint:
         if len(values) not in (1, joints):
             yield (
-                ("limits", "joint", name),
+                (*place, "limits", "joint", name),
                 f"has {len(values)} numbers for {joints} arm_joints: give one for all, or one each",
             )
+
+
+_AnySection = TypeVar("_AnySection", bound=Section)
+
+
+def _filled(section: _AnySection, over: Mapping[str, Any]) -> _AnySection:
+    """`section` with the values of `over`, map by map."""
+    if not over:
+        return section
+    return type(section).model_validate(_merged(section.model_dump(), over))
+
+
+def _merged(below: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    merged = dict(below)
+    for name, value in over.items():
+        under: Any = merged.get(name)
+        both = isinstance(under, Mapping) and isinstance(value, Mapping)
+        merged[name] = _merged(dict(under), value) if both else value
+    return merged
+
+
+def _parts(profile: Profile) -> Iterator[Fault]:
+    """What the parts of a robot have in common, and what only one arm can have."""
+    if len(profile.parts) == 1:
+        yield ("parts",), "names one part: leave it out, and describe the arm in robot and limits"
+    if profile.parts and profile.robot.driver != "sim":
+        yield (
+            ("parts",),
+            f"go with robot.driver: sim, and it is {profile.robot.driver}: give each real arm a "
+            "robot of its own",
+        )
+    if profile.parts and profile.robot.command != "joint":
+        yield (
+            ("robot", "command"),
+            "must be joint: the robot has parts, whose distance is only known where their joints "
+            "are commanded",
+        )
+    for name, part in profile.parts.items():
+        if name in NOT_PARTS:
+            taken = ", ".join(sorted(NOT_PARTS))
+            yield ("parts", name), f"is taken by keys; names that are taken: {taken}"
+        for field in {"name", "driver", "command"} & set(part.robot):
+            yield ("parts", name, "robot", field), "is that of the whole robot: leave it out"
+        for what in ("robot", "limits"):
+            try:
+                _filled(getattr(profile, what), getattr(part, what))
+            except ValidationError as error:
+                for fault in error.errors(include_url=False):
+                    place = ("parts", name, what, *map(str, fault["loc"]))
+                    yield place, describe_fault(fault)
+                break
+        else:
+            own = profile.of_part(name)
+            yield from _joint_limits(("parts", name), own.robot, own.limits)
 
 
 def _lerobot(profile: Profile) -> Iterator[Fault]:

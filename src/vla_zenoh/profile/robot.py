@@ -147,6 +147,18 @@ class RobotProfile(Section):
             yield ("gripper", "dead_band_m"), f"must be less than {width}: nothing would move"
 
 
+class PartBase(Section):
+    """Where a part stands, in the frame of the robot.
+
+    Args:
+        position_m: of its base frame.
+        yaw_rad: its turn about the vertical.
+    """
+
+    position_m: tuple[float, float, float] = Field(default=(0.0, 0.0, 0.0), strict=False)
+    yaw_rad: float = Field(default=0.0, ge=-6.3, le=6.3)
+
+
 def _option(value: str) -> str:
     if not value.isidentifier():
         raise ValueError(f"{value[:80]!r} cannot be the name of an option")

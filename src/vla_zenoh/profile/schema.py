@@ -9,8 +9,9 @@ from pydantic import AfterValidator, Field
 
 from vla_zenoh.profile.section import Distinct, Fault, Name, Names, Section, Text, Word
 from vla_zenoh.profile.session import Endpoints
+from vla_zenoh.types.states import MAX_DEPTH_UNIT_M, MIN_DEPTH_UNIT_M
 
-NodeKind = Literal["router", "sim", "ros2", "arm", "camera", "command", "worker"]
+NodeKind = Literal["router", "sim", "ros2", "arm", "camera", "command", "worker", "primitives"]
 SIMULATED: tuple[NodeKind, ...] = ("router", "sim", "camera", "command", "worker")
 CAMERA_SOURCES = {
     "sim": "sim:CAMERA",
@@ -21,6 +22,8 @@ CAMERA_SOURCES = {
     "ros2": "ros2:TOPIC",
 }
 """Kind of a camera's source -> how it is written. `nodes.camera.node.make_source` opens them."""
+DEPTH_SOURCES = ("sim",)
+"""Kinds of source that measure depth."""
 MIN_PERIODS = 3
 """A healthy link may be silent for up to this many periods."""
 
@@ -136,6 +139,8 @@ class CameraProfile(Section):
         jpeg_quality: of the JPEG stream, which hosts exchange, 1 to 100.
         jpeg_rate_hz: largest rate of the JPEG stream; null: every image.
         jpeg_width: wider images are scaled down for the JPEG stream; null: never.
+        depth_unit_m: metres of one count of the depth stream, 16 bits: at 0.001 it reaches 65 m in
+            steps of 1 mm; null: no depth. Of the sources ``sim:`` has depth.
         fit_for_workers: also publish images in the exact size of each model's spec, for workers on
             other hosts. Every source except ``ros2:`` supports it.
         loop: a file starts again at its end.
@@ -149,9 +154,17 @@ class CameraProfile(Section):
     jpeg_quality: int = Field(default=90, ge=1, le=100)
     jpeg_rate_hz: float | None = Field(default=None, gt=0, le=240)
     jpeg_width: int | None = Field(default=None, ge=16, le=8192)
+    depth_unit_m: float | None = Field(default=None, ge=MIN_DEPTH_UNIT_M, le=MAX_DEPTH_UNIT_M)
     fit_for_workers: bool = False
     loop: bool = True
     check: CameraCheck = CameraCheck()
+
+    def contradictions(self) -> Iterator[Fault]:
+        """Depth of a source that measures none."""
+        kind = self.source.partition(":")[0]
+        if self.depth_unit_m is not None and kind not in DEPTH_SOURCES:
+            known = ", ".join(CAMERA_SOURCES[one] for one in DEPTH_SOURCES)
+            yield ("depth_unit_m",), f"is set, and {kind}: measures no depth; these do: {known}"
 
     @property
     def from_ros2(self) -> bool:

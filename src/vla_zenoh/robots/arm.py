@@ -1,4 +1,4 @@
-"""The arm of a robot node: command stream and gripper commands in, states out."""
+"""An arm of a robot node: command stream and gripper commands in, states out."""
 
 from __future__ import annotations
 
@@ -34,37 +34,44 @@ class Arm:
     """
 
     def __init__(self, node: Node, driver: RobotDriver) -> None:
-        self._node, self._driver = node, driver
-        self.follower = CommandFollower(node, driver)
+        self._node, self._driver, profile = node, driver, driver.profile
+        self.follower = CommandFollower(node, driver, profile)
         self._gripper_commands = GripperCommands(node, driver)
-        keys = node.keys
+        keys = profile.keys
         self._joint_out = node.declare_publisher(keys.state_joint, Kind.STATE)
         self._pose_out = node.declare_publisher(keys.state_pose, Kind.STATE)
         self._gripper_out = node.declare_publisher(keys.state_gripper, Kind.STATE)
         # A little less than the period: readings come at multiples of another one.
-        self._period_ns = 0.9e9 / node.profile.timing.state_hz
+        self._period_ns = 0.9e9 / profile.timing.state_hz
         self._seq = self._published_ns = self._mono_ns = 0
-        self._gripper = GripperState(node.profile.robot.gripper.max_width_m, False, False)
+        self._gripper = GripperState(profile.robot.gripper.max_width_m, False, False)
         self._published_fault = self._was = ""
 
     # -- one tick -----------------------------------------------------------------------------
     def step(self, now_ns: int, mono_ns: int, stall_s: float) -> None:
-        """Run one tick.
+        """Run one tick; see `begin_step`."""
+        self.begin_step(now_ns, mono_ns, stall_s)
+        self.end_step(mono_ns)
+
+    def begin_step(self, now_ns: int, mono_ns: int, stall_s: float) -> None:
+        """Read a real robot, and move it or a simulated one.
 
         Args:
             now_ns: wall clock, for stamps.
             mono_ns: the same time on the monotonic clock.
             stall_s: how late the tick is.
         """
-        simulated = self._driver.simulated
         self._mono_ns = mono_ns
         self.follower.begin(mono_ns, stall_s)
-        if not simulated:
+        if not self._driver.simulated:
             self._read(mono_ns)
         self._follow(now_ns, mono_ns)
         if self.follower.accepting:
             self._gripper_commands.update(now_ns, self.follower)
-        if simulated:
+
+    def end_step(self, mono_ns: int) -> None:
+        """Read a simulated robot: what all its parts were asked for has an effect at once."""
+        if self._driver.simulated:
             self._read(mono_ns)
 
     def brake_step(self, now_ns: int, mono_ns: int, stall_s: float) -> None:
@@ -133,7 +140,7 @@ class Arm:
     @property
     def _silent(self) -> bool:
         age_s = None if self._driver.simulated else self.age_s
-        return age_s is not None and age_s > self._node.profile.timing.state_timeout_s
+        return age_s is not None and age_s > self._driver.profile.timing.state_timeout_s
 
     @property
     def state(self) -> str:
@@ -160,7 +167,9 @@ class Arm:
         self._was = state
         if was:
             level = "info" if state == "running" else "warning"
-            self._node.emit(Event(level, "transition", f"{was}->{state}", self._why(state)))
+            part, why = self._driver.profile.part, self._why(state)
+            why = f"{part}: {why}".rstrip(": ") if part else why
+            self._node.emit(Event(level, "transition", f"{was}->{state}", why))
         return True
 
     def _why(self, state: str) -> str:
@@ -169,7 +178,7 @@ class Arm:
                 f"the loop stood still for {self.follower.stall_s:.3f} s while it moved the arm; "
                 f"the motion does not go on{self._driver.stalled_hint}"
             )
-        timeout_s = self._node.profile.timing.command_timeout_s
+        timeout_s = self._driver.profile.timing.command_timeout_s
         return {
             "fault": self._driver.fault,
             "silent": self._driver.silent_why,
@@ -189,9 +198,9 @@ class GripperCommands:
 
     def __init__(self, node: Node, driver: RobotDriver) -> None:
         self._node, self._driver = node, driver
-        key = node.keys.command_gripper
+        key = driver.profile.keys.command_gripper
         self._commands = node.subscribe(key, CallbackRing(16, SMALL_BYTES))
-        self._guard = GripperGuard(node.profile.robot.gripper)
+        self._guard = GripperGuard(driver.profile.robot.gripper)
 
     def update(self, now_ns: int, follower: CommandFollower) -> None:
         """Accept or reject the commands that arrived.

@@ -15,6 +15,7 @@ from vla_zenoh.bus.node import Node
 from vla_zenoh.codec.records import SMALL_BYTES
 from vla_zenoh.guard.arm_guard import SETTLE_NS, ArmGuard, HeldReference, Measured, make_arm_guard
 from vla_zenoh.kinematics.so3 import Pose
+from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray, JointCommand, PoseCommand
 from vla_zenoh.types.commands import JointReference, PoseReference
 
@@ -46,6 +47,7 @@ class CommandFollower:
     Args:
         node: on the bus; its counters get the rejections.
         driver: of the robot.
+        profile: of the part of the robot; None: of the node.
 
     Attributes:
         stall_s: duration of the last stall.
@@ -53,9 +55,10 @@ class CommandFollower:
         accepting: False after `stop_accepting`.
     """
 
-    def __init__(self, node: Node, driver: FollowingRobot) -> None:
+    def __init__(self, node: Node, driver: FollowingRobot, profile: Profile | None = None) -> None:
         self._node, self._driver = node, driver
-        keys = node.keys
+        self._profile = profile or node.profile
+        keys = self._profile.keys
         subscribed = {"pose": keys.command_pose, "joint": keys.command_joint}
         self._streams = [
             (mode, node.subscribe(subscribed[mode], CallbackRing(BUFFER, SMALL_BYTES)))
@@ -64,7 +67,7 @@ class CommandFollower:
         self._guard: ArmGuard | None = None
         self._measured: Measured | None = None
         self._hold = HeldReference()
-        self._timeout_s = node.profile.timing.command_timeout_s
+        self._timeout_s = self._profile.timing.command_timeout_s
         self._stalled_until_ns = 0
         self._resting = False
         """The robot is to be sent its last set-point at rest: it may have kept a velocity."""
@@ -78,7 +81,7 @@ class CommandFollower:
         """Update the state of the arm; the first one makes it possible to follow."""
         self._measured = measured
         if self._guard is None:
-            profile, driver = self._node.profile, self._driver
+            profile, driver = self._profile, self._driver
             self._guard = make_arm_guard(
                 profile, self._state_now, driver.joint_range_rad, driver.period_s
             )
@@ -222,7 +225,7 @@ class CommandFollower:
     @property
     def mode(self) -> str:
         """Stream that is or was followed last: ``pose`` or ``joint``."""
-        return self._node.profile.robot.command if self._guard is None else self._guard.mode
+        return self._profile.robot.command if self._guard is None else self._guard.mode
 
     @property
     def writer(self) -> str:

@@ -98,8 +98,8 @@ class Report:
 class SteppedNode(Protocol):
     """The node as a driver runs it in lockstep."""
 
-    def publish_state(self, measurement: Measurement, mono_ns: int) -> None:
-        """Publish a measurement."""
+    def publish_state(self, measurement: Measurement, mono_ns: int, part: str = "") -> None:
+        """Publish a measurement of a part."""
         ...
 
     def step(self, tick: Tick) -> None:
@@ -181,6 +181,11 @@ class RobotDriver(ABC):
         """Set the set-point of the robot's controller; `now_ns` is its time on the wall clock."""
 
     # -- optional -----------------------------------------------------------------------------
+    @property
+    def parts(self) -> Mapping[str, RobotDriver]:
+        """The driver of each part of the robot; of one arm this driver, by no name."""
+        return {"": self}
+
     def attach(self, node: Node, follower: CommandFollower | None) -> None:
         """The node is on the bus; `follower` is None where there is no arm.
 

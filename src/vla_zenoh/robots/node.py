@@ -50,8 +50,14 @@ class RobotNode:
     def __init__(self, driver: RobotDriver, session: zenoh.Session) -> None:
         self.driver = driver
         node = self.node = Node(driver.name, driver.profile, session)
-        self.arm = Arm(node, driver) if driver.has_arm else None
+        self.arms: dict[str, Arm] = {}
+        if driver.has_arm:
+            self.arms = {name: Arm(node, part) for name, part in driver.parts.items()}
+        self.arm = next(iter(self.arms.values()), None)
         driver.attach(node, self.arm.follower if self.arm is not None else None)
+        for name, arm in self.arms.items():
+            if name:
+                driver.parts[name].attach(node, arm.follower)
         self._resets: CallbackRing | None = None
         if driver.recovers:
             self._resets = node.subscribe(node.keys.reset, CallbackRing(4, MAX_SETTING_BYTES))
@@ -127,10 +133,10 @@ class RobotNode:
                 self.node.emit(Event("error", "fault", "broken", why))
             raise
 
-    def publish_state(self, measurement: Measurement, mono_ns: int) -> None:
-        """Publish a measurement."""
-        if self.arm is not None:
-            self.arm.publish(measurement, mono_ns)
+    def publish_state(self, measurement: Measurement, mono_ns: int, part: str = "") -> None:
+        """Publish a measurement of a part."""
+        if part in self.arms:
+            self.arms[part].publish(measurement, mono_ns)
 
     def step(self, tick: Tick) -> None:
         """Run one tick."""
@@ -140,9 +146,11 @@ class RobotNode:
         if self._resets is not None and self._resets.drain():
             self.driver.recover()
         self.driver.poll(mono_ns)
-        if self.arm is not None:
-            now_ns = mono_ns if self.driver.lockstep else self.node.clock.wall_at(mono_ns)
-            self.arm.step(now_ns, mono_ns, tick.stall_s)
+        now_ns = mono_ns if self.driver.lockstep else self.node.clock.wall_at(mono_ns)
+        for arm in self.arms.values():
+            arm.begin_step(now_ns, mono_ns, tick.stall_s)
+        for arm in self.arms.values():
+            arm.end_step(mono_ns)
         self._rate.tick()
         self._watch()
 
@@ -190,11 +198,14 @@ class RobotNode:
     # -- status -------------------------------------------------------------------------------
     @property
     def state(self) -> str:
-        """State of the node, one word."""
-        return "running" if self.arm is None else self.arm.state
+        """State of the node, one word; of several parts that of the first that does not run."""
+        states = [arm.state for arm in self.arms.values()]
+        return next((state for state in states if state != "running"), "running")
 
     def _watch(self) -> None:
-        changed = self.driver.status_changed() or (self.arm is not None and self.arm.changed())
+        changed = self.driver.status_changed()
+        for arm in self.arms.values():
+            changed = arm.changed() or changed
         if not changed and time.monotonic() - self._watched_s < WATCH_S:
             return
         self._watched_s = time.monotonic()
@@ -210,12 +221,14 @@ class RobotNode:
         """Publish the status."""
         node, driver, found = self.node, self.driver, self.driver.status()
         detail = {**found.detail, "realtime": self._realtime}
-        if self.arm is not None:
-            follower = self.arm.follower
-            detail["following"] = follower.following
-            node.counters[f"{node.name}.stream_silences"] = follower.silences
+        followers = [arm.follower for arm in self.arms.values()]
+        if followers:
+            detail["following"] = all(follower.following for follower in followers)
+            node.counters[f"{node.name}.stream_silences"] = sum(one.silences for one in followers)
             if not driver.simulated:
-                node.counters[f"{node.name}.stalls"] = follower.stalls
+                node.counters[f"{node.name}.stalls"] = sum(one.stalls for one in followers)
+        if len(followers) > 1:
+            detail["parts"] = {name: arm.state for name, arm in self.arms.items()}
         node.publish_status(
             self.state,
             detail=detail,

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import zenoh
@@ -75,66 +76,88 @@ class SimDriver(RobotDriver):
         self.modes, self.period_s = ("pose", "joint"), STEP_NS / 1e9
         self._ticks = self._stamp_ns = 0
         self._was_reset = False
-        self._newest: Measurement | None = None
+        self._newest: dict[str, Measurement] = {}
         self._step_lock = threading.Lock()
         self._state_every = _every(profile.timing.state_hz)
         self._keys: _SimKeys | None = None
-        self._reference: PoseReference | JointReference = self.world.hold_reference()
+        self._parts = {name: SimPart(self, name) for name in profile.parts}
+        self._followers: dict[str, CommandFollower] = {}
+        self._references: dict[str, PoseReference | JointReference] = {
+            name: part.hold_reference() for name, part in self.world.parts.items()
+        }
+
+    @property
+    def parts(self) -> Mapping[str, RobotDriver]:
+        return self._parts or super().parts
 
     def attach(self, node: Node, follower: CommandFollower | None) -> None:
         """Subscribe to resets, and publish the scene."""
         super().attach(node, follower)
+        self._node, self._keys = node, _SimKeys(node)
+        if not self._parts:
+            self.lead("", follower)
+
+    def lead(self, part: str, follower: CommandFollower | None) -> None:
+        """Lead a part from where its follower stands."""
         assert follower is not None
         assert follower.reference is not None
-        self._node, self._follower, self._reference = node, follower, follower.reference
-        self._keys = _SimKeys(node)
+        self._followers[part], self._references[part] = follower, follower.reference
 
     # -- one millisecond ----------------------------------------------------------------------
     def poll(self, mono_ns: int) -> None:
         """Carry out resets."""
         for seed in self._keys.resets() if self._keys else ():
-            if self._follower.following and not self.fault:
+            if any(one.following for one in self._followers.values()) and not self.fault:
                 why = "sim/reset: the arm is being commanded; deactivate first"
                 self.report.reject("reset_refused", why)
             else:
                 self.reset(seed)
-                self._follower.restart()
+                for follower in self._followers.values():
+                    follower.restart()
 
-    def move(self, reference: PoseReference | JointReference, now_ns: int) -> None:
+    def move(self, reference: PoseReference | JointReference, now_ns: int, part: str = "") -> None:
         """Set the reference and the stamp of the next step."""
-        self._reference, self._stamp_ns = reference, now_ns
+        self._references[part], self._stamp_ns = reference, now_ns
 
-    def grip(self, command: GripperCommand, now_ns: int) -> None:
+    def grip(self, command: GripperCommand, now_ns: int, part: str = "") -> None:
         """Open or close."""
         force_n = max(command.force_n, LEAST_FORCE_N)
-        self.world.set_gripper(command.width_m, command.speed_m_s, force_n)
+        self.world.parts[part].set_gripper(command.width_m, command.speed_m_s, force_n)
 
     def read(self, mono_ns: int) -> Measurement | None:
         """Step the world; its state at multiples of the period of ``timing.state_hz``."""
+        self.step_world(mono_ns)
+        return self.measure()
+
+    def step_world(self, mono_ns: int) -> None:
+        """Step the world towards the references of all parts."""
         self._ticks += 1
         self.measured_ns = mono_ns
         if not self.fault:
             try:
-                self.world.tick(self._reference)
+                self.world.tick(self._references)
             except NodeError as error:
                 self.fault = str(error)
                 self.report.reject("simulation_fault", self.fault)
         if self._keys is not None:
             self._keys.publish(self.world, self._ticks, self._stamp_ns)
-        return None if self._ticks % self._state_every else self._measure(self._stamp_ns)
 
-    def _measure(self, stamp_ns: int) -> Measurement:
-        if self.fault and self._newest is not None:  # a diverged state may not be finite
-            return self._newest._replace(stamp_ns=stamp_ns)
-        world = self.world
-        self._newest = Measurement(
+    def measure(self, part: str = "") -> Measurement | None:
+        """State of a part, where this step has one."""
+        return None if self._ticks % self._state_every else self._measure(self._stamp_ns, part)
+
+    def _measure(self, stamp_ns: int, part: str = "") -> Measurement:
+        if self.fault and part in self._newest:  # a diverged state may not be finite
+            return self._newest[part]._replace(stamp_ns=stamp_ns)
+        arm = self.world.parts[part]
+        self._newest[part] = Measurement(
             stamp_ns,
-            world.joint_state(),
-            Pose(*world.tcp()),
-            world.pose_state(self._reference),
-            world.gripper_state(),
+            arm.joint_state(),
+            Pose(*arm.tcp()),
+            arm.pose_state(self._references[part]),
+            arm.gripper_state(),
         )
-        return self._newest
+        return self._newest[part]
 
     def reset(self, seed: int | None) -> None:
         """Put arm and objects where they begin; `seed` None: that of the profile."""
@@ -149,10 +172,11 @@ class SimDriver(RobotDriver):
         return was_reset
 
     # -- geometry -----------------------------------------------------------------------------
-    def state_now(self) -> Measured:
+    def state_now(self, part: str = "") -> Measured:
         """State of the world."""
-        state = self.world.joint_state()
-        return Measured(Pose(*self.world.tcp()), state.position_rad, state.velocity_rad_s)
+        arm = self.world.parts[part]
+        state = arm.joint_state()
+        return Measured(Pose(*arm.tcp()), state.position_rad, state.velocity_rad_s)
 
     @property
     def joint_range_rad(self) -> tuple[FloatArray, FloatArray]:
@@ -167,7 +191,8 @@ class SimDriver(RobotDriver):
     def serve_lockstep(self, node: SteppedNode, stop: threading.Event) -> None:
         """Publish the first state, and answer ``sim/step`` until `stop` is set."""
         self.measured_ns = 0
-        node.publish_state(self._measure(0), 0)
+        for part in self.world.parts:
+            node.publish_state(self._measure(0, part), 0, part)
         self._node.serve(self._node.keys.sim_step, lambda query: self._answer_step(node, query))
         while not stop.wait(WATCH_S):
             with self._step_lock:
@@ -187,16 +212,17 @@ class SimDriver(RobotDriver):
             self.report.reject(error.reason, f"sim/step: {error}")
             query.reply_err(str(error).encode())
             return
-        world = self.world
         with self._step_lock:
             for _ in range(duration_ns // STEP_NS):
                 node.step(Tick(1, (self._ticks + 1) * STEP_NS, 0.0, 0.0))
-            state = {
-                "time_ns": self._ticks * STEP_NS,
-                "joint": records.encode(world.joint_state()),
-                "pose": records.encode(world.pose_state(self._reference)),
-                "gripper": records.encode(world.gripper_state()),
-            }
+            state: dict[str, Any] = {"time_ns": self._ticks * STEP_NS}
+            for part, arm in self.world.parts.items():
+                found = {
+                    "joint": records.encode(arm.joint_state()),
+                    "pose": records.encode(arm.pose_state(self._references[part])),
+                    "gripper": records.encode(arm.gripper_state()),
+                }
+                state |= {part: found} if part else found
         query.reply(self._node.keys.sim_step, message.pack(state))
 
     # -- status -------------------------------------------------------------------------------
@@ -206,11 +232,60 @@ class SimDriver(RobotDriver):
         return DriverStatus(
             {
                 "scene": self.profile.sim.scene,
-                "command": self._follower.mode if self._keys else self.profile.robot.command,
+                "command": next(
+                    (one.mode for one in self._followers.values()), self.profile.robot.command
+                ),
                 "lockstep": self.lockstep,
                 "fault": self.fault,
             }
         )
+
+
+class SimPart(RobotDriver):
+    """One of several arms of the simulated robot.
+
+    Args:
+        sim: the driver of all of them.
+        part: its name.
+    """
+
+    name, simulated = "sim", True
+
+    def __init__(self, sim: SimDriver, part: str) -> None:
+        super().__init__(sim.profile.of_part(part))
+        self._sim, self._part = sim, part
+        self._is_first = part == next(iter(sim.profile.parts))
+        self.modes, self.period_s, self.lockstep = sim.modes, sim.period_s, sim.lockstep
+
+    def attach(self, node: Node, follower: CommandFollower | None) -> None:
+        """Begin where the arm stands."""
+        super().attach(node, follower)
+        self._sim.lead(self._part, follower)
+
+    def move(self, reference: PoseReference | JointReference, now_ns: int) -> None:
+        """Set the reference and the stamp of the next step."""
+        self._sim.move(reference, now_ns, self._part)
+
+    def grip(self, command: GripperCommand, now_ns: int) -> None:
+        """Open or close."""
+        self._sim.grip(command, now_ns, self._part)
+
+    def read(self, mono_ns: int) -> Measurement | None:
+        """State of the arm; the first part steps the world of all."""
+        sim = self._sim
+        if self._is_first:
+            sim.step_world(mono_ns)
+        self.fault, self.measured_ns = sim.fault, sim.measured_ns
+        return sim.measure(self._part)
+
+    def state_now(self) -> Measured:
+        """State of the arm in the world."""
+        return self._sim.state_now(self._part)
+
+    @property
+    def joint_range_rad(self) -> tuple[FloatArray, FloatArray]:
+        """Joint limits of the arm."""
+        return self._sim.world.parts[self._part].joint_range_rad
 
 
 class _SimKeys:

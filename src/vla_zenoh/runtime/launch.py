@@ -27,7 +27,7 @@ from vla_zenoh.runtime.router import reject_taken
 from vla_zenoh.runtime.supervisor import DownNode, NodeCommand, Supervisor
 from vla_zenoh.security.identity import Role, operator_role
 
-EXPENDABLE = ("worker", ROLLING)
+EXPENDABLE = ("worker", "primitives", ROLLING)
 ROUTER_PATIENCE_S = 10.0
 BRAKE_PATIENCE_S = 1.0
 STOP_BUDGET_S = 2.9

@@ -10,7 +10,7 @@ from enum import Enum
 from typing import TYPE_CHECKING
 
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.keys import NODE_KINDS, worker_node
+from vla_zenoh.keys import NODE_KINDS, PRIMITIVES, worker_node
 
 if TYPE_CHECKING:
     from vla_zenoh.profile import Profile
@@ -45,7 +45,8 @@ class Identity:
         host: in the profile.
         worker: name, if it is a worker.
         cameras: that it serves.
-        speaks_for: further roles: the node of a ROS 2 robot publishes the requests of ROS users.
+        speaks_for: further roles: the node of a ROS 2 robot publishes the requests of ROS users,
+            the node of the primitives changes settings for those who may ask it.
         addresses: of a bridge: at which it serves.
     """
 
@@ -133,6 +134,10 @@ def _nodes(profile: Profile, host: str) -> list[Identity]:
     found: list[Identity] = []
     for kind in part.nodes:
         role = Role(NODE_KINDS[kind].role)
+        if kind == PRIMITIVES:
+            name = profile.node_name(host, kind)
+            found.append(Identity(role, name, host, worker=PRIMITIVES, speaks_for=(Role.OPERATOR,)))
+            continue
         if role is Role.WORKER:
             found += [
                 Identity(role, worker_node(worker), host, worker=worker)

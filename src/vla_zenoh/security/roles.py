@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from enum import Enum
 from itertools import product
 
-from vla_zenoh.keys import KEY_PATHS, ROLLING, Keys
+from vla_zenoh.keys import KEY_PATHS, PRIMITIVES, ROLLING, Keys
 from vla_zenoh.security.identity import Identity, Role
 
 _, ROBOT, CAMERA, WORKER, COMMAND, OPERATOR, VIEWER, REPLAY, _ = Role
@@ -75,8 +75,10 @@ TABLE = (
     # Images show people, so a viewer does not see them.
     _stream("camera_raw", {CAMERA, ROBOT}, {WORKER, OPERATOR}),
     _stream("camera_jpeg", {CAMERA, ROBOT}, {WORKER, OPERATOR}),
+    _stream("camera_depth", {CAMERA, ROBOT}, {WORKER, OPERATOR}),
     _stream("camera_fitted", {CAMERA, ROBOT}, {WORKER, OPERATOR}),
     _stream("seen", {WORKER}, {OPERATOR}),
+    _stream("seen_depth", {WORKER}, {OPERATOR}),
     _stream("seen_record", {WORKER}, {OPERATOR}),
     _stream("state_joint", {ROBOT}, {WORKER, COMMAND, OPERATOR, VIEWER}),
     _stream("state_pose", {ROBOT}, {WORKER, COMMAND, OPERATOR, VIEWER}),
@@ -111,6 +113,7 @@ TABLE = (
     _stream("command_pose", {COMMAND}, {ROBOT, OPERATOR, VIEWER}),
     _stream("command_joint", {COMMAND}, {ROBOT, OPERATOR, VIEWER}),
     _stream("command_gripper", {COMMAND}, {ROBOT, OPERATOR, VIEWER}),
+    Row("primitive", answer=frozenset({WORKER}), ask=frozenset({OPERATOR})),
     Row("status", put=SPEAKERS, subscribe=frozenset({COMMAND}) | LOOKERS),
     Row("event", put=SPEAKERS, subscribe=frozenset({COMMAND}) | LOOKERS),
     Row("alive", announce=SPEAKERS, watch=NODES | LOOKERS | {REPLAY}),
@@ -146,6 +149,8 @@ def _choices(parameter: str, identity: Identity, act: Act) -> tuple[str, ...]:
         return RECORDERS if identity.role is OPERATOR else (identity.node,)
     if parameter == "worker":
         return (identity.worker,) if identity.worker else ()
+    if parameter == "primitive":
+        return ("*",) if identity.worker == PRIMITIVES else ()
     if parameter in ("form", "holder"):
         return ("*",)
     if parameter == "camera":  # a worker shows what it saw of any camera

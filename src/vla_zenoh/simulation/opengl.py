@@ -67,6 +67,29 @@ class OpenGlCanvas:
 
     def draw(self, data: mujoco.MjData, camera: str, width: int, height: int) -> NDArray[np.uint8]:
         """Image of `camera`, (height, width, 3) RGB."""
+        viewport = self._render(data, camera, width, height)
+        rgb = np.empty((height, width, 3), np.uint8)
+        mujoco.mjr_readPixels(rgb, None, viewport, self._gl)
+        return np.ascontiguousarray(rgb[::-1])  # OpenGL's first row is the lowest
+
+    def draw_depth(
+        self, data: mujoco.MjData, camera: str, width: int, height: int
+    ) -> NDArray[np.float64]:
+        """Distance along the optical axis in m, (height, width); infinite where nothing is."""
+        viewport = self._render(data, camera, width, height)
+        buffer = np.empty((height, width), np.float32)
+        mujoco.mjr_readPixels(None, buffer, viewport, self._gl)
+        # As MuJoCo's projection wrote it, between the clipping planes of the scene.
+        extent, visual = self._model.stat.extent, self._model.vis.map
+        near_m, far_m = visual.znear * extent, visual.zfar * extent
+        share = buffer[::-1].astype(np.float64)
+        if self._gl.readDepthMap == mujoco.mjtDepthMap.mjDEPTH_ZERONEAR:
+            share = 1.0 - share
+        with np.errstate(divide="ignore"):
+            depth_m = near_m * far_m / (near_m + share * (far_m - near_m))
+        return np.where(share <= 0.0, np.inf, depth_m)
+
+    def _render(self, data: mujoco.MjData, camera: str, width: int, height: int) -> mujoco.MjrRect:
         if self._size != (width, height):
             mujoco.mjr_resizeOffscreen(width, height, self._gl)
             self._size = (width, height)
@@ -81,10 +104,8 @@ class OpenGlCanvas:
             self._scene,
         )
         viewport = mujoco.MjrRect(0, 0, width, height)
-        rgb = np.empty((height, width, 3), np.uint8)
         mujoco.mjr_render(viewport, self._scene, self._gl)
-        mujoco.mjr_readPixels(rgb, None, viewport, self._gl)
-        return np.ascontiguousarray(rgb[::-1])  # OpenGL's first row is the lowest
+        return viewport
 
     def refresh(self) -> None:
         """Nothing to do: every image reads the model."""

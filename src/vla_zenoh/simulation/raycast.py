@@ -28,6 +28,8 @@ Pixels = NDArray[np.uint8]
 
 GRID_PX = 4
 SMOOTH_COSINE = 0.97
+FLAT_COSINE = 1.0 - 1e-9
+"""Between the normals of one plane."""
 FAR = 100.0
 NEAR_M = 1e-3
 GROUPS = 6
@@ -44,7 +46,7 @@ class Hits(NamedTuple):
 
 
 class Background(NamedTuple):
-    """Static bodies as a fixed camera sees them, (height, width, ...)."""
+    """What a fixed camera sees, (height, width, ...): colour and depth in m, or infinity."""
 
     rgb: Pixels
     distance: FloatArray
@@ -84,21 +86,36 @@ class RaycastCanvas:
 
     def draw(self, data: mujoco.MjData, camera: str, width: int, height: int) -> Pixels:
         """Image of `camera`, (height, width, 3) RGB."""
+        index, view = self._view(data, camera, width, height)
+        if self._stands(index):
+            return self._over_background(data, view, (index, width, height)).rgb
+        return self._coarse_to_fine(data, view)
+
+    def draw_depth(self, data: mujoco.MjData, camera: str, width: int, height: int) -> FloatArray:
+        """Distance along the optical axis in m, (height, width); infinite where nothing is."""
+        index, view = self._view(data, camera, width, height)
+        if self._stands(index):
+            return self._over_background(data, view, (index, width, height)).distance
+        return self._depth_coarse_to_fine(data, view)
+
+    def _view(
+        self, data: mujoco.MjData, camera: str, width: int, height: int
+    ) -> tuple[int, Viewpoint]:
         index = self._model.camera(camera).id
         focal = height / 2.0 / math.tan(math.radians(self._model.cam_fovy[index]) / 2.0)
         axes = data.cam_xmat[index].reshape(3, 3)
-        view = Viewpoint(data.cam_xpos[index].copy(), axes.copy(), focal, width, height)
+        return index, Viewpoint(data.cam_xpos[index].copy(), axes.copy(), focal, width, height)
+
+    def _stands(self, index: int) -> bool:
         body = self._model.cam_bodyid[index]
-        if self._model.body_weldid[body] == 0 and self._model.body_mocapid[body] < 0:
-            return self._over_background(data, view, (index, width, height))
-        return self._coarse_to_fine(data, view)
+        return self._model.body_weldid[body] == 0 and self._model.body_mocapid[body] < 0
 
     def close(self) -> None:
         """Nothing to free."""
 
     def _over_background(
         self, data: mujoco.MjData, view: Viewpoint, key: tuple[int, int, int]
-    ) -> Pixels:
+    ) -> Background:
         if key not in self._backgrounds:
             rays = self._directions(view).reshape(-1, 3)
             hits = self._cast(data, view, rays, {STATIC_GROUP})
@@ -110,10 +127,11 @@ class RaycastCanvas:
         rays = self._directions(view)[rows, columns]
         hits = self._cast(data, view, rays, {MOVING_GROUP})
         seen = (hits.geom >= 0) & (hits.distance < background.distance[rows, columns])
-        image = background.rgb.copy()
+        image, distance = background.rgb.copy(), background.distance.copy()
         front = Hits(hits.geom[seen], hits.distance[seen], hits.normal[seen])
         image[rows[seen], columns[seen]] = self._shade(data, view, rays[seen], front)
-        return image
+        distance[rows[seen], columns[seen]] = front.distance
+        return Background(image, distance)
 
     def _coarse_to_fine(self, data: mujoco.MjData, view: Viewpoint) -> Pixels:
         groups = {STATIC_GROUP, MOVING_GROUP}
@@ -136,6 +154,23 @@ class RaycastCanvas:
         fine = self._cast(data, view, rays, groups)
         image[rows, columns] = self._shade(data, view, rays, fine)
         return np.asarray(image, np.uint8)
+
+    def _depth_coarse_to_fine(self, data: mujoco.MjData, view: Viewpoint) -> FloatArray:
+        groups = {STATIC_GROUP, MOVING_GROUP}
+        coarse = self._directions(view, GRID_PX)
+        grid = coarse.shape[:2]
+        hits = self._cast(data, view, coarse.reshape(-1, 3), groups)
+        flat = _smooth_cells(hits.geom.reshape(grid), hits.normal.reshape(*grid, 3), FLAT_COSINE)
+        # One over the depth of a plane is linear in the picture: nothing is lost between the rays.
+        inverse = np.where(hits.geom < 0, 0.0, 1.0 / np.where(hits.geom < 0, 1.0, hits.distance))
+        inverse = _between(inverse.reshape(grid))[: view.height, : view.width]
+        rough = np.kron(~flat, np.ones((GRID_PX, GRID_PX), dtype=bool))
+        rows, columns = np.nonzero(rough[: view.height, : view.width])
+        fine = self._cast(data, view, self._directions(view)[rows, columns], groups)
+        with np.errstate(divide="ignore"):
+            depth_m = 1.0 / inverse
+        depth_m[rows, columns] = np.where(fine.geom < 0, np.inf, fine.distance)
+        return depth_m
 
     def _directions(self, view: Viewpoint, step_px: int = 1) -> FloatArray:
         """Rays through every `step_px`-th pixel, in the camera's own axes, one unit deep.
@@ -230,12 +265,23 @@ def _outline(model: mujoco.MjModel, geom: int) -> FloatArray:
     return box_corners(model, geom)
 
 
-def _smooth_cells(geom: NDArray[np.int32], normal: FloatArray) -> NDArray[np.bool_]:
+def _between(grid: FloatArray) -> FloatArray:
+    """Values at every pixel, linear between those of a grid of every `GRID_PX`-th one."""
+    share = np.arange(GRID_PX) / GRID_PX
+    rows = grid[:-1, None] * (1.0 - share[:, None]) + grid[1:, None] * share[:, None]
+    rows = rows.reshape(-1, grid.shape[1])
+    columns = rows[:, :-1, None] * (1.0 - share) + rows[:, 1:, None] * share
+    return columns.reshape(len(rows), -1)
+
+
+def _smooth_cells(
+    geom: NDArray[np.int32], normal: FloatArray, cosine: float = SMOOTH_COSINE
+) -> NDArray[np.bool_]:
     """Cells of a grid of rays whose corners lie on one geom without an edge between them."""
     first = (slice(None, -1), slice(None, -1))
     smooth = np.ones((geom.shape[0] - 1, geom.shape[1] - 1), dtype=bool)
     for row, column in ((0, 1), (1, 0), (1, 1)):
         other = (slice(row, geom.shape[0] - 1 + row), slice(column, geom.shape[1] - 1 + column))
         turn = np.einsum("ijk,ijk->ij", normal[first], normal[other])
-        smooth &= (geom[first] == geom[other]) & ((turn > SMOOTH_COSINE) | (geom[first] < 0))
+        smooth &= (geom[first] == geom[other]) & ((turn > cosine) | (geom[first] < 0))
     return smooth

@@ -14,7 +14,7 @@ import ctypes.util
 import os
 import subprocess
 import sys
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import TYPE_CHECKING
@@ -114,7 +114,7 @@ class Renderer:
 
     Args:
         scene: name or path of the scene, as the world's.
-        robot: the robot, as the world's.
+        robot: the robot or its parts, as the world's.
         backend: how to render; None: `choose_backend` chooses.
 
     Raises:
@@ -122,7 +122,9 @@ class Renderer:
         NodeError: the back end does not work here.
     """
 
-    def __init__(self, scene: str, robot: RobotModel, backend: Backend | None = None) -> None:
+    def __init__(
+        self, scene: str, robot: RobotModel | Sequence[RobotModel], backend: Backend | None = None
+    ) -> None:
         self.backend = choose_backend() if backend is None else backend
         # After the choice: with a bad MUJOCO_GL in the environment the import itself fails.
         import mujoco
@@ -168,9 +170,30 @@ class Renderer:
         Raises:
             ResourceError: there is no such camera.
         """
+        return self._canvas.draw(self._data, self._known(camera), width, height)
+
+    def _known(self, camera: str) -> str:
         if camera not in self.cameras:
             raise ResourceError(f"no camera {camera!r}; there are: {', '.join(self.cameras)}")
-        return self._canvas.draw(self._data, camera, width, height)
+        return camera
+
+    def render_depth(self, camera: str, width: int, height: int) -> NDArray[np.float64]:
+        """Distance along the optical axis of `camera` in m, (height, width); infinite where
+        nothing is.
+
+        Raises:
+            ResourceError: there is no such camera.
+        """
+        return self._canvas.draw_depth(self._data, self._known(camera), width, height)
+
+    def focal_px(self, camera: str, height: int) -> float:
+        """Focal length in pixels of an image of this height; the axis goes through its middle.
+
+        Raises:
+            ResourceError: there is no such camera.
+        """
+        fovy_rad = np.radians(self._model.cam_fovy[self._model.camera(self._known(camera)).id])
+        return float(height / 2.0 / np.tan(fovy_rad / 2.0))
 
     def view(self, camera: str) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
         """Camera pose: position (3,) m, axes (3, 3) in columns; and vertical field of view in rad.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from vla_zenoh.profile import RobotProfile
+from vla_zenoh.profile import Profile, RobotProfile
 
 Rgba = tuple[float, float, float, float]
 Vector3 = tuple[float, float, float]
@@ -93,6 +93,9 @@ class RobotModel:
         pad_friction: sliding, torsional, rolling friction of the fingers.
         colours: rgba of links by name.
         colour: rgba of every other link.
+        part: which part of a robot it is; empty: all of it.
+        base_m: (3,) where it stands in the world.
+        base_yaw_rad: its turn about the vertical.
     """
 
     description: str = "example-robot-data:panda_description/urdf/panda.urdf"
@@ -118,6 +121,14 @@ class RobotModel:
         ("panda_rightfinger", (0.16, 0.17, 0.19, 1.0)),
     )
     colour: Rgba = (0.88, 0.89, 0.90, 1.0)
+    part: str = ""
+    base_m: Vector3 = (0.0, 0.0, 0.0)
+    base_yaw_rad: float = 0.0
+
+    @property
+    def at_origin(self) -> bool:
+        """Its base frame is the world frame."""
+        return not any(self.base_m) and not self.base_yaw_rad
 
 
 SO101 = RobotModel(
@@ -163,3 +174,18 @@ def robot_model(robot: RobotProfile) -> RobotModel:
         return found
     width_m = robot.gripper.max_width_m
     return replace(found, finger_scale_m=width_m / (ends.open - ends.shut), max_width_m=width_m)
+
+
+def robot_models(profile: Profile) -> tuple[RobotModel, ...]:
+    """The robot of a profile, part by part."""
+    if not profile.parts:
+        return (robot_model(profile.robot),)
+    return tuple(
+        replace(
+            robot_model(profile.of_part(name).robot),
+            part=name,
+            base_m=part.base.position_m,
+            base_yaw_rad=part.base.yaw_rad,
+        )
+        for name, part in profile.parts.items()
+    )

@@ -7,6 +7,7 @@ the same arguments, so that a pose vector of one fits the other.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from vla_zenoh.simulation.robot_model import MountedCamera, RobotModel
 from vla_zenoh.types import FloatArray
 
 STEP_S = 1e-3
-PREFIX = "robot/"  # of every name in the robot description, so that a scene may use any name
+PREFIX = "robot/"
 TCP_SITE = "tcp"
 GRIPPER = "gripper"
 STATIC_GROUP = 0
@@ -47,32 +48,55 @@ def scene_file(scene: str) -> Path:
     return path
 
 
-def build_model(scene: str, robot: RobotModel, *, joint_friction_nm: float = 0.0) -> mujoco.MjModel:
-    """Compile `scene` with `robot` standing at the world's origin.
+def prefix_of(robot: RobotModel) -> str:
+    """Of every name in the robot's description, so that a scene may use any name."""
+    return f"{robot.part}/" if robot.part else PREFIX
+
+
+def build_model(
+    scene: str, robots: RobotModel | Sequence[RobotModel], *, joint_friction_nm: float = 0.0
+) -> mujoco.MjModel:
+    """Compile `scene` with a robot in it, or the parts of one.
 
     Args:
         scene: name or path of the scene.
-        robot: the robot.
+        robots: the robot; its parts, where it has several.
         joint_friction_nm: dry friction in every arm joint.
 
     Raises:
         ResourceError: scene or robot are missing, or MuJoCo rejects them.
     """
     path = scene_file(scene)
+    parts = (robots,) if isinstance(robots, RobotModel) else tuple(robots)
     try:
         spec = mujoco.MjSpec.from_file(str(path))
-        arm = _robot_spec(robot, joint_friction_nm)
-        spec.worldbody.add_frame().attach_body(arm.bodies[1], PREFIX, "")
+        for index, robot in enumerate(parts):
+            arm = _robot_spec(robot, joint_friction_nm)
+            if len(parts) > 1:
+                _meet_other_parts(arm, index, len(parts))
+            half_rad = robot.base_yaw_rad / 2
+            frame = spec.worldbody.add_frame(
+                pos=robot.base_m, quat=(math.cos(half_rad), 0.0, 0.0, math.sin(half_rad))
+            )
+            frame.attach_body(arm.bodies[1], prefix_of(robot), "")
+            if robot.camera is not None:
+                camera = f"{robot.part}_{robot.camera.name}" if robot.part else robot.camera.name
+                spec.camera(prefix_of(robot) + robot.camera.name).name = camera
         _set_solver(spec)
-        if robot.camera is not None:
-            spec.camera(PREFIX + robot.camera.name).name = robot.camera.name
         model = spec.compile()
     except (ValueError, mujoco.FatalError) as error:
-        raise ResourceError(
-            f"MuJoCo rejects scene {path} with {robot.description}: {error}"
-        ) from error
+        described = " and ".join(dict.fromkeys(robot.description for robot in parts))
+        raise ResourceError(f"MuJoCo rejects scene {path} with {described}: {error}") from error
     _sort_groups(model)
     return model
+
+
+def _meet_other_parts(arm: mujoco.MjSpec, index: int, parts: int) -> None:
+    """Contact masks of a part that meets the scene and the other parts, but not itself."""
+    own = 1 << (index + 1)
+    others = sum(1 << (other + 1) for other in range(parts) if other != index)
+    for geom in arm.geoms:
+        geom.contype, geom.conaffinity = 1 | own, others
 
 
 def read_pose_vector(data: mujoco.MjData) -> FloatArray:

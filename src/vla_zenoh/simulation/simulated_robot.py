@@ -6,9 +6,10 @@ import mujoco
 import numpy as np
 
 from vla_zenoh.errors import RecordError, ResourceError
+from vla_zenoh.kinematics.so3 import rotation_from_rpy
 from vla_zenoh.simulation.cartesian_impedance import ArmDynamics
 from vla_zenoh.simulation.robot_model import RobotModel
-from vla_zenoh.simulation.scene import GRIPPER, PREFIX, STEP_S, TCP_SITE
+from vla_zenoh.simulation.scene import GRIPPER, STEP_S, TCP_SITE, prefix_of
 from vla_zenoh.types import FloatArray, GripperState
 
 AT_REST_M_S = 2e-3
@@ -21,7 +22,8 @@ MAX_FORCE_N = 70.0
 class SimulatedArm:
     """The arm's part of a MuJoCo state, as views that stay valid as long as `data` lives.
 
-    They are as fresh as the last MuJoCo call of the code that steps `data`.
+    They are as fresh as the last MuJoCo call of the code that steps `data`. Poses and rates of the
+    TCP are in the base frame of the arm.
 
     Args:
         model: the scene with the robot in it.
@@ -34,14 +36,16 @@ class SimulatedArm:
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, robot: RobotModel) -> None:
         self._model, self._data = model, data
-        joints = [model.joint(PREFIX + name) for name in robot.arm_joints]
+        joints = [model.joint(prefix_of(robot) + name) for name in robot.arm_joints]
         first_dof, first_q = int(joints[0].dofadr[0]), int(joints[0].qposadr[0])
         if [int(joint.dofadr[0]) - first_dof for joint in joints] != list(range(len(joints))):
             raise ResourceError("the arm's joints do not follow each other in the URDF")
         self._dofs = slice(first_dof, first_dof + len(joints))
         self.lower_rad = np.array([joint.range[0] for joint in joints])
         self.upper_rad = np.array([joint.range[1] for joint in joints])
-        self.actuators = [int(model.actuator(PREFIX + name).id) for name in robot.arm_joints]
+        self.actuators = [
+            int(model.actuator(prefix_of(robot) + name).id) for name in robot.arm_joints
+        ]
         self.effort_limit_nm = model.actuator_ctrlrange[self.actuators, 1].copy()
 
         self._qpos = slice(first_q, first_q + len(joints))
@@ -49,10 +53,14 @@ class SimulatedArm:
         self.velocity_rad_s = data.qvel[self._dofs]
         self.effort_nm = data.qfrc_actuator[self._dofs]
         self._bias_nm = data.qfrc_bias[self._dofs]
-        self._tcp = int(model.site(PREFIX + TCP_SITE).id)
+        self._tcp = int(model.site(prefix_of(robot) + TCP_SITE).id)
         self._tcp_body = int(model.site_bodyid[self._tcp])
-        self.tcp_position_m = data.site_xpos[self._tcp]
-        self.tcp_rotation = data.site_xmat[self._tcp].reshape(3, 3)
+        self._world_m = data.site_xpos[self._tcp]
+        self._world_rotation = data.site_xmat[self._tcp].reshape(3, 3)
+        self._base: tuple[FloatArray, FloatArray] | None = None
+        if not robot.at_origin:
+            turn = rotation_from_rpy(np.array([0.0, 0.0, robot.base_yaw_rad]))
+            self._base = np.array(robot.base_m), turn
         root = model.body_rootid[self._tcp_body]
         # The fixed base presses against the ground it stands on, which is no contact of the arm.
         moves = model.body_weldid[model.geom_bodyid] != 0
@@ -75,12 +83,39 @@ class SimulatedArm:
             bias_nm=self._bias_nm,
         )
 
+    @property
+    def tcp_position_m(self) -> FloatArray:
+        """(3,) of the TCP."""
+        return self._in_base(self._world_m, self._world_rotation)[0]
+
+    @property
+    def tcp_rotation(self) -> FloatArray:
+        """(3, 3) of the TCP."""
+        return self._in_base(self._world_m, self._world_rotation)[1]
+
+    def _in_base(
+        self, position_m: FloatArray, rotation: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        if self._base is None:
+            return position_m, rotation
+        base_m, turn = self._base
+        return turn.T @ (position_m - base_m), turn.T @ rotation
+
+    def _axes_of_base(self, world: FloatArray) -> FloatArray:
+        """Rows (6, ...) in world axes, linear ones first, in the axes of the base."""
+        if self._base is None:
+            return world
+        turn = self._base[1].T
+        return np.concatenate([turn @ world[:3], turn @ world[3:]])
+
     def tcp_at(self, position_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
         """TCP position (3,) in m and rotation (3, 3) with the joints at `position_rad` (n,)."""
         data = self._scratch
         data.qpos[self._qpos] = position_rad
         mujoco.mj_kinematics(self._model, data)
-        return data.site_xpos[self._tcp].copy(), data.site_xmat[self._tcp].reshape(3, 3).copy()
+        position_m, rotation = data.site_xpos[self._tcp], data.site_xmat[self._tcp].reshape(3, 3)
+        position_m, rotation = self._in_base(position_m, rotation)
+        return position_m.copy(), rotation.copy()
 
     def jacobian(self) -> FloatArray:
         """(6, n) of the TCP, linear rows first, base axes."""
@@ -93,13 +128,14 @@ class SimulatedArm:
             self._data,
             self._linear,
             self._angular,
-            self.tcp_position_m,
+            self._world_m,
             self._tcp_body,
         )
         return self._stacked()
 
     def _stacked(self) -> FloatArray:
-        return np.concatenate([self._linear[:, self._dofs], self._angular[:, self._dofs]])
+        stacked = np.concatenate([self._linear[:, self._dofs], self._angular[:, self._dofs]])
+        return self._axes_of_base(stacked)
 
     def contact_wrench(self) -> FloatArray:
         """(6,) external contact wrench on the robot: N, and Nm about the TCP, base axes.
@@ -118,10 +154,10 @@ class SimulatedArm:
             axes = contact.frame.reshape(3, 3)  # rows; the force acts on the second geom
             sign = 1.0 if second else -1.0
             force, moment = sign * (local[:3] @ axes), sign * (local[3:] @ axes)
-            lever = contact.pos - self.tcp_position_m
+            lever = contact.pos - self._world_m
             total[:3] += force
             total[3:] += moment + np.cross(lever, force)
-        return total
+        return self._axes_of_base(total)
 
 
 class SimulatedGripper:
@@ -135,13 +171,13 @@ class SimulatedGripper:
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, robot: RobotModel) -> None:
         self._model, self._data = model, data
-        fingers = [model.joint(PREFIX + name) for name in robot.finger_joints]
+        fingers = [model.joint(prefix_of(robot) + name) for name in robot.finger_joints]
         self._q = [int(joint.qposadr[0]) for joint in fingers]
         self._dofs = [int(joint.dofadr[0]) for joint in fingers]
         self._scale_m, self._max_width_m = robot.finger_scale_m, robot.max_width_m
         # Each opens as far as the others.
         self._open = self._max_width_m / self._scale_m / len(fingers)
-        self._actuator = int(model.actuator(PREFIX + GRIPPER).id)
+        self._actuator = int(model.actuator(prefix_of(robot) + GRIPPER).id)
         self._hold_at(self._max_width_m)
 
     def open(self) -> None:

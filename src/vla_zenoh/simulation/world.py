@@ -1,9 +1,10 @@
-"""The simulated world: robot, controllers, gripper and objects, stepped by 1 ms per tick."""
+"""The simulated world: robots, controllers, grippers and objects, stepped by 1 ms per tick."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -20,7 +21,7 @@ from vla_zenoh.simulation.cartesian_impedance import (
 )
 from vla_zenoh.simulation.joint_impedance import JointImpedance, JointImpedanceOutput
 from vla_zenoh.simulation.objects import SimulatedObjects
-from vla_zenoh.simulation.robot_model import RobotModel, robot_model
+from vla_zenoh.simulation.robot_model import RobotModel, robot_models
 from vla_zenoh.simulation.scene import STEP_S, build_model, read_pose_vector, write_pose_vector
 from vla_zenoh.simulation.simulated_robot import SimulatedArm, SimulatedGripper
 from vla_zenoh.types import FloatArray, GripperState, JointState, PoseState, vector
@@ -31,56 +32,39 @@ WRENCH_FILTER_S = 0.01
 """Time constant of the reported wrench: a robot's own estimate is filtered too."""
 
 
-class World:
-    """A scene with a robot under impedance control of its TCP or joints, as `tick` is given.
+class SimulatedPart:
+    """One arm with its gripper in a `World`, under impedance control of its TCP or joints.
 
     At rest either law takes over from the other with the same torque; a change between them in
-    motion jolts the arm.
-
-    Deterministic to the bit: the same seed, references and gripper commands give the same state.
-    All poses are of the TCP in the robot's base frame, which is the world frame.
+    motion jolts the arm. All poses are of the TCP in the base frame of the arm.
 
     Args:
-        scene: name of a folder of ``sim/``, or a path.
-        robot: the robot in it.
-        home_rad: (n,) arm joints after a reset; also the posture that the nullspace prefers.
+        model: the scene with the robot in it.
+        data: its state.
+        robot: the arm.
+        home_rad: (n,) joints after a reset; also the posture that the nullspace prefers.
         gains: of the Cartesian impedance controller; None: the default ones.
-        joint_friction_nm: dry friction in every arm joint, which the controller does not model.
-        seed: see `reset`.
-        vary: what else a seeded reset changes, names of `appearance.VARIATIONS`.
-
-    Raises:
-        ResourceError: scene or robot are missing or do not fit.
-        RecordError: `home_rad` does not have one number per arm joint.
+        refresh: computes positions after a step.
     """
 
     def __init__(
         self,
-        scene: str,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
         robot: RobotModel,
-        *,
-        home_rad: ArrayLike,
-        gains: ImpedanceGains | None = None,
-        joint_friction_nm: float = 0.0,
-        seed: int | None = None,
-        vary: Collection[str] = (),
+        home_rad: FloatArray,
+        gains: ImpedanceGains | None,
+        refresh: Callable[[], None],
     ) -> None:
-        check_variations(vary)  # an unknown name fails here, not in the renderer
-        self._vary = frozenset(vary)
-        self.seed: int | None = None
-        self.robot = robot
-        self.model = build_model(scene, robot, joint_friction_nm=joint_friction_nm)
-        self._data = mujoco.MjData(self.model)
-        self._home_rad = vector("home_rad", home_rad, len(robot.arm_joints))
-        self._arm = SimulatedArm(self.model, self._data, robot)
-        self._gripper = SimulatedGripper(self.model, self._data, robot)
-        self._objects = SimulatedObjects(self.model, self._data)
+        self.robot, self._data, self._home_rad, self._refresh = robot, data, home_rad, refresh
+        self._arm = SimulatedArm(model, data, robot)
+        self.gripper = SimulatedGripper(model, data, robot)
         self._controller = CartesianImpedance(
             gains or ImpedanceGains(),
             lower_rad=self._arm.lower_rad,
             upper_rad=self._arm.upper_rad,
             effort_nm=self._arm.effort_limit_nm,
-            posture_rad=self._home_rad,
+            posture_rad=home_rad,
             period_s=STEP_S,
         )
         self._joint_controller = JointImpedance(
@@ -89,51 +73,67 @@ class World:
         self._active_law: CartesianImpedance | JointImpedance | None = None
         self._held_rad: FloatArray | None = None
         self._filtered_wrench = np.zeros(6)
-        self.saturated = 0
-        self.reset(seed)
 
     # -- time ----------------------------------------------------------------------------------
-
-    def reset(self, seed: int | None = None) -> None:
-        """Return to the home pose with the gripper open and the clock at zero.
-
-        Args:
-            seed: places objects at random in the scene's regions; None: as in the scene file.
-        """
-        model, data = self.model, self._data
-        self.seed = seed
-        mujoco.mj_resetData(model, data)
+    def go_home(self) -> None:
+        """Put the joints at home and open the gripper."""
         self._arm.position_rad[:] = self._home_rad
-        self._gripper.open()
-        if seed is not None:
-            self._objects.draw(seed, distractors=DISTRACTORS in self._vary)
-        self._controller.reset(self._home_rad)
-        self._reset_laws()
-        self._ticks = 0
-        self._filtered_wrench = np.zeros(6)
-        self.saturated = 0
-        mujoco.mj_forward(model, data)
-        self._fresh = True
+        self.gripper.open()
 
-    def tick(self, reference: PoseReference | JointReference) -> None:
-        """Step by one millisecond towards a reference of the TCP or the joints.
+    def reset_laws(self, *, home: bool) -> None:
+        """Forget what the controllers have accumulated, and with `home` what was measured."""
+        if home:
+            self._controller.reset(self._home_rad)
+            self._filtered_wrench = np.zeros(6)
+        else:
+            self._controller.reset()
+            self.gripper.stand()
+        self._joint_controller.reset()
+        self._active_law = None
+        self._held_rad = None
+
+    def torque(self, reference: PoseReference | JointReference) -> bool:
+        """Set the torques of this tick; whether an effort limit cut them.
 
         Raises:
-            NodeError: the simulation diverged; `reset` makes it usable again.
+            NodeError: the reference is not finite.
         """
-        mujoco.mj_step1(self.model, self._data)
+        output: ImpedanceOutput | JointImpedanceOutput
         if isinstance(reference, JointReference):
             self._held_rad, law = reference.position_rad, self._joint_controller
             output = law.torque(reference, self._switch_to(law))
         else:
             self._held_rad, law = None, self._controller
             output = law.torque(reference, self._switch_to(law))
-        self._apply(output, reference)
+        if not math.isfinite(output.torque_nm.sum()):
+            raise NodeError(f"the reference is not finite: {reference}")
+        self._data.ctrl[self._arm.actuators] = output.torque_nm
+        self.gripper.step()
+        return output.saturated
 
+    def filter_wrench(self) -> None:
+        """Follow the wrench of the last step."""
+        error = self._arm.contact_wrench() - self._filtered_wrench
+        self._filtered_wrench += (STEP_S / WRENCH_FILTER_S) * error
+
+    def _switch_to(self, law: CartesianImpedance | JointImpedance) -> ArmDynamics:
+        state = self._arm.state()
+        if self._active_law is not law:
+            if self._active_law is not None:
+                law.take_over(self._data.ctrl[self._arm.actuators], state)
+            self._active_law = law
+        return state
+
+    # -- measurements --------------------------------------------------------------------------
     def hold_reference(self) -> PoseReference:
         """Reference at the measured TCP, at rest."""
         position, rotation = self.tcp()
         return PoseReference(position, rotation, np.zeros(6), np.zeros(6))
+
+    @property
+    def joint_range_rad(self) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper limit of every arm joint, (n,) each."""
+        return self._arm.lower_rad.copy(), self._arm.upper_rad.copy()
 
     def set_gripper(self, width_m: float, speed_m_s: float, force_n: float) -> None:
         """Open or close to `width_m` at `speed_m_s`, pressing with at most `force_n` (N).
@@ -141,25 +141,17 @@ class World:
         Raises:
             RecordError: speed or force are not above zero.
         """
-        self._gripper.command(width_m, speed_m_s, force_n)
+        self.gripper.command(width_m, speed_m_s, force_n)
 
-    # -- measurements ------------------------------------------------------------------
-
-    @property
-    def joint_range_rad(self) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper limit of every arm joint, (n,) each."""
-        return self._arm.lower_rad.copy(), self._arm.upper_rad.copy()
-
-    @property
-    def time_ns(self) -> int:
-        """Simulated time since the last reset."""
-        return self._ticks * STEP_NS
+    def gripper_state(self) -> GripperState:
+        """Opening between the fingers, and whether they move or hold an object."""
+        return self.gripper.state()
 
     @property
     def wrench(self) -> FloatArray:
         """(6,) external contact wrench of the last step: N, Nm about the TCP, base axes.
 
-        A held object counts with its weight; contacts between parts of the robot do not.
+        A held object counts with its weight; contacts between parts of the arm do not.
         """
         self._refresh()
         return self._arm.contact_wrench()
@@ -202,14 +194,153 @@ class World:
             reference_quat_xyzw=_quat_xyzw(held_rotation),
         )
 
+
+class World:
+    """A scene with a robot in it, of one part or several, as `tick` leads them.
+
+    Deterministic to the bit: the same seed, references and gripper commands give the same state.
+    What is said of one arm is of the first part; see `part`. Poses are of its TCP in its base
+    frame, those of objects in the world frame, which is the base frame of a robot of one part.
+
+    Args:
+        scene: name of a folder of ``sim/``, or a path.
+        robot: the robot in it, or its parts.
+        home_rad: (n,) arm joints after a reset, or those of each part; also the posture that the
+            nullspace prefers.
+        gains: of the Cartesian impedance controller; None: the default ones.
+        joint_friction_nm: dry friction in every arm joint, which the controller does not model.
+        seed: see `reset`.
+        vary: what else a seeded reset changes, names of `appearance.VARIATIONS`.
+
+    Raises:
+        ResourceError: scene or robot are missing or do not fit.
+        RecordError: `home_rad` does not have one number per arm joint.
+    """
+
+    def __init__(
+        self,
+        scene: str,
+        robot: RobotModel | Sequence[RobotModel],
+        *,
+        home_rad: ArrayLike | Sequence[ArrayLike],
+        gains: ImpedanceGains | None = None,
+        joint_friction_nm: float = 0.0,
+        seed: int | None = None,
+        vary: Collection[str] = (),
+    ) -> None:
+        check_variations(vary)  # an unknown name fails here, not in the renderer
+        self._vary = frozenset(vary)
+        self.seed: int | None = None
+        self.model = build_model(scene, robot, joint_friction_nm=joint_friction_nm)
+        self._data = mujoco.MjData(self.model)
+        one = isinstance(robot, RobotModel)
+        homes: Sequence[Any] = [home_rad] if one else list(home_rad)  # pyright: ignore
+        self.parts: dict[str, SimulatedPart] = {
+            model.part: SimulatedPart(
+                self.model,
+                self._data,
+                model,
+                vector("home_rad", home, len(model.arm_joints)),
+                gains,
+                self._refresh,
+            )
+            for model, home in zip([robot] if one else robot, homes, strict=True)
+        }
+        self._first = next(iter(self.parts.values()))
+        self.robot = self._first.robot
+        self._objects = SimulatedObjects(self.model, self._data)
+        self.saturated = 0
+        self.reset(seed)
+
+    # -- time ----------------------------------------------------------------------------------
+
+    def reset(self, seed: int | None = None) -> None:
+        """Return to the home pose with the gripper open and the clock at zero.
+
+        Args:
+            seed: places objects at random in the scene's regions; None: as in the scene file.
+        """
+        model, data = self.model, self._data
+        self.seed = seed
+        mujoco.mj_resetData(model, data)
+        for part in self.parts.values():
+            part.go_home()
+        if seed is not None:
+            self._objects.draw(seed, distractors=DISTRACTORS in self._vary)
+        for part in self.parts.values():
+            part.reset_laws(home=True)
+        self._ticks = 0
+        self.saturated = 0
+        mujoco.mj_forward(model, data)
+        self._fresh = True
+
+    def tick(
+        self,
+        reference: PoseReference | JointReference | Mapping[str, PoseReference | JointReference],
+    ) -> None:
+        """Step by one millisecond towards a reference of the TCP or joints, or one of each part.
+
+        Raises:
+            NodeError: the simulation diverged; `reset` makes it usable again.
+        """
+        mujoco.mj_step1(self.model, self._data)
+        for name, part in self.parts.items():
+            self.saturated += part.torque(
+                reference[name] if isinstance(reference, Mapping) else reference
+            )
+        mujoco.mj_step2(self.model, self._data)
+        self._ticks += 1
+        self._fresh = False
+        for part in self.parts.values():
+            part.filter_wrench()
+        if self._data.warning.number.any():
+            self._raise_diverged()
+
+    def hold_reference(self) -> PoseReference:
+        """Reference at the measured TCP, at rest."""
+        return self._first.hold_reference()
+
+    def set_gripper(self, width_m: float, speed_m_s: float, force_n: float) -> None:
+        """See `SimulatedPart.set_gripper`."""
+        self._first.set_gripper(width_m, speed_m_s, force_n)
+
+    # -- measurements ------------------------------------------------------------------
+
+    @property
+    def joint_range_rad(self) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper limit of every arm joint, (n,) each."""
+        return self._first.joint_range_rad
+
+    @property
+    def time_ns(self) -> int:
+        """Simulated time since the last reset."""
+        return self._ticks * STEP_NS
+
+    @property
+    def wrench(self) -> FloatArray:
+        """See `SimulatedPart.wrench`."""
+        return self._first.wrench
+
+    def joint_state(self) -> JointState:
+        """See `SimulatedPart.joint_state`."""
+        return self._first.joint_state()
+
+    def tcp(self) -> tuple[FloatArray, FloatArray]:
+        """Measured TCP: position (3,) in metres and rotation (3, 3), copies."""
+        return self._first.tcp()
+
+    def pose_state(self, reference: PoseReference | JointReference) -> PoseState:
+        """See `SimulatedPart.pose_state`."""
+        return self._first.pose_state(reference)
+
     def gripper_state(self) -> GripperState:
         """Opening between the fingers, and whether they move or hold an object."""
-        return self._gripper.state()
+        return self._first.gripper.state()
 
     @property
     def grip_force_n(self) -> float:
         """Force of either finger, inwards positive."""
-        return self._gripper.force_n
+        return self._first.gripper.force_n
 
     # -- objects and poses of all bodies ------------------------------------------------------
 
@@ -236,45 +367,12 @@ class World:
         """Set all poses from `qpos` of a world of the same scene, at rest."""
         write_pose_vector(self.model, self._data, vector)
         self._data.qvel[:] = 0.0
-        self._controller.reset()
-        self._reset_laws()
-        self._gripper.stand()
+        for part in self.parts.values():
+            part.reset_laws(home=False)
         mujoco.mj_forward(self.model, self._data)
         self._fresh = True
 
     # -- inside --------------------------------------------------------------------------------
-
-    def _switch_to(self, law: CartesianImpedance | JointImpedance) -> ArmDynamics:
-        state = self._arm.state()
-        if self._active_law is not law:
-            if self._active_law is not None:
-                law.take_over(self._data.ctrl[self._arm.actuators], state)
-            self._active_law = law
-        return state
-
-    def _reset_laws(self) -> None:
-        self._joint_controller.reset()
-        self._active_law = None
-        self._held_rad = None
-
-    def _apply(
-        self,
-        output: ImpedanceOutput | JointImpedanceOutput,
-        reference: PoseReference | JointReference,
-    ) -> None:
-        data = self._data
-        if not math.isfinite(output.torque_nm.sum()):
-            raise NodeError(f"the reference is not finite: {reference}")
-        self.saturated += output.saturated
-        data.ctrl[self._arm.actuators] = output.torque_nm
-        self._gripper.step()
-        mujoco.mj_step2(self.model, data)
-        self._ticks += 1
-        self._fresh = False
-        error = self._arm.contact_wrench() - self._filtered_wrench
-        self._filtered_wrench += (STEP_S / WRENCH_FILTER_S) * error
-        if data.warning.number.any():
-            self._raise_diverged()
 
     def _refresh(self) -> None:
         """Compute positions after the last step; contacts and forces stay those of that step."""
@@ -300,10 +398,11 @@ def build_world(profile: Profile) -> World:
     Raises:
         ResourceError: scene or robot description are missing.
     """
+    homes = [profile.of_part(name).robot.home_rad for name in profile.part_names]
     return World(
         profile.sim.scene,
-        robot_model(profile.robot),
-        home_rad=profile.robot.home_rad,
+        robot_models(profile),
+        home_rad=homes,
         joint_friction_nm=profile.sim.joint_friction_nm,
         seed=profile.sim.seed,
         vary=profile.sim.vary,

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     )
     from vla_zenoh.types.reports import Event, NodeStatus, Task
     from vla_zenoh.types.states import (
+        Depth,
         GripperState,
         Image,
         JointState,
@@ -53,6 +54,7 @@ __all__ = [
     "QUATERNION_NORM_TOLERANCE",
     "ActionChunk",
     "Cause",
+    "Depth",
     "Event",
     "FloatArray",
     "GripperCommand",

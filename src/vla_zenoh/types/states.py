@@ -21,6 +21,10 @@ from vla_zenoh.types.checks import (
     texts,
 )
 
+MIN_DEPTH_UNIT_M, MAX_DEPTH_UNIT_M = 1e-5, 0.1
+"""Metres of one count of a depth picture: from 0.65 m to 6.5 km in all."""
+MAX_COUNT = 2**16 - 1
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointState:
@@ -208,3 +212,43 @@ class Image:
         rgb = np.ascontiguousarray(rgb).view()  # the maker's own array stays as writable as it was
         rgb.setflags(write=False)
         set_field(self, "rgb", rgb)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Depth:
+    """A depth picture: how far what each pixel shows is, along the camera's optical axis.
+
+    Args:
+        counts: (height, width) uint16, row by row from the top left; 0: not measured.
+        unit_m: metres of one count.
+    """
+
+    counts: NDArray[np.uint16]
+    unit_m: float
+
+    def __post_init__(self) -> None:
+        counts = self.counts
+        if not isinstance(counts, np.ndarray) or counts.dtype != np.uint16 or counts.ndim != 2:
+            raise RecordError("a depth picture must be a uint16 array (H, W)")
+        if 0 in counts.shape:
+            raise RecordError(f"a depth picture has shape {counts.shape}, wanted (H, W)")
+        counts = np.ascontiguousarray(counts).view()
+        counts.setflags(write=False)
+        set_field(self, "counts", counts)
+        set_field(self, "unit_m", number("unit_m", self.unit_m, MIN_DEPTH_UNIT_M, MAX_DEPTH_UNIT_M))
+
+    @staticmethod
+    def of_metres(depth_m: ArrayLike, unit_m: float) -> Depth:
+        """The picture of distances in m, (H, W); what no count can say is not measured.
+
+        Raises:
+            RecordError: another shape, or a unit out of range.
+        """
+        with np.errstate(invalid="ignore"):
+            counts = np.rint(np.asarray(depth_m, np.float64) / unit_m)
+            counts = np.where((counts >= 1) & (counts <= MAX_COUNT), counts, 0)
+        return Depth(counts.astype(np.uint16), unit_m)
+
+    def metres(self) -> NDArray[np.float32]:
+        """(H, W) distance in m; 0: not measured."""
+        return (self.counts * self.unit_m).astype(np.float32)

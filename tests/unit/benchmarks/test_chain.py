@@ -21,7 +21,7 @@ from benchmarks.chain.our_chain import bench_profile
 from benchmarks.chain.process import Server, free_port
 from benchmarks.chain.report import CHUNK, LINES, POSE, ROUND_TRIP, STAGES, TICK_WAIT, Result
 from benchmarks.chain.rounds import Interval, summarise
-from benchmarks.chain.ways import REFERENCE, WAYS, ServingWay
+from benchmarks.chain.ways import REFERENCE, WAYS, Load, ServingWay
 from benchmarks.peers import arrays
 from benchmarks.picture import NOISE_SIGMA, noisy_picture
 from vla_zenoh.errors import NodeError, how_to_install
@@ -91,20 +91,20 @@ def test_a_way_that_was_not_measured_has_no_summary_and_no_reference_gives_no_ra
 
 # -- report ---------------------------------------------------------------------------------------
 def test_the_table_names_a_missing_library_and_how_to_install_it() -> None:
-    result = Result([ABSENT], [{}], {}, 10)
+    result = Result([ABSENT], [{}], {}, Load())
     assert f"not installed: {how_to_install('bench')}" in shown(result)
     assert result.to_dict()["ways"]["absent"]["missing"] == ["a_module_that_nobody_has"]
 
 
 def test_the_wait_for_the_tick_stands_in_a_line_of_its_own() -> None:
-    text = shown(Result([CHAIN], [{REFERENCE: chain_slot([3.25])}], {}, 1))
+    text = shown(Result([CHAIN], [{REFERENCE: chain_slot([3.25])}], {}, Load()))
     assert f"{STAGES[TICK_WAIT]}" in text
     assert "the same without waiting for the tick" in text
     assert "3.250" in text
 
 
 def test_lost_requests_and_standing_cost_are_said() -> None:
-    result = Result([CHAIN], [{REFERENCE: chain_slot([1.0], lost=3)}], {"cores": 2}, 10)
+    result = Result([CHAIN], [{REFERENCE: chain_slot([1.0], lost=3)}], {"cores": 2}, Load())
     told = "\n".join(report.notes(result))
     assert "3 requests were not answered" in told
     assert "25 % of one core" in told
@@ -112,7 +112,7 @@ def test_lost_requests_and_standing_cost_are_said() -> None:
 
 def test_the_result_is_json() -> None:
     rounds = [{REFERENCE: chain_slot([1.0, 2.0]), "peer": peer_slot([4.0, 8.0])}]
-    told = json.loads(json.dumps(Result([CHAIN, A_PEER, ABSENT], rounds, {}, 2).to_dict()))
+    told = json.loads(json.dumps(Result([CHAIN, A_PEER, ABSENT], rounds, {}, Load()).to_dict()))
     assert told["ways"]["peer"][ROUND_TRIP]["ratio"] == pytest.approx(4.0)
     assert told["ways"][REFERENCE][POSE]["requests"] == 2
     assert set(told["ways"][REFERENCE]["stages"]) == set(STAGES)
@@ -141,7 +141,7 @@ def test_arrays_are_written_in_openpis_form() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(peers.MODULES))
-def test_every_other_way_answers_a_picture_with_its_seven_floats(name: str) -> None:
+def test_every_other_way_answers_pictures_with_its_seven_floats(name: str) -> None:
     for module in next(way for way in WAYS if way.name == name).modules:
         pytest.importorskip(module)
     port = free_port()
@@ -150,7 +150,9 @@ def test_every_other_way_answers_a_picture_with_its_seven_floats(name: str) -> N
         client = peers.load(name).Client(port)
         try:
             for _ in range(2):
-                assert client.request(noisy_picture()) == pytest.approx(peers.ACTION)
+                assert client.request([noisy_picture(), noisy_picture(32, 24)]) == pytest.approx(
+                    peers.ACTION
+                )
         finally:
             client.close()
 
@@ -191,8 +193,11 @@ def test_servers_end_with_the_context() -> None:
 
 
 def test_the_chain_has_an_address_of_its_own_and_a_worker_that_takes_raw_pictures() -> None:
-    profile = bench_profile(1000.0)
-    other = bench_profile(250.0)
+    pictures = [noisy_picture(224, 160)] * 3
+    profile = bench_profile(1000.0, pictures)
+    other = bench_profile(250.0, pictures)
     assert profile.session.connect == profile.session.listen != other.session.connect
     assert profile.timing.command_hz == 1000.0
     assert "camera" in profile.hosts["here"].nodes
+    assert len(profile.cameras) == 3
+    assert {(camera.width, camera.height) for camera in profile.cameras.values()} == {(224, 160)}

@@ -74,7 +74,7 @@ def test_every_kind_of_record_is_tested_here() -> None:
         for kind in (getattr(types, name) for name in types.__all__)
         if dataclasses.is_dataclass(kind) and kind.__module__.startswith(f"{types.__name__}.")
     }
-    beside = {types.Header, types.Stamped, types.Image, types.Cause}
+    beside = {types.Header, types.Stamped, types.Image, types.Depth, types.Cause}
     assert kinds - beside == set(RECORDS) - {ModelSpec}
 
 

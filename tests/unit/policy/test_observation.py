@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 
 from vla_zenoh.errors import SpecError
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, Observation, ObservationSpec
-from vla_zenoh.policy.observation import History, NotReady, assemble, prepare_image
+from vla_zenoh.policy.observation import History, NotReady, Streams, assemble, prepare_image
 from vla_zenoh.types import GripperState, Header, Image, PoseState, Stamped, Task
 
 MS = 1_000_000
@@ -54,7 +55,21 @@ def look(
     not_before_ns: int = 0,
 ) -> Observation | NotReady:
     states = {"pose": history(*ago_ms), "gripper": grippers(*ago_ms)}
-    return assemble(wanted, task, images, states, not_before_ns=not_before_ns, now_ns=NOW_NS)
+    streams = received(wanted, images, states)
+    return assemble(wanted, task, streams, not_before_ns=not_before_ns, now_ns=NOW_NS)
+
+
+def received(
+    wanted: ModelSpec, images: dict[str, Stamped[Image]], states: dict[str, History]
+) -> Streams:
+    """What a worker has got: the streams of its spec, with these pictures and states in them."""
+    empty = Streams.of(wanted.observation)
+    for name, one in images.items():
+        if name in empty.images:
+            empty.images[name].add(one)
+    return replace(
+        empty, states={part: states.get(part, own) for part, own in empty.states.items()}
+    )
 
 
 def refused(answer: Observation | NotReady) -> NotReady:
@@ -77,13 +92,21 @@ def test_the_oldest_picture_stamps_it_and_states_are_the_nearest_to_that() -> No
 
 def test_without_pictures_the_oldest_of_the_newest_states_stamps_it() -> None:
     states = {"pose": history(20, 10), "gripper": grippers(30, 15)}
-    seen = assemble(spec(), TASK, {}, states, not_before_ns=0, now_ns=NOW_NS)
+    seen = assemble(spec(), TASK, received(spec(), {}, states), not_before_ns=0, now_ns=NOW_NS)
     assert isinstance(seen, Observation)
     assert seen.stamp_wall_ns == NOW_NS - 15 * MS
 
 
 def test_what_was_never_heard_is_named() -> None:
-    answer = refused(assemble(spec("front"), TASK, {}, {}, not_before_ns=0, now_ns=NOW_NS))
+    answer = refused(
+        assemble(
+            spec("front"),
+            TASK,
+            Streams.of(spec("front").observation),
+            not_before_ns=0,
+            now_ns=NOW_NS,
+        )
+    )
     assert answer.why == "nothing received yet of camera 'front', state/pose, state/gripper"
     assert not answer.waiting
 

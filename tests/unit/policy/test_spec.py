@@ -86,10 +86,18 @@ CAMERAS = [{"camera": "front"}, {"camera": "wrist", "width": 64, "height": 64, "
 OTHER_VALUES: dict[tuple[str, ...], list[Any]] = {
     ("name",): ["other"],
     ("observation", "cameras"): [[], CAMERAS[:1], CAMERAS, CAMERAS[::-1]],
+    ("observation", "depth"): [
+        [{"camera": "front"}],
+        [{"camera": "front", "unit_m": 0.01}],
+        [{"camera": "front", "near_m": 0.1}],
+        [{"camera": "front", "far_m": 2.0}],
+        [{"camera": "front", "invalid": 65535}],
+    ],
     ("observation", "state"): [[], ["joint"], ["gripper", "pose"]],
     ("observation", "prompt"): [False],
     ("observation", "max_skew_s"): [0.05],
     ("observation", "max_age_s"): [0.4],
+    ("observation", "history_start"): ["wait"],
     ("action", "horizon"): [2, 50],
     ("action", "dt_s"): [0.1, 0.25],
     ("action", "kind"): ["absolute"],
@@ -104,11 +112,26 @@ OTHER_VALUES: dict[tuple[str, ...], list[Any]] = {
     ("action", "gripper_threshold"): [0.4],
     ("action", "normalisation"): ["bridge_orig"],
     ("action", "pace"): ["soonest"],
+    ("action", "parts"): [
+        [{"part": part, "action": {"horizon": 1, "dt_s": 0.2}} for part in names]
+        for names in (["left"], ["left", "right"], ["right", "left"])
+    ],
 }
 
 
 def test_every_declared_value_has_another_one_here() -> None:
-    assert set(meanings(SPEC)) == {*OTHER_VALUES, ("action", "space"), ("action", "joints")}
+    together = {("action", "space"), ("action", "joints")}
+    together |= {("observation", "history"), ("observation", "history_spacing_s")}
+    assert set(meanings(SPEC)) == {*OTHER_VALUES, *together}
+
+
+def test_the_length_and_the_spacing_of_a_history_are_meanings_of_their_own() -> None:
+    def looking_back(n: int, spacing_s: float) -> ModelSpec:
+        seen = SPEC.to_dict()["observation"] | {"history": n, "history_spacing_s": spacing_s}
+        return ModelSpec.from_dict(SPEC.to_dict() | {"observation": seen})
+
+    hashes = {SPEC.hash, *(looking_back(*each).hash for each in ((2, 0.1), (3, 0.1), (2, 0.2)))}
+    assert len(hashes) == 4
 
 
 def test_joints_and_their_order_are_meanings_of_their_own() -> None:
@@ -274,7 +297,8 @@ def test_steps_that_break_the_contract_are_refused(steps: Any, said: str) -> Non
 
 
 # -- example ----------------------------------------------------------------------------------
-STATE_PARTS = ("joint", "pose", "gripper", "privileged")
+STATE_PARTS = ("joint", "pose", "gripper", "privileged", "wrench", "effort")
+FIELDS = {"effort": "effort_nm"}
 
 
 def holds(spec: ModelSpec, observation: Observation) -> bool:
@@ -286,7 +310,8 @@ def holds(spec: ModelSpec, observation: Observation) -> bool:
             and observation.images[c.camera].dtype == np.uint8
             for c in wanted.cameras
         )
-        and {p for p in STATE_PARTS if getattr(observation, p) is not None} == set(wanted.state)
+        and {p for p in STATE_PARTS if getattr(observation, FIELDS.get(p, p)) is not None}
+        == set(wanted.state)
     )
 
 

@@ -28,7 +28,7 @@ PANDA, UR = 7, 6
 def seen(quat_xyzw: Any = (0, 0, -(0.5**0.5), -(0.5**0.5)), width_m: float = 0.02) -> Observation:
     spec = ModelSpec(
         name="all",
-        observation=ObservationSpec(state=("joint", "pose", "gripper")),
+        observation=ObservationSpec(state=("joint", "pose", "gripper", "wrench", "effort")),
         action=ActionSpec(horizon=1, dt_s=0.1),
     )
     return replace(

@@ -34,9 +34,13 @@ def words_of(profile: Profile, host: str, kind: str, *also: Path) -> tuple[str, 
 
 
 def test_nodes_start_from_the_router_on_and_the_robot_stops_after_what_drives_it() -> None:
-    assert list(NODE_KINDS) == ["router", "sim", "ros2", "arm", "command", "camera", "worker"]
+    robots = ["sim", "ros2", "arm"]
+    assert list(NODE_KINDS) == [
+        *("router", *robots, "command"),
+        *("camera", "worker", "primitives"),
+    ]
     assert [set(kinds) for kinds, _ in STOP_ORDER] == [
-        {"worker", "camera", "command"},
+        {"worker", "primitives", "camera", "command"},
         {"sim", "ros2", "arm"},
         {"rolling"},
         {"router"},

@@ -98,9 +98,23 @@ def test_a_worker_writes_its_own_keys_only(lab: Profile) -> None:
         "spec/scripted",
         "seen/scripted",
         "seen/scripted/*",
+        "seen/scripted/*/depth",
         "status/worker-scripted",
         "event/worker-scripted",
     }
+
+
+def test_the_node_of_the_primitives_is_a_worker_that_speaks_for_operators(lab: Profile) -> None:
+    robot = {"nodes": ["router", "sim", "command", "primitives"]}
+    named = override(load_profile("panda_sim"), {**LAB, "hosts": {**LAB["hosts"], "robot": robot}})
+    written = may(named, "worker-primitives@robot", Act.PUT)
+    assert {"delta/primitives", "spec/primitives", "active", "worker", "prompt"} <= written
+    assert not {"delta/scripted", "command/pose", "state/pose"} & written
+    assert may(named, "worker-primitives@robot", Act.ANSWER) >= {"primitive/*"}
+    assert "primitive/*" in may(named, "operator@desk", Act.ASK)
+    assert "primitive/*" not in may(named, "viewer@wall", Act.ASK)
+    for other in ("worker-scripted@gpu", "worker-teleop@desk"):
+        assert "primitive/*" not in may(named, other, Act.ANSWER)
 
 
 def test_an_operator_who_drives_by_hand_is_a_worker_like_any_other(lab: Profile) -> None:
@@ -109,6 +123,7 @@ def test_an_operator_who_drives_by_hand_is_a_worker_like_any_other(lab: Profile)
         "spec/teleop",
         "seen/teleop",
         "seen/teleop/*",
+        "seen/teleop/*/depth",
         "status/worker-teleop",
         "event/worker-teleop",
     }
@@ -129,6 +144,7 @@ def test_a_camera_host_writes_its_own_cameras_only(lab: Profile) -> None:
     assert may(lab, "camera-eyes@eyes", Act.PUT) == {
         "camera/front/raw",
         "camera/front/jpeg",
+        "camera/front/depth",
         "camera/front/fitted/*",
         "status/camera-eyes",
         "event/camera-eyes",

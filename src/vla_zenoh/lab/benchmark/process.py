@@ -240,6 +240,12 @@ class _Child:
                     f"model {self._worker.spec.name!r} needs the cameras {', '.join(missing)}; "
                     f"the benchmark has: {', '.join(known)}"
                 )
+            looks = self._worker.spec.observation
+            if looks.depth or looks.history > 1:
+                raise WorkerError(
+                    f"model {self._worker.spec.name!r} needs "
+                    f"{'depth' if looks.depth else 'a history'}, which no benchmark gives"
+                )
         return self._worker
 
     def _describe(self, suite: str | None) -> dict[str, Any]:

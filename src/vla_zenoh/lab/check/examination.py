@@ -154,7 +154,8 @@ class Examination:
     def _compare(self) -> None:
         """Repeat an observation, and change one thing at a time."""
         report, chart = self.report, self._styles[0]
-        cameras = bool(self._policy.spec.observation.cameras)
+        seen = self._policy.spec.observation
+        cameras = bool(seen.camera_names)
         first, again = self._infer_again(chart), self._infer_again(chart)
         if first is None or again is None:
             return
@@ -172,7 +173,7 @@ class Examination:
             if cameras
             else None,
             "colour order": ExampleStyle(chart.name, prompt=chart.prompt, swapped=True)
-            if cameras
+            if seen.cameras
             else None,
             "prompt": ExampleStyle(chart.name, prompt=self._another_prompt())
             if self._policy.spec.observation.prompt

@@ -9,10 +9,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_zenoh.policy import CameraSpec, ModelSpec, Observation
-from vla_zenoh.policy.observation import prepare_image
+from vla_zenoh.policy import CameraSpec, DepthSpec, ModelSpec, Observation
+from vla_zenoh.policy.observation import prepare_depth, prepare_image
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import GripperState, Image, JointState, PoseState, PrivilegedState, Task
+from vla_zenoh.types import (
+    Depth,
+    GripperState,
+    Image,
+    JointState,
+    PoseState,
+    PrivilegedState,
+    Task,
+)
 
 PROMPTS = (
     "put the red brick in the box",
@@ -23,6 +31,7 @@ PROMPTS = (
 STRANGE_PROMPT = "legt den grünen Klotz in die Kiste \N{PACKAGE}, bitte! " * 8
 """Long, in another language, not ASCII: a model may reject it, and must not break."""
 DEFAULT_SIZE = (480, 640)
+UNMEASURED_PX = 8
 PERIOD_NS = 200_000_000
 START_NS = 1_700_000_000_000_000_000
 MAX_WIDTH_M = 0.08
@@ -132,12 +141,13 @@ class ExampleMaker:
         seq = 0 if again else self.seq
         self.seq = max(self.seq, seq + 1)
         seen = example_observation(self.spec, prompt=style.prompt)
-        return replace(
+        made = replace(
             seen,
             stamp_wall_ns=START_NS + seq * PERIOD_NS,
             seq=seq,
             task=replace(seen.task, active=style.active, episode=1),
             images=self._images(style),
+            depth=self._depth(style),
             joint=self._joint() if seen.joint is not None else None,
             pose=PoseState(np.array(style.position_m), np.array(DOWN_XYZW), np.zeros(6))
             if seen.pose is not None
@@ -145,7 +155,15 @@ class ExampleMaker:
             gripper=GripperState(style.width_m, moving=False, holding=style.holding)
             if seen.gripper is not None
             else None,
+            effort_nm=self._joint().effort_nm if seen.effort_nm is not None else None,
+            history=(),
         )
+        # An arm that stood still and was looked at: earlier pictures are as this one.
+        earlier = (
+            replace(made, stamp_wall_ns=made.stamp_wall_ns + each.stamp_wall_ns)
+            for each in seen.history
+        )
+        return replace(made, history=tuple(earlier))
 
     def _images(self, style: ExampleStyle) -> Mapping[str, Picture]:
         out: dict[str, Picture] = {}
@@ -158,7 +176,21 @@ class ExampleMaker:
             out[camera.camera] = prepared
         return out
 
-    def _size(self, camera: CameraSpec) -> tuple[int, int]:
+    def _depth(self, style: ExampleStyle) -> Mapping[str, NDArray[np.uint16]]:
+        """What is bright is near: from 0.3 to 1.3 m, and a border that was not measured."""
+        out: dict[str, NDArray[np.uint16]] = {}
+        for camera in self.spec.observation.depth:
+            grey = style.picture(*self._size(camera)).mean(axis=2)
+            depth_m = 1.3 - grey / 255.0
+            depth_m[:, :UNMEASURED_PX] = 0.0
+            source = self.profile.cameras.get(camera.camera) if self.profile else None
+            unit_m = (source and source.depth_unit_m) or camera.unit_m
+            prepared = prepare_depth(Depth.of_metres(depth_m, unit_m), camera)
+            prepared.setflags(write=False)
+            out[camera.camera] = prepared
+        return out
+
+    def _size(self, camera: CameraSpec | DepthSpec) -> tuple[int, int]:
         """Height and width of the camera's images."""
         source = self.profile.cameras.get(camera.camera) if self.profile else None
         if source is not None:
@@ -189,12 +221,17 @@ def example_observation(
         camera.camera: np.full((camera.height or 480, camera.width or 640, 3), 128, np.uint8)
         for camera in spec.observation.cameras
     }
+    depth = {
+        one.camera: np.full((one.height or 480, one.width or 640), 500, np.uint16)
+        for one in spec.observation.depth
+    }
     zeros = np.zeros(7)
-    return Observation(
+    seen = Observation(
         stamp_wall_ns=0,
         seq=0,
         task=Task(episode=0, active=False, prompt=prompt, worker=spec.name, rate_hz=5.0),
         images=images,
+        depth=depth,
         joint=JointState(tuple(f"joint{i}" for i in range(1, 8)), zeros, zeros, zeros)
         if "joint" in asked
         else None,
@@ -205,4 +242,10 @@ def example_observation(
         if "gripper" in asked
         else None,
         privileged=PrivilegedState({}) if "privileged" in asked else None,
+        wrench=np.zeros(6) if "wrench" in asked else None,
+        effort_nm=zeros if "effort" in asked else None,
     )
+    before = range(spec.observation.history - 1, 0, -1)
+    spacing_ns = round((spec.observation.history_spacing_s or 0.0) * 1e9)
+    earlier = tuple(replace(seen, stamp_wall_ns=-steps * spacing_ns) for steps in before)
+    return replace(seen, history=earlier)

@@ -221,4 +221,16 @@ def _inputs(report: CheckReport) -> str:
         f"{c.colour}"
         for c in observation.cameras
     ]
-    return ", ".join([*cameras, *(f"state/{part}" for part in observation.state)]) or "none"
+    depths = [
+        f"depth of {d.camera} "
+        f"{f'{d.width}x{d.height} {d.resize}' if d.width else 'in its own size'} "
+        f"{d.unit_m * 1e3:g} mm a count"
+        for d in observation.depth
+    ]
+    parts = ", ".join([*cameras, *depths, *(f"state/{part}" for part in observation.state)])
+    if observation.history > 1:
+        parts += (
+            f"; {observation.history} observations {observation.history_spacing_s:g} s apart, at "
+            f"the start of an episode: {observation.history_start}"
+        )
+    return parts or "none"

@@ -146,14 +146,17 @@ def image_keys(of: Keys, nodes: Mapping[str, tuple[NodeStatus, float, bool]]) ->
     out: list[KeyTraffic] = []
     for name, (found, _, _) in nodes.items():
         cameras = found.detail.get("cameras")
-        for camera in cameras if isinstance(cameras, dict) else ():
+        for camera, detail in cameras.items() if isinstance(cameras, dict) else ():
             rate_hz = round(float(found.rates_hz.get(camera, 0.0)), 2)
             try:
                 raw, jpeg = of.camera_raw(camera), of.camera_jpeg(camera)
+                depth = of.camera_depth(camera)
             except ProfileError:  # not a camera's name: anyone can publish a status
                 continue
             out.append(KeyTraffic(raw, "pixels, on demand", name, rate_hz=rate_hz))
             out.append(KeyTraffic(jpeg, "image/jpeg, on demand", name))
+            if isinstance(detail, dict) and "depth_measured_share" in detail:
+                out.append(KeyTraffic(depth, "image/png, depth of 16 bits, on demand", name))
     return out
 
 

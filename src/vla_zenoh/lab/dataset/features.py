@@ -12,6 +12,7 @@ from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.dataset.episodes import RecordedEpisode
 from vla_zenoh.lab.recording.run import nearest
 from vla_zenoh.policy import ActionSpec, Observation
+from vla_zenoh.policy.spec import STREAM_OF
 from vla_zenoh.policy.state_vector import parts_of, state_vector
 from vla_zenoh.types import Task
 
@@ -25,6 +26,7 @@ NAMES = {
     "quaternion": ["qx", "qy", "qz", "qw"],
     "quat_xyzw": ["qx", "qy", "qz", "qw"],
     "quat_wxyz": ["qw", "qx", "qy", "qz"],
+    "wrench": [*(f"force_{axis}" for axis in "xyz"), *(f"torque_{axis}" for axis in "xyz")],
     "fingers_m": ["left_finger", "right_finger"],
 }
 NEAR_NS = 100_000_000
@@ -39,6 +41,7 @@ def state_names(parts: Sequence[str], joints: Sequence[str]) -> list[str]:
         joints: names of the arm's joints.
     """
     of_arm = {"joint": [*joints], "joint_deg": [f"{name}_deg" for name in joints]}
+    of_arm["effort"] = [f"{name}_effort" for name in joints]
     return [name for part in parts for name in {**NAMES, **of_arm}.get(part, [part])]
 
 
@@ -67,8 +70,8 @@ def states_of(episode: RecordedEpisode, parts: Sequence[str]) -> NDArray[np.floa
         RecordingError: no state was recorded near a frame.
     """
     run = episode.run
-    streams = {"joint": run.joints, "pose": run.poses, "gripper": run.grippers}
-    wanted = {part: streams[part] for part in parts_of(parts)}
+    streams: dict[str, Any] = {"joint": run.joints, "pose": run.poses, "gripper": run.grippers}
+    wanted = {part: streams[STREAM_OF.get(part, part)] for part in parts_of(parts)}
     most_m = run.max_width_m
     task = Task(0, True, "", episode.worker, 1.0)
     rows = []
@@ -80,7 +83,10 @@ def states_of(episode: RecordedEpisode, parts: Sequence[str]) -> NDArray[np.floa
                 raise RecordingError(
                     f"{run.path}: no state/{part} within {NEAR_NS / 1e6:g} ms of a frame"
                 )
-            found[part] = near.record
+            name = {"effort": "effort_nm"}.get(part, part)
+            found[name] = near.record if part in streams else getattr(near.record, name)
+            if found[name] is None:
+                raise RecordingError(f"{run.path}: its robot did not measure {part}")
         observation = Observation(frame.stamp_ns, 0, task, **found)
         rows.append(state_vector(parts, observation, most_m))
     return np.array(rows, np.float32)

@@ -14,6 +14,7 @@ import numpy as np
 
 from vla_zenoh.codec import records
 from vla_zenoh.control.commander import Commander, Inputs, Outputs, Setting
+from vla_zenoh.control.commander_io import NewStates
 from vla_zenoh.control.preflight import PeerSnapshot
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.errors import CodecError
@@ -26,6 +27,7 @@ from vla_zenoh.policy import Policy
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     ActionChunk,
+    Depth,
     Event,
     GripperCommand,
     GripperState,
@@ -40,7 +42,7 @@ from vla_zenoh.types import (
 )
 
 if TYPE_CHECKING:
-    from vla_zenoh.simulation.world import World
+    from vla_zenoh.simulation.world import SimulatedPart, World
 
 TICK_NS = 1_000_000
 """One step of the world."""
@@ -58,6 +60,7 @@ class Lockstep:
         policy: the model; its ``load`` is called here if it has one.
         delays: see `Delays`.
         picture: image of a camera, by name; None: small gray images.
+        depth: depth picture of a camera, by name; None: half a metre everywhere.
         reach: see `Commander`.
         dry_run: see `Commander`.
         seed: of the jitter.
@@ -72,7 +75,8 @@ class Lockstep:
         *,
         delays: Delays | None = None,
         picture: Callable[[str], Image] | None = None,
-        reach: ReachabilityFilter | None = None,
+        depth: Callable[[str], Depth] | None = None,
+        reach: ReachabilityFilter | Mapping[str, ReachabilityFilter] | None = None,
         dry_run: bool = False,
         seed: int = 0,
         others: Mapping[str, Policy] | None = None,
@@ -81,12 +85,23 @@ class Lockstep:
         self.delays = delays or Delays()
         self.now_ns = START_NS
         self.commander = Commander(profile, reach=reach, dry_run=dry_run)
-        self.guard = make_arm_guard(profile, self._measure, world.joint_range_rad, TICK_NS / 1e9)
+        self.guards = {
+            name: make_arm_guard(
+                profile.of_part(name),
+                partial(self._measure, name),
+                self._arm(name).joint_range_rad,
+                TICK_NS / 1e9,
+            )
+            for name in profile.part_names
+        }
+        self.guard = next(iter(self.guards.values()))
         self.tamper: Tamper | None = None
         self.trace = LockstepTrace()
         self.events: list[Event] = []
         self.refused: Counter[str] = Counter()
-        self._gripper_guard = GripperGuard(profile.robot.gripper)
+        self._gripper_guards = {
+            name: GripperGuard(profile.of_part(name).robot.gripper) for name in self.guards
+        }
         self.guard_refused: Counter[str] = Counter()
         policies = {profile.task.worker: policy, **(others or {})}
         self.workers = {
@@ -96,7 +111,7 @@ class Lockstep:
         self.alive = {SIM, CAMERA, COMMAND, *(w.source for w in self.workers.values())}
         self.camera_faults: dict[str, str] = {}
         self._clock_ns: Counter[str] = Counter()
-        self._picture = picture or _gray
+        self._picture, self._depth = picture or _gray, depth or _half_a_metre
         self._arrivals: list[tuple[int, int, Callable[[], None]]] = []
         self._sent = 0
         self._seq: Counter[str] = Counter()
@@ -158,11 +173,17 @@ class Lockstep:
         if self.now_ns >= self._next_command_ns:
             self._next_command_ns += round(1e9 / self.profile.timing.command_hz)
             self._command()
-        self.world.tick(self.guard.tick(self.wall_ns(SIM)))
+        now_ns = self.wall_ns(SIM)
+        references = {name: guard.tick(now_ns) for name, guard in self.guards.items()}
+        self.world.tick(references.get("", references))
 
-    def _measure(self) -> Measured:
-        state = self.world.joint_state()
-        return Measured(Pose(*self.world.tcp()), state.position_rad, state.velocity_rad_s)
+    def _arm(self, part: str) -> World | SimulatedPart:
+        return self.world.parts[part] if part else self.world
+
+    def _measure(self, part: str) -> Measured:
+        arm = self._arm(part)
+        state = arm.joint_state()
+        return Measured(Pose(*arm.tcp()), state.position_rad, state.velocity_rad_s)
 
     def _receive(self) -> None:
         while self._arrivals and self._arrivals[0][0] <= self.now_ns:
@@ -188,6 +209,7 @@ class Lockstep:
         self.trace.time_ns.append(self.now_ns)
         self.trace.commands.append(out.pose)
         self.trace.joints.append(out.joint)
+        self.trace.parts.append(out.parts)
         self.trace.position_m.append(position_m)
         self.trace.rotation.append(rotation)
         self.trace.width_m.append(self.world.gripper_state().width_m)
@@ -195,34 +217,43 @@ class Lockstep:
     def _publish(self, out: Outputs) -> None:
         self.events += out.events
         self.refused.update(refusal.reason for refusal in out.rejections)
-        if out.pose is not None:
-            self._send(COMMAND, out.pose, self._take_pose_command)
-        if out.joint is not None:
-            self._send(COMMAND, out.joint, self._take_joint_command)
-        if out.gripper is not None:
-            self._send(COMMAND, out.gripper, self._take_gripper_command)
+        for part in self.guards:
+            pose, joint, gripper = out.of(part)
+            if pose is not None:
+                self._send(COMMAND, pose, partial(self._take_pose_command, part), part=part)
+            if joint is not None:
+                self._send(COMMAND, joint, partial(self._take_joint_command, part), part=part)
+            if gripper is not None:
+                self._send(COMMAND, gripper, partial(self._take_gripper_command, part), part=part)
         if out.task_changed or any(worker.task is None for worker in self.workers.values()):
             self._send(COMMAND, self.commander.task, self._take_task)
 
     def _publish_states(self) -> None:
-        held = self.world.pose_state(self.guard.reference)
-        self._send(SIM, held, self._take_pose_state)
-        gripper = self.world.gripper_state()
-        if self.guard.braking or self.guard.unheeded:
-            gripper = replace(gripper, mode="braking" if self.guard.braking else "unheeded")
-        self._send(SIM, gripper, self._take_gripper_state)
-        wanted = {part for w in self.workers.values() for part in w.spec.observation.state}
-        if self.commander.reach is not None or "joint" in wanted:
-            self._send(SIM, self.world.joint_state(), self._take_joint_state)
+        for part, guard in self.guards.items():
+            arm = self._arm(part)
+            held = arm.pose_state(guard.reference)
+            self._send(SIM, held, partial(self._take_pose_state, part), part=part)
+            gripper = arm.gripper_state()
+            if guard.braking or guard.unheeded:
+                gripper = replace(gripper, mode="braking" if guard.braking else "unheeded")
+            self._send(SIM, gripper, partial(self._take_gripper_state, part), part=part)
+            looks = [worker.spec.observation for worker in self.workers.values()]
+            wanted = {what for each in looks for what in each.state_streams}
+            if self.commander.reach is not None or "joint" in wanted:
+                joints = arm.joint_state()
+                self._send(SIM, joints, partial(self._take_joint_state, part), part=part)
 
     def _publish_pictures(self) -> None:
         self._seq[CAMERA] += 1
         header = Header(self.wall_ns(CAMERA), self._seq[CAMERA], CAMERA)
         arrival_ns = self.now_ns + round(self.delays.camera_s * 1e9)
-        seen = {c.camera for w in self.workers.values() for c in w.spec.observation.cameras}
-        for camera in sorted(seen):
+        wanted = [worker.spec.observation for worker in self.workers.values()]
+        for camera in sorted({one.camera for each in wanted for one in each.cameras}):
             picture = Stamped(header, self._picture(camera), arrival_ns)
             self._deliver(arrival_ns, partial(self._take_picture, camera, picture))
+        for camera in sorted({one.camera for each in wanted for one in each.depth}):
+            depth = Stamped(header, self._depth(camera), arrival_ns)
+            self._deliver(arrival_ns, partial(self._take_depth, camera, depth))
 
     # -- the wire -----------------------------------------------------------------------------
     def _send(
@@ -231,16 +262,19 @@ class Lockstep:
         record: Any,
         take: Callable[[Stamped[Any]], None],
         sent_ns: int | None = None,
+        part: str = "",
     ) -> None:
         """Send a record; `take` receives it with the virtual time of its arrival."""
         sent_ns = self.now_ns if sent_ns is None else sent_ns
-        self._seq[f"{source} {type(record).__name__}"] += 1
-        seq = self._seq[f"{source} {type(record).__name__}"]
+        stream = f"{source} {type(record).__name__} {part}"
+        self._seq[stream] += 1
+        seq = self._seq[stream]
         message = Message(
             type(record),
             Header(sent_ns + self._clock_ns[source], seq, source),
             records.encode(record),
             sent_ns + round(self.delays.wire_s * 1e9),
+            part,
         )
         for arriving in [message] if self.tamper is None else self.tamper(message):
             self._deliver(arriving.arrival_ns, partial(self._arrive, arriving, take))
@@ -262,25 +296,43 @@ class Lockstep:
         self._sent += 1
         heapq.heappush(self._arrivals, (arrival_ns, self._sent, arrive))
 
-    def _take_pose_state(self, state: Stamped[PoseState]) -> None:
-        self._inbox.pose = self._at(COMMAND, state)
-        self._take_state(state)
+    def _take_pose_state(self, part: str, state: Stamped[PoseState]) -> None:
+        if part:
+            self._part_states(part, pose=self._at(COMMAND, state))
+        else:
+            self._inbox.pose = self._at(COMMAND, state)
+        self._take_state(state, part)
 
-    def _take_joint_state(self, state: Stamped[JointState]) -> None:
-        self._inbox.joint = self._at(COMMAND, state)
-        self._take_state(state)
+    def _take_joint_state(self, part: str, state: Stamped[JointState]) -> None:
+        if part:
+            self._part_states(part, joint=self._at(COMMAND, state))
+        else:
+            self._inbox.joint = self._at(COMMAND, state)
+        self._take_state(state, part)
 
-    def _take_gripper_state(self, state: Stamped[GripperState]) -> None:
-        self._inbox.gripper = self._at(COMMAND, state)
-        self._take_state(state)
+    def _take_gripper_state(self, part: str, state: Stamped[GripperState]) -> None:
+        if part:
+            self._part_states(part, gripper=self._at(COMMAND, state))
+        else:
+            self._inbox.gripper = self._at(COMMAND, state)
+        self._take_state(state, part)
 
-    def _take_state(self, state: Stamped[Any]) -> None:
+    def _part_states(self, part: str, **newest: Stamped[Any]) -> None:
+        known = self._inbox.parts.get(part) or NewStates()
+        assert isinstance(known, NewStates)
+        self._inbox.parts = {**self._inbox.parts, part: known._replace(**newest)}
+
+    def _take_state(self, state: Stamped[Any], part: str) -> None:
         for worker in self.workers.values():
-            worker.take_state(self._at(worker.source, state))
+            worker.take_state(self._at(worker.source, state), part)
 
     def _take_picture(self, camera: str, picture: Stamped[Image]) -> None:
         for worker in self.workers.values():
             worker.take_picture(camera, self._at(worker.source, picture))
+
+    def _take_depth(self, camera: str, picture: Stamped[Depth]) -> None:
+        for worker in self.workers.values():
+            worker.take_depth(camera, self._at(worker.source, picture))
 
     def _take_task(self, task: Stamped[Task]) -> None:
         for worker in self.workers.values():
@@ -292,34 +344,40 @@ class Lockstep:
             self._inbox.chunks = [*self._inbox.chunks, chunk]
             return
         self._prepared, inbox = True, self._inbox
-        states = Inputs((), [chunk], inbox.pose, inbox.gripper, None, inbox.joint)
+        states = replace(inbox, settings=(), chunks=[chunk], peers=None)
         inbox.pose = inbox.gripper = inbox.joint = None
+        inbox.parts = {}
         left_ns = self._next_command_ns - self.now_ns
         self.commander.prepare(states, self.wall_ns(COMMAND) + left_ns)
 
-    def _take_pose_command(self, command: Stamped[PoseCommand]) -> None:
-        refusal = self.guard.offer_pose(self._at(SIM, command), self.wall_ns(SIM))
+    def _take_pose_command(self, part: str, command: Stamped[PoseCommand]) -> None:
+        refusal = self.guards[part].offer_pose(self._at(SIM, command), self.wall_ns(SIM))
         if refusal is not None:
             self.guard_refused[refusal] += 1
 
-    def _take_joint_command(self, command: Stamped[JointCommand]) -> None:
-        refusal = self.guard.offer_joint(self._at(SIM, command), self.wall_ns(SIM))
+    def _take_joint_command(self, part: str, command: Stamped[JointCommand]) -> None:
+        refusal = self.guards[part].offer_joint(self._at(SIM, command), self.wall_ns(SIM))
         if refusal is not None:
             self.guard_refused[refusal] += 1
 
-    def _take_gripper_command(self, command: Stamped[GripperCommand]) -> None:
+    def _take_gripper_command(self, part: str, command: Stamped[GripperCommand]) -> None:
+        guard = self.guards[part]
         try:
-            order = self._gripper_guard.accept(
+            order = self._gripper_guards[part].accept(
                 command,
-                self.guard.writer,
+                guard.writer,
                 self.wall_ns(SIM),
-                writer_active=self.guard.writer_active,
+                writer_active=guard.writer_active,
             )
         except CodecError as error:
             self.guard_refused[error.reason] += 1
             return
-        self.world.set_gripper(order.width_m, order.speed_m_s, order.force_n)
+        self._arm(part).set_gripper(order.width_m, order.speed_m_s, order.force_n)
 
 
 def _gray(camera: str) -> Image:
     return Image(np.full((48, 64, 3), 128, np.uint8))
+
+
+def _half_a_metre(camera: str) -> Depth:
+    return Depth(np.full((48, 64), 500, np.uint16), 0.001)

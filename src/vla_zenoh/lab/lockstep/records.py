@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from vla_zenoh.control.commander_io import MotionCommands
 from vla_zenoh.types import FloatArray, Header, JointCommand, PoseCommand
 
 
@@ -37,12 +38,14 @@ class Message:
         header: of the writer.
         payload: encoded record.
         arrival_ns: virtual time of arrival.
+        part: whose state or command it is, of a robot of several parts.
     """
 
     kind: type[Any]
     header: Header
     payload: bytes
     arrival_ns: int
+    part: str = ""
 
 
 Tamper = Callable[[Message], Iterable[Message]]
@@ -60,6 +63,7 @@ class LockstepTrace:
         position_m: measured TCP, (3,) each.
         rotation: measured TCP, (3, 3) each.
         width_m: measured gripper width.
+        parts: commands to each part, of a robot of several; what is above is of the first part.
     """
 
     time_ns: list[int] = field(default_factory=list)
@@ -68,3 +72,4 @@ class LockstepTrace:
     position_m: list[FloatArray] = field(default_factory=list)
     rotation: list[FloatArray] = field(default_factory=list)
     width_m: list[float] = field(default_factory=list)
+    parts: list[Mapping[str, MotionCommands]] = field(default_factory=list)

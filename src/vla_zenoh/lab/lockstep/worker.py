@@ -9,10 +9,11 @@ from vla_zenoh.keys import worker_node
 from vla_zenoh.lab.lockstep.records import Delays
 from vla_zenoh.policy import ActionSteps, Policy, check_steps, reset_of
 from vla_zenoh.policy.chunk_prefix import ChunkPrefix
-from vla_zenoh.policy.observation import History, NotReady, assemble, make_chunk
+from vla_zenoh.policy.observation import NotReady, Streams, assemble, make_chunk, state_names
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     ActionChunk,
+    Depth,
     GripperState,
     Image,
     JointState,
@@ -43,9 +44,10 @@ class LockstepWorker:
         self.task: Task | None = None
         self._patience_s = profile.timing.max_observation_age_s
         self._delays, self._jitter = delays, jitter
-        self._images: dict[str, Stamped[Image]] = {}
-        self._states = {part: History() for part in self.spec.observation.state}
-        self._not_before_ns = self._due_ns = self._asked_ns = 0
+        self._streams = Streams.of(self.spec.observation, self.spec.parts)
+        names = state_names(self.spec.observation, self.spec.parts)
+        self._names = {(part, what): name for name, (part, what) in names.items()}
+        self._not_before_ns = self._due_ns = self._asked_ns = self._episode_ns = 0
         load = getattr(policy, "load", None)
         if callable(load):
             load()
@@ -56,20 +58,26 @@ class LockstepWorker:
         if known is not None and known.requested_hz != self.task.requested_hz:
             self._due_ns = min(self._due_ns, self._asked_ns)
         if known is None or known.episode != self.task.episode:
-            self._not_before_ns = task.header.stamp_wall_ns
+            self._not_before_ns = self._episode_ns = task.header.stamp_wall_ns
             reset = reset_of(self.policy)
             if reset is not None:
                 reset()
 
-    def take_state(self, state: Stamped[Any]) -> None:
-        """Receive a state; kept if the model's spec lists it."""
-        for part, history in self._states.items():
-            if isinstance(state.record, STATE_KINDS[part]):
-                history.add(state)
+    def take_state(self, state: Stamped[Any], part: str = "") -> None:
+        """Receive a state of a part of the robot; kept if the model's spec lists it."""
+        for (of_part, what), name in self._names.items():
+            if of_part == part and isinstance(state.record, STATE_KINDS[what]):
+                self._streams.states[name].add(state)
 
     def take_picture(self, camera: str, picture: Stamped[Image]) -> None:
-        """Receive an image."""
-        self._images[camera] = picture
+        """Receive an image; kept if the model's spec lists it."""
+        if camera in self._streams.images:
+            self._streams.images[camera].add(picture)
+
+    def take_depth(self, camera: str, picture: Stamped[Depth]) -> None:
+        """Receive a depth picture; kept if the model's spec lists it."""
+        if camera in self._streams.depth:
+            self._streams.depth[camera].add(picture)
 
     def step(self, now_ns: int, wall_ns: int) -> ActionChunk | None:
         """Infer if a request is due and an observation is complete.
@@ -86,10 +94,10 @@ class LockstepWorker:
         observation = assemble(
             self.spec,
             self.task,
-            self._images,
-            self._states,
+            self._streams,
             not_before_ns=self._not_before_ns,
             now_ns=wall_ns,
+            episode_ns=self._episode_ns,
         )
         if isinstance(observation, NotReady):
             return None

@@ -11,14 +11,16 @@ from typing import Any, NamedTuple
 
 import yaml
 
+from vla_zenoh.codec import image as image_codec
 from vla_zenoh.errors import CodecError
 from vla_zenoh.keys import Keys, last_chunk
 from vla_zenoh.lab.recording.reader import Recording, open_recording
-from vla_zenoh.lab.recording.sample import JPEG
+from vla_zenoh.lab.recording.sample import DEPTH, JPEG
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.types import (
     ActionChunk,
     Cause,
+    Depth,
     Event,
     GripperCommand,
     GripperState,
@@ -244,6 +246,19 @@ def pictures(file: Recording, camera: str) -> Iterator[RecordedImage]:
 def seen_pictures(file: Recording, worker: str, camera: str) -> Iterator[RecordedImage]:
     """Input images of a model; `seq` is that of the chunk, the stamp that of the observation."""
     return _jpegs(file, file.keys.seen(worker, camera))
+
+
+def depths(file: Recording, camera: str) -> Iterator[tuple[Header, Depth]]:
+    """Every depth picture of a camera, oldest first, one in memory at a time.
+
+    Raises:
+        CodecError: one cannot be decoded.
+    """
+    key = file.keys.camera_depth(camera)
+    for entry in file.entries(lambda each: each == key):
+        if entry.header is not None and entry.encoding.startswith(DEPTH):
+            schema = entry.encoding.partition(";")[2]
+            yield entry.header, image_codec.decode_depth(entry.payload, schema)
 
 
 def _jpegs(file: Recording, key: str) -> Iterator[RecordedImage]:

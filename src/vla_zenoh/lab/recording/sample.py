@@ -14,6 +14,8 @@ from vla_zenoh.types import Header
 MSGPACK, JPEG, TEXT = "application/msgpack", "image/jpeg", "text/plain"
 RAW = "zenoh/bytes;rgb8;"
 """Prefix of the encoding of raw images; height and width follow."""
+DEPTH = "image/png;depth16;"
+"""Prefix of the encoding of depth pictures; the metres of a count follow."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,8 @@
 """Writes samples into an MCAP file.
 
 Each key is a topic of the same name: ``/vla/panda/camera/front/jpeg`` with ROS 2's
-``CompressedImage``. A record is JSON in a ``std_msgs/String`` (see `record_json`), under the key's
+``CompressedImage``; depth pictures are such images of ``16UC1``, with the metres of a count in the
+channel's metadata. A record is JSON in a ``std_msgs/String`` (see `record_json`), under the key's
 name; a record that a standard message shows, such as a pose, has that message under the key's name
 and its JSON under ``<name>/full``. Bytes that are no record are JSON under ``<name>/bytes``.
 
@@ -31,7 +32,7 @@ from vla_zenoh.lab.recording.crash_safe_file import CrashSafeFile
 from vla_zenoh.lab.recording.record_json import bytes_to_json, record_to_json
 from vla_zenoh.lab.recording.record_types import RecordTypes
 from vla_zenoh.lab.recording.ros2_messages import serialize, standard_message
-from vla_zenoh.lab.recording.sample import JPEG, MSGPACK, RAW, Sample
+from vla_zenoh.lab.recording.sample import DEPTH, JPEG, MSGPACK, RAW, Sample
 
 ABOUT, ENDED = "vla_zenoh", "vla_zenoh.ended"
 """Names of the MCAP metadata records at the start and end of a file."""
@@ -155,7 +156,9 @@ class RecordingWriter:
         elif header.seq >= MAX_SEQ or not header.source:
             raise CodecError("invalid", "the header does not fit into the fields of a message")
         elif encoding == JPEG:
-            self._write_jpeg(sample)
+            self._write_compressed(sample, "jpeg")
+        elif encoding.startswith(DEPTH):
+            self._write_compressed(sample, "16UC1; png compressed")
         elif encoding.startswith(RAW):
             self._write_raw(sample)
         else:
@@ -171,11 +174,11 @@ class RecordingWriter:
             raise CodecError("malformed", "a setting is UTF-8 text") from error
         self._put(sample, ros2_messages.TEXT, serialize(ros2_messages.TEXT, text))
 
-    def _write_jpeg(self, sample: Sample) -> None:
+    def _write_compressed(self, sample: Sample, form: str) -> None:
         header = ros2_messages.header(sample.stamp_ns, _camera(sample.key))
         data = np.frombuffer(sample.payload, np.uint8)
         name = ros2_messages.JPEG_IMAGE
-        self._put(sample, name, serialize(name, header, "jpeg", data))
+        self._put(sample, name, serialize(name, header, form, data))
 
     def _write_raw(self, sample: Sample) -> None:
         image = image_codec.decode_raw(sample.payload, sample.encoding.partition(";")[2])

@@ -153,6 +153,15 @@ def make_served_policy(
         SpecError: what the model needs is not named, or named twice.
     """
     spec = policy.spec
+    senses = {
+        "depth": bool(spec.observation.depth),
+        "a history of observations": spec.observation.history > 1,
+        "wrench": "wrench" in spec.observation.state,
+        "effort": "effort" in spec.observation.state,
+    }
+    if any(senses.values()):
+        lacking = ", ".join(name for name, needed in senses.items() if needed)
+        raise SpecError(f"the model needs {lacking}, which is not among what is served")
     fields = {name: source for name, source in read_map(map_option).items() if source is not None}
     own = list(fields.values())
     if any(source.blank for source in own):

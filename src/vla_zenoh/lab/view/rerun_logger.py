@@ -10,10 +10,11 @@ import numpy as np
 import rerun as rr
 
 from vla_zenoh.codec import records, settings
+from vla_zenoh.codec.image import decode_depth
 from vla_zenoh.errors import CodecError, RecordError
 from vla_zenoh.keys import Keys, last_chunk
 from vla_zenoh.lab.recording.record_types import RecordTypes
-from vla_zenoh.lab.recording.sample import JPEG, Sample
+from vla_zenoh.lab.recording.sample import DEPTH, JPEG, Sample
 from vla_zenoh.lab.view import paths
 from vla_zenoh.lab.view.charts import Charts
 from vla_zenoh.lab.view.layout import blueprint
@@ -170,18 +171,25 @@ class RerunLogger:
     def _picture(self, sample: Sample, group: str) -> None:
         _, first, *rest = self.keys.short(sample.key).split("/", 2)
         second = rest[0] if rest else ""
-        if group == paths.CAMERA and second != "jpeg":
+        depth = sample.encoding.startswith(DEPTH)
+        if group == paths.CAMERA and second != "jpeg" and not depth:
             return
-        if not second or sample.encoding != JPEG or not sample.payload.startswith(JPEG_BEGINS):
+        if depth:
+            shown, suffix = _depth_of(sample), " depth"
+        elif second and sample.encoding == JPEG and sample.payload.startswith(JPEG_BEGINS):
+            shown, suffix = rr.EncodedImage(contents=sample.payload, media_type=JPEG), ""
+        else:
             raise CodecError("malformed", "not a JPEG")
         if group == paths.CAMERA:
-            path, known, name = paths.picture(first), self._cameras, first
+            name = first + suffix
+            path, known = paths.picture(name), self._cameras
         else:
-            path, known, name = paths.seen(first, second), self._seen[first], second
+            name = second.partition("/")[0] + suffix
+            path, known = paths.seen(first, name), self._seen[first]
         if name not in known:
             known.add(name)
             self._layout()
-        self._stream.log(path, rr.EncodedImage(contents=sample.payload, media_type=JPEG))
+        self._stream.log(path, shown)
 
     def _setting(self, sample: Sample) -> None:
         nested = "/" in self.keys.short(sample.key) and sample.key != self.keys.sim_reset
@@ -291,3 +299,10 @@ class RerunLogger:
 
     def _event(self, sample: Sample, stamp_ns: int, event: Event) -> None:
         self._texts.event(last_chunk(sample.key), stamp_ns, event)
+
+
+def _depth_of(sample: Sample) -> Any:
+    depth = decode_depth(sample.payload, sample.encoding.partition(";")[2])
+    return rr.EncodedDepthImage(
+        blob=sample.payload, media_type="image/png", meter=1.0 / depth.unit_m
+    )

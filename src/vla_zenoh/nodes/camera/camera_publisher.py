@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import cv2
@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 
 from vla_zenoh.bus.metrics import Percentiles, RateMeter
 from vla_zenoh.bus.node import Node
-from vla_zenoh.codec.image import encode_jpeg, encode_raw, raw_schema
+from vla_zenoh.codec.image import depth_schema, encode_depth, encode_jpeg, encode_raw, raw_schema
 from vla_zenoh.errors import NodeError
 from vla_zenoh.keys import Kind
 from vla_zenoh.nodes.camera.fitted_streams import FittedStreams, RateLimiter, shrink
 from vla_zenoh.nodes.camera.image_check import ImageCheck, ImageFault
 from vla_zenoh.nodes.camera.source import Pixels
 from vla_zenoh.profile.schema import CameraProfile
-from vla_zenoh.types import Event, Image
+from vla_zenoh.types import Depth, Event, Image
 
 WAITING, OK, LOST, ENDED = "waiting", "ok", "lost", "ended"
 _SOURCE_LIMIT = 200
@@ -30,7 +30,7 @@ _TO_RGB = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGB}
 
 
 class CameraPublisher:
-    """Publisher of one camera: raw, JPEG and fitted streams, each only while it has subscribers.
+    """Publisher of one camera: raw, JPEG, depth and fitted streams, each while it has subscribers.
 
     Used by the camera's own thread; another thread may read its status.
 
@@ -61,6 +61,12 @@ class CameraPublisher:
         self._shown, self._clock, self._emit = shown[:_SOURCE_LIMIT], node.clock, emit
         self._raw = node.declare_publisher(node.keys.camera_raw(name), Kind.FRAME)
         self._jpeg = node.declare_publisher(node.keys.camera_jpeg(name), Kind.FRAME)
+        self._depth = None
+        if profile.depth_unit_m is not None:
+            self._depth = node.declare_publisher(node.keys.camera_depth(name), Kind.FRAME)
+        self._measured_share = 0.0
+        self.intrinsics: dict[str, float] | None = None
+        """Of images of the profile's size, where the source knows them; for status."""
         self.fitted = FittedStreams(name, profile, node, emit)
         self._limiter = RateLimiter(profile.rate_hz)
         self._jpeg_limiter = RateLimiter(profile.jpeg_rate_hz)
@@ -135,7 +141,13 @@ class CameraPublisher:
     @property
     def has_subscribers(self) -> bool:
         """Whether any stream has a subscriber."""
-        return any(one.has_subscribers for one in (self._raw, self._jpeg, self.fitted))
+        streams = (self._raw, self._jpeg, self.fitted)
+        return self.wants_depth or any(one.has_subscribers for one in streams)
+
+    @property
+    def wants_depth(self) -> bool:
+        """Whether anyone subscribes to the depth stream."""
+        return self._depth is not None and self._depth.has_subscribers
 
     def publish(self, image: Pixels, mono_ns: int) -> None:
         """Publish an image of OpenCV, captured at `mono_ns`, in the profile's size.
@@ -149,8 +161,21 @@ class CameraPublisher:
         stamp_ns = self._clock.wall_ns() - (time.monotonic_ns() - mono_ns)
         self.publish_rgb(to_rgb(resize(image, width, height)), mono_ns, stamp_ns)
 
-    def publish_rgb(self, rgb: NDArray[np.uint8], mono_ns: int, stamp_wall_ns: int) -> None:
-        """Publish (H, W, 3) RGB of the profile's size on every stream that has subscribers."""
+    def publish_rgb(
+        self,
+        rgb: NDArray[np.uint8],
+        mono_ns: int,
+        stamp_wall_ns: int,
+        depth_m: NDArray[Any] | None = None,
+    ) -> None:
+        """Publish an image of the profile's size on every stream that has subscribers.
+
+        Args:
+            rgb: (H, W, 3).
+            mono_ns: time of capture, monotonic clock.
+            stamp_wall_ns: the same on the wall clock.
+            depth_m: (H, W) of the same view at the same time, in m, see `Depth.of_metres`.
+        """
         image, raw = Image(rgb), self._raw.has_subscribers
         if raw:  # first: whoever is on this computer gets it without waiting for the others
             schema = zenoh.Encoding.ZENOH_BYTES.with_schema(raw_schema(image))
@@ -159,7 +184,8 @@ class CameraPublisher:
             )
         fitted = self.fitted.due(mono_ns)
         jpeg = self._jpeg.has_subscribers and self._jpeg_limiter.due(mono_ns)
-        if not (raw or jpeg or fitted):
+        depth = depth_m is not None and self.wants_depth
+        if not (raw or jpeg or fitted or depth):
             return
         if jpeg:
             # A thinned stream numbers its own images.
@@ -172,9 +198,22 @@ class CameraPublisher:
             )
         for one in fitted:
             self.fitted.publish(one, image, stamp_wall_ns)
+        if depth:
+            self._publish_depth(depth_m, stamp_wall_ns)
         self._seq += 1
         with self._lock:
             self._latency_ms.add((time.monotonic_ns() - mono_ns) / 1e6)
+
+    def _publish_depth(self, depth_m: Any, stamp_wall_ns: int) -> None:
+        assert self._depth is not None and self.profile.depth_unit_m is not None
+        depth = Depth.of_metres(depth_m, self.profile.depth_unit_m)
+        self._measured_share = np.count_nonzero(depth.counts) / depth.counts.size
+        self._depth.publish(
+            encode_depth(depth),
+            stamp_wall_ns=stamp_wall_ns,
+            seq=self._seq,
+            encoding=zenoh.Encoding.IMAGE_PNG.with_schema(depth_schema(depth)),
+        )
 
     def _count_resized(self, size: tuple[int, ...]) -> None:
         self.counts["resized"] += 1
@@ -189,7 +228,7 @@ class CameraPublisher:
 
     # -- status -------------------------------------------------------------------------------
     def detail(self) -> dict[str, Any]:
-        """For status: state, source, back end, age of the newest image in s, fault."""
+        """For status: state, source, back end, age of the newest image in s, fault, intrinsics."""
         newest = self._newest_mono_ns
         detail: dict[str, Any] = {
             "state": self.state,
@@ -197,6 +236,10 @@ class CameraPublisher:
             "backend": self.backend,
             "age_s": None if newest is None else (time.monotonic_ns() - newest) / 1e9,
         }
+        if self.intrinsics is not None:
+            detail["intrinsics"] = self.intrinsics
+        if self._depth is not None:
+            detail["depth_measured_share"] = round(self._measured_share, 3)
         if (bad := self.fault) is not None:
             names = ("why", "check", "value", "limit")
             detail["bad"] = {name: getattr(bad, name) for name in names}
@@ -210,6 +253,8 @@ class CameraPublisher:
     def counters(self) -> dict[str, int]:
         """Counters for status, each prefixed with the camera's name."""
         counts = dict(self.counts) | {"raw": self._raw.seq, "jpeg": self._jpeg.seq}
+        if self._depth is not None:
+            counts["depth"] = self._depth.seq
         return {f"{self.name}.{what}": count for what, count in counts.items()}
 
 
@@ -238,3 +283,17 @@ def to_rgb(image: Pixels) -> NDArray[np.uint8]:
     if image.dtype == np.uint16:
         image = (image >> 8).astype(np.uint8)
     return np.asarray(cv2.cvtColor(image, _TO_RGB[channels]), np.uint8)
+
+
+DISTORTION = ("k1", "k2", "p1", "p2", "k3")
+
+
+def pinhole(
+    fx_px: float, fy_px: float, cx_px: float, cy_px: float, distortion: Sequence[float] = ()
+) -> dict[str, float]:
+    """Intrinsics as they stand in the status: focal lengths and principal point in pixels, with
+    (0, 0) at the outer corner of the first pixel; `DISTORTION` as OpenCV numbers it.
+    """
+    plain = {"fx_px": fx_px, "fy_px": fy_px, "cx_px": cx_px, "cy_px": cy_px}
+    named = plain | dict(zip(DISTORTION, distortion, strict=False))
+    return {name: float(value) for name, value in named.items()}

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from vla_zenoh.bus.buffers import LatestSample, ReceivedSample
 from vla_zenoh.errors import MissingExtraError, NodeError, RecordError, VlaZenohError, in_words
-from vla_zenoh.nodes.camera.camera_publisher import OK, CameraPublisher
+from vla_zenoh.nodes.camera.camera_publisher import OK, CameraPublisher, pinhole
 from vla_zenoh.nodes.camera.source import STALL_S
 from vla_zenoh.profile import Profile
 from vla_zenoh.simulation.render import AUTO, Renderer, choose_backend
-from vla_zenoh.simulation.robot_model import robot_model
+from vla_zenoh.simulation.robot_model import robot_models
 from vla_zenoh.types import SceneState, Stamped
 
 RAYCAST = "raycast"
@@ -114,7 +114,7 @@ class SimCameras:
 
     def _make_renderer(self) -> Renderer:
         wanted = self._profile.sim.renderer
-        robot = robot_model(self._profile.robot)
+        robot = robot_models(self._profile)
         try:
             # "auto" leaves the choice to the environment variable, if it is set.
             backend = choose_backend(None if wanted == AUTO else wanted)
@@ -142,7 +142,10 @@ class SimCameras:
                 )
         key = self._profile.keys.short(self._profile.keys.sim_scene)
         self._received_ns = max(self._received_ns, time.monotonic_ns())
-        for _, publisher in views:
+        for camera, publisher in views:
+            width, height = publisher.profile.width, publisher.profile.height
+            focal_px = renderer.focal_px(camera, height)
+            publisher.intrinsics = pinhole(focal_px, focal_px, width / 2, height / 2)
             publisher.set_waiting_reason(f"no scene on {key} yet")
         while not stop.is_set():
             if not self._buffer.wait(WAKE_S):
@@ -189,7 +192,11 @@ class SimCameras:
             if due if publisher.has_subscribers else proof_due:
                 rgb = self._render(renderer, camera, publisher)
                 publisher.check(rgb, mono_ns)
-                publisher.publish_rgb(rgb, mono_ns, stamp_ns)
+                width, height = publisher.profile.width, publisher.profile.height
+                depth_m = None
+                if publisher.wants_depth:
+                    depth_m = renderer.render_depth(camera, width, height)
+                publisher.publish_rgb(rgb, mono_ns, stamp_ns, depth_m)
                 self._drawn_ns[publisher.name] = mono_ns
                 publisher.set_state(OK)
             publisher.captured(mono_ns)

@@ -14,8 +14,9 @@ from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import MAX_MESSAGE_BYTES
 from vla_zenoh.codec import settings
 from vla_zenoh.codec.records import SMALL_BYTES
-from vla_zenoh.control.commander_io import Inputs, Setting
+from vla_zenoh.control.commander_io import Inputs, NewStates, Setting
 from vla_zenoh.errors import CodecError
+from vla_zenoh.keys import Keys
 from vla_zenoh.nodes.command.peer_monitor import PeerMonitor
 from vla_zenoh.types import ActionChunk, GripperState, JointState, PoseState, Stamped
 from vla_zenoh.types.stream import SingleWriterFilter
@@ -46,9 +47,8 @@ class CommandInputs:
         """Set when a chunk arrives."""
         ring = CallbackRing(CHUNKS, arrival=self.chunk_arrival)
         self._chunks = node.subscribe(keys.all_deltas, ring)
-        self._pose_slot = node.subscribe(keys.state_pose, CallbackRing(STATES, SMALL_BYTES))
-        self._gripper_slot = node.subscribe(keys.state_gripper, CallbackRing(STATES, SMALL_BYTES))
-        self._joint_slot = node.subscribe(keys.state_joint, CallbackRing(STATES, SMALL_BYTES))
+        names = node.profile.part_names
+        self._parts = {name: _PartInputs(node, keys.of_part(name)) for name in names}
         self._settings: list[tuple[str, ZenohRing, Callable[[bytes], Any]]] = [
             ("stop", node.subscribe(keys.stop, ZenohRing(8, ANYTHING)), lambda _: None),
             ("reset", node.subscribe(keys.reset, ZenohRing(8, ANYTHING)), lambda _: None),
@@ -63,11 +63,7 @@ class CommandInputs:
                 settings.decode_activation,
             ),
         ]
-        self._writers = {
-            kind: SingleWriterFilter(node.profile.timing.state_timeout_s)
-            for kind in (PoseState, JointState, GripperState)
-        }
-        self._last_clock = self._last_joint = 0.0
+        self._last_clock = 0.0
 
     @property
     def chunks_dropped(self) -> int:
@@ -90,12 +86,16 @@ class CommandInputs:
     def poll_streams(self, settings_put: Sequence[Setting] = ()) -> Inputs:
         """The chunks and states among them."""
         chunks = [self._chunk(arrival) for arrival in self._chunks.drain()]
-        return Inputs(
+        inputs = Inputs(
             chunks=[chunk for chunk in chunks if chunk is not None],
-            pose=self._state(PoseState, self._pose_slot),
-            joint=self._joints(settings_put),
-            gripper=self._state(GripperState, self._gripper_slot),
         )
+        requested = any(setting.name in ("active", "worker") for setting in settings_put)
+        states = {name: part.poll(requested) for name, part in self._parts.items()}
+        if "" in states:
+            inputs.pose, inputs.gripper, inputs.joint = states[""]
+        else:
+            inputs.parts = states
+        return inputs
 
     def _poll_settings(self) -> list[Setting]:
         """Settings put since the last tick, in the order of the router's timestamps.
@@ -144,25 +144,6 @@ class CommandInputs:
             return None
         return chunk
 
-    def _state(self, kind: type[Any], slot: CallbackRing) -> Stamped[Any] | None:
-        """The newest state from the robot's source, whatever other sources publish."""
-        newest: Stamped[Any] | None = None
-        for arrival in slot.drain():
-            newest = self._node.decode(kind, arrival, self._writers[kind]) or newest
-        return newest
-
-    def _joints(self, settings_put: Sequence[Setting]) -> Stamped[JointState] | None:
-        """The newest joints, at `JOINT_PERIOD_S`: decoding them is expensive."""
-        requested = any(setting.name in ("active", "worker") for setting in settings_put)
-        if not requested and time.monotonic() - self._last_joint < JOINT_PERIOD_S:
-            return None
-        for arrival in reversed(self._joint_slot.drain()):
-            found = self._node.decode(JointState, arrival, self._writers[JointState])
-            if found is not None:
-                self._last_joint = time.monotonic()
-                return found
-        return None
-
     def _check_clock(self) -> list[Setting]:
         if time.monotonic() - self._last_clock < CLOCK_PERIOD_S:
             return []
@@ -172,6 +153,47 @@ class CommandInputs:
             return []
         self._node.reject("clock_step", f"the wall clock was set by {step_s:+.3f} s")
         return [Setting("lose", f"the wall clock was set by {step_s:+.3f} s")]
+
+
+class _PartInputs:
+    """Subscriptions to the states of one part."""
+
+    def __init__(self, node: Node, keys: Keys) -> None:
+        self._node = node
+        self._pose = node.subscribe(keys.state_pose, CallbackRing(STATES, SMALL_BYTES))
+        self._gripper = node.subscribe(keys.state_gripper, CallbackRing(STATES, SMALL_BYTES))
+        self._joint = node.subscribe(keys.state_joint, CallbackRing(STATES, SMALL_BYTES))
+        self._writers = {
+            kind: SingleWriterFilter(node.profile.timing.state_timeout_s)
+            for kind in (PoseState, JointState, GripperState)
+        }
+        self._last_joint = 0.0
+
+    def poll(self, requested: bool) -> NewStates:
+        """The newest states since the last call; `requested`: an activation is, by these joints."""
+        return NewStates(
+            self._state(PoseState, self._pose),
+            joint=self._joints(requested),
+            gripper=self._state(GripperState, self._gripper),
+        )
+
+    def _state(self, kind: type[Any], slot: CallbackRing) -> Stamped[Any] | None:
+        """The newest state from the robot's source, whatever other sources publish."""
+        newest: Stamped[Any] | None = None
+        for arrival in slot.drain():
+            newest = self._node.decode(kind, arrival, self._writers[kind]) or newest
+        return newest
+
+    def _joints(self, requested: bool) -> Stamped[JointState] | None:
+        """The newest joints, at `JOINT_PERIOD_S`: decoding them is expensive."""
+        if not requested and time.monotonic() - self._last_joint < JOINT_PERIOD_S:
+            return None
+        for arrival in reversed(self._joint.drain()):
+            found = self._node.decode(JointState, arrival, self._writers[JointState])
+            if found is not None:
+                self._last_joint = time.monotonic()
+                return found
+        return None
 
 
 def _put_ns(arrival: ReceivedSample) -> int | None:

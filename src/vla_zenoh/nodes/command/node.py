@@ -7,6 +7,7 @@ import math
 import sys
 import threading
 import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,12 @@ from vla_zenoh.bus.clock import FixedRate, Tick
 from vla_zenoh.bus.metrics import Percentiles, RateMeter
 from vla_zenoh.bus.node import Node
 from vla_zenoh.codec import records
+from vla_zenoh.control.commanded_part import CommandedPart
 from vla_zenoh.control.commander import Commander, Outputs, Setting
+from vla_zenoh.control.commander_io import MotionCommands
 from vla_zenoh.control.reachability import make_reachability_filter
 from vla_zenoh.control.states import State
-from vla_zenoh.keys import Kind
+from vla_zenoh.keys import Keys, Kind
 from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.nodes.command.inputs import CommandInputs
 from vla_zenoh.profile import Profile
@@ -61,9 +64,9 @@ class CommandNode:
         latch: Path | None = None,
     ) -> None:
         node = self.node = Node("command", profile, session)
-        self.commander = Commander(
-            profile, reach=make_reachability_filter(profile), dry_run=dry_run
-        )
+        parts = {name: profile.of_part(name) for name in profile.part_names}
+        reach = {name: make_reachability_filter(part) for name, part in parts.items()}
+        self.commander = Commander(profile, reach=reach, dry_run=dry_run)
         self._latch = None if latch is None else EstopLatch(latch)
         before = None if self._latch is None else self._latch.read()
         if before is not None:
@@ -71,9 +74,7 @@ class CommandNode:
         keys = node.keys
         self._inputs = CommandInputs(node)
         self._status = CommandStatus(node, self.commander)
-        self._pose_out = node.declare_publisher(keys.command_pose, Kind.CONTROL)
-        self._joint_out = node.declare_publisher(keys.command_joint, Kind.CONTROL)
-        self._gripper_out = node.declare_publisher(keys.command_gripper, Kind.ORDER)
+        self._outs = {name: _CommandPublishers(node, part.keys) for name, part in parts.items()}
         self._task_out = node.declare_publisher(keys.task, Kind.CONTROL)
         self._last_task = 0.0
         self._next_chores_ns = 0
@@ -169,12 +170,8 @@ class CommandNode:
             self.node.emit(Event("error", "fault", "latch", why))
 
     def _publish(self, out: Outputs, now_ns: int) -> None:
-        if out.pose is not None:
-            self._pose_out.publish(out.pose, stamp_wall_ns=now_ns)
-        if out.joint is not None:
-            self._joint_out.publish(out.joint, stamp_wall_ns=now_ns)
-        if out.gripper is not None:
-            self._gripper_out.publish(out.gripper)
+        for name, publishers in self._outs.items():
+            publishers.publish(out.of(name), now_ns)
         for rejection in out.rejections:
             kind = "skipped" if rejection.quiet else "refused"
             self.node.counters[f"{kind}.{rejection.reason}"] += 1
@@ -186,6 +183,24 @@ class CommandNode:
         if out.task_changed or due:
             self._last_task = time.monotonic()
             self._task_out.publish(self.commander.task)
+
+
+class _CommandPublishers:
+    """Publishers of the commands to one part."""
+
+    def __init__(self, node: Node, keys: Keys) -> None:
+        self._pose = node.declare_publisher(keys.command_pose, Kind.CONTROL)
+        self._joint = node.declare_publisher(keys.command_joint, Kind.CONTROL)
+        self._gripper = node.declare_publisher(keys.command_gripper, Kind.ORDER)
+
+    def publish(self, commands: MotionCommands, now_ns: int) -> None:
+        """Publish what there is."""
+        if commands.pose is not None:
+            self._pose.publish(commands.pose, stamp_wall_ns=now_ns)
+        if commands.joint is not None:
+            self._joint.publish(commands.joint, stamp_wall_ns=now_ns)
+        if commands.gripper is not None:
+            self._gripper.publish(commands.gripper)
 
 
 class CommandStatus:
@@ -212,9 +227,9 @@ class CommandStatus:
 
     def add_tick(self, now_ns: int, late_s: float, cost_s: float) -> None:
         """Add a tick for `now_ns` that started `late_s` late and took `cost_s`."""
-        pose = self._commander.pose
-        if pose is not None:
-            self._pose_age_ms.add((now_ns - pose.header.stamp_wall_ns) / 1e6)
+        stamps_ns = [part.pose.header.stamp_wall_ns for part in self._commander.parts if part.pose]
+        if stamps_ns:
+            self._pose_age_ms.add((now_ns - min(stamps_ns)) / 1e6)
         self._late_us.add(late_s * 1e6)
         self._rate.tick()
         self._cost_us.add(cost_s * 1e6)
@@ -243,13 +258,21 @@ class CommandStatus:
         task = commander.task
         wall_ns = self._node.clock.wall_ns()
         ages_s = {
-            name: (wall_ns - stamped.received_ns) / 1e9
-            for name, stamped in (("pose", commander.pose), ("gripper", commander.gripper_state))
+            f"{part.name}/{name}" if part.name else name: (wall_ns - stamped.received_ns) / 1e9
+            for part in commander.parts
+            for name, stamped in (("pose", part.pose), ("gripper", part.gripper_state))
             if stamped is not None
         }
+        of_parts = {part.name: _part_detail(part) for part in commander.parts}
+        several = of_parts.get("", {"parts": of_parts})
+        near = commander.part_distance
+        if near is not None:
+            several["part_distance_m"] = round(near.distance_m, 4) if near.first else None
         latency = {name: meter.summary() for name, meter in self._latency.items()}
         self._node.counters["command.smoothing_failures"] = commander.smoothing_failures
-        self._node.counters["command.gripper_timeouts"] = commander.gripper.timeouts
+        self._node.counters["command.gripper_timeouts"] = sum(
+            part.motion.gripper.timeouts for part in commander.parts
+        )
         self._node.counters["command.chunks_dropped"] = chunks_dropped
         self._node.publish_status(
             commander.state.value,
@@ -266,10 +289,10 @@ class CommandStatus:
                 "held_by": commander.deadman.name if task.active else "",
                 "at_rest": commander.at_rest,
                 "streaming": commander.streaming,
-                "speed_share": round(commander.speed, 3),
-                "tracking_mm": round(commander.tracking_m * 1e3, 3),
-                "tracking_mrad": round(commander.tracking_rad * 1e3, 3),
-                "elbow_mrad": round(commander.elbow_rad * 1e3, 3),
+                "speed_share": round(min(part.motion.speed for part in commander.parts), 3),
+                "tracking_mm": _most(part.watchdog.tracking_m for part in commander.parts),
+                "tracking_mrad": _most(part.watchdog.tracking_rad for part in commander.parts),
+                "elbow_mrad": _most(part.elbow_rad for part in commander.parts),
                 "tick_us": self._cost_us.spread(),
                 "chunk_us": self._chunk_us.spread(),
                 "late_us": self._late_us.spread(),
@@ -277,9 +300,7 @@ class CommandStatus:
                 "realtime": self.realtime,
                 "mode": self._mode,
                 "limits": self._acting_limits(),
-                **self._goal(),
-                **self._margins(),
-                **self._contact(),
+                **several,
             },
             ages_s=ages_s,
             rates_hz={"loop": self._rate.rate_hz},
@@ -291,43 +312,40 @@ class CommandStatus:
         """Limits that acted in the last `ACTING_S`, and what slows the arm down now."""
         oldest_s = time.monotonic() - ACTING_S
         self._limits = {name: hit for name, hit in self._limits.items() if hit[1] > oldest_s}
-        slower = self._commander.slower
         acting = {name: why for name, (why, _) in self._limits.items()}
-        if slower is not None:
-            acting[slower.name] = f"{slower.share:.0%} of the speed{slower.at}"
+        for part in self._commander.parts:
+            slower = part.motion.slower if part.motion.streaming else None
+            if slower is not None:
+                acting[slower.name] = part.says(f"{slower.share:.0%} of the speed{slower.at}")
         return [f"{name}: {why}"[:MAX_LIMIT] for name, why in sorted(acting.items())]
 
-    def _goal(self) -> dict[str, Any]:
-        goal = self._commander.goal
-        if goal is None:
-            return {}
-        return {
-            "goal_m": [round(float(value), 6) for value in goal.pose.position_m],
-            "goal_quat_xyzw": [round(float(v), 6) for v in quat_from_rotation(goal.pose.rotation)],
-            "goal_width_m": round(goal.width_m, 5),
-        }
 
-    def _contact(self) -> dict[str, Any]:
-        """External load on the arm; None where it is not measured."""
-        force_n, torque_nm = self._commander.contact.force_n, self._commander.contact.torque_nm
-        return {
-            "external_force_n": None if force_n is None else round(force_n, 2),
-            "external_torque_nm": None if torque_nm is None else round(torque_nm, 2),
-        }
+def _most(values: Iterable[float]) -> float:
+    """The largest, in thousandths."""
+    return round(max(values) * 1e3, 3)
 
-    def _margins(self) -> dict[str, Any]:
-        """Margins of the arm at its goal."""
-        reach = self._commander.reach
-        if reach is None or self._commander.goal is None:
-            return {}
+
+def _part_detail(part: CommandedPart) -> dict[str, Any]:
+    """Goal, margins and external load of a part; None where a load is not measured."""
+    detail: dict[str, Any] = {}
+    goal, reach, contact = part.motion.goal, part.reach, part.contact
+    if goal is not None:
+        quat_xyzw = quat_from_rotation(goal.pose.rotation)
+        detail["goal_m"] = [round(float(value), 6) for value in goal.pose.position_m]
+        detail["goal_quat_xyzw"] = [round(float(value), 6) for value in quat_xyzw]
+        detail["goal_width_m"] = round(goal.width_m, 5)
+    if reach is not None and goal is not None:
         room = reach.margins
-        return {
-            "joint_margin_rad": round(room.joint_rad, 4),
-            "joint_margin_of": room.joint,
-            "singular_value": round(room.singular_value, 4),
-            "self_distance_m": round(room.self_m, 4) if math.isfinite(room.self_m) else None,
-            "table_distance_m": round(room.table_m, 4) if math.isfinite(room.table_m) else None,
-            "keep_out_distance_m": round(room.keep_out_m, 4)
-            if math.isfinite(room.keep_out_m)
-            else None,
-        }
+        detail["joint_margin_rad"] = round(room.joint_rad, 4)
+        detail["joint_margin_of"] = room.joint
+        detail["singular_value"] = round(room.singular_value, 4)
+        for name, far_m in (
+            ("self_distance_m", room.self_m),
+            ("table_distance_m", room.table_m),
+            ("keep_out_distance_m", room.keep_out_m),
+        ):
+            detail[name] = round(far_m, 4) if math.isfinite(far_m) else None
+    force_n, torque_nm = contact.force_n, contact.torque_nm
+    detail["external_force_n"] = None if force_n is None else round(force_n, 2)
+    detail["external_torque_nm"] = None if torque_nm is None else round(torque_nm, 2)
+    return detail

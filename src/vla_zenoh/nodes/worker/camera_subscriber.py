@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from typing import NamedTuple
 
-from vla_zenoh.bus.buffers import LatestSample, ReceivedSample
+from vla_zenoh.bus.buffers import CallbackRing, LatestSample, ReceivedSample
 from vla_zenoh.bus.node import Node
 from vla_zenoh.codec.image import MAX_IMAGE_BYTES
 from vla_zenoh.keys import Kind
@@ -17,6 +18,7 @@ from vla_zenoh.types.stream import SingleWriterFilter
 
 STREAM_PATIENCE_S = 0.5
 """After this silence of a stream's writer another one is accepted."""
+MAX_QUEUE = 96
 PATIENCE_S, PERIODS = 1.0, 3
 """Without images on the preferred stream for this long, and for this many periods of a slow camera,
 a worker subscribes to the common one as well."""
@@ -31,7 +33,7 @@ class ReceivedImage(NamedTuple):
 
 class _Stream(NamedTuple):
     key: str
-    buffer: LatestSample
+    buffer: LatestSample | CallbackRing
     writer: SingleWriterFilter
 
 
@@ -45,6 +47,7 @@ class CameraSubscriber:
         fallback_key: of the common stream; None if that is the preferred one.
         patience_s: silence on `key` after which `fallback_key` is subscribed to.
         changed: notified when an image arrives.
+        queue: images kept until they are taken; 1: the newest only.
 
     Raises:
         SessionError: the router does not answer at the port for images.
@@ -59,8 +62,9 @@ class CameraSubscriber:
         *,
         patience_s: float,
         changed: threading.Condition,
+        queue: int = 1,
     ) -> None:
-        self._node, self._camera, self._changed = node, camera, changed
+        self._node, self._camera, self._changed, self._queue = node, camera, changed, queue
         self._fallback_key, self._patience_s = fallback_key, patience_s
         self._preferred = self._subscribe(key)
         self._fallback: _Stream | None = None
@@ -74,7 +78,7 @@ class CameraSubscriber:
         )
 
     def pop(self) -> ReceivedImage | None:
-        """The newest image, once."""
+        """The newest image, once; of a queue the oldest."""
         arrival = self._preferred.buffer.pop()
         if arrival is not None:
             self._received_s = time.monotonic()
@@ -106,13 +110,17 @@ class CameraSubscriber:
         self._node.emit(Event("info", "notice", f"{self._camera}:own_pictures", why))
 
     def _subscribe(self, key: str) -> _Stream:
-        buffer = LatestSample(MAX_IMAGE_BYTES, self._changed)
+        buffer = (
+            LatestSample(MAX_IMAGE_BYTES, self._changed)
+            if self._queue == 1
+            else CallbackRing(self._queue, MAX_IMAGE_BYTES, changed=self._changed)
+        )
         self._node.subscribe(key, buffer, Kind.FRAME)
         return _Stream(key, buffer, SingleWriterFilter(STREAM_PATIENCE_S))
 
 
 def subscribe_to_camera(
-    camera: CameraSpec, node: Node, *, jpeg: bool, changed: threading.Condition
+    camera: CameraSpec, node: Node, *, jpeg: bool, changed: threading.Condition, history_s: float
 ) -> CameraSubscriber:
     """Subscribe to the stream that suits a model: raw, JPEG, or JPEG in its input size.
 
@@ -121,6 +129,7 @@ def subscribe_to_camera(
         node: of the worker.
         jpeg: JPEG rather than raw images.
         changed: notified when an image arrives.
+        history_s: images this much older than the newest are needed as well.
 
     Raises:
         SessionError: the router does not answer at the port for images.
@@ -134,4 +143,30 @@ def subscribe_to_camera(
             key, fallback = keys.camera_fitted(name, size), key
     rates_hz = (settings.rate_hz, settings.jpeg_rate_hz if jpeg else None) if settings else ()
     patience_s = max([PATIENCE_S, *(PERIODS / rate for rate in rates_hz if rate)])
-    return CameraSubscriber(node, name, key, fallback, patience_s=patience_s, changed=changed)
+    queue = _queue(node, name, history_s)
+    return CameraSubscriber(
+        node, name, key, fallback, patience_s=patience_s, changed=changed, queue=queue
+    )
+
+
+def subscribe_to_depth(
+    camera: str, node: Node, *, changed: threading.Condition, history_s: float
+) -> CameraSubscriber:
+    """Subscribe to the depth stream of a camera, of which there is one.
+
+    Raises:
+        SessionError: the router does not answer at the port for images.
+    """
+    key = node.keys.camera_depth(camera)
+    queue = _queue(node, camera, history_s)
+    return CameraSubscriber(
+        node, camera, key, None, patience_s=PATIENCE_S, changed=changed, queue=queue
+    )
+
+
+def _queue(node: Node, camera: str, history_s: float) -> int:
+    """Images that may come during one inference and are wanted after it."""
+    settings = node.profile.cameras.get(camera)
+    if history_s == 0.0 or settings is None:
+        return 1
+    return min(MAX_QUEUE, 1 + math.ceil((history_s + PATIENCE_S) * settings.rate_hz))

@@ -7,11 +7,11 @@ import zenoh
 from numpy.typing import NDArray
 
 from vla_zenoh.bus.node import Node
-from vla_zenoh.codec.image import encode_jpeg
+from vla_zenoh.codec.image import depth_schema, encode_depth, encode_jpeg
 from vla_zenoh.errors import CodecError, RecordError
 from vla_zenoh.keys import Kind
 from vla_zenoh.policy import ActionSteps, ModelSpec, Observation
-from vla_zenoh.types import Header, Image, InferenceDebug
+from vla_zenoh.types import Depth, Header, Image, InferenceDebug
 from vla_zenoh.types.chunk import plain_values
 
 JPEG_QUALITY = 95
@@ -36,6 +36,10 @@ class InferenceDebugPublisher:
         self._images = {
             camera.camera: node.declare_publisher(keys.seen(worker, camera.camera), Kind.FRAME)
             for camera in spec.observation.cameras
+        }
+        self._depths = {
+            one.camera: node.declare_publisher(keys.seen_depth(worker, one.camera), Kind.FRAME)
+            for one in spec.observation.depth
         }
 
     def publish(
@@ -66,6 +70,16 @@ class InferenceDebugPublisher:
                         stamp_wall_ns=stamp_ns,
                         seq=seq,
                         encoding=zenoh.Encoding.IMAGE_JPEG,
+                    )
+            for wanted in self._spec.observation.depth:
+                stream = self._depths[wanted.camera]
+                if stream.has_subscribers:
+                    depth = Depth(observation.depth[wanted.camera], wanted.unit_m)
+                    stream.publish(
+                        encode_depth(depth),
+                        stamp_wall_ns=stamp_ns,
+                        seq=seq,
+                        encoding=zenoh.Encoding.IMAGE_PNG.with_schema(depth_schema(depth)),
                     )
             if self._record.has_subscribers:
                 seen = InferenceDebug(

@@ -153,7 +153,7 @@ class WorkerNode:
         return ready
 
     def _wait(self, due: Sequence[RobotSession], stop: threading.Event) -> None:
-        """Sleep until a robot is due or sends an image, but only for a little while."""
+        """Sleep until a robot is due or has sent its images, but only for a little while."""
         now_s = time.monotonic()
         others_s = [robot.due_s - now_s for robot in self.sessions if robot not in due]
         if not due:
@@ -161,7 +161,7 @@ class WorkerNode:
         elif all(robot.needs_images for robot in due):
             for _ in range(NAPS):
                 with self._changed:
-                    if self._changed.wait_for(lambda: any(r.has_image for r in due), NAP_S):
+                    if self._changed.wait_for(lambda: any(r.has_images for r in due), NAP_S):
                         return
                 # States decoded while idle cost no time once the image is there.
                 for robot in self.sessions:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 import zenoh
@@ -17,18 +17,28 @@ from vla_zenoh.codec import records
 from vla_zenoh.codec.image import MAX_IMAGE_BYTES
 from vla_zenoh.codec.records import SMALL_BYTES
 from vla_zenoh.errors import CodecError, PeerError, SpecError, in_words
-from vla_zenoh.keys import Kind, worker_node
+from vla_zenoh.keys import Keys, Kind, last_chunk, worker_node
 from vla_zenoh.nodes.worker.camera_subscriber import (
     STREAM_PATIENCE_S,
+    CameraSubscriber,
     ReceivedImage,
     subscribe_to_camera,
+    subscribe_to_depth,
 )
 from vla_zenoh.nodes.worker.inference_debug import InferenceDebugPublisher
 from vla_zenoh.policy import ActionSteps, Observation, Policy, check_steps, reset_of
 from vla_zenoh.policy.chunk_prefix import ChunkPrefix
-from vla_zenoh.policy.observation import History, NotReady, assemble, make_chunk
+from vla_zenoh.policy.observation import (
+    MAX_STATES,
+    NotReady,
+    Streams,
+    assemble,
+    make_chunk,
+    state_names,
+)
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
+    Depth,
     GripperState,
     Image,
     JointState,
@@ -51,6 +61,15 @@ STATE_KINDS: dict[str, type[Any]] = {
     "gripper": GripperState,
     "privileged": PrivilegedState,
 }
+
+
+def _state_key(keys: Keys, what: str) -> str:
+    return {
+        "joint": keys.state_joint,
+        "pose": keys.state_pose,
+        "gripper": keys.state_gripper,
+        "privileged": keys.state_privileged,
+    }[what]
 
 
 class RobotSession:
@@ -91,32 +110,34 @@ class RobotSession:
             lambda query: query.reply(keys.spec(name), records.encode(self.spec)),
         )
         self._tasks = node.subscribe(keys.task, LatestSample(SMALL_BYTES))
-        self._jpeg = images == "jpeg"
+        self._jpeg, history_s = images == "jpeg", self.spec.observation.history_span_s
         self._cameras = {
-            one.camera: subscribe_to_camera(one, node, jpeg=self._jpeg, changed=changed)
+            one.camera: subscribe_to_camera(
+                one, node, jpeg=self._jpeg, changed=changed, history_s=history_s
+            )
             for one in self.spec.observation.cameras
         }
-        state_keys = {
-            "joint": keys.state_joint,
-            "pose": keys.state_pose,
-            "gripper": keys.state_gripper,
-            "privileged": keys.state_privileged,
+        self._depths = {
+            one.camera: subscribe_to_depth(one.camera, node, changed=changed, history_s=history_s)
+            for one in self.spec.observation.depth
         }
+        states = MAX_STATES if history_s else 256
         self._state_buffers = {
-            part: node.subscribe(state_keys[part], CallbackRing(256, SMALL_BYTES))
-            for part in self.spec.observation.state
+            name: node.subscribe(
+                _state_key(keys.of_part(part), what), CallbackRing(states, SMALL_BYTES)
+            )
+            for name, (part, what) in state_names(self.spec.observation, self.spec.parts).items()
         }
         self._task_writer = SingleWriterFilter(TASK_PATIENCE_S)
         self._state_writers = {
-            part: SingleWriterFilter(STREAM_PATIENCE_S) for part in self._state_buffers
+            name: SingleWriterFilter(STREAM_PATIENCE_S) for name in self._state_buffers
         }
-        self._images: dict[str, Stamped[Image]] = {}
-        self._images_s: dict[str, float] = {}
-        self._states = {part: History() for part in self.spec.observation.state}
+        self._streams = Streams.of(self.spec.observation, self.spec.parts)
+        self._received_s: dict[CameraSubscriber, float] = {}
         self.task: Task | None = None
         self._task_received_s = -1e9
         self._episode = -1
-        self._not_before_ns = 0
+        self._not_before_ns = self._episode_ns = 0
         self._rate = RateMeter(window_s=10.0)
         self._inference_ms = Percentiles(128)
         self._batch = 0
@@ -128,15 +149,23 @@ class RobotSession:
 
     # -- observation --------------------------------------------------------------------------
     @property
-    def has_image(self) -> bool:
-        """Whether the first camera has an image that was not polled yet."""
-        first = next(iter(self._cameras.values()), None)
-        return first is not None and first.has_new
+    def has_images(self) -> bool:
+        """Whether an image was not polled yet, and every camera has one since the last chunk."""
+        streams = self._streams
+        received = (
+            *((camera, streams.images[name]) for name, camera in self._cameras.items()),
+            *((camera, streams.depth[name]) for name, camera in self._depths.items()),
+        )
+        new = [camera.has_new for camera, _ in received]
+        return any(new) and all(
+            fresh or one.newest_ns >= self._not_before_ns
+            for fresh, (_, one) in zip(new, received, strict=True)
+        )
 
     @property
     def needs_images(self) -> bool:
         """Whether the model observes any camera."""
-        return bool(self._cameras)
+        return bool(self._cameras or self._depths)
 
     def poll(self) -> None:
         """Decode what was received since the last call."""
@@ -145,21 +174,29 @@ class RobotSession:
             task = self.node.decode(Task, arrival, self._task_writer)
             if task is not None:
                 self._set_task(task)
-        for name, camera in self._cameras.items():
-            received = camera.pop()
-            image = self._decode_image(name, received) if received is not None else None
-            if received is not None and image is not None:
-                self._images[name] = image
-                self._images_s[name] = received.arrival.mono_ns / 1e9
+        for cameras, streams, decode in (
+            (self._cameras, self._streams.images, self._image_of),
+            (self._depths, self._streams.depth, _depth_of),
+        ):
+            for name, camera in cameras.items():
+                # Without a history there is one, the newest.
+                while (received := camera.pop()) is not None:
+                    picture = self._decode(name, received, decode)
+                    if picture is not None:
+                        streams[name].add(picture)
+                        self._received_s[camera] = received.arrival.mono_ns / 1e9
+                    if not self.spec.observation.history_span_s:
+                        break
         self.poll_states()
 
     def poll_states(self) -> None:
         """Decode the states received since the last call."""
-        for part, buffer in self._state_buffers.items():
+        for name, buffer in self._state_buffers.items():
+            kind = STATE_KINDS[last_chunk(name)]
             for arrival in buffer.drain():
-                state = self.node.decode(STATE_KINDS[part], arrival, self._state_writers[part])
+                state = self.node.decode(kind, arrival, self._state_writers[name])
                 if state is not None:
-                    self._states[part].add(state)
+                    self._streams.states[name].add(state)
 
     def _set_task(self, task: Stamped[Task]) -> None:
         before, self.task, self._task_received_s = self.task, task.record, time.monotonic()
@@ -169,7 +206,7 @@ class RobotSession:
             return
         self._episode = task.record.episode
         # An observation from before the episode does not belong to it.
-        self._not_before_ns = task.header.stamp_wall_ns
+        self._not_before_ns = self._episode_ns = task.header.stamp_wall_ns
         reset = reset_of(self.policy, self.robot)
         if reset is not None:
             try:
@@ -177,18 +214,16 @@ class RobotSession:
             except Exception as error:
                 self.failed(error, "reset_failed")
 
-    def _decode_image(self, camera: str, received: ReceivedImage) -> Stamped[Image] | None:
+    def _decode(
+        self, camera: str, received: ReceivedImage, picture_of: Callable[[bytes, str], Any]
+    ) -> Stamped[Any] | None:
         arrival, writer = received
         sample = arrival.sample
         try:
             header = header_of(sample)
             writer.check(header, arrival.mono_ns)
             payload = bytes_of(sample.payload, MAX_IMAGE_BYTES)
-            if self._jpeg:
-                image = image_codec.decode_jpeg(payload)
-            else:
-                _, _, schema = str(sample.encoding).partition(";")
-                image = image_codec.decode_raw(payload, schema)
+            image = picture_of(payload, str(sample.encoding))
         except CodecError as error:
             self.node.reject(error.reason, f"camera {camera}: {error}")
             return None
@@ -196,6 +231,11 @@ class RobotSession:
         self.node.traffic.received(str(sample.key_expr), header, arrival.nth)
         header, image = self.node.clocks.to_local_clock(header, image)
         return Stamped(header, image, self.node.arrival_wall_ns(arrival))
+
+    def _image_of(self, payload: bytes, encoding: str) -> Image:
+        if self._jpeg:
+            return image_codec.decode_jpeg(payload)
+        return image_codec.decode_raw(payload, encoding.partition(";")[2])
 
     def observe(self) -> Observation | None:
         """Poll and assemble an observation; None if there is none yet.
@@ -214,11 +254,11 @@ class RobotSession:
             observation = assemble(
                 self.spec,
                 self.task,
-                self._images,
-                self._states,
+                self._streams,
                 not_before_ns=self._not_before_ns,
                 now_ns=self.node.clock.wall_ns(),
                 robot=self.robot,
+                episode_ns=self._episode_ns,
             )
         except ValueError as error:
             self.complaint = str(error)
@@ -228,9 +268,9 @@ class RobotSession:
                 self.complaint = observation.why
             return None
         self.complaint = ""
-        if self._images_s and time.monotonic() - self.due_s < FRESH_PATIENCE_S:
+        if self._received_s and time.monotonic() - self.due_s < FRESH_PATIENCE_S:
             tolerance_s = min(FRESH_TOLERANCE_S, 0.25 / observation.rate_hz)
-            if min(self._images_s.values()) < self.due_s - tolerance_s:
+            if min(self._received_s.values()) < self.due_s - tolerance_s:
                 return None
         return observation
 
@@ -276,6 +316,14 @@ class RobotSession:
         self._debug.publish(observation, answer, steps, header, (end_ns - start_ns) / 1e6)
         return True
 
+    def adopt_spec(self) -> None:
+        """Publish the policy's spec after it changed the meaning of its actions.
+
+        To be called before a chunk that follows it. What is observed has to stay the same.
+        """
+        self.spec, self._spec_hash = self.policy.spec, self.policy.spec.hash
+        self._specs.publish(self.spec)
+
     def failed(self, error: Exception, reason: str = "") -> Literal[False]:
         """Count and report an inference that failed; the next one is due a little later."""
         if not reason:
@@ -320,3 +368,7 @@ class RobotSession:
         """Report ``stopped`` and close the node."""
         self.node.publish_status("stopped", now=True)
         self.node.close()
+
+
+def _depth_of(payload: bytes, encoding: str) -> Depth:
+    return image_codec.decode_depth(payload, encoding.partition(";")[2])

@@ -1,0 +1,279 @@
+"""Requests for guarded primitives, and their answers: JSON, so that any language can ask.
+
+A request that is not understood is answered by what is wrong with which field; see `Answer`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    TypeAdapter,
+    ValidationError,
+    model_validator,
+)
+
+from vla_zenoh.errors import CodecError, ProfileError, describe_faults, nearest
+from vla_zenoh.keys import key_chunk
+from vla_zenoh.policy.spec import MAX_JOINTS
+from vla_zenoh.types import MAX_TEXT
+
+MAX_REQUEST_BYTES = 16 * 1024
+MAX_ANSWER_BYTES = 64 * 1024
+FURTHEST_M = 5.0
+FURTHEST_RAD = 4 * math.pi
+UNIT_TOLERANCE = 0.01
+DEFAULT_TIMEOUT_S = 30.0
+
+
+def _metres(value: float) -> float:
+    if abs(value) > FURTHEST_M:
+        raise ValueError(f"is {value:g}, at most {FURTHEST_M:g} m: positions are in metres")
+    return value
+
+
+def _radians(value: float) -> float:
+    if abs(value) > FURTHEST_RAD:
+        raise ValueError(
+            f"is {value:g}, at most {FURTHEST_RAD:.3g} rad: joints are in rad (m where they slide)"
+        )
+    return value
+
+
+def _unit(value: tuple[float, ...]) -> tuple[float, ...]:
+    length = math.hypot(*value)
+    if abs(length - 1.0) > UNIT_TOLERANCE:
+        raise ValueError(f"has the length {length:.4g}, a rotation is a unit quaternion x, y, z, w")
+    return tuple(part / length for part in value)
+
+
+def _name(value: str) -> str:
+    try:
+        return key_chunk(value, "name")
+    except ProfileError as error:
+        raise ValueError(str(error)) from None
+
+
+Metres = Annotated[float, AfterValidator(_metres)]
+Point = Annotated[tuple[Metres, Metres, Metres], Field(description="x, y, z in m, base frame")]
+Quaternion = Annotated[
+    tuple[float, float, float, float],
+    AfterValidator(_unit),
+    Field(description="x, y, z, w of the TCP in the base frame"),
+]
+Name = Annotated[str, AfterValidator(_name)]
+Radians = Annotated[float, AfterValidator(_radians)]
+Joints = Annotated[
+    tuple[Radians, ...],
+    Field(min_length=1, max_length=MAX_JOINTS, description="all joints in rad, from the base on"),
+]
+NamedJoints = Annotated[
+    dict[str, Radians],
+    Field(min_length=1, max_length=MAX_JOINTS, description="name -> rad; the others stay"),
+]
+Width = Annotated[float, Field(ge=0, le=1)] | Literal["open", "closed"]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
+
+
+class Request(_Part):
+    """What every request has.
+
+    Args:
+        holder: name of the asking client: as long as its liveliness token on `Keys.holding` is
+            there the arm may move.
+        timeout_s: then the arm is braked.
+    """
+
+    holder: Name
+    timeout_s: float = Field(default=DEFAULT_TIMEOUT_S, gt=0, le=3600)
+
+
+class MoveTo(Request):
+    """Move the TCP along a straight line to a pose, or the joints to positions.
+
+    Args:
+        position_m: of the TCP in the base frame.
+        quat_xyzw: of the TCP; None: as it is.
+        joints_rad: all joints in the order of the profile, or some of them by name.
+    """
+
+    position_m: Point | None = None
+    quat_xyzw: Quaternion | None = None
+    joints_rad: NamedJoints | Joints | None = None
+
+    @model_validator(mode="after")
+    def _one_target(self) -> MoveTo:
+        posed = self.position_m is not None or self.quat_xyzw is not None
+        if posed == (self.joints_rad is not None):
+            raise ValueError(
+                "wants one target: position_m (m), with or without quat_xyzw, or joints_rad (rad)"
+            )
+        return self
+
+
+class Home(Request):
+    """Move the joints to the profile's ``robot.home_rad``."""
+
+
+class Grip(Request):
+    """Open or close the gripper; the arm stands.
+
+    Args:
+        width_m: between the fingers, or ``open``, or ``closed``: until something is held.
+    """
+
+    width_m: Width
+
+
+class Region(_Part):
+    """A box that the TCP enters, in the base frame."""
+
+    low_m: Point
+    high_m: Point
+
+    @model_validator(mode="after")
+    def _has_a_size(self) -> Region:
+        if any(low > high for low, high in zip(self.low_m, self.high_m, strict=True)):
+            raise ValueError("low_m must not be above high_m")
+        return self
+
+
+class Until(_Part):
+    """Conditions that end a run, whichever comes first.
+
+    Args:
+        gripper: it is ``open``, or ``closed`` or holding something.
+        inside: the TCP is in this box.
+        force_n: the force on the arm has changed by this since the start.
+        still_s: neither arm nor gripper has moved for this long, after a first motion.
+        done: the model says that it is done.
+    """
+
+    gripper: Literal["open", "closed"] | None = None
+    inside: Region | None = None
+    force_n: float | None = Field(default=None, gt=0, le=1000)
+    still_s: float | None = Field(default=None, gt=0, le=600)
+    done: bool = False
+
+    @property
+    def names(self) -> list[str]:
+        """Of the conditions that are set."""
+        return [name for name in type(self).model_fields if getattr(self, name)]
+
+
+class Run(Request):
+    """Let a model move the arm until a condition holds, or the time is over.
+
+    Args:
+        worker: that moves the arm.
+        prompt: for it; None: the present one.
+        until: conditions; without any the run ends by its time.
+    """
+
+    worker: Name
+    prompt: str | None = Field(default=None, min_length=1, max_length=MAX_TEXT)
+    until: Until = Until()
+
+
+REQUESTS: Mapping[str, type[Request]] = {
+    "move_to": MoveTo,
+    "home": Home,
+    "grip": Grip,
+    "run": Run,
+}
+"""Primitive -> its request."""
+
+
+def decode_request(primitive: str, payload: bytes) -> Request:
+    """Read a request.
+
+    Raises:
+        CodecError: ``oversize``, ``malformed`` (no JSON, or no such primitive) or ``invalid``;
+            names every wrong field.
+    """
+    if len(payload) > MAX_REQUEST_BYTES:
+        raise CodecError("oversize", f"{len(payload)} bytes, at most {MAX_REQUEST_BYTES} are read")
+    kind = REQUESTS.get(primitive)
+    if kind is None:
+        there = f"there are {', '.join(REQUESTS)}"
+        raise CodecError(
+            "malformed",
+            f"no primitive {primitive[:40]!r}{nearest(primitive[:40], REQUESTS)} {there}",
+        )
+    try:
+        return kind.model_validate_json(payload or b"{}")
+    except ValidationError as error:
+        reason = "malformed" if error.errors()[0]["type"] == "json_invalid" else "invalid"
+        why = describe_faults(error, "request", most=4)
+        raise CodecError(reason, f"request {primitive}: {why}"[:MAX_TEXT]) from error
+
+
+@dataclass(frozen=True)
+class Answer:
+    """How a primitive ended, and where the arm stands.
+
+    Args:
+        ok: it did what was asked.
+        reason: short stable name: ``reached``; of a run the name of the condition; otherwise
+            ``timeout``, ``bound`` (a limit stopped the motion), ``stopped``, ``fault``,
+            ``deactivated``, ``ended`` (by the command node; `why` says more), or, before anything
+            moved, ``busy``, ``rejected``, ``invalid``.
+        why: a sentence; empty where nothing is to be said.
+        took_s: duration.
+        position_m: of the TCP in the base frame; None where it is not known.
+        quat_xyzw: of the TCP.
+        joints_rad: name -> position.
+        width_m: of the gripper.
+        holding: it holds something.
+        off_m: distance from the target of a motion.
+        off_rad: angle to it; of a motion of joints that are commanded the largest of theirs.
+    """
+
+    ok: bool
+    reason: str
+    why: str = ""
+    took_s: float = 0.0
+    position_m: Sequence[float] | None = None
+    quat_xyzw: Sequence[float] | None = None
+    joints_rad: Mapping[str, float] = field(default_factory=dict)
+    width_m: float | None = None
+    holding: bool = False
+    off_m: float | None = None
+    off_rad: float | None = None
+
+    def encode(self) -> bytes:
+        """The answer as JSON."""
+        return json.dumps(asdict(self)).encode()
+
+
+_ANSWER = TypeAdapter(Answer)
+
+
+def decode_answer(payload: bytes) -> Answer:
+    """Read an answer.
+
+    Raises:
+        CodecError: it is none.
+    """
+    if len(payload) > MAX_ANSWER_BYTES:
+        raise CodecError("oversize", f"{len(payload)} bytes, at most {MAX_ANSWER_BYTES} are read")
+    try:
+        return _ANSWER.validate_json(payload)
+    except ValidationError as error:
+        raise CodecError("malformed", describe_faults(error, "answer", most=4)) from error
+
+
+def encode_request(fields: Mapping[str, Any]) -> bytes:
+    """Fields of a request as JSON, those that are None left out."""
+    return json.dumps({name: value for name, value in fields.items() if value is not None}).encode()

@@ -1,0 +1,262 @@
+"""One arm and gripper of a robot under a `Commander`: its states, plans, motion and monitors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+from vla_zenoh.control.chunk_planner import ChunkPlanner
+from vla_zenoh.control.chunk_validation import Lease
+from vla_zenoh.control.commander_io import PartStates, make_event
+from vla_zenoh.control.joint_monitor import JOINT_PATIENCE_S, JointMonitor, joint_state_faults
+from vla_zenoh.control.limits import LimitHit
+from vla_zenoh.control.motion_pipeline import MotionPipeline
+from vla_zenoh.control.preflight import (
+    CLOCK_TOLERANCE_S,
+    PeerSnapshot,
+    reasons_by_joints,
+    reasons_of_part,
+)
+from vla_zenoh.control.reachability import ReachabilityFilter
+from vla_zenoh.control.watchdog import Watchdog
+from vla_zenoh.errors import RecordError, SpecError
+from vla_zenoh.kinematics.so3 import Pose, held_pose, pose_of
+from vla_zenoh.policy import ModelSpec
+from vla_zenoh.profile import Profile
+from vla_zenoh.types import (
+    ActionChunk,
+    Event,
+    GripperState,
+    JointState,
+    PoseState,
+    Stamped,
+)
+
+FUTURE_NS = round(CLOCK_TOLERANCE_S * 1e9)
+"""A pose that is stamped later than it arrived by more than this says nothing about the past."""
+
+
+class CommandedPart:
+    """States, plans, motion and monitors of one part.
+
+    Args:
+        profile: of the part.
+        reach: bounds goals by its kinematics; None: only the workspace box does.
+
+    Attributes:
+        name: of the part; empty: the robot has one.
+    """
+
+    def __init__(self, profile: Profile, reach: ReachabilityFilter | None) -> None:
+        self.profile, self.reach, self.name = profile, reach, profile.part
+        self.pose: Stamped[PoseState] | None = None
+        self.joint: Stamped[JointState] | None = None
+        self.gripper_state: Stamped[GripperState] | None = None
+        self._measured: Pose | None = None  # of the pose
+        self.planner = ChunkPlanner(profile, reach)
+        self.motion = MotionPipeline(profile, reach, self.planner)
+        self.contact, self.retreat = self.motion.contact, self.motion.retreat
+        self.watchdog = Watchdog(profile)
+        self._joint_monitor = None if reach is None else JointMonitor(profile, reach)
+        self._load_known = True
+
+    # -- how its name is said -----------------------------------------------------------------
+    def says(self, why: str) -> str:
+        """`why`, with the part that it is about."""
+        return f"{self.name}: {why}" if self.name and why else why
+
+    def tagged(self, events: Iterable[Event]) -> list[Event]:
+        """Events with the part that they are about."""
+        if not self.name:
+            return list(events)
+        return [replace(event, why=self.says(event.why) or self.name) for event in events]
+
+    @property
+    def elbow_rad(self) -> float:
+        """Greatest distance of a measured joint from where it is expected, see `JointMonitor`."""
+        return 0.0 if self._joint_monitor is None else self._joint_monitor.elbow_rad
+
+    # -- states -------------------------------------------------------------------------------
+    def update(self, states: PartStates) -> None:
+        """Take the newest states."""
+        if states.pose is not None:
+            self.pose = states.pose
+            self.planner.poses.add(states.pose, FUTURE_NS)
+            self.contact.update_pose(states.pose)
+            self._measured = pose_of(states.pose.record)
+            self.retreat.measure(self._measured)
+        if states.joint is not None:
+            self.joint = states.joint
+            self.planner.joints.add(states.joint, FUTURE_NS)
+            self.contact.update_joints(states.joint)
+        if states.gripper is not None:
+            self.gripper_state = states.gripper
+
+    def measure(self) -> str:
+        """Track whether the arm stands; why its joints are not those of this arm, or empty."""
+        if self.pose is None:
+            return ""
+        joint = self.joint.record if self.joint else None
+        try:
+            self.motion.measure(self.pose.record, joint, self.pose.received_ns)
+        except RecordError as error:
+            return str(error)
+        return ""
+
+    def track(self) -> None:
+        """Compare the measured pose with the commanded one."""
+        if self._measured is not None:
+            self.watchdog.measure(self.motion.commanded, self._measured)
+
+    # -- activation ---------------------------------------------------------------------------
+    def reasons_not_to_activate(self, peers: PeerSnapshot, now_ns: int) -> list[str]:
+        """Reasons of the arm itself, whatever the worker."""
+        return reasons_of_part(self.profile, peers, self.pose, self.gripper_state, now_ns)
+
+    def reasons_against(
+        self, worker: str, spec: ModelSpec | None, chunk: Stamped[ActionChunk] | None, now_ns: int
+    ) -> list[str]:
+        """Reasons by the joints of the arm, and by what the worker asks of them."""
+        bounds, reasons = self.planner.joint_bounds, list[str]()
+        if bounds is not None and self.pose is not None:
+            reasons += joint_state_faults(
+                self.profile, bounds.kinematics, self.joint, self.pose, now_ns
+            )
+            if spec is not None and chunk is not None and self.joint is not None:
+                reasons += reasons_by_joints(
+                    self.profile, worker, spec, chunk.record, bounds, self.joint
+                )
+        if self.reach is None and spec is not None and self._in_joints(spec):
+            reasons.append(
+                f"worker {worker!r} acts in joints, which needs the robot's kinematics: set "
+                "robot.description, robot.tcp_frame and robot.arm_joints in the profile"
+            )
+        if self.joint is not None and self.pose is not None:
+            writers = {self.joint.header.source, self.pose.header.source}
+            if len(writers) > 1:
+                reasons.append(f"joints and pose have different writers: {', '.join(writers)}")
+        return reasons
+
+    def _in_joints(self, spec: ModelSpec) -> bool:
+        try:
+            return spec.action.of(self.name).space == "joint"
+        except SpecError:
+            return False  # reported with the spec
+
+    def activate(self, lease: Lease, now_ns: int) -> None:
+        """Start the motion where the arm stands; its states are known."""
+        assert self.pose is not None and self.gripper_state is not None
+        self.contact.begin()
+        self.planner.restart(self.pose, self.joint)
+        measured, joint = self.pose.record, self.joint.record if self.joint else None
+        blocked = self.watchdog.begin(held_pose(measured), pose_of(measured))
+        self.motion.anchor(
+            measured,
+            self.gripper_state.record,
+            joint,
+            now_ns,
+            blocked=blocked,
+            in_joints=self._in_joints(lease.spec),
+        )
+
+    # -- supervision --------------------------------------------------------------------------
+    def lost(
+        self, peers: PeerSnapshot, worker: str, lease: Lease, now_ns: int, *, moves: bool
+    ) -> tuple[str, list[Event]]:
+        """Why the arm cannot go on, empty if it can, and events.
+
+        Args:
+            peers: the other nodes.
+            worker: that moves it.
+            lease: its right.
+            now_ns: time of this tick.
+            moves: commands are published: the arm may be blocked.
+        """
+        assert self.pose is not None and self.gripper_state is not None
+        self.motion.contact_slowdown = self.contact.slowdown()
+        events = self._load_sensing()
+        why = self.watchdog.lost(self.pose, self.gripper_state, peers, worker, lease, now_ns)
+        if not why and self.motion.streaming and moves:
+            why, found = self._obstructed()
+            events += found
+        return why or self.contact.lost or self.motion.stuck or self._joints_lost(now_ns), events
+
+    def _joints_lost(self, now_ns: int) -> str:
+        """Why the measured joints, which are monitored, count as lost; empty while they arrive."""
+        if self._joint_monitor is None or self.joint is None:
+            return ""
+        silent_s = (now_ns - self.joint.received_ns) / 1e9
+        patience_s = self.profile.timing.state_timeout_s + JOINT_PATIENCE_S
+        if silent_s <= patience_s:
+            return ""
+        return f"robot state lost: joints {silent_s:.3f} s old, at most {patience_s:g} s"
+
+    def monitor_late(self, now_ns: int) -> bool:
+        """The joints have been due for monitoring for long."""
+        return self._joint_monitor is not None and self._joint_monitor.late(now_ns)
+
+    def monitor_joints(self, now_ns: int, *, obeying: bool) -> LimitHit | None:
+        """Slow the arm down if its measured joints come near to a bound; a bound to brake at.
+
+        Raises:
+            RecordError: joints of another arm.
+        """
+        monitor, reach, motion = self._joint_monitor, self.reach, self.motion
+        if monitor is None or reach is None or self.joint is None:
+            return None
+        if not obeying or not motion.streaming:
+            monitor.reset()
+            return None
+        measured_rad = reach.kinematics.joints_of(self.joint.record)
+        commanded_rad = motion.joints_rad
+        hit = monitor.update(measured_rad, commanded_rad, now_ns, in_joints=motion.in_joints)
+        motion.joint_slowdown = monitor.slowdown
+        reach.set_elbow(measured_rad if commanded_rad is None else commanded_rad)
+        return hit
+
+    def _obstructed(self) -> tuple[str, list[Event]]:
+        """Why the arm is blocked or in contact, empty otherwise; it then brakes and retreats."""
+        commanded, overload = self.motion.commanded, self.contact.overload()
+        events: list[Event] = []
+        if overload is None:
+            why = self.watchdog.blocked()
+            # An arm without contact is not blocked: its state is stuck, or it was slowed down.
+            retreats = bool(why) and not (self.contact.known and self.contact.quiet)
+        else:
+            name, value, limit, unit = overload
+            events.append(make_event("warning", "limit", name, "stopped", value, limit))
+            why = (
+                f"something presses against the arm: {name} {value:.1f} {unit}, "
+                f"at most {limit:g} {unit}; it is led back"
+            )
+            retreats = True
+        if retreats and commanded is not None:
+            self.retreat.begin(commanded)
+        return why, events
+
+    def end_retreat(self, peers: PeerSnapshot, now_ns: int) -> None:
+        """End a retreat of an arm that is not alive and ready, without faults."""
+        if self.retreat.busy and not self._may_retreat(peers, now_ns):
+            self.retreat.end()
+
+    def _may_retreat(self, peers: PeerSnapshot, now_ns: int) -> bool:
+        """The robot is alive and ready, without faults, and publishes its state."""
+        pose, gripper = self.pose, self.gripper_state
+        if pose is None or gripper is None or self.watchdog.state_lost(pose, gripper, now_ns):
+            return False
+        alive = peers.robot_node in peers.alive
+        return alive and gripper.record.mode == "ready" and not gripper.record.faults
+
+    def _load_sensing(self) -> list[Event]:
+        """The event that the arm measures loads from now on, or no more."""
+        if self.contact.known is self._load_known:
+            return []
+        self._load_known = self.contact.known
+        if self._load_known:
+            why = "the robot measures external loads"
+            return [make_event("info", "notice", "contact_told", why)]
+        why = (
+            "the robot measures no external wrench: limits.contact has no effect, and a "
+            "blocked arm is detected by limits.tracking_m alone"
+        )
+        return [make_event("warning", "notice", "contact_not_told", why)]

@@ -1,0 +1,172 @@
+"""Keeps the parts of a robot apart: both stand before the distance between them is too small.
+
+Each tick the joints at which either arm would come to rest are computed, were it to brake one tick
+later. No pair of places on the two ways there may be nearer than ``limits.reach.part_stop_m``: so
+it does not matter which of the two stops first, or whether one of them stops at all. Otherwise both
+brake, on ways that the tick before found to be free. They go on when the first bit of the way
+towards their goals is free, for one arm alone and for both. Below ``part_slow_m`` arms that come
+nearer are slowed down to sqrt(distance left / zone) of their speed.
+
+Arms that begin too near to each other may only move apart.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from vla_zenoh.control.commanded_part import CommandedPart
+from vla_zenoh.control.limits import LimitHit, Slowdown
+from vla_zenoh.kinematics.part_distance import Nearest, PartDistance, PlacedArm
+from vla_zenoh.kinematics.so3 import Pose, rotation_from_rpy
+from vla_zenoh.profile import Profile
+from vla_zenoh.types import FloatArray
+
+NAME = "part_distance"
+SHARES = (0.0, 0.5, 1.0)
+"""Places on the way of a stop that are looked at."""
+FAR_M = 0.25
+"""Arms this much further apart than they may come are looked at now and then."""
+FAR_TICKS = 4
+NOISE_M = 2e-5
+SLOWEST = 0.05
+STEPS = 20
+"""Number of speed shares, so that the share does not change at every tick."""
+PROBE_RAD = 0.01
+"""First bit of the way to a goal: the joint that moves furthest."""
+
+
+class Spacing(NamedTuple):
+    """What the distance between the parts allows.
+
+    Args:
+        slowdown: why they are slower; None: they are not.
+        hit: why both stand; None: they may move.
+    """
+
+    slowdown: Slowdown | None = None
+    hit: LimitHit | None = None
+
+
+class PartSpacing:
+    """Distances between all parts of a robot.
+
+    Args:
+        profile: where the parts stand, and how near they may come.
+        parts: with kinematics.
+    """
+
+    def __init__(self, profile: Profile, parts: Sequence[CommandedPart]) -> None:
+        self._parts = tuple(parts)
+        placed: list[PlacedArm] = []
+        for part in self._parts:
+            base, reach = profile.parts[part.name].base, part.reach
+            assert reach is not None
+            turn = rotation_from_rpy(np.array([0.0, 0.0, base.yaw_rad]))
+            stands = Pose(np.array(base.position_m), turn)
+            placed.append(PlacedArm(reach.kinematics, reach.barriers.collisions, stands))
+        limits = [part.profile.limits.reach for part in self._parts]
+        self._pairs = [
+            (i, j, PartDistance(placed[i], placed[j]))
+            for i, j in itertools.combinations(range(len(placed)), 2)
+        ]
+        self._stop_m = max(limit.part_stop_m for limit in limits)
+        self._slow_m = max(limit.part_slow_m for limit in limits)
+        self._within_m = max(self._slow_m, self._stop_m) + FAR_M
+        self.nearest = Nearest(self._within_m)
+        """Of the commanded joints at the last look."""
+        self._skip = 0
+        self._held = False
+        self._slower = False
+
+    def look(self, now_ns: int, ahead_s: float, *, moves: bool) -> Spacing:
+        """What the distance allows in the coming tick.
+
+        Args:
+            now_ns: time of this tick.
+            ahead_s: until the next look.
+            moves: the arms are being led to their goals; else they brake or stand.
+        """
+        if not moves:
+            self._held = self._slower = False
+            self._skip = 0
+            return Spacing()
+        if self._skip > 0 and not self._held:
+            self._skip -= 1
+            return Spacing()
+        here = [part.motion.joints_rad for part in self._parts]
+        if any(joints_rad is None for joints_rad in here):
+            return Spacing()
+        at = [joints_rad for joints_rad in here if joints_rad is not None]
+        before, self.nearest = self.nearest, self._nearest(at, at)
+        if self.nearest.distance_m >= self._within_m:
+            self._skip, self._held = FAR_TICKS - 1, False
+            return Spacing()
+        floor_m = min(self._stop_m, self.nearest.distance_m - NOISE_M)
+        rests = [part.motion.resting_rad(ahead_s) for part in self._parts]
+        ahead = self._nearest(at, rests, floor_m + NOISE_M)
+        self._held = ahead.distance_m < floor_m or (
+            self._held and not self._may_go_on(at, now_ns, floor_m)
+        )
+        if self._held:
+            where = f"{self.nearest.first} and {self.nearest.second}"
+            value_m = min(ahead.distance_m, self.nearest.distance_m)
+            return Spacing(None, LimitHit(NAME, value_m, self._stop_m, where=where))
+        return Spacing(self._slow(before))
+
+    def _slow(self, before: Nearest) -> Slowdown | None:
+        near = self.nearest
+        if near.distance_m >= self._slow_m or self._slow_m <= self._stop_m:
+            self._slower = False
+            return None
+        if near.distance_m < before.distance_m - NOISE_M:
+            self._slower = True
+        elif near.distance_m > before.distance_m + NOISE_M:
+            self._slower = False
+        if not self._slower:
+            return None
+        left = max(near.distance_m - self._stop_m, 0.0) / (self._slow_m - self._stop_m)
+        share = max(np.ceil(np.sqrt(left) * STEPS) / STEPS, SLOWEST)
+        where = f"{near.first} and {near.second}"
+        return Slowdown(NAME, float(share), near.distance_m, self._slow_m, where)
+
+    def _may_go_on(self, at: Sequence[FloatArray], now_ns: int, floor_m: float) -> bool:
+        """Whether the first bit of the way to the goals is free."""
+        probes: list[FloatArray] = []
+        for part, here_rad in zip(self._parts, at, strict=True):
+            wanted_rad = part.motion.wanted_rad(now_ns)
+            way_rad = np.zeros(len(here_rad)) if wanted_rad is None else wanted_rad - here_rad
+            longest = float(np.abs(way_rad).max())
+            probes.append(here_rad + way_rad * min(1.0, PROBE_RAD / max(longest, 1e-9)))
+        return self._nearest(at, probes, floor_m + NOISE_M).distance_m >= floor_m
+
+    def _nearest(
+        self,
+        starts: Sequence[FloatArray],
+        ends: Sequence[FloatArray],
+        within_m: float | None = None,
+    ) -> Nearest:
+        """The nearest links anywhere on two straight motions of the joints."""
+        found = Nearest(self._within_m if within_m is None else within_m)
+        for i, j, pair in self._pairs:
+            moves = [not np.array_equal(starts[k], ends[k]) for k in (i, j)]
+            for one, other in itertools.product(
+                SHARES if moves[0] else SHARES[:1], SHARES if moves[1] else SHARES[:1]
+            ):
+                first_rad = starts[i] + one * (ends[i] - starts[i])
+                second_rad = starts[j] + other * (ends[j] - starts[j])
+                near = pair.nearest(first_rad, second_rad, found.distance_m)
+                if near.distance_m < found.distance_m:
+                    names = self._parts[i].name, self._parts[j].name
+                    found = Nearest(
+                        near.distance_m, f"{names[0]} {near.first}", f"{names[1]} {near.second}"
+                    )
+        return found
+
+    def measured_m(self, joints_rad: Mapping[str, FloatArray]) -> Nearest:
+        """The nearest links with the parts at these joints (n,) each."""
+        at = [joints_rad[part.name] for part in self._parts]
+        return self._nearest(at, at)

@@ -1,0 +1,166 @@
+"""When a primitive is over: target reached, no way on, or a condition of a run. Pure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from vla_zenoh.codec.primitives import Until
+from vla_zenoh.kinematics.so3 import Pose, pose_distance, pose_of
+from vla_zenoh.types import FloatArray, GripperState, PoseState
+
+NEAR_M, NEAR_RAD = 1e-3, 2e-3
+"""A target is reached within these, measured."""
+SLOW_M_S, SLOW_RAD_S = 0.005, 0.02
+SETTLED_S = 0.1
+PROGRESS = 0.05
+"""Part of what is left that has to be gained within `STUCK_S`."""
+STUCK_S = 2.5
+LEAST_SPEED = 0.05
+GRIPPED_S = 0.7
+"""A gripper that has not moved for this long stands: a command takes a moment to arrive."""
+WIDTH_TOLERANCE_M = 0.003
+SHUT, WIDE = 0.1, 0.9
+"""Parts of the largest width."""
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What is seen of the robot at one moment.
+
+    Args:
+        now_s: monotonic time.
+        pose: measured.
+        joints_rad: (n,) measured, in the order of the kinematics.
+        gripper: its state.
+        done: the model said that it is done.
+        speed: override in force, 0 to 1.
+    """
+
+    now_s: float
+    pose: PoseState
+    joints_rad: FloatArray
+    gripper: GripperState
+    done: bool = False
+    speed: float = 1.0
+
+    @property
+    def slow(self) -> bool:
+        """The arm stands, as far as can be measured."""
+        twist = self.pose.twist
+        linear, angular = np.linalg.norm(twist[:3]), np.linalg.norm(twist[3:])
+        return bool(linear < SLOW_M_S and angular < SLOW_RAD_S)
+
+
+class Ending(Protocol):
+    """Judges each `Sight` in turn."""
+
+    def check(self, sight: Sight) -> str:
+        """Reason why it is over; empty while it is not."""
+        ...
+
+
+class Arrival:
+    """Ends a motion: ``reached``, or ``bound`` where it makes no way any more.
+
+    Args:
+        pose: target of the TCP.
+        joints_rad: (n,) target of the joints, where they are judged; in the order of the
+            kinematics.
+    """
+
+    def __init__(self, pose: Pose, joints_rad: FloatArray | None = None) -> None:
+        self.pose, self.joints_rad = pose, joints_rad
+        self._best = np.inf
+        self._gained_s = self._there_s = -np.inf
+
+    def off(self, sight: Sight) -> tuple[float, float]:
+        """Distance of the TCP from the target, m, and angle or largest of the joints', rad."""
+        off_m, off_rad = pose_distance(pose_of(sight.pose), self.pose)
+        if self.joints_rad is not None:
+            off_rad = float(np.abs(sight.joints_rad - self.joints_rad).max())
+        return off_m, off_rad
+
+    def check(self, sight: Sight) -> str:
+        off_m, off_rad = self.off(sight)
+        # Joints that are judged by themselves place the TCP only as well as the arm is calibrated.
+        near = off_rad < NEAR_RAD and (off_m < NEAR_M or self.joints_rad is not None)
+        if not (near and sight.slow):
+            self._there_s = -np.inf
+        elif self._there_s == -np.inf:
+            self._there_s = sight.now_s
+        elif sight.now_s - self._there_s >= SETTLED_S:
+            return "reached"
+        left = max(off_m / NEAR_M, off_rad / NEAR_RAD)
+        if near or left < self._best * (1 - PROGRESS):
+            self._best, self._gained_s = left, sight.now_s
+        stuck = sight.now_s - self._gained_s > STUCK_S / max(sight.speed, LEAST_SPEED)
+        return "bound" if stuck else ""
+
+
+class Gripped:
+    """Ends a motion of the gripper: ``reached``, or ``bound`` where it stands elsewhere.
+
+    Args:
+        width_m: target.
+        closing: until something is held, or the fingers meet.
+    """
+
+    def __init__(self, width_m: float, *, closing: bool) -> None:
+        self._width_m, self._closing = width_m, closing
+        self._moved_s = -np.inf
+
+    def check(self, sight: Sight) -> str:
+        gripper = sight.gripper
+        if gripper.moving or self._moved_s == -np.inf:
+            self._moved_s = sight.now_s
+        if sight.now_s - self._moved_s < GRIPPED_S:
+            return ""
+        off_m = abs(gripper.width_m - self._width_m)
+        return "reached" if self._closing or off_m < WIDTH_TOLERANCE_M else "bound"
+
+
+class RunEnding:
+    """Ends a run: the name of the first condition that holds.
+
+    Args:
+        until: conditions.
+        max_width_m: of the gripper.
+    """
+
+    def __init__(self, until: Until, max_width_m: float) -> None:
+        self._until, self._max_width_m = until, max_width_m
+        self._before_n: FloatArray | None = None
+        self._moved_s: float | None = None
+
+    def check(self, sight: Sight) -> str:
+        return next((name for name in self._until.names if getattr(self, f"_{name}")(sight)), "")
+
+    def _gripper(self, sight: Sight) -> bool:
+        gripper, part = sight.gripper, sight.gripper.width_m / self._max_width_m
+        if self._until.gripper == "open":
+            return part > WIDE and not gripper.moving
+        return gripper.holding or (part < SHUT and not gripper.moving)
+
+    def _inside(self, sight: Sight) -> bool:
+        box, at_m = self._until.inside, sight.pose.position_m
+        return box is not None and bool(np.all((box.low_m <= at_m) & (at_m <= box.high_m)))
+
+    def _force_n(self, sight: Sight) -> bool:
+        if sight.pose.wrench is None:
+            return False
+        force_n = sight.pose.wrench[:3]
+        if self._before_n is None:
+            self._before_n = force_n
+        return bool(np.linalg.norm(force_n - self._before_n) >= (self._until.force_n or 0.0))
+
+    def _still_s(self, sight: Sight) -> bool:
+        if not sight.slow or sight.gripper.moving:
+            self._moved_s = sight.now_s
+        limit_s = self._until.still_s or 0.0
+        return self._moved_s is not None and sight.now_s - self._moved_s >= limit_s
+
+    def _done(self, sight: Sight) -> bool:
+        return sight.done

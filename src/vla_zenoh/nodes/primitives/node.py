@@ -1,0 +1,401 @@
+"""The node primitives: answers queries for guarded motions by driving the arm as a worker does.
+
+Nothing bypasses the command node: the node selects itself as the worker, activates the arm for as
+long as the asking client holds it, publishes chunks, and deactivates. One primitive at a time.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import zenoh
+
+from vla_zenoh.bus.buffers import bytes_of
+from vla_zenoh.bus.remote_robot import RemoteRobot
+from vla_zenoh.codec.primitives import (
+    MAX_REQUEST_BYTES,
+    Answer,
+    Grip,
+    Home,
+    MoveTo,
+    Request,
+    Run,
+    decode_request,
+)
+from vla_zenoh.control.reachability import make_reachability_filter
+from vla_zenoh.control.states import DEACTIVATED
+from vla_zenoh.control.target_check import TargetCheck
+from vla_zenoh.errors import CodecError, SessionError
+from vla_zenoh.keys import PRIMITIVES, last_chunk, worker_node
+from vla_zenoh.kinematics.so3 import Pose, pose_of, rotation_from_quat
+from vla_zenoh.nodes.primitives.endings import NEAR_RAD, Arrival, Ending, Gripped, RunEnding, Sight
+from vla_zenoh.nodes.primitives.policy import CHUNK_HZ, Target, TargetPolicy
+from vla_zenoh.nodes.worker.robot_session import RobotSession
+from vla_zenoh.policy import ActionSteps
+from vla_zenoh.profile import Profile
+from vla_zenoh.types import FloatArray
+
+POLL_S = 0.01
+SPEC_LEAD_S = 0.1
+"""A changed spec is published this long before the first chunk by it."""
+READY_S = 4.0
+"""Spec, first chunk and deadman have to reach the command node before it activates."""
+AGAIN_S = 0.25
+BRAKE_S = 5.0
+POSE_JOINTS = 6
+
+
+class Rejected(Exception):
+    """Why nothing moves."""
+
+
+class _Asked(NamedTuple):
+    name: str
+    request: Request
+    query: zenoh.Query
+    since_s: float
+
+
+class PrimitivesNode:
+    """Answers on `Keys.primitive`, see `vla_zenoh.codec.primitives`.
+
+    Args:
+        profile: the effective profile.
+        session: with the rights of a worker and of an operator.
+
+    Raises:
+        NodeError: it runs already.
+        ResourceError: the robot's description is missing.
+    """
+
+    def __init__(self, profile: Profile, session: zenoh.Session) -> None:
+        self._profile = profile
+        self._policy = TargetPolicy(profile.robot.arm_joints)
+        self._check = TargetCheck(profile, make_reachability_filter(profile))
+        self._worker = RobotSession(
+            *(profile, session, self._policy, PRIMITIVES),
+            images="jpeg",
+            host=None,
+            changed=threading.Condition(),
+        )
+        self._worker.complaint = ""
+        self._node, self._robot = self._worker.node, RemoteRobot(profile, session)
+        self._robot.subscribe()
+        self._stop = threading.Event()
+        self._asked: queue.SimpleQueue[_Asked] = queue.SimpleQueue()
+        self._current: _Asked | None = None
+        self._lock = threading.Lock()
+        handler = zenoh.handlers.Callback(self._on_query, indirect=False)
+        self._queryable = session.declare_queryable(
+            profile.keys.all_primitives, handler, complete=True
+        )
+
+    def run(self, stop: threading.Event) -> None:
+        """Serve until `stop` is set; an arm that moves is braked first."""
+        self._stop = stop
+        thread = threading.Thread(target=self._serve, name="primitive")
+        self._worker.report(now=True)
+        thread.start()
+        while thread.is_alive():
+            self._publish_chunk()
+            time.sleep(POLL_S)
+        self._queryable.undeclare()
+        self._worker.close()
+
+    # -- chunks -------------------------------------------------------------------------------
+    def _publish_chunk(self) -> None:
+        worker, now_s = self._worker, time.monotonic()
+        worker.poll()
+        observation = worker.observe() if worker.due_s <= now_s else None
+        if observation is not None:
+            clock = self._node.clock
+            observed_ns = clock.wall_ns()
+            steps = self._policy.infer(observation)
+            if self._policy.spec is not worker.spec:
+                worker.adopt_spec()
+                worker.due_s = now_s + SPEC_LEAD_S
+                return
+            worker.due_s = max(worker.due_s + 1 / CHUNK_HZ, now_s)
+            times_ns = observed_ns, observed_ns, clock.wall_ns()
+            worker.publish(observation, ActionSteps(steps.steps), times_ns, 1)
+        worker.report()
+
+    # -- queries ------------------------------------------------------------------------------
+    def _on_query(self, query: zenoh.Query) -> None:
+        """On Zenoh's thread: answers at once what cannot be carried out."""
+        name = last_chunk(str(query.key_expr))
+        payload = query.payload
+        try:
+            asked = bytes_of(payload, MAX_REQUEST_BYTES) if payload is not None else b""
+            request = decode_request(name, asked)
+        except CodecError as error:
+            self._node.reject(error.reason, f"primitive/{name[:40]}: {error}", "primitive")
+            self._reply(query, Answer(False, "invalid", str(error)))
+            return
+        with self._lock:
+            running = self._current
+            if running is None:
+                self._current = _Asked(name, request, query, time.monotonic())
+                self._asked.put(self._current)
+                return
+        since_s = time.monotonic() - running.since_s
+        why = f"{running.name} of {running.request.holder!r} has been running for {since_s:.1f} s"
+        self._node.reject("busy", f"primitive/{name}: {why}", "primitive")
+        self._reply(query, Answer(False, "busy", why))
+
+    def _reply(self, query: zenoh.Query, answer: Answer) -> None:
+        with query:
+            if "*" in str(query.key_expr):
+                query.reply_err(answer.encode())
+            else:
+                query.reply(query.key_expr, answer.encode(), encoding="application/json")
+
+    def _serve(self) -> None:
+        while not self._stop.is_set():
+            try:
+                asked = self._asked.get(timeout=AGAIN_S)
+            except queue.Empty:
+                continue
+            answer = self._carry_out(asked)
+            with self._lock:
+                self._current = None
+            self._reply(asked.query, answer)
+
+    # -- one primitive ------------------------------------------------------------------------
+    def _carry_out(self, asked: _Asked) -> Answer:
+        request = asked.request
+        off: tuple[float, float] | None = None
+        try:
+            ending, target = self._prepare(request)
+            with self._settings_kept(), self._stands_after():
+                self._policy.target = target
+                run = request if isinstance(request, Run) else None
+                self._activate(run.worker if run else PRIMITIVES, run and run.prompt, request)
+                reason, why = self._watch(ending, asked.since_s + request.timeout_s)
+            if isinstance(ending, Arrival):
+                off = ending.off(self._sight())
+                why = why or self._elbow(target)
+        except (Rejected, SessionError, CodecError) as error:
+            reason, why = "rejected", str(error)
+        ok = reason in ("reached", *_conditions(request))
+        return replace(
+            self._standing(),
+            ok=ok,
+            reason=reason,
+            why=why,
+            took_s=round(time.monotonic() - asked.since_s, 3),
+            off_m=None if off is None else round(off[0], 6),
+            off_rad=None if off is None else round(off[1], 6),
+        )
+
+    def _prepare(self, request: Request) -> tuple[Ending, Target]:
+        """What ends it and where it goes.
+
+        Raises:
+            Rejected: the arm cannot go there, or is not free; says why.
+        """
+        robot, profile = self._robot, self._profile
+        task = robot.task
+        if task is None:
+            raise Rejected("no command node is running")
+        if latched := robot.latch_reason():
+            raise Rejected(f"the arm is {latched}; `vla-zenoh reset` clears it")
+        if task.active:
+            raise Rejected(f"worker {task.worker!r} moves the arm: deactivate it first")
+        sight, most_m = self._sight(), profile.robot.gripper.max_width_m
+        if isinstance(request, Run):
+            return self._prepare_run(request, sight, most_m)
+        if isinstance(request, Grip):
+            width_m = request.width_m
+            closing = width_m == "closed"
+            wanted_m = {"closed": 0.0, "open": most_m}.get(str(width_m), width_m)
+            assert isinstance(wanted_m, float)
+            if wanted_m > most_m:
+                raise Rejected(f"width_m is {wanted_m:g}, the gripper opens to {most_m:g} m")
+            return Gripped(wanted_m, closing=closing), Target(width_m=wanted_m)
+        if isinstance(request, Home):
+            return self._to_joints(np.array(profile.robot.home_rad, float), sight)
+        assert isinstance(request, MoveTo)
+        if request.joints_rad is not None:
+            return self._to_joints(self._named(request.joints_rad, sight), sight)
+        return self._to_pose(request, sight)
+
+    def _prepare_run(self, request: Run, sight: Sight, most_m: float) -> tuple[Ending, Target]:
+        if worker_node(request.worker) not in self._robot.alive:
+            raise Rejected(f"worker {request.worker!r} is not alive")
+        if request.worker == PRIMITIVES:
+            raise Rejected(f"worker {PRIMITIVES!r} is this node: name a model")
+        if request.until.force_n and sight.pose.wrench is None:
+            raise Rejected("until.force_n: this robot does not report forces")
+        return RunEnding(request.until, most_m), Target()
+
+    def _to_pose(self, request: MoveTo, sight: Sight) -> tuple[Ending, Target]:
+        if len(self._profile.robot.arm_joints) < POSE_JOINTS:
+            raise Rejected("a pose needs an arm of six joints: give joints_rad")
+        here = pose_of(sight.pose)
+        position_m = here.position_m if request.position_m is None else request.position_m
+        quat = request.quat_xyzw
+        rotation = here.rotation if quat is None else rotation_from_quat(np.array(quat))
+        pose = Pose(np.array(position_m, float), rotation)
+        if why := self._check.pose_fault(sight.joints_rad, pose):
+            raise Rejected(why)
+        return Arrival(pose), Target(pose=pose)
+
+    def _named(self, joints_rad: dict[str, float] | tuple[float, ...], sight: Sight) -> FloatArray:
+        """(n,) in the order of the profile."""
+        names = self._profile.robot.arm_joints
+        if isinstance(joints_rad, dict):
+            if unknown := [name for name in joints_rad if name not in names]:
+                raise Rejected(f"joints_rad: no joint {unknown[0]!r}; there are {', '.join(names)}")
+            chain = self._check.kinematics.arm_joints
+            now = dict(zip(chain, sight.joints_rad.tolist(), strict=True))
+            return np.array([{**now, **joints_rad}[name] for name in names])
+        if len(joints_rad) != len(names):
+            raise Rejected(
+                f"joints_rad has {len(joints_rad)} entries, the arm has {len(names)} joints: "
+                f"{', '.join(names)}"
+            )
+        return np.array(joints_rad, float)
+
+    def _to_joints(self, joints_rad: FloatArray, sight: Sight) -> tuple[Ending, Target]:
+        kinematics = self._check.kinematics
+        chain_rad = kinematics.ordered(self._profile.robot.arm_joints, joints_rad)
+        if why := self._check.joints_fault(sight.joints_rad, chain_rad):
+            raise Rejected(why)
+        # The elbow of an arm that takes poses is its own controller's.
+        judged = chain_rad if self._profile.robot.command == "joint" else None
+        return Arrival(kinematics.forward(chain_rad), judged), Target(joints_rad=joints_rad)
+
+    def _elbow(self, target: Target) -> str:
+        """How far an arm that takes poses is from the joints it was asked for."""
+        if target.joints_rad is None or self._profile.robot.command == "joint":
+            return ""
+        names = self._profile.robot.arm_joints
+        asked_rad = self._check.kinematics.ordered(names, target.joints_rad)
+        off_rad = float(np.abs(self._sight().joints_rad - asked_rad).max())
+        return (
+            f"this robot takes poses: the TCP is where these joints place it, they are up to "
+            f"{off_rad:.2g} rad away, where its controller keeps the elbow"
+            if off_rad > NEAR_RAD
+            else ""
+        )
+
+    @contextmanager
+    def _settings_kept(self) -> Iterator[None]:
+        """Worker and prompt are afterwards what they were before."""
+        robot, before = self._robot, self._robot.task
+        try:
+            yield
+        finally:
+            with suppress(SessionError):  # where the command node is gone, so are they
+                if before is not None:
+                    robot.set_worker(before.worker)
+                    robot.set_prompt(before.prompt)
+
+    @contextmanager
+    def _stands_after(self) -> Iterator[None]:
+        try:
+            yield
+        finally:
+            self._robot.deactivate(BRAKE_S)
+            self._policy.target = Target()
+
+    def _activate(self, worker: str, prompt: str | None, request: Request) -> None:
+        """Select `worker`, and activate the arm for as long as the client holds it."""
+        robot, give_up_s = self._robot, time.monotonic() + min(READY_S, request.timeout_s)
+        robot.set_worker(worker)
+        if prompt is not None:
+            robot.set_prompt(prompt)
+        if worker == PRIMITIVES:
+            time.sleep(2 * SPEC_LEAD_S)
+        while True:
+            try:
+                robot.activate(holder=request.holder)
+                return
+            except SessionError:
+                if time.monotonic() > give_up_s or self._stop.is_set():
+                    raise
+            time.sleep(AGAIN_S)
+
+    def _watch(self, ending: Ending, until_s: float) -> tuple[str, str]:
+        """Wait until it is over: the reason, and more of it."""
+        robot = self._robot
+        while True:
+            task = robot.task
+            if task is None or not task.active:
+                return self._why_inactive()
+            if self._stop.is_set():
+                return "ended", "the node primitives was stopped"
+            if reason := ending.check(self._sight()):
+                return reason, self._acting() if reason == "bound" else ""
+            if time.monotonic() > until_s:
+                return "timeout", ""
+            time.sleep(POLL_S)
+
+    def _why_inactive(self) -> tuple[str, str]:
+        robot = self._robot
+        robot.wait_for(lambda: self._state() not in ("active", "holding"), 1.0)
+        status = robot.status("command")
+        if status is None or robot.task is None:
+            return "ended", "the command node is gone"
+        why = str(status.detail.get("why", ""))
+        if status.state in ("stopped", "fault"):
+            return status.state, why
+        return ("deactivated", "") if why == DEACTIVATED else ("ended", why)
+
+    def _acting(self) -> str:
+        status = self._robot.status("command")
+        limits = status.detail.get("limits") if status is not None else None
+        acting = ", ".join(map(str, limits)) if isinstance(limits, (list, tuple)) else ""
+        return f"it makes no way any more; limits that act: {acting or 'none'}"
+
+    def _state(self) -> str:
+        status = self._robot.status("command")
+        return status.state if status is not None else ""
+
+    def _sight(self) -> Sight:
+        robot = self._robot
+        task, status = robot.task, robot.status("command")
+        done = status is not None and status.detail.get("policy_done") is True
+        # A status from before the activation tells of an older episode.
+        if task is not None and status is not None:
+            done = done and status.detail.get("episode") == task.episode
+        return Sight(
+            time.monotonic(),
+            robot.pose_state().record,
+            self._check.kinematics.joints_of(robot.joint_state().record),
+            robot.gripper_state().record,
+            done,
+            task.speed if task is not None else 1.0,
+        )
+
+    def _standing(self) -> Answer:
+        """An answer with where the arm is."""
+        try:
+            pose, joint = self._robot.pose_state().record, self._robot.joint_state().record
+            gripper = self._robot.gripper_state().record
+        except (SessionError, CodecError):
+            return Answer(False, "")
+        return Answer(
+            False,
+            "",
+            position_m=pose.position_m.tolist(),
+            quat_xyzw=pose.quat_xyzw.tolist(),
+            joints_rad=dict(zip(joint.names, joint.position_rad.tolist(), strict=True)),
+            width_m=gripper.width_m,
+            holding=gripper.holding,
+        )
+
+
+def _conditions(request: Request) -> list[str]:
+    """Reasons by which a run ends well."""
+    if not isinstance(request, Run):
+        return []
+    return request.until.names or ["timeout"]

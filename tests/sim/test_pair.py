@@ -1,0 +1,254 @@
+"""Two arms under one policy: both move as asked, and when one cannot go on both stand.
+
+All figures are of MuJoCo's own TCPs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pair_rig import PARTS, Motion, Pair, joint_steps, shipped, steady, tcp_steps, world
+
+from vla_zenoh.codec import records
+from vla_zenoh.lab.lockstep import Message
+from vla_zenoh.types import GripperState, JointCommand, JointState, PoseState
+
+UPWARD = np.array([0.0, -0.02, 0.0, 0.02, 0.0, 0.0, 0.0, 0.04])
+"""A step of joints in which either TCP moves."""
+FAST_M_S = 0.05
+BOUND_S = 0.6
+"""Within it both arms stand, whatever happens to one; the single arm's rows of docs/design.md."""
+STOP_S = 0.35
+STILL = 2e-3
+LED_BACK_M = 0.08
+STOP_TOLERANCE_M = 1e-3
+TAMPERED = "left"
+
+
+def moving() -> Pair:
+    pair = Pair(steady(left=UPWARD, right=UPWARD))
+    pair.run(1.0)
+    assert min(pair.speed_m_s(part)[-1] for part in PARTS) > FAST_M_S
+    return pair
+
+
+def test_columns_move_the_joints_of_their_part_and_no_other() -> None:
+    def motion(_: int) -> dict[str, np.ndarray]:
+        home = np.array(shipped().robot.home_rad)
+        left, right = home.copy(), home.copy()
+        left[0] += 0.2
+        right[5] -= 0.15
+        return {"left": np.array([*left, 0.08]), "right": np.array([*right, 0.02])}
+
+    pair = Pair(motion, joint_steps("absolute"))
+    pair.run(3.0)
+    home = np.array(shipped().robot.home_rad)
+    asked = motion(0)
+    for part in PARTS:
+        assert pair.joints_rad(part) == pytest.approx(asked[part][:7], abs=0.005)
+        moved = np.abs(pair.joints_rad(part) - home) > 0.05
+        assert moved.sum() == 1
+    assert world().parts["left"].gripper_state().width_m == pytest.approx(0.08, abs=0.003)
+    assert world().parts["right"].gripper_state().width_m == pytest.approx(0.02, abs=0.003)
+
+
+def test_a_policy_sees_both_arms_at_one_time() -> None:
+    pair = moving()
+    seen = pair.policy.seen
+    assert seen is not None
+    assert seen.joint is None
+    assert set(seen.parts) == set(PARTS)
+    assert seen.parts["left"].stamp_wall_ns == seen.parts["right"].stamp_wall_ns
+    for part in PARTS:
+        joint = seen.parts[part].joint
+        assert joint is not None
+        assert np.abs(joint.position_rad - pair.joints_rad(part)).max() < 0.1
+
+
+def test_poses_of_both_tcps_are_followed_each_in_its_own_base_frame() -> None:
+    step = np.array([0.0, 0.0, -0.01, 0.0, 0.0, 0.0, 0.04])
+    aside = np.array([0.0, 0.01, 0.0, 0.0, 0.0, 0.0, 0.04])
+    pair = Pair(steady(left=step, right=aside), tcp_steps())
+    pair.run(1.5)
+    way = {part: np.array(pair.path_m[part])[-1] - pair.path_m[part][0] for part in PARTS}
+    assert way["left"][2] < -0.05
+    assert np.abs(way["left"][:2]).max() < 0.005
+    assert way["right"][1] > 0.05
+    assert np.abs(way["right"][[0, 2]]).max() < 0.005
+
+
+def test_one_stop_stops_both() -> None:
+    pair = moving()
+    since = pair.mark()
+    pair.loop.put("stop")
+    pair.run(1.0)
+    assert pair.state == "stopped"
+    for part in PARTS:
+        assert pair.stop_time_s(part, since) < STOP_S
+
+
+def test_both_brake_in_the_tick_in_which_one_has_to() -> None:
+    pair = moving()
+    pair.loop.tamper = dropped(PoseState)
+    while pair.state == "active":
+        pair.run(0.004)
+    braking = [part.motion._mover.braking for part in pair.commander.parts]  # pyright: ignore
+    assert braking == [True, True]
+
+
+# -- the fault table of a pair ----------------------------------------------------------------
+Tamper = Callable[[Message], Iterable[Message]]
+
+
+def of_part(kind: type, change: Callable[[Message], Iterable[Message]]) -> Tamper:
+    def tamper(message: Message) -> Iterable[Message]:
+        hit = message.part == TAMPERED and message.kind is kind
+        return change(message) if hit else [message]
+
+    return tamper
+
+
+def dropped(kind: type) -> Tamper:
+    return of_part(kind, lambda _: [])
+
+
+def changed(kind: type, **fields: object) -> Tamper:
+    def change(message: Message) -> Iterable[Message]:
+        record = replace(records.decode(kind, message.payload), **fields)
+        return [replace(message, payload=records.encode(record))]
+
+    return of_part(kind, change)
+
+
+FAULTS: dict[str, tuple[Tamper, str]] = {
+    "pose of one part missing": (dropped(PoseState), "left: robot state lost: pose"),
+    "gripper of one part missing": (dropped(GripperState), "left: robot state lost: gripper"),
+    "joints of one part missing": (dropped(JointState), "left: robot state lost: joints"),
+    "command stream of one part missing": (
+        dropped(JointCommand),
+        "left: the robot is not ready but 'braking'",
+    ),
+    "one part in another mode": (
+        changed(GripperState, mode="guiding"),
+        "left: the robot is not ready but 'guiding'",
+    ),
+    "one part reports a fault": (
+        changed(GripperState, faults=("reflex",)),
+        "left: the robot reports: reflex",
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_of_one_part_brings_both_to_rest_and_is_told(fault: str) -> None:
+    tamper, why = FAULTS[fault]
+    pair = moving()
+    since = pair.mark()
+    pair.loop.tamper = tamper
+    pair.run(1.5)
+    assert pair.state in ("inactive", "fault")
+    assert pair.commander.why.startswith(why)
+    for part in PARTS:
+        assert pair.stop_time_s(part, since) < BOUND_S
+    assert not pair.loop.commander.task.active
+
+
+def test_of_two_arms_the_one_that_something_presses_against_retreats_and_the_other_stands() -> None:
+    pair = moving()
+    since = pair.mark()
+    pair.loop.tamper = changed(PoseState, wrench=np.array([60.0, 0, 0, 0, 0, 0]))
+    pair.run(4.0)
+    assert pair.commander.why.startswith("left: something presses against the arm")
+    assert pair.stop_time_s("right", since) < STOP_S
+    led_m = np.array(pair.path_m["left"])[since + round(STOP_S / 0.004) :]
+    assert np.linalg.norm(led_m - led_m[0], axis=1).max() < LED_BACK_M
+    assert pair.speed_m_s("left")[-1] < STILL
+
+
+def test_the_worker_of_both_gone_brings_both_to_rest() -> None:
+    pair = moving()
+    since = pair.mark()
+    pair.loop.alive.discard("worker-scripted_pair")
+    pair.run(1.0)
+    assert pair.commander.why.endswith("node 'worker-scripted_pair' is gone")
+    for part in PARTS:
+        assert pair.stop_time_s(part, since) < STOP_S
+
+
+def test_what_is_rejected_for_one_part_is_rejected_for_both() -> None:
+    def motion(number: int) -> dict[str, np.ndarray]:
+        left = UPWARD.copy()
+        if number > 12:
+            left[:7] = 5.0  # degrees
+        return {"left": left, "right": UPWARD}
+
+    pair = Pair(motion)
+    pair.run(1.5)
+    assert pair.loop.refused == {}
+    since = pair.mark()
+    pair.run(3.5)
+    assert set(pair.loop.refused) == {"step_rad"}
+    assert any(event.why.startswith("scripted_pair: left: ") for event in pair.loop.events)
+    assert pair.state == "holding"
+    for part in PARTS:
+        assert pair.speed_m_s(part)[since + 500 :].max() < STILL
+
+
+# -- distance between the arms -----------------------------------------------------------------
+def towards_each_other(number: int) -> dict[str, np.ndarray]:
+    way = np.array([0.04, 0.0, -0.01]) * (1 if number < 28 else -1)
+    return dict.fromkeys(PARTS, np.array([*way, 0.0, 0.0, 0.0, 0.04]))
+
+
+def test_arms_that_are_sent_towards_each_other_stand_and_may_go_back() -> None:
+    pair = Pair(towards_each_other, tcp_steps())
+    pair.run(3.5, distances=True)
+    stop_m = shipped().limits.reach.part_stop_m
+    assert pair.least_m >= stop_m - STOP_TOLERANCE_M
+    assert pair.least_measured_m >= stop_m - 2 * STOP_TOLERANCE_M
+    assert pair.least_m < stop_m + 0.02
+    assert pair.state == "active"
+    assert any(event.what == "part_distance" for event in pair.loop.events)
+    assert pair.policy.asked < 28
+    near_m = pair.distance_m()
+    pair.run(2.5)
+    assert pair.distance_m() > near_m + 0.1
+
+
+def random_motion(seed: int, action: str) -> Motion:
+    """Steps that change every second or so, mostly into the space between the arms."""
+    random = np.random.default_rng(seed)
+    held: dict[str, np.ndarray] = {}
+    home = np.array(shipped().robot.home_rad)
+
+    def motion(number: int) -> dict[str, np.ndarray]:
+        for part in PARTS if number % 6 == 1 else ():
+            drawn = random.normal(size=8)
+            if action == "tcp":
+                into = abs(drawn[0]) if drawn[7] > -0.6 else drawn[0]
+                way = [0.05 * into, 0.02 * drawn[1], 0.03 * drawn[2], *0.03 * drawn[3:6], 0.04]
+            else:
+                lean = [0.4 * drawn[0], 0.9 + 0.5 * drawn[1], 0.5 * drawn[2], 0.6 + 0.5 * drawn[3]]
+                way = [*home + np.array([*lean, *0.5 * drawn[4:6], drawn[6]]), 0.04]
+            held[part] = np.array(way)
+        return dict(held)
+
+    return motion
+
+
+@pytest.mark.parametrize(
+    ("action", "seed"),
+    [
+        pytest.param(action, seed, marks=[pytest.mark.slow] if seed > 1 else [])
+        for action in ("tcp", "joint")
+        for seed in (1, 2, 3, 4)
+    ],
+)
+def test_no_random_chunks_bring_the_arms_nearer_than_the_stop(action: str, seed: int) -> None:
+    spec = tcp_steps() if action == "tcp" else joint_steps("absolute")
+    pair = Pair(random_motion(seed, action), spec, seed)
+    pair.run(12.0, distances=True)
+    assert pair.least_m >= shipped().limits.reach.part_stop_m - STOP_TOLERANCE_M
