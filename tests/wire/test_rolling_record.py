@@ -102,7 +102,12 @@ def test_the_log_says_which_session_put_what_and_what_came_of_it(
         by = {each["key"]: each["client"] for each in puts}
         assert (by["prompt"], by["active"]) == (author, author)
         assert by["rate"] == "", "a client of another program does not say who it is"
-        (told,) = [each for each in record.entries("client") if each["client"] == author]
+
+        def told_of() -> list[dict[str, Any]]:
+            return [each for each in record.entries("client") if each["client"] == author]
+
+        record.until("its address is known", told_of)
+        (told,) = told_of()
         assert told["certificate"] == "", "this lab has none"
         assert told["address"].startswith("tcp/127.0.0.1:")
         events = [each["event"] for each in record.entries("command")]
