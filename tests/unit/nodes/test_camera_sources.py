@@ -299,7 +299,7 @@ def test_all_cameras_but_those_of_ros2_are_served_unless_some_are_named() -> Non
 
 
 def test_an_unknown_kind_of_source_lists_the_known_ones() -> None:
-    with pytest.raises(NodeError, match="there are: v4l2, rtsp, rtsps, file, sim"):
+    with pytest.raises(NodeError, match="there are: v4l2, realsense, rtsp, rtsps, file, sim"):
         make_source(CameraProfile(source="ros2:/image"))
 
 

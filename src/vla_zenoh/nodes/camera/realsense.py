@@ -23,7 +23,7 @@ from vla_zenoh.nodes.camera.source import STALL_S, Pixels
 from vla_zenoh.profile.schema import CameraProfile
 
 WAIT_MS = 200
-QUEUE = 2
+QUEUE = 4
 SAME_S = 1.0
 LOCK_TOLERANCE = 0.1
 EXPOSURE_UNIT_US = 100.0
@@ -81,10 +81,10 @@ class RealsenseSource:
     ) -> None:
         self._serial, self._profile, self._device_of = serial, profile, device_of
         self._sensors: list[Any] = []
-        self._frames: Any = None
-        self._syncer: Any = None
+        self._queue: Any = None
         self._align: Any = None
         self._colour: Any = None
+        self._depth: Any = None
         self._clock = DeviceClock()
         self.intrinsics: Intrinsics | None = None
         self.same_s, self.backend = SAME_S, ""
@@ -93,7 +93,7 @@ class RealsenseSource:
     def open(self) -> None:
         rs = sdk()
         device = self._device_of(self._serial)
-        self._clock, self._syncer = DeviceClock(), rs.syncer(QUEUE)
+        self._clock, self._queue = DeviceClock(), rs.frame_queue(QUEUE)
         self._align = rs.align(rs.stream.color)
         colours: tuple[Any, ...] = (rs.format.bgr8, rs.format.rgb8)
         wanted = [(rs.stream.color, colours)]
@@ -109,7 +109,7 @@ class RealsenseSource:
                     self._set_intrinsics(chosen[0])
                 sensor.open(chosen)
                 self._sensors.append(sensor)
-                sensor.start(self._syncer)
+                sensor.start(self._queue)
                 wanted = [
                     kind for kind in wanted if all(one.stream_type() != kind[0] for one in chosen)
                 ]
@@ -126,9 +126,9 @@ class RealsenseSource:
     def grab(self, stop: threading.Event) -> int | None:
         give_up = time.monotonic() + STALL_S
         while not stop.is_set():
-            good, frames = self._syncer.try_wait_for_frames(WAIT_MS)
+            good, frame = self._queue.try_wait_for_frame(WAIT_MS)
             arrival_ns = time.monotonic_ns()
-            if good and self._whole(frames):
+            if good and self._complete(frame):
                 return self._captured_ns(arrival_ns)
             if time.monotonic() > give_up:
                 raise NodeError(
@@ -144,13 +144,13 @@ class RealsenseSource:
 
     def depth_m(self) -> NDArray[np.float32] | None:
         """Depth of the grabbed image in m, in its pixels; 0: not measured."""
-        if self._frames is None or self._profile.depth_unit_m is None:
+        if self._depth is None or self._colour is None:
             return None
-        depth = self._align.process(self._frames).get_depth_frame()
+        depth = self._align.process(_frameset(self._depth, self._colour)).get_depth_frame()
         return np.asanyarray(depth.get_data()) * np.float32(depth.get_units())
 
     def close(self) -> None:
-        self._frames = self._colour = None
+        self._colour = self._depth = None
         for sensor in self._sensors:
             for end in (sensor.stop, sensor.close):
                 try:
@@ -212,12 +212,21 @@ class RealsenseSource:
                     f"RealSense camera {self._serial} takes {took:g} for {name.name}, not {value:g}"
                 )
 
-    def _whole(self, frames: Any) -> bool:
-        colour, depth = frames.get_color_frame(), frames.get_depth_frame()
-        if not colour or (self._profile.depth_unit_m is not None and not depth):
+    def _complete(self, frame: Any) -> bool:
+        """Take a frame; whether there is colour now, and depth of the same moment if it is wanted.
+
+        The library's own syncer waits by the expected times of both, and may not pair them at all.
+        """
+        if frame.get_profile().stream_type() == sdk().stream.depth:
+            self._depth = frame.as_depth_frame()
+        else:
+            self._colour = frame.as_video_frame()
+        if self._profile.depth_unit_m is None:
+            return self._colour is not None
+        if self._colour is None or self._depth is None:
             return False
-        self._frames, self._colour = frames, colour
-        return True
+        apart_ms = abs(self._colour.get_timestamp() - self._depth.get_timestamp())
+        return apart_ms <= 500 / self._colour.get_profile().fps()
 
     def _captured_ns(self, arrival_ns: int) -> int:
         frame = self._colour
@@ -226,3 +235,14 @@ class RealsenseSource:
             return self._clock.host_ns(stamp_ns, arrival_ns)
         # The library has brought it to this computer's wall clock already.
         return min(arrival_ns, arrival_ns - (time.time_ns() - stamp_ns))
+
+
+def _frameset(*frames: Any) -> Any:
+    """The frames as one, as the library's filters take them."""
+    rs, out = sdk(), sdk().frame_queue(1)
+    join = rs.processing_block(
+        lambda _, source: source.frame_ready(source.allocate_composite_frame(list(frames)))
+    )
+    join.start(out)
+    join.invoke(frames[0])
+    return out.wait_for_frame().as_frameset()
