@@ -54,6 +54,8 @@ HUE_DISTANCE = 0.13
 MIN_PIXELS = 200
 AT_HOME_RAD = MAX_LAG_RAD = 0.1
 SPEED_RAD_S = 0.6
+LIFT_S = 4.0
+"""Slowly: what one arm is ahead of the other presses on the bar."""
 PIECES = 12
 """A straight way of the TCPs is followed through so many places."""
 DOWN = rotation_from_rpy(np.array([math.pi, 0.0, 0.0]))
@@ -220,7 +222,7 @@ class ScriptedPair:
             _way(home, down[0]),
             _along(down),
             Segment(np.array([up[0], up[0]]), 1.0),
-            _along(up),
+            _along(up)._replace(duration_s=LIFT_S),
         ]
         self._time_s, self._seen = 0.0, True
 

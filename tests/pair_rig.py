@@ -132,3 +132,24 @@ def steady(**joints: Any) -> Motion:
     """The same step at every inference; parts that are not named stand."""
     stand = np.array([*np.zeros(7), 0.04])
     return lambda _: {part: np.array(joints.get(part, stand)) for part in PARTS}
+
+
+def random_motion(seed: int, action: str) -> Motion:
+    """Steps that change every second or so, mostly into the space between the arms."""
+    random = np.random.default_rng(seed)
+    held: dict[str, FloatArray] = {}
+    home = np.array(shipped().robot.home_rad)
+
+    def motion(number: int) -> dict[str, FloatArray]:
+        for part in PARTS if number % 6 == 1 else ():
+            drawn = random.normal(size=8)
+            if action == "tcp":
+                into = abs(drawn[0]) if drawn[7] > -0.6 else drawn[0]
+                way = [0.05 * into, 0.02 * drawn[1], 0.03 * drawn[2], *0.03 * drawn[3:6], 0.04]
+            else:
+                lean = [0.4 * drawn[0], 0.9 + 0.5 * drawn[1], 0.5 * drawn[2], 0.6 + 0.5 * drawn[3]]
+                way = [*home + np.array([*lean, *0.5 * drawn[4:6], drawn[6]]), 0.04]
+            held[part] = np.array(way)
+        return dict(held)
+
+    return motion

@@ -41,7 +41,6 @@ PRESETS: Presets = {
         "map": f"{PICTURES}image=camera:front, {PICTURES}image2=camera:wrist, {STATE}={STATE8}, "
         f"{TASK}=prompt",
         "size": "",
-        "resize": "none",
         **OSC,
         "gripper": "binary",
         "gripper_open": "low",

@@ -7,12 +7,14 @@ package writes them. Variants: ``other`` (answers with another request's number)
 from __future__ import annotations
 
 import asyncio
+from contextlib import suppress
 from typing import Any
 
 import msgpack
 import numpy as np
 import policy
 import websockets.asyncio.server as server
+from websockets.exceptions import ConnectionClosed
 
 try:
     from msgpack_numpy import decode, encode
@@ -109,9 +111,11 @@ async def serve(connection: server.ServerConnection, variant: str) -> None:
 
 
 async def main(port: int, variant: str) -> None:
-    async with server.serve(
-        lambda connection: serve(connection, variant), "127.0.0.1", port, max_size=None
-    ) as running:
+    async def until_gone(connection: server.ServerConnection) -> None:
+        with suppress(ConnectionClosed):
+            await serve(connection, variant)
+
+    async with server.serve(until_gone, "127.0.0.1", port, max_size=None) as running:
         await running.serve_forever()
 
 

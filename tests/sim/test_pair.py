@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pair_rig import PARTS, Motion, Pair, joint_steps, shipped, steady, tcp_steps, world
+from pair_rig import PARTS, Pair, joint_steps, random_motion, shipped, steady, tcp_steps, world
 
 from vla_zenoh.codec import records
 from vla_zenoh.lab.lockstep import Message
@@ -173,7 +173,7 @@ def test_the_worker_of_both_gone_brings_both_to_rest() -> None:
     since = pair.mark()
     pair.loop.alive.discard("worker-scripted_pair")
     pair.run(1.0)
-    assert pair.commander.why.endswith("node 'worker-scripted_pair' is gone")
+    assert pair.commander.why == "node 'worker-scripted_pair' is gone"
     for part in PARTS:
         assert pair.stop_time_s(part, since) < STOP_S
 
@@ -216,27 +216,6 @@ def test_arms_that_are_sent_towards_each_other_stand_and_may_go_back() -> None:
     near_m = pair.distance_m()
     pair.run(2.5)
     assert pair.distance_m() > near_m + 0.1
-
-
-def random_motion(seed: int, action: str) -> Motion:
-    """Steps that change every second or so, mostly into the space between the arms."""
-    random = np.random.default_rng(seed)
-    held: dict[str, np.ndarray] = {}
-    home = np.array(shipped().robot.home_rad)
-
-    def motion(number: int) -> dict[str, np.ndarray]:
-        for part in PARTS if number % 6 == 1 else ():
-            drawn = random.normal(size=8)
-            if action == "tcp":
-                into = abs(drawn[0]) if drawn[7] > -0.6 else drawn[0]
-                way = [0.05 * into, 0.02 * drawn[1], 0.03 * drawn[2], *0.03 * drawn[3:6], 0.04]
-            else:
-                lean = [0.4 * drawn[0], 0.9 + 0.5 * drawn[1], 0.5 * drawn[2], 0.6 + 0.5 * drawn[3]]
-                way = [*home + np.array([*lean, *0.5 * drawn[4:6], drawn[6]]), 0.04]
-            held[part] = np.array(way)
-        return dict(held)
-
-    return motion
 
 
 @pytest.mark.parametrize(

@@ -537,19 +537,21 @@ class Commander:
         if self.state not in OBEYING:
             return
         assert self.lease is not None
-        lost: list[str] = []
+        lost: dict[str, str] = {}
         for part in self.parts:
             why, events = part.lost(
                 self._peers, self.task.worker, self.lease, now_ns, moves=not self.dry_run
             )
             self._out.events += part.tagged(events)
-            lost += [part.says(why)] if why else []
-        if not lost and self._watchdog.given_up(now_ns):
-            lost = [f"held for {self.profile.timing.max_hold_s:g} s without a fresh chunk"]
-        if not lost and unheld:
-            lost = [unheld]
-        if lost:
-            self._change(Trigger.LOSE, "; ".join(lost)[:MAX_TEXT])
+            if why:
+                lost[part.says(why)] = why
+        reasons = set(lost.values()) if len(lost) == len(self.parts) else set(lost)
+        why = "; ".join(reasons if len(reasons) == 1 else lost)[:MAX_TEXT]
+        if not why and self._watchdog.given_up(now_ns):
+            why = f"held for {self.profile.timing.max_hold_s:g} s without a fresh chunk"
+        why = why or unheld
+        if why:
+            self._change(Trigger.LOSE, why)
         elif self._watchdog.overdue(now_ns):
             self._change(Trigger.STARVE, "no fresh chunk within the watchdog")
 

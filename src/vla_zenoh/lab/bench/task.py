@@ -15,6 +15,8 @@ from vla_zenoh.lab.tasks import (
     COLOURS,
     DIRECTIONS,
     FAMILIES,
+    LIFT,
+    LIFT_PROMPT,
     LIMIT_S,
     Order,
     TaskEpisode,
@@ -113,6 +115,8 @@ class TaskRequest:
         Where the target cannot be pushed, another brick is; where none can, another family is drawn
         instead of skipping the layout.
         """
+        if self.family == LIFT:
+            return TaskEpisode(self.seed, Order(LIFT), LIFT_PROMPT)
         if self.family == STAY:
             return draw_stay(self.seed)
         for family, target in ((self.family, self.target), (self.family, None)):

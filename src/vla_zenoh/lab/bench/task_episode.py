@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol
 from vla_zenoh.errors import SpecError, WorkerError
 from vla_zenoh.lab.bench.task import NOT_OBEYED, TaskOutcome, TaskPlan, TaskRequest
 from vla_zenoh.lab.episode import EpisodeLimit
-from vla_zenoh.lab.tasks import TaskJudge
+from vla_zenoh.lab.tasks import judge_of
 from vla_zenoh.types import FloatArray, ObjectPoses
 
 DONE_S = 1.5
@@ -86,7 +86,7 @@ def run_task(stage: TaskStage, plan: TaskPlan, request: TaskRequest) -> TaskOutc
         if rejected:
             return outcome(False, NOT_OBEYED, 0.0, rejected)
         scene, began_s = stage.scene(), stage.time_s()
-        judge = TaskJudge(task.order, scene.objects, scene.tcp_m)
+        judge = judge_of(task.order, scene.objects, scene.tcp_m)
         limit = EpisodeLimit(plan.limit_s, DONE_S)
         while True:
             stage.step()

@@ -26,6 +26,7 @@ from vla_zenoh.policy import ActionSteps, ModelSpec, Observation, Policy, reset_
 from vla_zenoh.policy.loader import find_worker, make_policy
 from vla_zenoh.profile import Profile
 from vla_zenoh.simulation.render import AUTO, Renderer, choose_backend
+from vla_zenoh.simulation.robot_model import robot_models
 from vla_zenoh.simulation.world import World, build_world
 from vla_zenoh.types import Image, ObjectPoses
 
@@ -94,7 +95,10 @@ class _LockstepStage:
             self.policy,
             delays=Delays(self.plan.delay_ms / 1e3, camera_s=CAMERA_S, wire_s=WIRE_S),
             picture=lambda camera: _LazyImage(self, camera),  # pyright: ignore
-            reach=make_reachability_filter(self.profile),
+            reach={
+                part: make_reachability_filter(self.profile.of_part(part))
+                for part in self.profile.part_names
+            },
             seed=seed,
         )
         if self.plan.rate_hz is not None:
@@ -213,7 +217,9 @@ def _prepare(
         world = build_world(profile)
         wanted = profile.sim.renderer
         renderer = Renderer(
-            profile.sim.scene, world.robot, choose_backend(None if wanted == AUTO else wanted)
+            profile.sim.scene,
+            robot_models(profile),
+            choose_backend(None if wanted == AUTO else wanted),
         )
         _, model = find_worker(plan.worker, profile.models)
         policy = _Loaded(make_policy(model, options, profile=named))

@@ -40,7 +40,7 @@ class TaskRunner:
         assert host.session is not None and host.client is not None
         self._plan, self._client, session = plan, host.client, host.session
         self._runner = EpisodeRunner(host.client, stop, host.poll)
-        keys = host.profile.keys
+        keys = host.profile.of_part(host.profile.part_names[0]).keys
         self._states = NewestRecords(
             session,
             {

@@ -24,7 +24,7 @@ from vla_zenoh.cli.output import console, new_table, print_json, progress_bars
 from vla_zenoh.lab.bench.task import BASELINES, SCENE, TaskPlan, TaskScore
 from vla_zenoh.lab.cli.bench_file import running_nodes, write_json
 from vla_zenoh.lab.cli.output_path import ForceOption, if_wanted, output_folder, require_free_folder
-from vla_zenoh.lab.tasks import FAMILIES, LIMIT_S
+from vla_zenoh.lab.tasks import FAMILIES, LIFT, LIMIT_S
 from vla_zenoh.policy.loader import find_model
 from vla_zenoh.profile import Profile, override
 from vla_zenoh.resources import is_path
@@ -45,7 +45,8 @@ class EpisodeOptions:
     family: Annotated[
         str | None,
         typer.Option(
-            "--family", help="put, stack, push, or stay (nonsense); default: all but stay."
+            "--family",
+            help="put, stack, push, stay (nonsense), lift (two arms); default: the first three.",
         ),
     ] = None
     delay_ms: Annotated[
@@ -69,8 +70,8 @@ class EpisodeOptions:
 
     def plan(self, model: str) -> TaskPlan:
         """The plan for `model`."""
-        if self.family not in (None, "stay", *FAMILIES):
-            raise typer.BadParameter(f"--family is one of {', '.join(FAMILIES)}, stay")
+        if self.family not in (None, "stay", LIFT, *FAMILIES):
+            raise typer.BadParameter(f"--family is one of {', '.join(FAMILIES)}, stay, {LIFT}")
         return TaskPlan(model, **asdict(self))
 
 
@@ -144,7 +145,9 @@ def task(
     varied = _varied(vary or [])
     named, path = _named(model)
     plan = episodes.plan(named)
-    loaded = _with_bricks(effective_profile(profile), plan.worker, varied, path)
+    loaded = effective_profile(profile)
+    scene = loaded.sim.scene if plan.family == LIFT else SCENE
+    loaded = _with_bricks(loaded, plan.worker, varied, path, scene)
     chosen = model_options.choose(loaded, plan.worker)
     if output.output is not None:  # before an environment is made, which may take minutes
         require_free_folder(output.output, force=output.force)
@@ -196,13 +199,15 @@ def _named(model: str) -> tuple[str, str]:
     return found.name, str(found.path)
 
 
-def _with_bricks(profile: Profile, worker: str, vary: list[str], path: str = "") -> Profile:
+def _with_bricks(
+    profile: Profile, worker: str, vary: list[str], path: str = "", scene: str = SCENE
+) -> Profile:
     """The profile with the scene of the tasks and the worker, whose file is `path` if not empty."""
     workers = [*dict.fromkeys([worker, *profile.workers])]
     return override(
         profile,
         {
-            "sim": {"scene": SCENE, "vary": vary},
+            "sim": {"scene": scene, "vary": vary},
             "workers": workers,
             "models": {worker: path} if path else {},
             "task": {"worker": worker, "prompt": "hold"},

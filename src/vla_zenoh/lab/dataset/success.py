@@ -5,7 +5,8 @@ from __future__ import annotations
 from vla_zenoh.errors import RecordError
 from vla_zenoh.lab.dataset.episodes import RecordedEpisode
 from vla_zenoh.lab.recording.run import newest
-from vla_zenoh.lab.tasks.judge import SETTLED_S, TaskJudge
+from vla_zenoh.lab.tasks import judge_of
+from vla_zenoh.lab.tasks.judge import SETTLED_S
 from vla_zenoh.lab.tasks.wording import parse_prompt
 from vla_zenoh.lab.trial.verdict import Verdict, verdict_in
 
@@ -39,7 +40,7 @@ def succeeded(episode: RecordedEpisode) -> bool | None:
     if order is None or before is None or pose is None:
         return None
     try:
-        judge = TaskJudge(order, before.record, pose.record.position_m)
+        judge = judge_of(order, before.record, pose.record.position_m)
     except RecordError:
         return None
     verdict = None

@@ -1,4 +1,4 @@
-"""Tasks for the scene ``bricks``: goals, prompts, and a judge. Pure.
+"""Tasks for the scenes ``bricks`` and ``pair``: goals, prompts, and judges. Pure.
 
 Reset the scene with a seed, draw a `TaskEpisode` from the objects' true poses, publish its prompt,
 and feed a `TaskJudge`::
@@ -10,10 +10,20 @@ and feed a `TaskJudge`::
     verdict = verdict or judge.end()
 """
 
+from vla_zenoh.lab.tasks.bar import BarJudge
 from vla_zenoh.lab.tasks.episode import TaskEpisode, draw_episode, draw_stay
 from vla_zenoh.lab.tasks.judge import FAILURES, LIMIT_S, TaskJudge, Verdict
-from vla_zenoh.lab.tasks.order import COLOURS, DIRECTIONS, FAMILIES, Order, brick
-from vla_zenoh.lab.tasks.wording import HELD_OUT, NONSENSE, TRAINING, phrase
+from vla_zenoh.lab.tasks.order import COLOURS, DIRECTIONS, FAMILIES, LIFT, Order, brick
+from vla_zenoh.lab.tasks.wording import HELD_OUT, LIFT_PROMPT, NONSENSE, TRAINING, phrase
+from vla_zenoh.types import FloatArray, ObjectPoses
+
+
+def judge_of(
+    order: Order, before: ObjectPoses, tcp_m: FloatArray | None = None
+) -> TaskJudge | BarJudge:
+    """The judge of a goal; see `TaskJudge` for the arguments and errors."""
+    return BarJudge(order, before) if order.family == LIFT else TaskJudge(order, before, tcp_m)
+
 
 __all__ = [
     "COLOURS",
@@ -21,9 +31,12 @@ __all__ = [
     "FAILURES",
     "FAMILIES",
     "HELD_OUT",
+    "LIFT",
+    "LIFT_PROMPT",
     "LIMIT_S",
     "NONSENSE",
     "TRAINING",
+    "BarJudge",
     "Order",
     "TaskEpisode",
     "TaskJudge",
@@ -31,5 +44,6 @@ __all__ = [
     "brick",
     "draw_episode",
     "draw_stay",
+    "judge_of",
     "phrase",
 ]

@@ -40,6 +40,7 @@ KNOCKED, OFF_COURSE, NOT_MOVED, TIMEOUT, MOVED = (
     "timeout",
     "moved",
 )
+TILTED = "tilted"
 FAILURES = {
     WRONG_BRICK: "another brick was lifted, moved or put in the box",
     FELL: "a brick fell off the table",
@@ -49,6 +50,7 @@ FAILURES = {
     OFF_COURSE: "the brick was pushed, but not far enough or in another direction",
     NOT_MOVED: "no brick was moved",
     TIMEOUT: "the time limit was reached while the brick was held",
+    TILTED: "the bar was not level: one arm lifted its end alone, or lost it",
     MOVED: "the arm had to stay, and it or a brick moved",
 }
 """Kinds of failure and their meaning."""

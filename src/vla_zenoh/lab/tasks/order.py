@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from vla_zenoh.errors import RecordError
 
-PUT, STACK, PUSH, STAY = "put", "stack", "push", "stay"
+PUT, STACK, PUSH, STAY, LIFT = "put", "stack", "push", "stay", "lift"
 FAMILIES = (PUT, STACK, PUSH)
 COLOURS = ("red", "blue", "green", "yellow")
 DIRECTIONS: Mapping[str, tuple[float, float]] = {
@@ -31,8 +31,8 @@ class Order:
 
     Args:
         family: ``put`` into the box, ``stack`` on another brick, ``push`` over the table; ``stay``
-            for a nonsense prompt.
-        target: colour of the brick to move; empty for ``stay``.
+            for a nonsense prompt; ``lift`` the bar with both arms.
+        target: colour of the brick to move; empty for ``stay`` and ``lift``.
         onto: colour of the brick below it; only for ``stack``.
         direction: one of `DIRECTIONS`; only for ``push``.
 
@@ -46,10 +46,11 @@ class Order:
     direction: str = ""
 
     def __post_init__(self) -> None:
-        if self.family not in (*FAMILIES, STAY):
-            raise RecordError(f"no family {self.family!r} of tasks; {', '.join(FAMILIES)}, {STAY}")
+        if self.family not in (*FAMILIES, STAY, LIFT):
+            known = ", ".join((*FAMILIES, STAY, LIFT))
+            raise RecordError(f"no family {self.family!r} of tasks; {known}")
         for name, value, allowed, wanted in (
-            ("target", self.target, COLOURS, self.family != STAY),
+            ("target", self.target, COLOURS, self.family in FAMILIES),
             ("onto", self.onto, COLOURS, self.family == STACK),
             ("direction", self.direction, tuple(DIRECTIONS), self.family == PUSH),
         ):
