@@ -13,6 +13,7 @@ import typer
 from vla_zenoh.cli.options import JsonOption, options
 from vla_zenoh.cli.output import console, new_table, print_json, progress
 from vla_zenoh.errors import MissingExtraError, VlaZenohError, in_words
+from vla_zenoh.lab.cli.output_path import ForceOption, output_folder
 from vla_zenoh.nodes.camera.node import make_source
 from vla_zenoh.nodes.camera.realsense import connected, sdk
 from vla_zenoh.nodes.camera.v4l2_devices import list_devices
@@ -25,30 +26,32 @@ MAKER = "RealSense"
 
 @options
 def camera_list(
-    pictures: Annotated[
-        Path | None,
-        typer.Option("--pictures", "-p", help="Folder for a picture of each.", file_okay=False),
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Folder for a picture of each camera.")
     ] = None,
+    force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """List the cameras of this computer by what stands for them in a profile.
 
     A serial number, or a name in /dev/v4l/by-id, stays with a camera; /dev/videoN may be another
-    one after a restart. With --pictures each is opened: stop the nodes that use them first.
+    one after a restart. With --output each is opened: stop the nodes that use them first.
     """
-    found = _realsense() + _v4l2()
-    if pictures is not None:
-        pictures.mkdir(parents=True, exist_ok=True)
-        for row in found:
-            with progress(f"a picture of {row['source']}"):
-                row |= _picture(row["source"], pictures)
+    if output is None:
+        found = _realsense() + _v4l2()
+    else:
+        with output_folder(output, force=force) as folder:
+            found = _realsense() + _v4l2()
+            for row in found:
+                with progress(f"a picture of {row['source']}"):
+                    row |= _picture(row["source"], folder)
     if as_json:
         print_json(found)
         return
     if not found:
         console().print("no cameras")
         return
-    columns = ["source", "name", "device"] + (["picture"] if pictures is not None else [])
+    columns = ["source", "name", "device"] + ([] if output is None else ["picture"])
     table = new_table(*columns)
     for row in found:
         table.add_row(*(str(row.get(name, "")) for name in columns))
@@ -105,7 +108,7 @@ def _picture(source: str, folder: Path) -> dict[str, Any]:
         if not cv2.imwrite(str(path), image):
             return {"picture": f"none: {path} cannot be written"}
         height, width = image.shape[:2]
-        return {"picture": f"{path} ({width}x{height})"}
+        return {"picture": f"{path.name} ({width}x{height})"}
     except VlaZenohError as error:
         return {"picture": f"none: {in_words(error)}"}
     finally:
