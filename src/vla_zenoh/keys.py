@@ -244,7 +244,8 @@ class Keys:
         Keys of one or two parts that are added later are among them, too.
         """
         pictures = ("camera/*/jpeg", "camera/*/depth", "seen/*/*", "seen/*/*/depth")
-        return tuple(map(self.full, ("*", "*/*", *pictures)))
+        parts = (f"{self.part}/state/*", f"{self.part}/command/*") if self.part else ()
+        return tuple(map(self.full, ("*", "*/*", *pictures, *parts)))
 
     def of_part(self, part: str) -> Keys:
         """The same keys with states and commands of `part`; ``*``: of every part."""

@@ -109,7 +109,8 @@ def carry_out(loop: Lockstep, prompt: str, count: int) -> Run:
     loop.run(0.01)
     limit_s = 1.3 * count / commander.task.rate_hz + 3.0
     assert loop.run_until(lambda: commander.progress.done, limit_s), loop.refused
-    loop.run(SETTLE_S)
+    # At a steady pace the last step takes until the next chunk would come.
+    loop.run(SETTLE_S + 1.0 / commander.task.rate_hz)
     assert commander.at_rest
     assert commander.state.value in ("active", "holding"), commander.why
     assert not loop.guard_refused

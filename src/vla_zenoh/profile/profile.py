@@ -135,6 +135,11 @@ class Profile(Section):
         return Keys(self.robot.name, self.root, self._part)
 
     @property
+    def keys_of_all_parts(self) -> Keys:
+        """The keys of this robot, as expressions of every part where it has several."""
+        return self.keys.of_part(keys.ANY_PART) if self.parts else self.keys
+
+    @property
     def part(self) -> str:
         """The part that this profile is of; empty: the whole robot."""
         return self._part

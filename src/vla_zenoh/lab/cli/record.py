@@ -53,7 +53,7 @@ def record(
 
     loaded = target.load()
     path = output or RUNS / time.strftime("record-%Y%m%d-%H%M%S.mcap")
-    expressions = recorded_keys(loaded.keys, keys or (), raw=raw)
+    expressions = recorded_keys(loaded.keys_of_all_parts, keys or (), raw=raw)
     done: list[RecordingResult] = []
 
     with output_file(path, force=force) as part:

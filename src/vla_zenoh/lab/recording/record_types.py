@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.keys import Keys, last_chunk
+from vla_zenoh.keys import NOT_PARTS, PART_KEYS, Keys, last_chunk
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.types import (
     ActionChunk,
@@ -47,6 +47,7 @@ class RecordTypes:
 
     def __init__(self, keys: Keys) -> None:
         self._keys = keys
+        self._of_parts = {getattr(keys, member) for member in PART_KEYS}
         self._known: dict[str, type | None] = {
             keys.state_joint: JointState,
             keys.state_pose: PoseState,
@@ -75,6 +76,10 @@ class RecordTypes:
             (self._keys.seen_record, InferenceDebug),
         )
         name = last_chunk(key)
+        part, _, rest = self._keys.short(key).partition("/")
+        of_part = self._keys.full(rest)
+        if part not in NOT_PARTS and of_part in self._of_parts:
+            return self._known[of_part]
         try:
             return next((kind for make, kind in families if make(name) == key), None)
         except ProfileError:

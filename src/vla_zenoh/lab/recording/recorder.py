@@ -126,7 +126,7 @@ class Recorder:
         about: Mapping[str, str] | None = None,
     ) -> None:
         self.node = Node(name, profile, session)
-        self._expressions = expressions or recorded_keys(self.node.keys)
+        self._expressions = expressions or recorded_keys(profile.keys_of_all_parts)
         self._queue = SampleQueue(
             session, max_bytes=queue_bytes, max_samples=QUEUE_SAMPLES, clock=self.node.clock
         )

@@ -28,7 +28,7 @@ class ViewListener(SampleQueue):
         self, session: zenoh.Session, profile: Profile, *, queue_bytes: int = QUEUE_BYTES
     ) -> None:
         super().__init__(session, max_bytes=queue_bytes, max_samples=QUEUE_SAMPLES)
-        self.subscribe(profile.keys.without_raw_images)
+        self.subscribe(profile.keys_of_all_parts.without_raw_images)
         # Specs are published once a second, and chunks cannot be drawn without them.
         for reply in session.get(profile.keys.all_specs, timeout=REPLY_TIMEOUT_S):
             if reply.ok is not None:
