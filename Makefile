@@ -15,7 +15,7 @@ AGAIN := --reruns 1 -r fEsR
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test slow fuzz fuzz-motion soak test-ros2 test-franka test-models check format bench bench-faults bench-ros2 build docs ros2-bridge clean
+.PHONY: help setup demo test slow fuzz fuzz-motion soak test-ros2 test-franka test-realsense test-models check format bench bench-faults bench-ros2 build docs ros2-bridge clean
 
 help: ## Show this list
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z0-9-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
@@ -53,6 +53,10 @@ test-ros2: $(READY) ros2-bridge ## Run the tests with a real ROS 2 bridge and a 
 
 test-franka: $(READY) ## Run the tests of the driver franka against franka-sim, in an environment of its own
 	$(BIN)/python scripts/test_franka.py $(AGAIN) $(ARGS)
+
+test-realsense: $(READY) ## Run the tests of RealSense cameras with the SDK's software device
+	$(BIN)/uv pip install --quiet --no-deps --target .venv/realsense pyrealsense2
+	PYTHONPATH=.venv/realsense $(BIN)/python -m pytest tests/unit/nodes/test_realsense.py $(ARGS)
 
 test-models: $(READY) ## Run the tests of OpenVLA and LeRobot, each in its environment (12 GB, once)
 	$(BIN)/python scripts/test_models.py $(ARGS)

@@ -89,6 +89,10 @@ COMMANDS: Mapping[str, Mapping[str, str | Group]] = {
             "Compare a robot with its profile.",
             {"check": "lab.cli.robot_check:robot_check"},
         ),
+        "camera": Group(
+            "Cameras of this computer.",
+            {"list": "lab.cli.camera:camera_list"},
+        ),
         "secure": "lab.cli.secure:secure_app",
         "dataset": "lab.cli.dataset:dataset_app",
         "bench": Group(

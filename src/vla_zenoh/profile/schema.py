@@ -16,13 +16,18 @@ SIMULATED: tuple[NodeKind, ...] = ("router", "sim", "camera", "command", "worker
 CAMERA_SOURCES = {
     "sim": "sim:CAMERA",
     "v4l2": "v4l2:DEVICE",
+    "realsense": "realsense:SERIAL",
     "rtsp": "rtsp://HOST/PATH",
     "rtsps": "rtsps://HOST/PATH",
     "file": "file:PATH",
     "ros2": "ros2:TOPIC",
 }
 """Kind of a camera's source -> how it is written. `nodes.camera.node.make_source` opens them."""
-DEPTH_SOURCES = ("sim",)
+DEPTH_SOURCES = ("sim", "realsense")
+LENS_SOURCES = ("v4l2", "realsense", "rtsp", "rtsps", "file")
+"""Kinds of source whose images a camera node may crop, flip and undistort."""
+LOCK_SOURCES = ("v4l2", "realsense")
+"""Kinds of source whose exposure and white balance can be fixed."""
 """Kinds of source that measure depth."""
 MIN_PERIODS = 3
 """A healthy link may be silent for up to this many periods."""
@@ -126,11 +131,28 @@ class CameraCheck(Section):
     after_s: float = Field(default=0.5, ge=0, le=60)
 
 
+class Crop(Section):
+    """A part of a camera's image, in its own pixels.
+
+    Args:
+        left: first column.
+        top: first row.
+        width: columns.
+        height: rows.
+    """
+
+    left: int = Field(ge=0, le=8192)
+    top: int = Field(ge=0, le=8192)
+    width: int = Field(ge=16, le=8192)
+    height: int = Field(ge=16, le=8192)
+
+
 class CameraProfile(Section):
     """A camera.
 
     Args:
-        source: ``sim:<camera of the scene>``, ``v4l2:<device>`` (``v4l2:/dev/video0``),
+        source: ``sim:<camera of the scene>``, ``v4l2:<device>`` (a serial number, a name in
+            /dev/v4l/by-id, or a path; `vla-zenoh camera list`), ``realsense:<serial number>``,
             ``rtsp://...``, ``file:<video or folder of images>`` (relative to the profile), or
             ``ros2:<topic>``.
         width: of published images, pixels.
@@ -140,7 +162,15 @@ class CameraProfile(Section):
         jpeg_rate_hz: largest rate of the JPEG stream; null: every image.
         jpeg_width: wider images are scaled down for the JPEG stream; null: never.
         depth_unit_m: metres of one count of the depth stream, 16 bits: at 0.001 it reaches 65 m in
-            steps of 1 mm; null: no depth. Of the sources ``sim:`` has depth.
+            steps of 1 mm; null: no depth. ``sim:`` and ``realsense:`` have depth.
+        intrinsics: YAML file with width, height, fx_px, fy_px, cx_px, cy_px and distortion (k1, k2,
+            p1, p2, k3 of OpenCV) of the camera's own images; null: as the camera tells, if it does.
+        undistort: remove the distortion of the lens, before the crop.
+        crop: part of the image that is published, before it is flipped; null: all of it.
+        flip: ``horizontal`` (left and right), ``vertical``, or ``both``, of a camera that is
+            mounted upside down.
+        exposure_us: fixed exposure; null: automatic. Of ``v4l2:`` and ``realsense:``.
+        white_balance_k: fixed white balance; null: automatic. Of the same.
         fit_for_workers: also publish images in the exact size of each model's spec, for workers on
             other hosts. Every source except ``ros2:`` supports it.
         loop: a file starts again at its end.
@@ -155,16 +185,32 @@ class CameraProfile(Section):
     jpeg_rate_hz: float | None = Field(default=None, gt=0, le=240)
     jpeg_width: int | None = Field(default=None, ge=16, le=8192)
     depth_unit_m: float | None = Field(default=None, ge=MIN_DEPTH_UNIT_M, le=MAX_DEPTH_UNIT_M)
+    intrinsics: Text | None = None
+    undistort: bool = False
+    crop: Crop | None = None
+    flip: Literal["none", "horizontal", "vertical", "both"] = "none"
+    exposure_us: float | None = Field(default=None, ge=1, le=1_000_000)
+    white_balance_k: float | None = Field(default=None, ge=1000, le=20_000)
     fit_for_workers: bool = False
     loop: bool = True
     check: CameraCheck = CameraCheck()
 
     def contradictions(self) -> Iterator[Fault]:
-        """Depth of a source that measures none."""
+        """What this kind of source cannot do."""
         kind = self.source.partition(":")[0]
         if self.depth_unit_m is not None and kind not in DEPTH_SOURCES:
             known = ", ".join(CAMERA_SOURCES[one] for one in DEPTH_SOURCES)
             yield ("depth_unit_m",), f"is set, and {kind}: measures no depth; these do: {known}"
+        for names, kinds in (
+            (("intrinsics", "undistort", "crop", "flip"), LENS_SOURCES),
+            (("exposure_us", "white_balance_k"), LOCK_SOURCES),
+        ):
+            for name in names:
+                if getattr(self, name) not in (None, False, "none") and kind not in kinds:
+                    known = ", ".join(f"{one}:" for one in kinds)
+                    yield (name,), f"is set, and works with {known} only"
+        if self.undistort and self.intrinsics is None and kind != "realsense":
+            yield ("intrinsics",), "is missing: undistort needs the file with the lens"
 
     @property
     def from_ros2(self) -> bool:

@@ -72,6 +72,7 @@ WRITERS = {
     "bench command": Writer("bench command", "out.json"),
     "bench task": Writer("bench task --model hold", "out"),
     "bench sim": Writer("bench sim metaworld --worker scripted", "out"),
+    "camera list": Writer("camera list", "out"),
     "lab trial": Writer("lab trial --workers a --prompt go", "out"),
     "lab inspect": Writer("lab inspect", "out"),
     "secure init": Writer(

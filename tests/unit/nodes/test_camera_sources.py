@@ -17,9 +17,10 @@ from hypothesis import strategies as st
 
 from vla_zenoh.errors import NodeError
 from vla_zenoh.nodes.camera import v4l2
-from vla_zenoh.nodes.camera.camera_publisher import resize, to_rgb
+from vla_zenoh.nodes.camera.camera_publisher import to_rgb
 from vla_zenoh.nodes.camera.file import FileSource, natural, open_frames
 from vla_zenoh.nodes.camera.fitted_streams import EARLY, LATE, RateLimiter
+from vla_zenoh.nodes.camera.geometry import resize
 from vla_zenoh.nodes.camera.node import choose_cameras, make_source
 from vla_zenoh.nodes.camera.rtsp import RtspSource
 from vla_zenoh.nodes.camera.source import without_password
@@ -298,7 +299,7 @@ def test_all_cameras_but_those_of_ros2_are_served_unless_some_are_named() -> Non
 
 
 def test_an_unknown_kind_of_source_lists_the_known_ones() -> None:
-    with pytest.raises(NodeError, match="there are: v4l2, rtsp, rtsps, file, sim"):
+    with pytest.raises(NodeError, match="there are: v4l2, realsense, rtsp, rtsps, file, sim"):
         make_source(CameraProfile(source="ros2:/image"))
 
 

@@ -205,7 +205,7 @@ def test_sections_are_merged_and_lists_and_hosts_replaced(write: Write) -> None:
 def test_null_takes_an_inherited_camera_away(write: Write) -> None:
     assert list(load_profile(write("cameras: {wrist: null}")).cameras) == ["front"]
     assert (
-        "cameras.side: is empty: wants a map of: check, fit_for_workers, height"
+        "cameras.side: is empty: wants a map of: check, crop, depth_unit_m, exposure_us"
         in told(write("cameras: {side: null}"))[0]
     )
 

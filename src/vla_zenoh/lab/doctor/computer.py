@@ -10,7 +10,9 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
+from vla_zenoh.errors import NodeError
 from vla_zenoh.lab.doctor.finding import HostFinding
+from vla_zenoh.nodes.camera.v4l2_devices import DEV, find_device
 
 PRIORITY = 50
 NICENESS = -10
@@ -135,18 +137,19 @@ def disk(folder: Path | None = None, wanted_mib: int = DISK_WANTED_MIB) -> HostF
     return HostFinding("disk", level, found, "free some space, or work in a folder on another disk")
 
 
-DEV = Path("/dev")
-
-
 def video_devices(needed: Sequence[str] = (), dev: Path = DEV) -> HostFinding:
     """The video devices of the profile exist, and this user may open every video device.
 
     Args:
-        needed: paths of devices, or their numbers.
+        needed: as `find_device` takes them: paths, numbers, serial numbers, names.
         dev: folder of devices.
     """
     present = sorted(dev.glob("video[0-9]*"))
-    wanted = [dev / f"video{name}" if name.isdecimal() else Path(name) for name in needed]
+    try:
+        wanted = [find_device(name, dev) for name in needed]
+    except NodeError as error:
+        why = "plug the camera in, or correct its source: `vla-zenoh camera list`"
+        return HostFinding("video devices", "fail", str(error), why)
     missing = [str(path) for path in wanted if not path.exists()]
     if missing:
         there = ", ".join(map(str, present)) or "none"

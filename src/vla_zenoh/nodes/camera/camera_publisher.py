@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import cv2
@@ -19,6 +19,7 @@ from vla_zenoh.codec.image import depth_schema, encode_depth, encode_jpeg, encod
 from vla_zenoh.errors import NodeError
 from vla_zenoh.keys import Kind
 from vla_zenoh.nodes.camera.fitted_streams import FittedStreams, RateLimiter, shrink
+from vla_zenoh.nodes.camera.geometry import Geometry, Intrinsics
 from vla_zenoh.nodes.camera.image_check import ImageCheck, ImageFault
 from vla_zenoh.nodes.camera.source import Pixels
 from vla_zenoh.profile.schema import CameraProfile
@@ -65,8 +66,9 @@ class CameraPublisher:
         if profile.depth_unit_m is not None:
             self._depth = node.declare_publisher(node.keys.camera_depth(name), Kind.FRAME)
         self._measured_share = 0.0
-        self.intrinsics: dict[str, float] | None = None
-        """Of images of the profile's size, where the source knows them; for status."""
+        self._geometry: Geometry | None = None
+        self.intrinsics: Intrinsics | None = None
+        """Of published images, where they are known; for status."""
         self.fitted = FittedStreams(name, profile, node, emit)
         self._limiter = RateLimiter(profile.rate_hz)
         self._jpeg_limiter = RateLimiter(profile.jpeg_rate_hz)
@@ -121,9 +123,18 @@ class CameraPublisher:
         return True
 
     # -- image faults -------------------------------------------------------------------------
-    def opened(self, backend: str, same_s: float) -> None:
-        """The source was (re)opened: start the image check from scratch."""
-        self.backend = backend
+    def opened(self, backend: str, same_s: float, intrinsics: Intrinsics | None = None) -> None:
+        """The source was (re)opened: start the image check from scratch.
+
+        Args:
+            backend: of the source.
+            same_s: how long it may repeat an identical image, s; 0: indefinitely.
+            intrinsics: of its images, if it knows them.
+
+        Raises:
+            NodeError: the profile's intrinsics cannot be read.
+        """
+        self.backend, self._geometry = backend, Geometry(self.profile, intrinsics)
         self._check = ImageCheck(self.name, self.profile.check, same_s)
 
     def check(self, image: Pixels, mono_ns: int, stamp_ns: int | None = None) -> None:
@@ -149,17 +160,27 @@ class CameraPublisher:
         """Whether anyone subscribes to the depth stream."""
         return self._depth is not None and self._depth.has_subscribers
 
-    def publish(self, image: Pixels, mono_ns: int) -> None:
-        """Publish an image of OpenCV, captured at `mono_ns`, in the profile's size.
+    def publish(self, image: Pixels, mono_ns: int, depth_m: Pixels | None = None) -> None:
+        """Publish an image of OpenCV, captured at `mono_ns`, as the profile wants it.
+
+        Args:
+            image: of the source.
+            mono_ns: time of capture, monotonic clock.
+            depth_m: (H, W) of the same pixels, m.
 
         Raises:
-            NodeError: unknown image format.
+            NodeError: unknown image format, or a crop beyond the image.
         """
-        width, height = self.profile.width, self.profile.height
-        if image.shape[:2] != (height, width):
+        width, height, crop = self.profile.width, self.profile.height, self.profile.crop
+        if image.shape[:2] != (height, width) and crop is None:
             self._count_resized(image.shape[:2])
+        geometry = self._geometry or Geometry(self.profile)
+        image = geometry.apply(image)
+        self.intrinsics = geometry.intrinsics()
+        if depth_m is not None:
+            depth_m = geometry.apply(depth_m, depth=True)
         stamp_ns = self._clock.wall_ns() - (time.monotonic_ns() - mono_ns)
-        self.publish_rgb(to_rgb(resize(image, width, height)), mono_ns, stamp_ns)
+        self.publish_rgb(to_rgb(image), mono_ns, stamp_ns, depth_m)
 
     def publish_rgb(
         self,
@@ -237,7 +258,7 @@ class CameraPublisher:
             "age_s": None if newest is None else (time.monotonic_ns() - newest) / 1e9,
         }
         if self.intrinsics is not None:
-            detail["intrinsics"] = self.intrinsics
+            detail["intrinsics"] = self.intrinsics.shown()
         if self._depth is not None:
             detail["depth_measured_share"] = round(self._measured_share, 3)
         if (bad := self.fault) is not None:
@@ -258,16 +279,6 @@ class CameraPublisher:
         return {f"{self.name}.{what}": count for what, count in counts.items()}
 
 
-def resize(image: Pixels, width: int, height: int) -> Pixels:
-    """Stretch to (height, width): by area averaging to shrink, linearly to enlarge."""
-    had_height, had_width = image.shape[:2]
-    if (had_height, had_width) == (height, width):
-        return image
-    shrinks = width * height < had_width * had_height
-    method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-    return cv2.resize(image, (width, height), interpolation=method)
-
-
 def to_rgb(image: Pixels) -> NDArray[np.uint8]:
     """Convert grey, BGR or BGRA of 8 or 16 bits to RGB uint8 (H, W, 3).
 
@@ -283,17 +294,3 @@ def to_rgb(image: Pixels) -> NDArray[np.uint8]:
     if image.dtype == np.uint16:
         image = (image >> 8).astype(np.uint8)
     return np.asarray(cv2.cvtColor(image, _TO_RGB[channels]), np.uint8)
-
-
-DISTORTION = ("k1", "k2", "p1", "p2", "k3")
-
-
-def pinhole(
-    fx_px: float, fy_px: float, cx_px: float, cy_px: float, distortion: Sequence[float] = ()
-) -> dict[str, float]:
-    """Intrinsics as they stand in the status: focal lengths and principal point in pixels, with
-    (0, 0) at the outer corner of the first pixel; `DISTORTION` as OpenCV numbers it.
-    """
-    plain = {"fx_px": fx_px, "fy_px": fy_px, "cx_px": cx_px, "cy_px": cy_px}
-    named = plain | dict(zip(DISTORTION, distortion, strict=False))
-    return {name: float(value) for name, value in named.items()}

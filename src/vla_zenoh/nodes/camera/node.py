@@ -15,7 +15,13 @@ from vla_zenoh.errors import NodeError, in_words
 from vla_zenoh.keys import last_chunk
 from vla_zenoh.nodes.camera.camera_publisher import ENDED, OK, CameraPublisher
 from vla_zenoh.nodes.camera.fitted_streams import MAX_MODELS, RequestedSizes
-from vla_zenoh.nodes.camera.source import LOOK_S, STALL_S, Source, without_password
+from vla_zenoh.nodes.camera.source import (
+    LOOK_S,
+    STALL_S,
+    DepthSource,
+    Source,
+    without_password,
+)
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.schema import CameraProfile
@@ -72,7 +78,12 @@ def make_source(profile: CameraProfile) -> Source:
         from vla_zenoh.nodes.camera.file import FileSource
 
         return FileSource(rest, profile.rate_hz, profile.loop)
-    raise NodeError(f"no camera source called {kind!r}; there are: v4l2, rtsp, rtsps, file, sim")
+    if kind == "realsense":
+        from vla_zenoh.nodes.camera.realsense import RealsenseSource
+
+        return RealsenseSource(rest, profile)
+    known = "v4l2, realsense, rtsp, rtsps, file, sim"
+    raise NodeError(f"no camera source called {kind!r}; there are: {known}")
 
 
 class Grabber:
@@ -92,7 +103,8 @@ class Grabber:
         while not stop.is_set():
             try:
                 self._source.open()
-                self._publisher.opened(self._source.backend, self._source.same_s)
+                intrinsics = getattr(self._source, "intrinsics", None)
+                self._publisher.opened(self._source.backend, self._source.same_s, intrinsics)
                 self._grab_all(stop)
             except Exception as error:  # whatever a driver raises must not end the other cameras
                 if stop.is_set():
@@ -132,7 +144,10 @@ class Grabber:
             looked = now
             publisher.check(image, mono_ns, source.stamp_ns)
             if wanted:
-                publisher.publish(image, mono_ns)
+                depth_m = None
+                if publisher.wants_depth and isinstance(source, DepthSource):
+                    depth_m = source.depth_m()
+                publisher.publish(image, mono_ns, depth_m)
             publisher.captured(mono_ns)
             last_good, proved, broken = now, True, 0
             publisher.set_state(OK)

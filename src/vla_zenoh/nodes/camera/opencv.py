@@ -50,6 +50,10 @@ class Capture:
         """A capture property, 0 where unknown."""
         return 0.0 if self._capture is None else self._capture.get(quantity)
 
+    def set(self, quantity: int, value: float) -> bool:
+        """Set a capture property; False where the device has none."""
+        return self._capture is not None and self._capture.set(quantity, value)
+
     def grab(self) -> bool:
         """Wait for the next image; False on failure."""
         return self._capture is not None and self._capture.grab()

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from vla_zenoh.bus.buffers import LatestSample, ReceivedSample
 from vla_zenoh.errors import MissingExtraError, NodeError, RecordError, VlaZenohError, in_words
-from vla_zenoh.nodes.camera.camera_publisher import OK, CameraPublisher, pinhole
+from vla_zenoh.nodes.camera.camera_publisher import OK, CameraPublisher
+from vla_zenoh.nodes.camera.geometry import Intrinsics
 from vla_zenoh.nodes.camera.source import STALL_S
 from vla_zenoh.profile import Profile
 from vla_zenoh.simulation.render import AUTO, Renderer, choose_backend
@@ -145,7 +146,14 @@ class SimCameras:
         for camera, publisher in views:
             width, height = publisher.profile.width, publisher.profile.height
             focal_px = renderer.focal_px(camera, height)
-            publisher.intrinsics = pinhole(focal_px, focal_px, width / 2, height / 2)
+            publisher.intrinsics = Intrinsics(
+                width=width,
+                height=height,
+                fx_px=focal_px,
+                fy_px=focal_px,
+                cx_px=width / 2,
+                cy_px=height / 2,
+            )
             publisher.set_waiting_reason(f"no scene on {key} yet")
         while not stop.is_set():
             if not self._buffer.wait(WAKE_S):

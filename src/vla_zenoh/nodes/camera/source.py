@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import threading
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from numpy.typing import NDArray
 
@@ -63,6 +63,15 @@ class Source(Protocol):
 
     def close(self) -> None:
         """Release the device; harmless if it is not open."""
+        ...
+
+
+@runtime_checkable
+class DepthSource(Protocol):
+    """A `Source` that measures depth as well, and knows its lens."""
+
+    def depth_m(self) -> NDArray[Any] | None:
+        """Depth of the grabbed image in m, in its pixels; 0: not measured. None: it has none."""
         ...
 
 

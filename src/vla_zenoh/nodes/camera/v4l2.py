@@ -12,28 +12,31 @@ import cv2
 from vla_zenoh.errors import NodeError
 from vla_zenoh.nodes.camera.opencv import Capture
 from vla_zenoh.nodes.camera.source import STALL_S, Pixels
+from vla_zenoh.nodes.camera.v4l2_devices import DEV, SYS, find_device
 from vla_zenoh.profile.schema import CameraProfile
 
-DEV = Path("/dev")
 MAX_UNCOMPRESSED_PX = 640 * 480
 """USB 2 carries at most this many uncompressed pixels at 30 Hz."""
 SANE_AGE_S = 1.0
 SAME_S = 1.0
 """Sensor noise makes any two images differ in some bit of thousands of pixels."""
-SYS = Path("/sys/class/video4linux")
+MANUAL_EXPOSURE = 1
+"""V4L2_EXPOSURE_MANUAL."""
+EXPOSURE_UNIT_US = 100.0
+"""Of V4L2_CID_EXPOSURE_ABSOLUTE."""
 VIRTUAL = "/sys/devices/virtual/"
 
 
 class V4l2Source:
-    """A device such as ``/dev/video0`` or ``/dev/v4l/by-id/...``.
+    """A device such as ``/dev/video0`` or ``/dev/v4l/by-id/...``, or one with a serial number.
 
     Args:
-        device: path or number.
-        profile: size and rate to request; the device may choose others.
+        device: see `find_device`.
+        profile: size, rate and locks to request; the device may choose another size and rate.
     """
 
     def __init__(self, device: str, profile: CameraProfile) -> None:
-        self._path = DEV / f"video{device}" if device.isdecimal() else Path(device)
+        self._device, self._path = device, DEV
         self._profile = profile
         self._capture = Capture()
         self.same_s = SAME_S
@@ -44,6 +47,8 @@ class V4l2Source:
         return self._capture.backend
 
     def open(self) -> None:
+        # At every opening: a camera that was plugged in again may have another number.
+        self._path = find_device(self._device)
         why = why_not(self._path)
         if why:
             raise NodeError(why)
@@ -65,6 +70,32 @@ class V4l2Source:
                 f"it (fuser -v {self._path})? Of a camera with several devices, only the first one "
                 "gives images"
             )
+
+        self._lock()
+
+    def _lock(self) -> None:
+        """Fix what the profile fixes; the rest stays as it was set on the device."""
+        exposure = self._profile.exposure_us
+        for name, value, switch, manual, quantity in (
+            (
+                "exposure_us",
+                exposure and exposure / EXPOSURE_UNIT_US,
+                cv2.CAP_PROP_AUTO_EXPOSURE,
+                MANUAL_EXPOSURE,
+                cv2.CAP_PROP_EXPOSURE,
+            ),
+            (
+                "white_balance_k",
+                self._profile.white_balance_k,
+                cv2.CAP_PROP_AUTO_WB,
+                0,
+                cv2.CAP_PROP_WB_TEMPERATURE,
+            ),
+        ):
+            if value is None:
+                continue
+            if not (self._capture.set(switch, manual) and self._capture.set(quantity, value)):
+                raise NodeError(f"{self._path} does not take {name}: leave it out of the profile")
 
     def grab(self, stop: threading.Event) -> int | None:
         if not self._capture.grab():
