@@ -79,7 +79,7 @@ def _outline_of(profile: Profile) -> dict[str, Any]:
     return {
         "name": profile.name,
         "root": profile.root,
-        "robot": {"name": profile.robot.name, "driver": profile.robot.driver},
+        "robot": profile.robot.model_dump(include={"name", "driver", "base_frame"}),
         "session": profile.session.model_dump(mode="json"),
         "hosts": hosts,
         "cameras": {name: {"from_ros2": one.from_ros2} for name, one in profile.cameras.items()},

@@ -21,6 +21,8 @@ from vla_zenoh.lab.trial.score import TrialScore, score
 from vla_zenoh.lab.trial.verdict import EpisodeVerdict
 
 EPISODES, SECONDS = 20, 60.0
+STOPPED = 3
+"""Exit code of an unattended trial that a rule or a person stopped."""
 
 
 @dataclass(frozen=True)
@@ -73,12 +75,25 @@ def trial(
     ] = False,
     report: Annotated[bool, typer.Option("--report", help="Only show the results so far.")] = False,
     as_json: JsonOption = False,
+    unattended: Annotated[
+        Path | None,
+        typer.Option("--unattended", help="Plan (YAML) of tasks, resets and judge: needs nobody."),
+    ] = None,
 ) -> None:
     """Try models on a real arm; you judge whether each episode succeeded.
 
     Every worker does every setup, in an order that you do not see. Enter ends an episode, Ctrl-C
-    the trial; the arm brakes first. The same command continues it.
+    the trial; the arm brakes first. The same command continues it. With --unattended a program
+    resets and judges, and nobody has to be there.
     """
+    if unattended is not None:
+        robot = target.load().robot.name
+        if report or any(
+            value for name, value in plan_options.asked(robot).items() if name != "robot"
+        ):
+            raise typer.BadParameter("--unattended PLAN says it all: leave the other options out")
+        _unattended(output, unattended, target, robot, as_json=as_json)
+        return
     folder = TrialFolder(output)
     if report:
         plan = folder.plan()
@@ -143,6 +158,48 @@ def _plan(folder: TrialFolder, asked: dict[str, Any]) -> TrialPlan:
     plan = TrialPlan(**{**defaults, **given})
     folder.begin(plan)
     return plan
+
+
+def _unattended(
+    output: Path, plan_file: Path, target: RobotTarget, robot: str, *, as_json: bool
+) -> None:
+    from vla_zenoh.lab.episode import Interrupted
+    from vla_zenoh.lab.trial.unattended import PLAN, UnattendedTrial, run_unattended
+    from vla_zenoh.lab.trial.unattended_page import PAGE
+    from vla_zenoh.lab.trial.unattended_plan import read_plan
+    from vla_zenoh.runtime.process import stop_on_signals
+
+    plan = read_plan(plan_file)
+    check_folder(output, begun=(output / PLAN).exists())
+    stop = stop_on_signals()
+    signal.signal(signal.SIGHUP, lambda *_: stop.set())
+    with TrialFolder(output).lock():
+        trial = UnattendedTrial(output, plan, robot)
+        try:
+            why = run_unattended(
+                trial,
+                lambda: target.operator("lab", "trial", "--output", str(output)),
+                plan_file.parent,
+                stop,
+                lambda text: errors().print(text, style="yellow", markup=False),
+            )
+        except Interrupted:
+            errors().print("interrupted; the same command continues", markup=False)
+            raise typer.Exit(130) from None
+    found = trial.scores()
+    if as_json:
+        tasks = {
+            each.name: _mapping(trial.trial(each)[1], result, episodes)
+            for each, result, episodes in found
+        }
+        print_json({"stopped": why, "tasks": tasks})
+    else:
+        for each, result, _ in found:
+            _show(trial.trial(each)[1], result)
+        console().print(f"page: {output / PAGE}", markup=False)
+    if why:
+        errors().print(f"stopped by a rule or a person: {why}", style="yellow", markup=False)
+        raise typer.Exit(STOPPED)
 
 
 def _run(
