@@ -25,6 +25,8 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 
+import contextlib
+
 from chain import write_profile
 
 from vla_zenoh.lab.recording.reader import open_recording
@@ -104,7 +106,8 @@ class Night:
         due_s = time.monotonic() + 2 * self.kill_s[1]  # the start itself takes a while
         try:
             while True:
-                assert self.up is not None and self.trial is not None
+                assert self.up is not None
+                assert self.trial is not None
                 code = self.trial.poll()
                 if code == -signal.SIGKILL:
                     self._start_trial()
@@ -149,7 +152,8 @@ class Night:
         self.trial = self._start("trial", *words)
 
     def _kill_one(self) -> None:
-        assert self.up is not None and self.trial is not None
+        assert self.up is not None
+        assert self.trial is not None
         names = {name: pid for pid, name in self._nodes()} | {"trial": self.trial.pid}
         # Each once before any of them twice.
         fewest = min(self.killed[name] for name in names)
@@ -158,7 +162,8 @@ class Night:
         self.killed[name] += 1
 
     def _cut_power(self) -> None:
-        assert self.up is not None and self.trial is not None
+        assert self.up is not None
+        assert self.trial is not None
         for pid in [self.up.pid, self.trial.pid, *(pid for pid, _ in self._nodes())]:
             self._kill(pid)
         self.killed["power"] += 1
@@ -180,10 +185,8 @@ class Night:
 
     @staticmethod
     def _kill(pid: int) -> None:
-        try:
+        with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
-        except ProcessLookupError:
-            pass
 
     def _end(self) -> None:
         for process in (self.trial, self.up):
@@ -244,7 +247,9 @@ def examine(night: Night, code: int) -> tuple[dict[str, Any], list[str]]:
             void += each.verdict == "void"
             if each.verdict != "void":
                 recording = open_recording(folder.path / each.recording)
-                unlabelled += verdict_in(recording.metadata, each.worker) != each.verdict
+                for _ in recording.entries(lambda _: False):
+                    pass
+                unlabelled += verdict_in(recording.ended, each.worker) != each.verdict
     page = (night.output / "index.html").read_text()
     total = night.episodes * len(TASKS) * len(WORKERS)
     if f"{total} of {total} episodes" not in page:

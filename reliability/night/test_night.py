@@ -6,7 +6,6 @@ import random
 from pathlib import Path
 
 import pytest
-
 from night.night import Night, examine
 
 pytestmark = pytest.mark.slow

@@ -164,9 +164,10 @@ def _unattended(
     output: Path, plan_file: Path, target: RobotTarget, robot: str, *, as_json: bool
 ) -> None:
     from vla_zenoh.lab.episode import Interrupted
-    from vla_zenoh.lab.trial.unattended import PLAN, UnattendedTrial, run_unattended
+    from vla_zenoh.lab.trial.unattended import PLAN, UnattendedTrial
     from vla_zenoh.lab.trial.unattended_page import PAGE
     from vla_zenoh.lab.trial.unattended_plan import read_plan
+    from vla_zenoh.lab.trial.unattended_runner import run_unattended
     from vla_zenoh.runtime.process import stop_on_signals
 
     plan = read_plan(plan_file)

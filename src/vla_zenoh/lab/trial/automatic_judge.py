@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.codec.image import decode_jpeg
-from vla_zenoh.errors import NodeError
+from vla_zenoh.errors import NodeError, in_words
 from vla_zenoh.lab.trial.unattended_plan import JudgeChoice
 from vla_zenoh.types import GripperState, PoseState
 
@@ -105,7 +105,7 @@ def _python_judge(path: Path) -> Judge:
     try:
         function = runpy.run_path(str(path)).get("judge")
     except Exception as error:
-        raise NodeError(f"judge {path}: {type(error).__name__}: {error}") from error
+        raise NodeError(f"judge {path}: {in_words(error)}") from error
     if not callable(function):
         raise NodeError(f"judge {path}: define judge(episode), which returns True or False")
 
@@ -114,7 +114,7 @@ def _python_judge(path: Path) -> Judge:
             answer: Any = function(episode)
             success, note = answer if isinstance(answer, tuple) else (answer, "")
         except Exception as error:
-            raise NodeError(f"judge {path}: {type(error).__name__}: {error}") from error
+            raise NodeError(f"judge {path}: {in_words(error)}") from error
         if not isinstance(success, (bool, np.bool_)):
             raise NodeError(f"judge {path} returned {success!r}; allowed: True, False")
         return bool(success), _line(str(note))
@@ -154,7 +154,7 @@ def _answer(url: str, body: Mapping[str, Any]) -> str:
             found = json.loads(response.read(MAX_ANSWER_BYTES))
         return str(found["choices"][0]["message"]["content"])
     except (OSError, ValueError, LookupError, TypeError) as error:
-        raise NodeError(f"judge {url}: {type(error).__name__}: {error}") from error
+        raise NodeError(f"judge {url}: {in_words(error)}") from error
 
 
 def _line(text: str) -> str:

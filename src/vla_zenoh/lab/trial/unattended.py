@@ -1,39 +1,22 @@
-"""Runs an unattended trial: one `TrialFolder` for each task, until all is judged or a rule stops.
-
-Whatever ends the process, the same command goes on: an episode counts once its verdict is on the
-disk, and one without a verdict is repeated.
-"""
+"""The folder of an unattended trial: its plan, one `TrialFolder` for each task, and a journal."""
 
 from __future__ import annotations
 
 import json
 import os
-import threading
 import time
-from collections.abc import Callable
-from contextlib import AbstractContextManager
-from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from vla_zenoh.bus.client import Client
-from vla_zenoh.errors import NodeError, OutputError, RecordingError, SessionError
-from vla_zenoh.lab.episode import Interrupted
-from vla_zenoh.lab.trial.automatic_judge import make_judge
+from vla_zenoh.errors import OutputError
 from vla_zenoh.lab.trial.folder import TrialFolder
 from vla_zenoh.lab.trial.plan import TrialPlan
-from vla_zenoh.lab.trial.runner import TrialRunner
 from vla_zenoh.lab.trial.score import TrialScore, score
-from vla_zenoh.lab.trial.unattended_operator import TrialStopped, UnattendedOperator
-from vla_zenoh.lab.trial.unattended_page import write_page
 from vla_zenoh.lab.trial.unattended_plan import UnattendedPlan, UnattendedTask, checked_plan
 from vla_zenoh.lab.trial.verdict import EpisodeVerdict
-from vla_zenoh.lab.trial.webhook import Webhook
 
 PLAN, JOURNAL = "unattended.json", "unattended.jsonl"
-RETRY_S, MAX_TROUBLE = 5.0, 20
-"""Between two attempts after trouble, and how many without an episode in between."""
 
 
 class UnattendedTrial:
@@ -156,103 +139,3 @@ class UnattendedTrial:
         if deadline_s is not None and time.time() >= deadline_s:
             return f"at: {datetime.fromtimestamp(deadline_s):%H:%M}"
         return self.plan.stop.reason(self.episodes()[episodes:])
-
-
-def run_unattended(
-    trial: UnattendedTrial,
-    open_client: Callable[[], AbstractContextManager[Client]],
-    plan_folder: Path,
-    stop: threading.Event,
-    warn: Callable[[str], None],
-) -> str:
-    """Run what is due; why it stopped, empty: every episode is judged.
-
-    Args:
-        trial: its folder is locked by this process.
-        open_client: a client of the running robot; opened again after trouble.
-        plan_folder: where a Python judge is looked for.
-        stop: set by Ctrl-C.
-        warn: called with warnings.
-
-    Raises:
-        NodeError, SessionError: trouble that does not end.
-        Interrupted: Ctrl-C; the arm is at rest.
-        RecordingError, OutputError: the disk is full or broken.
-    """
-    judge = make_judge(trial.plan.judge, plan_folder)
-    hook = Webhook(trial.plan.webhook, warn)
-    trial.begin()
-    hook.tell("begun", _summary(trial))
-    try:
-        why = _run(trial, open_client, judge, stop, warn, hook)
-        trial.note("stopped" if why else "finished", why)
-        hook.tell("stopped" if why else "finished", {"why": why, **_summary(trial)})
-        return why
-    except (NodeError, SessionError, RecordingError, OutputError) as error:
-        hook.tell("failed", {"why": str(error), **_summary(trial)})
-        raise
-    finally:
-        write_page(trial)
-        hook.close()
-
-
-def _run(
-    trial: UnattendedTrial,
-    open_client: Callable[[], AbstractContextManager[Client]],
-    judge: Any,
-    stop: threading.Event,
-    warn: Callable[[str], None],
-    hook: Webhook,
-) -> str:
-    def due_to_stop() -> str:
-        write_page(trial)
-        return trial.due_to_stop()
-
-    for task in trial.plan.tasks:
-        folder, plan = trial.trial(task)
-        folder.path.mkdir(exist_ok=True)
-        if folder.plan() is None:
-            folder.begin(plan)
-        trouble, before = 0, -1
-        while plan.next_due(folder.episodes()) is not None:
-            if stop.is_set():
-                raise Interrupted
-            if why := trial.due_to_stop():
-                return why
-            try:
-                with open_client() as client:
-                    operator = UnattendedOperator(
-                        client, trial.plan, task, plan, folder, judge, stop, due_to_stop, warn
-                    )
-                    try:
-                        TrialRunner(client, plan, folder, operator, stop).run()
-                    finally:
-                        operator.close()
-            except TrialStopped as stopped:
-                return str(stopped)
-            except (NodeError, SessionError) as error:
-                judged = sum(each.verdict != "void" for each in folder.episodes())
-                trouble, before = (1 if judged > before else trouble + 1), judged
-                warn(f"trouble {trouble} of {MAX_TROUBLE}: {error}")
-                trial.note("trouble", str(error)[:500])
-                hook.tell("trouble", {"why": str(error)[:500], **_summary(trial)})
-                if trouble >= MAX_TROUBLE:
-                    raise
-                if stop.wait(RETRY_S):
-                    raise Interrupted from error
-    return ""
-
-
-def _summary(trial: UnattendedTrial) -> dict[str, Any]:
-    return {
-        "robot": trial.robot,
-        "folder": str(trial.path),
-        "tasks": {
-            task.name: {
-                "done": found.done,
-                "of": found.of,
-                "workers": {each.worker: asdict(each) for each in found.workers},
-            }
-            for task, found, _ in trial.scores()
-        },
-    }
