@@ -307,6 +307,7 @@ COUNTERS = {
     "command.missed_ticks": "ticks of the command node that were skipped",
     "command.smoothing_failures": "times Ruckig found no plan",
     "dropped": "recorder: samples that were not written",
+    "missed": "rolling record: samples that came while the disk took none",
     "gripper_bounded": "gripper commands that were bounded",
     "ros2.commands_sent": "set-points sent to ROS 2",
     "ros2.efforts_missing": "joint states without efforts",

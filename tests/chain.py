@@ -404,6 +404,7 @@ def running_chain(
     more: str = "",
     worker_options: Mapping[str, Sequence[str]] | None = None,
     also: Sequence[Path] = (),
+    rolling: Path | None = None,
 ) -> Iterator[Chain]:
     """Every node of a small profile, up while the block lasts.
 
@@ -415,6 +416,7 @@ def running_chain(
         more: YAML at the end of the profile.
         worker_options: worker -> ``name=value`` options of its model.
         also: profiles of other robots that the router serves.
+        rolling: folder of a rolling record.
     """
     path = profile_file or write_profile(folder, rate_hz=rate_hz, more=more)
     profile = load_profile(str(path))
@@ -437,7 +439,13 @@ def running_chain(
         # Children die with the thread that started them: it has to be the one that serves.
         try:
             with Host(
-                profile, host, log=log, tell=tell, worker_options=worker_options, also=others
+                profile,
+                host,
+                log=log,
+                tell=tell,
+                worker_options=worker_options,
+                also=others,
+                rolling=rolling,
             ) as running:
                 hosts.append(running)
                 running.serve(stop)

@@ -166,6 +166,7 @@ class Keys:
     )
     stop = _Key("stop", "Anything: latched emergency stop.")
     reset = _Key("reset", "Anything: clears the emergency stop.")
+    save = _Key("save", "Why: the rolling record of the last minutes is saved.")
 
     # -- model workers ------------------------------------------------------------------------
     task = _Key(
@@ -333,6 +334,10 @@ def worker_node(worker: str) -> str:
     """Node name of a worker."""
     return f"worker-{worker}"
 
+
+ROLLING = "rolling"
+"""Node, and kind of node, of the rolling record that `up` keeps beside a command node. It is not in
+`NODE_KINDS`: a profile does not name it."""
 
 CRASHED, STARTING = "crashed", "starting"
 """States in the status that `vla-zenoh up` publishes for a node of its host that does not run."""

@@ -31,7 +31,7 @@ BUSY_S = 1.0
 STILL_TWIST = 1e-3
 GIVE_UP_S = 90.0
 """Nine seconds of waiting between six starts of an interpreter."""
-NODES = {"router", "sim", "camera", "command", "worker-scripted"}
+NODES = {"router", "sim", "camera", "command", "worker-scripted", "rolling"}
 
 
 class Up:
@@ -39,6 +39,7 @@ class Up:
 
     def __init__(self, *arguments: str) -> None:
         environment = {**os.environ, "COLUMNS": "200", "NO_COLOR": "1", "TERM": "dumb"}
+        environment["XDG_STATE_HOME"] = str(Path(arguments[0]).parent / "state")
         self.process = subprocess.Popen(
             [sys.executable, "-m", "vla_zenoh", "up", *arguments],
             stdout=subprocess.PIPE,

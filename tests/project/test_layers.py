@@ -72,6 +72,8 @@ ALLOWED = {
             "lab/recording/recorder.py",
             "lab/recording/replay.py",
             "lab/recording/sample_queue.py",
+            "lab/rolling/audit_queue.py",
+            "lab/rolling/node.py",
             "lab/teleop/leader_arm.py",
             "lab/teleop/node.py",
             "lab/trial/runner.py",

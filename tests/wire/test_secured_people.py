@@ -27,6 +27,7 @@ from vla_zenoh.bus.session import open_session
 from vla_zenoh.keys import Keys
 from vla_zenoh.lab.cli.secure import secure_app
 from vla_zenoh.lab.recording.reader import open_recording
+from vla_zenoh.lab.rolling.audit_log import verify_folder
 from vla_zenoh.profile import load_profile
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(180)]
@@ -71,7 +72,8 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
         (folder / f"{place}.yaml").write_text(text)
     (folder / "ghost.yaml").write_text(f"extends: {HERE}\nrobot: {{name: {GHOST}}}\n")
     here, ghost = folder / f"{HERE}.yaml", folder / "ghost.yaml"
-    with running_chain(folder, profile_file=here, host=HERE, also=[ghost]) as chain:
+    also, rolling = [ghost], folder / "rolling"
+    with running_chain(folder, profile_file=here, host=HERE, also=also, rolling=rolling) as chain:
         chain.activate_when_ready()
         yield Lab(chain, folder)
 
@@ -261,3 +263,28 @@ def test_a_router_at_work_is_not_told_of_more_robots(lab: Lab) -> None:
     assert done.returncode == 1
     assert "cannot be told of other robots" in done.stderr
     assert "sim" in lab.chain.client.alive
+
+
+def test_the_log_of_a_lab_names_the_certificate_of_who_put_a_setting(lab: Lab) -> None:
+    rolling, prompt = lab.folder / "rolling", "HARD: hold"
+    done = command_line("prompt", prompt, profile=lab.profile("desk"))
+    assert done.returncode == 0, done.stderr
+
+    def facts(what: str) -> list[dict[str, Any]]:
+        entries = verify_folder(rolling).entries
+        return [each["facts"] for each in entries if each["what"] == what]
+
+    def author() -> str:
+        (put,) = [each for each in facts("put") if each["text"] == prompt]
+        names = {each["client"]: each["certificate"] for each in facts("client")}
+        return names.get(put["client"], "")
+
+    until("it is logged", lambda: prompt in [each["text"] for each in facts("put")])
+    until("its author is known", author)
+    assert author() == "operator@desk"
+    done = command_line("lab", "save", "by the desk", profile=lab.profile("desk"))
+    assert done.returncode == 0, done.stderr
+    done = command_line("lab", "save", "by the wall", profile=lab.profile("wall"))
+    assert done.returncode == 1
+    assert not list((rolling / "saved").glob("*by-the-wall"))
+    assert verify_folder(rolling).faults == []

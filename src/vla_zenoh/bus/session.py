@@ -205,8 +205,10 @@ def _explain(settings: dict[str, Any], error: Exception) -> SessionError:
 
 
 def put_text(session: zenoh.Session, key: str, text: str) -> None:
-    """Put plain text on a setting's key, as any Zenoh client could."""
-    session.put(key, text, encoding=zenoh.Encoding.TEXT_PLAIN, **QOS[Kind.ORDER])
+    """Put plain text on a setting's key, as any Zenoh client could, and say which session did."""
+    author = zenoh.SourceInfo(session.id, 0)
+    encoding = zenoh.Encoding.TEXT_PLAIN
+    session.put(key, text, encoding=encoding, source_info=author, **QOS[Kind.ORDER])
 
 
 PATIENCE_S, ATTEMPTS = 1.0, 5

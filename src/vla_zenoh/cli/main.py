@@ -105,13 +105,16 @@ COMMANDS: Mapping[str, Mapping[str, str | Group]] = {
             },
         ),
         "lab": Group(
-            "Compare and inspect models, and the network between the hosts.",
+            "Compare and inspect models, and the network between the hosts; the rolling record.",
             {
                 "trial": "lab.cli.trial:trial",
                 "compare": "lab.cli.compare:compare",
                 "inspect": "lab.cli.inspect:inspect",
                 "net": "lab.cli.net:net",
                 "serve": "lab.cli.serve:serve",
+                "rolling": "lab.cli.rolling:rolling",
+                "save": "lab.cli.rolling:save",
+                "audit": "lab.cli.rolling:audit",
             },
         ),
     },

@@ -12,8 +12,9 @@ import sys
 import threading
 import time
 import zlib
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -30,7 +31,8 @@ from vla_zenoh.cli.options import (
 from vla_zenoh.cli.output import console, errors, fail, styled
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import NodeError
-from vla_zenoh.profile import load_profile, profile_file
+from vla_zenoh.keys import ROLLING
+from vla_zenoh.profile import Profile, load_profile, profile_file
 from vla_zenoh.resources import is_path
 from vla_zenoh.runtime.launch import Host, choose_host, host_lock
 from vla_zenoh.runtime.parent_watch import DETAIL, FATAL
@@ -64,6 +66,10 @@ def up(
             "--log-dir", help="Folder of the log file. Default: ~/.local/state/vla-zenoh."
         ),
     ] = None,
+    no_record: Annotated[
+        bool,
+        typer.Option("--no-record", help="Keep no rolling record of the last minutes."),
+    ] = False,
     as_json: JsonOption = False,
     print_unit: Annotated[
         bool, typer.Option("--print-unit", help="Print a systemd unit that does this, and end.")
@@ -80,6 +86,7 @@ def up(
         for option, values in (("--connect", connect), ("--listen", listen), ("--also", also)):
             words += [word for value in values or () for word in (option, value)]
         words += ["--dry-run"] * dry_run + ["--verbose"] * verbose + ["--json"] * as_json
+        words += ["--no-record"] * no_record
         words += ["--log-dir", str(log_dir.absolute())] if log_dir else []
         kept = {key: os.environ[key] for key in KEPT if key in os.environ}
         what = f"robot {loaded.robot.name}, host {name}"
@@ -89,7 +96,8 @@ def up(
     once.take()  # says at once who runs already; the host takes it again
     once.release()
     reject_wrong(profile, host, connect, listen)
-    file, logger = log_file(log_dir or default_log_folder(), f"{loaded.robot.name}-{name}")
+    logs = log_dir or default_log_folder()
+    file, logger = log_file(logs, f"{loaded.robot.name}-{name}")
     stop = stop_on_signals()
     die_with_parent()
     out = console()
@@ -116,12 +124,18 @@ def up(
         show(node, sentence, "bold")
 
     others = [effective_profile(name, host=host) for name in also or ()]
-    with Host(loaded, host, log=log, tell=tell, also=others, dry_run=dry_run) as running:
+    record = None if no_record or lacks_mcap() else rolling_folder(logs, loaded)
+    given: dict[str, Any] = {"also": others, "dry_run": dry_run, "rolling": record}
+    with Host(loaded, host, log=log, tell=tell, **given) as running:
         where = ", ".join(running.profile.session.connect)
         more = "; the robot gets no commands" if dry_run else ""
         place = f"profile {loaded.name}, host {running.host}, router at {where}"
         tell("up", f"{running.mode} | {place}{more}")
         tell("up", f"log: {file}")
+        if ROLLING in {child.command.kind for child in running.supervisor.children}:
+            tell("up", f"rolling record: {record}")
+        elif not no_record and lacks_mcap():
+            tell("up", "no rolling record: it needs the extra record, as in vla-zenoh[record]")
         target = target_of(profile, running)
         status, activate, end = (target.typed(word) for word in ("status", "activate", "stop"))
         tell("up", f"watch: {status}; drive: {activate}, also prompt; stop: {end}; end: Ctrl-C")
@@ -138,6 +152,16 @@ def absolute(profile: str) -> str:
 def default_log_folder() -> Path:
     """Where `up` keeps its log: ``$XDG_STATE_HOME/vla-zenoh``."""
     return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "vla-zenoh"
+
+
+def rolling_folder(logs: Path, profile: Profile) -> Path:
+    """Where `up` keeps the rolling record of a robot, beside its log."""
+    return logs.absolute() / f"rolling-{profile.robot.name}"
+
+
+def lacks_mcap() -> bool:
+    """Whether what writes recordings is not installed."""
+    return any(find_spec(name) is None for name in ("mcap", "rosbags", "zstandard"))
 
 
 def log_file(folder: Path, name: str) -> tuple[Path, logging.Logger]:

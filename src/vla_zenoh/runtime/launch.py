@@ -17,7 +17,7 @@ from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.clock import HOST_VARIABLE, own_boot_id
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import NodeError, ProfileError, SessionError
-from vla_zenoh.keys import NODE_KINDS, worker_node
+from vla_zenoh.keys import NODE_KINDS, ROLLING, worker_node
 from vla_zenoh.profile import HostProfile, Profile, override, to_yaml
 from vla_zenoh.runtime.certificate_expiry import CertificateExpiry
 from vla_zenoh.runtime.down_nodes import DownNodes
@@ -27,7 +27,7 @@ from vla_zenoh.runtime.router import reject_taken
 from vla_zenoh.runtime.supervisor import DownNode, NodeCommand, Supervisor
 from vla_zenoh.security.identity import Role, operator_role
 
-EXPENDABLE = ("worker", "primitives")
+EXPENDABLE = ("worker", "primitives", ROLLING)
 ROUTER_PATIENCE_S = 10.0
 BRAKE_PATIENCE_S = 1.0
 STOP_BUDGET_S = 2.9
@@ -132,6 +132,7 @@ class Host:
         worker_arguments: more of the command line of every worker.
         also: other robots' profiles that the router of this host serves.
         dry_run: the command node computes and checks everything and commands nothing.
+        rolling: folder of the rolling record, which is kept beside a command node; None: none is.
 
     Raises:
         NodeError: this host runs already, a router answers although `own_router`, or does not know
@@ -152,6 +153,7 @@ class Host:
         worker_arguments: Sequence[str] = (),
         also: Sequence[Profile] = (),
         dry_run: bool = False,
+        rolling: Path | None = None,
     ) -> None:
         self.host, part = choose_host(profile, host)
         changes: dict[str, Any] = {"connect": list(part.connect)} if part.connect else {}
@@ -169,8 +171,12 @@ class Host:
         self.profile_file = self._write(profile)
         self._also = [self._write(other) for other in also]
         files = (self.profile_file, worker_options, worker_arguments, self._also)
+        commands = node_commands(profile, self.host, *files, dry_run=dry_run)
+        if rolling is not None and "command" in part.nodes:
+            words = ("lab", ROLLING, "--folder", str(rolling), "--profile", str(self.profile_file))
+            commands.append(NodeCommand(ROLLING, ROLLING, words))
         self.supervisor = Supervisor(
-            node_commands(profile, self.host, *files, dry_run=dry_run),
+            commands,
             log=log,
             tell=tell,
             folder=Path(self._folder.name),

@@ -9,6 +9,8 @@ import threading
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import zenoh
+
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import open_session, session_config
 from vla_zenoh.bus.tcp_user_timeout import TcpUserTimeout
@@ -19,6 +21,7 @@ from vla_zenoh.runtime.certificate_expiry import CertificateExpiry
 from vla_zenoh.security.rules import access_control
 
 POLL_S = 0.25
+MAX_CLIENTS = 64
 RUNTIME_VARIABLE, RUNTIME = "ZENOH_RUNTIME", "(rx: (worker_threads: 16))"
 """What arrives is handed on by the thread that received it, which waits where a link is stuck. With
 the usual two of them one bad link would hold up all others, the arm's among them."""
@@ -58,13 +61,45 @@ def run_router(
             TcpUserTimeout(profile.session.lease_ms / 1e3),
             CertificateExpiry(profile.session.security),
         )
+        clients = Clients(session)
         while not stop.wait(POLL_S):
             impatience.apply()
             links_now = len(list(session.info.links()))
+            detail["clients"] = clients.known()
             if profile.session.security is not None:
                 detail["certificates"] = expiry.outlook._asdict()
             node.publish_status("routing", detail={**detail, "links": links_now})
         node.close()
+
+
+class Clients:
+    """Who is, or was lately, connected to a router: session number -> certificate and address.
+
+    A command connects for a moment, so those that are gone are remembered.
+
+    Args:
+        session: of the router.
+    """
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._lock = threading.Lock()
+        self._known: dict[str, list[str]] = {}
+        handler = zenoh.handlers.Callback(self._heard, indirect=False)
+        self._listener = session.info.declare_link_events_listener(handler, history=True)
+
+    def _heard(self, event: zenoh.LinkEvent) -> None:
+        link = event.link
+        with self._lock:
+            if event.kind == zenoh.SampleKind.PUT:
+                self._known.pop(str(link.zid), None)
+                self._known[str(link.zid)] = [link.auth_identifier or "", str(link.dst)]
+            while len(self._known) > MAX_CLIENTS:
+                del self._known[next(iter(self._known))]
+
+    def known(self) -> dict[str, list[str]]:
+        """The last `MAX_CLIENTS` that connected: [name of the certificate or empty, address]."""
+        with self._lock:
+            return {number: list(told) for number, told in self._known.items()}
 
 
 def reject_taken(endpoints: Sequence[str]) -> None:

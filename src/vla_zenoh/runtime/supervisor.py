@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from vla_zenoh.keys import NODE_KINDS
+from vla_zenoh.keys import NODE_KINDS, ROLLING
 from vla_zenoh.runtime.parent_watch import DETAIL, FATAL, PARENT_VARIABLE, RUN_FOLDER_VARIABLE
 
 BACKOFF_S = (0.2, 0.5, 1.0, 2.0, 5.0)
@@ -24,9 +24,10 @@ STABLE_S = 60.0
 a busy machine, to find that it cannot run."""
 GIVE_UP_AFTER = 6
 """Crashes in a row, each before `STABLE_S`."""
+_STOPS_S = {**{kind: traits.stop_s for kind, traits in NODE_KINDS.items()}, ROLLING: 0.2}
 STOP_ORDER = tuple(
-    (tuple(kind for kind, traits in NODE_KINDS.items() if traits.stop_s == stop_s), stop_s)
-    for stop_s in sorted({traits.stop_s for traits in NODE_KINDS.values()}, reverse=True)
+    (tuple(kind for kind, other_s in _STOPS_S.items() if other_s == stop_s), stop_s)
+    for stop_s in sorted(set(_STOPS_S.values()), reverse=True)
 )
 """Kinds in the order they are stopped, and how long before the deadline the next follow."""
 POLL_S = 0.05
@@ -41,7 +42,7 @@ class NodeCommand(NamedTuple):
 
     Args:
         name: as in logs and status.
-        kind: one of `NODE_KINDS`.
+        kind: one of `NODE_KINDS`, or `ROLLING`.
         arguments: of the command line, after ``vla-zenoh``.
     """
 

@@ -10,14 +10,14 @@ from dataclasses import dataclass
 from enum import Enum
 from itertools import product
 
-from vla_zenoh.keys import KEY_PATHS, PRIMITIVES, Keys
+from vla_zenoh.keys import KEY_PATHS, PRIMITIVES, ROLLING, Keys
 from vla_zenoh.security.identity import Identity, Role
 
 _, ROBOT, CAMERA, WORKER, COMMAND, OPERATOR, VIEWER, REPLAY, _ = Role
 NODES = frozenset({ROBOT, CAMERA, WORKER, COMMAND})
 LOOKERS = frozenset({OPERATOR, VIEWER})
 SPEAKERS = NODES | {OPERATOR, REPLAY}
-RECORDER = "recorder"
+RECORDERS = ("recorder", ROLLING)
 """Nodes that an operator may run: they only subscribe, and publish their status."""
 NOBODY: frozenset[Role] = frozenset()
 
@@ -94,6 +94,7 @@ TABLE = (
     _stream("slower", {OPERATOR}, {COMMAND, OPERATOR, VIEWER}),
     _stream("stop", {OPERATOR}, {COMMAND, OPERATOR, VIEWER}),
     _stream("reset", {OPERATOR}, {COMMAND, ROBOT, OPERATOR, VIEWER}),
+    _stream("save", {OPERATOR}, {OPERATOR, VIEWER}),
     Row(
         "task",
         put=frozenset({COMMAND, REPLAY}),
@@ -145,7 +146,7 @@ def _choices(parameter: str, identity: Identity, act: Act) -> tuple[str, ...]:
     if act not in OWN or (identity.role is REPLAY and act is Act.PUT):
         return ("*",)
     if parameter == "node":
-        return (RECORDER if identity.role is OPERATOR else identity.node,)
+        return RECORDERS if identity.role is OPERATOR else (identity.node,)
     if parameter == "worker":
         return (identity.worker,) if identity.worker else ()
     if parameter == "primitive":

@@ -64,7 +64,7 @@ def access_control(profiles: Iterable[Profile]) -> dict[str, Any]:
             name = identity.common_name
             subjects[name] = {"id": name, "cert_common_names": [name]}
             own = of_subject.setdefault(name, [])
-            for made in _rules(identity, profile.keys):
+            for made in _rules(identity, profile.keys_of_all_parts):
                 rules.setdefault(made["id"], made)
                 if made["id"] not in own:
                     own.append(made["id"])

@@ -34,10 +34,11 @@ READ = {
     "web certificate",
     "web key",
     "lab compare file",
+    "lab audit folder",
     "profile bridge-config certificates",  # a name on another computer
 }
 """Files and folders that commands read."""
-LOGS = {"up log_dir"}
+LOGS = {"up log_dir", "lab rolling folder"}
 """Folders of files that are appended to, and turned over."""
 CERTIFICATES = {"secure init folder", "secure here folder", "secure show folder"}
 """Folders whose files only ``secure add --renew`` replaces; see `tests/unit/security`."""

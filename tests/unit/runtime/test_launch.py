@@ -42,6 +42,7 @@ def test_nodes_start_from_the_router_on_and_the_robot_stops_after_what_drives_it
     assert [set(kinds) for kinds, _ in STOP_ORDER] == [
         {"worker", "primitives", "camera", "command"},
         {"sim", "ros2", "arm"},
+        {"rolling"},
         {"router"},
     ]
 

@@ -328,5 +328,6 @@ def test_a_ros_node_speaks_for_ros_people_only_where_services_are_offered() -> N
 
 def test_an_operator_may_run_a_recorder_and_no_other_node(lab: Profile) -> None:
     said = {key for key in may(lab, "operator@desk", Act.PUT) if key.startswith("status/")}
-    assert said == {"status/recorder"}
-    assert may(lab, "operator@desk", Act.ANNOUNCE) == {"alive/recorder", "holding/*"}
+    assert said == {"status/recorder", "status/rolling"}
+    announced = {"alive/recorder", "alive/rolling", "holding/*"}
+    assert may(lab, "operator@desk", Act.ANNOUNCE) == announced

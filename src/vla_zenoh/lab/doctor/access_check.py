@@ -54,7 +54,7 @@ def identities_of_all(profiles: Sequence[Profile]) -> dict[str, list[RobotIdenti
     for profile in profiles:
         for one in identities(profile):
             if one.role is not Role.ROUTER:
-                out.setdefault(one.common_name, []).append((profile.keys, one))
+                out.setdefault(one.common_name, []).append((profile.keys_of_all_parts, one))
     return out
 
 
@@ -69,7 +69,7 @@ def probes(profiles: Sequence[Profile]) -> dict[Act, list[str]]:
         for row, identity in product(TABLE, identities(profile)):
             acts = {act for act in Act if row.roles(act)}
             for act in acts & {Act.PUT, Act.ANSWER, Act.ANNOUNCE}:
-                for key in expressions(profile.keys, row.member, identity, act):
+                for key in expressions(profile.keys_of_all_parts, row.member, identity, act):
                     made.setdefault(key.replace("*", camera), set()).update(acts)
     keys_of = {act: sorted(key for key, acts in made.items() if act in acts) for act in Act}
     watched = [one for profile in profiles for one in token_selectors(profile.keys)]

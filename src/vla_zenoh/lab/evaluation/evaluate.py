@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import numpy as np
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.evaluation.result import STAGES, Evaluation
 
-MCAP = ".mcap"
+MCAP, SEGMENTS = ".mcap", "segment-*.mcap"
 EMPTY = "{} holds no recording (.mcap)"
 COMBINED = "ALL"
 """``record_id`` of all runs together."""
@@ -29,9 +30,18 @@ _OF_ONE_RUN = (
 
 
 def recordings(paths: Iterable[Path]) -> Iterator[Path]:
-    """The given files, and the recordings below given folders in the order of their names."""
+    """The given files, and the recordings below given folders in the order of their names.
+
+    A folder with a saved rolling record is one recording.
+    """
     for path in paths:
-        yield from sorted(path.rglob(f"*{MCAP}")) if path.is_dir() else [path]
+        if not path.is_dir():
+            yield path
+            continue
+        found = {
+            file.parent if fnmatch(file.name, SEGMENTS) else file for file in path.rglob(f"*{MCAP}")
+        }
+        yield from sorted(found)
 
 
 def evaluate(

@@ -1,6 +1,7 @@
 """Reads the samples of a recording in the order of reception.
 
-A file that was cut off is read as far as it goes; `Recording.damage` then holds the reason.
+A file that was cut off is read as far as it goes; `Recording.damage` then holds the reason. A
+folder of a saved rolling record is read as one recording, its segments one after the other.
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ from vla_zenoh.types import Header
 
 MAX_RECORD_BYTES = 256 * 1024 * 1024
 SHOWN_TOPICS = 6
+SEGMENT = "segment-{:08d}.mcap"
+SEGMENTS = "segment-*.mcap"
 _KINDS = {kind.__name__: kind for kind in RECORDS}
 _SCHEMAS = (ros2_messages.TEXT, ros2_messages.IMAGE, ros2_messages.JPEG_IMAGE)
 _BROKEN = (
@@ -42,7 +45,7 @@ class Recording:
     """A recording on disk; `open_recording` opens one.
 
     Args:
-        path: of the file.
+        path: of the file, or of a folder of segments.
         about: metadata from its start: robot, root, version, ...
         profile_yaml: the profile that was in force.
     """
@@ -61,10 +64,19 @@ class Recording:
         Args:
             wanted: whether to read a key; other keys are skipped undecoded.
         """
+        self.damage, self.ended = "", None
+        dropped: Counter[str] = Counter()
+        for path in segments_of(self.path) or [self.path]:
+            self.ended = None
+            yield from self._entries_of(path, wanted)
+            dropped.update(self._dropped())
+        if self.ended is not None:
+            self.ended["dropped"] = dict(dropped)
+
+    def _entries_of(self, path: Path, wanted: Callable[[str], bool]) -> Iterator[Sample]:
         schemas: dict[int, Schema] = {}
         channels: dict[int, _Source | None] = {}
-        self.damage, self.ended = "", None
-        with self.path.open("rb") as file:
+        with path.open("rb") as file:
             for record in _whole(file, self._note_damage):
                 if isinstance(record, Message):
                     source = channels.get(record.channel_id)
@@ -89,9 +101,12 @@ class Recording:
     @property
     def dropped(self) -> int:
         """Samples that the recorder dropped, once `entries` has read the end."""
+        return sum(self._dropped().values())
+
+    def _dropped(self) -> dict[str, int]:
         counts = (self.ended or {}).get("dropped")
-        counted = counts.values() if isinstance(counts, dict) else ()
-        return sum(count for count in counted if type(count) is int)
+        counted = counts.items() if isinstance(counts, dict) else ()
+        return {key: count for key, count in counted if type(count) is int}
 
     def _note_damage(self, why: str) -> None:
         self.damage = why
@@ -170,13 +185,22 @@ def _whole(file: IO[bytes], damage: Callable[[str], None]) -> Iterator[Any]:
         yield record
 
 
+def segments_of(path: Path) -> list[Path]:
+    """Files of a rolling record in their order; none where `path` is no folder of such files."""
+    return sorted(path.glob(SEGMENTS)) if path.is_dir() else []
+
+
 def open_recording(path: Path) -> Recording:
-    """Open a file that ``vla-zenoh record`` wrote.
+    """Open a file that ``vla-zenoh record`` wrote, or a folder with a saved rolling record.
 
     Raises:
         RecordingError: the file cannot be read, is no MCAP file, or is of another program.
         MissingExtraError: rosbags is not installed.
     """
+    segments = segments_of(path)
+    if segments:
+        first = open_recording(segments[0])
+        return Recording(path, first.about, first.profile_yaml)
     ros2_messages.messages()
     about: dict[str, str] | None = None
     problems: list[str] = []

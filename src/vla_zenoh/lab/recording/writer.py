@@ -25,7 +25,7 @@ from mcap.writer import CompressionType, Writer
 
 from vla_zenoh import __version__, keys
 from vla_zenoh.codec import image as image_codec
-from vla_zenoh.errors import CodecError
+from vla_zenoh.errors import CodecError, RecordingError
 from vla_zenoh.keys import Keys
 from vla_zenoh.lab.recording import ros2_messages
 from vla_zenoh.lab.recording.crash_safe_file import CrashSafeFile
@@ -92,7 +92,11 @@ class RecordingWriter:
         self._out.add_attachment(
             began_ns, began_ns, PROFILE_FILE, "application/yaml", profile_yaml.encode()
         )
-        self._file.commit()
+        try:
+            self._file.commit()
+        except RecordingError:
+            self._file.close()
+            raise
 
     @property
     def size(self) -> int:

@@ -1,0 +1,158 @@
+"""An audit log on disk: lines that are chained by hash, written at once, bounded in size."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from vla_zenoh.errors import RecordingError
+from vla_zenoh.lab.rolling.chain import Link, Verification, fields_of, line_after, verify
+
+PATTERN = "audit-*.jsonl"
+FILE_BYTES = 8 * 1024 * 1024
+KEPT_FILES = 8
+MAX_PENDING = 10_000
+"""Lines that wait for a full disk; more are counted and lost."""
+
+
+class AuditLog:
+    """Appends lines to the newest file of a folder.
+
+    A last line that a power cut left incomplete is cut off, and `cut_bytes` says so.
+
+    Args:
+        folder: made if it is not there.
+        file_bytes: size at which another file begins; the last `KEPT_FILES` are kept.
+
+    Raises:
+        RecordingError: the folder cannot be used.
+    """
+
+    def __init__(self, folder: Path, *, file_bytes: int = FILE_BYTES) -> None:
+        self._folder, self._file_bytes = folder, file_bytes
+        self.link, self.cut_bytes, self.lost = Link(), 0, 0
+        self.last_what = ""
+        """Of the last line that was there before; empty: there was none."""
+        self._pending: list[str] = []
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            self._lock = _locked(folder)
+            files = _files(folder)
+            self._path = files[-1] if files else self._named()
+            self._resume()
+        except OSError as error:
+            raise RecordingError(f"{folder} cannot be used: {error.strerror}") from error
+
+    def _named(self) -> Path:
+        return self._folder / f"audit-{self.link.number:012d}.jsonl"
+
+    def _resume(self) -> None:
+        self._fd = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
+        self._size = os.fstat(self._fd).st_size
+        data = self._path.read_bytes()
+        whole = data[: data.rfind(b"\n") + 1]
+        if len(whole) < len(data):
+            self.cut_bytes = len(data) - len(whole)
+            self._size = len(whole)
+            os.ftruncate(self._fd, self._size)
+        # A file that was begun, with nothing in it yet, goes on from the one before.
+        for path in reversed(_files(self._folder)):
+            lines = path.read_text("utf-8", "replace").splitlines()
+            known = next((fields for line in reversed(lines) if (fields := fields_of(line))), None)
+            if known is not None:
+                self.link = Link(known["number"] + 1, known["hash"])
+                self.last_what = known["what"]
+                return
+
+    def add(self, what: str, wall_ns: int, **facts: Any) -> None:
+        """Chain a line; it is on disk after the next `write`."""
+        if len(self._pending) >= MAX_PENDING:
+            self.lost += 1
+            return
+        line, self.link = line_after(self.link, wall_ns, what, facts)
+        self._pending.append(line)
+
+    def write(self) -> None:
+        """Append what was added since; it is on the disk, not in a cache, when this returns.
+
+        Raises:
+            RecordingError: the disk is full or broken. The lines stay, for the next call.
+        """
+        if not self._pending:
+            return
+        data = "".join(f"{line}\n" for line in self._pending).encode()
+        try:
+            if self._size + len(data) > self._file_bytes and self._size:
+                self._turn_over()
+            written = 0
+            while written < len(data):
+                written += os.write(self._fd, data[written:])
+            os.fsync(self._fd)
+        except OSError as error:
+            os.ftruncate(self._fd, self._size)
+            raise RecordingError(f"{self._path}: {error.strerror}") from error
+        self._size += len(data)
+        self._pending.clear()
+
+    def _turn_over(self) -> None:
+        first = self.link.number - len(self._pending)
+        path = self._folder / f"audit-{first:012d}.jsonl"
+        fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
+        os.close(self._fd)
+        self._fd, self._path, self._size = fd, path, 0
+        for old in _files(self._folder)[:-KEPT_FILES]:
+            old.unlink(missing_ok=True)
+
+    def close(self) -> None:
+        """Close the file, and leave the folder to others."""
+        os.close(self._fd)
+        os.close(self._lock)
+
+
+def _locked(folder: Path) -> int:
+    """A lock of the folder: two logs in one would be no chain."""
+    lock = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(lock)
+        raise RecordingError(
+            f"another rolling record writes into {folder}: end it, or give this one another "
+            "--folder (`up`: another --log-dir, or --no-record)"
+        ) from error
+    return lock
+
+
+def _files(folder: Path) -> list[Path]:
+    return sorted(folder.glob(PATTERN))
+
+
+def lines_of(folder: Path) -> Iterator[str]:
+    """Lines of all files of a log, oldest first; the last one may be incomplete.
+
+    Raises:
+        RecordingError: there is none.
+    """
+    files = _files(folder)
+    if not files:
+        raise RecordingError(
+            f"{folder} has no audit log ({PATTERN}); `vla-zenoh up` says where its own is"
+        )
+    for path in files:
+        try:
+            text = path.read_text("utf-8", "replace")
+        except OSError as error:
+            raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
+        yield from text.removesuffix("\n").split("\n") if text else ()
+
+
+def verify_folder(folder: Path) -> Verification:
+    """Check the audit log of a folder.
+
+    Raises:
+        RecordingError: there is none.
+    """
+    return verify(lines_of(folder))

@@ -1,0 +1,401 @@
+"""The node `rolling`: a ring of the last minutes on disk, and the audit log.
+
+Everything but raw images goes into short MCAP files, of which the oldest are deleted. At a stop, a
+fault, a rejected activation or a put on `save` the files are kept in a folder of their own, some
+seconds later, so that what followed is in them. Settings, with the session that put them, and what
+the command node made of them go into the audit log at once.
+
+Whatever the disk does, the node goes on: it says so, counts what is missing, and tries again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import shutil
+import socket
+import sys
+import threading
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import zenoh
+
+from vla_zenoh.bus.node import Node
+from vla_zenoh.codec import records
+from vla_zenoh.errors import CodecError, RecordingError
+from vla_zenoh.keys import ROLLING, last_chunk
+from vla_zenoh.lab.recording.recorder import COMMIT_S, SWITCH_INTERVAL_S, WRITE_S, recorded_keys
+from vla_zenoh.lab.recording.sample_queue import SampleQueue
+from vla_zenoh.lab.recording.writer import RecordingWriter
+from vla_zenoh.lab.rolling.audit_log import PATTERN, AuditLog
+from vla_zenoh.lab.rolling.audit_queue import Allowance, AuditQueue, Put
+from vla_zenoh.lab.rolling.ring import PART, Ring, delete_oldest_saved
+from vla_zenoh.profile import Profile, to_yaml
+from vla_zenoh.types import MAX_TEXT, Event, NodeStatus
+
+NICE = 10
+"""Everything that moves the arm goes first."""
+KEEP_S, SEGMENT_S = 600.0, 30.0
+MAX_BYTES = 2 * 1024**3
+QUEUE_BYTES, QUEUE_SAMPLES = 64 * 1024 * 1024, 50_000
+AFTER_S = 3.0
+"""A saved record goes on for this long after what it was saved for."""
+APART_S = 60.0
+"""Between two automatic savings for rejected activations: a person who tries again and again."""
+AGAIN_S = 5.0
+"""After the disk was full."""
+KEPT_SAVED = 20
+"""Automatically saved folders; those that somebody asked for are never deleted."""
+MAX_CLIENTS = 1024
+LOST_EVERY_S = 5.0
+"""Between two lines that say how many puts were not logged."""
+STOPS = ("->stopped", "->fault")
+REFUSED = "activate_refused"
+ENDED = "ended"
+SEGMENT_WORDS = re.compile(r"[^A-Za-z0-9]+")
+
+
+class Limits(NamedTuple):
+    """Sizes of the record.
+
+    Args:
+        keep_s: of the ring.
+        max_bytes: of the ring's finished files.
+        segment_s: of one file.
+        after_s: that a saved record goes on.
+    """
+
+    keep_s: float = KEEP_S
+    max_bytes: int = MAX_BYTES
+    segment_s: float = SEGMENT_S
+    after_s: float = AFTER_S
+
+
+USUAL = Limits()
+
+
+class RollingRecord:
+    """See the module.
+
+    Args:
+        profile: the effective profile.
+        session: an open session; the caller closes it.
+        folder: of the record: ``ring/``, ``saved/`` and the audit log.
+        limits: its sizes.
+
+    Raises:
+        RecordingError: the folder cannot be used.
+        NodeError: a node of this name is alive.
+    """
+
+    def __init__(
+        self, profile: Profile, session: zenoh.Session, folder: Path, limits: Limits = USUAL
+    ) -> None:
+        self.node = Node(ROLLING, profile, session)
+        self._profile, self._folder, self._limits = profile, folder, limits
+        self._log = AuditLog(folder)
+        self._ring = Ring(
+            folder / "ring",
+            keep_s=limits.keep_s,
+            max_bytes=limits.max_bytes,
+            segment_s=limits.segment_s,
+        )
+        for part in (folder / "saved").glob(f"*{PART}"):
+            shutil.rmtree(part, ignore_errors=True)
+        self._queue = SampleQueue(
+            session, max_bytes=QUEUE_BYTES, max_samples=QUEUE_SAMPLES, clock=self.node.clock
+        )
+        self._audit = AuditQueue(session, self.node.clock)
+        self._writer: RecordingWriter | None = None
+        self._path = Path()
+        self._began_s = self._committed_s = self._try_s = 0.0
+        self._seen_drops: Counter[str] = Counter()
+        self._why = self._audit_why = ""
+        self._lost: Counter[str] = Counter()
+        self._lost_s = 0.0
+        self._allowed = Allowance()
+        self._clients: dict[str, tuple[str, str, str]] = {}
+        self._reasons: list[str] = []
+        self._save_s, self._asked, self._refused_s = 0.0, False, -1e9
+        self._saved = ""
+
+    # -- life ---------------------------------------------------------------------------------
+    def run(self, stop: threading.Event) -> None:
+        """Record until `stop` is set."""
+        sys.setswitchinterval(SWITCH_INTERVAL_S)
+        self._note_beginning()
+        keys = self.node.keys
+        settings = (keys.prompt, keys.active, keys.worker, keys.rate, keys.speed, keys.slower)
+        orders = (keys.stop, keys.reset, keys.save, keys.sim_reset)
+        self._audit.subscribe(
+            (*settings, *orders, keys.event("command"), f"{keys.status('router')}$*")
+        )
+        self._queue.subscribe(recorded_keys(keys))
+        while not stop.wait(WRITE_S):
+            self.step()
+        self.close()
+
+    def step(self) -> None:
+        """One round: the audit log first, then the ring, then what is to be saved."""
+        clock_step_s = self.node.clock.adopt_system_time()
+        if clock_step_s:
+            self._add("clock", step_s=round(clock_step_s, 3))
+            self.node.reject("clock_step", f"the wall clock was set by {clock_step_s:+.3f} s")
+        self._take_audit()
+        self._write_audit()
+        self._write_samples()
+        now_s = time.monotonic()
+        if self._save_s and now_s >= self._save_s:
+            self._save()
+        self._report()
+
+    def close(self) -> None:
+        """Write what there is, and leave."""
+        self._audit.close()
+        self._queue.close()
+        self.step()
+        if self._reasons:
+            self._save()
+        self._finish_segment()
+        self._note_lost()
+        self._add(ENDED)
+        self._write_audit()
+        self._log.close()
+        self.node.publish_status("stopped", detail=self._detail(), now=True)
+        self.node.close()
+
+    def _note_beginning(self) -> None:
+        last = self._log.last_what
+        if last not in ("", ENDED):
+            self._add("after_gap", why="the record before this one was killed, or lost its power")
+        if self._log.cut_bytes:
+            self._add("cut", bytes=self._log.cut_bytes)
+        profile = to_yaml(self._profile)
+        self._add(
+            "began",
+            robot=self._profile.robot.name,
+            profile=self._profile.name,
+            profile_sha256=hashlib.sha256(profile.encode()).hexdigest(),
+            host=socket.gethostname(),
+            pid=os.getpid(),
+        )
+        self._write_audit()
+
+    # -- the audit log ------------------------------------------------------------------------
+    def _add(self, what: str, wall_ns: int | None = None, **facts: Any) -> None:
+        self._log.add(what, self.node.clock.wall_ns() if wall_ns is None else wall_ns, **facts)
+
+    def _take_audit(self) -> None:
+        puts, lost = self._audit.take()
+        for put in puts:
+            name = self.node.keys.short(put.key)
+            group = name.partition("/")[0]
+            if group == "status":
+                self._note_clients(put)
+            elif group == "event":
+                self._note_event(put)
+            else:
+                self._note_setting(name, put)
+        self._lost.update(lost)
+        if self._lost and time.monotonic() - self._lost_s > LOST_EVERY_S:
+            self._note_lost()
+
+    def _note_lost(self) -> None:
+        self._lost_s = time.monotonic()
+        for key, count in self._lost.items():
+            self._add("lost", key=self.node.keys.short(key), puts=count)
+        self._lost.clear()
+
+    def _note_setting(self, name: str, put: Put) -> None:
+        text = put.payload[: 4 * MAX_TEXT].decode("utf-8", "replace")[:MAX_TEXT]
+        facts: dict[str, Any] = {"key": name, "text": text, "client": put.client}
+        if put.size > len(put.payload):
+            facts["bytes"] = put.size
+        if put.deleted:
+            facts["deleted"] = True
+        self._add("put", put.received_ns, **facts)
+        if put.deleted:
+            return
+        if name == "save":
+            self._want(f"asked: {text}"[:MAX_TEXT], asked=True)
+        elif name == "stop":
+            self._want("stop")
+
+    def _note_event(self, put: Put) -> None:
+        try:
+            event = records.decode(Event, put.payload)
+        except CodecError:
+            return
+        refused = event.kind == "refusal" and event.what.endswith("_refused")
+        if event.kind != "transition" and not refused:
+            return
+        self._add("command", put.received_ns, event=event.what, why=event.why)
+        if event.what.endswith(STOPS):
+            self._want(event.what.rpartition("->")[2])
+        elif event.what == REFUSED and time.monotonic() - self._refused_s > APART_S:
+            self._refused_s = time.monotonic()
+            self._want("activation refused")
+
+    def _note_clients(self, put: Put) -> None:
+        """Which certificate and address a session has, as its router says."""
+        try:
+            found = records.decode(NodeStatus, put.payload).detail.get("clients")
+        except CodecError:
+            return
+        router = last_chunk(put.key)
+        for number, told in found.items() if isinstance(found, dict) else ():
+            if not (isinstance(told, (list, tuple)) and len(told) == 2):
+                continue
+            certificate, address = map(str, told)
+            known = (router, certificate, address)
+            if self._clients.get(number) != known and self._allowed.take():
+                self._clients[number] = known
+                self._add(
+                    "client", client=number, certificate=certificate, address=address, by=router
+                )
+        while len(self._clients) > MAX_CLIENTS:
+            del self._clients[next(iter(self._clients))]
+
+    def _write_audit(self) -> None:
+        try:
+            self._log.write()
+        except RecordingError as error:
+            self._fault("audit_failed", self._audit_why, str(error))
+            self._audit_why = str(error)
+            return
+        if self._audit_why:
+            self._audit_why = ""
+            self._add("disk", why="the log could not be written for a while")
+        if self._log.lost:
+            self._add("lost", lines=self._log.lost)
+            self._log.lost = 0
+
+    # -- the ring -----------------------------------------------------------------------------
+    def _write_samples(self) -> None:
+        samples, now_s = self._queue.take(), time.monotonic()
+        try:
+            if self._writer is None:
+                if now_s < self._try_s:
+                    self.node.counters["missed"] += len(samples)
+                    return
+                self._begin_segment(now_s)
+            assert self._writer is not None
+            for sample in samples:
+                self._writer.write(sample)
+            if now_s - self._committed_s >= COMMIT_S:
+                self._committed_s = now_s
+                self._writer.commit()
+            most = self._limits.max_bytes // 20
+            if now_s - self._began_s >= self._limits.segment_s or self._writer.size > most:
+                self._finish_segment()
+        except RecordingError as error:
+            self._disk_failed(str(error), len(samples))
+
+    def _begin_segment(self, now_s: float) -> None:
+        self._path = self._ring.next_path()
+        self._writer = RecordingWriter(
+            self._path,
+            self.node.keys,
+            profile_yaml=to_yaml(self._profile),
+            base_frame=self._profile.robot.base_frame,
+            began_ns=self.node.clock.wall_ns(),
+            about={"profile": self._profile.name, "host": socket.gethostname()},
+        )
+        self._began_s = self._committed_s = now_s
+        if self._why:
+            self._why = ""
+            self._add("disk", why="nothing was recorded for a while")
+
+    def _finish_segment(self) -> None:
+        writer, self._writer = self._writer, None
+        if writer is None:
+            return
+        dropped = Counter(self._queue.dropped)
+        new, self._seen_drops = dropped - self._seen_drops, dropped
+        if new:
+            self._add("dropped", samples=new.total())
+        try:
+            writer.finish({"dropped": dict(new)})
+        except RecordingError as error:
+            self._disk_failed(str(error), 0)
+        self._ring.add(self._path, time.monotonic() - self._began_s)
+
+    def _disk_failed(self, why: str, samples: int) -> None:
+        """Say so, make room where that is ours to make, and try again soon."""
+        if self._writer is not None:
+            self._writer.abandon()
+            self._writer = None
+            self._ring.add(self._path, time.monotonic() - self._began_s)
+        elif self._path.exists() and not self._path.stat().st_size:  # it could not even begin
+            self._path.unlink()
+        self._ring.drop_oldest()
+        self.node.counters["missed"] += samples
+        self._try_s = time.monotonic() + AGAIN_S
+        self._fault("recording_failed", self._why, why)
+        self._why = why
+
+    def _fault(self, what: str, before: str, why: str) -> None:
+        if why != before:
+            self.node.emit(Event("error", "fault", what, why[:1000]))
+
+    # -- saving -------------------------------------------------------------------------------
+    def _want(self, why: str, *, asked: bool = False) -> None:
+        if why not in self._reasons:
+            self._reasons.append(why)
+        self._asked = self._asked or asked
+        self._save_s = self._save_s or time.monotonic() + self._limits.after_s
+
+    def _save(self) -> None:
+        reasons, asked = self._reasons, self._asked
+        self._reasons, self._asked, self._save_s = [], False, 0.0
+        self._finish_segment()
+        word = SEGMENT_WORDS.sub("-", reasons[0])[:40].strip("-") or "saved"
+        saved = self._folder / "saved"
+        folder = _new_folder(saved, f"{time.strftime('%Y%m%d-%H%M%S')}-{word}")
+        facts = {"reasons": reasons, "asked": asked, "head": self._log.link.head}
+        try:
+            self._write_audit()
+            count = self._ring.save(folder, sorted(self._folder.glob(PATTERN)), facts)
+        except RecordingError as error:
+            self._add("not_saved", reasons=reasons, why=str(error))
+            self._fault("not_saved", "", f"the rolling record was not saved: {error}")
+            return
+        self._saved = str(folder)
+        self._add("saved", folder=folder.name, reasons=reasons, segments=count)
+        said = f"the last {self._ring.seconds:.0f} s are in {folder}: {'; '.join(reasons)}"
+        self.node.emit(Event("info", "notice", "saved", said[:1000]))
+        for gone in delete_oldest_saved(saved, KEPT_SAVED):
+            self._add("deleted", folder=gone.name)
+
+    # -- out ----------------------------------------------------------------------------------
+    def _detail(self) -> dict[str, Any]:
+        size = 0 if self._writer is None else self._writer.size
+        return {
+            "folder": str(self._folder),
+            "seconds": round(self._ring.seconds, 1),
+            "size_bytes": self._ring.size_bytes + size,
+            "saved": self._saved,
+            "audit_lines": self._log.link.number,
+            "audit_head": self._log.link.head,
+            "why": self._why or self._audit_why,
+        }
+
+    def _report(self) -> None:
+        state = "failed" if self._why or self._audit_why else "recording"
+        if not self.node.status_due(state):
+            return
+        self.node.counters["dropped"] = self._queue.dropped.total()
+        self.node.publish_status(state, detail=self._detail())
+
+
+def _new_folder(parent: Path, name: str) -> Path:
+    """One that is not there yet: two savings in a second, or a clock that was set back."""
+    folder, number = parent / name, 1
+    while folder.exists():
+        number += 1
+        folder = parent / f"{name}-{number}"
+    return folder
