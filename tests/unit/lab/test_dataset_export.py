@@ -268,3 +268,30 @@ def test_the_commands_make_a_dataset_and_its_statistics(run_file: Path, tmp_path
     done = command_line("dataset", "export", str(run_file), "--output", str(out))
     assert done.returncode == 1
     assert "bricks exists; give another --output, or --force" in done.stderr
+
+
+def test_wrench_and_effort_are_parts_of_a_state_where_the_robot_measured_them(
+    tmp_path: Path,
+) -> None:
+    unmeasured = joint_run(tmp_path, kind="absolute")
+    with pytest.raises(RecordingError, match="did not measure effort"):
+        export(tmp_path / "none", episodes_of(unmeasured), [], read_parts("effort"))
+    felt, effort = np.arange(6.0), np.array([3.0, -4.0, 0.5])
+    run = replace(
+        unmeasured,
+        poses=[
+            each._replace(record=replace(each.record, wrench=felt)) for each in unmeasured.poses
+        ],
+        joints=[
+            each._replace(record=replace(each.record, effort_nm=effort))
+            for each in unmeasured.joints
+        ],
+    )
+    export(tmp_path / "out", episodes_of(run), [], read_parts("wrench+effort"))
+    info = json.loads((tmp_path / "out" / "meta" / "info.json").read_text())
+    names = info["features"]["observation.state"]["names"]
+    assert names[:4] == ["force_x", "force_y", "force_z", "torque_x"]
+    assert names[6:] == [f"{name}_effort" for name in JOINTS]
+    rows = pq.read_table(next((tmp_path / "out" / "data").rglob("*.parquet")))
+    for row in rows.column("observation.state"):
+        np.testing.assert_array_equal(row.as_py(), [*felt, *effort])

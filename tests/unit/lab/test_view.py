@@ -15,7 +15,7 @@ import rerun as rr
 from view_rig import Shown
 
 from vla_zenoh.codec import records
-from vla_zenoh.codec.image import encode_jpeg
+from vla_zenoh.codec.image import depth_schema, encode_depth, encode_jpeg
 from vla_zenoh.errors import ResourceError
 from vla_zenoh.keys import Keys
 from vla_zenoh.lab.recording.reader import open_recording
@@ -36,6 +36,7 @@ from vla_zenoh.types import (
     LATENCY_STAGES,
     ActionChunk,
     Cause,
+    Depth,
     Event,
     GripperCommand,
     GripperState,
@@ -442,3 +443,23 @@ def test_the_first_step_of_an_answer_has_names_and_units(shown: Shown) -> None:
     (answer,) = shown.texts("seen/scripted/answer")
     assert "| first step | x | y | z |" in answer
     assert "| mm | +0.0 | +0.0 | +0.0 |" in answer
+
+
+# -- depth ----------------------------------------------------------------------------------------
+def test_depth_of_a_camera_and_of_a_model_have_views_of_their_own(tmp_path: Path) -> None:
+    depth = Depth(np.arange(48, dtype=np.uint16).reshape(6, 8) * 100, 0.001)
+    encoding = f"image/png;{depth_schema(depth)}"
+    samples = [
+        Sample(key, encode_depth(depth), encoding, Header(ZERO_NS, 1, "camera#1"), ZERO_NS)
+        for key in (KEYS.camera_depth("front"), KEYS.seen_depth("scripted", "front"))
+    ]
+    show, seen = heard(tmp_path, *samples)
+    assert show.rejected == {}
+    assert {"camera/front\\ depth", "seen/scripted/front\\ depth"} <= set(seen.paths)
+
+
+def test_what_is_no_depth_is_counted_and_not_shown(tmp_path: Path) -> None:
+    key, header = KEYS.camera_depth("front"), Header(ZERO_NS, 1, "camera#1")
+    show, seen = heard(tmp_path, Sample(key, b"x", "image/png;depth16;0.001", header, ZERO_NS))
+    assert show.rejected == {"camera/front/depth: malformed": 1}
+    assert not any("depth" in path for path in seen.paths)
