@@ -174,8 +174,8 @@ def test_every_finding_has_a_meaning() -> None:
 # -- what is shipped ------------------------------------------------------------------------------
 IN_ENVIRONMENTS_OF_THEIR_OWN = {"lerobot", "openvla"}
 """Checked by tests/models/test_*_chain.py."""
-OF_ONE_SCENE = {"scripted_pick"}
-"""It fails with a brick out of its reach, as on a picture of noise: tests/sim/test_so101.py."""
+OF_ONE_SCENE = {"scripted_pair", "scripted_pick"}
+"""They fail with a brick out of reach, as on noise: tests/sim/test_so101.py, test_pair.py."""
 OF_BENCHMARKS = {"libero_privileged", "metaworld_expert", "ogbench_expert", "so101_expert"}
 """They act on what a benchmark knows, which no observation of a check has."""
 

@@ -18,9 +18,9 @@ from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan
 from vla_zenoh.errors import SpecError, WorkerError
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.lab.check.examples import example_observation
-from vla_zenoh.policy import ActionSpec, ActionSteps, ModelSpec, Policy, check_steps
+from vla_zenoh.policy import ActionSpec, ActionSteps, ModelSpec, Observation, Policy, check_steps
 from vla_zenoh.policy.loader import find_model, make_policy
-from vla_zenoh.profile import load_profile
+from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.types import JointState
 
 MODELS = resources.names("models")
@@ -40,8 +40,8 @@ EXPERTS = {"libero_privileged", "metaworld_expert", "ogbench_expert", "so101_exp
 HERE = [name for name in MODELS if name not in ELSEWHERE | EXPERTS]
 HEAVY = ("torch", "tensorflow", "jax", "zenoh", "mujoco")
 PROMPTS = {"scripted": "HARD: go up"}
-PROFILES = {"scripted_pick": "so101_sim"}
-"""Of workers that act for one arm."""
+PROFILES = {"scripted_pair": "two_pandas_sim", "scripted_pick": "so101_sim"}
+"""Of workers that act for one robot."""
 ATOL = 1e-7
 
 
@@ -71,11 +71,16 @@ def make(name: str, recorded: Path) -> Policy:
 def looked_at(policy: Policy, name: str, *, active: bool = True) -> Any:
     seen = example_observation(policy.spec, prompt=PROMPTS.get(name, "hold"))
     if name in PROFILES:
-        robot = load_profile(PROFILES[name]).robot
-        home = np.array(robot.home_rad)
-        still = np.zeros_like(home)
-        seen = replace(seen, joint=JointState(robot.arm_joints, home, still, still))
+        profile = load_profile(PROFILES[name])
+        parts = {part: at_home(profile.of_part(part), own) for part, own in seen.parts.items()}
+        seen = replace(seen, parts=parts) if parts else at_home(profile, seen)
     return replace(seen, task=replace(seen.task, active=active))
+
+
+def at_home(profile: Profile, seen: Observation) -> Observation:
+    home = np.array(profile.robot.home_rad)
+    still = np.zeros_like(home)
+    return replace(seen, joint=JointState(profile.robot.arm_joints, home, still, still))
 
 
 def test_models_are_shipped() -> None:

@@ -29,6 +29,7 @@ READ = {
     "bench compare b",
     "bench sim replay",
     "lab trial setups",
+    "lab trial unattended",
     "teleop leader",
     "web people",
     "web certificate",

@@ -158,6 +158,11 @@ class ExampleMaker:
             effort_nm=self._joint().effort_nm if seen.effort_nm is not None else None,
             history=(),
         )
+        parts = {
+            part: replace(made, joint=self._joint(part), gripper=own.gripper, pose=own.pose)
+            for part, own in seen.parts.items()
+        }
+        made = replace(made, parts=parts)
         # An arm that stood still and was looked at: earlier pictures are as this one.
         earlier = (
             replace(made, stamp_wall_ns=made.stamp_wall_ns + each.stamp_wall_ns)
@@ -199,14 +204,19 @@ class ExampleMaker:
             return camera.height, camera.width
         return DEFAULT_SIZE
 
-    def _joint(self) -> JointState:
-        names = tuple(f"joint{i}" for i in range(1, 8))
-        position = np.zeros(7)
-        if self.profile is not None:
-            names = self.profile.robot.arm_joints
-            position = np.array(self.profile.robot.home_rad)
+    def _joint(self, part: str = "") -> JointState:
+        names = _joint_names(self.spec, part)
+        position = np.zeros(len(names))
+        if self.profile is not None and part in self.profile.part_names:
+            robot = self.profile.of_part(part).robot
+            names, position = robot.arm_joints, np.array(robot.home_rad)
         zeros = np.zeros(len(names))
         return JointState(names, position, zeros, zeros)
+
+
+def _joint_names(spec: ModelSpec, part: str) -> tuple[str, ...]:
+    """Those that the model moves, or seven made up."""
+    return spec.action.of(part).joints or tuple(f"joint{number}" for number in range(1, 8))
 
 
 def example_observation(
@@ -245,6 +255,15 @@ def example_observation(
         wrench=np.zeros(6) if "wrench" in asked else None,
         effort_nm=zeros if "effort" in asked else None,
     )
+    if spec.parts != ("",):
+        parts: dict[str, Observation] = {}
+        for part in spec.parts:
+            names = _joint_names(spec, part)
+            still = np.zeros(len(names))
+            joint = JointState(names, still, still, still) if "joint" in asked else None
+            parts[part] = replace(seen, joint=joint)
+        none = replace(seen, joint=None, pose=None, gripper=None, wrench=None, effort_nm=None)
+        seen = replace(none, parts=parts)
     before = range(spec.observation.history - 1, 0, -1)
     spacing_ns = round((spec.observation.history_spacing_s or 0.0) * 1e9)
     earlier = tuple(replace(seen, stamp_wall_ns=-steps * spacing_ns) for steps in before)
