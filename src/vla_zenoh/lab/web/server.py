@@ -17,21 +17,27 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from vla_zenoh.errors import CodecError, MissingExtraError, VlaZenohError
+from vla_zenoh.errors import CodecError, MissingExtraError, RecordingError, VlaZenohError
 from vla_zenoh.lab.teleop.policy import OperatorInput
 from vla_zenoh.lab.web import metrics
 from vla_zenoh.lab.web.access import People, Person, RateLimit, host_is_ours, origin_is_ours
 from vla_zenoh.lab.web.arm import surroundings
+from vla_zenoh.lab.web.making import FILM
 from vla_zenoh.lab.web.pictures import Pictures
 from vla_zenoh.lab.web.requests import PageRequest, parse
 from vla_zenoh.lab.web.robot_link import RobotLink
+from vla_zenoh.lab.web.runs import HEADERS as RUN_HEADERS
+from vla_zenoh.lab.web.runs import KINDS, Runs
 from vla_zenoh.lab.web.tables import node_table, noted_event
 
 try:
     import uvicorn  # noqa: F401  # pyright: ignore[reportMissingImports]
     from starlette.applications import Starlette  # pyright: ignore[reportMissingImports]
     from starlette.requests import Request as HttpRequest  # pyright: ignore[reportMissingImports]
-    from starlette.responses import Response  # pyright: ignore[reportMissingImports]
+    from starlette.responses import (  # pyright: ignore[reportMissingImports]
+        FileResponse,
+        Response,
+    )
     from starlette.routing import Route, WebSocketRoute  # pyright: ignore[reportMissingImports]
     from starlette.websockets import (  # pyright: ignore[reportMissingImports]
         WebSocket,
@@ -48,8 +54,8 @@ FILES = {
 }
 HEADERS = {
     "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
-    "img-src 'self' blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
-    "frame-ancestors 'none'",
+    "img-src 'self' blob:; media-src 'self'; connect-src 'self'; base-uri 'none'; "
+    "form-action 'none'; frame-ancestors 'none'",
     "x-content-type-options": "nosniff",
     "referrer-policy": "no-referrer",
     "cross-origin-opener-policy": "same-origin",
@@ -68,6 +74,7 @@ RATE_HZ, BURST = 50.0, 100.0
 MAX_PICTURE_HZ, IN_FLIGHT, PICTURE_POLL_S = 30.0, 2, 0.01
 """Pictures sent that a page has not drawn yet: with more, a slow one would see the past."""
 POLICY_VIOLATION, TRY_LATER = 1008, 1013
+VIEWERS_TOO = ("runs", "make")
 OPERATORS_ONLY = "your token is a viewer's, which may look and nothing else"
 Send = Callable[[dict[str, Any]], None]
 
@@ -114,6 +121,7 @@ class PageServer:
     ) -> None:
         self._link, self._people = link, people
         self._names, self._secure = tuple(names), secure
+        self._runs = Runs()
         self._pictures = Pictures(link.session, link.keys, link.profile.cameras)
         self._pages: dict[int, Page] = {}
         self._next = 0
@@ -130,6 +138,7 @@ class PageServer:
         routes += [
             Route("/favicon.ico", lambda _: Response(status_code=204)),
             Route("/metrics", self._metrics),
+            Route("/runs/{ticket}/{rest:path}", self._made),
             Route("/stop", self._stop_by_post, methods=["POST"]),
             WebSocketRoute("/control", self._control),
             WebSocketRoute("/pictures", self._show_pictures),
@@ -184,6 +193,15 @@ class PageServer:
             return Response("send a token of this page: Authorization: Bearer TOKEN\n", 401)
         text = metrics.exposition(self._link.rows(), self.counters, len(self._pages))
         return Response(text, headers={"content-type": metrics.CONTENT_TYPE_LATEST})
+
+    async def _made(self, request: HttpRequest) -> Response:
+        """A page or film of a run, by its ticket."""
+        found = request.path_params
+        path = await asyncio.to_thread(self._runs.opened, found["ticket"], found["rest"])
+        if path is None:
+            await asyncio.sleep(DENIED_S)
+            return Response("no such address, or not any more: ask the page for it again\n", 404)
+        return FileResponse(path, headers={**RUN_HEADERS, "content-type": KINDS[path.suffix]})
 
     async def _stop_by_post(self, request: HttpRequest) -> Response:
         """The way of a page whose WebSocket is broken."""
@@ -279,7 +297,7 @@ class PageServer:
                 "robot": link.keys.robot,
                 "person": page.person.name,
                 "drives": page.drives,
-                "cameras": self._pictures.cameras if page.drives else (),
+                "pictures": self._pictures.offered if page.drives else (),
                 "surroundings": surroundings(link.profile),
                 "no_arm": link.no_arm,
                 "insecure": link.profile.session.insecure,
@@ -313,7 +331,7 @@ class PageServer:
             self._complain(page, "too_fast", f"more than {RATE_HZ:g} messages per second")
             return
         self.counters["message"] += 1
-        if not page.drives:
+        if not page.drives and request.do not in VIEWERS_TOO:
             self._complain(page, "not_allowed", OPERATORS_ONLY)
             return
         await self._obey(page, request)
@@ -330,32 +348,64 @@ class PageServer:
         if request.do == "stop":
             self._begin(self._stop(page.person))
         elif request.do == "hold":
-            self._press(page, values["press"], values["tick"])
+            name = page.person.name
+            self._press(page, request, lambda: link.activate_held(page.number, name))
+        elif request.do == "primitive":
+            name, what = page.person.name, values["name"]
+            self._press(page, request, lambda: link.primitive(page.number, name, what))
         elif request.do == "beat":
             hand = OperatorInput(tuple(values["twist"]), values["opening"])
             if not link.beat(page.number, values["press"], values["tick"], hand):
                 page.tell({"is": "hold_ended", "press": values["press"]})
         elif request.do == "release":
             link.release(page.number)
+        elif request.do == "runs":
+            self._begin(self._tell_runs(page))
+        elif request.do == "make":
+            self._begin(self._make(page, values["name"], values["kind"]))
         elif request.do in SETTINGS:
             self._change(page, request.do, lambda: SETTINGS[request.do](link, values))
         else:
             self._complain(page, "bad_message", f"{request.do} is no request of this socket")
 
-    def _press(self, page: Page, press: int, tick_ms: int) -> None:
+    def _press(self, page: Page, request: PageRequest, call: Callable[[], Any]) -> None:
+        """Begin a hold, and `call` with it."""
+        press = request.values["press"]
         try:
-            self._link.press(page.number, press, tick_ms)
+            self._link.press(page.number, press, request.values["tick"])
         except VlaZenohError as error:
             page.tell({"is": "hold_ended", "press": press, "why": str(error)})
             return
-        name = page.person.name
-        self._change(page, "hold", lambda: self._link.activate_held(page.number, name), press)
+        self._change(page, request.do, call, press)
+
+    async def _tell_runs(self, page: Page) -> None:
+        try:
+            page.tell({"is": "runs", "runs": await asyncio.to_thread(self._runs.listed)})
+        except OSError as error:  # one was removed meanwhile
+            self._complain(page, "runs", f"the folder of runs cannot be read: {error}")
+
+    async def _make(self, page: Page, name: str, kind: str) -> None:
+        """Make the page or film of a run, and tell how far it is."""
+        loop = asyncio.get_running_loop()
+        message = {"is": "making", "name": name, "kind": kind}
+
+        def told(share: float) -> None:
+            loop.call_soon_threadsafe(page.tell, {**message, "share": share})
+
+        try:
+            if kind == FILM and not page.drives:
+                raise RecordingError(OPERATORS_ONLY)
+            page.tell(message)
+            url = await asyncio.to_thread(self._runs.make, name, kind, page.drives, told)
+            page.tell({**message, "is": "made", "url": url})
+        except (VlaZenohError, OSError) as error:
+            page.tell({**message, "is": "made", "why": str(error)})
 
     def _change(self, page: Page, what: str, call: Callable[[], Any], press: int = 0) -> None:
         """Run what waits for the robot on a thread, one at a time for a page, and tell its end."""
         if page.busy:
             self._complain(page, "busy", f"still waiting for {page.busy}")
-            if what == "hold":
+            if press:
                 self._link.release(page.number)
             return
         page.busy = what
@@ -448,7 +498,7 @@ class PageServer:
         with contextlib.suppress(WebSocketDisconnect, RuntimeError):
             while True:
                 for name in look.due(time.monotonic(), self._pictures):
-                    picture = self._pictures.newest(name)
+                    picture = await asyncio.to_thread(self._pictures.newest, name)
                     if picture is None:
                         continue
                     look.sent += 1
@@ -456,6 +506,7 @@ class PageServer:
                         "name": name,
                         "frame": look.sent,
                         "stamp_ms": picture.stamp_wall_ns // 1_000_000,
+                        "said": picture.said,
                     }
                     self.counters["picture"] += 1
                     self.counters["picture_bytes"] += len(picture.jpeg)
@@ -503,12 +554,15 @@ async def _receive(socket: WebSocket) -> str:
 
 
 def _with_headers(send: Any) -> Any:
-    """`send` with `HEADERS` on every response."""
+    """`send` with `HEADERS` on every response that has none of its own."""
 
     async def sending(message: Any) -> None:
         if message["type"] == "http.response.start":
+            own = list(message.get("headers", ()))
+            given = {name for name, _ in own}
             more = [(name.encode(), value.encode()) for name, value in HEADERS.items()]
-            message = {**message, "headers": [*message.get("headers", ()), *more]}
+            own += [(name, value) for name, value in more if name not in given]
+            message = {**message, "headers": own}
         await send(message)
 
     return sending
@@ -525,6 +579,7 @@ SETTINGS: dict[str, Callable[[RobotLink, Any], Any]] = {
     "jog": lambda link, given: (
         link.hand.take(given["frame"], given["level"]) if given["on"] else link.hand.give_back()
     ),
+    "save": lambda link, given: link.save(given["note"]),
     "record": lambda link, given: link.record(given["on"], given["verdict"], given["note"]),
 }
 """Request -> what changes the robot; it waits for the confirmation."""
