@@ -25,6 +25,7 @@ from vla_zenoh.lab.web.arm import ArmLines, Line, rounded
 from vla_zenoh.lab.web.hand import HandWorker
 from vla_zenoh.lab.web.hold import Hold
 from vla_zenoh.lab.web.recordings import Recordings
+from vla_zenoh.lab.web.trial import PageTrial
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
@@ -90,6 +91,7 @@ class RobotLink:
         self._hand = OperatorInput()
         self.hand = HandWorker(profile, self.client, self._read_hand)
         self.recordings = Recordings(profile, session)
+        self.trial = PageTrial(profile)
         self._watcher = threading.Thread(target=self._watch_hold, name="hold", daemon=True)
         self._watcher.start()
 
@@ -202,7 +204,8 @@ class RobotLink:
             "done": detail.get("policy_done", False),
             "task": None if task is None else task_fields(task),
             "jog": self.hand.has_arm,
-            "primitives": PRIMITIVES in self.client.alive,
+            "trial": self.trial.state(),
+            "primitives": worker_node(PRIMITIVES) in self.client.alive,
             "rolling": ROLLING in self.client.alive,
             "seen": [] if task is None else self._seen.get(task.worker, []),
             "workers": sorted(
@@ -424,6 +427,7 @@ class RobotLink:
         self._closed.set()
         self._wake.set()
         self._watcher.join()
+        self.trial.close()
         self.hand.close()
         self.recordings.close()
         self.client.release_deadman()

@@ -12,13 +12,14 @@ import contextlib
 import json
 import time
 from collections import Counter, deque
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 from vla_zenoh.errors import CodecError, MissingExtraError, RecordingError, VlaZenohError
 from vla_zenoh.lab.teleop.policy import OperatorInput
+from vla_zenoh.lab.trial.plan import MAX_SETUPS
 from vla_zenoh.lab.web import metrics
 from vla_zenoh.lab.web.access import People, Person, RateLimit, host_is_ours, origin_is_ours
 from vla_zenoh.lab.web.arm import surroundings
@@ -76,7 +77,7 @@ MAX_PICTURE_HZ, IN_FLIGHT, PICTURE_POLL_S = 30.0, 2, 0.01
 POLICY_VIOLATION, TRY_LATER = 1008, 1013
 VIEWERS_TOO = ("runs", "make")
 OPERATORS_ONLY = "your token is a viewer's, which may look and nothing else"
-Send = Callable[[dict[str, Any]], None]
+Masked = Callable[[dict[str, Any]], dict[str, Any] | None]
 
 
 class Page:
@@ -85,10 +86,11 @@ class Page:
     Args:
         number: of its connection.
         person: who it is.
+        masked: what may be told of a message; None: nothing.
     """
 
-    def __init__(self, number: int, person: Person) -> None:
-        self.number, self.person = number, person
+    def __init__(self, number: int, person: Person, masked: Masked) -> None:
+        self.number, self.person, self._masked = number, person, masked
         self.limit = RateLimit(RATE_HZ, BURST, time.monotonic())
         self.complaints = RateLimit(5.0, 10.0, time.monotonic())
         self.answers: deque[str] = deque(maxlen=MAX_ANSWERS)
@@ -102,8 +104,10 @@ class Page:
 
     def tell(self, message: dict[str, Any]) -> None:
         """Send a message as soon as the connection takes it; the oldest give way."""
-        self.answers.append(json.dumps(message))
-        self.changed.set()
+        may = self._masked(message)
+        if may is not None:
+            self.answers.append(json.dumps(may))
+            self.changed.set()
 
 
 class PageServer:
@@ -233,7 +237,7 @@ class PageServer:
                 self._tell_all(news)
             if self._pages:
                 state = {**self._link.state(), "arm": self._link.arm(), "pages": len(self._pages)}
-                self._state = json.dumps(state)[1:]
+                self._state = json.dumps(self._link.trial.masked(state))[1:]
                 if now_s - nodes_s > NODES_S:
                     nodes_s = now_s
                     self._tell_all(self._node_message())
@@ -275,7 +279,7 @@ class PageServer:
                 await socket.close(TRY_LATER)
                 return
             self._next += 1
-            page = self._pages[self._next] = Page(self._next, person)
+            page = self._pages[self._next] = Page(self._next, person, self._link.trial.masked)
             self._welcome(page)
             sending = asyncio.create_task(self._send_state(page, socket))
             while True:
@@ -285,6 +289,7 @@ class PageServer:
         finally:
             if page is not None:
                 self._link.release(page.number, gone=True)
+                self._link.trial.gone(page.number)
                 del self._pages[page.number]
             if sending is not None:
                 sending.cancel()
@@ -359,6 +364,12 @@ class PageServer:
                 page.tell({"is": "hold_ended", "press": values["press"]})
         elif request.do == "release":
             link.release(page.number)
+        elif request.do == "answer":
+            link.trial.answer(page.number, values["number"], values["line"])
+        elif request.do == "watched":
+            link.trial.watched(page.number, values["tick"] / 1e3)
+        elif request.do == "trial":
+            self._change(page, "trial", lambda: link.trial.begin(*_trial(page.number, values)))
         elif request.do == "runs":
             self._begin(self._tell_runs(page))
         elif request.do == "make":
@@ -541,6 +552,19 @@ class Look:
         return found
 
 
+def _trial(page: int, given: Mapping[str, Any]) -> tuple[int, str, dict[str, Any]]:
+    """Arguments of `PageTrial.begin`; what is left empty is as the folder has it."""
+    workers = tuple(name.strip() for name in given["workers"].split(",") if name.strip())
+    asked = {
+        "workers": workers or None,
+        "prompt": given["prompt"].strip() or None,
+        "setups": ("",) * min(given["episodes"], MAX_SETUPS + 1) or None,
+        "seconds": float(given["seconds"]) or None,
+        "blind": None if given["blind"] else False,
+    }
+    return page, given["name"], asked
+
+
 async def _receive(socket: WebSocket) -> str:
     """The next text of a browser.
 
@@ -579,6 +603,7 @@ SETTINGS: dict[str, Callable[[RobotLink, Any], Any]] = {
     "jog": lambda link, given: (
         link.hand.take(given["frame"], given["level"]) if given["on"] else link.hand.give_back()
     ),
+    "end_trial": lambda link, _: link.trial.end(),
     "save": lambda link, given: link.save(given["note"]),
     "record": lambda link, given: link.record(given["on"], given["verdict"], given["note"]),
 }

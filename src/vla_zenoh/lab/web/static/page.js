@@ -142,6 +142,7 @@ function showState(message) {
   for (const button of $("primitives").children) button.disabled = !message.primitives;
   setText($("primitives-words"), message.primitives ? "They move while the button is pressed, from an arm that stands." : "They need the node primitives: `vla-zenoh node primitives`.");
   $("save").disabled = !message.rolling || !welcome.drives;
+  showTrial(message.trial || {});
   streams(message.seen || []);
   drawArm(arm);
   if (stopping && message.state === "stopped") setText($("stop-words"), `${welcome.robot}: stopped, coming to rest`);
@@ -296,6 +297,49 @@ function showRecording(message) {
 }
 
 $("save").addEventListener("click", () => send({ do: "save", note: $("note").value }));
+
+// -- a trial ------------------------------------------------------------------------------
+const numberOf = (id) => Number($(id).value) || 0;
+const FIRST = { label: "Scene is ready: go", line: "" };
+const JUDGE = [{ label: "Success", line: "y" }, { label: "Failure", line: "n" }, { label: "Void: repeat it", line: "x" }];
+const CHOICES = {
+  setup: [FIRST], blocked: [{ label: "Try again", line: "" }, JUDGE[2]], judge: JUDGE,
+  run: [{ label: "End it", line: "" }, JUDGE[0], JUDGE[1]],
+};
+let asked = 0, watchedMs = 0;
+$("trial-form").addEventListener("submit", (event) => {
+  event.preventDefault();
+  send({ do: "trial", name: $("trial-name").value, workers: $("trial-workers").value, prompt: $("trial-prompt").value,
+    episodes: numberOf("trial-episodes"), seconds: numberOf("trial-seconds"), blind: $("trial-blind").checked });
+});
+$("trial-end").addEventListener("click", () => send({ do: "end_trial" }));
+function showTrial(trial) {
+  const on = trial.on === true;
+  $("trial-form").hidden = on;
+  $("trial-now").hidden = !on;
+  setText($("trial-result"), on ? "" : trial.text || "");
+  if (!on) return;
+  const phase = trial.phase, judged = phase === "judge" || phase === "run";
+  if (phase === "run" && !document.hidden && performance.now() - watchedMs > 200) { watchedMs = performance.now(); send({ do: "watched", tick }); }
+  setText($("trial-at"), `episode ${trial.at} of ${trial.of}: ${trial.prompt}${trial.worker ? ` (${trial.worker})` : ""}`);
+  const words = { setup: `Set up ${trial.words || `number ${trial.setup}`}.`, blocked: "Not activated:", brake: "The arm brakes.",
+    run: `It runs: ${trial.time_s} of ${trial.seconds} s, ${trial.chunks} chunks, ${trial.state}.`, judge: "Did it succeed?", start: "It is activated." }[phase] || "";
+  setText($("trial-words"), `${words} ${trial.text || ""}`);
+  $("trial-judge").hidden = !judged;
+  const notes = (trial.notes || []).join("\n");
+  if ($("trial-notes").dataset.all !== notes) {
+    $("trial-notes").dataset.all = notes;
+    $("trial-notes").replaceChildren(...(trial.notes || []).map((note) => el("option", null, { value: note })));
+  }
+  if (asked === trial.number) return;
+  asked = trial.number;
+  if (phase === "setup") $("trial-note").value = "";
+  $("trial-buttons").replaceChildren(...(CHOICES[phase] || []).map((choice) => {
+    const button = el("button", choice.label);
+    button.addEventListener("click", () => send({ do: "answer", number: trial.number, line: choice.line && `${choice.line} ${$("trial-note").value}` }));
+    return button;
+  }));
+}
 
 // -- finished runs ------------------------------------------------------------------------
 const making = new Map(); // NAME KIND -> its cell
