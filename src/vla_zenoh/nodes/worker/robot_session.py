@@ -158,7 +158,7 @@ class RobotSession:
         )
         new = [camera.has_new for camera, _ in received]
         return any(new) and all(
-            fresh or one.newest_ns >= self._not_before_ns
+            fresh or (bool(one.entries) and one.newest_ns >= self._not_before_ns)
             for fresh, (_, one) in zip(new, received, strict=True)
         )
 
