@@ -12,6 +12,7 @@ from benchmarks.delay import delay
 from benchmarks.deployment import deployment
 from benchmarks.depth import depth
 from benchmarks.load.cli import load
+from benchmarks.motion.cli import motion
 from benchmarks.openvla import openvla
 from benchmarks.stop import stop
 from benchmarks.thesis.cli import thesis
@@ -25,7 +26,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-for command in (chain, codec, delay, deployment, depth, load, openvla, stop, thesis, web):
+for command in (chain, codec, delay, deployment, depth, load, motion, openvla, stop, thesis, web):
     app.command()(command)
 
 if __name__ == "__main__":

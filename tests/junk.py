@@ -46,12 +46,16 @@ OTHERS = (
     "camera_raw",
     "camera_jpeg",
     "camera_fitted",
+    "camera_depth",
     "seen",
+    "seen_depth",
     "seen_record",
     "alive",
     "holding",
     "clock",
     "sim_step",
+    "primitive",
+    "save",
 )
 OBEYED = ("stop",)
 """Whatever is put there stops the arm; it is tried at the end."""
@@ -69,6 +73,7 @@ NAMES = {
     "worker": "scripted",
     "node": "command",
     "holder": "anna",
+    "primitive": "home",
 }
 
 

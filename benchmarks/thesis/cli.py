@@ -22,7 +22,7 @@ def thesis(
     paths: Annotated[
         list[Path],
         typer.Argument(
-            help="Recordings of the thesis (.csv), or result.json of `vla-zenoh bench motion`."
+            help="Recordings of the thesis (.csv), or result.json of `python -m benchmarks motion`."
         ),
     ],
     result: ResultOptions,

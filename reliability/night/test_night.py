@@ -6,7 +6,7 @@ import random
 from pathlib import Path
 
 import pytest
-from night.night import Night, examine
+from night import Night, examine
 
 pytestmark = pytest.mark.slow
 

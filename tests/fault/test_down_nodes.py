@@ -78,7 +78,8 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
 def test_a_second_up_says_who_runs_and_starts_nothing(lab: Lab) -> None:
     done = command_line("up", str(lab.profile))
     assert done.returncode == 1
-    assert f"host here of robot panda runs already: pid {lab.running.process.pid}" in done.stderr
+    pid = lab.running.process.pid
+    assert f"host here of robot panda is already running: pid {pid}" in done.stderr
     assert "started" not in done.stdout
     assert lab.running.process.poll() is None
 

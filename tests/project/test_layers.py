@@ -54,8 +54,6 @@ ALLOWED = {
         (
             "lab/bench/command_runner.py",
             "lab/bench/cpu_time.py",
-            "lab/bench/motion_lockstep.py",
-            "lab/bench/motion_runner.py",
             "lab/bench/processes.py",
             "lab/bench/task_lockstep.py",
             "lab/bench/task_runner.py",

@@ -8,9 +8,9 @@ import time
 
 import pytest
 
+from benchmarks.motion.lockstep import lockstep_row, run_in_lockstep
+from benchmarks.motion.protocol import PROTOCOL, Conditions
 from vla_zenoh.errors import NodeError
-from vla_zenoh.lab.bench.motion import PROTOCOL, Conditions
-from vla_zenoh.lab.bench.motion_lockstep import lockstep_row, run_in_lockstep
 from vla_zenoh.profile import load_profile, override
 
 NAMES = {trial.name: trial for trial in PROTOCOL}

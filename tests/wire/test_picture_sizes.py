@@ -204,7 +204,9 @@ def test_a_worker_knows_where_its_pictures_are_and_where_those_of_all() -> None:
         )
         for_all = camera.declare_publisher(keys.camera_jpeg("front"), Kind.FRAME)
         wanted = CameraSpec(camera="front", width=32, height=32, resize="pad")
-        ears = subscribe_to_camera(wanted, worker, jpeg=True, changed=threading.Condition())
+        ears = subscribe_to_camera(
+            wanted, worker, jpeg=True, changed=threading.Condition(), history_s=0.0
+        )
         until("its own", lambda: own.has_subscribers)
         assert not other.has_subscribers
 

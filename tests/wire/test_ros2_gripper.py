@@ -52,7 +52,9 @@ class Rig:
         self, node: Node, gripper: Gripper, command: Publisher, stranger: Publisher
     ) -> None:
         self.node, self.gripper = node, gripper
-        driver = SimpleNamespace(no_gripper="", lockstep=False, grip=gripper.move)
+        driver = SimpleNamespace(
+            profile=node.profile, no_gripper="", lockstep=False, grip=gripper.move
+        )
         self.commands = GripperCommands(node, cast("RobotDriver", driver))
         self.command, self.stranger = command, stranger
         self.goals: list[Any] = []

@@ -30,7 +30,7 @@ hosts:
 
 @contextmanager
 def up(path: Path, host: str) -> Iterator[subprocess.Popen[str]]:
-    words = [sys.executable, "-m", "vla_zenoh", "up", str(path), "--host", host]
+    words = [sys.executable, "-m", "vla_zenoh", "up", str(path), "--host", host, "--no-record"]
     process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:
         yield process

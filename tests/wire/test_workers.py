@@ -140,7 +140,7 @@ def test_a_second_up_of_a_host_is_refused_and_leaves_the_arm_to_the_running_one(
     chain.activate_when_ready()
     twin = override(chain.profile, {"hosts": {chain.host.host: {"nodes": ["worker"]}}})
     with (
-        pytest.raises(NodeError, match=r"runs already: pid \d+, since"),
+        pytest.raises(NodeError, match=r"is already running: pid \d+, since"),
         Host(twin, None, log=lambda *_: None, tell=lambda *_: None),
     ):
         pass

@@ -35,7 +35,7 @@ def bytes_of(payload: zenoh.ZBytes | None, limit: int = MAX_RECORD_BYTES) -> byt
 
 
 def check_size(sample: zenoh.Sample, limit: int) -> None:
-    """Check that a sample is a put of limited size. A deletion would pass for an empty setting.
+    """Check that a sample is a put of limited size. A deletion would look like an empty setting.
 
     Raises:
         CodecError: ``deleted``, or ``oversize``: payload and attachment together exceed `limit`.

@@ -124,7 +124,7 @@ class Client:
             self._nodes.token_appeared(name)
             return
         self._nodes.token_gone(name)
-        if name == "command":  # the task is in force no more
+        if name == "command":  # the task is no longer in force
             with self._lock:
                 self.task = None
 
@@ -237,7 +237,7 @@ class Client:
         return self._set(key, f"{percent:g}", taken, what, timeout_s)
 
     def set_worker(self, worker: str, timeout_s: float = 2.0) -> Task:
-        """Choose the worker whose chunks are carried out, as `set_prompt`.
+        """Choose the worker whose chunks are executed, as `set_prompt`.
 
         Raises:
             CodecError: it cannot be a worker's name.
@@ -308,8 +308,8 @@ class Client:
         return stands
 
     def release_deadman(self) -> None:
-        """End the deadman's presence: the arm brakes if it is still active."""
-        with self._lock:  # several threads may let go
+        """Withdraw the deadman token: the arm brakes if it is still active."""
+        with self._lock:  # several threads may release it
             token, self._token = self._token, None
         if token is not None:
             token.undeclare()

@@ -95,7 +95,8 @@ class FixedRate:
         return self._next_ns
 
     def wait_for(self, arrival: threading.Event) -> bool:
-        """Wait for `arrival`, until the next multiple at the latest; whether it came, clears it."""
+        """Wait for `arrival`, at most until the next multiple; returns whether it came; clears
+        it."""
         left_ns = self._next_ns - time.monotonic_ns()
         if left_ns <= 0 or not arrival.wait(left_ns / 1e9):
             return False

@@ -1,8 +1,7 @@
 """Clock synchronisation: measures the clock offsets of other nodes and converts their stamps.
 
 A node queries the nodes it knows to be alive, and those whose streams it receives; it never waits
-for a reply. A header may name any source, so names known from headers alone have a quota of their
-own.
+for a reply. A header may name any source, so names known from headers alone have a separate quota.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ class _Peer:
     answered_s: float = -1e9
 
     def forgotten(self, now_s: float) -> bool:
-        """Silent for so long that another may have its place."""
+        """Silent for so long that another peer may take its place."""
         real = self.alive or self.answered_s > 0
         silent_s = now_s - max(self.answered_s, self.since_s)
         return silent_s > (FORGET_S if real else HEARD_PATIENCE_S)
@@ -124,7 +123,7 @@ class ClockSync:
             try:
                 heard_ns, said_ns = decode_stamps(bytes_of(reply.ok.payload, MAX_STAMPS_BYTES))
             except CodecError:
-                return  # not a clock of ours
+                return  # not one of our nodes' clocks
             with self._lock:
                 if peer.filter.add(Exchange(asked_ns, heard_ns, said_ns, got_ns)):
                     peer.answered_s = time.monotonic()

@@ -61,7 +61,7 @@ class Percentiles:
         return {name: round(value, 1) for name, value in zip(names, found, strict=False)}
 
     def _at(self, *shares: float) -> list[float]:
-        """The value below which each share of them lies; empty without values."""
+        """The values below which these shares lie; empty without values."""
         ordered = sorted(self._values)
         return [ordered[round(share * (len(ordered) - 1))] for share in shares if ordered]
 
@@ -70,7 +70,7 @@ LINKS_PERIOD_S = 5.0
 MAX_SENDERS = 256
 """Sources whose losses are counted; beyond that the one silent for longest is forgotten."""
 OTHERS = "others"
-"""Counts the losses of further keys than `MAX_SENDERS`."""
+"""Stands for all keys beyond `MAX_SENDERS` in the count of losses."""
 MAX_LINKS = 8
 
 

@@ -1,7 +1,7 @@
 """Registry of live nodes and their last status, for a bounded number of names.
 
-A client that may publish a status may do so under any name. So the registry always has a place for
-the nodes of the profile, and a quota for all others; `up` runs for weeks.
+Any client that may publish a status may do so under any name. So the registry always has a place
+for the nodes of the profile, and a quota for all others; `up` runs for weeks.
 """
 
 from __future__ import annotations

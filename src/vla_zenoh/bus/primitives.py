@@ -59,10 +59,10 @@ def ask(
         primitive: one of `vla_zenoh.codec.primitives.REQUESTS`.
         fields: of the request, without its holder.
         who: begins the name by which this client holds the arm.
-        cancelled: asked again and again; true: let go, so that the arm brakes.
+        cancelled: polled; once it returns true, the deadman is released and the arm brakes.
 
     Raises:
-        SessionError: nobody answers, or only with an error.
+        SessionError: no node answers, or only with an error.
     """
     holder = f"{who}-{secrets.token_hex(4)}"
     token: Any = client.session.liveliness().declare_token(client.keys.holding(holder))

@@ -88,7 +88,7 @@ class RemoteRobot(Client):
 
         Args:
             camera: its name in the profile.
-            jpeg: take JPEG, a tenth of the bandwidth, in place of pixels.
+            jpeg: take JPEG, a tenth of the bandwidth, instead of pixels.
             timeout_s: how long to wait for it.
 
         Raises:
@@ -123,7 +123,7 @@ class RemoteRobot(Client):
         Args:
             position_m: (3,) of the TCP in the base frame; None: as it is.
             quat_xyzw: (4,) of the TCP; None: as it is.
-            joints_rad: all joints in the order of the profile, or some by name; in place of a pose.
+            joints_rad: all joints in the order of the profile, or some by name; instead of a pose.
             timeout_s: then the arm is braked.
 
         Raises:
@@ -162,7 +162,7 @@ class RemoteRobot(Client):
         """Let a worker move the arm until a condition holds or the time is over.
 
         Args:
-            worker: that moves it.
+            worker: the worker that moves it.
             until: conditions, `vla_zenoh.codec.primitives.Until`: ``{"gripper": "closed"}``.
             prompt: for the worker; None: the present one.
             timeout_s: then the arm is braked.
@@ -171,7 +171,7 @@ class RemoteRobot(Client):
             with the condition as its reason, or ``timeout``.
 
         Raises:
-            PrimitiveError: it ended otherwise.
+            PrimitiveError: it ended for any other reason.
             SessionError: the node primitives does not answer.
         """
         return self._primitive("run", timeout_s, worker=worker, prompt=prompt, until=until)
@@ -199,7 +199,7 @@ class RemoteRobot(Client):
         """Clear an emergency stop or a fault. The arm stays inactive.
 
         Raises:
-            SessionError: it was not cleared within `timeout_s`; says why.
+            SessionError: it was not cleared within `timeout_s`; gives the reason.
         """
         super().reset()
         self._confirm("reset", self.cleared, timeout_s)
@@ -251,8 +251,8 @@ def connect(
 
     Args:
         profile: name or path, or a loaded one.
-        endpoints: routers, such as ``tcp/10.0.0.2:7447``, in place of the profile's.
-        robot: name, in place of the profile's.
+        endpoints: routers, such as ``tcp/10.0.0.2:7447``, instead of the profile's.
+        robot: name, instead of the profile's.
         wait_s: keep trying to reach the router for this long.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Opens Zenoh sessions, with a quality of service for each kind of key, and asks who is alive."""
+"""Opens Zenoh sessions, with a quality of service for each kind of key, and finds live nodes."""
 
 from __future__ import annotations
 
@@ -154,7 +154,7 @@ def open_session(
     """Open a session of a profile.
 
     Args:
-        profile: the session section; what follows it is explained at `session_config`.
+        profile: the session section; for the other arguments see `session_config`.
         wait_s: retry for this long.
         stop: gives up as soon as it is set.
 
@@ -205,7 +205,7 @@ def _explain(settings: dict[str, Any], error: Exception) -> SessionError:
 
 
 def put_text(session: zenoh.Session, key: str, text: str) -> None:
-    """Put plain text on a setting's key, as any Zenoh client could, and say which session did."""
+    """Put plain text on a setting's key, as any Zenoh client could, with this session's source."""
     author = zenoh.SourceInfo(session.id, 0)
     encoding = zenoh.Encoding.TEXT_PLAIN
     session.put(key, text, encoding=encoding, source_info=author, **QOS[Kind.ORDER])

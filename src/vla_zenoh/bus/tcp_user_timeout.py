@@ -15,9 +15,9 @@ class TcpUserTimeout:
     """Closes TCP connections whose data is not acknowledged in time; Linux only.
 
     Zenoh closes a link that fell silent. But if the kernel still holds data for it, the end of a
-    TLS session waits until that is sent, i.e. while the network is down. A client that reconnects
-    before then is taken for a second link of the old session, and is lost with it
-    (eclipse-zenoh/zenoh#2806). So the kernel has to give such data up.
+    TLS session waits until that is sent, i.e. as long as the network is down. A client that
+    reconnects before then is taken for a second link of the old session, and is lost with it
+    (eclipse-zenoh/zenoh#2806). So the kernel has to drop such data.
 
     The sockets belong to Zenoh; they are found among the open files of the process.
 

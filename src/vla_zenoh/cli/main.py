@@ -98,7 +98,6 @@ COMMANDS: Mapping[str, Mapping[str, str | Group]] = {
         "bench": Group(
             "Measure this computer, and how well models do tasks.",
             {
-                "motion": "lab.cli.bench_motion:motion",
                 "command": "lab.cli.bench_command:command",
                 "task": "lab.cli.bench_task:task",
                 "sim": "lab.cli.bench_sim:sim",

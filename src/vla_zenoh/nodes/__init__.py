@@ -1,1 +1,1 @@
-"""Processes on the bus. The only rooms that know Zenoh, clocks and threads."""
+"""Nodes: processes on the bus, with Zenoh, clocks and threads."""

@@ -17,7 +17,7 @@ from vla_zenoh.robots.driver import Measurement, RobotDriver
 from vla_zenoh.types import Event, GripperCommand, GripperState
 
 NOT_READY = ("braking", "stalled", "unheeded")
-"""States in which the robot is well, but not ready for commands; its gripper state says so too."""
+"""States of a healthy robot that is not ready for commands; its gripper state reports them too."""
 FAULT_AGAIN_NS = 100_000_000
 """A fault without measurements is published again after this, for late subscribers."""
 
@@ -70,7 +70,7 @@ class Arm:
             self._gripper_commands.update(now_ns, self.follower)
 
     def end_step(self, mono_ns: int) -> None:
-        """Read a simulated robot: what all its parts were asked for has an effect at once."""
+        """Read a simulated robot once all its parts have been moved: their commands act at once."""
         if self._driver.simulated:
             self._read(mono_ns)
 
@@ -96,7 +96,7 @@ class Arm:
     def publish(self, measurement: Measurement | None, mono_ns: int) -> None:
         """Publish a measurement when it is due; a fault, and its end, at once.
 
-        The gripper state carries the fault, also where there is no valid measurement with it.
+        The gripper state carries the fault, even without a valid measurement.
         """
         fault_changed = self._driver.fault != self._published_fault
         elapsed_ns = mono_ns - self._published_ns
@@ -160,7 +160,7 @@ class Arm:
     def changed(self) -> bool:
         """Whether the state changed since the last call; a transition is emitted as an event."""
         if self._driver.simulated and self._published_ns != self._mono_ns:
-            return False  # ticks are many: looked at whenever a state is published
+            return False  # ticks are frequent: checked only when a state is published
         state, was = self.state, self._was
         if state == was:
             return False
@@ -176,7 +176,7 @@ class Arm:
         if state == "stalled":
             return (
                 f"the loop stood still for {self.follower.stall_s:.3f} s while it moved the arm; "
-                f"the motion does not go on{self._driver.stalled_hint}"
+                f"the motion is not resumed{self._driver.stalled_hint}"
             )
         timeout_s = self._driver.profile.timing.command_timeout_s
         return {

@@ -1,7 +1,7 @@
-"""Follows a command stream: subscribes to it, guards it, and leads the driver along it.
+"""Follows a command stream: subscribes to it, guards it, and moves the driver along it.
 
 When the stream falls silent in motion, the guard brakes the arm. Then a real robot is sent nothing
-more: its controller holds the last set-point, until the driver says that it is idle.
+more: its controller holds the last set-point, until the driver reports that it is idle.
 """
 
 from __future__ import annotations
@@ -42,16 +42,16 @@ class FollowingRobot(Protocol):
 
 
 class CommandFollower:
-    """Leads a robot along the command streams of its profile.
+    """Moves a robot along the command streams of its profile.
 
     Args:
         node: on the bus; its counters get the rejections.
         driver: of the robot.
-        profile: of the part of the robot; None: of the node.
+        profile: of the robot's part; None: the node's profile.
 
     Attributes:
         stall_s: duration of the last stall.
-        stalls: how often the loop stood still while it moved the arm.
+        stalls: number of stalls of the loop while it moved the arm.
         accepting: False after `stop_accepting`.
     """
 
@@ -70,7 +70,7 @@ class CommandFollower:
         self._timeout_s = self._profile.timing.command_timeout_s
         self._stalled_until_ns = 0
         self._resting = False
-        """The robot is to be sent its last set-point at rest: it may have kept a velocity."""
+        """The robot must be sent its last set-point at rest: it may have kept a velocity."""
         self.stall_s, self.stalls = 0.0, 0
         self.accepting = True
         if (state := driver.state_now()) is not None:
@@ -78,7 +78,7 @@ class CommandFollower:
 
     # -- one tick -----------------------------------------------------------------------------
     def on_measured(self, measured: Measured) -> None:
-        """Update the state of the arm; the first one makes it possible to follow."""
+        """Update the state of the arm; needed once before a stream can be followed."""
         self._measured = measured
         if self._guard is None:
             profile, driver = self._profile, self._driver
@@ -155,7 +155,7 @@ class CommandFollower:
         guard = self._guard
         assert guard is not None
         if not (guard.following or guard.braking or self.holds):
-            guard.anchor()  # no controller holds a set-point of ours: begin where the arm is
+            guard.anchor()  # no controller holds our set-point: begin where the arm is
         command = self._node.decode(kind, arrival)
         if command is None:
             return
@@ -192,7 +192,7 @@ class CommandFollower:
         self.accepting = False
 
     def restart(self) -> None:
-        """The simulated robot was put elsewhere: follow no stream and stand there."""
+        """The simulated robot was reset to another pose: follow no stream and stay there."""
         if self._guard is not None:
             self._guard.reset()
 
@@ -209,7 +209,7 @@ class CommandFollower:
 
     @property
     def stalled(self) -> bool:
-        """The loop stood still a moment ago, while it moved the arm."""
+        """The loop stalled a moment ago, while it moved the arm."""
         return self._stalled_until_ns > 0
 
     @property

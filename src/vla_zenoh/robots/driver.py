@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from vla_zenoh.robots.command_follower import CommandFollower
 
 STREAMING = "streaming"
-"""State in the commands that a driver sends: the guard has already judged that of the writer."""
+"""State in the commands for a driver: the guard has already checked the writer's."""
 
 
 class Measurement(NamedTuple):
@@ -78,7 +78,7 @@ class Reporter(Protocol):
 
 
 class Report:
-    """A `Reporter` of a driver that is on no bus: keeps what it is told."""
+    """A `Reporter` for a driver without a bus: keeps what is reported."""
 
     def __init__(self) -> None:
         self.clock = Clock()
@@ -137,7 +137,7 @@ class RobotDriver(ABC):
         lockstep: time is simulated as well; `serve_lockstep` replaces the loop.
         switch_interval_s: how long another thread may hold the interpreter.
         loop: name of the loop's rate in the status.
-        fault: why the robot does not move; empty: it is well.
+        fault: why the robot does not move; empty: no fault.
         measured_ns: monotonic time of the newest valid measurement, None before the first.
         gripper_mode: mode of the gripper state while the arm is ready.
         no_gripper: why gripper commands are rejected; empty: the robot has a gripper.
@@ -183,11 +183,11 @@ class RobotDriver(ABC):
     # -- optional -----------------------------------------------------------------------------
     @property
     def parts(self) -> Mapping[str, RobotDriver]:
-        """The driver of each part of the robot; of one arm this driver, by no name."""
+        """Driver of each part, by name; of a robot with one arm this driver, by an empty name."""
         return {"": self}
 
     def attach(self, node: Node, follower: CommandFollower | None) -> None:
-        """The node is on the bus; `follower` is None where there is no arm.
+        """Called when the node is on the bus; `follower` is None if there is no arm.
 
         Only a driver with keys of its own overrides it.
         """
@@ -200,7 +200,7 @@ class RobotDriver(ABC):
         """Start a gripper motion."""
 
     def recover(self) -> None:
-        """Begin to clear the robot's errors: a person asked for it with ``reset``."""
+        """Begin to clear the robot's errors: an operator requested it with ``reset``."""
 
     def poll(self, mono_ns: int) -> None:
         """Begin a tick: handle other inputs than commands."""

@@ -2,10 +2,10 @@
 # requires-python = ">=3.12,<3.14"
 # dependencies = ["lerobot[dynamixel,feetech]==0.6.1"]
 # ///
-"""A robot class of LeRobot (SO-100, SO-101, Koch, ...), run in an environment of its own.
+"""A robot class of LeRobot (SO-100, SO-101, Koch, ...), run in its own environment.
 
-LeRobot speaks to the motors and keeps their calibration; its cameras are not used. Its joints have
-degrees, or -100 to 100 from one end to the other, and its gripper has 0 to 100. It reports neither
+LeRobot drives the motors and keeps their calibration; its cameras are not used. Its joints are in
+degrees, or -100 to 100 from one end to the other, and its gripper in 0 to 100. It reports neither
 velocity nor torque.
 """
 
@@ -29,8 +29,8 @@ LOST_S = 1.0
 """Motors that did not answer for this long count as lost."""
 OPEN = 100.0
 STILL, HELD = 1.0, 4.0
-"""The gripper stands where it moved by less, and holds something where it stands more open than it
-was told to, both of 100."""
+"""The gripper stands if it moved by less, and holds an object if it is open wider than commanded by
+this much; both of 100."""
 STILL_S = 0.3
 
 
@@ -64,7 +64,7 @@ class LeRobotArm:
 
     # -- connection ---------------------------------------------------------------------------
     def connect(self) -> None:
-        """Connect to the motors. LeRobot lets go of them for a moment while it sets them up.
+        """Connect to the motors. LeRobot releases them for a moment while it configures them.
 
         Raises:
             NodeError: they do not answer, are not calibrated, or are not those of the profile.
@@ -84,7 +84,7 @@ class LeRobotArm:
         try:
             robot.connect(calibrate=False)
             calibrated = robot.is_calibrated
-        except Exception as error:  # of whichever bus it is
+        except Exception as error:  # each bus raises its own
             raise NodeError(f"{settings.port}: {in_words(error)}") from error
         if not calibrated:
             raise NodeError(f"its motors have another calibration than {settings.id}; {calibrate}")
@@ -101,10 +101,10 @@ class LeRobotArm:
 
     # -- state --------------------------------------------------------------------------------
     def read(self) -> Reading | None:
-        """The newest state; None where the motors did not answer once.
+        """The newest state; None if the motors missed an answer.
 
         Raises:
-            NodeError: they have not answered for too long; the node begins again.
+            NodeError: they have not answered for too long; the node restarts.
         """
         now_s = time.monotonic()
         try:
@@ -125,7 +125,7 @@ class LeRobotArm:
         return (units - self._zero) * self._unit_rad
 
     def _grip(self, opening: float, now_s: float) -> tuple[float, bool, bool]:
-        """Width, whether a motion that was asked for goes on, whether something is held."""
+        """Width, whether a commanded motion is in progress, whether an object is held."""
         if abs(opening - self._grip_was) > STILL:
             self._grip_was, self._grip_moved_s = opening, now_s
         if now_s - self._grip_moved_s > STILL_S:
@@ -136,7 +136,7 @@ class LeRobotArm:
         return share * self._width_m, self._gripping, holding
 
     def status(self) -> Mapping[str, Any]:
-        """Which robot it is, and how often its motors did not answer."""
+        """Which robot it is, and how many answers of its motors were missed."""
         return {
             "lerobot": self._settings.robot,
             "calibration": str(self._robot.calibration_fpath),
@@ -161,7 +161,7 @@ def make_lerobot(profile: Profile) -> Any:
     """LeRobot's robot of a profile, not connected.
 
     Raises:
-        NodeError: LeRobot has none of this name, or it takes other settings.
+        NodeError: LeRobot has no robot of this name, or it does not accept these settings.
     """
     lerobot = import_module("lerobot.robots")
     settings = profile.lerobot

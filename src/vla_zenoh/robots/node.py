@@ -86,10 +86,11 @@ class RobotNode:
                 self._loop(driver.pace(), stop)
         finally:
             self._close()
-            gc.unfreeze()  # so that the interpreter frees everything at its end
+            gc.unfreeze()  # so that the interpreter frees everything at exit
 
     def _connect(self) -> None:
-        """Connect the driver, and report so: a node that does not would count as hung."""
+        """Connect the driver, publishing the status meanwhile: without it the node counts as
+        hung."""
         self.node.publish_status("connecting", now=True)
         done = threading.Event()
 

@@ -28,7 +28,7 @@ FUTURE_NS = 100_000_000
 class PythonDriver(RobotDriver):
     """The robot class that the profile names: in ``arm.file``, or built in.
 
-    What the class raises becomes a `NodeError` with the names of class and method.
+    Exceptions of the class become a `NodeError` with the names of class and method.
 
     Args:
         profile: the effective profile.
@@ -53,7 +53,7 @@ class PythonDriver(RobotDriver):
         self.recovers = self._method("recover") is not None
         if self._method("grip") is None:
             self.no_gripper = f"{self._called} has no method grip"
-        self.silent_why = f"{self._called}: read gives nothing new"
+        self.silent_why = f"{self._called}: read returns nothing new"
         self.stalled_hint = f"; does {self._called} wait for something?"
 
     # -- calls --------------------------------------------------------------------------------
@@ -86,7 +86,7 @@ class PythonDriver(RobotDriver):
             return None
         if not isinstance(reading, Reading):
             given = type(reading).__name__
-            raise NodeError(f"{self._called}: read gave {given}, wanted a Reading")
+            raise NodeError(f"{self._called}: read returned {given}, wanted a Reading")
         if self._fault.say(reading.fault, mono_ns):
             self.fault = self._fault.words
             if self.fault:
@@ -97,7 +97,7 @@ class PythonDriver(RobotDriver):
         try:
             measured_ns = _measured_ns(reading)
             if measured_ns == self.measured_ns:
-                return None  # the same again: the robot is slower than this loop
+                return None  # unchanged: the robot is slower than this loop
             stamp_ns = self.report.clock.wall_at(measured_ns)
             measured = self._reading.take(reading, stamp_ns, self._asked_m)
         except (TypeError, ValueError) as error:
@@ -121,7 +121,7 @@ class PythonDriver(RobotDriver):
         if holding and not self._held:
             self.report.emit(Event("info", "notice", "grasped", f"{self._width_m:.3f} m apart"))
         elif self._held and not holding and not released:
-            why = "the gripper holds nothing any more, and was not told to let go"
+            why = "the gripper lost its object without a command to release it"
             self.report.emit(Event("warning", "notice", "object_lost", why))
         self._held = holding
 
@@ -140,7 +140,7 @@ class PythonDriver(RobotDriver):
         self._call("close")
 
     def status(self) -> DriverStatus:
-        """Class, fault, width, and what the robot adds."""
+        """Class, fault, width, and the robot's own entries."""
         width_m = self._asked_m if self._width_m is None else self._width_m
         return DriverStatus(
             {
@@ -154,12 +154,12 @@ class PythonDriver(RobotDriver):
 
 
 def file_of(profile: Profile) -> Path | None:
-    """File whose header may ask for an environment of its own."""
+    """File whose header may ask for a separate environment."""
     if profile.robot.driver == "lerobot":
         return Path(__file__).with_name("lerobot_arm.py")
     if profile.robot.driver == "arm" and profile.arm is not None:
         path = Path(profile.arm.file).expanduser()
-        return path if path.is_file() else None  # `make_arm` says that it is missing
+        return path if path.is_file() else None  # `make_arm` reports that it is missing
     return None
 
 
@@ -198,5 +198,5 @@ def _measured_ns(reading: Reading) -> int:
         return now_ns
     measured_ns = operator.index(reading.measured_ns)
     if measured_ns > now_ns + FUTURE_NS:
-        raise ValueError("measured_ns is in the future; it is of time.monotonic_ns()")
+        raise ValueError("measured_ns is in the future; use time.monotonic_ns()")
     return measured_ns

@@ -21,7 +21,7 @@ class PythonReading:
     """Validates the readings of one arm.
 
     Args:
-        profile: whose robot it is.
+        profile: of the robot.
         kinematics: of that robot.
     """
 
@@ -30,15 +30,15 @@ class PythonReading:
         self._state = JointReading(profile, kinematics)
 
     def take(self, reading: Reading, stamp_ns: int, asked_m: float) -> Measurement:
-        """All of it, or nothing.
+        """Convert a reading; one invalid value rejects all of it.
 
         Args:
-            reading: as the robot gave it.
+            reading: as the robot returned it.
             stamp_ns: when it was measured, wall clock.
-            asked_m: width asked for last, believed where the reading has none.
+            asked_m: last commanded width, used if the reading has none.
 
         Raises:
-            ValueError: something of it is no number, or not what this arm can be and do.
+            ValueError: a value is not a number, or impossible for this arm.
         """
         count = len(self._names)
 
@@ -63,17 +63,17 @@ class PythonReading:
 
 
 class Fault:
-    """Why the robot does not move: from when it says so until it says otherwise."""
+    """Why the robot does not move: from a reading that reports a fault until one that does not."""
 
     def __init__(self) -> None:
         self.words = ""
         self._since_ns = 0
 
     def say(self, words: object, now_ns: int) -> bool:
-        """Take what a reading says; whether `words` are others now.
+        """Update from a reading; returns whether `words` changed.
 
         Args:
-            words: empty or None: it is well.
+            words: the reading's fault; empty or None: no fault.
             now_ns: on the monotonic clock.
         """
         before = self.words

@@ -98,14 +98,14 @@ class SimDriver(RobotDriver):
             self.lead("", follower)
 
     def lead(self, part: str, follower: CommandFollower | None) -> None:
-        """Lead a part from where its follower stands."""
+        """Attach the follower of a part and start at its reference."""
         assert follower is not None
         assert follower.reference is not None
         self._followers[part], self._references[part] = follower, follower.reference
 
     # -- one millisecond ----------------------------------------------------------------------
     def poll(self, mono_ns: int) -> None:
-        """Carry out resets."""
+        """Execute resets."""
         for seed in self._keys.resets() if self._keys else ():
             if any(one.following for one in self._followers.values()) and not self.fault:
                 why = "sim/reset: the arm is being commanded; deactivate first"
@@ -143,7 +143,7 @@ class SimDriver(RobotDriver):
             self._keys.publish(self.world, self._ticks, self._stamp_ns)
 
     def measure(self, part: str = "") -> Measurement | None:
-        """State of a part, where this step has one."""
+        """State of a part, if this step has one."""
         return None if self._ticks % self._state_every else self._measure(self._stamp_ns, part)
 
     def _measure(self, stamp_ns: int, part: str = "") -> Measurement:
@@ -160,7 +160,7 @@ class SimDriver(RobotDriver):
         return self._newest[part]
 
     def reset(self, seed: int | None) -> None:
-        """Put arm and objects where they begin; `seed` None: that of the profile."""
+        """Reset arm and objects to their initial state; `seed` None: that of the profile."""
         self.world.reset(self.profile.sim.seed if seed is None else seed)
         self.fault = ""
         self.report.counters["sim.resets"] += 1

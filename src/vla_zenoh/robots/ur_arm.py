@@ -1,9 +1,9 @@
-"""A UR arm over RTDE, by the library ur_rtde: set-points by ``servoj``, without ROS.
+"""A UR arm over RTDE, with the library ur_rtde: set-points by ``servoj``, without ROS.
 
 The library uploads a control program; it runs on the robot and follows the newest set-point, which
 it holds when none comes. The robot's own watchdog stops that program when this computer falls
-silent. Nothing starts the program again but `connect` and a person's ``reset``: the library is told
-not to upload it by itself, for it reconnects on its own.
+silent. Only `connect` and an operator's ``reset`` start the program again: the library reconnects
+on its own, and is configured not to upload the program then.
 """
 
 from __future__ import annotations
@@ -87,7 +87,8 @@ class UrArm:
         self._period_s = 1.0 / profile.timing.command_hz
         kinematics = make_kinematics(profile)
         reached = kinematics.forward(np.zeros(len(profile.robot.arm_joints))).position_m
-        # With all joints at 0 a UR reaches along -x of its own base; ROS turns that by half a turn.
+        # With all joints at 0 a UR reaches along -x of its own base; ROS rotates that base by 180
+        # degrees.
         self._turn = np.diag([-1.0, -1.0, 1.0] if reached[0] > 0 else [1.0, 1.0, 1.0])
         self._control: Any = None
         self._receive: Any = None
@@ -102,7 +103,7 @@ class UrArm:
         """Connect, and start the control program if the robot is ready for it.
 
         Raises:
-            NodeError: the robot does not answer, or takes no programs from this computer.
+            NodeError: the robot does not answer, or accepts no programs from this computer.
         """
         self.open()
         control, address = self._library["rtde_control"].RTDEControlInterface, self.address
@@ -121,7 +122,7 @@ class UrArm:
             NodeError: the robot does not answer.
         """
         address = self.address
-        for port in PORTS:  # the library keeps the interpreter while it waits for an answer
+        for port in PORTS:  # the library holds the GIL while it waits for an answer
             try:
                 socket.create_connection((address, port), CONNECT_S).close()
             except OSError as error:
@@ -146,7 +147,7 @@ class UrArm:
         self._control = self._receive = None
         links = [link for link in (control, receive) if link is not None]
         if not all(link.isConnected() for link in links) or self._silent_s > DOUBTFUL_S:
-            # The library crashes where it disconnects while it reconnects; so does its destructor.
+            # The library crashes if it disconnects while it reconnects; so does its destructor.
             _ABANDONED.append((control, receive))
             return
         if control is not None:
@@ -156,7 +157,7 @@ class UrArm:
             receive.disconnect()
 
     def _start(self) -> None:
-        """Start the control program, and set what the profile says of tool and payload."""
+        """Start the control program, and apply the profile's tool and payload."""
         settings, control = self._settings, self._control
         try:
             control.reuploadScript()
@@ -176,7 +177,7 @@ class UrArm:
         """The newest state.
 
         Raises:
-            NodeError: the robot has been silent for too long; the node begins again.
+            NodeError: the robot has been silent for too long; the node restarts.
         """
         self._update()
         if self._lost(self._receive):
@@ -188,8 +189,8 @@ class UrArm:
             self._started = False
             self._stopped = "the control program was stopped (at the pendant, or by the watchdog)"
         if self._started and not self._watched:
-            # Not in `connect`: a node has more to do between that and its first tick than a
-            # watchdog waits.
+            # Not in `connect`: a node does more between that and its first tick than the watchdog
+            # allows.
             self._watched = self._control.setWatchdog(self._settings.watchdog_hz)
         receive, now_ns = self._receive, time.monotonic_ns()
         if self._started and now_ns - self._sent_ns > KICK_S * 1e9:
@@ -208,11 +209,12 @@ class UrArm:
 
     def _update(self) -> None:
         robot_s = self._receive.getTimestamp()
-        if robot_s != self._robot_s:  # the same again: the robot is silent
+        if robot_s != self._robot_s:  # unchanged: the robot is silent
             self._robot_s, self._measured_ns = robot_s, time.monotonic_ns()
 
     def _lost(self, receive: Any) -> bool:
-        """The library's own state of the connection says nothing for the first seconds."""
+        """Silence, because the library's own connection flag means nothing for the first
+        seconds."""
         return receive is not None and self._silent_s > LOST_S
 
     @property
@@ -309,12 +311,12 @@ class UrArm:
     # -- for `robot check` --------------------------------------------------------------------
     @property
     def address(self) -> str:
-        """Of the control box."""
+        """Address of the control box."""
         return self._settings.address
 
     @property
     def safety_mode(self) -> str:
-        """UR's name of it."""
+        """UR's name of the safety mode."""
         mode = self._receive.getSafetyMode()
         return SAFETY_MODES.get(mode, f"UNKNOWN_{mode}")
 

@@ -1,8 +1,8 @@
-"""Publishes, for the nodes of this host that do not run, that they crashed or are starting.
+"""Publishes for the nodes of this host that are down that they crashed or are starting.
 
-A node that cannot start cannot say so; without this its reason would be in one terminal alone. It
-is published in the node's name and with its certificate, on its own keys, which no other role may
-put.
+A node that cannot start cannot publish its reason; without this it would be in one terminal only.
+The status is published in the node's name and with its certificate, on its own keys, which no other
+role may put.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class DownNodes:
 
     Args:
         profile: the effective profile.
-        session: of the people at this computer; nodes of a secured lab get one each.
+        session: of the operator at this computer; in a secured lab each node gets its own.
         host: of the profile.
         down: the nodes that are down now.
     """
@@ -61,7 +61,7 @@ class DownNodes:
             try:
                 self._publish(self._down())
             except (VlaZenohError, zenoh.ZError):
-                continue  # the router is away, and with it all who could hear
+                continue  # the router is down, and every subscriber with it
         self._forget(())
 
     def _publish(self, down: Sequence[DownNode]) -> None:

@@ -1,8 +1,8 @@
 """Runs a model in an environment of its own, as its PEP 723 header asks.
 
-Pins of different models cannot live in one environment, so a model whose dependencies are not here
-is started again by uv, which makes (and keeps) an environment with the model's pins and this very
-package in it.
+Pins of different models cannot share one environment, so a model whose dependencies are missing
+here is started again by uv, which makes (and keeps) an environment with the model's pins and this
+package.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ INSIDE_VARIABLE = "VLA_ZENOH_WORKER_ENVIRONMENT"
 def run_in_own_environment(
     model: ModelFile, python: str | None, *, extra: str = "", program: str = "vla_zenoh"
 ) -> None:
-    """Replace this process by one in the right environment; returns where this one is right.
+    """Replace this process by one in the right environment; returns if this one is right.
 
     Args:
         model: the file.
         python: interpreter of a prepared environment, which must have this package.
-        extra: of this package, which the command needs beside the model's own packages; a prepared
-            environment has to have it.
+        extra: extra of this package that the command needs besides the model's own packages; a
+            prepared environment must have it.
 
     Raises:
         WorkerError: another environment is needed and cannot be made.
     """
-    die_with_parent()  # before the model itself is made, which may take long or hang
+    die_with_parent()  # before the model is constructed, which may take long or hang
     missing = model.missing()
     if INSIDE_VARIABLE in os.environ:
         if missing:
@@ -87,14 +87,14 @@ def _check_interpreter(python: str) -> None:
 def environment_command(
     model: ModelFile, more: Sequence[str] = (), *, extra: str = ""
 ) -> list[str]:
-    """What runs a command in the environment that the model's header asks for.
+    """Command line that runs a command in the environment that the model's header asks for.
 
-    uv makes it at the first time and keeps it.
+    uv makes it the first time and keeps it.
 
     Args:
         model: the file.
         more: further packages.
-        extra: of this package.
+        extra: extra of this package.
 
     Raises:
         WorkerError: there is no uv.

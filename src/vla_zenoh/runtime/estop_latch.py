@@ -1,4 +1,4 @@
-"""A file that stands while an emergency stop or a fault is latched."""
+"""File that exists while an emergency stop or a fault is latched."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ FLUSH_S = 0.5
 
 
 class EstopLatch:
-    """Kept by a thread of its own: a full or slow disk must not hold up the loop that commands.
+    """Latch file, written by its own thread: a full or slow disk must not block the command loop.
 
     Args:
         path: the file.
@@ -24,7 +24,7 @@ class EstopLatch:
         threading.Thread(target=self._run, name="latch", daemon=True).start()
 
     def read(self) -> str | None:
-        """Why it stands; None where it does not. What cannot be read stands."""
+        """Why it is latched; None if it is not. A file that cannot be read counts as latched."""
         try:
             return self._path.read_text("utf-8", errors="replace")
         except FileNotFoundError:
@@ -33,7 +33,7 @@ class EstopLatch:
             return f"{self._path} cannot be read: {error}"
 
     def set(self, why: str | None) -> None:
-        """Let it stand for a reason, or be gone; returns at once."""
+        """Latch for a reason, or clear the latch (None); returns at once."""
         self._wanted.put(why)
 
     def failure(self) -> str | None:
@@ -43,7 +43,7 @@ class EstopLatch:
         return None
 
     def close(self) -> None:
-        """Wait, a little, until all of that is done; then it is kept no more."""
+        """Wait a short time for pending writes, then end the thread."""
         done = threading.Event()
         self._wanted.put(done)
         done.wait(FLUSH_S)
@@ -67,6 +67,6 @@ class EstopLatch:
         if why is None:
             self._path.unlink(missing_ok=True)
             return
-        # The folder may have been tidied away in the days since it was made.
+        # The folder may have been removed in the days since it was made.
         self._path.parent.mkdir(parents=True, exist_ok=True)
         self._path.write_text(why, "utf-8", errors="replace")

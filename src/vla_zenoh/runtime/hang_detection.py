@@ -1,6 +1,6 @@
 """Detects hung nodes of a host: they run, but their heartbeat (the status) has stopped.
 
-A hung node does no harm, since the arm brakes without it, but it has to be ended so that a new one
+A hung node does no harm, since the arm brakes without it, but it must be killed before a new one
 can start. Workers are exempt: a large model may take long to load or to infer.
 """
 
@@ -27,7 +27,7 @@ class LastStatus(NamedTuple):
 
 
 def hung_nodes(running: Mapping[str, tuple[str, int]], said: Mapping[str, LastStatus]) -> list[str]:
-    """Names of the nodes to end.
+    """Names of the nodes to kill.
 
     Args:
         running: node -> (kind, pid) of the running nodes that this host started.

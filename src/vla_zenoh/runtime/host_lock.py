@@ -1,4 +1,4 @@
-"""A lock that one `vla-zenoh up` of a host and robot holds, and who holds it."""
+"""A lock that only one `vla-zenoh up` per host and robot can hold, and which process holds it."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ class HostLock:
     """Held from `take` until `release`, or the end of the process, however it ends.
 
     Args:
-        name: of what runs only once.
-        what: the same, for the error.
+        name: of the lock file, one for each thing that may run only once.
+        what: the same in words, for the error.
     """
 
     def __init__(self, name: str, what: str) -> None:
@@ -31,7 +31,7 @@ class HostLock:
         """Hold the lock.
 
         Raises:
-            NodeError: another process holds it; says which, and since when.
+            NodeError: another process holds it; names it, and since when.
         """
         number = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o600)
         try:
@@ -39,13 +39,13 @@ class HostLock:
         except BlockingIOError:
             holder = os.read(number, 4096)
             os.close(number)
-            raise NodeError(f"{self._what} runs already{_described(holder)}") from None
+            raise NodeError(f"{self._what} is already running{_described(holder)}") from None
         os.ftruncate(number, 0)
         os.write(number, json.dumps({"pid": os.getpid(), "since_s": time.time()}).encode())
         self._file = number
 
     def release(self) -> None:
-        """Let go of the lock, if it is held."""
+        """Release the lock, if it is held."""
         if self._file is not None:
             os.close(self._file)  # the file stays: removing it would let two hold it
             self._file = None
@@ -61,7 +61,7 @@ def _described(holder: bytes) -> str:
 
 
 def _folder() -> Path:
-    """A folder of this user alone that is emptied when the computer starts."""
+    """A folder that only this user can access and that is emptied at boot."""
     run = os.environ.get("XDG_RUNTIME_DIR")
     folder = Path(run or tempfile.gettempdir()) / f"vla-zenoh-{os.getuid()}"
     folder.mkdir(mode=0o700, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Brings up and down the nodes that a profile assigns to a host."""
+"""Starts and stops the nodes that a profile assigns to a host."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ STOP_BUDGET_S = 2.9
 
 
 def choose_host(profile: Profile, host: str | None) -> tuple[str, HostProfile]:
-    """The part of the profile for this computer.
+    """The section of the profile for this computer.
 
     Raises:
-        ProfileError: no such host, or several and none named.
+        ProfileError: no such host, or several of which none was named.
     """
     if host is None:
         if len(profile.hosts) == 1:
@@ -54,7 +54,7 @@ def choose_host(profile: Profile, host: str | None) -> tuple[str, HostProfile]:
 
 
 def host_lock(profile: Profile, host: str) -> HostLock:
-    """What a running `Host` holds, so that there is only one."""
+    """The lock of a running `Host`, so that there is only one."""
     router = (profile.hosts[host].connect or profile.session.connect)[0]
     what = f"host {host} of robot {profile.robot.name}"
     return HostLock("-".join((profile.root, profile.robot.name, host, router)), what)
@@ -77,12 +77,12 @@ def node_commands(
         host: one of its hosts.
         profile_file: where nodes find that profile.
         worker_options: worker -> ``name=value`` options.
-        worker_arguments: more of the command line of every worker.
+        worker_arguments: further arguments for the command line of every worker.
         also_files: profiles of other robots that the router of this host serves.
         dry_run: the command node commands nothing.
 
     Raises:
-        ProfileError: there are such robots, and no router on this host; or nothing to be run dry.
+        ProfileError: `also_files` without a router on this host, or `dry_run` without command node.
     """
     part = profile.hosts[host]
     if dry_run and "command" not in part.nodes:
@@ -124,20 +124,20 @@ class Host:
 
     Args:
         profile: the effective profile.
-        host: which host; None where there is only one.
-        log: (node, line) for what nodes write.
-        tell: (node, sentence) for what happens to them.
-        own_router: refuse to use a router that answers already.
+        host: its name; None if there is only one.
+        log: called with (node, line) for each line that a node writes.
+        tell: called with (node, sentence) for each event of a node.
+        own_router: fail if a router already answers.
         worker_options: worker -> ``name=value`` options.
-        worker_arguments: more of the command line of every worker.
+        worker_arguments: further arguments for the command line of every worker.
         also: other robots' profiles that the router of this host serves.
-        dry_run: the command node computes and checks everything and commands nothing.
-        rolling: folder of the rolling record, which is kept beside a command node; None: none is.
+        dry_run: the command node computes and checks everything but commands nothing.
+        rolling: folder of the rolling record, which runs beside a command node; None: no record.
 
     Raises:
-        NodeError: this host runs already, a router answers although `own_router`, or does not know
-            who is in `also`.
-        ProfileError: there is no such host, or it has no router for `also`, or no command node
+        NodeError: this host already runs, or a router already answers although `own_router` is set
+            or `also` names robots that it does not know.
+        ProfileError: there is no such host, it has no router for `also`, or it has no command node
             for `dry_run`.
     """
 
@@ -163,11 +163,11 @@ class Host:
             profile = override(profile, {"session": changes})
         self.profile, self._part, self._tell = profile, part, tell
         self._folder = tempfile.TemporaryDirectory(prefix="vla-zenoh-")
-        # A lab is up for weeks, and systemd-tmpfiles takes away what is 10 days old, but for what
-        # is below a folder that somebody has locked (tmpfiles.d(5)).
+        # A lab is up for weeks, and systemd-tmpfiles removes files older than 10 days, except below
+        # a folder that is locked (tmpfiles.d(5)).
         self._lock: int | None = os.open(self._folder.name, os.O_RDONLY | os.O_DIRECTORY)
         fcntl.flock(self._lock, fcntl.LOCK_EX)
-        # Children read the very profile that is in force here, whatever its options were.
+        # Children read the profile that is in force here, with all options applied.
         self.profile_file = self._write(profile)
         self._also = [self._write(other) for other in also]
         files = (self.profile_file, worker_options, worker_arguments, self._also)
@@ -209,11 +209,11 @@ class Host:
         answers = self._router_answers()
         if answers and self._own_router:
             where = ", ".join(self.profile.session.connect)
-            raise NodeError(f"a router answers already at {where}")
+            raise NodeError(f"a router already answers at {where}")
         if answers and self._also:
             raise NodeError(
-                "a router answers already, and cannot be told of other robots; end it, or start it "
-                "with --also itself"
+                "a router already answers and cannot serve other robots; stop it, or start it "
+                "with --also"
             )
         if "router" in self._part.nodes:
             if answers:
@@ -234,11 +234,11 @@ class Host:
         client = self.client
         if client is None:
             return []
-        # Who hears of it has reached the only router, which is not expected.
+        # A client that receives this has reached the only router, so no second one is expected.
         return [each for each in self.supervisor.down(client.alive) if each.name in client.expected]
 
     def _router_answers(self) -> bool:
-        # Where this host runs a router it names that one first; the others stand in for it.
+        # If this host runs a router, its endpoint comes first; the others are substitutes.
         own = self.profile.session.connect[:1] if "router" in self._part.nodes else None
         try:
             open_session(self.profile.session, connect=own).close()
@@ -250,13 +250,13 @@ class Host:
         self.stop()
 
     def stop(self) -> None:
-        """Brake the arm, then end every node; within `STOP_BUDGET_S` in all.
+        """Brake the arm, then stop every node; within `STOP_BUDGET_S` in all.
 
-        An arm that needs no node of ours goes on: where a lab runs already, and all that was
-        started here was refused as there twice, it is none of our business.
+        An arm that needs none of our nodes continues: if a lab already runs and every node started
+        here was rejected as a duplicate, that lab is left alone.
         """
         deadline_s = time.monotonic() + STOP_BUDGET_S
-        # Where people may only look on, the arm brakes because the nodes of this host end.
+        # If this client may only observe, the arm brakes because the nodes of this host exit.
         may = (
             self.profile.session.security is None
             or operator_role(self.profile, self.host) is Role.OPERATOR
@@ -278,10 +278,10 @@ class Host:
             self._lock = None
 
     def _takes_part(self, client: Client) -> bool:
-        """Whether a node that lives is one of ours, and not another one of its name."""
+        """Whether a live node is one of ours, and not another one of the same name."""
         alive = client.alive
         return any(
-            kind == "router"  # which starts only where no other one answers
+            kind == "router"  # which starts only if no other one answers
             or (
                 name in alive
                 and (status := client.status(name)) is not None
@@ -294,20 +294,20 @@ class Host:
     def _brake(self, client: Client) -> None:
         try:
             if not client.deactivate(BRAKE_PATIENCE_S):
-                self._tell("command", "does not say that the arm stands")
+                self._tell("command", "does not confirm that the arm stands")
         except zenoh.ZError as error:
-            self._tell("command", f"cannot be told to brake ({error}); ending it brakes too")
+            self._tell("command", f"cannot be asked to brake ({error}); stopping it brakes too")
 
     def serve(self, stop: threading.Event) -> None:
         """Run the nodes until `stop` is set; nodes that crash or hang are restarted.
 
-        Tells once a day what is wrong with the certificates of this host, or is soon.
+        Reports once a day certificates of this host that are invalid or expire soon.
 
         A worker that keeps crashing is not restarted: a broken model must not end the
         robot's nodes beside it.
 
         Raises:
-            NodeError: another node dies again and again, or nothing is left here but such workers.
+            NodeError: another node keeps crashing, or only such workers are left here.
         """
         while not stop.wait(0.1):
             self._end_what_hangs()
@@ -320,14 +320,14 @@ class Host:
         """Restart nodes that crashed.
 
         Args:
-            spare: kinds without which the others go on.
+            spare: kinds of nodes that the others do not need.
 
         Raises:
-            NodeError: another node dies again and again.
+            NodeError: another node keeps crashing.
         """
         if not self.supervisor.poll(spare=spare) and (given_up := self.supervisor.given_up):
             why = f": {given_up.why}" if given_up.why else "; its last lines say why"
-            raise NodeError(f"{given_up.command.name} dies again and again{why}")
+            raise NodeError(f"{given_up.command.name} keeps crashing{why}")
 
     def _tell_when_ready(self) -> None:
         if self._ready or self.client is None:
@@ -340,7 +340,7 @@ class Host:
 
     @property
     def mode(self) -> str:
-        """SIM, DRY RUN or LIVE, which stands in front of what says that the arm moves."""
+        """SIM, DRY RUN or LIVE: prefix of messages about the arm's motion."""
         if self._dry_run:
             return "DRY RUN"
         return "SIM" if self.profile.robot.driver == "sim" else "LIVE"
@@ -351,5 +351,5 @@ class Host:
         heard = self.client.snapshot().items()
         said = {name: LastStatus(status.pid, age_s) for name, (status, age_s, _) in heard}
         for name in hung_nodes(self.supervisor.running(), said):
-            why = f"silent for {said[name].age_s:.0f} s; it hangs, ending it"
+            why = f"silent for {said[name].age_s:.0f} s; it hangs; killing it"
             self.supervisor.terminate(name, why)

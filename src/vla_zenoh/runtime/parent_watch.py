@@ -1,4 +1,4 @@
-"""Ends a child when its supervisor dies (PR_SET_PDEATHSIG). Imports little: it runs first."""
+"""Terminates a child when its supervisor dies (PR_SET_PDEATHSIG). Imports little: it runs first."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import time
 from pathlib import Path
 
 PARENT_VARIABLE = "VLA_ZENOH_PARENT"
-"""Process id of the supervisor; a child ends itself when that is gone."""
+"""Process id of the supervisor; a child exits when that process is gone."""
 RUN_FOLDER_VARIABLE = "VLA_ZENOH_RUN_FOLDER"
-"""Folder where a node may leave what it has to know after a restart."""
+"""Folder where a node may keep what it needs after a restart."""
 FATAL, DETAIL = "fatal: ", "detail: "
-"""Begin the lines in which a node says to its supervisor why it ends, and the traceback of it."""
+"""Prefixes of the lines by which a node reports why it exits, and the traceback of that."""
 PARENT_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG
 WATCH = "watch over the supervisor"
 LOOK_PERIOD_S = 0.25
@@ -24,11 +24,11 @@ LAST_WORDS_S = 1.5
 
 
 def die_with_parent() -> None:
-    """Where a supervisor started us: end in an orderly way when it dies, however it dies.
+    """Under a supervisor: exit in an orderly way when it dies, for whatever reason.
 
-    Linux tells a child at once. A process between us (uv, for a model with an environment of its
-    own) swallows that, and elsewhere there is no such thing: so we look as well, and what does not
-    end within `LAST_WORDS_S` of it, because it hangs in a library, is ended.
+    Linux signals the child at once. A process in between (uv, for a model with its own environment)
+    swallows that signal, and other systems have none: so we poll as well. A process that does not
+    exit within `LAST_WORDS_S`, because it hangs in a library, is killed.
     """
     parent = os.environ.get(PARENT_VARIABLE)
     if parent is None:

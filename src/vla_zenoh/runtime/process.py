@@ -1,4 +1,4 @@
-"""What a node's process does around it: signals and the session."""
+"""What surrounds a node in its process: signals and the session."""
 
 from __future__ import annotations
 
@@ -35,18 +35,17 @@ def run_node(
     wait_s: float | None = None,
     preferred: bool = False,
 ) -> None:
-    """Open a session and run a node in it until a signal comes.
+    """Open a session and run a node in it until a signal arrives.
 
     Args:
         profile: the session section is used.
         run: makes the node and runs it.
-        identity: the node's name, for its certificate; None: the people's at this computer.
-        wait_s: patience with a router that does not answer; longer under a supervisor, which may
-            be starting it.
-        preferred: it keeps an arm in motion, and goes before other programs where that is allowed.
+        identity: the node's name, for its certificate; None: the operator at this computer.
+        wait_s: how long to wait for a router; longer under a supervisor, which may be starting it.
+        preferred: the node keeps an arm in motion and runs before other programs, where allowed.
 
     Raises:
-        SecurityError: its certificate is not there.
+        SecurityError: its certificate is missing.
         SessionError: no router answers.
     """
     stop = stop_on_signals()

@@ -23,8 +23,8 @@ from vla_zenoh.security.rules import access_control
 POLL_S = 0.25
 MAX_CLIENTS = 64
 RUNTIME_VARIABLE, RUNTIME = "ZENOH_RUNTIME", "(rx: (worker_threads: 16))"
-"""What arrives is handed on by the thread that received it, which waits where a link is stuck. With
-the usual two of them one bad link would hold up all others, the arm's among them."""
+"""A sample is forwarded by the thread that received it, which blocks on a stuck link. With Zenoh's
+default of two threads, one bad link would delay all others, the arm's among them."""
 
 
 def run_router(
@@ -34,17 +34,17 @@ def run_router(
     host: str | None = None,
     also: Sequence[Profile] = (),
 ) -> None:
-    """Route until `stop` is set.
+    """Run a Zenoh router until `stop` is set.
 
     Args:
-        profile: the session section, and whom to let in.
-        stop: ends it.
-        host: which host of the profile this is; it matters where several have a router.
+        profile: the session section and the access rules are used.
+        stop: set to stop the router.
+        host: name of this host; it matters if several hosts have a router.
         also: other robots' profiles that this router serves.
 
     Raises:
-        SecurityError: the router's certificate is not there.
-        SessionError: the address is taken.
+        SecurityError: the router's certificate is missing.
+        SessionError: the address is in use.
     """
     profile, name, links = _placed(profile, host)
     access = _access(profile, also)
@@ -73,9 +73,9 @@ def run_router(
 
 
 class Clients:
-    """Who is, or was lately, connected to a router: session number -> certificate and address.
+    """Current and recent clients of a router: session number -> certificate and address.
 
-    A command connects for a moment, so those that are gone are remembered.
+    A CLI command connects only for a moment, so clients that left are remembered.
 
     Args:
         session: of the router.
@@ -97,7 +97,7 @@ class Clients:
                 del self._known[next(iter(self._known))]
 
     def known(self) -> dict[str, list[str]]:
-        """The last `MAX_CLIENTS` that connected: [name of the certificate or empty, address]."""
+        """The last `MAX_CLIENTS` clients: [name of the certificate or empty, address]."""
         with self._lock:
             return {number: list(told) for number, told in self._known.items()}
 
@@ -106,7 +106,7 @@ def reject_taken(endpoints: Sequence[str]) -> None:
     """Make sure that a router can listen on TCP endpoints.
 
     Raises:
-        NodeError: another program has the port, or this computer lacks the address.
+        NodeError: another program uses the port, or this computer lacks the address.
     """
     for endpoint in endpoints:
         host, _, port = address_of(endpoint).rpartition(":")
@@ -133,10 +133,10 @@ def reject_taken(endpoints: Sequence[str]) -> None:
 def router_config(
     profile: Profile, *, host: str | None = None, also: Sequence[Profile] = ()
 ) -> dict[str, Any]:
-    """Zenoh's configuration of the profile's router, of ours or of the program ``zenohd``.
+    """Zenoh configuration of the profile's router, for `run_router` or the program ``zenohd``.
 
     Raises:
-        SecurityError: the router's certificate is not there.
+        SecurityError: the router's certificate is missing.
     """
     profile, name, links = _placed(profile, host)
     return session_config(

@@ -1,4 +1,4 @@
-"""Who goes first on a busy computer: the loops that keep an arm in motion, then their links."""
+"""Scheduling priorities on a busy computer: loops that keep an arm in motion, then their links."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from contextlib import contextmanager
 LOOP_PRIORITY, LINK_PRIORITY = 40, 30
 """SCHED_FIFO priorities: no link thread may preempt a control loop."""
 INNER_PRIORITY = 45
-"""Of a robot's own loop inside a driver's library, which is faster than ours."""
+"""Of a robot's own loop inside a driver library, which is faster than ours."""
 TASKS = "/proc/self/task"
 NICENESS = -10
 SET_TIMER_SLACK, GET_TIMER_SLACK = 29, 30  # PR_SET_TIMERSLACK and PR_GET_TIMERSLACK of prctl(2)
 
 
 def prefer_this_process() -> bool:
-    """Ask that the threads started from now on go before those of other programs; False: refused.
+    """Let threads started from now on run before those of other programs; False: not permitted.
 
-    For those that get nothing better, and where there is nothing better to be had.
+    For threads without a real-time priority, and for systems that grant none.
     """
     try:
         os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
@@ -32,11 +32,10 @@ def prefer_this_process() -> bool:
 
 @contextmanager
 def realtime_links() -> Iterator[bool]:
-    """What is started in here gets SCHED_FIFO: the threads of a Zenoh session opened here.
+    """Threads started in this context get SCHED_FIFO: those of a Zenoh session opened here.
 
-    A state or a command that waits in one of them is as late as if the loop had waited, and one
-    that is put aside while it holds the interpreter holds the loop up as well. False where not
-    allowed.
+    A state or command that waits in such a thread is as late as if the loop had waited; and one
+    that is preempted while it holds the GIL blocks the loop as well. Yields False if not permitted.
     """
     with _scheduled(LINK_PRIORITY, inherited=True) as granted:
         yield granted
@@ -44,10 +43,10 @@ def realtime_links() -> Iterator[bool]:
 
 @contextmanager
 def realtime_thread() -> Iterator[bool]:
-    """Ask for SCHED_FIFO for the calling thread while it is in here; False where not allowed.
+    """SCHED_FIFO for the calling thread in this context; yields False if not permitted.
 
-    What it starts meanwhile, threads and programs alike, does not inherit that: a tool that starts
-    up with the priority of a control loop would hold every loop of the computer up.
+    Threads and programs started meanwhile do not inherit it: a tool that starts with the priority
+    of a control loop would block every loop of the computer.
     """
     slack_ns = _timer_slack(1)
     try:
@@ -59,7 +58,7 @@ def realtime_thread() -> Iterator[bool]:
 
 @contextmanager
 def realtime_children() -> Iterator[None]:
-    """Ask for SCHED_FIFO for the threads that a library starts while the caller is in here.
+    """SCHED_FIFO for the threads that a library starts in this context.
 
     They inherit nothing from a `realtime_thread`.
     """
@@ -68,7 +67,7 @@ def realtime_children() -> Iterator[None]:
     for task in set(_tasks()) - before:
         try:
             os.sched_setscheduler(task, os.SCHED_FIFO, os.sched_param(INNER_PRIORITY))
-        except (OSError, AttributeError):  # not allowed, over already, or not Linux
+        except (OSError, AttributeError):  # not permitted, already over, or not Linux
             return
 
 
@@ -82,7 +81,7 @@ def _scheduled(priority: int, *, inherited: bool) -> Iterator[bool]:
         before = os.sched_getscheduler(0), os.sched_getparam(0)
         flag = 0 if inherited else os.SCHED_RESET_ON_FORK
         os.sched_setscheduler(0, os.SCHED_FIFO | flag, os.sched_param(priority))
-    except (OSError, AttributeError):  # not allowed, or not Linux
+    except (OSError, AttributeError):  # not permitted, or not Linux
         yield False
         return
     try:
@@ -92,7 +91,7 @@ def _scheduled(priority: int, *, inherited: bool) -> Iterator[bool]:
 
 
 def _give_back(policy: int, parameter: os.sched_param) -> None:
-    """Restore the policy; without privilege what is not inherited cannot be restored."""
+    """Restore the policy; without privilege, one that is not inherited cannot be restored."""
     try:
         os.sched_setscheduler(0, policy, parameter)
     except PermissionError:

@@ -20,8 +20,8 @@ from vla_zenoh.runtime.parent_watch import DETAIL, FATAL, PARENT_VARIABLE, RUN_F
 
 BACKOFF_S = (0.2, 0.5, 1.0, 2.0, 5.0)
 STABLE_S = 60.0
-"""After this time a node starts with the shortest backoff again. It is longer than a node takes, on
-a busy machine, to find that it cannot run."""
+"""After this time a node's backoff starts again at the shortest. It is longer than a node on a busy
+machine needs to find that it cannot run."""
 GIVE_UP_AFTER = 6
 """Crashes in a row, each before `STABLE_S`."""
 _STOPS_S = {**{kind: traits.stop_s for kind, traits in NODE_KINDS.items()}, ROLLING: 0.2}
@@ -29,16 +29,16 @@ STOP_ORDER = tuple(
     (tuple(kind for kind, other_s in _STOPS_S.items() if other_s == stop_s), stop_s)
     for stop_s in sorted(set(_STOPS_S.values()), reverse=True)
 )
-"""Kinds in the order they are stopped, and how long before the deadline the next follow."""
+"""Kinds in stop order, and how long before the deadline the next ones follow."""
 POLL_S = 0.05
 LAST_LINES_S = 0.5
 """A process that ended may have started another one, which keeps its output open."""
 RUST_SOURCE = re.compile(r" at /\S+\.rs:\d+(?=\.?$)")
-"""Where in its sources Zenoh wrote a line of its log: a path of the computer it was built on."""
+"""Source location in a line of Zenoh's log: a path of the computer it was built on."""
 
 
 class NodeCommand(NamedTuple):
-    """A node to run.
+    """Command that starts a node.
 
     Args:
         name: as in logs and status.
@@ -62,14 +62,14 @@ class Child:
     left_alone: bool = False
     start_again_s: float = 0.0
     reader: threading.Thread | None = None
-    """Of its output."""
+    """Thread that reads its output."""
     pid: int = 0
     why: str = ""
-    """Why it ended, if it said so."""
+    """Why it exited, if it reported that."""
     told: str = ""
-    """The same, of its last end."""
+    """The same, of its last exit."""
     end: str = ""
-    """How it ended."""
+    """How it exited."""
 
 
 class DownNode(NamedTuple):
@@ -79,8 +79,8 @@ class DownNode(NamedTuple):
         name: of the node.
         pid: of its last process.
         crashes: in a row.
-        why: it crashed; empty if it did not.
-        left_alone: it is not started again.
+        why: reason of the crash; empty if it did not crash.
+        left_alone: it is not restarted.
     """
 
     name: str
@@ -93,15 +93,15 @@ class DownNode(NamedTuple):
 class Supervisor:
     """Starts, restarts and stops the nodes of a host.
 
-    Start and stop from one thread that lives as long as the nodes.
+    Call `start` and `stop` from one thread that lives as long as the nodes.
 
     Args:
         commands: in the order to start them.
-        log: called with (node name, line) for every line a node writes; what begins with `DETAIL`
-            or `FATAL` is for a log file, `tell` says what people need of it.
+        log: called with (node name, line) for every line a node writes; lines that begin with
+            `DETAIL` or `FATAL` belong in a log file only, `tell` gets the summary.
         tell: called with (node name, sentence) for what the supervisor does.
-        folder: where nodes may leave what they have to know after a restart.
-        variables: of the nodes' environment, beside ours.
+        folder: where nodes may keep what they need after a restart.
+        variables: environment of the nodes, added to ours.
     """
 
     def __init__(
@@ -119,7 +119,7 @@ class Supervisor:
         self.given_up: Child | None = None
 
     def start(self, kinds: Sequence[str] | None = None) -> None:
-        """Start those of `kinds` (None: all) that do not run yet."""
+        """Start the nodes of `kinds` (None: all) that do not run yet."""
         for child in self.children:
             if child.process is None and (kinds is None or child.command.kind in kinds):
                 self._spawn(child)
@@ -128,8 +128,8 @@ class Supervisor:
         """Restart nodes that crashed.
 
         Args:
-            spare: kinds without which the others go on: if one of them keeps crashing, it is not
-                restarted any more, as long as others run.
+            spare: kinds of nodes that the others do not need: one that keeps crashing is not
+                restarted, as long as others run.
 
         Returns:
             False if a node that the others need keeps crashing.
@@ -181,14 +181,14 @@ class Supervisor:
                 child.reader.join(0.2)
 
     def kill(self) -> None:
-        """End whatever still runs, at once."""
+        """Kill every node that still runs, at once."""
         for child in self.children:
             if child.process is not None:
                 _signal_group(child.process, signal.SIGKILL)
                 child.process.wait()
 
     def running(self) -> dict[str, tuple[str, int]]:
-        """Node name -> (kind, process number) of those that run."""
+        """Node name -> (kind, pid) of running nodes."""
         return {
             child.command.name: (child.command.kind, child.process.pid)
             for child in self.children
@@ -196,13 +196,13 @@ class Supervisor:
         }
 
     def pids(self) -> dict[str, int]:
-        """Node name -> process number of those that run."""
+        """Node name -> pid of running nodes."""
         return {name: pid for name, (_, pid) in self.running().items()}
 
     def owns(self, name: str, pid: int) -> bool:
-        """Whether a process of this computer is that node as it was started here, and runs.
+        """Whether a pid of this computer is this node, started here, and still runs.
 
-        A model's own environment may stand between us and the process that speaks.
+        The environment of a model (uv) may be a process between us and the node.
         """
         ours = self.pids().get(name)
         try:
@@ -225,7 +225,7 @@ class Supervisor:
         ]
 
     def terminate(self, name: str, why: str) -> None:
-        """End a node at once; `watch` starts it again."""
+        """Kill a node at once; `poll` restarts it."""
         for child in self.children:
             if child.command.name == name and child.process is not None:
                 self._tell(name, why)
@@ -235,7 +235,7 @@ class Supervisor:
         environment = {**os.environ, **self._variables}
         environment[PARENT_VARIABLE] = str(os.getpid())
         environment["PYTHONUNBUFFERED"] = "1"
-        # Zenoh colours its log also where it is read by us, and would look like a stranger's.
+        # Zenoh colours its log even when it writes to our pipe; then it would not be recognised.
         environment["NO_COLOR"] = "1"
         if self._folder is not None:
             environment[RUN_FOLDER_VARIABLE] = str(self._folder)
@@ -256,7 +256,7 @@ class Supervisor:
         reader.start()
         child.reader = reader
         started = f"started (pid {child.process.pid})"
-        if child.told:  # again, after what was told
+        if child.told:  # again, after a reported exit
             self._log(child.command.name, f"{DETAIL}{started}")
         else:
             self._tell(child.command.name, started)
@@ -293,7 +293,7 @@ class Supervisor:
 
 
 def _signal_group(process: subprocess.Popen[str], number: signal.Signals) -> None:
-    """Signal the process and all that it started, such as what made its environment.
+    """Signal the process and all that it started, such as the process that made its environment.
 
     The group has the number of the process (`start_new_session`).
     """

@@ -1,13 +1,13 @@
-"""The systemd unit by which a computer runs ``vla-zenoh up`` from boot on."""
+"""The systemd unit that runs ``vla-zenoh up`` from boot on."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
 STOP_S = 15
-"""`up` brakes the arm and ends its nodes in 3 s; a stuck one is killed after this."""
+"""`up` brakes the arm and stops its nodes in 3 s; one that hangs is killed after this."""
 RT_PRIORITY = 50
-"""What nodes that move an arm may ask for."""
+"""Highest real-time priority that nodes of an arm may request."""
 
 UNIT = """\
 [Unit]
@@ -42,11 +42,11 @@ def systemd_unit(
     Args:
         what: its description.
         command: absolute path of the program, and its arguments.
-        user: whom it runs as.
+        user: name of the user it runs as.
         environment: variables that the program needs.
 
     Raises:
-        ValueError: a word that no unit can hold.
+        ValueError: a word contains characters that no unit can hold.
     """
     lines = "".join(
         f"Environment={_quoted(f'{name}={value}')}\n" for name, value in environment.items()

@@ -198,7 +198,7 @@ class CameraPublisher:
             depth_m: (H, W) of the same view at the same time, in m, see `Depth.of_metres`.
         """
         image, raw = Image(rgb), self._raw.has_subscribers
-        if raw:  # first: whoever is on this computer gets it without waiting for the others
+        if raw:  # first: subscribers on this host need not wait for the rest
             schema = zenoh.Encoding.ZENOH_BYTES.with_schema(raw_schema(image))
             self._raw.publish(
                 encode_raw(image), stamp_wall_ns=stamp_wall_ns, seq=self._seq, encoding=schema

@@ -1,4 +1,4 @@
-"""Brings the time stamps of a camera's own clock to the clock of this computer."""
+"""Converts the time stamps of a camera's own clock to the clock of this computer."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ SET_S = 0.5
 
 
 class DeviceClock:
-    """Offset of a camera's clock: the least time from stamp to arrival, of the last `WINDOW_S`.
+    """Offset of a camera's clock: the shortest time from stamp to arrival in the last `WINDOW_S`.
 
-    What an image took longer than the fastest one is delay of the bus or of this computer, and no
-    part of its time of capture. What the fastest one took is not known, and counts as nothing.
+    Extra time over that of the fastest image is delay of the bus or this computer, not part of the
+    capture time. The delay of the fastest one is unknown and counts as zero.
     """
 
     def __init__(self) -> None:

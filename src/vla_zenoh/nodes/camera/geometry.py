@@ -21,15 +21,15 @@ MAX_FILE_BYTES = 100_000
 
 
 class Intrinsics(Section):
-    """Pinhole of a camera, as of a file that ``cameras.NAME.intrinsics`` names.
+    """Pinhole model of a camera, as in the file that ``cameras.NAME.intrinsics`` names.
 
     Args:
-        width: of the images that it was calibrated with, pixels.
-        height: of the same.
-        fx_px: focal length in pixels.
-        fy_px: of the other axis.
-        cx_px: principal point; (0, 0) is the outer corner of the first pixel.
-        cy_px: of the other axis.
+        width: of the calibration images, pixels.
+        height: of the calibration images, pixels.
+        fx_px: focal length along x, pixels.
+        fy_px: focal length along y, pixels.
+        cx_px: x of the principal point; (0, 0) is the outer corner of the first pixel.
+        cy_px: y of the principal point.
         distortion: k1, k2, p1, p2, k3 of OpenCV; empty: none.
     """
 
@@ -57,7 +57,7 @@ class Intrinsics(Section):
 
     @property
     def matrix(self) -> NDArray[np.float64]:
-        """(3, 3) as OpenCV has it, which counts from the middle of the first pixel."""
+        """(3, 3) camera matrix of OpenCV, whose origin is the centre of the first pixel."""
         cx, cy = self.cx_px - 0.5, self.cy_px - 0.5
         return np.array([[self.fx_px, 0.0, cx], [0.0, self.fy_px, cy], [0.0, 0.0, 1.0]])
 
@@ -87,8 +87,8 @@ def read_intrinsics(path: Path) -> Intrinsics:
 
 
 class Geometry:
-    """What a profile does with a camera's images before anyone gets them: undistortion in the size
-    that the camera gives, crop, flip, then the profile's size.
+    """Processing of a camera's images before publication: undistortion in the camera's own size,
+    crop, flip, then resizing to the profile's size.
 
     Args:
         profile: of the camera.
@@ -109,7 +109,7 @@ class Geometry:
         self._maps: dict[tuple[int, int], tuple[Pixels, Pixels]] = {}
 
     def apply(self, image: Pixels, *, depth: bool = False) -> Pixels:
-        """The image as it is published; `depth`: no pixel is a mean of others.
+        """The image as it is published; with `depth`, pixels are never averaged.
 
         Raises:
             NodeError: the crop reaches beyond the image.
@@ -132,11 +132,11 @@ class Geometry:
         return resize(image, profile.width, profile.height, depth=depth)
 
     def intrinsics(self) -> Intrinsics | None:
-        """Of what `apply` returns; None: unknown."""
+        """Intrinsics of the images that `apply` returns; None: unknown."""
         if self._own is None:
             return None
         profile, seen = self._profile, self._own
-        if self._size is not None:  # that of the camera, which the file need not be of
+        if self._size is not None:  # the camera's size, which may differ from the file's
             seen = seen.scaled(*self._size)
         change: dict[str, Any] = {"distortion": ()} if profile.undistort else {}
         if (crop := profile.crop) is not None:
@@ -144,7 +144,7 @@ class Geometry:
             change |= {"cx_px": seen.cx_px - crop.left, "cy_px": seen.cy_px - crop.top}
         seen = seen.model_copy(update=change)
         change, lens = {}, list(seen.distortion)
-        # In a mirror the tangential part of the distortion is the other way round.
+        # Mirroring reverses the sign of the tangential distortion.
         if profile.flip in ("horizontal", "both"):
             change["cx_px"] = seen.width - seen.cx_px
             lens[3:4] = [-value for value in lens[3:4]]

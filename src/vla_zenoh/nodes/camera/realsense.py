@@ -70,7 +70,7 @@ class RealsenseSource:
     Args:
         serial: its serial number.
         profile: size, rate, depth, locks; the camera's nearest size is taken.
-        device_of: finds the camera; raises `NodeError` where it is not there.
+        device_of: finds the camera; raises `NodeError` if it is missing.
     """
 
     def __init__(
@@ -180,7 +180,7 @@ class RealsenseSource:
 
     def _set_intrinsics(self, profile: Any) -> None:
         found = profile.as_video_stream_profile().get_intrinsics()
-        # librealsense counts from the middle of the first pixel.
+        # The origin of librealsense is the centre of the first pixel.
         self.intrinsics = Intrinsics(
             width=found.width,
             height=found.height,
@@ -192,7 +192,7 @@ class RealsenseSource:
         )
 
     def _lock(self, sensor: Any) -> None:
-        """Fix exposure and white balance where the profile does; else leave both to the camera."""
+        """Fix exposure and white balance if the profile does; else leave both to the camera."""
         option, profile = sdk().option, self._profile
         exposure = profile.exposure_us and profile.exposure_us / EXPOSURE_UNIT_US
         for automatic, name, value in (
@@ -213,7 +213,7 @@ class RealsenseSource:
                 )
 
     def _complete(self, frame: Any) -> bool:
-        """Take a frame; whether there is colour now, and depth of the same moment if it is wanted.
+        """Add a frame; returns whether there is colour, and depth of the same moment if wanted.
 
         The library's own syncer waits by the expected times of both, and may not pair them at all.
         """
@@ -238,7 +238,7 @@ class RealsenseSource:
 
 
 def _frameset(*frames: Any) -> Any:
-    """The frames as one, as the library's filters take them."""
+    """The frames as one frameset, which the library's filters take."""
     rs, out = sdk(), sdk().frame_queue(1)
     join = rs.processing_block(
         lambda _, source: source.frame_ready(source.allocate_composite_frame(list(frames)))

@@ -194,7 +194,7 @@ class SimCameras:
         mono_ns: int,
     ) -> None:
         for camera, publisher in views:
-            # By the time of the world, which in lockstep is not that of any clock here.
+            # In simulated time, which in lockstep differs from every clock here.
             due = publisher.due(stamp_ns)
             proof_due = mono_ns - self._drawn_ns[publisher.name] > IDLE_PERIOD_S * 1e9
             if due if publisher.has_subscribers else proof_due:

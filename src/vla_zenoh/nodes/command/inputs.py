@@ -22,7 +22,7 @@ from vla_zenoh.types import ActionChunk, GripperState, JointState, PoseState, St
 from vla_zenoh.types.stream import SingleWriterFilter
 
 STATES = 16
-"""States buffered between two ticks: those of the robot, and room for a foreign source."""
+"""States buffered between two ticks: the robot's, and room for those of another source."""
 CHUNKS = 64
 ANYTHING = MAX_MESSAGE_BYTES
 """Payload of a stop: any; it is not decoded."""
@@ -75,7 +75,7 @@ class CommandInputs:
 
         Args:
             now_ns: nominal time of this tick on the node's wall clock.
-            news: read what other nodes say of themselves; that they are gone is seen at once.
+            news: read what other nodes publish; their liveliness is always up to date.
         """
         settings_put = self._poll_settings()
         peers = self._peer_monitor.update(now_ns, news=news)
@@ -170,7 +170,8 @@ class _PartInputs:
         self._last_joint = 0.0
 
     def poll(self, requested: bool) -> NewStates:
-        """The newest states since the last call; `requested`: an activation is, by these joints."""
+        """The newest states since the last call; `requested`: an activation is to use these
+        joints."""
         return NewStates(
             self._state(PoseState, self._pose),
             joint=self._joints(requested),

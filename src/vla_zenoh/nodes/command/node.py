@@ -35,7 +35,7 @@ BRAKE_BEFORE_EXIT_S = 1.0
 SWITCH_INTERVAL_S = 5e-4
 MAX_WHY, MAX_LIMIT = 2000, 200
 CHORES_S = 0.02
-"""Period of what no motion depends on: status, queries of clocks, news of other nodes."""
+"""Period of tasks that no motion depends on: status, clock queries, reading other nodes' status."""
 ACTING_S = 1.0
 """Limits that shorten steps act once for each chunk."""
 SPREAD_S = 8.0
@@ -96,7 +96,7 @@ class CommandNode:
 
     # -- running ------------------------------------------------------------------------------
     def run(self, stop: threading.Event) -> None:
-        """Run until `stop` is set, then brake and end."""
+        """Run until `stop` is set, then brake and exit."""
         sys.setswitchinterval(SWITCH_INTERVAL_S)
         gc.collect()
         gc.freeze()
@@ -106,7 +106,7 @@ class CommandNode:
             self._latch.close()
         self.node.publish_status("stopped", now=True)
         self.node.close()
-        gc.unfreeze()  # so that the interpreter frees everything at its end
+        gc.unfreeze()  # so that the interpreter frees everything at exit
 
     def _loop(self, stop: threading.Event) -> None:
         loop = FixedRate(self.node.profile.timing.command_hz)
@@ -194,7 +194,7 @@ class _CommandPublishers:
         self._gripper = node.declare_publisher(keys.command_gripper, Kind.ORDER)
 
     def publish(self, commands: MotionCommands, now_ns: int) -> None:
-        """Publish what there is."""
+        """Publish the commands that are set."""
         if commands.pose is not None:
             self._pose.publish(commands.pose, stamp_wall_ns=now_ns)
         if commands.joint is not None:
@@ -321,7 +321,7 @@ class CommandStatus:
 
 
 def _most(values: Iterable[float]) -> float:
-    """The largest, in thousandths."""
+    """The largest value, in thousandths of its unit."""
     return round(max(values) * 1e3, 3)
 
 

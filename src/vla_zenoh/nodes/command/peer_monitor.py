@@ -133,7 +133,7 @@ class PeerMonitor:
         with self._lock:
             return self._spec_sources.get(worker)
 
-    # The source is checked before the payload: messages of foreign sources are not decoded, and no
+    # The source is checked before the payload: messages of other sources are not decoded, and no
     # clock is measured for a made-up name.
     def _receive_status(self, arrival: ReceivedSample, now_ns: int) -> None:
         """Accept a node's status on its own key, while it is alive, from the first source of it."""
@@ -166,7 +166,7 @@ class PeerMonitor:
                 self._update_camera(name, camera, fields, now_ns)
 
     def _receive_on_behalf(self, name: str, arrival: ReceivedSample, header: Header) -> None:
-        """Keep why a node does not run, by the `up` of its host; it is for people alone."""
+        """Keep why a node is down, as its host's `up` reports it; for display only."""
         stamped = self._node.decode(NodeStatus, arrival, header=header)
         why = None if stamped is None else stamped.record.detail.get("complaint")
         if stamped is None or stamped.record.state != CRASHED or not isinstance(why, str):
@@ -201,7 +201,7 @@ class PeerMonitor:
         self._node.counters["refused.foreign_spec"] += 1
 
     def _name_and_header(self, arrival: ReceivedSample) -> tuple[str, Header | None]:
-        """The node or worker by the sample's key, and the header; None: it is rejected."""
+        """Node or worker name from the sample's key, and the header; None: it is rejected."""
         key = str(arrival.sample.key_expr)
         try:
             return key_names.last_chunk(key), header_of(arrival.sample)

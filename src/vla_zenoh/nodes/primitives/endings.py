@@ -1,4 +1,4 @@
-"""When a primitive is over: target reached, no way on, or a condition of a run. Pure."""
+"""When a primitive ends: target reached, no more progress, or a condition of a run. Pure."""
 
 from __future__ import annotations
 
@@ -12,30 +12,30 @@ from vla_zenoh.kinematics.so3 import Pose, pose_distance, pose_of
 from vla_zenoh.types import FloatArray, GripperState, PoseState
 
 NEAR_M, NEAR_RAD = 1e-3, 2e-3
-"""A target is reached within these, measured."""
+"""Tolerances of the measured state for a reached target."""
 SLOW_M_S, SLOW_RAD_S = 0.005, 0.02
 SETTLED_S = 0.1
 PROGRESS = 0.05
-"""Part of what is left that has to be gained within `STUCK_S`."""
+"""Share of the remaining distance that must be covered within `STUCK_S`."""
 STUCK_S = 2.5
 LEAST_SPEED = 0.05
 GRIPPED_S = 0.7
 """A gripper that has not moved for this long stands: a command takes a moment to arrive."""
 WIDTH_TOLERANCE_M = 0.003
 SHUT, WIDE = 0.1, 0.9
-"""Parts of the largest width."""
+"""Shares of the largest width."""
 
 
 @dataclass(frozen=True)
 class Sight:
-    """What is seen of the robot at one moment.
+    """Observed state of the robot at one moment.
 
     Args:
         now_s: monotonic time.
         pose: measured.
         joints_rad: (n,) measured, in the order of the kinematics.
         gripper: its state.
-        done: the model said that it is done.
+        done: the model reported that it is done.
         speed: override in force, 0 to 1.
     """
 
@@ -63,12 +63,12 @@ class Ending(Protocol):
 
 
 class Arrival:
-    """Ends a motion: ``reached``, or ``bound`` where it makes no way any more.
+    """Ends a motion: ``reached``, or ``bound`` once it makes no more progress.
 
     Args:
         pose: target of the TCP.
-        joints_rad: (n,) target of the joints, where they are judged; in the order of the
-            kinematics.
+        joints_rad: (n,) joint target in the order of the kinematics; None: only the pose is
+            checked.
     """
 
     def __init__(self, pose: Pose, joints_rad: FloatArray | None = None) -> None:
@@ -77,7 +77,7 @@ class Arrival:
         self._gained_s = self._there_s = -np.inf
 
     def off(self, sight: Sight) -> tuple[float, float]:
-        """Distance of the TCP from the target, m, and angle or largest of the joints', rad."""
+        """Distance of the TCP from the target, m; its angle, or the largest joint error, rad."""
         off_m, off_rad = pose_distance(pose_of(sight.pose), self.pose)
         if self.joints_rad is not None:
             off_rad = float(np.abs(sight.joints_rad - self.joints_rad).max())
@@ -85,7 +85,7 @@ class Arrival:
 
     def check(self, sight: Sight) -> str:
         off_m, off_rad = self.off(sight)
-        # Joints that are judged by themselves place the TCP only as well as the arm is calibrated.
+        # With a joint target the TCP is not checked: its error includes the arm's calibration.
         near = off_rad < NEAR_RAD and (off_m < NEAR_M or self.joints_rad is not None)
         if not (near and sight.slow):
             self._there_s = -np.inf
@@ -101,7 +101,7 @@ class Arrival:
 
 
 class Gripped:
-    """Ends a motion of the gripper: ``reached``, or ``bound`` where it stands elsewhere.
+    """Ends a motion of the gripper: ``reached``, or ``bound`` if it stops elsewhere.
 
     Args:
         width_m: target.

@@ -53,7 +53,7 @@ POSE_JOINTS = 6
 
 
 class Rejected(Exception):
-    """Why nothing moves."""
+    """Reason why a primitive is rejected; nothing moves."""
 
 
 class _Asked(NamedTuple):
@@ -71,7 +71,7 @@ class PrimitivesNode:
         session: with the rights of a worker and of an operator.
 
     Raises:
-        NodeError: it runs already, or the robot has several arms.
+        NodeError: it is already running, or the robot has several arms.
         ResourceError: the robot's description is missing.
     """
 
@@ -131,7 +131,8 @@ class PrimitivesNode:
             times_ns = observed_ns, observed_ns, clock.wall_ns()
             worker.publish(observation, steps, times_ns, 1)
             with self._lock:
-                # An arm activated by a chunk to the target before would keep the spec of that.
+                # An arm activated by a chunk to the previous target would keep the spec of that
+                # chunk.
                 if target is self._policy.target:
                     self._published.set()
         worker.report()
@@ -145,7 +146,7 @@ class PrimitivesNode:
 
     # -- queries ------------------------------------------------------------------------------
     def _on_query(self, query: zenoh.Query) -> None:
-        """On Zenoh's thread: answers at once what cannot be carried out."""
+        """On Zenoh's thread: rejects at once what cannot be executed."""
         name = last_chunk(str(query.key_expr))
         payload = query.payload
         try:
@@ -212,7 +213,7 @@ class PrimitivesNode:
         )
 
     def _prepare(self, request: Request) -> tuple[Ending, Target]:
-        """What ends it and where it goes.
+        """Ending and target of a request.
 
         Raises:
             Rejected: the arm cannot go there, or is not free; says why.
@@ -285,12 +286,12 @@ class PrimitivesNode:
         chain_rad = kinematics.ordered(self._profile.robot.arm_joints, joints_rad)
         if why := self._check.joints_fault(sight.joints_rad, chain_rad):
             raise Rejected(why)
-        # The elbow of an arm that takes poses is its own controller's.
+        # An arm commanded by poses leaves the elbow to its own controller.
         judged = chain_rad if self._profile.robot.command == "joint" else None
         return Arrival(kinematics.forward(chain_rad), judged), Target(joints_rad=joints_rad)
 
     def _elbow(self, target: Target) -> str:
-        """How far an arm that takes poses is from the joints it was asked for."""
+        """How far an arm commanded by poses is from the requested joints."""
         if target.joints_rad is None or self._profile.robot.command == "joint":
             return ""
         names = self._profile.robot.arm_joints
@@ -305,12 +306,12 @@ class PrimitivesNode:
 
     @contextmanager
     def _settings_kept(self) -> Iterator[None]:
-        """Worker and prompt are afterwards what they were before."""
+        """Restores worker and prompt afterwards."""
         robot, before = self._robot, self._robot.task
         try:
             yield
         finally:
-            with suppress(SessionError):  # where the command node is gone, so are they
+            with suppress(SessionError):  # if the command node is gone, so are they
                 if before is not None:
                     robot.set_worker(before.worker)
                     robot.set_prompt(before.prompt)
@@ -342,7 +343,7 @@ class PrimitivesNode:
             time.sleep(AGAIN_S)
 
     def _watch(self, ending: Ending, until_s: float) -> tuple[str, str]:
-        """Wait until it is over: the reason, and more of it."""
+        """Wait until the primitive ends; returns its reason and details."""
         robot = self._robot
         while True:
             task = robot.task
@@ -371,7 +372,7 @@ class PrimitivesNode:
         status = self._robot.status("command")
         limits = status.detail.get("limits") if status is not None else None
         acting = ", ".join(map(str, limits)) if isinstance(limits, (list, tuple)) else ""
-        return f"it makes no way any more; limits that act: {acting or 'none'}"
+        return f"no more progress; active limits: {acting or 'none'}"
 
     def _state(self) -> str:
         status = self._robot.status("command")
@@ -381,7 +382,7 @@ class PrimitivesNode:
         robot = self._robot
         task, status = robot.task, robot.status("command")
         done = status is not None and status.detail.get("policy_done") is True
-        # A status from before the activation tells of an older episode.
+        # A status from before the activation describes an older episode.
         if task is not None and status is not None:
             done = done and status.detail.get("episode") == task.episode
         return Sight(
@@ -394,7 +395,7 @@ class PrimitivesNode:
         )
 
     def _standing(self) -> Answer:
-        """An answer with where the arm is."""
+        """An answer with the state of the arm."""
         try:
             pose, joint = self._robot.pose_state().record, self._robot.joint_state().record
             gripper = self._robot.gripper_state().record

@@ -1,4 +1,4 @@
-"""Policy of the primitives: chunks that lead to one target, or keep the arm where it is. Pure."""
+"""Policy of the primitives: chunks that move to one target, or keep the arm where it is. Pure."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CHUNK_HZ = 5.0
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """Where to go: at most one of these; none: the arm keeps standing.
+    """Where to go: at most one of these; none: the arm stays where it is.
 
     Args:
         pose: of the TCP in the base frame.
@@ -32,10 +32,10 @@ class Target:
 
 
 class TargetPolicy:
-    """A `Policy` whose chunks lead to `target`.
+    """A `Policy` whose chunks move to `target`.
 
     Its spec changes with the kind of target: absolute poses or joints, or deltas of zero with a
-    width. A gripper that is not asked for keeps what it holds.
+    width. Without a width the gripper keeps what it holds.
 
     Args:
         joints: names of the arm's joints, in the order of the profile.
@@ -59,7 +59,7 @@ class TargetPolicy:
         return self._still.model_copy(update={"action": ActionSpec(**fields)})
 
     def infer(self, observation: Observation) -> ActionSteps:
-        """The same step for the length of a chunk; `spec` says what it means."""
+        """The same step for the length of a chunk; `spec` defines its meaning."""
         target, step = self.target, [0.0] * 6
         spec = self._still
         if target.pose is not None:

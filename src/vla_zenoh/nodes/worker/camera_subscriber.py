@@ -165,7 +165,7 @@ def subscribe_to_depth(
 
 
 def _queue(node: Node, camera: str, history_s: float) -> int:
-    """Images that may come during one inference and are wanted after it."""
+    """Number of images that may arrive during one inference and are needed after it."""
     settings = node.profile.cameras.get(camera)
     if history_s == 0.0 or settings is None:
         return 1

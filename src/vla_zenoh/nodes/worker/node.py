@@ -44,10 +44,10 @@ class WorkerNode:
         host: of the profile, on which this runs.
         delay_s: added to every inference, to emulate a slower computer.
         robots: names of the robots to serve; empty: the profile's.
-        another: makes the model again, for every further robot, if it cannot batch.
+        another: constructs the model again for every further robot, if it cannot batch.
 
     Raises:
-        NodeError: a worker of this name serves one of the robots already.
+        NodeError: a worker of this name already serves one of the robots.
         WorkerError: the model cannot serve several robots; says why.
     """
 

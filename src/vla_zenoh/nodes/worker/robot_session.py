@@ -81,7 +81,7 @@ class RobotSession:
         policy: the model, not loaded yet; several sessions may share it.
         name: of the worker.
         images: image streams to subscribe to.
-        host: of the profile, on which this runs; it may have streams of its own.
+        host: of the profile, on which this runs; it may have its own streams.
         changed: notified when an image arrives.
     """
 
@@ -158,7 +158,7 @@ class RobotSession:
         )
         new = [camera.has_new for camera, _ in received]
         return any(new) and all(
-            fresh or one.newest_ns >= self._not_before_ns
+            fresh or (bool(one.entries) and one.newest_ns >= self._not_before_ns)
             for fresh, (_, one) in zip(new, received, strict=True)
         )
 
@@ -285,7 +285,7 @@ class RobotSession:
         """Validate an answer and publish it as a chunk; False if it was rejected.
 
         Args:
-            observation: it was inferred from.
+            observation: input of the inference.
             answer: of the model.
             times_ns: observation complete, inference started, inference ended; wall clock.
             batch: number of robots in this inference.
@@ -319,7 +319,7 @@ class RobotSession:
     def adopt_spec(self) -> None:
         """Publish the policy's spec after it changed the meaning of its actions.
 
-        To be called before a chunk that follows it. What is observed has to stay the same.
+        Call it before the chunk that follows it. The observation part of the spec must not change.
         """
         self.spec, self._spec_hash = self.policy.spec, self.policy.spec.hash
         self._specs.publish(self.spec)

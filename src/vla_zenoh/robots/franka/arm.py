@@ -1,4 +1,4 @@
-"""A Franka arm: follows set-points as a spring, by franky's 1 kHz torque loop on libfranka.
+"""A Franka arm: follows set-points like a spring, with franky's 1 kHz torque loop on libfranka.
 
 The 1 kHz loop is C++ and reads the newest set-point, with velocity and acceleration, in each
 cycle; Python is never in it. When Python falls silent in motion the velocity is dropped, so the arm
@@ -31,18 +31,18 @@ from vla_zenoh.runtime.scheduling import realtime_children
 from vla_zenoh.types import FloatArray, JointCommand
 
 REST_S = 1.0
-"""The loop ends when there was no set-point for this long."""
+"""The loop ends after this long without a set-point."""
 CLOSE_S = 1.0
 CONNECT_S = 10.0
 MOST_TCP_NM, MOST_POSTURE_NM = 6.0, 2.0
-"""What the spring at the TCP, and that of the elbow, turn with: the wrist's joints have 12 Nm."""
+"""Torque limits of the springs at the TCP and of the elbow: the wrist's joints have 12 Nm."""
 MOST_JOINT_NM = np.array([40.0, 40.0, 40.0, 40.0, 9.0, 9.0, 9.0])
-"""What the springs of the joints turn with."""
+"""Torque limits of the joints' springs."""
 LONGEST_S = 0.02
-"""Between two set-points, for the trim."""
+"""Longest time between two set-points that the trim integrates over."""
 READY = frozenset({"Idle", "Move"})
 STOPPED = frozenset({"Reflex", "UserStopped"})
-"""Robot modes that are a fault. In the others the robot is well, but follows no commands."""
+"""Robot modes that are a fault. In the others the robot is healthy but follows no commands."""
 
 
 class FrankaArm:
@@ -73,7 +73,7 @@ class FrankaArm:
         """Connect to the control box, and to the hand.
 
         Raises:
-            NodeError: it does not answer, or speaks another version of the interface.
+            NodeError: it does not answer, or has another version of the interface.
         """
         franky, address = self._franky, self._settings.address
         enforce = self._settings.realtime == "enforce"
@@ -111,7 +111,8 @@ class FrankaArm:
         self._robot = self._hand = None
 
     def _configure(self) -> None:
-        """Set what the profile says of load, tool and collisions; only an arm at rest takes it."""
+        """Apply the profile's load, tool and collision settings; only an arm at rest accepts
+        them."""
         settings, robot = self._settings, self._robot
         torque = list(settings.collision_joint_nm)
         force = [settings.collision_force_n] * 3 + [settings.collision_torque_nm] * 3
@@ -125,7 +126,7 @@ class FrankaArm:
         self._configured = True
 
     def flange_to_tcp(self) -> FloatArray:
-        """(4, 4): the TCP of the profile in the frame of the flange, by its description."""
+        """(4, 4) pose of the profile's TCP in the flange frame, by the robot description."""
         home_rad = np.array(self._profile.robot.home_rad)
         tcp = np.eye(4)
         pose = self._kinematics.forward(
@@ -148,7 +149,7 @@ class FrankaArm:
         except RuntimeError as error:  # of libfranka's network, too
             raise NodeError(
                 f"the robot fell silent ({in_words(error)}). Is its cable plugged in, and FCI "
-                "active? The node starts again and connects; the arm waits to be activated"
+                "active? The node restarts and reconnects; then activate the arm again"
             ) from error
         if self._was_in_control and not in_control:
             self._ended = self._why_ended()
@@ -175,7 +176,7 @@ class FrankaArm:
         )
 
     def _update(self, state: Any) -> None:
-        if state.time != self._time:  # the same again: the robot is silent
+        if state.time != self._time:  # unchanged: the robot is silent
             self._time, self._measured_ns = state.time, time.monotonic_ns()
         self._state = state
 
@@ -216,7 +217,7 @@ class FrankaArm:
 
     # -- motion -------------------------------------------------------------------------------
     def move(self, command: Command) -> None:
-        """Give the loop its set-point, and start it where it does not run."""
+        """Give the loop its set-point, and start the loop if it does not run."""
         if self._ended or not self._configured:
             return  # reported as a fault; only `recover` ends it
         now_ns = time.monotonic_ns()
@@ -235,20 +236,20 @@ class FrankaArm:
             self._was_in_control = True
 
     def _hold(self) -> None:
-        """Lead the arm to rest at its last set-point while the next one is overdue: a thread.
+        """Thread that brings the arm to rest at its last set-point while the next one is overdue.
 
-        The loop keeps a set-point with its velocity, and the spring would lead the arm beyond it.
+        The loop keeps a set-point with its velocity, and the spring would pull the arm beyond it.
         """
         period_s = self._timeout_s / 4
         while not self._closed.wait(period_s):
             if self._motion is None or not self._overdue:
                 continue
-            with self._referring, suppress(RuntimeError):  # `read` will tell what failed
+            with self._referring, suppress(RuntimeError):  # `read` reports the failure
                 motion, robot = self._motion, self._robot
                 if motion is None or robot is None or not self._overdue:
                     continue
                 if robot.is_in_control:
-                    if self._led:  # what friction took in motion pushes beyond the set-point now
+                    if self._led:  # the trim for friction in motion would now push beyond it
                         self._led, self._trim = False, self._trim.emptied()
                     still = at_rest(self._command)
                     motion.set_reference(self._reference(still, robot.state, period_s))
@@ -343,7 +344,7 @@ def at_rest(command: Command) -> Command:
 
 
 def _in_time(make: Callable[[], Any], what: str) -> Any:
-    """What `make` returns or raises; the library itself waits for ever.
+    """Result of `make`, with a timeout: the library itself waits for ever.
 
     Raises:
         NodeError: it took longer than `CONNECT_S`.
@@ -385,6 +386,6 @@ def error_names(errors: Any) -> list[str]:
 
 
 def inertia_rows(load: FrankaLoad) -> list[float]:
-    """The (3, 3) inertia of a load, its nine numbers."""
+    """The (3, 3) inertia of a load, row by row."""
     xx, yy, zz, xy, xz, yz = load.inertia_kg_m2
     return [xx, xy, xz, xy, yy, yz, xz, yz, zz]

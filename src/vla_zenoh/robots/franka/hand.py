@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 from vla_zenoh.errors import in_words
 
 CLEARLY_M = 0.002
-"""A smaller change of the width closes nothing, and fingers this much apart hold something."""
+"""Less is not a closing motion; fingers further than this from the request hold an object."""
 SHUT_M, STROKE_M = 0.005, 0.08
 WAIT_S = 0.02
 JOIN_S = 0.3
 RETRY_S = 0.5
 NO_STOP_S = 2.0
-"""A hand that has not ended a motion this long after it was told to is asked again."""
+"""A motion that has not ended this long after a stop is asked to stop again."""
 
 
 class GripRequest(NamedTuple):
@@ -37,15 +37,15 @@ class HandState(NamedTuple):
 class Hand:
     """Runs the motions of a hand.
 
-    The library's calls wait for the fingers, so they run here. A request that comes while one is
-    carried out ends it; those in between are dropped.
+    The library's calls block until the fingers arrive, so they run here. A new request interrupts
+    the one in progress; requests in between are dropped.
 
     Args:
         gripper: franky's.
 
     Attributes:
         fault: why the hand does not answer; empty: it does.
-        failed: why the last motion that failed did.
+        failed: reason of the last failed motion.
     """
 
     def __init__(self, gripper: Any) -> None:
@@ -74,7 +74,7 @@ class Hand:
         return HandState(self._width_m, moving, self._grasped and not moving)
 
     def close(self) -> None:
-        """End the threads; what the fingers hold they keep."""
+        """End the threads; the fingers keep what they hold."""
         self._end.set()
         with self._changed:
             self._changed.notify()
@@ -105,8 +105,8 @@ class Hand:
     def _carry_out(self, request: GripRequest) -> None:
         """Move until the fingers arrive, or a newer request ends it.
 
-        A grasp closes until the fingers meet resistance, whatever its width: it is for fingers that
-        are to shut, and for those that something kept from getting where they were sent.
+        A grasp closes until the fingers meet resistance, whatever its width. It is used to close
+        fully, and after an object kept the fingers from their target.
         """
         closes = request.width_m < self._width_m - CLEARLY_M
         try:
@@ -115,9 +115,9 @@ class Hand:
                 self._read()
                 closes = closes and self._width_m > request.width_m + CLEARLY_M
             if closes and not self._superseded():
-                # Succeeds on whatever is between the fingers, whose thickness nobody knows.
+                # Succeeds on whatever is between the fingers: its thickness is unknown.
                 self._wait(self._gripper.grasp_async(*request, STROKE_M, STROKE_M))
-        except Exception as error:  # a motion that was ended raises; the state says where it stands
+        except Exception as error:  # an interrupted motion raises; the state has the width
             if not self._superseded():
                 self.failed = in_words(error)
 

@@ -1,7 +1,8 @@
-"""What friction in the joints leaves of a set-point, added to the set-point in small measure.
+"""Compensates joint friction: a bounded correction that is added to the set-point.
 
-A spring stops short of its goal by the friction divided by its stiffness. The integral ends that in
-time; alone it overshoots and creeps from side to side, which the part in proportion prevents.
+A spring stops short of its goal by the friction divided by its stiffness. The integral part removes
+that over time; alone it overshoots and creeps from side to side, which the proportional part
+prevents.
 """
 
 from __future__ import annotations
@@ -12,11 +13,11 @@ from vla_zenoh.types import FloatArray
 
 INTEGRAL_S, PROPORTION = 0.2, 1.5
 MOST_M, MOST_RAD, MOST_JOINT_RAD = 0.008, 0.03, 0.008
-"""Friction of an FR3 fills half of these at the stiffness of its profile."""
+"""Limits. Friction of an FR3 takes half of them at the stiffness of its profile."""
 
 
 class Trim:
-    """The correction of one motion's set-points; from `left`, the set-point minus the measured.
+    """Correction of one motion's set-points, from `left`: set-point minus measured value.
 
     Args:
         columns: 6 for a pose (m, rad), 7 for joints (rad).
@@ -27,12 +28,12 @@ class Trim:
         self._integral: FloatArray = np.zeros(columns)
 
     def update(self, left: FloatArray, elapsed_s: float) -> FloatArray:
-        """What to add to the set-point, `elapsed_s` after the last one."""
+        """The correction of the set-point, `elapsed_s` after the last one."""
         self._integral = self._bounded(self._integral + elapsed_s / INTEGRAL_S * left)
         return self._bounded(self._integral + PROPORTION * left)
 
     def emptied(self) -> Trim:
-        """One that has added nothing yet."""
+        """A correction that starts from zero."""
         return Trim(len(self._integral))
 
     def _bounded(self, trim: FloatArray) -> FloatArray:

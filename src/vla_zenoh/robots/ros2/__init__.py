@@ -1,1 +1,1 @@
-"""Driver of robots that speak ROS 2."""
+"""Driver of ROS 2 robots."""

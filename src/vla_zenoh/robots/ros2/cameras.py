@@ -88,7 +88,7 @@ class Camera:
                 self._stamps.check(image.stamp_ns)
         except CodecError as error:
             self._reject(error.reason, f"{self._topic.topic}: {error}", publisher.name)
-            if error.reason in ("encoding", "frame"):  # of all further images as well
+            if error.reason in ("encoding", "frame"):  # true for all further images
                 publisher.lose(str(error))
             return False
         publisher.captured(arrival.mono_ns)

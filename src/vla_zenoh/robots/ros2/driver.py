@@ -47,13 +47,13 @@ LEAD_PERIODS = 2
 
 
 class Ros2Driver(RobotDriver):
-    """The ROS 2 robot of a profile; with another ``robot.driver``, its cameras and services alone.
+    """The ROS 2 robot of a profile; with another ``robot.driver``, only its cameras and services.
 
     Args:
         profile: the effective profile, with its section ros2.
 
     Raises:
-        ProfileError: the section ros2 is missing or names what is not known.
+        ProfileError: the section ros2 is missing or has an unknown name in it.
     """
 
     name = NAME
@@ -85,7 +85,7 @@ class Ros2Driver(RobotDriver):
         """Join the ROS graph.
 
         Raises:
-            ProfileError: a message type cannot carry what the profile wants.
+            ProfileError: a message type cannot carry the profile's commands.
             SessionError: ros2.connect does not answer.
             SecurityError: it is reached by TLS, and this node's certificate is missing.
         """
@@ -212,7 +212,7 @@ class Ros2Driver(RobotDriver):
         self.gripper.move(command, now_ns)
 
     def _width_m(self) -> float | None:
-        """Opening between the fingers, None where it is not known."""
+        """Opening between the fingers, None if unknown."""
         return None if self._fingers_lost else self.states.state.width_m
 
     def _gripper_state(self, stamp_ns: int) -> GripperState | None:
@@ -297,7 +297,7 @@ def read_messages(ros2: Ros2Profile) -> Messages:
     """Messages of the profile's distribution, and those of its definition files.
 
     Raises:
-        ProfileError: a file is missing or no definition.
+        ProfileError: a file is missing or is not a definition.
     """
     texts: dict[str, str] = {}
     for kind, path in ros2.messages.items():

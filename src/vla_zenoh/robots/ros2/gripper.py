@@ -80,7 +80,7 @@ class Gripper:
 
         A Franka's grasp succeeds where ``width - inner < d < width + outer`` holds for the distance
         d of its fingers. Both tolerances are the whole stroke here, as the thickness of the object
-        is unknown: so it also succeeds on nothing, and d tells whether an object is held.
+        is unknown: so it also succeeds on nothing, and d shows whether an object is held.
 
         Source: documentation of franka_gripper, ``grasp``.
         """

@@ -192,7 +192,7 @@ class RosGraph:
             return len(self._others)
 
     def _declare(self, endpoint: Endpoint) -> tuple[str, bytes | None]:
-        """Declare an endpoint; its key, and its gid where the wire format has gids."""
+        """Declare an endpoint; returns its key, and its gid if the wire format has gids."""
         token = self._wire.token(endpoint, next(self._numbers))
         self._declared.append(self.session.liveliness().declare_token(token))
         return self._wire.key(endpoint), attachments.gid_of(token) if self._rmw else None
@@ -234,7 +234,7 @@ class RosGraph:
         """Clients of an action's services: ``send_goal``, ``get_result``, ``cancel_goal``."""
         action = Endpoint(EntityRole.ACTION_CLIENT, name, kind)
         parts = parts_of(action)
-        if self._rmw:  # there every part is declared; a bridge wants the action alone
+        if self._rmw:  # there every part is declared; a bridge needs only the action
             return {part: self.client(end.name, end.type, CALL_S) for part, end in parts.items()}
         self._declare(action)
         return {

@@ -1,7 +1,7 @@
 """ROS services that control the robot: activate, stop, reset, prompt; topics of prompt and status.
 
 They run in a thread of their own, because the command node has to confirm a setting before the call
-is answered. A stop is sent at once, and no call made before it is carried out after it.
+is answered. A stop is sent at once, and no call made before it is executed after it.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class EstopOrder:
             raise SessionError("an emergency stop came after this request; send it again")
 
     def unless_stopped(self, asked_ns: int, publish: Callable[[], None]) -> None:
-        """Call `publish`; no stop of this process comes between the check and it.
+        """Call `publish`, with no stop of this process between the check and the call.
 
         Raises:
             SessionError: a stop came after `asked_ns`.
@@ -161,7 +161,8 @@ class RosServices:
                 self._publish_status()
 
     def _poll_prompts(self) -> None:
-        """Apply the prompts of the topic; a repeated one only if the task has another meanwhile."""
+        """Apply the prompts of the topic; a repeated one only if the task has a different one
+        now."""
         for arrival in self._prompts.drain():
             try:
                 payload = arrival.sample.payload.to_bytes()
@@ -169,7 +170,7 @@ class RosServices:
             except CodecError as error:
                 self._reject(error.reason, f"{self._prompt_topic}: {error}", PROMPT_TOPIC)
                 continue
-            # The task may lag behind what was just published: a new prompt counts in any case.
+            # The task may lag behind what was just published: a new prompt is always applied.
             changed, self._prompt = self._prompt not in ("", prompt), prompt
             task = self._client.task
             if changed or task is None or task.prompt != prompt:

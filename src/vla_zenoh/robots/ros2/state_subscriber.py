@@ -70,7 +70,7 @@ class StateSubscriber:
         return self._update_joints()
 
     def wrench(self, stamp_ns: int) -> FloatArray | None:
-        """(6,) external wrench in N and Nm, None where there is none of that time."""
+        """(6,) external wrench in N and Nm, None if there is none for that time."""
         found = self._wrench
         if found is None or abs(stamp_ns - found.stamp_ns) > WRENCH_TIMEOUT_NS:
             return None

@@ -1,4 +1,4 @@
-"""vla-zenoh bench motion: how well the arm does the thesis's ten motions."""
+"""python -m benchmarks motion: how well the arm does the thesis's ten motions."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.progress import TaskID
 
+from benchmarks.motion.protocol import PROTOCOL, STEPS, Conditions, MotionCase
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
     JsonOption,
@@ -21,7 +22,6 @@ from vla_zenoh.cli.options import (
     options,
 )
 from vla_zenoh.cli.output import console, print_json, progress_bars
-from vla_zenoh.lab.bench.motion import PROTOCOL, STEPS, Conditions, MotionCase
 from vla_zenoh.lab.cli.bench_file import running_nodes, write_json
 from vla_zenoh.lab.cli.output_path import ForceOption, if_wanted, output_folder
 from vla_zenoh.profile import Profile
@@ -94,7 +94,7 @@ class _Run:
 
     def in_lockstep(self) -> None:
         """Run on a virtual clock."""
-        from vla_zenoh.lab.bench.motion_lockstep import run_in_lockstep
+        from benchmarks.motion.lockstep import run_in_lockstep
 
         for row in run_in_lockstep(self._profile, self._cases, self._conditions, self._stop):
             self.rows.append(row)
@@ -120,7 +120,7 @@ class _Run:
     def _with_one_worker(
         self, profile: Profile, conditions: Sequence[Conditions], current: TaskID
     ) -> None:
-        from vla_zenoh.lab.bench.motion_runner import run_in_real_time
+        from benchmarks.motion.real_time import run_in_real_time
 
         def progress(case: MotionCase, each: Conditions, done: int) -> None:
             self.bars.update(current, description=f"{case.name} at {each.name}", completed=done)
@@ -171,7 +171,7 @@ def motion(
 
     Exits with 0 only when every row passes.
     """
-    from vla_zenoh.lab.cli.bench_motion_tables import motion_table
+    from benchmarks.motion.table import motion_table
     from vla_zenoh.runtime.process import stop_on_signals
 
     with if_wanted(output_folder, output, force=force) as folder:

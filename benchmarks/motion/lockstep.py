@@ -12,10 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from vla_zenoh.control.reachability import make_reachability_filter
-from vla_zenoh.errors import NodeError
-from vla_zenoh.kinematics.so3 import Pose
-from vla_zenoh.lab.bench.motion import (
+from benchmarks.motion.protocol import (
     PREPARATION_HZ,
     WAY_HZ,
     Conditions,
@@ -25,6 +22,9 @@ from vla_zenoh.lab.bench.motion import (
     make_row,
     path_length,
 )
+from vla_zenoh.control.reachability import make_reachability_filter
+from vla_zenoh.errors import NodeError
+from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.lab.bench.processes import in_processes
 from vla_zenoh.lab.demo.segments import DemoSegment, RestPose, judge_segment, make_segment
 from vla_zenoh.lab.lockstep import Delays, Lockstep

@@ -12,9 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from vla_zenoh.errors import NodeError
-from vla_zenoh.kinematics.so3 import pose_of
-from vla_zenoh.lab.bench.motion import (
+from benchmarks.motion.protocol import (
     PREPARATION_HZ,
     WAY_HZ,
     Conditions,
@@ -24,6 +22,8 @@ from vla_zenoh.lab.bench.motion import (
     make_row,
     path_length,
 )
+from vla_zenoh.errors import NodeError
+from vla_zenoh.kinematics.so3 import pose_of
 from vla_zenoh.lab.demo.runner import MotionRunner
 from vla_zenoh.lab.demo.segments import make_segment
 from vla_zenoh.lab.recording.recorder import Recorder
@@ -56,7 +56,8 @@ def run_in_real_time(
         NodeError: the chain does not come up.
         Interrupted: Ctrl-C.
     """
-    assert host.session is not None and host.client is not None
+    assert host.session is not None
+    assert host.client is not None
     run = MotionRunner(host.client, stop, host.poll)
     keys = host.profile.keys
     jobs = [(trial, each) for each in conditions for trial in trials]

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vla_zenoh.kinematics.so3 import Pose, exp3
-from vla_zenoh.lab.bench.motion import (
+from benchmarks.motion.protocol import (
     PROTOCOL,
     Conditions,
     MeasuredStream,
@@ -14,7 +13,8 @@ from vla_zenoh.lab.bench.motion import (
     make_row,
     path_length,
 )
-from vla_zenoh.lab.cli.bench_motion_tables import motion_table
+from benchmarks.motion.table import motion_table
+from vla_zenoh.kinematics.so3 import Pose, exp3
 from vla_zenoh.lab.demo.segments import SegmentOutcome
 from vla_zenoh.profile import load_profile
 

@@ -1,0 +1,1 @@
+"""The thesis's ten motions, at several rates: how well the simulated arm does them."""
