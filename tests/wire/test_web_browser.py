@@ -214,8 +214,10 @@ def test_a_trial_is_judged_by_buttons(chain: Chain, tab: Tab) -> None:
     for _ in range(20):
         words = tab.until(
             "an answer",
-            lambda: tab.text("trial-words").startswith(("It runs", "Not activated"))
-            and tab.text("trial-words"),
+            lambda: (
+                tab.text("trial-words").startswith(("It runs", "Not activated"))
+                and tab.text("trial-words")
+            ),
         )
         if words.startswith("It runs"):
             break
