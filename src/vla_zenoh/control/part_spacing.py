@@ -77,7 +77,7 @@ class PartSpacing:
         self._slow_m = max(limit.part_slow_m for limit in limits)
         self._within_m = max(self._slow_m, self._stop_m) + FAR_M
         self.nearest = Nearest(self._within_m)
-        """Of the commanded joints at the last look."""
+        """Distance of the commanded joints when last computed."""
         self._skip = 0
         self._held = False
         self._slower = False
@@ -88,7 +88,7 @@ class PartSpacing:
         Args:
             now_ns: time of this tick.
             ahead_s: until the next look.
-            moves: the arms are being led to their goals; else they brake or stand.
+            moves: the arms move to their goals; else they brake or stand.
         """
         if not moves:
             self._held = self._slower = False

@@ -15,7 +15,7 @@ from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.types import FloatArray
 
 KEPT = 8
-"""Configurations of an arm whose placements are kept: each is looked at with some of the other."""
+"""Configurations of an arm whose placements are kept: each is compared with several others."""
 
 
 class Nearest(NamedTuple):
@@ -23,7 +23,7 @@ class Nearest(NamedTuple):
 
     Args:
         distance_m: between them, negative where they are inside each other.
-        first: link of the first arm; empty: nothing is nearer than was looked for.
+        first: link of the first arm; empty: nothing is nearer than `within_m`.
         second: link of the second arm.
     """
 
