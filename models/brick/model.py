@@ -4,9 +4,9 @@
 # ///
 """Puts, stacks and pushes bricks by prompt: a small policy, trained in the scene ``bricks``.
 
-Two pictures, the hand and the prompt go in, waypoints of the hand come out, relative to where it
-was measured. What was asked for already, and is not reached yet, is taken off them, because a delta
-is put on the goal in force when the observation was taken. See README.md beside this file.
+Input are two images, the hand and the prompt; output are waypoints of the hand relative to its
+measured pose. Motion that was requested before and is not reached yet is subtracted, because a
+delta is added to the goal in force when the observation was taken. See README.md beside this file.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ FOLDER = Path(__file__).parent
 GRAPH, WORDS, MANIFEST = "brick.onnx", "words.txt", "weights.json"
 HORIZON, DT_S = 8, 0.1
 FRONT, WRIST = (128, 96), (96, 72)
-"""Width and height of the pictures."""
+"""Width and height of the images."""
 STEP_M, STEP_RAD = 0.045, 0.18
 """A waypoint further from the one before is approached in several steps."""
 WIDTH_STEP_M = 0.08
@@ -62,19 +62,19 @@ NEGATION = re.compile(
     r"|\b(do|does|did|ca|could|wo|would|sha|should|must|need|is|are|was|were|have|has|had|may)"
     r"\s?n\s?['\u2019`]?t\b"
 )
-"""What makes of a task something else. A network that misreads one of these moves an arm that was
-told to stay, so it is not asked."""
-"""A prompt that is a task with less probability is none."""
+"""Words that turn a task into something else. If the network misread one of these, an arm that was
+told to stay would move, so it is not asked."""
+"""A prompt with less probability of being a task is none."""
 
 
 class Waypoints(NamedTuple):
-    """What is to be done, relative to the measured hand.
+    """Waypoints, relative to the measured hand.
 
     Args:
         offset: (H, 4) x, y, z in m along the base axes and a turn about the vertical in rad.
-        opened: (H,) the gripper has to be open.
+        opened: (H,) the gripper must be open.
         understood: the prompt is a task; else the arm stays.
-        order: what was read: ``put red``, ``stack red blue``, ``left red``.
+        order: the parsed prompt: ``put red``, ``stack red blue``, ``left red``.
     """
 
     offset: FloatArray
@@ -85,7 +85,7 @@ class Waypoints(NamedTuple):
 
 @dataclass(slots=True)
 class Hand:
-    """The TCP, and what has to be remembered of it in an episode.
+    """The TCP, and its history in an episode.
 
     Args:
         position_m: (3,) measured.
@@ -102,7 +102,7 @@ class Hand:
     down_m: FloatArray | None = None
 
     def numbers(self) -> FloatArray:
-        """(9,) what the network is told of it."""
+        """(9,) the network's input for it."""
         x, y, z = self.position_m
         return np.array(
             [
@@ -120,7 +120,7 @@ class Hand:
 
 
 def words_of(prompt: str) -> list[str]:
-    """The prompt as words, numbers and marks, in small letters without accents."""
+    """The prompt as words, numbers and punctuation, in lower case without accents."""
     plain = unicodedata.normalize("NFKD", prompt.lower())
     plain = "".join(letter for letter in plain if not unicodedata.combining(letter))
     return re.findall(r"[a-z]+|[0-9]+|[^a-z0-9\s]", plain)
@@ -159,13 +159,13 @@ def tokens_of(prompt: str, vocabulary: dict[str, int]) -> NDArray[np.int64]:
 
 
 class Brick:
-    """See the module.
+    """A small policy for bricks; see the module.
 
     Args:
         weights: folder with graph and manifest; empty: beside this file.
         threads: of the inference.
-        prefix: ``on``: a chunk begins with the steps in execution that cannot change any more, and
-            goes on as the network learned to from such steps.
+        prefix: ``on``: a chunk begins with the steps in execution that can no longer change, and
+            continues as the network learned to from such steps.
     """
 
     def __init__(self, weights: str = "", threads: str = "2", prefix: str = "off") -> None:
@@ -194,7 +194,7 @@ class Brick:
         """Read the weights.
 
         Raises:
-            WorkerError: a file is missing, or not the one its manifest speaks of.
+            WorkerError: a file is missing, or not the one in its manifest.
         """
         manifest = read_manifest(self._folder)
         graph = checked(self._folder, GRAPH, manifest["sha256"])
@@ -202,7 +202,7 @@ class Brick:
 
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = self._threads
-        # Threads that wait for work must not take the time the controller needs.
+        # Threads that wait for work must not take time from the controller.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         self._session = onnxruntime.InferenceSession(
             graph, options, providers=["CPUExecutionProvider"]
@@ -211,15 +211,15 @@ class Brick:
         self._vocabulary = {word: index + 2 for index, word in enumerate(words)}
 
     def reset(self) -> None:
-        """Forget what was asked for and how the hand moved."""
+        """Forget past requests and the hand's history."""
         self._hand: Hand | None = None
         self._prompt = ""
         self._asked: tuple[int, FloatArray] | None = None
 
     def infer(self, observation: Observation, committed: Committed | None = None) -> ActionSteps:
-        """The next chunk; it begins with the frozen steps, and the network goes on from there."""
+        """The next chunk; it begins with the frozen steps, and the network continues from there."""
         if observation.prompt != self._prompt:
-            # A push that was made belongs to the task that was.
+            # A completed push belongs to the previous task.
             self._prompt, self._hand = observation.prompt, None
         hand = self._hand = self._follow(observation)
         goal = self._goal(observation, hand)
@@ -253,12 +253,13 @@ class Brick:
         return ActionSteps(steps.astype(np.float32), raw={"read": read})
 
     def think(self, observation: Observation, hand: Hand, given: FloatArray) -> Waypoints:
-        """What to do, as the network says.
+        """Waypoints by the network.
 
         Args:
             observation: now.
             hand: now.
-            given: (H, 6) waypoints that cannot change any more, as in `Waypoints`, relative to the
+            given: (H, 6) waypoints that can no longer change, as in `Waypoints`, relative to the
+                hand: the offset, 1 for open, and 1 for a row that is given.
                 hand: the offset, 1 for open, and 1 for a row that is given.
         """
         images = {name: observation.images[name][None] for name in ("front", "wrist")}
@@ -286,7 +287,7 @@ class Brick:
         )
 
     def read(self, prompt: str) -> str:
-        """What a prompt is taken for, as `Waypoints.order`; empty: for no task."""
+        """The task of a prompt, as `Waypoints.order`; empty: no task."""
         nothing = {
             "front": np.zeros((1, FRONT[1], FRONT[0], 3), np.uint8),
             "wrist": np.zeros((1, WRIST[1], WRIST[0], 3), np.uint8),
@@ -313,13 +314,13 @@ class Brick:
         return hand
 
     def _goal(self, observation: Observation, hand: Hand) -> FloatArray:
-        """(4,) x, y, z, yaw that had been asked for when the observation was taken."""
+        """(4,) x, y, z, yaw requested when the observation was taken."""
         pose = observation.pose
         assert pose is not None
         here = np.append(hand.position_m, hand.yaw_rad)
         if pose.reference_position_m is not None:
             here[:3] = pose.reference_position_m
-        # What the command node cut off is not known here; an arm at rest shows it.
+        # Parts that the command node cut off are not known here; an arm at rest shows them.
         at_rest = bool(np.linalg.norm(pose.twist[:3]) < AT_REST_M_S)
         if self._asked is None:
             return here
@@ -341,10 +342,10 @@ def yaw_of(pose: PoseState) -> float:
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """What belongs to the weights: the sha256 of each file.
+    """The manifest of the weights: the sha256 of each file.
 
     Raises:
-        WorkerError: it is not there, or not readable.
+        WorkerError: it is missing, or not readable.
     """
     path = folder / MANIFEST
     try:
@@ -356,7 +357,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 
 def checked(folder: Path, name: str, sha256: dict[str, str]) -> bytes:
-    """The file's content, if it is what the manifest says.
+    """The file's content, if it matches the manifest.
 
     Raises:
         WorkerError: it is missing, or its sha256 differs.

@@ -115,7 +115,7 @@ def lazy_names(package: str, *modules: str) -> Callable[[str], Any]:
     """
 
     def find(name: str) -> Any:
-        # Names with underscores are asked for by Python itself; submodules are no names of ours.
+        # Python itself asks for names with underscores; submodules are not among our names.
         for module in () if name.startswith("__") or name in modules else modules:
             found = getattr(import_module(f"{package}.{module}"), name, find)
             if found is not find:

@@ -6,7 +6,7 @@ if __name__ == "__main__":
     if "VLA_ZENOH_PARENT" in os.environ:  # `parent_watch.PARENT_VARIABLE`; a stop has none
         from vla_zenoh.runtime.parent_watch import die_with_parent
 
-        die_with_parent()  # before what a node imports, which takes its time
+        die_with_parent()  # before the imports of a node, which take long
 
     from vla_zenoh.cli.entry import main
 

@@ -9,12 +9,12 @@
     ├── SpecError          a model's spec is wrong or does not fit the profile
     ├── ResourceError      a model, scene, profile or robot description was not found
     ├── MissingExtraError  an optional dependency is not installed
-    ├── SessionError       no Zenoh session could be had
+    ├── SessionError       no Zenoh session could be opened
     ├── WorkerError        a model worker cannot be loaded or broke its contract
     ├── RecordingError     a recorded run cannot be written or read
     ├── OutputError        an output file cannot be written, or would overwrite something
-    ├── PeerError          a policy server gave no answer that can be used
-    ├── NodeError          a node cannot start or go on (a second command node, a dead device)
+    ├── PeerError          a policy server gave no usable answer
+    ├── NodeError          a node cannot start or continue (a second command node, a dead device)
     └── SecurityError      a certificate or key cannot be made or used
 
 A message says what is wrong, what is allowed and what to do. Errors of libraries are turned into
@@ -82,9 +82,9 @@ class ResourceError(VlaZenohError, FileNotFoundError):
 
 
 def how_to_install(extra: str = "") -> str:
-    """What brings an extra of this package, or the package itself.
+    """Command that installs an extra of this package, or the package itself.
 
-    Never by name alone: the package is on no index, and a stranger could register the name there.
+    Never by name alone: the package is on no index, and anyone could register the name there.
     """
     what = f"'.[{extra}]'" if extra else "."
     return f"pip install -c constraints.txt {what} in a checkout of vla-zenoh"
@@ -106,7 +106,7 @@ class MissingExtraError(VlaZenohError, ImportError):
 
 
 class SessionError(VlaZenohError, ConnectionError):
-    """No Zenoh session could be had."""
+    """No Zenoh session could be opened."""
 
 
 class WorkerError(VlaZenohError):
@@ -122,7 +122,7 @@ class OutputError(VlaZenohError):
 
 
 class PeerError(VlaZenohError):
-    """A policy server gave no answer that can be used.
+    """A policy server gave no usable answer.
 
     Attributes:
         reason: short stable name used as a counter in status, for example ``peer_timeout``.
@@ -134,7 +134,7 @@ class PeerError(VlaZenohError):
 
 
 class NodeError(VlaZenohError):
-    """A node cannot start or go on."""
+    """A node cannot start or continue."""
 
 
 class SecurityError(VlaZenohError):
@@ -171,7 +171,7 @@ _QUOTED = re.compile(r"'([^']*)'")
 
 
 def describe_fault(fault: Any) -> str:
-    """One entry of ``ValidationError.errors()``, as what is to be said after a field's name."""
+    """One entry of ``ValidationError.errors()``, as text that follows a field's name."""
     context = fault.get("ctx", {})
     if fault["type"] == "literal_error":
         near = nearest(str(fault.get("input")), _QUOTED.findall(context["expected"]), "")
@@ -213,8 +213,8 @@ def in_words(error: BaseException) -> str:
     """Message of any exception, for a person: without addresses of manuals or unsafe advice.
 
     A message of ours is kept. That of another library follows the name of its exception; faults of
-    a Pydantic model are named field by field, and a file that PyTorch refuses to unpickle is not
-    answered by its own advice to run what the file contains.
+    a Pydantic model are named field by field, and for a file that PyTorch refuses to unpickle its
+    own advice to execute the file's content is replaced.
     """
     if isinstance(error, VlaZenohError):
         return str(error)

@@ -105,8 +105,8 @@ class Keys:
     Args:
         robot: the robot's name.
         root: what stands before it, may hold slashes.
-        part: whose states and commands are meant, of a robot of several; ``*`` is any. Empty: the
-            robot has one part, without a name.
+        part: part whose states and commands are meant, of a robot of several; ``*`` is any. Empty:
+            the robot has one part, without a name.
     """
 
     robot: str
@@ -131,7 +131,7 @@ class Keys:
     )
     camera_depth = _KeyOf(
         "camera/{camera}/depth",
-        "A PNG file of 16 bits; its encoding says the metres of a count "
+        "A PNG file of 16 bits; its encoding gives the metres of a count "
         "(``image/png;depth16;0.001``), 0 is not measured. Published while there are subscribers.",
     )
     camera_fitted = _KeyOf(
@@ -240,7 +240,7 @@ class Keys:
 
     @property
     def without_raw_images(self) -> tuple[str, ...]:
-        """All keys, of images JPEG alone: a subscriber to raw ones makes cameras send 1 MB each.
+        """All keys, but only JPEG images: a subscriber to raw ones makes cameras send 1 MB each.
 
         Keys of one or two parts that are added later are among them, too.
         """
@@ -258,11 +258,11 @@ class Keys:
         return f"{self.root}/*/alive/command"
 
     def short(self, key: str) -> str:
-        """`key` without the root and robot, as people say it; other keys as they are."""
+        """`key` without the root and robot, as shown to people; other keys unchanged."""
         return key.removeprefix(f"{self.root}/{self.robot}/")
 
     def full(self, key: str) -> str:
-        """The way back of `short`; what begins with the root is taken as whole already."""
+        """Inverse of `short`; a key that begins with the root is taken as whole already."""
         return key if key.startswith(f"{self.root}/") else f"{self.root}/{self.robot}/{key}"
 
     def part_of(self, key: str) -> str:
@@ -271,17 +271,17 @@ class Keys:
         return first if rest and first not in NOT_PARTS and self.short(key) != key else ""
 
     def group(self, key: str) -> str:
-        """What follows robot and part: ``camera``, ``state``, ``prompt``; of others nothing."""
+        """What follows robot and part: ``camera``, ``state``, ``prompt``; empty for other keys."""
         own = self.short(key).removeprefix(f"{self.part_of(key)}/")
         return own.split("/")[0] if self.short(key) != key else ""
 
     def on(self, other: Keys, key: str) -> str:
-        """The key of `other` that says what `key` says of this robot."""
+        """The key of `other` that corresponds to `key` of this robot."""
         return other.full(self.short(key))
 
     @staticmethod
     def of(key: str, root: str) -> Keys | None:
-        """The keys of the robot that `key` is of, None where it is of none below `root`."""
+        """The keys of the robot that `key` belongs to, None if it belongs to none below `root`."""
         robot, _, rest = key.removeprefix(f"{root}/").partition("/")
         if not key.startswith(f"{root}/") or not rest:
             return None
@@ -296,7 +296,7 @@ KEY_PATHS: Mapping[str, KeyPath] = {
     for name, path in vars(Keys).items()
     if isinstance(path, KeyPath) and "*" not in path.path
 }
-"""Member of `Keys` -> its path, of all that are one key: the whole wire protocol."""
+"""Member of `Keys` -> its path, for all single keys: the whole wire protocol."""
 
 
 PART_KEYS = frozenset(name for name, path in KEY_PATHS.items() if isinstance(path, _PartKey))
@@ -306,14 +306,14 @@ NOT_PARTS = frozenset(path.path.split("/")[0] for path in KEY_PATHS.values())
 
 
 def last_chunk(key: str) -> str:
-    """The last part of a key: the node, worker or camera it is about."""
+    """The last part of a key: the name of the node, worker or camera."""
     return key.rsplit("/", 1)[-1]
 
 
 def covers(wide: str, narrow: str) -> bool:
-    """Whether every key that the expression `narrow` means is also meant by `wide`.
+    """Whether the expression `wide` includes every key of the expression `narrow`.
 
-    Of Zenoh's expressions ``*`` and ``**`` are known; that is all that is used here.
+    Supports Zenoh's ``*`` and ``**``, the only ones used here.
     """
     return _covers(wide.split("/"), narrow.split("/"))
 
@@ -348,7 +348,7 @@ ROLLING = "rolling"
 CRASHED, STARTING = "crashed", "starting"
 """States in the status that `vla-zenoh up` publishes for a node of its host that does not run."""
 ON_BEHALF = "up-"
-"""How the source of such a status begins."""
+"""Prefix of the source of such a status."""
 
 
 class NodeTraits(NamedTuple):

@@ -32,13 +32,13 @@ Record = TypeVar("Record")
 
 @dataclass(frozen=True, slots=True)
 class Exchange:
-    """One question and its answer, in ns.
+    """One query and its reply, in ns.
 
     Args:
-        asked: on our monotonic clock.
-        heard: when the other one heard it, on its wall clock.
-        said: when it answered, on its wall clock.
-        got: when the answer came, on our monotonic clock.
+        asked: time of the query, on our monotonic clock.
+        heard: time at which the peer received it, on its wall clock.
+        said: time of its reply, on its wall clock.
+        got: arrival of the reply, on our monotonic clock.
     """
 
     asked: int
@@ -53,16 +53,16 @@ class Exchange:
 
     @property
     def ahead_ns(self) -> int:
-        """The other one's wall clock minus our monotonic clock."""
+        """The peer's wall clock minus our monotonic clock."""
         return ((self.heard - self.asked) + (self.said - self.got)) // 2
 
 
 @dataclass(frozen=True, slots=True)
 class ClockOffset:
-    """The other one's wall clock minus ours.
+    """The peer's wall clock minus ours.
 
     Args:
-        offset_s: positive: the other clock is ahead.
+        offset_s: positive: the peer's clock is ahead.
         uncertainty_s: the truth is not further away than this.
         round_trip_s: of the newest exchange.
     """
@@ -72,24 +72,24 @@ class ClockOffset:
     round_trip_s: float
 
     def exceeds(self, bound_s: float) -> bool:
-        """Whether the clock is off by more than is reckoned with."""
+        """Whether the clock is off by more than is compensated."""
         return _beyond(self.offset_s, bound_s)
 
 
 def _beyond(offset_s: float, bound_s: float) -> bool:
-    """By the estimate alone: what is not corrected has to be refused, and the other way round.
+    """By the estimate alone: an offset is either corrected or rejected.
 
-    However long a link is, the estimate is near zero where clocks agree and both ways take the
-    same time. It is off by half of what one way takes longer than the other.
+    However long a link is, the estimate is near zero if the clocks agree and both directions take
+    the same time. It is off by half of their difference.
     """
     return abs(offset_s) > bound_s
 
 
 class ClockOffsetFilter:
-    """Makes one offset of many exchanges, and a steady one to translate stamps by.
+    """Combines exchanges into one offset, and a steady one to convert stamps with.
 
     Args:
-        bound_s: a clock that is off by more is wrong, and its stamps are not translated.
+        bound_s: a clock that is off by more is wrong, and its stamps are not converted.
     """
 
     def __init__(self, bound_s: float) -> None:
@@ -100,7 +100,7 @@ class ClockOffsetFilter:
         self._applied_for: tuple[Exchange, int] | None = None
 
     def add(self, exchange: Exchange) -> bool:
-        """Take one exchange; False: it cannot be, and is left out."""
+        """Add an exchange; False: it is impossible, and ignored."""
         if exchange.round_trip_ns < 0 or exchange.said < exchange.heard:
             return False
         if self._best is not None and self._differ(self._best, exchange):
@@ -134,7 +134,7 @@ class ClockOffsetFilter:
         best = self._best
         if best is None:
             return 0
-        # Nothing but these makes a difference: with its age an exchange only gets less certain.
+        # Only these make a difference: with its age an exchange only gets less certain.
         if self._applied_for == (best, wall_minus_mono_ns):
             return self._applied_ns
         self._applied_for = best, wall_minus_mono_ns

@@ -41,7 +41,7 @@ class Reading:
     """Newest measurement of the robot.
 
     A reading with a value that is not a number, or that this arm cannot have, is rejected whole and
-    counted; its fault counts all the same.
+    counted; its fault still counts.
 
     Args:
         position_rad: (n,) of the joints, in the order of ``robot.arm_joints``; m for prismatic
@@ -57,7 +57,7 @@ class Reading:
         fault: why the robot does not move (emergency stop, reflex, protective stop). The arm is
             stopped until the fault is gone and an operator has published ``reset``. Report it
             however brief it is, and also where nothing else is new.
-        mode: the robot's own word for why it follows no commands though it is well (it is guided by
+        mode: the robot's reason for following no commands although it is healthy (it is guided by
             hand, a recovery runs). The arm is not activated in it; empty: it is ready.
         measured_ns: time of the measurement by `time.monotonic_ns`; None: now. Set it where a
             library caches the newest state: otherwise a dead link looks like an arm at rest.
@@ -87,9 +87,9 @@ class Robot(Protocol):
 
     ``connect()`` runs once before the first reading, and may take long.
     ``grip(width_m, speed_m_s, force_n)`` starts a motion to an absolute opening, and returns.
-    ``recover()`` runs when a person published ``reset``: begin to clear the robot's errors, and
-    return. A robot that has it clears none by itself.
-    ``status()`` gives figures for the node's status, name -> number, text or list.
+    ``recover()`` runs when an operator published ``reset``: begin to clear the robot's errors, and
+    return. A robot with this method clears no errors by itself.
+    ``status()`` returns values for the node's status, name -> number, text or list.
     ``close()`` runs at the end, when the arm stands, also after a ``connect()`` that failed.
 
     An exception ends the node, after it braked the motion by further calls of `move`, unless those

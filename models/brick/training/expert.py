@@ -1,8 +1,8 @@
-"""The teacher: what to do next, from where everything truly is. No memory but `Hand.swept_m`.
+"""The teacher: the next action from the true poses. Its only memory is `Hand.swept_m`.
 
-A function of the present alone, so every state there is has a right answer: also those that only a
-learner gets into. Heights are funnels over the distance to the goal, so small errors in what the
-learner sees make small errors in what it does; it never waits for a time that no picture shows.
+A function of the present alone, so every state has a right answer, also states that only a learner
+reaches. Heights are funnels over the distance to the goal, so small errors in the learner's
+perception cause small errors in its actions; it never waits for a time that no image shows.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ CARRY_M, RELEASE_M = 0.125, 0.082
 PUSH_LOW_M, PUSH_HOVER_M = 0.016, 0.085
 PUSH_START_M, PUSH_WAY_M = 0.058, 0.105
 PUSH_RAMP_M = 0.010
-"""Within this height, a little above that of a push, the way on begins."""
+"""Within this height, a little above that of a push, the next part of the path begins."""
 CONTACT_M = 0.027
-"""From the middle of the shut fingers to that of a brick they push."""
+"""From the middle of the shut fingers to that of a brick that they push."""
 LOW_M = 0.035
-"""Under this height the way of the hand is counted as a push, see `Hand.swept_m`."""
+"""Below this height the hand's path counts as a push, see `Hand.swept_m`."""
 FOLLOWS = 0.5
-"""Share of the way to its waypoint that the hand makes in a step, about as Ruckig smooths it."""
+"""Share of the distance to its waypoint that the hand covers in a step, about as Ruckig does."""
 UP_M = 0.05
-"""Over this height a push that was broken off begins anew."""
+"""Above this height an interrupted push begins again."""
 
 
 class Point(NamedTuple):
-    """A place and a turn about the vertical, in the base frame."""
+    """A position and a rotation about the vertical, in the base frame."""
 
     x_m: float
     y_m: float
@@ -53,12 +53,12 @@ class Hand:
 
     Args:
         x_m: of the TCP, base frame.
-        y_m: likewise.
-        z_m: likewise.
+        y_m: of the TCP, base frame.
+        z_m: of the TCP, base frame.
         yaw_rad: turn about the vertical, 0 at home.
         width_m: opening.
-        swept_m: how far the hand has got from where it came down, below `LOW_M`. It is what tells a
-            push that was made from one that is to come: above `UP_M` less than a push is forgotten.
+        swept_m: distance of the hand from where it came down, below `LOW_M`. It distinguishes a
+            completed push from a coming one: above `UP_M` less than a push is forgotten.
         down: where it came down; None while it is above.
     """
 
@@ -71,7 +71,7 @@ class Hand:
     down: tuple[float, float] | None = None
 
     def swept(self) -> Hand:
-        """The same with its sweep brought up to date."""
+        """The same with `swept_m` updated."""
         if self.z_m >= LOW_M:
             again = self.z_m > UP_M and self.swept_m < PUSH_WAY_M
             return replace(self, down=None, swept_m=0.0 if again else self.swept_m)
@@ -81,7 +81,7 @@ class Hand:
 
 
 class Wish(NamedTuple):
-    """Where the hand should get to, and whether the gripper should be open."""
+    """Target of the hand, and whether the gripper should be open."""
 
     x_m: float
     y_m: float
@@ -92,7 +92,7 @@ class Wish(NamedTuple):
 
 
 def quarter(angle_rad: float) -> float:
-    """The angle within an eighth of a turn that is the same for a square."""
+    """The equivalent angle within an eighth of a turn, for a square."""
     return (angle_rad + math.pi / 4) % (math.pi / 2) - math.pi / 4
 
 
@@ -107,13 +107,13 @@ def is_held(hand: Hand, brick: Point) -> bool:
 
 
 def wish(family: str, hand: Hand, target: Point, goal: Point, direction: str) -> Wish:
-    """What to do now.
+    """The next target.
 
     Args:
         family: ``put``, ``stack`` or ``push``.
         hand: now.
         target: the brick to move.
-        goal: the box, or the brick to stack on; for a push anything.
+        goal: the box, or the brick to stack on; unused for a push.
         direction: of a push.
     """
     if family == "push":
@@ -149,7 +149,7 @@ def _carry(family: str, hand: Hand, target: Point, goal: Point, off: float) -> W
         most = least + 0.075
         height = least + clip((off - 0.004) * 3.0, 0.0, most - least)
         let_go = False
-    # Over what may be in the way first: sideways only near the height that belongs to the place.
+    # Over possible obstacles first: sideways only near the height that belongs to the place.
     free = clip((hand.z_m - height + 0.015) / 0.012, 0.0, 1.0)
     if let_go:
         return Wish(hand.x_m, hand.y_m, hand.z_m, 0.0, True)
@@ -190,7 +190,7 @@ def _push(hand: Hand, target: Point, u_x: float, u_y: float) -> Wish:
     along, beside = rel_x * u_x + rel_y * u_y, -rel_x * u_y + rel_y * u_x
     if hand.z_m < LOW_M:
         if abs(beside) < 0.022 and along < -0.012 and hand.width_m < 0.02:
-            # On along the line through the brick; an arm that lags would else slide over it.
+            # Continue along the line through the brick; an arm that lags would else slide over it.
             over = hand.z_m - PUSH_LOW_M - 0.4 * PUSH_RAMP_M
             ahead = PUSH_STEP_M * clip(1.0 - over / PUSH_RAMP_M, 0.0, 1.0)
             return Wish(
@@ -219,7 +219,7 @@ def _push(hand: Hand, target: Point, u_x: float, u_y: float) -> Wish:
 
 
 def advance(goal: Hand, hand: Hand, wished: Wish) -> Hand:
-    """The next waypoint, a step on from the last one towards what is wished of the hand."""
+    """The next waypoint, one step from the last one towards the wished target."""
     x, y, z = wished.x_m - goal.x_m, wished.y_m - goal.y_m, wished.z_m - goal.z_m
     share = min(1.0, wished.step_m / max(math.sqrt(x * x + y * y + z * z), 1e-9))
     turn = clip(hand.yaw_rad + wished.turn_rad - goal.yaw_rad, -STEP_RAD, STEP_RAD)
@@ -233,7 +233,7 @@ def advance(goal: Hand, hand: Hand, wished: Wish) -> Hand:
 
 
 def follow(hand: Hand, goal: Hand, share: float) -> Hand:
-    """The hand one step on, the gripper not taken into account: it lags behind the waypoints."""
+    """The hand one step later, without the gripper: it lags behind the waypoints."""
     return replace(
         hand,
         x_m=hand.x_m + share * (goal.x_m - hand.x_m),
@@ -255,14 +255,14 @@ def foretell(
     direction: str,
     committed: Sequence[Row] = (),
 ) -> list[Row]:
-    """The next `HORIZON` waypoints; the first ones are those committed, and it goes on from there.
+    """The next `HORIZON` waypoints; the first ones are the committed ones.
 
-    What is wished is asked of where the hand will be, not of the waypoint it was sent to: it is a
-    smoothed arm, and what is decided of a corner it has not reached cuts that corner. A push is
-    short and straight, there the two are taken for one.
+    Targets are computed for the predicted hand, not for its waypoint: the arm is smoothed, and
+    deciding at a corner that it has not reached would cut that corner. A push is short and
+    straight; there both count as the same.
 
-    What the hand holds goes with it. The fingers stay as they are in what is foretold: whether they
-    have gripped is to be seen, so nothing is lifted on trust.
+    A held object moves with the hand. The prediction does not change the fingers: only the robot
+    can show whether they have gripped, so nothing is lifted before that.
     """
     begin, way, out = hand, hand, []
     share = 1.0 if family == "push" else FOLLOWS
@@ -304,7 +304,7 @@ def foretell(
 
 
 def _pushed(hand: Hand, target: Point, u_x: float, u_y: float) -> Point:
-    """Where the brick is once the hand is there."""
+    """Pose of the brick once the hand is there."""
     rel_x, rel_y = hand.x_m - target.x_m, hand.y_m - target.y_m
     along, beside = rel_x * u_x + rel_y * u_y, -rel_x * u_y + rel_y * u_x
     if abs(beside) > 0.022 or not -CONTACT_M < along < 0.0:

@@ -4,7 +4,7 @@
 #   "vla-zenoh", "torch>=2.4", "safetensors>=0.4", "onnx", "onnxscript", "onnxruntime>=1.20",
 # ]
 # ///
-"""Makes of trained weights what the worker loads, and checks that both say the same.
+"""Exports trained weights for the worker, and checks that both give the same outputs.
 
     python export.py RUN [--out FOLDER]
 
@@ -33,12 +33,13 @@ INPUTS = ("tokens", "front", "wrist", "hand", "given")
 OUTPUTS = ("offset", "opened", "understood", "order", "bricks", "box")
 TOLERANCE, LOOSE = 1e-4, 1e-3
 """Between PyTorch and onnxruntime, in the outputs' own units (m, rad, probability). The loose one
-is of what is a close thing in noise: turns of bricks, and what is understood of any pieces."""
+is for outputs that are ambiguous for noise: turns of bricks, and whether random pieces are a
+task."""
 TRIALS = 20
 
 
 def inputs(random: np.random.Generator, words: int) -> dict[str, np.ndarray]:
-    """Any input of the right form."""
+    """Random input of the right shapes."""
     tokens = random.integers(1, words, (1, MAX_PIECES))
     tokens[0, random.integers(1, MAX_PIECES) :] = 0
     found = {
@@ -54,7 +55,7 @@ def inputs(random: np.random.Generator, words: int) -> dict[str, np.ndarray]:
 
 
 def strip(graph: Path) -> None:
-    """Leave out where each node came from: the exporter writes paths of this computer into it."""
+    """Remove the origin of each node: the exporter writes paths of this computer into it."""
     model = onnx.load(str(graph))
     for part in (
         *model.graph.node,

@@ -1,4 +1,4 @@
-"""How the eyes are taught where things are: by several processes, gone on with where it stopped."""
+"""Trains the localisation network with several processes; resumes where it stopped."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ WEIGHTS = {"front": 0.15, "wrist": 0.2, "scene": 1.0}
 AVERAGE = 0.998
 SAVE_S = 120.0
 HAND_NOISE = (0.01, 0.01, 0.01, 0.01, 0.01, 0.0, 0.01, 0.01, 0.0)
-"""What moves the hand a little between measuring and drawing moves the picture too."""
+"""A small motion of the hand between measuring and rendering also moves the image."""
 DISTANCES_MM = ((0, 15), (15, 60), (60, 120), (120, 500))
 CHECKS, CHECK_BATCH = 6, 100
 
 
 def spread(px: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
-    """Cells (n, K, 4) around each point and their weights; out of the picture: nowhere."""
+    """Cells (n, K, 4) around each point and their weights; outside the image: nowhere."""
     column, row = px[..., 0] * width - 0.5, px[..., 1] * height - 0.5
     out = (px[..., :2] < 0).any(-1) | (px[..., :2] >= 1).any(-1) | (px[..., 2] < 0.01)
     left, top = column.floor(), row.floor()
@@ -50,7 +50,7 @@ def map_loss(log_maps: Tensor, px: Tensor, size: torch.Size) -> Tensor:
 
 
 def scene_loss(found: Places, real: Scene) -> Tensor:
-    """Distance, relative to how far it is from the hand: near ones have to be exact."""
+    """Distance, relative to the distance from the hand: near objects must be exact."""
     far = real.bricks[..., :2].norm(dim=-1, keepdim=True)
     place = ((found.bricks - real.bricks[..., :3]).abs() / (far + 0.25)).mean()
     box_far = real.box.norm(dim=-1, keepdim=True)
@@ -58,7 +58,7 @@ def scene_loss(found: Places, real: Scene) -> Tensor:
 
 
 def losses_of(net: Policy, batch: dict[str, Tensor], weather: Weather | None) -> dict[str, Tensor]:
-    """All losses of one batch, under this weather; each with its weight."""
+    """All losses of one batch, with this augmentation; each with its weight."""
     hand, change = batch["hand"], normal
     if weather is not None:
         hand = hand + torch.randn_like(hand) * torch.tensor(HAND_NOISE)
@@ -74,7 +74,7 @@ def losses_of(net: Policy, batch: dict[str, Tensor], weather: Weather | None) ->
 
 @dataclass(slots=True)
 class State:
-    """Where the teaching is: what is saved now and then."""
+    """State of the training, saved now and then."""
 
     net: Policy
     optimiser: torch.optim.Optimizer
@@ -82,7 +82,7 @@ class State:
     step: int = 0
 
     def save(self, path: Path) -> None:
-        """Whole or not at all."""
+        """Save atomically."""
         part = path.with_suffix(".part")
         torch.save(
             {
@@ -96,7 +96,7 @@ class State:
         part.rename(path)
 
     def load(self, path: Path) -> None:
-        """What was saved."""
+        """Load a saved state."""
         saved = torch.load(path, weights_only=True)
         self.net.eyes.load_state_dict(saved["eyes"])
         self.optimiser.load_state_dict(saved["optimiser"])
@@ -104,7 +104,7 @@ class State:
 
 
 def teach_eyes(net: Policy, args: argparse.Namespace) -> None:
-    """Teach them with so many processes; their weights are in `net` afterwards."""
+    """Train the eyes with several processes; their weights are in `net` afterwards."""
     resume = args.out / "eyes.pt"
     port = 20_000 + os.getpid() % 20_000
     begin = {key: value.clone() for key, value in net.state_dict().items()}
@@ -164,7 +164,7 @@ def _learn(
 
 
 def _share(parameters: list[torch.nn.Parameter], many: int) -> None:
-    """Every process goes on with the mean of all gradients."""
+    """Give every process the mean of all gradients."""
     flat = torch.cat([p.grad.flatten() for p in parameters if p.grad is not None])
     dist.all_reduce(flat)
     flat /= many
@@ -177,7 +177,7 @@ def _share(parameters: list[torch.nn.Parameter], many: int) -> None:
 
 @torch.no_grad()
 def validate(state: State, data: Data, seed: int) -> str:
-    """How the mean of the weights does on shards it has not seen: mm off, median and 95 %."""
+    """Errors of the averaged weights on unseen shards: mm, median and 95 %."""
     other = Policy(len(state.net.reader.meaning))
     other.eyes.load_state_dict(state.mean)
     random = np.random.default_rng(seed)

@@ -2,11 +2,11 @@
 # requires-python = ">=3.11"
 # dependencies = ["vla-zenoh[sim]"]
 # ///
-"""Makes data: draws situations, draws what the two cameras see, asks the teacher what to do.
+"""Generates data: random situations, images of the two cameras, and the teacher's waypoints.
 
     python generate.py OUT --samples 60000 --seed 0 [--part 0 --parts 2]
 
-Writes ``OUT/<seed>-<number>.npz`` with 500 samples each; what is there already is left alone.
+Writes ``OUT/<seed>-<number>.npz`` with 500 samples each; existing files are left alone.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ IK_STEPS, IK_TOLERANCE = 12, 2e-4
 
 
 class Studio:
-    """The scene as a puppet theatre: poses are set, not simulated."""
+    """The scene with poses that are set, not simulated."""
 
     def __init__(self) -> None:
         robot = RobotModel()
@@ -60,7 +60,7 @@ class Studio:
         self._angular = np.zeros((3, self.model.nv))
 
     def show(self, situation: Situation, random: np.random.Generator, varied: bool) -> bool:
-        """Put everything in its place; False where the arm cannot get there."""
+        """Set all poses of a situation; False if the arm cannot get there."""
         model, data = self.model, self.data
         for colour, place in situation.bricks.items():
             address = int(model.joint(brick(colour)).qposadr[0])
@@ -114,7 +114,7 @@ class Studio:
         return False
 
     def pictures(self, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """What the front and the wrist camera see, in the size of the model."""
+        """Images of the front and the wrist camera, in the size of the model."""
         self.renderer.set_qpos(
             np.concatenate(
                 [self.data.qpos, self.data.mocap_pos.ravel(), self.data.mocap_quat.ravel()]
@@ -131,7 +131,7 @@ class Studio:
 
 
 def pixels(renderer: Renderer, camera: str, points: np.ndarray) -> np.ndarray:
-    """(n, 3) column, row in [0, 1] over the picture and depth of points (n, 3), as it looks now."""
+    """(n, 3) column, row in [0, 1] over the image and depth of points (n, 3), as now rendered."""
     position, axes, fovy = renderer.view(camera)
     local = (points - position) @ axes
     scale = 0.5 / math.tan(fovy / 2)
@@ -160,13 +160,13 @@ def labelled(
     renderer: Renderer,
     random: np.random.Generator,
 ) -> dict[str, np.ndarray]:
-    """A situation and what the two cameras see of it, with all that is taught about it.
+    """A situation, the images of the two cameras, and all labels.
 
     Args:
-        situation: as it is.
-        pictures: of the front and of the wrist camera, in the size of the model.
+        situation: the true one.
+        pictures: images of the front and of the wrist camera, in the size of the model.
         renderer: shows the situation.
-        random: draws other orders, of which the teacher is asked too.
+        random: draws other orders, for which the teacher is asked too.
     """
     known = numbers(situation, random)
     points, hand = known["objects"], known["pose"][None, :3]

@@ -1,6 +1,6 @@
-"""Situations as numbers, and what the teacher would do in them: all of a sample but the pictures.
+"""Situations as numbers, with the teacher's waypoints: all of a sample but the images.
 
-What to do is learned from many more situations than are worth drawing pictures of.
+Waypoints are learned from many more situations than are worth rendering.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from worker import Hand as Memory
 from vla_zenoh.lab.tasks import COLOURS, DIRECTIONS, FAMILIES, Order
 
 ORDERS = 4
-"""Orders per situation: what the teacher would do under each."""
+"""Orders per situation, each with the teacher's waypoints."""
 BOX_LOOK_M = 0.03
 """The box is looked for at half its height."""
 MOST_COMMITTED = 6
@@ -26,7 +26,7 @@ SURPRISE = 0.1
 
 
 def order_numbers(order: Order) -> list[int]:
-    """Family (pushes apart by direction), target, onto as numbers; -1: none."""
+    """Family (pushes separated by direction), target, onto as numbers; -1: none."""
     kinds = [*FAMILIES[:2], *DIRECTIONS]
     kind = order.direction if order.family == "push" else order.family
     onto = COLOURS.index(order.onto) if order.onto else -1
@@ -34,7 +34,7 @@ def order_numbers(order: Order) -> list[int]:
 
 
 def label(situation: Situation, order: Order, committed: tuple[Row, ...] = ()) -> np.ndarray:
-    """(H, 5) what the teacher would do, after waypoints that cannot change any more."""
+    """(H, 5) the teacher's waypoints after those that can no longer change."""
     goal = situation.bricks[order.onto] if order.family == "stack" else situation.box
     target = situation.bricks[order.target]
     way = foretell(order.family, situation.hand, target, goal, order.direction, committed)
@@ -46,7 +46,7 @@ def draw_committed(
 ) -> tuple[Row, ...]:
     """1 to `MOST_COMMITTED` waypoints that a chunk before this one may have left.
 
-    It saw things a little elsewhere, and the goal is ahead of the hand.
+    Its perception was slightly off, and the goal is ahead of the hand.
     """
     if random.uniform() < SURPRISE:
         order = draw_order(random)
@@ -78,17 +78,17 @@ def draw_committed(
 def numbers(
     situation: Situation, random: np.random.Generator, *, going_on: bool = False
 ) -> dict[str, np.ndarray]:
-    """One situation and what is taught about it.
+    """One situation and its labels.
 
     Args:
-        situation: as it is.
-        random: draws other orders, of which the teacher is asked too.
+        situation: the true one.
+        random: draws other orders, for which the teacher is asked too.
         going_on: with committed waypoints for each order.
 
     Returns:
         hand (9,) see `model.Hand`; pose (4,) x, y, z, yaw; objects (5, 3) m; yaw (4,) of the
-        bricks; orders (`ORDERS`, 3); way (`ORDERS`, H, 5). Going on: given (`ORDERS`, H, 6) as in
-        `model.Brick.think`, way_on (`ORDERS`, H, 5) what the teacher would do after it.
+        bricks; orders (`ORDERS`, 3); way (`ORDERS`, H, 5). With `going_on`: given (`ORDERS`, H, 6)
+        as in `model.Brick.think`, way_on (`ORDERS`, H, 5) the teacher's waypoints after it.
     """
     hand = situation.hand
     points = np.array([situation.bricks[c][:3] for c in COLOURS] + [situation.box[:3]])
@@ -121,7 +121,7 @@ def _going_on(
 
 
 def blind(count: int, seed: tuple[int, ...]) -> dict[str, np.ndarray]:
-    """So many situations without pictures, stacked."""
+    """`count` situations without images, stacked."""
     random = np.random.default_rng(seed)
     samples = [numbers(draw(random), random, going_on=True) for _ in range(count)]
     return {key: np.stack([s[key] for s in samples]) for key in samples[0]}

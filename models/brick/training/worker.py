@@ -1,4 +1,4 @@
-"""The worker's module, in the folder above, for the scripts of this one."""
+"""The worker's module, from the folder above, for the scripts of this one."""
 
 from __future__ import annotations
 

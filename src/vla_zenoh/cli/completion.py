@@ -102,7 +102,7 @@ COMPLETIONS: Mapping[str, Callable[[Any], Iterable[str]]] = {
     "key": keys,
     "keys": keys,
 }
-"""What completes a parameter, by its name; of one command where its words stand before."""
+"""What completes a parameter, by its name, or by command words and its name."""
 NO_HOST_OF_A_LAB = "lab serve.host"
 
 

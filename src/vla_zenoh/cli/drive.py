@@ -84,7 +84,7 @@ def activate(
 
 
 def _mode(client: Client) -> str:
-    """SIM, DRY RUN or LIVE, which stands in front of what says that the arm moves."""
+    """SIM, DRY RUN or LIVE: prefix of messages about the arm's motion."""
     from vla_zenoh.cli.node_rows import MODE_WORDS, mode_of
 
     client.wait_for(lambda: client.status("command"), MODE_PATIENCE_S)
@@ -148,9 +148,9 @@ def use(
 
 
 def _require_worker(client: Client, worker: str) -> None:
-    """End with the workers that are alive where `worker` is not: it may be mistyped."""
+    """Exit with the list of live workers if `worker` is not among them: it may be mistyped."""
     found = client.wait_for(lambda: worker_node(worker) in client.alive, ABSENT_PATIENCE_S)
-    if not found and "command" in client.alive:  # otherwise that is said
+    if not found and "command" in client.alive:  # otherwise that is reported
         named = worker_node("")
         alive = sorted(name[len(named) :] for name in client.alive if name.startswith(named))
         said = client.status(worker_node(worker))
@@ -267,7 +267,7 @@ def _stops(client: Client) -> bool:
 
 
 def _reaches(client: Client, done: Callable[[], bool]) -> bool:
-    """Wait until `done`; gives up sooner where there is no command node."""
+    """Wait until `done`; gives up sooner if there is no command node."""
     absent_s = time.monotonic() + ABSENT_PATIENCE_S
 
     def settled() -> bool:
@@ -278,7 +278,7 @@ def _reaches(client: Client, done: Callable[[], bool]) -> bool:
 
 
 def _fail(target: RobotTarget, client: Client, command: str, what: str) -> NoReturn:
-    """End with the reason why the command node did not do `what`."""
+    """Exit with the reason why the command node did not do `what`."""
     if why := target.not_operator(client.profile, command):
         fail(f"{target.named(client)} does not {what}: {why}")
     if "command" not in client.alive:

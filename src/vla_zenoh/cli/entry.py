@@ -1,7 +1,7 @@
-"""Entry of ``vla-zenoh``. The words that drive a robot start at once; all others go by Typer.
+"""Entry of ``vla-zenoh``. The commands that drive a robot start at once; all others use Typer.
 
-Typer, Rich and the profile's schema take half a second to load, in which an arm that shall stop
-moves on.
+Typer, Rich and the profile's schema take half a second to load, during which an arm that should
+stop keeps moving.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def main() -> None:
 
     Under a supervisor every error becomes one line for it, and the traceback lines for its log.
     """
-    if sys.argv[1:2] == ["stop"]:  # goes before other programs, where that is allowed
+    if sys.argv[1:2] == ["stop"]:  # runs before other programs, where permitted
         with suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, 0, HASTE)
     try:
@@ -60,7 +60,7 @@ def main() -> None:
 
 
 def _sentence(error: Exception) -> str | None:
-    """What a person is told of an expected error; None: it is a mistake in a program."""
+    """Message of an expected error; None: it is a mistake in a program."""
     from vla_zenoh.errors import VlaZenohError, how_to_install
 
     if isinstance(error, VlaZenohError):

@@ -17,7 +17,7 @@ from vla_zenoh.cli.words import WORDS
 from vla_zenoh.errors import describe_fault
 
 NODES = frozenset({"up", "worker", "node"})
-"""Commands that write a log; Zenoh's own log belongs into it."""
+"""Commands that write a log, which includes Zenoh's own."""
 
 
 class Group(NamedTuple):

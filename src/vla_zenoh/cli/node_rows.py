@@ -1,4 +1,4 @@
-"""State of every node of a robot: of those that live, and of those that the profile expects."""
+"""State of every node of a robot: live ones, and those that the profile expects."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MODE_WORDS = {
     "live": ("LIVE", "a real robot moves", "bold white on red"),
     UNKNOWN: ("MODE UNKNOWN", "no command node says whether a robot moves", "bold"),
 }
-"""Mode -> (word in front of what moves, sentence, style)."""
+"""Mode -> (prefix of what moves, sentence, style)."""
 MISSING, DEAD = "missing", "dead"
 ON_BEHALF = frozenset({CRASHED, STARTING})
 
@@ -28,11 +28,11 @@ class NodeRow(NamedTuple):
 
     Args:
         name: on the bus.
-        host: where it runs, or is to run.
+        host: where it runs, or should run.
         state: by its status, or ``missing``, ``starting``, ``crashed``, ``dead``.
-        why: of the latter, with what to do; else empty.
-        status: its last one.
-        age_s: of that.
+        why: reason of the last three, with what to do; else empty.
+        status: the last one.
+        age_s: of the status.
         alive: it has a liveliness token.
     """
 
@@ -48,10 +48,10 @@ class NodeRow(NamedTuple):
 def node_rows(
     said: Statuses, expected: Mapping[str, str], alive: frozenset[str] = frozenset()
 ) -> list[NodeRow]:
-    """Every node that was heard, and those expected on hosts that run, by name.
+    """Every node that published a status, and those expected on hosts that run, by name.
 
     Args:
-        said: by the nodes.
+        said: statuses of the nodes.
         expected: nodes of the profile, each with its host.
         alive: nodes that have a liveliness token.
     """
@@ -82,7 +82,7 @@ def _unheard(name: str, host: str, *, lives: bool) -> NodeRow:
 def hosts_down(
     said: Statuses, expected: Mapping[str, str], alive: frozenset[str] = frozenset()
 ) -> dict[str, list[str]]:
-    """Host of which no node was heard -> its nodes."""
+    """Host without any status of its nodes -> its nodes."""
     hosts: dict[str, list[str]] = {}
     for name, host in expected.items():
         hosts.setdefault(host, []).append(name)

@@ -1,8 +1,8 @@
 """Output of all commands: tables and text, JSON, errors on stderr.
 
 Most of the text comes from elsewhere: names, states and messages of nodes, lines of a model, a
-prompt. A `Screen` prints it as it is, never as Rich's markup, with control characters escaped.
-Colours come from `styled`. A `Screen` is made for each call, for the terminal and streams of then.
+prompt. A `Screen` prints it literally, never as Rich's markup, with control characters escaped.
+Colours come from `styled`. A `Screen` is made for each call, for the present terminal and streams.
 """
 
 from __future__ import annotations
@@ -43,8 +43,7 @@ LOOK: Mapping[str, Any] = {
 class Screen(Console):
     """A Rich console for untrusted text. Takes the arguments of Rich's own.
 
-    With NO_COLOR in the environment it has no styles at all. Where it is no terminal it breaks no
-    lines.
+    With NO_COLOR in the environment it has no styles at all. Without a terminal it breaks no lines.
     """
 
     def __init__(self, **settings: Any) -> None:
@@ -55,7 +54,7 @@ class Screen(Console):
             self.width = ENDLESS
 
     def render_str(self, text: str, **how: Any) -> Text:
-        """`text` as it is, also for cells, titles and columns of tables."""
+        """`text` literally, also for cells, titles and columns of tables."""
         return super().render_str(printable(text), **{**how, "markup": False, "emoji": False})
 
     def render(
@@ -87,8 +86,8 @@ def styled(text: object, style: str) -> Text:
 class Grid(Table):
     """A table that loses nothing.
 
-    On a terminal it has a box; where its figures do not fit even with the other cells wrapped, and
-    where there is no terminal, it is one line for each row, in columns for grep and awk.
+    On a terminal it has a box. If its figures do not fit even with the other cells wrapped, or
+    without a terminal, it is one line per row, in columns for grep and awk.
     """
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
@@ -169,7 +168,7 @@ def print_json(value: Any) -> None:
 
 
 def plain_types(value: Any) -> Any:
-    """`value` in types of JSON: records, profiles and arrays as what they hold, NaN as null."""
+    """`value` in types of JSON: records, profiles and arrays as their content, NaN as null."""
     return to_jsonable_python(value, inf_nan_mode="null", bytes_mode="hex", fallback=_plain)
 
 

@@ -1,4 +1,4 @@
-"""vla-zenoh do: move-to, home, grip, run. Guarded motions, carried out by the node primitives."""
+"""vla-zenoh do: move-to, home, grip, run. Guarded motions, executed by the node primitives."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Outlines of profiles, so that a command that drives need not load YAML and the schema.
 
 An outline is what a client needs of an effective profile: keys, session, and which node is where.
-It is written after a profile was loaded and validated, and used only while that would give the
-same: the same code, options and ``extends``, and every file with the same content.
+It is written after a profile was loaded and validated, and used only while loading would give the
+same result: the same code, options and ``extends``, and every file with the same content.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class _Outline:
     def model_copy(self, *, update: dict[str, Any]) -> _Outline:
         return _Outline({**self._sections, **update}, self._load)
 
-    # The answers of the profile's own methods are in the sections, see `_outline_of`.
+    # Results of the profile's own methods are in the sections, see `_outline_of`.
     def workers_of(self, host: _Section) -> list[str]:
         return host["workers"]
 
@@ -106,11 +106,11 @@ def cached_profile(name: str, options: Sequence[Any], load: Callable[[], Profile
         if known is not None and known["key"] == key and _unchanged(file, known["files"]):
             return cast("Profile", _Outline(known["outline"], load))
     except (VlaZenohError, OSError, ValueError, KeyError, TypeError):
-        return load()  # says what is wrong
+        return load()  # reports what is wrong
     before = _files(name)
     profile = load()
     with suppress(OSError):
-        if before is not None and before == _files(name):  # nobody saved one meanwhile
+        if before is not None and before == _files(name):  # none was saved meanwhile
             _write(cache, {"key": key, "files": before, "outline": _outline_of(profile)})
     return profile
 
@@ -126,7 +126,7 @@ def _files(name: str) -> list[tuple[str, str]] | None:
 
 
 def _unchanged(file: Path, files: Sequence[Sequence[str]]) -> bool:
-    """Whether the profile and those it extends have the content that they had."""
+    """Whether the profile and those it extends have the same content as before."""
     for number, (parent, text) in enumerate(files):
         file = extended_profile(file, parent) if number else file
         if file.read_text("utf-8") != text:
@@ -135,7 +135,7 @@ def _unchanged(file: Path, files: Sequence[Sequence[str]]) -> bool:
 
 
 def _code() -> list[Any]:
-    """What tells that the schema or its defaults may have changed."""
+    """Values that change when the schema or its defaults may have changed."""
     package = Path(vla_zenoh.__file__).parent
     modules = [*os.scandir(package / "profile"), *os.scandir(package / "cli")]
     dates = sorted(one.stat().st_mtime_ns for one in modules if one.name.endswith(".py"))
@@ -148,7 +148,7 @@ def _folder() -> Path:
 
 
 def _read(path: Path) -> Any:
-    """An outline that this user alone can have written; None: there is none."""
+    """An outline that only this user can have written; None: there is none."""
     for place in (path.parent, path):
         try:
             found = place.stat()

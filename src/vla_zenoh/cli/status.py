@@ -1,7 +1,7 @@
 """vla-zenoh status: state, rates, counters and events of all nodes.
 
-Shows what nodes publish in their `NodeStatus`, never a stream: a value to be shown belongs into the
-``detail`` of a node's status. The table is in ``status_table.py``: JSON goes without Rich.
+Shows what nodes publish in their `NodeStatus`, never a stream: a value to be shown belongs in the
+``detail`` of a node's status. The table is in ``status_table.py``: JSON needs no Rich.
 """
 
 from __future__ import annotations

@@ -122,7 +122,7 @@ def _fields(value: object) -> Mapping[str, Any]:
 
 
 def _warnings(nodes: Statuses, *, insecure: bool, left_out: int) -> Iterator[tuple[str, str]]:
-    """Sentences and their styles: open routers, bad certificates, strangers."""
+    """Sentences and their styles: open routers, bad certificates, unknown nodes."""
     details = {name: found.detail for name, (found, _, _) in nodes.items()}
     routers = {
         n: one.get("listen") for n, one in details.items() if one.get("security") == "insecure"
@@ -145,7 +145,7 @@ def _warnings(nodes: Statuses, *, insecure: bool, left_out: int) -> Iterator[tup
 
 
 def _cells(row: NodeRow, mode: str) -> tuple[str | Text, ...]:
-    """The cells of a node; what moves, or says that it does, has the mode in front."""
+    """The cells of a node; a node that moves the robot has the mode as prefix."""
     found, age_s = row.status, row.age_s
     state = one_line(row.state, MAX_LINE)
     style = STYLES.get(state, "white")

@@ -1,4 +1,4 @@
-"""vla-zenoh stop --wait-key: a standing emergency stop for the hand of a person beside the arm."""
+"""vla-zenoh stop --wait-key: a standby emergency stop for a person beside the arm."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def stop_by_key(target: RobotTarget, confirm: Callable[[Client], None]) -> None:
 
     Args:
         target: the robot.
-        confirm: waits until the robot has stopped and says so; raises `SystemExit` where it does
-            not.
+        confirm: waits until the robot has stopped and reports that; raises `SystemExit` if it does
+            not stop.
     """
     with target.client(stop=True) as client, _keys() as pressed:
         try:
@@ -50,7 +50,7 @@ def _stand(
     while (key := pressed()) is not False:
         if key:
             client.stop()
-            with suppress(SystemExit):  # it has been said; the hand stays on the key
+            with suppress(SystemExit):  # reported already; stay on standby
                 confirm(client)
         if connected != (connected := _connected(client)):
             _tell(connected, name)
@@ -76,7 +76,7 @@ def _connected(client: Client) -> bool:
 
 @contextmanager
 def _keys() -> Iterator[Callable[[], bool | None]]:
-    """A function that waits a little for a key: True; None: there was none; False: input ended.
+    """A function that waits briefly for a key: True; None: there was none; False: input ended.
 
     Signals that end or suspend a program raise `KeyboardInterrupt`, the first one alone.
     """
@@ -103,7 +103,7 @@ def _keys() -> Iterator[Callable[[], bool | None]]:
 
 
 def _single_keys(number: int) -> Callable[[], None]:
-    """Let a terminal give every key at once, unseen; returns what undoes that."""
+    """Let a terminal deliver every key at once, without echo; returns what undoes that."""
     if not os.isatty(number):
         return lambda: None
     import termios

@@ -19,7 +19,7 @@ from vla_zenoh.errors import SecurityError, SessionError
 from vla_zenoh.security.identity import Role, operator_role
 from vla_zenoh.security.operator_certificates import local_role, operator_hosts
 
-if TYPE_CHECKING:  # Typer and the schema: the words that drive go without them
+if TYPE_CHECKING:  # Typer and the schema: the commands that drive do without them
     import typer
 
     from vla_zenoh.bus.client import Client
@@ -29,13 +29,13 @@ if TYPE_CHECKING:  # Typer and the schema: the words that drive go without them
 
 @dataclass(frozen=True)
 class RobotTarget:
-    """Options that select a robot, and the client that they lead to.
+    """Options that select a robot, and its client.
 
     Args:
         profile: name or path.
-        connect: routers, in place of the profile's.
+        connect: routers, instead of the profile's.
         host: which host of the profile this computer is; selects the operator's certificate.
-        robot: in place of the profile's.
+        robot: instead of the profile's.
     """
 
     profile: ProfileOption = DEFAULT_PROFILE
@@ -51,8 +51,8 @@ class RobotTarget:
 
         Args:
             command: its words, such as ``status``.
-            host: in place of its own.
-            robot: in place of its own.
+            host: instead of its own.
+            robot: instead of its own.
         """
         words = ["vla-zenoh", *command]
         if self.profile != DEFAULT_PROFILE or PROFILE_VARIABLE in os.environ:
@@ -80,7 +80,7 @@ class RobotTarget:
         return profile if self.robot is None else as_robot(profile, self.robot)
 
     def outline(self) -> Profile:
-        """As `load`, from what is known of the unchanged files where it was loaded before.
+        """Like `load`, from the cached outline if the files have not changed since.
 
         Its sections are read; it is no `Profile` of pydantic.
         """
@@ -91,7 +91,7 @@ class RobotTarget:
     # -- sessions -----------------------------------------------------------------------------
     @contextmanager
     def client(self, *, stop: bool = False, stop_now: bool = False) -> Iterator[Client]:
-        """A connected client that is about to know the nodes.
+        """A connected client that will know the nodes in a moment.
 
         Args:
             stop: prefer a certificate that may stop the robot, and try every one.
@@ -99,7 +99,7 @@ class RobotTarget:
 
         Raises:
             ProfileError: the profile is invalid.
-            SecurityError: there is no certificate for a person.
+            SecurityError: there is no certificate for an operator or viewer.
             SessionError: no router answers.
         """
         stop = stop or stop_now
@@ -153,7 +153,7 @@ class RobotTarget:
         ]
 
     def not_operator(self, profile: Profile, *command: str) -> str:
-        """Why the certificate here may not drive, with what to type; empty where it may."""
+        """Why the certificate here may not drive, with what to type; empty if it may."""
         role = local_role(profile)
         if role is None or role is Role.OPERATOR:
             return ""
@@ -176,7 +176,7 @@ class RobotTarget:
 
 
 def _choices(profile: Profile, *, stop: bool) -> list[Profile]:
-    """The profile with each certificate that this computer has for a person, best first."""
+    """The profile with each certificate of an operator or viewer on this computer, best first."""
     hosts = operator_hosts(profile, stop=stop)
     return [_with_host(profile, host) for host in hosts] or [profile]
 

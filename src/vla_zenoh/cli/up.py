@@ -93,7 +93,7 @@ def up(
         print(systemd_unit(what, words, getpass.getuser(), kept), end="")
         return
     once = host_lock(loaded, name)
-    once.take()  # says at once who runs already; the host takes it again
+    once.take()  # reports at once a host that already runs; the host takes it again
     once.release()
     reject_wrong(profile, host, connect, listen)
     logs = log_dir or default_log_folder()
@@ -145,7 +145,7 @@ def up(
 
 
 def absolute(profile: str) -> str:
-    """A profile's name, or its path from any folder."""
+    """A profile's name, or its absolute path."""
     return str(profile_file(profile).absolute()) if is_path(profile) else profile
 
 
@@ -160,7 +160,7 @@ def rolling_folder(logs: Path, profile: Profile) -> Path:
 
 
 def lacks_mcap() -> bool:
-    """Whether what writes recordings is not installed."""
+    """Whether the library that writes recordings is missing."""
     return any(find_spec(name) is None for name in ("mcap", "rosbags", "zstandard"))
 
 
@@ -189,7 +189,7 @@ def reject_wrong(
 ) -> None:
     """Exit with the errors of ``vla-zenoh profile check``, if there are any.
 
-    A process of its own checks: models are imported there, which may take much memory.
+    A separate process checks: models are imported there, which may take much memory.
     """
     words = ["profile", "check", profile]
     words += ["--host", host] if host is not None else []

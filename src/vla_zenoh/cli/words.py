@@ -1,7 +1,7 @@
 """The commands that start at once, with their options, and a parser of them without Typer.
 
-A test compares the table with the signatures of the commands. What is not parsed here, ``--help``
-and mistakes above all, goes by Typer.
+A test compares the table with the signatures of the commands. Everything else, ``--help`` and
+mistakes above all, is left to Typer.
 """
 
 from __future__ import annotations

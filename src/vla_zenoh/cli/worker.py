@@ -36,7 +36,7 @@ def worker(
     """Run a model: observations in, action chunks out on its delta key."""
     profile = effective_profile(node.profile, node.connect, host=host)
     chosen = model_options.choose(profile, model, name)
-    # Returns only where this environment has what the model's header asks for.
+    # Returns only if this environment has what the model's header asks for.
     run_in_own_environment(chosen.model, model_options.python)
     policy = make_policy(chosen.model, chosen.options, profile=node.profile)
     if sys.stdout.isatty():

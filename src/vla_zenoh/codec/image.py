@@ -1,9 +1,9 @@
-"""Pictures: raw pixels with their size in the header's place, a plain JPEG file, and depth as a
-plain PNG file of 16 bits.
+"""Images: raw pixels with their size in the encoding, plain JPEG files, and depth as plain 16-bit
+PNG files.
 
-Raw frames are prefixed by nothing: the shape travels in the sample's encoding schema
-(``zenoh/bytes;rgb8;480x640``), so that the payload is the pixels and no more. That of a depth
-picture says how far a count is (``image/png;depth16;0.001``: 1 mm).
+Raw frames have no prefix: the shape travels in the sample's encoding schema
+(``zenoh/bytes;rgb8;480x640``), so that the payload is just the pixels. That of a depth image gives
+the metres of a count (``image/png;depth16;0.001``: 1 mm).
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ MAX_PIXELS = 8192 * 4096
 """A few forged bytes of JPEG can ask for this many pixels; three bytes of memory each."""
 MAX_JPEG_BYTES = 32 * 1024 * 1024
 MAX_IMAGE_BYTES = 3 * MAX_PIXELS
-"""Of any form."""
+"""Of an image in any form."""
 DEFAULT_JPEG_QUALITY = 90
 MAX_PNG_BYTES = 64 * 1024 * 1024
 
 PNG_BEGINS, PNG_ENDS = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 _GREY_16 = bytes((16, 0, 0, 0, 0))
 """Bits, colour type, compression, filter and interlace of a PNG's first chunk."""
-# Of noisy pictures, as cameras give them, the fastest way and the smallest file.
+# For noisy camera images: the fastest setting, and the smallest file.
 _PNG_WAY = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
 _DEPTH_SCHEMA = re.compile(r"depth16;([0-9]{1,3}(?:\.[0-9]{1,12})?(?:e-?[0-9]{1,2})?)")
 
@@ -40,7 +40,7 @@ _WITHOUT_LENGTH = frozenset({0x00, 0x01}) | frozenset(range(0xD0, 0xDA))
 
 
 def raw_schema(image: Image) -> str:
-    """What goes into the encoding's schema for this picture: ``rgb8;HEIGHTxWIDTH``."""
+    """The encoding's schema for this image: ``rgb8;HEIGHTxWIDTH``."""
     height, width, _ = image.rgb.shape
     return f"rgb8;{height}x{width}"
 
@@ -51,7 +51,7 @@ def encode_raw(image: Image) -> bytes:
 
 
 def decode_raw(payload: bytes, schema: str) -> Image:
-    """Pixels back to a picture without copying.
+    """An image from its pixels, without copying.
 
     Raises:
         CodecError: schema or length do not fit.
@@ -70,7 +70,7 @@ def encode_jpeg(image: Image, quality: int = DEFAULT_JPEG_QUALITY) -> bytes:
     """A JPEG file.
 
     Raises:
-        CodecError: the picture is larger than `decode_jpeg` reads.
+        CodecError: the image is larger than `decode_jpeg` reads.
     """
     height, width, _ = image.rgb.shape
     check_size(height, width)
@@ -101,13 +101,13 @@ def decode_jpeg(payload: bytes) -> Image:
         raise CodecError("malformed", f"not a JPEG file: {error.err}") from error
     if bgr is None:
         raise CodecError("malformed", "not a JPEG file that can be decoded")
-    # In place: a large picture is not held twice.
+    # In place: a large image is not held twice.
     rgb: NDArray[np.uint8] = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB, dst=bgr), np.uint8)
     return Image(rgb)
 
 
 def depth_schema(depth: Depth) -> str:
-    """What goes into the encoding's schema for this depth picture: ``depth16;METRES``."""
+    """The encoding's schema for this depth image: ``depth16;METRES``."""
     return f"depth16;{depth.unit_m:.9g}"
 
 
@@ -115,7 +115,7 @@ def encode_depth(depth: Depth) -> bytes:
     """A PNG file of 16 bits that `decode_depth` reads, pixel for pixel.
 
     Raises:
-        CodecError: the picture is larger than that.
+        CodecError: the image is larger than that.
     """
     check_size(*depth.counts.shape)
     ok, data = cv2.imencode(".png", depth.counts, _PNG_WAY)
@@ -125,11 +125,11 @@ def encode_depth(depth: Depth) -> bytes:
 
 
 def decode_depth(payload: bytes, schema: str) -> Depth:
-    """A PNG file of 16 bits back to a depth picture.
+    """A depth image from a PNG file of 16 bits.
 
     Raises:
-        CodecError: the schema does not say the unit; not a whole PNG file of one channel of 16
-            bits, or larger than we read.
+        CodecError: the schema lacks the unit; not a whole PNG file of one channel of 16 bits, or
+            larger than we read.
     """
     match = _DEPTH_SCHEMA.fullmatch(schema)
     if match is None:
@@ -145,7 +145,7 @@ def decode_depth(payload: bytes, schema: str) -> Depth:
     width, height = (int.from_bytes(payload[at : at + 4], "big") for at in (16, 20))
     check_size(height, width)
     if payload[24:29] != _GREY_16:
-        raise CodecError("invalid", "a depth picture is a PNG file of one channel of 16 bits")
+        raise CodecError("invalid", "a depth image is a PNG file of one channel of 16 bits")
     try:
         counts = cv2.imdecode(np.frombuffer(payload, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
@@ -175,8 +175,8 @@ def check_size(height: int, width: int) -> None:
 def _jpeg_size(payload: bytes) -> tuple[int, int]:
     """Height and width from the frame header, read before any memory is taken for pixels.
 
-    Stricter than decoders are: where they would pass over something that this walk reads in another
-    way, a second frame header could hide.
+    Stricter than decoders are: where they skip data that this walk reads in another way, a second
+    frame header could hide.
     """
     at = 2
     while at + 9 <= len(payload):

@@ -87,7 +87,7 @@ def unpack(payload: bytes, from_map: Callable[[dict[Any, Any]], Any] | None = No
         from_map: makes the array of a map that stands for one, see `make_array`; None: openpi's.
 
     Raises:
-        CodecError: whatever else the bytes are.
+        CodecError: the bytes are anything else.
     """
     if len(payload) > MAX_PAYLOAD_BYTES:
         raise CodecError(
@@ -122,7 +122,7 @@ def unpack(payload: bytes, from_map: Callable[[dict[Any, Any]], Any] | None = No
 
 
 def count_containers(error: Callable[[str], Exception] = _malformed) -> Callable[[Any], Any]:
-    """A hook that gives back what it is given, and raises at the one too many of `MAX_CONTAINERS`.
+    """A hook that returns its argument, and raises when there are more than `MAX_CONTAINERS`.
 
     Args:
         error: makes the exception of a sentence.

@@ -1,6 +1,6 @@
-"""Requests for guarded primitives, and their answers: JSON, so that any language can ask.
+"""Requests for guarded primitives, and their answers: JSON, for clients in any language.
 
-A request that is not understood is answered by what is wrong with which field; see `Answer`.
+An invalid request is answered with what is wrong with which field; see `Answer`.
 """
 
 from __future__ import annotations
@@ -157,7 +157,7 @@ class Until(_Part):
         inside: the TCP is in this box.
         force_n: the force on the arm has changed by this since the start.
         still_s: neither arm nor gripper has moved for this long, after a first motion.
-        done: the model says that it is done.
+        done: the model reports that it is done.
     """
 
     gripper: Literal["open", "closed"] | None = None
@@ -224,18 +224,18 @@ class Answer:
     """How a primitive ended, and where the arm stands.
 
     Args:
-        ok: it did what was asked.
+        ok: the request was fulfilled.
         reason: short stable name: ``reached``; of a run the name of the condition; otherwise
             ``timeout``, ``bound`` (a limit stopped the motion), ``stopped``, ``fault``,
-            ``deactivated``, ``ended`` (by the command node; `why` says more), or, before anything
+            ``deactivated``, ``ended`` (by the command node; `why` has details), or, before anything
             moved, ``busy``, ``rejected``, ``invalid``.
-        why: a sentence; empty where nothing is to be said.
+        why: a sentence; empty if there is nothing to add.
         took_s: duration.
-        position_m: of the TCP in the base frame; None where it is not known.
+        position_m: of the TCP in the base frame; None if unknown.
         quat_xyzw: of the TCP.
         joints_rad: name -> position.
         width_m: of the gripper.
-        holding: it holds something.
+        holding: it holds an object.
         off_m: distance from the target of a motion.
         off_rad: angle to it; of a motion of joints that are commanded the largest of theirs.
     """
@@ -264,7 +264,7 @@ def decode_answer(payload: bytes) -> Answer:
     """Read an answer.
 
     Raises:
-        CodecError: it is none.
+        CodecError: not an answer.
     """
     if len(payload) > MAX_ANSWER_BYTES:
         raise CodecError("oversize", f"{len(payload)} bytes, at most {MAX_ANSWER_BYTES} are read")

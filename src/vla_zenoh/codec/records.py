@@ -19,7 +19,7 @@ Record = TypeVar("Record")
 
 MAX_RECORD_BYTES = 4 * 1024 * 1024
 SMALL_BYTES = 1024 * 1024
-"""Any record but chunks, specs and what nodes say of themselves is smaller."""
+"""All records but chunks, specs and node statuses are smaller."""
 
 
 def encode(record: Any) -> bytes:
@@ -42,7 +42,7 @@ def decode(kind: type[Record], payload: bytes) -> Record:
 
     Raises:
         CodecError: reason ``oversize``, ``malformed`` (not such a map) or ``invalid`` (a value that
-            the record refuses: NaN, wrong shape, out of range).
+            the record rejects: NaN, wrong shape, out of range).
     """
     _check_length(kind, payload)
     frame = _frames.get((kind, len(payload)))
@@ -300,8 +300,8 @@ def decode_header(attachment: bytes | None) -> Header:
     """Read an attachment.
 
     Raises:
-        CodecError: ``no_header``, ``malformed``, ``schema`` for another version, or ``invalid``
-            for a value out of range. Fields that a later version may add are passed over.
+        CodecError: ``no_header``, ``malformed``, ``schema`` for another version, or ``invalid`` for
+            a value out of range. Fields that a later version may add are ignored.
     """
     if attachment is None:
         raise CodecError("no_header", "the sample has no attachment; streams carry a header there")

@@ -1,4 +1,4 @@
-"""Plain text that people and foreign clients put on the setting keys, to values and back.
+"""Converts plain text that people and other clients put on the setting keys to values and back.
 
 No envelope, no header: ``true`` on ``active`` is all it takes from any language.
 """
@@ -113,7 +113,7 @@ def decode_name(payload: bytes) -> str:
     """A worker's name: one word that can stand in a key.
 
     Raises:
-        CodecError: it cannot; says what is allowed.
+        CodecError: it cannot; lists what is allowed.
     """
     word = decode_text(payload)
     try:

@@ -23,7 +23,7 @@ from vla_zenoh.types import FloatArray, unit_quaternion
 
 Steps = NDArray[np.float32] | NDArray[np.float64]
 FURTHEST_RAD = 4 * math.pi
-"""No joint has a target further from zero; degrees are."""
+"""No joint target is further from zero; one in degrees is."""
 GRIPPER_SLACK = 0.25
 """A fraction outside [0, 1] by up to this is rounding of a model, and clipped."""
 GRIPPER_SLACK_M = 0.05
@@ -169,8 +169,8 @@ def step_width(
     """The gripper width that a step asks for, from `before_m`; None: the model has no gripper.
 
     Raises:
-        RecordError: a number that this meaning cannot have. The message names the meaning: usually
-            the spec declares another one than the model has.
+        RecordError: a number that is impossible by the declared meaning. The message names it:
+            usually the spec declares another meaning than the model's.
     """
     if spec.gripper == "none":
         return None

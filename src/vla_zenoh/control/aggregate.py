@@ -14,8 +14,8 @@ several rotations is that on SO(3), ``sum_i w_i log(R_i R^T) = 0``. The width is
 
 Only plans of one episode since the last hold are mixed: a new prompt counts at once.
 
-In every mode a later chunk stands on ``G(t)`` of the newest plan alone: that is what was asked for,
-the mode only says how to get there. So no step is lost or counted twice, and once the last plan is
+In every mode a later chunk builds on ``G(t)`` of the newest plan alone: that is the request, the
+mode only decides how to get there. So no step is lost or counted twice, and once the last plan is
 alone the goal is exactly where its steps end. ``F`` lies between bounded goals, and inside the
 workspace, which is convex.
 
@@ -111,7 +111,7 @@ def _with_rest(mixed: Goal, waypoints: Sequence[Goal]) -> Goal:
 
 
 def mean_goal(goals: Sequence[Goal], weights: FloatArray) -> Goal:
-    """Weighted mean of goals, in the space that the last of them is asked for in."""
+    """Weighted mean of goals, in the space (poses or joints) of the last of them."""
     last, weights = goals[-1], weights[: len(goals)]
     joints = [goal.joints_rad for goal in goals if goal.joints_rad is not None]
     if last.arm is None or len(joints) < len(goals):

@@ -58,7 +58,7 @@ _WAYS = (
     (Synchronization.No, False),
     (Synchronization.No, True),
 )
-"""Of planning a motion, in this order: how axes are synchronised, and `slowly` of `_input`."""
+"""Attempts at planning a motion, in order: how axes are synchronised, `slowly` of `_input`."""
 
 
 class Shares(NamedTuple):
@@ -501,7 +501,7 @@ class AxisSmoother:
 def stop_way(
     velocity: FloatArray, acceleration: FloatArray, box: FloatArray, ahead_s: float
 ) -> FloatArray:
-    """How far (n,) a stop of all axes together that begins in `ahead_s` goes at most.
+    """Longest distance (n,) of a stop of all axes together that begins in `ahead_s`.
 
     Args:
         velocity: (n,) of the axes.
@@ -530,10 +530,10 @@ def _across(along: FloatArray) -> FloatArray:
 def line_of(
     way: FloatArray, velocity: FloatArray, acceleration: FloatArray, pace: float
 ) -> FloatArray | None:
-    """The direction of a motion on a straight line through its target, None if it is on none.
+    """Direction of a motion on a straight line through its target, None if it is on none.
 
-    That of the way if there is one; the motion's own where the target is about to be passed, and
-    so near that its direction is rounding. Zero where there is neither way nor motion.
+    That of the displacement if there is one; the motion's own if the target is about to be passed
+    and so near that the displacement is rounding. Zero without displacement and motion.
     """
     motion = np.stack([way, velocity / pace, acceleration / pace**2])
     lengths = np.sqrt((motion * motion).sum(axis=1))

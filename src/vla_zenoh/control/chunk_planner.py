@@ -253,7 +253,7 @@ class ChunkPlanner:
                 return _not_measured(self._gap_ns)
             base = measured
         if action.space == "joint" and base.arm is None:
-            # Once: the elbow of a pose is that of the moment.
+            # Once: the elbow of a pose depends on the moment.
             assert self._reach is not None
             base = joint_goal(self._reach.kinematics, self._joints_at(base), base.width_m)
         steps = np.asarray(record.steps[:count, columns], np.float64)
@@ -438,7 +438,7 @@ class ChunkPlanner:
         return step
 
     def _joints_at(self, goal: Goal) -> FloatArray:
-        """(n,) those asked for, or those of the pose asked for, with the arm's present elbow."""
+        """(n,) joints of the goal, or those of its pose with the arm's present elbow."""
         if goal.arm is not None and goal.joints_rad is not None:
             return goal.joints_rad
         assert self._reach is not None
@@ -520,7 +520,7 @@ OVERTAKEN = Rejection("overtaken", "a newer chunk came before it was planned", q
 
 
 def _superseded(chunk: Stamped[ActionChunk], episode: int | None) -> Rejection | None:
-    """Why a chunk that was valid on arrival is not any more."""
+    """Why a chunk that was valid on arrival no longer is."""
     if chunk.record.episode == episode:
         return None
     return Rejection("superseded", "the arm was stopped or got a new task meanwhile", quiet=True)

@@ -151,7 +151,7 @@ def _validate_times(
 def validate_steps(
     action: ActionSpec, steps: FloatArray, start: Goal, limits: Limits, max_width_m: float
 ) -> Rejection | None:
-    """Why no step of this meaning can have such numbers, None where all of them can.
+    """Why these numbers are impossible for steps of this meaning, None if all are possible.
 
     All steps are checked before the arm follows the first one.
 
@@ -201,7 +201,7 @@ def validate_steps(
 
 
 def _validate_targets(positions_m: FloatArray, limits: Limits) -> Rejection | None:
-    """Why absolute targets (n, 3) are too far outside the workspace box to be meant."""
+    """Why absolute targets (n, 3) are too far outside the workspace box to be intended."""
     box, most_m = limits.workspace, REJECT_FACTOR * limits.step_m
     away_m = np.linalg.norm(positions_m - np.clip(positions_m, *workspace_corners(limits)), axis=1)
     for index in (away_m > most_m).nonzero()[0]:

@@ -93,7 +93,7 @@ class CommandedPart:
             self.gripper_state = states.gripper
 
     def measure(self) -> str:
-        """Track whether the arm stands; why its joints are not those of this arm, or empty."""
+        """Track whether the arm stands; returns why these joints are not this arm's, or empty."""
         if self.pose is None:
             return ""
         joint = self.joint.record if self.joint else None
@@ -116,7 +116,7 @@ class CommandedPart:
     def reasons_against(
         self, worker: str, spec: ModelSpec | None, chunk: Stamped[ActionChunk] | None, now_ns: int
     ) -> list[str]:
-        """Reasons by the joints of the arm, and by what the worker asks of them."""
+        """Reasons from the joints of the arm, and from what the worker asks of them."""
         bounds, reasons = self.planner.joint_bounds, list[str]()
         if bounds is not None and self.pose is not None:
             reasons += joint_state_faults(
@@ -163,7 +163,7 @@ class CommandedPart:
     def lost(
         self, peers: PeerSnapshot, worker: str, lease: Lease, now_ns: int, *, moves: bool
     ) -> tuple[str, list[Event]]:
-        """Why the arm cannot go on, empty if it can, and events.
+        """Why the arm cannot continue, empty if it can; and events.
 
         Args:
             peers: the other nodes.
@@ -192,11 +192,11 @@ class CommandedPart:
         return f"robot state lost: joints {silent_s:.3f} s old, at most {patience_s:g} s"
 
     def monitor_late(self, now_ns: int) -> bool:
-        """The joints have been due for monitoring for long."""
+        """Monitoring of the joints is long overdue."""
         return self._joint_monitor is not None and self._joint_monitor.late(now_ns)
 
     def monitor_joints(self, now_ns: int, *, obeying: bool) -> LimitHit | None:
-        """Slow the arm down if its measured joints come near to a bound; a bound to brake at.
+        """Slow the arm down if its measured joints come near a bound; returns a bound to brake at.
 
         Raises:
             RecordError: joints of another arm.
@@ -227,7 +227,7 @@ class CommandedPart:
             events.append(make_event("warning", "limit", name, "stopped", value, limit))
             why = (
                 f"something presses against the arm: {name} {value:.1f} {unit}, "
-                f"at most {limit:g} {unit}; it is led back"
+                f"at most {limit:g} {unit}; it retreats"
             )
             retreats = True
         if retreats and commanded is not None:
@@ -248,7 +248,7 @@ class CommandedPart:
         return alive and gripper.record.mode == "ready" and not gripper.record.faults
 
     def _load_sensing(self) -> list[Event]:
-        """The event that the arm measures loads from now on, or no more."""
+        """Event when the robot begins or ceases to measure external loads."""
         if self.contact.known is self._load_known:
             return []
         self._load_known = self.contact.known

@@ -82,7 +82,7 @@ class Commander:
         self.dry_run = dry_run
         self.state = State.INACTIVE
         self.why = "not activated yet"
-        self._ended = ""  # why the last activation did, if nobody ended it
+        self._ended = ""  # why the last activation did, if not on request
         asked = profile.task
         self.task = Task(0, False, asked.prompt, asked.worker, asked.rate_hz, asked.speed_percent)
         self.lease: Lease | None = None
@@ -346,7 +346,7 @@ class Commander:
         before = self.task.speed
         self.task = replace(self.task, speed_percent=percent)
         self._watchdog.override_changed(now_ns, before, self.task.speed)
-        # The scene may have changed during a pause: the rest of an old chunk is not carried out.
+        # The scene may have changed during a pause: the rest of an old chunk is not executed.
         oldest_ns = now_ns - int(self.profile.timing.max_observation_age_s * 1e9)
         paused = self.state in OBEYING and not before
         forgotten = [part.motion.forget_plan(oldest_ns, now_ns) for part in self.parts if paused]

@@ -32,7 +32,7 @@ from vla_zenoh.policy import ControllerSpec
 from vla_zenoh.types import FloatArray
 
 NO_CUT = 1e-9
-"""A way or a turn that is cut by less is whole."""
+"""A translation or rotation that is shortened by less counts as complete."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

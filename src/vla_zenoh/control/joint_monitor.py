@@ -8,9 +8,8 @@ joint's range, singular value, distances of the arm to itself and to the table):
 
 `PAST` allows for the tracking error of an arm that works at a stop. A value approaches when it
 leaves a band that follows it: noise within the band does not count, a slow drift does. In addition,
-no joint may be far from its command or, where poses are commanded, from where a model has it whose
-TCP follows the measured one: beyond ``limits.elbow_rad`` the arm slows down, at twice that it
-brakes.
+no joint may be far from its command or, if poses are commanded, from its place in a model whose TCP
+follows the measured one: beyond ``limits.elbow_rad`` the arm slows down, at twice that it brakes.
 """
 
 from __future__ import annotations
@@ -71,7 +70,7 @@ class JointMonitor:
         return slowest(self._bound_slowdown, self._elbow_slowdown)
 
     def late(self, now_ns: int) -> bool:
-        """A check has been due for as long as it takes to become due again."""
+        """A check is overdue by a whole period."""
         return now_ns >= self._next_ns + PERIOD_NS // 2
 
     def update(
@@ -88,7 +87,7 @@ class JointMonitor:
             measured_rad: (n,) in chain order.
             commanded_rad: (n,) joint commands; None: poses are commanded.
             now_ns: time of this tick.
-            in_joints: joints are asked for, to which a singularity does not matter.
+            in_joints: joints are commanded; then singularities do not matter.
 
         Returns:
             the bound for which the arm has to brake, None without one.
@@ -164,9 +163,9 @@ def _slowdown(name: str, share: float, value: float, limit: float, where: str) -
 
 JOINT_PATIENCE_S = 0.1
 SAME_TCP_M, SAME_TCP_RAD = 0.005, 0.02
-"""Kinematics and the robot's own word on its TCP may differ by this much."""
+"""Largest difference of the TCP by kinematics from the TCP that the robot reports."""
 HELD_RAD = 0.1
-"""A joint may be so far from where its controller holds it."""
+"""Largest distance of a joint from where its controller holds it."""
 
 
 def joint_state_faults(
@@ -176,7 +175,7 @@ def joint_state_faults(
     pose: Stamped[PoseState],
     now_ns: int,
 ) -> list[str]:
-    """Whether the kinematics know this robot: joints heard, and their TCP where it is said to be.
+    """Whether the kinematics fit this robot: joints are received, their TCP is the reported one.
 
     Args:
         profile: the effective profile.
@@ -186,7 +185,7 @@ def joint_state_faults(
         now_ns: same clock as the records' ``received_ns``.
     """
     if joint is None:
-        return ["the joints are not known: nothing was heard on state/joint"]
+        return ["the joints are not known: nothing received on state/joint"]
     age_s = (now_ns - joint.received_ns) / 1e9
     if age_s > profile.timing.state_timeout_s + JOINT_PATIENCE_S:
         return [f"the joint state is {age_s:.2f} s old"]
@@ -204,11 +203,11 @@ def joint_state_faults(
 
 
 def _elbow_is_not_held(profile: Profile, joint: JointState, pose: PoseState) -> list[str]:
-    """Whether joints that are to be commanded begin far from where they are.
+    """Whether joint commands would begin far from the measured joints.
 
-    They begin where the robot's controller holds them. A TCP that is far from there is blocked and
-    led back, with all its joints; where it is not, the elbow was moved by itself, and would be
-    pulled to where it once was.
+    They begin where the robot's controller holds the joints. If the TCP is far from there the arm
+    is blocked, and retreats with all its joints; otherwise only the elbow was moved, and would be
+    pulled back.
     """
     if profile.robot.command != "joint" or joint.reference_rad is None:
         return []

@@ -44,7 +44,7 @@ CORRECTIONS = 4
 PLACES = np.array([0.25, 0.5, 0.75, 1.0])
 """Places of a motion at which it is checked."""
 PARTS = (1.0, 0.5, 0.25, 0.125)
-"""Of the way to a goal in the box that are tried, the longest on the leash first."""
+"""Shares of the displacement to a goal in the box that are tried, longest on the leash first."""
 STOP_PLACES = np.linspace(0.125, 1.0, 8)
 """Parts of the time of a stop at which it is checked."""
 ARC_RAD = 0.25
@@ -125,7 +125,7 @@ class JointBounds:
     def far_out_of_range(
         self, action: ActionSpec, steps: FloatArray, base_rad: FloatArray
     ) -> Rejection | None:
-        """Why targets (n, D) in chain order are too far outside their ranges to be meant."""
+        """Why targets (n, D) in chain order are too far outside their ranges to be intended."""
         asked_rad = np.array([step_joints(action, step, base_rad, base_rad) for step in steps])
         away_rad = np.maximum(self.lower_rad - asked_rad, asked_rad - self.upper_rad)
         mosts = REJECT_FACTOR * self._of_each(self.limits.step_rad, self.limits.step_m)
@@ -381,7 +381,7 @@ class JointPath(AxisSmoother):
             self._held = True
 
     def _go_on(self) -> None:
-        """Move on after a brake before a bound, if the straight way to the goal is free."""
+        """Continue after a brake before a bound, if the straight way to the goal is free."""
         goal, shares, all_to_stop = self._asked
         assert goal.joints_rad is not None
         self._held = False
@@ -434,7 +434,7 @@ class JointPath(AxisSmoother):
         hits, self._hits = self._hits, []
         return hits
 
-    # -- as a pose's motion is asked ----------------------------------------------------------
+    # -- the same interface as for poses ------------------------------------------------------
     def way_to(self, goal: Goal) -> FloatArray:
         """(n,) from the commanded joints to those of `goal`."""
         assert goal.joints_rad is not None

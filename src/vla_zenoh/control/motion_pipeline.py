@@ -64,7 +64,7 @@ HELD_JOINT_RAD = 0.004
 HELD_LEAD_M, HELD_LEAD_RAD = 0.01, 0.02
 """The goal of an arm that another part holds up leads it by this much at most."""
 SAME_POSE = 1e-6
-"""m and rad: joints whose TCP is this near to a pose have it."""
+"""m and rad: joints whose TCP is this near to a pose reach it."""
 SETTLED, SETTLED_NS = 5e-4, 100_000_000
 """A robot that moves by less than this, in m and rad, for this long stands."""
 
@@ -184,7 +184,7 @@ class MotionPipeline:
 
     @property
     def stuck(self) -> str:
-        """Why the arm will not get where it was asked to, empty while it follows."""
+        """Why the arm will not reach its goal, empty while it follows."""
         if self._joints is None or self.in_joints:
             return self._no_joints
         return self._no_joints or self._joints.stuck
@@ -350,7 +350,7 @@ class MotionPipeline:
         return kinematics.joints_of(joint)
 
     def _width_to_keep(self, gripper: GripperState) -> float:
-        """The width sent last while the gripper obeys it: another one would end a grasp."""
+        """The width sent last while the gripper follows it: another one would end a grasp."""
         sent_m = self.gripper.sent_m
         if sent_m is not None and (
             abs(sent_m - gripper.width_m) < SAME_WIDTH_M
@@ -507,7 +507,7 @@ class MotionPipeline:
         return Leashed(replace(goal, pose=pose, joints_rad=None) if hits else goal, hits)
 
     def _well_within_leash(self, motion: Motion, goal: Pose, ahead_s: float) -> bool:
-        """Whether the leash is long enough wherever the arm is by then; cheaper to see than where.
+        """Whether the leash is long enough wherever the arm will be; cheaper than computing where.
 
         It moves no further than at its speed plus what the acceleration adds.
         """
@@ -525,7 +525,7 @@ class MotionPipeline:
     def _cut_lead(
         self, mover: Smoother | JointPath, plans: Sequence[Plan], goal: Goal, now_ns: int
     ) -> None:
-        """Keep the goal of an arm that has to stand close to it, so that it can be led back."""
+        """Keep the goal of an arm that has to stand close to it, so that the arm can retreat."""
         if isinstance(mover, JointPath):
             assert goal.joints_rad is not None
             here_rad = mover.state.position

@@ -77,7 +77,7 @@ class PartSpacing:
         self._slow_m = max(limit.part_slow_m for limit in limits)
         self._within_m = max(self._slow_m, self._stop_m) + FAR_M
         self.nearest = Nearest(self._within_m)
-        """Of the commanded joints at the last look."""
+        """Distance of the commanded joints when last computed."""
         self._skip = 0
         self._held = False
         self._slower = False
@@ -88,7 +88,7 @@ class PartSpacing:
         Args:
             now_ns: time of this tick.
             ahead_s: until the next look.
-            moves: the arms are being led to their goals; else they brake or stand.
+            moves: the arms move to their goals; else they brake or stand.
         """
         if not moves:
             self._held = self._slower = False
@@ -152,18 +152,18 @@ class PartSpacing:
         """The nearest links anywhere on two straight motions of the joints."""
         found = Nearest(self._within_m if within_m is None else within_m)
         for i, j, pair in self._pairs:
-            moves = [not np.array_equal(starts[k], ends[k]) for k in (i, j)]
-            for one, other in itertools.product(
-                SHARES if moves[0] else SHARES[:1], SHARES if moves[1] else SHARES[:1]
-            ):
-                first_rad = starts[i] + one * (ends[i] - starts[i])
-                second_rad = starts[j] + other * (ends[j] - starts[j])
-                near = pair.nearest(first_rad, second_rad, found.distance_m)
-                if near.distance_m < found.distance_m:
-                    names = self._parts[i].name, self._parts[j].name
-                    found = Nearest(
-                        near.distance_m, f"{names[0]} {near.first}", f"{names[1]} {near.second}"
-                    )
+            first, second = (
+                [starts[k]]
+                if np.array_equal(starts[k], ends[k])
+                else [starts[k] + share * (ends[k] - starts[k]) for share in SHARES]
+                for k in (i, j)
+            )
+            near = pair.nearest(first, second, found.distance_m)
+            if near.distance_m < found.distance_m:
+                names = self._parts[i].name, self._parts[j].name
+                found = Nearest(
+                    near.distance_m, f"{names[0]} {near.first}", f"{names[1]} {near.second}"
+                )
         return found
 
     def measured_m(self, joints_rad: Mapping[str, FloatArray]) -> Nearest:

@@ -166,7 +166,7 @@ class Plan:
         episode: of the chunk.
         steps_before: steps of the episode asked for until its observation was taken.
         steps_total: steps of the episode, as far as the policy has ended it.
-        done: the policy says that these steps are the last.
+        done: the policy reports that these steps are the last.
         arrival_ns: when the chunk arrived.
         clock: plan time. `dt_ns` is in plan time, the other times are wall time.
         soonest: the arm moves to each goal as fast as it can, and waits there for the next one.

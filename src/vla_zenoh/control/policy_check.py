@@ -345,7 +345,7 @@ def lost_motion(jacobian: NDArray[np.float64], twist: NDArray[np.float64]) -> ND
 
 
 def immovable_axes(jacobian: NDArray[np.float64]) -> tuple[str, ...]:
-    """Axes along or about which the TCP cannot move without moving otherwise too."""
+    """Axes along or about which the TCP cannot move without other motion."""
     return tuple(
         name
         for index, name in enumerate(AXES)
@@ -357,7 +357,7 @@ def immovable_axes(jacobian: NDArray[np.float64]) -> tuple[str, ...]:
 def outside_workspace_m(spec: ActionSpec, steps: Steps, limits: Limits) -> NDArray[np.float64]:
     """(H,) distance of absolute targets to the workspace box along the worst axis; inside below 0.
 
-    Without `control.limits`, which needs Ruckig: a model is checked where there is none, too.
+    Without `control.limits`, which needs Ruckig: models are also checked where that is missing.
     """
     box = limits.workspace
     low, high = np.array([box.x_m, box.y_m, box.z_m]).T

@@ -50,12 +50,12 @@ BRAKE_S = 0.1
 CREEPING, STUCK_S = 0.05, 0.5
 """A pose that advances at less than this pace for this long will not be reached."""
 OUTSIDE_M = 1e-3
-"""An arm further outside the box than this started there, and is led in."""
+"""An arm further outside the box than this started there, and is moved inside."""
 DAMPING = 1e-5
 RESTING_STEPS = 2
 """Newton steps to the joints of a resting pose."""
 ELBOW_S = 0.1
-"""An elbow that is let go moves on for about this long."""
+"""A released elbow continues to move for about this long."""
 
 
 class PoseToJoint:

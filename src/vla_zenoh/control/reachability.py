@@ -61,7 +61,7 @@ class BoundedStep(NamedTuple):
     """A step within what the arm can do.
 
     Args:
-        pose: its end: the very pose asked for if no limit acted, its start if nothing is left.
+        pose: its end: exactly the requested pose if no limit acted, its start if nothing is left.
         hits: limits that acted.
         joints_rad: (n,) of the model at its end.
         slowdown: why it is slower than full speed.

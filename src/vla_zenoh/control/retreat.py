@@ -36,7 +36,7 @@ PLACES = 60
 RAD_AS_M = 0.05
 """A rotation by 1 rad counts as this distance."""
 STRAY_M, STRAY_RAD = 0.01, 0.05
-"""An arm further away than when it was blocked, plus the brake and this, is not led back."""
+"""An arm further away than when it was blocked, plus the brake and this, does not retreat."""
 
 
 class CommandTrail:
@@ -187,10 +187,10 @@ class Retreat:
         if apart_m > most_m or apart_rad > most_rad:
             self.end()
             where = f"{apart_m:.3f} m and {apart_rad:.2f} rad from its command"
-            why = f"the arm is not led back: it is {where}"
+            why = f"the arm does not retreat: it is {where}"
             return RetreatStep(None, make_event("warning", "notice", "retreat", why))
         on_m = norm3(measured.position_m - begun.measured.position_m)
-        # It does not return to where a person has pushed it away from since.
+        # It does not return to a pose from which a person has pushed it away since.
         here = np.array(_place(measured))
         into = _place(commanded) - here
         self._ahead = [
@@ -219,5 +219,5 @@ class Retreat:
         self.end()
         force_n = self._contact.force_n
         force = "" if force_n is None else f", external force {force_n:.1f} N"
-        why = f"the arm was led back: {why}{force}"
+        why = f"the arm retreated: {why}{force}"
         return RetreatStep(None, make_event("info", "notice", "retreat", why))

@@ -32,11 +32,11 @@ class StateHistory(Generic[State]):
             self._states.append(measured.record)
 
     def add(self, measured: Stamped[State], tolerance_ns: int) -> None:
-        """Keep a state; where time goes back, a clock was set: only this one.
+        """Add a state; if time goes back, a clock was set, and only this state is kept.
 
         Args:
             measured: with the time of its measurement.
-            tolerance_ns: it may be stamped later than it was received by this at most.
+            tolerance_ns: the stamp may be later than the arrival by this at most.
         """
         stamp_ns = measured.header.stamp_wall_ns
         if stamp_ns > measured.received_ns + tolerance_ns:
@@ -52,11 +52,11 @@ class StateHistory(Generic[State]):
             self._states.popleft()
 
     def around(self, t_ns: int, gap_ns: int) -> tuple[State, State, float] | None:
-        """The states measured next before and after `t_ns`, and its share of the way between.
+        """The states measured next before and after `t_ns`, and the share of time between them.
 
         Args:
             t_ns: on the clock of the stamps.
-            gap_ns: a state measured longer before than this says nothing of `t_ns`.
+            gap_ns: a state measured longer before `t_ns` than this is not used.
 
         Returns:
             None where no state was measured within `gap_ns` before; the last one before it twice,

@@ -34,11 +34,11 @@ PHASE, PERIOD, DEVIATION = 0.3, 0.1, 0.2
 FIRST_DEVIATION = 0.1
 """Part of the asked period that arrivals are taken to deviate by before that is known."""
 SPARE = 3.0
-"""Mean deviations for which the arm has a way to go when a chunk is late."""
+"""Mean deviations for which the arm still has a distance to go when a chunk is late."""
 CHANGE = 0.4
-"""Part of the way to the speed that is wanted which a moving arm takes at each goal."""
+"""Part of the change to the wanted speed that a moving arm makes at each goal."""
 MOVING = 0.85
-"""Part of that speed from which on it does so; a slower one takes all of it."""
+"""Part of the wanted speed above which it does so; a slower arm takes all of it."""
 SLOWEST = 1e-3
 """Least share of the velocity limits."""
 SOON_NS = 1_000_000
@@ -48,7 +48,7 @@ EASING = 0.1
 
 
 class Arrivals:
-    """When the next chunk is to be expected, in plan time."""
+    """When the next chunk is expected, in plan time."""
 
     def __init__(self) -> None:
         self.restart()
@@ -69,7 +69,7 @@ class Arrivals:
         self._intervals += 1
         expected_ns = self._last_ns + self._period_ns
         late_ns, half_ns = now_ns - expected_ns, 0.5 * self._period_ns
-        # The first intervals say most: a slow model is not asked as often as it was meant to be.
+        # The first intervals weigh most: a slow model is asked less often than requested.
         phase, period = max(PHASE, 1 / self._intervals), max(PERIOD, 1 / self._intervals)
         self._last_ns = min(max(expected_ns + phase * late_ns, now_ns - half_ns), now_ns + half_ns)
         self._period_ns = max(self._period_ns + period * late_ns, 0.5 * asked_period_ns)

@@ -1,7 +1,7 @@
-"""Whether the arm can go to a target, before it moves: the same bounds as of a chunk, ahead of it.
+"""Checks a target of the arm before it moves, with the same bounds as for a chunk.
 
-The way is walked in small steps by the command node's own kinematic model and barriers. It ends
-where a limit leaves nothing of a step.
+The command node's own kinematic model and barriers follow the path in small steps, until a limit
+leaves nothing of a step.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from vla_zenoh.types import FloatArray
 
 STEP_M, STEP_RAD = 0.01, 0.05
 STEP_S = 1.0
-"""Duration of a step of the walk: the arm is slowed down where its joints need more time."""
+"""Duration of a step: the arm is slowed down where its joints need more time."""
 NEAR_M, NEAR_RAD = 5e-4, 1e-3
-"""The target is reached: half of what a primitive promises."""
+"""The target is reached: half the tolerance of a primitive."""
 TRIES = 12
 """Before a barrier each step takes half of what is left."""
 
@@ -40,7 +40,7 @@ class TargetCheck:
         self.bounds = JointBounds(profile, reach.kinematics, reach.barriers)
 
     def pose_fault(self, joints_rad: FloatArray, target: Pose) -> str:
-        """Why the TCP cannot go from joints (n,) straight to `target`; empty where it can."""
+        """Why the TCP cannot go from joints (n,) straight to `target`; empty if it can."""
         here = self.kinematics.forward(joints_rad)
         if why := self._outside(target.position_m, here.position_m):
             return why

@@ -15,7 +15,7 @@ NEVER_NS = 1 << 62
 FIRST_CHUNK_PATIENCE_S = 1.0
 """Extra time for the first chunk after activation: it needs an observation and an inference."""
 BACK_OFF_M, BACK_OFF_RAD = 0.005, 0.02
-"""A blocked arm that is led back counts as blocked again if it strays by this much more."""
+"""A blocked arm that comes back counts as blocked again if it strays by this much more."""
 
 
 class Watchdog:

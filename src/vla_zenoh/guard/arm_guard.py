@@ -24,7 +24,7 @@ STANDING_RAD_S = 0.02
 UNHEEDED = frozenset({"jump", "too_fast", "out_of_range", "names", "moving", "other_mode"})
 """Reasons for which a stream is rejected although no other is followed: its writer must know."""
 UNHEEDED_NS = 200_000_000
-"""The arm reports this for so long after the last such rejection."""
+"""The arm reports this for this long after the last such rejection."""
 ACTIVE_STATES = frozenset(state.value for state in OBEYING)
 """States in which a command node drives the arm; in any other it brakes or stands."""
 SETTLE_NS = 500_000_000
@@ -224,9 +224,9 @@ def make_arm_guard(
 class HeldReference:
     """Whether the robot's own controller still holds the last command it was sent.
 
-    A controller goes on holding that, some way from where the arm is measured, and the next stream
-    has to begin there. It no longer counts once something else moves the arm. Times are of the
-    monotonic clock.
+    A controller keeps holding it, some distance from the measured arm, and the next stream must
+    begin there. It no longer counts once something else moves the arm. Times are of the monotonic
+    clock.
     """
 
     def __init__(self) -> None:

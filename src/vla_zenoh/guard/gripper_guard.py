@@ -35,7 +35,7 @@ class GripperGuard:
     def accept(
         self, order: Stamped[GripperCommand], writer: str, now_ns: int, *, writer_active: bool
     ) -> GripperCommand:
-        """The command to carry out, within the limits of the profile.
+        """The command to execute, within the limits of the profile.
 
         Args:
             order: as received.

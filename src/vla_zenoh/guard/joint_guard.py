@@ -38,7 +38,7 @@ class JointGuardLimits(NamedTuple):
 
 
 class JointSpace:
-    """Space of joint positions (n,). A way beside one is their difference."""
+    """Space of joint positions (n,); an offset is their difference."""
 
     def rest(self, motion: JointReference) -> JointReference:
         """At rest at the position of `motion`."""
@@ -50,11 +50,11 @@ class JointSpace:
         return GovernedPath(np.zeros(len(velocity_rad_s)), velocity_rad_s, acceleration_rad_s2)
 
     def beside(self, base: JointReference, way: GovernedPath) -> JointReference:
-        """The motion that is `way` beside `base`."""
+        """The motion at the offset `way` from `base`."""
         return JointReference(base[0] + way[0], base[1] + way[1], base[2] + way[2])
 
     def apart(self, motion: JointReference, base: JointReference) -> GovernedPath:
-        """The way `motion` is beside `base`."""
+        """The offset of `motion` from `base`."""
         return GovernedPath(motion[0] - base[0], motion[1] - base[1], motion[2] - base[2])
 
     def sizes(self, shares: FloatArray) -> FloatArray:

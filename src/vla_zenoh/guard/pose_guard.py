@@ -29,7 +29,7 @@ from vla_zenoh.types import FloatArray, PoseCommand
 
 TURN_STOP, TURN_BESIDE = 0.55, 0.5
 """Share of a rotation limit for each axis, so that the norm of three stays within it: in a stop,
-and beside a motion that rotates as well."""
+and in an offset from a motion that rotates as well."""
 
 
 class GuardLimits(NamedTuple):
@@ -58,9 +58,9 @@ class GuardLimits(NamedTuple):
 
 
 class PoseSpace:
-    """Space of TCP poses. A way beside one is a translation and the vector r of ``exp3(r) R``.
+    """Space of TCP poses. An offset is a translation and the vector r of ``exp3(r) R``.
 
-    Rates are exact however large r is: the twist of a motion beside another is that of its poses.
+    Rates are exact however large r is: the twist of a motion at an offset is that of its poses.
     """
 
     def rest(self, motion: Motion) -> Motion:
@@ -72,7 +72,7 @@ class PoseSpace:
         return GovernedPath(_STILL, motion.twist, motion.acceleration)
 
     def beside(self, base: Motion, way: GovernedPath) -> Motion:
-        """The motion that is `way` beside `base`."""
+        """The motion at the offset `way` from `base`."""
         turn = exp3(way.value[3:])
         spin, spin_change = spatial_rates(way.value[3:], way.rate[3:], way.change[3:])
         twist, acceleration = base.twist + way.rate, base.acceleration + way.change
@@ -85,7 +85,7 @@ class PoseSpace:
         return Motion(pose, twist, acceleration)
 
     def apart(self, motion: Motion, base: Motion) -> GovernedPath:
-        """The way `motion` is beside `base`."""
+        """The offset of `motion` from `base`."""
         turn = motion.pose.rotation @ base.pose.rotation.T
         rotvec = log3(turn)
         carried = turn @ base.twist[3:]

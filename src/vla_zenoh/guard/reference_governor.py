@@ -66,7 +66,7 @@ Reference = TypeVar("Reference")
 
 
 class GovernedPath(NamedTuple):
-    """Motion beside another one: value, its first and second derivative, (n,) each."""
+    """Offset of one motion from another: value, first and second derivative, (n,) each."""
 
     value: FloatArray
     rate: FloatArray
@@ -74,7 +74,7 @@ class GovernedPath(NamedTuple):
 
 
 class Space(Protocol[Reference]):
-    """Space of references, in which one is a way (n,) beside another."""
+    """Space of references; a `way` (n,) is the offset of one from another."""
 
     def rest(self, motion: Reference) -> Reference:
         """At rest at the place of `motion`."""
@@ -85,15 +85,15 @@ class Space(Protocol[Reference]):
         ...
 
     def beside(self, base: Reference, way: GovernedPath) -> Reference:
-        """The motion that is `way` beside `base`, with its exact rate and change."""
+        """The motion at the offset `way` from `base`, with its exact rate and change."""
         ...
 
     def apart(self, motion: Reference, base: Reference) -> GovernedPath:
-        """The way `motion` is beside `base`: the inverse of `beside`."""
+        """The offset of `motion` from `base`: the inverse of `beside`."""
         ...
 
     def sizes(self, shares: FloatArray) -> FloatArray:
-        """Of shares (..., n) of the limits, what counts for each axis."""
+        """From shares (..., n) of the limits, those that count for each axis."""
         ...
 
 
@@ -105,7 +105,7 @@ class GovernorLimits(NamedTuple):
         acceleration: per axis.
         jerk: per axis.
         axis: share that one axis may use in a stop, where the limits bound a norm.
-        beside: share in a difference, which also rotates with the path it is beside.
+        beside: share in a difference, which also rotates with the commanded path.
     """
 
     velocity: FloatArray

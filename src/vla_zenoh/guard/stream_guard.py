@@ -55,7 +55,7 @@ class CommandStream(Generic[Command]):
         """Why a command is rejected: ``foreign``, ``replayed``, ``late``, or None.
 
         A late command was under way for longer than the stream may be silent: on a link that gets
-        slower and slower the arm would go on long after the writer has braked.
+        ever slower the arm would continue long after the writer has braked.
         """
         reason = self._filter.objection(header)
         if reason is None and self.newest is not None and self._late(header, received_ns):
@@ -288,8 +288,8 @@ class StreamGuard(ABC, Generic[Reference]):
         """Accept a command, or return the reason why it is rejected.
 
         Returns:
-            None, ``foreign``, ``replayed``, ``late``, ``braking``, ``jump``, ``too_fast``, or what
-            else the subclass objects to.
+            None, ``foreign``, ``replayed``, ``late``, ``braking``, ``jump``, ``too_fast``, or a
+            further reason of the subclass.
         """
         objection = self._stream.objection(command.header, command.received_ns)
         if objection is None and self.braking:

@@ -1,4 +1,4 @@
-"""Meaning of a foreign policy's output, by options of the user.
+"""Meaning of an external policy's output, by options of the user.
 
 The same options serve policy servers, LeRobot checkpoints and OpenVLA checkpoints::
 
@@ -106,7 +106,7 @@ _ASKED: Mapping[str, str] = {
 
 @dataclass(frozen=True, slots=True)
 class ActionSemantics:
-    """Converts a foreign policy's output to action steps; made by `read_action_semantics`.
+    """Converts an external policy's output to action steps; made by `read_action_semantics`.
 
     Args:
         spec: of the converted steps, in metres and radians.
@@ -282,7 +282,7 @@ def _gripper_range(chosen: Mapping[str, str]) -> tuple[float, float]:
 
 
 def _not_asked(chosen: Mapping[str, str]) -> set[str]:
-    """Options of `ADDED_TO` that have one meaning only, by the others."""
+    """Options of `ADDED_TO` for which the others leave only one meaning."""
     kind = _JOINT_KINDS.get(chosen["action"], chosen["action"])
     if kind == "velocity":
         return {"controller", "relative_to"}

@@ -1,4 +1,4 @@
-"""Base class of the adapters: models that query a foreign policy server.
+"""Base class of the adapters: models that query an external policy server.
 
 An adapter sends an observation and converts the answer by its options. It waits for an answer for
 at most `timeout_s`. A connection on which anything failed is closed, so that no answer is mistaken
@@ -51,7 +51,7 @@ ANSWERED = ("peer_error", "peer_reply")
 
 
 class Adapter(ABC):
-    """A model that queries a policy server; each subclass in models/ speaks one protocol.
+    """A model that queries a policy server; each subclass in models/ implements one protocol.
 
     Args:
         name: of the model, for its spec.

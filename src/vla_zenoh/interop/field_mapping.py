@@ -1,4 +1,4 @@
-"""Maps our observations to the fields of a foreign policy server, and its answers to action steps.
+"""Maps our observations to fields of an external policy server, and its answers to action steps.
 
 The mapping is made of text options (``--set name=value``). A preset is a set of such options for a
 known robot, each of which can be overridden; the preset ``none`` is empty::

@@ -52,8 +52,8 @@ class JointReading:
     """Newest state of one arm and its gripper, from its joint states.
 
     Args:
-        profile: whose robot it is.
-        kinematics: of that robot.
+        profile: of the robot.
+        kinematics: of the robot.
     """
 
     def __init__(self, profile: Profile, kinematics: Kinematics) -> None:
@@ -76,7 +76,7 @@ class JointReading:
         self.efforts_missing = 0
 
     def take(self, joints: Joints, stamp_ns: int) -> JointState | None:
-        """Take a message; the arm's joints of it, None where it says nothing of the arm.
+        """Process a message; returns the arm's joints in it, None if it has none of the arm.
 
         Args:
             joints: the message.
@@ -123,7 +123,7 @@ class JointReading:
             )
 
     def _velocity(self, position: FloatArray, stamp_ns: int) -> FloatArray:
-        """Difference to the previous message, bounded as two close stamps say little."""
+        """Difference to the previous message, bounded: two close stamps make it noisy."""
         elapsed_s = (stamp_ns - self.stamp_ns) / 1e9
         if self._joints is None or not 0 < elapsed_s < 1:
             return np.zeros(len(position))
@@ -174,7 +174,7 @@ class JointReading:
 
         Args:
             busy: a goal is in flight.
-            wanted_m: width asked for last; where no finger joints are described, it is believed.
+            wanted_m: last commanded width, used if no finger joints are described.
             held: the gripper reports that it holds an object.
         """
         if not self._finger_names:

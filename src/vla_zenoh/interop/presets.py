@@ -33,5 +33,5 @@ OSC = {
 OPENS_AT_1 = {"gripper": "binary", "gripper_open": "high"}
 """As data for OpenVLA and GR00T was converted to; LIBERO's environment takes -1 for open."""
 ADDED = {"anchor": "goal", "relative_to": "previous", "controller": "none"}
-"""Each step is added to the one before it, and all of it is carried out."""
+"""Each step is added to the one before it, and all of it is executed."""
 BRIDGE = {"action": "delta", **ADDED, "rotation": "rpy", "dt_s": "0.2", **OPENS_AT_1}

@@ -1,4 +1,4 @@
-"""Distances of the arm to itself, to the table and to what it keeps out of.
+"""Distances of the arm to itself, to the table and to keep-outs.
 
 Every link is the convex hull of its collision shapes. The pairs of links to check are found once,
 by sampling the joint space: pairs that are always near are neighbours by construction, pairs that
@@ -57,8 +57,8 @@ class CollisionModel:
         touching_m: distances below this are a collision.
         table_z_m: height of the table in the base frame; None: no table.
         known_good_rad: configurations (n,) that are known to be free.
-        keep_out: name -> shape in the base frame. Every link that moves keeps out, wherever it was
-            sampled.
+        keep_out: name -> shape in the base frame. Checked for every link that moves, whatever the
+            samples.
 
     Raises:
         ResourceError: the URDF's collision shapes cannot be loaded, or there are none.
@@ -114,7 +114,7 @@ class CollisionModel:
     def gradients(self, joints_rad: FloatArray, indices: Sequence[int]) -> FloatArray:
         """(len(indices), n) m/rad: how these distances change with each joint.
 
-        Only after `distances` of the same joints. Nothing for two that are inside each other.
+        Only after `distances` of the same joints. Undefined for two that are inside each other.
         """
         if not len(indices):
             return np.zeros((0, len(joints_rad)))

@@ -34,11 +34,11 @@ TOLERANCE_M, TOLERANCE_RAD = 1e-6, 1e-6
 POSTURE_GAIN = 0.1
 """Part of the way to the posture taken in a first iteration."""
 MAX_POSTURE_STEP_RAD = 0.01
-"""At most this far: a posture is drifted to, not leapt at."""
+"""At most this far: the posture is approached slowly."""
 DAMPING_BIAS = 1e-9
 """W of an error of zero."""
 MAX_JOINT_STEP_RAD = 0.5
-"""Of one iteration: a far pose is approached, not leapt at."""
+"""Of one iteration: a far pose is approached in several."""
 
 
 class Approach(NamedTuple):
@@ -121,8 +121,8 @@ class InverseKinematics:
         Args:
             pose: of the TCP.
             start_rad: (n,).
-            bounded: keep every joint within its bounds, by the other joints' taking over. Without,
-                the joints go where pose and posture alone put them.
+            bounded: keep every joint within its bounds, the other joints taking over. If not, pose
+                and posture alone decide where the joints go.
         """
         lower, upper = self.bounds(start_rad)
         joints = wanted = start_rad
@@ -140,7 +140,7 @@ class InverseKinematics:
                 effort += iteration
                 return Approach(joints, error_m, error_rad, solved, wanted, jacobian, effort)
             last = squared
-            # After the first iteration the pose has the last word.
+            # After the first iteration the pose alone decides.
             drift = self._drift(joints) if iteration == 0 else None
             step = self._step(error, jacobian, drift, 0.5 * squared + DAMPING_BIAS)
             largest = max(map(abs, step.tolist()))

@@ -39,11 +39,12 @@ class Kinematics:
         finger_joints: locked where the hand is widest.
         base_frame: poses are given in this link, which must not move; None: the URDF's root.
         joint_range_rad: narrows the range of each of `arm_joints`; empty: as the URDF has it.
-        finger_ends: where that is; None: at their upper limit, which needs joints that slide.
+        finger_ends: positions of the open and shut hand; None: open at their upper limit, which
+            needs joints that slide.
 
     Raises:
         ProfileError: a joint or link is not in the URDF, cannot be used, or lacks its limits; or
-            the ends of a finger joint are not such as it can have.
+            the ends of a finger joint are outside its range.
     """
 
     def __init__(
@@ -113,7 +114,7 @@ class Kinematics:
         """`values` (n,) given for `names` in any order, in the order of `arm_joints`.
 
         Raises:
-            RecordError: a joint is missing; what is not of the arm is passed over.
+            RecordError: a joint is missing; joints of other parts are ignored.
         """
         given = np.asarray(values, dtype=np.float64)
         places = {name: index for index, name in enumerate(names)}
@@ -166,7 +167,7 @@ def make_kinematics(profile: Profile) -> Kinematics:
     """Kinematics of the profile's robot.
 
     Raises:
-        ResourceError: its description is not there.
+        ResourceError: its description is missing.
         ProfileError: frames or joints that the description does not have.
     """
     robot = profile.robot
@@ -208,8 +209,8 @@ def _locked(
         joint = model.joints[model.getJointId(name)]
         if joint.nq != 1:
             raise ProfileError(
-                f"joint {name!r} of {urdf.name} turns without end, which this arm model does not "
-                "know: make it revolute and give it limits"
+                f"joint {name!r} of {urdf.name} is continuous; only joints with limits are "
+                "supported: make it revolute and give it limits"
             )
     position = pin.neutral(model)
     for name in finger_joints:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import coal
@@ -14,7 +15,7 @@ from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.types import FloatArray
 
 KEPT = 8
-"""Configurations of an arm whose placements are kept: each is looked at with some of the other."""
+"""Configurations of an arm whose placements are kept: each is compared with several others."""
 
 
 class Nearest(NamedTuple):
@@ -22,13 +23,25 @@ class Nearest(NamedTuple):
 
     Args:
         distance_m: between them, negative where they are inside each other.
-        first: link of the first arm; empty: nothing is nearer than was looked for.
+        first: link of the first arm; empty: nothing is nearer than `within_m`.
         second: link of the second arm.
     """
 
     distance_m: float
     first: str = ""
     second: str = ""
+
+
+class Placement(NamedTuple):
+    """The hulls of an arm's links at some joints.
+
+    Args:
+        transforms: of each hull into the frame of the robot.
+        centres_m: (m, 3) centres of the spheres around them.
+    """
+
+    transforms: list[Any]
+    centres_m: FloatArray
 
 
 class PlacedArm:
@@ -41,38 +54,38 @@ class PlacedArm:
     """
 
     def __init__(self, kinematics: Kinematics, collisions: CollisionModel, base: Pose) -> None:
-        self._model, self._data = kinematics.model, kinematics.model.createData()
-        self._geometry: Any = collisions.links()
-        self._placed = self._geometry.createData()
-        stands = pin.SE3(base.rotation, base.position_m)
-        self._base = stands * kinematics.base_placement.inverse()
+        self._model = kinematics.model.copy()
+        stands = pin.SE3(base.rotation, base.position_m) * kinematics.base_placement.inverse()
+        self._geometry: Any = collisions.links().copy()
+        for joint, parent in enumerate(self._model.parents):
+            if joint > 0 and parent == 0:
+                self._model.jointPlacements[joint] = stands * self._model.jointPlacements[joint]
+        for shape in self._geometry.geometryObjects:
+            if shape.parentJoint == 0:
+                shape.placement = stands * shape.placement
+        self._data, self._placed = self._model.createData(), self._geometry.createData()
         shapes = list(self._geometry.geometryObjects)
         self.names = [shape.name for shape in shapes]
         self.hulls: list[Any] = [shape.geometry for shape in shapes]
         for hull in self.hulls:
             hull.computeLocalAABB()
-        self._centres = np.array([hull.aabb_center for hull in self.hulls])
+        centres = np.array([hull.aabb_center for hull in self.hulls])
+        self._centres_m = np.hstack([centres, np.ones((len(centres), 1))])[:, :, None]
         self.radii_m = np.array([hull.aabb_radius for hull in self.hulls])
-        self._key = b""
-        self._kept: dict[bytes, tuple[list[Any], FloatArray]] = {}
+        self._kept: dict[bytes, Placement] = {}
 
-    def place(self, joints_rad: FloatArray) -> tuple[list[Any], FloatArray]:
-        """Transforms of the hulls at these joints (n,), and the centres (m, 3) of their spheres."""
+    def place(self, joints_rad: FloatArray) -> Placement:
+        """Where the hulls are at these joints (n,)."""
         key = joints_rad.tobytes()
         found = self._kept.get(key)
         if found is None:
             pin.updateGeometryPlacements(
                 self._model, self._data, self._geometry, self._placed, joints_rad
             )
-            placed = [self._base * placement for placement in self._placed.oMg]
-            centres = np.array(
-                [
-                    at.rotation @ c + at.translation
-                    for at, c in zip(placed, self._centres, strict=True)
-                ]
-            )
-            transforms = [coal.Transform3s(at.rotation, at.translation) for at in placed]
-            found = transforms, centres
+            frames = list(self._placed.oMg)
+            matrices = np.array([frame.homogeneous for frame in frames])
+            transforms = [coal.Transform3s(frame.rotation, frame.translation) for frame in frames]
+            found = Placement(transforms, (matrices @ self._centres_m)[:, :3, 0])
             if len(self._kept) >= KEPT:
                 self._kept.clear()
             self._kept[key] = found
@@ -92,29 +105,37 @@ class PartDistance:
         self._spheres_m = first.radii_m[:, None] + second.radii_m[None, :]
         self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
 
-    def nearest(self, first_rad: FloatArray, second_rad: FloatArray, within_m: float) -> Nearest:
-        """The nearest links with the arms at these joints (n,) each.
+    def nearest(
+        self, first_rad: Sequence[FloatArray], second_rad: Sequence[FloatArray], within_m: float
+    ) -> Nearest:
+        """The nearest links with the arms at any two of these joints.
 
         Args:
-            first_rad: of the first arm.
-            second_rad: of the second arm.
+            first_rad: configurations (n,) of the first arm.
+            second_rad: configurations (n,) of the second arm.
             within_m: links further apart than this are not looked for.
         """
-        one, one_m = self._first.place(first_rad)
-        other, other_m = self._second.place(second_rad)
-        apart = np.linalg.norm(one_m[:, None] - other_m[None, :], axis=2) - self._spheres_m
-        flat = apart.ravel()
+        ones = [self._first.place(joints_rad) for joints_rad in first_rad]
+        others = [self._second.place(joints_rad) for joints_rad in second_rad]
+        one_m = np.array([placed.centres_m for placed in ones])
+        other_m = np.array([placed.centres_m for placed in others])
+        between_m = one_m[:, None, :, None] - other_m[None, :, None, :]
+        apart_m = np.sqrt((between_m * between_m).sum(axis=-1)) - self._spheres_m
         found = Nearest(within_m)
-        for index in np.argsort(flat):
-            if flat[index] >= found.distance_m:
+        places = np.argwhere(apart_m < within_m)
+        bounds_m = apart_m[apart_m < within_m]
+        order = np.argsort(bounds_m)
+        for (a, b, i, j), bound_m in zip(
+            places[order].tolist(), bounds_m[order].tolist(), strict=True
+        ):
+            if bound_m >= found.distance_m:
                 break
-            i, j = divmod(int(index), len(other))
             self._result.clear()
             distance_m = coal.distance(
                 self._first.hulls[i],
-                one[i],
+                ones[a].transforms[i],
                 self._second.hulls[j],
-                other[j],
+                others[b].transforms[j],
                 self._request,
                 self._result,
             )

@@ -94,7 +94,7 @@ def quat_from_rotation(rotation: FloatArray) -> FloatArray:
 
 
 def orthonormal(rotation: FloatArray) -> FloatArray:
-    """A product of many rotation matrices without what rounding made of it."""
+    """A product of many rotation matrices, without its rounding errors."""
     return rotation_from_quat(quat_from_rotation(rotation))
 
 
@@ -125,12 +125,12 @@ def pose_distance(a: Pose, b: Pose) -> tuple[float, float]:
 
 
 def pose_of(measured: PoseState) -> Pose:
-    """The pose a robot tells."""
+    """The pose of a measured state."""
     return Pose(measured.position_m, rotation_from_quat(measured.quat_xyzw))
 
 
 def held_pose(measured: PoseState) -> Pose:
-    """Where the robot's controller holds the arm, where the robot tells it; else where it is."""
+    """Set-point of the robot's controller, if the robot reports it; else the measured pose."""
     if measured.reference_position_m is None or measured.reference_quat_xyzw is None:
         return pose_of(measured)
     return Pose(measured.reference_position_m, rotation_from_quat(measured.reference_quat_xyzw))

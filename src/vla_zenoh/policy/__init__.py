@@ -1,4 +1,4 @@
-"""The model contract: what a model declares, what it is given, and what it answers."""
+"""The model contract: what a model declares, its input and its output."""
 
 from vla_zenoh.policy.spec import (
     MAX_CAMERAS,

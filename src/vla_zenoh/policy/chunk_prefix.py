@@ -97,7 +97,7 @@ class ChunkPrefix:
         """Remember a published chunk.
 
         Args:
-            observation: it was inferred from.
+            observation: input of the inference.
             steps: (H, D).
             published_ns: wall clock.
             obeyed: the arm follows this worker; otherwise nothing is committed.

@@ -276,7 +276,7 @@ class ConstructorOptions:
         try:
             body = ast.parse(path.read_bytes()).body
         except (OSError, SyntaxError, ValueError):
-            return None  # `import_model` says what is wrong
+            return None  # `import_model` reports what is wrong
         classes = [each for each in body if isinstance(each, ast.ClassDef)]
         methods = [{f.name: f for f in c.body if isinstance(f, ast.FunctionDef)} for c in classes]
         found = [each for each in methods if "infer" in each]

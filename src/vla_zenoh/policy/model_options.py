@@ -1,4 +1,4 @@
-"""What a person tells a model: options are text (``--set name=value``), weights lie in a folder."""
+"""A user's options of a model: options are text (``--set name=value``), weights are in a folder."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from urllib.parse import SplitResult, urlsplit
 from vla_zenoh.errors import SpecError, WorkerError
 
 SECRET = "api_"
-"""How the name of an option begins that is not to be shown (`api_key`)."""
+"""Prefix of the names of options that must not be shown (`api_key`)."""
 
 
 def shown(options: Mapping[str, str]) -> dict[str, str]:
-    """Options as they may be written into a result; what is secret is left out of it."""
+    """Options as they may be written into a result, without the secret ones."""
     return {k: "(secret)" if k.startswith(SECRET) else value for k, value in options.items()}
 
 
@@ -77,7 +77,7 @@ def address(text: str, *schemes: str) -> SplitResult:
     parts = urlsplit(text if "://" in text else f"{schemes[0]}://{text}")
     try:
         fits = parts.scheme in schemes and bool(parts.hostname) and parts.port != 0
-    except ValueError:  # a port that is none
+    except ValueError:  # an invalid port
         fits = False
     if not fits:
         wanted = " or ".join(f"{scheme}://HOST:PORT" for scheme in schemes)

@@ -1,4 +1,4 @@
-"""One coherent look at the world out of many streams: newest, near in time, in the form asked."""
+"""Assembles coherent observations from many streams: newest, near in time, as the spec declares."""
 
 from __future__ import annotations
 
@@ -109,8 +109,8 @@ class Streams:
     """What a worker has received of the streams that its model observes.
 
     Args:
-        images: camera -> its pictures.
-        depth: camera -> its depth pictures.
+        images: camera -> its images.
+        depth: camera -> its depth images.
         states: record (``joint``, ``pose``, ``gripper``; see `state_names`) -> its states.
     """
 
@@ -120,8 +120,8 @@ class Streams:
 
     @staticmethod
     def of(spec: ObservationSpec, parts: Sequence[str] = ("",)) -> Streams:
-        """Empty ones, which keep what an observation of this kind needs of these parts."""
-        # A colour picture waits for the depth picture of the same moment.
+        """Empty ones, which keep enough for an observation of this kind of these parts."""
+        # A colour image waits for the depth image of the same moment.
         kept_s = PAIR_S if spec.depth or spec.history > 1 else 0.0
         if spec.history > 1:
             kept_s += spec.history_span_s + spec.max_skew_s
@@ -134,13 +134,13 @@ class Streams:
 
     @property
     def pictures(self) -> dict[str, History]:
-        """Images and depth by what messages call them."""
+        """Images and depth by their names in messages."""
         images = {f"camera {name!r}": one for name, one in self.images.items()}
         return images | {f"depth of camera {name!r}": one for name, one in self.depth.items()}
 
     @property
     def named_states(self) -> dict[str, History]:
-        """States by what messages call them."""
+        """States by their names in messages."""
         return {f"state/{part}": one for part, one in self.states.items()}
 
 
@@ -172,10 +172,10 @@ def assemble(
         spec: what the model needs.
         task: prompt and episode.
         streams: what was received.
-        not_before_ns: an observation from before this time is not wanted: it cannot show what the
-            last chunk did.
+        not_before_ns: an observation from before this time is not used: it cannot show the effect
+            of the last chunk.
         now_ns: wall clock.
-        robot: whose observation it is.
+        robot: its name, for the observation.
         episode_ns: when the episode began; what is older is not in its history.
 
     Raises:
@@ -219,7 +219,7 @@ def assemble(
 def _at(
     empty: Observation, wanted: ObservationSpec, streams: Streams, stamp_ns: int
 ) -> Observation | NotReady:
-    """An observation of what is nearest to a time in each stream."""
+    """An observation of the entries nearest to a time in each stream."""
     images, depth = streams.images, streams.depth
     records: dict[str, dict[str, Any]] = {}
     for name, one in streams.states.items():
@@ -249,7 +249,7 @@ _HOLDER = {"wrench": "pose", "effort_nm": "joint"}
 
 
 def _asked_for(wanted: ObservationSpec, records: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields of an observation out of the records of one arm; None: not measured."""
+    """Fields of an observation from the records of one arm; None: not measured."""
     fields: dict[str, Any] = {}
     for what in wanted.state:
         if what in STREAM_OF:
@@ -346,13 +346,13 @@ def _resize(rgb: NDArray[Any], spec: CameraSpec | DepthSpec) -> NDArray[Any]:
 def _scale(rgb: NDArray[Any], width: int, height: int) -> NDArray[Any]:
     smaller = width < rgb.shape[1] or height < rgb.shape[0]
     method = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
-    if rgb.ndim == 2:  # between an edge and what is behind it there is nothing half way
+    if rgb.ndim == 2:  # no depth is half way between an edge and its background
         method = cv2.INTER_NEAREST_EXACT
     return np.asarray(cv2.resize(rgb, (width, height), interpolation=method))
 
 
 def prepare_depth(depth: Depth, spec: DepthSpec) -> NDArray[np.uint16]:
-    """A depth picture in the size, unit and range of the spec, (H, W) in counts.
+    """A depth image in the size, unit and range of the spec, (H, W) in counts.
 
     Raises:
         SpecError: it has another size and the spec does not say how to resize it.
@@ -389,7 +389,7 @@ def make_chunk(
         worker: its name.
         spec_hash: of its model.
         dt_s: duration of a step.
-        observation: that was answered.
+        observation: input of the inference.
         answer: with checked steps.
         patience_s: how long the chunk is valid after its last step.
         observed_ns: observation complete, wall clock.

@@ -1,8 +1,8 @@
 """The thesis's ten HARD prompts: fixed deltas whose outcome is known beforehand.
 
 ``HARD: go up`` asks for one step of 0.01 m per request; ``HARD: go up x50`` for 50 of them, after
-which the arm is to stand still; ``HARD: go down x50 within 0.1`` turns back before it is further
-than 0.1 m (or rad) from where it began, and again when it is back there. Source: the set points of
+which the arm stands still; ``HARD: go down x50 within 0.1`` turns back before it is further than
+0.1 m (or rad) from where it began, and again when it is back there. Source: the set points of
 "Building a ROS2-VLA Bridge".
 """
 
@@ -55,7 +55,7 @@ _PROMPT = re.compile(
 
 
 class ScriptedPrompt(NamedTuple):
-    """A prompt that was understood.
+    """A parsed prompt.
 
     Args:
         motion: None: stand still.
@@ -90,7 +90,7 @@ def parse_scripted(prompt: str) -> ScriptedPrompt:
     """Read ``HARD: go up``, ``HARD: rol left x20`` (so spelt in the thesis too) or ``hold``.
 
     Raises:
-        SpecError: it names no motion; lists those there are.
+        SpecError: it names no motion; lists the known ones.
     """
     match = _PROMPT.fullmatch(" ".join(prompt.split()))
     name = match["name"].lower().replace("rol ", "roll ") if match else ""

@@ -1,4 +1,4 @@
-"""The model contract: what a model declares, what it is given, what it returns.
+"""The model contract: what a model declares, its input and its output.
 
 A model is a class with a `spec` and ``infer(observation) -> ActionSteps``; `Policy` is the whole
 contract. `ModelSpec` is published before anything moves, and its hash travels in every chunk, so
@@ -81,7 +81,7 @@ def _differ(values: tuple[Any, ...]) -> tuple[Any, ...]:
 
 
 class _Spec(BaseModel):
-    """Strict: neither ``"8"`` nor ``true`` is a number, so a slip is not read as a meaning."""
+    """Strict: neither ``"8"`` nor ``true`` is a number, so a typing error gets no meaning."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
 
@@ -127,7 +127,7 @@ class CameraSpec(_Spec):
 
 
 class DepthSpec(_Spec):
-    """One depth picture in the model's observation: distances along the camera's optical axis.
+    """One depth image in the model's observation: distances along the camera's optical axis.
 
     Args:
         camera: name of the camera in the profile, whose ``depth_unit_m`` is set.
@@ -136,8 +136,8 @@ class DepthSpec(_Spec):
         resize: how other sizes become this one, as of colour; each pixel is the nearest one, no
             mean, and padding is `invalid`.
         unit_m: metres of one count the model is given.
-        near_m: what is nearer becomes `invalid`.
-        far_m: what is further becomes `invalid`; None: no bound but that of 65535 counts.
+        near_m: nearer distances become `invalid`.
+        far_m: further distances become `invalid`; None: no bound but that of 65535 counts.
         invalid: count of a pixel that was not measured.
     """
 
@@ -159,7 +159,7 @@ class DepthSpec(_Spec):
 
 
 class ObservationSpec(_Spec):
-    """What the model has to see.
+    """What the model observes.
 
     Args:
         cameras: may be empty.
@@ -171,8 +171,8 @@ class ObservationSpec(_Spec):
         max_skew_s: the parts of one observation may lie this far apart in time.
         max_age_s: an older observation is not given to the model.
         history: n, observations that the model is given: this one and n - 1 before it.
-        history_spacing_s: time from one to the next. A picture or state that is further than
-            `max_skew_s`, or half the spacing, from its time is not taken for it.
+        history_spacing_s: time from one to the next. An image or state further than `max_skew_s`,
+            or half the spacing, from its time is not used.
         history_start: what stands for times before the episode: its first observation
             (``repeat``), or nothing, and the model is not asked until there are n (``wait``).
     """
@@ -222,7 +222,7 @@ class ObservationSpec(_Spec):
 
     @model_serializer(mode="wrap")
     def _senses_in_use(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        # So a model without these has the hash, and the spec on the wire, that it always had.
+        # So the hash and the wire form of a model without these stay as they are.
         fields = serialize(self)
         return {
             name: value
@@ -283,8 +283,8 @@ class ActionSpec(_Spec):
         pace: ``steady``: a step lasts `dt_s`, and the arm neither stops nor rushes between steps
             that come in time; ``soonest``: it goes to each goal as fast as its limits allow.
         normalisation: key of the statistics that the output was scaled with, for information.
-        parts: whose columns are whose, of a robot of several parts, in the order of the columns;
-            then what is said here besides `horizon` and `dt_s` means nothing. See `of_parts`.
+        parts: columns of each part of a robot of several parts, in order; the other fields, except
+            `horizon` and `dt_s`, are then unused. See `of_parts`.
     """
 
     horizon: int = Field(ge=1, le=1000)
@@ -320,7 +320,7 @@ class ActionSpec(_Spec):
         return ActionSpec(horizon=first.horizon, dt_s=first.dt_s, parts=each)
 
     def of(self, part: str) -> ActionSpec:
-        """What the columns of `part` mean; of a robot of one part, which has no name, all of it.
+        """Meaning of the columns of `part`; of a robot of one part, which has no name, all of it.
 
         Raises:
             SpecError: there are none.
@@ -344,7 +344,7 @@ class ActionSpec(_Spec):
 
     @model_serializer(mode="wrap")
     def _without_no_parts(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """As it always was where there are no parts, and with the same hash."""
+        """Leaves `parts` out if there are none, so that the hash of such a spec stays the same."""
         plain = handler(self)
         if not self.parts:
             plain.pop("parts", None)
@@ -387,7 +387,7 @@ class ActionSpec(_Spec):
 
     @property
     def targets(self) -> bool:
-        """Each step is a pose of its own, and no sum of the steps before it."""
+        """Each step is a pose itself, not added to the steps before it."""
         return self.kind == "absolute" or self.relative_to == "start"
 
     @model_validator(mode="after")
@@ -455,7 +455,7 @@ ActionSpec.model_rebuild()
 
 
 class ModelSpec(_Spec):
-    """Everything a command node has to know of a model before it obeys it."""
+    """Everything a command node must know about a model before it executes its chunks."""
 
     name: Text
     observation: ObservationSpec = ObservationSpec()
@@ -491,7 +491,7 @@ class ModelSpec(_Spec):
 
 @lru_cache(maxsize=256)
 def _digest(spec: ModelSpec) -> str:
-    # Not kept in the spec itself: a copy with other fields would take it along.
+    # Not kept in the spec itself: a copy with other fields would inherit it.
     canonical = json.dumps(spec.to_dict(), sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(canonical.encode()).hexdigest()[:16]
 
@@ -501,7 +501,7 @@ class ActionSteps(NamedTuple):
 
     Args:
         steps: (H, D), H at most the declared horizon; anything numpy can read.
-        done: the task is finished with these steps, as far as the model can tell.
+        done: the policy reports that the task is finished with these steps.
         raw: intermediate output for debugging, as text and numbers: tokens, normalised actions.
             Shown by ``vla-zenoh lab inspect``, otherwise unused.
         pictures: camera -> (H, W, 3) RGB uint8 as it went into the network, if the model itself
@@ -516,7 +516,7 @@ class ActionSteps(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observation:
-    """One coherent look at the world, in the form the spec asks for.
+    """One coherent observation, in the form the spec declares.
 
     Args:
         stamp_wall_ns: capture time of its oldest image (of its state, without images).
@@ -526,13 +526,14 @@ class Observation:
         joint: arm joints, where asked for.
         pose: TCP pose, where asked for.
         gripper: gripper state, where asked for.
-        privileged: what a simulated benchmark knows, where asked for; no real robot tells it.
+        privileged: state that only a simulated benchmark knows, where asked for; no real robot
+            reports it.
         wrench: (6,) N and Nm that the surroundings exert on the arm, as in `PoseState`, where asked
             for.
         effort_nm: (n,) as in `JointState`, where asked for.
         history: earlier observations, oldest first, `ObservationSpec.history` - 1 of them.
         task: prompt, episode and rate.
-        robot: whose it is, for a model that serves several and remembers something of each.
+        robot: its name, for a model that serves several and keeps state of each.
         parts: of a robot of several parts, name -> the same with the state of that part, all of one
             time; the observation itself then has no joint, pose and gripper.
     """
@@ -573,8 +574,8 @@ class Policy(Protocol):
     ``takes_committed = True``: it is called as ``infer(observation, committed=...)`` with the
     steps of its last chunk in execution, see `vla_zenoh.policy.chunk_prefix`.
     ``infer_batch(observations)`` answers several robots at once, one answer for each in their
-    order, at most ``max_batch`` of them where that is given. `Observation.robot` says whose each
-    is; ``reset`` takes that name then. With ``takes_committed`` it is called as
+    order, at most ``max_batch`` of them where that is given. `Observation.robot` names the robot of
+    each; ``reset`` then takes that name. With ``takes_committed`` it is called as
     ``infer_batch(observations, committed=[...])``.
     """
 
@@ -585,7 +586,7 @@ class Policy(Protocol):
 
 
 def reset_of(policy: Policy, robot: str = "") -> Callable[[], Any] | None:
-    """What begins an episode of `robot`; None: the model has no ``reset``."""
+    """Function that begins an episode of `robot`; None: the model has no ``reset``."""
     reset = getattr(policy, "reset", None)
     if not callable(reset):
         return None

@@ -111,7 +111,7 @@ def known_parts(joints: int | None = None) -> str:
 
 
 def parts_of(names: Sequence[str]) -> tuple[StatePart, ...]:
-    """What a model has to observe for them."""
+    """Parts of the state that a model must observe for them."""
     return tuple(dict.fromkeys(part for name in names if (part := PARTS[name][0]) is not None))
 
 
@@ -123,7 +123,7 @@ def state_vector(
 
     Args:
         names: of `read_parts`.
-        observation: has what `parts_of` says.
+        observation: has the state of `parts_of`.
         max_width_m: of the open gripper.
     """
     joint, pose, gripper = observation.joint, observation.pose, observation.gripper

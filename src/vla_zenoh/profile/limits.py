@@ -158,7 +158,7 @@ class ReachLimits(Section):
         table_slow_m: distance of hand and fingers to the table below which the arm slows down; they
             work close to it.
         table_stop_m: lower bound of that distance.
-        keep_out: name -> what the arm keeps out of: a camera's post, a wall, a person's side.
+        keep_out: name -> shape that the arm keeps out of: a camera's post, a wall, a person's side.
         part_slow_m: distance of two parts of a robot below which both slow down.
         part_stop_m: lower bound of that distance.
     """

@@ -192,8 +192,8 @@ def paths_in(data: dict[str, Any]) -> Iterator[tuple[dict[str, Any], str, str]]:
 
     These are ``robot.description`` and that of parts, ``arm.file``, ``ros2.messages.*``, paths in
     ``models.*``, ``cameras.*.source`` of the form ``file:PATH``, ``cameras.*.intrinsics``, and
-    options of models and of the arm that start with ``./`` or ``../``: of any other text only the
-    model knows whether it is one.
+    options of models and of the arm that start with ``./`` or ``../``: for any other text only the
+    model knows whether it is a path.
     """
     robot, arm, ros2 = (_map(data.get(name)) for name in ("robot", "arm", "ros2"))
     description = robot.get("description")

@@ -219,8 +219,8 @@ class FrankaProfile(Section):
         posture_stiffness_nm_rad: with which the elbow keeps its place, with robot.command: pose.
         collision_force_n: external force at the TCP that makes the robot end a motion (reflex);
             above limits.contact.force_stop_n, at which the arm retreats instead.
-        collision_torque_nm: external torque about the TCP that does.
-        collision_joint_nm: external torque of joint 1 to 7 that does.
+        collision_torque_nm: external torque about the TCP that does the same.
+        collision_joint_nm: external torque of joint 1 to 7 that does the same.
         load: beyond the end effector of Desk.
         hand: the robot has a Franka Hand.
     """
@@ -250,7 +250,7 @@ class UrProfile(Section):
         tcp_rotvec: its rotation there, as a rotation vector.
         payload_kg: mass that the flange carries.
         payload_centre_m: its centre of mass in the frame of the flange.
-        watchdog_hz: the robot stops its program when it hears less often from this computer.
+        watchdog_hz: the robot stops its program if messages from this computer come less often.
     """
 
     address: Word
@@ -277,7 +277,7 @@ class LeRobotProfile(Section):
         zero_deg: angle by LeRobot at which each joint of the description is 0; empty: 0 for each.
         reversed: arm_joints that turn against the description.
         gripper: its motor, 0 to 100; empty: there is none.
-        limp_at_end: the motors let go when the node ends, and the arm falls.
+        limp_at_end: the motors are released when the node ends, and the arm falls.
     """
 
     robot: Name = "so101_follower"

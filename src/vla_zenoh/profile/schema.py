@@ -164,7 +164,8 @@ class CameraProfile(Section):
         depth_unit_m: metres of one count of the depth stream, 16 bits: at 0.001 it reaches 65 m in
             steps of 1 mm; null: no depth. ``sim:`` and ``realsense:`` have depth.
         intrinsics: YAML file with width, height, fx_px, fy_px, cx_px, cy_px and distortion (k1, k2,
-            p1, p2, k3 of OpenCV) of the camera's own images; null: as the camera tells, if it does.
+            p1, p2, k3 of OpenCV) of the camera's own images; null: those that the camera reports,
+            if any.
         undistort: remove the distortion of the lens, before the crop.
         crop: part of the image that is published, before it is flipped; null: all of it.
         flip: ``horizontal`` (left and right), ``vertical``, or ``both``, of a camera that is

@@ -16,9 +16,9 @@ from vla_zenoh.types import MAX_TEXT, shown
 Place = tuple[str, ...]
 """Keys from the top of the profile down to a value."""
 Fault = tuple[Place, str] | tuple[Place, str, "Sequence[tuple[Place, str]]"]
-"""Where something is wrong, and a sentence that continues ``PLACE: ``. Of places that contradict
-each other also the other ones, with their sentences: the fault is where the loaded file itself
-says something, for what it extends may be right. ``{}`` there stands for the first place."""
+"""Where something is wrong, and a sentence that continues ``PLACE: ``. If places contradict each
+other, also the other ones with their sentences: the fault is reported where the loaded file itself
+sets a value, because the file that it extends may be right. ``{}`` stands for the first place."""
 Lines = dict[Place, str]
 """Place -> ``file:line``."""
 
@@ -80,7 +80,7 @@ Distinct = AfterValidator(_differ)
 
 
 NOT_MADE = {"depth": "cameras give colour images only; depth is not read."}
-"""Key that looks like a slip of another one but is a wish -> what there is."""
+"""Key that looks like a slip of another one but asks for more than exists -> what there is."""
 _NO_VALUE_SHOWN = {"missing", "extra_forbidden", "too_long", "too_short", "value_error"}
 
 

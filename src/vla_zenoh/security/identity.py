@@ -115,8 +115,8 @@ def identities(profile: Profile) -> list[Identity]:
 def expected_nodes(profile: Profile) -> dict[str, str]:
     """Nodes that publish a status where the profile runs -> their hosts.
 
-    A router that is the only one is left out: who hears anything has reached it, and it may be a
-    ``zenohd``, which publishes none.
+    A router that is the only one is left out: a client that receives anything has reached it, and
+    it may be a ``zenohd``, which publishes none.
     """
     found = {one.node: host for host in profile.hosts for one in _nodes(profile, host)}
     found.pop("router", None)

@@ -1,4 +1,4 @@
-"""Which of the certificates on this computer a person uses."""
+"""Chooses the certificate that an operator at this computer uses."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def operator_hosts(profile: Profile, *, stop: bool = False) -> list[str]:
 
 
 def local_role(profile: Profile) -> Role | None:
-    """Role of the people at this computer; None: unrestricted, or unknown."""
+    """Role of the operator at this computer; None: unrestricted, or unknown."""
     security = profile.session.security
     if security is None:
         return None

@@ -28,7 +28,7 @@ class Act(Enum):
     PUT = "put"
     DELETE = "delete"  # no role may, and nodes reject it
     SUBSCRIBE = "subscribe"
-    ANSWER = "answer"  # be asked by queries
+    ANSWER = "answer"  # receive queries
     ASK = "ask"
     ANNOUNCE = "announce"  # hold a liveliness token
     WATCH = "watch"  # see such tokens

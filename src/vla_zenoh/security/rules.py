@@ -2,8 +2,8 @@
 
 Zenoh checks messages where they enter and leave the router, so one right takes several rules. The
 samples of a writer must enter, and it must *learn* of subscribers, or it never sends; the
-declaration of a reader must enter, and the samples must leave. Whatever lacks a rule is
-dropped without a word.
+declaration of a reader must enter, and the samples must leave. Messages without a rule
+are dropped silently.
 """
 
 from __future__ import annotations
@@ -84,13 +84,13 @@ def _rules(identity: Identity, keys: Keys) -> list[dict[str, Any]]:
     for right in rights(keys, identity):
         for flow, message in MESSAGES[right.act]:
             wish = flow == OUT and message in WISHES
-            # A subscriber may ask for more than this key: the writer must learn of it all the same.
+            # A subscriber may ask for more than this key: the writer must still learn of it.
             key = "**" if wish else right.key
             granted.setdefault((flow, message), {})[key] = None
             if right.act is Act.SUBSCRIBE:
                 granted[flow, message].update(dict.fromkeys(wide(keys, identity)))
             if right.act is Act.WATCH and flow == IN and identity.roles & LOOKERS:
-                # They may ask which robots there are; the answer holds those they may know of.
+                # They may ask which robots there are; the answer contains those they may know.
                 granted[flow, message][keys.all_robots] = None
     who = f"{keys.root}/{keys.robot}:{identity.common_name}"
     return [

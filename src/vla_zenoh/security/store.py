@@ -1,4 +1,4 @@
-"""Folder of a lab's certificates, as the nodes and people of a host use it.
+"""Folder of a lab's certificates, as the nodes and operators of a host use it.
 
 ::
 

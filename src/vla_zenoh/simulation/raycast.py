@@ -161,7 +161,7 @@ class RaycastCanvas:
         grid = coarse.shape[:2]
         hits = self._cast(data, view, coarse.reshape(-1, 3), groups)
         flat = _smooth_cells(hits.geom.reshape(grid), hits.normal.reshape(*grid, 3), FLAT_COSINE)
-        # One over the depth of a plane is linear in the picture: nothing is lost between the rays.
+        # One over the depth of a plane is linear in the image: nothing is lost between the rays.
         inverse = np.where(hits.geom < 0, 0.0, 1.0 / np.where(hits.geom < 0, 1.0, hits.distance))
         inverse = _between(inverse.reshape(grid))[: view.height, : view.width]
         rough = np.kron(~flat, np.ones((GRID_PX, GRID_PX), dtype=bool))

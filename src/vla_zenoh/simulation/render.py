@@ -37,7 +37,7 @@ AUTO = "auto"
 PROBE_LIMIT_S = 60.0
 
 _LIBRARIES = ("EGL", "OpenGL")
-"""That PyOpenGL and MuJoCo load."""
+"""Libraries that PyOpenGL and MuJoCo load."""
 _PACKAGES = "libegl1 libopengl0 libgl1-mesa-dri"
 """Debian packages that have them; Mesa renders on the CPU where there is no GPU."""
 _GL_VARIABLES = ("MUJOCO_GL", "PYOPENGL_PLATFORM")
@@ -49,7 +49,7 @@ class Backend:
 
     Args:
         name: ``egl`` or ``raycast``.
-        reason: why OpenGL does not work here; empty where ray casting was asked for.
+        reason: why OpenGL does not work here; empty if ray casting was requested.
         install: Debian packages that OpenGL needs; may be empty.
     """
 
@@ -59,7 +59,7 @@ class Backend:
 
 
 def choose_backend(wanted: str | None = None) -> Backend:
-    """OpenGL where it works on this machine, else ray casting; or the one asked for.
+    """OpenGL if it works on this machine, else ray casting; or the requested one.
 
     Args:
         wanted: ``egl``, ``raycast`` or ``auto``; None: the environment variable

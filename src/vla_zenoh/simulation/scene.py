@@ -49,7 +49,7 @@ def scene_file(scene: str) -> Path:
 
 
 def prefix_of(robot: RobotModel) -> str:
-    """Of every name in the robot's description, so that a scene may use any name."""
+    """Prefix of every name in the robot's description, so that a scene may use any name."""
     return f"{robot.part}/" if robot.part else PREFIX
 
 

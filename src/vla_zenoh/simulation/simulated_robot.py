@@ -161,7 +161,7 @@ class SimulatedArm:
 
 
 class SimulatedGripper:
-    """Fingers with a width servo: the set width runs at a speed, under a bounded force.
+    """Fingers with a width servo: the set width changes at a given speed, under a bounded force.
 
     Args:
         model: the scene with the robot in it.
@@ -208,7 +208,7 @@ class SimulatedGripper:
                 f"a gripper needs speed and force above 0, got {speed_m_s} and {force_n}"
             )
         target = min(max(width_m, 0.0), self._max_width_m)
-        # Squeezing continues from the ramp, else a repeated command would let go for a moment; a
+        # Squeezing continues from the ramp, else a repeated command would release for a moment; a
         # reversal starts at the fingers, else it would lag by the whole squeeze.
         if (target - self._measured_m) * (self._set_m - self._measured_m) <= 0.0:
             self._set_m = self._measured_m

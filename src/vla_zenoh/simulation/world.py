@@ -196,10 +196,10 @@ class SimulatedPart:
 
 
 class World:
-    """A scene with a robot in it, of one part or several, as `tick` leads them.
+    """A scene with a robot in it, of one part or several, stepped by `tick`.
 
     Deterministic to the bit: the same seed, references and gripper commands give the same state.
-    What is said of one arm is of the first part; see `part`. Poses are of its TCP in its base
+    Members about one arm are those of the first part; see `part`. Poses are of its TCP in its base
     frame, those of objects in the world frame, which is the base frame of a robot of one part.
 
     Args:

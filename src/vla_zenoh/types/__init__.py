@@ -1,7 +1,7 @@
 """Records that travel on keys: frozen, checked, units in their names.
 
 A record that exists is valid: arrays have their shape, are finite, contiguous and read-only,
-quaternions are unit. Who makes one from bad values gets a `RecordError` that names the field.
+quaternions are unit. Constructing one from bad values raises a `RecordError` that names the field.
 The stamp is not part of a record: it travels beside it as a `Header`.
 
 Frames: poses are those of the tool centre point (TCP) in the robot's base frame. A twist is

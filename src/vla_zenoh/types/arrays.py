@@ -23,7 +23,7 @@ _NUMBER_KINDS = "iuf"
 
 
 def numbers(name: str, value: ArrayLike) -> NDArray[Any]:
-    """`value` as an array that numpy did not have to read out of text, truth values or objects."""
+    """`value` as an array of numbers; text, truth values and objects are rejected."""
     if isinstance(value, np.ndarray) and value.dtype.kind in _NUMBER_KINDS:
         return value
     try:
@@ -89,7 +89,7 @@ def is_finite(array: NDArray[Any]) -> bool:
 
 
 def unit_quaternion(name: str, value: ArrayLike) -> FloatArray:
-    """Like `vector` for four numbers x, y, z, w; normalised, refused when far from unit."""
+    """Like `vector` for four numbers x, y, z, w; normalised, rejected when far from unit."""
     array = vector(name, value, 4)
     norm = math.hypot(*array.tolist())
     if abs(norm - 1.0) > QUATERNION_NORM_TOLERANCE:

@@ -1,6 +1,6 @@
 """Checks of record fields: each returns the value in its final form, or raises a `RecordError`.
 
-Those of arrays are in ``arrays.py``: without them a command that only drives loads no numpy.
+Those of arrays are in ``arrays.py``, so that a command that only drives does not load numpy.
 """
 
 from __future__ import annotations

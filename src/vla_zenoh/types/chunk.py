@@ -41,7 +41,7 @@ class ActionChunk:
         observed_ns: wall time at which the worker took the observation.
         inference_start_ns: wall time.
         inference_end_ns: wall time.
-        done: the policy says its task is finished when these steps are.
+        done: the policy reports that its task is finished when these steps are.
     """
 
     worker: str
@@ -78,19 +78,19 @@ MAX_RAW_NUMBERS = 4096
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InferenceDebug:
-    """One inference, looked at from outside. Its pictures travel beside it, one key a camera.
+    """One inference, for debugging. Its images travel beside it, one key per camera.
 
     Args:
         worker: name of the worker.
-        chunk_seq: number of the chunk it led to; the pictures have the same.
+        chunk_seq: number of the resulting chunk; the images have the same.
         spec_hash: what the steps are to be read with.
         episode: as in the chunk.
-        observation_stamp_ns: capture time, wall clock; the pictures have the same.
-        prompt: the model was given.
+        observation_stamp_ns: capture time, wall clock; the images have the same.
+        prompt: input of the model.
         steps: (H, D) float32, the final action.
         inference_ms: time the model took.
-        raw: what stood before the steps: tokens, normalised action, whatever the model tells.
-        done: the policy says its task is finished with these steps.
+        raw: output before the steps: tokens, normalised action, whatever the model reports.
+        done: the policy reports that its task is finished with these steps.
     """
 
     worker: str
@@ -133,7 +133,7 @@ def _plain(value: Any, depth: int) -> Any:
         return {str(key)[:256]: _plain(item, depth - 1) for key, item in list(value.items())[:64]}
     try:
         array = np.asarray(value)
-    except Exception:  # tensors of other devices raise what they like
+    except Exception:  # tensors of other devices raise anything
         return shown(value)
     if array.dtype.kind not in "biuf" or array.ndim > 2:
         return shown(value)

@@ -30,7 +30,7 @@ LATENCY_STAGES = (
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """Which chunk a command carries out, and when that chunk passed each stage (wall clock)."""
+    """Which chunk a command executes, and when that chunk passed each stage (wall clock)."""
 
     worker: str
     chunk_seq: int
@@ -71,7 +71,7 @@ class PoseCommand:
         goal_position_m: (3,) where the smoothed motion is heading.
         goal_quat_xyzw: (4,) unit.
         state: the command node's state.
-        cause: the chunk carried out, None while nothing is.
+        cause: the chunk being executed, None: none is.
     """
 
     position_m: FloatArray
@@ -106,7 +106,7 @@ class JointCommand:
         velocity_rad_s: (n,).
         acceleration_rad_s2: (n,).
         state: the command node's state.
-        cause: the chunk carried out, None while nothing is.
+        cause: the chunk being executed, None: none is.
     """
 
     names: tuple[str, ...]

@@ -24,21 +24,21 @@ EVENT_KINDS = ("refusal", "transition", "limit", "fault", "notice")
 
 @dataclass(frozen=True, slots=True)
 class NodeStatus:
-    """A node's word on itself.
+    """Status of a node, published by itself.
 
     Args:
         node: its name.
         state: one word.
         host: where it runs: of the profile where it knows that, else the computer's own name.
         pid: process number.
-        started_wall_ns: when it started; tells a restart.
+        started_wall_ns: when it started; shows a restart.
         ages_s: age of the newest of every input.
-        rates_hz: of what it writes and loops.
+        rates_hz: of its publishers and loops.
         latency_ms: stage -> ``[p50, p95]``.
-        counters: everything counted; refusals as ``refused.<reason>``.
-        detail: whatever else a person wants to know: text, finite numbers, bools and None, in
-            lists and maps that are not nested deep.
-        boot: start of the computer it runs on, which no other one has; empty where none is told.
+        counters: everything counted; rejections as ``refused.<reason>``.
+        detail: further details for display: text, finite numbers, bools and None, in lists and maps
+            that are not nested deep.
+        boot: unique id of its computer's last boot; empty if unknown.
     """
 
     node: str
@@ -80,7 +80,7 @@ def _pair(name: str, value: Any) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something happened that a person may ask about later.
+    """Something that happened once.
 
     Args:
         level: ``info``, ``warning`` or ``error``.
@@ -118,16 +118,16 @@ LEAST_PERCENT = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """What is to be done now, as the command node has agreed to it.
+    """The task in force, as the command node has accepted it.
 
     Args:
-        episode: grows with every activation and every change of prompt or worker; a policy
-            starts afresh with it and a chunk of an older episode is refused.
-        active: the arm obeys the worker.
+        episode: grows with every activation and every change of prompt or worker; a policy is reset
+            with it, and a chunk of an older episode is rejected.
+        active: the arm follows the worker.
         prompt: plain text.
-        worker: name of the worker whose chunks are obeyed.
-        rate_hz: chunks per second asked of the workers.
-        speed_percent: of the speed that is planned, so much is driven; 0: the arm stands, active.
+        worker: name of the worker whose chunks are executed.
+        rate_hz: chunks per second requested of the workers.
+        speed_percent: speed override, percent of the planned speed; 0: the arm stands, active.
     """
 
     episode: int
@@ -147,11 +147,11 @@ class Task:
 
     @property
     def speed(self) -> float:
-        """Plan seconds per second, 0 to 1: a percent at least, or the arm stands."""
+        """Plan seconds per second, 0 to 1: at least one percent, or the arm stands."""
         return self.speed_percent / 100.0 if self.speed_percent >= LEAST_PERCENT else 0.0
 
     @property
     def requested_hz(self) -> float:
-        """Chunks per second asked of the worker now: at half the speed half as many, 0 where the
-        arm stands. A worker that is not obeyed is asked at the full rate."""
+        """Chunks per second requested of the worker now: at half the speed half as many, 0 if the
+        arm stands. A worker that is not the chosen one is asked at the full rate."""
         return self.rate_hz * (self.speed if self.active else 1.0)

@@ -22,7 +22,7 @@ from vla_zenoh.types.checks import (
 )
 
 MIN_DEPTH_UNIT_M, MAX_DEPTH_UNIT_M = 1e-5, 0.1
-"""Metres of one count of a depth picture: from 0.65 m to 6.5 km in all."""
+"""Metres of one count of a depth image: from 0.65 m to 6.5 km in all."""
 MAX_COUNT = 2**16 - 1
 
 
@@ -36,12 +36,12 @@ class JointState:
         names: of the joints.
         position_rad: (n,) measured.
         velocity_rad_s: (n,) measured.
-        effort_nm: (n,) what the motors apply: of the simulator and of ROS 2's joint states all of
-            it, the arm's own weight included. A robot class may tell the external torque in its
-            place, and its profile then bounds it (``limits.contact.effort_stop_nm``). None where
-            the robot does not measure it.
-        reference_rad: (n,) positions the robot's controller holds right now, or None where it
-            holds none, or the robot does not tell.
+        effort_nm: (n,) motor effort: of the simulator and of ROS 2's joint states the total,
+            including the arm's own weight. A robot class may report the external torque instead,
+            and its profile then bounds it (``limits.contact.effort_stop_nm``). None if the robot
+            does not measure it.
+        reference_rad: (n,) positions the robot's controller holds right now, or None if it holds
+            none or the robot does not report them.
     """
 
     names: tuple[str, ...]
@@ -110,8 +110,8 @@ class GripperState:
         width_m: opening between the fingers.
         moving: the fingers move.
         holding: an object is held.
-        mode: the robot's own word for its mode, ``ready`` when it will move.
-        faults: what the robot complains of, empty when well.
+        mode: the robot's name for its mode, ``ready`` when it will move.
+        faults: reported by the robot, empty if there are none.
     """
 
     width_m: float
@@ -149,8 +149,9 @@ class SceneState:
 
     Args:
         scene: name of the scene.
-        qpos: (nq,), the simulator's own order and units, then what it can place by hand.
-        seed: of the last reset, which says how the scene looks where its look is varied; or None.
+        qpos: (nq,), the simulator's own order and units, then positions and quaternions of mocap
+            bodies.
+        seed: of the last reset, which determines how a scene with a varied look appears; or None.
     """
 
     scene: str
@@ -199,7 +200,7 @@ def _point(name: str, value: ArrayLike) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Image:
-    """A picture: RGB, uint8, ``(height, width, 3)``, row by row from the top left."""
+    """An image: RGB, uint8, ``(height, width, 3)``, row by row from the top left."""
 
     rgb: NDArray[np.uint8]
 
@@ -216,7 +217,7 @@ class Image:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Depth:
-    """A depth picture: how far what each pixel shows is, along the camera's optical axis.
+    """A depth image: distance of what each pixel shows, along the camera's optical axis.
 
     Args:
         counts: (height, width) uint16, row by row from the top left; 0: not measured.
@@ -229,9 +230,9 @@ class Depth:
     def __post_init__(self) -> None:
         counts = self.counts
         if not isinstance(counts, np.ndarray) or counts.dtype != np.uint16 or counts.ndim != 2:
-            raise RecordError("a depth picture must be a uint16 array (H, W)")
+            raise RecordError("a depth image must be a uint16 array (H, W)")
         if 0 in counts.shape:
-            raise RecordError(f"a depth picture has shape {counts.shape}, wanted (H, W)")
+            raise RecordError(f"a depth image has shape {counts.shape}, wanted (H, W)")
         counts = np.ascontiguousarray(counts).view()
         counts.setflags(write=False)
         set_field(self, "counts", counts)
@@ -239,7 +240,7 @@ class Depth:
 
     @staticmethod
     def of_metres(depth_m: ArrayLike, unit_m: float) -> Depth:
-        """The picture of distances in m, (H, W); what no count can say is not measured.
+        """The image of distances in m, (H, W); what no count can represent is not measured.
 
         Raises:
             RecordError: another shape, or a unit out of range.

@@ -51,8 +51,8 @@ class SingleWriterFilter:
     """Passes the samples of one source at a time, and each of them once.
 
     The first source becomes the writer. Samples of any other source are rejected until the writer
-    is released or has been silent, so nobody else can interfere with a live stream. Times are of
-    any clock that never goes back.
+    is released or has been silent, so no other source can interfere with a live stream. Times are
+    of any clock that never goes back.
 
     Args:
         silence_s: a writer that is silent for this long is forgotten; None: never.

@@ -151,7 +151,7 @@ def test_a_joint_without_limits_is_refused(tmp_path: Path) -> None:
     end = text.index("</joint>", start)
     joint = text[start:end].replace('type="revolute"', 'type="continuous"')
     broken.write_text(text[:start] + joint + text[end:])
-    with pytest.raises(ProfileError, match="turns without end"):
+    with pytest.raises(ProfileError, match="is continuous; only joints with limits are supported"):
         Kinematics(broken, TCP_FRAME, ARM_JOINTS, FINGER_JOINTS)
 
 

@@ -1,1 +1,1 @@
-"""ROS 2 without ROS: messages, type hashes, names and keys of both ways in."""
+"""ROS 2 without ROS: messages, type hashes, names and keys of both transports."""

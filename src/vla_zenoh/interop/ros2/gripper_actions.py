@@ -1,4 +1,4 @@
-"""The actions a gripper may be commanded by: goals out, results in."""
+"""The actions by which a gripper may be commanded: goals out, results in."""
 
 from __future__ import annotations
 

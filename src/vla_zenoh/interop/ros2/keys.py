@@ -1,4 +1,4 @@
-"""Every key expression of the ROS 2 side, for both ways in. The only file with such text.
+"""Every key expression of the ROS 2 side, for both transports. The only file with such text.
 
 ``ros2dds``: the names zenoh-bridge-ros2dds gives to topics and services, and the liveliness tokens
 by which bridges tell each other what to route. ``rmw_zenoh``: those of robots that run rmw_zenoh.

@@ -1,7 +1,7 @@
 """All message types of one ROS 2 distribution: values, CDR both ways, and type hashes.
 
-rosbags does the work. What is added: services and actions, the definitions of this package, and
-that a decoder raises nothing but `CodecError`, whatever the bytes.
+Built on rosbags, with services and actions, the definitions of this package, and decoders that
+raise nothing but `CodecError`, whatever the bytes.
 """
 
 from __future__ import annotations

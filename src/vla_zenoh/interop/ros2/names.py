@@ -31,12 +31,12 @@ def dds_type(kind: str) -> str:
 
 
 def request_of(service: str) -> str:
-    """Type of what a service is asked with."""
+    """Type of a service's request."""
     return f"{service}_Request"
 
 
 def response_of(service: str) -> str:
-    """Type of what a service answers."""
+    """Type of a service's response."""
     return f"{service}_Response"
 
 

@@ -22,7 +22,7 @@ class Joints(NamedTuple):
         stamp_ns: of its header, 0 where the robot did not stamp it.
         names: of any joints.
         position: (n,) rad or m.
-        velocity: (n,), or None where the robot does not say.
+        velocity: (n,), or None if the robot does not report it.
         effort: (n,), or None.
     """
 

@@ -1,7 +1,7 @@
 """Messages that command a ROS 2 robot: poses, joint positions, gripper openings.
 
-A pose can be sent as any message with a pose in it, your own too, which is filled by what its
-fields are: ``geometry_msgs/Pose`` (or ``PoseStamped``) gets the pose, ``std_msgs/Header`` stamp and
+A pose can be sent as any message with a pose in it, your own too. Its fields are filled by their
+types: ``geometry_msgs/Pose`` (or ``PoseStamped``) gets the pose, ``std_msgs/Header`` stamp and
 frame, ``geometry_msgs/Twist`` the feed-forward velocity, and an array of as many numbers as the arm
 has joints the posture of its nullspace. The rest stays zero.
 """
