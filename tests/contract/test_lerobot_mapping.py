@@ -161,7 +161,7 @@ def test_a_policy_that_plans_by_itself_gives_one_step(
         ({"state": ""}, r"state has 8 numbers, '' has 0"),
         ({"state": "joint"}, r"state has 8 numbers, 'joint' has 7"),
         ({"state": "joint+grip"}, r"called 'grip'; there are: joint \(one"),
-        ({"map": "observation.images.hand=camera:wrist"}, r"no picture of the policy; its"),
+        ({"map": "observation.images.hand=camera:wrist"}, r"not an image of the policy; its"),
         ({"map": "observation.images.gripper_cam=camera:front"}, r"two pictures .* 'front'"),
         ({"map": f"{WRIST},observation.images.front="}, r"a policy 'act' needs it"),
         ({"map": "observation.images.front=joint"}, r"front is a picture, so .*=camera:NAME"),
