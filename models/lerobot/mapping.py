@@ -99,9 +99,7 @@ def pictures(
         if not source.camera:
             raise WorkerError(f"map: {feature} is a picture, so {feature}=camera:NAME")
         if source.camera in out:
-            raise WorkerError(
-                f"two images of the policy must come from camera {source.camera!r}"
-            )
+            raise WorkerError(f"two images of the policy must come from camera {source.camera!r}")
         if len(shape) != 3 or shape[0] != 3:
             raise WorkerError(f"{feature} has shape {shape}; wanted three colours: (3, H, W)")
         out[source.camera] = feature, shape

@@ -221,7 +221,8 @@ class Keys:
         "sim/reset", "Empty, or a seed as plain text: the arm goes home, objects are placed again."
     )
     sim_step = _Key(
-        "sim/step", "Query in lockstep mode: advance by a number of nanoseconds, reply with the state."
+        "sim/step",
+        "Query in lockstep mode: advance by a number of nanoseconds, reply with the state.",
     )
 
     # -- selectors ----------------------------------------------------------------------------

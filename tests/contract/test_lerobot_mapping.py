@@ -162,7 +162,7 @@ def test_a_policy_that_plans_by_itself_gives_one_step(
         ({"state": "joint"}, r"state has 8 numbers, 'joint' has 7"),
         ({"state": "joint+grip"}, r"called 'grip'; there are: joint \(one"),
         ({"map": "observation.images.hand=camera:wrist"}, r"not an image of the policy; its"),
-        ({"map": "observation.images.gripper_cam=camera:front"}, r"two pictures .* 'front'"),
+        ({"map": "observation.images.gripper_cam=camera:front"}, r"two images .* 'front'"),
         ({"map": f"{WRIST},observation.images.front="}, r"a policy 'act' needs it"),
         ({"map": "observation.images.front=joint"}, r"front is a picture, so .*=camera:NAME"),
         ({"horizon": "101"}, r"horizon is 101; the policy's chunks have 100"),

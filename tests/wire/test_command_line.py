@@ -37,7 +37,7 @@ def test_a_session_from_prompt_to_reset(chain: Chain) -> None:
     assert "speed: 30 % of the planned speed" in ok(chain, "speed", "30 %")
     assert "speed 30 %" in ok(chain, "status", "--once")
     assert "speed: 80 % of the planned speed" in ok(chain, "speed", "80")
-    assert "'fast' is no percentage" in run(chain, "speed", "fast").stderr
+    assert "'fast' is not a percentage" in run(chain, "speed", "fast").stderr
     ok(chain, "speed", "100")
 
     refused = run(chain, "use", "scripter")

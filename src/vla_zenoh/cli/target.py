@@ -165,7 +165,8 @@ class RobotTarget:
             if operator_role(profile, host) is Role.OPERATOR
         ]
         what = (
-            f"this computer also has an operator certificate: `{self.typed(*command, host=able[0])}`"
+            "this computer also has an operator certificate: "
+            f"`{self.typed(*command, host=able[0])}`"
             if able
             else "`vla-zenoh secure add HOST --role operator` makes an operator certificate"
         )

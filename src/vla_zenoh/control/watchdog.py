@@ -183,7 +183,7 @@ class Deadman:
         """
         reasons = []
         if holder and holder not in present:
-            reasons.append(f"deadman {holder!r} {NO_DEADMAN_TOKEN}")
+            reasons.append(f"the deadman of this activation, {holder!r}, {NO_DEADMAN_TOKEN}")
         if obeying and holder and self.name and holder != self.name:
             reasons.append(f"the arm is active already, held by {self.name!r}; deactivate it first")
         return reasons

@@ -56,7 +56,7 @@ def test_nobody_activates_in_the_name_of_one_who_is_not_there() -> None:
     rig.put("active", ANNA)
     assert rig.state == "inactive"
     assert rig.refused == {"activate_refused": 1}
-    assert "deadman 'anna-1' is not there" in rig.commander.why
+    assert "the deadman of this activation, 'anna-1', is not there" in rig.commander.why
 
 
 def test_what_one_holds_is_not_taken_over_by_others_or_by_nobody() -> None:
