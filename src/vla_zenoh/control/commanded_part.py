@@ -60,7 +60,7 @@ class CommandedPart:
         self._joint_monitor = None if reach is None else JointMonitor(profile, reach)
         self._load_known = True
 
-    # -- how its name is said -----------------------------------------------------------------
+    # -- its name in messages -----------------------------------------------------------------
     def says(self, why: str) -> str:
         """`why`, with the part that it is about."""
         return f"{self.name}: {why}" if self.name and why else why
