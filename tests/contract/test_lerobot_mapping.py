@@ -77,7 +77,7 @@ def test_numbers_are_read_in_the_units_and_bounds_that_are_told(tmp_path: Path) 
         False,
         0.0,
     )
-    steps = vars(policy)["_meaning"].steps(np.array([[1.0, -3.0, 0.5, 0.0, 0.2, 9.0, -1.0]]))
+    steps = vars(policy)["_meaning"][""].steps(np.array([[1.0, -3.0, 0.5, 0.0, 0.2, 9.0, -1.0]]))
     np.testing.assert_allclose(steps, [[0.05, -0.05, 0.025, 0, 0.1, 0.5, -1]], atol=ATOL)
 
 
