@@ -41,6 +41,7 @@ from vla_zenoh.types import (
     MAX_TEXT,
     ActionChunk,
     GripperState,
+    HeldBox,
     JointState,
     PoseState,
     Stamped,
@@ -274,6 +275,8 @@ class Commander:
         for part in self.parts:
             states = inputs.of(part.name)
             part.update(states)
+            if part.let_go:
+                self._hold(part, None)
             if states.gripper is None:
                 continue
             faults, mode = states.gripper.record.faults, states.gripper.record.mode
@@ -298,11 +301,15 @@ class Commander:
                 self._reject_setting(name, [late])
                 return
         try:
-            self._set(name, value, now_ns)
+            if name == "held":
+                box = value if isinstance(value, HeldBox) else None
+                self._hold(next(part for part in self.parts if part.name == setting.part), box)
+            else:
+                self._set(name, value, now_ns)
         except RecordError as error:
             self._reject_setting(name, [str(error)])
 
-    def _set(self, name: str, value: str | bool | float | None, now_ns: int) -> None:
+    def _set(self, name: str, value: object, now_ns: int) -> None:
         if name == "prompt" and isinstance(value, str):
             if value != self.task.prompt:
                 self._new_episode(now_ns, prompt=value)
@@ -331,6 +338,15 @@ class Commander:
             self._change(Trigger.LOSE, str(value))
         elif name != "stop":
             raise RecordError(f"{name!r} cannot be set to {value!r}")
+
+    def _hold(self, part: CommandedPart, box: HeldBox | None) -> None:
+        if box == part.held:
+            return
+        part.hold(box)
+        if self._spacing is not None:
+            self._spacing.place()
+        holds = "nothing" if box is None else f"a box of {box} m"
+        self._emit("info", "notice", "gripper_holds", part.says(f"the gripper holds {holds}"))
 
     def _new_episode(self, now_ns: int, **changes: str) -> None:
         # From the wall clock, so that a restarted node never reuses an episode number.

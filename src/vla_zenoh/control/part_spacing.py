@@ -60,19 +60,9 @@ class PartSpacing:
     """
 
     def __init__(self, profile: Profile, parts: Sequence[CommandedPart]) -> None:
-        self._parts = tuple(parts)
-        placed: list[PlacedArm] = []
-        for part in self._parts:
-            base, reach = profile.parts[part.name].base, part.reach
-            assert reach is not None
-            turn = rotation_from_rpy(np.array([0.0, 0.0, base.yaw_rad]))
-            stands = Pose(np.array(base.position_m), turn)
-            placed.append(PlacedArm(reach.kinematics, reach.barriers.collisions, stands))
+        self._parts, self._profile = tuple(parts), profile
         limits = [part.profile.limits.reach for part in self._parts]
-        self._pairs = [
-            (i, j, PartDistance(placed[i], placed[j]))
-            for i, j in itertools.combinations(range(len(placed)), 2)
-        ]
+        self.place()
         self._stop_m = max(limit.part_stop_m for limit in limits)
         self._slow_m = max(limit.part_slow_m for limit in limits)
         self._within_m = max(self._slow_m, self._stop_m) + FAR_M
@@ -81,6 +71,20 @@ class PartSpacing:
         self._skip = 0
         self._held = False
         self._slower = False
+
+    def place(self) -> None:
+        """Take the shapes of all parts, with what their grippers hold."""
+        placed: list[PlacedArm] = []
+        for part in self._parts:
+            base, reach = self._profile.parts[part.name].base, part.reach
+            assert reach is not None
+            turn = rotation_from_rpy(np.array([0.0, 0.0, base.yaw_rad]))
+            stands = Pose(np.array(base.position_m), turn)
+            placed.append(PlacedArm(reach.kinematics, reach.barriers.collisions, stands))
+        self._pairs = [
+            (i, j, PartDistance(placed[i], placed[j]))
+            for i, j in itertools.combinations(range(len(placed)), 2)
+        ]
 
     def look(self, now_ns: int, ahead_s: float, *, moves: bool) -> Spacing:
         """What the distance allows in the coming tick.

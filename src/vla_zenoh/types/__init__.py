@@ -31,6 +31,7 @@ if TYPE_CHECKING:
         LATENCY_STAGES,
         Cause,
         GripperCommand,
+        HeldBox,
         JointCommand,
         PoseCommand,
     )
@@ -60,6 +61,7 @@ __all__ = [
     "GripperCommand",
     "GripperState",
     "Header",
+    "HeldBox",
     "Image",
     "InferenceDebug",
     "JointCommand",
