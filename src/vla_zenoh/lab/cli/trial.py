@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import secrets
 import signal
 import sys
 from dataclasses import asdict, dataclass
@@ -14,13 +13,13 @@ import typer
 from vla_zenoh.cli.options import JsonOption, options
 from vla_zenoh.cli.output import console, errors, fail, new_table, print_json
 from vla_zenoh.cli.target import RobotTarget
+from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.cli.output_path import check_folder
 from vla_zenoh.lab.trial.folder import TrialFolder
 from vla_zenoh.lab.trial.plan import TrialPlan
 from vla_zenoh.lab.trial.score import TrialScore, score
 from vla_zenoh.lab.trial.verdict import EpisodeVerdict
 
-EPISODES, SECONDS = 20, 60.0
 STOPPED = 3
 """Exit code of an unattended trial that a rule or a person stopped."""
 
@@ -137,27 +136,14 @@ def _setups(episodes: int | None, file: Path | None) -> tuple[str, ...] | None:
 
 def _plan(folder: TrialFolder, asked: dict[str, Any]) -> TrialPlan:
     """The plan of the folder, or a new one from `asked`."""
-    plan = folder.plan()
-    if plan is not None:
-        if others := plan.differences(asked):
-            fail(
-                f"{folder.path} has another plan: {'; '.join(others)}. Leave that out to continue "
-                "it, or give another --output"
-            )
-        return plan
-    for name in ("workers", "prompt"):
-        if asked[name] is None:
-            raise typer.BadParameter(f"--{name} is required: {folder.path} holds no trial yet")
-    defaults = {
-        "setups": ("",) * EPISODES,
-        "seconds": SECONDS,
-        "seed": secrets.randbelow(2**32),
-        "blind": True,
-    }
-    given = {name: value for name, value in asked.items() if value is not None}
-    plan = TrialPlan(**{**defaults, **given})
-    folder.begin(plan)
-    return plan
+    if folder.plan() is None:
+        for name in ("workers", "prompt"):
+            if asked[name] is None:
+                raise typer.BadParameter(f"--{name} is required: {folder.path} holds no trial yet")
+    try:
+        return folder.agreed(asked)
+    except RecordingError as error:
+        fail(str(error))
 
 
 def _unattended(

@@ -10,7 +10,8 @@ import fcntl
 import json
 import os
 import re
-from collections.abc import Iterator, Sequence
+import secrets
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from functools import cache
@@ -23,6 +24,8 @@ from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.trial.plan import TrialPlan
 from vla_zenoh.lab.trial.verdict import EpisodeVerdict
 
+EPISODES, SECONDS = 20, 60.0
+"""Of a plan that does not say them."""
 PLAN, TRIALS = "plan.json", "trials.jsonl"
 _RECORDING = re.compile(r"episode-(\d+)\.mcap")
 
@@ -66,6 +69,35 @@ class TrialFolder:
             return None
         except OSError as error:
             raise RecordingError(f"{self.path / PLAN} cannot be read: {error.strerror}") from error
+
+    def agreed(self, asked: Mapping[str, Any]) -> TrialPlan:
+        """The plan of the trial; where the folder has none, a new one is written.
+
+        Args:
+            asked: fields of a plan; those that are None are as the folder has them, or usual ones.
+
+        Raises:
+            RecordingError: the folder has another plan, or cannot be read or written.
+            RecordError: a value is not allowed.
+        """
+        plan = self.plan()
+        if plan is not None:
+            if others := plan.differences(asked):
+                raise RecordingError(
+                    f"{self.path} has another plan: {'; '.join(others)}. Leave that out to "
+                    "continue it, or give another --output"
+                )
+            return plan
+        usual = {
+            "setups": ("",) * EPISODES,
+            "seconds": SECONDS,
+            "seed": secrets.randbelow(2**32),
+            "blind": True,
+        }
+        given = {name: value for name, value in asked.items() if value is not None}
+        plan = TrialPlan(**{**usual, **given})
+        self.begin(plan)
+        return plan
 
     def episodes(self) -> list[EpisodeVerdict]:
         """Verdicts in the order of the episodes.

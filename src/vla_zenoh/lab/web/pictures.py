@@ -1,23 +1,31 @@
-"""Pictures for pages: newest JPEG of each stream that some page looks at."""
+"""Pictures for pages: newest JPEG, or depth, of each stream that some page looks at."""
 
 from __future__ import annotations
 
 import threading
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
+import cv2
+import numpy as np
 import zenoh
 
 from vla_zenoh.bus.buffers import bytes_of, header_of
+from vla_zenoh.codec.image import decode_depth, encode_jpeg
 from vla_zenoh.errors import CodecError, ProfileError
 from vla_zenoh.keys import Keys
 from vla_zenoh.lab.newest_records import StreamSlot
+from vla_zenoh.profile import CameraProfile
+from vla_zenoh.types import Image
 
 MAX_PICTURE_BYTES = 4 * 1024 * 1024
 MAX_STREAMS = 32
 """Of all pages together."""
 JPEG_START = b"\xff\xd8"
+NEAR_PERCENT, FAR_PERCENT = 1.0, 99.0
+SPARSE = 4
+"""Of so many rows and columns one says how near and far a depth picture goes."""
 
 
 class Picture(NamedTuple):
@@ -26,10 +34,12 @@ class Picture(NamedTuple):
     Args:
         jpeg: the file.
         stamp_wall_ns: capture, clock of its camera.
+        said: which distances its colours mean, of a depth picture.
     """
 
     jpeg: bytes
     stamp_wall_ns: int
+    said: str
 
 
 class _Stream:
@@ -46,26 +56,35 @@ class Pictures:
     Args:
         session: open.
         keys: of the robot.
-        cameras: names in the profile.
+        cameras: of the profile.
+
+    Attributes:
+        offered: streams of the cameras: ``camera/NAME``, and ``depth/NAME`` where it measures it.
     """
 
-    def __init__(self, session: zenoh.Session, keys: Keys, cameras: Iterable[str]) -> None:
+    def __init__(
+        self, session: zenoh.Session, keys: Keys, cameras: Mapping[str, CameraProfile]
+    ) -> None:
         self._session, self._keys = session, keys
-        self.cameras = tuple(cameras)
+        self.offered = tuple(f"camera/{name}" for name in cameras) + tuple(
+            f"depth/{name}" for name, camera in cameras.items() if camera.depth_unit_m is not None
+        )
         self._streams: dict[str, _Stream] = {}
         self._lock = threading.Lock()
         self.rejected: Counter[str] = Counter()
 
     def _key(self, name: str) -> str:
-        """Key of ``camera/NAME`` or ``seen/WORKER/CAMERA``.
+        """Key of ``camera/NAME``, ``depth/NAME`` or ``seen/WORKER/CAMERA``.
 
         Raises:
             CodecError: there is no such stream.
         """
         kind, _, rest = name.partition("/")
         try:
-            if kind == "camera" and rest in self.cameras:
+            if kind == "camera" and name in self.offered:
                 return self._keys.camera_jpeg(rest)
+            if kind == "depth" and name in self.offered:
+                return self._keys.camera_depth(rest)
             if kind == "seen" and rest.count("/") == 1:
                 return self._keys.seen(*rest.split("/"))
         except ProfileError as error:
@@ -103,16 +122,40 @@ class Pictures:
         return 0 if stream is None else stream.latest.count
 
     def newest(self, name: str) -> Picture | None:
-        """The newest picture of a stream; None before the first, or if it is no JPEG file."""
+        """The newest picture of a stream; None before the first, or if it cannot be read.
+
+        That of a depth stream is made of it, in colours from near (red) to far (blue), which takes
+        some milliseconds.
+        """
         stream = self._streams.get(name)
         sample = None if stream is None else stream.latest.arrival
         if sample is None:
             return None
         try:
-            jpeg = bytes_of(sample.sample.payload, MAX_PICTURE_BYTES)
+            jpeg, said = bytes_of(sample.sample.payload, MAX_PICTURE_BYTES), ""
+            if name.startswith("depth/"):
+                jpeg, said = _coloured(jpeg, str(sample.sample.encoding))
             if not jpeg.startswith(JPEG_START):
                 raise CodecError("malformed", "no JPEG file")
-            return Picture(jpeg, header_of(sample.sample).stamp_wall_ns)
+            return Picture(jpeg, header_of(sample.sample).stamp_wall_ns, said)
         except CodecError as error:
             self.rejected[error.reason] += 1
             return None
+
+
+def _coloured(png: bytes, encoding: str) -> tuple[bytes, str]:
+    """A depth picture as JPEG, and which distances its colours mean.
+
+    Raises:
+        CodecError: it is no depth picture.
+    """
+    depth = decode_depth(png, encoding.partition(";")[2])
+    sparse = depth.counts[::SPARSE, ::SPARSE]
+    known = sparse[sparse > 0]
+    if not known.size:
+        return encode_jpeg(Image(np.zeros((*depth.counts.shape, 3), np.uint8))), "nothing measured"
+    near, far = np.percentile(known, (NEAR_PERCENT, FAR_PERCENT))
+    shares = np.interp(depth.counts, (near, max(far, near + 1)), (255.0, 0.0)).astype(np.uint8)
+    rgb = np.array(cv2.applyColorMap(shares, cv2.COLORMAP_TURBO)[:, :, ::-1], np.uint8)
+    rgb[depth.counts == 0] = 0
+    return encode_jpeg(Image(rgb)), f"{near * depth.unit_m:.2f} to {far * depth.unit_m:.2f} m"

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from vla_zenoh.errors import CodecError
+from vla_zenoh.lab.web.making import FILM, REPORT
 from vla_zenoh.types import MAX_TEXT, shown
 
 MAX_BYTES = 8192
@@ -66,6 +67,14 @@ def _verdict(value: Any) -> bool:
     return value in ("success", "failure", "void", "")
 
 
+def _made(value: Any) -> bool:
+    return value in (REPORT, FILM)
+
+
+def _primitive(value: Any) -> bool:
+    return value in ("home", "open", "closed")
+
+
 def _streams(value: Any) -> bool:
     return isinstance(value, list) and len(value) <= MAX_STREAMS and all(map(_text, value))
 
@@ -81,10 +90,25 @@ FIELDS: Mapping[str, Mapping[str, Callable[[Any], bool]]] = {
     "activate": {},
     "deactivate": {},
     "hold": {"press": _count, "tick": _count},
+    "primitive": {"press": _count, "tick": _count, "name": _primitive},
     "beat": {"press": _count, "tick": _count, "twist": _twist, "opening": _share},
     "release": {},
     "jog": {"on": _flag, "frame": _frame, "level": _level},
     "record": {"on": _flag, "verdict": _verdict, "note": _text},
+    "save": {"note": _text},
+    "trial": {
+        "name": _text,
+        "workers": _text,
+        "prompt": _text,
+        "episodes": _count,
+        "seconds": _number,
+        "blind": _flag,
+    },
+    "answer": {"number": _count, "line": _text},
+    "watched": {"tick": _count},
+    "end_trial": {},
+    "runs": {},
+    "make": {"name": _text, "kind": _made},
     "look": {"streams": _streams, "hz": _number},
     "drawn": {"frame": _count},
 }

@@ -13,10 +13,11 @@ import zenoh
 
 from vla_zenoh.bus.buffers import LatestSample, ReceivedSample, ZenohRing, bytes_of, header_of
 from vla_zenoh.bus.client import Client
+from vla_zenoh.bus.primitives import ask
 from vla_zenoh.cli.node_rows import NodeRow, acting_limits, mode_of, node_rows
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, RecordError, SessionError, VlaZenohError
-from vla_zenoh.keys import last_chunk, worker_node
+from vla_zenoh.keys import PRIMITIVES, ROLLING, last_chunk, worker_node
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.kinematics.so3 import Pose, rotation_from_quat
 from vla_zenoh.lab.teleop.policy import OperatorInput
@@ -24,6 +25,7 @@ from vla_zenoh.lab.web.arm import ArmLines, Line, rounded
 from vla_zenoh.lab.web.hand import HandWorker
 from vla_zenoh.lab.web.hold import Hold
 from vla_zenoh.lab.web.recordings import Recordings
+from vla_zenoh.lab.web.trial import PageTrial
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
@@ -89,6 +91,7 @@ class RobotLink:
         self._hand = OperatorInput()
         self.hand = HandWorker(profile, self.client, self._read_hand)
         self.recordings = Recordings(profile, session)
+        self.trial = PageTrial(profile)
         self._watcher = threading.Thread(target=self._watch_hold, name="hold", daemon=True)
         self._watcher.start()
 
@@ -201,6 +204,9 @@ class RobotLink:
             "done": detail.get("policy_done", False),
             "task": None if task is None else task_fields(task),
             "jog": self.hand.has_arm,
+            "trial": self.trial.state(),
+            "primitives": worker_node(PRIMITIVES) in self.client.alive,
+            "rolling": ROLLING in self.client.alive,
             "seen": [] if task is None else self._seen.get(task.worker, []),
             "workers": sorted(
                 name.removeprefix(worker_node(""))
@@ -287,6 +293,44 @@ class RobotLink:
                 raise
             self._confirmed = True
             return task
+
+    def primitive(self, page: int, name: str, what: str) -> str:
+        """Go home, open or close the gripper, for as long as this page holds; waits for the end.
+
+        Args:
+            page: that holds.
+            name: of the person.
+            what: ``home``, ``open`` or ``closed``.
+
+        Raises:
+            SessionError: let go, or it was not done; says why.
+        """
+        with self._activating:
+            try:
+                answer = ask(
+                    self.client,
+                    "home" if what == "home" else "grip",
+                    {} if what == "home" else {"width_m": what},
+                    who=f"web-{name}"[:MAX_HOLDER],
+                    cancelled=lambda: not self.holds(page),
+                )
+            finally:
+                with self._hold_lock:  # it has ended by itself: nothing is to be deactivated
+                    self._hold.release(page)
+        if not answer.ok:
+            raise SessionError(f"{what}: {answer.reason}{answer.why and f': {answer.why}'}")
+        return f"{what}: {answer.reason} after {answer.took_s:.1f} s"
+
+    def save(self, note: str) -> str:
+        """Have the rolling record keep its last minutes.
+
+        Raises:
+            SessionError: none runs.
+        """
+        if ROLLING not in self.client.alive:
+            raise SessionError("no rolling record runs; `vla-zenoh up` keeps one")
+        self.client.publish(self.keys.save, note or "asked on the page")
+        return "the rolling record saves its last minutes; the log says where"
 
     def holds(self, page: int) -> bool:
         """Whether the hold in force is of this page."""
@@ -383,6 +427,7 @@ class RobotLink:
         self._closed.set()
         self._wake.set()
         self._watcher.join()
+        self.trial.close()
         self.hand.close()
         self.recordings.close()
         self.client.release_deadman()

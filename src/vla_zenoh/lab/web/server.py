@@ -12,26 +12,33 @@ import contextlib
 import json
 import time
 from collections import Counter, deque
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from vla_zenoh.errors import CodecError, MissingExtraError, VlaZenohError
+from vla_zenoh.errors import CodecError, MissingExtraError, RecordingError, VlaZenohError
 from vla_zenoh.lab.teleop.policy import OperatorInput
+from vla_zenoh.lab.trial.plan import MAX_SETUPS
 from vla_zenoh.lab.web import metrics
 from vla_zenoh.lab.web.access import People, Person, RateLimit, host_is_ours, origin_is_ours
 from vla_zenoh.lab.web.arm import surroundings
+from vla_zenoh.lab.web.making import FILM
 from vla_zenoh.lab.web.pictures import Pictures
 from vla_zenoh.lab.web.requests import PageRequest, parse
 from vla_zenoh.lab.web.robot_link import RobotLink
+from vla_zenoh.lab.web.runs import HEADERS as RUN_HEADERS
+from vla_zenoh.lab.web.runs import KINDS, Runs
 from vla_zenoh.lab.web.tables import node_table, noted_event
 
 try:
     import uvicorn  # noqa: F401  # pyright: ignore[reportMissingImports]
     from starlette.applications import Starlette  # pyright: ignore[reportMissingImports]
     from starlette.requests import Request as HttpRequest  # pyright: ignore[reportMissingImports]
-    from starlette.responses import Response  # pyright: ignore[reportMissingImports]
+    from starlette.responses import (  # pyright: ignore[reportMissingImports]
+        FileResponse,
+        Response,
+    )
     from starlette.routing import Route, WebSocketRoute  # pyright: ignore[reportMissingImports]
     from starlette.websockets import (  # pyright: ignore[reportMissingImports]
         WebSocket,
@@ -48,8 +55,8 @@ FILES = {
 }
 HEADERS = {
     "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
-    "img-src 'self' blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
-    "frame-ancestors 'none'",
+    "img-src 'self' blob:; media-src 'self'; connect-src 'self'; base-uri 'none'; "
+    "form-action 'none'; frame-ancestors 'none'",
     "x-content-type-options": "nosniff",
     "referrer-policy": "no-referrer",
     "cross-origin-opener-policy": "same-origin",
@@ -68,8 +75,9 @@ RATE_HZ, BURST = 50.0, 100.0
 MAX_PICTURE_HZ, IN_FLIGHT, PICTURE_POLL_S = 30.0, 2, 0.01
 """Pictures sent that a page has not drawn yet: with more, a slow one would see the past."""
 POLICY_VIOLATION, TRY_LATER = 1008, 1013
+VIEWERS_TOO = ("runs", "make")
 OPERATORS_ONLY = "your token is a viewer's, which may look and nothing else"
-Send = Callable[[dict[str, Any]], None]
+Masked = Callable[[dict[str, Any]], dict[str, Any] | None]
 
 
 class Page:
@@ -78,10 +86,11 @@ class Page:
     Args:
         number: of its connection.
         person: who it is.
+        masked: what may be told of a message; None: nothing.
     """
 
-    def __init__(self, number: int, person: Person) -> None:
-        self.number, self.person = number, person
+    def __init__(self, number: int, person: Person, masked: Masked) -> None:
+        self.number, self.person, self._masked = number, person, masked
         self.limit = RateLimit(RATE_HZ, BURST, time.monotonic())
         self.complaints = RateLimit(5.0, 10.0, time.monotonic())
         self.answers: deque[str] = deque(maxlen=MAX_ANSWERS)
@@ -95,8 +104,10 @@ class Page:
 
     def tell(self, message: dict[str, Any]) -> None:
         """Send a message as soon as the connection takes it; the oldest give way."""
-        self.answers.append(json.dumps(message))
-        self.changed.set()
+        may = self._masked(message)
+        if may is not None:
+            self.answers.append(json.dumps(may))
+            self.changed.set()
 
 
 class PageServer:
@@ -114,6 +125,7 @@ class PageServer:
     ) -> None:
         self._link, self._people = link, people
         self._names, self._secure = tuple(names), secure
+        self._runs = Runs()
         self._pictures = Pictures(link.session, link.keys, link.profile.cameras)
         self._pages: dict[int, Page] = {}
         self._next = 0
@@ -130,6 +142,7 @@ class PageServer:
         routes += [
             Route("/favicon.ico", lambda _: Response(status_code=204)),
             Route("/metrics", self._metrics),
+            Route("/runs/{ticket}/{rest:path}", self._made),
             Route("/stop", self._stop_by_post, methods=["POST"]),
             WebSocketRoute("/control", self._control),
             WebSocketRoute("/pictures", self._show_pictures),
@@ -185,6 +198,15 @@ class PageServer:
         text = metrics.exposition(self._link.rows(), self.counters, len(self._pages))
         return Response(text, headers={"content-type": metrics.CONTENT_TYPE_LATEST})
 
+    async def _made(self, request: HttpRequest) -> Response:
+        """A page or film of a run, by its ticket."""
+        found = request.path_params
+        path = await asyncio.to_thread(self._runs.opened, found["ticket"], found["rest"])
+        if path is None:
+            await asyncio.sleep(DENIED_S)
+            return Response("no such address, or not any more: ask the page for it again\n", 404)
+        return FileResponse(path, headers={**RUN_HEADERS, "content-type": KINDS[path.suffix]})
+
     async def _stop_by_post(self, request: HttpRequest) -> Response:
         """The way of a page whose WebSocket is broken."""
         person = await self._bearer(request)
@@ -215,7 +237,7 @@ class PageServer:
                 self._tell_all(news)
             if self._pages:
                 state = {**self._link.state(), "arm": self._link.arm(), "pages": len(self._pages)}
-                self._state = json.dumps(state)[1:]
+                self._state = json.dumps(self._link.trial.masked(state))[1:]
                 if now_s - nodes_s > NODES_S:
                     nodes_s = now_s
                     self._tell_all(self._node_message())
@@ -257,7 +279,7 @@ class PageServer:
                 await socket.close(TRY_LATER)
                 return
             self._next += 1
-            page = self._pages[self._next] = Page(self._next, person)
+            page = self._pages[self._next] = Page(self._next, person, self._link.trial.masked)
             self._welcome(page)
             sending = asyncio.create_task(self._send_state(page, socket))
             while True:
@@ -267,6 +289,7 @@ class PageServer:
         finally:
             if page is not None:
                 self._link.release(page.number, gone=True)
+                self._link.trial.gone(page.number)
                 del self._pages[page.number]
             if sending is not None:
                 sending.cancel()
@@ -279,7 +302,7 @@ class PageServer:
                 "robot": link.keys.robot,
                 "person": page.person.name,
                 "drives": page.drives,
-                "cameras": self._pictures.cameras if page.drives else (),
+                "pictures": self._pictures.offered if page.drives else (),
                 "surroundings": surroundings(link.profile),
                 "no_arm": link.no_arm,
                 "insecure": link.profile.session.insecure,
@@ -313,7 +336,7 @@ class PageServer:
             self._complain(page, "too_fast", f"more than {RATE_HZ:g} messages per second")
             return
         self.counters["message"] += 1
-        if not page.drives:
+        if not page.drives and request.do not in VIEWERS_TOO:
             self._complain(page, "not_allowed", OPERATORS_ONLY)
             return
         await self._obey(page, request)
@@ -330,32 +353,70 @@ class PageServer:
         if request.do == "stop":
             self._begin(self._stop(page.person))
         elif request.do == "hold":
-            self._press(page, values["press"], values["tick"])
+            name = page.person.name
+            self._press(page, request, lambda: link.activate_held(page.number, name))
+        elif request.do == "primitive":
+            name, what = page.person.name, values["name"]
+            self._press(page, request, lambda: link.primitive(page.number, name, what))
         elif request.do == "beat":
             hand = OperatorInput(tuple(values["twist"]), values["opening"])
             if not link.beat(page.number, values["press"], values["tick"], hand):
                 page.tell({"is": "hold_ended", "press": values["press"]})
         elif request.do == "release":
             link.release(page.number)
+        elif request.do == "answer":
+            link.trial.answer(page.number, values["number"], values["line"])
+        elif request.do == "watched":
+            link.trial.watched(page.number, values["tick"] / 1e3)
+        elif request.do == "trial":
+            self._change(page, "trial", lambda: link.trial.begin(*_trial(page.number, values)))
+        elif request.do == "runs":
+            self._begin(self._tell_runs(page))
+        elif request.do == "make":
+            self._begin(self._make(page, values["name"], values["kind"]))
         elif request.do in SETTINGS:
             self._change(page, request.do, lambda: SETTINGS[request.do](link, values))
         else:
             self._complain(page, "bad_message", f"{request.do} is no request of this socket")
 
-    def _press(self, page: Page, press: int, tick_ms: int) -> None:
+    def _press(self, page: Page, request: PageRequest, call: Callable[[], Any]) -> None:
+        """Begin a hold, and `call` with it."""
+        press = request.values["press"]
         try:
-            self._link.press(page.number, press, tick_ms)
+            self._link.press(page.number, press, request.values["tick"])
         except VlaZenohError as error:
             page.tell({"is": "hold_ended", "press": press, "why": str(error)})
             return
-        name = page.person.name
-        self._change(page, "hold", lambda: self._link.activate_held(page.number, name), press)
+        self._change(page, request.do, call, press)
+
+    async def _tell_runs(self, page: Page) -> None:
+        try:
+            page.tell({"is": "runs", "runs": await asyncio.to_thread(self._runs.listed)})
+        except OSError as error:  # one was removed meanwhile
+            self._complain(page, "runs", f"the folder of runs cannot be read: {error}")
+
+    async def _make(self, page: Page, name: str, kind: str) -> None:
+        """Make the page or film of a run, and tell how far it is."""
+        loop = asyncio.get_running_loop()
+        message = {"is": "making", "name": name, "kind": kind}
+
+        def told(share: float) -> None:
+            loop.call_soon_threadsafe(page.tell, {**message, "share": share})
+
+        try:
+            if kind == FILM and not page.drives:
+                raise RecordingError(OPERATORS_ONLY)
+            page.tell(message)
+            url = await asyncio.to_thread(self._runs.make, name, kind, page.drives, told)
+            page.tell({**message, "is": "made", "url": url})
+        except (VlaZenohError, OSError) as error:
+            page.tell({**message, "is": "made", "why": str(error)})
 
     def _change(self, page: Page, what: str, call: Callable[[], Any], press: int = 0) -> None:
         """Run what waits for the robot on a thread, one at a time for a page, and tell its end."""
         if page.busy:
             self._complain(page, "busy", f"still waiting for {page.busy}")
-            if what == "hold":
+            if press:
                 self._link.release(page.number)
             return
         page.busy = what
@@ -448,7 +509,7 @@ class PageServer:
         with contextlib.suppress(WebSocketDisconnect, RuntimeError):
             while True:
                 for name in look.due(time.monotonic(), self._pictures):
-                    picture = self._pictures.newest(name)
+                    picture = await asyncio.to_thread(self._pictures.newest, name)
                     if picture is None:
                         continue
                     look.sent += 1
@@ -456,6 +517,7 @@ class PageServer:
                         "name": name,
                         "frame": look.sent,
                         "stamp_ms": picture.stamp_wall_ns // 1_000_000,
+                        "said": picture.said,
                     }
                     self.counters["picture"] += 1
                     self.counters["picture_bytes"] += len(picture.jpeg)
@@ -490,6 +552,19 @@ class Look:
         return found
 
 
+def _trial(page: int, given: Mapping[str, Any]) -> tuple[int, str, dict[str, Any]]:
+    """Arguments of `PageTrial.begin`; what is left empty is as the folder has it."""
+    workers = tuple(name.strip() for name in given["workers"].split(",") if name.strip())
+    asked = {
+        "workers": workers or None,
+        "prompt": given["prompt"].strip() or None,
+        "setups": ("",) * min(given["episodes"], MAX_SETUPS + 1) or None,
+        "seconds": float(given["seconds"]) or None,
+        "blind": None if given["blind"] else False,
+    }
+    return page, given["name"], asked
+
+
 async def _receive(socket: WebSocket) -> str:
     """The next text of a browser.
 
@@ -503,12 +578,15 @@ async def _receive(socket: WebSocket) -> str:
 
 
 def _with_headers(send: Any) -> Any:
-    """`send` with `HEADERS` on every response."""
+    """`send` with `HEADERS` on every response that has none of its own."""
 
     async def sending(message: Any) -> None:
         if message["type"] == "http.response.start":
+            own = list(message.get("headers", ()))
+            given = {name for name, _ in own}
             more = [(name.encode(), value.encode()) for name, value in HEADERS.items()]
-            message = {**message, "headers": [*message.get("headers", ()), *more]}
+            own += [(name, value) for name, value in more if name not in given]
+            message = {**message, "headers": own}
         await send(message)
 
     return sending
@@ -525,6 +603,8 @@ SETTINGS: dict[str, Callable[[RobotLink, Any], Any]] = {
     "jog": lambda link, given: (
         link.hand.take(given["frame"], given["level"]) if given["on"] else link.hand.give_back()
     ),
+    "end_trial": lambda link, _: link.trial.end(),
+    "save": lambda link, given: link.save(given["note"]),
     "record": lambda link, given: link.record(given["on"], given["verdict"], given["note"]),
 }
 """Request -> what changes the robot; it waits for the confirmation."""

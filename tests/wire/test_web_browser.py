@@ -1,0 +1,234 @@
+"""The page in headless Chromium at a robot at work: what a person touches, and what follows."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from camera_rig import PATIENCE_S, until
+from chain import Chain, running_chain, write_profile
+from web_rig import OPERATOR, Site, serving, write_people
+
+from vla_zenoh.lab.trial.folder import TrialFolder
+
+pytest.importorskip("starlette", reason="needs the extra web")
+webdriver = pytest.importorskip("selenium.webdriver", reason="needs selenium")
+CHROMIUM, DRIVER = Path("/usr/bin/chromium"), Path("/usr/bin/chromedriver")
+if not (CHROMIUM.exists() and DRIVER.exists()):
+    pytest.skip("needs Debian's chromium and chromium-driver", allow_module_level=True)
+
+from selenium.webdriver.chrome.service import Service  # noqa: E402
+
+pytestmark = pytest.mark.slow
+HOSTS = """\
+hosts:
+  here: {nodes: [router, sim, camera, command, worker, primitives]}
+"""
+
+
+@pytest.fixture(scope="module")
+def shared_chain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chain]:
+    folder = tmp_path_factory.mktemp("chain")
+    file = write_profile(folder, more=HOSTS)
+    file.write_text(file.read_text().replace("  wrist: null", DEPTH))
+    with running_chain(folder, profile_file=file, rolling=folder / "rolling") as chain:
+        chain.activate_when_ready()
+        yield chain
+
+
+DEPTH = """\
+  wrist: {source: "sim:wrist", width: 160, height: 120, rate_hz: 20, depth_unit_m: 0.001}"""
+
+
+@pytest.fixture(scope="module")
+def site(shared_chain: Chain, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
+    people = write_people(tmp_path_factory.mktemp("people"))
+    with serving(shared_chain.profile_file, people) as site:
+        yield site
+
+
+class Tab:
+    """A tab of Chromium with the page open."""
+
+    def __init__(self, driver: Any, site: Site) -> None:
+        self.driver = driver
+        driver.get(f"http://{site.host}/#{OPERATOR}")
+        self.until("it is connected", lambda: self.text("link") == "connected")
+
+    def text(self, name: str) -> str:
+        return self.run(f"return document.getElementById('{name}').textContent")
+
+    def run(self, script: str) -> Any:
+        return self.driver.execute_script(script)
+
+    def until(self, what: str, ask: Any, patience_s: float = PATIENCE_S) -> Any:
+        return until(what, ask, patience_s)
+
+    def button(self, words: str) -> Any:
+        """The button, or link, with these words or this name for screen readers."""
+        path = f"//*[self::button or self::a][normalize-space()='{words}' or @aria-label='{words}']"
+        return self.until(words, lambda: self.driver.find_elements("xpath", path))[0]
+
+    def click(self, words: str) -> None:
+        self.until(f"{words} is enabled", lambda: self.button(words).is_enabled())
+        self.driver.execute_script(
+            "arguments[0].scrollIntoView({block: 'center'}); arguments[0].click()",
+            self.button(words),
+        )
+
+    def press(self, words: str) -> None:
+        """Touch a button and keep it, by Chromium's own input."""
+        self._touch("touchStart", words)
+
+    def let_go(self) -> None:
+        self._touch("touchEnd", "")
+
+    def _touch(self, kind: str, words: str) -> None:
+        points = []
+        if words:
+            self.until(f"{words} is enabled", lambda: self.button(words).is_enabled())
+            x, y = self.driver.execute_script(
+                "arguments[0].scrollIntoView({block: 'center'});"
+                "const b = arguments[0].getBoundingClientRect();"
+                "return [b.x + b.width / 2, b.y + b.height / 2]",
+                self.button(words),
+            )
+            points = [{"x": x, "y": y}]
+        self.driver.execute_cdp_cmd(
+            "Input.dispatchTouchEvent", {"type": kind, "touchPoints": points}
+        )
+
+    def complaints(self) -> list[str]:
+        """What Chromium says of the page: violations of its policy, errors of its script."""
+        found = self.driver.get_log("browser")
+        return [line["message"] for line in found if line["level"] == "SEVERE"]
+
+
+@pytest.fixture
+def tab(site: Site) -> Iterator[Tab]:
+    options = webdriver.ChromeOptions()
+    options.binary_location = str(CHROMIUM)
+    for word in ("--headless=new", "--no-sandbox", "--disable-gpu", "--mute-audio"):
+        options.add_argument(word)
+    options.add_argument("--window-size=1440,1000")
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as data:
+        options.add_argument(f"--user-data-dir={data}")
+        driver = webdriver.Chrome(options=options, service=Service(str(DRIVER)))
+        try:
+            tab = Tab(driver, site)
+            yield tab
+            # The page of a report has another origin: it gets no icon of ours.
+            assert not [line for line in tab.complaints() if "favicon" not in line]
+        finally:
+            driver.quit()
+
+
+def test_a_finished_run_is_listed_with_its_report_and_its_video(chain: Chain, tab: Tab) -> None:
+    tab.click("Record")
+    tab.until("it records", lambda: "web-" in tab.text("recording"))
+    time.sleep(2.0)
+    tab.click("Stop and keep")
+    tab.until("it is kept", lambda: "not recording" in tab.text("recording"))
+    tab.click("List")
+    row = tab.until(
+        "a run",
+        lambda: tab.run(
+            "const r = document.querySelector('#run-rows tr'); return r && r.cells[0].textContent"
+        ),
+    )
+    tab.click(f"Video of {row}")
+    tab.until(
+        "the video plays",
+        lambda: tab.run(
+            "const f = document.getElementById('film');"
+            "return f.videoWidth > 0 && f.currentTime > 0.2"
+        ),
+    )
+    tab.click(f"Report of {row}")
+    tab.click(f"open the report of {row}")
+    tab.until("a second tab", lambda: len(tab.driver.window_handles) == 2)
+    tab.driver.switch_to.window(tab.driver.window_handles[1])
+    tab.until("its plots", lambda: tab.run("return document.querySelectorAll('.plotly').length"))
+    assert tab.run("try { return sessionStorage.length } catch (e) { return e.name }") == (
+        "SecurityError"
+    )
+    tab.driver.close()
+    tab.driver.switch_to.window(tab.driver.window_handles[0])
+
+
+def test_depth_is_shown_in_colours(chain: Chain, tab: Tab) -> None:
+    tab.click("wrist, depth")
+    found = tab.until(
+        "a depth picture",
+        lambda: tab.run(
+            "const v = shown.get('depth/wrist'); if (!v || !v.last) return null;"
+            "const p = v.canvas.getContext('2d').getImageData(0, 0, 160, 120).data;"
+            "const seen = new Set(); for (let i = 0; i < p.length; i += 4) seen.add(p[i] >> 4);"
+            "return [v.caption.textContent, seen.size]"
+        ),
+    )
+    assert " m (red: near)" in found[0]
+    assert found[1] > 3
+
+
+def test_home_goes_while_its_button_is_pressed(chain: Chain, tab: Tab) -> None:
+    chain.activate_when_ready()
+    chain.client.set_prompt("HARD: go up" if chain.height_m() < 0.42 else chain.down)
+    chain.until("it moves", chain.moves)
+    tab.click("Deactivate")
+    tab.until("it stands", lambda: "stands" in tab.text("facts"))
+    chain.wait_still()
+    before = chain.measured().position_m
+    tab.press("Home")
+    chain.until("it moves", chain.moves)
+    tab.let_go()
+    chain.wait_still()
+    tab.until("its word", lambda: "home" in tab.text("answer") or "let go" in tab.text("answer"))
+    assert abs(chain.measured().position_m - before).max() > 0.001
+    tab.press("Home")
+    tab.until("home", lambda: tab.text("answer").startswith("home: reached"))
+    tab.let_go()
+    task = chain.client.task
+    assert task is not None
+    assert task.worker == "scripted"
+
+
+def test_the_last_minutes_are_saved_on_a_touch(chain: Chain, tab: Tab) -> None:
+    tab.click("Save the last minutes")
+    tab.until("the log says so", lambda: "rolling: saved" in tab.text("events"))
+
+
+def test_a_trial_is_judged_by_buttons(chain: Chain, tab: Tab) -> None:
+    tab.run(
+        "for (const [id, text] of Object.entries({name: 'seen', workers: 'scripted',"
+        " prompt: 'HARD: go up', episodes: '1', seconds: '20'}))"
+        " document.getElementById(`trial-${id}`).value = text"
+    )
+    tab.click("Begin")
+    tab.click("Scene is ready: go")
+    for _ in range(20):
+        words = tab.until(
+            "an answer",
+            lambda: (
+                tab.text("trial-words").startswith(("It runs", "Not activated"))
+                and tab.text("trial-words")
+            ),
+        )
+        if words.startswith("It runs"):
+            break
+        tab.click("Try again")
+        time.sleep(0.5)
+    shown = [tab.run("return document.getElementById('worker').value"), tab.text("latency")]
+    assert not any("scripted" in words for words in shown)
+    tab.click("End it")
+    tab.until("the question", lambda: tab.text("trial-words").startswith("Did it succeed?"))
+    tab.run("document.getElementById('trial-note').value = 'in the box'")
+    tab.click("Success")
+    tab.until("the result", lambda: tab.text("trial-result") == "finished: scripted 1 of 1")
+    (only,) = TrialFolder(chain.profile_file.parent / "runs" / "seen").episodes()
+    assert (only.verdict, only.note, only.end) == ("success", "in the box", "person")
