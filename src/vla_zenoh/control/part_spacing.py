@@ -26,8 +26,8 @@ from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray
 
 NAME = "part_distance"
-SHARES = (0.0, 0.5, 1.0)
-"""Places on the way of a stop that are looked at."""
+SHARES = (0.5, 1.0)
+"""Places on the way of a stop that are looked at, beside its start."""
 FAR_M = 0.25
 """Arms this much further apart than they may come are looked at now and then."""
 FAR_TICKS = 4
@@ -105,13 +105,13 @@ class PartSpacing:
         if any(joints_rad is None for joints_rad in here):
             return Spacing()
         at = [joints_rad for joints_rad in here if joints_rad is not None]
-        before, self.nearest = self.nearest, self._nearest(at, at)
+        before, self.nearest = self.nearest, self._nearest(at)
         if self.nearest.distance_m >= self._within_m:
             self._skip, self._held = FAR_TICKS - 1, False
             return Spacing()
         floor_m = min(self._stop_m, self.nearest.distance_m - NOISE_M)
         rests = [part.motion.resting_rad(ahead_s) for part in self._parts]
-        ahead = self._nearest(at, rests, floor_m + NOISE_M)
+        ahead = self._nearest(at, floor_m + NOISE_M, rests)
         self._held = ahead.distance_m < floor_m or (
             self._held and not self._may_go_on(at, now_ns, floor_m)
         )
@@ -139,30 +139,34 @@ class PartSpacing:
 
     def _may_go_on(self, at: Sequence[FloatArray], now_ns: int, floor_m: float) -> bool:
         """Whether the first bit of the way to the goals is free."""
-        probes: list[FloatArray] = []
+        probes: list[list[FloatArray]] = []
         for part, here_rad in zip(self._parts, at, strict=True):
             wanted_rad = part.motion.wanted_rad(now_ns)
             way_rad = np.zeros(len(here_rad)) if wanted_rad is None else wanted_rad - here_rad
             longest = float(np.abs(way_rad).max())
-            probes.append(here_rad + way_rad * min(1.0, PROBE_RAD / max(longest, 1e-9)))
-        return self._nearest(at, probes, floor_m + NOISE_M).distance_m >= floor_m
+            probes.append([here_rad + way_rad * min(1.0, PROBE_RAD / max(longest, 1e-9))])
+        return self._nearest(at, floor_m + NOISE_M, probes).distance_m >= floor_m
 
     def _nearest(
         self,
-        starts: Sequence[FloatArray],
-        ends: Sequence[FloatArray],
+        at: Sequence[FloatArray],
         within_m: float | None = None,
+        ends: Sequence[Sequence[FloatArray]] = (),
     ) -> Nearest:
-        """The nearest links anywhere on two straight motions of the joints."""
+        """The nearest links with the parts anywhere between these joints and some ends of theirs.
+
+        Args:
+            at: (n,) joints of each part.
+            within_m: links further apart are not looked for.
+            ends: (n,) each of each part; none: it stands.
+        """
         found = Nearest(self._within_m if within_m is None else within_m)
+        places = [
+            [here_rad, *(here_rad + share * (end - here_rad) for end in own for share in SHARES)]
+            for here_rad, own in itertools.zip_longest(at, ends, fillvalue=())
+        ]
         for i, j, pair in self._pairs:
-            first, second = (
-                [starts[k]]
-                if np.array_equal(starts[k], ends[k])
-                else [starts[k] + share * (ends[k] - starts[k]) for share in SHARES]
-                for k in (i, j)
-            )
-            near = pair.nearest(first, second, found.distance_m)
+            near = pair.nearest(places[i], places[j], found.distance_m)
             if near.distance_m < found.distance_m:
                 names = self._parts[i].name, self._parts[j].name
                 found = Nearest(
@@ -173,4 +177,4 @@ class PartSpacing:
     def measured_m(self, joints_rad: Mapping[str, FloatArray]) -> Nearest:
         """The nearest links with the parts at these joints (n,) each."""
         at = [joints_rad[part.name] for part in self._parts]
-        return self._nearest(at, at)
+        return self._nearest(at)
