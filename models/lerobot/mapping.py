@@ -86,8 +86,8 @@ def pictures(
     strange = sorted(set(named) - set(wanted))
     if strange:
         raise WorkerError(
-            f"map names {strange[0]!r}, which is no picture of the policy; "
-            f"its pictures are: {', '.join(wanted) or 'none'} (map=FEATURE=camera:NAME,...)"
+            f"map names {strange[0]!r}, which is not an image of the policy; "
+            f"its images are: {', '.join(wanted) or 'none'} (map=FEATURE=camera:NAME,...)"
         )
     out: dict[str, tuple[str, tuple[int, ...]]] = {}
     for feature, shape in wanted.items():
@@ -99,9 +99,7 @@ def pictures(
         if not source.camera:
             raise WorkerError(f"map: {feature} is a picture, so {feature}=camera:NAME")
         if source.camera in out:
-            raise WorkerError(
-                f"two pictures of the policy are to come from camera {source.camera!r}"
-            )
+            raise WorkerError(f"two images of the policy must come from camera {source.camera!r}")
         if len(shape) != 3 or shape[0] != 3:
             raise WorkerError(f"{feature} has shape {shape}; wanted three colours: (3, H, W)")
         out[source.camera] = feature, shape

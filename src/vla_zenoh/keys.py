@@ -161,7 +161,7 @@ class Keys:
     holding = _KeyOf(
         "holding/{holder}", "Liveliness token of a deadman: the arm stays active while it is there."
     )
-    worker = _Key("worker", "Name of the worker whose chunks are carried out.")
+    worker = _Key("worker", "Name of the worker whose chunks are executed.")
     rate = _Key("rate", "Chunks per second, a plain number.")
     speed = _Key(
         "speed", "Speed override, 0 to 100 percent of the planned speed: ``30`` or ``30 %``."
@@ -226,7 +226,8 @@ class Keys:
         "sim/reset", "Empty, or a seed as plain text: the arm goes home, objects are placed again."
     )
     sim_step = _Key(
-        "sim/step", "Query in lockstep mode: advance by so many nanoseconds, reply with the state."
+        "sim/step",
+        "Query in lockstep mode: advance by a number of nanoseconds, reply with the state.",
     )
 
     # -- selectors ----------------------------------------------------------------------------
@@ -370,9 +371,9 @@ NODE_KINDS: Mapping[str, NodeTraits] = {
     "sim": NodeTraits("robot", 0.4, "there is one simulated robot"),
     "ros2": NodeTraits("robot", 0.4, "the robot has one driver"),
     "arm": NodeTraits("robot", 0.4, "the robot has one driver"),
-    "command": NodeTraits("command", 0.8, "the robot obeys one command node"),
+    "command": NodeTraits("command", 0.8, "the robot follows one command node"),
     "camera": NodeTraits("camera", 0.8),
     "worker": NodeTraits("worker", 0.8),
-    "primitives": NodeTraits("worker", 0.8, "one primitive is carried out at a time"),
+    "primitives": NodeTraits("worker", 0.8, "one primitive is executed at a time"),
 }
 """Every kind of node, in the order in which `up` starts them."""

@@ -34,7 +34,7 @@ def move_to(
     ] = None,
     joints: Annotated[
         str | None,
-        typer.Option("--joints", help="All joints in rad, or NAME=RAD,.., in place of a pose."),
+        typer.Option("--joints", help="All joints in rad, or NAME=RAD,.., instead of a pose."),
     ] = None,
     timeout_s: TimeoutOption = DEFAULT_TIMEOUT_S,
     as_json: JsonOption = False,
@@ -48,7 +48,7 @@ def move_to(
     if joints is not None:
         fields["joints_rad"] = _joints(joints)
     if not fields:
-        raise typer.BadParameter("say where to: --at X,Y,Z or --joints ..")
+        raise typer.BadParameter("give a target: --at X,Y,Z or --joints ..")
     _carry_out(target, "move_to", fields, timeout_s, as_json=as_json)
 
 
@@ -87,7 +87,7 @@ def run(
     target: RobotTarget,
     until: Annotated[
         list[str] | None,
-        typer.Option("--until", help=f"What ends it, repeatable: {CONDITIONS}."),
+        typer.Option("--until", help=f"Condition that ends it, repeatable: {CONDITIONS}."),
     ] = None,
     prompt: Annotated[
         str | None, typer.Option("--prompt", help="For the worker; default: the present one.")

@@ -101,7 +101,8 @@ def decode_percent(payload: bytes) -> float:
     number = word.removesuffix("%").rstrip()
     if not _NUMBER.fullmatch(number):
         raise CodecError(
-            "invalid", f"{word[:40]!r} is no percentage: give a number from 0 to 100, such as '30'"
+            "invalid",
+            f"{word[:40]!r} is not a percentage: give a number from 0 to 100, such as '30'",
         )
     percent = float(number)
     if not 0.0 <= percent <= 100.0:

@@ -67,7 +67,7 @@ class CommandedPart:
         self._grasp_m = np.inf
         """Least width of the gripper since it holds something."""
 
-    # -- how its name is said -----------------------------------------------------------------
+    # -- its name in messages -----------------------------------------------------------------
     def says(self, why: str) -> str:
         """`why`, with the part that it is about."""
         return f"{self.name}: {why}" if self.name and why else why

@@ -219,7 +219,7 @@ class PoseToJoint:
         held = sorted(self._held)
         return (
             f"the joints cannot follow the pose: it has waited for them for {STUCK_S:g} s; "
-            f"they are held by {', '.join(held) or 'nothing, so the arm cannot have this pose'}"
+            f"they are held by {', '.join(held) or 'nothing, so the arm cannot reach this pose'}"
         )
 
     def _inside(self, here: Pose, pose: Pose) -> Pose:

@@ -419,7 +419,7 @@ def _hosts(profile: Profile) -> Iterator[Fault]:
             yield (
                 (*place, "nodes"),
                 "is empty: give the host a node, or remove it. A computer that only drives or "
-                f"watches is no host: `vla-zenoh secure add {name} --role operator` (or viewer) "
+                f"watches is not a host: `vla-zenoh secure add {name} --role operator` (or viewer) "
                 "gives it a certificate",
             )
         yield from _unknown((*place, "cameras"), host.cameras or (), "cameras", profile.cameras)

@@ -122,7 +122,7 @@ def test_a_speed_is_a_number_of_percent(word: str, percent: float) -> None:
 
 @pytest.mark.parametrize("word", ["", "%", "slow", "30 % %", "% 30", "nan", "0x5", "5,0", "true"])
 def test_what_is_no_percentage_is_no_speed(word: str) -> None:
-    with pytest.raises(CodecError, match="is no percentage: give a number from 0 to 100"):
+    with pytest.raises(CodecError, match="is not a percentage: give a number from 0 to 100"):
         settings.decode_percent(word.encode())
 
 

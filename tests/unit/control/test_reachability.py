@@ -226,7 +226,7 @@ def test_a_keep_out_around_the_arm_at_home_is_an_error_with_its_name_and_the_lin
         ({}, "has no shape; give one of box_m, radius_m, normal"),
         ({"radius_m": 0.1, "normal": [0, 0, 1]}, "has radius_m and normal; give one of"),
         ({"normal": [0, 0, 0]}, "is zero; give a direction"),
-        ({"radius_m": 0.1, "yaw_rad": 1.0}, "turns a box; this is none"),
+        ({"radius_m": 0.1, "yaw_rad": 1.0}, "rotates a box; this is not one"),
         ({"box_m": [0.1, 0.0, 0.1]}, "greater than 0"),
         ({"radius_m": 450.0}, "less than or equal to 3"),
     ],

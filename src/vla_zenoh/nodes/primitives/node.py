@@ -305,8 +305,8 @@ class PrimitivesNode:
         asked_rad = self._check.kinematics.ordered(names, target.joints_rad)
         off_rad = float(np.abs(self._sight().joints_rad - asked_rad).max())
         return (
-            f"this robot takes poses: the TCP is where these joints place it, they are up to "
-            f"{off_rad:.2g} rad away, where its controller keeps the elbow"
+            f"this robot takes poses: the TCP is where these joints place it, the joints are up to "
+            f"{off_rad:.2g} rad away, because its controller keeps the elbow"
             if off_rad > NEAR_RAD
             else ""
         )
