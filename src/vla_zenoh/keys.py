@@ -271,10 +271,15 @@ class Keys:
         """Inverse of `short`; a key that begins with the root is taken as whole already."""
         return key if key.startswith(f"{self.root}/") else f"{self.root}/{self.robot}/{key}"
 
+    def part_of(self, key: str) -> str:
+        """The robot's part whose state or command `key` is; empty: it is of no part by name."""
+        first, _, rest = self.short(key).partition("/")
+        return first if rest and first not in NOT_PARTS and self.short(key) != key else ""
+
     def group(self, key: str) -> str:
-        """The first part below the robot: ``camera``, ``state``, ``prompt``; empty for other
-        keys."""
-        return self.short(key).split("/")[0] if self.short(key) != key else ""
+        """What follows robot and part: ``camera``, ``state``, ``prompt``; empty for other keys."""
+        own = self.short(key).removeprefix(f"{self.part_of(key)}/")
+        return own.split("/")[0] if self.short(key) != key else ""
 
     def on(self, other: Keys, key: str) -> str:
         """The key of `other` that corresponds to `key` of this robot."""

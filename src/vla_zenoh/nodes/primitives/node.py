@@ -32,7 +32,7 @@ from vla_zenoh.codec.primitives import (
 from vla_zenoh.control.reachability import make_reachability_filter
 from vla_zenoh.control.states import DEACTIVATED
 from vla_zenoh.control.target_check import TargetCheck
-from vla_zenoh.errors import CodecError, NodeError, SessionError
+from vla_zenoh.errors import CodecError, SessionError
 from vla_zenoh.keys import PRIMITIVES, last_chunk, worker_node
 from vla_zenoh.kinematics.so3 import Pose, pose_of, rotation_from_quat
 from vla_zenoh.nodes.primitives.endings import NEAR_RAD, Arrival, Ending, Gripped, RunEnding, Sight
@@ -71,16 +71,13 @@ class PrimitivesNode:
         session: with the rights of a worker and of an operator.
 
     Raises:
-        NodeError: it is already running, or the robot has several arms.
+        NodeError: it is already running.
+        ProfileError: the robot has several arms.
         ResourceError: the robot's description is missing.
     """
 
     def __init__(self, profile: Profile, session: zenoh.Session) -> None:
-        if profile.parts:
-            raise NodeError(
-                f"primitives move one arm, and robot {profile.robot.name!r} has the parts "
-                f"{', '.join(profile.parts)}: drive it by a worker"
-            )
+        profile.require_one_arm("primitives")
         self._profile = profile
         self._policy = TargetPolicy(profile.robot.arm_joints)
         self._check = TargetCheck(profile, make_reachability_filter(profile))
