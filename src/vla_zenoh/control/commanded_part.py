@@ -28,6 +28,7 @@ from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     ActionChunk,
     Event,
+    FloatArray,
     GripperState,
     HeldBox,
     JointState,
@@ -82,6 +83,16 @@ class CommandedPart:
     def elbow_rad(self) -> float:
         """Greatest distance of a measured joint from where it is expected, see `JointMonitor`."""
         return 0.0 if self._joint_monitor is None else self._joint_monitor.elbow_rad
+
+    @property
+    def measured_rad(self) -> FloatArray | None:
+        """(n,) newest measured joints of the arm, None without kinematics or joints of it."""
+        if self.reach is None or self.joint is None:
+            return None
+        try:
+            return self.reach.kinematics.joints_of(self.joint.record)
+        except RecordError:
+            return None  # reported by the monitor of its joints
 
     # -- states -------------------------------------------------------------------------------
     def update(self, states: PartStates) -> None:

@@ -27,7 +27,7 @@ from vla_zenoh.control.commander_io import (
 )
 from vla_zenoh.control.contact import Contact
 from vla_zenoh.control.gripper_arbiter import GripperArbiter
-from vla_zenoh.control.limits import Slowdown
+from vla_zenoh.control.limits import LimitHit, Slowdown
 from vla_zenoh.control.part_spacing import PartSpacing
 from vla_zenoh.control.plan_timeline import EpisodeProgress, Goal, Plan
 from vla_zenoh.control.preflight import PeerSnapshot, reasons_of_worker
@@ -159,6 +159,7 @@ class Commander:
         for part in self.parts:
             if not inputs.chunks or part.monitor_late(now_ns):  # planning them is work enough
                 self._monitor_joints(part, now_ns)
+        self._monitor_distance(now_ns)
         self._keep_apart(now_ns, ticks)
         overdue_ns, all_planned = self._watchdog.deadline_ns, True
         for part in self.parts:
@@ -593,9 +594,22 @@ class Commander:
             self._change(Trigger.LOSE, part.says(str(error)))
             return
         if hit is not None:
-            event = make_event(
-                "warning", "limit", hit.name, f"braked{hit.at}", hit.value, hit.limit
-            )
-            self._out.events += part.tagged([event])
-            why = f"the measured arm is too near to a bound: {hit.name}{hit.at} is {hit.value:.3g}"
-            self._change(Trigger.LOSE, part.says(f"{why}, the limit is {hit.limit:.3g}"))
+            self._brake_at(hit, part)
+
+    def _monitor_distance(self, now_ns: int) -> None:
+        """Brake if the measured parts come too near to each other."""
+        if self._spacing is None or self.state not in OBEYING or not self._motion.streaming:
+            return
+        measured = [part.measured_rad for part in self.parts]
+        known = [joints_rad for joints_rad in measured if joints_rad is not None]
+        hit = self._spacing.monitor(known, now_ns) if len(known) == len(measured) else None
+        if hit is not None:
+            self._brake_at(hit)
+
+    def _brake_at(self, hit: LimitHit, part: CommandedPart | None = None) -> None:
+        """End the activation at a bound of the measured arm; `part`: of which, None: of several."""
+        why = f"the measured arm is too near to a bound: {hit.name}{hit.at} is {hit.value:.3g}"
+        why = f"{why}, the limit is {hit.limit:.3g}"
+        event = make_event("warning", "limit", hit.name, f"braked{hit.at}", hit.value, hit.limit)
+        self._out.events += part.tagged([event]) if part else [event]
+        self._change(Trigger.LOSE, part.says(why) if part else why)

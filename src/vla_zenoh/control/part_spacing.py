@@ -8,6 +8,9 @@ towards their goals is free, for one arm alone and for both. Below ``part_slow_m
 nearer are slowed down to sqrt(distance left / zone) of their speed.
 
 Arms that begin too near to each other may only move apart.
+
+That is computed for the commanded joints. The measured ones are monitored as in `joint_monitor`:
+arms that are nearer than the stop by more than `PAST_M`, and come nearer, have to brake.
 """
 
 from __future__ import annotations
@@ -19,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vla_zenoh.control.commanded_part import CommandedPart
+from vla_zenoh.control.joint_monitor import BAND_M, PAST_M, PERIOD_NS
 from vla_zenoh.control.limits import LimitHit, Slowdown
 from vla_zenoh.kinematics.part_distance import Nearest, PartDistance, PlacedArm
 from vla_zenoh.kinematics.so3 import Pose, rotation_from_rpy
@@ -71,6 +75,7 @@ class PartSpacing:
         self._skip = 0
         self._held = False
         self._slower = False
+        self._edge_m, self._monitor_ns = np.inf, 0
 
     def place(self) -> None:
         """Take the shapes of all parts, with what their grippers hold."""
@@ -173,6 +178,20 @@ class PartSpacing:
                     near.distance_m, f"{names[0]} {near.first}", f"{names[1]} {near.second}"
                 )
         return found
+
+    def monitor(self, measured_rad: Sequence[FloatArray], now_ns: int) -> LimitHit | None:
+        """Check the measured joints (n,) of each part, every `PERIOD_NS`; returns why to brake."""
+        if now_ns < self._monitor_ns:
+            return None
+        begins = now_ns - self._monitor_ns > 2 * PERIOD_NS
+        self._monitor_ns, within_m = now_ns + PERIOD_NS, self._stop_m - PAST_M
+        near = self._nearest(measured_rad, within_m)
+        before_m = near.distance_m if begins else self._edge_m
+        self._edge_m = min(max(before_m, near.distance_m), near.distance_m + BAND_M)
+        if near.distance_m >= within_m or self._edge_m >= before_m:
+            return None
+        where = f"{near.first} and {near.second}"
+        return LimitHit(NAME, near.distance_m, self._stop_m, where=where)
 
     def measured_m(self, joints_rad: Mapping[str, FloatArray]) -> Nearest:
         """The nearest links with the parts at these joints (n,) each."""
