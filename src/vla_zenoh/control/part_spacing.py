@@ -3,8 +3,8 @@
 Each tick the joints at which either arm would come to rest are computed, were it to brake one tick
 later. No pair of places on the two ways there may be nearer than ``limits.reach.part_stop_m``: so
 it does not matter which of the two stops first, or whether one of them stops at all. Otherwise both
-brake, on ways that the tick before found to be free. They go on when the first bit of the way
-towards their goals is free, for one arm alone and for both. Below ``part_slow_m`` arms that come
+brake, on ways that the tick before found to be free. Once they stand they go on when the first bit
+of the way towards their goals is free, for one arm alone and for both. Below ``part_slow_m`` arms that come
 nearer are slowed down to sqrt(distance left / zone) of their speed.
 
 Arms that begin too near to each other may only move apart.
@@ -39,6 +39,8 @@ NOISE_M = 2e-5
 SLOWEST = 0.05
 STEPS = 20
 """Number of speed shares, so that the share does not change at every tick."""
+STANDS_RAD = 2e-3
+"""Arms whose joints go on by less than this stand."""
 PROBE_RAD = 0.01
 """First bit of the way to a goal: the joint that moves furthest."""
 
@@ -117,8 +119,14 @@ class PartSpacing:
         floor_m = min(self._stop_m, self.nearest.distance_m - NOISE_M)
         rests = [part.motion.resting_rad(ahead_s) for part in self._parts]
         ahead = self._nearest(at, floor_m + NOISE_M, rests)
+        # A brake that is given up and begun again would end further on.
+        stand = all(
+            np.abs(end - here_rad).max() < STANDS_RAD
+            for here_rad, ends in zip(at, rests, strict=True)
+            for end in ends
+        )
         self._held = ahead.distance_m < floor_m or (
-            self._held and not self._may_go_on(at, now_ns, floor_m)
+            self._held and not (stand and self._may_go_on(at, now_ns, floor_m))
         )
         if self._held:
             where = f"{self.nearest.first} and {self.nearest.second}"
