@@ -31,11 +31,10 @@ if TYPE_CHECKING:
         LATENCY_STAGES,
         Cause,
         GripperCommand,
-        HeldBox,
         JointCommand,
         PoseCommand,
     )
-    from vla_zenoh.types.reports import Event, NodeStatus, Task
+    from vla_zenoh.types.reports import Event, HeldBox, NodeStatus, Task
     from vla_zenoh.types.states import (
         Depth,
         GripperState,

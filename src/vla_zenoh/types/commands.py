@@ -28,22 +28,6 @@ LATENCY_STAGES = (
 """Stages between the capture of an image and the first command of its chunk."""
 
 
-class HeldBox(NamedTuple):
-    """What a gripper holds, as a box whose axes are those of the TCP.
-
-    Args:
-        size_m: of its edges along x, y, z.
-        centre_m: from the TCP.
-    """
-
-    size_m: tuple[float, float, float]
-    centre_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-    def __str__(self) -> str:
-        size, centre = (" ".join(f"{value:g}" for value in each) for each in self)
-        return f"{size} at {centre}" if any(self.centre_m) else size
-
-
 @dataclass(frozen=True, slots=True)
 class Cause:
     """Which chunk a command executes, and when that chunk passed each stage (wall clock)."""
