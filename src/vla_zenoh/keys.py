@@ -148,6 +148,11 @@ class Keys:
     )
 
     # -- settings: plain text, any client may put ---------------------------------------------
+    held = _PartKey(
+        "held",
+        "What the gripper holds, a box at the TCP: its size in m along the axes of the TCP, and "
+        "where its centre is (``0.04 0.04 0.12 at 0 0 0.02``, or without ``at``). Empty: nothing.",
+    )
     prompt = _Key("prompt", "Plain UTF-8 text.")
     active = _Key(
         "active",

@@ -13,6 +13,7 @@ from vla_zenoh.cli.options import number_list, options
 from vla_zenoh.cli.plain import fail, say
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.codec.primitives import DEFAULT_TIMEOUT_S, FURTHEST_M, FURTHEST_RAD, Answer
+from vla_zenoh.codec.settings import MAX_HELD_M, MIN_HELD_M
 from vla_zenoh.errors import SessionError
 
 TimeoutOption = Annotated[
@@ -63,13 +64,21 @@ def home(
 def grip(
     width: Annotated[str, typer.Argument(help="open, closed, or the width in m.")],
     target: RobotTarget,
+    holds: Annotated[
+        str | None,
+        typer.Option(
+            "--holds", help="Size X,Y,Z (m) of what it holds then, along the axes of the TCP."
+        ),
+    ] = None,
     timeout_s: TimeoutOption = DEFAULT_TIMEOUT_S,
     as_json: JsonOption = False,
 ) -> None:
     """Open or close the gripper while the arm stands."""
     word = {"close": "closed"}.get(width, width)
     wanted = word if word in ("open", "closed") else _number("WIDTH (open, closed, m)", word, 1.0)
-    _carry_out(target, "grip", {"width_m": wanted}, timeout_s, as_json=as_json)
+    holds_m = None if holds is None else number_list("--holds", holds, MIN_HELD_M, MAX_HELD_M)
+    fields = {"width_m": wanted, "holds_m": holds_m}
+    _carry_out(target, "grip", fields, timeout_s, as_json=as_json)
 
 
 @options

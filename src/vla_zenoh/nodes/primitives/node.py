@@ -39,7 +39,7 @@ from vla_zenoh.nodes.primitives.endings import NEAR_RAD, Arrival, Ending, Grippe
 from vla_zenoh.nodes.primitives.policy import CHUNK_HZ, Target, TargetPolicy
 from vla_zenoh.nodes.worker.robot_session import RobotSession
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import FloatArray
+from vla_zenoh.types import FloatArray, HeldBox
 
 POLL_S = 0.01
 SPEC_LEAD_S = 0.1
@@ -193,6 +193,8 @@ class PrimitivesNode:
                 run = request if isinstance(request, Run) else None
                 self._activate(run.worker if run else PRIMITIVES, run and run.prompt, request)
                 reason, why = self._watch(ending, asked.since_s + request.timeout_s)
+            if isinstance(request, Grip) and reason == "reached":
+                self._tell_held(request)
             if isinstance(ending, Arrival):
                 off = ending.off(self._sight())
                 why = why or self._elbow(target)
@@ -208,6 +210,11 @@ class PrimitivesNode:
             off_m=None if off is None else round(off[0], 6),
             off_rad=None if off is None else round(off[1], 6),
         )
+
+    def _tell_held(self, request: Grip) -> None:
+        box = None if request.holds_m is None else HeldBox(request.holds_m)
+        self._check.hold(box)
+        self._robot.publish(self._robot.keys.held, "" if box is None else str(box))
 
     def _prepare(self, request: Request) -> tuple[Ending, Target]:
         """Ending and target of a request.
