@@ -223,7 +223,7 @@ class TeleopPolicy:
         if active:
             moved_m = opening * OPENING_M_S * min(period_s, count * DT_S)
             self._width_m[part] = float(np.clip(width_m + moved_m, 0.0, most_m))
-        return np.column_stack([np.tile(motion, (count, 1)), widths])
+        return np.concatenate([np.tile(motion, (count, 1)), widths[:, None]], axis=1)
 
     def describe(self) -> str:
         """Speed and input, for a status line."""
