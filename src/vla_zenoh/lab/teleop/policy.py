@@ -219,11 +219,13 @@ class TeleopPolicy:
             ]
         )
         after_s = DT_S * np.arange(1, count + 1)
-        widths = np.clip(width_m + opening * OPENING_M_S * after_s, 0.0, most_m)
+        widths_m = np.clip(width_m + opening * OPENING_M_S * after_s, 0.0, most_m)
         if active:
             moved_m = opening * OPENING_M_S * min(period_s, count * DT_S)
             self._width_m[part] = float(np.clip(width_m + moved_m, 0.0, most_m))
-        return np.concatenate([np.tile(motion, (count, 1)), widths[:, None]], axis=1)
+        steps = np.empty((count, AXES + 1))
+        steps[:, :AXES], steps[:, AXES] = motion, widths_m
+        return steps
 
     def describe(self) -> str:
         """Speed and input, for a status line."""
