@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from operator import is_
 from typing import NamedTuple
 
 import numpy as np
@@ -136,6 +137,9 @@ class MotionPipeline:
         """Of poses, and of joints."""
         self._cause: Cause | None = None
         self._rest_since_ns: int | None = None
+        self._sent: PoseCommand | None = None
+        self._made_of: tuple[Motion, Goal | None, State, Cause | None] | None = None
+        """The pose command made last, and what it was made of."""
 
     # -- state --------------------------------------------------------------------------------
     @property
@@ -647,10 +651,14 @@ class MotionPipeline:
         return self.streaming and now_ns - self._rest_since_ns < LINGER_NS
 
     def _pose_command(self, motion: Motion, state: State) -> PoseCommand:
+        made_of = motion, self.goal, state, self._cause
+        if self._made_of and self._sent and all(map(is_, made_of, self._made_of)):
+            return self._sent  # the arm is at rest
         (position_m, rotation), twist, acceleration = motion
         goal = self.goal.pose if self.goal else motion.pose
         quat_xyzw, goal_quat_xyzw = map(quat_from_rotation, (rotation, goal.rotation))
-        return computed(
+        self._made_of = made_of
+        self._sent = computed(
             PoseCommand,
             position_m,
             quat_xyzw,
@@ -661,6 +669,7 @@ class MotionPipeline:
             state.value,
             self._cause,
         )
+        return self._sent
 
 
 def _apart(

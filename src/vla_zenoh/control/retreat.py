@@ -48,10 +48,13 @@ class CommandTrail:
     def __init__(self) -> None:
         self._poses: list[Pose] = []
         self._places: list[list[float]] = []
+        self._newest: Pose | None = None
 
     def add(self, pose: Pose) -> None:
         """Add a measured pose."""
-        place = _place(pose)
+        if pose is self._newest:
+            return
+        self._newest, place = pose, _place(pose)
         if self._places and math.dist(self._places[-1], place) < SPACE_M:
             return
         if self._places:
