@@ -306,7 +306,7 @@ class Node:
 
     def arrival_wall_ns(self, arrival: ReceivedSample) -> int:
         """Arrival time of a sample on this node's wall clock."""
-        return self.clock.wall_ns() - (time.monotonic_ns() - arrival.mono_ns)
+        return self.clock.wall_at(arrival.mono_ns)
 
     def decode(
         self,

@@ -132,6 +132,7 @@ class MotionPipeline:
         self._slowed_by: set[str] = set()
         self._smoother: Smoother | None = None
         self._standing: tuple[Pose, FloatArray | None, int] | None = None
+        self._measured: tuple[PoseState | None, JointState | None] = None, None
         self._measured_ns = 0
         self._timings: list[StepTiming] = []
         """Of poses, and of joints."""
@@ -317,10 +318,12 @@ class MotionPipeline:
         if not self.streaming or not self.at_rest:
             self._standing = None
             return
-        held = held_pose(measured)
-        held_rad = None if self._joints is None or joint is None else self._held_joints(joint)
-        if self._standing is None or max(_apart(held, held_rad, *self._standing[:2])) > SETTLED:
-            self._standing = held, held_rad, received_ns
+        before, self._measured = self._measured, (measured, joint)
+        if self._standing is None or not all(map(is_, before, self._measured)):
+            held = held_pose(measured)
+            held_rad = None if self._joints is None or joint is None else self._held_joints(joint)
+            if self._standing is None or max(_apart(held, held_rad, *self._standing[:2])) > SETTLED:
+                self._standing = held, held_rad, received_ns
         self._measured_ns = received_ns
 
     def unsettled(self) -> list[str]:
