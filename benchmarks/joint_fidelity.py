@@ -418,7 +418,7 @@ def show(rows: list[dict[str, Any]]) -> None:
         print(f"{about} {told} {sum(row['stuck'] for row in ended):6d}")
     steps = {kind: ended for kind, ended in kinds.items() if kind[2] == "steps"}
     if steps:
-        print(f"\n{'arm':10} {'asked':13} {'n':>3} {'carried out':>18} {'rest mrad':>10}")
+        print(f"\n{'arm':10} {'asked':13} {'n':>3} {'executed':>18} {'rest mrad':>10}")
     for (profile, name, _), ended in steps.items():
         parts = [100 * row["covered"] for row in ended]
         worst = max(row["rest_mrad"] for row in ended)

@@ -41,7 +41,7 @@ def main() -> int:
     still = np.array([0.0] * 6 + [-1.0])
     rows: list[tuple[float, float, float]] = []
     failed = 0
-    print("made and reset s, step ms, both pictures ms, task")
+    print("made and reset s, step ms, both images ms, task")
     for suite in sys.argv[1:] or SUITES:
         for task in libero.tasks(suite):
             try:

@@ -90,7 +90,7 @@ def uv_environment(environ: Mapping[str, str]) -> dict[str, str]:
 
 
 def fail(message: str) -> None:
-    """Ends the program with a message for people."""
+    """Ends the program with a message."""
     sys.exit("setup: " + message)
 
 

@@ -74,7 +74,7 @@ def say(message: str) -> None:
 
 
 def fail(message: str) -> NoReturn:
-    """Ends the program with a message for people."""
+    """Ends the program with a message."""
     sys.exit("ros2-bridge: " + message)
 
 

@@ -19,7 +19,7 @@ STAGES = {
     "worker": "worker: observation, model, chunk",
     "chunk_to_command": "chunk published -> at the command node",
     TICK_WAIT: "waiting for the command node's next tick",
-    "tick_to_pose": "tick -> pose command heard",
+    "tick_to_pose": "tick -> pose command received",
 }
 """Their sum is `POSE`."""
 LINES: Mapping[str, tuple[tuple[str, str], ...]] = {

@@ -268,7 +268,7 @@ class _Pictures:
         self.begin()
 
     def begin(self) -> None:
-        """Count anew."""
+        """Restart the count."""
         self.count = 0
         self.ages_ms = Percentiles(4096)
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from vla_zenoh.errors import WorkerError
+from vla_zenoh.errors import SpecError, WorkerError
 from vla_zenoh.interop.field_mapping import FieldSource, read_map, read_size
 from vla_zenoh.policy.model_options import one_of, read_json, whole_number
 from vla_zenoh.policy.state_vector import read_state
@@ -86,8 +86,8 @@ def pictures(
     strange = sorted(set(named) - set(wanted))
     if strange:
         raise WorkerError(
-            f"map names {strange[0]!r}, which is no picture of the policy; "
-            f"its pictures are: {', '.join(wanted) or 'none'} (map=FEATURE=camera:NAME,...)"
+            f"map names {strange[0]!r}, which is not an image of the policy; "
+            f"its images are: {', '.join(wanted) or 'none'} (map=FEATURE=camera:NAME,...)"
         )
     out: dict[str, tuple[str, tuple[int, ...]]] = {}
     for feature, shape in wanted.items():
@@ -99,9 +99,7 @@ def pictures(
         if not source.camera:
             raise WorkerError(f"map: {feature} is a picture, so {feature}=camera:NAME")
         if source.camera in out:
-            raise WorkerError(
-                f"two pictures of the policy are to come from camera {source.camera!r}"
-            )
+            raise WorkerError(f"two images of the policy must come from camera {source.camera!r}")
         if len(shape) != 3 or shape[0] != 3:
             raise WorkerError(f"{feature} has shape {shape}; wanted three colours: (3, H, W)")
         out[source.camera] = feature, shape
@@ -125,7 +123,11 @@ def picture_size(told: str, shape: tuple[int, ...], kind: str) -> tuple[int, int
 
 
 def state_parts(
-    folder: Path, kind: str, features: Mapping[str, tuple[int, ...]], told: str, joints: int
+    folder: Path,
+    kind: str,
+    features: Mapping[str, tuple[int, ...]],
+    told: str,
+    joints: Sequence[int],
 ) -> tuple[str, ...]:
     """Parts that make ``observation.state``, in order, see `vla_zenoh.policy.state_vector`.
 
@@ -134,7 +136,7 @@ def state_parts(
         kind: of policy.
         features: of the policy.
         told: the parts, joined by +.
-        joints: how many the arm has.
+        joints: how many each arm has.
 
     Raises:
         WorkerError: the policy needs other inputs than images and a flat state.
@@ -147,7 +149,7 @@ def state_parts(
     if len(shape) != 1:
         raise WorkerError(f"{STATE} has shape {shape}; wanted one row of numbers")
     trained = _trained_state(folder) if kind in OF_BASE else None
-    return read_state(told, trained or shape[0], joints)
+    return read_state(told, trained or shape[0], *joints)
 
 
 def _trained_state(folder: Path) -> int | None:
@@ -168,6 +170,25 @@ def _trained_state(folder: Path) -> int | None:
         except (SafetensorError, OSError) as error:
             raise WorkerError(f"{file} cannot be read: {str(error)[:200]}") from error
     return None
+
+
+def arm_names(told: str, parts: Sequence[str]) -> tuple[str, ...]:
+    """The robot's parts in the order of the policy's numbers; of a robot of one part ``("",)``.
+
+    Args:
+        told: their names, separated by commas; empty: in the order of the profile.
+        parts: those of the profile.
+
+    Raises:
+        SpecError: `told` names others.
+    """
+    named = tuple(name.strip() for name in told.split(",")) if told else tuple(parts)
+    if sorted(named) != sorted(parts):
+        raise SpecError(
+            f"parts is {told!r}; the robot's are: {', '.join(parts) or 'none, it is one arm'} "
+            "(--set parts=... names each once, in the order of the policy's numbers)"
+        )
+    return named or ("",)
 
 
 def one_by_one(config: Mapping[str, Any]) -> bool:

@@ -115,7 +115,7 @@ def features(mapping: FieldMapping, joints: int) -> dict[str, dict[str, Any]]:
             out[name] = {"dtype": "float32", "shape": (size,), "names": names}
         elif not source.prompt or name != TASK:
             raise SpecError(
-                f"map: {name!r} is not read by the server; a picture is {PICTURES}NAME, the "
+                f"map: {name!r} is not read by the server; an image is {PICTURES}NAME, the "
                 f"state {STATE}, the prompt {TASK}"
             )
     if STATE not in out:

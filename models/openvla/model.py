@@ -178,9 +178,9 @@ class OpenVLA:
             eyes = self.network.vision_backbone
             gray, mixed = (eyes(self._pixels(p)) for p in (np.full_like(noise, 128), noise))
             if not torch.isfinite(mixed).all():
-                raise WorkerError("the picture encoders compute NaN or infinity")
+                raise WorkerError("the image encoders compute NaN or infinity")
             if torch.equal(gray, mixed):
-                raise WorkerError("the picture encoders answer alike whatever the picture is")
+                raise WorkerError("the image encoders answer alike whatever the image is")
         # The first inference of a process costs much more than the others.
         ids, pictures = self.ids("stand still"), [self._pixels(noise)] * len(self._cameras)
         state = [0.0] * len(self._state_range.low) if self._state_range else None

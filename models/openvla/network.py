@@ -37,7 +37,7 @@ class Eyes(nn.Module):
         self.sides = [backbone.side for backbone in backbones]
         counts = {encoder.patch_embed.num_patches for encoder in self.encoders()}
         if len(counts) > 1:
-            raise WorkerError(f"encoders that cut a picture into {sorted(counts)} patches")
+            raise WorkerError(f"encoders that cut an image into {sorted(counts)} patches")
         self.patches: int = counts.pop()
 
     def encoders(self) -> list[Any]:
