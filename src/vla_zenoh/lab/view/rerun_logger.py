@@ -169,7 +169,7 @@ class RerunLogger:
         """Whose state or command it is."""
         arm = self._arms.get(self.keys.part_of(sample.key))
         if arm is None:
-            raise CodecError("unknown_part", f"{sample.key} is of no part of the profile's robot")
+            raise CodecError("invalid", f"{sample.key} is of no part of the profile's robot")
         return arm
 
     def _reject(self, key: str, reason: str) -> None:

@@ -157,7 +157,7 @@ def archetype_of(shape: Any) -> Any:
 def load_robot_model(
     profile: Profile, stream: rr.RecordingStream, root: str
 ) -> tuple[RobotMeshes | None, str]:
-    """The arm below `root` with its shapes logged, or None and the reason: all else is shown without it."""
+    """The arm with its shapes logged below `root`, or None and why not: all else is shown."""
     try:
         model = RobotMeshes(profile)
         model.log_shapes(stream, root)

@@ -184,8 +184,8 @@ class Scene:
         colour = paths.CHUNK if obeyed else paths.SHADOW
         path = self._ribbon(chunk.worker)
         self._stream.log(path, rr.LineStrips3D([line], radii=RIBBON_RADIUS_M, colors=[colour]))
-        steps = rr.Points3D(line[1:], radii=1.8 * RIBBON_RADIUS_M, colors=[colour])
-        self._stream.log(f"{path}/steps", steps)
+        waypoints = rr.Points3D(line[1:], radii=1.8 * RIBBON_RADIUS_M, colors=[colour])
+        self._stream.log(f"{path}/steps", waypoints)
 
     def _ribbon(self, worker: str) -> str:
         return paths.below(f"{self._root}/{paths.CHUNKS}", worker)
