@@ -191,9 +191,9 @@ def paths_in(data: dict[str, Any]) -> Iterator[tuple[dict[str, Any], str, str]]:
     """Paths of files in `data`: (section, key, prefix of the path in the value).
 
     These are ``robot.description`` and that of parts, ``arm.file``, ``ros2.messages.*``, paths in
-    ``models.*``, ``cameras.*.source`` of the form ``file:PATH``, ``cameras.*.intrinsics``, and
-    options of models and of the arm that start with ``./`` or ``../``: for any other text only the
-    model knows whether it is a path.
+    ``models.*``, ``cameras.*.source`` of the form ``file:PATH``, ``cameras.*.intrinsics``,
+    ``cameras.*.check.reference``, and options of models and of the arm that start with ``./`` or
+    ``../``: for any other text only the model knows whether it is a path.
     """
     robot, arm, ros2 = (_map(data.get(name)) for name in ("robot", "arm", "ros2"))
     description = robot.get("description")
@@ -210,6 +210,8 @@ def paths_in(data: dict[str, Any]) -> Iterator[tuple[dict[str, Any], str, str]]:
             yield camera, "source", FILE_SOURCE
         if isinstance(camera.get("intrinsics"), str):
             yield camera, "intrinsics", ""
+        if isinstance(_map(camera.get("check")).get("reference"), str):
+            yield _map(camera["check"]), "reference", ""
     if isinstance(arm.get("file"), str):
         yield arm, "file", ""
     models, messages = _map(data.get("models")), _map(ros2.get("messages"))

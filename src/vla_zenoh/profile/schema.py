@@ -120,7 +120,10 @@ class CameraCheck(Section):
         contrast_levels: between the brightest and darkest parts, of 255; less is a covered lens.
         uniform_share: largest share of the image that may be one even area. Off by default: a
             table top looks like a hand in front of the lens.
-        after_s: black, white, low contrast or evenness is a fault after this long.
+        after_s: black, white, low contrast, evenness or another camera's view is a fault after this
+            long.
+        reference: file with an image of what this camera shows at its place, as `vla-zenoh camera
+            list --output` writes it: cameras that have one are told from each other by it.
     """
 
     same_s: float | None = Field(default=None, ge=0, le=3600)
@@ -129,6 +132,7 @@ class CameraCheck(Section):
     contrast_levels: float = Field(default=5.0, ge=0, le=100)
     uniform_share: float = Field(default=1.0, gt=0, le=1)
     after_s: float = Field(default=0.5, ge=0, le=60)
+    reference: Text | None = None
 
 
 class Crop(Section):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import cv2
@@ -42,6 +42,7 @@ class CameraPublisher:
         node: publishes the streams.
         emit: emits an event; callable from any thread.
         same_s: how long its source may repeat an identical image, s; 0: indefinitely.
+        references: see `ImageCheck`.
     """
 
     def __init__(
@@ -52,12 +53,13 @@ class CameraPublisher:
         node: Node,
         emit: Callable[[Event], None],
         same_s: float = 0.0,
+        references: Mapping[str, NDArray[np.float64]] | None = None,
     ) -> None:
-        self.name, self.profile = name, profile
+        self.name, self.profile, self._references = name, profile, references
         self.backend = ""
         self.state, self.why = WAITING, "it is being opened"
         self.fault: ImageFault | None = None
-        self._check = ImageCheck(name, profile.check, same_s)
+        self._check = ImageCheck(name, profile.check, same_s, references)
         self.counts: Counter[str] = Counter()
         self._shown, self._clock, self._emit = shown[:_SOURCE_LIMIT], node.clock, emit
         self._raw = node.declare_publisher(node.keys.camera_raw(name), Kind.FRAME)
@@ -135,7 +137,7 @@ class CameraPublisher:
             NodeError: the profile's intrinsics cannot be read.
         """
         self.backend, self._geometry = backend, Geometry(self.profile, intrinsics)
-        self._check = ImageCheck(self.name, self.profile.check, same_s)
+        self._check = ImageCheck(self.name, self.profile.check, same_s, self._references)
 
     def check(self, image: Pixels, mono_ns: int, stamp_ns: int | None = None) -> None:
         """Update `fault` from an image captured at `mono_ns` with the driver's `stamp_ns`."""

@@ -1,4 +1,4 @@
-"""Detects from its own images that a camera is frozen, black, overexposed or covered.
+"""Detects from its own images that a camera is frozen, black, overexposed, covered or swapped.
 
 An image is sampled at about 96 x 128 points, at most ten times a second, which costs about 0.1 ms
 whatever its size. What an image cannot prove is not judged: blur, a loop of several images, a
@@ -7,12 +7,15 @@ camera that was moved.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_zenoh.profile.schema import CameraCheck
+from vla_zenoh.errors import NodeError
+from vla_zenoh.profile.schema import CameraCheck, CameraProfile
 
 ROWS, COLUMNS = 96, 128
 BLOCK = 8
@@ -25,6 +28,10 @@ CLOCK_SET_NS = 1_000_000_000
 BLACK_LEVEL, WHITE_LEVEL = 8, 247
 EVEN_LEVELS = 6
 """Blocks whose means lie within this many levels form one even area."""
+THUMB = 4
+"""Samples along a side of a point of the thumbnail that is compared with references."""
+LEAST_LIKE, LEAST_MORE = 0.5, 0.2
+"""Correlation with another camera's reference, and how much more than with its own."""
 FEW = 0.02
 """Share of the blocks that is ignored at either end of the contrast."""
 
@@ -34,7 +41,8 @@ class ImageFault(NamedTuple):
 
     Args:
         check: the field of `vla_zenoh.profile.schema.CameraCheck` that is violated.
-        what: a stable identifier: ``same``, ``stamps``, ``black``, ``white``, ``flat``, ``even``.
+        what: a stable identifier: ``same``, ``stamps``, ``black``, ``white``, ``flat``, ``even``,
+            ``swapped``.
         why: continues a sentence that begins with ``camera NAME``; has value and limit.
         value: measured, in the unit of the field.
         limit: value of the field.
@@ -54,10 +62,17 @@ class ImageCheck:
         name: of the camera, for messages.
         limits: of the profile.
         same_s: default of `CameraCheck.same_s` for this kind of source.
+        references: of the cameras that have one, see `read_references`.
     """
 
-    def __init__(self, name: str, limits: CameraCheck, same_s: float) -> None:
-        self._name, self._limits = name, limits
+    def __init__(
+        self,
+        name: str,
+        limits: CameraCheck,
+        same_s: float,
+        references: Mapping[str, NDArray[np.float64]] | None = None,
+    ) -> None:
+        self._name, self._limits, self._references = name, limits, references or {}
         self._same_s = same_s if limits.same_s is None else limits.same_s
         self.finding: ImageFault | None = None
         self._looked_ns: int | None = None
@@ -65,6 +80,7 @@ class ImageCheck:
         self._same = self._stamps = _Run(0, 0)
         self._stamp_ns: int | None = None
         self._content: tuple[str, int] = ("", 0)
+        self._other: ImageFault | None = None
 
     def update(
         self, image: NDArray[Any], now_ns: int, stamp_ns: int | None = None
@@ -85,7 +101,8 @@ class ImageCheck:
         sample = _sampled(image)
         found = self._frozen_stamps(stamp_ns, now_ns)
         found = self._same_image(sample, now_ns) or found
-        self.finding = self._lasting(_content(sample, self._limits), now_ns) or found
+        content = _content(sample, self._limits) or self._swapped(sample)
+        self.finding = self._lasting(content, now_ns) or found
         if self.finding is not None:
             why = f"{self.finding.why} (cameras.{self._name}.check.{self.finding.check})"
             self.finding = self.finding._replace(why=why)
@@ -117,6 +134,26 @@ class ImageCheck:
         self._content = ("" if found is None else found.what, since_ns)
         return found if now_ns - since_ns >= self._limits.after_s * 1e9 else None
 
+    def _swapped(self, sample: NDArray[Any]) -> ImageFault | None:
+        """Its image was like the reference of another camera, and never like its own since."""
+        if self._name not in self._references:
+            return None
+        seen = _thumbnail(sample)
+        like = {name: float(np.sum(seen * own)) for name, own in self._references.items()}
+        own = like.pop(self._name)
+        other = max(like, key=lambda name: like[name], default="")
+        limit = max(own + LEAST_MORE, LEAST_LIKE)
+        if other and like[other] >= limit:
+            why = (
+                f"shows what camera {other!r} should show: its image correlates with that "
+                f"reference to {like[other]:.2f}, with its own to {own:.2f} "
+                "(are the two cameras swapped?)"
+            )
+            self._other = ImageFault("reference", "swapped", why, like[other], limit)
+        elif own >= LEAST_LIKE:
+            self._other = None
+        return self._other
+
 
 class _Run(NamedTuple):
     """Successive checks in which nothing changed: their number, and the time of the first."""
@@ -143,6 +180,36 @@ def _sampled(image: NDArray[Any]) -> NDArray[Any]:
         image = image[:, :, None]
     down, across = max(1, image.shape[0] // ROWS), max(1, image.shape[1] // COLUMNS)
     return np.ascontiguousarray(np.moveaxis(image[::down, ::across, :3], 2, 0))
+
+
+def _thumbnail(sample: NDArray[Any]) -> NDArray[np.float64]:
+    """(h, w) grey levels whose mean is 0 and whose sum of squares is 1, whatever the light."""
+    small = cv2.resize(
+        sample.mean(axis=0), (COLUMNS // THUMB, ROWS // THUMB), interpolation=cv2.INTER_AREA
+    )
+    small -= small.mean()
+    return small / max(float(np.linalg.norm(small)), 1e-9)
+
+
+def read_references(cameras: Mapping[str, CameraProfile]) -> dict[str, NDArray[np.float64]]:
+    """Thumbnails of the references of those cameras that have one.
+
+    Raises:
+        NodeError: a file that is not an image.
+    """
+    found: dict[str, NDArray[np.float64]] = {}
+    for name, camera in cameras.items():
+        path = camera.check.reference
+        if path is None:
+            continue
+        image = cv2.imread(path)
+        if image is None:
+            raise NodeError(
+                f"cameras.{name}.check.reference: {path} is not an image that can be read; "
+                "`vla-zenoh camera list --output FOLDER` writes one of each camera"
+            )
+        found[name] = _thumbnail(_sampled(image))
+    return found
 
 
 def _content(sample: NDArray[Any], limits: CameraCheck) -> ImageFault | None:

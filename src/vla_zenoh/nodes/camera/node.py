@@ -15,6 +15,7 @@ from vla_zenoh.errors import NodeError, in_words
 from vla_zenoh.keys import last_chunk
 from vla_zenoh.nodes.camera.camera_publisher import ENDED, OK, CameraPublisher
 from vla_zenoh.nodes.camera.fitted_streams import MAX_MODELS, RequestedSizes
+from vla_zenoh.nodes.camera.image_check import read_references
 from vla_zenoh.nodes.camera.source import (
     LOOK_S,
     STALL_S,
@@ -173,7 +174,8 @@ class CameraNode:
         cameras: of the profile, to be served; None: all except those of ROS 2.
 
     Raises:
-        NodeError: unknown camera, or a node of this name is alive already.
+        NodeError: unknown camera, a reference that is not an image, or a node of this name is alive
+            already.
     """
 
     def __init__(
@@ -189,9 +191,15 @@ class CameraNode:
         self._scene_writer = SingleWriterFilter(STALL_S)
         self._node_lock = threading.Lock()  # a Node is used by one thread at a time
         self._halt = threading.Event()
+        references = read_references(chosen)
         self._publishers = {
             camera: CameraPublisher(
-                camera, settings, without_password(settings.source), self.node, self._emit
+                camera,
+                settings,
+                without_password(settings.source),
+                self.node,
+                self._emit,
+                references=references,
             )
             for camera, settings in chosen.items()
         }
