@@ -1,1 +1,1 @@
-"""What compares vla-zenoh with other ways of serving a policy. Not part of the wheel."""
+"""Compares vla-zenoh with other ways of serving a policy. Not part of the wheel."""

@@ -1,13 +1,13 @@
-"""How far an arm leaves its workspace box that slides along faces and edges of it.
+"""How far an arm leaves its workspace box while it slides along faces and edges of it.
 
     python -m benchmarks.box_edges [-n 100] [--perfect]
 
 Random policies push against each of the six faces and twelve edges and wander along it, in
 lockstep. The lower face is the shipped profile's, over the table. The shipped box's other faces are
-partly out of the arm's reach, where its joints bend the goals and not the box: in their place a box
-is taken whose pushed faces are `NEAR_M` from home and whose others are further than the arm gets.
-Told are the largest excursions outside the box, of the command and of the measured TCP, and how far
-the command leaves a face inwards, once it was there, which no policy asks for.
+partly out of the arm's reach, where its joints bend the goals and not the box: instead a box is
+used whose pushed faces are `NEAR_M` from home and whose others are out of reach. Reported are the
+largest excursions outside the box, of the command and of the measured TCP, and how far the command
+moves inwards from a face once it was there, which no policy asks for.
 """
 
 from __future__ import annotations
@@ -69,12 +69,12 @@ def box_at(sides: tuple[int, int, int], shipped: Any) -> dict[str, list[float]]:
 
 
 class Pusher:
-    """Pushes outwards, and along what is left, now here, now there.
+    """Pushes outwards, and wanders along the free directions.
 
     Args:
         sides: which faces it pushes against.
-        face_m: (3,) where those are.
-        seed: of all that is random.
+        face_m: (3,) positions of these faces.
+        seed: of all random numbers.
     """
 
     def __init__(self, sides: tuple[int, int, int], face_m: Any, seed: int) -> None:
@@ -102,7 +102,7 @@ class Pusher:
         self._turn /= np.linalg.norm(self._turn)
 
     def infer(self, observation: Observation) -> ActionSteps:
-        """The next chunk; nothing before the arm obeys."""
+        """The next chunk; no steps before the arm follows."""
         rng, pose = self._random, observation.pose
         assert pose is not None
         count = self.spec.action.horizon
@@ -194,7 +194,7 @@ def main() -> int:
     parser.add_argument("--profile", default="panda_sim", help="name or path")
     parser.add_argument("--command", choices=["pose", "joint"], default="pose")
     parser.add_argument("--perfect", action="store_true", help="without physics, much faster")
-    parser.add_argument("--jobs", type=int, help="at a time; else one a core")
+    parser.add_argument("--jobs", type=int, help="parallel processes; default: one per core")
     parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="every policy")
     options = parser.parse_args()
     how = (options.profile, options.command, options.perfect)

@@ -1,15 +1,14 @@
-"""What a blocked arm presses with: the whole loop in lockstep with MuJoCo, pushed on obstacles.
+"""Forces of a blocked arm: the whole loop in lockstep with MuJoCo, pushing on obstacles.
 
-The profile is `panda_sim`, with a table that the limits know nothing of. A worker pushes on at a
-speed, in steps of 0.1 s, until the activation ends and the command has come to rest; then the run
-goes on for three seconds. Forces are MuJoCo's contact forces on the robot, summed, each
-millisecond:
+The profile is `panda_sim`, with a table that its limits do not contain. A worker keeps pushing at a
+given speed, in steps of 0.1 s, until the activation ends and the command has come to rest; then the
+run continues for three seconds. Forces are MuJoCo's contact forces on the robot, summed, each
 
 - peak: the greatest of all, and the greatest mean over 50 ms;
 - lasting: the mean from 2 s to 3 s after the command came to rest.
 
-A person is a pad on a spring, whose other end does not give way: a hand that is clamped, somebody
-with his back against a wall. Stiffness and mass are those of ISO/TS 15066:2016, table A.3: hand and
+A person is a pad on a spring with a fixed other end: a clamped hand, a person with the back against
+a wall. Stiffness and mass are those of ISO/TS 15066:2016, table A.3: hand and
 fingers 75 N/mm and 0.6 kg, abdomen 10 N/mm (of its 40 kg the pad has 1 kg: the rest does not move).
 That standard's table A.2 allows 140 N of lasting and 280 N of short contact with the hand, 110 N
 and 220 N with the abdomen.
@@ -50,7 +49,7 @@ STEP_S = 0.1
 AFTER_S, LASTING_S = 3.0, 1.0
 MEAN_MS = 50
 PATIENCE_S = 8.0
-"""So long after it should have touched the arm is given to end by itself."""
+"""Time after the expected contact in which the arm has to end the motion."""
 HAND_M = 0.102
 """From the TCP to the side of the hand, which touches first."""
 HARD = 'solref="0.004 1" solimp="0.95 0.99 0.001"'
@@ -63,7 +62,7 @@ SPRING = """
 
 
 class Obstacle(NamedTuple):
-    """What is pushed on.
+    """An obstacle.
 
     Args:
         name: in the table.
@@ -87,7 +86,7 @@ OBSTACLES = (
 
 
 class Pushed(NamedTuple):
-    """What came of it; N."""
+    """Forces and the end of the motion; N."""
 
     peak_n: float
     mean_peak_n: float
@@ -96,7 +95,7 @@ class Pushed(NamedTuple):
 
 
 class Push:
-    """A model that goes on and on in one direction (3,) by `step_m` every 0.1 s."""
+    """A model that keeps moving in one direction (3,) by `step_m` every 0.1 s."""
 
     def __init__(self, step_m: np.ndarray) -> None:
         self.spec = ModelSpec(
@@ -149,7 +148,7 @@ def pushing(mode: str, scene: Path) -> Profile:
 
 
 def untold(sent: Message) -> list[Message]:
-    """A robot that tells no wrench."""
+    """Messages of a robot that reports no wrench."""
     if sent.kind is not PoseState:
         return [sent]
     fields = message.unpack(sent.payload)
@@ -157,13 +156,13 @@ def untold(sent: Message) -> list[Message]:
 
 
 def push(obstacle: Obstacle, mode: str, speed_m_s: float, *, told: bool = True) -> Pushed:
-    """Push on an obstacle until the activation ends, and look what is left.
+    """Push on an obstacle until the activation ends, and measure what remains.
 
     Args:
         obstacle: see `OBSTACLES`.
         mode: ``pose`` or ``joint``.
-        speed_m_s: of the way there.
-        told: the robot tells its external wrench.
+        speed_m_s: of the approach.
+        told: the robot reports its external wrench.
     """
     gap_m = 0.12 if speed_m_s > 0.2 else 0.03
     way_m = 0.16 if obstacle.table else gap_m
@@ -211,7 +210,7 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
     parser.add_argument("--only", default="", help="rows of obstacles with this text in their name")
-    parser.add_argument("--untold", action="store_true", help="the robot tells no wrench")
+    parser.add_argument("--untold", action="store_true", help="the robot reports no wrench")
     asked = parser.parse_args()
     print("| obstacle | by | m/s | peak N (1 ms / 50 ms) | lasting N | ended by |")
     print("|---|---|---|---|---|---|")

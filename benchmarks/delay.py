@@ -1,7 +1,7 @@
 """python -m benchmarks delay: success against the delay of a chunk, by ways to join chunks.
 
 The policy `brick` in lockstep, on a virtual clock. Every way and delay has the same layouts. Each
-episode is written to a file when it has ended; the same command continues a run that was ended.
+episode is written to a file when it has ended; the same command continues an interrupted run.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ Point = tuple[str, int]
 
 
 class Episode(NamedTuple):
-    """An outcome; the time is that from activation to the verdict."""
+    """A result; the time is that from activation to the verdict."""
 
     success: bool
     time_s: float
@@ -92,7 +92,7 @@ def delay(
 
 
 def read_outcomes(path: Path) -> Outcomes:
-    """Outcomes in the file; a last line that a kill cut off is taken out of it.
+    """Outcomes in the file; a last line that a kill cut off is removed from it.
 
     The episodes of a point are the first ones of its plan, without a gap.
     """
@@ -109,7 +109,7 @@ def read_outcomes(path: Path) -> Outcomes:
 
 
 def table(outcomes: Outcomes) -> list[dict[str, Any]]:
-    """A row a point, over the episodes that every way has at this delay."""
+    """One row per point, over the episodes that every way has at this delay."""
     rows: list[dict[str, Any]] = []
     for (way, delay_ms), known in sorted(outcomes.items(), key=_order):
         shared = set.intersection(*(set(o) for (_, ms), o in outcomes.items() if ms == delay_ms))
@@ -163,7 +163,7 @@ def _run(
 
 
 def draw(path: Path, rows: list[dict[str, Any]]) -> None:
-    """Draw success against delay, with 95 % intervals, a line a way.
+    """Draw success against delay, with 95 % intervals, one line per way.
 
     Raises:
         MissingExtraError: matplotlib is not installed.

@@ -1,4 +1,4 @@
-"""What deployment costs: runs of ``vla-zenoh bench sim`` beside one in native mode, paired."""
+"""Cost of deployment: runs of ``vla-zenoh bench sim`` compared with one in native mode, paired."""
 
 from __future__ import annotations
 

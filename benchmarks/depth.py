@@ -42,11 +42,11 @@ def depth(
     width: Annotated[int, typer.Option(min=16)] = 640,
     height: Annotated[int, typer.Option(min=16)] = 480,
 ) -> None:
-    """Measure depth pictures at 30 Hz: time to encode and decode, bytes, and latency of the wire.
+    """Measure depth images at 30 Hz: time to encode and decode, bytes, and latency of the wire.
 
-    The latency is from the publication of the simulator's scene to the decoded picture in another
-    session of this computer, with rendering in it. Pictures as the simulator draws them, and with
-    the noise and holes of a camera.
+    The latency is from the publication of the simulator's scene to the decoded image in another
+    session of this computer, with rendering in it. Images as the simulator draws them, and with the
+    noise and holes of a camera.
     """
     from rich.table import Table
 

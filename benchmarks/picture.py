@@ -1,4 +1,4 @@
-"""The picture that every way carries: a scene-like gradient with a sensor's noise on it."""
+"""The image that every way carries: a scene-like gradient with a sensor's noise on it."""
 
 from __future__ import annotations
 

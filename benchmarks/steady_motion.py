@@ -1,4 +1,4 @@
-"""How steadily an arm moves that is asked for the same step again and again.
+"""How steadily an arm moves when the same step is requested again and again.
 
     python -m benchmarks.steady_motion [--perfect] [--plot FILE.png] [-o FILE]
 
@@ -6,11 +6,11 @@ The scripted model asks for 50 steps of 0.01 m and of 0.05 rad, at several rates
 several lengths; an inference takes 140 ms, with and without jitter; a step lasts one period, or
 0.1 s. All in lockstep. One row each:
 
-- ripple: (greatest - least) / mean of the commanded speed, between 20 % and 80 % of the way;
+- ripple: (greatest - least) / mean of the commanded speed, between 20 % and 80 % of the distance;
 - jerk: RMS there, in m/s^3 or rad/s^3;
 - reached: of what was asked, by the measured TCP;
 - off: how far the command ever is from its axis, in mm and mrad;
-- lag: how much later than the goal in force the command covers a way, mean of 20 % to 80 %.
+- lag: how much later than the goal in force the command covers a distance, mean of 20 % to 80 %.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ RATES_HZ, HORIZONS, JITTERS = (2.0, 5.0, 10.0), (1, 4, 8), (0.0, 0.3)
 INFERENCE_S, CAMERA_S, WIRE_S = 0.14, 0.015, 0.0005
 STEP_S = 0.1
 PROMPTS = {"HARD: go up": "", "HARD: yaw left": "HARD: go up x20"}
-"""Each with what brings the arm to where it can be carried out."""
+"""Prompt -> the one that first brings the arm to where it can be executed."""
 STEADY = (0.2, 0.8)
 SETTLE_S, SLACK_S = 1.0, 5.0
 PLACES = 61
@@ -44,7 +44,7 @@ PLOTTED = ((5.0, 1, 0.3, 0.2), (5.0, 1, 0.3, 0.1), (2.0, 4, 0.3, 0.5), (10.0, 8,
 
 
 class Row(NamedTuple):
-    """One row: what was asked for.
+    """One row: its conditions.
 
     Args:
         prompt: of the scripted model.
@@ -74,7 +74,7 @@ def all_rows() -> list[Row]:
 
 
 def measure(row: Row, profile_name: str, perfect: bool, traced: bool) -> dict[str, Any]:
-    """Carry one row out; `traced`: with the commanded speed, for a plot."""
+    """Run one row; `traced`: with the commanded speed, for a plot."""
     options = {"horizon": str(row.horizon), "dt_s": str(row.dt_s)}
     loop = activated(
         load_profile(profile_name),
@@ -188,7 +188,7 @@ HEAD = (
 
 
 def line(row: dict[str, Any]) -> str:
-    """One row for people."""
+    """One row as text."""
     figures = [row.get(name, float("nan")) for name in ("ripple", "mean_speed", "jerk_rms")]
     return (
         f"{row['prompt'].removeprefix('HARD: '):15} {row['rate_hz']:4.0f} {row['horizon']:2d} "

@@ -75,7 +75,7 @@ def stop(
 
 
 class _Lab:
-    """A simulated robot that goes up and down, and what is heard of it."""
+    """A simulated robot that goes up and down, and its observed states."""
 
     def __init__(self, profile: Profile, host: Host) -> None:
         assert host.session is not None
@@ -177,7 +177,7 @@ class _Lab:
 
 @contextmanager
 def _busy(count: int) -> Iterator[None]:
-    """So many processes that compute without end."""
+    """`count` processes that compute without end."""
     words = ["sh", "-c", 'for _ in "$@"; do while :; do :; done & done; wait', "sh", *"x" * count]
     running = subprocess.Popen(words, start_new_session=True)
     try:

@@ -79,7 +79,7 @@ SCENARIOS = (
 
 
 class Player:
-    """A commander and all around it; see the module."""
+    """A commander with all its inputs; see the module."""
 
     def __init__(self, profile: Profile, scenario: Scenario) -> None:
         self.profile, self.scenario = profile, scenario

@@ -1,7 +1,8 @@
 """python -m benchmarks web: the operator's page in headless Chromium, at a simulated robot.
 
 Measures from a touch on STOP to an arm that stands, how an arm brakes whose page vanishes, what the
-page costs, and makes the pictures of the docs. Needs Debian's ``chromium`` and ``chromium-driver``,
+page costs, and makes the screenshots of the docs. Needs Debian's ``chromium`` and
+``chromium-driver``,
 and ``pip install selenium`` beside the extra ``web``.
 """
 
@@ -56,7 +57,7 @@ SHOTS = {
     "web_phone_dark": (390, 844, True),
 }
 KEPT = ("web_desktop", "web_tablet", "web_phone")
-"""Shown in the docs; the others are for a look."""
+"""Shown in the docs; the others are for inspection."""
 KEEP_OUT = {"post": {"centre_m": [0.62, -0.3, 0.35], "box_m": [0.06, 0.06, 0.7]}}
 
 
@@ -183,7 +184,7 @@ class Lab:
         for word in ("--headless=new", "--no-sandbox", "--disable-gpu", "--mute-audio"):
             options.add_argument(word)
         options.add_argument(f"--window-size={width},{height}")
-        self._user_data = tempfile.mkdtemp(prefix="web-page-")  # tells its processes from others
+        self._user_data = tempfile.mkdtemp(prefix="web-page-")  # identifies its processes
         options.add_argument(f"--user-data-dir={self._user_data}")
         driver = webdriver.Chrome(options=options, service=Service("/usr/bin/chromedriver"))
         try:
@@ -294,7 +295,7 @@ class Lab:
             return 1e3 * (stood_s - began_s)
 
     def measure_cost(self, seconds: float) -> None:
-        """Pictures and processor with one page and with five, and the arm's own loop."""
+        """Images and processor time with one page and with five, and the arm's own loop."""
         table = new_table(
             "open pages", "pictures/s each", "ms old", "server, cores", "kbit/s each",
             "late ms p99", "worst", "missed ticks",
@@ -339,7 +340,7 @@ class Lab:
         ]
 
     def _sent(self) -> float:
-        """Bytes of pictures sent so far, by the server's own metrics."""
+        """Bytes of images sent so far, by the server's own metrics."""
         asked = Request(f"http://127.0.0.1:{self._port}/metrics")
         asked.add_header("Authorization", f"Bearer {TOKEN}")
         with urlopen(asked) as answer:

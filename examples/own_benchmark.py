@@ -1,4 +1,4 @@
-"""A benchmark of one's own: a hand over a table has to reach a mark. No packages, no pictures.
+"""A custom benchmark: a hand over a table has to reach a mark. No packages, no images.
 
     vla-zenoh bench sim examples/own_benchmark.py --worker MODEL
 

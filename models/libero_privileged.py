@@ -4,8 +4,8 @@
 # ///
 """Privileged: picks and places in LIBERO from the true poses that a model on a robot never has.
 
-It runs the path from environment to model and back until a task is done, and judges no model. It
-knows the tasks of ``spatial`` that begin with a bowl in the open, and those of ``object``.
+It tests the chain from environment to model and back on whole tasks, and is no measure of models.
+It knows the tasks of ``spatial`` that begin with a bowl in the open, and those of ``object``.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from vla_zenoh.policy.spec import ControllerSpec
 
 UNIT_M = 0.05
 GAIN = 2.0
-"""Of the way to the goal; the controller covers about a quarter of a step."""
+"""Share of the distance to the goal; the controller covers about a quarter of a step."""
 PROMPT = re.compile(r"pick up the (?P<thing>.+?)(?: (?:between|from|next|on|in) .+)? and place it")
 RIM_M = (0.0, 0.045, 0.025)
 CARRIED_M = {"plate_1": 0.15, "basket_1": 0.26}
@@ -29,7 +29,7 @@ ABOVE_M, NEAR_M, GRASP_STEPS, RELEASE_STEPS = 0.1, 0.006, 8, 6
 
 
 class LiberoPrivileged:
-    """Goes above the thing, down, closes, lifts it, carries it over its place and lets go."""
+    """Goes above the object, down, closes, lifts it, carries it above its place and releases it."""
 
     spec = ModelSpec(
         name="libero_privileged",
@@ -63,7 +63,7 @@ class LiberoPrivileged:
         hand_m = observation.pose.position_m
         if self._phase < 3:
             self._grasp_m = thing_m + grasp_m
-        held_m = hand_m - thing_m  # the thing is to arrive above the place, not the hand
+        held_m = hand_m - thing_m  # the object must arrive above the place, not the hand
         carried_m = CARRIED_M[place]
         over_m = place_m + held_m + [0.0, 0.0, carried_m]
         goals_m = (
@@ -91,10 +91,10 @@ class LiberoPrivileged:
 
 
 def _meant(prompt: str) -> tuple[str, str, np.ndarray]:
-    """Thing, place, and where the hand takes the thing, from its origin.
+    """Object, place, and the grasp point of the hand, relative to the object's origin.
 
     Raises:
-        WorkerError: the prompt is none of a task that it knows.
+        WorkerError: the prompt is none of the tasks that it knows.
     """
     found = PROMPT.match(prompt)
     if found is None:

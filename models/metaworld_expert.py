@@ -42,7 +42,7 @@ class MetaWorldExpert:
     def load(self) -> None:
         from metaworld.policies import ENV_POLICY_MAP
 
-        warnings.filterwarnings("ignore", message="Constant")  # they say so at most steps
+        warnings.filterwarnings("ignore", message="Constant")  # logged at most steps
         self._known = ENV_POLICY_MAP
 
     def infer(self, observation: Observation) -> ActionSteps:

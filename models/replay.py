@@ -2,7 +2,7 @@
 # requires-python = ">=3.11"
 # dependencies = ["numpy"]
 # ///
-"""Plays a recorded chunk file: a model whose every answer is known beforehand.
+"""Plays a recorded chunk file: a model whose answers are known in advance.
 
 The file is what ``vla-zenoh demo`` writes as ``chunks.npz``::
 
@@ -26,7 +26,7 @@ from vla_zenoh.policy import ActionSteps, ModelSpec, Observation, check_steps
 
 
 class Replay:
-    """See the module.
+    """Plays recorded chunks; see the module.
 
     Args:
         file: the recorded chunks.

@@ -2,7 +2,7 @@
 # requires-python = ">=3.11"
 # dependencies = ["numpy"]
 # ///
-"""Fixed motions on command, without any learning: what a bridge is tested with.
+"""Fixed motions by prompt, without any learning: to test the chain.
 
 Prompts, one step per request, as in the thesis this package grew from::
 
@@ -13,8 +13,8 @@ Prompts, one step per request, as in the thesis this package grew from::
     HARD: open gripper | close gripper       +-0.05 m of width
     hold                                     stands still
 
-``HARD: go up x50`` does 50 steps, then says it is done and stands still; ``HARD: go down x50 within
-0.1`` turns back before it is further than 0.1 m from its start.
+``HARD: go up x50`` does 50 steps, then reports that it is done and stands still; ``HARD: go down
+x50 within 0.1`` turns back before it is further than 0.1 m from its start.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ from vla_zenoh.policy.model_options import number, whole_number
 from vla_zenoh.policy.scripted_motions import parse_scripted
 
 ROUNDING = 1e-6
-"""Less than this of a step is none."""
+"""A smaller part of a step counts as none."""
 
 
 class Scripted:
-    """See the module.
+    """Fixed motions by prompt; see the module.
 
     Args:
-        camera: picture every request waits for, as a real model would, or several
+        camera: camera whose image every request waits for, as a real model would, or several
             (``front,wrist``); empty: none.
         horizon: steps in one chunk.
         dt_s: duration of a step.
@@ -80,7 +80,7 @@ class Scripted:
         self.reset()
 
     def reset(self) -> None:
-        """Begin to count anew."""
+        """Restart the count."""
         self._last_stamp_ns = -1
         self._last: list[tuple[float, float]] = [(0.0, 0.0)]
 
@@ -101,15 +101,16 @@ class Scripted:
             reached.append((end, place))
             if asked.motion is not None:
                 steps[row, asked.motion.axis] = place - before
-        # Before the arm is given to us nothing is counted: nobody carries it out.
+        # Before the arm follows this worker nothing is counted: no step is executed.
         if observation.task.active:
             self._last_stamp_ns, self._last = observation.stamp_wall_ns, reached
         return ActionSteps(steps, asked.motion is None or ends[-1] >= limit - ROUNDING)
 
     def _asked_by(self, stamp_ns: int, speed: float) -> tuple[float, float]:
-        """Steps, and the way, asked for when this observation was taken: the next stands on them.
+        """Steps and distance requested when this observation was taken: the next steps add to them.
 
-        The command node reckons alike: the first step at once, a later one along its duration.
+        The command node counts in the same way: the first step at once, a later one along its
+        duration.
         """
         if self._last_stamp_ns < 0:
             return 0.0, 0.0

@@ -4,13 +4,13 @@
 # ///
 """Lifts a bar with both arms of ``two_pandas_sim``, in joints and without any learning.
 
-It sees the bar by its colour in one picture from above, taken while both arms are home and out of
-the way, plans one path for both, and follows it blindly. Prompts::
+It finds the bar by its colour in one image from above, taken while both arms are home and out of
+view, plans one path for both, and follows it blindly. Prompts::
 
     lift the bar                             by both its ends, level
     hold                                     stands still, as with any other prompt
 
-The camera is that of the scene ``pair``, whose place it knows.
+The camera is that of the scene ``pair``, whose pose is known.
 """
 
 from __future__ import annotations
@@ -55,17 +55,17 @@ MIN_PIXELS = 200
 AT_HOME_RAD = MAX_LAG_RAD = 0.1
 SPEED_RAD_S = 0.6
 LIFT_S = 4.0
-"""Slowly: what one arm is ahead of the other presses on the bar."""
+"""Slow: a lead of one arm over the other presses on the bar."""
 PIECES = 12
-"""A straight way of the TCPs is followed through so many places."""
+"""Number of points on a straight path of the TCPs."""
 DOWN = rotation_from_rpy(np.array([math.pi, 0.0, 0.0]))
 
 
 class Segment(NamedTuple):
-    """A way of all joints, and the openings on it.
+    """A path of all joints, with the openings.
 
     Args:
-        steps: (k, D) places on it, evenly apart, as the columns of a step.
+        steps: (k, D) points on it, evenly spaced, as the columns of a step.
         duration_s: of a minimum-jerk motion along it.
     """
 
@@ -74,7 +74,7 @@ class Segment(NamedTuple):
 
 
 class PairArm:
-    """One arm: where it stands, and the joints of its TCP's poses."""
+    """One arm: its base, and the joints of its TCP's poses."""
 
     def __init__(self, profile: Profile, part: str) -> None:
         own, base = profile.of_part(part), profile.parts[part].base
@@ -84,7 +84,7 @@ class PairArm:
         self._turn = rotation_from_rpy(np.array([0.0, 0.0, base.yaw_rad]))
 
     def solve(self, place_m: Vector, yaw_rad: float, start_rad: Vector) -> Vector:
-        """Joints with the TCP at a place of the world, pointing down, turned like the bar."""
+        """Joints with the TCP at a point of the world, pointing down, turned like the bar."""
         turned = (yaw_rad - self.yaw_rad + math.pi / 2) % math.pi - math.pi / 2
         rotation = rotation_from_rpy(np.array([0.0, 0.0, turned])) @ DOWN
         goal = Pose(self._turn.T @ (place_m - self._base_m), rotation)
@@ -105,10 +105,10 @@ class PairArm:
 
 
 class ScriptedPair:
-    """See the module.
+    """Lifts a bar with two arms; see the module.
 
     Args:
-        camera: that sees the table from above.
+        camera: the one above the table.
         profile: of the robot.
     """
 
@@ -140,7 +140,7 @@ class ScriptedPair:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the path, as at the begin of an episode."""
+        """Forget the path, as at the start of an episode."""
         self._path: list[Segment] = []
         self._seen = False
         self._time_s, self._stamp_ns = 0.0, 0
@@ -151,7 +151,7 @@ class ScriptedPair:
         stamp_ns, active = observation.stamp_wall_ns, observation.task.active
         wanted = observation.prompt.lower().strip(" .") == "lift the bar"
         if active and self._path:
-            # The arms are ahead by as much as chunks are late; where one is behind the path waits.
+            # The arms are ahead by as much as chunks are late; if one lags, the path waits.
             ahead = np.array([_at(self._path, time_s) for time_s in self._times_s(0)])
             if np.abs(self._joints(ahead) - self._joints(here)).max(axis=1).min() < MAX_LAG_RAD:
                 passed_s = (stamp_ns - self._stamp_ns) / 1e9
@@ -168,14 +168,14 @@ class ScriptedPair:
                 self._lift(observation, home)
                 total_s = sum(segment.duration_s for segment in self._path)
         done = self._seen and self._time_s >= total_s
-        times_s = self._times_s(1)[: 1 if done else HORIZON]  # done is what the last step is
+        times_s = self._times_s(1)[: 1 if done else HORIZON]  # `done` refers to the last step
         return ActionSteps([_at(self._path, time_s) for time_s in times_s], done)
 
     def _times_s(self, first: int) -> Vector:
         return self._time_s + DT_S * np.arange(first, HORIZON + 1)
 
     def _here(self, observation: Observation) -> Vector:
-        """The columns of a step that stays."""
+        """The columns of a step that keeps the present position."""
         columns: list[float] = []
         for part, arm in self._arms.items():
             own = observation.parts[part]
@@ -193,7 +193,7 @@ class ScriptedPair:
         return np.delete(steps, ends, axis=-1)
 
     def _lift(self, observation: Observation, home: Vector) -> None:
-        """Plan the way from home over both ends of the bar, down, and up with it."""
+        """Plan the path from home over both ends of the bar, down, and up with it."""
         found = see_bar(observation.images[self._camera])
         if found is None:
             return

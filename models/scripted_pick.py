@@ -4,13 +4,13 @@
 # ///
 """Puts a brick in the box with an SO-101, in joints and without any learning: for ``so101_sim``.
 
-It sees a brick by its colour in one picture, taken while the arm is home and out of the way, plans
-a path of joints, and follows it blindly. Prompts::
+It finds a brick by its colour in one image, taken while the arm is home and out of view, plans a
+path of joints, and follows it blindly. Prompts::
 
     put the red brick in the box             or blue, green, yellow
     hold                                     stands still, as with any other prompt
 
-The camera is that of the scene ``desk``, whose place it knows.
+The camera is that of the scene ``desk``, whose pose is known.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ FOVY_RAD = math.radians(46.0)
 HALF_HEIGHT_M = 0.0115
 """Of a brick with its studs."""
 BOX_M = np.array([0.18, 0.20, 0.12])
-"""Above the box, where the brick is let go."""
+"""Above the box, where the brick is released."""
 
 LIFT = ((0.012, 0.0), (0.03, 0.0), (0.05, 0.2), (0.07, 0.4))
 """Heights of the TCP in m from the grasp upwards, and how far it is tilted outwards there, rad."""
@@ -77,10 +77,10 @@ class Waypoint(NamedTuple):
 
 
 class ScriptedPick:
-    """See the module.
+    """Puts a brick in the box; see the module.
 
     Args:
-        camera: that sees the desk.
+        camera: the one that sees the desk.
         profile: of the arm.
     """
 
@@ -109,7 +109,7 @@ class ScriptedPick:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the path, as at the begin of an episode."""
+        """Forget the path, as at the start of an episode."""
         self._path: list[Waypoint] = []
         self._time_s, self._stamp_ns = 0.0, 0
 
@@ -120,7 +120,7 @@ class ScriptedPick:
         here_rad = self._kinematics.joints_of(observation.joint)
         stamp_ns, active = observation.stamp_wall_ns, observation.task.active
         if active and self._path:
-            # The arm is ahead by as much as chunks are late; where it is behind the path waits.
+            # The arm is ahead by as much as chunks are late; if it lags, the path waits.
             ahead = np.array([_at(self._path, time_s)[:-1] for time_s in self._times_s(0)])
             if np.abs(ahead - here_rad).max(axis=1).min() < MAX_LAG_RAD:
                 passed_s = (stamp_ns - self._stamp_ns) / 1e9
@@ -146,7 +146,7 @@ class ScriptedPick:
         yield self._to(here.joints_rad, self._home_rad, OPEN_M)
 
     def _goes_home(self, observation: Observation) -> bool:
-        """Whether the arm has gone out of the camera's way, and no brick was seen yet."""
+        """Whether the arm has left the camera's view, and no brick was seen yet."""
         if colour_of(observation.prompt) is None or len(self._path) > 2:
             return False
         here_rad = self._kinematics.joints_of(observation.joint)
@@ -277,7 +277,7 @@ def see_brick(image: NDArray[np.uint8], colour: str) -> tuple[Vector, float] | N
     if mask.sum() < MIN_PIXELS:
         return None
     # The outline is that of the top and of the sides in view: at half the height its middle is the
-    # brick's. The top alone is the brighter part, and tells the turn.
+    # brick's. The top alone is the brighter part, and gives the rotation.
     (x_m, y_m), _, _ = cv2.minAreaRect(_ground(mask, HALF_HEIGHT_M))
     top = mask & (brightness > 0.85 * np.percentile(brightness[mask], 80))
     _, _, degrees = cv2.minAreaRect(_ground(top, 2 * HALF_HEIGHT_M))

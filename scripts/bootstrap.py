@@ -1,8 +1,8 @@
-"""Makes ./.venv with the package and everything it is tested with; needs Python alone.
+"""Makes ./.venv with the package and everything it is tested with; needs only Python.
 
 The work is done by uv: the one on PATH, else one put into ./.tools. Versions come from
-constraints.txt. What pip was told about indexes, wheel folders and certificates (``PIP_*``
-variables, pip.conf) is handed on to uv.
+constraints.txt. pip's settings of indexes, wheel folders and certificates (``PIP_*`` variables,
+pip.conf) are passed on to uv.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ PIP_TO_UV = {
 
 
 def pip_settings(environ: Mapping[str, str]) -> dict[str, str]:
-    """What pip would obey: its files, then its variables, by the long name of the option."""
+    """pip's settings: from its files, then its variables, by the long name of the option."""
     home = Path(environ.get("HOME", "/nonexistent"))
     files = [
         Path("/etc/pip.conf"),
@@ -72,13 +72,13 @@ def pip_settings(environ: Mapping[str, str]) -> dict[str, str]:
 
 
 def uv_environment(environ: Mapping[str, str]) -> dict[str, str]:
-    """`environ` with pip's settings said again in uv's words; what uv was told itself stays."""
+    """`environ` with pip's settings as uv's variables; uv's own settings stay."""
     result = dict(environ)
     settings = pip_settings(environ)
     for option, (variable, separator) in PIP_TO_UV.items():
         values = settings.get(option, "").split()
         if option == "find-links":
-            # pip passes over folders that do not exist, uv stops at them.
+            # pip ignores folders that do not exist, uv stops at them.
             values = [value for value in values if "://" in value or Path(value).is_dir()]
         if values:
             result.setdefault(variable, separator.join(values))
@@ -90,7 +90,7 @@ def uv_environment(environ: Mapping[str, str]) -> dict[str, str]:
 
 
 def fail(message: str) -> None:
-    """Ends the program with a message for people."""
+    """Ends the program with a message."""
     sys.exit("setup: " + message)
 
 
@@ -161,7 +161,7 @@ def find_uv() -> Path | None:
 
 
 def install_uv() -> Path:
-    """Puts uv into ./.tools by whatever this Python has."""
+    """Puts uv into ./.tools with the installer that this Python has."""
     install = ["-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
     install += ["--constraint", str(CONSTRAINTS), "uv"]
     say("installing uv into .tools")

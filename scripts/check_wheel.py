@@ -81,7 +81,7 @@ def main() -> None:
     with zipfile.ZipFile(wheel) as archive:
         surplus = [name for name in archive.namelist() if LEFT_OUT.search(name)]
     if surplus:
-        sys.exit(f"build: the wheel has what nobody needs there: {', '.join(surplus)}")
+        sys.exit(f"build: the wheel contains unneeded files: {', '.join(surplus)}")
     print(f"build: {wheel.name} has {wheel.stat().st_size / 1e6:.2f} MB")
     if options.only_build:
         return

@@ -157,7 +157,7 @@ def measure(src: Path) -> dict[str, Any]:
 
 
 def traced_program(out: Path, arguments: list[str]) -> None:
-    """Be ``vla-zenoh`` with `arguments`, and write when each file's code was last called."""
+    """Run ``vla-zenoh`` with `arguments`, and write when each file's code was last called."""
     import threading
 
     last: dict[str, float] = {}
@@ -183,7 +183,7 @@ def traced_program(out: Path, arguments: list[str]) -> None:
 
 
 def trace(src: Path) -> list[str]:
-    """Files of the package that run while pictures become motions, command line and lab aside."""
+    """Files of the package that run while images become motions, command line and lab aside."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         with socket.socket() as probe:
@@ -244,7 +244,7 @@ def show(found: dict[str, Any]) -> None:
     print(f"modules that the four nodes import: {found['node_modules']}", end="")
     print(f" ({found['node_lines']} lines)")
     if "trace" in found:
-        print(f"files that run between a picture and a motion: {len(found['trace'])}")
+        print(f"files that run between an image and a motion: {len(found['trace'])}")
         print("  " + " ".join(found["trace"]))
     print(f"modules in cycles: {len(found['cycles'])} {' '.join(found['cycles'])}".rstrip())
     twice = found["class_names_twice"]

@@ -57,7 +57,7 @@ def described(kind: type) -> dict[str, str]:
 
 
 def first_paragraph(kind: Any) -> str:
-    """Of a docstring, as one line."""
+    """First paragraph of a docstring, as one line."""
     text = inspect.cleandoc(kind.__doc__ or "")
     return " ".join(text.partition("\n\n")[0].split())
 
@@ -113,7 +113,7 @@ def anchor(path: str) -> str:
 
 
 def default_text(field: FieldInfo) -> str:
-    """What a field is where the profile does not say."""
+    """Default of a field, as text."""
     if field.is_required():
         return "**required**"
     value = field.default if field.default is not PydanticUndefined else field.default_factory
@@ -278,7 +278,7 @@ REASONS = {
     "peer_request": "the observation lacks what the policy server asks for",
     "peer_timeout": "the policy server did not answer in time",
     "replayed": "a sequence number that was received before",
-    "reset_refused": "`sim/reset` that cannot be carried out",
+    "reset_refused": "`sim/reset` that cannot be executed",
     "robot_failed": "the robot's Python class raised",
     "schema": "another version of the wire",
     "seen": "what the model saw cannot be published",
@@ -302,7 +302,7 @@ COUNTERS = {
     "sim.stalls": "times the robot node stood still",
     "arm.stream_silences": "times the command stream fell silent",
     "command.chunks_dropped": "chunks dropped because more arrived than are kept",
-    "command.gripper_timeouts": "gripper commands that the gripper did not carry out in time",
+    "command.gripper_timeouts": "gripper commands that the gripper did not execute in time",
     "command.latch_failed": "times the latch file could not be written",
     "command.missed_ticks": "ticks of the command node that were skipped",
     "command.smoothing_failures": "times Ruckig found no plan",

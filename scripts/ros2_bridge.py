@@ -1,9 +1,9 @@
-"""Finds or builds a zenoh-bridge-ros2dds for the tests, and says where it is.
+"""Finds or builds a zenoh-bridge-ros2dds for the tests, and prints its path.
 
-The one on PATH is taken where there is one. Otherwise the program of tests/ros2_bridge/ is built:
-the plugin's crate with a small main. It is built once and kept in the user's cache folder, and
-built anew only when its sources change. Needs Python alone, like the other scripts here; and, to
-build, Rust (1.95 is tried), CMake, a C compiler and libclang.
+The one on PATH is used if there is one. Otherwise the program of tests/ros2_bridge/ is built: the
+plugin's crate with a small main. It is built once and kept in the user's cache folder, and rebuilt
+only when its sources change. Needs only Python, like the other scripts here; and, to build, Rust
+(1.95 is tried), CMake, a C compiler and libclang.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ LIBCLANG_PLACES = (
 
 
 def cache_folder() -> Path:
-    """Where what is built stays: one folder for each version of the sources."""
+    """Folder of builds: one for each version of the sources."""
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     text = b"".join((SOURCES / name).read_bytes() for name in ("Cargo.toml", "src/main.rs"))
     return base / "vla-zenoh" / "ros2-bridge" / hashlib.sha256(text).hexdigest()[:16]
@@ -55,7 +55,7 @@ def has_libclang() -> bool:
 
 
 def missing() -> dict[str, str]:
-    """What is needed for building and not there -> what to install on Debian."""
+    """Missing build requirement -> package that brings it on Debian."""
     lacking = {}
     if shutil.which("cmake") is None:
         lacking["cmake"] = "cmake"
@@ -74,7 +74,7 @@ def say(message: str) -> None:
 
 
 def fail(message: str) -> NoReturn:
-    """Ends the program with a message for people."""
+    """Ends the program with a message."""
     sys.exit("ros2-bridge: " + message)
 
 
@@ -119,7 +119,7 @@ def build() -> Path:
 
 
 def main() -> None:
-    """Build unless there is one, and say where it is.
+    """Build unless there is one, and print where it is.
 
     ``--path``: print the path of the one that is there, alone. ``--packages``: what Debian lacks
     for building one.

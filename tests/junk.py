@@ -41,7 +41,7 @@ STREAMS = (
     "sim_scene",
     "sim_objects",
 )
-SETTINGS = ("prompt", "active", "worker", "rate", "speed", "slower", "reset", "sim_reset")
+SETTINGS = ("prompt", "active", "worker", "rate", "speed", "slower", "held", "reset", "sim_reset")
 OTHERS = (
     "camera_raw",
     "camera_jpeg",

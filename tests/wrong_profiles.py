@@ -216,7 +216,7 @@ WRONG: list[tuple[str, str]] = [
     ),
     (
         "hosts: {a: {nodes: [command]}, b: {nodes: [command]}}",
-        "hosts.b.nodes: command runs on a and b: the robot obeys one command node",
+        "hosts.b.nodes: command runs on a and b: the robot follows one command node",
     ),
     (
         "hosts: {a: {nodes: [router]}, b: {nodes: [router]}}",
@@ -463,7 +463,7 @@ CHECKED: list[tuple[str, str]] = [
     (
         model("joints.py"),
         "A cannot be made: ActionSpec is wrong: horizon: wants a whole number (given: '8'); kind: "
-        "'joint_position' is no kind of action; joints are declared as space='joint' with",
+        "'joint_position' is not a kind of action; joints are declared as space='joint' with",
     ),
     (
         model("needs.py"),

@@ -1,1 +1,1 @@
-"""A picture's way to a pose command, beside other ways of serving a model."""
+"""From a camera image to a pose command, compared with other ways of serving a model."""

@@ -15,29 +15,29 @@ from vla_zenoh.lab.cli.bench_file import ResultOptions, write_json
 def chain(
     output: ResultOptions,
     rounds: Annotated[
-        int, typer.Option("--rounds", help="Turns that every way has.", min=1, max=100)
+        int, typer.Option("--rounds", help="Rounds for every way.", min=1, max=100)
     ] = 5,
     requests: Annotated[
-        int, typer.Option("--requests", help="Pictures in every turn.", min=1, max=10_000)
+        int, typer.Option("--requests", help="Images in every round.", min=1, max=10_000)
     ] = 100,
     only: Annotated[
         list[str] | None,
-        typer.Option("--only", help="Measure this way alone; may be given more than once."),
+        typer.Option("--only", help="Measure only this way; may be given more than once."),
     ] = None,
     size: Annotated[
-        str, typer.Option("--size", metavar="WIDTHxHEIGHT", help="Of a picture.")
+        str, typer.Option("--size", metavar="WIDTHxHEIGHT", help="Of an image.")
     ] = "640x480",
     cameras: Annotated[
-        int, typer.Option("--cameras", help="Pictures in a request.", min=1, max=3)
+        int, typer.Option("--cameras", help="Images in a request.", min=1, max=3)
     ] = 1,
     pause: Annotated[
         bool, typer.Option("--pause/--no-pause", help="12 to 20 ms from request to request.")
     ] = True,
 ) -> None:
-    """Measure picture to chunk and to pose command, beside other ways of serving a model.
+    """Measure image to chunk and to pose command, compared with other ways of serving a model.
 
-    Every way carries the same pictures and seven floats back; the model takes no time.
-    All servers are processes on this computer, started and ended by turns.
+    Every way carries the same images there and seven floats back; the model takes no time.
+    All servers are processes on this computer, started and stopped in turn.
     """
     from benchmarks.chain import report
     from benchmarks.chain.run import run

@@ -1,4 +1,4 @@
-"""Zenoh alone: pictures there and seven floats back, with none of our records around them."""
+"""Zenoh alone: images there and seven floats back, without our records."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ POLL_S = 0.25
 
 
 def session_at(endpoint: str, *, listen: bool) -> zenoh.Session:
-    """A client of a router at `endpoint`, or the one that others connect to there."""
+    """A client of a router at `endpoint`, or the peer that listens there."""
     if listen:
         return open_session(SessionProfile(listen=(endpoint,)), mode="router")
     return open_session(SessionProfile(connect=(endpoint,)), wait_s=ROUTER_PATIENCE_S)
 
 
 def serve(endpoint: str, cameras: int, *, listen: bool, stop: threading.Event) -> None:
-    """Answer every `cameras` pictures until `stop` is set."""
+    """Answer every `cameras` images until `stop` is set."""
     answer = np.array(ACTION, np.float32).tobytes()
     changed = threading.Condition()
     slots = [LatestSample(changed=changed) for _ in range(cameras)]
@@ -55,11 +55,11 @@ def serve(endpoint: str, cameras: int, *, listen: bool, stop: threading.Event) -
 
 
 class EchoClient:
-    """The asking end.
+    """Client side.
 
     Args:
         endpoint: where the server or the router listens.
-        cameras: pictures in a request.
+        cameras: images in a request.
     """
 
     def __init__(self, endpoint: str, cameras: int) -> None:
@@ -73,10 +73,10 @@ class EchoClient:
         ]
 
     def await_server(self, timeout_s: float) -> None:
-        """Wait until pictures are listened to.
+        """Wait until the server subscribes to images.
 
         Raises:
-            NodeError: nobody does.
+            NodeError: it does not.
         """
         give_up = time.monotonic() + timeout_s
         while not all(out.matching_status.matching for out in self._outs):  # pyright: ignore
@@ -85,10 +85,10 @@ class EchoClient:
             time.sleep(0.01)
 
     def request(self, pictures: Pictures) -> NDArray[Any]:
-        """Pictures there, seven floats back.
+        """Send images; returns seven floats.
 
         Raises:
-            TimeoutError: none came.
+            TimeoutError: none arrived.
         """
         self._answers.pop()
         for out, rgb in zip(self._outs, pictures, strict=True):

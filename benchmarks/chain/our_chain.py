@@ -1,6 +1,6 @@
-"""Our own chain under measurement: router, worker and command node as in a lab, each its process.
+"""Our own chain under measurement: router, worker and command node as in a lab, a process each.
 
-This process plays the camera and hears what the picture led to; another one plays the robot.
+This process plays the camera and receives the results; another one plays the robot.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from vla_zenoh.types import ActionChunk, PoseCommand, Stamped
 PROFILE, WORKER, PROMPT = "panda_sim", "scripted", "hold"
 CAMERAS = ("front", "left", "right")
 RATE_HZ = 100.0
-"""Asked of the worker: the highest there is, so that it waits for the picture and nothing else."""
+"""Requested of the worker: the highest rate, so that it waits for nothing but the image."""
 READY_PATIENCE_S = 20.0
 ANSWER_PATIENCE_S = 0.5
 POSE_PATIENCE_S = 0.3
@@ -36,17 +36,17 @@ POLL_S = 0.001
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What one picture led to; `figures_ms` as in `benchmarks.chain.report`."""
+    """Results of one image; `figures_ms` as in `benchmarks.chain.report`."""
 
     figures_ms: dict[str, float]
 
 
 def bench_profile(command_hz: float, pictures: Pictures) -> Profile:
-    """The shipped profile at an address of its own, with the nodes that are measured.
+    """The shipped profile at its own address, with the nodes that are measured.
 
     Args:
         command_hz: rate of the command node.
-        pictures: of the cameras that the model waits for.
+        pictures: images of the cameras that the model waits for.
     """
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     data = load_profile(PROFILE).model_dump()
@@ -60,21 +60,21 @@ def bench_profile(command_hz: float, pictures: Pictures) -> Profile:
         for name, rgb in cameras.items()
     }
     data["options"] = {WORKER: {"camera": ",".join(cameras)}}
-    # A worker takes raw pictures where the host has the cameras, as here.
+    # A worker takes raw images if its host has the cameras, as here.
     here = HostProfile(nodes=("router", "camera", "command", "worker"))
     data["hosts"] = {"here": here.model_dump()}
     return Profile.model_validate(data)
 
 
 class Chain:
-    """The chain, up and obeying while the context lasts.
+    """The chain, running and active during the context.
 
     Args:
         command_hz: rate of the command node.
-        pictures: shown until the worker answers.
+        pictures: images shown until the worker answers.
 
     Raises:
-        NodeError: it does not come up.
+        NodeError: it does not start.
     """
 
     def __init__(self, command_hz: float, pictures: Pictures) -> None:
@@ -129,7 +129,7 @@ class Chain:
         self._activate(client)
 
     def _activate(self, client: Client) -> None:
-        """Show pictures until the worker answers and the command node finds nothing to refuse."""
+        """Show images until the worker answers and the command node has no reason to reject."""
         give_up = time.monotonic() + READY_PATIENCE_S
         why = "the worker does not answer"
         while time.monotonic() < give_up:
@@ -169,10 +169,10 @@ class Chain:
         return mono_ns, wall_ns
 
     def request(self, pictures: Pictures) -> Answer:
-        """Show pictures and follow them.
+        """Show images and follow them.
 
         Raises:
-            TimeoutError: no chunk or no pose command came of it.
+            TimeoutError: no chunk or no pose command followed.
         """
         self._poses.drain()
         self._chunks.pop()
@@ -200,7 +200,7 @@ class Chain:
         raise TimeoutError
 
     def _await_pose(self, stamp_ns: int) -> tuple[Stamped[PoseCommand], int]:
-        """The first pose command of the picture, and when it was heard on the monotonic clock."""
+        """The first pose command of the image, and when it arrived on the monotonic clock."""
         give_up = time.monotonic() + POSE_PATIENCE_S
         while time.monotonic() < give_up:
             for arrival in self._poses.drain():
@@ -226,7 +226,7 @@ class Chain:
 
 
 def _pose_figures(pose: Stamped[PoseCommand], stamp_ns: int, total_ms: float) -> dict[str, float]:
-    """The way of a picture to its first pose command, cut where each node put its stamp.
+    """Stages from an image to its first pose command, divided by the stamps of the nodes.
 
     The stages are of the wall clocks of processes of one computer. The last one is what is left of
     the total, so that they add up to it.

@@ -27,7 +27,7 @@ POLL_S = 0.02
 
 
 def free_port() -> int:
-    """A TCP port that nobody uses now."""
+    """A free TCP port."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
@@ -78,16 +78,16 @@ class Server:
             time.sleep(POLL_S)
 
     def check(self) -> None:
-        """See that it lives.
+        """Check that it is alive.
 
         Raises:
-            NodeError: it has ended; what it wrote stands on stderr.
+            NodeError: it has ended; its output is on stderr.
         """
         assert self._process is not None
         if self._process.poll() is not None:
             raise NodeError(
                 f"the benchmark's process {' '.join(self._arguments)!r} ended with "
-                f"{self._process.returncode}; what it wrote stands above"
+                f"{self._process.returncode}; its output is above"
             )
 
     def __exit__(
@@ -106,7 +106,7 @@ class Server:
 
 
 def main(arguments: list[str]) -> None:
-    """Be the process that `arguments` name."""
+    """Run the process that `arguments` name."""
     role, *rest = arguments
     if role == "peer":
         name, port = rest

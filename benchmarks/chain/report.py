@@ -1,4 +1,4 @@
-"""What was measured, as a map for JSON and as tables for people."""
+"""Results as a map for JSON and as tables."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ STAGES = {
     "worker": "worker: observation, model, chunk",
     "chunk_to_command": "chunk published -> at the command node",
     TICK_WAIT: "waiting for the command node's next tick",
-    "tick_to_pose": "tick -> pose command heard",
+    "tick_to_pose": "tick -> pose command received",
 }
-"""Together they are `POSE`."""
+"""Their sum is `POSE`."""
 LINES: Mapping[str, tuple[tuple[str, str], ...]] = {
     "chain": (
         (CHUNK, "picture -> worker -> chunk back"),
@@ -35,13 +35,13 @@ LINES: Mapping[str, tuple[tuple[str, str], ...]] = {
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """Everything a benchmark found out.
+    """Results of a benchmark.
 
     Args:
         ways: in the order of the table.
         rounds: way -> slot, one map per round.
         machine: what it ran on.
-        load: asked of every way in every round.
+        load: of every way in every round.
     """
 
     ways: Sequence[ServingWay]
@@ -59,7 +59,7 @@ class Result:
         return {stage: summary.p50 for stage, summary in found.items() if summary}
 
     def standing_cpu(self, way: ServingWay) -> float:
-        """Share of one core while nothing is asked, mean of the rounds."""
+        """Share of one core while idle, mean of the rounds."""
         shares = [slots[way.name].standing_cpu for slots in self.rounds if way.name in slots]
         return sum(shares) / len(shares) if shares else 0.0
 
@@ -140,7 +140,7 @@ def stage_table(result: Result) -> Table | None:
 
 
 def notes(result: Result) -> list[str]:
-    """What has to be known to read the tables."""
+    """Notes for reading the tables."""
     machine = result.machine
     pace = "one every 12 to 20 ms at most"
     if not result.load.pause:

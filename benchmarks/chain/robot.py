@@ -1,4 +1,4 @@
-"""A robot that is all traffic and no simulator: it stands, or is always where it was told to be."""
+"""A robot without a simulator, only its traffic: it stands, or is always where it is commanded."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ def play_robot(profile_file: str, stop: threading.Event, *, follows: bool) -> No
     """Publish the state of an arm at the profile's rate.
 
     Args:
-        profile_file: whose robot it plays.
-        stop: ends it.
-        follows: the newest commanded pose is the measured one; otherwise the arm stands at home,
-            and hears nothing.
+        profile_file: of the robot.
+        stop: set to stop it.
+        follows: the newest commanded pose is the measured one; otherwise the arm stands at home and
+            receives nothing.
     """
     profile = load_profile(profile_file)
     robot = profile.robot

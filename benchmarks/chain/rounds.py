@@ -1,4 +1,4 @@
-"""Percentiles, and ratios of ways that were measured in turns."""
+"""Percentiles, and ratios of ways that were measured in turn."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import numpy as np
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """What one way did in one round.
+    """Results of one way in one round.
 
     Args:
         way: name of the way.
         figures_ms: figure -> one value per request, in ms.
         cpu_ms: figure -> CPU time of one request in all processes that take part, in ms.
-        standing_cpu: share of one core that the way takes while nothing is asked of it.
+        standing_cpu: share of one core that the way takes while idle.
         lost: requests that were not answered.
     """
 
@@ -33,13 +33,13 @@ class Summary:
 
     Args:
         p50: of all requests.
-        p95: likewise.
-        p99: likewise.
+        p95: of all requests.
+        p99: of all requests.
         low: smallest median of a round.
         high: largest median of a round.
         cpu: CPU time of one request, median of the rounds, or None.
         ratio: median over the rounds of this median by the reference's in the same round, or None.
-        requests: how many went in.
+        requests: their number.
     """
 
     p50: float
@@ -58,11 +58,11 @@ def summarise(
     """One figure of one way; None when it was never measured.
 
     Args:
-        rounds: way -> what it did, one map per round.
+        rounds: way -> its results, one map per round.
         way: name of the way.
         figure: which of its figures.
-        reference: (way, figure) that the ratio is taken to. Both stand in the same round, so that
-            what slowed the machine down in that round slowed both.
+        reference: (way, figure) that the ratio is taken to. Both are from the same round, so that a
+            slow moment of the machine affects both.
     """
     measured = [
         (slots[way], slots)

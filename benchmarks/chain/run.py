@@ -1,4 +1,4 @@
-"""Measures all ways in turns: round after round, so that a busy moment meets all of them."""
+"""Measures all ways in turn: round after round, so that a busy moment affects all of them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from vla_zenoh.lab.bench.cpu_time import cpu_s
 
 PERIOD_S = (0.012, 0.020)
 """From one request to the next, evenly drawn: two ticks of 250 Hz wide, so that every phase of the
-tick is met equally often, and slower than the worker's highest rate."""
+tick is equally frequent, and slower than the worker's highest rate."""
 WARM_UP = 20
 QUIET_S = 1.0
 MAX_LOST = 10
@@ -38,7 +38,7 @@ Ask = Callable[[peers.Pictures], Mapping[str, float]]
 
 
 class Running(NamedTuple):
-    """A way that is up.
+    """A running way.
 
     Args:
         ask: one request; gives its figures in ms.
@@ -123,7 +123,7 @@ _START = {"chain": _chain, "echo": _echo, "peer": _peer}
 
 
 def measure(way: ServingWay, load: Load, seed: int) -> Interval:
-    """Start one way, ask it ``load.requests`` times, end it.
+    """Start one way, send it ``load.requests`` requests, stop it.
 
     Raises:
         NodeError: it does not start, dies, or leaves too many requests unanswered.
@@ -139,7 +139,7 @@ def measure(way: ServingWay, load: Load, seed: int) -> Interval:
             _paced(running, pictures, draw.uniform(*pause_s))
         gc.collect()
         standing = _spent_in(running, lambda: time.sleep(QUIET_S))
-        # What waited in quiet is not the first to be measured.
+        # The first request after the pause is not measured.
         _paced(running, pictures, draw.uniform(*pause_s))
         lost = 0
 

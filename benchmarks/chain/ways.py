@@ -1,4 +1,4 @@
-"""What is measured: the ways a picture becomes seven floats, and ours on to a pose command."""
+"""The measured ways from an image to seven floats, and ours further to a pose command."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ class ServingWay:
 
 @dataclass(frozen=True, slots=True)
 class Load:
-    """What is asked of every way in a turn.
+    """Load of every way in a round.
 
     Args:
         requests: their number.
-        size: width and height of a picture.
-        cameras: pictures in a request.
+        size: width and height of an image.
+        cameras: images in a request.
         pause: from one request to the next; without it each follows the answer to the last.
     """
 
@@ -54,7 +54,7 @@ class Load:
     pause: bool = True
 
     def pictures(self) -> Pictures:
-        """Those of a request."""
+        """Images of a request."""
         return [noisy_picture(*self.size)] * self.cameras
 
 

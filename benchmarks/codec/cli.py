@@ -19,7 +19,7 @@ MIN_TURNS, MAX_TURNS = 5, 2000
 def codec(output: ResultOptions) -> None:
     """Measure encoding and decoding, ours and ROS 2's, in microseconds.
 
-    Of ROS 2 beside cyclonedds and pycdr2, where they are installed.
+    For ROS 2 also with cyclonedds and pycdr2, if they are installed.
     """
     from rich.table import Table
 

@@ -1,4 +1,4 @@
-"""What ``benchmarks codec`` measures: the forms pictures, states and commands travel in."""
+"""What ``benchmarks codec`` measures: the wire forms of images, states and commands."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ class Case:
     Args:
         name: for the table.
         payload_bytes: size on the wire.
-        encode: makes the bytes; of a ROS message, of a message that is there.
-        decode: reads them; of a ROS topic that we read, to the sample we use.
+        encode: makes the bytes; for ROS, from an existing message.
+        decode: reads them; for ROS topics that we read, to the sample we use.
         others: library -> (encode, decode) of the same bytes.
     """
 

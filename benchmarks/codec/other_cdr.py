@@ -27,7 +27,7 @@ class OtherCdr:
 
     Args:
         library: of `MODULES`.
-        messages: whose types.
+        messages: with the types.
 
     Raises:
         ImportError: it is not installed.

@@ -6,7 +6,7 @@ One row each. A run lasts 20 s; the simulator judges with its limits and its mon
 connection enforced.
 
 - reflexes: motions that the simulator ended;
-- ended: after how many seconds, where the motion did not outlast the targets;
+- ended: after how many seconds, if the motion ended before the targets;
 - jerk: the largest of the measured flange, over 20 ms, and its RMS, in m/s^3;
 - lag, off: how much later the flange follows the targets, and how far from them it is then (RMS);
 - CPU: of all processes of the contestant, of one core.

@@ -15,7 +15,7 @@ from target_stream import play
 
 ADDRESS = "127.0.0.1"
 SPEED_M_S, ACCELERATION_M_S2, JERK_M_S3 = 0.3, 1.0, 10.0
-"""The limits of the profile fr3, where a library takes such."""
+"""The limits of the profile fr3, for libraries that take limits."""
 SLOWER = 0.1
 SETTLE_S = 1.0
 

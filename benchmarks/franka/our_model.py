@@ -39,7 +39,7 @@ class Stream:
         self._offsets, self._late_s = offsets(), lateness_s()
 
     def infer(self, observation: Any) -> ActionSteps:
-        """One target, late as it is for everybody."""
+        """One target, as late as for every contestant."""
         pose = observation.pose
         if self._start is None or observation.prompt != "go":
             self._start = np.concatenate((pose.position_m, pose.quat_xyzw))

@@ -1,7 +1,7 @@
 """The targets that every contestant gets: 25 a second, late by up to a third, not quite continuous.
 
-A smooth path, as a policy that looks again every eight steps would give it: each chunk is a few
-millimetres off the one before. Needs numpy only; every contestant's environment has that.
+A smooth path, as from a policy that infers every eight steps: each chunk is a few millimetres off
+the one before. Needs numpy only; every contestant's environment has that.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def offsets(seed: int = 1) -> Iterator[np.ndarray]:
 
 
 def smooth(time_s: float) -> np.ndarray:
-    """The path without what the chunks disagree about."""
+    """The path without the offsets of the chunks."""
     turn = 2 * math.pi * time_s
     return np.array([0.0, 0.06 * math.sin(turn / 4.0), 0.03 * math.sin(turn / 2.5)])
 

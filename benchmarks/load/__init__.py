@@ -1,1 +1,1 @@
-"""Robots and cameras that one router carries."""
+"""Number of robots and cameras that one router carries."""

@@ -22,7 +22,7 @@ def load(
         str, typer.Option("--robots", help="Numbers of robots, separated by commas; empty: none.")
     ] = "1,2,4,8,16",
     cameras: Annotated[
-        str, typer.Option("--cameras", help="Numbers of cameras likewise.")
+        str, typer.Option("--cameras", help="Numbers of cameras, in the same form.")
     ] = "1,2,4,8",
     seconds: Annotated[
         float, typer.Option("--seconds", min=3, max=600, help="How long at each number.")
@@ -34,7 +34,7 @@ def load(
     """Measure how many robots and cameras one router and this computer carry.
 
     Robots follow their commands without a simulator; one worker serves all of them. Cameras send
-    pictures of 640x480, which are read raw.
+    images of 640x480, which are read raw.
     """
     from benchmarks.load.runner import Load
     from vla_zenoh.lab.cli.loopback import own_address

@@ -1,8 +1,8 @@
 """How many robots and cameras one router, and this computer, carry: rates, latency, CPU.
 
 Every robot is a process that follows its commands without a simulator, and a command node; one
-worker serves all of them. Cameras are one camera node that plays a picture with a sensor's noise,
-read raw by this process.
+worker serves all of them. Cameras are one camera node that publishes an image with a sensor's
+noise, read raw by this process.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ WORKER, RATE_HZ, CAMERA_HZ = "scripted", 10.0, 30.0
 PROMPT = "HARD: go up within 0.1"
 READY_S, SETTLE_S, POLL_S = 60.0, 3.0, 0.1
 HELD_SHARE, HELD_CHUNKS = 0.98, 0.9
-"""Of the asked rates; below this it does not hold."""
+"""Of the requested rates; below this it does not hold."""
 GONE_S = 3.0
 
 
@@ -102,7 +102,7 @@ class Load:
         self._clients[name] = Client(profile, self._session).subscribe()
 
     def _activate(self, name: str, give_up_s: float) -> bool:
-        """Whether a robot can be had to move by then."""
+        """Whether a robot moves by then."""
         client = self._clients[name]
         while time.monotonic() < give_up_s:
             self._wait(POLL_S)
@@ -239,7 +239,7 @@ class Load:
             raise NodeError("interrupted")
         for supervisor in self._supervisors.values():
             if not supervisor.poll():
-                raise NodeError("a node dies again and again; what it wrote stands above")
+                raise NodeError("a node keeps crashing; its output is above")
 
     def _pids(self) -> Mapping[str, list[int]]:
         found: dict[str, list[int]] = {"bench": [os.getpid()]}
@@ -262,13 +262,13 @@ class Load:
 
 
 class _Pictures:
-    """Counts the pictures of a camera, and how old they were when they came."""
+    """Counts the images of a camera, and their age on arrival."""
 
     def __init__(self) -> None:
         self.begin()
 
     def begin(self) -> None:
-        """Count anew."""
+        """Restart the count."""
         self.count = 0
         self.ages_ms = Percentiles(4096)
 

@@ -1,1 +1,1 @@
-"""Our response of a controller beside robosuite's own controller."""
+"""Our response of a controller compared with robosuite's own controller."""

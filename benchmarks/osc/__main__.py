@@ -1,4 +1,4 @@
-"""How far our arm moves by a policy of LIBERO or robosuite, beside robosuite's own controller.
+"""How far a policy of LIBERO or robosuite moves our arm, and robosuite's with its own controller.
 
     python -m benchmarks.osc [-n 200] [--seed 1] [-o FILE.json]
 
@@ -7,9 +7,10 @@ Panda (`robosuite_paths.py`, in an environment of its own that uv makes), and th
 node, guard and simulated Panda in lockstep, from the same joints: once with the controller declared
 (``controller: 150:1``), once with deltas added to the goal, as they are without it.
 
-Compared is the displacement of the TCP since the begin, after every step, at the same time; ours
-is moved in time by one constant for all sequences, which is told: what smoothing and control take.
-A sequence is a sine of its own on every axis with noise on it; ``--turns`` has rotations as well.
+Compared is the displacement of the TCP since the start, after every step, at the same time; ours is
+shifted by one constant time for all sequences, which is reported: the delay of smoothing and
+control. A sequence is a sine of its own on every axis with noise on it; ``--turns`` has rotations
+as well.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ SCALE = np.repeat([0.05, 0.5], 3)
 CONTROLLER = ControllerSpec(kp=150.0, damping_ratio=1.0)
 SINE_HZ, SINE, NOISE = (0.5, 1.5), 0.5, 0.3
 HEIGHT = 0.3
-"""Up and down so much less, or the arm meets the table where each step is covered whole."""
+"""Factor on vertical motion: the arm would meet the table if each step were covered whole."""
 TURN = 0.3
 """Share of a full turn: faster ones are above the profile's limit."""
 SHIFTS_S = np.arange(0.0, 0.3, 0.004)
@@ -67,7 +68,7 @@ def sequences(count: int, seed: int, *, turns: bool) -> FloatArray:
 
 
 class Played:
-    """A policy that plays one sequence once it is told to, 16 steps in a chunk."""
+    """A policy that plays one sequence when it is prompted to, 16 steps in a chunk."""
 
     def __init__(self, actions: FloatArray, controller: ControllerSpec | None) -> None:
         still = np.zeros((HORIZON, 6))
@@ -82,7 +83,7 @@ class Played:
         )
 
     def infer(self, observation: Observation) -> ActionSteps:
-        """The steps from the time of the observation on; pictures come as often as steps."""
+        """The steps from the time of the observation on; images come as often as steps."""
         stamp_ns = observation.stamp_wall_ns
         if not self.begins:
             return ActionSteps(self._steps[-HORIZON:])
@@ -138,7 +139,7 @@ def play(mode: str, index: int, actions: FloatArray, joints_rad: FloatArray) -> 
 
 
 def robosuite_paths(actions: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Displacements (n, STEPS, 3) m and rad of robosuite's arm, and its joints at the begin."""
+    """Displacements (n, STEPS, 3) m and rad of robosuite's arm, and its joints at the start."""
     with tempfile.TemporaryDirectory() as folder:
         given, written = Path(folder, "actions.npy"), Path(folder, "paths.npz")
         np.save(given, actions)
@@ -178,7 +179,7 @@ def _spread(values: FloatArray) -> dict[str, float]:
 
 
 def main() -> None:
-    """See the module."""
+    """Command line of the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("-n", type=int, default=200, help="sequences (200)")
     parser.add_argument("--seed", type=int, default=1)

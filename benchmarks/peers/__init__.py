@@ -21,14 +21,14 @@ PROMPT = "put the red brick in the box"
 
 
 Pictures = Sequence[NDArray[np.uint8]]
-"""(H, W, 3) of each camera, taken together."""
+"""(H, W, 3) of each camera, captured together."""
 
 
 class PeerClient(Protocol):
-    """The asking end."""
+    """Client side of a server."""
 
     def request(self, pictures: Pictures) -> NDArray[Any]:
-        """Pictures there, seven floats back."""
+        """Send images; returns seven floats."""
         ...
 
     def close(self) -> None: ...

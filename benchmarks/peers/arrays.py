@@ -14,7 +14,7 @@ def pack(value: Any) -> bytes:
 
 
 def unpack(payload: bytes) -> Any:
-    """The same back; arrays are views."""
+    """Inverse of `pack`; arrays are views."""
     return msgpack.unpackb(payload, object_hook=_from_map)
 
 

@@ -44,13 +44,13 @@ def _in_text(rgb: NDArray[np.uint8]) -> str:
 
 
 class Client:
-    """The asking end."""
+    """Client side."""
 
     def __init__(self, port: int) -> None:
         self._url = f"http://{ADDRESS}:{port}/act"
 
     def request(self, pictures: Pictures) -> NDArray[Any]:
-        """Pictures there, seven floats back."""
+        """Send images; returns seven floats."""
         body = {"images": list(map(_in_text, pictures)), "instruction": PROMPT}
         # A proxy that the environment names is not meant for this computer.
         proxies: Any = {"http": None}

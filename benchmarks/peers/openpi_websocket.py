@@ -39,7 +39,7 @@ def serve(port: int) -> None:
 
 
 class Client:
-    """The asking end."""
+    """Client side."""
 
     def __init__(self, port: int) -> None:
         self._up = ExitStack()
@@ -50,7 +50,7 @@ class Client:
         self._socket.recv()
 
     def request(self, pictures: Pictures) -> NDArray[Any]:
-        """Pictures there, seven floats back."""
+        """Send images; returns seven floats."""
         images = {f"observation/image_{number}": rgb for number, rgb in enumerate(pictures)}
         self._socket.send(arrays.pack({**images, "prompt": PROMPT}))
         answer = arrays.unpack(self._socket.recv())  # pyright: ignore[reportArgumentType]

@@ -25,7 +25,7 @@ def serve(port: int) -> None:
 
 
 class Client:
-    """The asking end."""
+    """Client side."""
 
     def __init__(self, port: int) -> None:
         self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.REQ)
@@ -34,10 +34,10 @@ class Client:
         self._socket.connect(f"tcp://{ADDRESS}:{port}")
 
     def request(self, pictures: Pictures) -> NDArray[Any]:
-        """Pictures there, seven floats back."""
+        """Send images; returns seven floats."""
         self._socket.send(arrays.pack({"images": list(pictures), "prompt": PROMPT}))
         return arrays.unpack(self._socket.recv())["actions"][0]
 
     def close(self) -> None:
-        """Let go of the socket."""
+        """Close the socket."""
         self._socket.close()

@@ -19,7 +19,7 @@ class PublishedRun:
 
     Args:
         path_m: length of the path of the TCP, in translation.
-        path_rad: likewise in rotation.
+        path_rad: the same in rotation.
         e2e_ms: request to pose command, mean and p95.
         outbound_ms: request to its arrival at the model, mean and p95.
     """

@@ -31,7 +31,7 @@ class Groot(Adapter):
         timeout_s: for connecting, and for each answer.
         api_token: if the server requires one.
         profile: of the robot: its gripper and, if answers are joints, its arm.
-        layout: see vla_zenoh/interop/field_mapping.py. Pictures are video.NAME, states state.NAME.
+        layout: see vla_zenoh/interop/field_mapping.py. Images are video.NAME, states state.NAME.
     """
 
     joints = True

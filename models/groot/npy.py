@@ -1,7 +1,7 @@
-"""Arrays in numpy's .npy form, without reading Python out of them.
+"""Arrays in numpy's .npy form, read without evaluating Python.
 
-numpy's own reader evaluates the header as Python text; this one takes only what numpy writes for a
-plain array of numbers, and looks at sizes before memory is taken.
+numpy's own reader evaluates the header as Python text; this one accepts only the header that numpy
+writes for a plain array of numbers, and checks sizes before memory is taken.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def load(data: Any) -> np.ndarray[Any, Any]:
     """A read-only array.
 
     Raises:
-        PeerError: whatever else it is, pickled objects among them.
+        PeerError: anything else, such as pickled objects.
     """
     if not isinstance(data, bytes) or data[:6] != MAGIC or len(data) < 12:
         raise _bad("not a .npy file")

@@ -73,10 +73,10 @@ def pack(value: Any) -> bytes:
 
 
 def unpack(payload: bytes) -> Any:
-    """The same back; a modality's description becomes a plain map.
+    """Inverse of `pack`; a modality's description becomes a plain map.
 
     Raises:
-        PeerError: whatever else the bytes are.
+        PeerError: the bytes are anything else.
     """
     if payload.startswith(_PICKLES):
         raise PeerError(
@@ -147,10 +147,10 @@ def reset_data(version: Version) -> Any:
 
 # -- answers --------------------------------------------------------------------------------------
 def read_answer(payload: bytes) -> Any:
-    """Any answer that is no error.
+    """An answer that is not an error.
 
     Raises:
-        PeerError: it is one, or cannot be read.
+        PeerError: it is an error, or cannot be read.
     """
     if payload == b"ERROR":
         raise PeerError("peer_error", "the server says ERROR; is it the right kind of server?")
@@ -175,7 +175,7 @@ def read_actions(payload: bytes) -> dict[str, Any]:
 
 
 def mismatches(modalities: Any, mapping: FieldMapping) -> list[str]:
-    """What the server's modalities and the layout differ in: one sentence each."""
+    """Differences between the server's modalities and the layout, one sentence each."""
     if not isinstance(modalities, dict):
         return []
     out: list[str] = []

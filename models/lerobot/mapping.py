@@ -1,12 +1,12 @@
-"""From what a LeRobot directory declares to cameras, state and actions of this robot."""
+"""Maps the declarations of a LeRobot directory to cameras, state and actions of this robot."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from vla_zenoh.errors import WorkerError
+from vla_zenoh.errors import SpecError, WorkerError
 from vla_zenoh.interop.field_mapping import FieldSource, read_map, read_size
 from vla_zenoh.policy.model_options import one_of, read_json, whole_number
 from vla_zenoh.policy.state_vector import read_state
@@ -15,15 +15,15 @@ CONFIG, WEIGHTS = "config.json", "model.safetensors"
 PIPELINES = ("policy_preprocessor.json", "policy_postprocessor.json")
 STATE, ACTION, PICTURE = "observation.state", "action", "observation.image"
 EMPTY = "observation.images.empty_camera_"
-"""Pictures of no camera, which LeRobot makes up itself."""
+"""Images without a camera, which LeRobot creates itself."""
 MAX_STEPS = 1000
 WITHOUT_WORDS = frozenset({"act", "diffusion", "tdmpc", "vqbet"})
 """Policies that read no prompt."""
 GO_WITHOUT = frozenset({"pi0", "pi05", "smolvla", "xvla"})
-"""Policies that do without a picture that is not given."""
+"""Policies that accept missing images."""
 OF_BASE = frozenset({"pi0", "pi05", "smolvla"})
-"""Fine-tuned, their config still has the pictures and the state of the published weights, whatever
-the data had; they bring pictures to their own size."""
+"""After fine-tuning, their config still has the images and the state of the published weights,
+whatever the data had; they resize images themselves."""
 RTC = frozenset({"pi0", "pi05", "smolvla"})
 """Policies that LeRobot conditions on the steps in execution."""
 REMOTE_CODE = frozenset({"gaussian_actor", "groot", "pi0_fast"})
@@ -34,7 +34,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     """The config of a policy directory.
 
     Raises:
-        WorkerError: it is none, or of a kind that is not run.
+        WorkerError: not a policy, or of a kind that is not supported.
     """
     config = read_json(folder / CONFIG)
     if not isinstance(config.get("type"), str):
@@ -53,7 +53,7 @@ def features(folder: Path, config: Mapping[str, Any], name: str) -> dict[str, tu
     """Feature -> shape, of ``input_features`` or ``output_features``.
 
     Raises:
-        WorkerError: they are not there in LeRobot's form.
+        WorkerError: they are missing or not in LeRobot's form.
     """
     found = config.get(name)
     try:
@@ -69,8 +69,8 @@ def pictures(
 
     Args:
         features: of the policy.
-        told: ``feature=camera:NAME,...`` where the camera is not called like the feature's last
-            part; ``feature=`` leaves one out.
+        told: ``feature=camera:NAME,...`` if the camera's name is not the feature's last part;
+            ``feature=`` leaves one out.
         kind: of policy.
 
     Raises:
@@ -86,8 +86,8 @@ def pictures(
     strange = sorted(set(named) - set(wanted))
     if strange:
         raise WorkerError(
-            f"map names {strange[0]!r}, which is no picture of the policy; "
-            f"its pictures are: {', '.join(wanted) or 'none'} (map=FEATURE=camera:NAME,...)"
+            f"map names {strange[0]!r}, which is not an image of the policy; "
+            f"its images are: {', '.join(wanted) or 'none'} (map=FEATURE=camera:NAME,...)"
         )
     out: dict[str, tuple[str, tuple[int, ...]]] = {}
     for feature, shape in wanted.items():
@@ -99,9 +99,7 @@ def pictures(
         if not source.camera:
             raise WorkerError(f"map: {feature} is a picture, so {feature}=camera:NAME")
         if source.camera in out:
-            raise WorkerError(
-                f"two pictures of the policy are to come from camera {source.camera!r}"
-            )
+            raise WorkerError(f"two images of the policy must come from camera {source.camera!r}")
         if len(shape) != 3 or shape[0] != 3:
             raise WorkerError(f"{feature} has shape {shape}; wanted three colours: (3, H, W)")
         out[source.camera] = feature, shape
@@ -109,7 +107,7 @@ def pictures(
 
 
 def picture_size(told: str, shape: tuple[int, ...], kind: str) -> tuple[int, int] | None:
-    """Width and height a picture is given in; None: as the camera gives it.
+    """Width and height of an input image; None: as the camera delivers it.
 
     Args:
         told: WIDTHxHEIGHT, nothing, or ``auto``: that of the config, where that is the data's.
@@ -125,7 +123,11 @@ def picture_size(told: str, shape: tuple[int, ...], kind: str) -> tuple[int, int
 
 
 def state_parts(
-    folder: Path, kind: str, features: Mapping[str, tuple[int, ...]], told: str, joints: int
+    folder: Path,
+    kind: str,
+    features: Mapping[str, tuple[int, ...]],
+    told: str,
+    joints: Sequence[int],
 ) -> tuple[str, ...]:
     """Parts that make ``observation.state``, in order, see `vla_zenoh.policy.state_vector`.
 
@@ -134,10 +136,10 @@ def state_parts(
         kind: of policy.
         features: of the policy.
         told: the parts, joined by +.
-        joints: how many the arm has.
+        joints: how many each arm has.
 
     Raises:
-        WorkerError: the policy wants something else than pictures and a flat state.
+        WorkerError: the policy needs other inputs than images and a flat state.
         SpecError: their numbers are not as many as the policy's.
     """
     other = sorted(name for name in features if name != STATE and not name.startswith(PICTURE))
@@ -147,7 +149,7 @@ def state_parts(
     if len(shape) != 1:
         raise WorkerError(f"{STATE} has shape {shape}; wanted one row of numbers")
     trained = _trained_state(folder) if kind in OF_BASE else None
-    return read_state(told, trained or shape[0], joints)
+    return read_state(told, trained or shape[0], *joints)
 
 
 def _trained_state(folder: Path) -> int | None:
@@ -170,13 +172,32 @@ def _trained_state(folder: Path) -> int | None:
     return None
 
 
+def arm_names(told: str, parts: Sequence[str]) -> tuple[str, ...]:
+    """The robot's parts in the order of the policy's numbers; of a robot of one part ``("",)``.
+
+    Args:
+        told: their names, separated by commas; empty: in the order of the profile.
+        parts: those of the profile.
+
+    Raises:
+        SpecError: `told` names others.
+    """
+    named = tuple(name.strip() for name in told.split(",")) if told else tuple(parts)
+    if sorted(named) != sorted(parts):
+        raise SpecError(
+            f"parts is {told!r}; the robot's are: {', '.join(parts) or 'none, it is one arm'} "
+            "(--set parts=... names each once, in the order of the policy's numbers)"
+        )
+    return named or ("",)
+
+
 def one_by_one(config: Mapping[str, Any]) -> bool:
-    """Policies that look at several observations, or average chunks, plan by themselves."""
+    """Whether a policy is asked step by step: it uses several observations, or averages chunks."""
     return config.get("n_obs_steps", 1) > 1 or config.get("temporal_ensemble_coeff") is not None
 
 
 def takes_prefix(config: Mapping[str, Any], told: str) -> bool:
-    """Whether the policy is given the steps in execution.
+    """Whether the policy gets the steps in execution.
 
     Args:
         config: of the policy.
@@ -196,7 +217,7 @@ def takes_prefix(config: Mapping[str, Any], told: str) -> bool:
 
 
 def horizon(config: Mapping[str, Any], told: str) -> int:
-    """Steps of a chunk that are sent: as told, else as many as the policy was made to carry out.
+    """Steps of a chunk that are sent: as set, else as many as the policy was made to execute.
 
     Raises:
         WorkerError: more than its chunks have.
@@ -210,7 +231,7 @@ def horizon(config: Mapping[str, Any], told: str) -> int:
 
 
 def device_step(pipeline: Path) -> bool:
-    """Whether a pipeline has a step that moves tensors; refuses steps named by module.
+    """Whether a pipeline has a step that moves tensors; rejects steps named by module.
 
     Raises:
         WorkerError: it cannot be read, or would import what the directory names.

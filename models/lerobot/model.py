@@ -10,8 +10,10 @@
 # ///
 """Any policy that LeRobot saved (ACT, SmolVLA, pi0, ...), run by LeRobot itself.
 
-A policy directory does not say what its numbers mean, so the options do, and what they say is
-checked against the sizes in its config. Weights are read from safetensors; nothing is unpickled.
+A policy directory does not define the meaning of its numbers, so the options do; they are checked
+against the sizes in its config. Weights are read from safetensors; nothing is unpickled.
+Of a robot of several arms they say what the numbers of each are. The arms' numbers follow one
+another in the state and in the actions, as in ALOHA's data.
 
     vla-zenoh worker lerobot --set checkpoint=DIR --set state=position+rpy+gripper_m \\
         --set action=delta --set rotation=rpy --set gripper=absolute_m --set dt_s=0.1
@@ -23,12 +25,14 @@ from collections.abc import Mapping
 from typing import Any, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 from vla_zenoh_model_lerobot.mapping import (
     ACTION,
     PIPELINES,
     STATE,
     WEIGHTS,
     WITHOUT_WORDS,
+    arm_names,
     device_step,
     features,
     horizon,
@@ -41,8 +45,9 @@ from vla_zenoh_model_lerobot.mapping import (
 )
 
 from vla_zenoh.errors import SpecError, WorkerError, in_words
-from vla_zenoh.interop.action_semantics import read_action_semantics
+from vla_zenoh.interop.action_semantics import ActionSemantics, read_action_semantics
 from vla_zenoh.policy import (
+    ActionSpec,
     ActionSteps,
     CameraSpec,
     ModelSpec,
@@ -57,18 +62,20 @@ from vla_zenoh.profile import load_profile
 
 
 class LeRobot:
-    """See the module.
+    """A policy that LeRobot saved; see the module.
 
     Args:
         checkpoint: directory with ``config.json``, ``model.safetensors`` and the two pipelines.
         state: what the numbers of ``observation.state`` are, in order, see `state_vector`.
-        map: ``feature=camera:NAME`` where the names differ, separated by commas; ``feature=``
-            leaves a picture out. Others are of the camera called like their last part.
-        size: of the pictures, WIDTHxHEIGHT; empty: as the camera gives them; ``auto``: that of the
+        map: ``feature=camera:NAME`` if the names differ, separated by commas; ``feature=`` leaves
+            an image out. Others are from the camera named like their last part.
+        size: of the images, WIDTHxHEIGHT; empty: as the camera gives them; ``auto``: that of the
             config, and as the camera gives them where a policy resizes them itself.
-        resize: how a picture of another size becomes one of this.
+        resize: how an image of another size becomes one of this.
         device: as torch names it; ``auto``: a GPU where there is one.
-        profile: of the robot: its gripper, and its arm.
+        profile: of the robot: its arms and grippers.
+        parts: names of the arms in the order of the policy's numbers, separated by commas; empty:
+            as in the profile.
         rtc: ``on``: a pi0, pi0.5 or SmolVLA continues the steps in execution, by LeRobot's own
             real-time chunking with the weights of the paper.
         meaning: of the actions, see vla_zenoh/interop/action_semantics.py. `horizon` defaults to
@@ -84,6 +91,7 @@ class LeRobot:
         resize: str = "none",
         device: str = "auto",
         profile: str = "panda_sim",
+        parts: str = "",
         rtc: str = "off",
         **meaning: str,
     ) -> None:
@@ -94,14 +102,17 @@ class LeRobot:
         self.takes_committed = takes_prefix(config, rtc)
         steps = 1 if self._one_by_one else horizon(config, meaning.get("horizon", ""))
         one_of("resize", resize, get_args(Resize))
-        robot = load_profile(profile).robot
-        self._max_width_m = robot.gripper.max_width_m
-        self._meaning = read_action_semantics(
-            {**meaning, "horizon": str(steps)}, joints=robot.arm_joints
-        )
+        robot = load_profile(profile)
+        arms = {name: robot.of_part(name).robot for name in arm_names(parts, tuple(robot.parts))}
+        self._max_width_m = {name: arm.gripper.max_width_m for name, arm in arms.items()}
+        self._meaning: dict[str, ActionSemantics] = {
+            name: read_action_semantics({**meaning, "horizon": str(steps)}, joints=arm.arm_joints)
+            for name, arm in arms.items()
+        }
         inputs = features(self._folder, config, "input_features")
         self._pictures = pictures(inputs, map, kind)
-        self._state = state_parts(self._folder, kind, inputs, state, len(robot.arm_joints))
+        joints = [len(arm.arm_joints) for arm in arms.values()]
+        self._state = state_parts(self._folder, kind, inputs, state, joints)
         self._check_action(config)
         self._device = device
         cameras: list[CameraSpec] = []
@@ -117,7 +128,9 @@ class LeRobot:
                 state=tuple(dict.fromkeys(parts_of(self._state))),
                 prompt=kind not in WITHOUT_WORDS,
             ),
-            action=self._meaning.spec,
+            action=self._meaning[""].spec
+            if "" in self._meaning
+            else ActionSpec.of_parts({name: own.spec for name, own in self._meaning.items()}),
         )
         self.policy: Any = None
         self._before: Any = None
@@ -125,12 +138,17 @@ class LeRobot:
 
     def _check_action(self, config: Mapping[str, Any]) -> None:
         shape = features(self._folder, config, "output_features").get(ACTION)
-        parts = self._meaning.parts()
-        if shape != (sum(parts.values()),):
-            wanted = " + ".join(f"{name} {count}" for name, count in parts.items())
+        counts = [
+            (f"{part} {name}".strip(), count)
+            for part, own in self._meaning.items()
+            for name, count in own.parts().items()
+        ]
+        total = sum(count for _, count in counts)
+        if shape != (total,):
+            wanted = " + ".join(f"{name} {count}" for name, count in counts)
             raise WorkerError(
-                f"{self._folder}: its actions have shape {shape}; {wanted} are "
-                f"({sum(parts.values())},). Is it one arm, and is action= what they are?"
+                f"{self._folder}: its actions have shape {shape}; {wanted} are ({total},). Is "
+                "action= what they are, and has the robot as many arms?"
             )
 
     def load(self) -> None:
@@ -189,20 +207,24 @@ class LeRobot:
         The pipeline that scales observations scales the steps in execution too, as in training.
 
         Raises:
-            SpecError: the policy answers with something else than its config says.
+            SpecError: the policy's answer does not match its config.
         """
         import torch
         from lerobot.policies.utils import prepare_observation_for_inference
 
         given: dict[str, Any] = {
-            # Copied: what came by the bus may not be written to, and torch takes no such arrays.
+            # Copied: arrays from the bus are read-only, which torch does not accept.
             feature: np.array(observation.images[camera])
             for camera, (feature, _) in self._pictures.items()
         }
         if self._state:
-            given[STATE] = state_vector(self._state, observation, self._max_width_m)
+            each = [
+                state_vector(self._state, observation.parts.get(part, observation), most_m)
+                for part, most_m in self._max_width_m.items()
+            ]
+            given[STATE] = np.concatenate(each)
         if committed is not None:
-            given[ACTION] = self._meaning.rows(committed.steps).astype(np.float32)
+            given[ACTION] = self._rows(committed.steps).astype(np.float32)
         # LeRobot's guidance takes a gradient, which inference mode cannot.
         with torch.no_grad() if self.takes_committed else torch.inference_mode():
             device = torch.device(self.policy.config.device)
@@ -227,7 +249,18 @@ class LeRobot:
             steps = torch.cat([self._after(step) for step in wanted.unbind(1)])
         raw = {"normalised": wanted[0].float().cpu().tolist()}
         rows = steps.double().cpu().numpy()
-        return ActionSteps(self._meaning.steps(rows), raw=raw)
+        return ActionSteps(self._steps(rows), raw=raw)
+
+    def _steps(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Action steps (H, D) of the policy's own numbers (H, C)."""
+        ends = np.cumsum([sum(own.parts().values()) for own in self._meaning.values()])
+        each = zip(self._meaning.values(), np.split(rows, ends[:-1], axis=1), strict=True)
+        return np.concatenate([own.steps(columns) for own, columns in each], axis=1)
+
+    def _rows(self, steps: NDArray[Any]) -> NDArray[np.float64]:
+        """The inverse of `_steps`."""
+        each = [(own, self.spec.action.columns(part)) for part, own in self._meaning.items()]
+        return np.concatenate([own.rows(steps[:, columns]) for own, columns in each], axis=1)
 
 
 def _rtc_config(horizon: int) -> Any:

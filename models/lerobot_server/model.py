@@ -4,8 +4,8 @@
 # ///
 """Queries lerobot's policy server (``lerobot.async_inference.policy_server``) over gRPC.
 
-The server loads the policy that it is told to, from a folder or a hub, and may take minutes for it.
-What it sends are pickles, which are read as data (see pickles.py); lerobot is not needed here.
+The server loads the policy that the client names, from a folder or a hub, and may take minutes for
+it. Its answers are pickles, which are read as data (see pickles.py); lerobot is not needed here.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ NEVER_MS = 2**31 - 1
 
 
 class LeRobotServer(Adapter):
-    """Client of a policy server of lerobot's.
+    """Client of lerobot's policy server.
 
     Args:
         url: of the server, as grpc://HOST:PORT.
@@ -38,7 +38,7 @@ class LeRobotServer(Adapter):
         load_s: how long the server may load.
         timeout_s: for connecting, and for each answer.
         profile: of the robot: its gripper and, if answers are joints, its arm.
-        layout: see vla_zenoh/interop/field_mapping.py. A picture is observation.images.NAME, the
+        layout: see vla_zenoh/interop/field_mapping.py. An image is observation.images.NAME, the
             state observation.state, the prompt task; size none: as the camera gives it.
     """
 

@@ -49,7 +49,7 @@ class _Name:
 
 
 Makers = Mapping[str, Callable[[tuple[Any, ...]], Any] | None]
-"""What may be named, and what is made of its arguments; None: it is only named."""
+"""Allowed names, and the constructor of their value; None: they are only named."""
 
 
 # -- read -----------------------------------------------------------------------------------------
@@ -57,7 +57,7 @@ def read(data: bytes) -> Any:
     """Values, tensors as arrays (n,), and `Instance` of `TIMED_ACTION`.
 
     Raises:
-        PeerError: whatever else it is; a name that is not allowed is told.
+        PeerError: anything else; reports a name that is not allowed.
     """
     return _whole(io.BytesIO(data), _OUTER)
 

@@ -115,7 +115,7 @@ def features(mapping: FieldMapping, joints: int) -> dict[str, dict[str, Any]]:
             out[name] = {"dtype": "float32", "shape": (size,), "names": names}
         elif not source.prompt or name != TASK:
             raise SpecError(
-                f"map: {name!r} is not read by the server; a picture is {PICTURES}NAME, the "
+                f"map: {name!r} is not read by the server; an image is {PICTURES}NAME, the "
                 f"state {STATE}, the prompt {TASK}"
             )
     if STATE not in out:
@@ -126,7 +126,7 @@ def features(mapping: FieldMapping, joints: int) -> dict[str, dict[str, Any]]:
 def policy_config(
     policy: str, checkpoint: str, device: str, described: Mapping[str, Any], steps: int
 ) -> bytes:
-    """Which policy the server is to load."""
+    """The policy that the server must load."""
     fields = {
         "policy_type": policy,
         "pretrained_name_or_path": checkpoint,
@@ -139,7 +139,7 @@ def policy_config(
 
 
 def observation(fields: Mapping[str, Any], number: int, stamp_s: float) -> bytes:
-    """One observation, which no other has the number of."""
+    """One observation with a unique number."""
     seen: dict[str, Any] = {}
     for name, value in fields.items():
         if name == STATE:

@@ -4,7 +4,7 @@
 # ///
 """Queries a policy server with openpi's protocol.
 
-vllm-omni speaks it too, and ``vla-zenoh lab serve``.
+vllm-omni and ``vla-zenoh lab serve`` implement it as well.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class OpenPi(Adapter):
         self._line = WebSocketClient(self.where, self.timeout_s, wire.MAX_BYTES, headers)
         self._session: str | None = None
         self._takes_reset = self._vllm
-        # Of single columns of an answer, the row that they came from cannot be made.
+        # The row of an answer cannot be restored from selected columns of it.
         whole = self.mapping.columns is None
         self.takes_committed = whole and self.spec.action.relative_to != "start"
         self._server_takes = False

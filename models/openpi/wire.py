@@ -1,8 +1,8 @@
 """openpi's wire: msgpack over WebSocket, one binary frame a request, one a reply, in turn.
 
-A server speaks first and says what it serves (a map, which may be empty). An observation is a map
-of names, an answer a map with ``actions`` (H, D). An error is a text frame, after which the
-connection is closed. ``GET /healthz`` is answered with ``OK``.
+A server sends first: a map that describes it, which may be empty. An observation is a map of names,
+an answer a map with ``actions`` (H, D). An error is a text frame, after which the connection is
+closed. ``GET /healthz`` is answered with ``OK``.
 
 vllm-omni serves the same with additions: ``{"endpoint": "reset"}``, a ``session_id`` in every
 observation, answers that are a bare array, and errors that are a map with ``type: error``.
@@ -24,9 +24,9 @@ VLLM_PATH = "/v1/realtime/robot/openpi"
 MAX_BYTES = message.MAX_PAYLOAD_BYTES
 MAX_ERROR = 400
 SPEC = "vla_zenoh_action"
-"""Where a server of ours says what its actions mean."""
+"""Where our servers declare the meaning of their actions."""
 TAKES_COMMITTED = "vla_zenoh_takes_committed"
-"""Where a server of ours says that its model takes the steps in execution."""
+"""Where our servers declare that their model takes the steps in execution."""
 COMMITTED = "vla_zenoh_committed"
 """Field of an observation: the steps in execution, in the numbers of the server's answers."""
 
@@ -80,7 +80,7 @@ def request(fields: Mapping[str, Any], session: str | None = None) -> bytes:
 
 
 def reset_request() -> bytes:
-    """An episode begins; for vllm-omni and servers of ours."""
+    """An episode begins; for vllm-omni and our servers."""
     return message.pack({"endpoint": "reset"})
 
 
@@ -135,9 +135,9 @@ def _read(frame: bytes | str) -> Any:
 
 
 def mismatches(metadata: Mapping[str, Any], mapping: FieldMapping) -> list[str]:
-    """What the server says of itself and the layout does not: one sentence each.
+    """Contradictions between the server's description and the layout, one sentence each.
 
-    openpi's own server says nothing of its actions; vllm-omni's and ours do.
+    openpi's own server does not describe its actions; vllm-omni's and ours do.
     """
     out: list[str] = []
     wanted = mapping.width

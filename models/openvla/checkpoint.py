@@ -14,7 +14,7 @@ CONFIG, STATISTICS = "config.json", "dataset_statistics.json"
 TOKENIZER, ADAPTER_CONFIG = "tokenizer.json", "adapter_config.json"
 INDEX, SINGLE = "model.safetensors.index.json", "model.safetensors"
 
-# What the names of published configurations stand for where the file itself does not say.
+# Values behind the names of published configurations that the files themselves omit.
 BACKBONES: Mapping[str, tuple[str, ...]] = {
     "dinosiglip-vit-so-224px": (
         "vit_large_patch14_reg4_dinov2.lvd142m",
@@ -27,7 +27,7 @@ BACKBONES: Mapping[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True, slots=True)
 class Backbone:
-    """One picture encoder.
+    """One image encoder.
 
     Args:
         name: architecture in timm.
@@ -44,7 +44,7 @@ class Backbone:
 
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
-    """What config and statistics say.
+    """Contents of config and statistics.
 
     Args:
         folder: where it is.
@@ -72,7 +72,7 @@ def read_checkpoint(folder: Path, adapter: Path | None = None) -> Checkpoint:
 
     Args:
         folder: with ``config.json``.
-        adapter: of an adapter; its statistics win over those of what it adapts.
+        adapter: folder of an adapter; its statistics replace those of the base model.
 
     Raises:
         WorkerError: something is missing or not as published; says what.

@@ -13,7 +13,7 @@ STEPS = {"libero": 8, "bridge": 5}
 
 @dataclass(frozen=True, slots=True)
 class ChunkFiles:
-    """What fine-tuning by OFT leaves.
+    """Files written by OFT's fine-tuning.
 
     Args:
         head: of the actions.
@@ -48,7 +48,7 @@ def find_chunk_files(folder: Path) -> ChunkFiles | None:
 
 
 def chunk_steps(told: str, key: str) -> int:
-    """Steps of a chunk, as told or as the data set is known to have.
+    """Steps of a chunk, as set or as known for the data set.
 
     Raises:
         WorkerError: neither.

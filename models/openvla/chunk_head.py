@@ -1,8 +1,9 @@
 """OpenVLA-OFT (Kim, Finn, Liang, 2025): a chunk of steps from one pass through Llama.
 
-The places of all the chunk's numbers are read at once, every token sees every other one, and a
-small network turns what Llama makes of these places into numbers. The other weights are laid out as
-those of OpenVLA; the head and the projector of the robot's state are files of their own.
+The positions of all the chunk's numbers are processed at once, every token attends to every other
+one, and a small network regresses the numbers from Llama's outputs there. The other weights are
+laid out as those of OpenVLA; the head and the projector of the robot's state are files of their
+own.
 """
 
 from __future__ import annotations
@@ -25,19 +26,19 @@ STOP_TOKEN = 2
 
 
 class Block(nn.Module):
-    """A layer that adds to what it is given."""
+    """A residual layer."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
         self.ffn = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, width), nn.ReLU())
 
     def forward(self, features: Tensor) -> Tensor:
-        """(..., width) of the same."""
+        """(..., width) from the same shape."""
         return features + self.ffn(features)
 
 
 class Head(nn.Module):
-    """From what Llama makes of a step's seven places to its seven numbers in [-1, 1]."""
+    """From Llama's outputs at a step's seven positions to its seven numbers in [-1, 1]."""
 
     def __init__(self, read: int) -> None:
         super().__init__()
@@ -95,14 +96,14 @@ class ChunkHead:
         Args:
             network: its eyes, projector and Llama.
             ids: T tokens of the prompt.
-            pictures: for each camera, what `Eyes.look` makes of it.
+            pictures: for each camera, the output of `Eyes.look`.
             state: normalised, where the policy reads it.
 
         Raises:
             WorkerError: the network computes NaN.
         """
         seen = [network.vision_backbone(pixels) for pixels in pictures]
-        # Before the projector, which treats every patch alike: one pass for all pictures.
+        # Before the projector, which treats every patch alike: one pass for all images.
         patches = network.projector(torch.cat(seen, dim=1))
         if self.state is not None:
             row = torch.tensor([list(state or ())], device=network.device, dtype=network.dtype)
@@ -111,12 +112,12 @@ class ChunkHead:
         places = read.new_zeros(1, self.steps * AXES, read.shape[-1])
         read = torch.cat([read[:, :-1], places, read[:, -1:]], dim=1)
         count = read.shape[1]
-        # All see all. What is not hidden is added as zero.
+        # Every token attends to every other one: the mask adds zero.
         mask = read.new_zeros(1, 1, count, count)
         out = network.language_model.model(
             inputs_embeds=read, attention_mask=mask, use_cache=False
         ).last_hidden_state
-        # A place is answered one place before it, as next tokens are.
+        # The output for a position is one before it, as for next tokens.
         first = count - 1 - places.shape[1] - 1
         numbers = self.head(out[:, first : first + places.shape[1]])[0].float()
         if not torch.isfinite(numbers).all():

@@ -15,7 +15,7 @@ from vla_zenoh_model_openvla.network import Network
 from vla_zenoh.errors import WorkerError
 
 SHOWN = 4
-"""So many names of wrong tensors are told, and how many more there are."""
+"""Names of wrong tensors in an error; of the others only the number."""
 
 
 def empty_network(checkpoint: Checkpoint) -> Network:
@@ -102,7 +102,7 @@ def _here(published: str) -> str | None:
     """The name of a published tensor in our network; None: it is computed here."""
     if published.endswith("rotary_emb.inv_freq"):
         return None
-    # transformers once renamed what ends in gamma, so the checkpoints call it otherwise than timm.
+    # transformers once renamed parameters that end in gamma, so checkpoints differ from timm.
     if published.endswith(".scale_factor"):
         return published.removesuffix("scale_factor") + "gamma"
     return published

@@ -1,4 +1,4 @@
-"""A LoRA adapter (Hu et al., ICLR 2022) as PEFT saves it, added to what it was trained on."""
+"""A LoRA adapter (Hu et al., ICLR 2022) as PEFT saves it, added to its base model."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ class Adapter:
 
     Args:
         folder: with ``adapter_config.json`` and ``adapter_model.safetensors``.
-        device: where the weights are that it is added to.
+        device: of the base weights.
 
     Raises:
-        WorkerError: files are missing, or it is of a kind that is not only added.
+        WorkerError: files are missing, or the adapter is not purely additive.
     """
 
     def __init__(self, folder: Path, device: str) -> None:
@@ -63,7 +63,7 @@ class Adapter:
         return weight.float() + self._scale * (up.float() @ down.float())
 
     def must_be_used_up(self) -> None:
-        """Say if something of it changed nothing.
+        """Check that every part of it changed something.
 
         Raises:
             WorkerError: names a layer that the network does not have.

@@ -1,4 +1,4 @@
-"""What the numbers of a data set mean once they are unnormalised: as it is known, or as told."""
+"""Meaning of a data set's unnormalised numbers: as known, or as set by options."""
 
 from __future__ import annotations
 
@@ -17,32 +17,32 @@ USUAL: Mapping[str, str] = {
     "gripper": "open_fraction",
     "gripper_open": "high",
 }
-"""What OpenVLA's own data sets were converted to: metres and radians."""
+"""Units that OpenVLA's own data sets were converted to: metres and radians."""
 DATA: Mapping[str, Mapping[str, str]] = {
     "bridge_orig": {**ADDED, "dt_s": "0.2"},
     "fractal20220817_data": {"dt_s": "0.333333"},
     "libero": OSC,
 }
-"""What is known of data sets, by how their names begin. LIBERO's statistics are in the units of its
-controller. Of others `dt_s` is asked for (a delta at another rate is another speed), and what a
-delta is added to."""
+"""Known meanings of data sets, by the beginning of their names. LIBERO's statistics are in the
+units of its controller. For others the options must set `dt_s` (a delta at another rate is another
+speed), and what a delta is added to."""
 LONGEST_STEP_M = 0.5
-"""No arm goes further in a step of its data: numbers that do are no metres."""
+"""No arm goes further in a step of its data: larger numbers are not metres."""
 
 
 def data_meaning(told: Mapping[str, str], key: str, trained: Range, chunk: int) -> ActionSemantics:
-    """What the numbers of the data set `key` mean, as told and as it is known.
+    """Meaning of the numbers of the data set `key`, as set and as known.
 
     Args:
-        told: by a person, see `vla_zenoh.interop.action_semantics`.
+        told: options of the user, see `vla_zenoh.interop.action_semantics`.
         key: of the data set.
         trained: range of its actions.
         chunk: steps in an answer of the model.
 
     Raises:
-        SpecError: an option cannot be, or is missing.
-        WorkerError: what is told is not `AXES` numbers, or more steps than a chunk has, or nobody
-            says what statistics are that cannot be metres.
+        SpecError: an option is invalid, or missing.
+        WorkerError: the options do not give `AXES` numbers, ask for more steps than a chunk has, or
+            leave open the unit of statistics that cannot be metres.
     """
     data = next((known for begin, known in DATA.items() if key.startswith(begin)), {})
     known = {**USUAL, **data, "horizon": str(chunk)}

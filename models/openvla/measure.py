@@ -1,4 +1,4 @@
-"""Time and memory of each stage of an action, beside transformers' own generation.
+"""Time and memory of each stage of an action, compared with transformers' own generation.
 
 The published code makes its tokens by ``generate``; here the same network and the same prompt go
 through both, one after the other in the same run.
@@ -32,7 +32,7 @@ WARM_UP = 2
 PROMPT_TOKENS = 26
 """Of ``In: What action should the robot take to put the red brick in the box? Out:``."""
 SPARE = 1.15
-"""So much more than its weights the network needs while it acts."""
+"""Memory of the network during inference, as a multiple of its weights."""
 CAMERA = (480, 640, 3)
 
 
@@ -44,7 +44,7 @@ class Stage:
         name: of it.
         times: how often it runs for an action.
         p50_ms: for one action, all its times together.
-        p95_ms: likewise.
+        p95_ms: for one action, all its times together.
     """
 
     name: str
@@ -105,7 +105,7 @@ def random_network(
     """A network of a checkpoint's sizes with random weights.
 
     Raises:
-        WorkerError: the device cannot be used, or has not memory enough.
+        WorkerError: the device cannot be used, or lacks memory.
     """
     try:
         torch.zeros(1, device=device)
@@ -177,7 +177,7 @@ def measure(network: Network, what: str, rounds: int) -> Report:
 
 
 class _Clock:
-    """Adds up how long things take; waits for the GPU before it looks."""
+    """Adds up durations; synchronises with the GPU before it reads the clock."""
 
     def __init__(self, device: torch.device) -> None:
         self._device = device

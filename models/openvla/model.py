@@ -15,9 +15,9 @@
 # ///
 """OpenVLA (Kim et al., CoRL 2024) from a directory of weights, as published or fine-tuned.
 
-One picture and the prompt in, one step out: by how much the TCP shall go and how far the gripper
-shall be open, in the units of the data. A directory fine-tuned by OpenVLA-OFT may want more
-pictures and the robot's state, and gives a chunk. No code of the checkpoint runs.
+Input are one image and the prompt, output is one step: the motion of the TCP and the opening of the
+gripper, in the units of the data. A directory fine-tuned by OpenVLA-OFT may need more images and
+the robot's state, and outputs a chunk. No code of the checkpoint runs.
 
     vla-zenoh worker openvla --set checkpoint=DIR --set unnorm_key=bridge_orig
 """
@@ -47,19 +47,19 @@ Quantise = Literal["none", "int8", "nf4"]
 Choice = Literal["auto", "yes", "no"]
 
 AUGMENTED = "image_aug"
-"""What the published fine-tuning writes into the name of a run whose pictures were cropped."""
+"""Part of the name of a run whose images were cropped, as the published fine-tuning writes it."""
 
 
 class OpenVLA:
-    """See the module.
+    """OpenVLA from a directory of weights; see the module.
 
     Args:
         checkpoint: directory with ``config.json``, ``*.safetensors`` and ``tokenizer.json``.
         unnorm_key: data set whose statistics turn numbers into metres; may be left out where there
             is only one.
         adapter: directory of a LoRA adapter that was not merged.
-        cameras: the picture that the model is given; OFT: several, separated by commas.
-        center_crop: give it the middle 90 % of the picture. ``auto``: where the directory's name
+        cameras: the camera whose image the model gets; OFT: several, separated by commas.
+        center_crop: give it the middle 90 % of the image. ``auto``: where the directory's name
             says that it was trained with ``image_aug``.
         template: prompt it was trained with, ``7b`` or ``v01``; ``auto``: by its Llama.
         device: as torch names it; ``auto``: a GPU where there is one.
@@ -120,7 +120,7 @@ class OpenVLA:
         self.spec = ModelSpec(
             name="openvla",
             observation=ObservationSpec(
-                # The picture as it comes: shrinking it is a part of what the model was trained on.
+                # The image in full size: shrinking it is part of the training data's preparation.
                 cameras=tuple(CameraSpec(camera=name) for name in self._cameras),
                 state=parts_of(self._state),
                 prompt=True,
@@ -169,7 +169,8 @@ class OpenVLA:
         self._must_see()
 
     def _must_see(self) -> None:
-        """Two pictures must look different: on newer libraries the published code sees none."""
+        """Two images must give different features: with newer libraries the published code sees
+        none."""
         import torch
 
         noise = np.random.default_rng(0).integers(0, 256, (224, 224, 3), dtype=np.uint8)
@@ -177,9 +178,9 @@ class OpenVLA:
             eyes = self.network.vision_backbone
             gray, mixed = (eyes(self._pixels(p)) for p in (np.full_like(noise, 128), noise))
             if not torch.isfinite(mixed).all():
-                raise WorkerError("the picture encoders compute NaN or infinity")
+                raise WorkerError("the image encoders compute NaN or infinity")
             if torch.equal(gray, mixed):
-                raise WorkerError("the picture encoders answer alike whatever the picture is")
+                raise WorkerError("the image encoders answer alike whatever the image is")
         # The first inference of a process costs much more than the others.
         ids, pictures = self.ids("stand still"), [self._pixels(noise)] * len(self._cameras)
         state = [0.0] * len(self._state_range.low) if self._state_range else None
@@ -212,7 +213,7 @@ class OpenVLA:
         """One step for the newest picture; OFT: a chunk.
 
         Raises:
-            SpecError: the model answered with something that is no action.
+            SpecError: the model's answer is not an action.
             WorkerError: it computes NaN.
         """
         seen = {

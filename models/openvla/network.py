@@ -1,4 +1,4 @@
-"""The network of OpenVLA on current torch, timm and transformers: two eyes, projector, Llama.
+"""The network of OpenVLA on current torch, timm and transformers: encoders, projector, Llama.
 
 Names of parameters are those of the published checkpoints. Nothing of a checkpoint is executed.
 """
@@ -20,11 +20,11 @@ from vla_zenoh_model_openvla.checkpoint import Backbone, Checkpoint
 from vla_zenoh.errors import WorkerError, in_words
 
 PROJECTOR_GROWTH = 4
-"""The first layer behind two eyes is so many times wider than what they see."""
+"""Width of the projector's first layer after two encoders, as a multiple of its input."""
 
 
 class Eyes(nn.Module):
-    """One or two picture encoders whose features are put side by side.
+    """One or two image encoders whose features are concatenated.
 
     Args:
         backbones: architectures.
@@ -37,29 +37,29 @@ class Eyes(nn.Module):
         self.sides = [backbone.side for backbone in backbones]
         counts = {encoder.patch_embed.num_patches for encoder in self.encoders()}
         if len(counts) > 1:
-            raise WorkerError(f"encoders that cut a picture into {sorted(counts)} patches")
+            raise WorkerError(f"encoders that cut an image into {sorted(counts)} patches")
         self.patches: int = counts.pop()
 
     def encoders(self) -> list[Any]:
-        """In the order of the picture's channels."""
+        """In the order of the image's channels."""
         return [self.featurizer] + ([self.fused_featurizer] if self.fused_featurizer else [])
 
     @property
     def width(self) -> int:
-        """Numbers that are seen in each patch."""
+        """Number of features of each patch."""
         return sum(encoder.embed_dim for encoder in self.encoders())
 
     def look(
         self, rgb: NDArray[np.uint8], *, device: torch.device, dtype: torch.dtype
     ) -> list[Tensor]:
-        """One normalised (1, 3, S, S) picture for each encoder, from one (H, W, 3) uint8 RGB."""
+        """One normalised (1, 3, S, S) image for each encoder, from one (H, W, 3) uint8 RGB."""
         return [
             _normalised(_square(rgb, side), encoder.pretrained_cfg).to(device, dtype)
             for encoder, side in zip(self.encoders(), self.sides, strict=True)
         ]
 
     def forward(self, pixels: Sequence[Tensor]) -> Tensor:
-        """(1, patches, width) from one normalised (1, 3, S, S) picture for each encoder."""
+        """(1, patches, width) from one normalised (1, 3, S, S) image for each encoder."""
         seen = [
             # The last block is left out, as in training: its features are made for its own task.
             encoder.get_intermediate_layers(picture, n=[len(encoder.blocks) - 2])[0]
@@ -75,7 +75,7 @@ def _square(rgb: NDArray[np.uint8], side: int) -> NDArray[np.uint8]:
 
 def _normalised(rgb: NDArray[np.uint8], trained: Mapping[str, Any]) -> Tensor:
     mean, std = (torch.tensor(trained[name]).view(1, 3, 1, 1) for name in ("mean", "std"))
-    # Copied, because what Pillow hands over may not be written to.
+    # Copied, because Pillow's arrays are read-only.
     return (torch.from_numpy(rgb.copy()).permute(2, 0, 1)[None] / 255 - mean) / std
 
 
@@ -94,7 +94,7 @@ def _encoder(backbone: Backbone) -> nn.Module:
 
 
 class Projector(nn.Module):
-    """From what the eyes see to what Llama reads; deeper behind two eyes than behind one."""
+    """From the encoders' features to Llama's embeddings; deeper for two encoders than for one."""
 
     def __init__(self, seen: int, read: int, *, deep: bool) -> None:
         super().__init__()
@@ -110,7 +110,7 @@ class Projector(nn.Module):
 
 
 class Network(nn.Module):
-    """Pictures and prompt in, action tokens out.
+    """Images and prompt in, action tokens out.
 
     Args:
         checkpoint: sizes; weights come later, see `load.load_network`.
@@ -137,7 +137,7 @@ class Network(nn.Module):
         return self.projector.fc1.weight.device
 
     def read(self, ids: Sequence[int], patches: Tensor) -> Tensor:
-        """(1, T + P, width): the prompt's embeddings with the picture's patches behind the first.
+        """(1, T + P, width): the prompt's embeddings with the image's patches after the first.
 
         Args:
             ids: T tokens of the prompt, the first one is the beginning of the text.
@@ -153,7 +153,7 @@ class Network(nn.Module):
         return self._step(DynamicCache(), inputs_embeds=embeddings)
 
     def go_on(self, token: Tensor, cache: DynamicCache) -> tuple[Tensor, DynamicCache]:
-        """Read one more (1,) token; likewise."""
+        """Read one more (1,) token; returns the same."""
         return self._step(cache, input_ids=token[:, None])
 
     def _step(self, cache: DynamicCache, **given: Tensor) -> tuple[Tensor, DynamicCache]:

@@ -1,7 +1,7 @@
-"""From a camera's picture to the one OpenVLA was trained on.
+"""From a camera's image to the one OpenVLA was trained on.
 
-The data went through JPEG and a Lanczos resize to a square, without care for the aspect ratio; a
-model that was trained with random crops sees the middle of the picture. What differs from that
+The data went through JPEG and a Lanczos resize to a square, without keeping the aspect ratio; a
+model that was trained with random crops gets the middle of the image. Any difference from that
 costs success (the crop alone about 3 points of 100 on LIBERO), so all of it is done here and
 nothing is left to the camera.
 """
@@ -25,7 +25,7 @@ Picture = NDArray[np.uint8]
 
 
 def trained_form(rgb: Picture, *, crop: bool, side: int = SIDE) -> Picture:
-    """A picture as the training data had it.
+    """An image in the form of the training data.
 
     Args:
         rgb: (H, W, 3) as the camera gave it.
@@ -40,7 +40,7 @@ def trained_form(rgb: Picture, *, crop: bool, side: int = SIDE) -> Picture:
 
 
 def through_jpeg(rgb: Picture) -> Picture:
-    """What JPEG makes of it."""
+    """The image after JPEG compression."""
     bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
     _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     back = cv2.imdecode(data, cv2.IMREAD_COLOR)

@@ -1,6 +1,6 @@
 """Llama's layers in 8 or 4 bits (Dettmers et al., 2022 and 2023), for GPUs with little memory.
 
-Picture encoders, projector, embeddings and the last layer stay as they are: they are a tenth of the
+Image encoders, projector, embeddings and the last layer stay as they are: they are a tenth of the
 memory and suffer most.
 """
 

@@ -23,8 +23,8 @@ class Range:
 
     Args:
         low: (D,) in the units of the data.
-        high: (D,) likewise.
-        mask: (D,) which numbers were scaled; the others are as they are.
+        high: (D,) in the units of the data.
+        mask: (D,) which numbers were scaled; the others are unchanged.
     """
 
     low: FloatArray
@@ -44,7 +44,7 @@ class Range:
 
 
 def choose(statistics: Mapping[str, Any], key: str, where: str) -> str:
-    """The key of the data set whose statistics are meant; without one, the only one there is.
+    """The key of the data set whose statistics are used; without one, the only one there is.
 
     Raises:
         WorkerError: none, or one that is not there; lists what is.
@@ -68,7 +68,7 @@ def read_range(
     Args:
         statistics: content of ``dataset_statistics.json``.
         key: of the data set, see `choose`.
-        part: what of it.
+        part: of the statistics.
         size: how many numbers there must be; None: as many as there are.
 
     Raises:

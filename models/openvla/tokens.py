@@ -58,8 +58,8 @@ class ActionBins:
         """(D,) numbers in [-1, 1]. The two last tokens share a centre, as published.
 
         Raises:
-            SpecError: a token that is none of an action. The published code takes it for the
-                largest motion there is.
+            SpecError: a token that is not an action's. The published code takes it for the largest
+                motion there is.
         """
         ids = np.asarray(tokens, dtype=np.int64)
         first = self.vocabulary - self.count

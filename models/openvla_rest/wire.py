@@ -66,10 +66,10 @@ def pack(value: Any) -> str:
 
 
 def unpack(text: bytes | str) -> Any:
-    """The same back.
+    """Inverse of `pack`.
 
     Raises:
-        PeerError: whatever else it is.
+        PeerError: it is anything else.
     """
     if len(text) > MAX_BYTES:
         raise PeerError("peer_reply", f"an answer of {len(text)} bytes, at most {MAX_BYTES}")
@@ -107,8 +107,8 @@ def request(fields: Mapping[str, Any], unnorm_key: str = "", *, encoded: bool = 
     """The body of a request.
 
     Args:
-        fields: names with pictures, arrays and text.
-        unnorm_key: statistics the server is to unnormalise with; empty: its own choice.
+        fields: names with images, arrays and text.
+        unnorm_key: statistics for the server to unnormalise with; empty: its own choice.
         encoded: as a text within JSON.
     """
     body = pack({**fields, **({"unnorm_key": unnorm_key} if unnorm_key else {})})

@@ -33,7 +33,7 @@ class Origami(Adapter):
         session_id: the session the policy was started for.
         preset: north_right; see wire.py.
         timeout_s: for each answer.
-        profile: of the robot whose arm and gripper are meant.
+        profile: of the robot, for its arm and gripper.
         layout: see vla_zenoh/interop/field_mapping.py.
     """
 

@@ -60,7 +60,7 @@ def request(
 
 
 def read_answer(payload: bytes, operation: Operation, request_id: str) -> Any:
-    """What was asked for: the metadata, True, or the actions.
+    """The requested result: the metadata, True, or the actions.
 
     Raises:
         PeerError: it is an error, belongs to another request, or cannot be read.
@@ -91,7 +91,7 @@ def read_answer(payload: bytes, operation: Operation, request_id: str) -> Any:
 
 
 def mismatches(metadata: Any, mapping: FieldMapping) -> list[str]:
-    """What the server says of itself and the layout does not: one sentence each."""
+    """Contradictions between the server's metadata and the layout, one sentence each."""
     if not isinstance(metadata, dict):
         return [f"its metadata is no map: {shown(metadata)}"]
     out: list[str] = []

@@ -4,8 +4,8 @@
 # ///
 """Queries a policy served by XPolicyLab (pi0.5, GR00T, RDT, SmolVLA and others) over WebSocket.
 
-An activation is a trial: the server is told when it begins (``reset``) and, with the next one, that
-it is over (``trial_end``).
+An activation is a trial: the server gets ``reset`` when it begins and, with the next one,
+``trial_end`` when it is over.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ class XPolicyLab(Adapter):
     Args:
         url: of the server, as ws://HOST:PORT or wss://HOST:PORT.
         preset: joint or pose, see wire.py; none: no defaults.
-        case: action case that the server is to prepare; empty: none.
+        case: action case for the server to prepare; empty: none.
         timeout_s: for connecting, and for each answer.
         profile: of the robot: its gripper and, if answers are joints, its arm.
-        layout: see vla_zenoh/interop/field_mapping.py. A name a/b/c is c of b of a.
+        layout: see vla_zenoh/interop/field_mapping.py. A name a/b/c is nested: c in b in a.
     """
 
     joints = True

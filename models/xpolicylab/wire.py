@@ -9,7 +9,7 @@ sent_at, payload}``; the answer repeats all but the type and the payload. An env
 ``reset``         ``reset_result``      a trial begins
 ``infer``         ``infer_result``      ``{observation}`` -> ``{actions, latency_ms}``
 ``trial_end``     ``trial_end_ack``     a trial is over
-``heartbeat``     ``heartbeat_ack``     is the server alive? Not asked here: WebSocket tells
+``heartbeat``     ``heartbeat_ack``     is the server alive? Not used here: WebSocket shows it
 ================  ====================  ======================================================
 
 or gets ``error`` with ``{code, message, details}``. A frame that the server cannot read has no
@@ -64,15 +64,15 @@ PRESETS: Presets = {
         "rotation": "quat_wxyz",
     },
 }
-"""One arm, by its action type. What the format leaves open is asked for."""
+"""One arm, by its action type. The format leaves the rest open, so options must set it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where in an evaluation a request belongs.
+    """Place of a request in an evaluation.
 
     Args:
-        evaluation_id: of everything that one client asks.
+        evaluation_id: of all requests of one client.
         action_case_id: of the case; empty: none.
         trial_id: of the trial; empty: none has begun.
         step: requests of the trial before this one.
@@ -122,7 +122,7 @@ def request(kind: Request, message_id: str, place: Place, payload: Mapping[str, 
 
 
 def observation(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """``observation`` of an infer: ``a/b/c`` is c of b of a."""
+    """``observation`` of an infer: ``a/b/c`` is c in b in a."""
     out: dict[str, Any] = {"data_format_version": FORMAT}
     for name, value in fields.items():
         *outer, last = name.split("/")
@@ -171,7 +171,7 @@ def read_answer(frame: bytes | str, kind: Request, message_id: str) -> dict[str,
 
 
 def read_actions(payload: Mapping[str, Any]) -> Any:
-    """Name -> (H, n), of a list of steps; what is no such list is left as it is.
+    """Name -> (H, n), of a list of steps; any other value is returned unchanged.
 
     Raises:
         PeerError: there are no actions, or steps differ in their names or sizes.

@@ -4,7 +4,7 @@
 # ///
 """LIBERO's suites, and LIBERO-Pro's perturbed ones, by the protocol of OpenVLA and openpi.
 
-Ten steps of no motion after the initial state, pictures of 256 x 256 turned by 180 degrees, step
+Ten steps of no motion after the initial state, images of 256 x 256 rotated by 180 degrees, step
 limits by suite, success when the goal holds. An action is added to the measured pose, 0.05 m and
 0.5 rad to the unit; the controller covers a part of it in a step. The gripper closes above 0.
 """
@@ -120,7 +120,7 @@ class Libero:
         index = found.get_task_names().index(task)
         wanted = found.tasks[index]
         folder = os.path.join(get_libero_path("bddl_files"), wanted.problem_folder)
-        # Nothing is drawn by itself: where the processor draws, a picture takes 0.4 s.
+        # No automatic rendering: on a CPU an image takes 0.4 s.
         self._env = ControlEnv(
             bddl_file_name=os.path.join(folder, wanted.bddl_file),
             use_camera_obs=False,

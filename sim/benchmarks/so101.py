@@ -6,7 +6,7 @@
 
 The index of an episode is its seed, which places cube and goal. An action is added to the point
 that the grasp is pulled to, 0.025 m to the unit, as the package's own expert has it; the hand
-points down and does not turn. Success: carried, let go and at rest within 0.03 m. The package's
+points down and does not turn. Success: carried, released and at rest within 0.03 m. The package's
 pick task is left out: its own expert cannot do it.
 """
 

@@ -148,6 +148,11 @@ class Keys:
     )
 
     # -- settings: plain text, any client may put ---------------------------------------------
+    held = _PartKey(
+        "held",
+        "What the gripper holds, a box at the TCP: its size in m along the axes of the TCP, and "
+        "where its centre is (``0.04 0.04 0.12 at 0 0 0.02``, or without ``at``). Empty: nothing.",
+    )
     prompt = _Key("prompt", "Plain UTF-8 text.")
     active = _Key(
         "active",
@@ -156,7 +161,7 @@ class Keys:
     holding = _KeyOf(
         "holding/{holder}", "Liveliness token of a deadman: the arm stays active while it is there."
     )
-    worker = _Key("worker", "Name of the worker whose chunks are carried out.")
+    worker = _Key("worker", "Name of the worker whose chunks are executed.")
     rate = _Key("rate", "Chunks per second, a plain number.")
     speed = _Key(
         "speed", "Speed override, 0 to 100 percent of the planned speed: ``30`` or ``30 %``."
@@ -221,7 +226,8 @@ class Keys:
         "sim/reset", "Empty, or a seed as plain text: the arm goes home, objects are placed again."
     )
     sim_step = _Key(
-        "sim/step", "Query in lockstep mode: advance by so many nanoseconds, reply with the state."
+        "sim/step",
+        "Query in lockstep mode: advance by a number of nanoseconds, reply with the state.",
     )
 
     # -- selectors ----------------------------------------------------------------------------
@@ -265,10 +271,15 @@ class Keys:
         """Inverse of `short`; a key that begins with the root is taken as whole already."""
         return key if key.startswith(f"{self.root}/") else f"{self.root}/{self.robot}/{key}"
 
+    def part_of(self, key: str) -> str:
+        """The robot's part whose state or command `key` is; empty: it is of no part by name."""
+        first, _, rest = self.short(key).partition("/")
+        return first if rest and first not in NOT_PARTS and self.short(key) != key else ""
+
     def group(self, key: str) -> str:
-        """The first part below the robot: ``camera``, ``state``, ``prompt``; empty for other
-        keys."""
-        return self.short(key).split("/")[0] if self.short(key) != key else ""
+        """What follows robot and part: ``camera``, ``state``, ``prompt``; empty for other keys."""
+        own = self.short(key).removeprefix(f"{self.part_of(key)}/")
+        return own.split("/")[0] if self.short(key) != key else ""
 
     def on(self, other: Keys, key: str) -> str:
         """The key of `other` that corresponds to `key` of this robot."""
@@ -365,9 +376,9 @@ NODE_KINDS: Mapping[str, NodeTraits] = {
     "sim": NodeTraits("robot", 0.4, "there is one simulated robot"),
     "ros2": NodeTraits("robot", 0.4, "the robot has one driver"),
     "arm": NodeTraits("robot", 0.4, "the robot has one driver"),
-    "command": NodeTraits("command", 0.8, "the robot obeys one command node"),
+    "command": NodeTraits("command", 0.8, "the robot follows one command node"),
     "camera": NodeTraits("camera", 0.8),
     "worker": NodeTraits("worker", 0.8),
-    "primitives": NodeTraits("worker", 0.8, "one primitive is carried out at a time"),
+    "primitives": NodeTraits("worker", 0.8, "one primitive is executed at a time"),
 }
 """Every kind of node, in the order in which `up` starts them."""

@@ -77,7 +77,7 @@ def test_numbers_are_read_in_the_units_and_bounds_that_are_told(tmp_path: Path) 
         False,
         0.0,
     )
-    steps = vars(policy)["_meaning"].steps(np.array([[1.0, -3.0, 0.5, 0.0, 0.2, 9.0, -1.0]]))
+    steps = vars(policy)["_meaning"][""].steps(np.array([[1.0, -3.0, 0.5, 0.0, 0.2, 9.0, -1.0]]))
     np.testing.assert_allclose(steps, [[0.05, -0.05, 0.025, 0, 0.1, 0.5, -1]], atol=ATOL)
 
 
@@ -161,8 +161,8 @@ def test_a_policy_that_plans_by_itself_gives_one_step(
         ({"state": ""}, r"state has 8 numbers, '' has 0"),
         ({"state": "joint"}, r"state has 8 numbers, 'joint' has 7"),
         ({"state": "joint+grip"}, r"called 'grip'; there are: joint \(one"),
-        ({"map": "observation.images.hand=camera:wrist"}, r"no picture of the policy; its"),
-        ({"map": "observation.images.gripper_cam=camera:front"}, r"two pictures .* 'front'"),
+        ({"map": "observation.images.hand=camera:wrist"}, r"not an image of the policy; its"),
+        ({"map": "observation.images.gripper_cam=camera:front"}, r"two images .* 'front'"),
         ({"map": f"{WRIST},observation.images.front="}, r"a policy 'act' needs it"),
         ({"map": "observation.images.front=joint"}, r"front is a picture, so .*=camera:NAME"),
         ({"horizon": "101"}, r"horizon is 101; the policy's chunks have 100"),

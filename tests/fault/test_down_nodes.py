@@ -91,7 +91,7 @@ def test_a_worker_whose_load_raises_is_one_line_and_its_reason_is_everywhere(lab
     until("it is given up", given_up, GIVE_UP_S)
     ours = [line for line in lab.running.lines if "worker-bad |" in line]
     ours = [line for line in ours if " zenoh::" not in line]  # of a query that comes as it ends
-    assert len([line for line in ours if "ended with code 1" in line]) == 1
+    assert len([line for line in ours if "exited with code 1" in line]) == 1
     assert all(REASON in line for line in ours if "started" not in line)
     assert "Traceback" not in lab.running.text
     log = lab.log.read_text()
@@ -156,5 +156,5 @@ def test_a_clean_end_is_silent(lab: Lab) -> None:
     """Last of all: it ends the lab."""
     lab.running.end(signal.SIGTERM)
     lab.running.thread.join(5.0)
-    assert "all nodes have ended" in lab.running.text
+    assert "all nodes have stopped" in lab.running.text
     assert [line for line in lab.running.lines if any(word in line for word in NOISE)] == []

@@ -164,7 +164,7 @@ def test_a_signal_brakes_the_arm_first_and_then_ends_everything(
         assert np.linalg.norm(state.twist[:3]) < MOVING_M_S
         running.thread.join(5.0)
         assert "braking the arm" in running.text
-        assert "all nodes have ended" in running.text
+        assert "all nodes have stopped" in running.text
 
 
 def test_nothing_outlives_a_killed_supervisor(tmp_path: Path) -> None:
@@ -286,7 +286,7 @@ def test_with_json_every_line_is_an_object_that_says_when_and_which_node(tmp_pat
     assert all(set(each) == {"time_s", "node", "from", "text"} for each in told)
     assert {each["node"] for each in told} == {"up", "router"}
     assert all(abs(each["time_s"] - time.time()) < READY_PATIENCE_S for each in told)
-    assert told[-1]["text"] == "all nodes have ended"
+    assert told[-1]["text"] == "all nodes have stopped"
 
 
 MODEL = """

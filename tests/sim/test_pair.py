@@ -5,6 +5,7 @@ All figures are of MuJoCo's own TCPs.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 
@@ -97,6 +98,32 @@ def test_both_brake_in_the_tick_in_which_one_has_to() -> None:
         pair.run(0.004)
     braking = [part.motion._mover.braking for part in pair.commander.parts]  # pyright: ignore
     assert braking == [True, True]
+
+
+def test_measured_arms_that_come_too_near_brake() -> None:
+    """Commanded ones stay apart; here one is pushed, or its commands are not what it follows."""
+    towards = np.array([0.02, 0.0, 0.0, 0.0, 0.0, 0.0, 0.04])
+    pair = Pair(steady(left=towards, right=towards), tcp_steps())
+    pair.run(6.0)
+    assert pair.state == "active"
+    stop_m = shipped().limits.reach.part_stop_m
+    assert pair.measured_m() < stop_m + 0.02
+    here, turn = pair.joints_rad("right"), 0.0
+    while pair.spacing.measured_m({"left": near(pair, turn), "right": here}).distance_m > 0.02:
+        turn += 0.005
+    pair.loop.tamper = changed(JointState, position_rad=near(pair, turn))
+    pair.run(0.2)
+    assert pair.state == "inactive"
+    assert re.search(r"too near to a bound: part_distance at left .+ and right .+", why(pair))
+
+
+def near(pair: Pair, turn_rad: float) -> np.ndarray:
+    """Joints of the left arm, with its shoulder turned forward."""
+    return pair.joints_rad("left") + turn_rad * np.array([0, 1, 0, 0, 0, 0, 0])
+
+
+def why(pair: Pair) -> str:
+    return pair.commander.why
 
 
 # -- the fault table of a pair ----------------------------------------------------------------

@@ -33,11 +33,11 @@ def test_a_session_from_prompt_to_reset(chain: Chain) -> None:
     chain.settle()
     assert "prompt: 'HARD: go up' (worker scripted, 10 Hz)" in ok(chain, "prompt", "HARD: go up")
     assert "rate: 5 Hz" in ok(chain, "rate", "5")
-    assert "speed: 100 % of what is planned" in ok(chain, "speed")
-    assert "speed: 30 % of what is planned" in ok(chain, "speed", "30 %")
+    assert "speed: 100 % of the planned speed" in ok(chain, "speed")
+    assert "speed: 30 % of the planned speed" in ok(chain, "speed", "30 %")
     assert "speed 30 %" in ok(chain, "status", "--once")
-    assert "speed: 80 % of what is planned" in ok(chain, "speed", "80")
-    assert "'fast' is no percentage" in run(chain, "speed", "fast").stderr
+    assert "speed: 80 % of the planned speed" in ok(chain, "speed", "80")
+    assert "'fast' is not a percentage" in run(chain, "speed", "fast").stderr
     ok(chain, "speed", "100")
 
     refused = run(chain, "use", "scripter")

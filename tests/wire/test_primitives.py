@@ -131,6 +131,23 @@ def test_the_gripper_opens_and_closes_while_the_arm_stands(robot: RemoteRobot) -
     assert here(robot) == pytest.approx(before_m, abs=NEAR_M)
 
 
+def test_what_a_grip_holds_bounds_the_arm_until_it_opens(robot: RemoteRobot) -> None:
+    def holds() -> object:
+        status = robot.status("command")
+        return None if status is None else status.detail.get("gripper_holds")
+
+    robot.grip("open")
+    robot.grip("closed", holds_m=(0.04, 0.04, 0.3))
+    until("the box is held", lambda: holds() == "0.04 0.04 0.3")
+    with pytest.raises(PrimitiveError, match="table") as found:
+        robot.move_to((0.45, 0.0, 0.12))
+    assert found.value.answer.reason == "rejected"
+    robot.grip("open")
+    until("nothing is held", lambda: holds() is None)
+    assert robot.move_to((0.45, 0.0, 0.12)).reason == "reached"
+    robot.home()
+
+
 @pytest.mark.parametrize(
     ("asked", "words"),
     [

@@ -198,7 +198,9 @@ def test_who_may_only_look_is_told_that_nothing_was_stopped(lab: Lab) -> None:
     assert done.exit_code == 1
     assert lab.stopped() == []
     assert "the certificate of this computer is viewer@gpu" in done.stderr
-    assert "`vla-zenoh secure add HOST --role operator` makes an operator's" in done.stderr
+    assert (
+        "`vla-zenoh secure add HOST --role operator` makes an operator certificate" in done.stderr
+    )
 
 
 def test_where_nobody_obeys_the_robots_that_are_there_are_told_with_what_to_type(lab: Lab) -> None:

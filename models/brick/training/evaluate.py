@@ -111,7 +111,7 @@ class Stage:
         return Image(self.renderer.render(camera, *self.size))
 
     def reset(self, seed: int) -> None:
-        """Everything anew."""
+        """Reset the world and its appearance."""
         self.world.reset(seed)
         self.renderer.vary(seed, self.vary)
 

@@ -35,7 +35,7 @@ MAX_WHAT, MAX_WHY = 128, 1000
 """Characters of an event that are kept; our nodes publish no more."""
 DROPPED_HINT = (
     "statuses or liveliness tokens dropped, because they are too many or too large: they come from "
-    "a process that is no node of ours"
+    "a process that is not one of our nodes"
 )
 
 

@@ -113,7 +113,7 @@ class Node:
         if alive_nodes(session, self.keys, name):
             raise NodeError(
                 f"node {name!r} of robot {profile.robot.name!r} is already running. Stop it, or "
-                "start this one with a different --name where the command has it"
+                "start this one with a different --name, if the command has that option"
             )
         self.clocks = ClockSync(
             session, self.keys, self.clock, name, profile.timing.max_clock_offset_s

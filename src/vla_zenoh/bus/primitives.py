@@ -25,7 +25,7 @@ MARGIN_S = 20.0
 """On top of a primitive's own time: for activation, brake and answer."""
 POLL_S = 0.05
 NO_NODE = (
-    "nothing answers on {key}: the node primitives does not run, or this certificate may not ask "
+    "nothing answers on {key}: the node primitives does not run, or this certificate may not query "
     "it. Start it with `vla-zenoh node primitives`, or name it in hosts.HOST.nodes of the profile"
 )
 

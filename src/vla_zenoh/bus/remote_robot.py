@@ -142,14 +142,17 @@ class RemoteRobot(Client):
         self,
         width_m: float | Literal["open", "closed"],
         timeout_s: float = DEFAULT_TIMEOUT_S,
+        holds_m: tuple[float, float, float] | None = None,
     ) -> Answer:
         """Set the width of the gripper while the arm stands; otherwise as `move_to`.
 
         Args:
             width_m: between the fingers; ``closed``: until something is held.
             timeout_s: then it ends.
+            holds_m: size of what it holds afterwards, along the axes of the TCP: kept from table,
+                keep-outs and the arm until the gripper opens.
         """
-        return self._primitive("grip", timeout_s, width_m=width_m)
+        return self._primitive("grip", timeout_s, width_m=width_m, holds_m=holds_m)
 
     def run(
         self,

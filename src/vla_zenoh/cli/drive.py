@@ -46,7 +46,7 @@ def _answered(command: Callable[..., None]) -> Callable[..., None]:
 
 @_answered
 def prompt(
-    text: Annotated[str, typer.Argument(help="What the model shall do.")],
+    text: Annotated[str, typer.Argument(help="Instruction for the model.")],
     target: RobotTarget,
     as_json: Annotated[bool, typer.Option("--json", help=JSON_HELP)] = False,
 ) -> None:
@@ -202,7 +202,7 @@ def speed(
 
 
 def _show_speed(target: RobotTarget, client: Client, task: Task) -> None:
-    _show(target, client, f"speed: {task.speed_percent:g} % of what is planned")
+    _show(target, client, f"speed: {task.speed_percent:g} % of the planned speed")
 
 
 @_answered

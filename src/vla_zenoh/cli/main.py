@@ -61,7 +61,7 @@ COMMANDS: Mapping[str, Mapping[str, str | Group]] = {
         "stop": "cli.drive:stop",
         "reset": "cli.drive:reset",
         "do": Group(
-            "Guarded motions: go to a pose, home, grip, run a model until something happens.",
+            "Guarded motions: go to a pose, home, grip, run a model until a condition holds.",
             {
                 "move-to": "cli.primitives:move_to",
                 "home": "cli.primitives:home",

@@ -16,7 +16,7 @@ MODE_WORDS = {
     "sim": ("SIM", "a simulated robot moves", "bold black on cyan"),
     "dry_run": ("DRY RUN", "everything is computed; the robot gets no commands", "black on yellow"),
     "live": ("LIVE", "a real robot moves", "bold white on red"),
-    UNKNOWN: ("MODE UNKNOWN", "no command node says whether a robot moves", "bold"),
+    UNKNOWN: ("MODE UNKNOWN", "no command node reports whether a robot moves", "bold"),
 }
 """Mode -> (prefix of what moves, sentence, style)."""
 MISSING, DEAD = "missing", "dead"
@@ -68,13 +68,13 @@ def node_rows(
         if not lives and state in ON_BEHALF:
             why = str(status.detail.get("complaint", ""))
         elif not lives:
-            state, why = DEAD, "it ended, or lost its connection; the output of `up` there says why"
+            state, why = DEAD, "it exited, or lost its connection; see the output of `up` there"
         rows.append(NodeRow(name, status.host, state, why, status, age_s, lives))
     return rows
 
 
 def _unheard(name: str, host: str, *, lives: bool) -> NodeRow:
-    why = f"not running; see the output of `vla-zenoh up` on host {host}, which is to start it"
+    why = f"not running; see the output of `vla-zenoh up` on host {host}, which should start it"
     state, why = (STARTING, "it has not published its status yet") if lives else (MISSING, why)
     return NodeRow(name, host, state, why, None, None, lives)
 

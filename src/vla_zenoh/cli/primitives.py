@@ -13,6 +13,7 @@ from vla_zenoh.cli.options import number_list, options
 from vla_zenoh.cli.plain import fail, say
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.codec.primitives import DEFAULT_TIMEOUT_S, FURTHEST_M, FURTHEST_RAD, Answer
+from vla_zenoh.codec.settings import MAX_HELD_M, MIN_HELD_M
 from vla_zenoh.errors import SessionError
 
 TimeoutOption = Annotated[
@@ -33,7 +34,7 @@ def move_to(
     ] = None,
     joints: Annotated[
         str | None,
-        typer.Option("--joints", help="All joints in rad, or NAME=RAD,.., in place of a pose."),
+        typer.Option("--joints", help="All joints in rad, or NAME=RAD,.., instead of a pose."),
     ] = None,
     timeout_s: TimeoutOption = DEFAULT_TIMEOUT_S,
     as_json: JsonOption = False,
@@ -47,7 +48,7 @@ def move_to(
     if joints is not None:
         fields["joints_rad"] = _joints(joints)
     if not fields:
-        raise typer.BadParameter("say where to: --at X,Y,Z or --joints ..")
+        raise typer.BadParameter("give a target: --at X,Y,Z or --joints ..")
     _carry_out(target, "move_to", fields, timeout_s, as_json=as_json)
 
 
@@ -63,13 +64,21 @@ def home(
 def grip(
     width: Annotated[str, typer.Argument(help="open, closed, or the width in m.")],
     target: RobotTarget,
+    holds: Annotated[
+        str | None,
+        typer.Option(
+            "--holds", help="Size X,Y,Z (m) of what it holds then, along the axes of the TCP."
+        ),
+    ] = None,
     timeout_s: TimeoutOption = DEFAULT_TIMEOUT_S,
     as_json: JsonOption = False,
 ) -> None:
     """Open or close the gripper while the arm stands."""
     word = {"close": "closed"}.get(width, width)
     wanted = word if word in ("open", "closed") else _number("WIDTH (open, closed, m)", word, 1.0)
-    _carry_out(target, "grip", {"width_m": wanted}, timeout_s, as_json=as_json)
+    holds_m = None if holds is None else number_list("--holds", holds, MIN_HELD_M, MAX_HELD_M)
+    fields = {"width_m": wanted, "holds_m": holds_m}
+    _carry_out(target, "grip", fields, timeout_s, as_json=as_json)
 
 
 @options
@@ -78,7 +87,7 @@ def run(
     target: RobotTarget,
     until: Annotated[
         list[str] | None,
-        typer.Option("--until", help=f"What ends it, repeatable: {CONDITIONS}."),
+        typer.Option("--until", help=f"Condition that ends it, repeatable: {CONDITIONS}."),
     ] = None,
     prompt: Annotated[
         str | None, typer.Option("--prompt", help="For the worker; default: the present one.")

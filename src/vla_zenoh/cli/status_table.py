@@ -183,7 +183,7 @@ def _message(row: NodeRow, found: NodeStatus, mode: str) -> str:
         slowed = isinstance(speed, (int, float)) and speed < 100
         task = (
             f"prompt {detail.get('prompt', '')!r}, worker {detail.get('worker', '')}, {rate} Hz, "
-            f"{detail.get('accepted_chunks', 0)} chunks carried out"
+            f"{detail.get('accepted_chunks', 0)} chunks executed"
             f"{f', speed {speed:g} %' if slowed else ''}"
         )
         return _cell([str(detail.get("why", "")), task], MAX_WORDS)

@@ -141,7 +141,7 @@ class RobotTarget:
         """Message that this robot has no such node, with `command` for the other robots."""
         others = [f"{name} (`{self.typed(*command, robot=name)}`)" for name in self.others(client)]
         there = f"Alive on this router: {', '.join(others)}"
-        none = "Nor is another robot visible on this router; `vla-zenoh up` starts one"
+        none = "No other robot is visible on this router; `vla-zenoh up` starts one"
         return f"no {kind} of {self.named(client)} is alive. {there if others else none}"
 
     def others(self, client: Client) -> list[str]:
@@ -165,9 +165,10 @@ class RobotTarget:
             if operator_role(profile, host) is Role.OPERATOR
         ]
         what = (
-            f"this computer also has an operator's: `{self.typed(*command, host=able[0])}`"
+            "this computer also has an operator certificate: "
+            f"`{self.typed(*command, host=able[0])}`"
             if able
-            else "`vla-zenoh secure add HOST --role operator` makes an operator's"
+            else "`vla-zenoh secure add HOST --role operator` makes an operator certificate"
         )
         return (
             f"the certificate of this computer is {who}, and the router drops what a {role.value} "

@@ -72,7 +72,7 @@ def up(
     ] = False,
     as_json: JsonOption = False,
     print_unit: Annotated[
-        bool, typer.Option("--print-unit", help="Print a systemd unit that does this, and end.")
+        bool, typer.Option("--print-unit", help="Print a systemd unit that does this, and exit.")
     ] = False,
 ) -> None:
     """Start and supervise all nodes of this host. Ctrl-C brakes the arm, then ends them.
@@ -140,8 +140,8 @@ def up(
         status, activate, end = (target.typed(word) for word in ("status", "activate", "stop"))
         tell("up", f"watch: {status}; drive: {activate}, also prompt; stop: {end}; end: Ctrl-C")
         running.serve(stop)
-        tell("up", "braking the arm, then ending every node")
-    tell("up", "all nodes have ended")
+        tell("up", "braking the arm, then stopping every node")
+    tell("up", "all nodes have stopped")
 
 
 def absolute(profile: str) -> str:
@@ -209,7 +209,7 @@ def reject_wrong(
     lines = done.stderr.splitlines() or [f"`profile check` ended with code {done.returncode}"]
     for line in lines:
         errors().print(styled(line, "red"), soft_wrap=True)
-    fail(f"nothing was started: {profile} has faults, which `vla-zenoh profile check` names too")
+    fail(f"nothing was started: {profile} has faults; `vla-zenoh profile check` lists them too")
 
 
 def target_of(profile: str, running: Host) -> RobotTarget:

@@ -40,7 +40,7 @@ def worker(
     run_in_own_environment(chosen.model, model_options.python)
     policy = make_policy(chosen.model, chosen.options, profile=node.profile)
     if sys.stdout.isatty():
-        say(f"worker {chosen.name} of robot {profile.robot.name} runs; Ctrl-C ends it")
+        say(f"worker {chosen.name} of robot {profile.robot.name} is running; Ctrl-C stops it")
     run_node(
         profile,
         lambda session, stop: WorkerNode(

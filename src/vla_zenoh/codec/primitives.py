@@ -21,6 +21,7 @@ from pydantic import (
     model_validator,
 )
 
+from vla_zenoh.codec.settings import MAX_HELD_M, MIN_HELD_M
 from vla_zenoh.errors import CodecError, ProfileError, describe_faults, nearest
 from vla_zenoh.keys import key_chunk
 from vla_zenoh.policy.spec import MAX_JOINTS
@@ -79,6 +80,8 @@ NamedJoints = Annotated[
     dict[str, Radians],
     Field(min_length=1, max_length=MAX_JOINTS, description="name -> rad; the others stay"),
 ]
+Edge = Annotated[float, Field(ge=MIN_HELD_M, le=MAX_HELD_M)]
+Size = Annotated[tuple[Edge, Edge, Edge], Field(description="x, y, z in m, axes of the TCP")]
 Width = Annotated[float, Field(ge=0, le=1)] | Literal["open", "closed"]
 
 
@@ -131,9 +134,12 @@ class Grip(Request):
 
     Args:
         width_m: between the fingers, or ``open``, or ``closed``: until something is held.
+        holds_m: size of what it holds afterwards, a box around the TCP that is kept from table,
+            keep-outs and the arm itself until the gripper opens.
     """
 
     width_m: Width
+    holds_m: Size | None = None
 
 
 class Region(_Part):

@@ -10,13 +10,15 @@ import unicodedata
 
 from vla_zenoh import keys
 from vla_zenoh.errors import CodecError, ProfileError
-from vla_zenoh.types import MAX_TEXT
+from vla_zenoh.types import MAX_TEXT, HeldBox
 
 MAX_SETTING_BYTES = 4 * MAX_TEXT
 TRUE_WORDS = frozenset({"true", "1", "on", "yes"})
 FALSE_WORDS = frozenset({"false", "0", "off", "no"})
 WHILE = "while"
 MIN_RATE_HZ, MAX_RATE_HZ = 0.05, 100.0
+MIN_HELD_M, MAX_HELD_M = 0.001, 1.0
+"""Of an edge of what a gripper holds, and of the distance of its centre."""
 
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?")
 _SEED = re.compile(r"[0-9]{1,10}")
@@ -99,7 +101,8 @@ def decode_percent(payload: bytes) -> float:
     number = word.removesuffix("%").rstrip()
     if not _NUMBER.fullmatch(number):
         raise CodecError(
-            "invalid", f"{word[:40]!r} is no percentage: give a number from 0 to 100, such as '30'"
+            "invalid",
+            f"{word[:40]!r} is not a percentage: give a number from 0 to 100, such as '30'",
         )
     percent = float(number)
     if not 0.0 <= percent <= 100.0:
@@ -107,6 +110,38 @@ def decode_percent(payload: bytes) -> float:
             "invalid", f"speed {word[:40]!r} percent is out of range: give 0 to 100 percent"
         )
     return abs(percent)  # of "-0"
+
+
+def decode_held(payload: bytes) -> HeldBox | str:
+    """What the gripper holds: ``X Y Z [at X Y Z]`` in m, numbers apart by spaces or commas.
+
+    Returns:
+        the box; empty: nothing is held.
+
+    Raises:
+        CodecError: anything else.
+    """
+    text = decode_text(payload)
+    if not text:
+        return text
+    size, at, centre = (part.replace(",", " ").split() for part in text.partition("at"))
+    numbers = [*size, *(centre if at else ("0", "0", "0"))]
+    if len(size) != 3 or len(numbers) != 6 or not all(map(_NUMBER.fullmatch, numbers)):
+        raise CodecError(
+            "invalid",
+            f"held {text[:60]!r} is no box: give its size in m along the axes of the TCP, such as "
+            "'0.04 0.04 0.12', and where its centre is, such as '... at 0 0 0.02'",
+        )
+    x_m, y_m, z_m, *at_m = map(float, numbers)
+    if not all(MIN_HELD_M <= edge <= MAX_HELD_M for edge in (x_m, y_m, z_m)) or not all(
+        abs(offset) <= MAX_HELD_M for offset in at_m
+    ):
+        raise CodecError(
+            "invalid",
+            f"held {text[:60]!r} is out of range: edges {MIN_HELD_M:g} to {MAX_HELD_M:g} m, a "
+            f"centre within {MAX_HELD_M:g} m of the TCP",
+        )
+    return HeldBox((x_m, y_m, z_m), (at_m[0], at_m[1], at_m[2]))
 
 
 def decode_name(payload: bytes) -> str:

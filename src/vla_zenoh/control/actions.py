@@ -129,6 +129,10 @@ def as_deltas(spec: ActionSpec, steps: Steps) -> tuple[ActionSpec, FloatArray]:
     A chunk of deltas on the previous step, or of absolute poses, is returned as it is.
     """
     steps = np.asarray(steps, np.float64)
+    if spec.parts:
+        own = {p.part: as_deltas(p.action, steps[:, spec.columns(p.part)]) for p in spec.parts}
+        action = ActionSpec.of_parts({part: meant for part, (meant, _) in own.items()})
+        return action, np.concatenate([rows for _, rows in own.values()], axis=1)
     if spec.kind == "velocity":
         size = spec.arm_size
         scaled = np.concatenate([steps[:, :size] * spec.dt_s, steps[:, size:]], axis=1)

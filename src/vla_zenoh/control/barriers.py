@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vla_zenoh.control.limits import LimitHit, Slowdown, slowdown, workspace_corners
-from vla_zenoh.kinematics.collision import CollisionModel
+from vla_zenoh.kinematics.collision import FREE_M, CollisionModel
 from vla_zenoh.kinematics.kinematics import Kinematics, smallest_singular_value
 from vla_zenoh.profile import Limits, ReachLimits
 from vla_zenoh.types import FloatArray
@@ -130,6 +130,8 @@ class Barriers:
             ("self_collision", "table_distance", "keep_out"), (np.inf, "")
         )
         for index, value in enumerate(values[1:], start=1):
+            if value >= FREE_M:
+                continue
             name = self.names[index]
             nearest[name] = min(nearest[name], (float(value), self.where(index)))
         return Margins(

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
+import numpy as np
+
 from vla_zenoh.control.chunk_planner import ChunkPlanner
 from vla_zenoh.control.chunk_validation import Lease
 from vla_zenoh.control.commander_io import PartStates, make_event
@@ -26,7 +28,9 @@ from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     ActionChunk,
     Event,
+    FloatArray,
     GripperState,
+    HeldBox,
     JointState,
     PoseState,
     Stamped,
@@ -34,6 +38,8 @@ from vla_zenoh.types import (
 
 FUTURE_NS = round(CLOCK_TOLERANCE_S * 1e9)
 """A pose that is stamped later than it arrived by more than this says nothing about the past."""
+LET_GO_M = 0.01
+"""A gripper that opens by more than this lets go of what it holds."""
 
 
 class CommandedPart:
@@ -59,8 +65,10 @@ class CommandedPart:
         self.watchdog = Watchdog(profile)
         self._joint_monitor = None if reach is None else JointMonitor(profile, reach)
         self._load_known = True
+        self._grasp_m = np.inf
+        """Least width of the gripper since it holds something."""
 
-    # -- how its name is said -----------------------------------------------------------------
+    # -- its name in messages -----------------------------------------------------------------
     def says(self, why: str) -> str:
         """`why`, with the part that it is about."""
         return f"{self.name}: {why}" if self.name and why else why
@@ -75,6 +83,16 @@ class CommandedPart:
     def elbow_rad(self) -> float:
         """Greatest distance of a measured joint from where it is expected, see `JointMonitor`."""
         return 0.0 if self._joint_monitor is None else self._joint_monitor.elbow_rad
+
+    @property
+    def measured_rad(self) -> FloatArray | None:
+        """(n,) newest measured joints of the arm, None without kinematics or joints of it."""
+        if self.reach is None or self.joint is None:
+            return None
+        try:
+            return self.reach.kinematics.joints_of(self.joint.record)
+        except RecordError:
+            return None  # reported by the monitor of its joints
 
     # -- states -------------------------------------------------------------------------------
     def update(self, states: PartStates) -> None:
@@ -91,6 +109,40 @@ class CommandedPart:
             self.contact.update_joints(states.joint)
         if states.gripper is not None:
             self.gripper_state = states.gripper
+            self._grasp_m = min(self._grasp_m, states.gripper.record.width_m)
+
+    # -- what it holds ------------------------------------------------------------------------
+    @property
+    def held(self) -> HeldBox | None:
+        """What the gripper holds."""
+        return None if self.reach is None else self.reach.barriers.collisions.held
+
+    @property
+    def let_go(self) -> bool:
+        """The gripper has opened since it holds something."""
+        gripper = self.gripper_state
+        return (
+            self.held is not None
+            and gripper is not None
+            and gripper.record.width_m > self._grasp_m + LET_GO_M
+        )
+
+    def hold(self, box: HeldBox | None) -> None:
+        """Count `box` among the arm's links from now on; None: the gripper holds nothing.
+
+        Raises:
+            RecordError: the profile does not describe the robot's kinematics.
+        """
+        if self.reach is None:
+            raise RecordError(
+                "what the gripper holds needs the robot's kinematics: set robot.description, "
+                "robot.tcp_frame and robot.arm_joints in the profile"
+            )
+        self.reach.hold(box)
+        gripper = self.gripper_state
+        self._grasp_m = np.inf if gripper is None else gripper.record.width_m
+        if self._joint_monitor is not None:
+            self._joint_monitor.reset()  # what is too near now may only move apart
 
     def measure(self) -> str:
         """Track whether the arm stands; returns why these joints are not this arm's, or empty."""

@@ -27,7 +27,7 @@ from vla_zenoh.control.commander_io import (
 )
 from vla_zenoh.control.contact import Contact
 from vla_zenoh.control.gripper_arbiter import GripperArbiter
-from vla_zenoh.control.limits import Slowdown
+from vla_zenoh.control.limits import LimitHit, Slowdown
 from vla_zenoh.control.part_spacing import PartSpacing
 from vla_zenoh.control.plan_timeline import EpisodeProgress, Goal, Plan
 from vla_zenoh.control.preflight import PeerSnapshot, reasons_of_worker
@@ -41,6 +41,7 @@ from vla_zenoh.types import (
     MAX_TEXT,
     ActionChunk,
     GripperState,
+    HeldBox,
     JointState,
     PoseState,
     Stamped,
@@ -158,6 +159,7 @@ class Commander:
         for part in self.parts:
             if not inputs.chunks or part.monitor_late(now_ns):  # planning them is work enough
                 self._monitor_joints(part, now_ns)
+        self._monitor_distance(now_ns)
         self._keep_apart(now_ns, ticks)
         overdue_ns, all_planned = self._watchdog.deadline_ns, True
         for part in self.parts:
@@ -274,6 +276,8 @@ class Commander:
         for part in self.parts:
             states = inputs.of(part.name)
             part.update(states)
+            if part.let_go:
+                self._hold(part, None)
             if states.gripper is None:
                 continue
             faults, mode = states.gripper.record.faults, states.gripper.record.mode
@@ -298,11 +302,15 @@ class Commander:
                 self._reject_setting(name, [late])
                 return
         try:
-            self._set(name, value, now_ns)
+            if name == "held":
+                box = value if isinstance(value, HeldBox) else None
+                self._hold(next(part for part in self.parts if part.name == setting.part), box)
+            else:
+                self._set(name, value, now_ns)
         except RecordError as error:
             self._reject_setting(name, [str(error)])
 
-    def _set(self, name: str, value: str | bool | float | None, now_ns: int) -> None:
+    def _set(self, name: str, value: object, now_ns: int) -> None:
         if name == "prompt" and isinstance(value, str):
             if value != self.task.prompt:
                 self._new_episode(now_ns, prompt=value)
@@ -331,6 +339,15 @@ class Commander:
             self._change(Trigger.LOSE, str(value))
         elif name != "stop":
             raise RecordError(f"{name!r} cannot be set to {value!r}")
+
+    def _hold(self, part: CommandedPart, box: HeldBox | None) -> None:
+        if box == part.held:
+            return
+        part.hold(box)
+        if self._spacing is not None:
+            self._spacing.place()
+        holds = "nothing" if box is None else f"a box of {box} m"
+        self._emit("info", "notice", "gripper_holds", part.says(f"the gripper holds {holds}"))
 
     def _new_episode(self, now_ns: int, **changes: str) -> None:
         # From the wall clock, so that a restarted node never reuses an episode number.
@@ -577,9 +594,22 @@ class Commander:
             self._change(Trigger.LOSE, part.says(str(error)))
             return
         if hit is not None:
-            event = make_event(
-                "warning", "limit", hit.name, f"braked{hit.at}", hit.value, hit.limit
-            )
-            self._out.events += part.tagged([event])
-            why = f"the measured arm is too near to a bound: {hit.name}{hit.at} is {hit.value:.3g}"
-            self._change(Trigger.LOSE, part.says(f"{why}, the limit is {hit.limit:.3g}"))
+            self._brake_at(hit, part)
+
+    def _monitor_distance(self, now_ns: int) -> None:
+        """Brake if the measured parts come too near to each other."""
+        if self._spacing is None or self.state not in OBEYING or not self._motion.streaming:
+            return
+        measured = [part.measured_rad for part in self.parts]
+        known = [joints_rad for joints_rad in measured if joints_rad is not None]
+        hit = self._spacing.monitor(known, now_ns) if len(known) == len(measured) else None
+        if hit is not None:
+            self._brake_at(hit)
+
+    def _brake_at(self, hit: LimitHit, part: CommandedPart | None = None) -> None:
+        """End the activation at a bound of the measured arm; `part`: of which, None: of several."""
+        why = f"the measured arm is too near to a bound: {hit.name}{hit.at} is {hit.value:.3g}"
+        why = f"{why}, the limit is {hit.limit:.3g}"
+        event = make_event("warning", "limit", hit.name, f"braked{hit.at}", hit.value, hit.limit)
+        self._out.events += part.tagged([event]) if part else [event]
+        self._change(Trigger.LOSE, part.says(why) if part else why)

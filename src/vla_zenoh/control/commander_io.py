@@ -17,6 +17,7 @@ from vla_zenoh.types import (
     Event,
     GripperCommand,
     GripperState,
+    HeldBox,
     JointCommand,
     JointState,
     PoseCommand,
@@ -29,15 +30,17 @@ class Setting(NamedTuple):
     """A setting received from a client, or a loss found by the command node itself.
 
     Args:
-        name: prompt, active, worker, rate, speed, slower, stop, reset or lose.
+        name: prompt, active, worker, rate, speed, slower, held, stop, reset or lose.
         value: of ``active`` a text is the name of the deadman, the client that holds the arm
             active.
         put_ns: when it was put, by the router's clock; None: unknown.
+        part: of the robot, for ``held``.
     """
 
     name: str
-    value: str | bool | float | None = None
+    value: str | bool | float | HeldBox | None = None
     put_ns: int | None = None
+    part: str = ""
 
 
 class PartStates(Protocol):

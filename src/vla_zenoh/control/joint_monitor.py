@@ -198,7 +198,7 @@ def joint_state_faults(
         return _elbow_is_not_held(profile, joint.record, pose.record)
     return [
         f"the joints put the TCP {apart_m * 1e3:.1f} mm and {apart_rad:.3f} rad from where "
-        "the robot says it is: robot.description or robot.tcp_frame is another robot's"
+        "the robot reports it: robot.description or robot.tcp_frame is another robot's"
     ]
 
 
@@ -220,5 +220,5 @@ def _elbow_is_not_held(profile: Profile, joint: JointState, pose: PoseState) -> 
         return []
     return [
         f"joint {joint.names[worst]} is {away_rad[worst]:.2f} rad from where its controller holds "
-        f"it, at most {HELD_RAD:g}: let go of the arm, or move the robot by its own means once"
+        f"it, at most {HELD_RAD:g}: release the arm, or move the robot once by its own means"
     ]

@@ -163,14 +163,14 @@ class MotionPipeline:
             return self._path.state.position
         return self._joints.position_rad
 
-    def resting_rad(self, ahead_s: float) -> FloatArray:
-        """(n,) where commanded joints come to rest at most, were they to brake in `ahead_s`."""
+    def resting_rad(self, ahead_s: float) -> list[FloatArray]:
+        """(n,) each, where commanded joints may come to rest, were they to brake in `ahead_s`."""
         assert self._joints is not None
         if self.in_joints and self._path is not None:
             path = self._path
-            return path.state.position + path.stop_way(ahead_s)
+            return [path.state.position + path.stop_way(ahead_s)]
         if self._smoother is None:
-            return self._joints.position_rad
+            return [self._joints.position_rad]
         return self._joints.resting_rad(self._smoother, ahead_s)
 
     def wanted_rad(self, now_ns: int) -> FloatArray | None:

@@ -3,11 +3,14 @@
 Each tick the joints at which either arm would come to rest are computed, were it to brake one tick
 later. No pair of places on the two ways there may be nearer than ``limits.reach.part_stop_m``: so
 it does not matter which of the two stops first, or whether one of them stops at all. Otherwise both
-brake, on ways that the tick before found to be free. They go on when the first bit of the way
-towards their goals is free, for one arm alone and for both. Below ``part_slow_m`` arms that come
-nearer are slowed down to sqrt(distance left / zone) of their speed.
+brake, on ways that the tick before found to be free. Once they stand they go on when the first bit
+of the way towards their goals is free, for one arm alone and for both. Below ``part_slow_m`` arms
+that come nearer are slowed down to sqrt(distance left / zone) of their speed.
 
 Arms that begin too near to each other may only move apart.
+
+That is computed for the commanded joints. The measured ones are monitored as in `joint_monitor`:
+arms that are nearer than the stop by more than `PAST_M`, and come nearer, have to brake.
 """
 
 from __future__ import annotations
@@ -19,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vla_zenoh.control.commanded_part import CommandedPart
+from vla_zenoh.control.joint_monitor import BAND_M, PAST_M, PERIOD_NS
 from vla_zenoh.control.limits import LimitHit, Slowdown
 from vla_zenoh.kinematics.part_distance import Nearest, PartDistance, PlacedArm
 from vla_zenoh.kinematics.so3 import Pose, rotation_from_rpy
@@ -26,8 +30,8 @@ from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray
 
 NAME = "part_distance"
-SHARES = (0.0, 0.5, 1.0)
-"""Places on the way of a stop that are looked at."""
+SHARES = (0.5, 1.0)
+"""Places on the way of a stop that are looked at, beside its start."""
 FAR_M = 0.25
 """Arms this much further apart than they may come are looked at now and then."""
 FAR_TICKS = 4
@@ -35,6 +39,8 @@ NOISE_M = 2e-5
 SLOWEST = 0.05
 STEPS = 20
 """Number of speed shares, so that the share does not change at every tick."""
+STANDS_RAD = 2e-3
+"""Arms whose joints go on by less than this stand."""
 PROBE_RAD = 0.01
 """First bit of the way to a goal: the joint that moves furthest."""
 
@@ -60,19 +66,9 @@ class PartSpacing:
     """
 
     def __init__(self, profile: Profile, parts: Sequence[CommandedPart]) -> None:
-        self._parts = tuple(parts)
-        placed: list[PlacedArm] = []
-        for part in self._parts:
-            base, reach = profile.parts[part.name].base, part.reach
-            assert reach is not None
-            turn = rotation_from_rpy(np.array([0.0, 0.0, base.yaw_rad]))
-            stands = Pose(np.array(base.position_m), turn)
-            placed.append(PlacedArm(reach.kinematics, reach.barriers.collisions, stands))
+        self._parts, self._profile = tuple(parts), profile
         limits = [part.profile.limits.reach for part in self._parts]
-        self._pairs = [
-            (i, j, PartDistance(placed[i], placed[j]))
-            for i, j in itertools.combinations(range(len(placed)), 2)
-        ]
+        self.place()
         self._stop_m = max(limit.part_stop_m for limit in limits)
         self._slow_m = max(limit.part_slow_m for limit in limits)
         self._within_m = max(self._slow_m, self._stop_m) + FAR_M
@@ -81,6 +77,21 @@ class PartSpacing:
         self._skip = 0
         self._held = False
         self._slower = False
+        self._edge_m, self._monitor_ns = np.inf, 0
+
+    def place(self) -> None:
+        """Take the shapes of all parts, with what their grippers hold."""
+        placed: list[PlacedArm] = []
+        for part in self._parts:
+            base, reach = self._profile.parts[part.name].base, part.reach
+            assert reach is not None
+            turn = rotation_from_rpy(np.array([0.0, 0.0, base.yaw_rad]))
+            stands = Pose(np.array(base.position_m), turn)
+            placed.append(PlacedArm(reach.kinematics, reach.barriers.collisions, stands))
+        self._pairs = [
+            (i, j, PartDistance(placed[i], placed[j]))
+            for i, j in itertools.combinations(range(len(placed)), 2)
+        ]
 
     def look(self, now_ns: int, ahead_s: float, *, moves: bool) -> Spacing:
         """What the distance allows in the coming tick.
@@ -101,15 +112,21 @@ class PartSpacing:
         if any(joints_rad is None for joints_rad in here):
             return Spacing()
         at = [joints_rad for joints_rad in here if joints_rad is not None]
-        before, self.nearest = self.nearest, self._nearest(at, at)
+        before, self.nearest = self.nearest, self._nearest(at)
         if self.nearest.distance_m >= self._within_m:
             self._skip, self._held = FAR_TICKS - 1, False
             return Spacing()
         floor_m = min(self._stop_m, self.nearest.distance_m - NOISE_M)
         rests = [part.motion.resting_rad(ahead_s) for part in self._parts]
-        ahead = self._nearest(at, rests, floor_m + NOISE_M)
+        ahead = self._nearest(at, floor_m + NOISE_M, rests)
+        # A brake that is given up and begun again would end further on.
+        stand = all(
+            np.abs(end - here_rad).max() < STANDS_RAD
+            for here_rad, ends in zip(at, rests, strict=True)
+            for end in ends
+        )
         self._held = ahead.distance_m < floor_m or (
-            self._held and not self._may_go_on(at, now_ns, floor_m)
+            self._held and not (stand and self._may_go_on(at, now_ns, floor_m))
         )
         if self._held:
             where = f"{self.nearest.first} and {self.nearest.second}"
@@ -135,30 +152,34 @@ class PartSpacing:
 
     def _may_go_on(self, at: Sequence[FloatArray], now_ns: int, floor_m: float) -> bool:
         """Whether the first bit of the way to the goals is free."""
-        probes: list[FloatArray] = []
+        probes: list[list[FloatArray]] = []
         for part, here_rad in zip(self._parts, at, strict=True):
             wanted_rad = part.motion.wanted_rad(now_ns)
             way_rad = np.zeros(len(here_rad)) if wanted_rad is None else wanted_rad - here_rad
             longest = float(np.abs(way_rad).max())
-            probes.append(here_rad + way_rad * min(1.0, PROBE_RAD / max(longest, 1e-9)))
-        return self._nearest(at, probes, floor_m + NOISE_M).distance_m >= floor_m
+            probes.append([here_rad + way_rad * min(1.0, PROBE_RAD / max(longest, 1e-9))])
+        return self._nearest(at, floor_m + NOISE_M, probes).distance_m >= floor_m
 
     def _nearest(
         self,
-        starts: Sequence[FloatArray],
-        ends: Sequence[FloatArray],
+        at: Sequence[FloatArray],
         within_m: float | None = None,
+        ends: Sequence[Sequence[FloatArray]] = (),
     ) -> Nearest:
-        """The nearest links anywhere on two straight motions of the joints."""
+        """The nearest links with the parts anywhere between these joints and some ends of theirs.
+
+        Args:
+            at: (n,) joints of each part.
+            within_m: links further apart are not looked for.
+            ends: (n,) each of each part; none: it stands.
+        """
         found = Nearest(self._within_m if within_m is None else within_m)
+        places = [
+            [here_rad, *(here_rad + share * (end - here_rad) for end in own for share in SHARES)]
+            for here_rad, own in itertools.zip_longest(at, ends, fillvalue=())
+        ]
         for i, j, pair in self._pairs:
-            first, second = (
-                [starts[k]]
-                if np.array_equal(starts[k], ends[k])
-                else [starts[k] + share * (ends[k] - starts[k]) for share in SHARES]
-                for k in (i, j)
-            )
-            near = pair.nearest(first, second, found.distance_m)
+            near = pair.nearest(places[i], places[j], found.distance_m)
             if near.distance_m < found.distance_m:
                 names = self._parts[i].name, self._parts[j].name
                 found = Nearest(
@@ -166,7 +187,21 @@ class PartSpacing:
                 )
         return found
 
+    def monitor(self, measured_rad: Sequence[FloatArray], now_ns: int) -> LimitHit | None:
+        """Check the measured joints (n,) of each part, every `PERIOD_NS`; returns why to brake."""
+        if now_ns < self._monitor_ns:
+            return None
+        begins = now_ns - self._monitor_ns > 2 * PERIOD_NS
+        self._monitor_ns, within_m = now_ns + PERIOD_NS, self._stop_m - PAST_M
+        near = self._nearest(measured_rad, within_m)
+        before_m = near.distance_m if begins else self._edge_m
+        self._edge_m = min(max(before_m, near.distance_m), near.distance_m + BAND_M)
+        if near.distance_m >= within_m or self._edge_m >= before_m:
+            return None
+        where = f"{near.first} and {near.second}"
+        return LimitHit(NAME, near.distance_m, self._stop_m, where=where)
+
     def measured_m(self, joints_rad: Mapping[str, FloatArray]) -> Nearest:
         """The nearest links with the parts at these joints (n,) each."""
         at = [joints_rad[part.name] for part in self._parts]
-        return self._nearest(at, at)
+        return self._nearest(at)

@@ -9,6 +9,8 @@ follows them. An arm that stops does not make up for its lag.
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 
 from vla_zenoh.control.axis_smoothing import Shares, stop_way
@@ -52,6 +54,8 @@ CREEPING, STUCK_S = 0.05, 0.5
 OUTSIDE_M = 1e-3
 """An arm further outside the box than this started there, and is moved inside."""
 DAMPING = 1e-5
+LAGS = 0.5
+"""Joints that lag by this much, see `PoseToJoint._lag`, may stop by themselves."""
 RESTING_STEPS = 2
 """Newton steps to the joints of a resting pose."""
 ELBOW_S = 0.1
@@ -152,27 +156,32 @@ class PoseToJoint:
         ahead = Pose(position_m + way[:3], exp3(way[3:]) @ rotation)
         smoother.brake(self.shares(smoother.motion, ahead, smoother.box, bend=BRAKE_BEND))
 
-    def resting_rad(self, smoother: Smoother, ahead_s: float) -> FloatArray:
-        """(n,) about where the joints come to rest, were the arm to brake in `ahead_s`."""
-        joints, velocity = self._now[:2]
+    def resting_rad(self, smoother: Smoother, ahead_s: float) -> list[FloatArray]:
+        """(n,) where the joints may come to rest, were the arm to brake in `ahead_s`.
+
+        By the brake of the pose; and by that of the joints, if they lag or are about to.
+        """
+        joints = self._now.position_rad
         if smoother.at_rest and self.at_rest:
-            return joints
-        (position_m, rotation), twist, acceleration = smoother.motion
-        way = BRAKE_S * twist
-        ahead = Pose(position_m + way[:3], exp3(way[3:]) @ rotation)
-        shares = self.shares(smoother.motion, ahead, smoother.box, bend=BRAKE_BEND)
-        box = smoother.box * np.array(shares)[:, None]
-        way = stop_way(twist, acceleration, box, ahead_s)
-        rest = Pose(position_m + way[:3], exp3(way[3:]) @ rotation)
-        at_rest = joints
+            return [joints]
+        ahead = copy(smoother)
+        if not ahead.braking:
+            ahead.tick(self.pace * ahead_s / self._dt_s)
+            self.brake(ahead)
+        rest = ahead.resting_pose()
+        jacobian = self._kinematics.jacobian(joints)
+        square = jacobian @ jacobian.T + DAMPING * np.eye(6)
+        velocity = self._now.velocity_rad_s
+        elbow = velocity - jacobian.T @ np.linalg.solve(square, jacobian @ velocity)
+        at_rest = joints + (ahead_s + ELBOW_S) * elbow
         for _ in range(RESTING_STEPS):
             here, jacobian = self._kinematics.pose_and_jacobian(at_rest)
             square = jacobian @ jacobian.T + DAMPING * np.eye(6)
             at_rest = at_rest + jacobian.T @ np.linalg.solve(square, pose_error(rest, here))
-        jacobian = self._kinematics.jacobian(joints)
-        square = jacobian @ jacobian.T + DAMPING * np.eye(6)
-        elbow = velocity - jacobian.T @ np.linalg.solve(square, jacobian @ velocity)
-        return at_rest + (ahead_s + ELBOW_S) * elbow
+        if self._lag(self._kinematics.forward(joints), smoother.motion.pose) < LAGS:
+            return [at_rest]
+        box = np.array(self.limits)
+        return [at_rest, joints + stop_way(velocity, self._acceleration, box, ahead_s)]
 
     def tick(self, smoother: Smoother, *, braking: bool = False, elbow: bool = True) -> None:
         """Advance `smoother` by one tick and follow its pose, or stop.
@@ -210,7 +219,7 @@ class PoseToJoint:
         held = sorted(self._held)
         return (
             f"the joints cannot follow the pose: it has waited for them for {STUCK_S:g} s; "
-            f"they are held by {', '.join(held) or 'nothing, so the arm cannot have this pose'}"
+            f"they are held by {', '.join(held) or 'nothing, so the arm cannot reach this pose'}"
         )
 
     def _inside(self, here: Pose, pose: Pose) -> Pose:

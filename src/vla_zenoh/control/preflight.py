@@ -238,7 +238,7 @@ def _worker(worker: str, prompt: str, peers: PeerSnapshot) -> list[str]:
         reasons.append(f"worker {worker!r} needs a prompt and there is none")
     complaint = peers.worker_complaints.get(worker)
     if complaint:
-        reasons.append(f"worker {worker!r} says: {complaint}")
+        reasons.append(f"worker {worker!r} reports: {complaint}")
     return reasons
 
 

@@ -41,7 +41,7 @@ from vla_zenoh.kinematics.ik import TOLERANCE_M, Approach, InverseKinematics, po
 from vla_zenoh.kinematics.kinematics import Kinematics, make_kinematics
 from vla_zenoh.kinematics.so3 import Pose, exp3, orthonormal
 from vla_zenoh.profile import Limits, Profile
-from vla_zenoh.types import FloatArray
+from vla_zenoh.types import FloatArray, HeldBox
 
 HALVINGS = 4
 REFINEMENTS = 4
@@ -155,6 +155,13 @@ class ReachabilityFilter:
         """Of the step bounded last."""
         self.cost = 1
         """Number of evaluations that the last one counts as."""
+
+    def hold(self, box: HeldBox | None) -> None:
+        """Count what the gripper holds among the arm's links; None: nothing."""
+        self.barriers.collisions.hold(box)
+        here = self._here
+        jacobian = self.kinematics.jacobian(here.joints_rad)
+        self._here = here._replace(barriers=self.barriers.at(here.joints_rad, jacobian))
 
     def set_elbow(self, joints_rad: FloatArray) -> None:
         """Start the next step with the elbow of these joints (n,) of the robot."""

@@ -15,7 +15,7 @@ from vla_zenoh.control.limits import LimitHit, into_workspace, workspace_corners
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.kinematics.so3 import Pose, interpolate, pose_distance
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import FloatArray
+from vla_zenoh.types import FloatArray, HeldBox
 
 STEP_M, STEP_RAD = 0.01, 0.05
 STEP_S = 1.0
@@ -38,6 +38,10 @@ class TargetCheck:
         self._limits, self._reach = profile.limits, reach
         self.kinematics = reach.kinematics
         self.bounds = JointBounds(profile, reach.kinematics, reach.barriers)
+
+    def hold(self, box: HeldBox | None) -> None:
+        """Count what the gripper holds among the arm's links; None: nothing."""
+        self._reach.hold(box)
 
     def pose_fault(self, joints_rad: FloatArray, target: Pose) -> str:
         """Why the TCP cannot go from joints (n,) straight to `target`; empty if it can."""

@@ -183,7 +183,7 @@ class Deadman:
         """
         reasons = []
         if holder and holder not in present:
-            reasons.append(f"{holder!r}, who is to hold the arm active, {NO_DEADMAN_TOKEN}")
+            reasons.append(f"the deadman of this activation, {holder!r}, {NO_DEADMAN_TOKEN}")
         if obeying and holder and self.name and holder != self.name:
             reasons.append(f"the arm is active already, held by {self.name!r}; deactivate it first")
         return reasons
@@ -192,4 +192,4 @@ class Deadman:
         """Why the arm must brake, empty while the client is present."""
         if not self.name or self.name in present:
             return ""
-        return f"{self.name!r}, who held the arm active, is gone"
+        return f"deadman {self.name!r} is gone"

@@ -21,19 +21,24 @@ from vla_zenoh.errors import ProfileError, ResourceError
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import rotation_from_rpy
 from vla_zenoh.profile import KeepOut
-from vla_zenoh.types import FloatArray
+from vla_zenoh.types import FloatArray, HeldBox
 
 SAMPLES = 1000
 NEVER_SPARE_M = 0.03
 """A pair may come nearer than in any of the samples by this much."""
 TABLE = "table"
+HELD = "the held object"
+WRIST = 2
+"""Last joints whose links may touch what the gripper holds."""
+FREE_M = 10.0
+"""Distance of a held object while there is none."""
 
 
 class CollisionPair(NamedTuple):
     """Two things that must not touch.
 
     Args:
-        first: a link.
+        first: a link, or the held object.
         second: another link, ``table``, or the name of a keep-out.
         limit: ``self_collision``, ``table_distance`` or ``keep_out``.
         is_hand: `first` moves with the last joint of the arm.
@@ -76,6 +81,9 @@ class CollisionModel:
         keep_out: Mapping[str, KeepOut] | None = None,
     ) -> None:
         self._model, self._data = kinematics.model, kinematics.model.createData()
+        self.held: HeldBox | None = None
+        """What the gripper holds, see `hold`."""
+        self._held_pairs: list[tuple[int, int]] = []
         self._geometry: Any = _one_hull_a_link(kinematics)
         if table_z_m is not None:
             self._geometry.addGeometryObject(_table(kinematics, table_z_m))
@@ -89,27 +97,43 @@ class CollisionModel:
         used = [pair for pair, keep in zip(pairs, wanted, strict=True) if keep]
         apart = self._add_keep_outs(kinematics, keep_out or {}, links)
         self._require_apart(apart, known_good_rad, touching_m)
-        self._use([*used, *apart])
+        self._pairs, self._held_pairs = [*used, *apart], self._add_held(kinematics)
+        self._use(self._pairs)
         last = kinematics.model.njoints - 1
         self.pairs: tuple[CollisionPair, ...] = tuple(
-            self._pair(first, second, last, keep_out=index >= len(used))
-            for index, (first, second) in enumerate([*used, *apart])
+            self._pair(first, second, last) for first, second in [*self._pairs, *self._held_pairs]
         )
 
     def links(self) -> Any:
         """A geometry model of the arm's links alone, a hull each."""
         alone = pin.GeometryModel()
-        for shape in list(self._geometry.geometryObjects)[: self._links]:
+        shapes = list(self._geometry.geometryObjects)
+        for shape in shapes[: self._links] + (shapes[-1:] if self.held else []):
             alone.addGeometryObject(shape)
         return alone
 
+    def hold(self, box: HeldBox | None) -> None:
+        """Count `box` among the arm's links, at its TCP; None: the gripper holds nothing."""
+        self.held = box
+        if box is not None:
+            shape = self._geometry.geometryObjects[len(self._geometry.geometryObjects) - 1]
+            shape.geometry = coal.Box(np.array(box.size_m))
+            shape.placement = self._tcp * pin.SE3(np.eye(3), np.array(box.centre_m))
+        self._use([*self._pairs, *(self._held_pairs if box else ())])
+
     def distances(self, joints_rad: FloatArray) -> FloatArray:
-        """(len(pairs),) m, negative where two things are inside each other."""
+        """(len(pairs),) m, negative where two things are inside each other.
+
+        `FREE_M` for pairs of the held object while there is none.
+        """
         pin.updateGeometryPlacements(
             self._model, self._data, self._geometry, self._work, joints_rad
         )
         pin.computeDistances(self._geometry, self._work)
-        return np.array([result.min_distance for result in self._results])
+        found = [result.min_distance for result in self._results]
+        if self.held is None:
+            found += [FREE_M] * len(self._held_pairs)
+        return np.array(found)
 
     def gradients(self, joints_rad: FloatArray, indices: Sequence[int]) -> FloatArray:
         """(len(indices), n) m/rad: how these distances change with each joint.
@@ -137,11 +161,27 @@ class CollisionModel:
                 found[row] += sign * (normal @ (jacobian[:3] - pin.skew(arm_m) @ jacobian[3:]))
         return found
 
-    def _pair(self, first: int, second: int, last: int, *, keep_out: bool) -> CollisionPair:
+    def _pair(self, first: int, second: int, last: int) -> CollisionPair:
         link, other = (self._geometry.geometryObjects[index] for index in (first, second))
-        limit = "table_distance" if other.name == TABLE else "self_collision"
-        is_hand = link.parentJoint == last
-        return CollisionPair(link.name, other.name, "keep_out" if keep_out else limit, is_hand)
+        limit = "self_collision"
+        if other.parentJoint == 0 and second >= self._links:
+            limit = "table_distance" if other.name == TABLE else "keep_out"
+        return CollisionPair(link.name, other.name, limit, link.parentJoint == last)
+
+    def _add_held(self, kinematics: Kinematics) -> list[tuple[int, int]]:
+        """Add a box that is not there yet; its pairs with all but the wrist."""
+        joint, self._tcp = kinematics.tcp_placement
+        wrist = {joint}
+        for _ in range(WRIST - 1):
+            wrist |= {kinematics.model.parents[each] for each in wrist} - {0}
+        others = [
+            index
+            for index, shape in enumerate(self._geometry.geometryObjects)
+            if shape.parentJoint not in wrist
+        ]
+        box = pin.GeometryObject(HELD, joint, 0, self._tcp, coal.Box(np.full(3, 1e-3)))
+        added = self._geometry.addGeometryObject(box)
+        return [(added, other) for other in others]
 
     def _add_keep_outs(
         self, kinematics: Kinematics, keep_out: Mapping[str, KeepOut], links: int

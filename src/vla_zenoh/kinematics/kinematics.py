@@ -109,6 +109,12 @@ class Kinematics:
         """Of the positions of joint `index`: rad, or m where it slides."""
         return "m" if self.slides[index] else "rad"
 
+    @property
+    def tcp_placement(self) -> tuple[int, Any]:
+        """The joint that moves the TCP, and the TCP's placement in its frame."""
+        frame = self.model.frames[self._tcp]
+        return frame.parentJoint, frame.placement
+
     # -- joints -------------------------------------------------------------------------------
     def ordered(self, names: Sequence[str], values: ArrayLike) -> FloatArray:
         """`values` (n,) given for `names` in any order, in the order of `arm_joints`.

@@ -96,7 +96,7 @@ def _check_size(width: int | None, height: int | None, resize: Resize) -> None:
 def _no_joints(kind: Any) -> Any:
     if isinstance(kind, str) and "joint" in kind:
         raise ValueError(
-            f"{kind!r} is no kind of action; joints are declared as space='joint' with "
+            f"{kind!r} is not a kind of action; joints are declared as space='joint' with "
             "joints=(names in the order of the columns) and kind='absolute', 'delta' or 'velocity'"
         )
     return kind
@@ -201,7 +201,7 @@ class ObservationSpec(_Spec):
                 f"{self.history_span_s:g} s, at most {MAX_HISTORY_S:g} s are kept"
             )
         if self.history > 1 and not (self.cameras or self.depth or self.state):
-            raise ValueError("there is nothing to have a history of: name cameras or state")
+            raise ValueError("a history needs cameras or state: name some")
         return self
 
     @property
@@ -331,7 +331,7 @@ class ActionSpec(_Spec):
             if each.part == part:
                 return each.action
         named = ", ".join(each.part for each in self.parts) or "no part by name"
-        raise SpecError(f"the spec says nothing of part {part!r}; it names {named}", "parts")
+        raise SpecError(f"the spec has no columns for part {part!r}; it names {named}", "parts")
 
     def columns(self, part: str) -> slice:
         """The columns of `part` in one step."""

@@ -74,22 +74,24 @@ def read_parts(text: str) -> tuple[str, ...]:
     return tuple(names)
 
 
-def read_state(text: str, size: int, joints: int) -> tuple[str, ...]:
+def read_state(text: str, size: int, joints: int, *more: int) -> tuple[str, ...]:
     """Names of the parts in `text`, whose numbers are `size` in all.
 
     Args:
-        text: see `read_parts`.
+        text: see `read_parts`; of a robot of several arms that of each, one after the other.
         size: how many numbers the model wants.
         joints: how many the arm has.
+        more: how many each further arm has.
 
     Raises:
         SpecError: a name that is not known, or another count; says what there is.
     """
     names = read_parts(text)
-    found = sum(size_of(name, joints) for name in names)
+    found = sum(size_of(name, count) for count in (joints, *more) for name in names)
     if found != size:
+        each = f" of {1 + len(more)} arms" if more else ""
         raise SpecError(
-            f"the model's state has {size} numbers, {text!r} has {found}; "
+            f"the model's state has {size} numbers, {text!r}{each} has {found}; "
             f"join its parts by +, in order: {known_parts(joints)}"
         )
     return names

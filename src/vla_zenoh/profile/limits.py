@@ -139,7 +139,7 @@ class KeepOut(Section):
         if self.normal is not None and not any(self.normal):
             yield ("normal",), "is zero; give a direction, as [0, 1, 0]"
         if self.yaw_rad and self.box_m is None:
-            yield ("yaw_rad",), "turns a box; this is none"
+            yield ("yaw_rad",), "rotates a box; this is not one"
 
 
 class ReachLimits(Section):

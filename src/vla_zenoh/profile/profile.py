@@ -159,6 +159,21 @@ class Profile(Section):
         made._part = name
         return made
 
+    def require_one_arm(self, what: str) -> None:
+        """Reject a robot of parts.
+
+        Args:
+            what: moves or shows one arm only; begins the message.
+
+        Raises:
+            ProfileError: the robot has parts.
+        """
+        if self.parts:
+            raise ProfileError(
+                f"{what}: for one arm only, and robot {self.robot.name!r} has the parts "
+                f"{', '.join(self.parts)}"
+            )
+
     def contradictions(self) -> Iterator[Fault]:
         """Sections that do not go together."""
         yield from _robot(self)
@@ -419,7 +434,7 @@ def _hosts(profile: Profile) -> Iterator[Fault]:
             yield (
                 (*place, "nodes"),
                 "is empty: give the host a node, or remove it. A computer that only drives or "
-                f"watches is no host: `vla-zenoh secure add {name} --role operator` (or viewer) "
+                f"watches is not a host: `vla-zenoh secure add {name} --role operator` (or viewer) "
                 "gives it a certificate",
             )
         yield from _unknown((*place, "cameras"), host.cameras or (), "cameras", profile.cameras)

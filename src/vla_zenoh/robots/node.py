@@ -169,8 +169,8 @@ class RobotNode:
         if mono_ns < self._brake_until_ns:
             return False
         self._emit_not_braked(
-            f"after {patience_s:.1f} s the arm is still braking; left where it is, because the "
-            "loop came too late too often"
+            f"after {patience_s:.1f} s the arm is still braking; giving up, because the "
+            "loop was late too often"
         )
         return True
 

@@ -59,8 +59,8 @@ class EstopLatch:
             except OSError as error:
                 done = "removed" if wanted is None else "written"
                 self._failures.put(
-                    f"{self._path} cannot be {done} ({error}): a command node that is started "
-                    "again will not know whether it is stopped"
+                    f"{self._path} cannot be {done} ({error}): a restarted command node "
+                    "will not know whether it is stopped"
                 )
 
     def _write(self, why: str | None) -> None:

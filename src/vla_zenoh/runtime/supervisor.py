@@ -279,7 +279,7 @@ class Supervisor:
         child.process, child.start_again_s = None, now + wait_s
         if child.reader is not None:
             child.reader.join(LAST_LINES_S)
-        how = f"killed by {_signal_name(-code)}" if code < 0 else f"ended with code {code}"
+        how = f"killed by {_signal_name(-code)}" if code < 0 else f"exited with code {code}"
         sentence = how
         if child.deaths_in_a_row < GIVE_UP_AFTER:
             sentence += f"; starting again in {wait_s:g} s"

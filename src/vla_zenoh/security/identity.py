@@ -91,7 +91,7 @@ def identities_of(profile: Profile, host: str) -> list[Identity]:
         known = ", ".join(sorted({*profile.hosts, *_people(profile)}))
         raise ProfileError(
             f"profile {profile.name} knows no host {host!r}, it knows: {known}. For a computer "
-            "from which people look or drive, say --role viewer or --role operator"
+            "that only watches or drives, use --role viewer or --role operator"
         )
     found = [*_nodes(profile, host)] if host in profile.hosts else []
     names = {identity.node for identity in found}

@@ -92,6 +92,7 @@ TABLE = (
     _setting("speed"),
     # Every role that may stop the arm may slow it down.
     _stream("slower", {OPERATOR}, {COMMAND, OPERATOR, VIEWER}),
+    _stream("held", {OPERATOR}, {COMMAND, OPERATOR, VIEWER}),
     _stream("stop", {OPERATOR}, {COMMAND, OPERATOR, VIEWER}),
     _stream("reset", {OPERATOR}, {COMMAND, ROBOT, OPERATOR, VIEWER}),
     _stream("save", {OPERATOR}, {OPERATOR, VIEWER}),

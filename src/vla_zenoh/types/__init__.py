@@ -34,7 +34,7 @@ if TYPE_CHECKING:
         JointCommand,
         PoseCommand,
     )
-    from vla_zenoh.types.reports import Event, NodeStatus, Task
+    from vla_zenoh.types.reports import Event, HeldBox, NodeStatus, Task
     from vla_zenoh.types.states import (
         Depth,
         GripperState,
@@ -60,6 +60,7 @@ __all__ = [
     "GripperCommand",
     "GripperState",
     "Header",
+    "HeldBox",
     "Image",
     "InferenceDebug",
     "JointCommand",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 from vla_zenoh.errors import RecordError
 from vla_zenoh.types.checks import (
@@ -20,6 +20,22 @@ from vla_zenoh.types.checks import (
 
 EVENT_LEVELS = ("info", "warning", "error")
 EVENT_KINDS = ("refusal", "transition", "limit", "fault", "notice")
+
+
+class HeldBox(NamedTuple):
+    """What a gripper holds, as a box whose axes are those of the TCP.
+
+    Args:
+        size_m: of its edges along x, y, z.
+        centre_m: from the TCP.
+    """
+
+    size_m: tuple[float, float, float]
+    centre_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __str__(self) -> str:
+        size, centre = (" ".join(f"{value:g}" for value in each) for each in self)
+        return f"{size} at {centre}" if any(self.centre_m) else size
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,6 +25,7 @@ from dataset_rig import (
     write_run,
 )
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from pair_recording_rig import WIDTH_M, write_pair_run
 
 from vla_zenoh.lab.dataset.episodes import episodes_of
 from vla_zenoh.lab.dataset.lerobot import export
@@ -112,3 +113,17 @@ def test_batches_are_made_and_one_episode_can_be_chosen(folder: Path) -> None:
     second = opened(folder, episodes=[1])
     assert len(second) == FRAMES
     np.testing.assert_array_equal(second[0]["action"].numpy(), steps_of(1, 0)[0])
+
+
+def test_a_run_of_two_arms_has_the_columns_of_a_robot_with_two_arms(tmp_path: Path) -> None:
+    run = write_pair_run(tmp_path / "pair.mcap")
+    export(tmp_path / "pair", episodes_of(load_run(run)), ["front"], ("joint", "gripper_m"))
+    dataset = opened(tmp_path / "pair")
+    for name in ("action", "observation.state"):
+        names = dataset.features[name]["names"]
+        assert names[:3] == ["left_joint1.pos", "left_joint2.pos", "left_gripper.pos"]
+        assert names[3:] == [each.replace("left", "right") for each in names[:3]]
+    found = np.stack([dataset[index]["action"].numpy() for index in range(len(dataset))])
+    wanted = [steps_of(0, chunk, 6)[:USED] for chunk in range(CHUNKS)]
+    np.testing.assert_array_equal(found, np.concatenate(wanted))
+    assert float(dataset[0]["observation.state"][5]) == pytest.approx(WIDTH_M["right"])

@@ -34,6 +34,7 @@ STATISTICS: dict[str, dict[str, torch.Tensor]] = {
 def write(
     folder: Path,
     action: Mapping[str, torch.Tensor] = STATISTICS["action"],
+    state: Mapping[str, torch.Tensor] = STATISTICS["observation.state"],
     **changes: Any,
 ) -> ACTPolicy:
     """Save a policy with its pipelines.
@@ -41,12 +42,13 @@ def write(
     Args:
         folder: is made.
         action: statistics of its actions.
+        state: statistics of the state.
         changes: of its config.
     """
     torch.manual_seed(0)
     features: Mapping[str, PolicyFeature] = {
         "observation.images.front": PolicyFeature(FeatureType.VISUAL, (3, HEIGHT, WIDTH)),
-        "observation.state": PolicyFeature(FeatureType.STATE, (STATE_SIZE,)),
+        "observation.state": PolicyFeature(FeatureType.STATE, tuple(state["mean"].shape)),
     }
     config = ACTConfig(
         **{
@@ -69,7 +71,8 @@ def write(
     )
     policy = ACTPolicy(config).eval()
     before, after = make_pre_post_processors(
-        config, dataset_stats={**STATISTICS, "action": dict(action)}
+        config,
+        dataset_stats={**STATISTICS, "action": dict(action), "observation.state": dict(state)},
     )
     # As after a real training: the file names weights that would be fetched.
     config.pretrained_backbone_weights = "ResNet18_Weights.IMAGENET1K_V1"

@@ -244,7 +244,9 @@ OVER_INPUTS: list[tuple[Writer, str]] = [
 ]
 
 
-@pytest.mark.parametrize(("writer", "name"), OVER_INPUTS, ids=str)
+@pytest.mark.parametrize(
+    ("writer", "name"), OVER_INPUTS, ids=lambda each: getattr(each, "words", each)
+)
 def test_an_input_is_not_overwritten_even_by_force(writer: Writer, name: str, here: Path) -> None:
     said = refusal(writer, str(here / name), "--force")
     assert "input" in said or "current folder" in said

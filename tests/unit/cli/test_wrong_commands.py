@@ -19,7 +19,11 @@ WRONG: list[tuple[str, int, str]] = [
         "error: rate '1000' Hz is out of range: give 0.05 to 100 chunks per second",
     ),
     ("rate 0", FAILED, "error: rate '0' Hz is out of range: give 0.05 to 100 chunks per second"),
-    ("speed fast", FAILED, "error: 'fast' is no percentage: give a number from 0 to 100, such as"),
+    (
+        "speed fast",
+        FAILED,
+        "error: 'fast' is not a percentage: give a number from 0 to 100, such as",
+    ),
     ("speed 120", FAILED, "error: speed '120' percent is out of range: give 0 to 100 percent"),
     ("use a/b", FAILED, "error: worker name 'a/b' cannot be part of a key"),
     ("use", USAGE, "Missing argument 'worker'"),

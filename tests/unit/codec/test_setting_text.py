@@ -13,6 +13,7 @@ from random_records import refusal
 from vla_zenoh import keys
 from vla_zenoh.codec import settings
 from vla_zenoh.errors import CodecError
+from vla_zenoh.types import HeldBox
 
 DECODERS: dict[str, Callable[[bytes], Any]] = {
     "text": settings.decode_text,
@@ -121,7 +122,7 @@ def test_a_speed_is_a_number_of_percent(word: str, percent: float) -> None:
 
 @pytest.mark.parametrize("word", ["", "%", "slow", "30 % %", "% 30", "nan", "0x5", "5,0", "true"])
 def test_what_is_no_percentage_is_no_speed(word: str) -> None:
-    with pytest.raises(CodecError, match="is no percentage: give a number from 0 to 100"):
+    with pytest.raises(CodecError, match="is not a percentage: give a number from 0 to 100"):
         settings.decode_percent(word.encode())
 
 
@@ -152,3 +153,23 @@ def test_a_seed_is_nothing_or_a_whole_number() -> None:
     for word in ("-1", "1.5", "x", "\u0665", "1" * 11, "²"):
         with pytest.raises(CodecError, match="is not a seed"):
             settings.decode_seed(word.encode())
+
+
+def test_what_a_gripper_holds_is_a_size_and_may_have_a_place() -> None:
+    assert settings.decode_held(b"0.04 0.04 0.12") == HeldBox((0.04, 0.04, 0.12))
+    found = settings.decode_held(b" .04,.04,.12 at 0, 0, -2e-2\n")
+    assert found == HeldBox((0.04, 0.04, 0.12), (0.0, 0.0, -0.02))
+    assert settings.decode_held(str(found).encode()) == found
+    assert settings.decode_held(b"") == ""
+
+
+@pytest.mark.parametrize("word", ["0.1", "0.1 0.1", "a b c", "1 1 1 1", "nan 1 1", "1 1 1 at 1 1"])
+def test_what_is_no_box_is_rejected_with_an_example(word: str) -> None:
+    with pytest.raises(CodecError, match=r"is no box: give its size .* such as '0.04"):
+        settings.decode_held(word.encode())
+
+
+@pytest.mark.parametrize("word", ["0 1 1", "-1 1 1", "40 40 120", "0.1 0.1 0.1 at 2 0 0"])
+def test_a_held_box_in_millimetres_or_without_a_size_is_rejected(word: str) -> None:
+    with pytest.raises(CodecError, match=r"out of range: edges 0.001 to 1 m"):
+        settings.decode_held(word.encode())

@@ -37,7 +37,7 @@ def test_an_arm_in_motion_brakes_when_who_holds_it_is_gone() -> None:
     rig.peers = replace(rig.peers, holders=frozenset({BEN}))
     rig.tick()
     assert rig.state == "inactive"
-    assert rig.commander.why == "'anna-1', who held the arm active, is gone"
+    assert rig.commander.why == "deadman 'anna-1' is gone"
     rig.settle()
 
 
@@ -56,7 +56,7 @@ def test_nobody_activates_in_the_name_of_one_who_is_not_there() -> None:
     rig.put("active", ANNA)
     assert rig.state == "inactive"
     assert rig.refused == {"activate_refused": 1}
-    assert "'anna-1', who is to hold the arm active, is not there" in rig.commander.why
+    assert "the deadman of this activation, 'anna-1', is not there" in rig.commander.why
 
 
 def test_what_one_holds_is_not_taken_over_by_others_or_by_nobody() -> None:

@@ -132,7 +132,7 @@ def test_when_all_is_well_there_is_no_reason() -> None:
         ("worker 'ghost' is not alive", set_("worker", "ghost")),
         ("has not published its spec", peers(specs={})),
         ("needs a prompt and there is none", set_("prompt", "")),
-        ("worker 'scripted' says: no sun", peers(worker_complaints={WORKER: "no sun"})),
+        ("worker 'scripted' reports: no sun", peers(worker_complaints={WORKER: "no sun"})),
         ("has published no chunk in the last 2.2 s", set_("chunk", None)),
         ("has published no chunk in the last 2.2 s", later(2.3)),
         ("has published no chunk", by_another_source),

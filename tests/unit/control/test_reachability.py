@@ -15,11 +15,11 @@ from pydantic import ValidationError
 from vla_zenoh.control.limits import SLOWEST, LimitHit
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.errors import ProfileError, RecordError
-from vla_zenoh.kinematics.collision import TABLE, CollisionModel
+from vla_zenoh.kinematics.collision import HELD, TABLE, CollisionModel
 from vla_zenoh.kinematics.kinematics import smallest_singular_value
 from vla_zenoh.kinematics.so3 import Pose, angle_between, log3
 from vla_zenoh.profile import Limits, ReachLimits
-from vla_zenoh.types import FloatArray
+from vla_zenoh.types import FloatArray, HeldBox
 
 STEP_M, STEP_RAD = 0.01, 0.05
 SOLVED_M = 2e-6
@@ -226,7 +226,7 @@ def test_a_keep_out_around_the_arm_at_home_is_an_error_with_its_name_and_the_lin
         ({}, "has no shape; give one of box_m, radius_m, normal"),
         ({"radius_m": 0.1, "normal": [0, 0, 1]}, "has radius_m and normal; give one of"),
         ({"normal": [0, 0, 0]}, "is zero; give a direction"),
-        ({"radius_m": 0.1, "yaw_rad": 1.0}, "turns a box; this is none"),
+        ({"radius_m": 0.1, "yaw_rad": 1.0}, "rotates a box; this is not one"),
         ({"box_m": [0.1, 0.0, 0.1]}, "greater than 0"),
         ({"radius_m": 450.0}, "less than or equal to 3"),
     ],
@@ -234,6 +234,53 @@ def test_a_keep_out_around_the_arm_at_home_is_an_error_with_its_name_and_the_lin
 def test_a_keep_out_that_is_no_shape_is_rejected(shape: dict[str, Any], said: str) -> None:
     with pytest.raises(ValidationError, match=said):
         limits(keep_out={"post": {"centre_m": [0.5, 0, 0], **shape}})
+
+
+# -- what the gripper holds -----------------------------------------------------------------------
+BAR = HeldBox((0.04, 0.04, 0.2))
+"""Half of it is below the TCP, whose z axis points down."""
+
+
+def test_what_the_gripper_holds_stops_above_the_table_as_the_fingers_would() -> None:
+    def lowest_m(box: HeldBox | None) -> float:
+        model = ReachabilityFilter(KINEMATICS, MIDDLE_RAD, limits(), known_good_rad=[HOME_RAD])
+        model.hold(box)
+        pose, hits = KINEMATICS.forward(MIDDLE_RAD), []
+        for _ in range(60):
+            pose, hits = model.bound(pose, moved(pose, STEP_M * DOWN, STILL))
+        assert hits[0].name in ("table_distance", "workspace")
+        return float(pose.position_m[2])
+
+    assert LIMITS.table_z_m is not None
+    held_m = lowest_m(BAR)
+    bottom_m = held_m - BAR.size_m[2] / 2 - LIMITS.table_z_m
+    assert bottom_m == pytest.approx(LIMITS.table_stop_m, abs=2e-3)
+    assert held_m > lowest_m(None) + 0.05
+
+
+def test_a_box_that_stands_on_the_table_is_lifted_and_not_pushed() -> None:
+    assert LIMITS.table_z_m is not None
+    start_m = LIMITS.table_z_m + BAR.size_m[2] / 2
+    start_rad = tool_down_at(KINEMATICS, 0.45, 0.0, start_m)
+    model = ReachabilityFilter(KINEMATICS, start_rad, limits(), known_good_rad=[HOME_RAD])
+    model.hold(BAR)
+    start = KINEMATICS.forward(start_rad)
+    down, hits = model.bound(start, moved(start, STEP_M * DOWN, STILL))
+    assert hits[0].name == "table_distance"
+    assert HELD in hits[0].where
+    assert start.position_m[2] - down.position_m[2] < 1e-4
+    up, hits = model.bound(down, moved(down, STEP_M * UP, STILL))
+    assert not hits
+    assert up.position_m[2] - down.position_m[2] == pytest.approx(STEP_M)
+
+
+def test_an_arm_that_let_go_has_the_bounds_that_it_had() -> None:
+    model = ReachabilityFilter(KINEMATICS, MIDDLE_RAD, limits(), known_good_rad=[HOME_RAD])
+    before = model.margins
+    model.hold(BAR)
+    assert model.margins.table_m < before.table_m
+    model.hold(None)
+    assert model.margins == before
 
 
 @pytest.mark.parametrize("axis", [ROLL, PITCH])

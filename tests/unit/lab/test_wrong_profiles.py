@@ -83,5 +83,5 @@ def test_up_runs_the_same_check_before_it_starts_anything(
     done = typed(capsys, "up", str(path))
     assert (done.code, done.stdout) == (1, "")
     assert expected(said, path.parent) in done.stderr
-    why = f"{path} has faults, which `vla-zenoh profile check` names too"
+    why = f"{path} has faults; `vla-zenoh profile check` lists them too"
     assert done.stderr.endswith(f"error: nothing was started: {why}\n")

@@ -155,7 +155,7 @@ def test_what_is_kept_is_bounded_in_time_and_number() -> None:
         ({"history": 2, "history_spacing_s": None}, "go together"),
         ({"history": 1, "history_spacing_s": 0.1}, "go together"),
         ({"history": 16, "history_spacing_s": 0.2}, "span 3 s, at most 2 s are kept"),
-        ({"cameras": (), "state": ()}, "nothing to have a history of"),
+        ({"cameras": (), "state": ()}, "a history needs cameras or state"),
         ({"history": 17}, "less than or equal to 16"),
     ],
 )

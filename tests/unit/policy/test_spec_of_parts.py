@@ -39,7 +39,7 @@ def test_a_spec_of_one_arm_is_that_of_its_only_part() -> None:
     assert one.of("") is one
     assert one.columns("") == slice(0, 7)
     assert "parts" not in one.model_dump()
-    with pytest.raises(SpecError, match="says nothing of part 'left'"):
+    with pytest.raises(SpecError, match="has no columns for part 'left'"):
         one.of("left")
 
 

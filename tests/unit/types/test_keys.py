@@ -129,6 +129,10 @@ def test_a_key_is_told_from_those_of_other_robots() -> None:
     assert ours.group(key) == "camera"
     assert ours.group(ours.prompt) == "prompt"
     assert theirs.group(key) == ""
+    left = ours.of_part("left").state_pose
+    assert (ours.group(left), ours.part_of(left)) == ("state", "left")
+    assert [ours.part_of(each) for each in (key, ours.prompt, ours.state_pose)] == ["", "", ""]
+    assert theirs.part_of(left) == ""
     assert ours.on(theirs, key) == theirs.camera_jpeg("front")
 
 

@@ -29,6 +29,7 @@ def run_demo(segments: list[DemoSegment], profile: str, given: DemoOptions) -> N
         steps = max(round(given.seconds * given.rate_hz), 1)
         segments = [replace(segment, steps=steps) for segment in segments]
     with open_stage(profile, folder, force=given.force) as stage:
+        stage.profile.require_one_arm("fixed motions of demo")
         outcomes, statuses = _run(stage, segments, given.rate_hz)
         run, interrupted = stage.recorded(), len(outcomes) < len(segments)
         summary = _summary(stage.profile, given.rate_hz, outcomes, statuses, run)

@@ -21,7 +21,7 @@ from vla_zenoh.cli.output import Screen, errors, progress_bars
 from vla_zenoh.lab.cli.bench_file import running_nodes
 from vla_zenoh.lab.cli.loopback import own_address
 from vla_zenoh.lab.cli.output_path import RUNS, output_folder
-from vla_zenoh.lab.evaluation.mcap_file import evaluate_loaded
+from vla_zenoh.lab.evaluation.mcap_file import evaluate_parts
 from vla_zenoh.lab.evaluation.plot_image import write_plot
 from vla_zenoh.lab.recording.film import Film, write_film
 from vla_zenoh.lab.recording.recorder import Recorder
@@ -111,13 +111,14 @@ class Stage:
                 bars.update(filming, description="no images, no video", completed=1, total=1)
 
     def draw(self, run: Run) -> None:
-        """Write plot.png."""
+        """Write plot.png; of a robot of parts plot_PART.png of each."""
         with progress_bars(24, self.screen, counted=False) as bars:
-            drawing = bars.add_task("drawing plot.png", total=1)
-            found = evaluate_loaded(run)
-            found.name = self.name
-            write_plot(self.folder / "plot.png", found)
-            bars.update(drawing, completed=1)
+            drawing = bars.add_task("drawing plots", total=len(run.part_names))
+            for part, found in zip(run.part_names, evaluate_parts(run), strict=True):
+                found.name = f"{self.name}/{part}" if part else self.name
+                path = f"plot_{part}.png" if part else "plot.png"
+                write_plot(self.folder / path, found)
+                bars.update(drawing, advance=1)
 
 
 @contextmanager

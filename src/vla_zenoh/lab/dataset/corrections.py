@@ -7,6 +7,8 @@ goal at the beginning of a frame to that at its end, or that pose or those joint
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,6 +26,16 @@ from vla_zenoh.types import FloatArray
 
 BINARY = 0.5
 """How far from its threshold a binary gripper is told to be open or shut."""
+
+
+def commanded_motion(run: Run, spec: ActionSpec) -> Callable[[int, int], NDArray[np.float32]]:
+    """`CommandedMotion.action` of a run, of all parts of its robot."""
+    own = [CommandedMotion(run.of_part(each.part), each.action) for each in spec.parts]
+    if not own:
+        return CommandedMotion(run, spec).action
+    return lambda since_ns, until_ns: np.concatenate(
+        [motion.action(since_ns, until_ns) for motion in own]
+    )
 
 
 class CommandedMotion:

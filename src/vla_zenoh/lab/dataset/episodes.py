@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from vla_zenoh.control.actions import as_deltas
 from vla_zenoh.errors import RecordingError
-from vla_zenoh.lab.dataset.corrections import CommandedMotion
+from vla_zenoh.lab.dataset.corrections import commanded_motion
 from vla_zenoh.lab.dataset.label import EpisodeLabel
 from vla_zenoh.lab.evaluation.activations import activations, obeyed_chunks
 from vla_zenoh.lab.recording.run import RecordedSample, Run, newest
@@ -177,7 +177,7 @@ def _episode(
     own = [chunk for span in led if span[2] == whose for chunk in _within(span, carried_out)]
     spec, own = _one_by_one(_spec_of(run, own), own)
     mixed = any(worker != whose for _, _, worker in led)
-    motion = CommandedMotion(run, spec.action) if mixed else None
+    motion = commanded_motion(run, spec.action) if mixed else None
     parts = [(span, _within(span, own)) for span in led]
     begins = [
         chunks[0].record.observation_stamp_ns if chunks else span[0] for span, chunks in parts
@@ -194,7 +194,7 @@ def _episode(
             since_ns = max(begin_ns, frames[-1].stamp_ns + dt_ns if frames else begin_ns)
             stamps = [since_ns + dt_ns * at for at in range(round((end_ns - since_ns) / dt_ns))]
             frames += [
-                Frame(at_ns, motion.action(at_ns, at_ns + dt_ns), _prompt(run, at_ns), person)
+                Frame(at_ns, motion(at_ns, at_ns + dt_ns), _prompt(run, at_ns), person)
                 for at_ns in stamps
             ]
     return RecordedEpisode(run, whose, spec, led[0][0], led[-1][1], frames, led)
@@ -220,7 +220,7 @@ def _one_by_one(
     spec: ModelSpec, chunks: list[RecordedSample]
 ) -> tuple[ModelSpec, list[RecordedSample]]:
     """Chunks whose steps mean something one by one, also apart from the start of their chunk."""
-    if spec.action.relative_to == "previous":
+    if all(spec.action.of(part).relative_to == "previous" for part in spec.parts):
         return spec, chunks
     action, out = spec.action, []
     for chunk in chunks:
@@ -266,6 +266,9 @@ def _prompt(run: Run, at_ns: int) -> str:
 
 def hold(spec: ActionSpec, last: NDArray[np.float32]) -> NDArray[np.float32]:
     """(D,) the step without motion after `last`."""
+    if spec.parts:
+        own = [hold(each.action, last[spec.columns(each.part)]) for each in spec.parts]
+        return np.concatenate(own)
     if spec.kind == "absolute":
         out = last.copy()
     else:

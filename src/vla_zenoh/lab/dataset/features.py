@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.dataset.episodes import RecordedEpisode
-from vla_zenoh.lab.recording.run import nearest
+from vla_zenoh.lab.recording.run import Run, nearest
 from vla_zenoh.policy import ActionSpec, Observation
 from vla_zenoh.policy.spec import STREAM_OF
 from vla_zenoh.policy.state_vector import parts_of, state_vector
@@ -29,6 +29,7 @@ NAMES = {
     "wrench": [*(f"force_{axis}" for axis in "xyz"), *(f"torque_{axis}" for axis in "xyz")],
     "fingers_m": ["left_finger", "right_finger"],
 }
+GRIPPER_POSITIONS = ("gripper_m", "gripper_absolute_m", "gripper_open", "gripper_open_fraction")
 NEAR_NS = 100_000_000
 """Largest distance in time between a frame and its state."""
 
@@ -45,34 +46,76 @@ def state_names(parts: Sequence[str], joints: Sequence[str]) -> list[str]:
     return [name for part in parts for name in {**NAMES, **of_arm}.get(part, [part])]
 
 
-def joints_of(episode: RecordedEpisode) -> tuple[str, ...]:
-    """Names of the recorded arm joints; none without joint states."""
-    return episode.run.joints[0].record.names if episode.run.joints else ()
+def names_of_state(episode: RecordedEpisode, parts: Sequence[str]) -> list[str]:
+    """Names of the numbers of an episode's state, one part of the robot after the other.
+
+    Args:
+        episode: its recording has the names of the joints.
+        parts: of the state.
+    """
+    out: list[str] = []
+    for part in episode.spec.parts:
+        joints = episode.run.of_part(part).joints
+        names = joints[0].record.names if joints else ()
+        out += _of_part(part, state_names(parts, names), names)
+    return out
 
 
 def action_names(spec: ActionSpec) -> list[str]:
-    """Names of the numbers of a step."""
+    """Names of the numbers of a step, one part of the robot after the other."""
+    if spec.parts:
+        each = [
+            _of_part(
+                one.part,
+                action_names(one.action),
+                one.action.joints if one.action.kind == "absolute" else (),
+            )
+            for one in spec.parts
+        ]
+        return [name for names in each for name in names]
     gripper = [] if spec.gripper == "none" else [f"gripper_{spec.gripper}"]
     arm = spec.joints if spec.space == "joint" else [*NAMES["position"], *NAMES[spec.rotation]]
     return [*arm, *gripper]
 
 
+def _of_part(part: str, names: Sequence[str], joints: Sequence[str]) -> list[str]:
+    """Names as of LeRobot's robots with two arms: ``left_joint1.pos``, ``left_gripper.pos``.
+
+    Those that LeRobot has no name for follow the part as they are. Units are ours: rad, and metres
+    or a share of the opening.
+
+    Args:
+        part: of the robot; empty: it is one arm, whose names stay.
+        names: of its numbers.
+        joints: that are positions.
+    """
+    if not part:
+        return [*names]
+    own = {name: f"{name}.pos" for name in joints} | dict.fromkeys(GRIPPER_POSITIONS, "gripper.pos")
+    return [f"{part}_{own.get(name, name)}" for name in names]
+
+
 def usual_state(episodes: Sequence[RecordedEpisode]) -> str:
     """Parts of the state that go with the actions: joints with joints, else the pose."""
-    joints = bool(episodes) and episodes[0].spec.action.space == "joint"
+    first = episodes[0].spec if episodes else None
+    joints = first is not None and first.action.of(first.parts[0]).space == "joint"
     return "joint+gripper_m" if joints else "position+rpy+gripper_m"
 
 
 def states_of(episode: RecordedEpisode, parts: Sequence[str]) -> NDArray[np.float32]:
-    """(n, S) state of the robot at each frame.
+    """(n, S) state of the robot at each frame, one part of the robot after the other.
 
     Raises:
         RecordingError: no state was recorded near a frame.
     """
-    run = episode.run
+    each = [_states(episode, episode.run.of_part(part), parts) for part in episode.spec.parts]
+    return np.concatenate(each, axis=1)
+
+
+def _states(episode: RecordedEpisode, run: Run, parts: Sequence[str]) -> NDArray[np.float32]:
     streams: dict[str, Any] = {"joint": run.joints, "pose": run.poses, "gripper": run.grippers}
     wanted = {part: streams[STREAM_OF.get(part, part)] for part in parts_of(parts)}
-    most_m = run.max_width_m
+    most_m, place = run.max_width_m, f"{run.part}/" if run.part else ""
     task = Task(0, True, "", episode.worker, 1.0)
     rows = []
     for frame in episode.frames:
@@ -81,7 +124,7 @@ def states_of(episode: RecordedEpisode, parts: Sequence[str]) -> NDArray[np.floa
             near = nearest(stream, frame.stamp_ns)
             if near is None or abs(near.header.stamp_wall_ns - frame.stamp_ns) > NEAR_NS:
                 raise RecordingError(
-                    f"{run.path}: no state/{part} within {NEAR_NS / 1e6:g} ms of a frame"
+                    f"{run.path}: no {place}state/{part} within {NEAR_NS / 1e6:g} ms of a frame"
                 )
             name = {"effort": "effort_nm"}.get(part, part)
             found[name] = near.record if part in streams else getattr(near.record, name)

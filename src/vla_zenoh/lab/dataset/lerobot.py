@@ -28,8 +28,7 @@ from vla_zenoh.lab.dataset.features import (
     PICTURE,
     STATE,
     action_names,
-    joints_of,
-    state_names,
+    names_of_state,
     states_of,
 )
 from vla_zenoh.lab.dataset.videos import (
@@ -130,7 +129,7 @@ class _Dataset:
         self._spec = episodes[0].spec
         self._fps = fps_of(self._spec.action)
         self._states = [states_of(episode, parts) for episode in self._episodes]
-        self._state_names = state_names(parts, joints_of(episodes[0]))
+        self._state_names = names_of_state(episodes[0], parts)
         self._tasks = list(
             dict.fromkeys(frame.prompt for episode in self._episodes for frame in episode.frames)
         )

@@ -33,7 +33,7 @@ def openvla_statistics(folder: Path, name: str) -> dict[str, Any]:
             names = info["features"][column]["names"] or []
             found = feature_statistics.of_numbers(columns[column])
             content[part] = {figure: found[figure] for figure in FIGURES} | {
-                "mask": [not str(each).startswith("gripper") for each in names]
+                "mask": ["gripper" not in str(each) for each in names]
             }
     content["num_transitions"] = info["total_frames"]
     content["num_trajectories"] = info["total_episodes"]

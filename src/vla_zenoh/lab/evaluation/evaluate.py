@@ -27,6 +27,7 @@ _OF_ONE_RUN = (
         *("about", "film"),
     }
 )
+_OF_A_ROBOT = {"requests", "succeeded", "seconds", "refusals", "skipped", "verdicts"}
 
 
 def recordings(paths: Iterable[Path]) -> Iterator[Path]:
@@ -52,6 +53,8 @@ def evaluate(
 ) -> tuple[list[Evaluation], dict[str, str]]:
     """Evaluate every file, and in every folder the recordings, in the order of their names.
 
+    A robot of parts has an evaluation for each part.
+
     Args:
         paths: files and folders.
         pictures: number of moments to show of each camera.
@@ -60,7 +63,9 @@ def evaluate(
     Returns:
         Evaluations, and the reason for each file that has none.
     """
-    from vla_zenoh.lab.evaluation.mcap_file import evaluate_run  # needs the libraries of MCAP
+    # They need the libraries of MCAP.
+    from vla_zenoh.lab.evaluation.mcap_file import evaluate_parts
+    from vla_zenoh.lab.recording.run import load_run
 
     runs: list[Evaluation] = []
     faults: dict[str, str] = {}
@@ -70,7 +75,7 @@ def evaluate(
             faults[str(path)] = EMPTY.format(path)
         for file in found:
             try:
-                runs.append(evaluate_run(file, pictures=pictures))
+                runs += evaluate_parts(load_run(file), pictures=pictures)
             except RecordingError as error:
                 faults[str(file)] = str(error)
             evaluated(file)
@@ -78,16 +83,21 @@ def evaluate(
 
 
 def combined(runs: Sequence[Evaluation]) -> Evaluation:
-    """All runs as one: values of all requests together, lengths and counts added up."""
+    """All runs as one: values of all requests together, lengths and counts added up.
+
+    What the parts of a robot have in common counts once.
+    """
     out = Evaluation(COMBINED)
+    robots = list({run.path or id(run): run for run in reversed(runs)}.values())[::-1]
     for each in fields(Evaluation):
         if each.name not in _OF_ONE_RUN and each.name != "stages_ms":
-            setattr(out, each.name, _joined([getattr(run, each.name) for run in runs]))
+            of = robots if each.name in _OF_A_ROBOT else runs
+            setattr(out, each.name, _joined([getattr(run, each.name) for run in of]))
     if any(run.succeeded is None for run in runs):
         out.succeeded = None
     out.prompts = list(dict.fromkeys(out.prompts))
     out.stages_ms = {
-        stage: _joined([run.stages_ms[stage] for run in runs if stage in run.stages_ms])
+        stage: _joined([run.stages_ms[stage] for run in robots if stage in run.stages_ms])
         for stage in STAGES
         if any(stage in run.stages_ms for run in runs)
     }

@@ -43,7 +43,7 @@ class MeasuredMotion(NamedTuple):
 
 
 def evaluate_run(path: Path, *, pictures: int = 0) -> Evaluation:
-    """Evaluate a recording; `Evaluation.problems` lists what cannot be read.
+    """Evaluate a recording of one arm; `Evaluation.problems` lists what cannot be read.
 
     Args:
         path: of the file.
@@ -55,10 +55,22 @@ def evaluate_run(path: Path, *, pictures: int = 0) -> Evaluation:
     return evaluate_loaded(load_run(path), pictures=pictures)
 
 
+def evaluate_parts(run: Run, *, pictures: int = 0) -> list[Evaluation]:
+    """One evaluation of each part, named ``RUN/PART``; of one arm just that.
+
+    Requests, latencies and rejections are those of the robot, the same for all parts; pictures and
+    film are in the first.
+    """
+    first, *others = run.part_names
+    own = [evaluate_loaded(run.of_part(first), pictures=pictures)]
+    return own + [evaluate_loaded(run.of_part(part)) for part in others]
+
+
 def evaluate_loaded(run: Run, *, pictures: int = 0) -> Evaluation:
-    """`evaluate_run` of a run in memory."""
+    """`evaluate_run` of a run in memory, of one arm or part."""
     zero_ns = run.began_ns
     name = run.path.parent.name if run.path.stem == "run" else run.path.stem
+    name += f"/{run.part}" if run.part else ""
     out = Evaluation(name, run.path, problems=list(run.problems))
     if run.file.ended is None and not run.file.damage:
         out.problems.append("its recorder was ended before it could finish the file")

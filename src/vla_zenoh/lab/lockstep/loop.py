@@ -32,6 +32,7 @@ from vla_zenoh.types import (
     GripperCommand,
     GripperState,
     Header,
+    HeldBox,
     Image,
     JointCommand,
     JointState,
@@ -121,9 +122,11 @@ class Lockstep:
         self._publish_states()
 
     # -- from outside -------------------------------------------------------------------------
-    def put(self, name: str, value: str | bool | float | None = None) -> None:
+    def put(
+        self, name: str, value: str | bool | float | HeldBox | None = None, part: str = ""
+    ) -> None:
         """Publish a setting, for the next tick of the commander."""
-        self._inbox.settings = [*self._inbox.settings, Setting(name, value)]
+        self._inbox.settings = [*self._inbox.settings, Setting(name, value, part=part)]
 
     def run(self, duration_s: float) -> None:
         """Advance time by `duration_s`."""

@@ -43,6 +43,7 @@ GROUPS = (
     "rate",
     "speed",
     "slower",
+    "held",
     "stop",
     "reset",
     "status",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from bisect import bisect_left, bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,6 +36,8 @@ from vla_zenoh.types import (
 )
 
 MAX_PROBLEMS = 20
+PART_STREAMS = ("poses", "joints", "grippers", "commands", "joint_commands", "gripper_commands")
+"""Fields of a `Run` that each part of a robot has of its own."""
 
 
 class RecordedSample(NamedTuple):
@@ -68,7 +70,8 @@ class RecordedSetting(NamedTuple):
 class Run:
     """All records of one robot in a file, oldest first; a minute takes some 60 MB of memory.
 
-    Images stay in the file, see `pictures`.
+    Images stay in the file, see `pictures`. Of a robot of parts states and commands of all parts
+    are in the same lists; see `of_part`.
     """
 
     file: Recording
@@ -98,6 +101,8 @@ class Run:
     """Reception of the first sample."""
     ended_ns: int = 0
     """Reception of the last sample."""
+    part: str = ""
+    """Whose states and commands these are, of a robot of parts; empty: those of all."""
 
     @property
     def path(self) -> Path:
@@ -118,9 +123,30 @@ class Run:
     def max_width_m(self) -> float:
         """Of the gripper, from the profile in force; 1 without one, so that shares equal widths."""
         try:
-            return float(yaml.safe_load(self.file.profile_yaml)["robot"]["gripper"]["max_width_m"])
-        except (TypeError, KeyError, ValueError, yaml.YAMLError):
+            profile = yaml.safe_load(self.file.profile_yaml)
+            own = profile.get("parts", {}).get(self.part, {}).get("robot", {}).get("gripper", {})
+            return float({**profile["robot"]["gripper"], **own}["max_width_m"])
+        except (AttributeError, TypeError, KeyError, ValueError, yaml.YAMLError):
             return 1.0
+
+    @property
+    def part_names(self) -> tuple[str, ...]:
+        """Names of the parts that sent states, in alphabetical order; of one arm one empty name."""
+        keys = {entry.key for entry in (*self.poses, *self.joints, *self.grippers)}
+        found = {self.keys.part_of(key) for key in keys}
+        return (self.part,) if self.part else tuple(sorted(found)) or ("",)
+
+    def of_part(self, name: str) -> Run:
+        """The same run with states and commands of one part alone; of no name: this one."""
+        if not name:
+            return self
+        every = {entry.key for stream in PART_STREAMS for entry in getattr(self, stream)}
+        keys = {key for key in every if self.keys.part_of(key) == name}
+        own = {
+            stream: [entry for entry in getattr(self, stream) if entry.key in keys]
+            for stream in PART_STREAMS
+        }
+        return replace(self, part=name, **own)
 
     def prompts(self) -> list[tuple[int, str]]:
         """(wall ns, prompt) of each published prompt."""

@@ -130,9 +130,10 @@ class RollingRecord:
         self._note_beginning()
         keys = self.node.keys
         settings = (keys.prompt, keys.active, keys.worker, keys.rate, keys.speed, keys.slower)
+        held = [keys.of_part(part).held for part in self._profile.parts] or [keys.held]
         orders = (keys.stop, keys.reset, keys.save, keys.sim_reset)
         self._audit.subscribe(
-            (*settings, *orders, keys.event("command"), f"{keys.status('router')}$*")
+            (*settings, *held, *orders, keys.event("command"), f"{keys.status('router')}$*")
         )
         self._queue.subscribe(recorded_keys(keys))
         while not stop.wait(WRITE_S):

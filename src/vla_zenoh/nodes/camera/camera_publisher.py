@@ -107,7 +107,7 @@ class CameraPublisher:
     def count_broken(self) -> None:
         """Count an image that could not be decoded, and emit an event."""
         self.counts["broken"] += 1
-        why = "an image could not be decoded and was left out"
+        why = "an image could not be decoded and was skipped"
         self._emit(Event("warning", "fault", f"{self.name}:broken_picture", why))
 
     def captured(self, mono_ns: int) -> None:

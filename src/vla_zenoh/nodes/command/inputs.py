@@ -104,22 +104,27 @@ class CommandInputs:
         Without timestamps only the order on each key is kept.
         """
         arrivals = [
-            (_put_ns(arrival), name, decode, arrival)
+            (_put_ns(arrival), name, "", decode, arrival)
             for name, buffer, decode in self._settings
             for arrival in buffer.drain()
+        ]
+        arrivals += [
+            (_put_ns(arrival), "held", name, settings.decode_held, arrival)
+            for name, part in self._parts.items()
+            for arrival in part.held.drain()
         ]
         if not arrivals:
             return []
         if all(put_ns is not None for put_ns, *_ in arrivals):
             arrivals.sort(key=itemgetter(0))
         put: list[Setting] = []
-        for put_ns, name, decode, arrival in arrivals:
+        for put_ns, name, part, decode, arrival in arrivals:
             if name in ("stop", "reset"):
                 put.append(Setting(name, put_ns=put_ns))
                 continue
             value = self._node.decode_text(decode, arrival)
             if value is not None:
-                put.append(Setting(name, value, put_ns))
+                put.append(Setting(name, value, put_ns, part))
         return put
 
     def _chunk(self, arrival: ReceivedSample) -> Stamped[ActionChunk] | None:
@@ -156,13 +161,14 @@ class CommandInputs:
 
 
 class _PartInputs:
-    """Subscriptions to the states of one part."""
+    """Subscriptions to the states of one part, and to what it holds."""
 
     def __init__(self, node: Node, keys: Keys) -> None:
         self._node = node
         self._pose = node.subscribe(keys.state_pose, CallbackRing(STATES, SMALL_BYTES))
         self._gripper = node.subscribe(keys.state_gripper, CallbackRing(STATES, SMALL_BYTES))
         self._joint = node.subscribe(keys.state_joint, CallbackRing(STATES, SMALL_BYTES))
+        self.held = node.subscribe(keys.held, ZenohRing(16, WORDS))
         self._writers = {
             kind: SingleWriterFilter(node.profile.timing.state_timeout_s)
             for kind in (PoseState, JointState, GripperState)

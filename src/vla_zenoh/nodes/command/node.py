@@ -329,6 +329,8 @@ def _part_detail(part: CommandedPart) -> dict[str, Any]:
     """Goal, margins and external load of a part; None where a load is not measured."""
     detail: dict[str, Any] = {}
     goal, reach, contact = part.motion.goal, part.reach, part.contact
+    if part.held is not None:
+        detail["gripper_holds"] = str(part.held)
     if goal is not None:
         quat_xyzw = quat_from_rotation(goal.pose.rotation)
         detail["goal_m"] = [round(float(value), 6) for value in goal.pose.position_m]

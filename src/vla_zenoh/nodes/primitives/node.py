@@ -32,14 +32,14 @@ from vla_zenoh.codec.primitives import (
 from vla_zenoh.control.reachability import make_reachability_filter
 from vla_zenoh.control.states import DEACTIVATED
 from vla_zenoh.control.target_check import TargetCheck
-from vla_zenoh.errors import CodecError, NodeError, SessionError
+from vla_zenoh.errors import CodecError, SessionError
 from vla_zenoh.keys import PRIMITIVES, last_chunk, worker_node
 from vla_zenoh.kinematics.so3 import Pose, pose_of, rotation_from_quat
 from vla_zenoh.nodes.primitives.endings import NEAR_RAD, Arrival, Ending, Gripped, RunEnding, Sight
 from vla_zenoh.nodes.primitives.policy import CHUNK_HZ, Target, TargetPolicy
 from vla_zenoh.nodes.worker.robot_session import RobotSession
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import FloatArray
+from vla_zenoh.types import FloatArray, HeldBox
 
 POLL_S = 0.01
 SPEC_LEAD_S = 0.1
@@ -71,16 +71,13 @@ class PrimitivesNode:
         session: with the rights of a worker and of an operator.
 
     Raises:
-        NodeError: it is already running, or the robot has several arms.
+        NodeError: it is already running.
+        ProfileError: the robot has several arms.
         ResourceError: the robot's description is missing.
     """
 
     def __init__(self, profile: Profile, session: zenoh.Session) -> None:
-        if profile.parts:
-            raise NodeError(
-                f"primitives move one arm, and robot {profile.robot.name!r} has the parts "
-                f"{', '.join(profile.parts)}: drive it by a worker"
-            )
+        profile.require_one_arm("primitives")
         self._profile = profile
         self._policy = TargetPolicy(profile.robot.arm_joints)
         self._check = TargetCheck(profile, make_reachability_filter(profile))
@@ -196,6 +193,8 @@ class PrimitivesNode:
                 run = request if isinstance(request, Run) else None
                 self._activate(run.worker if run else PRIMITIVES, run and run.prompt, request)
                 reason, why = self._watch(ending, asked.since_s + request.timeout_s)
+            if isinstance(request, Grip) and reason == "reached":
+                self._tell_held(request)
             if isinstance(ending, Arrival):
                 off = ending.off(self._sight())
                 why = why or self._elbow(target)
@@ -211,6 +210,11 @@ class PrimitivesNode:
             off_m=None if off is None else round(off[0], 6),
             off_rad=None if off is None else round(off[1], 6),
         )
+
+    def _tell_held(self, request: Grip) -> None:
+        box = None if request.holds_m is None else HeldBox(request.holds_m)
+        self._check.hold(box)
+        self._robot.publish(self._robot.keys.held, "" if box is None else str(box))
 
     def _prepare(self, request: Request) -> tuple[Ending, Target]:
         """Ending and target of a request.
@@ -298,8 +302,8 @@ class PrimitivesNode:
         asked_rad = self._check.kinematics.ordered(names, target.joints_rad)
         off_rad = float(np.abs(self._sight().joints_rad - asked_rad).max())
         return (
-            f"this robot takes poses: the TCP is where these joints place it, they are up to "
-            f"{off_rad:.2g} rad away, where its controller keeps the elbow"
+            f"this robot takes poses: the TCP is where these joints place it, the joints are up to "
+            f"{off_rad:.2g} rad away, because its controller keeps the elbow"
             if off_rad > NEAR_RAD
             else ""
         )
