@@ -383,6 +383,7 @@ class Lab:
 
 
 def _save_jpeg(image: Any, folder: Path, name: str) -> None:
+    data = b""
     for quality in range(92, 30, -4):
         data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
         if len(data) <= MOST_BYTES:
