@@ -9,7 +9,7 @@ import numpy as np
 from vla_zenoh.bus.buffers import LatestSample
 from vla_zenoh.bus.clock import FixedRate
 from vla_zenoh.bus.metrics import RateMeter
-from vla_zenoh.bus.node import Node
+from vla_zenoh.bus.node import Node, publish_together
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec.records import SMALL_BYTES
 from vla_zenoh.keys import Kind
@@ -53,9 +53,8 @@ def play_robot(profile_file: str, stop: threading.Event, *, follows: bool) -> No
             if order is not None:
                 told = order.record
                 pose = PoseState(told.position_m, told.quat_xyzw, told.twist)
-            header = poses.publish(pose)
-            arms.publish(joints, stamp_wall_ns=header.stamp_wall_ns, seq=header.seq)
-            grippers.publish(gripper, stamp_wall_ns=header.stamp_wall_ns, seq=header.seq)
+            states = (poses, pose), (arms, joints), (grippers, gripper)
+            publish_together(node.clock.wall_ns(), poses.seq, *states)
             rate.tick()
             node.publish_status(
                 "following" if follows else "standing", rates_hz={"state": rate.rate_hz}

@@ -98,10 +98,12 @@ class CommandedPart:
     def update(self, states: PartStates) -> None:
         """Take the newest states."""
         if states.pose is not None:
+            same = self.pose is not None and states.pose.record is self.pose.record
             self.pose = states.pose
             self.planner.poses.add(states.pose, FUTURE_NS)
             self.contact.update_pose(states.pose)
-            self._measured = pose_of(states.pose.record)
+            if self._measured is None or not same:
+                self._measured = pose_of(states.pose.record)
             self.retreat.measure(self._measured)
         if states.joint is not None:
             self.joint = states.joint

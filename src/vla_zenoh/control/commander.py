@@ -149,6 +149,7 @@ class Commander:
             self._stop_put_ns, self._stop_came_ns = max(put_ns, default=0), now_ns
         for setting in inputs.settings:
             self._apply_setting(setting, now_ns, stopped)
+        planned = self._prepared or bool(inputs.chunks)
         if not self._prepared:
             self._begin_planning()
         self._prepared = False
@@ -157,7 +158,7 @@ class Commander:
         self._plan_chunks(now_ns)
         self._supervise(now_ns)
         for part in self.parts:
-            if not inputs.chunks or part.monitor_late(now_ns):  # planning them is work enough
+            if not planned or part.monitor_late(now_ns):  # a new goal is work enough
                 self._monitor_joints(part, now_ns)
         self._monitor_distance(now_ns)
         self._keep_apart(now_ns, ticks)

@@ -57,12 +57,12 @@ class _LoadFilter:
         unit: str,
         slow: float | None,
         stop: float | None,
-        size: Callable[[Sequence[float]], float],
+        apart: Callable[[Sequence[float], Sequence[float]], float],
     ) -> None:
         self.name, self.unit = name, unit
         self.stop = math.inf if stop is None else stop
         self.slow = self.stop if slow is None else slow
-        self._size = size
+        self._apart = apart
         self.known = False
         self._filtered: list[float] = []
         self._bias: list[float] = []
@@ -83,31 +83,23 @@ class _LoadFilter:
             drift = dt_s / DRIFT_S
             bias = [b + drift * (f - b) for b, f in zip(self._bias, filtered, strict=True)]
             self._bias = self._near(bias, self._start_bias)
-        self._measure()
+        self.value = self._apart(filtered, self._bias)
 
     def zero(self) -> None:
         """Take the present load for the bias, as far as `slow`."""
         self._bias = self._start_bias = self._near(self._filtered, [0.0] * len(self._filtered))
-        self._measure()
+        self.value = self._apart(self._filtered, self._bias)
 
-    def _near(self, values: Sequence[float], middle: Sequence[float]) -> list[float]:
-        apart = [v - m for v, m in zip(values, middle, strict=True)]
-        size = self._size(apart)
-        if size <= self.slow:
-            return list(values)
-        share = self.slow / max(size, 1e-9)
-        return [m + share * a for m, a in zip(middle, apart, strict=True)]
-
-    def _measure(self) -> None:
-        self.value = self._size([f - b for f, b in zip(self._filtered, self._bias, strict=True)])
+    def _near(self, values: list[float], middle: Sequence[float]) -> list[float]:
+        apart = self._apart(values, middle)
+        if apart <= self.slow:
+            return values
+        share = self.slow / max(apart, 1e-9)
+        return [m + share * (v - m) for v, m in zip(values, middle, strict=True)]
 
 
-def _length(values: Sequence[float]) -> float:
-    return math.hypot(*values)
-
-
-def _greatest(values: Sequence[float]) -> float:
-    return max(map(abs, values), default=0.0)
+def _greatest(values: Sequence[float], others: Sequence[float]) -> float:
+    return max((abs(a - b) for a, b in zip(values, others, strict=True)), default=0.0)
 
 
 class Contact:
@@ -119,10 +111,10 @@ class Contact:
 
     def __init__(self, limits: ContactLimits) -> None:
         self._force = _LoadFilter(
-            "contact_force", "N", limits.force_slow_n, limits.force_stop_n, _length
+            "contact_force", "N", limits.force_slow_n, limits.force_stop_n, math.dist
         )
         self._torque = _LoadFilter(
-            "contact_torque", "Nm", limits.torque_slow_nm, limits.torque_stop_nm, _length
+            "contact_torque", "Nm", limits.torque_slow_nm, limits.torque_stop_nm, math.dist
         )
         self._effort = _LoadFilter(
             "contact_effort", "Nm", limits.effort_slow_nm, limits.effort_stop_nm, _greatest

@@ -14,6 +14,9 @@ follows the measured one: beyond ``limits.elbow_rad`` the arm slows down, at twi
 
 from __future__ import annotations
 
+from operator import is_
+from typing import Any
+
 import numpy as np
 
 from vla_zenoh.control.limits import SLOWEST, LimitHit, Slowdown, joint_margins, slowest
@@ -31,6 +34,8 @@ PAST_MARGIN = 0.5
 BAND_RAD, BAND_M, BAND_SINGULAR = 2e-3, 5e-4, 5e-4
 STEPS = 20
 """Number of speed shares, so that the share does not change at every update."""
+
+_NOTHING = (None, None, None)
 
 
 class JointMonitor:
@@ -63,6 +68,8 @@ class JointMonitor:
         """Greatest distance of a joint from where it is expected."""
         self._bound_slowdown: Slowdown | None = None
         self._elbow_slowdown: Slowdown | None = None
+        # Joints that passed each check, so that an arm at rest is not checked again.
+        self._passed: list[tuple[Any, ...]] = [_NOTHING, _NOTHING]
 
     @property
     def slowdown(self) -> Slowdown | None:
@@ -96,9 +103,15 @@ class JointMonitor:
             return None
         self._next_ns = now_ns + PERIOD_NS // 2
         self._elbow_next = not self._elbow_next
+        seen = measured_rad, commanded_rad, in_joints
+        if self.slowdown is None and all(map(is_, seen, self._passed[self._elbow_next])):
+            return None  # nothing moved since they passed this check
         if self._elbow_next:
-            return self._bounds(measured_rad, in_joints=in_joints)
-        return self._elbow(measured_rad, commanded_rad)
+            hit = self._bounds(measured_rad, in_joints=in_joints)
+        else:
+            hit = self._elbow(measured_rad, commanded_rad)
+        self._passed[self._elbow_next] = seen if hit is None else _NOTHING
+        return hit
 
     def _bounds(self, measured_rad: FloatArray, *, in_joints: bool) -> LimitHit | None:
         kinematics, barriers = self._reach.kinematics, self._reach.barriers

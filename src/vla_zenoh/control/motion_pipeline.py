@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from operator import is_
 from typing import NamedTuple
 
 import numpy as np
@@ -131,11 +132,15 @@ class MotionPipeline:
         self._slowed_by: set[str] = set()
         self._smoother: Smoother | None = None
         self._standing: tuple[Pose, FloatArray | None, int] | None = None
+        self._measured: tuple[PoseState | None, JointState | None] = None, None
         self._measured_ns = 0
         self._timings: list[StepTiming] = []
         """Of poses, and of joints."""
         self._cause: Cause | None = None
         self._rest_since_ns: int | None = None
+        self._sent: PoseCommand | None = None
+        self._made_of: tuple[Motion, Goal | None, State, Cause | None] | None = None
+        """The pose command made last, and what it was made of."""
 
     # -- state --------------------------------------------------------------------------------
     @property
@@ -313,10 +318,12 @@ class MotionPipeline:
         if not self.streaming or not self.at_rest:
             self._standing = None
             return
-        held = held_pose(measured)
-        held_rad = None if self._joints is None or joint is None else self._held_joints(joint)
-        if self._standing is None or max(_apart(held, held_rad, *self._standing[:2])) > SETTLED:
-            self._standing = held, held_rad, received_ns
+        before, self._measured = self._measured, (measured, joint)
+        if self._standing is None or not all(map(is_, before, self._measured)):
+            held = held_pose(measured)
+            held_rad = None if self._joints is None or joint is None else self._held_joints(joint)
+            if self._standing is None or max(_apart(held, held_rad, *self._standing[:2])) > SETTLED:
+                self._standing = held, held_rad, received_ns
         self._measured_ns = received_ns
 
     def unsettled(self) -> list[str]:
@@ -647,10 +654,14 @@ class MotionPipeline:
         return self.streaming and now_ns - self._rest_since_ns < LINGER_NS
 
     def _pose_command(self, motion: Motion, state: State) -> PoseCommand:
+        made_of = motion, self.goal, state, self._cause
+        if self._made_of and self._sent and all(map(is_, made_of, self._made_of)):
+            return self._sent  # the arm is at rest
         (position_m, rotation), twist, acceleration = motion
         goal = self.goal.pose if self.goal else motion.pose
         quat_xyzw, goal_quat_xyzw = map(quat_from_rotation, (rotation, goal.rotation))
-        return computed(
+        self._made_of = made_of
+        self._sent = computed(
             PoseCommand,
             position_m,
             quat_xyzw,
@@ -661,6 +672,7 @@ class MotionPipeline:
             state.value,
             self._cause,
         )
+        return self._sent
 
 
 def _apart(

@@ -29,6 +29,7 @@ class Watchdog:
         self._limits, self._timing = profile.limits, profile.timing
         self.tracking_m = self.tracking_rad = 0.0
         self._excused = (0.0, 0.0)
+        self._compared: tuple[Pose | None, Pose | None] = None, None
         self.deadline_ns = 0
         """When the next chunk is overdue."""
         self._left_ns, self._patience_ns = 0.0, 0
@@ -91,6 +92,9 @@ class Watchdog:
 
     def measure(self, commanded: Pose | None, actual: Pose) -> None:
         """Update the tracking error; `commanded` is None while nothing is streamed."""
+        before, self._compared = self._compared, (commanded, actual)
+        if commanded is before[0] and actual is before[1]:
+            return
         self.tracking_m, self.tracking_rad = (
             (0.0, 0.0) if commanded is None else pose_distance(commanded, actual)
         )

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 from vla_zenoh.bus.buffers import CallbackRing
-from vla_zenoh.bus.node import Node
+from vla_zenoh.bus.node import Node, Publisher, publish_together
 from vla_zenoh.codec.records import SMALL_BYTES
 from vla_zenoh.errors import CodecError
 from vla_zenoh.guard.arm_guard import Measured
@@ -103,7 +104,7 @@ class Arm:
         if measurement is None:
             if fault_changed or (self._driver.fault and elapsed_ns >= FAULT_AGAIN_NS):
                 stamp_ns = mono_ns if self._driver.lockstep else self._node.clock.wall_at(mono_ns)
-                self._publish_gripper(self._gripper, stamp_ns, mono_ns)
+                self._publish(stamp_ns, mono_ns, self._gripper)
             return
         if not fault_changed and elapsed_ns < self._period_ns:
             return
@@ -117,16 +118,23 @@ class Arm:
             )
         if held_rad is not None:
             joints = replace(joints, reference_rad=held_rad)
-        self._joint_out.publish(joints, stamp_wall_ns=stamp_ns, seq=self._seq)
-        self._pose_out.publish(pose, stamp_wall_ns=stamp_ns, seq=self._seq)
-        self._publish_gripper(measurement.gripper, stamp_ns, mono_ns)
+        states = (self._joint_out, joints), (self._pose_out, pose)
+        self._publish(stamp_ns, mono_ns, measurement.gripper, *states)
 
-    def _publish_gripper(self, gripper: GripperState | None, stamp_ns: int, mono_ns: int) -> None:
+    def _publish(
+        self,
+        stamp_ns: int,
+        mono_ns: int,
+        gripper: GripperState | None,
+        *states: tuple[Publisher, Any],
+    ) -> None:
+        """Publish states of one time, that of the gripper with fault and mode among them."""
         fault, state = self._driver.fault, self.state
         if gripper is not None:
             mode = state if state in NOT_READY else self._driver.gripper_mode
             gripper = replace(gripper, mode=mode, faults=(fault,) if fault else ())
-            self._gripper_out.publish(gripper, stamp_wall_ns=stamp_ns, seq=self._seq)
+            states = *states, (self._gripper_out, gripper)
+        publish_together(stamp_ns, self._seq, *states)
         self._seq += 1
         self._published_ns, self._published_fault = mono_ns, fault
 

@@ -74,6 +74,26 @@ def test_an_arm_that_comes_near_to_a_bound_is_slower_and_then_brakes_and_says_wh
     assert limit is None or hit.limit == limit
 
 
+def test_an_arm_that_stood_for_long_is_checked_again_as_soon_as_it_moves() -> None:
+    watching = Watching()
+    assert watching.at(HOME_RAD, ticks=50 * TICKS_A_LOOK) is None
+    for step in range(1, 6):
+        joints_rad = HOME_RAD - step / 5 * 0.5 * JOINT["panda_joint4"]
+        watching.commanded_rad = joints_rad
+        hit = watching.at(joints_rad)
+    assert hit is not None
+    assert hit.name == "joint_limit"
+
+
+def test_an_arm_that_stands_still_is_checked_again_when_its_command_moves_away() -> None:
+    watching = Watching(commanded_rad=HOME_RAD)
+    assert watching.at(HOME_RAD, ticks=50 * TICKS_A_LOOK) is None
+    watching.commanded_rad = HOME_RAD + 3 * LIMITS.elbow_rad * JOINT["panda_joint1"]
+    hit = watching.at(HOME_RAD)
+    assert hit is not None
+    assert hit.name == "elbow_rad"
+
+
 def test_on_the_way_back_an_arm_is_neither_slower_nor_braked() -> None:
     watching = Watching()
     way_rad = -0.41 * JOINT["panda_joint4"]

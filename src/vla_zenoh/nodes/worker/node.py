@@ -159,9 +159,10 @@ class WorkerNode:
         if not due:
             stop.wait(max(0.0, min(*others_s, POLL_PERIOD_S)))
         elif all(robot.needs_images for robot in due):
-            for _ in range(NAPS):
+            silent = all(robot.cameras_silent for robot in self.sessions)
+            for nap_s in (IDLE_NAP_S,) if silent else (NAP_S,) * NAPS:
                 with self._changed:
-                    if self._changed.wait_for(lambda: any(r.has_images for r in due), NAP_S):
+                    if self._changed.wait_for(lambda: any(r.has_images for r in due), nap_s):
                         return
                 # States decoded while idle cost no time once the image is there.
                 for robot in self.sessions:

@@ -53,6 +53,7 @@ SPEC_PERIOD_S = 1.0
 TASK_PATIENCE_S = 1.5
 AFTER_A_FAILURE_S = 0.5
 FRESH_PATIENCE_S = 0.05
+SILENT_S = 0.5
 FRESH_TOLERANCE_S = 0.005
 MAX_COMPLAINT = 500
 STATE_KINDS: dict[str, type[Any]] = {
@@ -166,6 +167,11 @@ class RobotSession:
     def needs_images(self) -> bool:
         """Whether the model observes any camera."""
         return bool(self._cameras or self._depths)
+
+    @property
+    def cameras_silent(self) -> bool:
+        """Whether no image came lately: none is expected in the next moment."""
+        return time.monotonic() - max(self._received_s.values(), default=0.0) > SILENT_S
 
     def poll(self) -> None:
         """Decode what was received since the last call."""
