@@ -11,10 +11,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pair_rig import PARTS, Pair, joint_steps, random_motion, shipped, steady, tcp_steps, world
+from pair_rig import (
+    PARTS,
+    Pair,
+    joint_steps,
+    random_motion,
+    reach,
+    shipped,
+    steady,
+    tcp_steps,
+    world,
+)
 
 from vla_zenoh.codec import records
-from vla_zenoh.lab.lockstep import Message
+from vla_zenoh.lab.lockstep import Lockstep, Message
+from vla_zenoh.lab.teleop.policy import OperatorInput, TeleopPolicy
 from vla_zenoh.types import GripperState, JointCommand, JointState, PoseState
 
 UPWARD = np.array([0.0, -0.02, 0.0, 0.02, 0.0, 0.0, 0.0, 0.04])
@@ -100,6 +111,31 @@ def test_both_brake_in_the_tick_in_which_one_has_to() -> None:
         pair.run(0.004)
     braking = [part.motion._mover.braking for part in pair.commander.parts]  # pyright: ignore
     assert braking == [True, True]
+
+
+def test_a_person_moves_one_arm_after_the_other() -> None:
+    wish = OperatorInput()
+    world().reset()
+    policy = TeleopPolicy(shipped(), shipped().task.worker, lambda: wish, lambda: 2)
+    loop = Lockstep(shipped(), world(), policy, reach=reach())
+    loop.put("rate", 10.0)
+    loop.run(0.5)
+    loop.put("active", True)
+    loop.run(0.3)
+    assert loop.commander.state.value == "active", loop.commander.why
+    for count, (moved, stands) in enumerate([PARTS, PARTS[::-1]]):
+        before = {part: world().parts[part].tcp()[0].copy() for part in PARTS}
+        wish = OperatorInput((0, 0, 1, 0, 0, 0), toggles=count, part=count)
+        loop.run(1.5)
+        after = {part: world().parts[part].tcp()[0] for part in PARTS}
+        assert after[moved][2] > before[moved][2] + 0.05
+        wish = wish._replace(twist=(0.0,) * 6)
+        loop.run(0.6)
+        assert np.linalg.norm(world().parts[stands].tcp()[0] - before[stands]) < 0.01
+    widths = {part: world().parts[part].gripper_state().width_m for part in PARTS}
+    assert widths["left"] > 0.03
+    assert widths["right"] < 0.01
+    assert policy.describe().endswith("right still")
 
 
 def test_measured_arms_that_come_too_near_brake() -> None:
