@@ -42,13 +42,18 @@ def _note_states(heard_s: list[float]) -> None:
 
     take = CommandInputs.poll
 
-    def take_and_note(self: CommandInputs, now_ns: int) -> Any:
-        inputs = take(self, now_ns)
+    def take_and_note(self: CommandInputs, now_ns: int, **named: Any) -> Any:
+        inputs = take(self, now_ns, **named)
         if inputs.pose is not None:
             heard_s[0] = time.monotonic()
         return inputs
 
     CommandInputs.poll = take_and_note
+
+
+def _record(publisher: Any, record: Any) -> Any:
+    """What was published, also where its publisher had encoded it before."""
+    return publisher._encoded[0] if isinstance(record, bytes) else record
 
 
 def _install(node: str, path: str) -> None:
@@ -64,6 +69,7 @@ def _install(node: str, path: str) -> None:
     def put_and_keep(self: Publisher, record: Any, **named: Any) -> Any:
         header = put(self, record, **named)
         if self.key.endswith(key_end):
+            record = _record(self, record)
             if key_end == RECORDED["sim"]:
                 reference = record.reference_position_m
                 parts, asked_ns = (record.position_m, record.twist, reference), None
@@ -117,7 +123,8 @@ def _install_parts(node: str, folder: Path, parts: list[str]) -> None:
             self._publisher = publisher
         if self.key.endswith(JOINTS[node]) and (part := self.key.split("/")[-3]) in parts:
             at_s = (header.stamp_wall_ns - self._clock.offset_ns) / 1e9
-            row = [[at_s], record.position_rad, record.velocity_rad_s]
+            joints = _record(self, record)
+            row = [[at_s], joints.position_rad, joints.velocity_rad_s]
             file_of(part).write(np.concatenate(row).tobytes())
         return header
 
