@@ -11,10 +11,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pair_rig import PARTS, Pair, joint_steps, random_motion, shipped, steady, tcp_steps, world
+from pair_rig import (
+    PARTS,
+    Pair,
+    joint_steps,
+    random_motion,
+    reach,
+    shipped,
+    steady,
+    tcp_steps,
+    world,
+)
 
 from vla_zenoh.codec import records
-from vla_zenoh.lab.lockstep import Message
+from vla_zenoh.lab.lockstep import Lockstep, Message
+from vla_zenoh.lab.teleop.policy import OperatorInput, TeleopPolicy
 from vla_zenoh.types import GripperState, JointCommand, JointState, PoseState
 
 UPWARD = np.array([0.0, -0.02, 0.0, 0.02, 0.0, 0.0, 0.0, 0.04])
@@ -25,6 +36,8 @@ BOUND_S = 0.6
 STOP_S = 0.35
 STILL = 2e-3
 LED_BACK_M = 0.08
+NEAR_M = 0.12
+"""From here the arms would be at their stop within the time that a fault takes to be noticed."""
 STOP_TOLERANCE_M = 1e-3
 TAMPERED = "left"
 
@@ -98,6 +111,31 @@ def test_both_brake_in_the_tick_in_which_one_has_to() -> None:
         pair.run(0.004)
     braking = [part.motion._mover.braking for part in pair.commander.parts]  # pyright: ignore
     assert braking == [True, True]
+
+
+def test_a_person_moves_one_arm_after_the_other() -> None:
+    wish = OperatorInput()
+    world().reset()
+    policy = TeleopPolicy(shipped(), shipped().task.worker, lambda: wish, lambda: 2)
+    loop = Lockstep(shipped(), world(), policy, reach=reach())
+    loop.put("rate", 10.0)
+    loop.run(0.5)
+    loop.put("active", True)
+    loop.run(0.3)
+    assert loop.commander.state.value == "active", loop.commander.why
+    for count, (moved, stands) in enumerate([PARTS, PARTS[::-1]]):
+        before = {part: world().parts[part].tcp()[0].copy() for part in PARTS}
+        wish = OperatorInput((0, 0, 1, 0, 0, 0), toggles=count, part=count)
+        loop.run(1.5)
+        after = {part: world().parts[part].tcp()[0] for part in PARTS}
+        assert after[moved][2] > before[moved][2] + 0.05
+        wish = wish._replace(twist=(0.0,) * 6)
+        loop.run(0.6)
+        assert np.linalg.norm(world().parts[stands].tcp()[0] - before[stands]) < 0.01
+    widths = {part: world().parts[part].gripper_state().width_m for part in PARTS}
+    assert widths["left"] > 0.03
+    assert widths["right"] < 0.01
+    assert policy.describe().endswith("right still")
 
 
 def test_measured_arms_that_come_too_near_brake() -> None:
@@ -228,6 +266,28 @@ def test_what_is_rejected_for_one_part_is_rejected_for_both() -> None:
 def towards_each_other(number: int) -> dict[str, np.ndarray]:
     way = np.array([0.04, 0.0, -0.01]) * (1 if number < 28 else -1)
     return dict.fromkeys(PARTS, np.array([*way, 0.0, 0.0, 0.0, 0.04]))
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        pytest.param(fault, marks=[] if fault.startswith("command") else pytest.mark.slow)
+        for fault in FAULTS
+    ],
+)
+def test_arms_on_their_way_to_each_other_stand_apart_when_one_of_them_fails(fault: str) -> None:
+    pair = Pair(towards_each_other, tcp_steps())
+    while pair.distance_m() > NEAR_M:
+        pair.run(0.02)
+    assert min(pair.speed_m_s(part)[-1] for part in PARTS) > FAST_M_S
+    since = pair.mark()
+    pair.loop.tamper = FAULTS[fault][0]
+    pair.run(BOUND_S, distances=True)
+    for part in PARTS:
+        assert pair.stop_time_s(part, since) < BOUND_S
+    stop_m = shipped().limits.reach.part_stop_m
+    assert min(pair.least_m, pair.least_measured_m) >= stop_m - STOP_TOLERANCE_M
+    assert pair.state != "active"
 
 
 def test_arms_that_are_sent_towards_each_other_stand_and_may_go_back() -> None:

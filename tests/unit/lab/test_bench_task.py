@@ -209,6 +209,12 @@ def test_the_sheet_shows_the_failures_alone() -> None:
     )
 
 
+def test_a_sheet_of_many_failures_is_a_picture_that_can_be_read() -> None:
+    found = failure_sheet([ended("push", "off_course") for _ in range(25)])
+    assert found is not None
+    assert decode_jpeg(found).rgb.shape[0] == 15 * (TITLE_HEIGHT + FRAME_HEIGHT + GAP)
+
+
 @pytest.mark.parametrize(("failure", "strongest"), [("", "green"), ("off_course", "red")])
 def test_the_mark_of_a_row_tells_success_from_failure(failure: str, strongest: str) -> None:
     found = sheet([replace(ended("push", failure), prompt="push the red brick left")])

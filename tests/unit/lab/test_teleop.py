@@ -176,6 +176,13 @@ def test_two_hands_together_are_not_faster_than_one() -> None:
     assert both == OperatorInput((1, -0.5, 0, 0, 0, 0), 1, 3)
 
 
+def test_p_moves_the_next_part() -> None:
+    keyboard = Keyboard()
+    for stroke in KeystrokeParser().read(b"ppw"):
+        keyboard.update(stroke, 0.0)
+    assert keyboard.read(0.0) == OperatorInput((1, 0, 0, 0, 0, 0), part=2)
+
+
 # -- wishes to steps -----------------------------------------------------------------------------
 class Person:
     """Says what it is told to."""

@@ -1,4 +1,4 @@
-"""Sheet of outcomes: a row for each episode, its start and end side by side, and the verdict."""
+"""Sheet of outcomes: start and end of each episode side by side, and the verdict."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from vla_zenoh.lab.bench.task import STAY, TaskOutcome, is_judged
 from vla_zenoh.types import Image
 
 FRAME_WIDTH, FRAME_HEIGHT, TITLE_HEIGHT, GAP = 560, 420, 56, 8
-MAX_ROWS = 30
+MAX_EPISODES, ROWS = 30, 15
+"""A JPEG's side is 8192 px at most: with more than 15 episodes there are two columns."""
 MARK_PX = 34
 GREEN, RED, GREY = (24, 140, 60), (200, 30, 30), (110, 110, 110)
 INK, PAPER, SOFT = (25, 30, 36), 255, (90, 98, 106)
@@ -29,10 +30,17 @@ def failure_sheet(ended: Sequence[TaskOutcome]) -> bytes | None:
 
 def sheet(ended: Sequence[TaskOutcome]) -> bytes | None:
     """A JPEG of the first outcomes with pictures; None: there are none."""
-    shown = [each for each in ended if each.pictures is not None][:MAX_ROWS]
+    shown = [each for each in ended if each.pictures is not None][:MAX_EPISODES]
     if not shown:
         return None
-    return encode_jpeg(Image(np.ascontiguousarray(np.vstack([_row(each) for each in shown]))))
+    rows = [_row(each) for each in shown]
+    columns = [np.vstack(rows[at : at + ROWS]) for at in range(0, len(rows), ROWS)]
+    height = columns[0].shape[0]
+    filled = [
+        np.pad(each, ((0, height - len(each)), (0, 0), (0, 0)), constant_values=PAPER)
+        for each in columns
+    ]
+    return encode_jpeg(Image(np.ascontiguousarray(np.hstack(filled))))
 
 
 def _row(ended: TaskOutcome) -> Picture:

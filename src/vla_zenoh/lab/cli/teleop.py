@@ -55,6 +55,8 @@ def teleop(
     from vla_zenoh.lab.teleop.sticks import DEVICES
 
     loaded = target.load()
+    if leader is not None:
+        loaded.require_one_arm("--leader")
     with ExitStack() as stack:
         stick = DEVICES[device]() if device in DEVICES else None
         if stick is not None:

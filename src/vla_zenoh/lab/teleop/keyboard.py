@@ -38,7 +38,7 @@ MOVES: dict[str, tuple[int, float]] = {
 }
 """Key -> axis of the twist and direction."""
 OPENINGS = {".": 1.0, ",": -1.0}
-TOGGLE = "space"
+TOGGLE, NEXT_PART = "space", "p"
 LEVELS = "12345"
 QUIT, STOP, ACTIVATE, TAKE_OVER = "quit", "stop", "activate", "take_over"
 KEY_COMMANDS = {"q": QUIT, "ctrl+c": QUIT, "x": STOP, "enter": ACTIVATE, "tab": TAKE_OVER}
@@ -46,6 +46,7 @@ LEGEND = """\
   w/s  x forward, back     l/j  rotate about x   space  gripper         enter  (de)activate
   a/d  y left, right       i/k  rotate about y   . ,    open, close     tab    take over, return
   r/f  z up, down          u/o  rotate about z   1-5    speed           x STOP      q quit"""
+PARTS_LEGEND = "  p  move the next of: {}"
 
 _ESCAPE = 0x1B
 _CSI = re.compile(rb"\x1b\[([0-?]*)[ -/]*([@-~])")
@@ -141,7 +142,7 @@ class Keyboard:
         self.reports_releases = False
         self._until_s: dict[str, float] = {}
         self._new: set[str] = set()
-        self._toggles = 0
+        self._toggles = self._part = 0
 
     def update(self, stroke: Keystroke, now_s: float) -> str | None:
         """Process one keystroke; the command it gives, one of `KEY_COMMANDS`, if any."""
@@ -155,6 +156,8 @@ class Keyboard:
         elif event in (KeyEvent.TYPED, KeyEvent.PRESSED):
             if key == TOGGLE:
                 self._toggles += 1
+            elif key == NEXT_PART:
+                self._part += 1
             elif key in LEVELS:
                 self.level = LEVELS.index(key)
             return KEY_COMMANDS.get(key)
@@ -183,4 +186,4 @@ class Keyboard:
             axis, sign = MOVES[key]
             twist[axis] += sign
         opening = sum(OPENINGS[key] for key in down & OPENINGS.keys())
-        return OperatorInput(clipped_twist(twist), opening, self._toggles)
+        return OperatorInput(clipped_twist(twist), opening, self._toggles, part=self._part)

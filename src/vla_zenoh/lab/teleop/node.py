@@ -21,6 +21,7 @@ from vla_zenoh.lab.teleop.keyboard import (
     BEGIN,
     END,
     LEGEND,
+    PARTS_LEGEND,
     QUIT,
     STOP,
     TAKE_OVER,
@@ -50,7 +51,8 @@ class Teleop:
         device: beside the keyboard.
         frame: axes of a step.
         level: initial speed, from 0.
-        leader: arm whose joints are followed, in place of keys and device that move.
+        leader: arm whose joints are followed, in place of keys and device that move; for a robot of
+            one arm.
 
     Raises:
         NodeError: no terminal, or a worker of this name is alive.
@@ -84,13 +86,15 @@ class Teleop:
         self.worker = WorkerNode(profile, session, self.policy, name)
         self._client = Client(profile, operator).subscribe() if operator is not None else None
         self._other_worker = profile.task.worker
+        parts = PARTS_LEGEND.format(", ".join(profile.parts)) if profile.parts else ""
+        self._legend = f"{LEGEND}\n{parts}"
         self._lines: deque[str] = deque(maxlen=16)
 
     def run(self, stop: threading.Event) -> None:
         """Until `stop`, Ctrl-C, q, or the end of the terminal."""
         self._stop = stop
         with self._terminal as terminal:
-            for line in LEGEND.splitlines():
+            for line in self._legend.splitlines():
                 terminal.print(line)
             threads = [threading.Thread(target=self._show_status, args=(terminal,), name="screen")]
             if self._device is not None:

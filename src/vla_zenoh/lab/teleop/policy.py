@@ -40,12 +40,14 @@ class OperatorInput(NamedTuple):
         opening: opens (1) or closes (-1) the gripper, in [-1, 1].
         toggles: count of open/close commands so far; only changes matter.
         takeovers: count of commands to take the arm or give it back so far.
+        part: count of commands to move the next part of the robot so far.
     """
 
     twist: Twist = STILL
     opening: float = 0.0
     toggles: int = 0
     takeovers: int = 0
+    part: int = 0
 
 
 class InputDevice(Protocol):
@@ -74,7 +76,8 @@ def combined(one: OperatorInput, other: OperatorInput) -> OperatorInput:
     """Sum of two inputs, clipped."""
     twist = [a + b for a, b in zip(one.twist, other.twist, strict=True)]
     opening = _clipped(one.opening + other.opening)
-    return OperatorInput(clipped_twist(twist), opening, one.toggles + other.toggles)
+    toggles, part = one.toggles + other.toggles, one.part + other.part
+    return OperatorInput(clipped_twist(twist), opening, toggles, part=part)
 
 
 def clipped_twist(values: Sequence[float]) -> Twist:
@@ -103,10 +106,14 @@ class Speed(NamedTuple):
 
 
 def speeds_of(profile: Profile) -> tuple[Speed, ...]:
-    """The levels within the profile's limits of velocity and of a single step."""
-    limits = profile.limits
-    most_m_s = min(limits.translation.velocity_m_s, BELOW * limits.step_m / DT_S)
-    most_rad_s = min(limits.rotation.velocity_rad_s, BELOW * limits.step_rad / DT_S)
+    """The levels within the profile's limits of velocity and of a single step, of every part."""
+    every = [profile.of_part(name).limits for name in profile.parts] or [profile.limits]
+    most_m_s = min(
+        min(limits.translation.velocity_m_s, BELOW * limits.step_m / DT_S) for limits in every
+    )
+    most_rad_s = min(
+        min(limits.rotation.velocity_rad_s, BELOW * limits.step_rad / DT_S) for limits in every
+    )
     return tuple(Speed(min(v, most_m_s), min(w, most_rad_s)) for v, w in SPEEDS)
 
 
@@ -115,7 +122,8 @@ class TeleopPolicy:
 
     A step is a delta of the goal in `frame` axes, with the rotation as a rotation vector, and the
     absolute width of the gripper. While the worker is not active the width is the measured one, or
-    0 where an object is held, so that taking over drops nothing.
+    0 where an object is held, so that taking over drops nothing. Of a robot of parts one is moved
+    at a time, and the others stand.
 
     Args:
         profile: for limits and gripper.
@@ -136,23 +144,28 @@ class TeleopPolicy:
         *,
         frame: Frame = "base",
     ) -> None:
+        action = ActionSpec(
+            horizon=HORIZON,
+            dt_s=DT_S,
+            kind="delta",
+            frame=frame,
+            rotation="rotvec",
+            gripper="absolute_m",
+        )
         self.spec = ModelSpec(
             name=PERSON,
             observation=ObservationSpec(cameras=(), state=("pose", "gripper"), prompt=False),
-            action=ActionSpec(
-                horizon=HORIZON,
-                dt_s=DT_S,
-                kind="delta",
-                frame=frame,
-                rotation="rotvec",
-                gripper="absolute_m",
-            ),
+            action=ActionSpec.of_parts(dict.fromkeys(profile.parts, action))
+            if profile.parts
+            else action,
         )
         self.speeds = speeds_of(profile)
         self.last = OperatorInput()
         self._name, self._read, self._level = name, read, level
-        self._max_width_m = profile.robot.gripper.max_width_m
-        self._width_m: float | None = None
+        parts = {part: profile.of_part(part).robot for part in profile.parts or ("",)}
+        self._max_width_m = {part: robot.gripper.max_width_m for part, robot in parts.items()}
+        self._parts = tuple(parts)
+        self._width_m: dict[str, float] = {}
 
     def infer(self, observation: Observation) -> ActionSteps:
         """Steps until the next request is due, and a little longer.
@@ -162,14 +175,40 @@ class TeleopPolicy:
         """
         wanted, before = self._read(), self.last
         self.last = wanted
-        gripper = observation.gripper
-        assert gripper is not None
         active = observation.task.active and observation.task.worker == self._name
         if not active:
-            wanted, self._width_m = wanted._replace(opening=0.0), None
-        width_m = kept_width_m(gripper) if self._width_m is None else self._width_m
-        if active and (wanted.toggles - before.toggles) % 2:
-            width_m = 0.0 if width_m > self._max_width_m / 2 else self._max_width_m
+            self._width_m.clear()
+        toggled = (wanted.toggles - before.toggles) % 2 == 1
+        each = [
+            self._steps(part, observation, wanted, toggled=toggled, active=active)
+            if part == self._moved
+            else self._steps(part, observation, OperatorInput(), toggled=False, active=active)
+            for part in self._parts
+        ]
+        raw = {"twist": list(wanted.twist), "speed_m_s": self.speeds[self._level()].translation_m_s}
+        return ActionSteps(np.concatenate(each, axis=1), raw=raw)
+
+    @property
+    def _moved(self) -> str:
+        """The part that is moved."""
+        return self._parts[self.last.part % len(self._parts)]
+
+    def _steps(
+        self,
+        part: str,
+        observation: Observation,
+        wanted: OperatorInput,
+        *,
+        toggled: bool,
+        active: bool,
+    ) -> FloatArray:
+        """(H, 7) steps of one part."""
+        gripper = observation.parts[part].gripper if part else observation.gripper
+        assert gripper is not None
+        opening, most_m = wanted.opening if active else 0.0, self._max_width_m[part]
+        width_m = self._width_m.get(part, kept_width_m(gripper))
+        if active and toggled:
+            width_m = 0.0 if width_m > most_m / 2 else most_m
         period_s = 1 / observation.rate_hz
         count = min(math.ceil((period_s + COVER_S) / DT_S - 1e-9), HORIZON)
         speed = self.speeds[self._level()]
@@ -180,14 +219,13 @@ class TeleopPolicy:
             ]
         )
         after_s = DT_S * np.arange(1, count + 1)
-        widths = np.clip(width_m + wanted.opening * OPENING_M_S * after_s, 0.0, self._max_width_m)
-        steps = np.column_stack([np.tile(motion, (count, 1)), widths])
+        widths_m = np.clip(width_m + opening * OPENING_M_S * after_s, 0.0, most_m)
         if active:
-            moved_m = wanted.opening * OPENING_M_S * min(period_s, count * DT_S)
-            self._width_m = float(np.clip(width_m + moved_m, 0.0, self._max_width_m))
-        return ActionSteps(
-            steps, raw={"twist": list(wanted.twist), "speed_m_s": speed.translation_m_s}
-        )
+            moved_m = opening * OPENING_M_S * min(period_s, count * DT_S)
+            self._width_m[part] = float(np.clip(width_m + moved_m, 0.0, most_m))
+        steps = np.empty((count, AXES + 1))
+        steps[:, :AXES], steps[:, AXES] = motion, widths_m
+        return steps
 
     def describe(self) -> str:
         """Speed and input, for a status line."""
@@ -199,7 +237,7 @@ class TeleopPolicy:
         )
         return (
             f"{100 * speed.translation_m_s:g} cm/s, {speed.rotation_rad_s:.2g} rad/s | "
-            f"{moving or 'still'}"
+            f"{f'{self._moved} ' if self._moved else ''}{moving or 'still'}"
         )
 
 

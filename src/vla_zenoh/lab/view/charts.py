@@ -25,10 +25,11 @@ class Charts:
     Args:
         stream: to log into.
         joints: names of the arm joints, in the order of the profile.
+        part: of the robot; empty: it is one arm.
     """
 
-    def __init__(self, stream: rr.RecordingStream, joints: Sequence[str]) -> None:
-        self._stream, self._joints = stream, tuple(joints)
+    def __init__(self, stream: rr.RecordingStream, joints: Sequence[str], part: str = "") -> None:
+        self._stream, self._joints, self._part = stream, tuple(joints), part
         self._newest: tuple[str, int] | None = None
         for stage, colour in STAGE_COLOURS.items():
             self._style(paths.below(paths.LATENCY, stage), stage, colour)
@@ -36,9 +37,17 @@ class Charts:
             for name in (paths.COMMANDED, paths.MEASURED):
                 # A gripper command holds until the next one.
                 held = origin == paths.GRIPPER and name == paths.COMMANDED
-                self._style(f"{origin}/{name}", name, paths.COLOURS[name], held=held)
-        self._style(f"{paths.TRACKING}/distance", "distance", STAGE_COLOURS["end_to_end"])
+                series = f"{part} {name}".strip()
+                self._style(f"{self._own(origin)}/{name}", series, paths.COLOURS[name], held=held)
+        self._style(
+            f"{self._own(paths.TRACKING)}/distance",
+            f"{part} distance".strip(),
+            STAGE_COLOURS["end_to_end"],
+        )
         self._style(f"{paths.BOUNDS}/share", "share", paths.COLOURS[paths.COMMANDED])
+
+    def _own(self, origin: str) -> str:
+        return paths.plot(origin, self._part)
 
     def _style(
         self, path: str, name: str, colour: tuple[int, int, int], *, held: bool = False
@@ -69,21 +78,21 @@ class Charts:
     # -- motion -------------------------------------------------------------------------------
     def speed(self, name: str, twist: FloatArray) -> None:
         """Speed of the TCP: `commanded` or `measured`."""
-        self._put(f"{paths.SPEED}/{name}", float(np.linalg.norm(twist[:3])) * 1e3)
+        self._put(f"{self._own(paths.SPEED)}/{name}", float(np.linalg.norm(twist[:3])) * 1e3)
 
     def tracking(self, apart_m: float) -> None:
         """Distance between the measured and the commanded TCP."""
-        self._put(f"{paths.TRACKING}/distance", apart_m * 1e3)
+        self._put(f"{self._own(paths.TRACKING)}/distance", apart_m * 1e3)
 
     def joints(self, names: Sequence[str], position_rad: FloatArray) -> None:
         """Measured arm joints."""
         for name, value in zip(names, position_rad.tolist(), strict=True):
             if name in self._joints:
-                self._put(paths.below(paths.JOINTS, name), value)
+                self._put(paths.below(self._own(paths.JOINTS), name), value)
 
     def gripper(self, name: str, width_m: float) -> None:
         """Opening of the gripper: `commanded` or `measured`."""
-        self._put(f"{paths.GRIPPER}/{name}", width_m * 1e3)
+        self._put(f"{self._own(paths.GRIPPER)}/{name}", width_m * 1e3)
 
     def status(self, status: NodeStatus) -> None:
         """Share of the speed that limits leave, as the command node reports it."""

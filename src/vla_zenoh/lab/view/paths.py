@@ -6,10 +6,8 @@ import rerun as rr
 
 TIMELINE = "time"
 WORLD = "world"
-ROBOT = "world/robot"
-POSES = "world/pose"
-TRAILS = "world/trail"
-CHUNKS = "world/chunk"
+ROBOT, POSES, TRAILS, CHUNKS = "robot", "pose", "trail", "chunk"
+"""Of an arm, below `arm`."""
 OBJECTS = "world/objects"
 CAMERA, SEEN = "camera", "seen"
 LATENCY, SPEED, TRACKING = "plot/latency", "plot/speed", "plot/tracking"
@@ -25,6 +23,16 @@ CHUNK, SHADOW = (236, 92, 206), (150, 110, 160)
 def below(path: str, name: str) -> str:
     """The path of any name below `path`."""
     return f"{path}/{rr.escape_entity_path_part(name)}"
+
+
+def arm(part: str) -> str:
+    """The base frame of a part of the robot; of no part: of a robot that is one arm."""
+    return below(WORLD, part) if part else WORLD
+
+
+def plot(origin: str, part: str) -> str:
+    """The time series of a part, below those of the robot."""
+    return below(origin, part) if part else origin
 
 
 def picture(camera: str) -> str:

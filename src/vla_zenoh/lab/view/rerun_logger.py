@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,8 +12,9 @@ import rerun as rr
 
 from vla_zenoh.codec import records, settings
 from vla_zenoh.codec.image import decode_depth
-from vla_zenoh.errors import CodecError, RecordError
+from vla_zenoh.errors import CodecError, RecordError, SpecError
 from vla_zenoh.keys import Keys, last_chunk
+from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.lab.recording.record_types import RecordTypes
 from vla_zenoh.lab.recording.sample import DEPTH, JPEG, Sample
 from vla_zenoh.lab.view import paths
@@ -51,6 +53,17 @@ COMMAND_NODE = "command"
 APPLICATION = "vla-zenoh"
 
 
+@dataclass(slots=True)
+class _Arm:
+    """What is drawn of an arm: one part of the robot, or all of it."""
+
+    part: str
+    scene: Scene
+    charts: Charts
+    kinematics: Kinematics | None
+    commanded: PoseCommand | None = None
+
+
 class RerunLogger:
     """Logs samples, in the order of reception, into a Rerun stream.
 
@@ -77,16 +90,26 @@ class RerunLogger:
         self._command_status = self.keys.status(COMMAND_NODE)
         stream.set_log_time_enabled(False)
         stream.set_log_tick_enabled(False)
-        robot, missing = load_robot_model(profile, stream)
-        self._kinematics = robot.kinematics if robot is not None else None
-        self._scene = Scene(stream, profile, robot)
-        self._charts = Charts(stream, profile.robot.arm_joints)
+        self._arms: dict[str, _Arm] = {}
+        missing = ""
+        for part in profile.parts or ("",):
+            own = profile.of_part(part) if part else profile
+            robot, why = load_robot_model(own, stream, f"{paths.arm(part)}/{paths.ROBOT}")
+            charts = Charts(stream, own.robot.arm_joints, part)
+            kinematics = robot.kinematics if robot is not None else None
+            self._arms[part] = _Arm(part, Scene(stream, own, robot), charts, kinematics)
+            missing = missing or why
+            if part:
+                base = profile.parts[part].base
+                turn = rr.RotationAxisAngle(axis=(0.0, 0.0, 1.0), radians=base.yaw_rad)
+                placed = rr.Transform3D(translation=base.position_m, rotation=turn)
+                stream.log(paths.arm(part), placed, static=True)
+        self._first = next(iter(self._arms.values()))
         self._texts = TextPanels(stream, to_yaml(profile), missing)
         self._drawn_ns: dict[str, int] = {}
         self._specs: dict[str, ModelSpec] = {}
         self._waiting: deque[tuple[str, int, ActionChunk]] = deque()
         self._obeyed = profile.task.worker
-        self._commanded: PoseCommand | None = None
         self._widest_mm = profile.robot.gripper.max_width_m * 1e3
         self._cameras: set[str] = set()
         self._seen: defaultdict[str, set[str]] = defaultdict(set)
@@ -127,7 +150,8 @@ class RerunLogger:
             return
         stamp_ns = self._stamp_ns(sample)
         if not self.shown:
-            self._scene.robot_moved()  # at home, until its joints are known
+            for arm in self._arms.values():
+                arm.scene.robot_moved()  # at home, until its joints are known
         try:
             if kind is not None:
                 self._record(kind, sample, stamp_ns)
@@ -140,6 +164,13 @@ class RerunLogger:
             self._reject(sample.key, error.reason)
         except RecordError:
             self._reject(sample.key, UNFIT)
+
+    def _arm(self, sample: Sample) -> _Arm:
+        """Whose state or command it is."""
+        arm = self._arms.get(self.keys.part_of(sample.key))
+        if arm is None:
+            raise CodecError("invalid", f"{sample.key} is of no part of the profile's robot")
+        return arm
 
     def _reject(self, key: str, reason: str) -> None:
         self.rejected[f"{self.keys.short(key)}: {reason}"] += 1
@@ -198,51 +229,56 @@ class RerunLogger:
         self._texts.setting(self.keys.short(sample.key), settings.decode_text(sample.payload))
 
     # -- the robot ----------------------------------------------------------------------------
-    def _pose_state(self, _: Sample, stamp_ns: int, state: PoseState) -> None:
-        self._scene.pose(paths.MEASURED, stamp_ns, pose_of(state.position_m, state.quat_xyzw))
-        self._charts.speed(paths.MEASURED, state.twist)
+    def _pose_state(self, sample: Sample, stamp_ns: int, state: PoseState) -> None:
+        arm = self._arm(sample)
+        arm.scene.pose(paths.MEASURED, stamp_ns, pose_of(state.position_m, state.quat_xyzw))
+        arm.charts.speed(paths.MEASURED, state.twist)
         commanded_m = state.reference_position_m
-        if commanded_m is None and self._commanded is not None:
-            commanded_m = self._commanded.position_m
+        if commanded_m is None and arm.commanded is not None:
+            commanded_m = arm.commanded.position_m
         if commanded_m is not None:
-            self._charts.tracking(float(np.linalg.norm(commanded_m - state.position_m)))
+            arm.charts.tracking(float(np.linalg.norm(commanded_m - state.position_m)))
 
-    def _joint_state(self, _: Sample, stamp_ns: int, state: JointState) -> None:
-        self._scene.joints(state.names, state.position_rad)
-        self._charts.joints(state.names, state.position_rad)
+    def _joint_state(self, sample: Sample, stamp_ns: int, state: JointState) -> None:
+        arm = self._arm(sample)
+        arm.scene.joints(state.names, state.position_rad)
+        arm.charts.joints(state.names, state.position_rad)
 
-    def _gripper_state(self, _: Sample, stamp_ns: int, state: GripperState) -> None:
-        self._scene.gripper(max(state.width_m, 0.0))
-        self._charts.gripper(paths.MEASURED, state.width_m)
+    def _gripper_state(self, sample: Sample, stamp_ns: int, state: GripperState) -> None:
+        arm = self._arm(sample)
+        arm.scene.gripper(max(state.width_m, 0.0))
+        arm.charts.gripper(paths.MEASURED, state.width_m)
 
     def _objects(self, _: Sample, stamp_ns: int, objects: ObjectPoses) -> None:
-        self._scene.objects(objects)
+        self._first.scene.objects(objects)
 
     # -- commands -----------------------------------------------------------------------------
     def _pose_command(self, sample: Sample, stamp_ns: int, command: PoseCommand) -> None:
+        arm = self._arm(sample)
         goal = pose_of(command.goal_position_m, command.goal_quat_xyzw)
-        self._scene.goal(stamp_ns, goal)
-        self._charts.command(stamp_ns, command.cause)
-        self._commanded = command
+        arm.scene.goal(stamp_ns, goal)
+        self._first.charts.command(stamp_ns, command.cause)
+        arm.commanded = command
         if self._due(sample.key, stamp_ns):
             pose = pose_of(command.position_m, command.quat_xyzw)
-            self._scene.pose(paths.COMMANDED, stamp_ns, pose)
-            self._scene.pose(paths.GOAL, stamp_ns, goal)
-            self._charts.speed(paths.COMMANDED, command.twist)
+            arm.scene.pose(paths.COMMANDED, stamp_ns, pose)
+            arm.scene.pose(paths.GOAL, stamp_ns, goal)
+            arm.charts.speed(paths.COMMANDED, command.twist)
 
     def _joint_command(self, sample: Sample, stamp_ns: int, command: JointCommand) -> None:
-        self._charts.command(stamp_ns, command.cause)
-        arm = self._kinematics
-        if arm is None or not self._due(sample.key, stamp_ns):
+        arm = self._arm(sample)
+        self._first.charts.command(stamp_ns, command.cause)
+        chain = arm.kinematics
+        if chain is None or not self._due(sample.key, stamp_ns):
             return
-        joints_rad = arm.ordered(command.names, command.position_rad)
-        velocity = arm.ordered(command.names, command.velocity_rad_s)
-        pose, jacobian = arm.pose_and_jacobian(joints_rad)
-        self._scene.pose(paths.COMMANDED, stamp_ns, pose)
-        self._charts.speed(paths.COMMANDED, jacobian @ velocity)
+        joints_rad = chain.ordered(command.names, command.position_rad)
+        velocity = chain.ordered(command.names, command.velocity_rad_s)
+        pose, jacobian = chain.pose_and_jacobian(joints_rad)
+        arm.scene.pose(paths.COMMANDED, stamp_ns, pose)
+        arm.charts.speed(paths.COMMANDED, jacobian @ velocity)
 
-    def _gripper_command(self, _: Sample, stamp_ns: int, command: GripperCommand) -> None:
-        self._charts.gripper(paths.COMMANDED, command.width_m)
+    def _gripper_command(self, sample: Sample, stamp_ns: int, command: GripperCommand) -> None:
+        self._arm(sample).charts.gripper(paths.COMMANDED, command.width_m)
 
     # -- models -------------------------------------------------------------------------------
     def _spec(self, _: Sample, stamp_ns: int, spec: ModelSpec) -> None:
@@ -269,10 +305,17 @@ class RerunLogger:
             self._reject(self._waiting.popleft()[0], NO_SPEC)
 
     def _draw_chunk(self, stamp_ns: int, chunk: ActionChunk, spec: ModelSpec) -> None:
-        obeyed = chunk.worker == self._obeyed
-        self._scene.chunk(stamp_ns, chunk, spec, obeyed)
+        obeyed, action, steps = chunk.worker == self._obeyed, spec.action, chunk.steps
+        if steps.shape[1] != action.dimension:
+            raise RecordError(f"steps have {steps.shape[1]} numbers, their spec {action.dimension}")
+        for part, arm in self._arms.items():
+            try:
+                own = action.of(part)
+            except SpecError as error:
+                raise RecordError(str(error)) from error
+            arm.scene.chunk(stamp_ns, chunk, own, steps[:, action.columns(part)], obeyed)
         if not obeyed:
-            self._charts.shadow(chunk)
+            self._first.charts.shadow(chunk)
 
     def close(self) -> None:
         """Count the chunks whose spec was never received."""
@@ -293,7 +336,7 @@ class RerunLogger:
 
     def _status(self, sample: Sample, stamp_ns: int, status: NodeStatus) -> None:
         if sample.key == self._command_status:
-            self._charts.status(status)
+            self._first.charts.status(status)
             self._texts.status(status)
         self._texts.now(stamp_ns, self.rejected, self.dropped)
 

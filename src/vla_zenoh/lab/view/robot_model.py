@@ -65,8 +65,8 @@ class RobotMeshes:
     def _index(self, joint: str) -> int:
         return self._model.joints[self._model.getJointId(joint)].idx_q
 
-    def log_shapes(self, stream: rr.RecordingStream) -> None:
-        """Log every shape, static below the entity of its link.
+    def log_shapes(self, stream: rr.RecordingStream, root: str) -> None:
+        """Log every shape, static below the entity of its link below `root`.
 
         Raises:
             ResourceError: a shape that Rerun cannot draw.
@@ -74,7 +74,7 @@ class RobotMeshes:
         for index, (link, shape, placement) in enumerate(self._shapes):
             scaled = placement.rotation * np.asarray(shape.meshScale).ravel()
             placed = rr.Transform3D(translation=placement.translation, mat3x3=scaled)
-            path = f"{paths.below(paths.ROBOT, link)}/{index}"
+            path = f"{paths.below(root, link)}/{index}"
             stream.log(path, placed, archetype_of(shape), static=True)
 
     def move(self, positions: Mapping[str, float]) -> None:
@@ -155,12 +155,12 @@ def archetype_of(shape: Any) -> Any:
 
 
 def load_robot_model(
-    profile: Profile, stream: rr.RecordingStream
+    profile: Profile, stream: rr.RecordingStream, root: str
 ) -> tuple[RobotMeshes | None, str]:
-    """The robot with its shapes logged, or None and the reason: all else is shown without it."""
+    """The arm with its shapes logged below `root`, or None and why not: all else is shown."""
     try:
         model = RobotMeshes(profile)
-        model.log_shapes(stream)
+        model.log_shapes(stream, root)
         return model, ""
     except VlaZenohError as error:
         return None, str(error)

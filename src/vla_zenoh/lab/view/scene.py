@@ -9,13 +9,12 @@ import numpy as np
 import pinocchio as pin
 import rerun as rr
 
-from vla_zenoh.control.actions import chunk_poses
+from vla_zenoh.control.actions import Steps, chunk_poses
 from vla_zenoh.control.plan_timeline import Goal, Plan
-from vla_zenoh.errors import RecordError
 from vla_zenoh.kinematics.so3 import Pose, rotation_from_quat
 from vla_zenoh.lab.view import paths
 from vla_zenoh.lab.view.robot_model import RobotMeshes
-from vla_zenoh.policy import ModelSpec
+from vla_zenoh.policy import ActionSpec
 from vla_zenoh.profile import KeepOut, Profile
 from vla_zenoh.types import ActionChunk, FloatArray, ObjectPoses
 
@@ -45,8 +44,8 @@ REACH_M = 0.3
 class PoseTrail:
     """Recent path of a pose."""
 
-    def __init__(self, stream: rr.RecordingStream, name: str) -> None:
-        self._stream, self._name = stream, name
+    def __init__(self, stream: rr.RecordingStream, root: str, name: str) -> None:
+        self._stream, self._name, self._path = stream, name, f"{root}/{paths.TRAILS}/{name}"
         self._points: deque[tuple[int, FloatArray]] = deque()
         self._drawn_ns, self._drawn = 0, 0
 
@@ -65,7 +64,7 @@ class PoseTrail:
         self._drawn_ns, self._drawn = stamp_ns, len(points)
         line = [point for _, point in points] if len(points) > 1 else []
         self._stream.log(
-            f"{paths.TRAILS}/{self._name}",
+            self._path,
             rr.LineStrips3D(
                 [line] if line else [], radii=TRAIL_RADIUS_M, colors=[paths.COLOURS[self._name]]
             ),
@@ -95,19 +94,19 @@ def _drawn(shape: KeepOut) -> rr.Boxes3D | rr.Ellipsoids3D:
 
 
 class Scene:
-    """Logs the 3-D view in the base frame of the robot, at the current time of a Rerun stream.
+    """Logs the 3-D view in the base frame of an arm, at the current time of a Rerun stream.
 
     Args:
         stream: to log into.
-        profile: for the workspace.
+        profile: of the arm, for the workspace.
         robot: its model; None: only poses are shown.
     """
 
     def __init__(
         self, stream: rr.RecordingStream, profile: Profile, robot: RobotMeshes | None
     ) -> None:
-        self._stream, self._robot = stream, robot
-        self._trails = {name: PoseTrail(stream, name) for name in paths.COLOURS}
+        self._stream, self._robot, self._root = stream, robot, paths.arm(profile.part)
+        self._trails = {name: PoseTrail(stream, self._root, name) for name in paths.COLOURS}
         self._goals: deque[tuple[int, Pose]] = deque(maxlen=HISTORY)
         self._measured: Pose | None = None
         self._plans: dict[str, Plan] = {}
@@ -121,9 +120,9 @@ class Scene:
         low, high = np.array([space.x_m, space.y_m, space.z_m]).T
         self._reach = low - REACH_M, high + REACH_M
         box = rr.Boxes3D(mins=[low], sizes=[high - low], colors=[(120, 130, 150, 70)], radii=0.001)
-        log(f"{paths.WORLD}/workspace", box, static=True)
+        log(f"{self._root}/workspace", box, static=True)
         for name, shape in profile.limits.reach.keep_out.items():
-            log(f"{paths.WORLD}/keep_out/{name}", _drawn(shape), static=True)
+            log(f"{self._root}/keep_out/{name}", _drawn(shape), static=True)
 
     # -- robot and poses ----------------------------------------------------------------------
     def joints(self, names: Sequence[str], positions: FloatArray) -> None:
@@ -140,11 +139,11 @@ class Scene:
     def robot_moved(self) -> None:
         """Draw the robot at its current joints."""
         for link, pose in self._robot.placements() if self._robot is not None else ():
-            self._log_pose(paths.below(paths.ROBOT, link), pose)
+            self._log_pose(paths.below(f"{self._root}/{paths.ROBOT}", link), pose)
 
     def pose(self, name: str, stamp_ns: int, pose: Pose) -> None:
         """Draw the pose `goal`, `commanded` or `measured`."""
-        self._log_pose(f"{paths.POSES}/{name}", pose, rr.TransformAxes3D(AXIS_M))
+        self._log_pose(f"{self._root}/{paths.POSES}/{name}", pose, rr.TransformAxes3D(AXIS_M))
         self._trails[name].add(stamp_ns, pose.position_m)
         if name == paths.MEASURED:
             self._measured = pose
@@ -161,32 +160,35 @@ class Scene:
         self._stream.log(path, placed, *more)
 
     # -- chunks -------------------------------------------------------------------------------
-    def chunk(self, stamp_ns: int, chunk: ActionChunk, spec: ModelSpec, obeyed: bool) -> None:
+    def chunk(
+        self, stamp_ns: int, chunk: ActionChunk, action: ActionSpec, steps: Steps, obeyed: bool
+    ) -> None:
         """Draw the waypoints of a chunk, from the goal in force at its observation.
 
-        Raises:
-            RecordError: a step that does not fit the spec.
+        Args:
+            stamp_ns: of the chunk.
+            chunk: of which model, from which observation.
+            action: what the arm's numbers are.
+            steps: (H, D) the arm's numbers.
+            obeyed: the arm follows this model.
         """
-        measured = spec.action.anchor == "measured"
+        measured = action.anchor == "measured"
         start = self._measured if measured else self._start_of(chunk)
-        if start is None:
-            return
-        action = spec.action
-        if action.space == "joint":
-            return  # its waypoints are poses only by the arm's kinematics
-        for step in chunk.steps:
-            if len(step) != action.dimension:
-                raise RecordError(f"a step has {len(step)} numbers, its spec {action.dimension}")
-        goals = [Goal(pose, 0.0) for pose in chunk_poses(action, chunk.steps, start)]
+        if start is None or action.space == "joint":
+            return  # waypoints in joints are poses only by the arm's kinematics
+        goals = [Goal(pose, 0.0) for pose in chunk_poses(action, steps, start)]
         dt_ns = max(int(action.dt_s * 1e9), 1)
         self._plans[chunk.worker] = Plan(stamp_ns, chunk.observation_stamp_ns, dt_ns, goals)
         self._ribbons[chunk.worker] = stamp_ns
         line = np.array([start.position_m, *(goal.pose.position_m for goal in goals)])
         colour = paths.CHUNK if obeyed else paths.SHADOW
-        path = paths.below(paths.CHUNKS, chunk.worker)
+        path = self._ribbon(chunk.worker)
         self._stream.log(path, rr.LineStrips3D([line], radii=RIBBON_RADIUS_M, colors=[colour]))
-        steps = rr.Points3D(line[1:], radii=1.8 * RIBBON_RADIUS_M, colors=[colour])
-        self._stream.log(f"{path}/steps", steps)
+        waypoints = rr.Points3D(line[1:], radii=1.8 * RIBBON_RADIUS_M, colors=[colour])
+        self._stream.log(f"{path}/steps", waypoints)
+
+    def _ribbon(self, worker: str) -> str:
+        return paths.below(f"{self._root}/{paths.CHUNKS}", worker)
 
     def _start_of(self, chunk: ActionChunk) -> Pose | None:
         """The goal that was in force when its observation was taken, else the measured pose.
@@ -208,7 +210,7 @@ class Scene:
         for worker, drawn_ns in list(self._ribbons.items()):
             if not 0 <= stamp_ns - drawn_ns < STALE_NS:
                 del self._ribbons[worker]
-                self._stream.log(paths.below(paths.CHUNKS, worker), rr.Clear(recursive=True))
+                self._stream.log(self._ribbon(worker), rr.Clear(recursive=True))
 
     # -- objects ------------------------------------------------------------------------------
     def objects(self, objects: ObjectPoses) -> None:

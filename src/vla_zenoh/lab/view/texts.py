@@ -8,9 +8,10 @@ from collections.abc import Mapping
 from typing import Any
 
 import rerun as rr
+from numpy.typing import NDArray
 
 from vla_zenoh.lab.view import paths
-from vla_zenoh.policy import ModelSpec
+from vla_zenoh.policy import ActionSpec, ModelSpec
 from vla_zenoh.types import Event, InferenceDebug, NodeStatus, Task
 
 LEVELS = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
@@ -146,11 +147,19 @@ def _first_step(seen: InferenceDebug, spec: ModelSpec | None) -> str:
     step = seen.steps[0]
     if spec is None or len(step) != spec.action.dimension:
         return "first step " + " ".join(f"{value:+.4f}" for value in step)
-    if spec.action.space == "joint":
-        arm = zip(spec.action.joints, step.tolist(), strict=False)
-        return "first step " + ", ".join(f"{name} {value:+.4f}" for name, value in arm)
-    action, scale_mm = spec.action, spec.action.position_scale_m * 1e3
-    rows = ["| first step | x | y | z |", "|---|---|---|---|"]
+    action = spec.action
+    each = [(own.part, own.action) for own in action.parts] or [("", action)]
+    return "\n\n".join(_of_arm(part, own, step[action.columns(part)]) for part, own in each)
+
+
+def _of_arm(part: str, action: ActionSpec, step: NDArray[Any]) -> str:
+    """The numbers of one arm in a step."""
+    title = f"{part} first step".strip()
+    if action.space == "joint":
+        arm = zip(action.joints, step.tolist(), strict=False)
+        return f"{title} " + ", ".join(f"{name} {value:+.4f}" for name, value in arm)
+    scale_mm = action.position_scale_m * 1e3
+    rows = [f"| {title} | x | y | z |", "|---|---|---|---|"]
     per = "/s" if action.kind == "velocity" else ""
     rows.append(
         f"| mm{per} | " + " | ".join(f"{value * scale_mm:+.1f}" for value in step[:3]) + " |"
