@@ -388,7 +388,8 @@ class Chain:
         news = [f"  {node} {e.what}: {e.why}" for node, _, e in list(self.client.events)[-12:]]
         lines = [f"  {node} | {line}" for node, line in self.lines[-25:]]
         states = {name: found.state for name, (found, _, _) in self.client.snapshot().items()}
-        z_m = f"{self.height_m():.3f} m, at {self.client.task}"
+        newest = self.recorder.newest_state()  # not `measured`, which waits, and tells this
+        z_m = f"{newest.position_m[2] if newest else np.nan:.3f} m, at {self.client.task}"
         refused = {name: count for name, count in self.refused().items() if count}
         states = {"nodes": states, "height": z_m, "refused": refused}
         return "\n".join([f"states: {states}", "events:", *news, "log:", *lines])

@@ -83,6 +83,7 @@ ALLOWED = {
             "lab/view/listener.py",
             "lab/view/viewer.py",
             "lab/web/hand.py",
+            "lab/web/part_streams.py",
             "lab/web/pictures.py",
             "lab/web/recordings.py",
             "lab/web/robot_link.py",

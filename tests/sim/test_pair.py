@@ -36,6 +36,8 @@ BOUND_S = 0.6
 STOP_S = 0.35
 STILL = 2e-3
 LED_BACK_M = 0.08
+NEAR_M = 0.12
+"""From here the arms would be at their stop within the time that a fault takes to be noticed."""
 STOP_TOLERANCE_M = 1e-3
 TAMPERED = "left"
 
@@ -264,6 +266,28 @@ def test_what_is_rejected_for_one_part_is_rejected_for_both() -> None:
 def towards_each_other(number: int) -> dict[str, np.ndarray]:
     way = np.array([0.04, 0.0, -0.01]) * (1 if number < 28 else -1)
     return dict.fromkeys(PARTS, np.array([*way, 0.0, 0.0, 0.0, 0.04]))
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        pytest.param(fault, marks=[] if fault.startswith("command") else pytest.mark.slow)
+        for fault in FAULTS
+    ],
+)
+def test_arms_on_their_way_to_each_other_stand_apart_when_one_of_them_fails(fault: str) -> None:
+    pair = Pair(towards_each_other, tcp_steps())
+    while pair.distance_m() > NEAR_M:
+        pair.run(0.02)
+    assert min(pair.speed_m_s(part)[-1] for part in PARTS) > FAST_M_S
+    since = pair.mark()
+    pair.loop.tamper = FAULTS[fault][0]
+    pair.run(BOUND_S, distances=True)
+    for part in PARTS:
+        assert pair.stop_time_s(part, since) < BOUND_S
+    stop_m = shipped().limits.reach.part_stop_m
+    assert min(pair.least_m, pair.least_measured_m) >= stop_m - STOP_TOLERANCE_M
+    assert pair.state != "active"
 
 
 def test_arms_that_are_sent_towards_each_other_stand_and_may_go_back() -> None:

@@ -4,17 +4,23 @@ Python imports this file at its start, where its folder is on PYTHONPATH. Betwee
 watches it there is a network that may be down, and what is measured of a fault must not depend on
 it. So `state/pose` and `command/pose` are kept in files beside their writers, in the folder that
 FLIGHT_FOLDER names, with when each of the two last heard the other: one row of float64 a record,
-see `netns.flight_log`.
+see `netns.flight_log`. Of a robot of the parts that FLIGHT_PARTS names these are the joints of each
+part, measured and commanded; and of what the file ``blocked`` names ("SHARE KEY") that share of the
+records is not sent.
 """
 
 from __future__ import annotations
 
 import os
+import random
 import sys
 import time
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 RECORDED = {"sim": "state/pose", "command": "command/pose"}
+JOINTS = {"sim": "state/joint", "command": "command/joint"}
 
 
 def _note_commands(heard_s: list[float]) -> None:
@@ -36,13 +42,18 @@ def _note_states(heard_s: list[float]) -> None:
 
     take = CommandInputs.poll
 
-    def take_and_note(self: CommandInputs, now_ns: int) -> Any:
-        inputs = take(self, now_ns)
+    def take_and_note(self: CommandInputs, now_ns: int, **named: Any) -> Any:
+        inputs = take(self, now_ns, **named)
         if inputs.pose is not None:
             heard_s[0] = time.monotonic()
         return inputs
 
     CommandInputs.poll = take_and_note
+
+
+def _record(publisher: Any, record: Any) -> Any:
+    """What was published, also where its publisher had encoded it before."""
+    return publisher._encoded[0] if isinstance(record, bytes) else record
 
 
 def _install(node: str, path: str) -> None:
@@ -58,6 +69,7 @@ def _install(node: str, path: str) -> None:
     def put_and_keep(self: Publisher, record: Any, **named: Any) -> Any:
         header = put(self, record, **named)
         if self.key.endswith(key_end):
+            record = _record(self, record)
             if key_end == RECORDED["sim"]:
                 reference = record.reference_position_m
                 parts, asked_ns = (record.position_m, record.twist, reference), None
@@ -77,7 +89,52 @@ def _install(node: str, path: str) -> None:
     Publisher.publish = put_and_keep
 
 
+class _Nowhere:
+    """In place of Zenoh's publisher: what is put is lost."""
+
+    def put(self, *_: Any, **__: Any) -> None:
+        pass
+
+
+def _install_parts(node: str, folder: Path, parts: list[str]) -> None:
+    import numpy as np
+
+    from vla_zenoh.bus.node import Publisher
+
+    put, nowhere = Publisher.publish, _Nowhere()
+
+    @cache
+    def file_of(part: str) -> Any:
+        return (folder / f"{part}.{node}.joints").open("ab", buffering=0)
+
+    def lost(key: str) -> bool:
+        try:
+            share, _, what = (folder / "blocked").read_text().partition(" ")
+        except FileNotFoundError:
+            return False
+        return bool(what) and what in key and random.random() < float(share)
+
+    def put_and_keep(self: Publisher, record: Any, **named: Any) -> Any:
+        publisher = self._publisher
+        self._publisher = nowhere if lost(self.key) else publisher  # pyright: ignore
+        try:
+            header = put(self, record, **named)
+        finally:
+            self._publisher = publisher
+        if self.key.endswith(JOINTS[node]) and (part := self.key.split("/")[-3]) in parts:
+            at_s = (header.stamp_wall_ns - self._clock.offset_ns) / 1e9
+            joints = _record(self, record)
+            row = [[at_s], joints.position_rad, joints.velocity_rad_s]
+            file_of(part).write(np.concatenate(row).tobytes())
+        return header
+
+    Publisher.publish = put_and_keep
+
+
 _node = sys.orig_argv[4] if sys.orig_argv[1:4] == ["-m", "vla_zenoh", "node"] else ""
 _folder = os.environ.get("FLIGHT_FOLDER")
-if _folder and _node in RECORDED:
+_parts = os.environ.get("FLIGHT_PARTS")
+if _folder and _parts and _node in JOINTS:
+    _install_parts(_node, Path(_folder), _parts.split(","))
+elif _folder and _node in RECORDED:
     _install(_node, os.path.join(_folder, f"{_node}.flight"))

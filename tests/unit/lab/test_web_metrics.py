@@ -15,7 +15,7 @@ from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.lab.web.arm import ArmLines
 from vla_zenoh.policy import ActionSpec, ModelSpec, ObservationSpec
 from vla_zenoh.profile import load_profile
-from vla_zenoh.types import ActionChunk, JointState, NodeStatus
+from vla_zenoh.types import JointState, NodeStatus
 
 parser = pytest.importorskip("prometheus_client.openmetrics.parser", reason="needs the extra web")
 metrics = pytest.importorskip("vla_zenoh.lab.web.metrics", exc_type=ImportError)
@@ -115,14 +115,10 @@ def spec(**changes: object) -> ModelSpec:
     return ModelSpec(name="m", observation=ObservationSpec(), action=action)
 
 
-def chunk(steps: np.ndarray) -> ActionChunk:
-    return ActionChunk("w", "0", 1, 1, 1, 2, steps, 1, 1, 1)
-
-
 def test_a_chunk_of_poses_is_a_line_from_where_it_begins(lines: ArmLines) -> None:
     state, start = home(lines)
     steps = np.tile([0.01, 0, 0, 0, 0, 0], (5, 1)).astype(np.float32)
-    line = np.array(lines.chunk(chunk(steps), spec(), start, state))
+    line = np.array(lines.chunk(steps, spec().action, start, state))
     assert len(line) == 6
     np.testing.assert_allclose(line[-1] - line[0], [0.05, 0, 0], atol=ATOL_M)
 
@@ -133,7 +129,7 @@ def test_a_chunk_of_joints_is_the_path_of_the_tcp_in_any_order_of_joints(lines: 
     joints = np.array(HOME)[::-1].copy()
     joints[-1] += 0.1  # the first joint turns the arm about z
     whole = spec(space="joint", kind="absolute", joints=backwards)
-    line = np.array(lines.chunk(chunk(joints[None].astype(np.float32)), whole, start, state))
+    line = np.array(lines.chunk(joints[None].astype(np.float32), whole.action, start, state))
     turned = np.hypot(*line[1, :2]), np.arctan2(line[1, 1], line[1, 0])
     assert turned[0] == pytest.approx(np.hypot(*line[0, :2]), abs=ATOL_M)
     assert turned[1] - np.arctan2(line[0, 1], line[0, 0]) == pytest.approx(0.1, abs=1e-3)
@@ -142,7 +138,7 @@ def test_a_chunk_of_joints_is_the_path_of_the_tcp_in_any_order_of_joints(lines: 
 def test_a_chunk_that_does_not_fit_is_named(lines: ArmLines) -> None:
     state, start = home(lines)
     with pytest.raises(RecordError, match="numbers"):
-        lines.chunk(chunk(np.zeros((1, 9), np.float32)), spec(), start, state)
+        lines.chunk(np.zeros((1, 9), np.float32), spec().action, start, state)
     foreign = spec(space="joint", kind="absolute", joints=("a", "b"))
     with pytest.raises(RecordError, match="not those of the arm"):
-        lines.chunk(chunk(np.zeros((1, 2), np.float32)), foreign, start, state)
+        lines.chunk(np.zeros((1, 2), np.float32), foreign.action, start, state)

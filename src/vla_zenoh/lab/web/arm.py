@@ -6,14 +6,15 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vla_zenoh.control.actions import chunk_poses, step_joints
 from vla_zenoh.errors import RecordError
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import Pose
-from vla_zenoh.policy import ModelSpec
-from vla_zenoh.profile import Profile
-from vla_zenoh.types import ActionChunk, FloatArray, JointState
+from vla_zenoh.policy import ActionSpec
+from vla_zenoh.profile import PartBase, Profile
+from vla_zenoh.types import FloatArray, JointState
 
 MAX_LINE = 60
 """Points of a chunk that are drawn."""
@@ -25,10 +26,17 @@ def rounded(points: FloatArray | Sequence[FloatArray]) -> Line:
     return np.round(np.asarray(points, float), 4).tolist()
 
 
-def surroundings(profile: Profile) -> dict[str, Any]:
-    """What stays: workspace, table and keep-outs, m in the base frame."""
-    space, reach = profile.limits.workspace, profile.limits.reach
+def surroundings(profile: Profile) -> dict[str, dict[str, Any]]:
+    """What stays, by part: base (x, y, z m, yaw rad); workspace, table, keep-outs, m, in it."""
+    return {name: _around(profile, name) for name in profile.part_names}
+
+
+def _around(profile: Profile, name: str) -> dict[str, Any]:
+    base = profile.parts[name].base if name else PartBase()
+    limits = profile.of_part(name).limits
+    space, reach = limits.workspace, limits.reach
     return {
+        "base": [*base.position_m, base.yaw_rad],
         "workspace": [list(space.x_m), list(space.y_m), list(space.z_m)],
         "table_z_m": reach.table_z_m,
         "keep_out": {
@@ -73,20 +81,20 @@ class ArmLines:
         return rounded([pose.position_m])[0]
 
     def chunk(
-        self, chunk: ActionChunk, spec: ModelSpec, start: Pose, state: JointState | None
+        self, steps: NDArray[Any], action: ActionSpec, start: Pose, state: JointState | None
     ) -> Line:
         """Path of the TCP that a chunk asks for.
 
         Args:
-            chunk: of `spec`.
-            spec: of its worker.
+            steps: (H, D) of a chunk, those of this arm.
+            action: what they mean.
             start: where it begins, with poses.
             state: where it begins, with joints; None: unknown.
 
         Raises:
             RecordError: it does not fit the spec.
         """
-        action, steps = spec.action, chunk.steps[:MAX_LINE]
+        steps = steps[:MAX_LINE]
         if steps.shape[1] != action.dimension:
             raise RecordError(f"a step has {steps.shape[1]} numbers, not {action.dimension}")
         if action.space == "tcp":

@@ -28,6 +28,9 @@ class HandWorker:
         profile: of the robot.
         client: that selects the worker.
         read: input now.
+
+    Attributes:
+        why_not: why it cannot move this robot; empty: it can.
     """
 
     def __init__(self, profile: Profile, client: Client, read: Callable[[], OperatorInput]) -> None:
@@ -39,6 +42,8 @@ class HandWorker:
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
         self._session: zenoh.Session | None = None
+        parts = ", ".join(profile.parts)
+        self.why_not = f"By hand moves one arm; here a worker moves all: {parts}" if parts else ""
         self.speeds_m_s = [speed.translation_m_s for speed in speeds_of(profile)]
 
     @property
@@ -51,10 +56,12 @@ class HandWorker:
         """Select this worker; it starts, or again with other axes.
 
         Raises:
-            NodeError: a worker of this name runs elsewhere.
+            NodeError: a worker of this name runs elsewhere, or the robot has parts.
             SecurityError: this computer has no certificate for it.
             SessionError: it was not selected.
         """
+        if self.why_not:
+            raise NodeError(self.why_not)
         with self._lock:
             self._level = level
             if self._thread is None or frame != self._frame:

@@ -4,36 +4,31 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Mapping
+from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
 import zenoh
 
-from vla_zenoh.bus.buffers import LatestSample, ReceivedSample, ZenohRing, bytes_of, header_of
+from vla_zenoh.bus.buffers import LatestSample, ReceivedSample, ZenohRing, bytes_of
 from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.primitives import ask
 from vla_zenoh.cli.node_rows import NodeRow, acting_limits, mode_of, node_rows
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, RecordError, SessionError, VlaZenohError
 from vla_zenoh.keys import PRIMITIVES, ROLLING, last_chunk, worker_node
-from vla_zenoh.kinematics.kinematics import make_kinematics
-from vla_zenoh.kinematics.so3 import Pose, rotation_from_quat
 from vla_zenoh.lab.teleop.policy import OperatorInput
-from vla_zenoh.lab.web.arm import ArmLines, Line, rounded
 from vla_zenoh.lab.web.hand import HandWorker
 from vla_zenoh.lab.web.hold import Hold
+from vla_zenoh.lab.web.part_streams import PartStreams
 from vla_zenoh.lab.web.recordings import Recordings
 from vla_zenoh.lab.web.trial import PageTrial
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     ActionChunk,
-    GripperState,
-    JointCommand,
-    JointState,
-    PoseCommand,
     PoseState,
     Task,
 )
@@ -43,10 +38,7 @@ STILL_M_S = 0.005
 STAND_S, STAND_POLL_S = 3.0, 0.01
 WATCH_S = 0.05
 MAX_HOLDER = 48
-GOALS = 100
 SPECS = 64
-CHUNK_S = 2.0
-"""A chunk that none followed for this long is drawn no more."""
 
 
 class RobotLink:
@@ -64,27 +56,21 @@ class RobotLink:
         self.profile, self.session, self.keys = profile, session, profile.keys
         self.client = Client(profile, session).subscribe()
         self.counters: Counter[str] = Counter()
-        self.speed_m_s = 0.0
-        self._rings: dict[type[Any], ZenohRing] = {}
-        self._subscribers: list[Any] = []
-        keys = self.keys
-        for kind, key, size in (
-            (PoseState, keys.state_pose, 1),
-            (JointState, keys.state_joint, 1),
-            (GripperState, keys.state_gripper, 1),
-            (PoseCommand, keys.command_pose, 1),
-            (JointCommand, keys.command_joint, 1),
-            (ActionChunk, keys.all_deltas, 16),
-            (ModelSpec, keys.all_specs, 16),
-        ):
-            ring = self._rings[kind] = ZenohRing(size)
-            self._subscribers.append(ring.subscribe(session, key))
-        self._newest: dict[type[Any], tuple[Any, float]] = {}
-        self._goals: deque[tuple[int, Pose]] = deque(maxlen=GOALS)
+        self._parts = {
+            name: PartStreams(profile.of_part(name), session, self.counters)
+            for name in profile.part_names
+        }
+        self.no_arm = next((part.no_arm for part in self._parts.values()), "")
+        self._rings: dict[type[Any], ZenohRing] = {
+            ActionChunk: ZenohRing(16),
+            ModelSpec: ZenohRing(16),
+        }
+        self._subscribers = [
+            self._rings[ActionChunk].subscribe(session, self.keys.all_deltas),
+            self._rings[ModelSpec].subscribe(session, self.keys.all_specs),
+        ]
         self._specs: dict[str, ModelSpec] = {}
         self._seen: dict[str, list[str]] = {}
-        self._chunk: tuple[Line, float] = ([], 0.0)
-        self._lines, self.no_arm = _lines_of(profile)
         self._hold, self._let_go, self._confirmed = Hold(), False, False
         self._hold_lock, self._activating = threading.Lock(), threading.Lock()
         self._wake, self._closed = threading.Event(), threading.Event()
@@ -99,6 +85,8 @@ class RobotLink:
     def poll(self) -> None:
         """Decode the newest sample of each stream."""
         now_s = time.monotonic()
+        for part in self._parts.values():
+            part.poll(now_s)
         for kind, ring in self._rings.items():
             for sample in ring.drain():
                 self._take(kind, sample, now_s)
@@ -107,7 +95,6 @@ class RobotLink:
 
     def _take(self, kind: type[Any], sample: ReceivedSample, now_s: float) -> None:
         try:
-            header = header_of(sample.sample)
             record = records.decode(kind, bytes_of(sample.sample.payload))
             if kind is ActionChunk:
                 self._take_chunk(record, now_s)
@@ -115,18 +102,10 @@ class RobotLink:
         except (CodecError, RecordError):
             self.counters["bad_sample"] += 1
             return
-        if kind is ModelSpec:
-            if len(self._specs) >= SPECS:
-                del self._specs[next(iter(self._specs))]
-            self._specs[record.hash] = record
-            self._take_seen(last_chunk(str(sample.sample.key_expr)), record)
-            return
-        self._newest[kind] = (record, now_s)
-        if kind is PoseState:
-            self.speed_m_s = float(np.linalg.norm(record.twist[:3]))
-        elif kind is PoseCommand:
-            goal = Pose(record.goal_position_m, rotation_from_quat(record.goal_quat_xyzw))
-            self._goals.append((header.stamp_wall_ns, goal))
+        if len(self._specs) >= SPECS:
+            del self._specs[next(iter(self._specs))]
+        self._specs[record.hash] = record
+        self._take_seen(last_chunk(str(sample.sample.key_expr)), record)
 
     def _take_seen(self, worker: str, spec: ModelSpec) -> None:
         """Note which pictures show what a worker's model sees."""
@@ -135,51 +114,16 @@ class RobotLink:
             self._seen[worker] = seen
 
     def _take_chunk(self, chunk: ActionChunk, now_s: float) -> None:
-        """Draw a chunk of the chosen worker, from the goal in force at its observation."""
+        """Draw a chunk of the chosen worker."""
         spec, task = self._specs.get(chunk.spec_hash), self.client.task
-        measured, lines = self._recent(PoseState, now_s), self._lines
-        if spec is None or measured is None or lines is None or task is None:
-            return
-        if chunk.worker != task.worker:
-            return
-        start = Pose(measured.position_m, rotation_from_quat(measured.quat_xyzw))
-        if spec.action.anchor == "goal":
-            seen_ns = chunk.observation_stamp_ns
-            before = (pose for stamp_ns, pose in reversed(self._goals) if stamp_ns <= seen_ns)
-            start = next(before, start)
-        joints = self._recent(JointState, now_s)
-        self._chunk = (lines.chunk(chunk, spec, start, joints), now_s)
+        if spec is not None and task is not None and chunk.worker == task.worker:
+            for part in self._parts.values():
+                part.take_chunk(chunk, spec, now_s)
 
-    def _recent(self, kind: type[Any], now_s: float) -> Any:
-        """The newest record of a stream, None if it is silent."""
-        record, at_s = self._newest.get(kind, (None, 0.0))
-        return record if now_s - at_s < 1.0 else None
-
-    def arm(self) -> dict[str, Any]:
-        """Positions for the picture of the arm, m in the base frame; what is unknown is absent."""
+    def arms(self) -> dict[str, dict[str, Any]]:
+        """What is drawn of each part; of a robot that is one arm, of one without a name."""
         now_s = time.monotonic()
-        pose, joints = self._recent(PoseState, now_s), self._recent(JointState, now_s)
-        found: dict[str, Any] = {"speed_m_s": round(self.speed_m_s, 4)}
-        if pose is not None:
-            found["measured_m"] = rounded([pose.position_m])[0]
-        command = self._recent(PoseCommand, now_s)
-        if command is not None:
-            found["command_m"] = rounded([command.position_m])[0]
-            found["goal_m"] = rounded([command.goal_position_m])[0]
-        gripper = self._recent(GripperState, now_s)
-        if gripper is not None:
-            found |= {"width_m": round(gripper.width_m, 4), "holding": gripper.holding}
-        if now_s - self._chunk[1] < CHUNK_S:
-            found["chunk_m"] = self._chunk[0]
-        try:
-            if self._lines is not None and joints is not None:
-                found["links_m"] = self._lines.links_of(joints)
-            by_joints = self._recent(JointCommand, now_s)
-            if self._lines is not None and by_joints is not None:
-                found["command_m"] = self._lines.tcp(by_joints.names, by_joints.position_rad)
-        except RecordError:
-            self.counters["bad_sample"] += 1
-        return found
+        return {name: part.described(now_s) for name, part in self._parts.items()}
 
     # -- nodes --------------------------------------------------------------------------------
     def rows(self) -> list[NodeRow]:
@@ -225,20 +169,25 @@ class RobotLink:
         """
         began_s = time.monotonic()
         self.client.stop()
-        measured = LatestSample()
-        subscriber = measured.subscribe(self.session, self.keys.state_pose)
-        try:
+        with ExitStack() as stack:
+            measured: list[LatestSample] = []
+            for name in self.profile.part_names:
+                measured.append(LatestSample())
+                key = self.keys.of_part(name).state_pose
+                stack.callback(measured[-1].subscribe(self.session, key).undeclare)
             return self._stopping(measured, began_s)
-        finally:
-            subscriber.undeclare()
 
-    def _stopping(self, measured: LatestSample, began_s: float) -> dict[str, Any]:
+    def _stopping(self, measured: list[LatestSample], began_s: float) -> dict[str, Any]:
         stopped_s: float | None = None
+        moving = list(measured)
         while (now_s := time.monotonic()) < began_s + STAND_S:
             status = self.client.status("command")
             if status is not None and status.state == "stopped":
                 stopped_s = stopped_s or now_s - began_s
-                if status.detail.get("at_rest") is True and self._stands(measured):
+                if status.detail.get("at_rest") is not True:
+                    moving = list(measured)
+                moving = [each for each in moving if not self._stands(each)]
+                if status.detail.get("at_rest") is True and not moving:
                     return self._stop_report(stopped_s, now_s - began_s)
             time.sleep(STAND_POLL_S)
         return self._stop_report(stopped_s, None)
@@ -433,6 +382,8 @@ class RobotLink:
         self.client.release_deadman()
         for subscriber in self._subscribers:
             subscriber.undeclare()
+        for part in self._parts.values():
+            part.close()
 
 
 def task_fields(task: Task) -> dict[str, Any]:
@@ -445,11 +396,3 @@ def task_fields(task: Task) -> dict[str, Any]:
         "active": task.active,
         "episode": task.episode,
     }
-
-
-def _lines_of(profile: Profile) -> tuple[ArmLines | None, str]:
-    """The arm of a profile, or why it cannot be drawn."""
-    try:
-        return ArmLines(make_kinematics(profile)), ""
-    except VlaZenohError as error:
-        return None, str(error)

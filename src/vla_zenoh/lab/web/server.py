@@ -236,7 +236,7 @@ class PageServer:
                 self._news.append(news)
                 self._tell_all(news)
             if self._pages:
-                state = {**self._link.state(), "arm": self._link.arm(), "pages": len(self._pages)}
+                state = {**self._link.state(), "arms": self._link.arms(), "pages": len(self._pages)}
                 self._state = json.dumps(self._link.trial.masked(state))[1:]
                 if now_s - nodes_s > NODES_S:
                     nodes_s = now_s
@@ -305,6 +305,7 @@ class PageServer:
                 "pictures": self._pictures.offered if page.drives else (),
                 "surroundings": surroundings(link.profile),
                 "no_arm": link.no_arm,
+                "no_hand": link.hand.why_not,
                 "insecure": link.profile.session.insecure,
                 "levels": link.hand.speeds_m_s,
             }

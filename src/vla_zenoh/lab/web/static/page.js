@@ -90,7 +90,10 @@ function enter(message) {
   if (!message.drives) $("hold-help").textContent = "A viewer may look. Stop at the robot, or ask an operator.";
   warn(message.insecure ? "Insecure profile: anyone on the network can command this robot." : "");
   $("arm-words").textContent = message.no_arm;
-  $("keep-out-legend").hidden = !Object.keys(message.surroundings.keep_out).length;
+  $("keep-out-legend").hidden = Object.values(message.surroundings).every((part) => !Object.keys(part.keep_out).length);
+  $("no-hand").hidden = !message.no_hand;
+  setText($("no-hand"), message.no_hand);
+  for (const node of document.querySelectorAll(".hand")) node.hidden = Boolean(message.no_hand);
   $("events").replaceChildren();
   levels(message.levels || []);
   if (message.drives) watchPictures();
@@ -127,12 +130,12 @@ function showState(message) {
     if (document.activeElement !== $("speed")) { $("speed").value = task.speed_percent; setText($("speed-now"), `${task.speed_percent} %`); }
     options($("worker"), [...new Set([...message.workers, task.worker])], task.worker);
   }
-  const arm = message.arm || {};
+  const arms = Object.entries(message.arms || {}), fastest = Math.max(0, ...arms.map(([, arm]) => arm.speed_m_s || 0));
   facts([
     ["why", message.why],
     ["held by", message.held_by ? (message.you_hold ? `${message.held_by} (you)` : message.held_by) : task && task.active ? "nobody: it runs without a hold" : "nobody"],
-    ["arm", `${message.at_rest === null ? "unknown" : message.at_rest ? "stands" : "moves"}, ${((arm.speed_m_s || 0) * 100).toFixed(1)} cm/s`],
-    ["gripper", arm.width_m === undefined ? "" : `${(arm.width_m * 1000).toFixed(0)} mm${arm.holding ? ", holds an object" : ""}`],
+    ["arm", `${message.at_rest === null ? "unknown" : message.at_rest ? "stands" : "moves"}, ${(fastest * 100).toFixed(1)} cm/s`],
+    ...arms.map(([name, arm]) => [`gripper ${name}`.trim(), arm.width_m === undefined ? "" : `${(arm.width_m * 1000).toFixed(0)} mm${arm.holding ? ", holds an object" : ""}`]),
     ["limits", message.limits.join("; ")],
     ["pages", String(message.pages)],
   ]);
@@ -144,7 +147,7 @@ function showState(message) {
   $("save").disabled = !message.rolling || !welcome.drives;
   showTrial(message.trial || {});
   streams(message.seen || []);
-  drawArm(arm);
+  drawArms(message.arms || {});
   if (stopping && message.state === "stopped") setText($("stop-words"), `${welcome.robot}: stopped, coming to rest`);
   else if (message.state === "stopped" && !$("stop-words").textContent) setText($("stop-words"), `${welcome.robot} is stopped: ${message.why}`);
 }
@@ -315,7 +318,7 @@ $("trial-form").addEventListener("submit", (event) => {
 $("trial-end").addEventListener("click", () => send({ do: "end_trial" }));
 function showTrial(trial) {
   const on = trial.on === true;
-  $("trial-form").hidden = on;
+  $("trial-begin").hidden = on;
   $("trial-now").hidden = !on;
   setText($("trial-result"), on ? "" : trial.text || "");
   if (!on) return;
@@ -453,82 +456,121 @@ function draw(head, image) {
 }
 
 // -- the arm ------------------------------------------------------------------------------
-function drawArm(arm) {
-  const fixed = welcome.surroundings;
-  if (!fixed) return;
-  view($("side"), arm, fixed, 0, 2);
-  view($("top"), arm, fixed, 0, 1);
-  const at = arm.measured_m;
-  if (at && !welcome.no_arm) setText($("arm-words"), `TCP at x ${at[0].toFixed(3)}, y ${at[1].toFixed(3)}, z ${at[2].toFixed(3)} m in the base frame`);
+// Seen from far away (orthographic): lines keep their lengths, so distances can be compared.
+const FROM = { "3-D": [-0.9, 0.45], front: [Math.PI / 2, 0], side: [0, 0], top: [0, Math.PI / 2] };
+let [turn, tilt] = FROM["3-D"], dragged = null;
+for (const [name, from] of Object.entries(FROM)) {
+  const button = el("button", name, { className: "small", type: "button" });
+  button.addEventListener("click", () => { [turn, tilt] = from; drawArms(state.arms || {}); });
+  $("turns").append(button);
 }
-function view(canvas, arm, fixed, across, up) {
-  const scale = window.devicePixelRatio || 1, size = Math.round(canvas.clientWidth * scale);
-  if (!size) return;
-  if (canvas.width !== size) canvas.width = canvas.height = size;
+function turned(right, up) {
+  turn += right;
+  tilt = Math.min(Math.PI / 2, Math.max(-0.3, tilt + up));
+  drawArms(state.arms || {});
+}
+$("space").addEventListener("pointerdown", (event) => { dragged = event; $("space").setPointerCapture(event.pointerId); });
+$("space").addEventListener("pointermove", (event) => {
+  if (!dragged) return;
+  turned((dragged.clientX - event.clientX) / 150, (event.clientY - dragged.clientY) / 150);
+  dragged = event;
+});
+for (const name of ["pointerup", "pointercancel"]) $("space").addEventListener(name, () => { dragged = null; });
+const KEYS = { ArrowLeft: [0.1, 0], ArrowRight: [-0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] };
+$("space").addEventListener("keydown", (event) => { if (KEYS[event.key]) { event.preventDefault(); turned(...KEYS[event.key]); } });
+
+function boxed([x, y, z]) { return [0, 1, 2, 3, 4, 5, 6, 7].map((at) => [x[at & 1], y[(at >> 1) & 1], z[at >> 2]]); }
+const EDGES = [[0, 1], [2, 3], [4, 5], [6, 7], [0, 2], [1, 3], [4, 6], [5, 7], [0, 4], [1, 5], [2, 6], [3, 7]];
+const FACES = [[0, 1, 3, 2], [4, 5, 7, 6], [0, 1, 5, 4], [2, 3, 7, 6], [0, 2, 6, 4], [1, 3, 7, 5]];
+function placed([x, y, z, yaw]) { // base frame of a part -> frame of the robot
+  const c = Math.cos(yaw), s = Math.sin(yaw);
+  return (p) => [x + c * p[0] - s * p[1], y + s * p[0] + c * p[1], z + p[2]];
+}
+function drawArms(arms) {
+  const parts = Object.entries(welcome.surroundings || {}).map(([name, fixed]) => ({ name, fixed, arm: arms[name] || {}, at: placed(fixed.base) }));
+  const canvas = $("space"), scale = window.devicePixelRatio || 1;
+  const width = Math.round(canvas.clientWidth * scale), height = Math.round(canvas.clientHeight * scale);
+  if (!width || !parts.length) return;
+  if (canvas.width !== width || canvas.height !== height) { canvas.width = width; canvas.height = height; }
+  const all = parts.flatMap(({ fixed, at }) => [...boxed(fixed.workspace), [0, 0, 0]].map(at));
+  const middle = [0, 1, 2].map((axis) => (Math.min(...all.map((p) => p[axis])) + Math.max(...all.map((p) => p[axis]))) / 2);
+  const reach = Math.max(...all.map((p) => Math.hypot(p[0] - middle[0], p[1] - middle[1], p[2] - middle[2])));
+  const zoom = (0.56 * Math.min(width, height)) / reach;
+  const [ca, sa, ce, se] = [Math.cos(turn), Math.sin(turn), Math.cos(tilt), Math.sin(tilt)];
+  const see = (p) => {
+    const [x, y, z] = [p[0] - middle[0], p[1] - middle[1], p[2] - middle[2]];
+    return [width / 2 + zoom * (ca * x + sa * y), height / 2 - zoom * (se * (ca * y - sa * x) + ce * z)];
+  };
   const style = getComputedStyle(document.documentElement), colour = (name) => style.getPropertyValue(`--${name}`);
-  const pen = canvas.getContext("2d"), box = fixed.workspace;
-  const points = [[0, 0, 0], [box[0][0], box[1][0], box[2][0]], [box[0][1], box[1][1], box[2][1]], ...(arm.links_m || [])];
-  const range = (axis) => [Math.min(...points.map((p) => p[axis])), Math.max(...points.map((p) => p[axis]))];
-  const [left, right] = range(across), [low, high] = range(up);
-  const zoom = (size * 0.9) / Math.max(right - left, high - low);
-  const X = (p) => size / 2 + zoom * (p[across] - (left + right) / 2), Y = (p) => size / 2 - zoom * (p[up] - (low + high) / 2);
-  pen.clearRect(0, 0, size, size);
+  const pen = canvas.getContext("2d");
+  pen.clearRect(0, 0, width, height);
   pen.lineJoin = pen.lineCap = "round";
-  const line = (path, ink, width, dash = []) => {
-    pen.beginPath();
-    path.forEach((p, at) => (at ? pen.lineTo(X(p), Y(p)) : pen.moveTo(X(p), Y(p))));
-    Object.assign(pen, { strokeStyle: colour(ink), lineWidth: width * scale });
-    pen.setLineDash(dash.map((part) => part * scale));
-    pen.stroke();
-    pen.setLineDash([]);
-  };
-  const dot = (p, ink, radius, fill = true) => {
-    pen.beginPath();
-    pen.arc(X(p), Y(p), radius * scale, 0, 7);
-    Object.assign(pen, { fillStyle: colour(ink), strokeStyle: colour(ink), lineWidth: 2 * scale });
-    if (fill) pen.fill(); else pen.stroke();
-  };
-  const corner = (a, b) => { const p = [0, 0, 0]; p[across] = box[across][a]; p[up] = box[up][b]; return p; };
-  line([corner(0, 0), corner(1, 0), corner(1, 1), corner(0, 1), corner(0, 0)], "space", 1.5, [6, 5]);
-  if (up === 2 && fixed.table_z_m !== null) line([[left - 1, 0, fixed.table_z_m], [right + 1, 0, fixed.table_z_m]], "space", 1);
-  pen.globalAlpha = 0.35;
-  for (const shape of Object.values(fixed.keep_out)) keepOut(pen, shape, across, up, X, Y, zoom, colour("keep-out"));
-  pen.globalAlpha = 1;
-  if (arm.links_m) {
-    line(arm.links_m, "arm", 5);
-    for (const joint of arm.links_m.slice(0, -1)) dot(joint, "arm", 4);
-  }
-  if (arm.chunk_m && arm.chunk_m.length) {
-    line(arm.chunk_m, "chunk", 2.5);
-    for (const p of arm.chunk_m.slice(1)) dot(p, "chunk", 2);
-  }
-  if (arm.goal_m) dot(arm.goal_m, "goal", 8, false);
-  if (arm.command_m) dot(arm.command_m, "command", 5);
-  if (arm.measured_m) dot(arm.measured_m, "measured", 3);
-}
-function keepOut(pen, shape, across, up, X, Y, zoom, ink) {
-  const c = shape.centre_m;
-  pen.fillStyle = ink;
-  pen.beginPath();
-  if (shape.radius_m) pen.arc(X(c), Y(c), zoom * shape.radius_m, 0, 7);
-  else if (shape.box_m) {
-    const [a, b, h] = shape.box_m.map((edge) => edge / 2), turn = shape.yaw_rad || 0;
-    const corners = [[a, b], [-a, b], [-a, -b], [a, -b]].map(([x, y]) => [c[0] + x * Math.cos(turn) - y * Math.sin(turn), c[1] + x * Math.sin(turn) + y * Math.cos(turn)]);
-    const xs = corners.map((p) => p[0]);
-    const outline = up === 1 ? corners.map((p) => [...p, 0]) : [[Math.min(...xs), 0, c[2] - h], [Math.max(...xs), 0, c[2] - h], [Math.max(...xs), 0, c[2] + h], [Math.min(...xs), 0, c[2] + h]];
-    for (const p of outline) pen.lineTo(X(p), Y(p));
-  } else {
-    const n = shape.normal, size = Math.hypot(n[across], n[up]);
-    if (size < 0.05 * Math.hypot(...n)) return; // it is parallel to this view
-    const [nx, ny] = [n[across] / size, n[up] / size], far = 5;
-    for (const [along, deep] of [[far, 0], [-far, 0], [-far, far], [far, far]]) {
-      const p = [0, 0, 0];
-      p[across] = c[across] - ny * along - nx * deep;
-      p[up] = c[up] + nx * along - ny * deep;
-      pen.lineTo(X(p), Y(p));
+  for (const { name, fixed, arm, at } of parts) {
+    const path = (points) => { pen.beginPath(); for (const p of points) pen.lineTo(...see(at(p))); };
+    const line = (points, ink, thick, dash = [], alpha = 1) => {
+      path(points);
+      Object.assign(pen, { strokeStyle: colour(ink), lineWidth: thick * scale, globalAlpha: alpha });
+      pen.setLineDash(dash.map((each) => each * scale));
+      pen.stroke();
+      pen.setLineDash([]);
+      pen.globalAlpha = 1;
+    };
+    const fill = (points, ink, alpha) => { path(points); Object.assign(pen, { fillStyle: colour(ink), globalAlpha: alpha }); pen.fill(); pen.globalAlpha = 1; };
+    const dot = (p, ink, radius, full = true) => {
+      pen.beginPath();
+      pen.arc(...see(at(p)), radius * scale, 0, 7);
+      Object.assign(pen, { fillStyle: colour(ink), strokeStyle: colour(ink), lineWidth: 2 * scale });
+      if (full) pen.fill(); else pen.stroke();
+    };
+    const space = boxed(fixed.workspace), floor = fixed.table_z_m;
+    if (floor !== null) fill([0, 1, 3, 2].map((corner) => [space[corner][0], space[corner][1], floor]), "space", 0.13);
+    for (const [a, b] of EDGES) line([space[a], space[b]], "space", 1, [5, 5], 0.8);
+    for (const shape of Object.values(fixed.keep_out)) keepOut(shape, fill, line, (p) => see(at(p)), pen, zoom, colour("keep-out"));
+    for (const [axis, ink] of [[[0.12, 0, 0], "x-axis"], [[0, 0.12, 0], "y-axis"], [[0, 0, 0.12], "z-axis"]]) line([[0, 0, 0], axis], ink, 2);
+    if (arm.links_m) {
+      if (floor !== null) line(arm.links_m.map((p) => [p[0], p[1], floor]), "arm", 4, [], 0.25); // its shadow
+      line(arm.links_m, "arm", 6);
+      for (const joint of arm.links_m.slice(0, -1)) dot(joint, "arm", 4.5);
     }
+    if (arm.chunk_m && arm.chunk_m.length) {
+      line(arm.chunk_m, "chunk", 9, [], 0.3);
+      line(arm.chunk_m, "chunk", 2);
+      for (const p of arm.chunk_m.slice(1)) dot(p, "chunk", 2);
+    }
+    if (arm.goal_m) dot(arm.goal_m, "goal", 8, false);
+    if (arm.command_m) dot(arm.command_m, "command", 5);
+    if (arm.measured_m) dot(arm.measured_m, "measured", 3);
+    if (name) { pen.fillStyle = colour("ink"); pen.font = `${13 * scale}px system-ui, sans-serif`; pen.fillText(name, see(at([0, 0, 0]))[0] + 8 * scale, see(at([0, 0, 0]))[1] + 16 * scale); }
   }
-  pen.fill();
+  const where = parts.filter(({ arm }) => arm.measured_m).map(({ name, arm }) => {
+    const [x, y, z] = arm.measured_m;
+    return `TCP${name && ` of ${name}`} at x ${x.toFixed(3)}, y ${y.toFixed(3)}, z ${z.toFixed(3)} m`;
+  });
+  if (!welcome.no_arm) setText($("arm-words"), where.length ? `${where.join("; ")}, in the base frame` : "no state of the arm");
+}
+function keepOut(shape, fill, line, see, pen, zoom, ink) {
+  const c = shape.centre_m;
+  if (shape.radius_m) {
+    pen.beginPath();
+    pen.arc(...see(c), zoom * shape.radius_m, 0, 7);
+    Object.assign(pen, { fillStyle: ink, globalAlpha: 0.3 });
+    pen.fill();
+    pen.globalAlpha = 1;
+  } else if (shape.box_m) {
+    const [a, b, h] = shape.box_m.map((edge) => edge / 2), at = placed([...c, shape.yaw_rad || 0]);
+    const corners = boxed([[-a, a], [-b, b], [-h, h]]).map(at);
+    for (const face of FACES) fill(face.map((corner) => corners[corner]), "keep-out", 0.15);
+    for (const [one, other] of EDGES) line([corners[one], corners[other]], "keep-out", 1);
+  } else { // a wall: a piece of it, and the side that is free
+    const size = Math.hypot(...shape.normal), n = shape.normal.map((each) => each / size);
+    const across = Math.abs(n[2]) < 0.9 ? [-n[1], n[0], 0] : [1, 0, 0], length = Math.hypot(...across), u = across.map((each) => each / length);
+    const v = [n[1] * u[2] - n[2] * u[1], n[2] * u[0] - n[0] * u[2], n[0] * u[1] - n[1] * u[0]];
+    const corner = (i, j) => c.map((each, axis) => each + 0.5 * (i * u[axis] + j * v[axis]));
+    const wall = [corner(-1, -1), corner(1, -1), corner(1, 1), corner(-1, 1)];
+    fill(wall, "keep-out", 0.2);
+    line([...wall, wall[0]], "keep-out", 1);
+    line([c, c.map((each, axis) => each + 0.1 * n[axis])], "keep-out", 2);
+  }
 }
 
 // -- nodes and log ------------------------------------------------------------------------

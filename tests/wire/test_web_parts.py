@@ -1,0 +1,116 @@
+"""The page of a robot of two arms: both are drawn, both stand after a stop, neither is jogged."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from camera_rig import free_endpoint, until
+from web_rig import Browser, Site, browsing, serving, write_people
+
+from vla_zenoh.errors import SessionError
+from vla_zenoh.profile import load_profile
+from vla_zenoh.runtime.launch import Host
+
+pytest.importorskip("starlette", reason="needs the extra web")
+pytest.importorskip("uvicorn", reason="needs the extra web")
+
+READY_S, PATIENCE_S = 90.0, 20.0
+POLL_S = 0.05
+PROFILE = """\
+extends: two_pandas_sim
+cameras:
+  front: {{source: "sim:front", width: 160, height: 120, rate_hz: 10}}
+  top: {{source: "sim:top", width: 160, height: 120, rate_hz: 10}}
+  left_wrist: null
+  right_wrist: null
+session:
+  listen: [{endpoint}]
+  connect: [{endpoint}]
+timing: {{command_timeout_s: 0.5, state_timeout_s: 0.5}}
+"""
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Host, Site]]:
+    folder: Path = tmp_path_factory.mktemp("pair")
+    file = folder / "pair.yaml"
+    file.write_text(PROFILE.format(endpoint=free_endpoint()))
+    over = threading.Event()
+    with Host(load_profile(str(file)), None, log=lambda *_: None, tell=lambda *_: None) as host:
+
+        def poll() -> None:
+            while not over.wait(POLL_S):
+                host.poll()
+
+        thread = threading.Thread(target=poll)
+        thread.start()
+        try:
+            assert host.client is not None
+            alive = host.client
+            until("a worker", lambda: "worker-scripted_pair" in alive.alive, READY_S)
+            with serving(file, write_people(folder)) as site:
+                yield host, site
+        finally:
+            over.set()
+            thread.join()
+
+
+def moves(page: Browser) -> bool:
+    arms = page.state.get("arms", {})
+    return all(arms[part].get("speed_m_s", 0) > 0.01 for part in ("left", "right"))
+
+
+def activate(host: Host, page: Browser) -> None:
+    client = host.client
+    assert client is not None
+
+    def tried() -> bool:
+        try:
+            client.activate()
+        except SessionError:
+            return False
+        return True
+
+    until("it is active", tried, READY_S)
+    until("both arms move", lambda: moves(page), PATIENCE_S)
+
+
+def test_both_arms_are_drawn_where_they_stand(pair: tuple[Host, Site]) -> None:
+    with browsing(pair[1]) as page:
+        around = page.answers("welcome")[0]["surroundings"]
+        assert around["left"]["base"][:3] == [0.0, 0.0, 0.0]
+        assert around["right"]["base"] == pytest.approx([1.2, 0.0, 0.0, 3.14159], abs=1e-4)
+        activate(pair[0], page)
+        until("chunks", lambda: all(arm.get("chunk_m") for arm in page.state["arms"].values()))
+        for part in ("left", "right"):
+            arm = page.state["arms"][part]
+            assert len(arm["links_m"]) == 9
+            assert arm["links_m"][-1] == pytest.approx(arm["measured_m"], abs=0.02)
+            assert {"width_m", "command_m"} <= arm.keys()
+            # A chunk begins near the arm of its own columns.
+            assert arm["chunk_m"][0] == pytest.approx(arm["measured_m"], abs=0.1)
+
+
+def test_a_stop_is_told_when_both_arms_stand(pair: tuple[Host, Site]) -> None:
+    with browsing(pair[1]) as page:
+        if not moves(page):
+            activate(pair[0], page)
+        page.send(do="stop")
+        report = page.wait("stopped")
+        assert report["stopped"]
+        assert report["stands_s"] is not None
+        speeds = [arm["speed_m_s"] for arm in page.state["arms"].values()]
+        assert len(speeds) == 2
+        until("both stand", lambda: not moves(page))
+        assert page.ask(do="reset")["is"] == "done"
+
+
+def test_a_jog_is_refused_in_a_sentence(pair: tuple[Host, Site]) -> None:
+    with browsing(pair[1]) as page:
+        why = page.answers("welcome")[0]["no_hand"]
+        assert why == "By hand moves one arm; here a worker moves all: left, right"
+        answer = page.ask(do="jog", on=True, frame="base", level=1)
+        assert (answer["is"], answer["why"]) == ("failed", why)
