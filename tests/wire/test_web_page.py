@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
 import pytest
 from camera_rig import PATIENCE_S, until
 from chain import READY_PATIENCE_S, Chain
@@ -197,6 +198,21 @@ def test_settings_of_the_page_are_those_of_the_robot(chain: Chain, site: Site) -
             assert browser.ask(**request)["is"] == "done"
             until(f"the page shows {field}", lambda f=field, v=value: browser.state["task"][f] == v)
         assert browser.ask(do="speed", percent=400)["is"] == "failed"
+
+
+def test_what_the_gripper_holds_is_said_and_drawn(chain: Chain, site: Site) -> None:
+    with browsing(site) as browser:
+        assert browser.ask(do="held", part="", text="0.04 0.06 0.1 at 0 0 0.02")["is"] == "done"
+        until("it is drawn", lambda: "held_m" in browser.state["arms"][""])
+        corners_m = np.array(browser.state["arms"][""]["held_m"])
+        edges_m = np.linalg.norm(corners_m[[1, 2, 4]] - corners_m[0], axis=1)
+        assert edges_m == pytest.approx([0.04, 0.06, 0.1], abs=1e-3)
+        tcp_m = browser.state["arms"][""]["measured_m"]
+        assert np.linalg.norm(corners_m.mean(axis=0) - tcp_m) == pytest.approx(0.02, abs=1e-3)
+        for text, part in (("0.04", ""), ("a b c", ""), ("0.1 0.1 0.1", "left")):
+            assert browser.ask(do="held", part=part, text=text)["is"] == "failed"
+        assert browser.ask(do="held", part="", text="")["is"] == "done"
+        until("it is gone", lambda: "held_m" not in browser.state["arms"][""])
 
 
 def test_a_person_takes_the_arm_by_hand_and_gives_it_back(chain: Chain, site: Site) -> None:

@@ -14,7 +14,7 @@ from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.profile import PartBase, Profile
-from vla_zenoh.types import FloatArray, JointState
+from vla_zenoh.types import FloatArray, HeldBox, JointState
 
 MAX_LINE = 60
 """Points of a chunk that are drawn."""
@@ -24,6 +24,13 @@ Line = list[list[float]]
 def rounded(points: FloatArray | Sequence[FloatArray]) -> Line:
     """Points (n, 3) m as lists, to the tenth of a millimetre."""
     return np.round(np.asarray(points, float), 4).tolist()
+
+
+def corners_of(box: HeldBox, tcp: Pose) -> Line:
+    """The eight corners (8, 3) m of what a gripper holds at a TCP; x changes first, z last."""
+    signs = np.array([(x, y, z) for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)])
+    own = np.array(box.centre_m) + 0.5 * signs * np.array(box.size_m)
+    return rounded(own @ tcp.rotation.T + tcp.position_m)
 
 
 def surroundings(profile: Profile) -> dict[str, dict[str, Any]]:

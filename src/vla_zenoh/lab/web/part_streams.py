@@ -10,15 +10,17 @@ import zenoh
 
 from vla_zenoh.bus.buffers import ReceivedSample, ZenohRing, bytes_of, header_of
 from vla_zenoh.codec import records
+from vla_zenoh.codec.settings import decode_held
 from vla_zenoh.errors import CodecError, RecordError, SpecError, VlaZenohError
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.kinematics.so3 import Pose, rotation_from_quat
-from vla_zenoh.lab.web.arm import ArmLines, Line, rounded
+from vla_zenoh.lab.web.arm import ArmLines, Line, corners_of, rounded
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     ActionChunk,
     GripperState,
+    HeldBox,
     JointCommand,
     JointState,
     PoseCommand,
@@ -115,14 +117,26 @@ class PartStreams:
         record, at_s = self._newest.get(kind, (None, 0.0))
         return record if now_s - at_s < SILENT_S else None
 
-    def described(self, now_s: float) -> dict[str, Any]:
-        """Positions for the picture, m in the base frame of this arm, its speed, its gripper; what
-        is unknown is absent."""
+    def described(self, now_s: float, holds: str) -> dict[str, Any]:
+        """Positions for the picture, m in the base frame of this arm, its speed, its gripper.
+
+        What is unknown is absent.
+
+        Args:
+            now_s: monotonic clock.
+            holds: the box that its gripper is said to hold; empty: none.
+        """
         pose, joints = self._recent(PoseState, now_s), self._recent(JointState, now_s)
         found: dict[str, Any] = {}
         if pose is not None:
             found["measured_m"] = rounded([pose.position_m])[0]
             found["speed_m_s"] = round(float(np.linalg.norm(pose.twist[:3])), 4)
+        box = decode_held(holds.encode())
+        if isinstance(box, HeldBox):
+            found["holds"] = holds
+            if pose is not None:
+                tcp = Pose(pose.position_m, rotation_from_quat(pose.quat_xyzw))
+                found["held_m"] = corners_of(box, tcp)
         command = self._recent(PoseCommand, now_s)
         if command is not None:
             found["command_m"] = rounded([command.position_m])[0]

@@ -87,6 +87,7 @@ FIELDS: Mapping[str, Mapping[str, Callable[[Any], bool]]] = {
     "worker": {"name": _text},
     "rate": {"hz": _number},
     "speed": {"percent": _number},
+    "held": {"part": _text, "text": _text},
     "activate": {},
     "deactivate": {},
     "hold": {"press": _count, "tick": _count},

@@ -17,6 +17,7 @@ from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.primitives import ask
 from vla_zenoh.cli.node_rows import NodeRow, acting_limits, mode_of, node_rows
 from vla_zenoh.codec import records
+from vla_zenoh.codec.settings import decode_held
 from vla_zenoh.errors import CodecError, RecordError, SessionError, VlaZenohError
 from vla_zenoh.keys import PRIMITIVES, ROLLING, last_chunk, worker_node
 from vla_zenoh.lab.teleop.policy import OperatorInput
@@ -123,7 +124,30 @@ class RobotLink:
     def arms(self) -> dict[str, dict[str, Any]]:
         """What is drawn of each part; of a robot that is one arm, of one without a name."""
         now_s = time.monotonic()
-        return {name: part.described(now_s) for name, part in self._parts.items()}
+        return {
+            name: part.described(now_s, self._held_by(name)) for name, part in self._parts.items()
+        }
+
+    def _held_by(self, part: str) -> str:
+        """The box that a gripper holds, as the command node reports it."""
+        status = self.client.status("command")
+        detail: Mapping[str, Any] = {} if status is None else status.detail
+        return str(detail.get("parts", {"": detail}).get(part, {}).get("gripper_holds", ""))
+
+    def hold_box(self, part: str, text: str) -> str:
+        """Say what a gripper holds, see the key ``held``, and wait until it counts.
+
+        Raises:
+            CodecError: it is not a box.
+            SessionError: there is no such part, or it was not accepted.
+        """
+        if part not in self._parts:
+            raise SessionError(f"the robot has no part {part!r}")
+        box = decode_held(text.encode())
+        self.client.publish(self.keys.of_part(part).held if part else self.keys.held, str(box))
+        if not self.client.wait_for(lambda: self._held_by(part) == str(box), STAND_S):
+            raise SessionError("not accepted: the log says why")
+        return f"counted as held: {box} m" if box else "nothing is held"
 
     # -- nodes --------------------------------------------------------------------------------
     def rows(self) -> list[NodeRow]:

@@ -598,6 +598,7 @@ SETTINGS: dict[str, Callable[[RobotLink, Any], Any]] = {
     "worker": lambda link, given: link.client.set_worker(given["name"]),
     "rate": lambda link, given: link.client.set_rate(given["hz"]),
     "speed": lambda link, given: link.client.set_speed(given["percent"]),
+    "held": lambda link, given: link.hold_box(given["part"], given["text"]),
     "activate": lambda link, _: link.client.activate(),
     "deactivate": lambda link, _: link.deactivate(),
     "reset": lambda link, _: link.reset(),

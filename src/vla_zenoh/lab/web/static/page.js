@@ -96,7 +96,16 @@ function enter(message) {
   for (const node of document.querySelectorAll(".hand")) node.hidden = Boolean(message.no_hand);
   $("events").replaceChildren();
   levels(message.levels || []);
+  $("held").replaceChildren(...Object.keys(message.surroundings).map(heldField));
   if (message.drives) watchPictures();
+}
+
+function heldField(part) { // the box that a gripper holds
+  const input = el("input", "", { maxLength: 100, placeholder: "0.04 0.04 0.12", autocomplete: "off" });
+  input.addEventListener("change", () => { send({ do: "held", part, text: input.value.trim() }); input.blur(); });
+  const label = el("label", `The ${part} gripper holds a box of X Y Z m, along the tool (empty: nothing) `.replace("  ", " "));
+  label.append(input);
+  return label;
 }
 
 function warn(text) { $("warning").hidden = !text; setText($("warning"), text); }
@@ -135,7 +144,7 @@ function showState(message) {
     ["why", message.why],
     ["held by", message.held_by ? (message.you_hold ? `${message.held_by} (you)` : message.held_by) : task && task.active ? "nobody: it runs without a hold" : "nobody"],
     ["arm", `${message.at_rest === null ? "unknown" : message.at_rest ? "stands" : "moves"}, ${(fastest * 100).toFixed(1)} cm/s`],
-    ...arms.map(([name, arm]) => [`gripper ${name}`.trim(), arm.width_m === undefined ? "" : `${(arm.width_m * 1000).toFixed(0)} mm${arm.holding ? ", holds an object" : ""}`]),
+    ...arms.map(([name, arm]) => [`gripper ${name}`.trim(), arm.width_m === undefined ? "" : `${(arm.width_m * 1000).toFixed(0)} mm${arm.holding ? ", holds an object" : ""}${arm.holds ? `, counted as a box of ${arm.holds} m` : ""}`]),
     ["limits", message.limits.join("; ")],
     ["pages", String(message.pages)],
   ]);
@@ -537,6 +546,7 @@ function drawArms(arms) {
       line(arm.chunk_m, "chunk", 2);
       for (const p of arm.chunk_m.slice(1)) dot(p, "chunk", 2);
     }
+    if (arm.held_m) for (const [a, b] of EDGES) line([arm.held_m[a], arm.held_m[b]], "arm", 2);
     if (arm.goal_m) dot(arm.goal_m, "goal", 8, false);
     if (arm.command_m) dot(arm.command_m, "command", 5);
     if (arm.measured_m) dot(arm.measured_m, "measured", 3);
