@@ -20,12 +20,12 @@ class Distribution:
 
     Args:
         count: of the values.
-        mean: likewise.
+        mean: of the values.
         std: of a sample (divisor n - 1), 0 for a single value.
         min: smallest.
         p50: median.
-        p95: likewise.
-        p99: likewise.
+        p95: 95th percentile.
+        p99: 99th percentile.
         max: largest.
     """
 

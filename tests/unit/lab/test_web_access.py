@@ -57,7 +57,7 @@ def test_a_file_of_people_is_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "named"),
     [
-        ("", "names nobody"),
+        ("", "names no person"),
         ("anna: operator", "anna: write"),
         ("anna: {role: boss, token: '0123456789abcdef'}", "a role is operator or viewer"),
         ("anna: {role: operator, token: short}", "16 characters"),

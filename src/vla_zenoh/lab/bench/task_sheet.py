@@ -71,7 +71,7 @@ def _row(ended: TaskOutcome) -> Picture:
 
 
 def _mark(row: Picture, colour: tuple[int, int, int], *, done: bool, judged: bool) -> None:
-    """A disc with a tick, a cross, or a dash where nobody judged."""
+    """A disc with a tick, a cross, or a dash if it was not judged."""
     x, y, r = GAP + MARK_PX // 2, TITLE_HEIGHT // 2, MARK_PX // 2
     cv2.circle(row, (x, y), r, colour, -1, cv2.LINE_AA)
     if not judged:

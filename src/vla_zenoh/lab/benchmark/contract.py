@@ -28,7 +28,7 @@ class BenchmarkTask:
     Args:
         name: of the task, in the benchmark's own words.
         prompt: its language.
-        max_steps: an episode that has not succeeded after so many steps has failed.
+        max_steps: steps after which an episode has failed.
         episodes: number of its initial states; 0: an episode's index is a seed, any will do.
     """
 

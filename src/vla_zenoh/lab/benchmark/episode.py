@@ -54,10 +54,10 @@ def replay_episode(
     actions: Sequence[FloatArray],
     look: Callable[[int], None] = lambda step: None,
 ) -> EpisodeOutcome:
-    """Carry out recorded steps from the same initial state, without a model.
+    """Execute recorded steps from the same initial state, without a model.
 
     Args:
-        benchmark: likewise.
+        benchmark: in which.
         request: whose steps they are.
         actions: every step.
         look: called with the number of steps so far, 0 first.

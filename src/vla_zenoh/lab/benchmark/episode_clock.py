@@ -76,7 +76,7 @@ class EpisodeOutcome:
         end: hash of the simulation's state after the last step, empty: it does not tell.
         failure: empty, ``steps`` (the limit) or what the command node stopped for.
         attempts: how often it was begun; those before were lost with their process.
-        actions: every step that the environment carried out.
+        actions: every step that the environment executed.
     """
 
     suite: str

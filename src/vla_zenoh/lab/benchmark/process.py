@@ -79,7 +79,7 @@ class BenchmarkProcess:
     """A benchmark in a process of its own.
 
     Args:
-        setting: likewise.
+        setting: of the benchmark.
         robot: in whose keys it runs.
         python: interpreter of a prepared environment; None: the file's header is obeyed.
 

@@ -93,10 +93,10 @@ def write_videos(
 
     Args:
         folder: of the run.
-        place: where the steps are carried out again.
-        failed: likewise.
+        place: where the steps are executed again.
+        failed: requests and outcomes of failed episodes.
         camera: of the benchmark.
-        most: at most so many; the first failure of every task comes first.
+        most: largest number; the first failure of every task comes first.
     """
     first: dict[str, int] = Counter()
     order = []

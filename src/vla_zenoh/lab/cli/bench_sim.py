@@ -158,7 +158,7 @@ def sim(
     ] = None,
     replay: Annotated[
         Path | None,
-        typer.Option("--replay", help="Folder of a run whose steps are carried out again."),
+        typer.Option("--replay", help="Folder of a run whose steps are executed again."),
     ] = None,
     list_tasks: Annotated[
         bool, typer.Option("--list", help="Print suites, tasks of --suite, cameras and action.")

@@ -147,7 +147,7 @@ def run_folder(given: Path | None) -> Path:
 def latency_line(latency: Mapping[str, Any]) -> str:
     """The latency of a run, see `vla_zenoh.lab.demo.segments.latencies`, in one line."""
     if latency.get("p50") is None:
-        return "latency: no chunk was carried out"
+        return "latency: no chunk was executed"
     stages = ", ".join(
         f"{name.replace('_', ' ')} {values['p50']:.1f}"
         for name, values in latency["stages"].items()

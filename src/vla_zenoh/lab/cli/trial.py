@@ -76,14 +76,16 @@ def trial(
     as_json: JsonOption = False,
     unattended: Annotated[
         Path | None,
-        typer.Option("--unattended", help="Plan (YAML) of tasks, resets and judge: needs nobody."),
+        typer.Option(
+            "--unattended", help="Plan (YAML) of tasks, resets and judge: no person is needed."
+        ),
     ] = None,
 ) -> None:
     """Try models on a real arm; you judge whether each episode succeeded.
 
     Every worker does every setup, in an order that you do not see. Enter ends an episode, Ctrl-C
     the trial; the arm brakes first. The same command continues it. With --unattended a program
-    resets and judges, and nobody has to be there.
+    resets and judges without a person.
     """
     if unattended is not None:
         robot = target.load().robot.name

@@ -86,7 +86,7 @@ def web(
 
 
 def _most(profile: Profile) -> PageRole:
-    """Role that nobody on the page exceeds: that of the certificate here."""
+    """Highest role of a person on the page: that of the certificate here."""
     return "viewer" if local_role(profile) is Role.VIEWER else "operator"
 
 

@@ -99,7 +99,7 @@ def export(
         MissingExtraError: pyarrow or PyAV is not installed.
     """
     if not episodes:
-        raise RecordingError("the recordings hold no episode: no chunk was carried out in them")
+        raise RecordingError("the recordings hold no episode: no chunk was executed in them")
     if any(episode.spec.action != episodes[0].spec.action for episode in episodes):
         whose = ", ".join(sorted({episode.worker for episode in episodes}))
         raise RecordingError(

@@ -156,7 +156,7 @@ class SegmentOutcome:
             if not value <= limit
         ]
         if self.steps_done != self.segment.steps:
-            out.append(f"{self.steps_done} of {self.segment.steps} steps were carried out")
+            out.append(f"{self.steps_done} of {self.segment.steps} steps were executed")
         return out
 
     def to_dict(self) -> dict[str, Any]:

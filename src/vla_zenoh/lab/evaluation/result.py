@@ -34,7 +34,7 @@ class PromptSegment:
 
     Args:
         prompt: as published.
-        requests: carried out.
+        requests: executed.
         seconds: duration.
         path_m: length of the path.
         path_rad: length of the path in rotation.
@@ -88,7 +88,7 @@ class TaskVerdict:
 
     Args:
         prompt: of the task.
-        success: None: nobody judged.
+        success: None: not judged.
         said: in words.
     """
 

@@ -117,7 +117,7 @@ SEGMENT_COLUMNS = (
 
 HINTS = {
     "requests": "chunks of the worker in control while the arm was active",
-    "succeeded": "requests of which at least one step was carried out",
+    "succeeded": "requests of which at least one step was executed",
     "path": "length of the measured way of the TCP",
     "tracking error, mean / p95 / max": "measured from commanded position at the same time",
     "idle while active": "the arm stood still though it was active",

@@ -20,7 +20,7 @@ another, and does not push out what the log has."""
 
 
 class Allowance:
-    """Lets so many through at once, and so many per second in the long run."""
+    """Token bucket: a burst at once, then a rate."""
 
     def __init__(self) -> None:
         self._left, self._at_s = float(BURST), time.monotonic()

@@ -49,7 +49,7 @@ APART_S = 60.0
 AGAIN_S = 5.0
 """After the disk was full."""
 KEPT_SAVED = 20
-"""Automatically saved folders; those that somebody asked for are never deleted."""
+"""Automatically saved folders; those that a person asked for are never deleted."""
 MAX_CLIENTS = 1024
 LOST_EVERY_S = 5.0
 """Between two lines that say how many puts were not logged."""

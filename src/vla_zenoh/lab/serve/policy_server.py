@@ -1,4 +1,4 @@
-"""Serves one of our models over WebSocket, without Zenoh, in the form of somebody else's clients.
+"""Serves one of our models over WebSocket, without Zenoh, in the protocol of another server's clients.
 
 It serves one client at a time, as a model may keep state; a second client is rejected.
 """
@@ -45,7 +45,7 @@ class PolicyServer:
         converse: begins the conversation of a new connection.
         host: address to listen on.
         port: to listen on; 0: any.
-        health: path that answers whoever asks whether it is up.
+        health: path of the health check.
         max_bytes: of a frame.
         api_key: required of clients; empty: none.
     """

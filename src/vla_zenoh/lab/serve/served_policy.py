@@ -127,7 +127,7 @@ class ServedPolicy:
 
 
 class DefaultNames(NamedTuple):
-    """How clients name what nobody named otherwise.
+    """Default names of the clients' fields.
 
     Args:
         camera: with a place for the name of the camera.

@@ -61,7 +61,7 @@ class Verdict:
     """How an episode ended.
 
     Args:
-        success: the order was carried out.
+        success: the order was executed.
         failure: one of `FAILURES`; empty after a success.
         time_s: of the verdict, on the caller's clock.
     """

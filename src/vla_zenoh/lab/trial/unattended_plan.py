@@ -32,7 +32,7 @@ class UnattendedTask(_Part):
 
     Args:
         name: of its folder.
-        prompt: likewise.
+        prompt: of its episodes.
         episodes: of each worker.
         seconds: time limit of an episode.
         order: goal for the simulator's judge, as `vla_zenoh.lab.tasks.Order`.
@@ -145,12 +145,12 @@ class UnattendedPlan(_Part):
 
     Args:
         workers: each once.
-        tasks: likewise.
+        tasks: each once.
         reset: before each episode.
         judge: of each episode.
         stop: rules.
         seed: of order and layouts.
-        webhook: is sent JSON at start, trouble and end; empty: nobody is told.
+        webhook: is sent JSON at start, trouble and end; empty: none is sent.
     """
 
     workers: tuple[str, ...]

@@ -38,7 +38,7 @@ class People:
 
     Args:
         people: with different tokens.
-        most: role that nobody exceeds: that of the certificate with which the page is on the bus.
+        most: highest role: that of the certificate with which the page is on the bus.
     """
 
     def __init__(self, people: Iterable[Person], most: PageRole = "operator") -> None:
@@ -91,7 +91,7 @@ def read_people(path: Path) -> list[Person]:
         except ProfileError as error:
             raise SecurityError(f"{path}: {error}") from error
     if not people:
-        raise SecurityError(f"{path} names nobody: write NAME: {{role: operator, token: ...}}")
+        raise SecurityError(f"{path} names no person: write NAME: {{role: operator, token: ...}}")
     if len({person.token for person in people}) < len(people):
         raise SecurityError(f"{path}: two people have the same token")
     return people
@@ -100,7 +100,7 @@ def read_people(path: Path) -> list[Person]:
 def host_is_ours(host: str, names: Iterable[str]) -> bool:
     """Whether the header ``Host`` names this server.
 
-    A name of somebody else's that was made to resolve to us (DNS rebinding) does not; an address
+    A foreign name that was made to resolve to us (DNS rebinding) does not; an address
     cannot be such a name.
 
     Args:

@@ -22,7 +22,7 @@ START_S = 5.0
 
 
 class HandWorker:
-    """The worker ``teleop``, while somebody has taken the arm on the page.
+    """The worker ``teleop``, while a person has taken the arm on the page.
 
     Args:
         profile: of the robot.

@@ -1,4 +1,4 @@
-"""OpenMetrics of every node that was heard, and of the page itself.
+"""OpenMetrics of every node, and of the page itself.
 
 Names and units follow the convention of OpenMetrics: base units, ``_total`` for counters. Labels
 are names of nodes, stages, reasons and keys; of each family at most `MAX_SERIES` are given.
@@ -106,7 +106,7 @@ def families(rows: Iterable[NodeRow], web: Mapping[str, int], pages: int) -> lis
     """Families of metrics.
 
     Args:
-        rows: every node heard or expected.
+        rows: every node seen or expected.
         web: counters of the page.
         pages: that are open.
     """

@@ -25,7 +25,7 @@ MAX_STREAMS = 32
 JPEG_START = b"\xff\xd8"
 NEAR_PERCENT, FAR_PERCENT = 1.0, 99.0
 SPARSE = 4
-"""Of so many rows and columns one says how near and far a depth picture goes."""
+"""One row and column in this many says how near and far a depth picture goes."""
 
 
 class Picture(NamedTuple):

@@ -151,7 +151,7 @@ class RobotLink:
 
     # -- nodes --------------------------------------------------------------------------------
     def rows(self) -> list[NodeRow]:
-        """Every node heard or expected."""
+        """Every node seen or expected."""
         client = self.client
         return node_rows(client.snapshot(), client.expected, client.alive)
 
@@ -348,7 +348,7 @@ class RobotLink:
             with self._hold_lock:
                 before = self._hold.held
                 self._hold.expire(time.monotonic())
-                if self._over():  # stopped, or ended by itself: a new press begins anew
+                if self._over():  # stopped, or ended by itself: a new press starts again
                     self._hold.held = None
                 held = self._hold.held is not None
                 let_go, self._let_go = self._let_go, False

@@ -1,7 +1,7 @@
 """Finished runs in the folder of recordings, and the pages and films that are made of them.
 
 Browsers name a run as the list does, so no path of theirs is ever opened. What was made is opened
-by a ticket: an address that nobody can guess, good for this one result and for a while. A
+by a ticket: an address that cannot be guessed, good for this one result and for a while. A
 link cannot carry the token of a person, and the address of a page is no place for it.
 """
 

@@ -443,7 +443,7 @@ class PageServer:
         now_s = time.monotonic()
         if self._stopping is None or self._stopping.done():
             self._stopping = asyncio.ensure_future(self._stop_and_tell(person))
-        elif now_s - self._stop_s > STOP_AGAIN_S:  # somebody may have reset it meanwhile
+        elif now_s - self._stop_s > STOP_AGAIN_S:  # it may have been reset meanwhile
             self._stops.submit(self._link.client.stop)
         else:
             return await asyncio.shield(self._stopping)

@@ -209,7 +209,7 @@ class PageTrial:
         return None
 
     def poll_line(self) -> str | None:
-        """See `Operator`; an episode that nobody watches is ended."""
+        """See `Operator`; an episode without a watching page is ended."""
         if self._page == NO_PAGE or time.monotonic() - self._watched_s > WATCHED_S:
             self.notify("ended: the page that ran it was closed, hidden or not connected")
             return ""
