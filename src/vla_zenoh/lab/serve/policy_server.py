@@ -1,4 +1,4 @@
-"""Serves one of our models over WebSocket, without Zenoh, in the protocol of another server's clients.
+"""Serves one of our models over WebSocket, without Zenoh, in the protocol of another server.
 
 It serves one client at a time, as a model may keep state; a second client is rejected.
 """
