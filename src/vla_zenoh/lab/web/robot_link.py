@@ -125,10 +125,10 @@ class RobotLink:
         """What is drawn of each part; of a robot that is one arm, of one without a name."""
         now_s = time.monotonic()
         return {
-            name: part.described(now_s, self._held_by(name)) for name, part in self._parts.items()
+            name: part.described(now_s, self._box_of(name)) for name, part in self._parts.items()
         }
 
-    def _held_by(self, part: str) -> str:
+    def _box_of(self, part: str) -> str:
         """The box that a gripper holds, as the command node reports it."""
         status = self.client.status("command")
         detail: Mapping[str, Any] = {} if status is None else status.detail
@@ -145,7 +145,7 @@ class RobotLink:
             raise SessionError(f"the robot has no part {part!r}")
         box = decode_held(text.encode())
         self.client.publish(self.keys.of_part(part).held if part else self.keys.held, str(box))
-        if not self.client.wait_for(lambda: self._held_by(part) == str(box), STAND_S):
+        if not self.client.wait_for(lambda: self._box_of(part) == str(box), STAND_S):
             raise SessionError("not accepted: the log says why")
         return f"counted as held: {box} m" if box else "nothing is held"
 
