@@ -230,7 +230,7 @@ def test_a_loop_that_is_too_slow_to_brake_ends_in_time_and_says_so(turns: Turns)
     turns.run()
     assert (turns.turn - turns.last) * SLOW_S < 2 * LEAST_S
     (event,) = turns.told("not_braked")
-    assert "the loop came too late" in event.why
+    assert "the loop was late too often" in event.why
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -154,4 +154,4 @@ def test_a_loop_that_is_too_slow_to_brake_ends_in_time_and_says_so(loop: Loop) -
     loop.run()
     assert loop.turns.arm.follower.moving
     (event,) = loop.turns.told("not_braked")
-    assert "the loop came too late" in event.why
+    assert "the loop was late too often" in event.why
