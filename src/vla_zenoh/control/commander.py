@@ -140,7 +140,7 @@ class Commander:
             ticks: periods since the last call. More than one after a late wake-up: the motion is a
                 function of time, so the same trajectory is sampled later, no faster.
         """
-        task_before, state_before = self.task, self.state
+        task_before = self.task
         self._update_states(inputs)
         stopped = any(setting.name == "stop" for setting in inputs.settings)
         if stopped:
@@ -177,7 +177,7 @@ class Commander:
                 self._out.parts[part.name] = commands
             else:
                 self._out.pose, self._out.joint, self._out.gripper = commands
-        if self.state is not state_before and self.task.active != (self.state in OBEYING):
+        if self.task.active != (self.state in OBEYING):  # `prepare` may have changed the state
             self.task = replace(self.task, active=self.state in OBEYING)
         self._out.task_changed = self.task is not task_before and self.task != task_before
         out, self._out = self._out, Outputs()

@@ -1136,3 +1136,13 @@ def test_of_a_chunk_planned_before_a_stop_nothing_is_carried_out() -> None:
     assert rig.state == "stopped"
     rig.settle()
     rig.assert_smooth()
+
+
+def test_a_robot_that_leaves_its_ready_mode_between_two_ticks_is_inactive_in_the_task() -> None:
+    rig = moving_rig()
+    rig.gripper = replace(rig.gripper, mode="stalled")
+    rig.commander.prepare(Inputs(gripper=rig.gripper_state()), rig.now_ns + rig.period_ns)
+    out = rig.tick()
+    assert rig.state == "inactive"
+    assert not rig.commander.task.active
+    assert out.task_changed
