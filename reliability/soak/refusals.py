@@ -27,6 +27,9 @@ OVERDUE: Reasons = {
 }
 """Who did not run for a while: chunks are old, and the robot brakes as its stream fell silent."""
 FROM_ROBOT: Reasons = {
+    # A simulator that was killed is back at home after 0.7 s; the stream to the old one brakes, and
+    # ends 0.5 s after the arm stands.
+    "sim": frozenset({"pose_jump"}),
     "command": BEGUN_ANEW | BACKLOG,
     "worker": BEGUN_ANEW | BACKLOG,
     "camera": BEGUN_ANEW | BACKLOG,
