@@ -27,9 +27,6 @@ OVERDUE: Reasons = {
 }
 """Who did not run for a while: chunks are old, and the robot brakes as its stream fell silent."""
 FROM_ROBOT: Reasons = {
-    # A simulator that was killed is back at home after 0.7 s; the stream to the old one brakes, and
-    # ends 0.5 s after the arm stands.
-    "sim": frozenset({"pose_jump"}),
     "command": BEGUN_ANEW | BACKLOG,
     "worker": BEGUN_ANEW | BACKLOG,
     "camera": BEGUN_ANEW | BACKLOG,
@@ -40,6 +37,9 @@ FROM_COMMAND: Reasons = {
 }
 FROM_WORKER: Reasons = {"command": frozenset({"stale", "expired"}) | BEGUN_ANEW}
 FROM_CAMERA: Reasons = {"command": frozenset({"stale"}), "worker": BEGUN_ANEW}
+RESTARTED: Mapping[str, Reasons] = {"sim": {"sim": frozenset({"pose_jump"})}}
+"""Kind of node that was killed -> who refuses what for it. A simulator is back after 0.7 s, with the
+arm at home; the stream to the old one brakes, and ends 0.5 s after the arm stands."""
 WHO_LIVES: Reasons = {"command": frozenset({"foreign_spec", "foreign_status"})}
 """Who was away, or hears of one who was, is told what they say before it knows that they live."""
 NEVER = frozenset({"simulation_fault", "inference_failed", "contract", "reset_failed", "seen"})
@@ -118,6 +118,8 @@ def unexplained(
         whom: node it was done to; empty: to none.
     """
     tables = [EXPLAINS[action], FROM.get(kind_of(whom), {})]
+    if action == "kill":
+        tables.append(RESTARTED.get(kind_of(whom), {}))
     if action == "freeze":  # it finds on its desk what has piled up
         own = kind_of(whom)
         tables.append({own: OVERDUE.get(own, frozenset()) | BACKLOG})

@@ -79,7 +79,7 @@ USUAL = Limits()
 
 
 class RollingRecord:
-    """See the module.
+    """The node `rolling`: keeps a ring of recordings on disk and writes the audit log.
 
     Args:
         profile: the effective profile.
