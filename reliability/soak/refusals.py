@@ -38,7 +38,7 @@ FROM_COMMAND: Reasons = {
 FROM_WORKER: Reasons = {"command": frozenset({"stale", "expired"}) | BEGUN_ANEW}
 FROM_CAMERA: Reasons = {"command": frozenset({"stale"}), "worker": BEGUN_ANEW}
 RESTARTED: Mapping[str, Reasons] = {"sim": {"sim": frozenset({"pose_jump"})}}
-"""Kind of node that was killed -> who refuses what for it. A simulator is back after 0.7 s, with the
+"""Kind of node that was killed -> who refuses what for it. A simulator is back after 0.7 s, its
 arm at home; the stream to the old one brakes, and ends 0.5 s after the arm stands."""
 WHO_LIVES: Reasons = {"command": frozenset({"foreign_spec", "foreign_status"})}
 """Who was away, or hears of one who was, is told what they say before it knows that they live."""
