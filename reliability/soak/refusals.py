@@ -21,7 +21,9 @@ ASKED_EARLY: Reasons = {"command": frozenset({"activate_refused"})}
 """The arm is asked for again while preflight still finds something missing: that is we."""
 OVERDUE: Reasons = {
     "command": frozenset({"stale", "expired", "future", "clock_step", "worker_refused"}),
-    "sim": frozenset({"pose_late", "pose_braking", "pose_jump", "pose_too_fast", "clock_step"}),
+    "sim": frozenset(
+        {"pose_late", "pose_braking", "pose_inactive", "pose_jump", "pose_too_fast", "clock_step"}
+    ),
     "camera": frozenset({"clock_step"}),
     "worker": frozenset({"clock_step"}),
 }
@@ -32,12 +34,13 @@ FROM_ROBOT: Reasons = {
     "camera": BEGUN_ANEW | BACKLOG,
 }
 FROM_COMMAND: Reasons = {
-    "sim": frozenset({"pose_braking", "pose_jump", "pose_too_fast", "pose_foreign"}) | BEGUN_ANEW,
+    "sim": BEGUN_ANEW
+    | {"pose_braking", "pose_inactive", "pose_jump", "pose_too_fast", "pose_foreign"},
     "worker": BEGUN_ANEW,
 }
 FROM_WORKER: Reasons = {"command": frozenset({"stale", "expired"}) | BEGUN_ANEW}
 FROM_CAMERA: Reasons = {"command": frozenset({"stale"}), "worker": BEGUN_ANEW}
-RESTARTED: Mapping[str, Reasons] = {"sim": {"sim": frozenset({"pose_jump"})}}
+RESTARTED: Mapping[str, Reasons] = {"sim": {"sim": frozenset({"pose_inactive"})}}
 """Kind of node that was killed -> who refuses what for it. A simulator is back after 0.7 s, its
 arm at home; the stream to the old one brakes, and ends 0.5 s after the arm stands."""
 WHO_LIVES: Reasons = {"command": frozenset({"foreign_spec", "foreign_status"})}

@@ -49,10 +49,12 @@ def test_a_refusal_needs_a_cause() -> None:
     assert unexplained(found, "kill", 0.0, "worker-b") == malformed
     assert unexplained(found, "prompt", 2 * STALL_S) == malformed
     assert unexplained(found, "junk", 0.0) == {}
-    jump = {"sim.pose_jump": 4}
-    assert unexplained(jump, "kill", 0.0, "sim") == {}
+    rest = {"sim.pose_inactive": 4}
+    assert unexplained(rest, "kill", 0.0, "sim") == {}
     for action, whom in (("kill", "camera"), ("prompt", ""), ("stop", "")):
-        assert unexplained(jump, action, 0.0, whom) == jump
+        assert unexplained(rest, action, 0.0, whom) == rest
+    jump = {"sim.pose_jump": 1}
+    assert unexplained(jump, "kill", 0.0, "sim") == jump
     assert unexplained({"sim.simulation_fault": 1}, "junk", 0.0) == {"sim.simulation_fault": 1}
 
 

@@ -71,14 +71,14 @@ def move(arm: FrankaArm, duration_s: float) -> FloatArray:
             position = np.array(start.translation) + (0.0, 0.0, gone)
             twist = np.array([0.0, 0.0, speed, 0.0, 0.0, 0.0])
             quat = np.array(start.quaternion)
-            command = PoseCommand(position, quat, twist, np.zeros(6), position, quat, "streaming")
+            command = PoseCommand(position, quat, twist, np.zeros(6), position, quat, "active")
             given = position
         else:
             gone, speed = way(elapsed_s, SPEED_RAD_S)
             given, rate = q.copy(), np.zeros(7)
             given[JOINT], rate[JOINT] = q[JOINT] + gone, speed
             names = arm._profile.robot.arm_joints
-            command = JointCommand(names, given, rate, np.zeros(7), "streaming")
+            command = JointCommand(names, given, rate, np.zeros(7), "active")
         arm.move(command)
         time.sleep(TICK_S)
     return given
@@ -112,12 +112,12 @@ def test_a_set_point_that_is_far_off_is_no_reflex(robot: Simulator, arm: FrankaA
             turned = exp3(np.array([FAR_RAD, 0.0, 0.0])) @ state.O_T_EE.matrix[:3, :3]
             quat = quat_from_rotation(turned)
             still = np.zeros(6)
-            command = PoseCommand(position, quat, still, still, position, quat, "streaming")
+            command = PoseCommand(position, quat, still, still, position, quat, "active")
         else:
             wanted = np.array(state.q)
             wanted[WRIST] += FAR_RAD
             names = arm._profile.robot.arm_joints
-            command = JointCommand(names, wanted, np.zeros(7), np.zeros(7), "streaming")
+            command = JointCommand(names, wanted, np.zeros(7), np.zeros(7), "active")
         arm.move(command)
         time.sleep(TICK_S)
     assert arm.robot.is_in_control, robot.aborts(since)

@@ -141,8 +141,9 @@ class ArmGuard:
         """Accept a pose, or return the reason why it is rejected.
 
         Returns:
-            None, ``other_mode`` (joints are followed), ``moving`` (the arm moves, so its control
-            law cannot be exchanged), or what `PoseGuard.offer` returns.
+            None, ``inactive`` (no stream begins in a state in which its writer brakes or stands),
+            ``other_mode`` (joints are followed), ``moving`` (the arm moves, so its control law
+            cannot be exchanged), or what `PoseGuard.offer` returns.
         """
         return self._offer("pose", command, now_ns)
 
@@ -151,8 +152,11 @@ class ArmGuard:
         return self._offer("joint", command, now_ns)
 
     def _offer(self, mode: Mode, command: Stamped[Any], now_ns: int) -> str | None:
-        reason = self._change(mode) or self._of(mode).offer(command, now_ns)
         state = command.record.state
+        if not (self.following or self.braking or state in ACTIVE_STATES):
+            # The end of a stream to a robot node that was restarted, or that had been silent.
+            return "inactive"
+        reason = self._change(mode) or self._of(mode).offer(command, now_ns)
         if reason is None:
             self.mode, self._writer, self._state = mode, command.header.source, state
         elif reason in UNHEEDED and state in ACTIVE_STATES and not (self.following or self.braking):

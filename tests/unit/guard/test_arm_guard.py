@@ -237,7 +237,7 @@ def test_an_arm_that_follows_somebody_heeds_no_stranger_and_does_not_say_so() ->
 
 def test_a_stream_of_one_that_brakes_already_need_not_be_told() -> None:
     side = Side()
-    assert side.pose(0.1, state="inactive") == "jump"
+    assert side.pose(0.1, state="inactive") == "inactive"
     side.tick()
     assert not side.guard.unheeded
 
@@ -248,3 +248,30 @@ def test_after_a_clock_was_set_back_it_is_not_unheeded_for_ever() -> None:
     side.now_ns -= 3_600_000 * MS
     side.tick()
     assert not side.guard.unheeded
+
+
+@pytest.mark.parametrize("state", ["inactive", "stopped", "fault", ""])
+def test_no_stream_begins_in_a_state_in_which_its_writer_brakes(state: str) -> None:
+    side = Side()
+    assert side.pose(0.0004, 0.02, state=state) == "inactive"
+    assert not side.guard.following
+    assert side.pose(0.0004, 0.02) is None
+    assert side.guard.following
+
+
+def test_a_followed_stream_brakes_the_arm_in_any_state() -> None:
+    side = Side()
+    assert side.pose(0.0, 0.02) is None
+    side.tick(4)
+    assert side.pose(0.0001, 0.01, state="stopped") is None
+    assert side.guard.following
+    assert not side.guard.writer_active
+
+
+def test_a_robot_that_was_reset_ignores_the_rest_of_the_stream_to_the_one_before() -> None:
+    side = Side()
+    assert side.pose(0.0, 0.0) is None
+    side.tick(4)
+    side.guard.reset()
+    assert side.pose(0.0, 0.0, state="stopped") == "inactive"
+    assert not side.guard.following
