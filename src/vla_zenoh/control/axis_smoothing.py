@@ -473,6 +473,12 @@ class AxisSmoother:
             self.brake()
         return self._state.position if self._plan is None else self._plan.end
 
+    def halfway_to_rest(self) -> FloatArray:
+        """Position (n,) after half of the time that is left of the motion in progress."""
+        if self._plan is None:
+            return self._state.position
+        return self._plan.at(0.5 * (self._elapsed_s + self._plan.duration_s)).position
+
     @property
     def at_rest(self) -> bool:
         """The motion stands, and is not about to start."""
@@ -515,6 +521,11 @@ def stop_way(
     fast = np.where(np.abs(later) > np.abs(velocity), later, velocity)
     stop_s = float(np.max(0.5 * (np.abs(later) / most + most / jerk) + ramp_s))
     return (ahead_s + stop_s) * fast
+
+
+def between(start: FloatArray, end: FloatArray) -> list[FloatArray]:
+    """Two places (n,) of a short motion: half of it, and its end."""
+    return [0.5 * (start + end), end]
 
 
 def _across(along: FloatArray) -> FloatArray:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Generator, Iterable
+from copy import copy
 from typing import NamedTuple
 
 import numpy as np
@@ -412,6 +413,16 @@ class JointPath(AxisSmoother):
     def stop_way(self, ahead_s: float) -> FloatArray:
         """How far (n,) a stop that begins in `ahead_s` goes at most."""
         return stop_way(*self.state[1:], self.box, ahead_s)
+
+    def stopping_rad(self, ahead_s: float) -> list[FloatArray]:
+        """(n,) each, joints on the way of a stop that begins in `ahead_s`, and at its end."""
+        if self.at_rest:
+            return [self.state.position]
+        ahead = copy(self)
+        if not self.braking:
+            ahead.advance(ahead_s / self._dt_s)
+        end_rad = ahead.braked()
+        return [ahead.halfway_to_rest(), end_rad]
 
     def _follow(self) -> None:
         """Compute the motion of the TCP."""

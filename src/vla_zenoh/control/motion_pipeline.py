@@ -168,15 +168,14 @@ class MotionPipeline:
             return self._path.state.position
         return self._joints.position_rad
 
-    def resting_rad(self, ahead_s: float) -> list[FloatArray]:
-        """(n,) each, where commanded joints may come to rest, were they to brake in `ahead_s`."""
+    def stopping_rad(self, ahead_s: float) -> list[FloatArray]:
+        """(n,) each, commanded joints on the way to rest and at rest, from a brake in `ahead_s`."""
         assert self._joints is not None
         if self.in_joints and self._path is not None:
-            path = self._path
-            return [path.state.position + path.stop_way(ahead_s)]
+            return self._path.stopping_rad(ahead_s)
         if self._smoother is None:
             return [self._joints.position_rad]
-        return self._joints.resting_rad(self._smoother, ahead_s)
+        return self._joints.stopping_rad(self._smoother, ahead_s)
 
     def wanted_rad(self, now_ns: int) -> FloatArray | None:
         """(n,) joints of the goal in force, None where it has none."""

@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vla_zenoh.control.axis_smoothing import between
 from vla_zenoh.control.commanded_part import CommandedPart
 from vla_zenoh.control.joint_monitor import BAND_M, PAST_M, PERIOD_NS
 from vla_zenoh.control.limits import LimitHit, Slowdown
@@ -30,8 +31,6 @@ from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray
 
 NAME = "part_distance"
-SHARES = (0.5, 1.0)
-"""Places on the way of a stop that are looked at, beside its start."""
 FAR_M = 0.25
 """Arms this much further apart than they may come are looked at now and then."""
 FAR_TICKS = 4
@@ -117,13 +116,13 @@ class PartSpacing:
             self._skip, self._held = FAR_TICKS - 1, False
             return Spacing()
         floor_m = min(self._stop_m, self.nearest.distance_m - NOISE_M)
-        rests = [part.motion.resting_rad(ahead_s) for part in self._parts]
-        ahead = self._nearest(at, floor_m + NOISE_M, rests)
+        stops = [part.motion.stopping_rad(ahead_s) for part in self._parts]
+        ahead = self._nearest(at, floor_m + NOISE_M, stops)
         # A brake that is given up and begun again would end further on.
         stand = all(
             np.abs(end - here_rad).max() < STANDS_RAD
-            for here_rad, ends in zip(at, rests, strict=True)
-            for end in ends
+            for here_rad, stop in zip(at, stops, strict=True)
+            for end in stop
         )
         self._held = ahead.distance_m < floor_m or (
             self._held and not (stand and self._may_go_on(at, now_ns, floor_m))
@@ -157,26 +156,26 @@ class PartSpacing:
             wanted_rad = part.motion.wanted_rad(now_ns)
             way_rad = np.zeros(len(here_rad)) if wanted_rad is None else wanted_rad - here_rad
             longest = float(np.abs(way_rad).max())
-            probes.append([here_rad + way_rad * min(1.0, PROBE_RAD / max(longest, 1e-9))])
+            probe_rad = here_rad + way_rad * min(1.0, PROBE_RAD / max(longest, 1e-9))
+            probes.append(between(here_rad, probe_rad))
         return self._nearest(at, floor_m + NOISE_M, probes).distance_m >= floor_m
 
     def _nearest(
         self,
         at: Sequence[FloatArray],
         within_m: float | None = None,
-        ends: Sequence[Sequence[FloatArray]] = (),
+        stops: Sequence[Sequence[FloatArray]] = (),
     ) -> Nearest:
-        """The nearest links with the parts anywhere between these joints and some ends of theirs.
+        """The nearest links with each part at its joints or anywhere on its way of a stop.
 
         Args:
             at: (n,) joints of each part.
             within_m: links further apart are not looked for.
-            ends: (n,) each of each part; none: it stands.
+            stops: (n,) each, further joints of each part; none: it stands.
         """
         found = Nearest(self._within_m if within_m is None else within_m)
         places = [
-            [here_rad, *(here_rad + share * (end - here_rad) for end in own for share in SHARES)]
-            for here_rad, own in itertools.zip_longest(at, ends, fillvalue=())
+            [here_rad, *stop] for here_rad, stop in itertools.zip_longest(at, stops, fillvalue=())
         ]
         for i, j, pair in self._pairs:
             near = pair.nearest(places[i], places[j], found.distance_m)

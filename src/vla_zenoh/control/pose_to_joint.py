@@ -13,7 +13,7 @@ from copy import copy
 
 import numpy as np
 
-from vla_zenoh.control.axis_smoothing import Shares, stop_way
+from vla_zenoh.control.axis_smoothing import Shares, between, stop_way
 from vla_zenoh.control.barriers import Barriers, DistanceConstraints
 from vla_zenoh.control.joint_follower import FollowSettings, JointFollower, JointMotion
 from vla_zenoh.control.joint_space import followed_shares
@@ -156,8 +156,8 @@ class PoseToJoint:
         ahead = Pose(position_m + way[:3], exp3(way[3:]) @ rotation)
         smoother.brake(self.shares(smoother.motion, ahead, smoother.box, bend=BRAKE_BEND))
 
-    def resting_rad(self, smoother: Smoother, ahead_s: float) -> list[FloatArray]:
-        """(n,) where the joints may come to rest, were the arm to brake in `ahead_s`.
+    def stopping_rad(self, smoother: Smoother, ahead_s: float) -> list[FloatArray]:
+        """(n,) each, joints on the way to rest and at rest, were the arm to brake in `ahead_s`.
 
         By the brake of the pose; and by that of the joints, if they lag or are about to.
         """
@@ -179,9 +179,10 @@ class PoseToJoint:
             square = jacobian @ jacobian.T + DAMPING * np.eye(6)
             at_rest = at_rest + jacobian.T @ np.linalg.solve(square, pose_error(rest, here))
         if self._lag(self._kinematics.forward(joints), smoother.motion.pose) < LAGS:
-            return [at_rest]
+            return between(joints, at_rest)
         box = np.array(self.limits)
-        return [at_rest, joints + stop_way(velocity, self._acceleration, box, ahead_s)]
+        lagging = joints + stop_way(velocity, self._acceleration, box, ahead_s)
+        return [*between(joints, at_rest), *between(joints, lagging)]
 
     def tick(self, smoother: Smoother, *, braking: bool = False, elbow: bool = True) -> None:
         """Advance `smoother` by one tick and follow its pose, or stop.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from joint_rig import Joints, panda
@@ -128,3 +130,28 @@ def test_a_far_target_is_approached_no_faster_than_the_limit_along_the_whole_cur
     speed = np.diff(np.array(arm.places_m[begun:]), axis=0) * 1e9 / arm.rig.period_ns
     most_m_s = arm.profile.limits.approach_m_s
     assert 0.9 * most_m_s < np.linalg.norm(speed, axis=1).max() < 1.001 * most_m_s
+
+
+def test_joints_that_brake_pass_and_end_where_they_were_said_to() -> None:
+    rng, path = np.random.default_rng(3), made_path()
+    dt_s, moved_rad = 1.0 / panda().timing.command_hz, 0.0
+    for _ in range(100):
+        target = HOME_RAD + 0.6 - rng.choice([0.0, 0.0, 0.3, 1.2], 7) * rng.random(7)
+        path.move_to(target)
+        for _ in range(int(rng.integers(5, 120))):
+            path.advance(1.0)
+        before = path.state
+        said = path.stopping_rad(dt_s)
+        assert path.state is before
+        path.advance(1.0)
+        path.brake()
+        passed = [path.state.position]
+        while not path.at_rest:
+            path.advance(1.0)
+            passed.append(path.state.position)
+        middle_rad, end_rad = said
+        tick_rad = max(float(np.abs(b - a).max()) for a, b in pairwise(passed))
+        assert min(float(np.abs(middle_rad - at).max()) for at in passed) < tick_rad
+        np.testing.assert_allclose(end_rad, passed[-1], atol=PASSED_RAD)
+        moved_rad = max(moved_rad, float(np.abs(end_rad - before.position).max()))
+    assert moved_rad > 0.05
