@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.codec import records
-from vla_zenoh.codec.image import encode_jpeg
+from vla_zenoh.codec.image import depth_schema, encode_depth, encode_jpeg
 from vla_zenoh.keys import Keys
 from vla_zenoh.lab.recording.sample import JPEG, MSGPACK, Sample
 from vla_zenoh.lab.recording.writer import RecordingWriter
@@ -18,6 +18,7 @@ from vla_zenoh.policy import ActionSpec, ModelSpec, ObservationSpec
 from vla_zenoh.types import (
     ActionChunk,
     Cause,
+    Depth,
     GripperCommand,
     GripperState,
     Header,
@@ -62,9 +63,15 @@ def put(key: str, record: Any, at_ms: float, seq: int) -> Sample:
     return Sample(key, records.encode(record), MSGPACK, Header(at_ns, seq, "node#1"), at_ns + MS)
 
 
+def depth_counts(number: int) -> NDArray[np.uint16]:
+    """A slope; farther each time."""
+    return (np.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH) + 10 * number).astype(np.uint16)
+
+
 def write_run(
     path: Path,
     *,
+    depth_unit_m: float | None = None,
     of: ModelSpec | None = None,
     prompts: Sequence[str] = PROMPTS,
     silent: Sequence[int] = (),
@@ -75,6 +82,7 @@ def write_run(
 
     Args:
         path: of the file.
+        depth_unit_m: of the depth that the camera measures; None: none.
         of: what the steps mean.
         prompts: of the activations.
         silent: chunks that were never published, in each activation.
@@ -120,6 +128,11 @@ def write_run(
         header = Header(at_ns, number, "camera#1")
         key = KEYS.camera_jpeg("front")
         samples.append(Sample(key, picture(number), JPEG, header, at_ns + MS))
+        if depth_unit_m is not None:
+            depth = Depth(depth_counts(number), depth_unit_m)
+            encoding = f"image/png;{depth_schema(depth)}"
+            key = KEYS.camera_depth("front")
+            samples.append(Sample(key, encode_depth(depth), encoding, header, at_ns + MS))
     out = RecordingWriter(path, KEYS, profile_yaml="", base_frame="base", began_ns=ZERO_NS)
     for sample in sorted(samples, key=lambda each: each.received_ns):
         out.write(sample)

@@ -105,8 +105,9 @@ def test_a_plane_is_within_a_millimetre_after_wire_and_recording(tmp_path: Path)
         assert kind == "image/png"
         assert_plane(rig, decode_depth(heard[-1].payload, schema))
         kept = dict(
-            (header.seq, depth)
-            for header, depth in depths(open_recording(tmp_path / "run.mcap"), "front")
+            (sample.header.seq, sample.depth())
+            for sample in depths(open_recording(tmp_path / "run.mcap"), "front")
+            if sample.header is not None
         )
         assert kept
         for frame in heard:

@@ -3,9 +3,9 @@
 Each tick the joints at which either arm would come to rest are computed, were it to brake one tick
 later. No pair of places on the two ways there may be nearer than ``limits.reach.part_stop_m`` and
 `SPARE_M`: so it does not matter which of the two stops first, or whether one of them stops at all.
-Otherwise both brake, on ways that the tick before found to be free. Once they stand they go on when the first bit
-of the way towards their goals is free, for one arm alone and for both. Below ``part_slow_m`` arms
-that come nearer are slowed down to sqrt(distance left / zone) of their speed.
+Otherwise both brake, on ways that the tick before found to be free. Once they stand they go on when
+the first bit of the way towards their goals is free, for one arm alone and for both. Below
+``part_slow_m`` arms that come nearer are slowed down to sqrt(distance left / zone) of their speed.
 
 Arms that begin too near to each other may only move apart.
 

@@ -20,6 +20,7 @@ from dataset_rig import (
     MIXED,
     PROMPTS,
     WIDTH,
+    depth_counts,
     steps_of,
     write_mixed_run,
     write_run,
@@ -73,6 +74,25 @@ def test_pictures_states_and_words_belong_together(folder: Path) -> None:
         assert float(item["observation.state"][2]) == pytest.approx(at_ms / 1e4, abs=6e-4)
         assert item["task"] == PROMPTS[episode]
         assert float(item["timestamp"]) == pytest.approx(frame * DT_S)
+
+
+@pytest.mark.parametrize("unit_m", [0.001, 0.0001])
+def test_depth_is_read_in_millimetres(tmp_path: Path, unit_m: float) -> None:
+    run = write_run(tmp_path / "deep.mcap", depth_unit_m=unit_m)
+    parts = read_parts("position+rpy+gripper_m")
+    export(tmp_path / "deep", episodes_of(load_run(run)), ["front"], parts, depth=["front"])
+    dataset, name = opened(tmp_path / "deep"), "observation.images.front_depth"
+    assert dataset.meta.depth_keys == [name]
+    for index in (0, FRAMES, 2 * FRAMES - 1):
+        episode, frame = divmod(index, FRAMES)
+        at_ms = 505 + episode * (CHUNK_MS * CHUNKS + 500) + frame * 100
+        found = dataset[index][name].numpy()
+        assert found.shape == (1, HEIGHT, WIDTH)
+        np.testing.assert_allclose(found[0], depth_counts(at_ms // 50) * unit_m * 1e3, rtol=1e-5)
+    most = float(np.reshape(dataset.meta.stats[name]["max"], 1)[0])
+    assert most == pytest.approx(float(found.max()), rel=0.1)
+    batch = next(iter(torch.utils.data.DataLoader(dataset, batch_size=4)))
+    assert batch[name].shape == (4, 1, HEIGHT, WIDTH)
 
 
 def test_an_action_chunk_of_the_future_stays_within_its_episode(folder: Path) -> None:

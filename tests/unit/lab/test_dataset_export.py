@@ -7,16 +7,28 @@ from dataclasses import replace
 from pathlib import Path
 
 import av
+import cv2
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from chain import command_line
-from dataset_rig import CHUNK_MS, CHUNKS, DT_S, HEIGHT, HORIZON, PROMPTS, WIDTH, spec, steps_of
+from dataset_rig import (
+    CHUNK_MS,
+    CHUNKS,
+    DT_S,
+    HEIGHT,
+    HORIZON,
+    PROMPTS,
+    WIDTH,
+    depth_counts,
+    spec,
+    steps_of,
+)
 from dataset_rig import write_run as make_run
 
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.dataset.episodes import episodes_of, fps_of, hold
-from vla_zenoh.lab.dataset.feature_statistics import Colours, of_numbers
+from vla_zenoh.lab.dataset.feature_statistics import Histogram, of_numbers
 from vla_zenoh.lab.dataset.features import action_names, usual_state
 from vla_zenoh.lab.dataset.lerobot import export
 from vla_zenoh.lab.dataset.openvla import openvla_statistics
@@ -161,7 +173,7 @@ def test_openvla_statistics_are_those_of_the_actions(dataset: Path) -> None:
 
 def test_figures_of_pictures_are_those_of_their_pixels() -> None:
     random = np.random.default_rng(0)
-    colours, seen = Colours(), []
+    colours, seen = Histogram(), []
     for _ in range(3):
         rgb = random.integers(0, 256, (40, 40, 3), np.uint8)
         colours.add(rgb)
@@ -172,6 +184,53 @@ def test_figures_of_pictures_are_those_of_their_pixels() -> None:
         np.testing.assert_allclose(np.reshape(found[name], 3), wanted[name], rtol=1e-9)
     for name in ("q01", "q10", "q50", "q90", "q99"):
         np.testing.assert_allclose(np.reshape(found[name], 3), wanted[name], atol=1.5 / 255)
+
+
+@pytest.mark.parametrize(("unit_m", "unit"), [(0.001, "mm"), (0.0001, "m")])
+def test_depth_is_a_column_of_files_with_every_count_of_the_recording(
+    tmp_path: Path, unit_m: float, unit: str
+) -> None:
+    run = make_run(tmp_path / "deep.mcap", depth_unit_m=unit_m)
+    out, name = tmp_path / "out", "observation.images.front_depth"
+    done = command_line("dataset", "export", str(run), "--output", str(out), "--json")
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["depth"] == ["front"]
+    info = json.loads((out / "meta" / "info.json").read_text())["features"][name]
+    assert (info["dtype"], info["shape"]) == ("image", [HEIGHT, WIDTH, 1])
+    assert info["info"] == {"is_depth_map": True, "depth_unit": unit}
+    rows = pq.read_table(next((out / "data").rglob("*.parquet"))).to_pylist()
+    scale = 1.0 if unit == "mm" else unit_m
+    found = []
+    for index, row in enumerate(rows):
+        episode, frame = divmod(index, USED * CHUNKS)
+        at_ms = 505 + episode * (CHUNK_MS * CHUNKS + 500) + frame * 100
+        image = cv2.imdecode(np.frombuffer(row[name]["bytes"], np.uint8), cv2.IMREAD_UNCHANGED)
+        np.testing.assert_allclose(image, depth_counts(at_ms // 50) * scale, rtol=1e-6)
+        found.append(image[::4, ::4].reshape(-1))
+    kept = json.loads((out / "meta" / "stats.json").read_text())[name]
+    assert kept["count"] == [len(rows)]
+    wanted = of_numbers(np.concatenate(found).astype(np.float64))
+    for key in ("min", "max", "mean", "std"):
+        np.testing.assert_allclose(np.reshape(kept[key], 1), wanted[key], rtol=1e-5)
+
+
+def test_depth_may_be_left_out(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "deep.mcap", depth_unit_m=0.001)
+    args = ("--output", str(tmp_path / "out"), "--no-depth", "--json")
+    done = command_line("dataset", "export", str(run), *args)
+    assert json.loads(done.stdout)["depth"] == []
+    info = json.loads((tmp_path / "out" / "meta" / "info.json").read_text())
+    assert not [name for name in info["features"] if "depth" in name]
+
+
+def test_depths_of_two_units_do_not_become_one_dataset(tmp_path: Path) -> None:
+    runs = [
+        load_run(make_run(tmp_path / f"{number}.mcap", depth_unit_m=unit_m))
+        for number, unit_m in enumerate((0.001, 0.0001))
+    ]
+    episodes = [episode for run in runs for episode in episodes_of(run)]
+    with pytest.raises(RecordingError, match=r"the unit 0\.0001, before it was 0\.001.*--no-depth"):
+        export(tmp_path / "out", episodes, [], PARTS, depth=["front"])
 
 
 def test_the_state_of_an_arm_has_as_many_joints_as_it_was_recorded_with(

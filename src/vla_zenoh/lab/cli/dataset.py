@@ -32,6 +32,12 @@ def export(
         list[str] | None,
         typer.Option("--camera", help="Only this camera; repeatable. Default: all recorded ones."),
     ] = None,
+    depth: Annotated[
+        bool,
+        typer.Option(
+            help="Depth images of these cameras, where they were recorded, as LeRobot 0.6 has them."
+        ),
+    ] = True,
     state: Annotated[
         str | None,
         typer.Option(
@@ -64,7 +70,7 @@ def export(
 
     parts, files = read_parts(state) if state else None, _files(runs)
     wanted = labels or [each for each in EpisodeLabel if each is not EpisodeLabel.DISCARDED]
-    episodes, seen, workers, left_out = [], None, set[str](), Counter[str]()
+    episodes, seen, deep, workers, left_out = [], None, None, set[str](), Counter[str]()
     with (
         output_folder(output, force=force, inputs=files) as part,
         progress("reading the recordings") as status,
@@ -83,6 +89,7 @@ def export(
             left_out.update(each.label for each in found if each.label not in wanted)
             if found:
                 seen = set(run.picture_counts) if seen is None else seen & set(run.picture_counts)
+                deep = run.depth_cameras if deep is None else deep & run.depth_cameras
         if worker is not None and worker not in workers:
             known = ", ".join(sorted(workers)) or "none"
             fail(
@@ -95,12 +102,14 @@ def export(
                 f"no episode has the label {' or '.join(wanted)}; there are: {those}. Choose "
                 "another --label"
             )
+        wanted_cameras = cameras or sorted(seen or ())
         written = write(
             part,
             episodes,
-            cameras or sorted(seen or ()),
+            wanted_cameras,
             parts or read_parts(usual_state(episodes)),
             lambda doing: status.update(f"writing {doing} ({counted(len(episodes), 'episode')})"),
+            [camera for camera in wanted_cameras if depth and camera in (deep or ())],
         )
     written = written._replace(folder=output)
     if as_json:
@@ -111,6 +120,7 @@ def export(
         f"{written.folder}: {written.episodes} episodes ({known}), {written.frames} frames at "
         f"{written.fps} Hz, {written.interventions} of them led by a person, "
         f"cameras {', '.join(written.cameras) or 'none'}, "
+        f"depth {', '.join(written.depth) or 'none'}, "
         f"{counted(len(written.tasks), 'prompt')}"
     )
 

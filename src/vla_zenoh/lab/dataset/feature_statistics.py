@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
-LEVELS = 256
 STRIDE = 4
 """Only every fourth row and column of an image counts."""
 
@@ -27,28 +28,34 @@ def of_numbers(rows: ArrayLike) -> dict[str, list[Any]]:
     return {name: value.tolist() for name, value in out.items()} | {"count": [len(table)]}
 
 
-class Colours:
-    """Histogram of the colours of images; statistics are in [0, 1] as LeRobot's."""
+class Histogram:
+    """Histogram of images, whose statistics LeRobot keeps for each channel.
 
-    def __init__(self) -> None:
-        self.levels = np.zeros((3, LEVELS), np.int64)
-        self.count = 0
+    Args:
+        step: value of one level; LeRobot's colours are in [0, 1].
+        channels: of an image.
+        levels: number of levels.
+    """
 
-    def add(self, rgb: NDArray[np.uint8]) -> None:
-        """Count the colours of an image, (H, W, 3)."""
-        for channel in range(3):
-            seen = rgb[::STRIDE, ::STRIDE, channel].reshape(-1)
-            self.levels[channel] += np.bincount(seen, minlength=LEVELS)
+    def __init__(self, step: float = 1 / 255, channels: int = 3, levels: int = 256) -> None:
+        self.levels = np.zeros((channels, levels), np.int64)
+        self.count, self._step = 0, step
+
+    def add(self, image: NDArray[Any]) -> None:
+        """Count the levels of an image, (H, W, channels) or (H, W)."""
+        seen = image[::STRIDE, ::STRIDE].reshape(-1, len(self.levels))
+        for levels, values in zip(self.levels, seen.T, strict=True):
+            levels += np.bincount(values, minlength=len(levels))
         self.count += 1
 
-    def join(self, other: Colours) -> None:
+    def join(self, other: Histogram) -> None:
         """Add the counts of another histogram."""
         self.levels += other.levels
         self.count += other.count
 
     def statistics(self) -> dict[str, list[Any]]:
-        """As `of_numbers`, each of shape (3, 1, 1); count is the number of images."""
-        values = np.arange(LEVELS) / (LEVELS - 1)
+        """As `of_numbers`, each of shape (channels, 1, 1); count is the number of images."""
+        values = np.arange(self.levels.shape[1]) * self._step
         channels: dict[str, list[float]] = {}
         for levels in self.levels:
             seen = np.flatnonzero(levels)
@@ -66,3 +73,11 @@ class Colours:
         return {name: [[[v]] for v in found] for name, found in channels.items()} | {
             "count": [self.count]
         }
+
+
+def joined(histograms: Iterable[Histogram]) -> dict[str, list[Any]]:
+    """Statistics of all `histograms` together; there is at least one."""
+    first, *others = (copy.deepcopy(each) for each in histograms)
+    for other in others:
+        first.join(other)
+    return first.statistics()

@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 
 from vla_zenoh.errors import MissingExtraError, RecordingError
 from vla_zenoh.lab.dataset import feature_statistics
+from vla_zenoh.lab.dataset.depths import DepthColumn
 from vla_zenoh.lab.dataset.episodes import RecordedEpisode, fps_of
-from vla_zenoh.lab.dataset.feature_statistics import Colours
+from vla_zenoh.lab.dataset.feature_statistics import joined
 from vla_zenoh.lab.dataset.features import (
     ACTION,
     INTERVENTION,
@@ -60,6 +61,7 @@ class Written(NamedTuple):
         frames: number of frames.
         fps: frames per second.
         cameras: names of its cameras.
+        depth: names of its cameras with depth.
         tasks: all prompts.
         successes: number of successful episodes; None if unknown for all.
         interventions: number of frames that a person led.
@@ -71,6 +73,7 @@ class Written(NamedTuple):
     frames: int
     fps: int
     cameras: tuple[str, ...]
+    depth: tuple[str, ...]
     tasks: tuple[str, ...]
     successes: int | None
     interventions: int
@@ -83,6 +86,7 @@ def export(
     cameras: Sequence[str],
     parts: Sequence[str],
     progress: Callable[[str], None] = lambda doing: None,
+    depth: Sequence[str] = (),
 ) -> Written:
     """Write a dataset.
 
@@ -92,6 +96,7 @@ def export(
         cameras: whose images to export.
         parts: of the state, see `vla_zenoh.policy.state_vector`.
         progress: called with what is being written.
+        depth: cameras whose depth images to export.
 
     Raises:
         RecordingError: the folder is not empty; there are no episodes; their actions differ in
@@ -107,7 +112,7 @@ def export(
         )
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise RecordingError(f"{folder} is there already; give --output a new folder")
-    return _Dataset(folder, episodes, cameras, parts).write(progress)
+    return _Dataset(folder, episodes, cameras, parts, depth).write(progress)
 
 
 class _Dataset:
@@ -117,6 +122,7 @@ class _Dataset:
         episodes: Sequence[RecordedEpisode],
         cameras: Sequence[str],
         parts: Sequence[str],
+        depth: Sequence[str],
     ) -> None:
         try:
             import pyarrow
@@ -126,6 +132,7 @@ class _Dataset:
         self._pa, self._pq = pyarrow, pyarrow.parquet
         self._root, self._episodes = root, list(episodes)
         self._cameras, self._parts = tuple(cameras), parts
+        self._depths = [DepthColumn(camera) for camera in depth]
         self._spec = episodes[0].spec
         self._fps = fps_of(self._spec.action)
         self._states = [states_of(episode, parts) for episode in self._episodes]
@@ -139,7 +146,7 @@ class _Dataset:
         for camera in self._cameras:
             progress(f"videos of camera {camera}")
             videos[camera] = self._write_videos(camera)
-        progress("numbers of all frames")
+        progress("depth images and numbers" if self._depths else "numbers of all frames")
         rows = self._write_data()
         self._write_tasks()
         self._write_episodes(rows, videos)
@@ -151,6 +158,7 @@ class _Dataset:
             sum(len(each["index"]) for each in rows),
             self._fps,
             self._cameras,
+            tuple(column.camera for column in self._depths),
             tuple(self._tasks),
             sum(known) if known else None,
             sum(int(each[INTERVENTION].sum()) for each in rows),
@@ -190,6 +198,9 @@ class _Dataset:
             + [(INTERVENTION, pa.bool_()), ("timestamp", pa.float32())]
             + [(name, pa.int64()) for name in COUNTERS[1:]]
         )
+        file = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+        for depth in self._depths:
+            schema = schema.append(pa.field(depth.name, file))
         out, first = [], 0
         with self._pq.ParquetWriter(self._place(DATA, 0), schema) as writer:
             for number, (episode, states) in enumerate(
@@ -213,7 +224,8 @@ class _Dataset:
                     else pa.array(values, schema.field(name).type)
                     for name, values in rows.items()
                 ]
-                table = pa.Table.from_arrays(columns, names=list(rows)).cast(schema)
+                columns += [pa.array(depth.files(episode), file) for depth in self._depths]
+                table = pa.Table.from_arrays(columns, names=schema.names).cast(schema)
                 writer.write_table(table)  # a row group of its own
                 out.append(rows)
                 first += count
@@ -274,7 +286,9 @@ class _Dataset:
                     f"videos/{name}/from_timestamp": 0.0,
                     f"videos/{name}/to_timestamp": count / self._fps,
                 }
-                found[name] = of_episodes[number].colours.statistics()
+                found[name] = of_episodes[number].histogram.statistics()
+            for depth in self._depths:
+                found[depth.name] = depth.histograms[number].statistics()
             for name, values in found.items():
                 entry |= {f"stats/{name}/{what}": value for what, value in values.items()}
             for name, value in entry.items():
@@ -291,10 +305,9 @@ class _Dataset:
             for name in rows[0]
         }
         for camera, of_episodes in videos.items():
-            colours = Colours()
-            for video in of_episodes:
-                colours.join(video.colours)
-            stats[PICTURE + camera] = colours.statistics()
+            stats[PICTURE + camera] = joined(video.histogram for video in of_episodes)
+        for depth in self._depths:
+            stats[depth.name] = joined(depth.histograms)
         info = {
             "codebase_version": VERSION,
             "robot_type": self._episodes[0].run.keys.robot,
@@ -348,6 +361,7 @@ class _Dataset:
                     "has_audio": False,
                 },
             }
+        out |= {depth.name: depth.feature() for depth in self._depths}
         for name, names in (
             (STATE, self._state_names),
             (ACTION, action_names(self._spec.action)),

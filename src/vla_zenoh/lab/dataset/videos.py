@@ -8,7 +8,7 @@ from pathlib import Path
 from vla_zenoh.codec import image as image_codec
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.dataset.episodes import RecordedEpisode
-from vla_zenoh.lab.dataset.feature_statistics import Colours
+from vla_zenoh.lab.dataset.feature_statistics import Histogram
 from vla_zenoh.lab.recording.run import Run, pictures
 from vla_zenoh.lab.video import VideoWriter
 
@@ -22,8 +22,16 @@ def stamps_of(run: Run, camera: str) -> list[int]:
     return [picture.stamp_ns for picture in pictures(run.file, camera)]
 
 
-def chosen(episode: RecordedEpisode, camera: str, stamps: list[int]) -> list[int]:
+def chosen(
+    episode: RecordedEpisode, camera: str, stamps: list[int], kind: str = "images"
+) -> list[int]:
     """Number of the newest image captured before each frame.
+
+    Args:
+        episode: its frames.
+        camera: its name.
+        stamps: of the images.
+        kind: of images, for messages.
 
     Raises:
         RecordingError: no image, or only one that is too old.
@@ -37,11 +45,11 @@ def chosen(episode: RecordedEpisode, camera: str, stamps: list[int]) -> list[int
             if not in_time:
                 there = ", ".join(sorted(episode.run.picture_counts)) or "none"
                 raise RecordingError(
-                    f"{episode.run.path} has no images of camera {camera!r}; it has those of: "
+                    f"{episode.run.path} has no {kind} of camera {camera!r}; it has images of: "
                     f"{there}"
                 )
             raise RecordingError(
-                f"{episode.run.path}: no picture of camera {camera!r} within "
+                f"{episode.run.path}: no {kind} of camera {camera!r} within "
                 f"{OLDEST_NS / 1e9:g} s before a frame; leave the camera out with --camera"
             )
         out.append(order[at])
@@ -49,7 +57,7 @@ def chosen(episode: RecordedEpisode, camera: str, stamps: list[int]) -> list[int
 
 
 class EpisodeVideo:
-    """The MP4 of one episode and camera, and the colour statistics of its images.
+    """The MP4 of one episode and camera, and the histogram of its images.
 
     Raises:
         MissingExtraError: PyAV is not installed.
@@ -57,7 +65,7 @@ class EpisodeVideo:
 
     def __init__(self, path: Path, fps: int) -> None:
         self.video = VideoWriter(path, fps, extra="dataset", **OPTIONS)
-        self.colours = Colours()
+        self.histogram = Histogram()
 
     def add(self, jpeg: bytes, count: int) -> None:
         """Append an image as `count` frames.
@@ -66,7 +74,7 @@ class EpisodeVideo:
             RecordingError: its size differs from that of the images before.
             CodecError: it is no JPEG file.
         """
-        self.colours.add(self.video.add(image_codec.decode_jpeg(jpeg).rgb, count))
+        self.histogram.add(self.video.add(image_codec.decode_jpeg(jpeg).rgb, count))
 
 
 def write_videos(

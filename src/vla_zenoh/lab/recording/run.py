@@ -11,16 +11,14 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from vla_zenoh.codec import image as image_codec
 from vla_zenoh.errors import CodecError
 from vla_zenoh.keys import Keys, last_chunk
 from vla_zenoh.lab.recording.reader import Recording, open_recording
-from vla_zenoh.lab.recording.sample import DEPTH, JPEG
+from vla_zenoh.lab.recording.sample import DEPTH, JPEG, Sample
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.types import (
     ActionChunk,
     Cause,
-    Depth,
     Event,
     GripperCommand,
     GripperState,
@@ -95,6 +93,8 @@ class Run:
     settings: list[RecordedSetting] = field(default_factory=list)
     picture_counts: Counter[str] = field(default_factory=Counter)
     """Pictures by camera."""
+    depth_cameras: set[str] = field(default_factory=set)
+    """Cameras with depth."""
     problems: list[str] = field(default_factory=list)
     """Messages about what could not be read."""
     began_ns: int = 0
@@ -217,6 +217,8 @@ def load_run(path: Path) -> Run:
                 )
             elif entry.encoding == JPEG:
                 run.picture_counts[_camera(keys, entry.key)] += 1
+            elif entry.encoding.startswith(DEPTH):
+                run.depth_cameras.add(_camera(keys, entry.key))
             else:
                 rejected[f"{keys.short(entry.key)}: bytes that are no record"] += 1
             continue
@@ -240,7 +242,8 @@ def _of_interest(keys: Keys) -> Callable[[str], bool]:
     def wanted(key: str) -> bool:
         group = keys.group(key)
         if group == "camera":
-            return key == keys.camera_jpeg(_camera(keys, key))
+            camera = _camera(keys, key)
+            return key in (keys.camera_jpeg(camera), keys.camera_depth(camera))
         if group == "seen":
             return key == keys.seen_record(last_chunk(key))
         return bool(group)
@@ -274,17 +277,12 @@ def seen_pictures(file: Recording, worker: str, camera: str) -> Iterator[Recorde
     return _jpegs(file, file.keys.seen(worker, camera))
 
 
-def depths(file: Recording, camera: str) -> Iterator[tuple[Header, Depth]]:
-    """Every depth picture of a camera, oldest first, one in memory at a time.
-
-    Raises:
-        CodecError: one cannot be decoded.
-    """
+def depths(file: Recording, camera: str) -> Iterator[Sample]:
+    """Every depth image of a camera, oldest first, one in memory at a time."""
     key = file.keys.camera_depth(camera)
     for entry in file.entries(lambda each: each == key):
         if entry.header is not None and entry.encoding.startswith(DEPTH):
-            schema = entry.encoding.partition(";")[2]
-            yield entry.header, image_codec.decode_depth(entry.payload, schema)
+            yield entry
 
 
 def _jpegs(file: Recording, key: str) -> Iterator[RecordedImage]:

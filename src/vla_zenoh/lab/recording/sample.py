@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from vla_zenoh.codec import records
+from vla_zenoh.codec.image import decode_depth
 from vla_zenoh.errors import CodecError
-from vla_zenoh.types import Header
+from vla_zenoh.types import Depth, Header
 
 MSGPACK, JPEG, TEXT = "application/msgpack", "image/jpeg", "text/plain"
 RAW = "zenoh/bytes;rgb8;"
@@ -67,6 +68,14 @@ class Sample:
         if self.kind is None:
             raise CodecError("malformed", f"{self.key} carries no record")
         return records.from_map(self.kind, self.fields)
+
+    def depth(self) -> Depth:
+        """The depth image, whose encoding begins with `DEPTH`.
+
+        Raises:
+            CodecError: it cannot be decoded.
+        """
+        return decode_depth(self.payload, self.encoding.partition(";")[2])
 
 
 def received_sample(

@@ -11,7 +11,6 @@ import numpy as np
 import rerun as rr
 
 from vla_zenoh.codec import records, settings
-from vla_zenoh.codec.image import decode_depth
 from vla_zenoh.errors import CodecError, RecordError, SpecError
 from vla_zenoh.keys import Keys, last_chunk
 from vla_zenoh.kinematics.kinematics import Kinematics
@@ -345,7 +344,5 @@ class RerunLogger:
 
 
 def _depth_of(sample: Sample) -> Any:
-    depth = decode_depth(sample.payload, sample.encoding.partition(";")[2])
-    return rr.EncodedDepthImage(
-        blob=sample.payload, media_type="image/png", meter=1.0 / depth.unit_m
-    )
+    meter = 1.0 / sample.depth().unit_m
+    return rr.EncodedDepthImage(blob=sample.payload, media_type="image/png", meter=meter)
