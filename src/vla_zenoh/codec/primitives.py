@@ -89,7 +89,7 @@ class _Part(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
 
 
-class Request(_Part):
+class PrimitiveRequest(_Part):
     """What every request has.
 
     Args:
@@ -102,7 +102,7 @@ class Request(_Part):
     timeout_s: float = Field(default=DEFAULT_TIMEOUT_S, gt=0, le=3600)
 
 
-class MoveTo(Request):
+class MoveTo(PrimitiveRequest):
     """Move the TCP along a straight line to a pose, or the joints to positions.
 
     Args:
@@ -125,11 +125,11 @@ class MoveTo(Request):
         return self
 
 
-class Home(Request):
+class Home(PrimitiveRequest):
     """Move the joints to the profile's ``robot.home_rad``."""
 
 
-class Grip(Request):
+class Grip(PrimitiveRequest):
     """Open or close the gripper; the arm stands.
 
     Args:
@@ -142,14 +142,14 @@ class Grip(Request):
     holds_m: Size | None = None
 
 
-class Region(_Part):
+class TcpRegion(_Part):
     """A box that the TCP enters, in the base frame."""
 
     low_m: Point
     high_m: Point
 
     @model_validator(mode="after")
-    def _has_a_size(self) -> Region:
+    def _has_a_size(self) -> TcpRegion:
         if any(low > high for low, high in zip(self.low_m, self.high_m, strict=True)):
             raise ValueError("low_m must not be above high_m")
         return self
@@ -167,7 +167,7 @@ class Until(_Part):
     """
 
     gripper: Literal["open", "closed"] | None = None
-    inside: Region | None = None
+    inside: TcpRegion | None = None
     force_n: float | None = Field(default=None, gt=0, le=1000)
     still_s: float | None = Field(default=None, gt=0, le=600)
     done: bool = False
@@ -178,7 +178,7 @@ class Until(_Part):
         return [name for name in type(self).model_fields if getattr(self, name)]
 
 
-class Run(Request):
+class RunModel(PrimitiveRequest):
     """Let a model move the arm until a condition holds, or the time is over.
 
     Args:
@@ -192,16 +192,16 @@ class Run(Request):
     until: Until = Until()
 
 
-REQUESTS: Mapping[str, type[Request]] = {
+REQUESTS: Mapping[str, type[PrimitiveRequest]] = {
     "move_to": MoveTo,
     "home": Home,
     "grip": Grip,
-    "run": Run,
+    "run": RunModel,
 }
 """Primitive -> its request."""
 
 
-def decode_request(primitive: str, payload: bytes) -> Request:
+def decode_request(primitive: str, payload: bytes) -> PrimitiveRequest:
     """Read a request.
 
     Raises:

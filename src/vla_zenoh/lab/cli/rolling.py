@@ -42,11 +42,11 @@ def rolling(
     At a stop, a fault, a rejected activation or `vla-zenoh lab save` the minutes are kept in a
     folder of their own. It runs at a low priority.
     """
-    from vla_zenoh.lab.rolling.node import NICE, Limits, RollingRecord
+    from vla_zenoh.lab.rolling.node import NICE, RingLimits, RollingRecord
 
     loaded = target.load()
     place = folder or rolling_folder(default_log_folder(), loaded)
-    limits = Limits(keep_s=60 * minutes, max_bytes=megabytes * 1024 * 1024)
+    limits = RingLimits(keep_s=60 * minutes, max_bytes=megabytes * 1024 * 1024)
     with suppress(OSError):
         os.nice(NICE)
 

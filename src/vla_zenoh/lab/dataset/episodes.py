@@ -31,7 +31,7 @@ Span = tuple[int, int, str]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Frame:
+class EpisodeFrame:
     """One time step.
 
     Args:
@@ -68,7 +68,7 @@ class RecordedEpisode:
     spec: ModelSpec
     since_ns: int
     until_ns: int
-    frames: list[Frame] = field(default_factory=list)
+    frames: list[EpisodeFrame] = field(default_factory=list)
     led: list[Span] = field(default_factory=list)
     success: bool | None = None
     discarded: bool = False
@@ -183,7 +183,7 @@ def _episode(
         chunks[0].record.observation_stamp_ns if chunks else span[0] for span, chunks in parts
     ]
     ends = [*begins[1:], led[-1][1]]
-    frames: list[Frame] = []
+    frames: list[EpisodeFrame] = []
     dt_ns = round(spec.action.dt_s * 1e9)
     for (span, chunks), begin_ns, end_ns in zip(parts, begins, ends, strict=True):
         person = span[2] in people
@@ -194,7 +194,7 @@ def _episode(
             since_ns = max(begin_ns, frames[-1].stamp_ns + dt_ns if frames else begin_ns)
             stamps = [since_ns + dt_ns * at for at in range(round((end_ns - since_ns) / dt_ns))]
             frames += [
-                Frame(at_ns, motion(at_ns, at_ns + dt_ns), _prompt(run, at_ns), person)
+                EpisodeFrame(at_ns, motion(at_ns, at_ns + dt_ns), _prompt(run, at_ns), person)
                 for at_ns in stamps
             ]
     return RecordedEpisode(run, whose, spec, led[0][0], led[-1][1], frames, led)
@@ -238,11 +238,11 @@ def _frames(
     *,
     person: bool = False,
     to_the_end: bool = False,
-) -> list[Frame]:
+) -> list[EpisodeFrame]:
     dt_ns = round(spec.dt_s * 1e9)
     begins = [chunk.record.observation_stamp_ns for chunk in chunks]
     ends = [*begins[1:], until_ns]
-    out: list[Frame] = []
+    out: list[EpisodeFrame] = []
     for chunk, begin_ns, end_ns in zip(chunks, begins, ends, strict=True):
         steps = chunk.record.steps
         count = max(round((end_ns - begin_ns) / dt_ns), 1)
@@ -254,7 +254,7 @@ def _frames(
             # A chunk's observation may be from just before the activation.
             prompt = _prompt(run, max(at_ns, chunk.header.stamp_wall_ns))
             action = steps[index] if index < len(steps) else rest
-            out.append(Frame(at_ns, action, prompt, person))
+            out.append(EpisodeFrame(at_ns, action, prompt, person))
     return out
 
 

@@ -59,7 +59,7 @@ ENDED = "ended"
 SEGMENT_WORDS = re.compile(r"[^A-Za-z0-9]+")
 
 
-class Limits(NamedTuple):
+class RingLimits(NamedTuple):
     """Sizes of the record.
 
     Args:
@@ -75,7 +75,7 @@ class Limits(NamedTuple):
     after_s: float = AFTER_S
 
 
-USUAL = Limits()
+USUAL = RingLimits()
 
 
 class RollingRecord:
@@ -93,7 +93,7 @@ class RollingRecord:
     """
 
     def __init__(
-        self, profile: Profile, session: zenoh.Session, folder: Path, limits: Limits = USUAL
+        self, profile: Profile, session: zenoh.Session, folder: Path, limits: RingLimits = USUAL
     ) -> None:
         self.node = Node(ROLLING, profile, session)
         self._profile, self._folder, self._limits = profile, folder, limits

@@ -25,8 +25,8 @@ from vla_zenoh.codec.primitives import (
     Grip,
     Home,
     MoveTo,
-    Request,
-    Run,
+    PrimitiveRequest,
+    RunModel,
     decode_request,
 )
 from vla_zenoh.control.reachability import make_reachability_filter
@@ -58,7 +58,7 @@ class Rejected(Exception):
 
 class _Asked(NamedTuple):
     name: str
-    request: Request
+    request: PrimitiveRequest
     query: zenoh.Query
     since_s: float
 
@@ -190,7 +190,7 @@ class PrimitivesNode:
             ending, target = self._prepare(request)
             with self._settings_kept(), self._stands_after():
                 self._aim(target)
-                run = request if isinstance(request, Run) else None
+                run = request if isinstance(request, RunModel) else None
                 self._activate(run.worker if run else PRIMITIVES, run and run.prompt, request)
                 reason, why = self._watch(ending, asked.since_s + request.timeout_s)
             if isinstance(request, Grip) and reason == "reached":
@@ -216,7 +216,7 @@ class PrimitivesNode:
         self._check.hold(box)
         self._robot.publish(self._robot.keys.held, "" if box is None else str(box))
 
-    def _prepare(self, request: Request) -> tuple[Ending, Target]:
+    def _prepare(self, request: PrimitiveRequest) -> tuple[Ending, Target]:
         """Ending and target of a request.
 
         Raises:
@@ -231,7 +231,7 @@ class PrimitivesNode:
         if task.active:
             raise Rejected(f"worker {task.worker!r} moves the arm: deactivate it first")
         sight, most_m = self._sight(), profile.robot.gripper.max_width_m
-        if isinstance(request, Run):
+        if isinstance(request, RunModel):
             return self._prepare_run(request, sight, most_m)
         if isinstance(request, Grip):
             width_m = request.width_m
@@ -248,7 +248,7 @@ class PrimitivesNode:
             return self._to_joints(self._named(request.joints_rad, sight), sight)
         return self._to_pose(request, sight)
 
-    def _prepare_run(self, request: Run, sight: Sight, most_m: float) -> tuple[Ending, Target]:
+    def _prepare_run(self, request: RunModel, sight: Sight, most_m: float) -> tuple[Ending, Target]:
         if worker_node(request.worker) not in self._robot.alive:
             raise Rejected(f"worker {request.worker!r} is not alive")
         if request.worker == PRIMITIVES:
@@ -328,7 +328,7 @@ class PrimitivesNode:
             self._robot.deactivate(BRAKE_S)
             self._aim(Target())
 
-    def _activate(self, worker: str, prompt: str | None, request: Request) -> None:
+    def _activate(self, worker: str, prompt: str | None, request: PrimitiveRequest) -> None:
         """Select `worker`, and activate the arm for as long as the client holds it."""
         robot, give_up_s = self._robot, time.monotonic() + min(READY_S, request.timeout_s)
         robot.set_worker(worker)
@@ -416,8 +416,8 @@ class PrimitivesNode:
         )
 
 
-def _conditions(request: Request) -> list[str]:
+def _conditions(request: PrimitiveRequest) -> list[str]:
     """Reasons by which a run ends well."""
-    if not isinstance(request, Run):
+    if not isinstance(request, RunModel):
         return []
     return request.until.names or ["timeout"]

@@ -142,7 +142,7 @@ function showState(message) {
   }
   const arms = Object.entries(message.arms || {}), fastest = Math.max(0, ...arms.map(([, arm]) => arm.speed_m_s || 0));
   facts([
-    ["why", message.why],
+    ["why", message.why.replace(/'web-(.+?)-[0-9a-f]+'/, "$1")],
     ["held by", message.you_hold ? "you" : message.held_by ? holder(message.held_by) : task && task.active ? "nobody: it runs without a hold" : "nobody"],
     ["arm", `${message.at_rest === null ? "unknown" : message.at_rest ? "stands" : "moves"}, ${(fastest * 100).toFixed(1)} cm/s`],
     ...arms.map(([name, arm]) => [`gripper ${name}`.trim(), arm.width_m === undefined ? "" : `${(arm.width_m * 1000).toFixed(0)} mm${arm.holding ? ", holds an object" : ""}${arm.holds ? `, counted as a box of ${arm.holds} m` : ""}`]),
