@@ -143,6 +143,18 @@ class Browser:
         self.send(do="hold", press=self._press, tick=self._tick)
         self._holding.set()
 
+    def hold_until_active(self, patience_s: float) -> None:
+        """Press, as a person does who tries again while something is not ready yet."""
+        give_up_s = time.monotonic() + patience_s
+        while True:
+            self.heard.clear()
+            self.hold()
+            ended = until("an answer", lambda: self.answers("done") + self.answers("failed"))
+            if ended[0]["is"] == "done":
+                return
+            assert time.monotonic() < give_up_s, ended
+            self.let_go()
+
     def let_go(self) -> None:
         self._holding.clear()
         self.send(do="release")

@@ -54,6 +54,9 @@ def site(shared_chain: Chain, tmp_path_factory: pytest.TempPathFactory) -> Itera
 class Tab:
     """A tab of Chromium with the page open."""
 
+    KEY_LEFT = "\ue012"
+    """The left arrow, in WebDriver's code."""
+
     def __init__(self, driver: Any, site: Site) -> None:
         self.driver = driver
         driver.get(f"http://{site.host}/#{OPERATOR}")
@@ -78,6 +81,19 @@ class Tab:
         self.driver.execute_script(
             "arguments[0].scrollIntoView({block: 'center'}); arguments[0].click()",
             self.button(words),
+        )
+
+    def put(self, name: str, text: str, *events: str) -> None:
+        """Fill a field, as if typed."""
+        words = [f"f.dispatchEvent(new Event('{event}', {{bubbles: true}}))" for event in events]
+        self.run(
+            f"const f = document.getElementById('{name}'); f.value = '{text}'; " + ";".join(words)
+        )
+
+    def reasons(self) -> list[str]:
+        """Reasons of a rejected activation."""
+        return self.run(
+            "return [...document.querySelectorAll('#answer li')].map((one) => one.textContent)"
         )
 
     def press(self, words: str) -> None:
@@ -134,13 +150,14 @@ def test_a_finished_run_is_listed_with_its_report_and_its_video(chain: Chain, ta
     time.sleep(2.0)
     tab.click("Stop and keep")
     tab.until("it is kept", lambda: "not recording" in tab.text("recording"))
-    tab.click("List")
-    row = tab.until(
-        "a run",
-        lambda: tab.run(
+
+    def listed() -> str | None:
+        tab.click("List")
+        return tab.run(
             "const r = document.querySelector('#run-rows tr'); return r && r.cells[0].textContent"
-        ),
-    )
+        )
+
+    row = tab.until("a run", listed)
     tab.click(f"Video of {row}")
     tab.until(
         "the video plays",
@@ -159,6 +176,68 @@ def test_a_finished_run_is_listed_with_its_report_and_its_video(chain: Chain, ta
     )
     tab.driver.close()
     tab.driver.switch_to.window(tab.driver.window_handles[0])
+
+
+def test_settings_are_those_of_the_page(chain: Chain, tab: Tab) -> None:
+    def said(field: str) -> Any:
+        return getattr(chain.client.task, field)
+
+    tab.put("prompt", "HARD: go up", "input")
+    tab.click("Set")
+    tab.until("the prompt", lambda: said("prompt") == "HARD: go up")
+    for text, rate_hz in (("4", 4.0), ("5", 5.0)):
+        tab.put("rate", text, "change")
+        tab.until("the rate", lambda wanted=rate_hz: said("rate_hz") == wanted)
+    for text, percent in (("50", 50), ("100", 100)):
+        tab.put("speed", text, "change")
+        tab.until("the speed", lambda wanted=percent: said("speed_percent") == wanted)
+
+
+def test_a_rejected_activation_lists_every_reason(chain: Chain, tab: Tab) -> None:
+    tab.click("Deactivate")
+    tab.until("it stands", lambda: "stands" in tab.text("facts"))
+    chain.client.set_worker("nobody")
+    tab.click("Activate")
+    tab.until("the reasons", lambda: any("nobody" in reason for reason in tab.reasons()))
+    chain.client.set_worker("scripted")
+
+
+def test_the_arm_moves_while_the_button_is_held_and_the_page_says_who_holds(
+    chain: Chain, tab: Tab
+) -> None:
+    tab.click("Deactivate")
+    chain.client.set_prompt("HARD: go up" if chain.height_m() < 0.42 else chain.down)
+
+    def held() -> bool:
+        tab.press("Hold to run")
+        answer = tab.until("an answer", lambda: tab.text("answer"))
+        if not answer.startswith("active"):
+            tab.let_go()
+        return answer.startswith("active")
+
+    tab.until("it is active", held, 60.0)
+    chain.until("it moves", chain.moves)
+    tab.until("the page has it", lambda: "held byyou" in tab.text("facts"))
+    assert not tab.run("return document.getElementById('activate').classList.contains('next')")
+    tab.let_go()
+    chain.wait_still()
+    tab.until("nobody has it", lambda: "held bynobody" in tab.text("facts"))
+
+
+def test_the_drawing_is_turned_by_keys_and_by_dragging(chain: Chain, tab: Tab) -> None:
+    drawn = "return document.getElementById('space').toDataURL().length"
+    tab.until("it is drawn", lambda: tab.run(drawn) > 5000)
+    before = tab.run("return [turn, tilt]")
+    tab.driver.find_element("id", "space").send_keys(tab.KEY_LEFT)
+    after = tab.run("return [turn, tilt]")
+    assert after != before
+    tab.run(
+        "const c = document.getElementById('space'), e = (t, x) =>"
+        " c.dispatchEvent(new PointerEvent(t, {pointerId: 1, clientX: x, clientY: 0}));"
+        "c.setPointerCapture = () => {};"
+        "e('pointerdown', 0); e('pointermove', 60); e('pointerup', 60)"
+    )
+    assert tab.run("return [turn, tilt]")[0] != after[0]
 
 
 def test_depth_is_shown_in_colours(chain: Chain, tab: Tab) -> None:

@@ -49,17 +49,8 @@ def site(shared_chain: Chain, tmp_path_factory: pytest.TempPathFactory) -> Itera
 
 
 def hold_until_it_moves(chain: Chain, browser: Browser) -> None:
-    """Press, as a person does who tries again while something is not ready yet."""
     chain.client.set_prompt("HARD: go up" if chain.height_m() < 0.42 else chain.down)
-    give_up_s = time.monotonic() + READY_PATIENCE_S
-    while True:
-        browser.heard.clear()
-        browser.hold()
-        ended = until("an answer", lambda: browser.answers("done") + browser.answers("failed"))
-        if ended[0]["is"] == "done":
-            break
-        assert time.monotonic() < give_up_s, ended
-        browser.let_go()
+    browser.hold_until_active(READY_PATIENCE_S)
     chain.until("it moves", chain.moves)
 
 
@@ -217,7 +208,7 @@ def test_what_the_gripper_holds_is_said_and_drawn(chain: Chain, site: Site) -> N
 
 def test_a_person_takes_the_arm_by_hand_and_gives_it_back(chain: Chain, site: Site) -> None:
     with browsing(site) as browser:
-        assert browser.ask(do="jog", on=True, frame="base", level=2)["is"] == "done"
+        assert browser.ask(do="jog", on=True, frame="base", level=2, part="")["is"] == "done"
         until("the page has the arm", lambda: browser.state["jog"])
         before_m = chain.measured().position_m
         browser.twist = [0.0, 0.0, 1.0 if before_m[2] < 0.42 else -1.0, 0.0, 0.0, 0.0]
@@ -226,7 +217,7 @@ def test_a_person_takes_the_arm_by_hand_and_gives_it_back(chain: Chain, site: Si
         browser.let_go()
         chain.wait_still()
         assert abs(chain.measured().position_m[:2] - before_m[:2]).max() * 1e3 < STILL_MM
-        assert browser.ask(do="jog", on=False, frame="base", level=2)["is"] == "done"
+        assert browser.ask(do="jog", on=False, frame="base", level=2, part="")["is"] == "done"
         until("the model has it", lambda: browser.state["task"]["worker"] == "scripted")
 
 
@@ -462,3 +453,26 @@ def test_metrics_are_openmetrics_and_want_a_token(chain: Chain, site: Site) -> N
     assert families["vla_zenoh_latency_seconds"].unit == "seconds"
     assert families["vla_zenoh_web_events"].type == "counter"
     assert len(body.splitlines()) < 3000
+
+
+def test_settings_sent_at_once_are_made_in_their_order(chain: Chain, site: Site) -> None:
+    with browsing(site) as browser:
+        for percent in (90, 70, 80):
+            browser.send(do="speed", percent=percent)
+        browser.send(do="rate", hz=4)
+        until("all are made", lambda: len(browser.answers("done")) == 4, READY_PATIENCE_S)
+        task = chain.client.task
+        assert task is not None
+        assert (task.speed_percent, task.rate_hz) == (80, 4.0)
+        assert not browser.answers("rejected")
+        assert browser.ask(do="speed", percent=100)["is"] == "done"
+        assert browser.ask(do="rate", hz=5)["is"] == "done"
+
+
+def test_a_page_that_floods_settings_is_told_that_they_wait(site: Site) -> None:
+    with browsing(site) as browser:
+        for _ in range(20):
+            browser.send(do="speed", percent=100)
+        until("one is rejected", lambda: browser.answers("rejected"))
+        assert browser.answers("rejected")[0]["what"] == "busy"
+        until("8 are made", lambda: len(browser.answers("done")) >= 8, READY_PATIENCE_S)

@@ -1,4 +1,4 @@
-"""The page of a robot of two arms: both are drawn, both stand after a stop, neither is jogged."""
+"""The page of a robot of two arms: both are drawn, both stand after a stop, one moves by hand."""
 
 from __future__ import annotations
 
@@ -108,9 +108,36 @@ def test_a_stop_is_told_when_both_arms_stand(pair: tuple[Host, Site]) -> None:
         assert page.ask(do="reset")["is"] == "done"
 
 
-def test_a_jog_is_refused_in_a_sentence(pair: tuple[Host, Site]) -> None:
+def test_the_chosen_arm_is_moved_by_hand_and_the_other_stands(pair: tuple[Host, Site]) -> None:
+    client = pair[0].client
+    assert client is not None
     with browsing(pair[1]) as page:
-        why = page.answers("welcome")[0]["no_hand"]
-        assert why == "By hand moves one arm; here a worker moves all: left, right"
-        answer = page.ask(do="jog", on=True, frame="base", level=1)
-        assert (answer["is"], answer["why"]) == ("failed", why)
+        client.deactivate()
+        for part, other in (("left", "right"), ("right", "left")):
+            answer = page.ask(do="jog", on=True, frame="base", level=2, part=part)
+            assert answer["is"] == "done", answer
+            until("the page has the arm", lambda: page.state["jog"], PATIENCE_S)
+            until("both stand", lambda: all_slower(page), PATIENCE_S)
+            began = {name: arm["measured_m"] for name, arm in page.state["arms"].items()}
+            page.twist = [0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+            page.hold_until_active(READY_S)
+            until("it rises", lambda p=part, b=began: height(page, p) > b[p][2] + 0.03, PATIENCE_S)
+            page.let_go()
+            until("both stand", lambda: all_slower(page), PATIENCE_S)
+            assert page.state["arms"][other]["measured_m"] == pytest.approx(began[other], abs=3e-3)
+        assert page.ask(do="jog", on=False, frame="base", level=2, part="left")["is"] == "done"
+
+
+def test_an_arm_that_the_robot_lacks_is_named(pair: tuple[Host, Site]) -> None:
+    with browsing(pair[1]) as page:
+        answer = page.ask(do="jog", on=True, frame="base", level=1, part="middle")
+        assert answer["is"] == "failed"
+        assert answer["why"] == "the robot has no part 'middle'; it has left, right"
+
+
+def height(page: Browser, part: str) -> float:
+    return float(page.state["arms"][part]["measured_m"][2])
+
+
+def all_slower(page: Browser) -> bool:
+    return all(arm.get("speed_m_s", 1.0) < 0.003 for arm in page.state["arms"].values())

@@ -30,7 +30,7 @@ class HandWorker:
         read: input now.
 
     Attributes:
-        why_not: why it cannot move this robot; empty: it can.
+        parts: of the robot, of which one is moved at a time; of one arm one without a name.
     """
 
     def __init__(self, profile: Profile, client: Client, read: Callable[[], OperatorInput]) -> None:
@@ -38,12 +38,11 @@ class HandWorker:
         self._lock = threading.Lock()
         self._other_worker = profile.task.worker
         self._frame: Frame = "base"
-        self._level = 1
+        self._level = self._part = 0
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
         self._session: zenoh.Session | None = None
-        parts = ", ".join(profile.parts)
-        self.why_not = f"By hand moves one arm; here a worker moves all: {parts}" if parts else ""
+        self.parts = profile.part_names
         self.speeds_m_s = [speed.translation_m_s for speed in speeds_of(profile)]
 
     @property
@@ -52,18 +51,18 @@ class HandWorker:
         task = self._client.task
         return self._thread is not None and task is not None and task.worker == TELEOP
 
-    def take(self, frame: Frame, level: int) -> Task:
-        """Select this worker; it starts, or again with other axes.
+    def take(self, frame: Frame, level: int, part: str) -> Task:
+        """Select this worker, to move `part`; it starts, or again with other axes.
 
         Raises:
-            NodeError: a worker of this name runs elsewhere, or the robot has parts.
+            NodeError: a worker of this name runs elsewhere, or the robot has no such part.
             SecurityError: this computer has no certificate for it.
             SessionError: it was not selected.
         """
-        if self.why_not:
-            raise NodeError(self.why_not)
+        if part not in self.parts:
+            raise NodeError(f"the robot has no part {part!r}; it has {', '.join(self.parts)}")
         with self._lock:
-            self._level = level
+            self._level, self._part = level, self.parts.index(part)
             if self._thread is None or frame != self._frame:
                 self._end()
                 self._begin(frame)
@@ -87,7 +86,11 @@ class HandWorker:
     def _begin(self, frame: Frame) -> None:
         self._frame, self._stop = frame, threading.Event()
         self._session = open_session(self._profile.session, identity=worker_node(TELEOP))
-        policy = TeleopPolicy(self._profile, TELEOP, self._read, lambda: self._level, frame=frame)
+
+        def read() -> OperatorInput:
+            return self._read()._replace(part=self._part)
+
+        policy = TeleopPolicy(self._profile, TELEOP, read, lambda: self._level, frame=frame)
         try:
             node = WorkerNode(self._profile, self._session, policy, TELEOP)
         except NodeError:

@@ -94,7 +94,7 @@ FIELDS: Mapping[str, Mapping[str, Callable[[Any], bool]]] = {
     "primitive": {"press": _count, "tick": _count, "name": _primitive},
     "beat": {"press": _count, "tick": _count, "twist": _twist, "opening": _share},
     "release": {},
-    "jog": {"on": _flag, "frame": _frame, "level": _level},
+    "jog": {"on": _flag, "frame": _frame, "level": _level, "part": _text},
     "record": {"on": _flag, "verdict": _verdict, "note": _text},
     "save": {"note": _text},
     "trial": {

@@ -70,6 +70,8 @@ DENIED_S = 0.5
 """A wrong token is answered this late."""
 STOP_AGAIN_S = 0.1
 MAX_PAGES, MAX_ANSWERS, MAX_NEWS = 32, 200, 300
+MAX_WAITING = 8
+"""Requests of one page that wait for the robot, in turn."""
 RATE_HZ, BURST = 50.0, 100.0
 """Requests of one page; a stop is always taken."""
 MAX_PICTURE_HZ, IN_FLIGHT, PICTURE_POLL_S = 30.0, 2, 0.01
@@ -94,7 +96,7 @@ class Page:
         self.limit = RateLimit(RATE_HZ, BURST, time.monotonic())
         self.complaints = RateLimit(5.0, 10.0, time.monotonic())
         self.answers: deque[str] = deque(maxlen=MAX_ANSWERS)
-        self.busy = ""
+        self.turn, self.waiting = asyncio.Lock(), 0
         self.changed = asyncio.Event()
 
     @property
@@ -305,7 +307,6 @@ class PageServer:
                 "pictures": self._pictures.offered if page.drives else (),
                 "surroundings": surroundings(link.profile),
                 "no_arm": link.no_arm,
-                "no_hand": link.hand.why_not,
                 "insecure": link.profile.session.insecure,
                 "levels": link.hand.speeds_m_s,
             }
@@ -414,25 +415,28 @@ class PageServer:
             page.tell({**message, "is": "made", "why": str(error)})
 
     def _change(self, page: Page, what: str, call: Callable[[], Any], press: int = 0) -> None:
-        """Run what waits for the robot on a thread, one at a time for a page, and tell its end."""
-        if page.busy:
-            self._complain(page, "busy", f"still waiting for {page.busy}")
+        """Run what waits for the robot on a thread, in turn for each page, and tell its end."""
+        if page.waiting >= MAX_WAITING:
+            self._complain(page, "busy", f"{page.waiting} requests of this page are waiting")
             if press:
                 self._link.release(page.number)
             return
-        page.busy = what
+        page.waiting += 1
 
         async def run() -> None:
             answer: dict[str, Any] = {"is": "done", "what": what, "press": press}
+            # To deactivate waits for nothing.
+            turn = contextlib.nullcontext() if what == "deactivate" else page.turn
             try:
-                found = await asyncio.to_thread(call)
+                async with turn:
+                    found = await asyncio.to_thread(call)
                 if isinstance(found, str):
                     answer["text"] = found
             except VlaZenohError as error:
                 first, *reasons = str(error).split("\n  - ")
                 answer |= {"is": "failed", "why": first.rstrip(":"), "reasons": reasons}
             finally:
-                page.busy = ""
+                page.waiting -= 1
             page.tell(answer)
 
         self._begin(run())
@@ -603,7 +607,9 @@ SETTINGS: dict[str, Callable[[RobotLink, Any], Any]] = {
     "deactivate": lambda link, _: link.deactivate(),
     "reset": lambda link, _: link.reset(),
     "jog": lambda link, given: (
-        link.hand.take(given["frame"], given["level"]) if given["on"] else link.hand.give_back()
+        link.hand.take(given["frame"], given["level"], given["part"])
+        if given["on"]
+        else link.hand.give_back()
     ),
     "end_trial": lambda link, _: link.trial.end(),
     "save": lambda link, given: link.save(given["note"]),

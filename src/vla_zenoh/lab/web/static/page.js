@@ -91,12 +91,12 @@ function enter(message) {
   warn(message.insecure ? "Insecure profile: anyone on the network can command this robot." : "");
   $("arm-words").textContent = message.no_arm;
   $("keep-out-legend").hidden = Object.values(message.surroundings).every((part) => !Object.keys(part.keep_out).length);
-  $("no-hand").hidden = !message.no_hand;
-  setText($("no-hand"), message.no_hand);
-  for (const node of document.querySelectorAll(".hand")) node.hidden = Boolean(message.no_hand);
+  const parts = Object.keys(message.surroundings);
+  options($("part"), parts, parts.includes($("part").value) ? $("part").value : parts[0]);
+  $("which-arm").hidden = parts.length < 2;
   $("events").replaceChildren();
   levels(message.levels || []);
-  $("held").replaceChildren(...Object.keys(message.surroundings).map(heldField));
+  $("held").replaceChildren(...parts.map(heldField));
   if (message.drives) watchPictures();
 }
 
@@ -125,6 +125,7 @@ const GOOD = ["active", "inferring", "running", "routing", "ok"], BAD = ["stoppe
 const level = (word) => (GOOD.includes(word) ? "good" : BAD.includes(word) ? "bad" : "warn");
 const MODES = { sim: "SIM", dry_run: "DRY RUN", live: "LIVE", unknown: "MODE UNKNOWN" };
 
+const holder = (name) => name.replace(/^web-(.+)-[^-]+$/, "$1, on the page"); // of a deadman's token
 function showState(message) {
   state = message;
   tick = message.tick;
@@ -142,12 +143,13 @@ function showState(message) {
   const arms = Object.entries(message.arms || {}), fastest = Math.max(0, ...arms.map(([, arm]) => arm.speed_m_s || 0));
   facts([
     ["why", message.why],
-    ["held by", message.held_by ? (message.you_hold ? `${message.held_by} (you)` : message.held_by) : task && task.active ? "nobody: it runs without a hold" : "nobody"],
+    ["held by", message.you_hold ? "you" : message.held_by ? holder(message.held_by) : task && task.active ? "nobody: it runs without a hold" : "nobody"],
     ["arm", `${message.at_rest === null ? "unknown" : message.at_rest ? "stands" : "moves"}, ${(fastest * 100).toFixed(1)} cm/s`],
     ...arms.map(([name, arm]) => [`gripper ${name}`.trim(), arm.width_m === undefined ? "" : `${(arm.width_m * 1000).toFixed(0)} mm${arm.holding ? ", holds an object" : ""}${arm.holds ? `, counted as a box of ${arm.holds} m` : ""}`]),
     ["limits", message.limits.join("; ")],
     ["pages", String(message.pages)],
   ]);
+  $("activate").classList.toggle("next", !(task && task.active));
   $("take").setAttribute("aria-pressed", String(message.jog === true));
   setText($("take"), message.jog ? "Hand back" : "Take the arm");
   for (const button of $("pad").children) button.disabled = !message.jog;
@@ -291,13 +293,13 @@ for (const [name, what] of [["Home", "home"], ["Open", "open"], ["Close", "close
   holdable(button, () => beginHold(NONE, 0, what));
   $("primitives").append(button);
 }
-function jog(on) { send({ do: "jog", on, frame: $("frame").value, level: Number($("level").value || 1) }); }
+function jog(on) { send({ do: "jog", on, frame: $("frame").value, level: Number($("level").value || 1), part: $("part").value }); }
 function levels(given) {
   $("level").replaceChildren(...given.map((speed, at) => el("option", `${(speed * 100).toFixed(0)} cm/s`, { value: at })));
   $("level").value = "1";
 }
 $("take").addEventListener("click", () => jog(!state.jog));
-for (const id of ["frame", "level"]) $(id).addEventListener("change", () => { if (state.jog) jog(true); });
+for (const id of ["frame", "level", "part"]) $(id).addEventListener("change", () => { if (state.jog) jog(true); });
 
 // -- recording ----------------------------------------------------------------------------
 let recordingNow = false;
