@@ -160,6 +160,7 @@ class Extrapolation(Generic[Reference]):
         self._jerk, self._gap_s = jerk, gap_s
         self._first = GovernedPath(np.zeros(len(rate)), rate, change)
         self._limits = velocity_limit, jerk_limit
+        self._still = not (rate.any() or change.any() or jerk.any())
 
     @cached_property
     def _later(self) -> tuple[GovernedPath, FloatArray, FloatArray, FloatArray]:
@@ -178,6 +179,8 @@ class Extrapolation(Generic[Reference]):
 
     def at(self, ahead_s: float) -> Reference:
         """The reference `ahead_s` after the command."""
+        if self._still:
+            return self._base
         if ahead_s <= self._gap_s:
             return self._space.beside(self._base, _on(self._first, self._jerk, ahead_s))
         way, steady_s, fading_s, fade = self._later

@@ -36,6 +36,8 @@ from vla_zenoh.types.commands import PoseReference
 # Task-space mobility (1/kg or 1/(kg m^2)) below which a direction counts as singular: its apparent
 # inertia grows without bound, and so would damping and feed-forward.
 MIN_MOBILITY = 0.01
+SAME_RAD = 1e-4
+"""Joints that moved by less than this have the same inertia in task space and damping."""
 
 
 class ArmDynamics(NamedTuple):
@@ -60,6 +62,22 @@ class ArmDynamics(NamedTuple):
     drift: FloatArray
     inertia: FloatArray
     bias_nm: FloatArray
+
+
+class _TaskSpace(NamedTuple):
+    """What the law uses of an arm whose joints are at one place.
+
+    Args:
+        at_rad: (n,) the joints.
+        inertia: (6, 6) Lambda.
+        damping: (6, 6) D.
+        consistent: (6, n) transposed Jbar.
+    """
+
+    at_rad: FloatArray
+    inertia: FloatArray
+    damping: FloatArray
+    consistent: FloatArray
 
 
 class ImpedanceOutput(NamedTuple):
@@ -143,6 +161,7 @@ class CartesianImpedance:
         self._integral_rate = gains.integral_1_s * period_s * self._stiffness
         self._integral_limit = _per_axis(gains.max_integral_n, gains.max_integral_nm)
         self._integral = np.zeros(6)
+        self._task_space: _TaskSpace | None = None
 
     @property
     def integral(self) -> FloatArray:
@@ -151,7 +170,7 @@ class CartesianImpedance:
 
     def reset(self, posture_rad: FloatArray | None = None) -> None:
         """Clear the integral; set the posture where `posture_rad` (n,) is given."""
-        self._integral = np.zeros(6)
+        self._integral, self._task_space = np.zeros(6), None
         if posture_rad is not None:
             self._posture_rad = np.array(posture_rad, float)
 
@@ -161,10 +180,7 @@ class CartesianImpedance:
         The part of that torque beyond the model (friction, payload) goes into the integral, so that
         the first torque of this law equals the last of the other at the TCP.
         """
-        compliance = np.linalg.solve(state.inertia, state.jacobian.T)
-        mobility, axes = np.linalg.eigh(state.jacobian @ compliance)
-        task_inertia = (axes / np.maximum(mobility, MIN_MOBILITY)) @ axes.T
-        wrench = task_inertia @ (compliance.T @ (torque_nm - state.bias_nm))
+        wrench = self._seen(state).consistent @ (torque_nm - state.bias_nm)
         self._integral = np.minimum(np.maximum(wrench, -self._integral_limit), self._integral_limit)
         self._posture_rad = state.position_rad.copy()
 
@@ -176,24 +192,32 @@ class CartesianImpedance:
         error[3:] = pin.log3(reference.rotation @ state.tcp_rotation.T)
         spring_error, feed = self._clamp(error)
 
-        compliance = np.linalg.solve(state.inertia, transposed)  # M^-1 J^T, (n, 6)
-        mobility, axes = np.linalg.eigh(jacobian @ compliance)
-        mobility = np.maximum(mobility, MIN_MOBILITY)
-        task_inertia = (axes / mobility) @ axes.T
-        half_damping = ((axes / np.sqrt(mobility)) @ axes.T) * self._damping_scale
+        _, inertia, damping, consistent = self._seen(state)
 
-        spring = self._stiffness * spring_error
         slip = feed * reference.twist - jacobian @ state.velocity_rad_s
-        wrench = spring + half_damping @ slip + half_damping.T @ slip + self._integral
-        wrench += task_inertia @ (feed * reference.acceleration - state.drift)
+        wrench = self._stiffness * spring_error + damping @ slip + self._integral
+        wrench += inertia @ (feed * reference.acceleration - state.drift)
 
         posture = self._posture_torque(state)
-        seen_at_tcp = task_inertia @ (compliance.T @ posture)  # Jbar^T tau_posture
-        wanted = transposed @ (wrench - seen_at_tcp) + posture + state.bias_nm
+        wanted = transposed @ (wrench - consistent @ posture) + posture + state.bias_nm
         torque = np.minimum(np.maximum(wanted, -self._effort_nm), self._effort_nm)
         saturated = bool((torque != wanted).any())
         self._integrate(spring_error, held=saturated or feed <= 0.0)
         return ImpedanceOutput(torque, error, wrench, saturated)
+
+    def _seen(self, state: ArmDynamics) -> _TaskSpace:
+        """The arm in task space; kept while the joints stay where they are."""
+        known, position_rad = self._task_space, state.position_rad
+        if known is not None and float(np.abs(position_rad - known.at_rad).max()) < SAME_RAD:
+            return known
+        compliance = np.linalg.solve(state.inertia, state.jacobian.T)  # M^-1 J^T, (n, 6)
+        mobility, axes = np.linalg.eigh(state.jacobian @ compliance)
+        mobility = np.maximum(mobility, MIN_MOBILITY)
+        inertia = (axes / mobility) @ axes.T
+        half = ((axes / np.sqrt(mobility)) @ axes.T) * self._damping_scale
+        known = _TaskSpace(position_rad.copy(), inertia, half + half.T, inertia @ compliance.T)
+        self._task_space = known
+        return known
 
     def _clamp(self, error: FloatArray) -> tuple[FloatArray, float]:
         """Bounded stretch of the spring, and the share of the feed-forward that remains, 1 to 0.
@@ -221,12 +245,11 @@ class CartesianImpedance:
 
     def _posture_torque(self, state: ArmDynamics) -> FloatArray:
         position = state.position_rad
-        below = np.maximum(self._soft_lower_rad - position, 0.0)
-        above = np.maximum(position - self._soft_upper_rad, 0.0)
+        inside = np.minimum(np.maximum(position, self._soft_lower_rad), self._soft_upper_rad)
         return (
             self.gains.posture_nm_rad * (self._posture_rad - position)
             - self._posture_damping * state.velocity_rad_s
-            + self.gains.limit_nm_rad * (below - above)
+            + self.gains.limit_nm_rad * (inside - position)
         )
 
 

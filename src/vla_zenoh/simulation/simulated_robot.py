@@ -65,7 +65,9 @@ class SimulatedArm:
         # The fixed base presses against the ground it stands on, which is no contact of the arm.
         moves = model.body_weldid[model.geom_bodyid] != 0
         self._own_geom = moves & (model.body_rootid[model.geom_bodyid] == root)
-        self._linear, self._angular = np.zeros((3, model.nv)), np.zeros((3, model.nv))
+        # (6, nv): of the TCP and its rate; MuJoCo writes both halves of each.
+        self._jacobian, self._rate = np.zeros((6, model.nv)), np.zeros((6, model.nv))
+        self._halves = [(rows[:3], rows[3:]) for rows in (self._jacobian, self._rate)]
         self._inertia = np.zeros((model.nv, model.nv))
         self._scratch = mujoco.MjData(model)
 
@@ -78,7 +80,7 @@ class SimulatedArm:
             tcp_position_m=self.tcp_position_m,
             tcp_rotation=self.tcp_rotation,
             jacobian=self.jacobian(),
-            drift=self._jacobian_rate() @ self.velocity_rad_s,
+            drift=self._drift(),
             inertia=self._inertia[self._dofs, self._dofs],
             bias_nm=self._bias_nm,
         )
@@ -119,23 +121,12 @@ class SimulatedArm:
 
     def jacobian(self) -> FloatArray:
         """(6, n) of the TCP, linear rows first, base axes."""
-        mujoco.mj_jacSite(self._model, self._data, self._linear, self._angular, self._tcp)
-        return self._stacked()
+        mujoco.mj_jacSite(self._model, self._data, *self._halves[0], self._tcp)
+        return self._axes_of_base(self._jacobian[:, self._dofs])
 
-    def _jacobian_rate(self) -> FloatArray:
-        mujoco.mj_jacDot(
-            self._model,
-            self._data,
-            self._linear,
-            self._angular,
-            self._world_m,
-            self._tcp_body,
-        )
-        return self._stacked()
-
-    def _stacked(self) -> FloatArray:
-        stacked = np.concatenate([self._linear[:, self._dofs], self._angular[:, self._dofs]])
-        return self._axes_of_base(stacked)
+    def _drift(self) -> FloatArray:
+        mujoco.mj_jacDot(self._model, self._data, *self._halves[1], self._world_m, self._tcp_body)
+        return self._axes_of_base(self._rate[:, self._dofs] @ self.velocity_rad_s)
 
     def contact_wrench(self) -> FloatArray:
         """(6,) external contact wrench on the robot: N, and Nm about the TCP, base axes.
@@ -172,8 +163,8 @@ class SimulatedGripper:
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, robot: RobotModel) -> None:
         self._model, self._data = model, data
         fingers = [model.joint(prefix_of(robot) + name) for name in robot.finger_joints]
-        self._q = [int(joint.qposadr[0]) for joint in fingers]
-        self._dofs = [int(joint.dofadr[0]) for joint in fingers]
+        self._q = [data.qpos[joint.qposadr[0] :][:1] for joint in fingers]
+        self._v = [data.qvel[joint.dofadr[0] :][:1] for joint in fingers]
         self._scale_m, self._max_width_m = robot.finger_scale_m, robot.max_width_m
         # Each opens as far as the others.
         self._open = self._max_width_m / self._scale_m / len(fingers)
@@ -182,7 +173,8 @@ class SimulatedGripper:
 
     def open(self) -> None:
         """Put the fingers at their widest, as after a reset."""
-        self._data.qpos[self._q] = self._open
+        for joint in self._q:
+            joint[:] = self._open
         self._hold_at(self._max_width_m)
 
     def stand(self) -> None:
@@ -246,8 +238,8 @@ class SimulatedGripper:
         return self._measured_m - self._set_m > HELD_MARGIN_M and not self._moving
 
     def _opening(self) -> tuple[float, float]:
-        q, v = self._data.qpos[self._q].sum(), self._data.qvel[self._dofs].sum()
-        return float(q) * self._scale_m, float(v) * self._scale_m
+        q, v = (sum(at.item() for at in joints) for joints in (self._q, self._v))
+        return q * self._scale_m, v * self._scale_m
 
     def _bound_force(self, force_n: float) -> None:
         limit_n = min(force_n, MAX_FORCE_N)

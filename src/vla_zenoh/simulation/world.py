@@ -105,7 +105,7 @@ class SimulatedPart:
         else:
             self._held_rad, law = None, self._controller
             output = law.torque(reference, self._switch_to(law))
-        if not math.isfinite(output.torque_nm.sum()):
+        if not math.isfinite(sum(output.torque_nm.tolist())):
             raise NodeError(f"the reference is not finite: {reference}")
         self._data.ctrl[self._arm.actuators] = output.torque_nm
         self.gripper.step()
@@ -409,7 +409,10 @@ def build_world(profile: Profile) -> World:
     )
 
 
+_XYZW = [1, 2, 3, 0]
+
+
 def _quat_xyzw(rotation: FloatArray) -> FloatArray:
     quat_wxyz = np.empty(4)
     mujoco.mju_mat2Quat(quat_wxyz, np.ascontiguousarray(rotation).ravel())
-    return np.roll(quat_wxyz, -1)
+    return quat_wxyz[_XYZW]
