@@ -19,10 +19,12 @@ from vla_zenoh.robot import Reading
 from vla_zenoh.robots.driver import DriverStatus, Measurement, RobotDriver, command_of
 from vla_zenoh.robots.python_reading import MAX_WORDS, Fault, PythonReading
 from vla_zenoh.sanitize import one_line
-from vla_zenoh.types import Event, GripperCommand
+from vla_zenoh.types import Event, GripperCommand, GripperState
 from vla_zenoh.types.commands import JointReference, PoseReference
 
 FUTURE_NS = 100_000_000
+RELEASED_M = 0.002
+"""Fingers that are this much wider apart than around an object were opened."""
 
 
 class PythonDriver(RobotDriver):
@@ -49,7 +51,8 @@ class PythonDriver(RobotDriver):
         self._rate = RateMeter()
         self._asked_m = profile.robot.gripper.max_width_m
         self._width_m: float | None = None
-        self._held = False
+        self._held_m: float | None = None
+        """Width at which an object is held."""
         self.recovers = self._method("recover") is not None
         if self._method("grip") is None:
             self.no_gripper = f"{self._called} has no method grip"
@@ -107,7 +110,8 @@ class PythonDriver(RobotDriver):
         gripper = measured.gripper
         assert gripper is not None
         self.measured_ns, self._width_m = measured_ns, gripper.width_m
-        self._set_held(gripper.holding, released=gripper.moving)
+        if not gripper.moving:  # while the fingers move nobody knows
+            self._set_held(gripper)
         self._rate.tick()
         return measured
 
@@ -117,13 +121,14 @@ class PythonDriver(RobotDriver):
             self.report.emit(Event(level, "transition", f"robot:{self.gripper_mode}->{mode}"))
             self.gripper_mode = mode
 
-    def _set_held(self, holding: bool, *, released: bool) -> None:
-        if holding and not self._held:
-            self.report.emit(Event("info", "notice", "grasped", f"{self._width_m:.3f} m apart"))
-        elif self._held and not holding and not released:
-            why = "the gripper lost its object without a command to release it"
+    def _set_held(self, gripper: GripperState) -> None:
+        width_m, held_m = gripper.width_m, self._held_m
+        self._held_m = width_m if gripper.holding else None
+        if gripper.holding and held_m is None:
+            self.report.emit(Event("info", "notice", "grasped", f"{width_m:.3f} m apart"))
+        elif held_m is not None and not gripper.holding and width_m < held_m + RELEASED_M:
+            why = "the gripper lost its object and was not opened"
             self.report.emit(Event("warning", "notice", "object_lost", why))
-        self._held = holding
 
     def move(self, reference: PoseReference | JointReference, now_ns: int) -> None:
         """Give the robot its set-point."""

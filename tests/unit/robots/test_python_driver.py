@@ -146,6 +146,21 @@ def test_a_grasp_and_the_loss_of_the_object_are_told_once(rig: Rig) -> None:
     assert len(rig.told("object_lost")) == 1
 
 
+def test_an_object_that_is_lost_while_the_fingers_close_again_is_told(rig: Rig) -> None:
+    rig.read(width_m=0.04, holding=True)
+    rig.read(width_m=0.02, holding=False, moving=True)
+    rig.read(width_m=0.0, holding=False)
+    assert len(rig.told("object_lost")) == 1
+
+
+def test_closing_again_on_the_same_object_is_no_second_grasp(rig: Rig) -> None:
+    rig.read(width_m=0.04, holding=True)
+    rig.read(width_m=0.04, holding=False, moving=True)
+    rig.read(width_m=0.039, holding=True)
+    assert len(rig.told("grasped")) == 1
+    assert not rig.told("object_lost")
+
+
 def test_letting_go_is_no_loss(rig: Rig) -> None:
     rig.read(width_m=0.04, holding=True)
     rig.read(width_m=0.05, holding=False, moving=True)

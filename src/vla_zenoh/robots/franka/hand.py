@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 from vla_zenoh.errors import in_words
 
 CLEARLY_M = 0.002
-"""Less is not a closing motion; fingers further than this from the request hold an object."""
+"""Less is not a closing motion; fingers further than this from the request hold an object; so do
+those that are further than this from each other."""
 SHUT_M, STROKE_M = 0.005, 0.08
 WAIT_S = 0.02
 JOIN_S = 0.3
@@ -71,7 +72,9 @@ class Hand:
     def state(self) -> HandState:
         """The newest state, at once."""
         moving = self._running is not None or self._newest is not None
-        return HandState(self._width_m, moving, self._grasped and not moving)
+        # A grasp takes any width: the hand also calls it one when the fingers meet.
+        holds = self._grasped and self._width_m > CLEARLY_M and not moving
+        return HandState(self._width_m, moving, holds)
 
     def close(self) -> None:
         """End the threads; the fingers keep what they hold."""
@@ -117,6 +120,7 @@ class Hand:
             if closes and not self._superseded():
                 # Succeeds on whatever is between the fingers: its thickness is unknown.
                 self._wait(self._gripper.grasp_async(*request, STROKE_M, STROKE_M))
+                self._read()  # the state before it would say that nothing is held
         except Exception as error:  # an interrupted motion raises; the state has the width
             if not self._superseded():
                 self.failed = in_words(error)
