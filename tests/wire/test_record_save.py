@@ -21,9 +21,9 @@ from vla_zenoh.errors import SessionError
 from vla_zenoh.keys import ROLLING
 from vla_zenoh.lab.recording.run import load_run
 from vla_zenoh.lab.rolling.audit_log import verify_folder
-from vla_zenoh.lab.rolling.node import Limits, RollingRecord
+from vla_zenoh.lab.rolling.node import RingLimits, RollingRecord
 
-SHORT = Limits(keep_s=4.0, max_bytes=40 * 1024**2, segment_s=1.0, after_s=0.5)
+SHORT = RingLimits(keep_s=4.0, max_bytes=40 * 1024**2, segment_s=1.0, after_s=0.5)
 STEP_S = 7.0
 FLOOD = 20_000
 
@@ -48,7 +48,7 @@ class Kept:
 
 
 @contextmanager
-def kept(chain: Chain, folder: Path, limits: Limits = SHORT) -> Iterator[Kept]:
+def kept(chain: Chain, folder: Path, limits: RingLimits = SHORT) -> Iterator[Kept]:
     stop = threading.Event()
     with open_session(chain.profile.session) as session:
         record = RollingRecord(chain.profile, session, folder, limits)
