@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import itertools
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from camera_rig import PATIENCE_S, Rig, await_match, camera_rig, until
+from depth_rig import Looker, looking
 
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import records
@@ -19,20 +15,11 @@ from vla_zenoh.codec.image import decode_depth
 from vla_zenoh.lab.recording.reader import open_recording
 from vla_zenoh.lab.recording.recorder import Recorder
 from vla_zenoh.lab.recording.run import depths
-from vla_zenoh.nodes.worker.node import WorkerNode
-from vla_zenoh.policy import (
-    ActionSpec,
-    CameraSpec,
-    DepthSpec,
-    ModelSpec,
-    Observation,
-    ObservationSpec,
-)
 from vla_zenoh.profile.schema import CameraProfile
 from vla_zenoh.simulation.render import Renderer, choose_backend
 from vla_zenoh.simulation.robot_model import robot_model
 from vla_zenoh.simulation.world import build_world
-from vla_zenoh.types import Depth, Header, SceneState, Task
+from vla_zenoh.types import Depth, Header, SceneState
 
 LIMIT_M = 0.001
 CAMERAS = {
@@ -128,62 +115,15 @@ def test_nobody_who_asks_for_depth_costs_no_depth() -> None:
         assert rig.counter("front.depth") == 0
 
 
-class Looker:
-    """A model of colour and depth that keeps what it was given."""
-
-    def __init__(self, takes_s: float = 0.0, **fields: Any) -> None:
-        self._takes_s = takes_s
-        looks = ObservationSpec(
-            cameras=(CameraSpec(camera="front"),),
-            depth=(DepthSpec(camera="front", unit_m=0.0005, far_m=3.0),),
-            state=(),
-            prompt=False,
-            max_age_s=5.0,
-            **fields,
-        )
-        action = ActionSpec(horizon=1, dt_s=0.1, gripper="none")
-        self.spec = ModelSpec(name="looker", observation=looks, action=action)
-        self.seen: list[Observation] = []
-
-    def infer(self, observation: Observation) -> list[list[float]]:
-        self.seen.append(observation)
-        time.sleep(self._takes_s)
-        return [[0.0] * 6]
-
-
-@contextmanager
-def looking(rig: Rig, model: Looker) -> Iterator[Callable[[], None]]:
-    """The model's worker at work; what is yielded shows it a scene and a task."""
-    keys, number = rig.profile.keys, itertools.count()
-    stage = Stage(rig)
-    with open_session(rig.profile.session) as session:
-        worker = WorkerNode(rig.profile, session, model, "looker")
-        stop = threading.Event()
-        thread = threading.Thread(target=worker.run, args=(stop,))
-        thread.start()
-        tasks = rig.watcher.declare_publisher(keys.task)
-
-        def show() -> None:
-            stage.show()
-            task = records.encode(Task(1, False, "", "looker", 10.0))
-            header = Header(time.time_ns(), next(number), "command#test")
-            tasks.put(task, attachment=records.encode_header(header))
-
-        try:
-            until("a worker", lambda: tasks.matching_status.matching)
-            yield show
-        finally:
-            stop.set()
-            thread.join()
-
-
 def test_a_model_gets_the_depth_of_its_picture_and_shows_it_as_it_got_it() -> None:
     model = Looker()
     with camera_rig(CAMERAS) as rig:
         shown, _one = rig.listen(rig.profile.keys.seen_depth("looker", "front"))
-        with looking(rig, model) as show:
+        stage = Stage(rig)
+        with looking(rig, model) as tell:
             while len(shown) < 3:
-                show()
+                stage.show()
+                tell()
         by_stamp = {seen.stamp_wall_ns: seen for seen in model.seen}
         for frame in shown:
             depth = decode_depth(frame.payload, frame.encoding.partition(";")[2])
@@ -198,10 +138,11 @@ def test_a_model_gets_the_depth_of_its_picture_and_shows_it_as_it_got_it() -> No
 
 def test_a_slow_model_gets_a_history_of_what_came_while_it_was_thinking() -> None:
     model = Looker(0.4, history=3, history_spacing_s=0.2, max_skew_s=0.1)
-    with camera_rig(CAMERAS) as rig, looking(rig, model) as show:
-        give_up = time.monotonic() + PATIENCE_S
+    with camera_rig(CAMERAS) as rig, looking(rig, model) as tell:
+        stage, give_up = Stage(rig), time.monotonic() + PATIENCE_S
         while len(model.seen) < 6 and time.monotonic() < give_up:
-            show()
+            stage.show()
+            tell()
     assert len(model.seen) == 6
     first = model.seen[0]
     assert [each.stamp_wall_ns for each in first.history] == [first.stamp_wall_ns] * 2

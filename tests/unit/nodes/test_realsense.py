@@ -9,14 +9,20 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from camera_rig import Rig, await_match, camera_rig, until
+from depth_rig import Looker, looking
 
+from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec.image import decode_depth
 from vla_zenoh.errors import NodeError
+from vla_zenoh.lab.recording.reader import open_recording
+from vla_zenoh.lab.recording.recorder import Recorder
+from vla_zenoh.lab.recording.run import depths
 from vla_zenoh.nodes.camera.realsense import RealsenseSource
 from vla_zenoh.profile.schema import CameraProfile, Crop
 
@@ -217,3 +223,33 @@ def test_through_the_node_depth_comes_flipped_and_cropped_as_its_colour(
         _again = heard(rig, rig.profile.keys.camera_depth("wrist"), 30)
         told = until("a share", lambda: rig.camera("wrist").get("depth_measured_share"))
         assert told > MEASURED_SHARE
+
+
+def test_its_depth_reaches_a_model_and_a_recording_unchanged(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    camera, model, file = SoftwareCamera(), Looker(camera="wrist"), tmp_path / "run.mcap"
+    monkeypatch.setattr(RealsenseSource.__init__, "__defaults__", (lambda _: camera.device,))
+    with camera_rig({"wrist": profile(depth_unit_m=UNIT_M)}) as rig, camera.filming():
+        rig.wait_for("wrist", "ok")
+        with open_session(rig.profile.session) as session, looking(rig, model) as tell:
+            recorder = Recorder(rig.profile, session, file).start()
+            await_match(rig.session, rig.profile.keys.camera_depth("wrist"))
+
+            def seen() -> bool:
+                tell()
+                time.sleep(0.05)
+                return len(model.seen) >= 5
+
+            until("the model sees", seen)
+            recorder.close()
+    kept = {each.stamp_ns: each.depth() for each in depths(open_recording(file), "wrist")}
+    both = [each for each in model.seen if each.stamp_wall_ns in kept]
+    assert both
+    for each in both:
+        depth = kept[each.stamp_wall_ns]
+        assert depth.unit_m == UNIT_M
+        measured = depth.counts > 0
+        assert measured.mean() > MEASURED_SHARE
+        # The model asked for half millimetres.
+        np.testing.assert_array_equal(each.depth["wrist"], 2 * depth.counts)
