@@ -89,8 +89,8 @@ class OpenVlaRest(Adapter):
             headers = {"Content-Type": "application/json", "Connection": "close"}
             path = self._url.path.rstrip("/") or wire.PATH
             connection.request("POST", path, body, headers)
-            response = connection.getresponse()
-            answer = response.status, response.read(wire.MAX_BYTES + 1)
+            with connection.getresponse() as response:
+                answer = response.status, response.read(wire.MAX_BYTES + 1)
         except self.lost as error:
             if late.is_set():
                 raise TimeoutError from error

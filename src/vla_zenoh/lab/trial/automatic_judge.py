@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import runpy
+import urllib.error
 import urllib.request
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -154,6 +155,8 @@ def _answer(url: str, body: Mapping[str, Any]) -> str:
             found = json.loads(response.read(MAX_ANSWER_BYTES))
         return str(found["choices"][0]["message"]["content"])
     except (OSError, ValueError, LookupError, TypeError) as error:
+        if isinstance(error, urllib.error.HTTPError):
+            error.close()
         raise NodeError(f"judge {url}: {in_words(error)}") from error
 
 

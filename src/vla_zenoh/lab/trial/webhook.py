@@ -6,6 +6,7 @@ import json
 import queue
 import threading
 import time
+import urllib.error
 import urllib.request
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -58,6 +59,8 @@ class Webhook:
                     with urllib.request.urlopen(request, timeout=PATIENCE_S):
                         break
                 except (OSError, ValueError) as error:
+                    if isinstance(error, urllib.error.HTTPError):
+                        error.close()
                     if attempt == ATTEMPTS - 1:
                         self._warn(f"webhook: {message['what']!r} was not delivered: {error}")
                     time.sleep(BACK_OFF_S)
