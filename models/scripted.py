@@ -26,6 +26,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from vla_zenoh.lab.policy_servers.model_options import number, whole_number
 from vla_zenoh.policy import (
     ActionSpec,
     ActionSteps,
@@ -34,7 +35,6 @@ from vla_zenoh.policy import (
     Observation,
     ObservationSpec,
 )
-from vla_zenoh.policy.model_options import number, whole_number
 from vla_zenoh.policy.scripted_motions import parse_scripted
 
 ROUNDING = 1e-6

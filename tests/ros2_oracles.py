@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from rosbags.interfaces import Nodetype
 
 from benchmarks.codec.other_cdr import EMPTY
-from vla_zenoh.interop.ros2.messages import Messages
+from vla_zenoh.ros2.messages import Messages
 
 _texts = st.text(st.characters(exclude_categories=("Cs",), exclude_characters="\0"), max_size=20)
 MAX_ITEMS = 4

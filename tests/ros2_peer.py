@@ -17,9 +17,9 @@ import numpy as np
 import zenoh
 from panda_arm import ARM_JOINTS, HOME_RAD, panda
 
-from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.kinematics.ik import InverseKinematics
 from vla_zenoh.kinematics.so3 import Pose, rotation_from_quat
+from vla_zenoh.ros2.messages import Messages
 
 FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
 GOAL = "multi_mode_control_msgs/msg/CartesianImpedanceGoal"

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.errors import WorkerError, in_words
+from vla_zenoh.lab.policy_servers.model_options import one_of
 from vla_zenoh.policy import (
     ActionSpec,
     ActionSteps,
@@ -34,7 +35,6 @@ from vla_zenoh.policy import (
     ObservationSpec,
 )
 from vla_zenoh.policy.chunk_prefix import Committed
-from vla_zenoh.policy.model_options import one_of
 from vla_zenoh.types import PoseState
 
 FloatArray = NDArray[np.float64]

@@ -17,8 +17,8 @@ import zmq
 from vla_zenoh_model_groot import wire
 
 from vla_zenoh.errors import PeerError, SpecError
-from vla_zenoh.interop.adapter import Adapter
-from vla_zenoh.policy.model_options import address, one_of
+from vla_zenoh.lab.policy_servers.adapter import Adapter
+from vla_zenoh.lab.policy_servers.model_options import address, one_of
 
 
 class Groot(Adapter):
@@ -31,7 +31,7 @@ class Groot(Adapter):
         timeout_s: for connecting, and for each answer.
         api_token: if the server requires one.
         profile: of the robot: its gripper and, if answers are joints, its arm.
-        layout: see vla_zenoh/interop/field_mapping.py. Images are video.NAME, states state.NAME.
+        layout: see lab/policy_servers/field_mapping.py. Images are video.NAME, states state.NAME.
     """
 
     joints = True

@@ -27,8 +27,8 @@ from vla_zenoh_model_groot import npy
 
 from vla_zenoh.codec import message
 from vla_zenoh.errors import CodecError, PeerError
-from vla_zenoh.interop.field_mapping import FieldMapping
-from vla_zenoh.interop.presets import BRIDGE, OPENS_AT_1, OSC, Presets
+from vla_zenoh.lab.policy_servers.field_mapping import FieldMapping
+from vla_zenoh.lab.policy_servers.presets import BRIDGE, OPENS_AT_1, OSC, Presets
 from vla_zenoh.types import shown
 
 Version = Literal["n1.5", "n1.6"]

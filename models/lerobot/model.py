@@ -45,7 +45,9 @@ from vla_zenoh_model_lerobot.mapping import (
 )
 
 from vla_zenoh.errors import SpecError, WorkerError, in_words
-from vla_zenoh.interop.action_semantics import ActionSemantics, read_action_semantics
+from vla_zenoh.lab.policy_servers.action_semantics import ActionSemantics, read_action_semantics
+from vla_zenoh.lab.policy_servers.model_options import checkpoint_folder, one_of
+from vla_zenoh.lab.policy_servers.state_vector import parts_of, state_vector
 from vla_zenoh.policy import (
     ActionSpec,
     ActionSteps,
@@ -56,8 +58,6 @@ from vla_zenoh.policy import (
     Resize,
 )
 from vla_zenoh.policy.chunk_prefix import Committed
-from vla_zenoh.policy.model_options import checkpoint_folder, one_of
-from vla_zenoh.policy.state_vector import parts_of, state_vector
 from vla_zenoh.profile import load_profile
 
 
@@ -78,7 +78,7 @@ class LeRobot:
             as in the profile.
         rtc: ``on``: a pi0, pi0.5 or SmolVLA continues the steps in execution, by LeRobot's own
             real-time chunking with the weights of the paper.
-        meaning: of the actions, see vla_zenoh/interop/action_semantics.py. `horizon` defaults to
+        meaning: of the actions, see lab/policy_servers/action_semantics.py. `horizon` defaults to
             the number of steps that the policy was made to execute.
     """
 

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 from vla_zenoh_model_lerobot_server import wire
 
 from vla_zenoh.errors import PeerError, SpecError
-from vla_zenoh.interop.adapter import Adapter
-from vla_zenoh.policy.model_options import address, number, one_of
+from vla_zenoh.lab.policy_servers.adapter import Adapter
+from vla_zenoh.lab.policy_servers.model_options import address, number, one_of
 from vla_zenoh.profile import load_profile
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ class LeRobotServer(Adapter):
         load_s: how long the server may load.
         timeout_s: for connecting, and for each answer.
         profile: of the robot: its gripper and, if answers are joints, its arm.
-        layout: see vla_zenoh/interop/field_mapping.py. An image is observation.images.NAME, the
+        layout: see lab/policy_servers/field_mapping.py. An image is observation.images.NAME, the
             state observation.state, the prompt task; size none: as the camera gives it.
     """
 

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from vla_zenoh_model_openpi import wire
 
-from vla_zenoh.interop.adapter import Adapter
-from vla_zenoh.interop.websocket_client import WebSocketClient
+from vla_zenoh.lab.policy_servers.adapter import Adapter
+from vla_zenoh.lab.policy_servers.model_options import address, one_of
+from vla_zenoh.lab.policy_servers.websocket_client import WebSocketClient
 from vla_zenoh.policy import ActionSteps, Observation
 from vla_zenoh.policy.chunk_prefix import Committed
-from vla_zenoh.policy.model_options import address, one_of
 
 
 class OpenPi(Adapter):
@@ -33,7 +33,7 @@ class OpenPi(Adapter):
         dialect: openpi, vllm (knows resets and sessions), auto: by the path of the URL.
         api_key: sent as ``Authorization: Api-Key``.
         profile: of the robot: its gripper and, if answers are joints, its arm.
-        layout: see vla_zenoh/interop/field_mapping.py.
+        layout: see lab/policy_servers/field_mapping.py.
     """
 
     joints = True

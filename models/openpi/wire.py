@@ -15,8 +15,8 @@ from typing import Any
 
 from vla_zenoh.codec import message
 from vla_zenoh.errors import CodecError, PeerError
-from vla_zenoh.interop.field_mapping import FieldMapping
-from vla_zenoh.interop.presets import ADDED, OSC, STATE8, Presets
+from vla_zenoh.lab.policy_servers.field_mapping import FieldMapping
+from vla_zenoh.lab.policy_servers.presets import ADDED, OSC, STATE8, Presets
 from vla_zenoh.types import shown
 
 PORT = 8000

@@ -36,9 +36,9 @@ from vla_zenoh_model_openvla.statistics import AXES, Range, choose, read_range
 from vla_zenoh_model_openvla.tokens import PROMPTS, ActionBins, prompt_text, prompt_tokens
 
 from vla_zenoh.errors import SpecError, WorkerError, in_words
+from vla_zenoh.lab.policy_servers.model_options import checkpoint_folder, one_of
+from vla_zenoh.lab.policy_servers.state_vector import parts_of, read_state, state_vector
 from vla_zenoh.policy import ActionSteps, CameraSpec, ModelSpec, Observation, ObservationSpec
-from vla_zenoh.policy.model_options import checkpoint_folder, one_of
-from vla_zenoh.policy.state_vector import parts_of, read_state, state_vector
 from vla_zenoh.profile import load_profile
 
 Device = str
@@ -66,10 +66,10 @@ class OpenVLA:
         dtype: of weights; ``auto``: bfloat16 on a GPU, else float32.
         quantise: ``int8`` or ``nf4``: Llama's layers in less memory.
         chunk: OFT: steps of a chunk; known for LIBERO and Bridge.
-        state: OFT: what the numbers of the robot's state are, see `vla_zenoh.policy.state_vector`.
+        state: OFT: what the numbers of the robot's state are, see lab/policy_servers.
         profile: of the robot; OFT: its gripper and arm, for the state.
         meaning: of the numbers in the units of the data, known for some data sets, see
-            vla_zenoh/interop/action_semantics.py. `horizon` defaults to the whole chunk.
+            vla_zenoh/lab/policy_servers/action_semantics.py. `horizon` defaults to the whole chunk.
     """
 
     def __init__(

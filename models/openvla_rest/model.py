@@ -18,8 +18,8 @@ from typing import Any
 
 from vla_zenoh_model_openvla_rest import wire
 
-from vla_zenoh.interop.adapter import Adapter
-from vla_zenoh.policy.model_options import address, yes_no
+from vla_zenoh.lab.policy_servers.adapter import Adapter
+from vla_zenoh.lab.policy_servers.model_options import address, yes_no
 
 
 class OpenVlaRest(Adapter):
@@ -32,7 +32,7 @@ class OpenVlaRest(Adapter):
         encoded: yes: JSON within JSON, for servers without json_numpy on the wire.
         timeout_s: for each request.
         profile: of the robot, for its gripper.
-        layout: see vla_zenoh/interop/field_mapping.py.
+        layout: see lab/policy_servers/field_mapping.py.
     """
 
     lost = (OSError, http.client.HTTPException)

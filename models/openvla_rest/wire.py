@@ -19,7 +19,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from vla_zenoh.errors import PeerError
-from vla_zenoh.interop.presets import BRIDGE, OPENS_AT_1, OSC, STATE8, Presets
+from vla_zenoh.lab.policy_servers.presets import BRIDGE, OPENS_AT_1, OSC, STATE8, Presets
 from vla_zenoh.types import shown
 
 PORT = 8000

@@ -19,7 +19,7 @@ from vla_zenoh_model_origami import wire
 
 from vla_zenoh.codec.message import MAX_PAYLOAD_BYTES
 from vla_zenoh.errors import CodecError, PeerError, SpecError
-from vla_zenoh.interop.adapter import Adapter
+from vla_zenoh.lab.policy_servers.adapter import Adapter
 
 if TYPE_CHECKING:
     import zenoh
@@ -34,7 +34,7 @@ class Origami(Adapter):
         preset: north_right; see wire.py.
         timeout_s: for each answer.
         profile: of the robot, for its arm and gripper.
-        layout: see vla_zenoh/interop/field_mapping.py.
+        layout: see lab/policy_servers/field_mapping.py.
     """
 
     joints = True

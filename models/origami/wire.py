@@ -13,8 +13,8 @@ from typing import Any, Literal
 
 from vla_zenoh.codec import message
 from vla_zenoh.errors import CodecError, PeerError
-from vla_zenoh.interop.field_mapping import FieldMapping
-from vla_zenoh.interop.presets import Presets
+from vla_zenoh.lab.policy_servers.field_mapping import FieldMapping
+from vla_zenoh.lab.policy_servers.presets import Presets
 from vla_zenoh.types import shown
 
 PROTOCOL = "origami-zenoh-v1"

@@ -18,10 +18,10 @@ from typing import Any
 
 from vla_zenoh_model_xpolicylab import wire
 
-from vla_zenoh.interop.adapter import Adapter
-from vla_zenoh.interop.field_mapping import NONE
-from vla_zenoh.interop.websocket_client import WebSocketClient
-from vla_zenoh.policy.model_options import address
+from vla_zenoh.lab.policy_servers.adapter import Adapter
+from vla_zenoh.lab.policy_servers.field_mapping import NONE
+from vla_zenoh.lab.policy_servers.model_options import address
+from vla_zenoh.lab.policy_servers.websocket_client import WebSocketClient
 
 
 class XPolicyLab(Adapter):
@@ -33,7 +33,7 @@ class XPolicyLab(Adapter):
         case: action case for the server to prepare; empty: none.
         timeout_s: for connecting, and for each answer.
         profile: of the robot: its gripper and, if answers are joints, its arm.
-        layout: see vla_zenoh/interop/field_mapping.py. A name a/b/c is nested: c in b in a.
+        layout: see lab/policy_servers/field_mapping.py. A name a/b/c is nested: c in b in a.
     """
 
     joints = True

@@ -30,8 +30,8 @@ import numpy as np
 
 from vla_zenoh.codec import message
 from vla_zenoh.errors import CodecError, PeerError, SpecError
-from vla_zenoh.interop.field_mapping import FieldMapping
-from vla_zenoh.interop.presets import Presets
+from vla_zenoh.lab.policy_servers.field_mapping import FieldMapping
+from vla_zenoh.lab.policy_servers.presets import Presets
 from vla_zenoh.types import shown
 
 PORT = 19000

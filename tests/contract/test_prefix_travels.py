@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vla_zenoh.errors import PeerError
-from vla_zenoh.interop.action_semantics import read_action_semantics
 from vla_zenoh.lab.check.examples import example_observation
+from vla_zenoh.lab.policy_servers.action_semantics import read_action_semantics
 from vla_zenoh.lab.serve import openpi_frames
 from vla_zenoh.lab.serve.openpi_conversation import OpenPiConversation
 from vla_zenoh.lab.serve.policy_server import PolicyServer

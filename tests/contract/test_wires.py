@@ -27,7 +27,7 @@ from model_wires import (
 )
 
 from vla_zenoh.errors import PeerError
-from vla_zenoh.interop.field_mapping import read_field_mapping
+from vla_zenoh.lab.policy_servers.field_mapping import read_field_mapping
 from vla_zenoh.lab.serve import openpi_frames
 from vla_zenoh.policy import ActionSpec
 

@@ -27,9 +27,6 @@ from vla_zenoh.cli.options import model_options, number_list
 from vla_zenoh.cli.output import Screen, plain_types
 from vla_zenoh.codec import image, message, primitives, records, settings
 from vla_zenoh.errors import CodecError, PeerError, ProfileError, SpecError, VlaZenohError
-from vla_zenoh.interop.ros2 import attachment, readers
-from vla_zenoh.interop.ros2.definitions import parse
-from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.keys import Keys
 from vla_zenoh.lab.cli import inspect as cli_inspect
 from vla_zenoh.lab.cli import keys as cli_keys
@@ -44,6 +41,9 @@ from vla_zenoh.policy import ActionSpec, ModelSpec, ObservationSpec
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.policy.scripted_motions import parse_scripted
 from vla_zenoh.profile import load_profile
+from vla_zenoh.ros2 import attachment, readers
+from vla_zenoh.ros2.definitions import parse
+from vla_zenoh.ros2.messages import Messages
 from vla_zenoh.types import Depth, Event, Header, InferenceDebug, NodeStatus
 
 OF_TORCH = Path(__file__).parents[1] / "contract" / "lerobot_actions.pickle"

@@ -24,7 +24,7 @@ ORDER = (
     ("kinematics",),
     ("control",),
     ("guard",),
-    ("interop", "security", "simulation"),
+    ("ros2", "security", "simulation"),
     ("bus",),
     ("runtime",),
     ("nodes",),

@@ -18,8 +18,6 @@ from vla_zenoh.bus.clock import Clock
 from vla_zenoh.bus.node import Node, Publisher
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.guard.gripper_guard import OLDEST_NS
-from vla_zenoh.interop.ros2.gripper_actions import SUCCEEDED
-from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.keys import Kind
 from vla_zenoh.profile import load_profile
 from vla_zenoh.robots.arm import GripperCommands
@@ -27,6 +25,8 @@ from vla_zenoh.robots.command_follower import CommandFollower
 from vla_zenoh.robots.driver import RobotDriver
 from vla_zenoh.robots.ros2.gripper import Gripper
 from vla_zenoh.robots.ros2.ros_graph import RosGraph
+from vla_zenoh.ros2.gripper_actions import SUCCEEDED
+from vla_zenoh.ros2.messages import Messages
 from vla_zenoh.types import GripperCommand
 
 HOUR_NS = 3_600_000_000_000

@@ -19,11 +19,11 @@ from ros2_rig import write_profile
 from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import records
-from vla_zenoh.interop.ros2.messages import Messages
 from vla_zenoh.keys import Keys
 from vla_zenoh.profile import load_profile
 from vla_zenoh.robots.ros2.ros_graph import RosGraph
 from vla_zenoh.robots.ros2.ros_services import RosServices
+from vla_zenoh.ros2.messages import Messages
 from vla_zenoh.types import Header, Task
 
 PATIENCE_S = 30.0

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from vla_zenoh.interop.joint_reading import JointReading, pose_state
-from vla_zenoh.interop.ros2.samples import Joints
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.profile import Profile
 from vla_zenoh.robot import Reading, numbers
 from vla_zenoh.robots.driver import Measurement
+from vla_zenoh.robots.joint_reading import JointReading, pose_state
+from vla_zenoh.ros2.samples import Joints
 from vla_zenoh.sanitize import one_line
 from vla_zenoh.types import FloatArray, GripperState
 

@@ -30,8 +30,8 @@ from pair_recording_rig import WIDTH_M, write_pair_run
 
 from vla_zenoh.lab.dataset.episodes import episodes_of
 from vla_zenoh.lab.dataset.lerobot import export
+from vla_zenoh.lab.policy_servers.state_vector import read_parts
 from vla_zenoh.lab.recording.run import load_run
-from vla_zenoh.policy.state_vector import read_parts
 
 pytestmark = pytest.mark.models
 

@@ -32,8 +32,8 @@ from vla_zenoh.lab.dataset.feature_statistics import Histogram, of_numbers
 from vla_zenoh.lab.dataset.features import action_names, usual_state
 from vla_zenoh.lab.dataset.lerobot import export
 from vla_zenoh.lab.dataset.openvla import openvla_statistics
+from vla_zenoh.lab.policy_servers.state_vector import read_parts
 from vla_zenoh.lab.recording.run import Run, load_run
-from vla_zenoh.policy.state_vector import read_parts
 from vla_zenoh.types import JointState
 
 FPS, USED = 10, 2

@@ -27,10 +27,10 @@ from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.cli.dataset import dataset_app
 from vla_zenoh.lab.dataset.episodes import RecordedEpisode, Span, episodes_of, together
 from vla_zenoh.lab.dataset.lerobot import export
+from vla_zenoh.lab.policy_servers.state_vector import read_parts
 from vla_zenoh.lab.recording.run import load_run
 from vla_zenoh.lab.trial.verdict import FACT
 from vla_zenoh.policy import ControllerSpec
-from vla_zenoh.policy.state_vector import read_parts
 
 PARTS = read_parts("position+rpy+gripper_m")
 EACH = 10

@@ -24,8 +24,8 @@ from vla_zenoh.lab.dataset.features import action_names, names_of_state, usual_s
 from vla_zenoh.lab.dataset.lerobot import export
 from vla_zenoh.lab.dataset.openvla import openvla_statistics
 from vla_zenoh.lab.evaluation.evaluate import combined, evaluate
+from vla_zenoh.lab.policy_servers.state_vector import read_parts
 from vla_zenoh.lab.recording.run import load_run
-from vla_zenoh.policy.state_vector import read_parts
 
 USED, COLUMNS = 2, 6
 NAMES = [

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from vla_zenoh.lab.policy_servers.state_vector import read_parts, state_vector
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, Observation, ObservationSpec
 from vla_zenoh.policy.observation import MAX_PICTURES, NotReady, Streams, assemble
-from vla_zenoh.policy.state_vector import read_parts, state_vector
 from vla_zenoh.types import Header, Image, JointState, PoseState, Stamped, Task
 
 MS = 1_000_000

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from vla_zenoh.errors import ResourceError
+from vla_zenoh.lab.policy_servers.model_options import shown
 from vla_zenoh.lab.statistics import wilson_95
 from vla_zenoh.lab.tasks import (
     COLOURS,
@@ -25,7 +26,6 @@ from vla_zenoh.lab.tasks import (
 )
 from vla_zenoh.lab.tasks.order import PUSH
 from vla_zenoh.lab.tasks.wording import is_nonsense, parse_prompt
-from vla_zenoh.policy.model_options import shown
 from vla_zenoh.types import ObjectPoses
 
 SCENE = "bricks"

@@ -65,8 +65,8 @@ def export(
     from vla_zenoh.lab.dataset.features import usual_state
     from vla_zenoh.lab.dataset.lerobot import export as write
     from vla_zenoh.lab.dataset.success import succeeded, verdict_of_person
+    from vla_zenoh.lab.policy_servers.state_vector import read_parts
     from vla_zenoh.lab.recording.run import load_run
-    from vla_zenoh.policy.state_vector import read_parts
 
     parts, files = read_parts(state) if state else None, _files(runs)
     wanted = labels or [each for each in EpisodeLabel if each is not EpisodeLabel.DISCARDED]

@@ -19,9 +19,9 @@ from vla_zenoh.kinematics.so3 import (
     quat_from_rotation,
     rotation_from_quat,
 )
+from vla_zenoh.lab.policy_servers.state_vector import rpy
 from vla_zenoh.lab.recording.run import Run, newest
 from vla_zenoh.policy import ActionSpec
-from vla_zenoh.policy.state_vector import rpy
 from vla_zenoh.types import FloatArray
 
 BINARY = 0.5

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.dataset.episodes import RecordedEpisode
+from vla_zenoh.lab.policy_servers.state_vector import parts_of, state_vector
 from vla_zenoh.lab.recording.run import Run, nearest
 from vla_zenoh.policy import ActionSpec, Observation
 from vla_zenoh.policy.spec import STREAM_OF
-from vla_zenoh.policy.state_vector import parts_of, state_vector
 from vla_zenoh.types import Task
 
 STATE, ACTION, PICTURE = "observation.state", "action", "observation.images."

@@ -94,7 +94,7 @@ def export(
         folder: must not exist, or be empty.
         episodes: in their order.
         cameras: whose images to export.
-        parts: of the state, see `vla_zenoh.policy.state_vector`.
+        parts: of the state, see `vla_zenoh.lab.policy_servers.state_vector`.
         progress: called with what is being written.
         depth: cameras whose depth images to export.
 

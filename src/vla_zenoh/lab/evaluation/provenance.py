@@ -7,9 +7,9 @@ import datetime as dt
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.lab.evaluation.activations import activations
 from vla_zenoh.lab.evaluation.result import TASKS, TaskVerdict
+from vla_zenoh.lab.policy_servers.model_options import shown
 from vla_zenoh.lab.recording.run import Run
 from vla_zenoh.lab.trial.verdict import FACT
-from vla_zenoh.policy.model_options import shown
 from vla_zenoh.profile import Profile, read_profile
 
 

@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.interop.ros2.keys import EntityRole
 from vla_zenoh.lab.profile.ros2_endpoints import endpoints
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.ros2 import Ros2Profile
@@ -19,6 +18,7 @@ from vla_zenoh.profile.session import (
     host_of,
     is_loopback,
 )
+from vla_zenoh.ros2.keys import EntityRole
 
 PROGRAM = "zenoh-bridge-ros2dds"
 ALLOWED_AS = {

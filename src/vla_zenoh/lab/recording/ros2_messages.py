@@ -17,7 +17,7 @@ from vla_zenoh.errors import CodecError, MissingExtraError
 from vla_zenoh.types import JointCommand, JointState, ObjectPoses, PoseCommand, PoseState
 
 if TYPE_CHECKING:
-    from vla_zenoh.interop.ros2.messages import Messages
+    from vla_zenoh.ros2.messages import Messages
 
 IMAGE, JPEG_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 POSE, POSES = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseArray"
@@ -36,7 +36,7 @@ def messages() -> Messages:
         MissingExtraError: rosbags is not installed.
     """
     try:
-        from vla_zenoh.interop.ros2.messages import Messages
+        from vla_zenoh.ros2.messages import Messages
     except ImportError as error:
         raise MissingExtraError("rosbags", "record") from error
     return Messages(DISTRIBUTION)

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.errors import PeerError, RecordError, SpecError
-from vla_zenoh.interop.field_mapping import FieldSource, read_map
+from vla_zenoh.lab.policy_servers.field_mapping import FieldSource, read_map
+from vla_zenoh.lab.policy_servers.state_vector import ROTATIONS, parts_of, read_parts
 from vla_zenoh.lab.serve.state_parts import state_of
 from vla_zenoh.policy import (
     ActionSteps,
@@ -22,7 +23,6 @@ from vla_zenoh.policy import (
 )
 from vla_zenoh.policy.chunk_prefix import Committed
 from vla_zenoh.policy.observation import prepare_image
-from vla_zenoh.policy.state_vector import ROTATIONS, parts_of, read_parts
 from vla_zenoh.types import GripperState, Image, JointState, PoseState, Task, shown
 
 _OF_PART = {"pose": "position+quat_xyzw", "gripper": "gripper_m", "joint": "joint"}

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.errors import SpecError
-from vla_zenoh.policy.state_vector import JOINTS, Numbers, size_of
+from vla_zenoh.lab.policy_servers.state_vector import JOINTS, Numbers, size_of
 
 
 def state_of(

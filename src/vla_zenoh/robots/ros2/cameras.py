@@ -9,16 +9,16 @@ from collections.abc import Callable
 from vla_zenoh.bus.buffers import LatestSample, ReceivedSample
 from vla_zenoh.bus.node import Node
 from vla_zenoh.errors import CodecError
-from vla_zenoh.interop.joint_reading import StampFilter
-from vla_zenoh.interop.ros2.keys import SENSOR
-from vla_zenoh.interop.ros2.messages import MAX_PICTURE_BYTES, Messages
-from vla_zenoh.interop.ros2.readers import read
-from vla_zenoh.interop.ros2.samples import RosImage
 from vla_zenoh.nodes.camera.camera_publisher import OK, CameraPublisher
 from vla_zenoh.nodes.camera.geometry import resize
 from vla_zenoh.nodes.camera.source import LOOK_S, STALL_S
 from vla_zenoh.profile.ros2 import Ros2Camera
+from vla_zenoh.robots.joint_reading import StampFilter
 from vla_zenoh.robots.ros2.ros_graph import RosGraph
+from vla_zenoh.ros2.keys import SENSOR
+from vla_zenoh.ros2.messages import MAX_PICTURE_BYTES, Messages
+from vla_zenoh.ros2.readers import read
+from vla_zenoh.ros2.samples import RosImage
 from vla_zenoh.types import Event
 
 WAIT_S = 0.1

@@ -18,21 +18,21 @@ import zenoh
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import ProfileError, RecordError
-from vla_zenoh.interop.joint_reading import pose_state
-from vla_zenoh.interop.ros2.keys import COMMAND
-from vla_zenoh.interop.ros2.messages import Messages
-from vla_zenoh.interop.ros2.samples import Stamp
-from vla_zenoh.interop.ros2.writers import Write, joint_writer, pose_writer
 from vla_zenoh.profile import Profile, SessionProfile
 from vla_zenoh.profile.ros2 import Ros2Output, Ros2Profile
 from vla_zenoh.profile.session import TRUSTED_PROTOCOLS
 from vla_zenoh.robots.command_follower import CommandFollower
 from vla_zenoh.robots.driver import DriverStatus, Measurement, RobotDriver, command_of
+from vla_zenoh.robots.joint_reading import pose_state
 from vla_zenoh.robots.ros2.cameras import Camera
 from vla_zenoh.robots.ros2.gripper import Gripper
 from vla_zenoh.robots.ros2.ros_graph import RosGraph
 from vla_zenoh.robots.ros2.ros_services import RosServices
 from vla_zenoh.robots.ros2.state_subscriber import StateSubscriber
+from vla_zenoh.ros2.keys import COMMAND
+from vla_zenoh.ros2.messages import Messages
+from vla_zenoh.ros2.samples import Stamp
+from vla_zenoh.ros2.writers import Write, joint_writer, pose_writer
 from vla_zenoh.runtime.process import ROUTER_PATIENCE_S
 from vla_zenoh.types import Event, GripperCommand, GripperState
 from vla_zenoh.types.commands import JointReference, PoseReference

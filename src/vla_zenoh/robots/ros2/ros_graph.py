@@ -13,9 +13,10 @@ import zenoh
 
 from vla_zenoh.bus.buffers import CallbackRing, LatestSample, bytes_of
 from vla_zenoh.errors import CodecError
-from vla_zenoh.interop.ros2 import attachment as attachments
-from vla_zenoh.interop.ros2.attachment import Attachment
-from vla_zenoh.interop.ros2.keys import (
+from vla_zenoh.profile.ros2 import Ros2Profile
+from vla_zenoh.ros2 import attachment as attachments
+from vla_zenoh.ros2.attachment import Attachment
+from vla_zenoh.ros2.keys import (
     DEFAULT,
     Endpoint,
     EntityRole,
@@ -25,8 +26,7 @@ from vla_zenoh.interop.ros2.keys import (
     Wire,
     parts_of,
 )
-from vla_zenoh.interop.ros2.messages import Messages
-from vla_zenoh.profile.ros2 import Ros2Profile
+from vla_zenoh.ros2.messages import Messages
 
 Buffer = TypeVar("Buffer", LatestSample, CallbackRing)
 

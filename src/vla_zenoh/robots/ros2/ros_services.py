@@ -19,12 +19,14 @@ from vla_zenoh.bus.buffers import CallbackRing
 from vla_zenoh.bus.client import Client
 from vla_zenoh.codec import settings
 from vla_zenoh.errors import CodecError, SessionError
-from vla_zenoh.interop.ros2 import diagnostics
-from vla_zenoh.interop.ros2.messages import Messages
-from vla_zenoh.interop.ros2.names import request_of, response_of
-from vla_zenoh.interop.ros2.readers import TEXT, read
-from vla_zenoh.interop.ros2.samples import Stamp
-from vla_zenoh.interop.ros2.services import (
+from vla_zenoh.profile import Profile
+from vla_zenoh.robots.ros2.ros_graph import Request, RosGraph
+from vla_zenoh.ros2 import diagnostics
+from vla_zenoh.ros2.messages import Messages
+from vla_zenoh.ros2.names import request_of, response_of
+from vla_zenoh.ros2.readers import TEXT, read
+from vla_zenoh.ros2.samples import Stamp
+from vla_zenoh.ros2.services import (
     PROMPT_TOPIC,
     RESET,
     SERVICES,
@@ -35,8 +37,6 @@ from vla_zenoh.interop.ros2.services import (
     STOP,
     Service,
 )
-from vla_zenoh.profile import Profile
-from vla_zenoh.robots.ros2.ros_graph import Request, RosGraph
 
 STATUS_PERIOD_S = 1.0
 POLL_S = 0.05

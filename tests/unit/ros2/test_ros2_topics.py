@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from vla_zenoh.errors import CodecError, ProfileError
-from vla_zenoh.interop.ros2 import diagnostics, readers
-from vla_zenoh.interop.ros2.gripper_actions import (
+from vla_zenoh.profile import GripperProfile
+from vla_zenoh.profile.ros2 import Ros2Gripper
+from vla_zenoh.ros2 import diagnostics, readers
+from vla_zenoh.ros2.gripper_actions import (
     GRASP,
     GRIPPER_COMMAND,
     MOVE,
@@ -20,11 +22,9 @@ from vla_zenoh.interop.ros2.gripper_actions import (
     position,
     send_goal,
 )
-from vla_zenoh.interop.ros2.messages import Messages
-from vla_zenoh.interop.ros2.samples import RosImage, Stamp
-from vla_zenoh.interop.ros2.writers import Write, joint_writer, pose_writer, position_message
-from vla_zenoh.profile import GripperProfile
-from vla_zenoh.profile.ros2 import Ros2Gripper
+from vla_zenoh.ros2.messages import Messages
+from vla_zenoh.ros2.samples import RosImage, Stamp
+from vla_zenoh.ros2.writers import Write, joint_writer, pose_writer, position_message
 from vla_zenoh.types import GripperCommand, JointCommand, NodeStatus, PoseCommand
 
 M = Messages(

@@ -13,7 +13,7 @@ from typing import Any
 from rosbags.typesys import TypesysError, get_types_from_msg
 
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.interop.ros2.names import split_type
+from vla_zenoh.ros2.names import split_type
 
 SEPARATOR = "---"
 _SUFFIXES = (".msg", ".srv", ".action")

@@ -16,8 +16,8 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_typestore
 
 from vla_zenoh.errors import CodecError, ProfileError, nearest
-from vla_zenoh.interop.ros2.definitions import parse, shipped
-from vla_zenoh.interop.ros2.names import request_of, response_of, split_type
+from vla_zenoh.ros2.definitions import parse, shipped
+from vla_zenoh.ros2.names import request_of, response_of, split_type
 
 STORES = {
     "humble": Stores.ROS2_HUMBLE,

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from vla_zenoh.codec.image import MAX_JPEG_BYTES, check_size, decode_jpeg
 from vla_zenoh.errors import CodecError
-from vla_zenoh.interop.ros2.messages import MAX_MESSAGE_BYTES, MAX_PICTURE_BYTES, Messages
-from vla_zenoh.interop.ros2.samples import SECOND_NS, Joints, RosImage, Wrench
+from vla_zenoh.ros2.messages import MAX_MESSAGE_BYTES, MAX_PICTURE_BYTES, Messages
+from vla_zenoh.ros2.samples import SECOND_NS, Joints, RosImage, Wrench
 from vla_zenoh.types import MAX_NAMES, FloatArray
 
 JOINT_STATE, WRENCH = "sensor_msgs/msg/JointState", "geometry_msgs/msg/WrenchStamped"

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from vla_zenoh.interop.ros2.messages import Messages
-from vla_zenoh.interop.ros2.samples import Stamp
-from vla_zenoh.interop.ros2.writers import header
+from vla_zenoh.ros2.messages import Messages
+from vla_zenoh.ros2.samples import Stamp
+from vla_zenoh.ros2.writers import header
 from vla_zenoh.types import NodeStatus
 
 TYPE = "diagnostic_msgs/msg/DiagnosticArray"

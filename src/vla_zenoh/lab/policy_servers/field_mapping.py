@@ -11,7 +11,7 @@ known robot, each of which can be overridden; the preset ``none`` is empty::
     keys       names in the answer, concatenated column-wise (groot: x,y,z,...)
     columns    which of its columns, as 0:7 or 0,1,2,6
 
-For the meaning of the numbers see `vla_zenoh.interop.action_semantics`.
+For the meaning of the numbers see `vla_zenoh.lab.policy_servers.action_semantics`.
 """
 
 from __future__ import annotations
@@ -25,12 +25,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.errors import PeerError, SpecError
-from vla_zenoh.interop.action_semantics import (
+from vla_zenoh.lab.policy_servers.action_semantics import (
     ACTION_OPTIONS,
     ActionSemantics,
     as_spec_error,
     read_action_semantics,
 )
+from vla_zenoh.lab.policy_servers.state_vector import parts_of, read_parts, state_vector
 from vla_zenoh.policy import (
     ActionSteps,
     CameraSpec,
@@ -39,7 +40,6 @@ from vla_zenoh.policy import (
     ObservationSpec,
     StatePart,
 )
-from vla_zenoh.policy.state_vector import parts_of, read_parts, state_vector
 from vla_zenoh.types import shown
 
 
@@ -49,7 +49,7 @@ class FieldSource:
 
     Args:
         camera: image of this camera, or empty.
-        parts: of the robot state, see `vla_zenoh.policy.state_vector`.
+        parts: of the robot state, see `vla_zenoh.lab.policy_servers.state_vector`.
         prompt: the prompt.
         blank: height and width of a black image.
     """

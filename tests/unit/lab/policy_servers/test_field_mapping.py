@@ -10,13 +10,18 @@ import pytest
 from model_wires import groot, openpi, openvla_rest, origami
 
 from vla_zenoh.errors import PeerError, SpecError
-from vla_zenoh.interop import action_semantics as meaning
-from vla_zenoh.interop import field_mapping
-from vla_zenoh.interop.adapter import FIRST_S, LONGEST_S, Backoff
-from vla_zenoh.interop.field_mapping import DEFAULTS, FieldMapping, read_columns, read_field_mapping
-from vla_zenoh.interop.presets import Presets
 from vla_zenoh.kinematics.so3 import exp3, quat_from_rotation
 from vla_zenoh.lab.check.examples import example_observation
+from vla_zenoh.lab.policy_servers import action_semantics as meaning
+from vla_zenoh.lab.policy_servers import field_mapping
+from vla_zenoh.lab.policy_servers.adapter import FIRST_S, LONGEST_S, Backoff
+from vla_zenoh.lab.policy_servers.field_mapping import (
+    DEFAULTS,
+    FieldMapping,
+    read_columns,
+    read_field_mapping,
+)
+from vla_zenoh.lab.policy_servers.presets import Presets
 from vla_zenoh.lab.serve import openpi_frames
 from vla_zenoh.policy import Observation
 from vla_zenoh.profile import load_profile

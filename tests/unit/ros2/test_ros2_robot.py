@@ -14,17 +14,17 @@ from panda_arm import ARM_JOINTS, HOME_RAD, panda
 
 from vla_zenoh.errors import CodecError
 from vla_zenoh.guard.arm_guard import MOVED_M, MOVED_RAD, SETTLE_NS, HeldReference, Measured
-from vla_zenoh.interop.joint_reading import (
+from vla_zenoh.kinematics.so3 import Pose
+from vla_zenoh.profile import load_profile
+from vla_zenoh.robots.joint_reading import (
     BEYOND,
     JointReading,
     StampFilter,
     pose_state,
 )
-from vla_zenoh.interop.ros2.action_goals import GoalSequencer, GoalStep
-from vla_zenoh.interop.ros2.robot_clock import RobotClock
-from vla_zenoh.interop.ros2.samples import Joints
-from vla_zenoh.kinematics.so3 import Pose
-from vla_zenoh.profile import load_profile
+from vla_zenoh.ros2.action_goals import GoalSequencer, GoalStep
+from vla_zenoh.ros2.robot_clock import RobotClock
+from vla_zenoh.ros2.samples import Joints
 from vla_zenoh.types import GripperCommand
 
 FINGERS = ("panda_finger_joint1", "panda_finger_joint2")

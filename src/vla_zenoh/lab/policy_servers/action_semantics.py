@@ -37,6 +37,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from vla_zenoh.errors import SpecError, describe_faults
+from vla_zenoh.lab.policy_servers.model_options import number, one_of, whole_number
 from vla_zenoh.policy import (
     ActionSpec,
     Anchor,
@@ -45,7 +46,6 @@ from vla_zenoh.policy import (
     GripperSemantics,
     RelativeTo,
 )
-from vla_zenoh.policy.model_options import number, one_of, whole_number
 
 Action = Literal["delta", "absolute", "velocity", "joint_delta", "joint_position", "joint_velocity"]
 _JOINT_KINDS: Mapping[str, str] = {

@@ -13,8 +13,8 @@ from ros2_oracles import plain, random_messages
 
 from benchmarks.codec.other_cdr import MODULES, OtherCdr
 from vla_zenoh.errors import CodecError, ProfileError
-from vla_zenoh.interop.ros2 import readers
-from vla_zenoh.interop.ros2.messages import MAX_MESSAGE_BYTES, NO_HASH, STORES, Messages
+from vla_zenoh.ros2 import readers
+from vla_zenoh.ros2.messages import MAX_MESSAGE_BYTES, NO_HASH, STORES, Messages
 
 JAZZY = Messages("jazzy")
 SPOKEN = (

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 
-from vla_zenoh.interop.ros2.names import dds_type, get_result_of, send_goal_of
+from vla_zenoh.ros2.names import dds_type, get_result_of, send_goal_of
 
 CANCEL_GOAL = "action_msgs/srv/CancelGoal"
 _SLASH_OF_BRIDGES = "§"

@@ -15,8 +15,8 @@ import numpy as np
 from rosbags.interfaces import Nodetype
 
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.interop.ros2.messages import Messages
-from vla_zenoh.interop.ros2.samples import SECOND_NS, Stamp
+from vla_zenoh.ros2.messages import Messages
+from vla_zenoh.ros2.samples import SECOND_NS, Stamp
 from vla_zenoh.types import FloatArray, JointCommand, PoseCommand
 
 POSE, POSE_STAMPED = "geometry_msgs/msg/Pose", "geometry_msgs/msg/PoseStamped"

@@ -6,11 +6,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vla_zenoh.interop.ros2.messages import Messages
-from vla_zenoh.interop.ros2.names import request_of, send_goal_of
 from vla_zenoh.kinematics.fingers import Fingers
 from vla_zenoh.profile import GripperProfile
 from vla_zenoh.profile.ros2 import Ros2Gripper
+from vla_zenoh.ros2.messages import Messages
+from vla_zenoh.ros2.names import request_of, send_goal_of
 from vla_zenoh.types import GripperCommand
 
 MOVE, GRASP = "franka_msgs/action/Move", "franka_msgs/action/Grasp"

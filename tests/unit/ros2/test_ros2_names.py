@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vla_zenoh.errors import CodecError, ProfileError
-from vla_zenoh.interop.ros2 import attachment as attachments
-from vla_zenoh.interop.ros2.attachment import Attachment
-from vla_zenoh.interop.ros2.keys import (
+from vla_zenoh.ros2 import attachment as attachments
+from vla_zenoh.ros2.attachment import Attachment
+from vla_zenoh.ros2.keys import (
     COMMAND,
     DEFAULT,
     SENSOR,
@@ -19,7 +19,7 @@ from vla_zenoh.interop.ros2.keys import (
     Ros2Dds,
     parts_of,
 )
-from vla_zenoh.interop.ros2.names import dds_type
+from vla_zenoh.ros2.names import dds_type
 
 HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 ZID = "f9980ee0495eaafb3e38f0d19e2eae12"

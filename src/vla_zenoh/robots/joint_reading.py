@@ -9,11 +9,11 @@ from __future__ import annotations
 import numpy as np
 
 from vla_zenoh.errors import CodecError, RecordError
-from vla_zenoh.interop.ros2.samples import Joints
 from vla_zenoh.kinematics.fingers import Fingers
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import Pose, quat_from_rotation
 from vla_zenoh.profile import Profile
+from vla_zenoh.ros2.samples import Joints
 from vla_zenoh.types import FloatArray, GripperState, JointState, PoseState
 
 MOVING_M_S = 0.002

@@ -12,10 +12,10 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 from vla_zenoh.errors import PeerError, SpecError
-from vla_zenoh.interop.field_mapping import read_field_mapping
-from vla_zenoh.interop.presets import Presets
+from vla_zenoh.lab.policy_servers.field_mapping import read_field_mapping
+from vla_zenoh.lab.policy_servers.model_options import number
+from vla_zenoh.lab.policy_servers.presets import Presets
 from vla_zenoh.policy import ActionSteps, ModelSpec, Observation
-from vla_zenoh.policy.model_options import number
 from vla_zenoh.profile import load_profile
 
 FIRST_S = 0.25
@@ -58,7 +58,7 @@ class Adapter(ABC):
         where: the server, for messages.
         presets: name -> options.
         preset: name of the preset.
-        mapping: options that override it, see `vla_zenoh.interop.field_mapping`.
+        mapping: options that override it, see `vla_zenoh.lab.policy_servers.field_mapping`.
         timeout_s: for connecting, and for each answer.
         profile: of the robot: its gripper and, if answers are joints, its arm.
         clock_s: seconds that only go forwards.
