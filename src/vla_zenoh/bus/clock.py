@@ -91,17 +91,31 @@ class FixedRate:
 
     @property
     def next_ns(self) -> int:
-        """The next multiple, monotonic clock."""
+        """Time of the next cycle, monotonic clock."""
         return self._next_ns
 
+    def skip(self, periods: int) -> None:
+        """Let the next cycle be the `periods`-th from now; those before are not missed."""
+        self._next_ns += (periods - 1) * self._period_ns
+
+    def resume(self) -> None:
+        """End a skip: the next cycle is at the next multiple."""
+        early = (self._next_ns - time.monotonic_ns()) // self._period_ns
+        self._next_ns -= max(early, 0) * self._period_ns
+
     def wait_for(self, arrival: threading.Event) -> bool:
-        """Wait for `arrival`, at most until the next multiple; returns whether it came; clears
-        it."""
+        """Wait for `arrival`, at most until the next cycle; returns whether it came; clears it."""
         left_ns = self._next_ns - time.monotonic_ns()
         if left_ns <= 0 or not arrival.wait(left_ns / 1e9):
             return False
         arrival.clear()
         return True
+
+    def wait_until(self, before_ns: int) -> None:
+        """Sleep until `before_ns` before the next cycle."""
+        left_ns = self._next_ns - before_ns - time.monotonic_ns()
+        if left_ns > 0:
+            time.sleep(left_ns / 1e9)
 
     def wait(self) -> Tick:
         """Sleep until the next multiple."""

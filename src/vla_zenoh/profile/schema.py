@@ -47,7 +47,7 @@ class Timing(Section):
     """Rates and timeouts.
 
     Args:
-        command_hz: rate of the command stream.
+        command_hz: rate of the command stream in motion; at rest it is 50 Hz.
         state_hz: rate of the simulated robot's state; a real robot has its own.
         watchdog_s: the arm brakes and holds if no new chunk arrives for this long after the last
             one ran out.

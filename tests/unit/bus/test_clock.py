@@ -18,6 +18,7 @@ BUSY_S = 60.0
 READ_APART_NS = 5_000_000
 """Two clocks are read within this, on a busy computer, at least once in `TRIES`."""
 TRIES = 1000
+SKIPPED = 5
 
 
 def test_a_computer_that_was_suspended_stalled_once_and_missed_no_turn(
@@ -73,3 +74,34 @@ def test_an_arrival_ends_the_wait_once_and_the_turn_is_at_its_time_all_the_same(
     assert not arrival.is_set()
     assert not loop.wait_for(arrival)
     assert loop.wait().nominal_ns == due_ns
+
+
+def test_cycles_that_are_skipped_are_not_missed() -> None:
+    loop = FixedRate(RATE_HZ)
+    loop.wait()
+    due_ns = loop.next_ns
+    loop.skip(SKIPPED)
+    tick = loop.wait()
+    assert tick.nominal_ns >= due_ns + (SKIPPED - 1) * 1e9 / RATE_HZ
+    assert tick.stall_s < BUSY_S
+    assert tick.periods < BUSY_S * RATE_HZ
+
+
+def test_a_skip_that_is_ended_goes_on_with_the_next_multiple() -> None:
+    loop = FixedRate(RATE_HZ)
+    due_ns = loop.next_ns
+    loop.skip(1000)
+    loop.resume()
+    assert due_ns <= loop.next_ns < due_ns + BUSY_S * 1e9
+    assert (loop.next_ns - due_ns) % round(1e9 / RATE_HZ) == 0
+    loop.resume()
+    assert loop.next_ns < due_ns + BUSY_S * 1e9
+
+
+def test_a_loop_can_sleep_until_shortly_before_its_next_cycle() -> None:
+    loop = FixedRate(1.0)
+    before_ns = round(0.95e9)
+    loop.wait_until(before_ns)
+    assert loop.next_ns - time.monotonic_ns() <= before_ns
+    loop.wait_until(round(2e9))  # that time is over: no sleep
+    assert time.monotonic_ns() < loop.next_ns

@@ -36,6 +36,12 @@ SWITCH_INTERVAL_S = 5e-4
 MAX_WHY, MAX_LIMIT = 2000, 200
 CHORES_S = 0.02
 """Period of tasks that no motion depends on: status, clock queries, reading other nodes' status."""
+PLANNING_NS = 1_500_000
+"""A chunk is planned this long before the next tick, or at once if it arrives later. Its other
+readers get it first: planning at a real-time priority keeps a processor from them."""
+REST_S, REST_TIMEOUTS = 0.02, 5
+"""Period of the ticks while the arm rests, and how many of them a command timeout has at least."""
+REST_AFTER_NS = 100_000_000
 ACTING_S = 1.0
 """Limits that shorten steps act once for each chunk."""
 SPREAD_S = 8.0
@@ -46,6 +52,8 @@ CHUNKS = 128
 
 class CommandNode:
     """Runs a `Commander` at ``timing.command_hz`` between its subscriptions and publishers.
+
+    While the arm rests and no step is due, it ticks every `REST_S`; a chunk ends that at once.
 
     Args:
         profile: limits, timing, initial settings.
@@ -77,7 +85,7 @@ class CommandNode:
         self._outs = {name: _CommandPublishers(node, part.keys) for name, part in parts.items()}
         self._task_out = node.declare_publisher(keys.task, Kind.CONTROL)
         self._last_task = 0.0
-        self._next_chores_ns = 0
+        self._next_chores_ns = self._busy_ns = 0
         self._serve_settings()
 
     def _serve_settings(self) -> None:
@@ -109,10 +117,16 @@ class CommandNode:
         gc.unfreeze()  # so that the interpreter frees everything at exit
 
     def _loop(self, stop: threading.Event) -> None:
-        loop = FixedRate(self.node.profile.timing.command_hz)
+        timing, arrival = self.node.profile.timing, self._inputs.chunk_arrival
+        loop = FixedRate(timing.command_hz)
+        rest_s = min(REST_S, timing.command_timeout_s / REST_TIMEOUTS)
+        rest_periods = max(int(rest_s * timing.command_hz), 1)
         give_up = 0.0
         while True:
-            if loop.wait_for(self._inputs.chunk_arrival):
+            if loop.wait_for(arrival):
+                loop.resume()
+                loop.wait_until(PLANNING_NS)
+                arrival.clear()
                 self._prepare(loop.next_ns)
             tick = loop.wait()
             if tick.periods > 1:
@@ -123,7 +137,8 @@ class CommandNode:
                 extra.append(Setting("active", False))
                 if not self.commander.streaming or time.monotonic() > give_up:
                     break
-            self._on_tick(extra, tick)
+            if self._on_tick(extra, tick):
+                loop.skip(rest_periods)
 
     def _stall_settings(self, tick: Tick) -> list[Setting]:
         if tick.stall_s <= self.node.profile.timing.command_timeout_s:
@@ -132,12 +147,13 @@ class CommandNode:
         return [Setting("lose", f"{why}, {tick.computed_s:.3f} s of it computing")]
 
     def _prepare(self, next_mono_ns: int) -> None:
-        """Plan a chunk as soon as it arrives, so that the next tick need not."""
+        """Plan chunks that arrived, so that the next tick need not."""
         began = time.perf_counter()
         self.commander.prepare(self._inputs.poll_streams(), self.node.clock.wall_at(next_mono_ns))
         self._status.add_preparation(time.perf_counter() - began)
 
-    def _on_tick(self, extra: list[Setting], tick: Tick) -> None:
+    def _on_tick(self, extra: list[Setting], tick: Tick) -> bool:
+        """Returns whether the arm rests."""
         began = time.perf_counter()
         now_ns = self.node.clock.wall_at(tick.nominal_ns)
         chores = tick.nominal_ns >= self._next_chores_ns
@@ -156,6 +172,14 @@ class CommandNode:
         if chores or out.events or out.task_changed:
             self._report_latch_failure()
             self._status.publish(out, self._inputs.chunks_dropped)
+        if inputs.chunks or inputs.settings or not self.commander.at_rest:
+            self._busy_ns = now_ns
+        return now_ns - max(self._busy_ns, self._planned_until_ns()) > REST_AFTER_NS
+
+    def _planned_until_ns(self) -> int:
+        """When the last step that is planned ends."""
+        timelines = (part.motion.timeline for part in self.commander.parts)
+        return max((timeline.plan.end_ns for timeline in timelines if timeline), default=0)
 
     def _update_latch(self) -> None:
         if self._latch is None:

@@ -1,0 +1,77 @@
+"""The command node while the arm rests: fewer ticks and commands, and a chunk ends that at once."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from chain import Chain, running_chain
+
+from vla_zenoh.nodes.command.node import REST_S
+
+REST_HZ = 1.0 / REST_S
+WINDOW_S = 2.0
+RARELY_HZ = 0.1
+SLOW, FAST = 1.2, 0.5
+"""Shares of a rate: the most at rest, and the least that a busy computer reaches."""
+SAME_M = 1e-4
+
+
+@pytest.fixture(scope="module")
+def chain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chain]:
+    folder: Path = tmp_path_factory.mktemp("rest")
+    with running_chain(folder) as chain:
+        yield chain
+
+
+def commands_hz(chain: Chain) -> float:
+    """Rate of the pose commands in the next `WINDOW_S`."""
+    since_ns = time.time_ns()
+    time.sleep(WINDOW_S)
+    return len(chain.recorder.commands(since_ns)) / WINDOW_S
+
+
+def loop_hz(chain: Chain) -> float:
+    """Rate of the ticks, as status has it."""
+    status = chain.client.status("command")
+    return status.rates_hz["loop"] if status else 0.0
+
+
+def test_an_arm_that_rests_gets_fewer_commands_until_a_chunk_moves_it(chain: Chain) -> None:
+    chain.activate_when_ready()
+    chain.client.set_rate(RARELY_HZ)
+    chain.until("it rests", lambda: loop_hz(chain) < SLOW * REST_HZ, 2 / RARELY_HZ)
+    assert chain.detail("streaming")
+    missed = chain.counter("command.missed_ticks")
+    resting_hz = min(commands_hz(chain) for _ in range(2))  # a chunk falls into one at most
+    assert FAST * REST_HZ < resting_hz < SLOW * REST_HZ
+    assert chain.counter("command.missed_ticks") - missed < SLOW * REST_HZ
+    chain.client.set_rate(chain.profile.task.rate_hz)
+    assert chain.go("up", 10) == pytest.approx(0.1, abs=0.005)
+    chain.move()
+    moving_hz = commands_hz(chain)
+    assert moving_hz > FAST * chain.profile.timing.command_hz
+    chain.settle()
+
+
+def test_a_motion_out_of_rest_begins_without_a_step(chain: Chain) -> None:
+    chain.activate_when_ready()
+    time.sleep(0.5)
+    since_ns = time.time_ns()
+    chain.move()
+    positions_m = np.array([pose.position_m for _, pose in chain.recorder.commands(since_ns)])
+    steps_m = np.linalg.norm(np.diff(positions_m, axis=0), axis=1)
+    began = int(np.argmax(steps_m > 0))
+    assert steps_m[began] < SAME_M
+    chain.settle()
+
+
+def test_a_stop_is_obeyed_while_the_arm_rests(chain: Chain) -> None:
+    chain.activate_when_ready()
+    time.sleep(0.5)
+    chain.session.put(chain.profile.keys.stop, b"")
+    chain.until("stopped", lambda: chain.state() == "stopped")
+    chain.settle()
