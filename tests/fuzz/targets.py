@@ -33,6 +33,7 @@ from vla_zenoh.lab.cli import keys as cli_keys
 from vla_zenoh.lab.cli import net as cli_net
 from vla_zenoh.lab.evaluation.mcap_file import evaluate_run
 from vla_zenoh.lab.inference_views import InferenceView
+from vla_zenoh.lab.primitives.requests import decode_request
 from vla_zenoh.lab.recording.record_json import record_from_json, record_to_json
 from vla_zenoh.lab.recording.record_types import RECORDS
 from vla_zenoh.lab.serve import mcp, openpi_frames
@@ -357,7 +358,7 @@ def _targets() -> Iterator[Target]:
     ):
         yield Target(
             f"primitive-{name}",
-            partial(primitives.decode_request, name),
+            partial(decode_request, name),
             codec,
             lambda asked=asked: [asked],
         )

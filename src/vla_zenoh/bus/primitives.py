@@ -56,7 +56,7 @@ def ask(
 
     Args:
         client: of the robot.
-        primitive: one of `vla_zenoh.codec.primitives.REQUESTS`.
+        primitive: one of `vla_zenoh.lab.primitives.requests.REQUESTS`.
         fields: of the request, without its holder.
         who: begins the name by which this client holds the arm.
         cancelled: polled; once it returns true, the deadman is released and the arm brakes.

@@ -166,7 +166,7 @@ class RemoteRobot(Client):
 
         Args:
             worker: the worker that moves it.
-            until: conditions, `vla_zenoh.codec.primitives.Until`: ``{"gripper": "closed"}``.
+            until: conditions, `vla_zenoh.lab.primitives.requests.Until`: ``{"gripper": "closed"}``.
             prompt: for the worker; None: the present one.
             timeout_s: then the arm is braked.
 

@@ -47,7 +47,7 @@ COMMANDS: Mapping[str, Mapping[str, str | Group]] = {
                 "arm": "cli.nodes:arm",
                 "camera": "cli.nodes:camera",
                 "command": "cli.nodes:command",
-                "primitives": "cli.nodes:primitives",
+                "primitives": "lab.cli.primitives:node",
             },
         ),
     },
@@ -63,10 +63,10 @@ COMMANDS: Mapping[str, Mapping[str, str | Group]] = {
         "do": Group(
             "Guarded motions: go to a pose, home, grip, run a model until a condition holds.",
             {
-                "move-to": "cli.primitives:move_to",
-                "home": "cli.primitives:home",
-                "grip": "cli.primitives:grip",
-                "run": "cli.primitives:run",
+                "move-to": "lab.cli.primitives:move_to",
+                "home": "lab.cli.primitives:home",
+                "grip": "lab.cli.primitives:grip",
+                "run": "lab.cli.primitives:run",
             },
         ),
         "web": "lab.cli.web:web",

@@ -1,4 +1,4 @@
-"""vla-zenoh node: router, sim, ros2, arm, camera, command, primitives: one node until Ctrl-C."""
+"""vla-zenoh node: router, sim, ros2, arm, camera, command: one node until Ctrl-C."""
 
 from __future__ import annotations
 
@@ -148,18 +148,4 @@ def command(
         lambda session, stop: CommandNode(profile, session, dry_run=dry_run, latch=latch).run(stop),
         identity="command",
         preferred=True,
-    )
-
-
-@options
-def primitives(node: NodeOptions) -> None:
-    """Answer queries for guarded motions: `vla-zenoh do`, scripts and agents."""
-    from vla_zenoh.keys import PRIMITIVES, worker_node
-    from vla_zenoh.nodes.primitives.node import PrimitivesNode
-
-    profile = node.load()
-    run_node(
-        profile,
-        lambda session, stop: PrimitivesNode(profile, session).run(stop),
-        identity=worker_node(PRIMITIVES),
     )

@@ -1,4 +1,4 @@
-"""vla-zenoh do: move-to, home, grip, run. Guarded motions, executed by the node primitives."""
+"""vla-zenoh do: move-to, home, grip, run. Guarded motions, and the node that executes them."""
 
 from __future__ import annotations
 
@@ -9,18 +9,34 @@ from typing import Annotated, Any
 import typer
 
 from vla_zenoh.bus.primitives import ask
-from vla_zenoh.cli.options import number_list, options
+from vla_zenoh.cli.options import NodeOptions, number_list, options
 from vla_zenoh.cli.plain import fail, say
 from vla_zenoh.cli.target import RobotTarget
-from vla_zenoh.codec.primitives import DEFAULT_TIMEOUT_S, FURTHEST_M, FURTHEST_RAD, Answer
+from vla_zenoh.codec.primitives import DEFAULT_TIMEOUT_S, Answer
 from vla_zenoh.codec.settings import MAX_HELD_M, MIN_HELD_M
 from vla_zenoh.errors import SessionError
+from vla_zenoh.keys import PRIMITIVES, worker_node
+from vla_zenoh.lab.primitives.requests import FURTHEST_M, FURTHEST_RAD
+from vla_zenoh.runtime.process import run_node
 
 TimeoutOption = Annotated[
     float, typer.Option("--timeout", min=0.1, max=3600, help="Seconds until the arm is braked.")
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the answer as JSON on stdout.")]
 CONDITIONS = "gripper=closed|open, inside=X,Y,Z:X,Y,Z (m), force=N, still=S, done"
+
+
+@options
+def node(node: NodeOptions) -> None:
+    """Answer queries for guarded motions: `vla-zenoh do`, scripts and agents."""
+    from vla_zenoh.lab.primitives.node import PrimitivesNode
+
+    profile = node.load()
+    run_node(
+        profile,
+        lambda session, stop: PrimitivesNode(profile, session).run(stop),
+        identity=worker_node(PRIMITIVES),
+    )
 
 
 @options

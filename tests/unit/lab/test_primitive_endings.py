@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vla_zenoh.codec.primitives import Until
 from vla_zenoh.kinematics.so3 import Pose
-from vla_zenoh.nodes.primitives.endings import (
+from vla_zenoh.lab.primitives.endings import (
     GRIPPED_S,
     SETTLED_S,
     STUCK_S,
@@ -20,6 +19,7 @@ from vla_zenoh.nodes.primitives.endings import (
     RunEnding,
     Sight,
 )
+from vla_zenoh.lab.primitives.requests import Until
 from vla_zenoh.types import GripperState, PoseState
 
 PERIOD_S = 0.01

@@ -19,9 +19,16 @@ import zenoh
 
 from vla_zenoh.bus.buffers import bytes_of
 from vla_zenoh.bus.remote_robot import RemoteRobot
-from vla_zenoh.codec.primitives import (
+from vla_zenoh.codec.primitives import Answer
+from vla_zenoh.control.reachability import make_reachability_filter
+from vla_zenoh.control.states import DEACTIVATED
+from vla_zenoh.errors import CodecError, SessionError
+from vla_zenoh.keys import PRIMITIVES, last_chunk, worker_node
+from vla_zenoh.kinematics.so3 import Pose, pose_of, rotation_from_quat
+from vla_zenoh.lab.primitives.endings import NEAR_RAD, Arrival, Ending, Gripped, RunEnding, Sight
+from vla_zenoh.lab.primitives.policy import CHUNK_HZ, Target, TargetPolicy
+from vla_zenoh.lab.primitives.requests import (
     MAX_REQUEST_BYTES,
-    Answer,
     Grip,
     Home,
     MoveTo,
@@ -29,14 +36,7 @@ from vla_zenoh.codec.primitives import (
     RunModel,
     decode_request,
 )
-from vla_zenoh.control.reachability import make_reachability_filter
-from vla_zenoh.control.states import DEACTIVATED
-from vla_zenoh.control.target_check import TargetCheck
-from vla_zenoh.errors import CodecError, SessionError
-from vla_zenoh.keys import PRIMITIVES, last_chunk, worker_node
-from vla_zenoh.kinematics.so3 import Pose, pose_of, rotation_from_quat
-from vla_zenoh.nodes.primitives.endings import NEAR_RAD, Arrival, Ending, Gripped, RunEnding, Sight
-from vla_zenoh.nodes.primitives.policy import CHUNK_HZ, Target, TargetPolicy
+from vla_zenoh.lab.primitives.target_check import TargetCheck
 from vla_zenoh.nodes.worker.robot_session import RobotSession
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray, HeldBox
@@ -64,7 +64,7 @@ class _Asked(NamedTuple):
 
 
 class PrimitivesNode:
-    """Answers on `Keys.primitive`, see `vla_zenoh.codec.primitives`.
+    """Answers on `Keys.primitive`, see `vla_zenoh.lab.primitives.requests`.
 
     Args:
         profile: the effective profile.
