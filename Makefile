@@ -1,12 +1,15 @@
 # Every target sets up ./.venv by itself. Needed from the system: make and Python 3.11 or newer.
 # Another interpreter: make setup PYTHON=python3.12        Options for a command: make test ARGS="-k brake"
+# Less to install: make demo EXTRAS=all, without viewer, page, gamepads and what only tests and benchmarks need.
 
 PYTHON ?= python3
+EXTRAS ?= all,dev
 ARGS ?=
 SECONDS ?= 60
 MINUTES ?= 60
 BIN := .venv/bin
-READY := .venv/.ready
+COMMA := ,
+READY := .venv/.ready-$(subst $(COMMA),-,$(EXTRAS))
 SUITE := not slow and not models and not ros2 and not franka
 # Real arms brake when their computer stands still for a tenth of a second, and so do those of the tests: one that
 # fails in real time is tried once more, and told in the summary.
@@ -23,7 +26,7 @@ help: ## Show this list
 setup: $(READY) ## Make ./.venv with everything in it
 
 $(READY): pyproject.toml constraints.txt scripts/bootstrap.py
-	@$(PYTHON) scripts/bootstrap.py
+	@$(PYTHON) scripts/bootstrap.py $(EXTRAS)
 	@touch $@
 
 demo: $(READY) ## Simulator, model and command node at work, no GPU needed

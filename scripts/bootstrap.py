@@ -29,6 +29,8 @@ CONSTRAINTS = ROOT / "constraints.txt"
 OLDEST_PYTHON = (3, 11)
 OLDEST_UV = (0, 8)
 
+EVERYTHING = "all,dev"
+
 OPENMP = "libgomp.so.1"
 """Pinocchio needs it and no wheel of ours brings it; a bare Debian has no package that does."""
 OPENMP_CARRIER = "scikit-learn"
@@ -187,7 +189,8 @@ def make_venv(uv: Path) -> None:
 
 
 def main() -> None:
-    """Sets everything up, or says what is missing."""
+    """Sets everything up, or says what is missing; the argument names the extras."""
+    extras = sys.argv[1] if len(sys.argv) > 1 else EVERYTHING
     if sys.version_info < OLDEST_PYTHON:
         fail(
             "Python {}.{} or newer is needed, this is {}.{} ({}). "
@@ -202,10 +205,11 @@ def main() -> None:
         fail("a part of the system is missing. On Debian and Ubuntu: sudo apt install " + packages)
     uv = uv or install_uv()
     make_venv(uv)
-    say("installing the package and its libraries into .venv (once; 2.7 GB on disk)")
+    size = " (once; 2.7 GB on disk)" if extras == EVERYTHING else ""
+    say(f"installing the package with the extras {extras} into .venv{size}")
     quiet = [] if sys.stderr.isatty() else ["--quiet"]
     target = ["--python", VENV / "bin" / "python", "--constraint", CONSTRAINTS]
-    run(uv, *quiet, "pip", "install", *target, "--editable", ".[all,dev]")
+    run(uv, *quiet, "pip", "install", *target, "--editable", f".[{extras}]")
     bring_openmp(uv, VENV / "bin" / "python")
     say("done; the command is .venv/bin/vla-zenoh")
 
