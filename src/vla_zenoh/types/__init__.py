@@ -14,71 +14,34 @@ from typing import TYPE_CHECKING
 from vla_zenoh import lazy_names
 
 if TYPE_CHECKING:
-    from vla_zenoh.types.arrays import (
-        QUATERNION_NORM_TOLERANCE,
-        FloatArray,
-        computed,
-        unit_quaternion,
-        vector,
-    )
-    from vla_zenoh.types.checks import (
-        MAX_NAMES,
-        MAX_TEXT,
-        shown,
-    )
-    from vla_zenoh.types.chunk import ActionChunk, InferenceDebug
-    from vla_zenoh.types.commands import (
-        LATENCY_STAGES,
-        Cause,
-        GripperCommand,
-        JointCommand,
-        PoseCommand,
-    )
-    from vla_zenoh.types.reports import Event, HeldBox, NodeStatus, Task
-    from vla_zenoh.types.states import (
-        Depth,
-        GripperState,
-        Image,
-        JointState,
-        ObjectPoses,
-        PoseState,
-        PrivilegedState,
-        SceneState,
-    )
-    from vla_zenoh.types.stream import Header, Stamped
+    from vla_zenoh.types.arrays import QUATERNION_NORM_TOLERANCE as QUATERNION_NORM_TOLERANCE
+    from vla_zenoh.types.arrays import FloatArray as FloatArray
+    from vla_zenoh.types.arrays import computed as computed
+    from vla_zenoh.types.arrays import unit_quaternion as unit_quaternion
+    from vla_zenoh.types.arrays import vector as vector
+    from vla_zenoh.types.checks import MAX_NAMES as MAX_NAMES
+    from vla_zenoh.types.checks import MAX_TEXT as MAX_TEXT
+    from vla_zenoh.types.checks import shown as shown
+    from vla_zenoh.types.commands import LATENCY_STAGES as LATENCY_STAGES
+    from vla_zenoh.types.commands import ActionChunk as ActionChunk
+    from vla_zenoh.types.commands import Cause as Cause
+    from vla_zenoh.types.commands import GripperCommand as GripperCommand
+    from vla_zenoh.types.commands import InferenceDebug as InferenceDebug
+    from vla_zenoh.types.commands import JointCommand as JointCommand
+    from vla_zenoh.types.commands import PoseCommand as PoseCommand
+    from vla_zenoh.types.reports import Event as Event
+    from vla_zenoh.types.reports import HeldBox as HeldBox
+    from vla_zenoh.types.reports import NodeStatus as NodeStatus
+    from vla_zenoh.types.reports import Task as Task
+    from vla_zenoh.types.states import Depth as Depth
+    from vla_zenoh.types.states import GripperState as GripperState
+    from vla_zenoh.types.states import Image as Image
+    from vla_zenoh.types.states import JointState as JointState
+    from vla_zenoh.types.states import ObjectPoses as ObjectPoses
+    from vla_zenoh.types.states import PoseState as PoseState
+    from vla_zenoh.types.states import PrivilegedState as PrivilegedState
+    from vla_zenoh.types.states import SceneState as SceneState
+    from vla_zenoh.types.stream import Header as Header
+    from vla_zenoh.types.stream import Stamped as Stamped
 
-__all__ = [
-    "LATENCY_STAGES",
-    "MAX_NAMES",
-    "MAX_TEXT",
-    "QUATERNION_NORM_TOLERANCE",
-    "ActionChunk",
-    "Cause",
-    "Depth",
-    "Event",
-    "FloatArray",
-    "GripperCommand",
-    "GripperState",
-    "Header",
-    "HeldBox",
-    "Image",
-    "InferenceDebug",
-    "JointCommand",
-    "JointState",
-    "NodeStatus",
-    "ObjectPoses",
-    "PoseCommand",
-    "PoseState",
-    "PrivilegedState",
-    "SceneState",
-    "Stamped",
-    "Task",
-    "computed",
-    "shown",
-    "unit_quaternion",
-    "vector",
-]
-
-__getattr__ = lazy_names(
-    __name__, "checks", "stream", "reports", "commands", "states", "chunk", "arrays"
-)
+__getattr__ = lazy_names(__name__, "checks", "stream", "reports", "commands", "states", "arrays")

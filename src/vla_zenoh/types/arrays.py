@@ -42,7 +42,7 @@ def _holds_bool(value: Any) -> bool:
     return isinstance(value, (bool, np.bool_))
 
 
-def vector(name: str, value: ArrayLike, size: int | None) -> FloatArray:
+def vector(name: str, value: ArrayLike, size: int | None = None) -> FloatArray:
     """Copy `value` into a finite, read-only float64 vector of `size` (None: any size)."""
     if (
         type(value) is np.ndarray
@@ -91,7 +91,7 @@ def to_float32(array: NDArray[Any]) -> NDArray[np.float32]:
 def is_finite(array: NDArray[Any]) -> bool:
     """Whether no number of an array is NaN or infinite."""
     if array.size <= FEW:
-        values = array.tolist() if array.ndim == 1 else array.ravel().tolist()
+        values = array.ravel().tolist()
         return math.isfinite(sum(values)) or all(map(math.isfinite, values))  # a sum may overflow
     return bool(np.isfinite(array).all())
 

@@ -8,7 +8,8 @@ from __future__ import annotations
 import math
 import reprlib
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from numbers import Integral, Real
 from typing import Any
 
 from vla_zenoh.errors import RecordError
@@ -19,7 +20,7 @@ MAX_CHUNK_NUMBERS = 100_000
 MAX_NAMES = 1024
 MAX_ENTRIES = 1024
 MAX_DETAIL_TEXT = 65_536
-MAX_DETAIL_DEPTH = 4
+MAX_DETAIL_DEPTH = 3
 
 
 def shown(value: Any) -> str:
@@ -29,19 +30,17 @@ def shown(value: Any) -> str:
     return reprlib.repr(value)[:MAX_SHOWN]
 
 
-def is_numpy(value: Any, *kinds: str) -> bool:
-    """Whether `value` is a numpy scalar of one of these types, without importing numpy."""
+def is_bool(value: Any) -> bool:
+    """Whether `value` is a bool, of numpy too, which is not imported for it."""
     numpy = sys.modules.get("numpy")
-    return numpy is not None and isinstance(value, tuple(getattr(numpy, kind) for kind in kinds))
+    return isinstance(value, bool) or (numpy is not None and isinstance(value, numpy.bool_))
 
 
 def number(name: str, value: Any, minimum: float = -math.inf, maximum: float = math.inf) -> float:
     """A finite float within ``[minimum, maximum]``."""
     if type(value) is float and minimum <= value <= maximum and math.isfinite(value):
         return value
-    if isinstance(value, bool) or not (
-        isinstance(value, (int, float)) or is_numpy(value, "integer", "floating")
-    ):
+    if isinstance(value, bool) or not isinstance(value, Real):
         raise RecordError(f"{name} is not a number: {shown(value)}")
     try:
         result = float(value)
@@ -58,13 +57,14 @@ def integer(name: str, value: Any, minimum: int = 0, maximum: int = 2**63 - 1) -
     """An int within ``[minimum, maximum]``."""
     if type(value) is int and minimum <= value <= maximum:
         return value
-    if isinstance(value, bool) or not (isinstance(value, int) or is_numpy(value, "integer")):
+    if isinstance(value, bool) or not isinstance(value, Integral):
         raise RecordError(f"{name} is not a whole number: {shown(value)}")
-    if not minimum <= value <= maximum:
+    result = int(value)
+    if not minimum <= result <= maximum:
         raise RecordError(
             f"{name} is {shown(value)}, wanted a whole number in [{minimum}, {maximum}]"
         )
-    return int(value)
+    return result
 
 
 def text(name: str, value: Any, limit: int = MAX_TEXT) -> str:
@@ -90,9 +90,9 @@ def texts(name: str, value: Any, limit: int) -> tuple[str, ...]:
     return tuple(text(name, item, limit) for item in value)
 
 
-def joint_names(value: Any) -> tuple[str, ...]:
+def joint_names(name: str, value: Any) -> tuple[str, ...]:
     """Names of joints: at least one, none of them twice."""
-    names = texts("names", value, 128)
+    names = texts(name, value, 128)
     if not names or len(set(names)) != len(names):
         raise RecordError(f"joint names must be present and differ: {shown(names)}")
     return names
@@ -100,39 +100,39 @@ def joint_names(value: Any) -> tuple[str, ...]:
 
 def boolean(name: str, value: Any) -> bool:
     """A bool; 0 and 1 are rejected."""
-    if not (isinstance(value, bool) or is_numpy(value, "bool_")):
+    if not is_bool(value):
         raise RecordError(f"{name} is not true or false: {shown(value)}")
     return bool(value)
 
 
-def entries(name: str, value: Any) -> dict[str, Any]:
-    """A copy of a map from short names to anything."""
+def entries(name: str, value: Any, of: Callable[..., Any], **bounds: Any) -> dict[str, Any]:
+    """A copy of a map from short names to what the check `of` returns."""
     if not isinstance(value, Mapping):
         raise RecordError(f"{name} is not a map: {shown(value)}")
     if len(value) > MAX_ENTRIES:
         raise RecordError(f"{name} has {len(value)} entries, at most {MAX_ENTRIES} are allowed")
-    return {text(f"a name in {name}", key, 256): item for key, item in value.items()}
+    return {
+        text(f"a name in {name}", key, 256): of(f"{name}.{key}", item, **bounds)
+        for key, item in value.items()
+    }
 
 
 def details(name: str, value: Any, depth: int = MAX_DETAIL_DEPTH) -> Any:
     """Text, finite numbers, bools and None, in lists and maps that are not nested deep."""
-    if value is None or isinstance(value, bool):
-        return value
+    if value is None:
+        return None
+    if is_bool(value):
+        return bool(value)
     if isinstance(value, str):
         return text(name, value, MAX_DETAIL_TEXT)
-    if isinstance(value, int) or is_numpy(value, "integer"):
+    if isinstance(value, Integral):
         return integer(name, value, -(2**63))
-    if isinstance(value, float) or is_numpy(value, "floating"):
+    if isinstance(value, Real):
         return number(name, value)
-    if is_numpy(value, "bool_"):
-        return bool(value)
     if depth == 0:
         raise RecordError(f"{name} is nested too deep")
     if isinstance(value, Mapping):
-        return {
-            key: details(f"{name}.{key}", item, depth - 1)
-            for key, item in entries(name, value).items()
-        }
+        return entries(name, value, details, depth=depth - 1)
     if isinstance(value, (list, tuple)) and len(value) <= MAX_ENTRIES:
         return [details(name, item, depth - 1) for item in value]
     raise RecordError(f"{name} is not text, a number, a bool, a list or a map: {shown(value)}")
@@ -141,3 +141,15 @@ def details(name: str, value: Any, depth: int = MAX_DETAIL_DEPTH) -> Any:
 def set_field(record: Any, name: str, value: Any) -> None:
     """Put the final form of a field into a frozen record."""
     object.__setattr__(record, name, value)
+
+
+def keep(record: Any, check: Callable[..., Any], *names: str, **bounds: Any) -> None:
+    """Put fields of a frozen record into the final form that `check` returns."""
+    for name in names:
+        set_field(record, name, check(name, getattr(record, name), **bounds))
+
+
+def keep_given(record: Any, check: Callable[..., Any], *names: str, **bounds: Any) -> None:
+    """`keep` for fields that may be None."""
+    given = (name for name in names if getattr(record, name) is not None)
+    keep(record, check, *given, **bounds)

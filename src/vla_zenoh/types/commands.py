@@ -1,23 +1,34 @@
-"""Commands to an arm and a gripper, and the set-points a controller holds."""
+"""What moves a robot: action chunks of a model worker, commands of the command node, set-points."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vla_zenoh.errors import RecordError
-from vla_zenoh.types.arrays import FloatArray, unit_quaternion, vector
+from vla_zenoh.types.arrays import FloatArray, float32_table, unit_quaternion, vector
 from vla_zenoh.types.checks import (
+    MAX_CHUNK_NUMBERS,
+    MAX_ENTRIES,
+    MAX_TEXT,
+    boolean,
+    details,
+    entries,
     integer,
     joint_names,
+    keep,
+    keep_given,
     number,
-    set_field,
     shown,
     text,
 )
 
+MAX_RAW_NUMBERS = 4096
 LATENCY_STAGES = (
     "capture_to_worker",
     "inference",
@@ -26,6 +37,113 @@ LATENCY_STAGES = (
     "end_to_end",
 )
 """Stages between the capture of an image and the first command of its chunk."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ActionChunk:
+    """What a model asks for: `H` steps of `D` numbers whose meaning its spec declares.
+
+    Args:
+        worker: name of the worker.
+        spec_hash: hash of the spec its steps are to be read with.
+        episode: the episode (see `Task`) the policy was reset for.
+        observation_stamp_ns: capture time of the observation, wall clock.
+        observation_seq: its sequence number.
+        valid_until_ns: after this wall time the chunk must not be started.
+        steps: (H, D) float32.
+        observed_ns: wall time at which the worker took the observation.
+        inference_start_ns: wall time.
+        inference_end_ns: wall time.
+        done: the policy reports that its task is finished when these steps are.
+    """
+
+    worker: str
+    spec_hash: str
+    episode: int
+    observation_stamp_ns: int
+    observation_seq: int
+    valid_until_ns: int
+    steps: NDArray[np.float32]
+    observed_ns: int
+    inference_start_ns: int
+    inference_end_ns: int
+    done: bool = False
+
+    def __post_init__(self) -> None:
+        keep(self, text, "worker", "spec_hash", limit=128)
+        keep(self, integer, "episode", "observation_stamp_ns", "observation_seq", "valid_until_ns")
+        keep(self, integer, "observed_ns", "inference_start_ns", "inference_end_ns")
+        keep(self, boolean, "done")
+        keep(self, float32_table, "steps", most=MAX_CHUNK_NUMBERS)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class InferenceDebug:
+    """One inference, for debugging. Its images travel beside it, one key per camera.
+
+    Args:
+        worker: name of the worker.
+        chunk_seq: number of the resulting chunk; the images have the same.
+        spec_hash: what the steps are to be read with.
+        episode: as in the chunk.
+        observation_stamp_ns: capture time, wall clock; the images have the same.
+        prompt: input of the model.
+        steps: (H, D) float32, the final action.
+        inference_ms: time the model took.
+        raw: output before the steps: tokens, normalised action, whatever the model reports.
+        done: the policy reports that its task is finished with these steps.
+    """
+
+    worker: str
+    chunk_seq: int
+    spec_hash: str
+    episode: int
+    observation_stamp_ns: int
+    prompt: str
+    steps: NDArray[np.float32]
+    inference_ms: float
+    raw: Mapping[str, Any] = field(default_factory=dict)
+    done: bool = False
+
+    def __post_init__(self) -> None:
+        keep(self, text, "worker", "spec_hash", limit=128)
+        keep(self, text, "prompt")
+        keep(self, integer, "chunk_seq", "episode", "observation_stamp_ns")
+        keep(self, number, "inference_ms", minimum=0.0)
+        keep(self, float32_table, "steps", most=MAX_CHUNK_NUMBERS)
+        keep(self, entries, "raw", of=details)
+
+
+def plain_values(raw: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Raw output of a model as plain text, numbers and lists.
+
+    Arrays of any library become lists; what is too large or has no such form is described.
+    """
+    return {str(name)[:256]: _plain(value, 2) for name, value in list((raw or {}).items())[:64]}
+
+
+def _plain(value: Any, depth: int) -> Any:
+    if isinstance(value, np.generic):
+        value = value.item()
+    if value is None or isinstance(value, int):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else str(value)
+    if isinstance(value, str):
+        return value[:MAX_TEXT].encode("utf-8", "replace").decode()
+    if isinstance(value, Mapping) and depth:
+        return {str(key)[:256]: _plain(item, depth - 1) for key, item in list(value.items())[:64]}
+    try:
+        array = np.asarray(value)
+    except Exception:  # tensors of other devices raise anything
+        return shown(value)
+    if array.dtype.kind not in "biuf" or array.ndim > 2:
+        return shown(value)
+    if array.size > MAX_RAW_NUMBERS or max(array.shape, default=0) > MAX_ENTRIES:
+        return f"{array.dtype} of shape {array.shape}"
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        return shown(array.tolist())
+    return array.tolist()
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,10 +160,9 @@ class Cause:
     received_ns: int
 
     def __post_init__(self) -> None:
-        text("worker", self.worker, 128)
-        for name in self.__dataclass_fields__:
-            if name != "worker":
-                set_field(self, name, integer(name, getattr(self, name)))
+        worker, *numbers = self.__match_args__
+        keep(self, text, worker, limit=128)
+        keep(self, integer, *numbers)
 
     def latency_ms(self, command_ns: int) -> dict[str, float]:
         """Duration of each of `LATENCY_STAGES` for a command stamped `command_ns` (wall clock)."""
@@ -84,14 +201,11 @@ class PoseCommand:
     cause: Cause | None = None
 
     def __post_init__(self) -> None:
-        for name, size in (("position_m", 3), ("goal_position_m", 3)):
-            set_field(self, name, vector(name, getattr(self, name), size))
-        for name in ("quat_xyzw", "goal_quat_xyzw"):
-            set_field(self, name, unit_quaternion(name, getattr(self, name)))
-        for name in ("twist", "acceleration"):
-            set_field(self, name, vector(name, getattr(self, name), 6))
-        text("state", self.state, 32)
-        _check_cause(self.cause)
+        keep(self, vector, "position_m", "goal_position_m", size=3)
+        keep(self, unit_quaternion, "quat_xyzw", "goal_quat_xyzw")
+        keep(self, vector, "twist", "acceleration", size=6)
+        keep(self, text, "state", limit=32)
+        keep_given(self, _cause, "cause")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,17 +231,17 @@ class JointCommand:
     cause: Cause | None = None
 
     def __post_init__(self) -> None:
-        names = joint_names(self.names)
-        set_field(self, "names", names)
-        for name in ("position_rad", "velocity_rad_s", "acceleration_rad_s2"):
-            set_field(self, name, vector(name, getattr(self, name), len(names)))
-        text("state", self.state, 32)
-        _check_cause(self.cause)
+        keep(self, joint_names, "names")
+        fields = ("position_rad", "velocity_rad_s", "acceleration_rad_s2")
+        keep(self, vector, *fields, size=len(self.names))
+        keep(self, text, "state", limit=32)
+        keep_given(self, _cause, "cause")
 
 
-def _check_cause(cause: Any) -> None:
-    if cause is not None and not isinstance(cause, Cause):
-        raise RecordError(f"cause is not a Cause: {shown(cause)}")
+def _cause(name: str, value: Any) -> Cause:
+    if not isinstance(value, Cause):
+        raise RecordError(f"{name} is not a Cause: {shown(value)}")
+    return value
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,9 +253,9 @@ class GripperCommand:
     force_n: float
 
     def __post_init__(self) -> None:
-        set_field(self, "width_m", number("width_m", self.width_m, 0.0, 1.0))
-        set_field(self, "speed_m_s", number("speed_m_s", self.speed_m_s, 1e-4, 10.0))
-        set_field(self, "force_n", number("force_n", self.force_n, 0.0, 1000.0))
+        keep(self, number, "width_m", minimum=0.0, maximum=1.0)
+        keep(self, number, "speed_m_s", minimum=1e-4, maximum=10.0)
+        keep(self, number, "force_n", minimum=0.0, maximum=1000.0)
 
 
 class PoseReference(NamedTuple):

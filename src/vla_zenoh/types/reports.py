@@ -12,8 +12,9 @@ from vla_zenoh.types.checks import (
     details,
     entries,
     integer,
+    keep,
+    keep_given,
     number,
-    set_field,
     shown,
     text,
 )
@@ -70,22 +71,12 @@ class NodeStatus:
     boot: str = ""
 
     def __post_init__(self) -> None:
-        for name in ("node", "state", "host", "boot"):
-            text(name, getattr(self, name), 256)
-        set_field(self, "pid", integer("pid", self.pid))
-        set_field(self, "started_wall_ns", integer("started_wall_ns", self.started_wall_ns))
-        for name in ("ages_s", "rates_hz"):
-            given = entries(name, getattr(self, name))
-            set_field(self, name, {key: number(f"{name}.{key}", v) for key, v in given.items()})
-        given = entries("counters", self.counters)
-        set_field(
-            self, "counters", {key: integer(f"counters.{key}", v) for key, v in given.items()}
-        )
-        given = entries("latency_ms", self.latency_ms)
-        set_field(
-            self, "latency_ms", {key: _pair(f"latency_ms.{key}", v) for key, v in given.items()}
-        )
-        set_field(self, "detail", details("detail", entries("detail", self.detail)))
+        keep(self, text, "node", "state", "host", "boot", limit=256)
+        keep(self, integer, "pid", "started_wall_ns")
+        keep(self, entries, "ages_s", "rates_hz", of=number)
+        keep(self, entries, "counters", of=integer)
+        keep(self, entries, "latency_ms", of=_pair)
+        keep(self, entries, "detail", of=details)
 
 
 def _pair(name: str, value: Any) -> tuple[float, float]:
@@ -117,16 +108,13 @@ class Event:
     count: int = 1
 
     def __post_init__(self) -> None:
-        for name in ("level", "kind", "what", "why"):
-            text(name, getattr(self, name))
+        keep(self, text, "level", "kind", "what", "why")
         for name, allowed in (("level", EVENT_LEVELS), ("kind", EVENT_KINDS)):
             if getattr(self, name) not in allowed:
                 given = shown(getattr(self, name))
                 raise RecordError(f"{name} is {given}, allowed: {', '.join(allowed)}")
-        set_field(self, "count", integer("count", self.count, 1))
-        for name in ("value", "limit"):
-            if getattr(self, name) is not None:
-                set_field(self, name, number(name, getattr(self, name)))
+        keep(self, integer, "count", minimum=1)
+        keep_given(self, number, "value", "limit")
 
 
 LEAST_PERCENT = 1.0
@@ -154,12 +142,12 @@ class Task:
     speed_percent: float = 100.0
 
     def __post_init__(self) -> None:
-        set_field(self, "episode", integer("episode", self.episode))
-        set_field(self, "active", boolean("active", self.active))
-        text("prompt", self.prompt)
-        text("worker", self.worker, 128)
-        set_field(self, "rate_hz", number("rate_hz", self.rate_hz, 0.01, 1000.0))
-        set_field(self, "speed_percent", number("speed_percent", self.speed_percent, 0.0, 100.0))
+        keep(self, integer, "episode")
+        keep(self, boolean, "active")
+        keep(self, text, "prompt")
+        keep(self, text, "worker", limit=128)
+        keep(self, number, "rate_hz", minimum=0.01, maximum=1000.0)
+        keep(self, number, "speed_percent", minimum=0.0, maximum=100.0)
 
     @property
     def speed(self) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,6 +16,8 @@ from vla_zenoh.types.checks import (
     entries,
     integer,
     joint_names,
+    keep,
+    keep_given,
     number,
     set_field,
     text,
@@ -51,13 +54,10 @@ class JointState:
     reference_rad: FloatArray | None = None
 
     def __post_init__(self) -> None:
-        names = joint_names(self.names)
-        set_field(self, "names", names)
-        for name in ("position_rad", "velocity_rad_s"):
-            set_field(self, name, vector(name, getattr(self, name), len(names)))
-        for name in ("effort_nm", "reference_rad"):
-            if getattr(self, name) is not None:
-                set_field(self, name, vector(name, getattr(self, name), len(names)))
+        keep(self, joint_names, "names")
+        joints = len(self.names)
+        keep(self, vector, "position_rad", "velocity_rad_s", size=joints)
+        keep_given(self, vector, "effort_nm", "reference_rad", size=joints)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,24 +82,14 @@ class PoseState:
     reference_quat_xyzw: FloatArray | None = None
 
     def __post_init__(self) -> None:
-        set_field(self, "position_m", vector("position_m", self.position_m, 3))
-        set_field(self, "quat_xyzw", unit_quaternion("quat_xyzw", self.quat_xyzw))
-        set_field(self, "twist", vector("twist", self.twist, 6))
-        if self.wrench is not None:
-            set_field(self, "wrench", vector("wrench", self.wrench, 6))
+        keep(self, vector, "position_m", size=3)
+        keep(self, unit_quaternion, "quat_xyzw")
+        keep(self, vector, "twist", size=6)
+        keep_given(self, vector, "wrench", size=6)
         if (self.reference_position_m is None) != (self.reference_quat_xyzw is None):
             raise RecordError("a reference pose needs both position and quaternion")
-        if self.reference_position_m is not None and self.reference_quat_xyzw is not None:
-            set_field(
-                self,
-                "reference_position_m",
-                vector("reference_position_m", self.reference_position_m, 3),
-            )
-            set_field(
-                self,
-                "reference_quat_xyzw",
-                unit_quaternion("reference_quat_xyzw", self.reference_quat_xyzw),
-            )
+        keep_given(self, vector, "reference_position_m", size=3)
+        keep_given(self, unit_quaternion, "reference_quat_xyzw")
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,11 +111,10 @@ class GripperState:
     faults: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        set_field(self, "width_m", number("width_m", self.width_m, -0.01, 1.0))
-        set_field(self, "moving", boolean("moving", self.moving))
-        set_field(self, "holding", boolean("holding", self.holding))
-        text("mode", self.mode, 128)
-        set_field(self, "faults", texts("faults", self.faults, 512))
+        keep(self, number, "width_m", minimum=-0.01, maximum=1.0)
+        keep(self, boolean, "moving", "holding")
+        keep(self, text, "mode", limit=128)
+        keep(self, texts, "faults", limit=512)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,8 +128,7 @@ class PrivilegedState:
     values: Mapping[str, FloatArray]
 
     def __post_init__(self) -> None:
-        given = entries("values", self.values)
-        set_field(self, "values", {name: vector(name, part, None) for name, part in given.items()})
+        keep(self, entries, "values", of=vector)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -159,10 +147,9 @@ class SceneState:
     seed: int | None = None
 
     def __post_init__(self) -> None:
-        text("scene", self.scene, 512)
-        set_field(self, "qpos", vector("qpos", self.qpos, None))
-        if self.seed is not None:
-            set_field(self, "seed", integer("seed", self.seed))
+        keep(self, text, "scene", limit=512)
+        keep(self, vector, "qpos")
+        keep_given(self, integer, "seed")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -180,22 +167,15 @@ class ObjectPoses:
     quat_xyzw: FloatArray
 
     def __post_init__(self) -> None:
-        names = texts("names", self.names, 128)
-        set_field(self, "names", names)
-        for name, size in (("position_m", 3), ("quat_xyzw", 4)):
-            rows = numbers(name, getattr(self, name))
-            if not names and rows.size == 0:  # an empty list does not say how wide it is
-                rows = rows.reshape(0, size)
-            if rows.shape != (len(names), size):
-                raise RecordError(f"{name} has shape {rows.shape}, wanted ({len(names)}, {size})")
-            check = unit_quaternion if name == "quat_xyzw" else _point
-            array = np.array([check(name, row) for row in rows]).reshape(len(names), size)
-            array.setflags(write=False)
-            set_field(self, name, array)
-
-
-def _point(name: str, value: ArrayLike) -> FloatArray:
-    return vector(name, value, 3)
+        keep(self, texts, "names", limit=128)
+        for name, size, check in (("position_m", 3, vector), ("quat_xyzw", 4, unit_quaternion)):
+            rows, shape = numbers(name, getattr(self, name)), (len(self.names), size)
+            if not self.names and rows.size == 0:  # an empty list does not say how wide it is
+                rows = rows.reshape(shape)
+            if rows.shape != shape:
+                raise RecordError(f"{name} has shape {rows.shape}, wanted {shape}")
+            checked = np.array([check(name, row) for row in rows], np.float64)
+            set_field(self, name, _locked(checked.reshape(shape)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -210,9 +190,14 @@ class Image:
             raise RecordError("an image must be a uint8 array (H, W, 3) in RGB order")
         if rgb.ndim != 3 or rgb.shape[2] != 3 or 0 in rgb.shape:
             raise RecordError(f"an image has shape {rgb.shape}, wanted (H, W, 3)")
-        rgb = np.ascontiguousarray(rgb).view()  # the maker's own array stays as writable as it was
-        rgb.setflags(write=False)
-        set_field(self, "rgb", rgb)
+        set_field(self, "rgb", _locked(rgb))
+
+
+def _locked(array: NDArray[Any]) -> NDArray[Any]:
+    """A read-only view, row by row; the maker's own array stays as writable as it was."""
+    view = np.ascontiguousarray(array).view()
+    view.setflags(write=False)
+    return view
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -233,10 +218,8 @@ class Depth:
             raise RecordError("a depth image must be a uint16 array (H, W)")
         if 0 in counts.shape:
             raise RecordError(f"a depth image has shape {counts.shape}, wanted (H, W)")
-        counts = np.ascontiguousarray(counts).view()
-        counts.setflags(write=False)
-        set_field(self, "counts", counts)
-        set_field(self, "unit_m", number("unit_m", self.unit_m, MIN_DEPTH_UNIT_M, MAX_DEPTH_UNIT_M))
+        set_field(self, "counts", _locked(counts))
+        keep(self, number, "unit_m", minimum=MIN_DEPTH_UNIT_M, maximum=MAX_DEPTH_UNIT_M)
 
     @staticmethod
     def of_metres(depth_m: ArrayLike, unit_m: float) -> Depth:

@@ -12,7 +12,7 @@ from vla_zenoh.errors import CodecError, RecordError
 from vla_zenoh.keys import Kind
 from vla_zenoh.policy import ActionSteps, ModelSpec, Observation
 from vla_zenoh.types import Depth, Header, Image, InferenceDebug
-from vla_zenoh.types.chunk import plain_values
+from vla_zenoh.types.commands import plain_values
 
 JPEG_QUALITY = 95
 
