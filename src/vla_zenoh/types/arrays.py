@@ -91,7 +91,7 @@ def to_float32(array: NDArray[Any]) -> NDArray[np.float32]:
 def is_finite(array: NDArray[Any]) -> bool:
     """Whether no number of an array is NaN or infinite."""
     if array.size <= FEW:
-        values = array.ravel().tolist()
+        values = array.tolist() if array.ndim == 1 else array.ravel().tolist()
         return math.isfinite(sum(values)) or all(map(math.isfinite, values))  # a sum may overflow
     return bool(np.isfinite(array).all())
 

@@ -138,9 +138,8 @@ def details(name: str, value: Any, depth: int = MAX_DETAIL_DEPTH) -> Any:
     raise RecordError(f"{name} is not text, a number, a bool, a list or a map: {shown(value)}")
 
 
-def set_field(record: Any, name: str, value: Any) -> None:
-    """Put the final form of a field into a frozen record."""
-    object.__setattr__(record, name, value)
+set_field = object.__setattr__
+"""Puts the final form of a field into a frozen record."""
 
 
 def keep(record: Any, check: Callable[..., Any], *names: str, **bounds: Any) -> None:
@@ -151,5 +150,6 @@ def keep(record: Any, check: Callable[..., Any], *names: str, **bounds: Any) -> 
 
 def keep_given(record: Any, check: Callable[..., Any], *names: str, **bounds: Any) -> None:
     """`keep` for fields that may be None."""
-    given = (name for name in names if getattr(record, name) is not None)
-    keep(record, check, *given, **bounds)
+    for name in names:
+        if getattr(record, name) is not None:
+            keep(record, check, name, **bounds)
