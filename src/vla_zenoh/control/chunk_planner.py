@@ -124,6 +124,11 @@ class ChunkPlanner:
         self.poses.restart(pose)
         self.joints.restart(joint)
 
+    @property
+    def waiting(self) -> bool:
+        """Chunks are queued, or one is being planned."""
+        return self._pending is not None or bool(self._queue)
+
     def begin_tick(self) -> None:
         """Renew the budget of evaluations."""
         self._left = self.budget

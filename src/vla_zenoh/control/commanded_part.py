@@ -64,6 +64,8 @@ class CommandedPart:
         self.contact, self.retreat = self.motion.contact, self.motion.retreat
         self.watchdog = Watchdog(profile)
         self._joint_monitor = None if reach is None else JointMonitor(profile, reach)
+        self.held = None if reach is None else reach.barriers.collisions.held
+        """What the gripper holds."""
         self._load_known = True
         self._grasp_m = np.inf
         """Least width of the gripper since it holds something."""
@@ -111,23 +113,15 @@ class CommandedPart:
             self.contact.update_joints(states.joint)
         if states.gripper is not None:
             self.gripper_state = states.gripper
-            self._grasp_m = min(self._grasp_m, states.gripper.record.width_m)
+            if self.held is not None:
+                self._grasp_m = min(self._grasp_m, states.gripper.record.width_m)
 
     # -- what it holds ------------------------------------------------------------------------
-    @property
-    def held(self) -> HeldBox | None:
-        """What the gripper holds."""
-        return None if self.reach is None else self.reach.barriers.collisions.held
-
     @property
     def let_go(self) -> bool:
         """The gripper has opened since it holds something."""
         gripper = self.gripper_state
-        return (
-            self.held is not None
-            and gripper is not None
-            and gripper.record.width_m > self._grasp_m + LET_GO_M
-        )
+        return gripper is not None and gripper.record.width_m > self._grasp_m + LET_GO_M
 
     def hold(self, box: HeldBox | None) -> None:
         """Count `box` among the arm's links from now on; None: the gripper holds nothing.
@@ -141,6 +135,7 @@ class CommandedPart:
                 "robot.tcp_frame and robot.arm_joints in the profile"
             )
         self.reach.hold(box)
+        self.held = box
         gripper = self.gripper_state
         self._grasp_m = np.inf if gripper is None else gripper.record.width_m
         if self._joint_monitor is not None:
@@ -227,13 +222,13 @@ class CommandedPart:
             moves: commands are published: the arm may be blocked.
         """
         assert self.pose is not None and self.gripper_state is not None
-        self.motion.contact_slowdown = self.contact.slowdown()
-        events = self._load_sensing()
+        contact, motion = self.contact, self.motion
+        motion.contact_slowdown = contact.slowdown()
+        events = [] if contact.known is self._load_known else [self._load_sensing()]
         why = self.watchdog.lost(self.pose, self.gripper_state, peers, worker, lease, now_ns)
-        if not why and self.motion.streaming and moves:
-            why, found = self._obstructed()
-            events += found
-        return why or self.contact.lost or self.motion.stuck or self._joints_lost(now_ns), events
+        if not why and motion.streaming and moves:
+            why = self._obstructed(events)
+        return why or contact.lost or motion.stuck or self._joints_lost(now_ns), events
 
     def _joints_lost(self, now_ns: int) -> str:
         """Why the measured joints, which are monitored, count as lost; empty while they arrive."""
@@ -261,21 +256,23 @@ class CommandedPart:
         if not obeying or not motion.streaming:
             monitor.reset()
             return None
+        commanded_rad, hit = motion.joints_rad, None
         measured_rad = reach.kinematics.joints_of(self.joint.record)
-        commanded_rad = motion.joints_rad
-        hit = monitor.update(measured_rad, commanded_rad, now_ns, in_joints=motion.in_joints)
-        motion.joint_slowdown = monitor.slowdown
+        if now_ns >= monitor.next_ns:
+            hit = monitor.update(measured_rad, commanded_rad, now_ns, in_joints=motion.in_joints)
+            motion.joint_slowdown = monitor.slowdown
         reach.set_elbow(measured_rad if commanded_rad is None else commanded_rad)
         return hit
 
-    def _obstructed(self) -> tuple[str, list[Event]]:
+    def _obstructed(self, events: list[Event]) -> str:
         """Why the arm is blocked or in contact, empty otherwise; it then brakes and retreats."""
-        commanded, overload = self.motion.commanded, self.contact.overload()
-        events: list[Event] = []
+        overload = self.contact.overload()
         if overload is None:
             why = self.watchdog.blocked()
+            if not why:
+                return ""
             # An arm without contact is not blocked: its state is stuck, or it was slowed down.
-            retreats = bool(why) and not (self.contact.known and self.contact.quiet)
+            retreats = not (self.contact.known and self.contact.quiet)
         else:
             name, value, limit, unit = overload
             events.append(make_event("warning", "limit", name, "stopped", value, limit))
@@ -284,16 +281,12 @@ class CommandedPart:
                 f"at most {limit:g} {unit}; it retreats"
             )
             retreats = True
+        commanded = self.motion.commanded
         if retreats and commanded is not None:
             self.retreat.begin(commanded)
-        return why, events
+        return why
 
-    def end_retreat(self, peers: PeerSnapshot, now_ns: int) -> None:
-        """End a retreat of an arm that is not alive and ready, without faults."""
-        if self.retreat.busy and not self._may_retreat(peers, now_ns):
-            self.retreat.end()
-
-    def _may_retreat(self, peers: PeerSnapshot, now_ns: int) -> bool:
+    def may_retreat(self, peers: PeerSnapshot, now_ns: int) -> bool:
         """The robot is alive and ready, without faults, and publishes its state."""
         pose, gripper = self.pose, self.gripper_state
         if pose is None or gripper is None or self.watchdog.state_lost(pose, gripper, now_ns):
@@ -301,16 +294,14 @@ class CommandedPart:
         alive = peers.robot_node in peers.alive
         return alive and gripper.record.mode == "ready" and not gripper.record.faults
 
-    def _load_sensing(self) -> list[Event]:
+    def _load_sensing(self) -> Event:
         """Event when the robot begins or ceases to measure external loads."""
-        if self.contact.known is self._load_known:
-            return []
         self._load_known = self.contact.known
         if self._load_known:
             why = "the robot measures external loads"
-            return [make_event("info", "notice", "contact_told", why)]
+            return make_event("info", "notice", "contact_told", why)
         why = (
             "the robot measures no external wrench: limits.contact has no effect, and a "
             "blocked arm is detected by limits.tracking_m alone"
         )
-        return [make_event("warning", "notice", "contact_not_told", why)]
+        return make_event("warning", "notice", "contact_not_told", why)

@@ -12,7 +12,7 @@ of its own: `ChunkPlanner` makes plans of chunks, `MotionPipeline` makes command
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from vla_zenoh.control.chunk_planner import ChunkOutcome
@@ -140,15 +140,10 @@ class Commander:
             ticks: periods since the last call. More than one after a late wake-up: the motion is a
                 function of time, so the same trajectory is sampled later, no faster.
         """
-        task_before = self.task
+        task_before, out, parts = self.task, self._out, self.parts
         self._update_states(inputs)
-        stopped = any(setting.name == "stop" for setting in inputs.settings)
-        if stopped:
-            self._change(Trigger.STOP, "emergency stop")
-            put_ns = [s.put_ns for s in inputs.settings if s.name == "stop" and s.put_ns]
-            self._stop_put_ns, self._stop_came_ns = max(put_ns, default=0), now_ns
-        for setting in inputs.settings:
-            self._apply_setting(setting, now_ns, stopped)
+        if inputs.settings:
+            self._apply_settings(inputs.settings, now_ns)
         planned = self._prepared or bool(inputs.chunks)
         if not self._prepared:
             self._begin_planning()
@@ -157,30 +152,32 @@ class Commander:
             self._submit_chunk(chunk, now_ns)
         self._plan_chunks(now_ns)
         self._supervise(now_ns)
-        for part in self.parts:
+        for part in parts:
             if not planned or part.monitor_late(now_ns):  # a new goal is work enough
                 self._monitor_joints(part, now_ns)
-        self._monitor_distance(now_ns)
-        self._keep_apart(now_ns, ticks)
+        if self._spacing is not None:
+            self._monitor_distance(self._spacing, now_ns)
+            self._keep_apart(self._spacing, now_ns, ticks)
         overdue_ns, all_planned = self._watchdog.deadline_ns, True
-        for part in self.parts:
+        for part in parts:
             planned, events = part.motion.advance(self.state, self.task, overdue_ns, now_ns, ticks)
-            self._out.events += part.tagged(events)
+            if events:
+                out.events += part.tagged(events)
             all_planned = all_planned and planned
         if not all_planned:
             self._change(Trigger.FAULT, "no trajectory could be computed; braked")
         if self.state is State.ACTIVE and self._motion.timeline is not None:
             self.progress.update(self._motion.timeline, self.task.episode, now_ns)
-        for part in self.parts if not self.dry_run else ():
+        for part in parts if not self.dry_run else ():
             commands = part.motion.commands(self.state, now_ns, part.gripper_state)
             if part.name:
-                self._out.parts[part.name] = commands
+                out.parts[part.name] = commands
             else:
-                self._out.pose, self._out.joint, self._out.gripper = commands
+                out.pose, out.joint, out.gripper = commands
         if self.task.active != (self.state in OBEYING):  # `prepare` may have changed the state
             self.task = replace(self.task, active=self.state in OBEYING)
-        self._out.task_changed = self.task is not task_before and self.task != task_before
-        out, self._out = self._out, Outputs()
+        out.task_changed = self.task is not task_before and self.task != task_before
+        self._out = Outputs()
         return out
 
     # -- of the first part, which a robot that is one arm has alone ----------------------------
@@ -277,16 +274,26 @@ class Commander:
         for part in self.parts:
             states = inputs.of(part.name)
             part.update(states)
-            if part.let_go:
+            if part.held is not None and part.let_go:
                 self._hold(part, None)
             if states.gripper is None:
                 continue
-            faults, mode = states.gripper.record.faults, states.gripper.record.mode
-            if faults:
-                why = f"the robot reports: {'; '.join(faults)}"
+            gripper = states.gripper.record
+            if gripper.faults:
+                why = f"the robot reports: {'; '.join(gripper.faults)}"
                 self._change(Trigger.FAULT, part.says(why))
-            elif mode != "ready":
-                self._change(Trigger.LOSE, part.says(f"the robot is not ready but {mode!r}"))
+            elif gripper.mode != "ready":
+                why = f"the robot is not ready but {gripper.mode!r}"
+                self._change(Trigger.LOSE, part.says(why))
+
+    def _apply_settings(self, settings: Sequence[Setting], now_ns: int) -> None:
+        stops = [setting for setting in settings if setting.name == "stop"]
+        if stops:
+            self._change(Trigger.STOP, "emergency stop")
+            self._stop_put_ns = max(stop.put_ns or 0 for stop in stops)
+            self._stop_came_ns = now_ns
+        for setting in settings:
+            self._apply_setting(setting, now_ns, bool(stops))
 
     def _apply_setting(self, setting: Setting, now_ns: int, stopped: bool) -> None:
         name, value = setting.name, setting.value
@@ -504,7 +511,7 @@ class Commander:
 
     def _plan_chunks(self, now_ns: int) -> None:
         timeline, lease = self._motion.timeline, self.lease
-        if timeline is None or lease is None:
+        if timeline is None or lease is None or not self._planner.waiting:
             return
         episode = self.task.episode if self.state in OBEYING else None
         resumed_ns = now_ns if self.state is State.HOLDING else self._resumed_ns
@@ -549,8 +556,7 @@ class Commander:
         self._measure()
         unheld = self.deadman.lost(self._peers.holders)
         for part in self.parts:
-            part.end_retreat(self._peers, now_ns)
-            if part.retreat.busy and unheld:
+            if part.retreat.busy and (unheld or not part.may_retreat(self._peers, now_ns)):
                 part.retreat.end()
         if self.state not in OBEYING:
             return
@@ -560,11 +566,14 @@ class Commander:
             why, events = part.lost(
                 self._peers, self.task.worker, self.lease, now_ns, moves=not self.dry_run
             )
-            self._out.events += part.tagged(events)
+            if events:
+                self._out.events += part.tagged(events)
             if why:
                 lost[part.says(why)] = why
-        reasons = set(lost.values()) if len(lost) == len(self.parts) else set(lost)
-        why = "; ".join(reasons if len(reasons) == 1 else lost)[:MAX_TEXT]
+        why = ""
+        if lost:
+            reasons = set(lost.values()) if len(lost) == len(self.parts) else set(lost)
+            why = "; ".join(reasons if len(reasons) == 1 else lost)[:MAX_TEXT]
         if not why and self._watchdog.given_up(now_ns):
             why = f"held for {self.profile.timing.max_hold_s:g} s without a fresh chunk"
         why = why or unheld
@@ -573,13 +582,11 @@ class Commander:
         elif self._watchdog.overdue(now_ns):
             self._change(Trigger.STARVE, "no fresh chunk within the watchdog")
 
-    def _keep_apart(self, now_ns: int, ticks: int) -> None:
+    def _keep_apart(self, spacing: PartSpacing, now_ns: int, ticks: int) -> None:
         """Slow the parts down, or let all of them stand, before they come too near."""
-        if self._spacing is None:
-            return
         moves = self.state is State.ACTIVE or self.retreating
         ahead_s = ticks / self.profile.timing.command_hz
-        slowdown, hit = self._spacing.look(now_ns, ahead_s, moves=moves)
+        slowdown, hit = spacing.look(now_ns, ahead_s, moves=moves)
         if hit is not None and not self._motion.held:
             why = f"stand{hit.at}"
             event = make_event("warning", "limit", hit.name, why, hit.value, hit.limit)
@@ -597,13 +604,13 @@ class Commander:
         if hit is not None:
             self._brake_at(hit, part)
 
-    def _monitor_distance(self, now_ns: int) -> None:
+    def _monitor_distance(self, spacing: PartSpacing, now_ns: int) -> None:
         """Brake if the measured parts come too near to each other."""
-        if self._spacing is None or self.state not in OBEYING or not self._motion.streaming:
+        if self.state not in OBEYING or not self._motion.streaming:
             return
         measured = [part.measured_rad for part in self.parts]
         known = [joints_rad for joints_rad in measured if joints_rad is not None]
-        hit = self._spacing.monitor(known, now_ns) if len(known) == len(measured) else None
+        hit = spacing.monitor(known, now_ns) if len(known) == len(measured) else None
         if hit is not None:
             self._brake_at(hit)
 

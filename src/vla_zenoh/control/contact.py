@@ -74,26 +74,29 @@ class _LoadFilter:
         """Add a measurement, `dt_s` after the last one; `drifts`: let the bias follow."""
         if not self.known or len(measured) != len(self._filtered):
             self._filtered, self.known = list(measured), True
-            self._bias = self._start_bias = [0.0] * len(measured)
+            self._bias, self._start_bias = [0.0] * len(measured), [0.0] * len(measured)
+        filtered, bias = self._filtered, self._bias
         share = -math.expm1(-dt_s / FILTER_S)
-        filtered = self._filtered = [
-            f + share * (t - f) for f, t in zip(self._filtered, measured, strict=True)
-        ]
+        for index, value in enumerate(measured):
+            filtered[index] += share * (value - filtered[index])
         if drifts and dt_s > 0:
             drift = dt_s / DRIFT_S
-            bias = [b + drift * (f - b) for b, f in zip(self._bias, filtered, strict=True)]
-            self._bias = self._near(bias, self._start_bias)
-        self.value = self._apart(filtered, self._bias)
+            for index, value in enumerate(filtered):
+                bias[index] += drift * (value - bias[index])
+            if self._apart(bias, self._start_bias) > self.slow:
+                self._bias = bias = self._near(bias, self._start_bias)
+        self.value = self._apart(filtered, bias)
 
     def zero(self) -> None:
         """Take the present load for the bias, as far as `slow`."""
-        self._bias = self._start_bias = self._near(self._filtered, [0.0] * len(self._filtered))
+        self._start_bias = self._near(self._filtered, [0.0] * len(self._filtered))
+        self._bias = self._start_bias.copy()
         self.value = self._apart(self._filtered, self._bias)
 
     def _near(self, values: list[float], middle: Sequence[float]) -> list[float]:
         apart = self._apart(values, middle)
         if apart <= self.slow:
-            return values
+            return values.copy()
         share = self.slow / max(apart, 1e-9)
         return [m + share * (v - m) for v, m in zip(values, middle, strict=True)]
 
@@ -122,6 +125,8 @@ class Contact:
         self._all = (self._force, self._torque, self._effort)
         self._wants_effort = limits.effort_stop_nm is not None
         self._active = False
+        self._kinds: list[_LoadFilter] = []
+        """Those that the robot measures."""
         self._begun: list[_LoadFilter] = []
         self._pose_ns = self._joint_ns = 0
 
@@ -130,23 +135,36 @@ class Contact:
         """Add the newest pose, with the wrench if the robot measures one."""
         wrench = state.record.wrench
         if wrench is None:
-            self._force.known = self._torque.known = False
+            self._forget(self._force, self._torque)
             return
         load = wrench.tolist()
         dt_s = _passed_s(self._pose_ns, state.header.stamp_wall_ns)
         self._pose_ns = state.header.stamp_wall_ns
         self._force.update(load[:3], dt_s, drifts=self._active)
         self._torque.update(load[3:], dt_s, drifts=self._active)
+        if self._force not in self._kinds:
+            self._measures()
 
     def update_joints(self, state: Stamped[JointState]) -> None:
         """Add the newest joints; used if a limit of the profile says that efforts are external."""
         effort_nm = state.record.effort_nm
         if effort_nm is None:
-            self._effort.known = False
+            self._forget(self._effort)
         elif self._wants_effort:
             dt_s = _passed_s(self._joint_ns, state.header.stamp_wall_ns)
             self._joint_ns = state.header.stamp_wall_ns
             self._effort.update(effort_nm.tolist(), dt_s, drifts=self._active)
+            if self._effort not in self._kinds:
+                self._measures()
+
+    def _forget(self, *kinds: _LoadFilter) -> None:
+        if any(kind.known for kind in kinds):
+            for kind in kinds:
+                kind.known = False
+            self._measures()
+
+    def _measures(self) -> None:
+        self._kinds = [kind for kind in self._all if kind.known]
 
     def begin(self) -> None:
         """Start an activation: the present load is not a contact."""
@@ -217,10 +235,6 @@ class Contact:
             if share < (slowest.share if slowest else 1.0):
                 slowest = Slowdown(kind.name, share, value, kind.slow, "")
         return slowest
-
-    @property
-    def _kinds(self) -> list[_LoadFilter]:
-        return [kind for kind in self._all if kind.known]
 
 
 def _passed_s(before_ns: int, now_ns: int) -> float:

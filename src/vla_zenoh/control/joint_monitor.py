@@ -62,7 +62,8 @@ class JointMonitor:
         """Forget the last values: the arm is not being moved."""
         self._edge: FloatArray | None = None
         self._expected_rad: FloatArray | None = None
-        self._next_ns = 0
+        self.next_ns = 0
+        """When the next check is due."""
         self._elbow_next = False
         self.elbow_rad = 0.0
         """Greatest distance of a joint from where it is expected."""
@@ -78,7 +79,7 @@ class JointMonitor:
 
     def late(self, now_ns: int) -> bool:
         """A check is overdue by a whole period."""
-        return now_ns >= self._next_ns + PERIOD_NS // 2
+        return now_ns >= self.next_ns + PERIOD_NS // 2
 
     def update(
         self,
@@ -99,9 +100,9 @@ class JointMonitor:
         Returns:
             the bound for which the arm has to brake, None without one.
         """
-        if now_ns < self._next_ns:
+        if now_ns < self.next_ns:
             return None
-        self._next_ns = now_ns + PERIOD_NS // 2
+        self.next_ns = now_ns + PERIOD_NS // 2
         self._elbow_next = not self._elbow_next
         seen = measured_rad, commanded_rad, in_joints
         if self.slowdown is None and all(map(is_, seen, self._passed[self._elbow_next])):

@@ -204,8 +204,11 @@ class Slowdown(NamedTuple):
 
 def slowest(*reasons: Slowdown | None) -> Slowdown | None:
     """The slowdown with the least share, None without any."""
-    given = [reason for reason in reasons if reason is not None]
-    return min(given, key=lambda reason: reason.share) if given else None
+    least: Slowdown | None = None
+    for reason in reasons:
+        if reason is not None and (least is None or reason.share < least.share):
+            least = reason
+    return least
 
 
 def slowdown(

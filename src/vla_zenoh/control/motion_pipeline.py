@@ -131,6 +131,8 @@ class MotionPipeline:
         self._back: Pose | None = None
         self._slowed_by: set[str] = set()
         self._smoother: Smoother | None = None
+        self._mover: Smoother | JointPath | None = None
+        """What moves the arm: the smoother of poses, or of joints; None before any activation."""
         self._standing: tuple[Pose, FloatArray | None, int] | None = None
         self._measured: tuple[PoseState | None, JointState | None] = None, None
         self._measured_ns = 0
@@ -144,20 +146,17 @@ class MotionPipeline:
 
     # -- state --------------------------------------------------------------------------------
     @property
-    def _mover(self) -> Smoother | JointPath | None:
-        """What moves the arm: the smoother of poses, or of joints; None before any activation."""
-        return self._path if self.in_joints else self._smoother
-
-    @property
     def at_rest(self) -> bool:
         """The commanded motion stands still."""
+        mover = self._mover
         still = self.in_joints or self._joints is None or self._joints.at_rest
-        return self._mover is None or (self._mover.at_rest and still)
+        return mover is None or (mover.at_rest and still)
 
     @property
     def commanded(self) -> Pose | None:
         """The pose streamed last, None while nothing is streamed."""
-        return self._mover.motion.pose if self._mover and self.streaming else None
+        mover = self._mover
+        return mover.motion.pose if mover is not None and self.streaming else None
 
     @property
     def joints_rad(self) -> FloatArray | None:
@@ -236,6 +235,7 @@ class MotionPipeline:
             # Commanded joints have distance constraints of their own.
             inside = workspace_corners(self._limits) if self._joints is None else None
             self._smoother = Smoother(start, self._dt_s, motion_limits(self._limits), inside)
+            self._mover = self._smoother
             self._timings = [
                 StepTiming(mover.box) for mover in (self._smoother, self._path) if mover
             ]
@@ -293,7 +293,7 @@ class MotionPipeline:
                     f"{apart[1]:.4f} rad are left"
                 )
                 return
-        self.in_joints = joints
+        self.in_joints, self._mover = joints, path if joints else smoother
         self._restart_timing()
 
     def _resting_goal(self, actual: Pose, width_m: float) -> Goal:
@@ -413,7 +413,7 @@ class MotionPipeline:
                 active = active and not self._changing and not self.held
                 braking = not active and self._back is None
                 self._joints.tick(self._smoother, braking=braking, elbow=active)
-        if self._path is not None:
+        if self.in_joints and self._path is not None:
             events += limit_events(self._path.taken_hits())
         return self.failures == failures, events
 
@@ -466,10 +466,11 @@ class MotionPipeline:
         ticks: int,
     ) -> list[Event]:
         plans = self._aggregator.plans(timeline, now_ns)
-        events = limit_events(self._planner.bound_due(plans, now_ns))
+        found = self._planner.bound_due(plans, now_ns)
+        events = limit_events(found) if found else []
         goal = self._aggregator.goal(plans, now_ns)
         joints = goal.arm is not None
-        if self.at_rest:
+        if joints is not self.in_joints and self.at_rest:
             self._enter(joints=joints)
         self._changing = joints is not self.in_joints
         mover = self._mover
@@ -519,14 +520,11 @@ class MotionPipeline:
         """
         limits, (pose, twist, acceleration) = self._limits, motion
         apart_m, apart_rad = pose_distance(goal, pose)
-        rates = [
-            abs(v) + ahead_s * abs(a)
-            for v, a in zip(twist.tolist(), acceleration.tolist(), strict=True)
-        ]
-        return (
-            apart_m + ahead_s * sum(rates[:3]) <= limits.lead_m
-            and apart_rad + ahead_s * sum(rates[3:]) <= limits.lead_rad
-        )
+        x, y, z, rx, ry, rz = map(abs, twist.tolist())
+        ax, ay, az, arx, ary, arz = map(abs, acceleration.tolist())
+        way_m = ahead_s * (x + y + z + ahead_s * (ax + ay + az))
+        turn_rad = ahead_s * (rx + ry + rz + ahead_s * (arx + ary + arz))
+        return apart_m + way_m <= limits.lead_m and apart_rad + turn_rad <= limits.lead_rad
 
     def _cut_lead(
         self, mover: Smoother | JointPath, plans: Sequence[Plan], goal: Goal, now_ns: int
@@ -657,8 +655,13 @@ class MotionPipeline:
         if self._made_of and self._sent and all(map(is_, made_of, self._made_of)):
             return self._sent  # the arm is at rest
         (position_m, rotation), twist, acceleration = motion
-        goal = self.goal.pose if self.goal else motion.pose
-        quat_xyzw, goal_quat_xyzw = map(quat_from_rotation, (rotation, goal.rotation))
+        goal, quat_xyzw = self.goal, quat_from_rotation(rotation)
+        if goal is None:
+            heads_m, heads_xyzw = position_m, quat_xyzw
+        elif self._sent and self._made_of and goal is self._made_of[1]:
+            heads_m, heads_xyzw = self._sent.goal_position_m, self._sent.goal_quat_xyzw
+        else:
+            heads_m, heads_xyzw = goal.pose.position_m, quat_from_rotation(goal.pose.rotation)
         self._made_of = made_of
         self._sent = computed(
             PoseCommand,
@@ -666,8 +669,8 @@ class MotionPipeline:
             quat_xyzw,
             twist,
             acceleration,
-            goal.position_m,
-            goal_quat_xyzw,
+            heads_m,
+            heads_xyzw,
             state.value,
             self._cause,
         )

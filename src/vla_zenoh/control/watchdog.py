@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Set as AbstractSet
+from operator import is_
 
 from vla_zenoh.control.chunk_validation import Lease
 from vla_zenoh.control.preflight import CLOCK_TOLERANCE_S, PeerSnapshot
@@ -33,6 +34,8 @@ class Watchdog:
         self.deadline_ns = 0
         """When the next chunk is overdue."""
         self._left_ns, self._patience_ns = 0.0, 0
+        self._present: tuple[PeerSnapshot, str, Lease] | None = None
+        """The nodes, worker and lease that nothing was missing of."""
 
     # -- chunks -------------------------------------------------------------------------------
     def expect_first(self, now_ns: int, rate_hz: float, speed: float = 1.0) -> None:
@@ -102,6 +105,12 @@ class Watchdog:
     def blocked(self) -> str:
         """Why the arm counts as blocked, empty while it follows."""
         limits = self._limits
+        if (
+            self._excused == (0.0, 0.0)
+            and self.tracking_m <= limits.tracking_m
+            and self.tracking_rad <= limits.tracking_rad
+        ):
+            return ""
         for apart, limit, excused, back_off, unit in (
             (self.tracking_m, limits.tracking_m, self._excused[0], BACK_OFF_M, "m"),
             (self.tracking_rad, limits.tracking_rad, self._excused[1], BACK_OFF_RAD, "rad"),
@@ -147,6 +156,9 @@ class Watchdog:
         lost = self.state_lost(pose, gripper, now_ns)
         if lost:
             return lost
+        seen = peers, worker, lease
+        if self._present is not None and all(map(is_, seen, self._present)):
+            return ""
         needed = [peers.robot_node, worker_node(worker)]
         cameras = lease.spec.observation.camera_names
         needed += [peers.camera_nodes.get(camera, "camera") for camera in cameras]
@@ -158,6 +170,7 @@ class Watchdog:
                 return f"camera {camera!r} {peers.camera_faults[camera]}"
         if peers.spec_sources.get(worker) != lease.source:
             return f"worker {worker!r} was restarted"
+        self._present = seen
         return ""
 
 

@@ -117,11 +117,10 @@ def computed(kind: type[Record], *values: Any) -> Record:
     Raises:
         RecordError: a vector is not finite.
     """
-    record = object.__new__(kind)
+    record, total = object.__new__(kind), 0.0
     for name, value in zip(kind.__match_args__, values, strict=True):  # pyright: ignore
-        if isinstance(value, np.ndarray):
-            if not is_finite(value):
-                return kind(*values)
+        if type(value) is np.ndarray:
+            total += sum(value.tolist())
             value.setflags(write=False)
         set_field(record, name, value)
-    return record
+    return record if math.isfinite(total) else kind(*values)  # which names what is not finite
