@@ -14,7 +14,7 @@ import typer
 
 from vla_zenoh.bus.clock import HOST_VARIABLE
 from vla_zenoh.cli.words import DEFAULT_PROFILE, PROFILE_VARIABLE
-from vla_zenoh.policy.loader import ConstructorOptions, ModelFile, find_worker
+from vla_zenoh.policy.loader import ModelFile, find_worker
 from vla_zenoh.profile import Profile, load_profile, override
 
 ProfileOption = Annotated[
@@ -176,9 +176,8 @@ class ModelOptions:
         usual = profile.options.get(called, {}) if profile is not None else {}
         chosen = {**usual, **given}
         # Before an environment is made for the model, which may take minutes and gigabytes.
-        declared = ConstructorOptions.declared(model.path) if model.missing() else None
-        if declared is not None:
-            declared.check(chosen, str(model.path))
+        if model.missing():
+            model.check_options(chosen)
         return WorkerChoice(called, model, chosen)
 
 

@@ -10,11 +10,11 @@ import operator
 import re
 import sys
 import tomllib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 from vla_zenoh import resources
 from vla_zenoh.errors import ResourceError, WorkerError, in_words, nearest
@@ -23,6 +23,16 @@ from vla_zenoh.robot import Robot
 
 # The pattern of PEP 723: the block ends at the last line that can end it.
 _HEADER = re.compile(r"(?m)^# /// script$\s(?P<body>(?:^#(?:| .*)$\s)+)^# ///$")
+_CLAUSE = re.compile(r"(>=|<=|==|!=|~=|>|<)\s*(\d+(?:\.\d+)*)(\.\*)?")
+_COMPARE: Mapping[str, Callable[[Any, Any], bool]] = {
+    ">=": operator.ge,
+    "<=": operator.le,
+    ">": operator.gt,
+    "<": operator.lt,
+    "==": operator.eq,
+    "!=": operator.ne,
+    "~=": lambda here, version: here >= version and here[:-1] == version[:-1],
+}
 ENTRY_FILE = "model.py"
 
 
@@ -55,26 +65,25 @@ class ModelFile:
                 absent.append(requirement)
         return absent
 
+    def check_options(self, given: Mapping[str, str]) -> None:
+        """Compare options with those of its class as far as the file shows them, not running it.
 
-_CLAUSE = re.compile(r"(>=|<=|==|!=|~=|>|<)\s*(\d+(?:\.\d+)*)(\.\*)?")
+        Raises:
+            WorkerError: one is unknown, or a required one is missing.
+        """
+        declared = _declared_options(self.path)
+        if declared is not None:
+            declared.check(given, str(self.path))
 
 
 def _this_python_is(wanted: str) -> bool:
     """Whether this interpreter has a version that ``requires-python`` allows."""
-    compare = {">=": operator.ge, "<=": operator.le, ">": operator.gt, "<": operator.lt}
     for clause in wanted.split(","):
         found = _CLAUSE.fullmatch(clause.strip())
         if found is None:
             continue  # uv reads it where it makes an environment
-        sign, version = found[1], tuple(map(int, found[2].split(".")))
-        here = tuple(sys.version_info[: len(version)])
-        if sign == "~=":
-            fits = here >= version and here[:-1] == version[:-1]
-        elif sign in ("==", "!="):
-            fits = (here == version) is (sign == "==")
-        else:
-            fits = compare[sign](here, version)
-        if not fits:
+        version = tuple(map(int, found[2].split(".")))
+        if not _COMPARE[found[1]](sys.version_info[: len(version)], version):
             return False
     return True
 
@@ -117,27 +126,21 @@ def find_worker(word: str, models: Mapping[str, str]) -> tuple[str, ModelFile]:
         ResourceError: no such model.
         WorkerError: invalid header.
     """
-    if word in models:
-        return word, find_model(models[word])
-    found = find_model(word)
-    return found.name, found
+    found = find_model(models.get(word, word))
+    return (word if word in models else found.name), found
 
 
 def _read_header(path: Path) -> Mapping[str, Any]:
     try:
-        blocks = [found["body"] for found in _HEADER.finditer(path.read_text("utf-8-sig"))]
+        blocks = _HEADER.findall(path.read_text("utf-8-sig"))
     except (OSError, UnicodeDecodeError) as error:
         raise WorkerError(f"{path} cannot be read: {error}") from error
     if not blocks:
         return {}
     if len(blocks) > 1:
         raise WorkerError(f"{path} has {len(blocks)} script headers; PEP 723 allows one")
-    body = "".join(
-        line[2:] if line.startswith("# ") else line[1:]
-        for line in blocks[0].splitlines(keepends=True)
-    )
     try:
-        return tomllib.loads(body)
+        return tomllib.loads(re.sub("(?m)^# ?", "", blocks[0]))
     except tomllib.TOMLDecodeError as error:
         raise WorkerError(f"{path}: its script header is not valid TOML: {error}") from error
 
@@ -178,6 +181,7 @@ def import_model(model: ModelFile) -> ModuleType:
     return module
 
 
+# -- making what a file holds ---------------------------------------------------------------------
 def make_policy(
     model: ModelFile, options: Mapping[str, str] | None = None, *, profile: str | None = None
 ) -> Policy:
@@ -190,22 +194,20 @@ def make_policy(
     Raises:
         WorkerError: the file fails to import, has no such class, or rejects the options.
     """
-    module = import_model(model)
-    maker = _maker(module, model.path, "MODEL", "infer")
-    name = getattr(maker, "__name__", "MODEL")
+    maker = _find_maker(model, "MODEL", "infer")
     chosen = dict(options or {})
-    if profile is not None and "profile" in _options_of(maker).names:
+    if profile is not None and "profile" in maker.options.names:
         chosen.setdefault("profile", profile)
-    policy = _made(maker, model.path, name, chosen)
+    policy = maker.make(chosen)
     try:
         fits = isinstance(policy, Policy) and isinstance(policy.spec, ModelSpec)
     except Exception as error:  # a property that fails
         raise WorkerError(
-            f"{model.path}: the spec of {name} cannot be read: {in_words(error)}"
+            f"{model.path}: the spec of {maker.name} cannot be read: {in_words(error)}"
         ) from error
     if not fits:
         raise WorkerError(
-            f"{model.path}: {name} needs a property `spec` (a vla_zenoh.policy.ModelSpec) "
+            f"{maker.where} needs a property `spec` (a vla_zenoh.policy.ModelSpec) "
             "and a method `infer(observation)`"
         )
     return policy
@@ -217,8 +219,7 @@ def make_by_method(file: ModelFile, named: str, method: str, options: Mapping[st
     Raises:
         WorkerError: the file fails to import, has no such class, or rejects the options.
     """
-    maker = _maker(import_model(file), file.path, named, method)
-    return _made(maker, file.path, getattr(maker, "__name__", named), options)
+    return _find_maker(file, named, method).make(options)
 
 
 def make_robot(path: Path, options: Mapping[str, str] | None = None) -> Robot:
@@ -230,92 +231,11 @@ def make_robot(path: Path, options: Mapping[str, str] | None = None) -> Robot:
     Raises:
         WorkerError: the file fails to import, has no such class, or rejects the options.
     """
-    maker, name = _robot_class(path)
-    robot = _made(maker, path, name, dict(options or {}))
+    maker = _robot_maker(path)
+    robot = maker.make(options or {})
     if not isinstance(robot, Robot):
-        raise WorkerError(f"{path}: {name} needs methods `read()` and `move(command)`")
+        raise WorkerError(f"{maker.where} {_IS_ROBOT}")
     return robot
-
-
-def _options_of(maker: Callable[..., Any]) -> ConstructorOptions:
-    try:
-        return ConstructorOptions.of(inspect.signature(maker).parameters.values())
-    except (TypeError, ValueError):  # written in C, without a signature
-        return ConstructorOptions((), (), anything=True)
-
-
-@dataclass(frozen=True, slots=True)
-class ConstructorOptions:
-    """Options that a class takes: keyword arguments of its constructor.
-
-    Args:
-        names: all of them.
-        required: those without a default.
-        anything: it takes any other name too.
-    """
-
-    names: tuple[str, ...]
-    required: tuple[str, ...]
-    anything: bool = False
-
-    @staticmethod
-    def of(parameters: Iterable[inspect.Parameter]) -> ConstructorOptions:
-        """The options among the parameters of a constructor."""
-        variable = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
-        found = list(parameters)
-        named = [each for each in found if each.kind not in variable]
-        return ConstructorOptions(
-            tuple(each.name for each in named),
-            tuple(each.name for each in named if each.default is each.empty),
-            any(each.kind is each.VAR_KEYWORD for each in found),
-        )
-
-    @staticmethod
-    def declared(path: Path) -> ConstructorOptions | None:
-        """Options of the model class in a file that is not run; None: not written there."""
-        try:
-            body = ast.parse(path.read_bytes()).body
-        except (OSError, SyntaxError, ValueError):
-            return None  # `import_model` reports what is wrong
-        classes = [each for each in body if isinstance(each, ast.ClassDef)]
-        methods = [{f.name: f for f in c.body if isinstance(f, ast.FunctionDef)} for c in classes]
-        found = [each for each in methods if "infer" in each]
-        if len(found) != 1 or "__init__" not in found[0]:
-            return None
-        given = found[0]["__init__"].args
-        plain = [each.arg for each in (*given.posonlyargs, *given.args)][1:]
-        first_default = len(plain) - len(given.defaults)
-        keywords = list(zip(given.kwonlyargs, given.kw_defaults, strict=True))
-        return ConstructorOptions(
-            (*plain, *(each.arg for each, _ in keywords)),
-            (*plain[:first_default], *(each.arg for each, default in keywords if default is None)),
-            given.kwarg is not None,
-        )
-
-    @property
-    def listed(self) -> str:
-        """Their names, as text."""
-        return ", ".join(self.names) or "none"
-
-    def check(self, given: Mapping[str, str], what: str) -> None:
-        """Compare with the options that are given.
-
-        Raises:
-            WorkerError: one is unknown, or a required one is missing.
-        """
-        missing = [name for name in self.required if name not in given]
-        for name in given:
-            known = name in self.names or (self.anything and not nearest(name, missing, ""))
-            if not known:
-                raise WorkerError(
-                    f"{what} has no option {name!r}{nearest(name, self.names)} "
-                    f"Its options: {self.listed}"
-                )
-        if missing:
-            raise WorkerError(
-                f"{what} needs the option {missing[0]!r}: give {missing[0]}=VALUE, with --set or "
-                f"in the profile's options. Its options: {self.listed}"
-            )
 
 
 def inspect_robot(path: Path, options: Mapping[str, str]) -> None:
@@ -324,36 +244,52 @@ def inspect_robot(path: Path, options: Mapping[str, str]) -> None:
     Raises:
         WorkerError: as `make_robot`.
     """
-    maker, name = _robot_class(path)
-    _options_of(maker).check(options, f"{path}: {name}")
-    if not all(callable(getattr(maker, method, None)) for method in ("read", "move")):
-        raise WorkerError(f"{path}: {name} needs methods `read()` and `move(command)`")
+    maker = _robot_maker(path)
+    maker.options.check(options, maker.where)
+    if not all(callable(getattr(maker.function, method, None)) for method in ("read", "move")):
+        raise WorkerError(f"{maker.where} {_IS_ROBOT}")
 
 
-def _robot_class(path: Path) -> tuple[Callable[..., Any], str]:
+_IS_ROBOT = "needs methods `read()` and `move(command)`"
+
+
+def _robot_maker(path: Path) -> _Maker:
     if not path.is_file():
         raise WorkerError(f"{path} is not a file; arm.file of the profile names it")
-    module = import_model(ModelFile(path.stem, path))
-    maker = _maker(module, path, "ROBOT", "move")
-    return maker, getattr(maker, "__name__", "ROBOT")
+    return _find_maker(ModelFile(path.stem, path), "ROBOT", "move")
 
 
-def _maker(module: ModuleType, path: Path, named: str, method: str) -> Callable[..., Any]:
-    maker = getattr(module, named, None) or _only_class(module, path, named, method)
-    if not callable(maker):
-        raise WorkerError(f"{path}: {named} must be a class, it is a {type(maker).__name__}")
-    return maker
+class _Maker(NamedTuple):
+    """A class or function of a file, with the options it takes."""
+
+    path: Path
+    name: str
+    function: Callable[..., Any]
+    options: _Options
+
+    @property
+    def where(self) -> str:
+        return f"{self.path}: {self.name}"
+
+    def make(self, options: Mapping[str, str]) -> Any:
+        self.options.check(options, self.where)
+        try:
+            return self.function(**options)
+        except (Exception, SystemExit) as error:
+            raise WorkerError(
+                f"{self.where} cannot be made: {in_words(error)} (its options: "
+                f"{self.options.listed})"
+            ) from error
 
 
-def _made(maker: Callable[..., Any], path: Path, name: str, options: Mapping[str, str]) -> Any:
-    taken = _options_of(maker)
-    taken.check(options, f"{path}: {name}")
-    try:
-        return maker(**options)
-    except (Exception, SystemExit) as error:
+def _find_maker(file: ModelFile, named: str, method: str) -> _Maker:
+    module = import_model(file)
+    function = getattr(module, named, None) or _only_class(module, file.path, named, method)
+    if not callable(function):
         raise WorkerError(
-            f"{path}: {name} cannot be made: {in_words(error)} (its options: {taken.listed})"
-        ) from error
+            f"{file.path}: {named} must be a class, it is a {type(function).__name__}"
+        )
+    return _Maker(file.path, getattr(function, "__name__", named), function, _options_of(function))
 
 
 def _only_class(module: ModuleType, path: Path, named: str, method: str) -> type:
@@ -371,3 +307,69 @@ def _only_class(module: ModuleType, path: Path, named: str, method: str) -> type
             f"name the right one with {named} = ClassName"
         )
     return candidates[0]
+
+
+# -- options --------------------------------------------------------------------------------------
+class _Options(NamedTuple):
+    """Keyword arguments of a constructor: all of them, those without a default, and whether it
+    takes any other name too."""
+
+    names: tuple[str, ...]
+    required: tuple[str, ...]
+    anything: bool
+
+    @property
+    def listed(self) -> str:
+        return ", ".join(self.names) or "none"
+
+    def check(self, given: Mapping[str, str], what: str) -> None:
+        missing = [name for name in self.required if name not in given]
+        for name in given:
+            known = name in self.names or (self.anything and not nearest(name, missing, ""))
+            if not known:
+                raise WorkerError(
+                    f"{what} has no option {name!r}{nearest(name, self.names)} "
+                    f"Its options: {self.listed}"
+                )
+        if missing:
+            raise WorkerError(
+                f"{what} needs the option {missing[0]!r}: give {missing[0]}=VALUE, with --set or "
+                f"in the profile's options. Its options: {self.listed}"
+            )
+
+
+def _options_of(maker: Callable[..., Any]) -> _Options:
+    try:
+        parameters = inspect.signature(maker).parameters.values()
+    except (TypeError, ValueError):  # written in C, without a signature
+        return _Options((), (), anything=True)
+    named = [
+        each for each in parameters if each.kind not in (each.VAR_KEYWORD, each.VAR_POSITIONAL)
+    ]
+    return _Options(
+        tuple(each.name for each in named),
+        tuple(each.name for each in named if each.default is each.empty),
+        any(each.kind is each.VAR_KEYWORD for each in parameters),
+    )
+
+
+def _declared_options(path: Path) -> _Options | None:
+    """Options of the model class in a file that is not run; None: not written there."""
+    try:
+        body = ast.parse(path.read_bytes()).body
+    except (OSError, SyntaxError, ValueError):
+        return None  # `import_model` reports what is wrong
+    classes = [each for each in body if isinstance(each, ast.ClassDef)]
+    methods = [{f.name: f for f in c.body if isinstance(f, ast.FunctionDef)} for c in classes]
+    found = [each for each in methods if "infer" in each]
+    if len(found) != 1 or "__init__" not in found[0]:
+        return None
+    given = found[0]["__init__"].args
+    plain = [each.arg for each in (*given.posonlyargs, *given.args)][1:]
+    first_default = len(plain) - len(given.defaults)
+    keywords = list(zip(given.kwonlyargs, given.kw_defaults, strict=True))
+    return _Options(
+        (*plain, *(each.arg for each, _ in keywords)),
+        (*plain[:first_default], *(each.arg for each, default in keywords if default is None)),
+        given.kwarg is not None,
+    )

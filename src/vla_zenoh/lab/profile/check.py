@@ -29,7 +29,7 @@ from vla_zenoh.lab.profile.robot_check import (
     simulator,
 )
 from vla_zenoh.policy import ModelSpec
-from vla_zenoh.policy.loader import ConstructorOptions, find_worker, make_policy
+from vla_zenoh.policy.loader import find_worker, make_policy
 from vla_zenoh.profile import Profile, load_with_lines
 from vla_zenoh.profile.section import located, own_place
 from vla_zenoh.profile.session import ends_at
@@ -122,9 +122,7 @@ def _workers(profile: Profile, name: str, host: str | None) -> Iterator[ProfileF
             place = ("options", worker)
         try:
             if model.missing():  # it gets an environment of its own, and is not made here
-                declared = ConstructorOptions.declared(model.path)
-                if declared is not None:
-                    declared.check(options, str(model.path))
+                model.check_options(options)
                 continue
             with contextlib.redirect_stdout(sys.stderr):  # a model's output is not the result
                 policy = make_policy(model, options, profile=name)
