@@ -10,10 +10,10 @@ from __future__ import annotations
 import hashlib
 import inspect
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
-from typing import Annotated, Any, Literal, NamedTuple, Protocol, runtime_checkable
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -53,7 +53,6 @@ GripperSemantics = Literal["none", "delta_m", "absolute_m", "open_fraction", "bi
 
 ROTATION_SIZE: Mapping[Rotation, int] = {"rpy": 3, "rotvec": 3, "quaternion": 4}
 
-
 MAX_CAMERAS = MAX_JOINTS = 16
 MAX_PARTS = 4
 
@@ -62,14 +61,6 @@ MAX_HISTORY, MAX_HISTORY_S = 16, 2.0
 
 STREAM_OF: Mapping[StatePart, StatePart] = {"wrench": "pose", "effort": "joint"}
 """Parts of the state that travel in the records of another one."""
-
-LATER_FIELDS: Mapping[str, Any] = {
-    "depth": (),
-    "history": 1,
-    "history_spacing_s": None,
-    "history_start": "repeat",
-}
-"""Fields of `ObservationSpec` that are written only where they differ from this."""
 
 Text = Annotated[str, Field(min_length=1, max_length=128)]
 
@@ -85,12 +76,27 @@ class _Spec(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
 
+    LATER: ClassVar[tuple[str, ...]] = ()
+    """Fields that are left out where they have their default, so that the hash and the wire form
+    of a model without them stay as they were."""
 
-def _check_size(width: int | None, height: int | None, resize: Resize) -> None:
-    if (width is None) != (height is None):
-        raise ValueError("give both width and height, or neither")
-    if resize != "none" and width is None:
-        raise ValueError(f"resize {resize!r} needs width and height")
+    @model_serializer(mode="wrap")
+    def _without_unused(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        fields = serialize(self)
+        for name in self.LATER:
+            if getattr(self, name) == type(self).model_fields[name].default:
+                fields.pop(name, None)
+        return fields
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> Self:
+        for why in self._faults():
+            raise ValueError(why)
+        return self
+
+    def _faults(self) -> Iterator[str]:
+        """Contradictions between fields, one sentence each."""
+        yield from ()
 
 
 def _no_joints(kind: Any) -> Any:
@@ -102,7 +108,20 @@ def _no_joints(kind: Any) -> Any:
     return kind
 
 
-class CameraSpec(_Spec):
+class _ImageSpec(_Spec):
+    camera: Text
+    width: int | None = Field(default=None, ge=8, le=8192)
+    height: int | None = Field(default=None, ge=8, le=8192)
+    resize: Resize = "none"
+
+    def _faults(self) -> Iterator[str]:
+        if (self.width is None) != (self.height is None):
+            yield "give both width and height, or neither"
+        if self.resize != "none" and self.width is None:
+            yield f"resize {self.resize!r} needs width and height"
+
+
+class CameraSpec(_ImageSpec):
     """One camera image in the model's observation.
 
     Args:
@@ -114,48 +133,32 @@ class CameraSpec(_Spec):
         colour: channel order the model is given.
     """
 
-    camera: Text
-    width: int | None = Field(default=None, ge=8, le=8192)
-    height: int | None = Field(default=None, ge=8, le=8192)
-    resize: Resize = "none"
     colour: Literal["rgb", "bgr"] = "rgb"
 
-    @model_validator(mode="after")
-    def _size_goes_with_resize(self) -> CameraSpec:
-        _check_size(self.width, self.height, self.resize)
-        return self
 
-
-class DepthSpec(_Spec):
+class DepthSpec(_ImageSpec):
     """One depth image in the model's observation: distances along the camera's optical axis.
 
     Args:
         camera: name of the camera in the profile, whose ``depth_unit_m`` is set.
-        width: pixels the model is given; None: as they come.
-        height: pixels the model is given; None: as they come.
-        resize: how other sizes become this one, as of colour; each pixel is the nearest one, no
-            mean, and padding is `invalid`.
+        width: as of colour.
+        height: as of colour.
+        resize: as of colour; each pixel is the nearest one, no mean, and padding is `invalid`.
         unit_m: metres of one count the model is given.
         near_m: nearer distances become `invalid`.
         far_m: further distances become `invalid`; None: no bound but that of 65535 counts.
         invalid: count of a pixel that was not measured.
     """
 
-    camera: Text
-    width: int | None = Field(default=None, ge=8, le=8192)
-    height: int | None = Field(default=None, ge=8, le=8192)
-    resize: Resize = "none"
     unit_m: float = Field(default=0.001, ge=MIN_DEPTH_UNIT_M, le=MAX_DEPTH_UNIT_M)
     near_m: float = Field(default=0.0, ge=0, le=1000)
     far_m: float | None = Field(default=None, gt=0, le=1000)
     invalid: Literal[0, 65535] = 0
 
-    @model_validator(mode="after")
-    def _size_goes_with_resize(self) -> DepthSpec:
-        _check_size(self.width, self.height, self.resize)
+    def _faults(self) -> Iterator[str]:
+        yield from super()._faults()
         if self.far_m is not None and self.far_m <= self.near_m:
-            raise ValueError(f"far_m ({self.far_m:g}) must be more than near_m ({self.near_m:g})")
-        return self
+            yield f"far_m ({self.far_m:g}) must be more than near_m ({self.near_m:g})"
 
 
 class ObservationSpec(_Spec):
@@ -177,6 +180,8 @@ class ObservationSpec(_Spec):
             (``repeat``), or nothing, and the model is not asked until there are n (``wait``).
     """
 
+    LATER = ("depth", "history", "history_spacing_s", "history_start")
+
     cameras: tuple[CameraSpec, ...] = Field(default=(), max_length=MAX_CAMERAS, strict=False)
     depth: tuple[DepthSpec, ...] = Field(default=(), max_length=MAX_CAMERAS, strict=False)
     state: Annotated[tuple[StatePart, ...], AfterValidator(_differ)] = Field(
@@ -189,20 +194,18 @@ class ObservationSpec(_Spec):
     history_spacing_s: float | None = Field(default=None, ge=0.01, le=MAX_HISTORY_S)
     history_start: Literal["repeat", "wait"] = "repeat"
 
-    @model_validator(mode="after")
-    def _history_has_a_spacing(self) -> ObservationSpec:
+    def _faults(self) -> Iterator[str]:
         if (self.history > 1) != (self.history_spacing_s is not None):
-            raise ValueError(
-                "history (more than 1) and history_spacing_s go together: give both, or neither"
-            )
+            yield "history (more than 1) and history_spacing_s go together: give both, or neither"
         if self.history_span_s > MAX_HISTORY_S + 1e-9:
-            raise ValueError(
+            yield (
                 f"{self.history} observations {self.history_spacing_s:g} s apart span "
                 f"{self.history_span_s:g} s, at most {MAX_HISTORY_S:g} s are kept"
             )
         if self.history > 1 and not (self.cameras or self.depth or self.state):
-            raise ValueError("a history needs cameras or state: name some")
-        return self
+            yield "a history needs cameras or state: name some"
+        _differ(tuple(camera.camera for camera in self.cameras))
+        _differ(tuple(camera.camera for camera in self.depth))
 
     @property
     def history_span_s(self) -> float:
@@ -213,22 +216,6 @@ class ObservationSpec(_Spec):
     def state_streams(self) -> tuple[StatePart, ...]:
         """Parts whose records hold all parts of the state."""
         return tuple(dict.fromkeys(STREAM_OF.get(part, part) for part in self.state))
-
-    @model_validator(mode="after")
-    def _one_picture_of_a_camera(self) -> ObservationSpec:
-        _differ(tuple(camera.camera for camera in self.cameras))
-        _differ(tuple(camera.camera for camera in self.depth))
-        return self
-
-    @model_serializer(mode="wrap")
-    def _senses_in_use(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        # So the hash and the wire form of a model without these stay as they are.
-        fields = serialize(self)
-        return {
-            name: value
-            for name, value in fields.items()
-            if name not in LATER_FIELDS or getattr(self, name) != LATER_FIELDS[name]
-        }
 
     @property
     def camera_names(self) -> tuple[str, ...]:
@@ -287,6 +274,8 @@ class ActionSpec(_Spec):
             `horizon` and `dt_s`, are then unused. See `of_parts`.
     """
 
+    LATER = ("parts",)
+
     horizon: int = Field(ge=1, le=1000)
     dt_s: float = Field(gt=0, le=60)
     kind: Annotated[MotionKind, BeforeValidator(_no_joints)] = "delta"
@@ -342,27 +331,6 @@ class ActionSpec(_Spec):
             begin += each.action.dimension
         return slice(0, self.dimension)
 
-    @model_serializer(mode="wrap")
-    def _without_no_parts(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leaves `parts` out if there are none, so that the hash of such a spec stays the same."""
-        plain = handler(self)
-        if not self.parts:
-            plain.pop("parts", None)
-        return plain
-
-    @model_validator(mode="after")
-    def _parts_go_together(self) -> ActionSpec:
-        _differ(tuple(each.part for each in self.parts))
-        for part, action in ((each.part, each.action) for each in self.parts):
-            if action.parts:
-                raise ValueError(f"part {part!r} has parts of its own; name all of them at the top")
-            if (action.horizon, action.dt_s) != (self.horizon, self.dt_s):
-                raise ValueError(
-                    f"part {part!r} has {action.horizon} steps of {action.dt_s:g} s, the chunk "
-                    f"{self.horizon} of {self.dt_s:g} s; all parts of a chunk have the same"
-                )
-        return self
-
     @property
     def arm_size(self) -> int:
         """Numbers of the arm in one step; that of the gripper follows."""
@@ -375,68 +343,58 @@ class ActionSpec(_Spec):
             return sum(each.action.dimension for each in self.parts)
         return self.arm_size + (self.gripper != "none")
 
-    @model_validator(mode="after")
-    def _joints_are_named(self) -> ActionSpec:
-        if self.space == "joint" and not self.joints:
-            raise ValueError(
-                "space 'joint' needs joints: the names of the arm's joints in column order"
-            )
-        if self.joints and self.space != "joint":
-            raise ValueError("joints are named, and space is 'tcp'; set space: joint")
-        return self
-
     @property
     def targets(self) -> bool:
         """Each step is a pose itself, not added to the steps before it."""
         return self.kind == "absolute" or self.relative_to == "start"
 
-    @model_validator(mode="after")
-    def _absolute_is_in_base(self) -> ActionSpec:
-        if self.space == "joint" and (self.frame != "base" or self.controller is not None):
-            raise ValueError("joints have no frame and no controller; leave out both")
-        if self.space == "joint" and self.position_scale_m != 1.0:
-            raise ValueError(
+    def _faults(self) -> Iterator[str]:
+        joint = self.space == "joint"
+        _differ(tuple(each.part for each in self.parts))
+        for part, action in ((each.part, each.action) for each in self.parts):
+            if action.parts:
+                yield f"part {part!r} has parts of its own; name all of them at the top"
+            if (action.horizon, action.dt_s) != (self.horizon, self.dt_s):
+                yield (
+                    f"part {part!r} has {action.horizon} steps of {action.dt_s:g} s, the chunk "
+                    f"{self.horizon} of {self.dt_s:g} s; all parts of a chunk have the same"
+                )
+        if joint and not self.joints:
+            yield "space 'joint' needs joints: the names of the arm's joints in column order"
+        if self.joints and not joint:
+            yield "joints are named, and space is 'tcp'; set space: joint"
+        if joint and (self.frame != "base" or self.controller is not None):
+            yield "joints have no frame and no controller; leave out both"
+        if joint and self.position_scale_m != 1.0:
+            yield (
                 "position_scale_m scales x, y and z, which joints have not; leave it out, and "
                 "give joints in rad (prismatic ones in m)"
             )
-        if self.kind != "absolute":
-            return self
-        if self.frame != "base":
-            raise ValueError("an absolute pose is given in the base frame; set frame: base")
-        if self.anchor != "goal" or self.relative_to != "previous":
-            raise ValueError(
+        if self.kind == "absolute" and self.frame != "base":
+            yield "an absolute pose is given in the base frame; set frame: base"
+        if self.kind == "absolute" and (self.anchor != "goal" or self.relative_to != "previous"):
+            yield (
                 "an absolute pose is added to nothing; leave out anchor and relative_to, or set "
                 "kind: delta"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _velocity_is_integrated(self) -> ActionSpec:
-        if self.kind != "velocity":
-            return self
-        if self.space == "tcp" and self.rotation != "rotvec":
-            raise ValueError("an angular velocity is a vector in rad/s; set rotation: rotvec")
-        if self.relative_to != "previous":
-            raise ValueError(
+        if self.kind == "velocity" and not joint and self.rotation != "rotvec":
+            yield "an angular velocity is a vector in rad/s; set rotation: rotvec"
+        if self.kind == "velocity" and self.relative_to != "previous":
+            yield (
                 "each velocity continues where the step before it ended; set relative_to: previous"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _controller_adds_to_its_own_state(self) -> ActionSpec:
         if self.controller is None:
-            return self
+            return
         if self.kind != "delta" or self.frame != "base" or self.relative_to != "previous":
-            raise ValueError(
+            yield (
                 "a controller covers deltas in the base frame, one after the other; set kind: "
                 "delta, frame: base, relative_to: previous, or leave out controller"
             )
         if self.anchor != "goal":
-            raise ValueError(
+            yield (
                 "a controller adds each delta to where its own response is, which the goal "
                 "follows; set anchor: goal"
             )
-        return self
 
 
 class PartAction(_Spec):
