@@ -26,6 +26,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from vla_zenoh.lab.demo.scripted_motions import parse_scripted
 from vla_zenoh.lab.policy_servers.model_options import number, whole_number
 from vla_zenoh.policy import (
     ActionSpec,
@@ -35,7 +36,6 @@ from vla_zenoh.policy import (
     Observation,
     ObservationSpec,
 )
-from vla_zenoh.policy.scripted_motions import parse_scripted
 
 ROUNDING = 1e-6
 """A smaller part of a step counts as none."""

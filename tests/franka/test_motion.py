@@ -14,7 +14,7 @@ from chain import command_line
 from franka_lab import REACHED_M, REACHED_RAD, Lab, running_lab
 
 from vla_zenoh.kinematics.so3 import pose_distance, pose_of
-from vla_zenoh.policy.scripted_motions import STEP_RAD
+from vla_zenoh.lab.demo.scripted_motions import STEP_RAD
 
 AGAIN_S = 30.0
 

@@ -15,7 +15,7 @@ import pytest
 from franka_lab import REACHED_M, REACHED_RAD, Lab, running_lab
 
 from vla_zenoh.kinematics.so3 import pose_distance, pose_of
-from vla_zenoh.policy.scripted_motions import HARD, STEP_M, STEP_RAD
+from vla_zenoh.lab.demo.scripted_motions import HARD, STEP_M, STEP_RAD
 
 DELAY = ("delay_ms=140", "jitter=0.3")
 PAIRS = (

@@ -18,7 +18,7 @@ from franka_lab import Lab, running_lab
 
 from vla_zenoh.errors import SessionError
 from vla_zenoh.guard.arm_guard import max_braking_time_s
-from vla_zenoh.policy.scripted_motions import HARD
+from vla_zenoh.lab.demo.scripted_motions import HARD
 
 STREAM_S = 60.0
 SETTLES_S = 0.6

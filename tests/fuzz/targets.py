@@ -31,6 +31,7 @@ from vla_zenoh.keys import Keys
 from vla_zenoh.lab.cli import inspect as cli_inspect
 from vla_zenoh.lab.cli import keys as cli_keys
 from vla_zenoh.lab.cli import net as cli_net
+from vla_zenoh.lab.demo.scripted_motions import parse_scripted
 from vla_zenoh.lab.evaluation.mcap_file import evaluate_run
 from vla_zenoh.lab.inference_views import InferenceView
 from vla_zenoh.lab.primitives.requests import decode_request
@@ -40,7 +41,6 @@ from vla_zenoh.lab.serve import mcp, openpi_frames
 from vla_zenoh.lab.tasks.wording import parse_prompt
 from vla_zenoh.policy import ActionSpec, ModelSpec, ObservationSpec
 from vla_zenoh.policy.loader import find_model, make_policy
-from vla_zenoh.policy.scripted_motions import parse_scripted
 from vla_zenoh.profile import load_profile
 from vla_zenoh.ros2 import attachment, readers
 from vla_zenoh.ros2.definitions import parse

@@ -17,7 +17,7 @@ import own_arm
 import pytest
 from chain import STILL_M_S, Chain, running_chain, write_profile
 
-from vla_zenoh.policy.scripted_motions import STEP_WIDTH_M
+from vla_zenoh.lab.demo.scripted_motions import STEP_WIDTH_M
 
 STEPS, STEP_M = 10, 0.01
 ON_ITS_WAY_M = 0.02

@@ -18,7 +18,7 @@ from ur_peer import NORMAL, PeerProcess
 
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.kinematics.so3 import pose_distance
-from vla_zenoh.policy.scripted_motions import STEP_M, STEP_RAD
+from vla_zenoh.lab.demo.scripted_motions import STEP_M, STEP_RAD
 
 REACHED_M, REACHED_RAD = 1e-3, 2e-3
 AGAIN_S = 30.0

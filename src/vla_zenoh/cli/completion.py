@@ -55,12 +55,10 @@ def cameras(context: Any) -> Iterable[str]:
 
 
 def prompts(context: Any) -> Iterable[str]:
-    """The profile's prompt, one task of every kind, and the motions of the scripted worker."""
-    from vla_zenoh.policy.scripted_motions import HARD
-
+    """The profile's prompt, one task of every kind, and some motions of the scripted worker."""
     tasks = ("put the red brick in the box", "stack the red brick on the green brick")
-    words = [_profile(context).task.prompt, *tasks, "push the red brick left", "hold"]
-    return [*words, *(f"HARD: {name}" for name in HARD)]
+    motions = ("HARD: go up", "HARD: go down", "HARD: yaw left", "HARD: close gripper", "hold")
+    return [_profile(context).task.prompt, *tasks, "push the red brick left", *motions]
 
 
 def keys(context: Any) -> Iterable[str]:

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from vla_zenoh.kinematics.so3 import Pose, log3
+from vla_zenoh.lab.demo.scripted_motions import ScriptedMotion, ScriptedPrompt, parse_scripted
 from vla_zenoh.lab.statistics import percentiles
-from vla_zenoh.policy.scripted_motions import ScriptedMotion, ScriptedPrompt, parse_scripted
 from vla_zenoh.types import LATENCY_STAGES, Cause, FloatArray
 
 TOUR: tuple[tuple[str, int], ...] = (

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from vla_zenoh.errors import SpecError
+from vla_zenoh.lab.demo.scripted_motions import ScriptedPrompt, parse_scripted
 from vla_zenoh.lab.evaluation.result import PromptSegment
 from vla_zenoh.lab.evaluation.trajectory import path_m, rotvecs, turned_rad
-from vla_zenoh.policy.scripted_motions import ScriptedPrompt, parse_scripted
 from vla_zenoh.types import FloatArray
 
 
