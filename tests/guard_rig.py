@@ -21,8 +21,13 @@ from ruckig import (
 
 from vla_zenoh.control.limits import JointMotionLimits
 from vla_zenoh.control.smoothing import Motion, Smoother, motion_limits
-from vla_zenoh.guard.joint_guard import JointGuard, joint_guard_limits, joint_motion_limits
-from vla_zenoh.guard.pose_guard import PoseGuard, guard_limits
+from vla_zenoh.guard.command_guards import (
+    JointGuard,
+    PoseGuard,
+    guard_limits,
+    joint_guard_limits,
+    joint_motion_limits,
+)
 from vla_zenoh.kinematics.so3 import Pose, exp3, log3, quat_from_rotation
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.types import FloatArray, Header, JointCommand, PoseCommand, Stamped

@@ -19,7 +19,7 @@ from vla_zenoh.bus import buffers as slots
 from vla_zenoh.bus.clock import Tick
 from vla_zenoh.codec import records
 from vla_zenoh.errors import NodeError
-from vla_zenoh.guard.joint_guard import joint_motion_limits
+from vla_zenoh.guard.command_guards import joint_motion_limits
 from vla_zenoh.guard.reference_governor import BRAKE_MARGIN
 from vla_zenoh.profile import load_profile
 from vla_zenoh.robots import python_driver

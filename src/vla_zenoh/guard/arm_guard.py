@@ -9,8 +9,13 @@ import numpy as np
 
 from vla_zenoh.control.smoothing import ROTATION_BOX
 from vla_zenoh.control.states import OBEYING
-from vla_zenoh.guard.joint_guard import JointGuard, joint_guard_limits, joint_motion_limits
-from vla_zenoh.guard.pose_guard import PoseGuard, guard_limits
+from vla_zenoh.guard.command_guards import (
+    JointGuard,
+    PoseGuard,
+    guard_limits,
+    joint_guard_limits,
+    joint_motion_limits,
+)
 from vla_zenoh.guard.reference_governor import BRAKE_MARGIN
 from vla_zenoh.guard.stream_guard import ACCELERATE_S
 from vla_zenoh.kinematics.so3 import Pose, pose_distance
@@ -37,13 +42,7 @@ Mode = Literal["pose", "joint"]
 
 
 class Measured(NamedTuple):
-    """Measured state of the arm.
-
-    Args:
-        pose: of the TCP.
-        position_rad: (n,).
-        velocity_rad_s: (n,).
-    """
+    """Measured state of the arm: pose of the TCP, and position and velocity (n,) of the joints."""
 
     pose: Pose
     position_rad: FloatArray
@@ -61,8 +60,7 @@ class ArmGuard:
     moves nothing.
 
     Args:
-        poses: guard of the pose stream.
-        joints: guard of the joint stream.
+        poses, joints: guards of the two streams.
         measure: reads the state of the arm.
         mode: the stream that holds the arm at first.
     """
@@ -74,18 +72,15 @@ class ArmGuard:
         measure: Callable[[], Measured],
         mode: Mode = "pose",
     ) -> None:
-        self._poses, self._joints = poses, joints
+        self._guards: dict[Mode, PoseGuard | JointGuard] = {"pose": poses, "joint": joints}
         self._measure = measure
         self._writer = self._state = ""
         self._unheeded_until_ns = self._now_ns = 0
         self.mode: Mode = mode
 
-    def _of(self, mode: Mode) -> PoseGuard | JointGuard:
-        return self._poses if mode == "pose" else self._joints
-
     @property
     def _active(self) -> PoseGuard | JointGuard:
-        return self._of(self.mode)
+        return self._guards[self.mode]
 
     @property
     def following(self) -> bool:
@@ -125,17 +120,15 @@ class ArmGuard:
     @property
     def silences(self) -> int:
         """Number of times a stream fell silent in motion."""
-        return self._poses.silences + self._joints.silences
+        return sum(guard.silences for guard in self._guards.values())
 
     @property
     def reference(self) -> PoseReference | JointReference:
         """The set-point now."""
-        if self.mode == "joint":
-            return self._joints.motion
-        motion = self._poses.motion
-        return PoseReference(
-            motion.pose.position_m, motion.pose.rotation, motion.twist, motion.acceleration
-        )
+        motion = self._active.motion
+        if isinstance(motion, JointReference):
+            return motion
+        return PoseReference(*motion.pose, motion.twist, motion.acceleration)
 
     def offer_pose(self, command: Stamped[PoseCommand], now_ns: int) -> str | None:
         """Accept a pose, or return the reason why it is rejected.
@@ -156,7 +149,7 @@ class ArmGuard:
         if not (self.following or self.braking or state in ACTIVE_STATES):
             # The end of a stream to a robot node that was restarted, or that had been silent.
             return "inactive"
-        reason = self._change(mode) or self._of(mode).offer(command, now_ns)
+        reason = self._change(mode) or self._guards[mode].offer(command, now_ns)
         if reason is None:
             self.mode, self._writer, self._state = mode, command.header.source, state
         elif reason in UNHEEDED and state in ACTIVE_STATES and not (self.following or self.braking):
@@ -172,7 +165,7 @@ class ArmGuard:
         measured = self._measure()
         if float(np.abs(measured.velocity_rad_s).max()) > STANDING_RAD_S:
             return "moving"
-        self._of(mode).anchor(measured.at(mode))
+        self._guards[mode].anchor(measured.at(mode))
         return None
 
     def tick(self, now_ns: int) -> PoseReference | JointReference:
@@ -187,8 +180,8 @@ class ArmGuard:
         Commands received before are still replays.
         """
         measured = self._measure()
-        self._poses.anchor(measured.pose)
-        self._joints.anchor(measured.position_rad)
+        for mode, guard in self._guards.items():
+            guard.anchor(measured.at(mode))
 
     def hold(self) -> None:
         """Follow no stream and hold the reference: the arm stopped there by itself."""
@@ -197,8 +190,8 @@ class ArmGuard:
     def reset(self) -> None:
         """Follow no stream, forget the last, and hold the measured place: the robot was reset."""
         measured = self._measure()
-        self._poses.reset(measured.pose)
-        self._joints.reset(measured.position_rad)
+        for mode, guard in self._guards.items():
+            guard.reset(measured.at(mode))
 
 
 def make_arm_guard(
@@ -210,7 +203,7 @@ def make_arm_guard(
     """Make the guard of a profile's robot; it holds the arm where it stands.
 
     Args:
-        profile: limits, timing, and the stream that holds the arm at first.
+        profile: of the robot.
         measure: reads the state of the arm.
         joint_range_rad: lower and upper ends of the joint ranges, (n,) each.
         dt_s: period of the controller.
@@ -239,7 +232,6 @@ class HeldReference:
 
     @property
     def held(self) -> bool:
-        """The controller holds the last command."""
         return self._sent_ns is not None
 
     def on_sent(self, now_ns: int) -> None:
@@ -271,14 +263,14 @@ def max_braking_time_s(profile: Profile) -> float:
     """
     if profile.robot.command == "joint":
         limits = joint_motion_limits(profile, BRAKE_MARGIN)
-        stops_s = [_stop_s(*map(float, axis), share=1.0) for axis in zip(*limits, strict=True)]
+        stops_s = [_stop_s(*axis, share=1.0) for axis in zip(*limits, strict=True)]
     else:
         brake = guard_limits(profile).brake
         stops_s = [
             _stop_s(*brake.translation, share=1.0),
             _stop_s(*brake.rotation, share=ROTATION_BOX),
         ]
-    return profile.timing.command_timeout_s + max(stops_s)
+    return profile.timing.command_timeout_s + float(max(stops_s))
 
 
 def _stop_s(velocity: float, acceleration: float, jerk: float, share: float) -> float:

@@ -15,16 +15,10 @@ MAX_SOURCES = 64
 
 
 class GripperGuard:
-    """Checks commands between the bus and a gripper.
+    """Checks commands between the bus and a gripper, and clamps them to the limits of its profile.
 
     Gripper commands are rare, so silence of their writer means nothing: a replay is rejected
-    however much later it comes.
-
-    Args:
-        profile: of the gripper; accepted commands are clamped to its limits.
-
-    Attributes:
-        bounded: number of commands that were clamped.
+    however much later it comes. `bounded` counts the commands that were clamped.
     """
 
     def __init__(self, profile: GripperProfile) -> None:
@@ -54,10 +48,7 @@ class GripperGuard:
             raise CodecError("stale", f"is {age_ns / 1e9:.1f} s old")
         if writer and not writer_active:
             raise CodecError("outlived", "its source has been stopped")
-        return self._clamped(order.record)
-
-    def _clamped(self, command: GripperCommand) -> GripperCommand:
-        limits = self._profile
+        command, limits = order.record, self._profile
         clamped = GripperCommand(
             min(command.width_m, limits.max_width_m),
             min(command.speed_m_s, limits.speed_m_s),

@@ -74,36 +74,25 @@ class GovernedPath(NamedTuple):
 
 
 class Space(Protocol[Reference]):
-    """Space of references; a `way` (n,) is the offset of one from another."""
+    """Space of references; a `way` (n,) is the offset of one from another.
 
-    def rest(self, motion: Reference) -> Reference:
-        """At rest at the place of `motion`."""
-        ...
+    ``rest`` is at rest at the place of a motion; ``speed`` its rate and change, with value zero;
+    ``beside`` the motion at the offset `way` from `base`, with its exact rate and change; ``apart``
+    the inverse of that; ``sizes``, from shares (..., n) of the limits, those that count per axis.
+    """
 
-    def speed(self, motion: Reference) -> GovernedPath:
-        """Rate and change of a motion; its value is zero."""
-        ...
-
-    def beside(self, base: Reference, way: GovernedPath) -> Reference:
-        """The motion at the offset `way` from `base`, with its exact rate and change."""
-        ...
-
-    def apart(self, motion: Reference, base: Reference) -> GovernedPath:
-        """The offset of `motion` from `base`: the inverse of `beside`."""
-        ...
-
-    def sizes(self, shares: FloatArray) -> FloatArray:
-        """From shares (..., n) of the limits, those that count for each axis."""
-        ...
+    def rest(self, motion: Reference) -> Reference: ...
+    def speed(self, motion: Reference) -> GovernedPath: ...
+    def beside(self, base: Reference, way: GovernedPath) -> Reference: ...
+    def apart(self, motion: Reference, base: Reference) -> GovernedPath: ...
+    def sizes(self, shares: FloatArray) -> FloatArray: ...
 
 
 class GovernorLimits(NamedTuple):
-    """Limits of the reference, (n,) each.
+    """Limits of the reference per axis, (n,) each.
 
     Args:
-        velocity: per axis.
-        acceleration: per axis.
-        jerk: per axis.
+        velocity, acceleration, jerk: of the axis.
         axis: share that one axis may use in a stop, where the limits bound a norm.
         beside: share in a difference, which also rotates with the commanded path.
     """
@@ -212,7 +201,7 @@ class ReferenceGovernor(Generic[Reference]):
             at = on if self._way is None else space.beside(on, self._way)
             self._way, self._planned, self._stopping = space.apart(at, target), False, False
         self.target = target
-        self.motion = target if self._way is None else space.beside(target, self._way)
+        self.motion = self._beside_target()
 
     def rest(self) -> None:
         """Advance by a tick without a command: to the last set-point, or to the end of a stop."""
@@ -224,9 +213,7 @@ class ReferenceGovernor(Generic[Reference]):
             self._stands = self._way is None and not moved
             return
         self._advance()
-        self.motion = (
-            self.target if self._way is None else self._space.beside(self.target, self._way)
-        )
+        self.motion = self._beside_target()
 
     def stop(self) -> None:
         """Brake to rest as fast as the limits allow, each axis by itself."""
@@ -237,6 +224,9 @@ class ReferenceGovernor(Generic[Reference]):
         if not self._planned:  # nothing to stop, or no plan: stand at once
             self.put(self.motion)
 
+    def _beside_target(self) -> Reference:
+        return self.target if self._way is None else self._space.beside(self.target, self._way)
+
     # -- commanded path -----------------------------------------------------------------------
     def _share_of(self, target: Reference) -> FloatArray:
         """The jerk (n,) that leads to `target`, as shares of its limit, at most 1."""
@@ -246,10 +236,9 @@ class ReferenceGovernor(Generic[Reference]):
         return share if self._cramped is None else np.where(self._cramped, 0.0, share)
 
     def _went_on(self, target: Reference) -> tuple[Reference, FloatArray]:
-        """The set-point of the last tick, continued with the jerk that leads nearest to `target`.
+        """The last set-point, continued with the jerk that leads nearest to `target`.
 
-        Returns:
-            The continued set-point, and the jerk (n,) as shares of its limit.
+        The second result is that jerk (n,), as shares of its limit.
         """
         space, dt_s, share = self._space, self._dt_s, self._share_of(target)
         _, rate, change = space.speed(self.target)
@@ -270,9 +259,7 @@ class ReferenceGovernor(Generic[Reference]):
     def _advance(self, target: Reference | None = None, share: FloatArray | None = None) -> None:
         """Advance the difference by a tick.
 
-        Args:
-            target: commanded set-point at its end; None: there is none.
-            share: (n,) of the jerk that the commanded path uses meanwhile.
+        At its end the set-point `target` is commanded, if any, with this `share` (n,) of the jerk.
         """
         if self._way is None:
             return

@@ -1,8 +1,8 @@
 """Guard of a command stream on the robot's side, whatever its set-points are.
 
-`vla_zenoh.guard.pose_guard` and `vla_zenoh.guard.joint_guard` say how poses and joint positions
-are checked. Everything else is the same for both and stands here: which samples are accepted, what
-the arm does between two of them, and how it brakes when the stream falls silent in motion.
+`vla_zenoh.guard.command_guards` says how poses and joint positions are checked. Everything else is
+the same for both and stands here: which samples are accepted, what the arm does between two of
+them, and how it brakes when the stream falls silent in motion.
 """
 
 from __future__ import annotations
@@ -40,8 +40,7 @@ Command = TypeVar("Command")
 class CommandStream(Generic[Command]):
     """Commands of one writer at a time, on the clock of the receiver.
 
-    Args:
-        timeout_s: silence after which the stream has ended.
+    The stream has ended when it is silent for `timeout_s`.
     """
 
     def __init__(self, timeout_s: float) -> None:
@@ -97,11 +96,10 @@ class CommandStream(Generic[Command]):
         has_new, self._has_new, self._ticked_ns = self._has_new, False, now_ns
         return has_new or abs(late_s) > 0.5 * dt_s
 
-    def live(self, now_ns: int) -> Command | None:
-        """The newest command, None if there is none or the stream has timed out."""
-        if self.newest is None or now_ns - self.newest.received_ns > self._timeout_s * 1e9:
-            return None
-        return self.newest.record
+    def live(self, now_ns: int) -> bool:
+        """Whether there is a command, and the stream has not timed out."""
+        newest = self.newest
+        return newest is not None and now_ns - newest.received_ns <= self._timeout_s * 1e9
 
     def ahead_s(self, now_ns: int) -> float:
         """How far `now_ns` is past the time the newest command is meant for.
@@ -220,7 +218,7 @@ class StreamGuard(ABC, Generic[Reference]):
 
     Attributes:
         braking: the stream fell silent in motion, and the reference still moves.
-        silences: number of times a stream fell silent in motion.
+        silences: how often that happened.
     """
 
     def __init__(
@@ -295,15 +293,14 @@ class StreamGuard(ABC, Generic[Reference]):
             further reason of the subclass.
         """
         objection = self._stream.objection(command.header, command.received_ns)
-        if objection is None and self.braking:
-            return "braking"
-        if objection is not None:
-            return objection
+        if objection is not None or self.braking:
+            return objection or "braking"
         motion = self._admit(command.record)
         if isinstance(motion, str):
             return motion
-        before, gap_s = self._stream.newest, 0.0
+        before = self._stream.newest
         self._stream.take(Stamped(command.header, motion, command.received_ns))
+        gap_s = 0.0
         if before is not None:
             gap_s = (command.header.stamp_wall_ns - before.header.stamp_wall_ns) / 1e9
         self._extrapolation = Extrapolation(
@@ -314,7 +311,7 @@ class StreamGuard(ABC, Generic[Reference]):
     def tick(self, now_ns: int) -> Reference:
         """The reference to follow at `now_ns`."""
         governor = self._governor
-        if self._stream.live(now_ns) is not None and self._extrapolation is not None:
+        if self._stream.live(now_ns) and self._extrapolation is not None:
             steady = not self._stream.may_step(now_ns, self._dt_s)
             governor.follow(self._extrapolation.at(self._stream.ahead_s(now_ns)), steady=steady)
             return governor.motion

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from vla_zenoh.guard.arm_guard import STANDING_RAD_S, UNHEEDED_NS, ArmGuard, Measured, Mode
-from vla_zenoh.guard.joint_guard import JointGuard, joint_guard_limits
-from vla_zenoh.guard.pose_guard import PoseGuard, guard_limits
+from vla_zenoh.guard.command_guards import JointGuard, PoseGuard, guard_limits, joint_guard_limits
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import Header, JointCommand, PoseCommand, Stamped

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from vla_zenoh.control.smoothing import Motion, Smoother
 from vla_zenoh.guard.arm_guard import max_braking_time_s
-from vla_zenoh.guard.joint_guard import joint_motion_limits
-from vla_zenoh.guard.pose_guard import guard_limits
+from vla_zenoh.guard.command_guards import guard_limits, joint_motion_limits
 from vla_zenoh.guard.reference_governor import BRAKE_MARGIN
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import Profile, load_profile, override

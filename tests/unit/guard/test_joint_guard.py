@@ -10,7 +10,7 @@ import pytest
 from guard_rig import stop_from
 
 from vla_zenoh.control.limits import JointMotionLimits
-from vla_zenoh.guard.joint_guard import (
+from vla_zenoh.guard.command_guards import (
     JointGuard,
     JointGuardLimits,
     joint_guard_limits,

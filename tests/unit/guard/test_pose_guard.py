@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vla_zenoh.control.smoothing import MotionLimits, Smoother, motion_limits
-from vla_zenoh.guard.pose_guard import GuardLimits, PoseGuard, guard_limits
+from vla_zenoh.guard.command_guards import GuardLimits, PoseGuard, guard_limits
 from vla_zenoh.kinematics.so3 import Pose, angle_between, exp3, norm3, quat_from_rotation
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import Header, PoseCommand, Stamped

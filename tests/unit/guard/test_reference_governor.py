@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vla_zenoh.control.smoothing import Motion, MotionLimits
-from vla_zenoh.guard.joint_guard import JointSpace
-from vla_zenoh.guard.pose_guard import GuardLimits, PoseGuard, PoseSpace
+from vla_zenoh.guard.command_guards import GuardLimits, JointSpace, PoseGuard, PoseSpace
 from vla_zenoh.guard.reference_governor import BRAKE_MARGIN, GovernorLimits, ReferenceGovernor
 from vla_zenoh.kinematics.so3 import Pose, angle_between, exp3
 from vla_zenoh.types import FloatArray, Header, PoseCommand, Stamped
