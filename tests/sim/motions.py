@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import pinocchio as pin
 
-from vla_zenoh.simulation.cartesian_impedance import ImpedanceGains
+from vla_zenoh.simulation.impedance import ImpedanceGains
 from vla_zenoh.simulation.robot_model import RobotModel
 from vla_zenoh.simulation.world import STEP_S, World
 from vla_zenoh.types.commands import PoseReference

@@ -22,7 +22,7 @@ from vla_zenoh.policy import (
 )
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import load_profile
-from vla_zenoh.simulation.cartesian_impedance import ImpedanceGains
+from vla_zenoh.simulation.impedance import ImpedanceGains
 from vla_zenoh.simulation.world import World
 from vla_zenoh.types.commands import PoseReference
 

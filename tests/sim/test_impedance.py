@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from motions import circle, follow, line, make_world, still, wait
 
-from vla_zenoh.simulation.cartesian_impedance import ImpedanceGains
+from vla_zenoh.simulation.impedance import ImpedanceGains
 from vla_zenoh.simulation.scene import STEP_S
 
 FOLLOW_LIMIT_M = 1e-3

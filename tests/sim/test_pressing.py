@@ -15,7 +15,8 @@ import pytest
 
 from vla_zenoh.kinematics.so3 import norm3
 from vla_zenoh.profile import load_profile
-from vla_zenoh.simulation.world import WRENCH_FILTER_S, World, build_world
+from vla_zenoh.simulation.simulated_robot import WRENCH_FILTER_S
+from vla_zenoh.simulation.world import World, build_world
 
 LASTING_N = 5.0
 HELD_N, WEIGHT_N = 5.0, 0.5

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
+import mujoco
 import numpy as np
 from camera_rig import PATIENCE_S, Rig, await_match, camera_rig, until
 from depth_rig import Looker, looking
@@ -16,8 +17,8 @@ from vla_zenoh.lab.recording.reader import open_recording
 from vla_zenoh.lab.recording.recorder import Recorder
 from vla_zenoh.lab.recording.run import depths
 from vla_zenoh.profile.schema import CameraProfile
-from vla_zenoh.simulation.render import Renderer, choose_backend
 from vla_zenoh.simulation.robot_model import robot_model
+from vla_zenoh.simulation.scene import build_model
 from vla_zenoh.simulation.world import build_world
 from vla_zenoh.types import Depth, Header, SceneState
 
@@ -51,10 +52,11 @@ def assert_plane(rig: Rig, depth: Depth) -> None:
     """The table top in a depth picture, by the intrinsics that the camera tells."""
     told = [one.detail["cameras"] for one in rig.statuses if "cameras" in one.detail]
     seen = told[-1]["front"]["intrinsics"]
-    with Renderer(
-        rig.profile.sim.scene, robot_model(rig.profile.robot), choose_backend("raycast")
-    ) as scene:
-        position_m, axes, _ = scene.view("front")
+    model = build_model(rig.profile.sim.scene, robot_model(rig.profile.robot))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    camera = data.camera("front")
+    position_m, axes = camera.xpos, camera.xmat.reshape(3, 3)
     rows, columns = np.indices(depth.counts.shape)
     x = (columns + 0.5 - seen["cx_px"]) / seen["fx_px"]
     y = (rows + 0.5 - seen["cy_px"]) / seen["fy_px"]

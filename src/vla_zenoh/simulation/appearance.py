@@ -34,8 +34,7 @@ class Appearance(NamedTuple):
     """Differences from the scene file, of which a reset applies those that are varied.
 
     Args:
-        ambient: (3,) ambient colour of the head light.
-        head: (3,) diffuse colour of the head light.
+        ambient, head: (3,) ambient and diffuse colour of the head light.
         key: (3,) diffuse colour of the scene's light.
         key_turn_rad: rotation vector (3,) of the direction of that light, world frame.
         table: (3,) colour of the table.
@@ -74,11 +73,7 @@ def check_variations(vary: Collection[str]) -> None:
 
 
 class AppearanceSwitcher:
-    """Applies appearances to one model, each in place of the last.
-
-    Args:
-        model: a compiled scene; it is modified.
-    """
+    """Applies appearances to a compiled scene, which it modifies, each in place of the last."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         self._model = model

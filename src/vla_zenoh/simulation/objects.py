@@ -45,12 +45,7 @@ class Region(NamedTuple):
 
 
 class SimulatedObjects:
-    """Every object of a model that can be placed: free bodies and mocap bodies.
-
-    Args:
-        model: the scene.
-        data: its state.
-    """
+    """Every object of a model that can be placed, see `objects_of`."""
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         self._model, self._data = model, data

@@ -32,9 +32,6 @@ PROBE_SCENE = """
 class OpenGlCanvas:
     """Off-screen OpenGL context of one model; use it from the thread that made it.
 
-    Args:
-        model: the scene.
-
     Raises:
         NodeError: OpenGL does not work this way here.
     """

@@ -13,7 +13,7 @@ Lighting is that of MuJoCo's OpenGL without shadows, textures and specular highl
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import mujoco
@@ -63,11 +63,7 @@ class Viewpoint(NamedTuple):
 
 
 class RaycastCanvas:
-    """Renders one model, whose geoms `build_model` has sorted into groups, by ray casting.
-
-    Args:
-        model: the scene.
-    """
+    """Renders one model, whose geoms `build_model` has sorted into groups, by ray casting."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         self._model = model
@@ -129,47 +125,41 @@ class RaycastCanvas:
         seen = (hits.geom >= 0) & (hits.distance < background.distance[rows, columns])
         image, distance = background.rgb.copy(), background.distance.copy()
         front = Hits(hits.geom[seen], hits.distance[seen], hits.normal[seen])
-        image[rows[seen], columns[seen]] = self._shade(data, view, rays[seen], front)
-        distance[rows[seen], columns[seen]] = front.distance
+        pixels = rows[seen], columns[seen]
+        image[pixels] = self._shade(data, view, rays[seen], front)
+        distance[pixels] = front.distance
         return Background(image, distance)
 
-    def _coarse_to_fine(self, data: mujoco.MjData, view: Viewpoint) -> Pixels:
-        groups = {STATIC_GROUP, MOVING_GROUP}
+    def _cast_grid(
+        self, data: mujoco.MjData, view: Viewpoint, cosine: float
+    ) -> tuple[FloatArray, Hits, NDArray[np.bool_]]:
+        """Rays of the coarse grid, their hits, and the pixels (height, width) to cast in full."""
         coarse = self._directions(view, GRID_PX)
-        grid = coarse.shape[:2]
-        hits = self._cast(data, view, coarse.reshape(-1, 3), groups)
-        colour = self._shade(data, view, coarse.reshape(-1, 3), hits).reshape(*grid, 3)
-        smooth = _smooth_cells(hits.geom.reshape(grid), hits.normal.reshape(*grid, 3))
-
-        size, scale = (view.width, view.height), 1.0 / GRID_PX
-        image = cv2.warpAffine(
-            colour,
-            np.array([[scale, 0.0, 0.0], [0.0, scale, 0.0]]),
-            size,
-            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        hits = self._cast(data, view, coarse.reshape(-1, 3), {STATIC_GROUP, MOVING_GROUP})
+        smooth = _smooth_cells(
+            hits.geom.reshape(coarse.shape[:2]), hits.normal.reshape(coarse.shape), cosine
         )
         rough = np.kron(~smooth, np.ones((GRID_PX, GRID_PX), dtype=bool))
-        rows, columns = np.nonzero(rough[: view.height, : view.width])
-        rays = self._directions(view)[rows, columns]
-        fine = self._cast(data, view, rays, groups)
-        image[rows, columns] = self._shade(data, view, rays, fine)
+        return coarse, hits, rough[: view.height, : view.width]
+
+    def _coarse_to_fine(self, data: mujoco.MjData, view: Viewpoint) -> Pixels:
+        coarse, hits, rough = self._cast_grid(data, view, SMOOTH_COSINE)
+        colour = self._shade(data, view, coarse.reshape(-1, 3), hits).reshape(coarse.shape)
+        image = _between(colour, view)
+        rays = self._directions(view)[rough]
+        fine = self._cast(data, view, rays, {STATIC_GROUP, MOVING_GROUP})
+        image[rough] = self._shade(data, view, rays, fine)
         return np.asarray(image, np.uint8)
 
     def _depth_coarse_to_fine(self, data: mujoco.MjData, view: Viewpoint) -> FloatArray:
-        groups = {STATIC_GROUP, MOVING_GROUP}
-        coarse = self._directions(view, GRID_PX)
-        grid = coarse.shape[:2]
-        hits = self._cast(data, view, coarse.reshape(-1, 3), groups)
-        flat = _smooth_cells(hits.geom.reshape(grid), hits.normal.reshape(*grid, 3), FLAT_COSINE)
+        coarse, hits, rough = self._cast_grid(data, view, FLAT_COSINE)
         # One over the depth of a plane is linear in the image: nothing is lost between the rays.
         inverse = np.where(hits.geom < 0, 0.0, 1.0 / np.where(hits.geom < 0, 1.0, hits.distance))
-        inverse = _between(inverse.reshape(grid))[: view.height, : view.width]
-        rough = np.kron(~flat, np.ones((GRID_PX, GRID_PX), dtype=bool))
-        rows, columns = np.nonzero(rough[: view.height, : view.width])
-        fine = self._cast(data, view, self._directions(view)[rows, columns], groups)
         with np.errstate(divide="ignore"):
-            depth_m = 1.0 / inverse
-        depth_m[rows, columns] = np.where(fine.geom < 0, np.inf, fine.distance)
+            depth_m = 1.0 / _between(inverse.reshape(coarse.shape[:2]), view)
+        rays = self._directions(view)[rough]
+        fine = self._cast(data, view, rays, {STATIC_GROUP, MOVING_GROUP})
+        depth_m[rough] = np.where(fine.geom < 0, np.inf, fine.distance)
         return depth_m
 
     def _directions(self, view: Viewpoint, step_px: int = 1) -> FloatArray:
@@ -265,18 +255,17 @@ def _outline(model: mujoco.MjModel, geom: int) -> FloatArray:
     return box_corners(model, geom)
 
 
-def _between(grid: FloatArray) -> FloatArray:
+def _between(grid: NDArray[Any], view: Viewpoint) -> NDArray[Any]:
     """Values at every pixel, linear between those of a grid of every `GRID_PX`-th one."""
-    share = np.arange(GRID_PX) / GRID_PX
-    rows = grid[:-1, None] * (1.0 - share[:, None]) + grid[1:, None] * share[:, None]
-    rows = rows.reshape(-1, grid.shape[1])
-    columns = rows[:, :-1, None] * (1.0 - share) + rows[:, 1:, None] * share
-    return columns.reshape(len(rows), -1)
+    return cv2.warpAffine(
+        grid,
+        np.array([[1.0 / GRID_PX, 0.0, 0.0], [0.0, 1.0 / GRID_PX, 0.0]]),
+        (view.width, view.height),
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+    )
 
 
-def _smooth_cells(
-    geom: NDArray[np.int32], normal: FloatArray, cosine: float = SMOOTH_COSINE
-) -> NDArray[np.bool_]:
+def _smooth_cells(geom: NDArray[np.int32], normal: FloatArray, cosine: float) -> NDArray[np.bool_]:
     """Cells of a grid of rays whose corners lie on one geom without an edge between them."""
     first = (slice(None, -1), slice(None, -1))
     smooth = np.ones((geom.shape[0] - 1, geom.shape[1] - 1), dtype=bool)

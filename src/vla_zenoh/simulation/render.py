@@ -16,20 +16,12 @@ import subprocess
 import sys
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from types import TracebackType
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.errors import NodeError, ResourceError
 from vla_zenoh.simulation.robot_model import RobotModel
-
-if TYPE_CHECKING:
-    import mujoco
-
-    from vla_zenoh.simulation.opengl import OpenGlCanvas
-    from vla_zenoh.simulation.raycast import RaycastCanvas
 
 VARIABLE = "VLA_ZENOH_RENDERER"
 EGL, RAYCAST = "egl", "raycast"
@@ -134,7 +126,11 @@ class Renderer:
 
         self._model = build_model(scene, robot)
         self._data = mujoco.MjData(self._model)
-        self._canvas = _canvas(self.backend.name, self._model)
+        if self.backend.name == RAYCAST:
+            from vla_zenoh.simulation.raycast import RaycastCanvas as Canvas
+        else:
+            from vla_zenoh.simulation.opengl import OpenGlCanvas as Canvas
+        self._canvas = Canvas(self._model)
         self._appearance = AppearanceSwitcher(self._model)
         self._update()
 
@@ -172,11 +168,6 @@ class Renderer:
         """
         return self._canvas.draw(self._data, self._known(camera), width, height)
 
-    def _known(self, camera: str) -> str:
-        if camera not in self.cameras:
-            raise ResourceError(f"no camera {camera!r}; there are: {', '.join(self.cameras)}")
-        return camera
-
     def render_depth(self, camera: str, width: int, height: int) -> NDArray[np.float64]:
         """Distance along the optical axis of `camera` in m, (height, width); infinite where
         nothing is.
@@ -195,15 +186,10 @@ class Renderer:
         fovy_rad = np.radians(self._model.cam_fovy[self._model.camera(self._known(camera)).id])
         return float(height / 2.0 / np.tan(fovy_rad / 2.0))
 
-    def view(self, camera: str) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-        """Camera pose: position (3,) m, axes (3, 3) in columns; and vertical field of view in rad.
-
-        The axes are MuJoCo's: x to the right, y up, looking along -z.
-        """
-        index = self._model.camera(camera).id
-        axes = self._data.cam_xmat[index].reshape(3, 3).copy()
-        fovy_rad = float(np.radians(self._model.cam_fovy[index]))
-        return self._data.cam_xpos[index].copy(), axes, fovy_rad
+    def _known(self, camera: str) -> str:
+        if camera not in self.cameras:
+            raise ResourceError(f"no camera {camera!r}; there are: {', '.join(self.cameras)}")
+        return camera
 
     def close(self) -> None:
         """Free the graphics context."""
@@ -212,12 +198,7 @@ class Renderer:
     def __enter__(self) -> Renderer:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _update(self) -> None:
@@ -226,13 +207,3 @@ class Renderer:
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_comPos(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
-
-
-def _canvas(name: str, model: mujoco.MjModel) -> OpenGlCanvas | RaycastCanvas:
-    if name == RAYCAST:
-        from vla_zenoh.simulation.raycast import RaycastCanvas
-
-        return RaycastCanvas(model)
-    from vla_zenoh.simulation.opengl import OpenGlCanvas
-
-    return OpenGlCanvas(model)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 from vla_zenoh.profile import Profile, RobotProfile
 
@@ -14,13 +14,8 @@ Vector3 = tuple[float, float, float]
 class MountedCamera:
     """A camera fixed to a link of the robot, described in that link's frame.
 
-    Args:
-        name: the camera's name.
-        link: the link that carries it.
-        position_m: (3,) of the lens.
-        look_at_m: (3,) a point on the optical axis.
-        up: (3,) direction that is up in the image.
-        fovy_rad: vertical field of view.
+    The optical axis goes through `look_at_m`, the vertical field of view is `fovy_rad`, and `up` in
+    the image is this direction.
     """
 
     name: str
@@ -35,15 +30,9 @@ class MountedCamera:
 class JointGains:
     """Gains of the joint impedance controller, per joint from the base outwards.
 
-    By default it follows within a milliradian; a blocked joint exerts at most 40 Nm. A longer arm
-    repeats the last number, a shorter one ignores the surplus.
-
-    Args:
-        stiffness_nm_rad: K.
-        damping_ratio: zeta, 1 is critical.
-        integral_1_s: ki, 0 switches integral action off.
-        max_integral_nm: bound of the integral torque.
-        max_error_rad: largest stretch of the spring, which bounds the torque of a blocked joint.
+    By default it follows within a milliradian; a blocked joint exerts at most 40 Nm, at the stretch
+    `max_error_rad` of its spring. A longer arm repeats the last number, a shorter one ignores the
+    surplus. See `ImpedanceGains` for the other fields.
     """
 
     stiffness_nm_rad: tuple[float, ...] = (600.0, 600.0, 600.0, 600.0, 250.0, 150.0, 50.0)
@@ -54,17 +43,14 @@ class JointGains:
 
 
 PANDA_GAINS = JointGains()
-
-
-def _panda_wrist() -> MountedCamera:
-    return MountedCamera(
-        name="wrist",
-        link="panda_hand",
-        position_m=(0.085, 0.0, 0.03),
-        look_at_m=(0.02, 0.0, 0.13),
-        up=(1.0, 0.0, 0.0),
-        fovy_rad=1.2,
-    )
+PANDA_WRIST = MountedCamera(
+    name="wrist",
+    link="panda_hand",
+    position_m=(0.085, 0.0, 0.03),
+    look_at_m=(0.02, 0.0, 0.13),
+    up=(1.0, 0.0, 0.0),
+    fovy_rad=1.2,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,14 +74,12 @@ class RobotModel:
         finger_links: links whose geoms touch the object.
         tcp_link: link whose frame is the TCP.
         camera: the camera mounted on the robot, or None.
-        gripper_stiffness_n_m: of the width servo; the force bound of a command caps it.
-        gripper_damping_ns_m: of the width servo.
+        gripper_stiffness_n_m, gripper_damping_ns_m: of the width servo; the force bound of a
+            command caps it.
         pad_friction: sliding, torsional, rolling friction of the fingers.
-        colours: rgba of links by name.
-        colour: rgba of every other link.
+        colours, colour: rgba of links by name, and of every other link.
         part: which part of a robot it is; empty: all of it.
-        base_m: (3,) where it stands in the world.
-        base_yaw_rad: its turn about the vertical.
+        base_m, base_yaw_rad: where it stands in the world, and its turn about the vertical.
     """
 
     description: str = "example-robot-data:panda_description/urdf/panda.urdf"
@@ -109,7 +93,7 @@ class RobotModel:
     max_width_m: float = 0.08
     finger_links: tuple[str, ...] = ("panda_leftfinger", "panda_rightfinger")
     tcp_link: str = "panda_hand_tcp"
-    camera: MountedCamera | None = field(default_factory=_panda_wrist)
+    camera: MountedCamera | None = PANDA_WRIST
     gripper_stiffness_n_m: float = 4000.0
     gripper_damping_ns_m: float = 25.0
     pad_friction: Vector3 = (1.5, 0.02, 0.001)
@@ -124,11 +108,6 @@ class RobotModel:
     part: str = ""
     base_m: Vector3 = (0.0, 0.0, 0.0)
     base_yaw_rad: float = 0.0
-
-    @property
-    def at_origin(self) -> bool:
-        """Its base frame is the world frame."""
-        return not any(self.base_m) and not self.base_yaw_rad
 
 
 SO101 = RobotModel(

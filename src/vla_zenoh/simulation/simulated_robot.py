@@ -1,17 +1,28 @@
-"""The robot as MuJoCo simulates it: arm state for a torque controller, and a parallel gripper."""
+"""One arm as MuJoCo simulates it, under impedance control, and its gripper."""
 
 from __future__ import annotations
+
+import math
+from collections.abc import Callable
 
 import mujoco
 import numpy as np
 
-from vla_zenoh.errors import RecordError, ResourceError
+from vla_zenoh.errors import NodeError, RecordError, ResourceError
 from vla_zenoh.kinematics.so3 import rotation_from_rpy
-from vla_zenoh.simulation.cartesian_impedance import ArmDynamics
+from vla_zenoh.simulation.impedance import (
+    ArmDynamics,
+    CartesianImpedance,
+    ImpedanceGains,
+    JointImpedance,
+)
 from vla_zenoh.simulation.robot_model import RobotModel
 from vla_zenoh.simulation.scene import GRIPPER, STEP_S, TCP_SITE, prefix_of
-from vla_zenoh.types import FloatArray, GripperState
+from vla_zenoh.types import FloatArray, GripperState, JointState, PoseState
+from vla_zenoh.types.commands import JointReference, PoseReference
 
+WRENCH_FILTER_S = 0.01
+"""Time constant of the reported wrench: a robot's own estimate is filtered too."""
 AT_REST_M_S = 2e-3
 AT_REST_TICKS = 50  # milliseconds of standstill before the gripper reports "holding"
 HELD_MARGIN_M = 5e-4  # set narrower than measured by this much: an object is in between
@@ -19,46 +30,60 @@ DEFAULT_FORCE_N = 20.0
 MAX_FORCE_N = 70.0
 
 
-class SimulatedArm:
-    """The arm's part of a MuJoCo state, as views that stay valid as long as `data` lives.
+class SimulatedPart:
+    """One arm with its gripper in a `World`, under impedance control of its TCP or joints.
 
-    They are as fresh as the last MuJoCo call of the code that steps `data`. Poses and rates of the
-    TCP are in the base frame of the arm.
+    At rest either law takes over from the other with the same torque; a change between them in
+    motion jolts the arm. All poses are of the TCP in the base frame of the arm.
 
     Args:
         model: the scene with the robot in it.
         data: its state.
-        robot: names of joints.
+        robot: the arm.
+        home_rad: (n,) joints after a reset; also the posture that the nullspace prefers.
+        gains: of the Cartesian impedance controller.
+        refresh: computes positions after a step.
+
+    Attributes:
+        joint_range_rad: lower and upper limit of every arm joint, (n,) each.
 
     Raises:
         ResourceError: the arm's joints are not one chain.
     """
 
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, robot: RobotModel) -> None:
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        robot: RobotModel,
+        home_rad: FloatArray,
+        gains: ImpedanceGains,
+        refresh: Callable[[], None],
+    ) -> None:
+        self.robot, self._home_rad, self._refresh = robot, home_rad, refresh
         self._model, self._data = model, data
+        self.gripper = SimulatedGripper(model, data, robot)
+        self.set_gripper, self.gripper_state = self.gripper.command, self.gripper.state
         joints = [model.joint(prefix_of(robot) + name) for name in robot.arm_joints]
         first_dof, first_q = int(joints[0].dofadr[0]), int(joints[0].qposadr[0])
         if [int(joint.dofadr[0]) - first_dof for joint in joints] != list(range(len(joints))):
             raise ResourceError("the arm's joints do not follow each other in the URDF")
         self._dofs = slice(first_dof, first_dof + len(joints))
-        self.lower_rad = np.array([joint.range[0] for joint in joints])
-        self.upper_rad = np.array([joint.range[1] for joint in joints])
-        self.actuators = [
+        self._actuators = [
             int(model.actuator(prefix_of(robot) + name).id) for name in robot.arm_joints
         ]
-        self.effort_limit_nm = model.actuator_ctrlrange[self.actuators, 1].copy()
-
+        # Views of the state: as fresh as the last MuJoCo call of the code that steps it.
         self._qpos = slice(first_q, first_q + len(joints))
-        self.position_rad = data.qpos[self._qpos]
-        self.velocity_rad_s = data.qvel[self._dofs]
-        self.effort_nm = data.qfrc_actuator[self._dofs]
+        self._position_rad = data.qpos[self._qpos]
+        self._velocity_rad_s = data.qvel[self._dofs]
+        self._effort_nm = data.qfrc_actuator[self._dofs]
         self._bias_nm = data.qfrc_bias[self._dofs]
         self._tcp = int(model.site(prefix_of(robot) + TCP_SITE).id)
         self._tcp_body = int(model.site_bodyid[self._tcp])
         self._world_m = data.site_xpos[self._tcp]
         self._world_rotation = data.site_xmat[self._tcp].reshape(3, 3)
         self._base: tuple[FloatArray, FloatArray] | None = None
-        if not robot.at_origin:
+        if any(robot.base_m) or robot.base_yaw_rad:
             turn = rotation_from_rpy(np.array([0.0, 0.0, robot.base_yaw_rad]))
             self._base = np.array(robot.base_m), turn
         root = model.body_rootid[self._tcp_body]
@@ -71,30 +96,87 @@ class SimulatedArm:
         self._inertia = np.zeros((model.nv, model.nv))
         self._scratch = mujoco.MjData(model)
 
-    def state(self) -> ArmDynamics:
+        lower_rad, upper_rad = np.array([joint.range for joint in joints]).T
+        self.joint_range_rad = lower_rad, upper_rad
+        effort_nm = model.actuator_ctrlrange[self._actuators, 1]
+        self._cartesian = CartesianImpedance(
+            gains,
+            lower_rad=lower_rad,
+            upper_rad=upper_rad,
+            effort_nm=effort_nm,
+            posture_rad=home_rad,
+            period_s=STEP_S,
+        )
+        self._joint = JointImpedance(robot.gains, effort_nm=effort_nm, period_s=STEP_S)
+        self._active_law: CartesianImpedance | JointImpedance | None = None
+        self._held_rad: FloatArray | None = None
+        self._filtered_wrench = np.zeros(6)
+
+    # -- time ---------------------------------------------------------------------------------
+    def go_home(self) -> None:
+        """Put the joints at home and open the gripper."""
+        self._position_rad[:] = self._home_rad
+        self.gripper.open()
+
+    def reset_laws(self, *, home: bool) -> None:
+        """Forget what the controllers have accumulated, and with `home` what was measured."""
+        self._cartesian.reset(self._home_rad if home else None)
+        self._joint.reset()
+        self._active_law = self._held_rad = None
+        if home:
+            self._filtered_wrench = np.zeros(6)
+        else:
+            self.gripper.stand()
+
+    def torque(self, reference: PoseReference | JointReference) -> bool:
+        """Set the torques of this tick; whether an effort limit cut them.
+
+        Raises:
+            NodeError: the reference is not finite.
+        """
+        state = self._dynamics()
+        if isinstance(reference, JointReference):
+            self._held_rad = reference.position_rad
+            self._switch_to(self._joint, state)
+            output = self._joint.torque(reference, state)
+        else:
+            self._held_rad = None
+            self._switch_to(self._cartesian, state)
+            output = self._cartesian.torque(reference, state)
+        if not math.isfinite(sum(output.torque_nm.tolist())):
+            raise NodeError(f"the reference is not finite: {reference}")
+        self._data.ctrl[self._actuators] = output.torque_nm
+        self.gripper.step()
+        return output.saturated
+
+    def _switch_to(self, law: CartesianImpedance | JointImpedance, state: ArmDynamics) -> None:
+        if self._active_law is not law:
+            if self._active_law is not None:
+                law.take_over(self._data.ctrl[self._actuators], state)
+            self._active_law = law
+
+    def _dynamics(self) -> ArmDynamics:
         """State for an impedance law; some arrays are views, valid until the next step."""
         mujoco.mj_fullM(self._model, self._data, self._inertia)
+        tcp_m, tcp_rotation = self._in_base(self._world_m, self._world_rotation)
+        mujoco.mj_jacDot(self._model, self._data, *self._halves[1], self._world_m, self._tcp_body)
         return ArmDynamics(
-            position_rad=self.position_rad,
-            velocity_rad_s=self.velocity_rad_s,
-            tcp_position_m=self.tcp_position_m,
-            tcp_rotation=self.tcp_rotation,
-            jacobian=self.jacobian(),
-            drift=self._drift(),
+            position_rad=self._position_rad,
+            velocity_rad_s=self._velocity_rad_s,
+            tcp_position_m=tcp_m,
+            tcp_rotation=tcp_rotation,
+            jacobian=self._tcp_jacobian(),
+            drift=self._axes_of_base(self._rate[:, self._dofs] @ self._velocity_rad_s),
             inertia=self._inertia[self._dofs, self._dofs],
             bias_nm=self._bias_nm,
         )
 
-    @property
-    def tcp_position_m(self) -> FloatArray:
-        """(3,) of the TCP."""
-        return self._in_base(self._world_m, self._world_rotation)[0]
+    def filter_wrench(self) -> None:
+        """Follow the wrench of the last step."""
+        error = self._contact_wrench() - self._filtered_wrench
+        self._filtered_wrench += (STEP_S / WRENCH_FILTER_S) * error
 
-    @property
-    def tcp_rotation(self) -> FloatArray:
-        """(3, 3) of the TCP."""
-        return self._in_base(self._world_m, self._world_rotation)[1]
-
+    # -- geometry -----------------------------------------------------------------------------
     def _in_base(
         self, position_m: FloatArray, rotation: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
@@ -110,30 +192,11 @@ class SimulatedArm:
         turn = self._base[1].T
         return np.concatenate([turn @ world[:3], turn @ world[3:]])
 
-    def tcp_at(self, position_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """TCP position (3,) in m and rotation (3, 3) with the joints at `position_rad` (n,)."""
-        data = self._scratch
-        data.qpos[self._qpos] = position_rad
-        mujoco.mj_kinematics(self._model, data)
-        position_m, rotation = data.site_xpos[self._tcp], data.site_xmat[self._tcp].reshape(3, 3)
-        position_m, rotation = self._in_base(position_m, rotation)
-        return position_m.copy(), rotation.copy()
-
-    def jacobian(self) -> FloatArray:
-        """(6, n) of the TCP, linear rows first, base axes."""
+    def _tcp_jacobian(self) -> FloatArray:
         mujoco.mj_jacSite(self._model, self._data, *self._halves[0], self._tcp)
         return self._axes_of_base(self._jacobian[:, self._dofs])
 
-    def _drift(self) -> FloatArray:
-        mujoco.mj_jacDot(self._model, self._data, *self._halves[1], self._world_m, self._tcp_body)
-        return self._axes_of_base(self._rate[:, self._dofs] @ self.velocity_rad_s)
-
-    def contact_wrench(self) -> FloatArray:
-        """(6,) external contact wrench on the robot: N, and Nm about the TCP, base axes.
-
-        Contacts between the robot's own parts are left out. What the fingers squeeze presses on
-        both of them and cancels, so that its weight remains.
-        """
+    def _contact_wrench(self) -> FloatArray:
         model, data = self._model, self._data
         total, local = np.zeros(6), np.zeros(6)
         if data.ncon == 0:
@@ -150,15 +213,72 @@ class SimulatedArm:
             total[3:] += moment + np.cross(lever, force)
         return self._axes_of_base(total)
 
+    # -- measurements -------------------------------------------------------------------------
+    def hold_reference(self) -> PoseReference:
+        """Reference at the measured TCP, at rest."""
+        position, rotation = self.tcp()
+        return PoseReference(position, rotation, np.zeros(6), np.zeros(6))
+
+    @property
+    def wrench(self) -> FloatArray:
+        """(6,) external contact wrench of the last step: N, Nm about the TCP, base axes.
+
+        Contacts between the robot's own parts are left out. What the fingers squeeze presses on
+        both of them and cancels, so that its weight remains.
+        """
+        self._refresh()
+        return self._contact_wrench()
+
+    def joint_state(self) -> JointState:
+        """Arm joints; the effort is that of the motors.
+
+        The reference is that of the joints; under Cartesian control the measured position.
+        """
+        measured_rad = self._position_rad
+        held_rad = measured_rad if self._held_rad is None else self._held_rad
+        return JointState(
+            self.robot.arm_joints, measured_rad, self._velocity_rad_s, self._effort_nm, held_rad
+        )
+
+    def tcp(self) -> tuple[FloatArray, FloatArray]:
+        """Measured TCP: position (3,) in metres and rotation (3, 3), copies."""
+        self._refresh()
+        position_m, rotation = self._in_base(self._world_m, self._world_rotation)
+        return position_m.copy(), rotation.copy()
+
+    def pose_state(self, reference: PoseReference | JointReference) -> PoseState:
+        """Measured TCP pose, twist and wrench, with `reference`.
+
+        The wrench is `wrench` behind a first-order low-pass of `WRENCH_FILTER_S`.
+        """
+        position, rotation = self.tcp()
+        if isinstance(reference, JointReference):
+            data = self._scratch
+            data.qpos[self._qpos] = reference.position_rad
+            mujoco.mj_kinematics(self._model, data)
+            held_m, held_rotation = self._in_base(
+                data.site_xpos[self._tcp], data.site_xmat[self._tcp].reshape(3, 3)
+            )
+        else:
+            held_m, held_rotation = reference.position_m, reference.rotation
+        return PoseState(
+            position_m=position,
+            quat_xyzw=_quat_xyzw(rotation),
+            twist=self._tcp_jacobian() @ self._velocity_rad_s,
+            wrench=self._filtered_wrench.copy(),
+            reference_position_m=held_m,
+            reference_quat_xyzw=_quat_xyzw(held_rotation),
+        )
+
+
+def _quat_xyzw(rotation: FloatArray) -> FloatArray:
+    quat_wxyz = np.empty(4)
+    mujoco.mju_mat2Quat(quat_wxyz, np.ascontiguousarray(rotation).ravel())
+    return quat_wxyz[[1, 2, 3, 0]]
+
 
 class SimulatedGripper:
-    """Fingers with a width servo: the set width changes at a given speed, under a bounded force.
-
-    Args:
-        model: the scene with the robot in it.
-        data: its state.
-        robot: names of the finger joints.
-    """
+    """Fingers with a width servo: the set width changes at a given speed, under a bounded force."""
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, robot: RobotModel) -> None:
         self._model, self._data = model, data

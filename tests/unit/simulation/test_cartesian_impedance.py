@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 
 from vla_zenoh import resources
-from vla_zenoh.simulation.cartesian_impedance import ArmDynamics, CartesianImpedance, ImpedanceGains
+from vla_zenoh.simulation.impedance import ArmDynamics, CartesianImpedance, ImpedanceGains
 from vla_zenoh.types.commands import PoseReference
 
 URDF = "example-robot-data:panda_description/urdf/panda.urdf"

@@ -7,8 +7,12 @@ import pinocchio as pin
 import pytest
 
 from vla_zenoh import resources
-from vla_zenoh.simulation.cartesian_impedance import ArmDynamics, CartesianImpedance, ImpedanceGains
-from vla_zenoh.simulation.joint_impedance import JointImpedance
+from vla_zenoh.simulation.impedance import (
+    ArmDynamics,
+    CartesianImpedance,
+    ImpedanceGains,
+    JointImpedance,
+)
 from vla_zenoh.simulation.robot_model import JointGains
 from vla_zenoh.types import FloatArray
 from vla_zenoh.types.commands import JointReference, PoseReference
@@ -77,7 +81,7 @@ def test_a_small_error_pulls_each_joint_like_a_spring_of_its_own(model: pin.Mode
     output = controller().torque(ahead(off), state)
     pull = output.torque_nm - state.bias_nm
     np.testing.assert_allclose(pull, off * FRANKA_NM_RAD, atol=TORQUE_ATOL_NM)
-    np.testing.assert_allclose(output.error_rad, off, atol=1e-15)
+    np.testing.assert_allclose(output.error, off, atol=1e-15)
 
 
 def test_with_feed_forward_a_moving_reference_is_matched_exactly(model: pin.Model) -> None:

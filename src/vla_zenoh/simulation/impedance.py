@@ -1,7 +1,7 @@
-"""Cartesian impedance control of an arm by joint torques.
+"""Impedance control of an arm by joint torques: a damped spring pulls it to a moving reference.
 
-The TCP behaves as if a damped spring connected it to a moving reference. With ``Lambda`` its
-inertia in task space and ``J`` its Jacobian::
+`CartesianImpedance` pulls the TCP. With ``Lambda`` its inertia in task space and ``J`` its
+Jacobian::
 
     e       = [p_ref - p ; log3(R_ref R^T)]            base frame, clamped to ``max_error_*``
     Lambda  = (J M^-1 J^T)^-1
@@ -17,8 +17,19 @@ control of robot manipulators: the operational space formulation*, IEEE J. Robot
 3(1), 1987). The damping is the factorisation design of Albu-Schaeffer, Ott, Frese and Hirzinger
 (*Cartesian impedance control of redundant robots*, ICRA 2003; Ott, *Cartesian Impedance Control of
 Redundant and Flexible-Joint Robots*, Springer 2008), which keeps the damping ratio in every pose;
-a constant matrix does not. The integral term carries joint friction and payload that the model
-lacks.
+a constant matrix does not.
+
+`JointImpedance` pulls every joint. With ``M`` the arm's inertia::
+
+    e    = q_ref - q                                    clamped to ``max_error_rad``
+    D    = zeta (M^1/2 K^1/2 + K^1/2 M^1/2)
+    tau  = M qdd_ref + K e + D (qd_ref - qd) + I + h
+
+Inertia as feed-forward beside a spring and a damper is the PD+ law of Paden and Panja (*Globally
+asymptotically stable 'PD+' controller for robot manipulators*, Int. J. Control 47(6), 1988). The
+stiffness is that of Franka's own example (``joint_impedance_example_controller`` of franka_ros).
+
+The integral term of either law carries joint friction and payload that the model lacks.
 """
 
 from __future__ import annotations
@@ -29,13 +40,15 @@ from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
+from vla_zenoh.simulation.robot_model import JointGains
 from vla_zenoh.types import FloatArray
-from vla_zenoh.types.commands import PoseReference
+from vla_zenoh.types.commands import JointReference, PoseReference
 
-# Task-space mobility (1/kg or 1/(kg m^2)) below which a direction counts as singular: its apparent
-# inertia grows without bound, and so would damping and feed-forward.
 MIN_MOBILITY = 0.01
+"""Task-space mobility (1/kg or 1/(kg m^2)) below which a direction counts as singular: its apparent
+inertia grows without bound, and so would damping and feed-forward."""
 SAME_RAD = 1e-4
 """Joints that moved by less than this have the same inertia in task space and damping."""
 
@@ -65,14 +78,7 @@ class ArmDynamics(NamedTuple):
 
 
 class _TaskSpace(NamedTuple):
-    """What the law uses of an arm whose joints are at one place.
-
-    Args:
-        at_rad: (n,) the joints.
-        inertia: (6, 6) Lambda.
-        damping: (6, 6) D.
-        consistent: (6, n) transposed Jbar.
-    """
+    """Lambda, D (6, 6) and the transposed Jbar (6, n) of an arm with its joints at `at_rad`."""
 
     at_rad: FloatArray
     inertia: FloatArray
@@ -85,15 +91,16 @@ class ImpedanceOutput(NamedTuple):
 
     Args:
         torque_nm: (n,) within the effort limits.
-        error: (6,) m and rad from TCP to reference, before the clamp.
-        wrench: (6,) N and Nm that the TCP should exert, without the nullspace part.
         saturated: an effort limit cut the torque.
+        error: to the reference, before the clamp: of the TCP (6,) m and rad, or of joints (n,) rad.
+        wrench: (6,) N and Nm that the TCP should exert, without the nullspace part; None: in joint
+            control.
     """
 
     torque_nm: FloatArray
-    error: FloatArray
-    wrench: FloatArray
     saturated: bool
+    error: FloatArray
+    wrench: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,14 +108,11 @@ class ImpedanceGains:
     """Gains of the law: by default it follows within a millimetre, and presses with at most 55 N.
 
     Args:
-        translational_n_m: stiffness.
-        rotational_nm_rad: stiffness.
+        translational_n_m, rotational_nm_rad: stiffness.
         damping_ratio: zeta, 1 is critical.
         integral_1_s: ki, 0 switches integral action off.
-        max_integral_n: bound of the integral force, per axis.
-        max_integral_nm: bound of the integral moment, per axis.
-        max_error_m: largest stretch of the spring, which bounds the pressing force.
-        max_error_rad: the same for rotation.
+        max_integral_n, max_integral_nm: bounds of the integral force and moment, per axis.
+        max_error_m, max_error_rad: largest stretch of the spring, which bounds the pressing force.
         posture_nm_rad: nullspace stiffness towards the posture.
         limit_nm_rad: stiffness with which the nullspace leaves a joint limit.
         limit_margin_rad: distance to a joint limit at which that begins.
@@ -127,13 +131,30 @@ class ImpedanceGains:
     limit_margin_rad: float = 0.1
 
 
+class _Integral:
+    """Integral action, clamped to `limit`; `rate` is ki K dt."""
+
+    def __init__(self, rate: FloatArray, limit: FloatArray) -> None:
+        self._rate, self._limit = rate, limit
+        self.value = np.zeros(len(limit))
+
+    def put(self, value: FloatArray | float) -> None:
+        self.value = np.minimum(np.maximum(value, -self._limit), self._limit)
+
+    def add(self, error: FloatArray, held: bool | NDArray[np.bool_]) -> None:
+        """Integrate; where `held`, towards zero only: the arm is blocked, or a torque is cut."""
+        step = self._rate * error
+        if held is not False:
+            step[held & (step * self.value >= 0.0)] = 0.0
+        self.put(self.value + step)
+
+
 class CartesianImpedance:
     """Cartesian impedance controller; its only state is the integral wrench.
 
     Args:
         gains: stiffness, damping, bounds.
-        lower_rad: (n,) joint limits.
-        upper_rad: (n,) joint limits.
+        lower_rad, upper_rad: (n,) joint limits.
         effort_nm: (n,) torque limits.
         posture_rad: (n,) joints that the nullspace prefers.
         period_s: time between two calls of `torque`.
@@ -158,19 +179,19 @@ class CartesianImpedance:
         self._stiffness = _per_axis(gains.translational_n_m, gains.rotational_nm_rad)
         # zeta * sqrt(K_j) scales the columns of Lambda^1/2; its transpose gives the other half.
         self._damping_scale = gains.damping_ratio * np.sqrt(self._stiffness)
-        self._integral_rate = gains.integral_1_s * period_s * self._stiffness
-        self._integral_limit = _per_axis(gains.max_integral_n, gains.max_integral_nm)
-        self._integral = np.zeros(6)
+        rate = gains.integral_1_s * period_s * self._stiffness
+        self._integral = _Integral(rate, _per_axis(gains.max_integral_n, gains.max_integral_nm))
         self._task_space: _TaskSpace | None = None
 
     @property
     def integral(self) -> FloatArray:
-        """(6,) N and Nm of the integral action; a copy."""
-        return self._integral.copy()
+        """(6,) N and Nm of the integral action."""
+        return self._integral.value
 
     def reset(self, posture_rad: FloatArray | None = None) -> None:
         """Clear the integral; set the posture where `posture_rad` (n,) is given."""
-        self._integral, self._task_space = np.zeros(6), None
+        self._integral.put(np.zeros(6))
+        self._task_space = None
         if posture_rad is not None:
             self._posture_rad = np.array(posture_rad, float)
 
@@ -180,8 +201,7 @@ class CartesianImpedance:
         The part of that torque beyond the model (friction, payload) goes into the integral, so that
         the first torque of this law equals the last of the other at the TCP.
         """
-        wrench = self._seen(state).consistent @ (torque_nm - state.bias_nm)
-        self._integral = np.minimum(np.maximum(wrench, -self._integral_limit), self._integral_limit)
+        self._integral.put(self._seen(state).consistent @ (torque_nm - state.bias_nm))
         self._posture_rad = state.position_rad.copy()
 
     def torque(self, reference: PoseReference, state: ArmDynamics) -> ImpedanceOutput:
@@ -195,15 +215,15 @@ class CartesianImpedance:
         _, inertia, damping, consistent = self._seen(state)
 
         slip = feed * reference.twist - jacobian @ state.velocity_rad_s
-        wrench = self._stiffness * spring_error + damping @ slip + self._integral
+        wrench = self._stiffness * spring_error + damping @ slip + self._integral.value
         wrench += inertia @ (feed * reference.acceleration - state.drift)
 
         posture = self._posture_torque(state)
         wanted = transposed @ (wrench - consistent @ posture) + posture + state.bias_nm
         torque = np.minimum(np.maximum(wanted, -self._effort_nm), self._effort_nm)
         saturated = bool((torque != wanted).any())
-        self._integrate(spring_error, held=saturated or feed <= 0.0)
-        return ImpedanceOutput(torque, error, wrench, saturated)
+        self._integral.add(spring_error, saturated or feed <= 0.0)
+        return ImpedanceOutput(torque, saturated, error, wrench)
 
     def _seen(self, state: ArmDynamics) -> _TaskSpace:
         """The arm in task space; kept while the joints stay where they are."""
@@ -235,14 +255,6 @@ class CartesianImpedance:
         clamped[3:] *= min(1.0, self.gains.max_error_rad / max(angle, 1e-12))
         return clamped, max(0.0, 2.0 - 2.0 * stretch)
 
-    def _integrate(self, error: FloatArray, *, held: bool) -> None:
-        """Integrate; towards zero only while the arm is blocked or a torque is at its limit."""
-        step = self._integral_rate * error
-        if held:
-            step = np.where(step * self._integral < 0.0, step, 0.0)
-        total = self._integral + step
-        self._integral = np.minimum(np.maximum(total, -self._integral_limit), self._integral_limit)
-
     def _posture_torque(self, state: ArmDynamics) -> FloatArray:
         position = state.position_rad
         inside = np.minimum(np.maximum(position, self._soft_lower_rad), self._soft_upper_rad)
@@ -255,3 +267,64 @@ class CartesianImpedance:
 
 def _per_axis(translational: float, rotational: float) -> FloatArray:
     return np.array([translational] * 3 + [rotational] * 3)
+
+
+class JointImpedance:
+    """Joint impedance controller; its only state is the integral torque.
+
+    Args:
+        gains: stiffness, damping, bounds.
+        effort_nm: (n,) torque limits.
+        period_s: time between two calls of `torque`.
+    """
+
+    def __init__(self, gains: JointGains, *, effort_nm: FloatArray, period_s: float) -> None:
+        self.gains = gains
+        self._effort_nm = np.array(effort_nm, float)
+        joints = len(self._effort_nm)
+        self._stiffness = _per_joint(gains.stiffness_nm_rad, joints)
+        # zeta * sqrt(K_j) scales the columns of M^1/2; its transpose gives the other half.
+        self._damping_scale = gains.damping_ratio * np.sqrt(self._stiffness)
+        rate = gains.integral_1_s * period_s * self._stiffness
+        self._integral = _Integral(rate, _per_joint(gains.max_integral_nm, joints))
+
+    @property
+    def integral_nm(self) -> FloatArray:
+        """(n,) torque of the integral action."""
+        return self._integral.value
+
+    def reset(self) -> None:
+        """Clear the integral."""
+        self._integral.put(np.zeros(len(self._effort_nm)))
+
+    def take_over(self, torque_nm: FloatArray, state: ArmDynamics) -> None:
+        """Take over from the other law, see `CartesianImpedance.take_over`."""
+        self._integral.put(torque_nm - state.bias_nm)
+
+    def torque(self, reference: JointReference, state: ArmDynamics) -> ImpedanceOutput:
+        """One control period: joint torques that pull the arm to `reference`."""
+        error = reference.position_rad - state.position_rad
+        stretch = np.abs(error) / self.gains.max_error_rad
+        spring_error = error / np.maximum(stretch, 1.0)
+        # As in Cartesian control the feed-forward fades while the arm is blocked.
+        feed = min(1.0, max(0.0, 2.0 - 2.0 * float(stretch.max())))
+
+        inertias, axes = np.linalg.eigh(state.inertia)
+        half_damping = ((axes * np.sqrt(inertias)) @ axes.T) * self._damping_scale
+        slip = feed * reference.velocity_rad_s - state.velocity_rad_s
+        wanted = (
+            state.inertia @ (feed * reference.acceleration_rad_s2)
+            + self._stiffness * spring_error
+            + half_damping @ slip
+            + half_damping.T @ slip
+            + self._integral.value
+            + state.bias_nm
+        )
+        torque = np.minimum(np.maximum(wanted, -self._effort_nm), self._effort_nm)
+        cut = torque != wanted
+        self._integral.add(spring_error, cut | (stretch >= 1.0))
+        return ImpedanceOutput(torque, bool(cut.any()), error)
+
+
+def _per_joint(values: tuple[float, ...], joints: int) -> FloatArray:
+    return np.array([values[min(joint, len(values) - 1)] for joint in range(joints)])
