@@ -14,6 +14,7 @@ from benchmarks.depth import depth
 from benchmarks.load.cli import load
 from benchmarks.motion.cli import motion
 from benchmarks.openvla import openvla
+from benchmarks.readers import readers
 from benchmarks.stop import stop
 from benchmarks.thesis.cli import thesis
 from benchmarks.web import web
@@ -26,7 +27,21 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-for command in (chain, codec, delay, deployment, depth, load, motion, openvla, stop, thesis, web):
+COMMANDS = (
+    chain,
+    codec,
+    delay,
+    deployment,
+    depth,
+    load,
+    motion,
+    openvla,
+    readers,
+    stop,
+    thesis,
+    web,
+)
+for command in COMMANDS:
     app.command()(command)
 
 if __name__ == "__main__":

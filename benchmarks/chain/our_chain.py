@@ -6,9 +6,14 @@ This process plays the camera and receives the results; another one plays the ro
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from pathlib import Path
 from types import TracebackType
+
+import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.chain import report
 from benchmarks.chain.process import Server, free_port
@@ -41,25 +46,27 @@ class Answer:
     figures_ms: dict[str, float]
 
 
-def bench_profile(command_hz: float, pictures: Pictures) -> Profile:
+def bench_profile(command_hz: float, pictures: Pictures, shadows: Sequence[str] = ()) -> Profile:
     """The shipped profile at its own address, with the nodes that are measured.
 
     Args:
         command_hz: rate of the command node.
         pictures: images of the cameras that the model waits for.
+        shadows: names of workers that are not obeyed, with the same model.
     """
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     data = load_profile(PROFILE).model_dump()
     data["session"].update(connect=(endpoint,), listen=(endpoint,))
     data["timing"]["command_hz"] = command_hz
     data["task"].update(prompt=PROMPT, worker=WORKER, rate_hz=RATE_HZ)
-    data["workers"] = (WORKER,)
+    data["workers"] = (WORKER, *shadows)
+    data["models"] = dict.fromkeys(shadows, WORKER)
     cameras = dict(zip(CAMERAS, pictures, strict=False))
     data["cameras"] = {
         name: {**data["cameras"]["front"], "height": rgb.shape[0], "width": rgb.shape[1]}
         for name, rgb in cameras.items()
     }
-    data["options"] = {WORKER: {"camera": ",".join(cameras)}}
+    data["options"] = {name: {"camera": ",".join(cameras)} for name in data["workers"]}
     # A worker takes raw images if its host has the cameras, as here.
     here = HostProfile(nodes=("router", "camera", "command", "worker"))
     data["hosts"] = {"here": here.model_dump()}
@@ -72,13 +79,14 @@ class Chain:
     Args:
         command_hz: rate of the command node.
         pictures: images shown until the worker answers.
+        shadows: see `bench_profile`.
 
     Raises:
         NodeError: it does not start.
     """
 
-    def __init__(self, command_hz: float, pictures: Pictures) -> None:
-        self.profile = bench_profile(command_hz, pictures)
+    def __init__(self, command_hz: float, pictures: Pictures, shadows: Sequence[str] = ()) -> None:
+        self.profile = bench_profile(command_hz, pictures, shadows)
         self._first = pictures
         self._lines: list[str] = []
         self._up = ExitStack()
@@ -115,17 +123,18 @@ class Chain:
         assert session is not None
         assert client is not None
         self._robot = self._up.enter_context(Server("robot", str(self._host.profile_file)))
-        self._node = Node("camera", self.profile, session)
-        self._up.callback(self._node.close)
+        self.node = Node("camera", self.profile, session)
+        self._up.callback(self.node.close)
         self._outlets = {
-            name: CameraPublisher(name, camera, "benchmark", self._node, self._node.emit)
+            name: CameraPublisher(name, camera, "benchmark", self.node, self.node.emit)
             for name, camera in self.profile.cameras.items()
         }
         for outlet in self._outlets.values():
             outlet.set_state(OK)
-        keys = self._node.keys
-        self._chunks = self._node.subscribe(keys.delta(WORKER), LatestSample())
-        self._poses = self._node.subscribe(keys.command_pose, CallbackRing(4096))
+        keys = self.node.keys
+        self.chunk_key = keys.delta(WORKER)
+        self._chunks = self.node.subscribe(self.chunk_key, LatestSample())
+        self._poses = self.node.subscribe(keys.command_pose, CallbackRing(4096))
         self._activate(client)
 
     def _activate(self, client: Client) -> None:
@@ -134,7 +143,7 @@ class Chain:
         why = "the worker does not answer"
         while time.monotonic() < give_up:
             self._robot.check()
-            self._publish(self._first)
+            self.publish(self._first)
             self._report()
             if not self._chunks.wait(0.1):
                 continue
@@ -149,6 +158,11 @@ class Chain:
         said = "\n".join(self._lines[-20:])
         raise NodeError(f"the chain does not come up: {why}\n{said}".rstrip())
 
+    @property
+    def profile_file(self) -> Path:
+        """Profile of the running nodes."""
+        return Path(self._host.profile_file)
+
     # -- CPU ----------------------------------------------------------------------------------
     def cpu_s(self) -> dict[str, float]:
         """Process -> CPU time so far; this one is ``camera``."""
@@ -158,14 +172,25 @@ class Chain:
     # -- one request --------------------------------------------------------------------------
     def _report(self) -> None:
         cameras = {name: {"state": OK, "age_s": 0.0} for name in self._outlets}
-        self._node.publish_status(OK, detail={"cameras": cameras})
+        self.node.publish_status(OK, detail={"cameras": cameras})
 
-    def _publish(self, pictures: Pictures) -> tuple[int, int]:
-        """Returns when, on the monotonic and on the wall clock."""
-        mono_ns, wall_ns = time.monotonic_ns(), self._node.clock.wall_ns()
-        for outlet, rgb in zip(self._outlets.values(), pictures, strict=True):
+    def publish(
+        self, pictures: Pictures, in_turn: Callable[..., Iterable[None]] = map
+    ) -> tuple[int, int]:
+        """Publish an image of each camera; returns when, on the monotonic and the wall clock.
+
+        Args:
+            pictures: of the cameras.
+            in_turn: `map`, or that of an executor: each camera then has a thread, as in a lab.
+        """
+        mono_ns, wall_ns = time.monotonic_ns(), self.node.clock.wall_ns()
+
+        def publish_one(outlet: CameraPublisher, rgb: NDArray[np.uint8]) -> None:
             outlet.captured(mono_ns)
             outlet.publish_rgb(rgb, mono_ns, wall_ns)
+
+        for _ in in_turn(publish_one, self._outlets.values(), pictures):
+            pass
         return mono_ns, wall_ns
 
     def request(self, pictures: Pictures) -> Answer:
@@ -176,7 +201,7 @@ class Chain:
         """
         self._poses.drain()
         self._chunks.pop()
-        began_ns, stamp_ns = self._publish(pictures)
+        began_ns, stamp_ns = self.publish(pictures)
         self._await_chunk(stamp_ns, began_ns)
         chunk_ns = time.monotonic_ns()
         time.sleep(self._period_s + TICK_MARGIN_S)
@@ -194,7 +219,7 @@ class Chain:
             if not self._chunks.wait(left_ns / 1e9):
                 break
             arrival = self._chunks.pop()
-            chunk = self._node.decode(ActionChunk, arrival) if arrival else None
+            chunk = self.node.decode(ActionChunk, arrival) if arrival else None
             if chunk is not None and chunk.record.observation_stamp_ns == stamp_ns:
                 return
         raise TimeoutError
@@ -204,7 +229,7 @@ class Chain:
         give_up = time.monotonic() + POSE_PATIENCE_S
         while time.monotonic() < give_up:
             for arrival in self._poses.drain():
-                pose = self._node.decode(PoseCommand, arrival)
+                pose = self.node.decode(PoseCommand, arrival)
                 cause = pose.record.cause if pose else None
                 if pose is not None and cause and cause.observation_stamp_ns == stamp_ns:
                     return pose, arrival.mono_ns
