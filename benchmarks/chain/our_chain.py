@@ -236,6 +236,11 @@ class Chain:
             time.sleep(POLL_S)
         raise TimeoutError
 
+    def awake(self) -> None:
+        """Put the prompt again: the command node ticks at its rate for a moment."""
+        assert self._host.client is not None
+        self._host.client.publish(self.profile.keys.prompt, PROMPT)
+
     def rest(self) -> None:
         """Between requests: a node that died is not restarted, it ends the measurement.
 

@@ -16,7 +16,7 @@ class Interval:
         way: name of the way.
         figures_ms: figure -> one value per request, in ms.
         cpu_ms: figure -> CPU time of one request in all processes that take part, in ms.
-        standing_cpu: share of one core that the way takes while idle.
+        standing_cpu: share of one core that our chain takes while its arm rests.
         lost: requests that were not answered.
     """
 

@@ -32,6 +32,9 @@ PERIOD_S = (0.012, 0.020)
 tick is equally frequent, and slower than the worker's highest rate."""
 WARM_UP = 20
 QUIET_S = 1.0
+REST_AFTER_S, REST_S = 2.5, 2.0
+"""The command node ticks at its rate for this long after a chunk; then its arm rests."""
+AWAKE_S = 0.05
 MAX_LOST = 10
 
 Ask = Callable[[peers.Pictures], Mapping[str, float]]
@@ -45,12 +48,14 @@ class Running(NamedTuple):
         cpu_s: process -> CPU time so far.
         parts: figure -> the processes whose CPU time it takes.
         check: raises when a process has died.
+        awake: keeps the command node ticking at its rate for `AWAKE_S` without an image.
     """
 
     ask: Ask
     cpu_s: Callable[[], dict[str, float]]
     parts: Mapping[str, Sequence[str]]
     check: Callable[[], None]
+    awake: Callable[[], None] = lambda: None
 
 
 @contextmanager
@@ -62,7 +67,11 @@ def _chain(way: ServingWay, pictures: peers.Pictures) -> Iterator[Running]:
             report.CHUNK: to_chunk,
             report.POSE: everybody,
         }
-        yield Running(lambda them: chain.request(them).figures_ms, chain.cpu_s, parts, chain.rest)
+
+        def ask(them: peers.Pictures) -> Mapping[str, float]:
+            return chain.request(them).figures_ms
+
+        yield Running(ask, chain.cpu_s, parts, chain.rest, chain.awake)
 
 
 @contextmanager
@@ -138,7 +147,7 @@ def measure(way: ServingWay, load: Load, seed: int) -> Interval:
         for _ in range(WARM_UP):
             _paced(running, pictures, draw.uniform(*pause_s))
         gc.collect()
-        standing = _spent_in(running, lambda: time.sleep(QUIET_S))
+        standing = _spent_in(running, lambda: _stay_awake(running))
         # The first request after the pause is not measured.
         _paced(running, pictures, draw.uniform(*pause_s))
         lost = 0
@@ -158,12 +167,22 @@ def measure(way: ServingWay, load: Load, seed: int) -> Interval:
         began = time.monotonic()
         busy = _spent_in(running, ask_all)
         took_s = time.monotonic() - began
+        resting: dict[str, float] = {}
+        if way.kind == "chain":
+            time.sleep(REST_AFTER_S)
+            resting = _spent_in(running, lambda: time.sleep(REST_S))
     share = {name: spent_s / QUIET_S for name, spent_s in standing.items()}
     cpu_ms = {
         figure: max(sum(busy[p] - share[p] * took_s for p in parts), 0.0) / requests * 1e3
         for figure, parts in running.parts.items()
     }
-    return Interval(way.name, dict(figures), cpu_ms, sum(share.values()), lost)
+    return Interval(way.name, dict(figures), cpu_ms, sum(resting.values()) / REST_S, lost)
+
+
+def _stay_awake(running: Running) -> None:
+    for _ in range(round(QUIET_S / AWAKE_S)):
+        running.awake()
+        time.sleep(AWAKE_S)
 
 
 def _spent_in(running: Running, act: Callable[[], None]) -> dict[str, float]:
