@@ -150,16 +150,14 @@ def notes(result: Result) -> list[str]:
         f"{pace}. {machine.get('cores', '?')} cores, load {machine.get('load', '?')} at the start.",
         "A command node answers at its next tick: half a period on average, shown apart. The other "
         "ways end with the floats; what would follow to move an arm is not in them.",
-        "CPU: of one request in all its processes, without what the same ticks and states take without requests.",
+        "CPU: of one request in all its processes, without that of ticks and states.",
         "Other users of a shared machine show in p95 and p99; compare ratios, and runs only when "
         "the medians of the rounds are near each other.",
     ]
     for way in result.ways:
         if way.kind == "chain" and not way.missing() and result.standing_cpu(way):
             share = 100 * result.standing_cpu(way)
-            told.append(
-                f"{way.title}: takes {share:.0f} % of one core while no image comes and the arm rests."
-            )
+            told.append(f"{way.title}: takes {share:.0f} % of one core without images, at rest.")
         if result.lost(way):
             told.append(f"{way.title}: {result.lost(way)} requests were not answered.")
     return told
