@@ -1,4 +1,13 @@
-"""Barriers and distance constraints of an arm: singularity, collisions, keep-outs, workspace."""
+"""Barriers and distance constraints of an arm: singularity, collisions, keep-outs, workspace.
+
+A barrier ``h`` (singular value or distance, minus its stop) that is inside its zone ``z`` (slow
+minus stop) and shrinks limits the speed of the TCP to a share of the profile's::
+
+    share = sqrt(h / z), at least SLOWEST
+
+the speed that a constant deceleration can stop within the distance left, if it can stop full speed
+within the zone.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vla_zenoh.control.limits import LimitHit, Slowdown, slowdown, workspace_corners
+from vla_zenoh.control.limits import SLOWEST, LimitHit, Slowdown, workspace_corners
 from vla_zenoh.kinematics.collision import FREE_M, CollisionModel
 from vla_zenoh.kinematics.kinematics import Kinematics, smallest_singular_value
 from vla_zenoh.profile import Limits, ReachLimits
@@ -17,6 +26,8 @@ DECAY = 0.5
 """Part of the distance to a stop that one step may take inside its zone."""
 NOISE = 2e-6
 """m, and singular value: difference of distances and solver between two equal poses."""
+SHRINKING = 1e-6
+"""A barrier that changes by less counts as constant."""
 NEAR_M = 0.08
 """A pair further from its stop than this is no constraint until the next update."""
 
@@ -92,7 +103,7 @@ class Barriers:
         slows_m = np.where(hand, limits.table_slow_m, limits.collision_slow_m)
         self.stop = np.array([limits.singularity_stop, *stops_m])
         self.slow = np.array([limits.singularity_slow, *slows_m])
-        self._zone = self.slow - self.stop
+        self._zone = np.maximum(self.slow - self.stop, 1e-12)
 
     def at(self, joints_rad: FloatArray, jacobian: FloatArray) -> FloatArray:
         """Barriers (n,) at these joints, whose Jacobian is (6, n) m and rad."""
@@ -103,11 +114,7 @@ class Barriers:
 
     def floor(self, before: FloatArray) -> FloatArray:
         """Least values (n,) after one step from `before`."""
-        floor = np.minimum(self._zone, (1 - DECAY) * before)
-        past = before <= 0
-        if past.any():
-            floor[past] = before[past] - NOISE
-        return floor
+        return np.where(before > 0, np.minimum(self._zone, (1 - DECAY) * before), before - NOISE)
 
     def where(self, index: int) -> str:
         """The part of the arm that barrier `index` is about; empty: the whole arm."""
@@ -118,7 +125,15 @@ class Barriers:
 
     def slowdown(self, before: FloatArray, after: FloatArray) -> Slowdown | None:
         """The slowdown of a step from barriers `before` to `after`, None for full speed."""
-        return slowdown(before, after, self.stop, self.slow, self.names, self.where)
+        if (after >= self._zone).all():
+            return None
+        left = np.where(after < before - SHRINKING, np.clip(after / self._zone, 0.0, 1.0), 1.0)
+        index = int(left.argmin())
+        if left[index] >= 1.0:
+            return None
+        share = max(float(np.sqrt(left[index])), SLOWEST)
+        value, slow = float(after[index] + self.stop[index]), float(self.slow[index])
+        return Slowdown(self.names[index], share, value, slow, self.where(index))
 
     def margins(self, joints_rad: FloatArray, barriers: FloatArray) -> Margins:
         """Margins at these joints, whose barriers are known."""

@@ -26,7 +26,6 @@ from typing import NamedTuple
 import numpy as np
 
 from vla_zenoh.control.actions import covered_step, step_joints, step_width
-from vla_zenoh.control.chunk_plan import ChunkPlan, StepBounding
 from vla_zenoh.control.chunk_validation import (
     ROUNDING,
     Lease,
@@ -34,18 +33,26 @@ from vla_zenoh.control.chunk_validation import (
     validate_chunk,
     validate_steps,
 )
-from vla_zenoh.control.joint_space import BoundedJoints, JointBounds
+from vla_zenoh.control.joint_space import JointBounds
 from vla_zenoh.control.limits import (
     APPROACH,
     LEAST,
+    BoundedStep,
     LimitHit,
     Slowdown,
     bound_step,
     full_speed_s,
     keep_slowdown,
 )
-from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan, joint_goal
-from vla_zenoh.control.reachability import BoundedStep, ReachabilityFilter
+from vla_zenoh.control.plan_timeline import (
+    ChunkPlan,
+    Goal,
+    GoalTimeline,
+    Plan,
+    StepBounding,
+    joint_goal,
+)
+from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.state_history import StateHistory
 from vla_zenoh.errors import RecordError
 from vla_zenoh.kinematics.so3 import interpolate, pose_distance, pose_of
@@ -372,7 +379,7 @@ class ChunkPlanner:
             or step.shifted is not plan.shifted_goal
         ):
             step = plan.current = self._begin_step(plan)
-        found: BoundedStep | BoundedJoints | None = None
+        found: BoundedStep | None = None
         while step.search is not None and found is None:
             if self._left <= 0 or self._reach is None:
                 return None

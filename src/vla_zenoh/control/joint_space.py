@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from collections.abc import Generator, Iterable
 from copy import copy
-from typing import NamedTuple
 
 import numpy as np
 
@@ -22,8 +21,8 @@ from vla_zenoh.control.axis_smoothing import FULL, AxisSmoother, Shares, line_of
 from vla_zenoh.control.barriers import Barriers
 from vla_zenoh.control.chunk_validation import Rejection
 from vla_zenoh.control.limits import (
+    BoundedStep,
     LimitHit,
-    Slowdown,
     into_workspace,
     joint_margins,
     joint_motion_limits,
@@ -32,7 +31,7 @@ from vla_zenoh.control.limits import (
 from vla_zenoh.control.plan_timeline import Goal, joint_goal
 from vla_zenoh.control.smoothing import ROTATION_BOX, Motion, motion_limits
 from vla_zenoh.kinematics.kinematics import Kinematics
-from vla_zenoh.kinematics.so3 import Pose, norm3
+from vla_zenoh.kinematics.so3 import norm3
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.profile import REJECT_FACTOR, Profile
 from vla_zenoh.types import Cause, FloatArray, JointCommand, computed
@@ -62,15 +61,6 @@ BEND = 0.5
 LEAST_SHARE = 0.02
 NOTHING = 1e-9
 PEEK_RAD = 1e-4
-
-
-class BoundedJoints(NamedTuple):
-    """A step within what the arm can do; as `vla_zenoh.control.reachability.BoundedStep`."""
-
-    pose: Pose
-    hits: list[LimitHit]
-    joints_rad: FloatArray
-    slowdown: Slowdown | None
 
 
 class JointBounds:
@@ -145,7 +135,7 @@ class JointBounds:
 
     def bound_in_pieces(
         self, start_rad: FloatArray, asked_rad: FloatArray
-    ) -> Generator[None, None, BoundedJoints]:
+    ) -> Generator[None, None, BoundedStep]:
         """The end of a step from `start_rad` (n,) towards `asked_rad` (n,), in pieces.
 
         Yields before every evaluation of the distances.
@@ -172,7 +162,7 @@ class JointBounds:
             hits = [found, *hits]
             target_rad = start_rad + low * (whole - start_rad)
         slower = barriers.slowdown(before, after)
-        return BoundedJoints(kinematics.forward(target_rad), hits, target_rad, slower)
+        return BoundedStep(kinematics.forward(target_rad), hits, target_rad, slower)
 
     def _barriers_at(self, joints_rad: FloatArray) -> FloatArray:
         """Barriers of the distances; a singularity is none."""

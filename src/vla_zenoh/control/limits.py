@@ -1,22 +1,14 @@
-"""Limits on what a model may ask for, and slowdowns near the bounds of the arm.
+"""Limits on what a model may ask for, and slowdowns.
 
-A barrier ``h`` (singular value or distance, minus its stop) that is inside its zone ``z`` (slow
-minus stop) and shrinks limits the speed of the TCP to a share of the profile's::
-
-    share = sqrt(h / z), at least SLOWEST
-
-the speed that a constant deceleration can stop within the distance left, if it can stop full speed
-within the zone. Away from a bound the arm moves at full speed.
-
-A step for which the joints are too slow takes the time that they need, and a far target is
-approached at a speed of its own. The arm is then later than the steps ask for, and the slowdown
-lasts until it has caught up (`keep_slowdown`): until then it is still where it needs that speed.
+The arm moves at full speed, unless a barrier is near (`vla_zenoh.control.barriers`). A step for
+which the joints are too slow takes the time that they need, and a far target is approached at a
+speed of its own. The arm is then later than the steps ask for, and the slowdown lasts until it has
+caught up (`keep_slowdown`): until then it is still where it needs that speed.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -35,8 +27,6 @@ SLOWEST = 0.1
 """Least share of the speed close to a stop: the arm has to be able to work there."""
 LEAST = 0.02
 """Least share where the joints are too slow, or a far target is approached."""
-SHRINKING = 1e-6
-"""A barrier that changes by less counts as constant."""
 
 
 class JointMotionLimits(NamedTuple):
@@ -98,19 +88,17 @@ def bound_step(limits: Limits, before: Pose, asked: Pose) -> tuple[Pose, list[Li
     Returns:
         the bounded pose, and the limits that acted; after a fatal hit the pose must not be used.
     """
-    hits: list[LimitHit] = []
-    translation = asked.position_m - before.position_m
-    rotvec = log3(asked.rotation @ before.rotation.T)
-    translation, hit = _bound_norm("step_m", translation, limits.step_m)
+    way_m = asked.position_m - before.position_m
+    turn = log3(asked.rotation @ before.rotation.T)
+    way_m, hits = _bound_norm("step_m", way_m, limits.step_m)
+    turn, hit = _bound_norm("step_rad", turn, limits.step_rad)
     hits += hit
-    rotvec, hit = _bound_norm("step_rad", rotvec, limits.step_rad)
-    hits += hit
-    inside, overshoot_m = into_workspace(limits, before.position_m + translation, before.position_m)
+    inside, overshoot_m = into_workspace(limits, before.position_m + way_m, before.position_m)
     if overshoot_m > 0:
         hits.append(LimitHit("workspace", overshoot_m, 0.0))
     if not hits:
         return Pose(inside, asked.rotation), hits
-    return Pose(inside, orthonormal(exp3(rotvec) @ before.rotation)), hits
+    return Pose(inside, orthonormal(exp3(turn) @ before.rotation)), hits
 
 
 def _bound_norm(name: str, vector: FloatArray, limit: float) -> tuple[FloatArray, list[LimitHit]]:
@@ -157,14 +145,14 @@ def into_workspace(
 
 def leash(limits: Limits, goal: Pose, commanded: Pose) -> tuple[Pose, list[LimitHit]]:
     """Keep the goal near the commanded pose, so that no backlog builds up."""
-    hits: list[LimitHit] = []
     apart_m, apart_rad = pose_distance(goal, commanded)
     if apart_m <= limits.lead_m and apart_rad <= limits.lead_rad:
-        return goal, hits
-    ahead = goal.position_m - commanded.position_m
+        return goal, []
+    hits: list[LimitHit] = []
+    ahead_m = goal.position_m - commanded.position_m
     turn = log3(goal.rotation @ commanded.rotation.T)
     for name, vector, limit in (
-        ("lead_m", ahead, limits.lead_m),
+        ("lead_m", ahead_m, limits.lead_m),
         ("lead_rad", turn, limits.lead_rad),
     ):
         norm = norm3(vector)
@@ -173,7 +161,7 @@ def leash(limits: Limits, goal: Pose, commanded: Pose) -> tuple[Pose, list[Limit
             vector *= limit / norm
     if not hits:
         return goal, hits
-    return Pose(commanded.position_m + ahead, orthonormal(exp3(turn) @ commanded.rotation)), hits
+    return Pose(commanded.position_m + ahead_m, orthonormal(exp3(turn) @ commanded.rotation)), hits
 
 
 # -- slowing down ---------------------------------------------------------------------------------
@@ -181,11 +169,11 @@ class Slowdown(NamedTuple):
     """Why the arm moves slower than at full speed.
 
     Args:
-        name: the bound, as in `vla_zenoh.control.limits.LimitHit`.
+        name: the bound, as in `LimitHit`.
         share: of the speed limits.
         value: singular value or distance there.
         limit: the value below which it slows down.
-        where: the joint, the two links, or the link over the table; empty for the whole arm.
+        where: as in `LimitHit`.
         late_s: time by which the arm arrives later because of it.
     """
 
@@ -211,38 +199,8 @@ def slowest(*reasons: Slowdown | None) -> Slowdown | None:
     return least
 
 
-def slowdown(
-    before: FloatArray,
-    after: FloatArray,
-    stop: FloatArray,
-    slow: FloatArray,
-    names: Sequence[str],
-    where: Callable[[int], str],
-) -> Slowdown | None:
-    """The barrier that slows a step most, None for full speed.
-
-    Args:
-        before: (n,) barriers at the start of the step.
-        after: (n,) barriers at its end.
-        stop: (n,) value at which a barrier is zero.
-        slow: (n,) value at which its zone begins.
-        names: of the barriers.
-        where: the part of the arm that barrier i is about.
-    """
-    zone = np.maximum(slow - stop, 1e-12)
-    if (after >= zone).all():
-        return None
-    left = np.where(after < before - SHRINKING, np.clip(after / zone, 0.0, 1.0), 1.0)
-    index = int(np.argmin(left))
-    if left[index] >= 1.0:
-        return None
-    share = max(float(np.sqrt(left[index])), SLOWEST)
-    value = float(after[index] + stop[index])
-    return Slowdown(names[index], share, value, float(slow[index]), where(index))
-
-
 def full_speed_s(limits: Limits, before: Pose, after: Pose) -> float:
-    """Time (s) that a step takes at full speed, whose limits are those of `Smoother.box`."""
+    """Time (s) that a step takes at full speed, by the limits of `Smoother.box`."""
     way_m = after.position_m - before.position_m
     turn = log3(before.rotation.T @ after.rotation)
     return max(
@@ -274,3 +232,19 @@ def keep_slowdown(
     elif late_s <= 0.0:
         return now
     return before._replace(late_s=max(min(late_s, most_s / before.share), 0.0))
+
+
+class BoundedStep(NamedTuple):
+    """A step within what the arm can do.
+
+    Args:
+        pose: its end: exactly the requested pose if no limit acted, its start if nothing is left.
+        hits: limits that acted.
+        joints_rad: (n,) at its end.
+        slowdown: why it is slower than full speed.
+    """
+
+    pose: Pose
+    hits: list[LimitHit]
+    joints_rad: FloatArray
+    slowdown: Slowdown | None

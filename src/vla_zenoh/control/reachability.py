@@ -31,6 +31,7 @@ from vla_zenoh.control.barriers import Barriers, Margins
 from vla_zenoh.control.limits import (
     LEAST,
     SLOWEST,
+    BoundedStep,
     LimitHit,
     Slowdown,
     full_speed_s,
@@ -55,22 +56,6 @@ EFFORT = 5
 """Iterations of the solver per evaluation; one with more counts as several."""
 SAME_POSE = 1e-9
 NEWTON_STEPS = 8
-
-
-class BoundedStep(NamedTuple):
-    """A step within what the arm can do.
-
-    Args:
-        pose: its end: exactly the requested pose if no limit acted, its start if nothing is left.
-        hits: limits that acted.
-        joints_rad: (n,) of the model at its end.
-        slowdown: why it is slower than full speed.
-    """
-
-    pose: Pose
-    hits: list[LimitHit]
-    joints_rad: FloatArray
-    slowdown: Slowdown | None
 
 
 class _Configuration(NamedTuple):

@@ -12,10 +12,9 @@ from command_rig import DOWN, MS, START_M, START_NS, Rig, lone_chunk, profile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vla_zenoh.control.actions import as_deltas, chunk_poses
+from vla_zenoh.control.actions import as_deltas, chunk_poses, respond
 from vla_zenoh.control.chunk_planner import ChunkPlan, ChunkPlanner
 from vla_zenoh.control.commander import Setting
-from vla_zenoh.control.controller_response import respond
 from vla_zenoh.control.plan_timeline import Goal, GoalTimeline
 from vla_zenoh.control.state_history import StateHistory
 from vla_zenoh.kinematics.so3 import Pose, angle_between, exp3, log3, rotation_from_quat

@@ -10,8 +10,8 @@ from collections.abc import Generator
 
 import numpy as np
 
-from vla_zenoh.control.joint_space import BoundedJoints, JointBounds
-from vla_zenoh.control.limits import LimitHit, into_workspace, workspace_corners
+from vla_zenoh.control.joint_space import JointBounds
+from vla_zenoh.control.limits import BoundedStep, LimitHit, into_workspace, workspace_corners
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.kinematics.so3 import Pose, interpolate, pose_distance
 from vla_zenoh.profile import Profile
@@ -104,7 +104,7 @@ class TargetCheck:
         )
 
 
-def _last(pieces: Generator[None, None, BoundedJoints]) -> BoundedJoints:
+def _last(pieces: Generator[None, None, BoundedStep]) -> BoundedStep:
     while True:
         try:
             next(pieces)
