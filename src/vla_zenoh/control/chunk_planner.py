@@ -105,17 +105,15 @@ class ChunkPlanner:
     """
 
     def __init__(self, profile: Profile, reach: ReachabilityFilter | None) -> None:
-        self._part = profile.part
+        self._part, self._timing = profile.part, profile.timing
         self._limits = profile.limits
         self._rejecting = profile.limits.out_of_bounds == "refuse"
-        self._open_loop_s = profile.timing.max_open_loop_s
-        self._max_age_s = profile.timing.max_observation_age_s
         self._max_width_m = profile.robot.gripper.max_width_m
+        self._pace = profile.composition.pace
         self._reach = reach
         self.joint_bounds: JointBounds | None = None
         if reach is not None:
             self.joint_bounds = JointBounds(profile, reach.kinematics, reach.barriers)
-        self._pace = profile.composition.pace
         self._gap_ns = round(profile.timing.state_timeout_s * 1e9)
         self.poses: StateHistory[PoseState] = StateHistory()
         """Where chunks anchored at the measured pose begin."""
@@ -154,7 +152,9 @@ class ChunkPlanner:
         Returns:
             a chunk that was rejected: this one, or the oldest of a full queue.
         """
-        rejection = validate_chunk(chunk, owner, lease, task, self._max_age_s, now_ns)
+        rejection = validate_chunk(
+            chunk, owner, lease, task, self._timing.max_observation_age_s, now_ns
+        )
         if rejection is not None:
             return ChunkOutcome(chunk, rejection)
         if lease is None:
@@ -196,50 +196,33 @@ class ChunkPlanner:
         while self._pending is not None or self._queue:
             if self._pending is None:
                 chunk = self._queue.pop()
-                rejection = _superseded(chunk, episode)
-                plans: list[ChunkPlan] = []
-                for planner, own in parts if rejection is None else ():
-                    plan = planner.plan(chunk, action, own)
-                    if isinstance(plan, Rejection):
-                        rejection = planner.tagged(plan)
-                        break
-                    plans.append(plan)
-                if rejection is not None:
-                    outcomes.append(ChunkOutcome(chunk, rejection))
+                plans = _superseded(chunk, episode) or _planned(parts, chunk, action)
+                if isinstance(plans, Rejection):
+                    outcomes.append(ChunkOutcome(chunk, plans))
                     continue
                 outcomes += [ChunkOutcome(older, OVERTAKEN) for older in self._queue]
                 self._queue.clear()
                 self._pending = chunk, plans
             chunk, plans = self._pending
-            rejection, ready = _superseded(chunk, episode), True
-            for (planner, _), plan in zip(parts, plans, strict=True):
-                bounded = rejection or planner.bound(plan, now_ns)
-                if isinstance(bounded, Rejection):
-                    rejection = rejection or planner.tagged(bounded)
-                ready = ready and bool(bounded)
-            if not ready:
+            ready = _superseded(chunk, episode) or _bounded(parts, plans, now_ns)
+            if ready is False:
                 break
             self._pending = None
-            if rejection is not None:
-                outcomes.append(ChunkOutcome(chunk, rejection))
+            if isinstance(ready, Rejection):
+                outcomes.append(ChunkOutcome(chunk, ready))
                 continue
             hits: list[LimitHit] = []
             for (planner, own), plan in zip(parts, plans, strict=True):
                 plan.effective_ns = max(plan.effective_ns, earliest_ns)
                 own.add(plan, now_ns)
-                hits += planner.tagged_hits(plan.unreported_hits())
+                for hit in plan.unreported_hits():
+                    hits.append(hit._replace(where=f"{planner._part} {hit.where}".strip()))
             outcomes.append(ChunkOutcome(chunk, None, plans[0], hits))
         return outcomes
 
     def tagged(self, rejection: Rejection) -> Rejection:
         """A rejection with the part that it is about."""
         return rejection._replace(why=f"{self._part}: {rejection.why}") if self._part else rejection
-
-    def tagged_hits(self, hits: Sequence[LimitHit]) -> Sequence[LimitHit]:
-        """Limits that acted, with the part that they are about."""
-        if not self._part:
-            return hits
-        return [hit._replace(where=f"{self._part} {hit.where}".strip()) for hit in hits]
 
     # -- plan ---------------------------------------------------------------------------------
     def plan(
@@ -252,9 +235,9 @@ class ChunkPlanner:
         """
         record, columns = chunk.record, action.columns(self._part)
         action = action.of(self._part)
-        count = len(record.steps)
-        if count * action.dt_s > self._open_loop_s + ROUNDING:
-            count = max(1, int((self._open_loop_s + ROUNDING) / action.dt_s))
+        count, open_loop_s = len(record.steps), self._timing.max_open_loop_s
+        if count * action.dt_s > open_loop_s + ROUNDING:
+            count = max(1, int((open_loop_s + ROUNDING) / action.dt_s))
         done = record.done and count == len(record.steps)
         observed_ns = record.observation_stamp_ns
         previous = timeline.in_force(observed_ns)
@@ -264,22 +247,20 @@ class ChunkPlanner:
             if measured is None:
                 return _not_measured(self._gap_ns)
             base = measured
-        if action.space == "joint" and base.arm is None:
-            # Once: the elbow of a pose depends on the moment.
-            assert self._reach is not None
-            base = joint_goal(self._reach.kinematics, self._joints_at(base), base.width_m)
         steps = np.asarray(record.steps[:count, columns], np.float64)
-        if action.space == "joint":
-            assert self.joint_bounds is not None
-            steps = self.joint_bounds.in_chain_order(action, steps)
+        bounds = self.joint_bounds
+        if action.space == "joint" and bounds is not None:
+            if base.arm is None:  # once: the elbow of a pose depends on the moment
+                base = joint_goal(bounds.kinematics, self._joints_at(base), base.width_m)
+            steps = bounds.in_chain_order(action, steps)
         rejection = validate_steps(action, steps, base, self._limits, self._max_width_m)
-        if rejection is None and action.space == "joint" and action.targets:
-            assert self.joint_bounds is not None
-            rejection = self.joint_bounds.far_out_of_range(action, steps, self._joints_at(base))
+        if rejection is None and bounds is not None and action.space == "joint" and action.targets:
+            rejection = bounds.far_out_of_range(action, steps, self._joints_at(base))
         if rejection is not None:
             return rejection
         # Between two waypoints the joints and the speed are about those of the coming one.
         near = previous.goals[previous.index_at(observed_ns)]
+        start_rad = near.joints_rad if base.joints_rad is None else base.joints_rad
         plan = ChunkPlan(
             max(chunk.header.stamp_wall_ns, observed_ns),
             observed_ns,
@@ -294,12 +275,10 @@ class ChunkPlanner:
             soonest=(action.pace if self._pace == "spec" else self._pace) == "soonest",
             action=action,
             steps=steps,
-            base=replace(base, joints_rad=_joints(base, near), slowdown=near.slowdown),
+            base=replace(base, joints_rad=start_rad, slowdown=near.slowdown),
         )
         if count < len(record.steps):
-            plan.add_hits(
-                [LimitHit("open_loop", len(record.steps) * action.dt_s, self._open_loop_s)]
-            )
+            plan.add_hits([LimitHit("open_loop", len(record.steps) * action.dt_s, open_loop_s)])
         if isinstance(previous, ChunkPlan) and previous.approaches:
             # An approach that continues is not reported again, nor is it faster the more often a
             # model is asked.
@@ -390,14 +369,14 @@ class ChunkPlanner:
             self._left -= self._reach.cost
             plan.evaluations += self._reach.cost
         index, pose, hits, slower, joints_rad = plan.bounded, step.target, step.hits, None, None
+        plan.computed = max(plan.computed, index + 1)
         if found is not None:
             pose, joints_rad, slower = found.pose, found.joints_rad, found.slowdown
-            cut = sum(pose_distance(pose, step.target)) if found.hits else 0.0
-            # The limit that cuts most comes first.
-            hits = [*found.hits, *hits] if cut > step.cut else [*hits, *found.hits]
-            plan.computed = index + 1 if found.hits else max(plan.computed, index + 1)
-        else:
-            plan.computed = max(plan.computed, index + 1)
+            if found.hits:
+                cut = sum(pose_distance(pose, step.target))
+                # The limit that cuts most comes first.
+                hits = [*found.hits, *hits] if cut > step.cut else [*hits, *found.hits]
+                plan.computed = index + 1
         if step.slowdown is not None and (slower is None or step.slowdown.share < slower.share):
             slower = step.slowdown
         most_s = self._limits.lead_m / self._limits.translation.velocity_m_s
@@ -412,42 +391,71 @@ class ChunkPlanner:
         return hits
 
     def _begin_step(self, plan: ChunkPlan) -> StepBounding:
-        """The next step of `plan` within the limits of a step."""
-        if plan.action.space == "joint":
-            return self._begin_joint_step(plan)
+        """The next step of `plan` within the limits of a step, and the search for its end."""
         start, shifted = plan.step_start, plan.shifted_goal
+        bounds = self.joint_bounds if plan.action.space == "joint" else None
         if shifted is not None:
-            step = StepBounding(
-                start,
-                shifted,
-                shifted.pose,
-                shifted.pose,
-                shifted.width_m,
-                slowdown=shifted.slowdown,
-                response=shifted.response,
-            )
+            step = StepBounding(start, shifted, shifted.pose, shifted.pose, shifted.joints_rad)
+            step.width_m, step.slowdown = shifted.width_m, shifted.slowdown
+            step.response = shifted.response
         else:
             numbers = plan.steps[plan.bounded]
-            asked, response = covered_step(
-                plan.action, numbers, start.pose, plan.base.pose, start.response
-            )
-            slower: Slowdown | None = None
-            if plan.action.targets:
-                full_s = full_speed_s(self._limits, start.pose, asked)
-                part, slower = self._approach(plan, *pose_distance(start.pose, asked), full_s)
-                asked = interpolate(start.pose, asked, part) if slower else asked
+            if bounds is None:
+                step = self._pose_step(plan, numbers)
+            else:
+                step = self._joint_step(plan, numbers, bounds)
             width_m = step_width(plan.action, numbers, start.width_m, self._max_width_m)
-            pose, acted = bound_step(self._limits, start.pose, asked)
-            cut = sum(pose_distance(pose, asked)) if acted else 0.0
-            width_m = start.width_m if width_m is None else width_m
-            step = StepBounding(start, None, asked, pose, width_m, acted, cut, slower, response)
-        if self._reach is not None:
+            step.width_m = start.width_m if width_m is None else width_m
+        if self._reach is None:
+            return step
+        if bounds is not None and step.target_rad is not None:
+            self._reach.cost = 1
+            step.search = bounds.bound_in_pieces(self._joints_at(start), step.target_rad)
+        else:
             dt_s = plan.dt_ns / 1e9
             step.search = self._reach.bound_in_pieces(
                 start.pose, step.target, dt_s, start.joints_rad
             )
-            next(step.search)  # up to its first evaluation
+        next(step.search)  # up to its first evaluation
         return step
+
+    def _pose_step(self, plan: ChunkPlan, numbers: FloatArray) -> StepBounding:
+        start, limits = plan.step_start, self._limits
+        asked, response = covered_step(
+            plan.action, numbers, start.pose, plan.base.pose, start.response
+        )
+        slower: Slowdown | None = None
+        if plan.action.targets:
+            full_s = full_speed_s(limits, start.pose, asked)
+            part, slower = self._approach(plan, *pose_distance(start.pose, asked), full_s)
+            asked = interpolate(start.pose, asked, part) if slower else asked
+        pose, hits = bound_step(limits, start.pose, asked)
+        cut = sum(pose_distance(pose, asked)) if hits else 0.0
+        return StepBounding(start, None, asked, pose, None, hits, cut, slower, response)
+
+    def _joint_step(
+        self, plan: ChunkPlan, numbers: FloatArray, bounds: JointBounds
+    ) -> StepBounding:
+        start, limits = plan.step_start, self._limits
+        start_rad = self._joints_at(start)
+        asked_rad = step_joints(plan.action, numbers, start_rad, self._joints_at(plan.base))
+        way_rad = asked_rad - start_rad
+        far_m, far_rad = bounds.ways(start_rad, way_rad)
+        part, slower, hits = 1.0, None, list[LimitHit]()
+        if plan.action.targets:
+            part, slower = self._approach(plan, far_m, far_rad, bounds.full_speed_s(way_rad))
+        else:
+            for name, far, most in (
+                ("step_m", far_m, limits.step_m),
+                ("step_rad", far_rad, limits.step_rad),
+            ):
+                if far > most * (1 + ROUNDING):
+                    hits.append(LimitHit(name, far, most))
+                    part = min(part, most / far)
+        if part < 1.0:
+            asked_rad = start_rad + part * way_rad
+        asked = bounds.kinematics.forward(asked_rad)
+        return StepBounding(start, None, asked, asked, asked_rad, hits, slowdown=slower)
 
     def _joints_at(self, goal: Goal) -> FloatArray:
         """(n,) joints of the goal, or those of its pose with the arm's present elbow."""
@@ -455,45 +463,6 @@ class ChunkPlanner:
             return goal.joints_rad
         assert self._reach is not None
         return self._reach.joints_at(goal.pose)
-
-    def _begin_joint_step(self, plan: ChunkPlan) -> StepBounding:
-        """The same of a step in joint space."""
-        bounds, start, shifted = self.joint_bounds, plan.step_start, plan.shifted_goal
-        assert bounds is not None
-        assert self._reach is not None
-        start_rad = self._joints_at(start)
-        slower: Slowdown | None = None
-        acted: list[LimitHit] = []
-        if shifted is not None and shifted.joints_rad is not None:
-            asked_rad, width_m, slower = shifted.joints_rad, shifted.width_m, shifted.slowdown
-        else:
-            numbers = plan.steps[plan.bounded]
-            base_rad = self._joints_at(plan.base)
-            asked_rad = step_joints(plan.action, numbers, start_rad, base_rad)
-            way_rad = asked_rad - start_rad
-            far_m, far_rad = bounds.ways(start_rad, way_rad)
-            if plan.action.targets:
-                full_s = bounds.full_speed_s(way_rad)
-                part, slower = self._approach(plan, far_m, far_rad, full_s)
-            else:
-                parts = {"step_m": (far_m, self._limits.step_m)}
-                parts["step_rad"] = far_rad, self._limits.step_rad
-                acted = [
-                    LimitHit(name, far, most)
-                    for name, (far, most) in parts.items()
-                    if far > most * (1 + ROUNDING)
-                ]
-                part = min((hit.limit / hit.value for hit in acted), default=1.0)
-            if part < 1.0:
-                asked_rad = start_rad + part * way_rad
-            width_m = step_width(plan.action, numbers, start.width_m, self._max_width_m)
-            width_m = start.width_m if width_m is None else width_m
-        asked = bounds.kinematics.forward(asked_rad)
-        step = StepBounding(start, shifted, asked, asked, width_m, acted, slowdown=slower)
-        self._reach.cost = 1
-        step.search = bounds.bound_in_pieces(start_rad, asked_rad)
-        next(step.search)
-        return step
 
     def _approach(
         self, plan: ChunkPlan, far_m: float, far_rad: float, full_s: float
@@ -519,15 +488,6 @@ class ChunkPlanner:
         return part, Slowdown(APPROACH, share, far, step, "", BEHIND_S)
 
 
-def _not_measured(gap_ns: int) -> Rejection:
-    """Its anchor is not known."""
-    return Rejection(
-        "not_measured",
-        f"the arm was not measured within {gap_ns / 1e9:g} s before its observation, which "
-        "the first step is added to (anchor: measured)",
-    )
-
-
 OVERTAKEN = Rejection("overtaken", "a newer chunk came before it was planned", quiet=True)
 
 
@@ -538,9 +498,40 @@ def _superseded(chunk: Stamped[ActionChunk], episode: int | None) -> Rejection |
     return Rejection("superseded", "the arm was stopped or got a new task meanwhile", quiet=True)
 
 
-def _joints(base: Goal, near: Goal) -> FloatArray | None:
-    """Joints of a goal, or those to start the search for them with."""
-    return near.joints_rad if base.joints_rad is None else base.joints_rad
+def _not_measured(gap_ns: int) -> Rejection:
+    return Rejection(
+        "not_measured",
+        f"the arm was not measured within {gap_ns / 1e9:g} s before its observation, which "
+        "the first step is added to (anchor: measured)",
+    )
+
+
+def _planned(
+    parts: Sequence[tuple[ChunkPlanner, GoalTimeline]],
+    chunk: Stamped[ActionChunk],
+    action: ActionSpec,
+) -> list[ChunkPlan] | Rejection:
+    """A plan for each part, or why a part rejects the chunk."""
+    plans: list[ChunkPlan] = []
+    for planner, timeline in parts:
+        plan = planner.plan(chunk, action, timeline)
+        if isinstance(plan, Rejection):
+            return planner.tagged(plan)
+        plans.append(plan)
+    return plans
+
+
+def _bounded(
+    parts: Sequence[tuple[ChunkPlanner, GoalTimeline]], plans: Sequence[ChunkPlan], now_ns: int
+) -> bool | Rejection:
+    """Whether the plans of all parts may come into force, or why a part rejects the chunk."""
+    ready = True
+    for (planner, _), plan in zip(parts, plans, strict=True):
+        bounded = planner.bound(plan, now_ns)
+        if isinstance(bounded, Rejection):
+            return planner.tagged(bounded)
+        ready = ready and bounded
+    return ready
 
 
 def _cause(chunk: Stamped[ActionChunk]) -> Cause:
