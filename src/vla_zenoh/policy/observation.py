@@ -7,7 +7,7 @@ from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -73,24 +73,14 @@ class History:
         """Stamp of the newest; 0 without records."""
         return _stamp_ns(self.entries[-1]) if self.entries else 0
 
-    def at(self, stamp_ns: int) -> Any:
-        """The record whose stamp is nearest; there must be one."""
-        near = self.nearest(stamp_ns)
-        assert near is not None
-        return near.record
-
-    def skew_s(self, stamp_ns: int) -> float:
-        """How far the stamp of that record is away; infinity without records."""
-        near = self.nearest(stamp_ns)
-        return math.inf if near is None else abs(_stamp_ns(near) - stamp_ns) / 1e9
-
-    def nearest(self, stamp_ns: int) -> Stamped[Any] | None:
-        """The entry whose stamp is nearest."""
-        if not self.entries:
-            return None
+    def nearest(self, stamp_ns: int) -> Stamped[Any]:
+        """The entry whose stamp is nearest; there must be one."""
+        newest = self.entries[-1]
+        if newest.header.stamp_wall_ns <= stamp_ns:
+            return newest
         right = bisect_left(self.entries, stamp_ns, key=_stamp_ns)
-        around = self.entries[max(right - 1, 0) : right + 1]
-        return min(around, key=lambda entry: abs(entry.header.stamp_wall_ns - stamp_ns))
+        before, after = self.entries[max(right - 1, 0)], self.entries[right]
+        return after if _stamp_ns(after) - stamp_ns < stamp_ns - _stamp_ns(before) else before
 
 
 def state_names(
@@ -104,8 +94,37 @@ def state_names(
     }
 
 
-@dataclass(frozen=True, slots=True)
-class Streams:
+class Moment(NamedTuple):
+    """The entry of each stream that is nearest to a time; see `Streams`."""
+
+    stamp_ns: int
+    images: Mapping[str, Stamped[Image]]
+    depth: Mapping[str, Stamped[Depth]]
+    states: Mapping[str, Stamped[Any]]
+
+    def apart(self, most_s: float) -> tuple[str, float, str] | None:
+        """Name of the first entry more than `most_s` away, how far in s, and from what."""
+        for kind, entries, others in (
+            (_STATE, self.states, "images"),
+            (_IMAGE, self.images, "others"),
+            (_DEPTH, self.depth, "others"),
+        ):
+            for name, entry in entries.items():
+                apart_s = abs(_stamp_ns(entry) - self.stamp_ns) / 1e9
+                if apart_s > most_s:
+                    return kind.format(name), apart_s, others
+        return None
+
+
+def _stamp_ns(entry: Stamped[Any]) -> int:
+    return entry.header.stamp_wall_ns
+
+
+_IMAGE, _DEPTH, _STATE = "camera {!r}", "depth of camera {!r}", "state/{}"
+"""Names of streams in messages."""
+
+
+class Streams(NamedTuple):
     """What a worker has received of the streams that its model observes.
 
     Args:
@@ -132,20 +151,27 @@ class Streams:
             {name: History(keep_s=kept_s) for name in state_names(spec, parts)},
         )
 
-    @property
-    def pictures(self) -> dict[str, History]:
-        """Images and depth by their names in messages."""
-        images = {f"camera {name!r}": one for name, one in self.images.items()}
-        return images | {f"depth of camera {name!r}": one for name, one in self.depth.items()}
+    def leading(self) -> list[History]:
+        """The streams whose stamps are those of the observation."""
+        pictures = [*self.images.values(), *self.depth.values()]
+        return pictures or list(self.states.values())
 
-    @property
-    def named_states(self) -> dict[str, History]:
-        """States by their names in messages."""
-        return {f"state/{part}": one for part, one in self.states.items()}
+    def silent(self) -> list[str]:
+        """Names of the streams of which nothing was received."""
+        named = (_IMAGE, self.images), (_DEPTH, self.depth), (_STATE, self.states)
+        return [
+            kind.format(name)
+            for kind, streams in named
+            for name, one in streams.items()
+            if not one.entries
+        ]
 
-
-def _stamp_ns(entry: Stamped[Any]) -> int:
-    return entry.header.stamp_wall_ns
+    def at(self, stamp_ns: int) -> Moment:
+        """What was received nearest to this time; nothing may be `silent`."""
+        images, depth, states = (
+            {name: one.nearest(stamp_ns) for name, one in streams.items()} for streams in self
+        )
+        return Moment(stamp_ns, images, depth, states)
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,13 +211,11 @@ def assemble(
     wanted = spec.observation
     if wanted.prompt and not task.prompt:
         return NotReady("there is no prompt", waiting=True)
-    pictures, states = streams.pictures, streams.named_states
-    missing = [name for name, one in (pictures | states).items() if not one.entries]
-    if missing:
-        return NotReady(f"nothing received yet of {', '.join(missing)}")
-    oldest = _oldest([one.entries[-1] for one in (pictures or states).values()])
+    silent = streams.silent()
+    if silent:
+        return NotReady(f"nothing received yet of {', '.join(silent)}")
+    oldest = min((one.entries[-1] for one in streams.leading()), key=_stamp_ns, default=None)
     stamp_ns = oldest.header.stamp_wall_ns if oldest else now_ns
-    seq = oldest.header.seq if oldest else 0
     age_s = (now_ns - stamp_ns) / 1e9
     if age_s > wanted.max_age_s:
         return NotReady(
@@ -204,27 +228,27 @@ def assemble(
         )
     if stamp_ns < not_before_ns:
         return NotReady("no observation since the last chunk", waiting=True)
-    for names, others in ((states, "images"), (pictures, "others")):
-        for name, one in names.items():
-            skew_s = one.skew_s(stamp_ns)
-            if skew_s > wanted.max_skew_s:
-                return NotReady(f"{name} is {skew_s:.3f} s apart from the {others}")
-    now = _at(Observation(stamp_ns, seq, task, robot=robot), wanted, streams, stamp_ns)
+    moment = streams.at(stamp_ns)
+    apart = moment.apart(wanted.max_skew_s)
+    if apart is not None:
+        name, skew_s, others = apart
+        return NotReady(f"{name} is {skew_s:.3f} s apart from the {others}")
+    seq = oldest.header.seq if oldest else 0
+    now = _observation(wanted, moment, (stamp_ns, seq, task), robot)
     if wanted.history == 1 or isinstance(now, NotReady):
         return now
     before = _history(now, wanted, streams, episode_ns)
     return before if isinstance(before, NotReady) else replace(now, history=before)
 
 
-def _at(
-    empty: Observation, wanted: ObservationSpec, streams: Streams, stamp_ns: int
+def _observation(
+    wanted: ObservationSpec, moment: Moment, first: tuple[int, int, Task], robot: str
 ) -> Observation | NotReady:
-    """An observation of the entries nearest to a time in each stream."""
-    images, depth = streams.images, streams.depth
+    """The observation of a moment; `first`: its stamp, number and task."""
     records: dict[str, dict[str, Any]] = {}
-    for name, one in streams.states.items():
+    for name, entry in moment.states.items():
         part, _, what = name.rpartition("/")
-        records.setdefault(part, {})[what] = one.at(stamp_ns)
+        records.setdefault(part, {})[what] = entry.record
     found: dict[str, dict[str, Any]] = {}
     for part, own in records.items():
         given = _asked_for(wanted, own)
@@ -233,12 +257,9 @@ def _at(
                 key = "/".join(filter(None, ("state", part, _HOLDER[name])))
                 return NotReady(f"{key} holds no {name}: this robot does not measure it")
         found[part] = given
-    whole = replace(
-        empty,
-        images={c.camera: prepare_image(images[c.camera].at(stamp_ns), c) for c in wanted.cameras},
-        depth={c.camera: prepare_depth(depth[c.camera].at(stamp_ns), c) for c in wanted.depth},
-        **found.pop("", {}),
-    )
+    images = {c.camera: prepare_image(moment.images[c.camera].record, c) for c in wanted.cameras}
+    depth = {c.camera: prepare_depth(moment.depth[c.camera].record, c) for c in wanted.depth}
+    whole = Observation(*first, images, depth, robot=robot, **found.pop("", {}))
     if not found:
         return whole
     return replace(whole, parts={part: replace(whole, **own) for part, own in found.items()})
@@ -265,8 +286,7 @@ def _history(
 ) -> tuple[Observation, ...] | NotReady:
     """The observations before this one, oldest first, or why there are none."""
     assert wanted.history_spacing_s is not None
-    named = streams.pictures | streams.named_states
-    leading = list((streams.pictures or streams.named_states).values())
+    leading = streams.leading()
     first_ns = max(one.first_since(episode_ns) for one in leading)
     most_s = min(wanted.max_skew_s, wanted.history_spacing_s / 2)
     before: list[Observation] = []
@@ -276,27 +296,21 @@ def _history(
         if at_ns < first_ns and wanted.history_start == "wait":
             return NotReady(f"the episode is younger than {ago_s:g} s", waiting=True)
         # Never later than the observation itself, which may be the first one.
-        at_ns = min(max(at_ns, first_ns), now.stamp_wall_ns)
-        for name, one in named.items():
-            apart_s = one.skew_s(at_ns)
-            if apart_s > most_s:
-                return NotReady(
-                    f"history: {name} has nothing within {most_s:g} s of the time {ago_s:g} s "
-                    f"ago, the nearest is {apart_s:.3f} s away"
-                )
-        lead = _oldest([near for one in leading if (near := one.nearest(at_ns))])
-        assert lead is not None
-        stamp_ns, seq = _stamp_ns(lead), lead.header.seq
-        empty = Observation(stamp_ns, seq, now.task, robot=now.robot)
-        then = _at(empty, wanted, streams, at_ns)
+        moment = streams.at(min(max(at_ns, first_ns), now.stamp_wall_ns))
+        apart = moment.apart(most_s)
+        if apart is not None:
+            name, apart_s, _ = apart
+            return NotReady(
+                f"history: {name} has nothing within {most_s:g} s of the time {ago_s:g} s "
+                f"ago, the nearest is {apart_s:.3f} s away"
+            )
+        lead = min((one.nearest(moment.stamp_ns) for one in leading), key=_stamp_ns).header
+        first = lead.stamp_wall_ns, lead.seq, now.task
+        then = _observation(wanted, moment, first, now.robot)
         if isinstance(then, NotReady):
             return then
         before.append(then)
     return tuple(before)
-
-
-def _oldest(entries: Sequence[Stamped[Any]]) -> Stamped[Any] | None:
-    return min(entries, key=_stamp_ns, default=None)
 
 
 def size_variant(spec: CameraSpec) -> str | None:
