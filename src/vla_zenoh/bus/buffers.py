@@ -162,9 +162,9 @@ class LatestSample(SampleBuffer):
 
     def pop(self) -> ReceivedSample | None:
         """The newest sample, once."""
+        if self._popped == self._count:
+            return None
         with self._changed:
-            if self._popped == self._count:
-                return None
             self._popped = self._count
             return self._arrival
 

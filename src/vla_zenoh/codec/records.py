@@ -111,7 +111,7 @@ def _layout(kind: type) -> _Layout:
 def _fields(record: Any) -> dict[str, Any]:
     fields = {name: getattr(record, name) for name in _layout(type(record)).names}
     return {
-        name: dict(value) if isinstance(value, Mapping) else value for name, value in fields.items()
+        name: dict(value) if hasattr(value, "keys") else value for name, value in fields.items()
     }
 
 

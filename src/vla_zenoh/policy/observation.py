@@ -25,6 +25,7 @@ from vla_zenoh.policy import (
 )
 from vla_zenoh.policy.spec import STREAM_OF
 from vla_zenoh.types import ActionChunk, Depth, Image, Stamped, Task
+from vla_zenoh.types.arrays import computed
 from vla_zenoh.types.states import MAX_COUNT
 
 MAX_STATES, MAX_PICTURES = 4096, 128
@@ -412,16 +413,18 @@ def make_chunk(
     """
     steps = np.asarray(answer.steps)
     valid_ns = int(len(steps) * dt_s * 1e9) + int(patience_s * 1e9)
-    return ActionChunk(
-        worker=worker,
-        spec_hash=spec_hash,
-        episode=observation.task.episode,
-        observation_stamp_ns=observation.stamp_wall_ns,
-        observation_seq=observation.seq,
-        valid_until_ns=observation.stamp_wall_ns + valid_ns,
-        steps=steps,
-        observed_ns=observed_ns,
-        inference_start_ns=start_ns,
-        inference_end_ns=end_ns,
-        done=answer.done,
+    stamp_ns = observation.stamp_wall_ns
+    return computed(
+        ActionChunk,
+        worker,
+        spec_hash,
+        observation.task.episode,
+        stamp_ns,
+        observation.seq,
+        stamp_ns + valid_ns,
+        steps,
+        observed_ns,
+        start_ns,
+        end_ns,
+        bool(answer.done),
     )

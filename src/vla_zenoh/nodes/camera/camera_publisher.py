@@ -201,9 +201,9 @@ class CameraPublisher:
         """
         image, raw = Image(rgb), self._raw.has_subscribers
         if raw:  # first: subscribers on this host need not wait for the rest
-            schema = zenoh.Encoding.ZENOH_BYTES.with_schema(raw_schema(image))
+            encoding = zenoh.Encoding.ZENOH_BYTES.with_schema(raw_schema(image))
             self._raw.publish(
-                encode_raw(image), stamp_wall_ns=stamp_wall_ns, seq=self._seq, encoding=schema
+                encode_raw(image), stamp_wall_ns=stamp_wall_ns, seq=self._seq, encoding=encoding
             )
         fitted = self.fitted.due(mono_ns)
         jpeg = self._jpeg.has_subscribers and self._jpeg_limiter.due(mono_ns)

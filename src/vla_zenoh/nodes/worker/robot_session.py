@@ -5,11 +5,17 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Mapping
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import zenoh
 
-from vla_zenoh.bus.buffers import CallbackRing, LatestSample, bytes_of, header_of
+from vla_zenoh.bus.buffers import (
+    CallbackRing,
+    LatestSample,
+    ReceivedSample,
+    bytes_of,
+    header_of,
+)
 from vla_zenoh.bus.metrics import Percentiles, RateMeter
 from vla_zenoh.bus.node import Node
 from vla_zenoh.codec import image as image_codec
@@ -21,7 +27,7 @@ from vla_zenoh.keys import Keys, Kind, last_chunk, worker_node
 from vla_zenoh.nodes.worker.camera_subscriber import (
     STREAM_PATIENCE_S,
     CameraSubscriber,
-    ReceivedImage,
+    Stream,
     subscribe_to_camera,
     subscribe_to_depth,
 )
@@ -30,6 +36,7 @@ from vla_zenoh.policy import ActionSteps, Observation, Policy, check_steps, rese
 from vla_zenoh.policy.chunk_prefix import ChunkPrefix
 from vla_zenoh.policy.observation import (
     MAX_STATES,
+    History,
     NotReady,
     Streams,
     assemble,
@@ -73,6 +80,15 @@ def _state_key(keys: Keys, what: str) -> str:
     }[what]
 
 
+class _Feed(NamedTuple):
+    """One camera's colour or depth images, from the subscriber to what is kept of them."""
+
+    name: str
+    camera: CameraSubscriber
+    images: History
+    decode: Callable[[bytes, str], Any]
+
+
 class RobotSession:
     """One robot's side of a worker: its own node, prompt, episode, activation and rate.
 
@@ -111,17 +127,29 @@ class RobotSession:
             lambda query: query.reply(keys.spec(name), records.encode(self.spec)),
         )
         self._tasks = node.subscribe(keys.task, LatestSample(SMALL_BYTES))
-        self._jpeg, history_s = images == "jpeg", self.spec.observation.history_span_s
+        history_s = self._history_s = self.spec.observation.history_span_s
+        self._jpeg = images == "jpeg"
+        self._streams = Streams.of(self.spec.observation, self.spec.parts)
         self._cameras = {
             one.camera: subscribe_to_camera(
                 one, node, jpeg=self._jpeg, changed=changed, history_s=history_s
             )
             for one in self.spec.observation.cameras
         }
-        self._depths = {
+        depths = {
             one.camera: subscribe_to_depth(one.camera, node, changed=changed, history_s=history_s)
             for one in self.spec.observation.depth
         }
+        self._feeds = [
+            *(
+                _Feed(name, camera, self._streams.images[name], self._image_of)
+                for name, camera in self._cameras.items()
+            ),
+            *(
+                _Feed(name, camera, self._streams.depth[name], _depth_of)
+                for name, camera in depths.items()
+            ),
+        ]
         states = MAX_STATES if history_s else 256
         self._state_buffers = {
             name: node.subscribe(
@@ -133,7 +161,6 @@ class RobotSession:
         self._state_writers = {
             name: SingleWriterFilter(STREAM_PATIENCE_S) for name in self._state_buffers
         }
-        self._streams = Streams.of(self.spec.observation, self.spec.parts)
         self._received_s: dict[CameraSubscriber, float] = {}
         self.task: Task | None = None
         self._task_received_s = -1e9
@@ -152,21 +179,18 @@ class RobotSession:
     @property
     def has_images(self) -> bool:
         """Whether an image was not polled yet, and every camera has one since the last chunk."""
-        streams = self._streams
-        received = (
-            *((camera, streams.images[name]) for name, camera in self._cameras.items()),
-            *((camera, streams.depth[name]) for name, camera in self._depths.items()),
-        )
-        new = [camera.has_new for camera, _ in received]
-        return any(new) and all(
-            fresh or (bool(one.entries) and one.newest_ns >= self._not_before_ns)
-            for fresh, (_, one) in zip(new, received, strict=True)
-        )
+        new = False
+        for feed in self._feeds:
+            if feed.camera.has_new:
+                new = True
+            elif not feed.images.entries or feed.images.newest_ns < self._not_before_ns:
+                return False
+        return new
 
     @property
     def needs_images(self) -> bool:
         """Whether the model observes any camera."""
-        return bool(self._cameras or self._depths)
+        return bool(self._feeds)
 
     @property
     def cameras_silent(self) -> bool:
@@ -180,19 +204,12 @@ class RobotSession:
             task = self.node.decode(Task, arrival, self._task_writer)
             if task is not None:
                 self._set_task(task)
-        for cameras, streams, decode in (
-            (self._cameras, self._streams.images, self._image_of),
-            (self._depths, self._streams.depth, _depth_of),
-        ):
-            for name, camera in cameras.items():
-                # Without a history there is one, the newest.
-                while (received := camera.pop()) is not None:
-                    picture = self._decode(name, received, decode)
-                    if picture is not None:
-                        streams[name].add(picture)
-                        self._received_s[camera] = received.arrival.mono_ns / 1e9
-                    if not self.spec.observation.history_span_s:
-                        break
+        for feed in self._feeds:
+            # Without a history there is one, the newest.
+            while (received := feed.camera.pop()) is not None:
+                self._receive(feed, *received)
+                if not self._history_s:
+                    break
         self.poll_states()
 
     def poll_states(self) -> None:
@@ -220,23 +237,21 @@ class RobotSession:
             except Exception as error:
                 self.failed(error, "reset_failed")
 
-    def _decode(
-        self, camera: str, received: ReceivedImage, picture_of: Callable[[bytes, str], Any]
-    ) -> Stamped[Any] | None:
-        arrival, writer = received
-        sample = arrival.sample
+    def _receive(self, feed: _Feed, arrival: ReceivedSample, stream: Stream) -> None:
+        sample, mono_ns, node = arrival.sample, arrival.mono_ns, self.node
         try:
             header = header_of(sample)
-            writer.check(header, arrival.mono_ns)
+            stream.writer.check(header, mono_ns)
             payload = bytes_of(sample.payload, MAX_IMAGE_BYTES)
-            image = picture_of(payload, str(sample.encoding))
+            image = feed.decode(payload, str(sample.encoding))
         except CodecError as error:
-            self.node.reject(error.reason, f"camera {camera}: {error}")
-            return None
-        writer.accept(header, arrival.mono_ns)
-        self.node.traffic.received(str(sample.key_expr), header, arrival.nth)
-        header, image = self.node.clocks.to_local_clock(header, image)
-        return Stamped(header, image, self.node.arrival_wall_ns(arrival))
+            node.reject(error.reason, f"camera {feed.name}: {error}")
+            return
+        stream.writer.accept(header, mono_ns)
+        node.traffic.received(stream.key, header, arrival.nth)
+        header, image = node.clocks.to_local_clock(header, image)
+        feed.images.add(Stamped(header, image, node.arrival_wall_ns(arrival)))
+        self._received_s[feed.camera] = mono_ns / 1e9
 
     def _image_of(self, payload: bytes, encoding: str) -> Image:
         if self._jpeg:
@@ -301,8 +316,6 @@ class RobotSession:
         except Exception as error:
             return self.failed(error)
         observed_ns, start_ns, end_ns = times_ns
-        self._batch = batch
-        self._inference_ms.add((end_ns - start_ns) / 1e6)
         chunk = make_chunk(
             self.name,
             self._spec_hash,
@@ -316,6 +329,8 @@ class RobotSession:
         )
         header = self._chunks.publish(chunk)
         self._not_before_ns = header.stamp_wall_ns
+        self._batch = batch
+        self._inference_ms.add((end_ns - start_ns) / 1e6)
         self._rate.tick()
         obeyed = observation.task.active and observation.task.worker == self.name
         self.prefix.published(observation, steps, header.stamp_wall_ns, obeyed=obeyed)
