@@ -24,9 +24,15 @@ PATIENCE_S, PERIODS = 1.0, 3
 a worker subscribes to the common one as well."""
 
 
-class Stream(NamedTuple):
-    """An image stream: its key, its newest images, and the filter of its writer."""
+class ReceivedImage(NamedTuple):
+    """A received image, and the writer filter and key of its stream."""
 
+    arrival: ReceivedSample
+    writer: SingleWriterFilter
+    key: str
+
+
+class _Stream(NamedTuple):
     key: str
     buffer: LatestSample | CallbackRing
     writer: SingleWriterFilter
@@ -62,7 +68,7 @@ class CameraSubscriber:
         self._node, self._camera, self._changed, self._queue = node, camera, changed, queue
         self._fallback_key, self._patience_s = fallback_key, patience_s
         self._preferred = self._subscribe(key)
-        self._fallback: Stream | None = None
+        self._fallback: _Stream | None = None
         self._received_s = time.monotonic()
 
     @property
@@ -72,18 +78,20 @@ class CameraSubscriber:
             self._fallback is not None and self._fallback.buffer.has_new
         )
 
-    def pop(self) -> tuple[ReceivedSample, Stream] | None:
-        """The newest image, once, and its stream; of a queue the oldest."""
+    def pop(self) -> ReceivedImage | None:
+        """The newest image, once; of a queue the oldest."""
         arrival = self._preferred.buffer.pop()
         if arrival is not None:
             self._received_s = time.monotonic()
             self._drop_fallback()
-            return arrival, self._preferred
+            return ReceivedImage(arrival, self._preferred.writer, self._preferred.key)
         if self._fallback is None:
             self._fall_back()
             return None
         arrival = self._fallback.buffer.pop()
-        return None if arrival is None else (arrival, self._fallback)
+        if arrival is None:
+            return None
+        return ReceivedImage(arrival, self._fallback.writer, self._fallback.key)
 
     def _fall_back(self) -> None:
         silent_s = time.monotonic() - self._received_s
@@ -104,14 +112,14 @@ class CameraSubscriber:
         why = f"there are images on {self._node.keys.short(self._preferred.key)} again"
         self._node.emit(Event("info", "notice", f"{self._camera}:own_pictures", why))
 
-    def _subscribe(self, key: str) -> Stream:
+    def _subscribe(self, key: str) -> _Stream:
         buffer = (
             LatestSample(MAX_IMAGE_BYTES, self._changed)
             if self._queue == 1
             else CallbackRing(self._queue, MAX_IMAGE_BYTES, changed=self._changed)
         )
         self._node.subscribe(key, buffer, Kind.FRAME)
-        return Stream(key, buffer, SingleWriterFilter(STREAM_PATIENCE_S))
+        return _Stream(key, buffer, SingleWriterFilter(STREAM_PATIENCE_S))
 
 
 def subscribe_to_camera(

@@ -9,13 +9,7 @@ from typing import Any, Literal, NamedTuple
 
 import zenoh
 
-from vla_zenoh.bus.buffers import (
-    CallbackRing,
-    LatestSample,
-    ReceivedSample,
-    bytes_of,
-    header_of,
-)
+from vla_zenoh.bus.buffers import CallbackRing, LatestSample, bytes_of, header_of
 from vla_zenoh.bus.metrics import Percentiles, RateMeter
 from vla_zenoh.bus.node import Node
 from vla_zenoh.codec import image as image_codec
@@ -27,7 +21,7 @@ from vla_zenoh.keys import Keys, Kind, last_chunk, worker_node
 from vla_zenoh.nodes.worker.camera_subscriber import (
     STREAM_PATIENCE_S,
     CameraSubscriber,
-    Stream,
+    ReceivedImage,
     subscribe_to_camera,
     subscribe_to_depth,
 )
@@ -207,7 +201,7 @@ class RobotSession:
         for feed in self._feeds:
             # Without a history there is one, the newest.
             while (received := feed.camera.pop()) is not None:
-                self._receive(feed, *received)
+                self._receive(feed, received)
                 if not self._history_s:
                     break
         self.poll_states()
@@ -237,18 +231,19 @@ class RobotSession:
             except Exception as error:
                 self.failed(error, "reset_failed")
 
-    def _receive(self, feed: _Feed, arrival: ReceivedSample, stream: Stream) -> None:
-        sample, mono_ns, node = arrival.sample, arrival.mono_ns, self.node
+    def _receive(self, feed: _Feed, received: ReceivedImage) -> None:
+        (arrival, writer, key), node = received, self.node
+        sample, mono_ns = arrival.sample, arrival.mono_ns
         try:
             header = header_of(sample)
-            stream.writer.check(header, mono_ns)
+            writer.check(header, mono_ns)
             payload = bytes_of(sample.payload, MAX_IMAGE_BYTES)
             image = feed.decode(payload, str(sample.encoding))
         except CodecError as error:
             node.reject(error.reason, f"camera {feed.name}: {error}")
             return
-        stream.writer.accept(header, mono_ns)
-        node.traffic.received(stream.key, header, arrival.nth)
+        writer.accept(header, mono_ns)
+        node.traffic.received(key, header, arrival.nth)
         header, image = node.clocks.to_local_clock(header, image)
         feed.images.add(Stamped(header, image, node.arrival_wall_ns(arrival)))
         self._received_s[feed.camera] = mono_ns / 1e9
