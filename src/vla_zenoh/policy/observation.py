@@ -25,7 +25,6 @@ from vla_zenoh.policy import (
 )
 from vla_zenoh.policy.spec import STREAM_OF
 from vla_zenoh.types import ActionChunk, Depth, Image, Stamped, Task
-from vla_zenoh.types.arrays import computed
 from vla_zenoh.types.states import MAX_COUNT
 
 MAX_STATES, MAX_PICTURES = 4096, 128
@@ -414,8 +413,7 @@ def make_chunk(
     steps = np.asarray(answer.steps)
     valid_ns = int(len(steps) * dt_s * 1e9) + int(patience_s * 1e9)
     stamp_ns = observation.stamp_wall_ns
-    return computed(
-        ActionChunk,
+    return ActionChunk(
         worker,
         spec_hash,
         observation.task.episode,
@@ -426,5 +424,5 @@ def make_chunk(
         observed_ns,
         start_ns,
         end_ns,
-        bool(answer.done),
+        answer.done,
     )
