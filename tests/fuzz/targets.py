@@ -43,8 +43,7 @@ from vla_zenoh.policy import ActionSpec, ModelSpec, ObservationSpec
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import load_profile
 from vla_zenoh.ros2 import attachment, readers
-from vla_zenoh.ros2.definitions import parse
-from vla_zenoh.ros2.messages import Messages
+from vla_zenoh.ros2.messages import Messages, parse
 from vla_zenoh.types import Depth, Event, Header, InferenceDebug, NodeStatus
 
 OF_TORCH = Path(__file__).parents[1] / "contract" / "lerobot_actions.pickle"

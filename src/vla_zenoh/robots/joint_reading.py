@@ -6,6 +6,8 @@ missing efforts are None.
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
 
 from vla_zenoh.errors import CodecError, RecordError
@@ -26,6 +28,10 @@ FURTHEST = 10.0
 RESTARTED_NS = 1_000_000_000
 """A stamp this much older than the last one means a restarted robot or a clock that was set; a
 smaller step back is a message that was overtaken."""
+CLOCK_WINDOW = 1000
+"""Number of messages by which clocks are compared."""
+TOLERATED_NS = 20_000_000
+"""Clocks that differ by less count as equal, as in the command node's preflight."""
 
 
 class StampFilter:
@@ -48,12 +54,47 @@ class StampFilter:
         self._stamp_ns = stamp_ns
 
 
+class RobotClock:
+    """Offset of the robot's clock from ours, by stamps and arrivals, both in ns since the epoch.
+
+    A message cannot arrive before it was sent: the minimum of (arrival - stamp) over the last
+    messages is the offset of the clocks plus the shortest delay, and that of small messages is
+    short.
+    """
+
+    def __init__(self) -> None:
+        self._delays_ns: deque[int] = deque(maxlen=CLOCK_WINDOW)
+        self.unstamped = 0
+
+    def take(self, stamp_ns: int, arrived_ns: int) -> None:
+        """Note the arrival of a message; a stamp of 0 is none."""
+        if stamp_ns == 0:
+            self.unstamped += 1
+            return
+        self._delays_ns.append(arrived_ns - stamp_ns)
+
+    @property
+    def offset_s(self) -> float | None:
+        """Upper bound of how far the robot's clock is behind ours; negative: it is ahead."""
+        return min(self._delays_ns) / 1e9 if self._delays_ns else None
+
+    @property
+    def differs(self) -> bool:
+        """Whether the clocks differ by more than `TOLERATED_NS`."""
+        offset_s = self.offset_s
+        return offset_s is not None and abs(offset_s) * 1e9 > TOLERATED_NS
+
+
 class JointReading:
     """Newest state of one arm and its gripper, from its joint states.
 
     Args:
         profile: of the robot.
         kinematics: of the robot.
+
+    Attributes:
+        joints: the newest, None before the first; `stamp_ns` is theirs.
+        width_m: opening of the gripper, None before the first; `width_stamp_ns` is its.
     """
 
     def __init__(self, profile: Profile, kinematics: Kinematics) -> None:
@@ -68,7 +109,7 @@ class JointReading:
         self._furthest_rad = BEYOND * (upper_rad - lower_rad) / 2
         self._fastest_rad_s = BEYOND * kinematics.velocity_rad_s[at]
         self._arm_newness, self._finger_newness = StampFilter(), StampFilter()
-        self._joints: JointState | None = None
+        self.joints: JointState | None = None
         self.stamp_ns = 0
         self.width_m: float | None = None
         self.width_stamp_ns = 0
@@ -108,7 +149,7 @@ class JointReading:
             state = JointState(self._arm, position, velocity, self._effort(joints, at))
         except RecordError as error:
             raise CodecError("invalid", str(error)) from error
-        self._joints, self.stamp_ns = state, stamp_ns
+        self.joints, self.stamp_ns = state, stamp_ns
         return state
 
     def _check(self, off: FloatArray, most: FloatArray, values: FloatArray, unit: str) -> None:
@@ -125,9 +166,9 @@ class JointReading:
     def _velocity(self, position: FloatArray, stamp_ns: int) -> FloatArray:
         """Difference to the previous message, bounded: two close stamps make it noisy."""
         elapsed_s = (stamp_ns - self.stamp_ns) / 1e9
-        if self._joints is None or not 0 < elapsed_s < 1:
+        if self.joints is None or not 0 < elapsed_s < 1:
             return np.zeros(len(position))
-        velocity = (position - self._joints.position_rad) / elapsed_s
+        velocity = (position - self.joints.position_rad) / elapsed_s
         return np.clip(velocity, -self._fastest_rad_s, self._fastest_rad_s)
 
     def _effort(self, joints: Joints, at: list[int]) -> FloatArray | None:
@@ -156,17 +197,12 @@ class JointReading:
         self.width_m, self.width_stamp_ns = width_m, stamp_ns
 
     # -- state --------------------------------------------------------------------------------
-    @property
-    def joints(self) -> JointState | None:
-        """The newest, None before the first."""
-        return self._joints
-
     def tcp(self) -> tuple[Pose, FloatArray]:
         """Pose and twist (6,) of the TCP, by our kinematics; needs `joints`."""
-        assert self._joints is not None
-        ordered = self._kinematics.joints_of(self._joints)
+        assert self.joints is not None
+        ordered = self._kinematics.joints_of(self.joints)
         pose, jacobian = self._kinematics.pose_and_jacobian(ordered)
-        velocity = self._kinematics.ordered(self._joints.names, self._joints.velocity_rad_s)
+        velocity = self._kinematics.ordered(self.joints.names, self.joints.velocity_rad_s)
         return pose, jacobian @ velocity
 
     def gripper(self, *, busy: bool, wanted_m: float | None, held: bool) -> GripperState | None:

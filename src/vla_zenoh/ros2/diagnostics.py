@@ -16,6 +16,7 @@ BAD = frozenset(
     {"fault", "stopped", "degraded", "braking", "waiting", "silent", "stalled", "unheeded"}
 )
 MAX_VALUE = 200
+PLAIN = (str, int, float, bool)
 
 
 def write(
@@ -53,7 +54,7 @@ def _entry(messages: Messages, robot: str, status: NodeStatus, age_s: float, ali
             f"{name}_ms": f"p50 {p50:.1f}, p95 {p95:.1f}"
             for name, (p50, p95) in status.latency_ms.items()
         },
-        **{name: str(value) for name, value in status.detail.items() if _plain(value)},
+        **{name: str(value) for name, value in status.detail.items() if isinstance(value, PLAIN)},
         **{name: str(count) for name, count in status.counters.items() if count},
     }
     return messages.new(
@@ -67,7 +68,3 @@ def _entry(messages: Messages, robot: str, status: NodeStatus, age_s: float, ali
             for key, value in values.items()
         ],
     )
-
-
-def _plain(value: Any) -> bool:
-    return isinstance(value, (str, int, float, bool))

@@ -1,22 +1,25 @@
 """All message types of one ROS 2 distribution: values, CDR both ways, and type hashes.
 
 Built on rosbags, with services and actions, the definitions of this package, and decoders that
-raise nothing but `CodecError`, whatever the bytes.
+raise nothing but `CodecError`, whatever the bytes. A service or action is several messages. What
+ROS generates for them (request, response, goal id, status, ...) is made here, so that their hashes
+are those of the real thing.
 """
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, TypesysError, get_typestore
+from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
 from vla_zenoh.errors import CodecError, ProfileError, nearest
-from vla_zenoh.ros2.definitions import parse, shipped
 from vla_zenoh.ros2.names import request_of, response_of, split_type
 
 STORES = {
@@ -35,6 +38,13 @@ MAX_MESSAGE_BYTES = 4 * 1024 * 1024
 MAX_PICTURE_BYTES = 128 * 1024 * 1024
 
 _EVENT_INFO = "service_msgs/msg/ServiceEventInfo"
+
+_SEPARATOR = "---"
+_SUFFIXES = (".msg", ".srv", ".action")
+_PARTS = {"srv": ("_Request", "_Response"), "action": ("_Goal", "_Result", "_Feedback")}
+
+Definitions = dict[str, Any]
+"""Type -> (constants, fields), as rosbags keeps them."""
 
 
 class Messages:
@@ -66,11 +76,8 @@ class Messages:
     def _hash_chars_as_ros_does(self) -> None:
         """ROS 2 makes a ``char`` of message text a ``uint8``; rosbags hashes it as a character."""
         for kind, (constants, fields) in self._store.fielddefs.items():
-            if any(_is_char(described) for _, described in fields):
-                self._store.fielddefs[kind] = (
-                    constants,
-                    [(name, _as_uint8(described)) for name, described in fields],
-                )
+            changed = [(name, _as_uint8(described)) for name, described in fields]
+            self._store.fielddefs[kind] = (constants, changed)
 
     def _register(self, definitions: Mapping[str, Any]) -> None:
         known = {*self._store.fielddefs, *definitions}
@@ -192,38 +199,25 @@ class Messages:
         def at_most_one(kind: str) -> Any:
             return (Nodetype.SEQUENCE, (one(kind), 1))
 
-        self._store.fielddefs[event] = (
-            [],
-            [
-                ("info", one(_EVENT_INFO)),
-                ("request", at_most_one(request)),
-                ("response", at_most_one(response)),
-            ],
-        )
-        self._store.fielddefs[service] = (
-            [],
-            [
-                ("request_message", one(request)),
-                ("response_message", one(response)),
-                ("event_message", one(event)),
-            ],
-        )
-
-
-def _is_char(described: Any) -> bool:
-    node, what = described
-    if node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
-        return _is_char(what[0])
-    return node == Nodetype.BASE and what[0] == "char"
+        of_event = [
+            ("info", one(_EVENT_INFO)),
+            ("request", at_most_one(request)),
+            ("response", at_most_one(response)),
+        ]
+        of_service = [
+            ("request_message", one(request)),
+            ("response_message", one(response)),
+            ("event_message", one(event)),
+        ]
+        self._store.fielddefs |= {event: ([], of_event), service: ([], of_service)}
 
 
 def _as_uint8(described: Any) -> Any:
-    if not _is_char(described):
-        return described
+    """A field with any ``char`` in it as one of ``uint8``."""
     node, what = described
-    if node == Nodetype.BASE:
-        return (node, ("uint8", 0))
-    return (node, (_as_uint8(what[0]), what[1]))
+    if node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        return (node, (_as_uint8(what[0]), what[1]))
+    return (node, ("uint8", 0)) if node == Nodetype.BASE and what[0] == "char" else described
 
 
 def _named(described: Any) -> str | None:
@@ -232,3 +226,68 @@ def _named(described: Any) -> str | None:
     if node == Nodetype.NAME:
         return what
     return _named(what[0]) if node in (Nodetype.ARRAY, Nodetype.SEQUENCE) else None
+
+
+# -- text of definitions --------------------------------------------------------------------------
+def shipped() -> dict[str, str]:
+    """Type -> text of every definition in the folder ``text`` beside this module."""
+    root = Path(__file__).parent / "text"
+    return {
+        file.relative_to(root).with_suffix("").as_posix(): file.read_text("utf-8")
+        for file in sorted(root.glob("*/*/*"))
+        if file.suffix in _SUFFIXES
+    }
+
+
+def parse(kind: str, text: str) -> Definitions:
+    """Definitions of all messages that `kind` consists of.
+
+    Args:
+        kind: ``package/msg/Name``, ``package/srv/Name`` or ``package/action/Name``.
+        text: of its file.
+
+    Raises:
+        ProfileError: the text is no such definition.
+    """
+    _, room, _ = split_type(kind)
+    if room == "msg":
+        return _message(kind, text)
+    suffixes = _PARTS[room]
+    parts = [f"{part}\n" for part in re.split(rf"(?m)^\s*{_SEPARATOR}\s*$", text)]
+    if len(parts) != len(suffixes):
+        raise ProfileError(
+            f"{kind}: has {len(parts)} parts; wanted {len(suffixes)}, with a line {_SEPARATOR} "
+            "between two"
+        )
+    found: Definitions = {}
+    for suffix, part in zip(suffixes, parts, strict=True):
+        found |= _message(f"{kind}{suffix}", part)
+    if room == "action":
+        found |= _around_action(kind)
+    return found
+
+
+def _message(kind: str, text: str) -> Definitions:
+    # rosbags knows messages only: a part of a service is read as one, then called what it is.
+    package, _, name = split_type(kind)
+    as_message = f"{package}/msg/{name}"
+    try:
+        return {kind: get_types_from_msg(text, as_message)[as_message]}
+    except TypesysError as error:
+        raise ProfileError(f"{kind} is not a ROS message: {str(error)[:300]}") from error
+
+
+def _around_action(kind: str) -> Definitions:
+    """Messages that ROS generates around goal, result and feedback."""
+    goal_id = "unique_identifier_msgs/UUID goal_id\n"
+    text = {
+        "_SendGoal_Request": f"{goal_id}{kind}_Goal goal\n",
+        "_SendGoal_Response": "bool accepted\nbuiltin_interfaces/Time stamp\n",
+        "_GetResult_Request": goal_id,
+        "_GetResult_Response": f"int8 status\n{kind}_Result result\n",
+        "_FeedbackMessage": f"{goal_id}{kind}_Feedback feedback\n",
+    }
+    found: Definitions = {}
+    for suffix, lines in text.items():
+        found |= _message(f"{kind}{suffix}", lines)
+    return found

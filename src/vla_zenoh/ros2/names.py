@@ -1,8 +1,9 @@
-"""Names of ROS 2 types, in source form and on the wire."""
+"""Names of ROS 2 types, in source form and on the wire, and of our own services and topics."""
 
 from __future__ import annotations
 
 import re
+from typing import NamedTuple
 
 from vla_zenoh.errors import ProfileError
 
@@ -48,3 +49,20 @@ def send_goal_of(action: str) -> str:
 def get_result_of(action: str) -> str:
     """The service that waits for the end of an action."""
     return f"{action}_GetResult"
+
+
+class Service(NamedTuple):
+    """A service of ours: the last part of its name, and its type."""
+
+    name: str
+    type: str
+
+
+SET_ACTIVE = Service("set_active", "std_srvs/srv/SetBool")
+STOP = Service("stop", "std_srvs/srv/Trigger")
+RESET = Service("reset", "std_srvs/srv/Trigger")
+SET_PROMPT = Service("set_prompt", "vla_msgs/srv/SetPrompt")
+SET_REQUEST = Service("set_request", "vla_msgs/srv/SetRequest")
+SERVICES = (SET_ACTIVE, STOP, RESET, SET_PROMPT, SET_REQUEST)
+
+PROMPT_TOPIC, STATUS_TOPIC = "prompt", "status"

@@ -135,7 +135,13 @@ def _fill(
     if what == POSE_STAMPED:
         pose = _pose(messages, command)
         return messages.new(POSE_STAMPED, header=header(messages, stamp), pose=pose)
-    return _twist(messages, command) if what == _TWIST else None
+    if what != _TWIST:
+        return None
+    linear, angular = (
+        _xyz(messages, "geometry_msgs/msg/Vector3", part)
+        for part in (command.twist[:3], command.twist[3:])
+    )
+    return messages.new(_TWIST, linear=linear, angular=angular)
 
 
 def _pose(messages: Messages, command: PoseCommand) -> Any:
@@ -145,14 +151,6 @@ def _pose(messages: Messages, command: PoseCommand) -> Any:
         position=_xyz(messages, "geometry_msgs/msg/Point", command.position_m),
         orientation=messages.new("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
     )
-
-
-def _twist(messages: Messages, command: PoseCommand) -> Any:
-    linear, angular = (
-        _xyz(messages, "geometry_msgs/msg/Vector3", part)
-        for part in (command.twist[:3], command.twist[3:])
-    )
-    return messages.new(_TWIST, linear=linear, angular=angular)
 
 
 def _xyz(messages: Messages, kind: str, values: FloatArray) -> Any:

@@ -19,11 +19,11 @@ from vla_zenoh.profile import load_profile
 from vla_zenoh.robots.joint_reading import (
     BEYOND,
     JointReading,
+    RobotClock,
     StampFilter,
     pose_state,
 )
-from vla_zenoh.ros2.action_goals import GoalSequencer, GoalStep
-from vla_zenoh.ros2.robot_clock import RobotClock
+from vla_zenoh.ros2.gripper_actions import GoalSequencer, GoalStep
 from vla_zenoh.ros2.samples import Joints
 from vla_zenoh.types import GripperCommand
 

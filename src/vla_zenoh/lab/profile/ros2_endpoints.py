@@ -9,8 +9,8 @@ from vla_zenoh.profile.ros2 import GRIPPER_ACTIONS, Ros2Gripper, Ros2Profile
 from vla_zenoh.ros2 import diagnostics
 from vla_zenoh.ros2.gripper_actions import GRASP
 from vla_zenoh.ros2.keys import Endpoint, EntityRole
+from vla_zenoh.ros2.names import PROMPT_TOPIC, SERVICES, STATUS_TOPIC
 from vla_zenoh.ros2.readers import JOINT_STATE, TEXT, WRENCH
-from vla_zenoh.ros2.services import PROMPT_TOPIC, SERVICES, STATUS_TOPIC
 
 
 def endpoints(profile: Profile) -> tuple[Endpoint, ...]:

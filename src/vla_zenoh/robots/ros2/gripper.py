@@ -13,8 +13,7 @@ from vla_zenoh.errors import CodecError
 from vla_zenoh.profile.ros2 import GRIPPER_ACTIONS, Ros2Gripper
 from vla_zenoh.robots.ros2.ros_graph import RosGraph, ServiceClient
 from vla_zenoh.ros2 import gripper_actions
-from vla_zenoh.ros2.action_goals import ActionGoal, GoalSequencer, GoalStep
-from vla_zenoh.ros2.gripper_actions import GRASP
+from vla_zenoh.ros2.gripper_actions import GRASP, ActionGoal, GoalSequencer, GoalStep
 from vla_zenoh.ros2.keys import COMMAND
 from vla_zenoh.ros2.messages import Messages
 from vla_zenoh.ros2.names import get_result_of, request_of, response_of, send_goal_of

@@ -23,10 +23,7 @@ from vla_zenoh.profile import Profile
 from vla_zenoh.robots.ros2.ros_graph import Request, RosGraph
 from vla_zenoh.ros2 import diagnostics
 from vla_zenoh.ros2.messages import Messages
-from vla_zenoh.ros2.names import request_of, response_of
-from vla_zenoh.ros2.readers import TEXT, read
-from vla_zenoh.ros2.samples import Stamp
-from vla_zenoh.ros2.services import (
+from vla_zenoh.ros2.names import (
     PROMPT_TOPIC,
     RESET,
     SERVICES,
@@ -36,7 +33,11 @@ from vla_zenoh.ros2.services import (
     STATUS_TOPIC,
     STOP,
     Service,
+    request_of,
+    response_of,
 )
+from vla_zenoh.ros2.readers import TEXT, read
+from vla_zenoh.ros2.samples import Stamp
 
 STATUS_PERIOD_S = 1.0
 POLL_S = 0.05

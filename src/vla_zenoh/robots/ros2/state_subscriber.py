@@ -12,12 +12,11 @@ from vla_zenoh.bus.node import Node
 from vla_zenoh.errors import CodecError
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.profile.ros2 import Ros2Profile
-from vla_zenoh.robots.joint_reading import JointReading
+from vla_zenoh.robots.joint_reading import JointReading, RobotClock
 from vla_zenoh.robots.ros2.ros_graph import RosGraph
 from vla_zenoh.ros2.keys import SENSOR
 from vla_zenoh.ros2.messages import Messages
 from vla_zenoh.ros2.readers import JOINT_STATE, WRENCH, read
-from vla_zenoh.ros2.robot_clock import RobotClock
 from vla_zenoh.ros2.samples import Wrench
 from vla_zenoh.types import FloatArray
 
