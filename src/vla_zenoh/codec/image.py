@@ -13,7 +13,6 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from vla_zenoh.errors import CodecError, RecordError
 from vla_zenoh.types import Depth, Image, shown
@@ -102,15 +101,33 @@ def decode_jpeg(payload: bytes) -> Image:
     if payload.rstrip(b"\0")[-2:] != b"\xff\xd9":
         raise CodecError("truncated", "a JPEG file without its end")
     check_size(*_jpeg_size(payload))
+    return _decode(payload, "JPEG")
+
+
+def decode_png(payload: bytes) -> Image:
+    """A PNG file to RGB pixels, for images of others.
+
+    Raises:
+        CodecError: not a PNG file, or larger than we read.
+    """
+    if len(payload) > MAX_JPEG_BYTES:
+        raise CodecError("oversize", f"a PNG of {len(payload)} bytes, at most {MAX_JPEG_BYTES}")
+    if len(payload) < 24 or not payload.startswith(PNG_BEGINS):
+        raise CodecError("malformed", "not a PNG file")
+    width, height = (int.from_bytes(payload[at : at + 4], "big") for at in (16, 20))
+    check_size(height, width)
+    return _decode(payload, "PNG")
+
+
+def _decode(payload: bytes, kind: str) -> Image:
     try:
         bgr = cv2.imdecode(np.frombuffer(payload, np.uint8), cv2.IMREAD_COLOR)
     except cv2.error as error:
-        raise CodecError("malformed", f"not a JPEG file: {error.err}") from error
+        raise CodecError("malformed", f"not a {kind} file: {error.err}") from error
     if bgr is None:
-        raise CodecError("malformed", "not a JPEG file that can be decoded")
+        raise CodecError("malformed", f"not a {kind} file that can be decoded")
     # In place: a large image is not held twice.
-    rgb: NDArray[np.uint8] = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB, dst=bgr), np.uint8)
-    return Image(rgb)
+    return Image(np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB, dst=bgr), np.uint8))
 
 
 def depth_schema(depth: Depth) -> str:

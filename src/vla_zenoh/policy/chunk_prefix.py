@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,9 +59,6 @@ class Committed:
 class ChunkPrefix:
     """Calls a model with the prefix of its next chunk, from its last chunk and its latency.
 
-    Args:
-        policy: the model.
-
     Raises:
         SpecError: it takes the prefix, and its steps are relative to the start of their chunk.
     """
@@ -79,11 +77,8 @@ class ChunkPrefix:
 
     def infer(self, observation: Observation) -> ActionSteps:
         """Infer, with the committed steps if the model takes them."""
-        if self._takes:
-            committed = self.committed(observation)
-            result = self._policy.infer(observation, committed=committed)  # pyright: ignore
-        else:
-            result = self._policy.infer(observation)
+        extra: Any = {"committed": self.committed(observation)} if self._takes else {}
+        result = self._policy.infer(observation, **extra)
         return result if isinstance(result, ActionSteps) else ActionSteps(result)
 
     def published(

@@ -91,9 +91,7 @@ def _this_python_is(wanted: str) -> bool:
 def find_model(name: str, kind: str = "models") -> ModelFile:
     """The model `name`, which may be a path to a file or a folder with a model.py.
 
-    Args:
-        name: its name or path.
-        kind: of the file, see `vla_zenoh.resources`; a benchmark is found by the same rules.
+    A benchmark is found by the same rules; for `kind` see `vla_zenoh.resources`.
 
     Raises:
         ResourceError: not found.
@@ -116,11 +114,7 @@ def find_model(name: str, kind: str = "models") -> ModelFile:
 
 
 def find_worker(word: str, models: Mapping[str, str]) -> tuple[str, ModelFile]:
-    """Name of a worker, and its model.
-
-    Args:
-        word: a worker in `models`, or the name or path of a model.
-        models: of the profile: worker -> path or name of its model.
+    """Name of a worker, and its model: one of the profile's `models`, or any by name or path.
 
     Raises:
         ResourceError: no such model.
@@ -217,7 +211,7 @@ def make_by_method(file: ModelFile, named: str, method: str, options: Mapping[st
     """Construct the only class with `method` of a file, or the one that `named` names there.
 
     Raises:
-        WorkerError: the file fails to import, has no such class, or rejects the options.
+        WorkerError: as `make_policy`.
     """
     return _find_maker(file, named, method).make(options)
 
@@ -229,7 +223,7 @@ def make_robot(path: Path, options: Mapping[str, str] | None = None) -> Robot:
     `options` are keyword arguments of its constructor, as text.
 
     Raises:
-        WorkerError: the file fails to import, has no such class, or rejects the options.
+        WorkerError: as `make_policy`.
     """
     maker = _robot_maker(path)
     robot = maker.make(options or {})

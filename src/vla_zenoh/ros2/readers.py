@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_zenoh.codec.image import MAX_JPEG_BYTES, check_size, decode_jpeg
+from vla_zenoh.codec.image import PNG_BEGINS, check_size, decode_jpeg, decode_png
 from vla_zenoh.errors import CodecError
 from vla_zenoh.ros2.messages import MAX_MESSAGE_BYTES, MAX_PICTURE_BYTES, Messages
 from vla_zenoh.ros2.samples import SECOND_NS, Joints, RosImage, Wrench
@@ -19,7 +19,7 @@ JOINT_STATE, WRENCH = "sensor_msgs/msg/JointState", "geometry_msgs/msg/WrenchSta
 IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 TEXT = "std_msgs/msg/String"
 CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1}
-_PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
+_JPEG = b"\xff\xd8\xff"
 
 
 def read(messages: Messages, kind: str, payload: bytes) -> Any:
@@ -110,26 +110,12 @@ def _image(message: Any) -> RosImage:
 def _compressed_image(message: Any) -> RosImage:
     """A JPEG or PNG, told apart by its bytes: drivers write many things into ``format``."""
     payload = np.asarray(message.data, np.uint8).tobytes()
-    if "compressedDepth" in message.format or not payload.startswith((_PNG, _JPEG)):
+    if "compressedDepth" in message.format or not payload.startswith((PNG_BEGINS, _JPEG)):
         raise CodecError(
             "encoding", f"a compressed image {message.format[:40]!r}; read are: jpeg, png"
         )
-    rgb = decode_jpeg(payload).rgb if payload.startswith(_JPEG) else _png(payload)
-    return RosImage(_stamp_ns(message.header), message.header.frame_id, rgb)
-
-
-def _png(payload: bytes) -> NDArray[np.uint8]:
-    if len(payload) > MAX_JPEG_BYTES:
-        raise CodecError("oversize", f"a PNG of {len(payload)} bytes, at most {MAX_JPEG_BYTES}")
-    width, height = (int.from_bytes(payload[at : at + 4], "big") for at in (16, 20))
-    check_size(height, width)
-    try:
-        bgr = cv2.imdecode(np.frombuffer(payload, np.uint8), cv2.IMREAD_COLOR)
-    except cv2.error as error:
-        raise CodecError("malformed", f"not a PNG file: {error.err}") from error
-    if bgr is None:
-        raise CodecError("malformed", "not a PNG file that can be decoded")
-    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB, dst=bgr), np.uint8)
+    decode = decode_jpeg if payload.startswith(_JPEG) else decode_png
+    return RosImage(_stamp_ns(message.header), message.header.frame_id, decode(payload).rgb)
 
 
 def _text(message: Any) -> str:

@@ -14,13 +14,12 @@ from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh import __version__
 from vla_zenoh.codec import message
-from vla_zenoh.codec.image import check_size, decode_jpeg
+from vla_zenoh.codec.image import decode_jpeg, decode_png
 from vla_zenoh.errors import CodecError, PeerError, in_words
 from vla_zenoh.lab.serve.served_policy import DefaultNames, ServedPolicy
 from vla_zenoh.policy import ActionSpec
@@ -30,7 +29,6 @@ PORT = 8000
 HEALTH_PATH = "/health"
 PROTOCOL_VERSION = 1
 NAMES = DefaultNames(camera="images/{}", state="states/{}", prompt="task_description")
-_PNG = b"\x89PNG\r\n\x1a\n"
 _ROTATIONS = {"rpy": "euler_xyz", "rotvec": "axis_angle", "quat_xyzw": "quaternion_xyzw"}
 MAX_ERROR = 1000
 LOG = logging.getLogger("vla_zenoh.serve")
@@ -165,16 +163,7 @@ def _image(value: Mapping[str, Any]) -> NDArray[np.uint8]:
         return _value({"__ndarray__": True, **value})
     if not isinstance(data, bytes) or kind not in ("jpeg", "png"):
         raise CodecError("malformed", f"an image of format {shown(kind)}; raw, png or jpeg")
-    if kind == "jpeg":
-        return decode_jpeg(data).rgb
-    if len(data) < 24 or not data.startswith(_PNG):
-        raise CodecError("malformed", "not a PNG file")
-    # Its size, read before memory is taken for it.
-    check_size(int.from_bytes(data[20:24], "big"), int.from_bytes(data[16:20], "big"))
-    bgr = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    if bgr is None:
-        raise CodecError("malformed", "not a PNG file that can be decoded")
-    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
+    return (decode_jpeg if kind == "jpeg" else decode_png)(data).rgb
 
 
 def _flat(payload: Mapping[str, Any], before: str = "") -> dict[str, Any]:
