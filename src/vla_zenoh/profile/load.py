@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +13,10 @@ from vla_zenoh import resources
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.profile import yaml_text
 from vla_zenoh.profile.profile import Profile
-from vla_zenoh.profile.section import Lines, Place, explain
+from vla_zenoh.profile.section import WITH_REMOVABLE, Lines, explain, merge
 from vla_zenoh.resources import ROBOT_DATA_PREFIX, extended_profile, is_path, profile_file
 
 MAX_EXTENDS = 8
-REPLACED_WHOLE = {("hosts",)}
-WITH_REMOVABLE = {("cameras",), ("ros2", "cameras"), ("models",), ("serves",), ("options",)}
-"""Maps of which null removes an inherited entry; null in place of the map: all of them."""
 
 
 def profile_names() -> list[str]:
@@ -45,11 +42,7 @@ def load_with_lines(name: str) -> tuple[Profile, Lines]:
 
 
 def followed(name: str) -> list[tuple[Path, str]]:
-    """Files of a profile along ``extends``, each with its name in the previous one.
-
-    Args:
-        name: of a valid profile, or its path.
-    """
+    """Files of a valid profile along ``extends``, each with its name in the previous one."""
     out = [(profile_file(name), name)]
     while True:
         path = out[-1][0]
@@ -83,7 +76,7 @@ def override(profile: Profile, changes: Mapping[str, Any]) -> Profile:
     Raises:
         ProfileError: the result is invalid.
     """
-    data, _ = _merge(profile.model_dump(), {}, changes, {}, ())
+    data, _ = merge(profile.model_dump(), {}, changes, {}, ())
     return _checked(data, {})
 
 
@@ -105,8 +98,7 @@ def to_yaml(profile: Profile) -> str:
 
 
 def _checked(data: Mapping[str, Any], lines: Lines) -> Profile:
-    empty = {place[0] for place in WITH_REMOVABLE if len(place) == 1}
-    given = {key: value for key, value in data.items() if value is not None or key not in empty}
+    given = {key: v for key, v in data.items() if v is not None or (key,) not in WITH_REMOVABLE}
     try:
         return Profile.model_validate(given)
     except ValidationError as error:
@@ -118,7 +110,8 @@ def _read(path: Path, seen: tuple[Path, ...]) -> tuple[dict[str, Any], Lines]:
         way = " -> ".join(str(p) for p in (*seen, path))
         raise ProfileError(f"{path}:1: profiles extend each other in a circle or too deep: {way}")
     data, lines = yaml_text.read(_bytes(path), str(path))
-    anchor(data, path.parent)
+    for section, name, prefix in list(paths_in(data)):
+        section[name] = prefix + below(path.parent, section[name].removeprefix(prefix))
     if "extends" not in data:
         return data, lines
     where, parent = lines["extends",], data.pop("extends")
@@ -130,7 +123,7 @@ def _read(path: Path, seen: tuple[Path, ...]) -> tuple[dict[str, Any], Lines]:
         raise ProfileError(f"{where}: extends: {error}") from error
     base, base_lines = _read(parent_path, (*seen, path.resolve()))
     base.pop("name", None)
-    return _merge(base, base_lines, data, lines, ())
+    return merge(base, base_lines, data, lines, ())
 
 
 def _bytes(path: Path) -> bytes:
@@ -143,88 +136,43 @@ def _bytes(path: Path) -> bytes:
         raise ProfileError(f"{path} cannot be read: {error.strerror}") from error
 
 
-def _merge(
-    base: Mapping[str, Any], base_lines: Lines, over: Mapping[str, Any], lines: Lines, at: Place
-) -> tuple[dict[str, Any], Lines]:
-    """Merge sections; `over` wins. Lists and hosts are replaced as a whole, null removes."""
-    out, out_lines = dict(base), {**base_lines}
-    if at in lines:
-        out_lines[at] = lines[at]
-    for key, value in over.items():
-        place, inherited = (*at, key), out.get(key)
-        merged = isinstance(value, Mapping) and place not in REPLACED_WHOLE
-        if merged and isinstance(inherited, Mapping):
-            out[key], out_lines = _merge(inherited, out_lines, value, lines, place)
-            continue
-        if value is None and at in WITH_REMOVABLE and key in out:
-            del out[key]
-        else:
-            out[key] = value
-        _move(place, lines, out_lines)
-    return out, out_lines
-
-
-def _move(place: Place, lines: Lines, out: Lines) -> None:
-    """Take the lines at and below `place` from the file that replaced it."""
-    depth = len(place)
-    for known in [known for known in out if known[:depth] == place]:
-        del out[known]
-    out.update({known: line for known, line in lines.items() if known[:depth] == place})
-
-
 FILE_SOURCE = "file:"
-BESIDE = ("./", "../")
+PATHS: Mapping[str, Callable[[str], bool]] = {
+    "robot.description": lambda text: not text.startswith(ROBOT_DATA_PREFIX),
+    "parts.*.robot.description": lambda text: not text.startswith(ROBOT_DATA_PREFIX),
+    "cameras.*.source": lambda text: text.startswith(FILE_SOURCE),
+    "cameras.*.intrinsics": lambda text: True,
+    "cameras.*.check.reference": lambda text: True,
+    "arm.file": lambda text: True,
+    "models.*": is_path,
+    "ros2.messages.*": lambda text: True,
+    # Of any other text only the model, or the arm, knows whether it is a path.
+    "options.*.*": lambda text: text in (".", "..") or text.startswith(("./", "../")),
+    "arm.options.*": lambda text: text in (".", "..") or text.startswith(("./", "../")),
+}
+"""Place of texts in a profile, ``*`` for any name -> whether a text there is the path of a file."""
 
 
-def anchor(data: dict[str, Any], folder: Path) -> None:
-    """Make relative paths in `data` absolute, in place.
+def paths_in(data: Mapping[str, Any]) -> Iterator[tuple[dict[str, Any], str, str]]:
+    """Paths of files in `data`: (section, key, prefix of the path in the value)."""
+    for place, names_file in PATHS.items():
+        *above, last = place.split(".")
+        for section in _sections(data, above):
+            for name in list(section) if last == "*" else [last]:
+                text = section.get(name)
+                if isinstance(text, str) and names_file(text):
+                    yield section, name, FILE_SOURCE if last == "source" else ""
 
-    Args:
-        data: of a profile file, not validated yet.
-        folder: of that file.
-    """
-    for section, name, prefix in list(paths_in(data)):
-        section[name] = prefix + below(folder, section[name].removeprefix(prefix))
 
-
-def paths_in(data: dict[str, Any]) -> Iterator[tuple[dict[str, Any], str, str]]:
-    """Paths of files in `data`: (section, key, prefix of the path in the value).
-
-    These are ``robot.description`` and that of parts, ``arm.file``, ``ros2.messages.*``, paths in
-    ``models.*``, ``cameras.*.source`` of the form ``file:PATH``, ``cameras.*.intrinsics``,
-    ``cameras.*.check.reference``, and options of models and of the arm that start with ``./`` or
-    ``../``: for any other text only the model knows whether it is a path.
-    """
-    robot, arm, ros2 = (_map(data.get(name)) for name in ("robot", "arm", "ros2"))
-    description = robot.get("description")
-    if isinstance(description, str) and not description.startswith(ROBOT_DATA_PREFIX):
-        yield robot, "description", ""
-    for part in map(_map, _map(data.get("parts")).values()):
-        described = _map(part.get("robot"))
-        description = described.get("description")
-        if isinstance(description, str) and not description.startswith(ROBOT_DATA_PREFIX):
-            yield described, "description", ""
-    for camera in map(_map, _map(data.get("cameras")).values()):
-        source = camera.get("source")
-        if isinstance(source, str) and source.startswith(FILE_SOURCE):
-            yield camera, "source", FILE_SOURCE
-        if isinstance(camera.get("intrinsics"), str):
-            yield camera, "intrinsics", ""
-        if isinstance(_map(camera.get("check")).get("reference"), str):
-            yield _map(camera["check"]), "reference", ""
-    if isinstance(arm.get("file"), str):
-        yield arm, "file", ""
-    models, messages = _map(data.get("models")), _map(ros2.get("messages"))
-    for name, model in models.items():
-        if isinstance(model, str) and is_path(model):
-            yield models, name, ""
-    for name, path in messages.items():
-        if isinstance(path, str):
-            yield messages, name, ""
-    for options in (*_map(data.get("options")).values(), arm.get("options")):
-        for name, value in _map(options).items():
-            if isinstance(value, str) and (value in (".", "..") or value.startswith(BESIDE)):
-                yield _map(options), name, ""
+def _sections(data: Any, place: Sequence[str]) -> Iterator[dict[str, Any]]:
+    if not isinstance(data, dict):
+        return
+    if not place:
+        yield data
+        return
+    first, *rest = place
+    for inside in data.values() if first == "*" else (data.get(first),):
+        yield from _sections(inside, rest)
 
 
 def below(folder: Path, path: str) -> str:
@@ -233,7 +181,3 @@ def below(folder: Path, path: str) -> str:
     if not path or path.startswith("~"):
         return path
     return os.path.normpath(folder.absolute() / path)
-
-
-def _map(value: Any) -> dict[str, Any]:
-    return value if isinstance(value, dict) else {}

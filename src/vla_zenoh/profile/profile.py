@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -40,6 +40,7 @@ from vla_zenoh.profile.section import (
     Section,
     Text,
     Word,
+    merge,
     unknown_name,
 )
 from vla_zenoh.profile.session import (
@@ -52,11 +53,8 @@ from vla_zenoh.resources import is_path
 
 
 def _root(value: str) -> str:
-    try:
-        for part in value.split("/"):
-            keys.key_chunk(part, "root")
-    except ProfileError as error:
-        raise ValueError(str(error)) from error
+    for part in value.split("/"):
+        keys.key_chunk(part, "root")
     return value
 
 
@@ -160,14 +158,7 @@ class Profile(Section):
         return made
 
     def require_one_arm(self, what: str) -> None:
-        """Reject a robot of parts.
-
-        Args:
-            what: moves or shows one arm only; begins the message.
-
-        Raises:
-            ProfileError: the robot has parts.
-        """
+        """Reject a robot of parts by a `ProfileError`: `what` moves or shows one arm only."""
         if self.parts:
             raise ProfileError(
                 f"{what}: for one arm only, and robot {self.robot.name!r} has the parts "
@@ -180,7 +171,7 @@ class Profile(Section):
         yield from _parts(self)
         yield from _cameras(self)
         yield from _ros2(self)
-        yield from _task(self)
+        yield from _unknown(("task", "worker"), [self.task.worker], "workers", self.workers)
         yield from _serves(self)
         yield from _unknown(("models",), self.models, "workers", self.workers)
         yield from _unknown(("options",), self.options, "workers", self.workers)
@@ -195,11 +186,8 @@ class Profile(Section):
 
     def served_cameras(self, host: HostProfile) -> tuple[str, ...]:
         """Those of `cameras_of` that its camera node opens: cameras of ROS 2 have another node."""
-        return tuple(
-            name
-            for name in self.cameras_of(host)
-            if name not in self.cameras or not self.cameras[name].from_ros2
-        )
+        ros2 = self.ros2_cameras()
+        return tuple(name for name in self.cameras_of(host) if name not in ros2)
 
     def ros2_cameras(self) -> dict[str, Ros2Camera]:
         """Camera -> its topic, of all that come from ROS 2."""
@@ -232,24 +220,27 @@ class Profile(Section):
         for host, part in self.hosts.items():
             for camera in self.cameras_of(part):
                 servers[camera] = self.node_name(host, "camera")
-        from_ros2 = (name for name, camera in self.cameras.items() if camera.from_ros2)
-        return servers | dict.fromkeys(from_ros2, "ros2")
+        return servers | dict.fromkeys(self.ros2_cameras(), "ros2")
 
 
 # -- checks across sections: (place, sentence) of every fault -------------------------------------
+TO_GIVE = {
+    "ros2": "",
+    "arm": ". Name the Python file, as arm: {file: ...}",
+    "franka": ". Give franka: {address: ...}",
+    "ur": ". Give ur: {address: ...}",
+    "lerobot": ". Give lerobot: {port: .., id: ..}",
+}
+"""Driver with a section of its own -> what to write there."""
+
+
 def _robot(profile: Profile) -> Iterator[Fault]:
-    if profile.robot.driver == "ros2" and profile.ros2 is None:
-        yield ("ros2",), "is missing: robot.driver is ros2"
-    if profile.robot.driver == "arm" and profile.arm is None:
-        yield ("arm",), "is missing: robot.driver is arm. Name the Python file, as arm: {file: ...}"
-    if profile.robot.driver == "franka" and profile.franka is None:
-        yield ("franka",), "is missing: robot.driver is franka. Give franka: {address: ...}"
-    if profile.robot.driver == "ur" and profile.ur is None:
-        yield ("ur",), "is missing: robot.driver is ur. Give ur: {address: ...}"
-    if profile.robot.driver == "lerobot":
-        yield from _lerobot(profile)
-    if profile.robot.driver in ("ur", "lerobot") and profile.robot.command != "joint":
-        yield ("robot", "command"), f"must be joint: robot.driver is {profile.robot.driver}"
+    driver = profile.robot.driver
+    if driver in TO_GIVE and getattr(profile, driver) is None:
+        yield (driver,), f"is missing: robot.driver is {driver}{TO_GIVE[driver]}"
+    yield from _lerobot(profile)
+    if driver in ("ur", "lerobot") and profile.robot.command != "joint":
+        yield ("robot", "command"), f"must be joint: robot.driver is {driver}"
     yield from _joint_limits((), profile.robot, profile.limits)
 
 
@@ -270,16 +261,7 @@ def _filled(section: _AnySection, over: Mapping[str, Any]) -> _AnySection:
     """`section` with the values of `over`, map by map."""
     if not over:
         return section
-    return type(section).model_validate(_merged(section.model_dump(), over))
-
-
-def _merged(below: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    merged = dict(below)
-    for name, value in over.items():
-        under: Any = merged.get(name)
-        both = isinstance(under, Mapping) and isinstance(value, Mapping)
-        merged[name] = _merged(dict(under), value) if both else value
-    return merged
+    return type(section).model_validate(merge(section.model_dump(), {}, over, {}, ("parts",))[0])
 
 
 def _parts(profile: Profile) -> Iterator[Fault]:
@@ -319,8 +301,7 @@ def _parts(profile: Profile) -> Iterator[Fault]:
 
 def _lerobot(profile: Profile) -> Iterator[Fault]:
     found, joints = profile.lerobot, profile.robot.arm_joints
-    if found is None:
-        yield ("lerobot",), "is missing: robot.driver is lerobot. Give lerobot: {port: .., id: ..}"
+    if found is None or profile.robot.driver != "lerobot":
         return
     for name in ("motors", "zero_deg"):
         given = getattr(found, name)
@@ -342,14 +323,13 @@ def _cameras(profile: Profile) -> Iterator[Fault]:
                 f"is {camera.source!r}, and robot.driver is {profile.robot.driver}: nothing is "
                 f"simulated. Give another source, or leave an inherited camera out: {name}: null",
             )
-    if profile.ros2 is not None:
-        yield from _unknown(("ros2", "cameras"), profile.ros2.cameras, "cameras", profile.cameras)
 
 
 def _ros2(profile: Profile) -> Iterator[Fault]:
     ros2, robot = profile.ros2, profile.robot
     if ros2 is None:
         return
+    yield from _unknown(("ros2", "cameras"), ros2.cameras, "cameras", profile.cameras)
     wanted = f"{robot.command}_command"
     if robot.driver == "ros2" and getattr(ros2, wanted) is None:
         yield ("ros2",), f"lacks {wanted}: robot.command is {robot.command}"
@@ -357,15 +337,15 @@ def _ros2(profile: Profile) -> Iterator[Fault]:
         source = profile.cameras[name].source if name in profile.cameras else ""
         if source.startswith("ros2:") and source.removeprefix("ros2:") != camera.topic:
             yield ("ros2", "cameras", name, "topic"), f"is not that of cameras.{name}: {source!r}"
-    yield from _way_to_ros2(profile)
+    yield from _way_to_ros2(profile, ros2.connect)
     joints = ros2.joint_command
     if joints is not None and joints.type not in JOINT_COMMANDS:
         wanted = " or ".join(JOINT_COMMANDS)
         yield ("ros2", "joint_command", "type"), f"is {joints.type}: joints are sent as {wanted}"
     gripper = ros2.gripper
-    if gripper is not None and gripper.grasp and gripper.type != "franka_msgs/action/Move":
-        yield ("ros2", "gripper", "grasp"), "goes with type franka_msgs/action/Move only"
     if gripper is not None:
+        if gripper.grasp and gripper.type != "franka_msgs/action/Move":
+            yield ("ros2", "gripper", "grasp"), "goes with type franka_msgs/action/Move only"
         yield from _gripper_position(gripper, robot.gripper.joint_ends is not None)
 
 
@@ -385,10 +365,9 @@ def _gripper_position(gripper: Ros2Gripper, has_ends: bool) -> Iterator[Fault]:
         )
 
 
-def _way_to_ros2(profile: Profile) -> Iterator[Fault]:
+def _way_to_ros2(profile: Profile, places: Sequence[str] | None) -> Iterator[Fault]:
     """A client of the bridge can move the robot without our command node."""
-    assert profile.ros2 is not None
-    places, secured = profile.ros2.connect, profile.session.security is not None
+    secured = profile.session.security is not None
     used = any("ros2" in host.nodes for host in profile.hosts.values())
     if places is None and secured and used:
         yield (
@@ -406,11 +385,6 @@ def _way_to_ros2(profile: Profile) -> Iterator[Fault]:
             why = "lets anyone on the network command the robot: write tls/, or tcp/127.0.0.1:7450"
         if why:
             yield ("ros2", "connect", str(index)), why
-
-
-def _task(profile: Profile) -> Iterator[Fault]:
-    if profile.task.worker not in profile.workers:
-        yield unknown_name(("task", "worker"), profile.task.worker, "workers", profile.workers)
 
 
 def _serves(profile: Profile) -> Iterator[Fault]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 from pydantic import AfterValidator, Field
 
@@ -32,12 +32,13 @@ Topic = Annotated[str, Field(max_length=256), AfterValidator(_topic)]
 RosType = Annotated[str, Field(max_length=256), AfterValidator(_type)]
 
 JOINT_COMMANDS = ("trajectory_msgs/msg/JointTrajectory", "std_msgs/msg/Float64MultiArray")
-GRIPPER_ACTIONS = (
+GripperAction = Literal[
     "franka_msgs/action/Move",
     "franka_msgs/action/Grasp",
     "control_msgs/action/GripperCommand",
     "control_msgs/action/ParallelGripperCommand",
-)
+]
+GRIPPER_ACTIONS: tuple[GripperAction, ...] = get_args(GripperAction)
 
 
 class Ros2Camera(Section):
@@ -98,14 +99,7 @@ class Ros2Gripper(Section):
     """
 
     topic: Topic
-    type: Literal[
-        "franka_msgs/action/Move",
-        "franka_msgs/action/Grasp",
-        "control_msgs/action/GripperCommand",
-        "control_msgs/action/ParallelGripperCommand",
-        "std_msgs/msg/Float64",
-        "std_msgs/msg/Float64MultiArray",
-    ]
+    type: Literal[GripperAction, "std_msgs/msg/Float64", "std_msgs/msg/Float64MultiArray"]
     grasp: Topic | None = None
     position: Literal["width", "finger", "joint"] | None = None
 

@@ -24,11 +24,11 @@ CAMERA_SOURCES = {
 }
 """Kind of a camera's source -> how it is written. `nodes.camera.node.make_source` opens them."""
 DEPTH_SOURCES = ("sim", "realsense")
+"""Kinds of source that measure depth."""
 LENS_SOURCES = ("v4l2", "realsense", "rtsp", "rtsps", "file")
 """Kinds of source whose images a camera node may crop, flip and undistort."""
 LOCK_SOURCES = ("v4l2", "realsense")
 """Kinds of source whose exposure and white balance can be fixed."""
-"""Kinds of source that measure depth."""
 MIN_PERIODS = 3
 """A healthy link may be silent for up to this many periods."""
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import types
 import typing
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from typing import Annotated, Any, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from vla_zenoh import keys
-from vla_zenoh.errors import ProfileError, describe_fault, nearest
+from vla_zenoh.errors import describe_fault, nearest
+from vla_zenoh.keys import key_chunk
 from vla_zenoh.types import MAX_TEXT, shown
 
 Place = tuple[str, ...]
@@ -50,13 +51,6 @@ class InconsistentSections(ValueError):
         super().__init__("; ".join(f"{'.'.join(fault[0])} {fault[1]}" for fault in faults))
 
 
-def _key_part(value: str) -> str:
-    try:
-        return keys.key_chunk(value, "name")
-    except ProfileError as error:
-        raise ValueError(str(error)) from error
-
-
 def _differ(values: tuple[Any, ...]) -> tuple[Any, ...]:
     twice = sorted({str(value) for value in values if values.count(value) > 1})
     if twice:
@@ -70,7 +64,7 @@ def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
     return pair
 
 
-Name = Annotated[str, AfterValidator(_key_part)]
+Name = Annotated[str, AfterValidator(partial(key_chunk, what="name"))]
 Text = Annotated[str, Field(max_length=MAX_TEXT)]
 Word = Annotated[str, Field(min_length=1, max_length=512)]
 Names = Annotated[tuple[Name, ...], Field(strict=False, max_length=64), AfterValidator(_differ)]
@@ -78,10 +72,36 @@ Words = Annotated[tuple[Word, ...], Field(strict=False, max_length=64), AfterVal
 Range = Annotated[tuple[float, float], Field(strict=False), AfterValidator(_ordered)]
 Distinct = AfterValidator(_differ)
 
-
+REPLACED_WHOLE = {("hosts",)}
+WITH_REMOVABLE = {("cameras",), ("ros2", "cameras"), ("models",), ("serves",), ("options",)}
+"""Maps of which null removes an inherited entry; null in place of the map: all of them."""
 NOT_MADE = {"depth": "cameras give colour images only; depth is not read."}
 """Key that looks like a slip of another one but asks for more than exists -> what there is."""
 _NO_VALUE_SHOWN = {"missing", "extra_forbidden", "too_long", "too_short", "value_error"}
+
+
+def merge(
+    base: Mapping[str, Any], base_lines: Lines, over: Mapping[str, Any], lines: Lines, at: Place
+) -> tuple[dict[str, Any], Lines]:
+    """Merge sections at `at`; `over` wins. Lists and hosts are replaced whole, null removes."""
+    out, out_lines = dict(base), {**base_lines}
+    if at in lines:
+        out_lines[at] = lines[at]
+    for key, value in over.items():
+        place, inherited = (*at, key), out.get(key)
+        merged = isinstance(value, Mapping) and place not in REPLACED_WHOLE
+        if merged and isinstance(inherited, Mapping):
+            out[key], out_lines = merge(inherited, out_lines, value, lines, place)
+            continue
+        if value is None and at in WITH_REMOVABLE and key in out:
+            del out[key]
+        else:
+            out[key] = value
+        # The lines at and below it are those of the file that replaced it.
+        depth = len(place)
+        out_lines = {known: line for known, line in out_lines.items() if known[:depth] != place}
+        out_lines |= {known: line for known, line in lines.items() if known[:depth] == place}
+    return out, out_lines
 
 
 def explain(error: ValidationError, lines: Lines, model: type[Section]) -> list[str]:
@@ -91,30 +111,41 @@ def explain(error: ValidationError, lines: Lines, model: type[Section]) -> list[
         place = tuple(str(part) for part in fault["loc"] if part != "[key]")
         cause = fault.get("ctx", {}).get("error")
         if isinstance(cause, InconsistentSections):
-            lines_out += [_located(fault, lines, place) for fault in cause.faults]
+            lines_out += [located_fault(fault, lines, place) for fault in cause.faults]
         else:
             lines_out.append(located(place, _why(fault, place, model), lines))
     return lines_out
 
 
-def own_place(places: Sequence[Place], lines: Lines) -> Place:
-    """The first of several places that the loaded file itself gives, else the first."""
-    own = _file(line_of((), lines))
-    return next((each for each in places if _file(line_of(each, lines)) == own), places[0])
+def located(place: Place, why: str, lines: Lines) -> str:
+    """Sentence about a place, with file and line where they are known."""
+    name = ".".join(place) or "the profile"
+    where = _line_of(place, lines)
+    return f"{where}: {name}: {why}" if where else f"{name}: {why}"
 
 
-def line_of(place: Place, lines: Lines) -> str:
+def located_fault(fault: Fault, lines: Lines, above: Place = ()) -> str:
+    """Sentence about the first of a fault's places that the loaded file itself gives."""
+    below, why, *rest = fault
+    place = (*above, *below)
+    own, first = _file(lines.get((), "")), _line_of(place, lines)
+    if rest and _file(first) != own:
+        for other, sentence in rest[0]:
+            if _file(lines.get(other, "")) == own:
+                named = f"{'.'.join(place)} ({first})"
+                return located(other, sentence.replace("{}", named, 1), lines)
+    return located(place, why, lines)
+
+
+def _line_of(place: Place, lines: Lines) -> str:
     """``file:line`` of a value, or of what it is in; empty if unknown."""
     while place not in lines and place:
         place = place[:-1]
     return lines.get(place, "")
 
 
-def located(place: Place, why: str, lines: Lines) -> str:
-    """Sentence about a place, with file and line where they are known."""
-    name = ".".join(place) or "the profile"
-    where = line_of(place, lines)
-    return f"{where}: {name}: {why}" if where else f"{name}: {why}"
+def _file(where: str) -> str:
+    return where.rpartition(":")[0]
 
 
 def unknown_name(place: Place, name: str, section: str, known: Iterable[str]) -> Fault:
@@ -134,23 +165,6 @@ def unknown_name(place: Place, name: str, section: str, known: Iterable[str]) ->
             ((section,), f"lacks {name!r}, but {{}} names it{slip} List it, or {remedy}"),
         ),
     )
-
-
-def _located(fault: Fault, lines: Lines, above: Place) -> str:
-    """The line of a fault: at the first of its places that the loaded file itself gives."""
-    below, why, *rest = fault
-    place = (*above, *below)
-    own, first = _file(line_of((), lines)), line_of(place, lines)
-    if rest and _file(first) != own:
-        for other, sentence in rest[0]:
-            if other in lines and _file(lines[other]) == own:
-                named = f"{'.'.join(place)} ({first})"
-                return located(other, sentence.replace("{}", named, 1), lines)
-    return located(place, why, lines)
-
-
-def _file(where: str) -> str:
-    return where.rpartition(":")[0]
 
 
 def _why(fault: Any, place: Place, model: type[Section]) -> str:

@@ -58,9 +58,7 @@ def address_of(endpoint: str) -> str:
 
 def is_loopback(endpoint: str) -> bool:
     """Whether an endpoint is on this computer: a file, ``localhost``, or a loopback address."""
-    if endpoint.startswith(FILE_PROTOCOLS):
-        return True
-    return is_loopback_address(host_of(endpoint))
+    return endpoint.startswith(FILE_PROTOCOLS) or is_loopback_address(host_of(endpoint))
 
 
 def is_loopback_address(address: str) -> bool:
@@ -83,10 +81,7 @@ def endpoint_faults(
 ) -> Iterator[tuple[int, str]]:
     """(index, sentence) for endpoints that contradict the session's security or links.
 
-    Args:
-        endpoints: of the session or of one host.
-        session: the session section.
-        listen: a router listens on them; otherwise nodes connect to them.
+    If `listen`, a router listens on them; otherwise nodes connect to them.
     """
     for index, endpoint in enumerate(endpoints):
         protocol = endpoint.partition("/")[0]
@@ -104,15 +99,6 @@ def endpoint_faults(
             )
         if session.separate_links and not _has_a_second(endpoint):
             yield index, "separate_links needs PROTOCOL/HOST:PORT, and the next port too"
-
-
-def ends_at(target: str, listening: str) -> bool:
-    """Whether a connection to `target` on this computer can end at an endpoint `listening`."""
-    there, here = (_HOST_AND_PORT.fullmatch(address_of(each)) for each in (target, listening))
-    if there is None or here is None:
-        return address_of(target) == address_of(listening)
-    same_protocol = target.partition("/")[0] == listening.partition("/")[0]
-    return same_protocol and there["port"] == here["port"]
 
 
 def _has_a_second(endpoint: str) -> bool:

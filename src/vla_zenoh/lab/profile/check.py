@@ -31,8 +31,8 @@ from vla_zenoh.lab.profile.robot_check import (
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.policy.loader import find_worker, make_policy
 from vla_zenoh.profile import Profile, load_with_lines
-from vla_zenoh.profile.section import located, own_place
-from vla_zenoh.profile.session import ends_at
+from vla_zenoh.profile.section import located, located_fault
+from vla_zenoh.profile.session import address_of, host_of
 
 SIM, FILE, DEVICE = "sim:", "file:", "v4l2:/dev/"
 
@@ -81,8 +81,8 @@ def check_profile(
     for check in CHECKS:
         for place, why, node, other in check(profile, name, host):
             if not node or node in here:
-                places = [place, *([other] if other else [])]
-                errors.append(located(own_place(places, lines), why, lines))
+                fault = (place, why, ((other, why),)) if other else (place, why)
+                errors.append(located_fault(fault, lines))
             else:
                 hints.append(f"{'.'.join(place)}: on this computer: {why}")
     hints += [*joints_advice(profile), *braking_advice(profile)]
@@ -149,13 +149,22 @@ def _router(profile: Profile, name: str, host: str | None) -> Iterator[ProfileFa
         return
     listen = session.listen if part.listen is None else part.listen
     connect = session.connect if part.connect is None else part.connect
-    if not any(ends_at(target, endpoint) for target in connect for endpoint in listen):
+    if not any(_ends_at(target, endpoint) for target in connect for endpoint in listen):
         place = ("session", "connect") if part.connect is None else ("hosts", str(host), "connect")
         yield ProfileFault(
             place,
             f"leads to {', '.join(connect)}, and the router of this host listens on "
             f"{', '.join(listen)}: its nodes would not find it. Give both the same port",
         )
+
+
+def _ends_at(target: str, listening: str) -> bool:
+    """Whether a connection to `target` on this computer can end at an endpoint `listening`."""
+    there, here = address_of(target), address_of(listening)
+    if not (host_of(target) and host_of(listening)):
+        return there == here
+    same_protocol = target.partition("/")[0] == listening.partition("/")[0]
+    return same_protocol and there.rpartition(":")[2] == here.rpartition(":")[2]
 
 
 def _certificates(profile: Profile, name: str, host: str | None) -> Iterator[ProfileFault]:
