@@ -29,7 +29,7 @@ from vla_zenoh.keys import KEY_PATHS
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.lab.doctor.franka_limits import BY_FCI, JOINTS
 from vla_zenoh.profile import Profile, load_profile
-from vla_zenoh.security.roles import TABLE
+from vla_zenoh.security.roles import OWN, TABLE
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = ROOT / "docs" / "reference"
@@ -169,11 +169,11 @@ def keys_page() -> str:
         "without certificates they are not checked."
     )
     rows = ["| key | payload | published by | read by |", "|---|---|---|---|"]
-    for row in sorted(TABLE, key=lambda row: row.member):
-        path = KEY_PATHS[row.member]
+    for member, allowed in sorted(TABLE.items()):
+        path = KEY_PATHS[member]
         text = path.path.replace("{", "<").replace("}", ">")
-        writers = sorted(r.value for r in (row.put | row.announce | row.answer))
-        readers = sorted(r.value for r in (row.subscribe | row.ask | row.watch))
+        writers = sorted({r.value for act in allowed if act in OWN for r in allowed[act]})
+        readers = sorted({r.value for act in allowed if act not in OWN for r in allowed[act]})
         about = path.payload.replace("|", "\\|")
         rows.append(f"| `{text}` | {about} | {', '.join(writers)} | {', '.join(readers)} |")
     return "\n\n".join([*out, "\n".join(rows)]) + "\n"

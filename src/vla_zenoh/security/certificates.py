@@ -135,11 +135,7 @@ def read(pem: bytes) -> Certificate:
     Raises:
         SecurityError: not a certificate.
     """
-    try:
-        found = x509.load_pem_x509_certificate(pem)
-        extensions = found.extensions
-    except ValueError as error:
-        raise SecurityError(f"is not a certificate: {error}") from error
+    found, extensions = _parsed(pem)
     names = found.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     try:
         addresses = extensions.get_extension_for_class(x509.SubjectAlternativeName).value
@@ -159,15 +155,20 @@ def signed_by(pem: bytes, authority: bytes) -> bool:
     Raises:
         SecurityError: one of them is not a certificate.
     """
-    try:
-        found, signer = map(x509.load_pem_x509_certificate, (pem, authority))
-    except ValueError as error:
-        raise SecurityError(f"is not a certificate: {error}") from error
+    (found, _), (signer, _) = _parsed(pem), _parsed(authority)
     try:
         found.verify_directly_issued_by(signer)
     except (ValueError, TypeError, InvalidSignature):
         return False
     return True
+
+
+def _parsed(pem: bytes) -> tuple[x509.Certificate, x509.Extensions]:
+    try:
+        found = x509.load_pem_x509_certificate(pem)
+        return found, found.extensions
+    except ValueError as error:
+        raise SecurityError(f"is not a certificate: {error}") from error
 
 
 def key_fits(certificate: bytes, key: bytes) -> bool:

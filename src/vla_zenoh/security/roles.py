@@ -5,7 +5,7 @@ A key of `keys.py` without a row here is allowed to no role; a test checks that 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass
 from enum import Enum
 from itertools import product
@@ -19,7 +19,6 @@ LOOKERS = frozenset({OPERATOR, VIEWER})
 SPEAKERS = NODES | {OPERATOR, REPLAY}
 RECORDERS = ("recorder", ROLLING)
 """Nodes that an operator may run: they only subscribe, and publish their status."""
-NOBODY: frozenset[Role] = frozenset()
 
 
 class Act(Enum):
@@ -34,109 +33,86 @@ class Act(Enum):
     WATCH = "watch"  # see such tokens
 
 
-@dataclass(frozen=True, slots=True)
-class Row:
-    """Rights on one member of `Keys`.
+Allowed = Mapping[Act, Set[Role]]
+"""Rights on one member of `Keys`.
 
-    Where a key has parameters, a writer may use its own only: its name, worker, cameras. Readers
-    may read all of them, and a replay may write all of them.
-    """
+Where a key has parameters, a writer may use its own only: its name, worker, cameras. Readers may
+read all of them, and a replay may write all of them."""
 
-    member: str
-    put: frozenset[Role] = NOBODY
-    delete: frozenset[Role] = NOBODY
-    subscribe: frozenset[Role] = NOBODY
-    answer: frozenset[Role] = NOBODY
-    ask: frozenset[Role] = NOBODY
-    announce: frozenset[Role] = NOBODY
-    watch: frozenset[Role] = NOBODY
-
-    def roles(self, act: Act) -> frozenset[Role]:
-        """Roles that may do `act`."""
-        return getattr(self, act.value)
+SETTING: Allowed = {
+    Act.PUT: {OPERATOR, REPLAY},
+    Act.SUBSCRIBE: {COMMAND} | LOOKERS,
+    Act.ANSWER: {COMMAND},
+    Act.ASK: LOOKERS,
+}
+"""Published by the operator, received by the command node, visible to viewers."""
+NEWS: Allowed = {Act.PUT: SPEAKERS, Act.SUBSCRIBE: {COMMAND} | LOOKERS}
 
 
-def _setting(member: str) -> Row:
-    """A setting: published by the operator, received by the command node, visible to viewers."""
-    return Row(
-        member,
-        put=frozenset({OPERATOR, REPLAY}),
-        subscribe=frozenset({COMMAND}) | LOOKERS,
-        answer=frozenset({COMMAND}),
-        ask=LOOKERS,
-    )
+def _stream(writers: set[Role], readers: set[Role]) -> Allowed:
+    return {Act.PUT: writers | {REPLAY}, Act.SUBSCRIBE: readers}
 
 
-def _stream(member: str, writers: set[Role], readers: set[Role]) -> Row:
-    return Row(member, put=frozenset(writers) | {REPLAY}, subscribe=frozenset(readers))
-
-
-TABLE = (
+TABLE: Mapping[str, Allowed] = {
     # Images show people, so a viewer does not see them.
-    _stream("camera_raw", {CAMERA, ROBOT}, {WORKER, OPERATOR}),
-    _stream("camera_jpeg", {CAMERA, ROBOT}, {WORKER, OPERATOR}),
-    _stream("camera_depth", {CAMERA, ROBOT}, {WORKER, OPERATOR}),
-    _stream("camera_fitted", {CAMERA, ROBOT}, {WORKER, OPERATOR}),
-    _stream("seen", {WORKER}, {OPERATOR}),
-    _stream("seen_depth", {WORKER}, {OPERATOR}),
-    _stream("seen_record", {WORKER}, {OPERATOR}),
-    _stream("state_joint", {ROBOT}, {WORKER, COMMAND, OPERATOR, VIEWER}),
-    _stream("state_pose", {ROBOT}, {WORKER, COMMAND, OPERATOR, VIEWER}),
-    _stream("state_gripper", {ROBOT}, {WORKER, COMMAND, OPERATOR, VIEWER}),
-    _stream("state_privileged", {ROBOT}, {WORKER, OPERATOR, VIEWER}),
-    _setting("prompt"),
-    _setting("active"),
-    Row("holding", announce=frozenset({OPERATOR}), watch=frozenset({COMMAND})),
-    _setting("worker"),
-    _setting("rate"),
-    _setting("speed"),
+    "camera_raw": _stream({CAMERA, ROBOT}, {WORKER, OPERATOR}),
+    "camera_jpeg": _stream({CAMERA, ROBOT}, {WORKER, OPERATOR}),
+    "camera_depth": _stream({CAMERA, ROBOT}, {WORKER, OPERATOR}),
+    "camera_fitted": _stream({CAMERA, ROBOT}, {WORKER, OPERATOR}),
+    "seen": _stream({WORKER}, {OPERATOR}),
+    "seen_depth": _stream({WORKER}, {OPERATOR}),
+    "seen_record": _stream({WORKER}, {OPERATOR}),
+    "state_joint": _stream({ROBOT}, {WORKER, COMMAND, OPERATOR, VIEWER}),
+    "state_pose": _stream({ROBOT}, {WORKER, COMMAND, OPERATOR, VIEWER}),
+    "state_gripper": _stream({ROBOT}, {WORKER, COMMAND, OPERATOR, VIEWER}),
+    "state_privileged": _stream({ROBOT}, {WORKER, OPERATOR, VIEWER}),
+    "prompt": SETTING,
+    "active": SETTING,
+    "holding": {Act.ANNOUNCE: {OPERATOR}, Act.WATCH: {COMMAND}},
+    "worker": SETTING,
+    "rate": SETTING,
+    "speed": SETTING,
     # Every role that may stop the arm may slow it down.
-    _stream("slower", {OPERATOR}, {COMMAND, OPERATOR, VIEWER}),
-    _stream("held", {OPERATOR}, {COMMAND, OPERATOR, VIEWER}),
-    _stream("stop", {OPERATOR}, {COMMAND, OPERATOR, VIEWER}),
-    _stream("reset", {OPERATOR}, {COMMAND, ROBOT, OPERATOR, VIEWER}),
-    _stream("save", {OPERATOR}, {OPERATOR, VIEWER}),
-    Row(
-        "task",
-        put=frozenset({COMMAND, REPLAY}),
-        subscribe=frozenset({ROBOT, WORKER}) | LOOKERS,
-        answer=frozenset({COMMAND}),
-        ask=frozenset({WORKER}) | LOOKERS,
-    ),
-    _stream("delta", {WORKER}, {COMMAND, OPERATOR, VIEWER}),
-    Row(
-        "spec",
-        put=frozenset({WORKER, REPLAY}),
-        subscribe=frozenset({CAMERA, COMMAND, OPERATOR, VIEWER}),
-        answer=frozenset({WORKER}),
-        ask=frozenset({COMMAND, OPERATOR, VIEWER}),
-    ),
-    _stream("command_pose", {COMMAND}, {ROBOT, OPERATOR, VIEWER}),
-    _stream("command_joint", {COMMAND}, {ROBOT, OPERATOR, VIEWER}),
-    _stream("command_gripper", {COMMAND}, {ROBOT, OPERATOR, VIEWER}),
-    Row("primitive", answer=frozenset({WORKER}), ask=frozenset({OPERATOR})),
-    Row("status", put=SPEAKERS, subscribe=frozenset({COMMAND}) | LOOKERS),
-    Row("event", put=SPEAKERS, subscribe=frozenset({COMMAND}) | LOOKERS),
-    Row("alive", announce=SPEAKERS, watch=NODES | LOOKERS | {REPLAY}),
-    Row("clock", answer=SPEAKERS, ask=NODES | LOOKERS | {REPLAY}),
-    _stream("sim_scene", {ROBOT}, {CAMERA, OPERATOR}),
-    _stream("sim_objects", {ROBOT}, {OPERATOR, VIEWER}),
-    _stream("sim_reset", {OPERATOR}, {ROBOT, OPERATOR}),
-    Row("sim_step", answer=frozenset({ROBOT}), ask=frozenset({OPERATOR})),
-)
+    "slower": _stream({OPERATOR}, {COMMAND, OPERATOR, VIEWER}),
+    "held": _stream({OPERATOR}, {COMMAND, OPERATOR, VIEWER}),
+    "stop": _stream({OPERATOR}, {COMMAND, OPERATOR, VIEWER}),
+    "reset": _stream({OPERATOR}, {COMMAND, ROBOT, OPERATOR, VIEWER}),
+    "save": _stream({OPERATOR}, {OPERATOR, VIEWER}),
+    "task": {
+        Act.PUT: {COMMAND, REPLAY},
+        Act.SUBSCRIBE: {ROBOT, WORKER} | LOOKERS,
+        Act.ANSWER: {COMMAND},
+        Act.ASK: {WORKER} | LOOKERS,
+    },
+    "delta": _stream({WORKER}, {COMMAND, OPERATOR, VIEWER}),
+    "spec": {
+        Act.PUT: {WORKER, REPLAY},
+        Act.SUBSCRIBE: {CAMERA, COMMAND, OPERATOR, VIEWER},
+        Act.ANSWER: {WORKER},
+        Act.ASK: {COMMAND, OPERATOR, VIEWER},
+    },
+    "command_pose": _stream({COMMAND}, {ROBOT, OPERATOR, VIEWER}),
+    "command_joint": _stream({COMMAND}, {ROBOT, OPERATOR, VIEWER}),
+    "command_gripper": _stream({COMMAND}, {ROBOT, OPERATOR, VIEWER}),
+    "primitive": {Act.ANSWER: {WORKER}, Act.ASK: {OPERATOR}},
+    "status": NEWS,
+    "event": NEWS,
+    "alive": {Act.ANNOUNCE: SPEAKERS, Act.WATCH: NODES | LOOKERS | {REPLAY}},
+    "clock": {Act.ANSWER: SPEAKERS, Act.ASK: NODES | LOOKERS | {REPLAY}},
+    "sim_scene": _stream({ROBOT}, {CAMERA, OPERATOR}),
+    "sim_objects": _stream({ROBOT}, {OPERATOR, VIEWER}),
+    "sim_reset": _stream({OPERATOR}, {ROBOT, OPERATOR}),
+    "sim_step": {Act.ANSWER: {ROBOT}, Act.ASK: {OPERATOR}},
+}
 
 OWN = frozenset({Act.PUT, Act.ANSWER, Act.ANNOUNCE})
 """Acts that a node may do in its own name only."""
 
 
 def expressions(keys: Keys, member: str, identity: Identity, act: Act) -> Iterator[str]:
-    """The key expressions on which `identity` does `act`, where its role may do it at all.
+    """Key expressions of a `member` of `Keys` on which `identity` does `act`, if its role may.
 
-    Args:
-        keys: of the robot.
-        member: of `Keys`.
-        identity: of the node or operator.
-        act: in its own name only if it is in `OWN`.
+    In its own name only if the act is in `OWN`.
     """
     path = KEY_PATHS[member]
     for parts in product(*(_choices(name, identity, act) for name in path.parameters)):
@@ -172,8 +148,8 @@ def rights(keys: Keys, identity: Identity) -> list[Right]:
     """All rights of `identity`; none are listed for a router, which forwards everything."""
     return [
         Right(identity, act, key)
-        for row in TABLE
-        for act in Act
-        if identity.roles & row.roles(act)
-        for key in expressions(keys, row.member, identity, act)
+        for member, allowed in TABLE.items()
+        for act, roles in allowed.items()
+        if identity.roles & roles
+        for key in expressions(keys, member, identity, act)
     ]

@@ -110,10 +110,10 @@ def wide(keys: Keys, identity: Identity) -> list[str]:
     if identity.role is not Role.VIEWER:
         return []
     groups: dict[str, bool] = {}
-    for row in TABLE:
-        for key in expressions(keys, row.member, identity, Act.SUBSCRIBE):
+    for member, allowed in TABLE.items():
+        may = identity.role in allowed.get(Act.SUBSCRIBE, ())
+        for key in expressions(keys, member, identity, Act.SUBSCRIBE):
             above, _, _ = key.rpartition("/")
-            may = identity.role in row.subscribe
             groups[above] = groups.get(above, True) and may
     top = keys.all_keys.removesuffix("/**")
     return [f"{group}/*" for group, may in groups.items() if may and group != top]

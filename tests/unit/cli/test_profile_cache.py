@@ -15,7 +15,7 @@ from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.profile import Profile, profile_names
 from vla_zenoh.security.identity import identities, operator_role
-from vla_zenoh.security.operator_certificates import operator_hosts
+from vla_zenoh.security.store import operator_hosts
 
 SECURED = """\
 extends: panda_sim

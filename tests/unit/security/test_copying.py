@@ -16,8 +16,7 @@ from typer.testing import CliRunner
 from vla_zenoh.lab.cli.addresses import is_own
 from vla_zenoh.lab.cli.secure import secure_app
 from vla_zenoh.profile import Profile, load_profile
-from vla_zenoh.security.operator_certificates import operator_hosts
-from vla_zenoh.security.store import THIS_HOST, Store
+from vla_zenoh.security.store import THIS_HOST, Store, operator_hosts
 
 PATIENCE_S = 30.0
 TYPED = "  "

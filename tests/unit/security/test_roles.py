@@ -47,17 +47,18 @@ def who(lab: Profile, common_name: str) -> Identity:
 
 
 def test_every_key_has_a_row_in_the_table_of_roles() -> None:
-    assert sorted(row.member for row in TABLE) == sorted(KEY_PATHS)
+    assert sorted(TABLE) == sorted(KEY_PATHS)
 
 
 def test_every_kind_of_node_has_a_role() -> None:
     assert {traits.role for traits in NODE_KINDS.values()} <= {role.value for role in Role}
 
 
-@pytest.mark.parametrize("row", TABLE, ids=lambda row: row.member)
-def test_every_key_is_written_by_somebody_and_read_by_somebody(row) -> None:
-    said = row.put | row.answer | row.announce
-    heard = row.subscribe | row.ask | row.watch
+@pytest.mark.parametrize("member", TABLE)
+def test_every_key_is_written_by_somebody_and_read_by_somebody(member: str) -> None:
+    allowed = TABLE[member]
+    said = [allowed[act] for act in (Act.PUT, Act.ANSWER, Act.ANNOUNCE) if act in allowed]
+    heard = [allowed[act] for act in (Act.SUBSCRIBE, Act.ASK, Act.WATCH) if act in allowed]
     assert said
     assert heard
 
@@ -205,9 +206,9 @@ def every_possible_act(lab: Profile) -> Iterator[Right]:
     tried = {
         (act, key)
         for other in people
-        for row in TABLE
+        for member in TABLE
         for act in Act
-        for key in expressions(KEYS, row.member, other, act)
+        for key in expressions(KEYS, member, other, act)
     }
     for one in people:
         for act, key in sorted(tried, key=str):

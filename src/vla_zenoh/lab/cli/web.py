@@ -17,7 +17,7 @@ from vla_zenoh.lab.web.access import PageRole, People, Person, read_people
 from vla_zenoh.profile.session import is_loopback_address
 from vla_zenoh.runtime.process import run_node
 from vla_zenoh.security.identity import Role
-from vla_zenoh.security.operator_certificates import local_role
+from vla_zenoh.security.store import local_role
 
 if TYPE_CHECKING:
     from vla_zenoh.profile import Profile

@@ -22,7 +22,7 @@ from vla_zenoh.lab.doctor.access import AccessVerdict
 from vla_zenoh.lab.doctor.access_rules import allowing, missing, passages
 from vla_zenoh.profile import Profile
 from vla_zenoh.security.identity import Identity, Role, identities
-from vla_zenoh.security.roles import TABLE, Act, expressions, rights
+from vla_zenoh.security.roles import OWN, TABLE, Act, expressions, rights
 from vla_zenoh.security.rules import access_control
 
 REPLY_S = 2.0
@@ -66,11 +66,10 @@ def probes(profiles: Sequence[Profile]) -> dict[Act, list[str]]:
     made: dict[str, set[Act]] = {}
     for profile in profiles:
         camera = next(iter(profile.cameras), "front")
-        for row, identity in product(TABLE, identities(profile)):
-            acts = {act for act in Act if row.roles(act)}
-            for act in acts & {Act.PUT, Act.ANSWER, Act.ANNOUNCE}:
-                for key in expressions(profile.keys_of_all_parts, row.member, identity, act):
-                    made.setdefault(key.replace("*", camera), set()).update(acts)
+        for (member, allowed), identity in product(TABLE.items(), identities(profile)):
+            for act in OWN & set(allowed):
+                for key in expressions(profile.keys_of_all_parts, member, identity, act):
+                    made.setdefault(key.replace("*", camera), set()).update(allowed)
     keys_of = {act: sorted(key for key, acts in made.items() if act in acts) for act in Act}
     watched = [one for profile in profiles for one in token_selectors(profile.keys)]
     return {**keys_of, Act.DELETE: keys_of[Act.PUT], Act.WATCH: watched}
