@@ -41,33 +41,6 @@ if TYPE_CHECKING:
     from vla_zenoh.robot import Command, Reading, Robot
     from vla_zenoh.types import ActionChunk, GripperState, Image, JointState, PoseState, Stamped
 
-_MODULES = {
-    "bus.primitives": ("PrimitiveError",),
-    "bus.remote_robot": ("RemoteRobot", "connect"),
-    "errors": (
-        "CodecError",
-        "ProfileError",
-        "RecordError",
-        "SecurityError",
-        "SessionError",
-        "SpecError",
-        "VlaZenohError",
-    ),
-    "policy": (
-        "ActionSpec",
-        "ActionSteps",
-        "CameraSpec",
-        "ModelSpec",
-        "Observation",
-        "ObservationSpec",
-        "Policy",
-    ),
-    "profile": ("Profile", "load_profile"),
-    "robot": ("Command", "Reading", "Robot"),
-    "types": ("ActionChunk", "GripperState", "Image", "JointState", "PoseState", "Stamped"),
-}
-_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
-
 __all__ = [
     "ActionChunk",
     "ActionSpec",
@@ -100,13 +73,6 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
-    module = _MODULE_OF.get(name)
-    if module is None:
-        raise AttributeError(f"module 'vla_zenoh' has no attribute {name!r}")
-    return getattr(import_module(f"vla_zenoh.{module}"), name)
-
-
 def lazy_names(package: str, *modules: str) -> Callable[[str], Any]:
     """A package's ``__getattr__``: imports the first of `modules` that has the name.
 
@@ -123,6 +89,17 @@ def lazy_names(package: str, *modules: str) -> Callable[[str], Any]:
         raise AttributeError(f"module {package!r} has no attribute {name!r}")
 
     return find
+
+
+_find = lazy_names(
+    __name__, "errors", "types", "robot", "policy", "profile", "bus.primitives", "bus.remote_robot"
+)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module 'vla_zenoh' has no attribute {name!r}")
+    return _find(name)
 
 
 def __dir__() -> list[str]:

@@ -186,12 +186,19 @@ def describe_fault(fault: Any) -> str:
     return f"wants {wanted.removeprefix('be ')}"
 
 
-def describe_faults(error: Any, top: str, most: int = 20) -> str:
-    """The faults of a ``ValidationError`` in one line: each with its field, or `top`."""
-    return "; ".join(
-        f"{'.'.join(map(str, fault['loc'])) or top}: {describe_fault(fault)}"[:300]
-        for fault in error.errors(include_url=False)[:most]
-    )
+def describe_faults(error: Any, top: str, most: int = 20, *, given: bool = False) -> str:
+    """The faults of a ``ValidationError`` in one line: each with its field, or `top`.
+
+    With the value that was `given`, if asked for.
+    """
+    out: list[str] = []
+    for fault in error.errors(include_url=False)[:most]:
+        place, value = ".".join(map(str, fault["loc"])) or top, fault.get("input")
+        said = f"{place}: {describe_fault(fault)}" if place else describe_fault(fault)
+        if given and isinstance(value, (str, int, float)) and fault["type"] != "missing":
+            said += f" (given: {reprlib.repr(value)})"
+        out.append(said[:300])
+    return "; ".join(out)
 
 
 def nearest(word: str, known: Iterable[str], otherwise: str = ".") -> str:
@@ -218,9 +225,9 @@ def in_words(error: BaseException) -> str:
     """
     if isinstance(error, VlaZenohError):
         return str(error)
-    faults = getattr(error, "errors", None)
-    if type(error).__name__ == "ValidationError" and callable(faults):
-        return f"{getattr(error, 'title', 'it')} is wrong: " + "; ".join(_fields(faults))
+    if type(error).__name__ == "ValidationError" and callable(getattr(error, "errors", None)):
+        title = getattr(error, "title", "it")
+        return f"{title} is wrong: {describe_faults(error, '', given=True)}"
     text = str(error)
     if "weights_only" in text:
         return (
@@ -236,15 +243,3 @@ def in_words(error: BaseException) -> str:
     text = text.strip()
     short = text if len(text) <= MAX_FOREIGN else f"{text[:MAX_FOREIGN]} ..."
     return f"{name}: {short}" if short else name
-
-
-def _fields(faults: Any) -> list[str]:
-    """Faults of a Pydantic model: field, what is wrong, what was given."""
-    out: list[str] = []
-    for fault in faults(include_url=False):
-        place = ".".join(str(part) for part in fault["loc"])
-        given = fault.get("input")
-        shown = isinstance(given, (str, int, float, bool)) and fault["type"] != "missing"
-        value = f" (given: {reprlib.repr(given)})" if shown else ""
-        out.append(f"{place}: " * bool(place) + describe_fault(fault) + value)
-    return out

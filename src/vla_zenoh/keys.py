@@ -70,23 +70,17 @@ class KeyPath:
     def text(self, keys: Keys, *parts: str) -> str:
         """The whole key with `parts` in place of its parameters; they may be ``*``."""
         own = self.path.format(**dict(zip(self.parameters, parts, strict=True)))
-        return f"{keys.root}/{keys.robot}/{own}"
-
-
-class _PartKey(KeyPath):
-    """A key that every part of a robot has."""
-
-    def text(self, keys: Keys, *parts: str) -> str:
-        path = f"{keys.part}/{self.path}" if keys.part else self.path
-        return f"{keys.root}/{keys.robot}/{path}"
-
-    def __get__(self, keys: Keys, owner: object = None) -> str:
-        return self.text(keys)
+        of_part = f"{keys.part}/" if keys.part and isinstance(self, _PartKey) else ""
+        return f"{keys.root}/{keys.robot}/{of_part}{own}"
 
 
 class _Key(KeyPath):
     def __get__(self, keys: Keys, owner: object = None) -> str:
         return self.text(keys)
+
+
+class _PartKey(_Key):
+    """A key that every part of a robot has."""
 
 
 class _KeyOf(KeyPath):
@@ -281,10 +275,6 @@ class Keys:
         own = self.short(key).removeprefix(f"{self.part_of(key)}/")
         return own.split("/")[0] if self.short(key) != key else ""
 
-    def on(self, other: Keys, key: str) -> str:
-        """The key of `other` that corresponds to `key` of this robot."""
-        return other.full(self.short(key))
-
     @staticmethod
     def of(key: str, root: str) -> Keys | None:
         """The keys of the robot that `key` belongs to, None if it belongs to none below `root`."""
@@ -317,10 +307,7 @@ def last_chunk(key: str) -> str:
 
 
 def covers(wide: str, narrow: str) -> bool:
-    """Whether the expression `wide` includes every key of the expression `narrow`.
-
-    Supports Zenoh's ``*`` and ``**``, the only ones used here.
-    """
+    """Whether the expression `wide` includes every key of `narrow`; both may have * and **."""
     return _covers(wide.split("/"), narrow.split("/"))
 
 

@@ -1,6 +1,7 @@
 """Converts plain text that people and other clients put on the setting keys to values and back.
 
-No envelope, no header: ``true`` on ``active`` is all it takes from any language.
+No envelope, no header: ``true`` on ``active`` is all it takes from any language. Decoders raise a
+`CodecError` that says what is allowed: ``oversize``, ``malformed`` (not UTF-8) or ``invalid``.
 """
 
 from __future__ import annotations
@@ -25,11 +26,7 @@ _SEED = re.compile(r"[0-9]{1,10}")
 
 
 def decode_text(payload: bytes) -> str:
-    """UTF-8 text without control characters, white space trimmed.
-
-    Raises:
-        CodecError: ``oversize``, ``malformed`` (not UTF-8) or ``invalid`` (control characters).
-    """
+    """UTF-8 text without control characters, white space trimmed."""
     if len(payload) > MAX_SETTING_BYTES:
         raise CodecError("oversize", f"{len(payload)} bytes, at most {MAX_SETTING_BYTES} are read")
     try:
@@ -45,11 +42,7 @@ def decode_text(payload: bytes) -> str:
 
 
 def decode_bool(payload: bytes) -> bool:
-    """true/false, 1/0, on/off, yes/no in any case; JSON booleans are among them.
-
-    Raises:
-        CodecError: anything else.
-    """
+    """true/false, 1/0, on/off, yes/no in any case; JSON booleans are among them."""
     word = decode_text(payload).lower()
     if word in TRUE_WORDS:
         return True
@@ -59,29 +52,15 @@ def decode_bool(payload: bytes) -> bool:
 
 
 def decode_activation(payload: bytes) -> bool | str:
-    """A bool as `decode_bool`, or the deadman's name of ``true while NAME``.
-
-    Returns:
-        True or False; a name for the latter.
-
-    Raises:
-        CodecError: anything else.
-    """
+    """A bool as `decode_bool`, or the deadman's name of ``true while NAME``."""
     words = decode_text(payload).split()
     if len(words) != 3 or words[0].lower() not in TRUE_WORDS or words[1].lower() != WHILE:
         return decode_bool(payload)
-    try:
-        return keys.key_chunk(words[2], "holder")
-    except ProfileError as error:
-        raise CodecError("invalid", str(error)) from error
+    return _key_part(words[2], "holder")
 
 
 def decode_rate(payload: bytes) -> float:
-    """Chunks per second within `MIN_RATE_HZ` and `MAX_RATE_HZ`.
-
-    Raises:
-        CodecError: not a plain number, or outside.
-    """
+    """Chunks per second within `MIN_RATE_HZ` and `MAX_RATE_HZ`."""
     word, wanted = decode_text(payload), f"{MIN_RATE_HZ:g} to {MAX_RATE_HZ:g} chunks per second"
     if not _NUMBER.fullmatch(word):
         raise CodecError("invalid", f"rate {word[:40]!r} is not a number: give {wanted}")
@@ -92,11 +71,7 @@ def decode_rate(payload: bytes) -> float:
 
 
 def decode_percent(payload: bytes) -> float:
-    """A share of the speed, 0 to 100 percent: a plain number, ``%`` may stand behind it.
-
-    Raises:
-        CodecError: not such a number, or outside.
-    """
+    """A share of the speed, 0 to 100 percent: a plain number, ``%`` may stand behind it."""
     word = decode_text(payload)
     number = word.removesuffix("%").rstrip()
     if not _NUMBER.fullmatch(number):
@@ -113,14 +88,7 @@ def decode_percent(payload: bytes) -> float:
 
 
 def decode_held(payload: bytes) -> HeldBox | str:
-    """What the gripper holds: ``X Y Z [at X Y Z]`` in m, numbers apart by spaces or commas.
-
-    Returns:
-        the box; empty: nothing is held.
-
-    Raises:
-        CodecError: anything else.
-    """
+    """What the gripper holds: ``X Y Z [at X Y Z]`` in m, with spaces or commas; empty: nothing."""
     text = decode_text(payload)
     if not text:
         return text
@@ -145,24 +113,19 @@ def decode_held(payload: bytes) -> HeldBox | str:
 
 
 def decode_name(payload: bytes) -> str:
-    """A worker's name: one word that can stand in a key.
+    """A worker's name: one word that can stand in a key."""
+    return _key_part(decode_text(payload), "worker name")
 
-    Raises:
-        CodecError: it cannot; lists what is allowed.
-    """
-    word = decode_text(payload)
+
+def _key_part(word: str, what: str) -> str:
     try:
-        return keys.key_chunk(word, "worker name")
+        return keys.key_chunk(word, what)
     except ProfileError as error:
         raise CodecError("invalid", str(error)) from error
 
 
 def decode_seed(payload: bytes) -> int | None:
-    """Empty, or a whole number: the seed of the simulator's next placement.
-
-    Raises:
-        CodecError: anything else.
-    """
+    """Empty, or a whole number: the seed of the simulator's next placement."""
     word = decode_text(payload)
     if not word:
         return None

@@ -133,23 +133,19 @@ def _nodes(profile: Profile, host: str) -> list[Identity]:
     from_ros2 = tuple(n for n, c in profile.cameras.items() if c.from_ros2)
     found: list[Identity] = []
     for kind in part.nodes:
-        role = Role(NODE_KINDS[kind].role)
+        role, name = Role(NODE_KINDS[kind].role), profile.node_name(host, kind)
         if kind == PRIMITIVES:
-            name = profile.node_name(host, kind)
             found.append(Identity(role, name, host, worker=PRIMITIVES, speaks_for=(Role.OPERATOR,)))
-            continue
-        if role is Role.WORKER:
-            found += [
-                Identity(role, worker_node(worker), host, worker=worker)
-                for worker in profile.workers_of(part)
-            ]
-            continue
-        cameras = {
-            Role.CAMERA: tuple(c for c in profile.cameras_of(part) if c not in from_ros2),
-            Role.ROBOT: from_ros2 if kind == "ros2" else (),
-        }
-        name = profile.node_name(host, kind)
-        offers = kind == "ros2" and profile.ros2 is not None and profile.ros2.services is not None
-        people = (Role.OPERATOR,) if offers else ()
-        found.append(Identity(role, name, host, cameras=cameras.get(role, ()), speaks_for=people))
+        elif role is Role.WORKER:
+            workers = profile.workers_of(part)
+            found += [Identity(role, worker_node(one), host, worker=one) for one in workers]
+        elif role is Role.CAMERA:
+            served = tuple(c for c in profile.cameras_of(part) if c not in from_ros2)
+            found.append(Identity(role, name, host, cameras=served))
+        elif kind == "ros2":
+            offers = profile.ros2 is not None and profile.ros2.services is not None
+            people = (Role.OPERATOR,) if offers else ()
+            found.append(Identity(role, name, host, cameras=from_ros2, speaks_for=people))
+        else:
+            found.append(Identity(role, name, host))
     return found

@@ -133,7 +133,7 @@ def test_a_key_is_told_from_those_of_other_robots() -> None:
     assert (ours.group(left), ours.part_of(left)) == ("state", "left")
     assert [ours.part_of(each) for each in (key, ours.prompt, ours.state_pose)] == ["", "", ""]
     assert theirs.part_of(left) == ""
-    assert ours.on(theirs, key) == theirs.camera_jpeg("front")
+    assert theirs.full(ours.short(key)) == theirs.camera_jpeg("front")
 
 
 def test_a_short_key_is_made_whole_and_a_whole_one_left() -> None:

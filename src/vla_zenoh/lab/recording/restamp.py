@@ -57,7 +57,7 @@ class Restamper:
         if entry.fields is not None:
             payload = message.pack(_stamps_moved(entry.fields, self.moved_ns))
         return Sample(
-            self._here.on(self._there, entry.key),
+            self._there.full(self._here.short(entry.key)),
             payload,
             entry.encoding,
             header,
