@@ -11,7 +11,7 @@ import zenoh
 from numpy.typing import NDArray
 
 from benchmarks.peers import ACTION, Pictures
-from vla_zenoh.bus.buffers import LatestSample
+from vla_zenoh.bus.buffers import LatestSample, Wake
 from vla_zenoh.bus.session import QOS, open_session
 from vla_zenoh.errors import NodeError
 from vla_zenoh.keys import Kind
@@ -34,7 +34,7 @@ def session_at(endpoint: str, *, listen: bool) -> zenoh.Session:
 def serve(endpoint: str, cameras: int, *, listen: bool, stop: threading.Event) -> None:
     """Answer every `cameras` images until `stop` is set."""
     answer = np.array(ACTION, np.float32).tobytes()
-    changed = threading.Condition()
+    changed = Wake()
     slots = [LatestSample(changed=changed) for _ in range(cameras)]
     with session_at(endpoint, listen=listen) as session:
         out = session.declare_publisher(ANSWER_KEY, **QOS[Kind.ORDER])
@@ -43,9 +43,8 @@ def serve(endpoint: str, cameras: int, *, listen: bool, stop: threading.Event) -
             for key, slot in zip(PICTURE_KEYS, slots, strict=False)
         ]
         while not stop.is_set():
-            with changed:
-                if not changed.wait_for(lambda: all(slot.has_new for slot in slots), POLL_S):
-                    continue
+            if not changed.wait(POLL_S) or not all(slot.has_new for slot in slots):
+                continue
             for arrival in [slot.pop() for slot in slots]:
                 assert arrival is not None
                 np.frombuffer(arrival.sample.payload.to_bytes(), np.uint8)

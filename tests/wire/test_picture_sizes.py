@@ -14,7 +14,7 @@ import pytest
 import zenoh
 from camera_rig import Rig, camera_rig, free_endpoint, grey, until
 
-from vla_zenoh.bus.buffers import header_of
+from vla_zenoh.bus.buffers import Wake, header_of
 from vla_zenoh.bus.node import Node, Publisher
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec.image import decode_jpeg, encode_jpeg
@@ -169,7 +169,7 @@ def test_plain_pictures_are_taken_while_none_come_in_the_own_size_and_no_longer(
         keys = worker.keys
         own = camera.declare_publisher(keys.camera_fitted("front", "32x32-pad"), Kind.FRAME)
         plain = camera.declare_publisher(keys.camera_jpeg("front"), Kind.FRAME)
-        changed = threading.Condition()
+        changed = Wake()
         ears = CameraSubscriber(
             worker, "front", own.key, plain.key, patience_s=PATIENCE_S, changed=changed
         )
@@ -204,9 +204,7 @@ def test_a_worker_knows_where_its_pictures_are_and_where_those_of_all() -> None:
         )
         for_all = camera.declare_publisher(keys.camera_jpeg("front"), Kind.FRAME)
         wanted = CameraSpec(camera="front", width=32, height=32, resize="pad")
-        ears = subscribe_to_camera(
-            wanted, worker, jpeg=True, changed=threading.Condition(), history_s=0.0
-        )
+        ears = subscribe_to_camera(wanted, worker, jpeg=True, changed=Wake(), history_s=0.0)
         until("its own", lambda: own.has_subscribers)
         assert not other.has_subscribers
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Iterator
 
@@ -11,6 +10,7 @@ import pytest
 import zenoh
 from camera_rig import free_endpoint, until
 
+from vla_zenoh.bus.buffers import Wake
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import records
 from vla_zenoh.nodes.worker.robot_session import RobotSession
@@ -42,7 +42,7 @@ class Cameras:
 
     def __init__(self, session: zenoh.Session) -> None:
         profile = load_profile("panda_sim")
-        self.changed = threading.Condition()
+        self.changed = Wake()
         self.worker = RobotSession(
             profile, session, Look(), "look", images="raw", host=None, changed=self.changed
         )

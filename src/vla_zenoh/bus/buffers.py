@@ -11,6 +11,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import zenoh
@@ -126,29 +127,45 @@ class SampleBuffer:
         return list(found.values())
 
 
+class Wake:
+    """Wakes one waiting thread: an event that clears itself, and costs half of a condition."""
+
+    def __init__(self) -> None:
+        self._asleep = threading.Lock()
+        self._asleep.acquire()
+
+    def set(self) -> None:
+        """Let the present or next `wait` return."""
+        with suppress(RuntimeError):  # it is set already
+            self._asleep.release()
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait until it is set, since the last time; False after `timeout_s`."""
+        return self._asleep.acquire(timeout=max(timeout_s, 0.0))
+
+
 class LatestSample(SampleBuffer):
     """Keeps the newest sample; a thread can wait for it.
 
     Args:
         limit: bytes of payload and attachment together.
-        changed: notified at every sample; several buffers may share one.
+        changed: set at every sample; several buffers may share one.
     """
 
-    def __init__(
-        self, limit: int = MAX_RECORD_BYTES, changed: threading.Condition | None = None
-    ) -> None:
+    def __init__(self, limit: int = MAX_RECORD_BYTES, changed: Wake | None = None) -> None:
         super().__init__(limit)
-        self._changed = changed or threading.Condition()
+        self._changed = changed or Wake()
+        self._lock = threading.Lock()
         self._arrival: ReceivedSample | None = None
         self._count = self._popped = 0
 
     def __call__(self, sample: zenoh.Sample) -> None:
         if not self._accepts(sample):
             return
-        with self._changed:
+        with self._lock:
             self._count += 1
             self._arrival = ReceivedSample(sample, time.monotonic_ns(), self._count)
-            self._changed.notify_all()
+        self._changed.set()
 
     @property
     def count(self) -> int:
@@ -164,14 +181,16 @@ class LatestSample(SampleBuffer):
         """The newest sample, once."""
         if self._popped == self._count:
             return None
-        with self._changed:
+        with self._lock:
             self._popped = self._count
             return self._arrival
 
     def wait(self, timeout_s: float) -> bool:
         """Wait for a sample that was not popped; False after `timeout_s`."""
-        with self._changed:
-            return self._changed.wait_for(lambda: self._popped != self._count, timeout_s)
+        give_up_s = time.monotonic() + timeout_s
+        while not self.has_new and self._changed.wait(give_up_s - time.monotonic()):
+            pass
+        return self.has_new
 
 
 class CallbackRing(SampleBuffer):
@@ -180,19 +199,17 @@ class CallbackRing(SampleBuffer):
     Args:
         size: samples.
         limit: bytes of one.
-        arrival: set whenever a sample is added.
-        changed: notified whenever a sample is added; several buffers may share one.
+        arrival: set whenever a sample is added; several buffers may share one.
     """
 
     def __init__(
         self,
         size: int,
         limit: int = MAX_RECORD_BYTES,
-        arrival: threading.Event | None = None,
-        changed: threading.Condition | None = None,
+        arrival: threading.Event | Wake | None = None,
     ) -> None:
         super().__init__(limit)
-        self._arrival, self._changed = arrival, changed
+        self._arrival = arrival
         self._arrivals: deque[ReceivedSample] = deque(maxlen=size)
         self._size = size
         self._count = 0
@@ -207,9 +224,6 @@ class CallbackRing(SampleBuffer):
         self._arrivals.append(ReceivedSample(sample, time.monotonic_ns(), self._count))
         if self._arrival is not None:
             self._arrival.set()
-        if self._changed is not None:
-            with self._changed:
-                self._changed.notify_all()
 
     @property
     def has_new(self) -> bool:
@@ -232,12 +246,13 @@ class ZenohRing(SampleBuffer):
     """A `CallbackRing` that Zenoh fills by itself, without running Python for each sample.
 
     A flood of samples then costs the loop that drains it nothing. The price: the time of arrival is
-    that of `drain`, and samples that are too large are dropped only there.
+    that of `drain`, and samples that are too large are dropped only there. Samples of a full ring
+    are not counted, since others may have been dropped.
     """
 
     def __init__(self, size: int, limit: int = MAX_RECORD_BYTES) -> None:
         super().__init__(limit)
-        self._size = size
+        self._size, self._count = size, 0
         self._receive: Callable[[], zenoh.Sample | None] = lambda: None
 
     def subscribe(self, session: zenoh.Session, key: str) -> zenoh.Subscriber[Any]:
@@ -253,5 +268,8 @@ class ZenohRing(SampleBuffer):
             if sample is None:
                 break
             if self._accepts(sample):
-                drained.append(ReceivedSample(sample, time.monotonic_ns()))
+                self._count += 1
+                drained.append(ReceivedSample(sample, time.monotonic_ns(), self._count))
+        else:
+            return [arrival._replace(nth=0) for arrival in drained]
         return drained

@@ -115,11 +115,12 @@ class Traffic:
         Args:
             key: of the record.
             header: of the record.
-            arrivals: samples its buffer had received by then; 0: not counted.
+            arrivals: samples its buffer had received by then; 0: unknown, the count begins anew.
         """
-        if arrivals == 0:
-            return
         who = (key, header.source)
+        if arrivals == 0:
+            self._received.pop(who, None)
+            return
         seq, count, before = self._received.pop(who, (header.seq, arrivals, 0))
         lost = max((header.seq - seq) - (arrivals - count), before)
         self._received[who] = (seq, count, lost)

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import zenoh
 
-from vla_zenoh.bus.buffers import bytes_of
+from vla_zenoh.bus.buffers import Wake, bytes_of
 from vla_zenoh.bus.remote_robot import RemoteRobot
 from vla_zenoh.codec.primitives import Answer
 from vla_zenoh.control.reachability import make_reachability_filter
@@ -85,7 +85,7 @@ class PrimitivesNode:
             *(profile, session, self._policy, PRIMITIVES),
             images="jpeg",
             host=None,
-            changed=threading.Condition(),
+            changed=Wake(),
         )
         self._worker.complaint = ""
         self._node, self._robot = self._worker.node, RemoteRobot(profile, session)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-import threading
 import time
 from typing import NamedTuple
 
-from vla_zenoh.bus.buffers import CallbackRing, LatestSample, ReceivedSample
+from vla_zenoh.bus.buffers import CallbackRing, LatestSample, ReceivedSample, Wake
 from vla_zenoh.bus.node import Node
 from vla_zenoh.codec.image import MAX_IMAGE_BYTES
 from vla_zenoh.keys import Kind
@@ -47,7 +46,7 @@ class CameraSubscriber:
         key: of the preferred stream.
         fallback_key: of the common stream; None if that is the preferred one.
         patience_s: silence on `key` after which `fallback_key` is subscribed to.
-        changed: notified when an image arrives.
+        changed: set when an image arrives.
         queue: images kept until they are taken; 1: the newest only.
 
     Raises:
@@ -62,7 +61,7 @@ class CameraSubscriber:
         fallback_key: str | None,
         *,
         patience_s: float,
-        changed: threading.Condition,
+        changed: Wake,
         queue: int = 1,
     ) -> None:
         self._node, self._camera, self._changed, self._queue = node, camera, changed, queue
@@ -116,14 +115,14 @@ class CameraSubscriber:
         buffer = (
             LatestSample(MAX_IMAGE_BYTES, self._changed)
             if self._queue == 1
-            else CallbackRing(self._queue, MAX_IMAGE_BYTES, changed=self._changed)
+            else CallbackRing(self._queue, MAX_IMAGE_BYTES, self._changed)
         )
         self._node.subscribe(key, buffer, Kind.FRAME)
         return _Stream(key, buffer, SingleWriterFilter(STREAM_PATIENCE_S))
 
 
 def subscribe_to_camera(
-    camera: CameraSpec, node: Node, *, jpeg: bool, changed: threading.Condition, history_s: float
+    camera: CameraSpec, node: Node, *, jpeg: bool, changed: Wake, history_s: float
 ) -> CameraSubscriber:
     """Subscribe to the stream that suits a model: raw, JPEG, or JPEG in its input size.
 
@@ -131,7 +130,7 @@ def subscribe_to_camera(
         camera: of the model's spec.
         node: of the worker.
         jpeg: JPEG rather than raw images.
-        changed: notified when an image arrives.
+        changed: set when an image arrives.
         history_s: images this much older than the newest are needed as well.
 
     Raises:
@@ -153,7 +152,7 @@ def subscribe_to_camera(
 
 
 def subscribe_to_depth(
-    camera: str, node: Node, *, changed: threading.Condition, history_s: float
+    camera: str, node: Node, *, changed: Wake, history_s: float
 ) -> CameraSubscriber:
     """Subscribe to the depth stream of a camera, of which there is one.
 

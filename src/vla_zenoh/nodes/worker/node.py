@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 import zenoh
 
+from vla_zenoh.bus.buffers import Wake
 from vla_zenoh.errors import SpecError, WorkerError
 from vla_zenoh.nodes.worker.robot_session import RobotSession
 from vla_zenoh.policy import ActionSteps, Observation, Policy, reset_of, takes_robot
@@ -22,7 +23,7 @@ from vla_zenoh.types import Event
 
 POLL_PERIOD_S = 0.25
 NAP_S, NAPS = 0.004, 5
-BLIND_NAP_S, IDLE_NAP_S = 0.002, 0.02
+BLIND_NAP_S, IDLE_NAP_S, SILENT_NAP_S = 0.002, 0.02, 0.1
 
 Ready = tuple[RobotSession, Observation, int]
 """A robot, its observation, and when that was complete (wall ns)."""
@@ -64,7 +65,7 @@ class WorkerNode:
         robots: Sequence[str] = (),
         another: Callable[[], Policy] | None = None,
     ) -> None:
-        self._delay_s, self._changed = delay_s, threading.Condition()
+        self._delay_s, self._changed = delay_s, Wake()
         self._infer_batch: Callable[..., Any] | None = getattr(policy, "infer_batch", None)
         max_batch = getattr(policy, "max_batch", None) or max(len(robots), 1)
         self._max_batch: int = 1 if self._infer_batch is None else max_batch
@@ -160,10 +161,9 @@ class WorkerNode:
             stop.wait(max(0.0, min(*others_s, POLL_PERIOD_S)))
         elif all(robot.needs_images for robot in due):
             silent = all(robot.cameras_silent for robot in self.sessions)
-            for nap_s in (IDLE_NAP_S,) if silent else (NAP_S,) * NAPS:
-                with self._changed:
-                    if self._changed.wait_for(lambda: any(r.has_images for r in due), nap_s):
-                        return
+            for nap_s in (SILENT_NAP_S,) if silent else (NAP_S,) * NAPS:
+                if self._changed.wait(nap_s) and any(robot.has_images for robot in due):
+                    return
                 # States decoded while idle cost no time once the image is there.
                 for robot in self.sessions:
                     robot.poll_states()

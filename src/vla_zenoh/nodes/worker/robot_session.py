@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import zenoh
 
-from vla_zenoh.bus.buffers import CallbackRing, LatestSample, bytes_of, header_of
+from vla_zenoh.bus.buffers import (
+    CallbackRing,
+    LatestSample,
+    ReceivedSample,
+    Wake,
+    ZenohRing,
+    bytes_of,
+    header_of,
+)
 from vla_zenoh.bus.metrics import Percentiles, RateMeter
 from vla_zenoh.bus.node import Node
 from vla_zenoh.codec import image as image_codec
@@ -17,7 +24,7 @@ from vla_zenoh.codec import records
 from vla_zenoh.codec.image import MAX_IMAGE_BYTES
 from vla_zenoh.codec.records import SMALL_BYTES
 from vla_zenoh.errors import CodecError, PeerError, SpecError, in_words
-from vla_zenoh.keys import Keys, Kind, last_chunk, worker_node
+from vla_zenoh.keys import Keys, Kind, worker_node
 from vla_zenoh.nodes.worker.camera_subscriber import (
     STREAM_PATIENCE_S,
     CameraSubscriber,
@@ -83,6 +90,50 @@ class _Feed(NamedTuple):
     decode: Callable[[bytes, str], Any]
 
 
+class _StateStream:
+    """One stream of states, from its samples to what is kept of them.
+
+    Args:
+        node: of the worker.
+        key: of the stream.
+        kind: of its records.
+        states: where they go.
+        size: samples received between two calls of `poll`.
+        every: decode all; otherwise those that no image needs are skipped.
+    """
+
+    def __init__(
+        self, node: Node, key: str, kind: type[Any], states: History, size: int, *, every: bool
+    ) -> None:
+        self._node, self._kind, self._states, self._every = node, kind, states, every
+        self._writer = SingleWriterFilter(STREAM_PATIENCE_S)
+        ring = CallbackRing if every else ZenohRing
+        self._ring: CallbackRing | ZenohRing = node.subscribe(key, ring(size, SMALL_BYTES))
+
+    def poll(self, since_ns: int) -> None:
+        """Decode what was received since the last call: the last before `since_ns`, and later."""
+        arrivals = self._ring.drain()
+        for arrival in arrivals if self._every else arrivals[self._first(arrivals, since_ns) :]:
+            state = self._node.decode(self._kind, arrival, self._writer)
+            if state is not None:
+                self._states.add(state)
+
+    def _first(self, arrivals: Sequence[ReceivedSample], since_ns: int) -> int:
+        """The last that the writer measured before `since_ns`, or its first."""
+        first = 0
+        for number in range(len(arrivals) - 1, -1, -1):
+            try:
+                header = header_of(arrivals[number].sample)
+            except CodecError:
+                continue
+            if header.source == self._writer.writer:
+                first = number
+                header, _ = self._node.clocks.to_local_clock(header, None)
+                if header.stamp_wall_ns <= since_ns:
+                    break
+        return first
+
+
 class RobotSession:
     """One robot's side of a worker: its own node, prompt, episode, activation and rate.
 
@@ -93,7 +144,7 @@ class RobotSession:
         name: of the worker.
         images: image streams to subscribe to.
         host: of the profile, on which this runs; it may have its own streams.
-        changed: notified when an image arrives.
+        changed: set when an image arrives.
     """
 
     def __init__(
@@ -105,7 +156,7 @@ class RobotSession:
         *,
         images: Literal["raw", "jpeg"],
         host: str | None,
-        changed: threading.Condition,
+        changed: Wake,
     ) -> None:
         self.robot = profile.robot.name
         node = self.node = Node(worker_node(name), profile, session, host=host)
@@ -144,17 +195,19 @@ class RobotSession:
                 for name, camera in depths.items()
             ),
         ]
-        states = MAX_STATES if history_s else 256
-        self._state_buffers = {
-            name: node.subscribe(
-                _state_key(keys.of_part(part), what), CallbackRing(states, SMALL_BYTES)
+        self._every_state = bool(history_s) or not self._feeds
+        self._states = [
+            _StateStream(
+                node,
+                _state_key(keys.of_part(part), what),
+                STATE_KINDS[what],
+                self._streams.states[name],
+                MAX_STATES if history_s else 256,
+                every=self._every_state,
             )
             for name, (part, what) in state_names(self.spec.observation, self.spec.parts).items()
-        }
+        ]
         self._task_writer = SingleWriterFilter(TASK_PATIENCE_S)
-        self._state_writers = {
-            name: SingleWriterFilter(STREAM_PATIENCE_S) for name in self._state_buffers
-        }
         self._received_s: dict[CameraSubscriber, float] = {}
         self.task: Task | None = None
         self._task_received_s = -1e9
@@ -207,13 +260,12 @@ class RobotSession:
         self.poll_states()
 
     def poll_states(self) -> None:
-        """Decode the states received since the last call."""
-        for name, buffer in self._state_buffers.items():
-            kind = STATE_KINDS[last_chunk(name)]
-            for arrival in buffer.drain():
-                state = self.node.decode(kind, arrival, self._state_writers[name])
-                if state is not None:
-                    self._streams.states[name].add(state)
+        """Decode the states received since the last call, unless the cameras fell silent."""
+        if not self._every_state and self._received_s and self.cameras_silent:
+            return  # those near the next image are in their rings when it comes
+        since_ns = min((feed.images.newest_ns for feed in self._feeds), default=0)
+        for stream in self._states:
+            stream.poll(since_ns)
 
     def _set_task(self, task: Stamped[Task]) -> None:
         before, self.task, self._task_received_s = self.task, task.record, time.monotonic()
