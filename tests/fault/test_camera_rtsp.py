@@ -13,9 +13,8 @@ from camera_rig import camera_rig, until, write_video
 from rtsp_server import RtspServer
 
 from vla_zenoh.errors import NodeError
-from vla_zenoh.nodes.camera.opencv import prepare
 from vla_zenoh.nodes.camera.rtsp import RtspSource
-from vla_zenoh.nodes.camera.source import STALL_S
+from vla_zenoh.nodes.camera.source import STALL_S, prepare_opencv
 from vla_zenoh.profile.schema import CameraProfile
 
 RATE_HZ, LENGTH_S = 25, 2.0
@@ -84,7 +83,7 @@ def test_the_password_is_used_and_never_shown(video: Path) -> None:
 
 
 def test_a_stalled_stream_is_noticed_in_time(video: Path) -> None:
-    prepare()
+    prepare_opencv()
     with RtspServer(video, LENGTH_S) as server:
         source = RtspSource(f"rtsp://127.0.0.1:{server.port}/cam")
         source.open()

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from chain import MOVING_M_S, Chain
 
-from vla_zenoh.runtime.hang_detection import HANG_S
+from vla_zenoh.runtime.supervisor import HANG_S
 
 BRAKE_S = 0.35
 """A jerk-limited stop from 0.15 m/s takes 0.17 s, the rest is the arm's lag."""

@@ -22,7 +22,7 @@ from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import SessionError
 from vla_zenoh.profile import load_profile
-from vla_zenoh.runtime.parent_watch import PARENT_VARIABLE
+from vla_zenoh.runtime.process import PARENT_VARIABLE
 from vla_zenoh.runtime.supervisor import GIVE_UP_AFTER, NodeCommand, Supervisor
 
 END_S = 3.0

@@ -19,7 +19,7 @@ from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import MAX_MESSAGE_BYTES, open_session
 from vla_zenoh.errors import CodecError
 from vla_zenoh.profile import SessionProfile, load_profile, override
-from vla_zenoh.runtime.parent_watch import is_running
+from vla_zenoh.runtime.process import is_running
 from vla_zenoh.types import Header
 from vla_zenoh.types.stream import SingleWriterFilter
 

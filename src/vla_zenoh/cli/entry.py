@@ -46,7 +46,7 @@ def main() -> None:
     except KeyboardInterrupt:
         sys.exit(130)
     except Exception as error:
-        from vla_zenoh.runtime.parent_watch import PARENT_VARIABLE
+        from vla_zenoh.runtime.process import PARENT_VARIABLE
 
         sentence = _sentence(error)
         if PARENT_VARIABLE in os.environ:
@@ -77,7 +77,7 @@ def _tell_supervisor(error: Exception, sentence: str | None) -> None:
     import traceback
 
     from vla_zenoh.cli.plain import say
-    from vla_zenoh.runtime.parent_watch import DETAIL, FATAL
+    from vla_zenoh.runtime.process import DETAIL, FATAL
 
     for line in "".join(traceback.format_exception(error)).splitlines():
         say(f"{DETAIL}{line}")

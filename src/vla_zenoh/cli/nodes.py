@@ -20,8 +20,12 @@ from vla_zenoh.cli.options import (
     effective_profile,
     options,
 )
-from vla_zenoh.runtime.parent_watch import RUN_FOLDER_VARIABLE
-from vla_zenoh.runtime.process import die_with_parent, run_node, stop_on_signals
+from vla_zenoh.runtime.process import (
+    RUN_FOLDER_VARIABLE,
+    die_with_parent,
+    run_node,
+    stop_on_signals,
+)
 
 if TYPE_CHECKING:
     from vla_zenoh.profile import Profile

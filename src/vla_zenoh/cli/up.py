@@ -34,9 +34,8 @@ from vla_zenoh.errors import NodeError
 from vla_zenoh.keys import ROLLING
 from vla_zenoh.profile import Profile, load_profile, profile_file
 from vla_zenoh.resources import is_path
-from vla_zenoh.runtime.launch import Host, choose_host, host_lock
-from vla_zenoh.runtime.parent_watch import DETAIL, FATAL
-from vla_zenoh.runtime.process import die_with_parent, stop_on_signals
+from vla_zenoh.runtime.launch import Host, HostLock, choose_host
+from vla_zenoh.runtime.process import DETAIL, FATAL, die_with_parent, stop_on_signals
 from vla_zenoh.runtime.systemd_unit import systemd_unit
 
 LOG_BYTES = 10 * 1024 * 1024
@@ -92,7 +91,7 @@ def up(
         what = f"robot {loaded.robot.name}, host {name}"
         print(systemd_unit(what, words, getpass.getuser(), kept), end="")
         return
-    once = host_lock(loaded, name)
+    once = HostLock(loaded, name)
     once.take()  # reports at once a host that already runs; the host takes it again
     once.release()
     reject_wrong(profile, host, connect, listen)

@@ -32,12 +32,7 @@ class ExpiryOutlook(NamedTuple):
 
 
 def outlook(security: SecurityProfile, now: dt.datetime) -> ExpiryOutlook:
-    """Check the certificates of this computer.
-
-    Args:
-        security: of the profile; its host says which computer this is.
-        now: UTC.
-    """
+    """Check the certificates of this computer, at `now` in UTC."""
     try:
         from vla_zenoh.security.certificates import CheckedStore
 

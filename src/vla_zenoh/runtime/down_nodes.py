@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 
 import zenoh
 
-from vla_zenoh.bus.clock import Clock, own_host_id
+from vla_zenoh.bus.clock import Clock, HostId, own_host_id
 from vla_zenoh.bus.node import Publisher
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import VlaZenohError
@@ -68,10 +68,8 @@ class DownNodes:
         self._forget([node.name for node in down])
         for node in down:
             if node.name not in self._voices:
-                secured = self._profile.session.security is not None
-                own = open_session(self._profile.session, identity=node.name) if secured else None
-                self._voices[node.name] = _Voice(self._profile, node.name, self._session, own)
-            self._voices[node.name].publish(node, self._host_id.host, self._host_id.boot)
+                self._voices[node.name] = _Voice(self._profile, node.name, self._session)
+            self._voices[node.name].publish(node, self._host_id)
 
     def _forget(self, names: Sequence[str]) -> None:
         for name in [name for name in self._voices if name not in names]:
@@ -81,16 +79,17 @@ class DownNodes:
 class _Voice:
     """Publishers of one node that is down."""
 
-    def __init__(
-        self, profile: Profile, name: str, session: zenoh.Session, own: zenoh.Session | None
-    ) -> None:
-        keys, clock, used = profile.keys, Clock(), own or session
+    def __init__(self, profile: Profile, name: str, session: zenoh.Session) -> None:
+        self._own: zenoh.Session | None = None
+        if profile.session.security is not None:
+            session = self._own = open_session(profile.session, identity=name)
+        keys, clock = profile.keys, Clock()
         source = f"{ON_BEHALF}{name}#{secrets.token_hex(4)}"
-        self._own, self._since_wall_ns, self._crashes = own, time.time_ns(), 0
-        self._status = Publisher(used, keys.status(name), Kind.TELEMETRY, source, clock)
-        self._event = Publisher(used, keys.event(name), Kind.TELEMETRY, source, clock)
+        self._since_wall_ns, self._crashes = time.time_ns(), 0
+        self._status = Publisher(session, keys.status(name), Kind.TELEMETRY, source, clock)
+        self._event = Publisher(session, keys.event(name), Kind.TELEMETRY, source, clock)
 
-    def publish(self, node: DownNode, host: str, boot: str) -> None:
+    def publish(self, node: DownNode, on: HostId) -> None:
         state, why = _state(node)
         if node.crashes > self._crashes:
             self._event.publish(Event("error", "fault", CRASHED, why))
@@ -98,7 +97,7 @@ class _Voice:
         detail = {"complaint": why, "crashes": node.crashes, "given_up": node.left_alone}
         since_ns = self._since_wall_ns
         self._status.publish(
-            NodeStatus(node.name, state, host, node.pid, since_ns, detail=detail, boot=boot)
+            NodeStatus(node.name, state, on.host, node.pid, since_ns, detail=detail, boot=on.boot)
         )
 
     def close(self) -> None:

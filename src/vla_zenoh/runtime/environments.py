@@ -18,7 +18,7 @@ from pathlib import Path
 from vla_zenoh import __version__
 from vla_zenoh.errors import WorkerError, how_to_install
 from vla_zenoh.policy.loader import ModelFile
-from vla_zenoh.runtime.parent_watch import die_with_parent
+from vla_zenoh.runtime.process import die_with_parent
 
 INSIDE_VARIABLE = "VLA_ZENOH_WORKER_ENVIRONMENT"
 
@@ -63,11 +63,6 @@ def run_in_own_environment(
 
 
 def _check_interpreter(python: str) -> None:
-    """Make sure that an interpreter exists and has this package.
-
-    Raises:
-        WorkerError: it does not.
-    """
     if shutil.which(python) is None:
         raise WorkerError(
             f"--python {python!r} is not a program: give the interpreter of an environment, as "

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import fcntl
+import json
 import os
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +23,12 @@ from vla_zenoh.keys import NODE_KINDS, ROLLING, worker_node
 from vla_zenoh.profile import HostProfile, Profile, override, to_yaml
 from vla_zenoh.runtime.certificate_expiry import CertificateExpiry
 from vla_zenoh.runtime.down_nodes import DownNodes
-from vla_zenoh.runtime.hang_detection import LastStatus, hung_nodes
-from vla_zenoh.runtime.host_lock import HostLock
+from vla_zenoh.runtime.process import ROUTER_PATIENCE_S
 from vla_zenoh.runtime.router import reject_taken
-from vla_zenoh.runtime.supervisor import DownNode, NodeCommand, Supervisor
+from vla_zenoh.runtime.supervisor import DownNode, NodeCommand, Supervisor, hung_nodes
 from vla_zenoh.security.identity import Role, operator_role
 
 EXPENDABLE = ("worker", "primitives", ROLLING)
-ROUTER_PATIENCE_S = 10.0
 BRAKE_PATIENCE_S = 1.0
 STOP_BUDGET_S = 2.9
 
@@ -53,11 +53,63 @@ def choose_host(profile: Profile, host: str | None) -> tuple[str, HostProfile]:
     return host, profile.hosts[host]
 
 
-def host_lock(profile: Profile, host: str) -> HostLock:
-    """The lock of a running `Host`, so that there is only one."""
-    router = (profile.hosts[host].connect or profile.session.connect)[0]
-    what = f"host {host} of robot {profile.robot.name}"
-    return HostLock("-".join((profile.root, profile.robot.name, host, router)), what)
+class HostLock:
+    """Held by the only `vla-zenoh up` of a host and robot until `release`, or its process ends.
+
+    Args:
+        profile: of the robot.
+        host: one of its hosts.
+    """
+
+    def __init__(self, profile: Profile, host: str) -> None:
+        router = (profile.hosts[host].connect or profile.session.connect)[0]
+        name = "-".join((profile.root, profile.robot.name, host, router))
+        readable = "".join(c if c.isalnum() or c in "-._" else "_" for c in name)
+        self._path = _own_folder() / f"{readable[:200]}.lock"
+        self._what = f"host {host} of robot {profile.robot.name}"
+        self._file: int | None = None
+
+    def take(self) -> None:
+        """Hold the lock.
+
+        Raises:
+            NodeError: another process holds it; names it, and since when.
+        """
+        number = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o600)
+        try:
+            fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            holder = os.read(number, 4096)
+            os.close(number)
+            raise NodeError(f"{self._what} is already running{_described(holder)}") from None
+        os.ftruncate(number, 0)
+        os.write(number, json.dumps({"pid": os.getpid(), "since_s": time.time()}).encode())
+        self._file = number
+
+    def release(self) -> None:
+        """Release the lock, if it is held."""
+        if self._file is not None:
+            os.close(self._file)  # the file stays: removing it would let two hold it
+            self._file = None
+
+
+def _described(holder: bytes) -> str:
+    with suppress(ValueError, KeyError, TypeError):
+        found = json.loads(holder)
+        pid, since_s = int(found["pid"]), float(found["since_s"])
+        since = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(since_s))
+        return f": pid {pid}, since {since}. End it there with Ctrl-C, or `kill {pid}`"
+    return ""
+
+
+def _own_folder() -> Path:
+    """A folder that only this user can access and that is emptied at boot."""
+    run = os.environ.get("XDG_RUNTIME_DIR")
+    folder = Path(run or tempfile.gettempdir()) / f"vla-zenoh-{os.getuid()}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    if folder.stat().st_uid != os.getuid():
+        raise NodeError(f"{folder} belongs to another user; set XDG_RUNTIME_DIR")
+    return folder
 
 
 def node_commands(
@@ -70,16 +122,7 @@ def node_commands(
     *,
     dry_run: bool = False,
 ) -> list[NodeCommand]:
-    """Command lines of all nodes of `host`, in the order to start them.
-
-    Args:
-        profile: the effective profile.
-        host: one of its hosts.
-        profile_file: where nodes find that profile.
-        worker_options: worker -> ``name=value`` options.
-        worker_arguments: further arguments for the command line of every worker.
-        also_files: profiles of other robots that the router of this host serves.
-        dry_run: the command node commands nothing.
+    """Command lines of all nodes of `host`, in the order to start them; arguments as of `Host`.
 
     Raises:
         ProfileError: `also_files` without a router on this host, or `dry_run` without command node.
@@ -97,11 +140,7 @@ def node_commands(
         )
     common = ("--profile", str(profile_file))
     more: dict[str, Sequence[str]] = {
-        "router": (
-            "--host",
-            host,
-            *(word for file in also_files for word in ("--also", str(file))),
-        ),
+        "router": ("--host", host, *_each("--also", map(str, also_files))),
         "camera": ("--name", profile.node_name(host, "camera"), *(part.cameras or ())),
         "command": ("--dry-run",) if dry_run else (),
     }
@@ -114,9 +153,13 @@ def node_commands(
         for worker in profile.workers_of(part):
             options = (worker_options or {}).get(worker, ())
             words = ("worker", worker, *common, "--host", host, *worker_arguments)
-            words += tuple(word for option in options for word in ("--set", option))
+            words += _each("--set", options)
             commands.append(NodeCommand(worker_node(worker), kind, words))
     return commands
+
+
+def _each(option: str, values: Iterable[str]) -> tuple[str, ...]:
+    return tuple(word for value in values for word in (option, value))
 
 
 class Host:
@@ -165,8 +208,8 @@ class Host:
         self._folder = tempfile.TemporaryDirectory(prefix="vla-zenoh-")
         # A lab is up for weeks, and systemd-tmpfiles removes files older than 10 days, except below
         # a folder that is locked (tmpfiles.d(5)).
-        self._lock: int | None = os.open(self._folder.name, os.O_RDONLY | os.O_DIRECTORY)
-        fcntl.flock(self._lock, fcntl.LOCK_EX)
+        self._folder_lock = os.open(self._folder.name, os.O_RDONLY | os.O_DIRECTORY)
+        fcntl.flock(self._folder_lock, fcntl.LOCK_EX)
         # Children read the profile that is in force here, with all options applied.
         self.profile_file = self._write(profile)
         self._also = [self._write(other) for other in also]
@@ -183,7 +226,7 @@ class Host:
             variables={HOST_VARIABLE: self.host},
         )
         self._own_router = own_router
-        self._once = host_lock(profile, self.host)
+        self._once = HostLock(profile, self.host)
         self._down: DownNodes | None = None
         self._ready, self._dry_run = False, dry_run
         self._expiry = CertificateExpiry(profile.session.security)
@@ -222,8 +265,7 @@ class Host:
                     child for child in self.supervisor.children if child.command.kind != "router"
                 ]
             else:
-                listen = self._part.listen or self.profile.session.listen
-                reject_taken(listen)
+                reject_taken(self._part.listen or self.profile.session.listen)
                 self.supervisor.start(["router"])
         self.session = open_session(self.profile.session, wait_s=ROUTER_PATIENCE_S)
         self.client = Client(self.profile, self.session).subscribe()
@@ -273,23 +315,22 @@ class Host:
         self.supervisor.stop(deadline_s)
         self._once.release()
         self._folder.cleanup()
-        if self._lock is not None:
-            os.close(self._lock)
-            self._lock = None
+        if self._folder_lock >= 0:
+            os.close(self._folder_lock)
+            self._folder_lock = -1
 
     def _takes_part(self, client: Client) -> bool:
         """Whether a live node is one of ours, and not another one of the same name."""
         alive = client.alive
-        return any(
-            kind == "router"  # which starts only if no other one answers
-            or (
-                name in alive
-                and (status := client.status(name)) is not None
-                and status.boot == own_boot_id()
-                and self.supervisor.owns(name, status.pid)
-            )
-            for name, (kind, _) in self.supervisor.running().items()
-        )
+        for name, (kind, _) in self.supervisor.running().items():
+            if kind == "router":  # which starts only if no other one answers
+                return True
+            status = client.status(name) if name in alive else None
+            if status is None or status.boot != own_boot_id():
+                continue
+            if self.supervisor.owns(name, status.pid):
+                return True
+        return False
 
     def _brake(self, client: Client) -> None:
         try:
@@ -301,16 +342,14 @@ class Host:
     def serve(self, stop: threading.Event) -> None:
         """Run the nodes until `stop` is set; nodes that crash or hang are restarted.
 
-        Reports once a day certificates of this host that are invalid or expire soon.
-
-        A worker that keeps crashing is not restarted: a broken model must not end the
-        robot's nodes beside it.
+        Reports once a day certificates of this host that are invalid or expire soon. A worker that
+        keeps crashing is not restarted: a broken model must not end the robot's nodes beside it.
 
         Raises:
             NodeError: another node keeps crashing, or only such workers are left here.
         """
         while not stop.wait(0.1):
-            self._end_what_hangs()
+            self._kill_hung()
             for sentence in self._expiry.due():
                 self._tell("up", sentence)
             self._tell_when_ready()
@@ -345,11 +384,12 @@ class Host:
             return "DRY RUN"
         return "SIM" if self.profile.robot.driver == "sim" else "LIVE"
 
-    def _end_what_hangs(self) -> None:
+    def _kill_hung(self) -> None:
         if self.client is None:
             return
         heard = self.client.snapshot().items()
-        said = {name: LastStatus(status.pid, age_s) for name, (status, age_s, _) in heard}
+        said = {name: (status.pid, age_s) for name, (status, age_s, _) in heard}
         for name in hung_nodes(self.supervisor.running(), said):
-            why = f"silent for {said[name].age_s:.0f} s; it hangs; killing it"
-            self.supervisor.terminate(name, why)
+            self.supervisor.terminate(
+                name, f"silent for {said[name][1]:.0f} s; it hangs; killing it"
+            )

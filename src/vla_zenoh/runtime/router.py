@@ -57,10 +57,8 @@ def run_router(
             "listen": list(profile.session.listen),
             "security": security_summary(profile),
         }
-        impatience, expiry = (
-            TcpUserTimeout(profile.session.lease_ms / 1e3),
-            CertificateExpiry(profile.session.security),
-        )
+        impatience = TcpUserTimeout(profile.session.lease_ms / 1e3)
+        expiry = CertificateExpiry(profile.session.security)
         clients = Clients(session)
         while not stop.wait(POLL_S):
             impatience.apply()

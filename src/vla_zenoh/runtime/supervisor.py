@@ -16,8 +16,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from vla_zenoh.keys import NODE_KINDS, ROLLING
-from vla_zenoh.runtime.parent_watch import DETAIL, FATAL, PARENT_VARIABLE, RUN_FOLDER_VARIABLE
+from vla_zenoh.runtime.process import DETAIL, FATAL, PARENT_VARIABLE, RUN_FOLDER_VARIABLE
 
+HANG_S = 10.0
+"""Nodes publish their status twice a second; a stall of the whole computer is not their fault."""
+HEARD_S = 2.0
 BACKOFF_S = (0.2, 0.5, 1.0, 2.0, 5.0)
 STABLE_S = 60.0
 """After this time a node's backoff starts again at the shortest. It is longer than a node on a busy
@@ -53,7 +56,7 @@ class NodeCommand(NamedTuple):
 
 @dataclass(slots=True)
 class Child:
-    """A running node."""
+    """A node of this host; `why` it exited, if it said so, what was `told` of that, and how."""
 
     command: NodeCommand
     process: subprocess.Popen[str] | None = None
@@ -62,14 +65,10 @@ class Child:
     left_alone: bool = False
     start_again_s: float = 0.0
     reader: threading.Thread | None = None
-    """Thread that reads its output."""
     pid: int = 0
     why: str = ""
-    """Why it exited, if it reported that."""
     told: str = ""
-    """The same, of its last exit."""
     end: str = ""
-    """How it exited."""
 
 
 class DownNode(NamedTuple):
@@ -88,6 +87,29 @@ class DownNode(NamedTuple):
     crashes: int
     why: str
     left_alone: bool
+
+
+def hung_nodes(
+    running: Mapping[str, tuple[str, int]], said: Mapping[str, tuple[int, float]]
+) -> list[str]:
+    """Nodes to kill: they run, but their heartbeat (the status) has stopped.
+
+    A hung node does no harm, since the arm brakes without it, but a new one cannot start beside it.
+    Workers are exempt: a large model may take long to load or to infer.
+
+    Args:
+        running: node -> kind and pid of the running nodes that this host started.
+        said: node -> pid and age (s) of its last status, of all hosts.
+    """
+    silent = [
+        name
+        for name, (kind, pid) in running.items()
+        if kind != "worker" and name in said and said[name][0] == pid and said[name][1] > HANG_S
+    ]
+    if any(age_s < HEARD_S for _, age_s in said.values()):
+        return sorted(silent)
+    # No status at all: the fault is the router's, or the network's, which no restart repairs.
+    return sorted(name for name in silent if running[name][0] == "router")
 
 
 class Supervisor:
@@ -113,7 +135,16 @@ class Supervisor:
         folder: Path | None = None,
         variables: Mapping[str, str] | None = None,
     ) -> None:
-        self._folder, self._variables = folder, dict(variables or {})
+        self._environment = {
+            **os.environ,
+            **(variables or {}),
+            PARENT_VARIABLE: str(os.getpid()),
+            "PYTHONUNBUFFERED": "1",
+            # Zenoh colours its log even when it writes to our pipe: then it is not recognised.
+            "NO_COLOR": "1",
+        }
+        if folder is not None:
+            self._environment[RUN_FOLDER_VARIABLE] = str(folder)
         self.children = [Child(command) for command in commands]
         self._log, self._tell = log, tell
         self.given_up: Child | None = None
@@ -232,13 +263,6 @@ class Supervisor:
                 _signal_group(child.process, signal.SIGKILL)
 
     def _spawn(self, child: Child) -> None:
-        environment = {**os.environ, **self._variables}
-        environment[PARENT_VARIABLE] = str(os.getpid())
-        environment["PYTHONUNBUFFERED"] = "1"
-        # Zenoh colours its log even when it writes to our pipe; then it would not be recognised.
-        environment["NO_COLOR"] = "1"
-        if self._folder is not None:
-            environment[RUN_FOLDER_VARIABLE] = str(self._folder)
         child.process = subprocess.Popen(
             [sys.executable, "-m", "vla_zenoh", *child.command.arguments],
             stdin=subprocess.DEVNULL,
@@ -246,7 +270,7 @@ class Supervisor:
             stderr=subprocess.STDOUT,
             text=True,
             errors="replace",
-            env=environment,
+            env=self._environment,
             # Ctrl-C in the terminal must reach the supervisor alone: it brakes the arm first.
             start_new_session=True,
         )

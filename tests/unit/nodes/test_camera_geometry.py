@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vla_zenoh.errors import NodeError, ProfileError
-from vla_zenoh.nodes.camera.device_clock import WINDOW_S, DeviceClock
 from vla_zenoh.nodes.camera.geometry import Geometry, Intrinsics, read_intrinsics
+from vla_zenoh.nodes.camera.realsense import WINDOW_S, DeviceClock
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.profile.schema import CameraProfile, Crop
 

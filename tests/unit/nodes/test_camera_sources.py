@@ -310,9 +310,9 @@ def test_what_opencv_says_of_broken_sources_does_not_reach_the_terminal(tmp_path
 import threading
 from vla_zenoh.errors import NodeError
 from vla_zenoh.nodes.camera.node import make_source
-from vla_zenoh.nodes.camera.opencv import prepare
+from vla_zenoh.nodes.camera.source import prepare_opencv
 from vla_zenoh.profile.schema import CameraProfile
-prepare()
+prepare_opencv()
 for source in ("file:{tmp_path}/a.mp4", "file:{tmp_path}/a.png", "v4l2:{tmp_path}/a.mp4",
                "rtsp://127.0.0.1:1/a"):
     source = make_source(CameraProfile(source=source))

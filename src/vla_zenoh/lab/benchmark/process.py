@@ -35,7 +35,7 @@ from vla_zenoh.policy.loader import ModelFile, find_model
 from vla_zenoh.profile import as_robot, load_profile
 from vla_zenoh.resources import BENCHMARKS
 from vla_zenoh.runtime.environments import environment_command
-from vla_zenoh.runtime.parent_watch import PARENT_VARIABLE, die_with_parent
+from vla_zenoh.runtime.process import PARENT_VARIABLE, die_with_parent
 from vla_zenoh.types import Image
 
 ANSWER_PATIENCE_S = 300.0

@@ -19,9 +19,8 @@ from vla_zenoh.codec.image import depth_schema, encode_depth, encode_jpeg, encod
 from vla_zenoh.errors import NodeError
 from vla_zenoh.keys import Kind
 from vla_zenoh.nodes.camera.fitted_streams import FittedStreams, RateLimiter, shrink
-from vla_zenoh.nodes.camera.geometry import Geometry, Intrinsics
+from vla_zenoh.nodes.camera.geometry import Geometry, Intrinsics, Pixels
 from vla_zenoh.nodes.camera.image_check import ImageCheck, ImageFault
-from vla_zenoh.nodes.camera.source import Pixels
 from vla_zenoh.profile.schema import CameraProfile
 from vla_zenoh.types import Depth, Event, Image
 

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import cv2
 
 from vla_zenoh.errors import NodeError
-from vla_zenoh.nodes.camera.opencv import Capture
-from vla_zenoh.nodes.camera.source import Pixels
+from vla_zenoh.nodes.camera.geometry import Pixels
+from vla_zenoh.nodes.camera.source import Source
 
 LOOK_S = 0.5
 """An open file stays readable after it was deleted, so its name is checked this often."""
@@ -42,20 +42,24 @@ def open_video(path: Path) -> Frames:
     Raises:
         NodeError: not a readable video.
     """
-    capture = Capture()
-    if not capture.open(str(path), cv2.CAP_FFMPEG):
+    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    if not capture.isOpened():
         raise NodeError(f"{path} is neither an image nor a video that can be read")
+
+    def decode() -> Pixels | None:
+        good, image = capture.retrieve()
+        return image if good else None
 
     def images() -> Generator[Callable[[], Pixels | None]]:
         try:
             while capture.grab():
-                yield capture.retrieve
+                yield decode
         finally:
-            capture.close()
+            capture.release()
 
     rate_hz = capture.get(cv2.CAP_PROP_FPS)
     sane = math.isfinite(rate_hz) and 0 < rate_hz <= MAX_VIDEO_HZ
-    return Frames(images(), capture.backend, rate_hz if sane else None)
+    return Frames(images(), capture.getBackendName(), rate_hz if sane else None)
 
 
 def natural(path: Path) -> list[tuple[int, str]]:
@@ -81,7 +85,7 @@ def open_frames(path: Path) -> Frames:
     return Frames(partial(cv2.imread, image, cv2.IMREAD_COLOR) for image in images)
 
 
-class FileSource:
+class FileSource(Source):
     """Replays a file in real time: a video at its own rate, images at `rate_hz`.
 
     Args:
@@ -89,8 +93,6 @@ class FileSource:
         rate_hz: of images, and of a video without a rate of its own.
         loop: start again at the end.
     """
-
-    same_s, stamp_ns = 0.0, None  # an image may be shown for any length of time
 
     def __init__(self, path: str, rate_hz: float, loop: bool) -> None:
         self._path = Path(path).expanduser()
@@ -101,13 +103,10 @@ class FileSource:
         self._next_s = self._look_s = 0.0
         self._period_s = 1.0 / rate_hz
 
-    @property
-    def backend(self) -> str:
-        return "" if self._frames is None else self._frames.backend
-
     def open(self) -> None:
         self.close()
         self._frames = open_frames(self._path)
+        self.backend = self._frames.backend
         self._identity = self._file_identity()
         self._period_s = 1.0 / (self._frames.rate_hz or self._rate_hz)
         self._next_s = time.monotonic()

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
 from vla_zenoh.errors import NodeError, describe_faults
-from vla_zenoh.nodes.camera.source import Pixels
 from vla_zenoh.profile.schema import CameraProfile
 from vla_zenoh.profile.section import Section
 
+Pixels = NDArray[Any]
+"""An image as OpenCV returns it: (H, W) or (H, W, 1, 3 or 4), BGR, uint8 or uint16."""
 DISTORTION = ("k1", "k2", "p1", "p2", "k3")
 MAX_FILE_BYTES = 100_000
 

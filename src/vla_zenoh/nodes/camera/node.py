@@ -19,8 +19,8 @@ from vla_zenoh.nodes.camera.image_check import read_references
 from vla_zenoh.nodes.camera.source import (
     LOOK_S,
     STALL_S,
-    DepthSource,
     Source,
+    prepare_opencv,
     without_password,
 )
 from vla_zenoh.policy import ModelSpec
@@ -63,9 +63,7 @@ def make_source(profile: CameraProfile) -> Source:
     Raises:
         NodeError: unknown kind of source.
     """
-    from vla_zenoh.nodes.camera.opencv import prepare
-
-    prepare()
+    prepare_opencv()
     kind, _, rest = profile.source.partition(":")
     if kind == "v4l2":
         from vla_zenoh.nodes.camera.v4l2 import V4l2Source
@@ -104,8 +102,9 @@ class Grabber:
         while not stop.is_set():
             try:
                 self._source.open()
-                intrinsics = getattr(self._source, "intrinsics", None)
-                self._publisher.opened(self._source.backend, self._source.same_s, intrinsics)
+                self._publisher.opened(
+                    self._source.backend, self._source.same_s, self._source.intrinsics
+                )
                 self._grab_all(stop)
             except Exception as error:  # whatever a driver raises must not end the other cameras
                 if stop.is_set():
@@ -145,9 +144,7 @@ class Grabber:
             looked = now
             publisher.check(image, mono_ns, source.stamp_ns)
             if wanted:
-                depth_m = None
-                if publisher.wants_depth and isinstance(source, DepthSource):
-                    depth_m = source.depth_m()
+                depth_m = source.depth_m() if publisher.wants_depth else None
                 publisher.publish(image, mono_ns, depth_m)
             publisher.captured(mono_ns)
             last_good, proved, broken = now, True, 0

@@ -8,18 +8,17 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from vla_zenoh.errors import MissingExtraError, NodeError, in_words
-from vla_zenoh.nodes.camera.device_clock import DeviceClock
-from vla_zenoh.nodes.camera.geometry import Intrinsics
-from vla_zenoh.nodes.camera.source import STALL_S, Pixels
+from vla_zenoh.nodes.camera.geometry import Intrinsics, Pixels
+from vla_zenoh.nodes.camera.source import STALL_S, Source
 from vla_zenoh.profile.schema import CameraProfile
 
 WAIT_MS = 200
@@ -28,6 +27,10 @@ SAME_S = 1.0
 LOCK_TOLERANCE = 0.1
 EXPOSURE_UNIT_US = 100.0
 """Of the colour sensor's exposure."""
+WINDOW_S = 20.0
+"""A clock that is off by 100 ppm moves by 2 ms in this time."""
+SET_S = 0.5
+"""A stamp that jumps further against its arrival means that the camera's clock was set."""
 
 
 def sdk() -> Any:
@@ -64,7 +67,36 @@ def find_device(serial: str) -> Any:
     return serials[serial]
 
 
-class RealsenseSource:
+class DeviceClock:
+    """Offset of a camera's clock: the shortest time from stamp to arrival in the last `WINDOW_S`.
+
+    Extra time over that of the fastest image is delay of the bus or this computer, not part of the
+    capture time. The delay of the fastest one is unknown and counts as zero.
+    """
+
+    def __init__(self) -> None:
+        self._offsets: deque[tuple[int, int]] = deque()  # arrival, arrival - stamp; both ascending
+
+    def host_ns(self, device_ns: int, arrival_ns: int) -> int:
+        """Time of capture on the clock of `arrival_ns`, never later than that.
+
+        Args:
+            device_ns: stamp of the camera, on its own clock.
+            arrival_ns: when the image arrived, on the clock of this computer.
+        """
+        offset_ns = arrival_ns - device_ns
+        offsets = self._offsets
+        if offsets and abs(offset_ns - offsets[0][1]) > SET_S * 1e9:
+            offsets.clear()
+        while offsets and offsets[-1][1] >= offset_ns:
+            offsets.pop()
+        offsets.append((arrival_ns, offset_ns))
+        while arrival_ns - offsets[0][0] > WINDOW_S * 1e9:
+            offsets.popleft()
+        return device_ns + offsets[0][1]
+
+
+class RealsenseSource(Source):
     """A RealSense camera.
 
     Args:
@@ -72,6 +104,8 @@ class RealsenseSource:
         profile: size, rate, depth, locks; the camera's nearest size is taken.
         device_of: finds the camera; raises `NodeError` if it is missing.
     """
+
+    same_s = SAME_S
 
     def __init__(
         self,
@@ -86,9 +120,6 @@ class RealsenseSource:
         self._colour: Any = None
         self._depth: Any = None
         self._clock = DeviceClock()
-        self.intrinsics: Intrinsics | None = None
-        self.same_s, self.backend = SAME_S, ""
-        self.stamp_ns: int | None = None
 
     def open(self) -> None:
         rs = sdk()
@@ -142,8 +173,7 @@ class RealsenseSource:
         image = np.asanyarray(self._colour.get_data())
         return cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if rgb else image.copy()
 
-    def depth_m(self) -> NDArray[np.float32] | None:
-        """Depth of the grabbed image in m, in its pixels; 0: not measured."""
+    def depth_m(self) -> Pixels | None:
         if self._depth is None or self._colour is None:
             return None
         depth = self._align.process(_frameset(self._depth, self._colour)).get_depth_frame()

@@ -8,8 +8,7 @@ import time
 import cv2
 
 from vla_zenoh.errors import NodeError
-from vla_zenoh.nodes.camera.opencv import Capture
-from vla_zenoh.nodes.camera.source import STALL_S, Pixels, without_password
+from vla_zenoh.nodes.camera.source import STALL_S, CaptureSource, without_password
 
 OPEN_S = 10.0
 """To log in and to wait for a key frame, which some cameras send every few seconds only."""
@@ -25,22 +24,18 @@ _OPTIONS = (
 )
 
 
-class RtspSource:
+class RtspSource(CaptureSource):
     """An RTSP stream. Images are stamped on arrival: the camera's clock is not ours.
 
     Args:
         url: ``rtsp://[user:password@]host[:port]/path``.
     """
 
-    same_s, stamp_ns = SAME_S, None
+    same_s = SAME_S
 
     def __init__(self, url: str) -> None:
+        super().__init__()
         self._url, self._shown = url, without_password(url)
-        self._capture = Capture()
-
-    @property
-    def backend(self) -> str:
-        return self._capture.backend
 
     def open(self) -> None:
         if not self._capture.open(self._url, cv2.CAP_FFMPEG, _OPTIONS):
@@ -48,7 +43,12 @@ class RtspSource:
                 f"{self._shown} does not answer with an image within {OPEN_S:g} s; is the camera "
                 "on, and are address, user and password right?"
             )
-        self._skip_backlog()
+        self.backend = self._capture.getBackendName()
+        # Images that queued up while OpenCV probed the stream return at once.
+        for _ in range(MAX_BACKLOG):
+            began = time.monotonic()
+            if not self._capture.grab() or time.monotonic() - began > INSTANT_S:
+                return
 
     def grab(self, stop: threading.Event) -> int | None:
         began = time.monotonic()
@@ -57,16 +57,3 @@ class RtspSource:
         if not good or time.monotonic() - began > 0.9 * STALL_S:
             raise NodeError(f"{self._shown} has ended, or sent nothing for {STALL_S:g} s")
         return time.monotonic_ns()
-
-    def _skip_backlog(self) -> None:
-        """Drop images that queued up while OpenCV probed the stream: they return at once."""
-        for _ in range(MAX_BACKLOG):
-            began = time.monotonic()
-            if not self._capture.grab() or time.monotonic() - began > INSTANT_S:
-                return
-
-    def retrieve(self) -> Pixels | None:
-        return self._capture.retrieve()
-
-    def close(self) -> None:
-        self._capture.close()

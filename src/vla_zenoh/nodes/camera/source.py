@@ -1,15 +1,15 @@
-"""Interface of the image sources that the camera node waits for."""
+"""Sources of images that the camera node waits for, and what those that OpenCV reads share."""
 
 from __future__ import annotations
 
+import os
 import re
 import threading
-from typing import Any, Protocol, runtime_checkable
+from abc import ABC, abstractmethod
 
-from numpy.typing import NDArray
+import cv2
 
-Pixels = NDArray[Any]
-"""An image as OpenCV returns it: (H, W) or (H, W, 1, 3 or 4), BGR, uint8 or uint16."""
+from vla_zenoh.nodes.camera.geometry import Intrinsics, Pixels
 
 LOOK_S = 0.5
 """Without subscribers one image in this time is still decoded, to detect a broken camera."""
@@ -17,34 +17,38 @@ STALL_S = 2.0
 """A source that delivers no image for this long is closed and opened again."""
 _USER = re.compile(r"(?<=://)[^/]*@")
 _SECRET = re.compile(r"(?i)(password|passwd|pass|pwd|token)=[^&/?]*")
+_SILENT = 0
+# OpenCV reads these when it opens its first capture. A user's own values are kept.
+_ENVIRONMENT = {
+    "OPENCV_FFMPEG_LOGLEVEL": "-8",  # FFmpeg's "quiet"
+    "OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT": f"{STALL_S:.0f}",
+}
 
 
-class Source(Protocol):
-    """A device, stream or file. Used by one thread; may be opened again after `close`."""
+class Source(ABC):
+    """A device, stream or file. Used by one thread; may be opened again after `close`.
 
-    @property
-    def backend(self) -> str:
-        """Name of the library or driver that reads it; known once it is open."""
-        ...
+    Attributes:
+        backend: name of the library or driver that reads it; known once it is open.
+        same_s: how long a working source may repeat an identical image, s; 0: indefinitely.
+        stamp_ns: driver's time stamp of the grabbed image, on any clock; None if there is none.
+        intrinsics: of its images, if it knows them once it is open.
+    """
 
-    @property
-    def same_s(self) -> float:
-        """How long a working source may repeat an identical image, s; 0: indefinitely."""
-        ...
+    backend = ""
+    same_s = 0.0
+    stamp_ns: int | None = None
+    intrinsics: Intrinsics | None = None
 
-    @property
-    def stamp_ns(self) -> int | None:
-        """Driver's time stamp of the grabbed image, on any clock; None if there is none."""
-        ...
-
+    @abstractmethod
     def open(self) -> None:
         """Open the source.
 
         Raises:
             NodeError: missing or not readable; says what to do.
         """
-        ...
 
+    @abstractmethod
     def grab(self, stop: threading.Event) -> int | None:
         """Wait for the next image, decoding as little of it as possible.
 
@@ -55,24 +59,40 @@ class Source(Protocol):
         Raises:
             NodeError: the source is gone.
         """
-        ...
 
+    @abstractmethod
     def retrieve(self) -> Pixels | None:
         """Decode the grabbed image; None if it is corrupt."""
-        ...
 
+    @abstractmethod
     def close(self) -> None:
         """Release the device; harmless if it is not open."""
-        ...
+
+    def depth_m(self) -> Pixels | None:
+        """(H, W) depth of the grabbed image in m, in its pixels; 0: not measured. None: none."""
+        return None
 
 
-@runtime_checkable
-class DepthSource(Protocol):
-    """A `Source` that measures depth as well, and knows its lens."""
+class CaptureSource(Source):
+    """A `Source` that OpenCV's `VideoCapture` reads."""
 
-    def depth_m(self) -> NDArray[Any] | None:
-        """Depth of the grabbed image in m, in its pixels; 0: not measured. None: it has none."""
-        ...
+    def __init__(self) -> None:
+        self._capture = cv2.VideoCapture()
+
+    def retrieve(self) -> Pixels | None:
+        good, image = self._capture.retrieve()
+        return image if good else None
+
+    def close(self) -> None:
+        self._capture.release()
+
+
+def prepare_opencv() -> None:
+    """Silence OpenCV's logging and shorten its time-outs; call it before threads start."""
+    for name, value in _ENVIRONMENT.items():
+        os.environ.setdefault(name, value)
+    if "OPENCV_LOG_LEVEL" not in os.environ:
+        cv2.utils.logging.setLogLevel(_SILENT)
 
 
 def without_password(url: str) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from vla_zenoh.runtime.hang_detection import HANG_S, LastStatus, hung_nodes
+from vla_zenoh.runtime.supervisor import HANG_S, hung_nodes
 
 RUNNING = {
     "router": ("router", 1),
@@ -13,11 +13,11 @@ RUNNING = {
 FRESH_S, LONG_S = 0.3, HANG_S + 1.0
 
 
-def said(**ages_s: float) -> dict[str, LastStatus]:
+def said(**ages_s: float) -> dict[str, tuple[int, float]]:
     """Everybody was heard just now, but those named."""
     heard = {name: FRESH_S for name in RUNNING}
     heard.update({name.replace("_", "-"): age_s for name, age_s in ages_s.items()})
-    return {name: LastStatus(RUNNING[name][1], age_s) for name, age_s in heard.items()}
+    return {name: (RUNNING[name][1], age_s) for name, age_s in heard.items()}
 
 
 def test_nobody_hangs_while_all_speak() -> None:
@@ -34,7 +34,7 @@ def test_a_worker_may_think_as_long_as_it_likes() -> None:
 
 
 def test_a_node_that_was_started_anew_is_not_blamed_for_what_ran_before() -> None:
-    before = {**said(), "sim": LastStatus(17, LONG_S)}
+    before = {**said(), "sim": (17, LONG_S)}
     assert hung_nodes(RUNNING, before) == []
 
 
