@@ -7,8 +7,8 @@ from typing import Annotated
 import typer
 
 from vla_zenoh.cli.options import options
-from vla_zenoh.cli.output import progress_bars
 from vla_zenoh.lab.cli.bench_file import ResultOptions, write_json
+from vla_zenoh.lab.cli.output import progress_bars
 
 
 @options

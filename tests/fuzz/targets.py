@@ -23,14 +23,16 @@ from model_wires import groot, lerobot_server, npy, openpi, openvla_rest, origam
 
 from vla_zenoh.bus.clock_sync import decode_stamps
 from vla_zenoh.cli import status_table as cli_status
-from vla_zenoh.cli.options import model_options, number_list
-from vla_zenoh.cli.output import Screen, plain_types
+from vla_zenoh.cli.options import model_options
+from vla_zenoh.cli.output import Screen
 from vla_zenoh.codec import image, message, primitives, records, settings
 from vla_zenoh.errors import CodecError, PeerError, ProfileError, SpecError, VlaZenohError
 from vla_zenoh.keys import Keys
 from vla_zenoh.lab.cli import inspect as cli_inspect
 from vla_zenoh.lab.cli import keys as cli_keys
 from vla_zenoh.lab.cli import net as cli_net
+from vla_zenoh.lab.cli.options import number_list
+from vla_zenoh.lab.cli.output import plain_types
 from vla_zenoh.lab.demo.scripted_motions import parse_scripted
 from vla_zenoh.lab.evaluation.mcap_file import evaluate_run
 from vla_zenoh.lab.inference_views import InferenceView

@@ -8,21 +8,20 @@ import inspect
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
 from vla_zenoh.bus.clock import HOST_VARIABLE
 from vla_zenoh.cli.words import DEFAULT_PROFILE, PROFILE_VARIABLE
-from vla_zenoh.policy.loader import ModelFile, find_worker
-from vla_zenoh.profile import Profile, load_profile, override
+
+if TYPE_CHECKING:  # Pydantic and the schema: `up` has more to do while it loads them
+    from vla_zenoh.policy.loader import ModelFile
+    from vla_zenoh.profile import Profile
 
 ProfileOption = Annotated[
     str,
     typer.Option("--profile", "-p", envvar=PROFILE_VARIABLE, help="Name or path of a profile."),
-]
-SimulatedProfileOption = Annotated[
-    str, typer.Option("--profile", "-p", help="Name or path of a simulated robot's profile.")
 ]
 ConnectOption = Annotated[
     list[str] | None,
@@ -108,6 +107,8 @@ def effective_profile(
     Raises:
         ProfileError: the profile is invalid.
     """
+    from vla_zenoh.profile import load_profile, override
+
     loaded = load_profile(profile) if isinstance(profile, str) else profile
     changes: dict[str, Any] = {"connect": connect} if connect else {}
     changes |= {"listen": listen} if listen else {}
@@ -170,6 +171,8 @@ class ModelOptions:
             WorkerError: its header cannot be read, or it has no such option.
             typer.BadParameter: an option is not ``name=value``.
         """
+        from vla_zenoh.policy.loader import find_worker
+
         given = model_options(self.settings or [])
         own, model = find_worker(word, profile.models if profile is not None else {})
         called = name or own
@@ -194,18 +197,3 @@ def model_options(given: list[str]) -> dict[str, str]:
             raise typer.BadParameter(f"--set wants name=value, not {option!r}")
         out[key] = value
     return out
-
-
-def number_list(option: str, text: str, low: float, high: float) -> list[float]:
-    """Parse numbers separated by commas.
-
-    Raises:
-        typer.BadParameter: not numbers, or out of [low, high]; names the option.
-    """
-    try:
-        numbers = [float(part) for part in text.split(",")]
-    except ValueError as error:
-        raise typer.BadParameter(f"{option} wants numbers separated by commas: {error}") from error
-    if not all(low <= number <= high for number in numbers):
-        raise typer.BadParameter(f"{option} wants numbers from {low:g} to {high:g}")
-    return numbers

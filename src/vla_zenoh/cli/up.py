@@ -12,6 +12,8 @@ import sys
 import threading
 import time
 import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
@@ -78,12 +80,12 @@ def up(
 
     The profile is checked first, as `profile check` does; nothing starts if it cannot run.
     """
-    loaded = effective_profile(profile, connect, listen)
-    name, _ = choose_host(loaded, host)
+    endpoints = repeated({"--connect": connect, "--listen": listen})
     if print_unit:
+        loaded = effective_profile(profile, connect, listen)
+        name, _ = choose_host(loaded, host)
         words = [sys.executable, "-m", "vla_zenoh", "up", absolute(profile), "--host", name]
-        for option, values in (("--connect", connect), ("--listen", listen), ("--also", also)):
-            words += [word for value in values or () for word in (option, value)]
+        words += [*endpoints, *repeated({"--also": also})]
         words += ["--dry-run"] * dry_run + ["--verbose"] * verbose + ["--json"] * as_json
         words += ["--no-record"] * no_record
         words += ["--log-dir", str(log_dir.absolute())] if log_dir else []
@@ -91,10 +93,14 @@ def up(
         what = f"robot {loaded.robot.name}, host {name}"
         print(systemd_unit(what, words, getpass.getuser(), kept), end="")
         return
-    once = HostLock(loaded, name)
-    once.take()  # reports at once a host that already runs; the host takes it again
-    once.release()
-    reject_wrong(profile, host, connect, listen)
+    named = [] if host is None else ["--host", host]
+    with profile_check([profile, *named, *endpoints]) as check:
+        loaded = effective_profile(profile, connect, listen)
+        name, _ = choose_host(loaded, host)
+        once = HostLock(loaded, name)
+        once.take()  # reports at once a host that already runs; the host takes it again
+        once.release()
+        reject_wrong(profile, check)
     logs = log_dir or default_log_folder()
     file, logger = log_file(logs, f"{loaded.robot.name}-{name}")
     stop = stop_on_signals()
@@ -183,32 +189,46 @@ def log_file(folder: Path, name: str) -> tuple[Path, logging.Logger]:
     return path, logger
 
 
-def reject_wrong(
-    profile: str, host: str | None, connect: list[str] | None, listen: list[str] | None
-) -> None:
-    """Exit with the errors of ``vla-zenoh profile check``, if there are any.
+@contextmanager
+def profile_check(words: Sequence[str]) -> Iterator[subprocess.Popen[str]]:
+    """``vla-zenoh profile check`` with these arguments; it ends with the block.
 
     A separate process checks: models are imported there, which may take much memory.
     """
-    words = ["profile", "check", profile]
-    words += ["--host", host] if host is not None else []
-    for option, endpoints in (("--connect", connect), ("--listen", listen)):
-        words += [word for endpoint in endpoints or () for word in (option, endpoint)]
-    command = [sys.executable, "-m", "vla_zenoh", *words]
+    with subprocess.Popen(
+        [sys.executable, "-m", "vla_zenoh", "profile", "check", *words],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        errors="replace",
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def reject_wrong(profile: str, check: subprocess.Popen[str]) -> None:
+    """Exit with the errors of the check, if there are any."""
     try:
-        done = subprocess.run(
-            command, capture_output=True, text=True, errors="replace", timeout=CHECK_PATIENCE_S
-        )
+        _, said = check.communicate(timeout=CHECK_PATIENCE_S)
     except subprocess.TimeoutExpired:
         why = f"the check of the profile took over {CHECK_PATIENCE_S:g} s; starting without it"
         errors().print(styled(why, "yellow"), soft_wrap=True)
         return
-    if done.returncode == 0:
+    if check.returncode == 0:
         return
-    lines = done.stderr.splitlines() or [f"`profile check` ended with code {done.returncode}"]
+    lines = said.splitlines() or [f"`profile check` ended with code {check.returncode}"]
     for line in lines:
         errors().print(styled(line, "red"), soft_wrap=True)
     fail(f"nothing was started: {profile} has faults; `vla-zenoh profile check` lists them too")
+
+
+def repeated(options: Mapping[str, Sequence[str] | None]) -> list[str]:
+    """Words of a command line for options that may be given several times."""
+    return [
+        word for name, values in options.items() for value in values or () for word in (name, value)
+    ]
 
 
 def target_of(profile: str, running: Host) -> RobotTarget:

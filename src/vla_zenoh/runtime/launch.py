@@ -266,7 +266,7 @@ class Host:
                 ]
             else:
                 reject_taken(self._part.listen or self.profile.session.listen)
-                self.supervisor.start(["router"])
+                self.supervisor.start()  # the others wait for it while they import
         self.session = open_session(self.profile.session, wait_s=ROUTER_PATIENCE_S)
         self.client = Client(self.profile, self.session).subscribe()
         self.supervisor.start()

@@ -149,10 +149,10 @@ class Supervisor:
         self._log, self._tell = log, tell
         self.given_up: Child | None = None
 
-    def start(self, kinds: Sequence[str] | None = None) -> None:
-        """Start the nodes of `kinds` (None: all) that do not run yet."""
+    def start(self) -> None:
+        """Start the nodes that do not run yet."""
         for child in self.children:
-            if child.process is None and (kinds is None or child.command.kind in kinds):
+            if child.process is None:
                 self._spawn(child)
 
     def poll(self, spare: Sequence[str] = ()) -> bool:

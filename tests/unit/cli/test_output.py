@@ -12,7 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vla_zenoh.cli.output import Screen, console, errors, fail, new_table, print_json, styled
+from vla_zenoh.cli.output import Screen, console, errors, fail, new_table, styled
+from vla_zenoh.lab.cli.output import print_json
 from vla_zenoh.profile import load_profile
 from vla_zenoh.sanitize import printable
 from vla_zenoh.types import GripperState, SceneState

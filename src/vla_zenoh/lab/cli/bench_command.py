@@ -7,15 +7,10 @@ from typing import Annotated
 import typer
 from rich.progress import track
 
-from vla_zenoh.cli.options import (
-    DEFAULT_PROFILE,
-    SimulatedProfileOption,
-    effective_profile,
-    number_list,
-    options,
-)
+from vla_zenoh.cli.options import DEFAULT_PROFILE, effective_profile, options
 from vla_zenoh.cli.output import errors, new_table
 from vla_zenoh.lab.cli.bench_file import ResultOptions, kept_rows
+from vla_zenoh.lab.cli.options import SimulatedProfileOption, number_list
 
 SHARES = ("p50", "p95", "p99", "max")
 

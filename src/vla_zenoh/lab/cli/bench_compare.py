@@ -9,10 +9,11 @@ import typer
 from rich.table import Table
 
 from vla_zenoh.cli.options import JsonOption
-from vla_zenoh.cli.output import console, new_table, print_json
+from vla_zenoh.cli.output import console, new_table
 from vla_zenoh.errors import ResourceError
 from vla_zenoh.lab.bench.paired_tasks import ALPHA, CONDITIONS, Comparison, figures, read_run
 from vla_zenoh.lab.bench.paired_tasks import compare as compare_runs
+from vla_zenoh.lab.cli.output import print_json
 
 B_IS_WORSE = 3
 """Exit code; 1 and 2 are those of every command for errors."""

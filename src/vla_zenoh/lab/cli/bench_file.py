@@ -15,7 +15,8 @@ import typer
 from rich.console import RenderableType
 
 from vla_zenoh.cli.options import JsonOption
-from vla_zenoh.cli.output import console, errors, print_json
+from vla_zenoh.cli.output import console, errors
+from vla_zenoh.lab.cli.output import print_json
 from vla_zenoh.lab.cli.output_path import ForceOption, if_wanted, output_file
 
 if TYPE_CHECKING:

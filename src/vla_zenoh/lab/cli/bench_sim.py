@@ -15,7 +15,7 @@ from rich.progress import TimeRemainingColumn
 
 from vla_zenoh import __version__
 from vla_zenoh.cli.options import JsonOption, ModelOptions, model_options, options
-from vla_zenoh.cli.output import console, errors, new_table, print_json, progress_bars
+from vla_zenoh.cli.output import console, errors, new_table
 from vla_zenoh.errors import ResourceError
 from vla_zenoh.lab.benchmark.contract import BenchmarkTask
 from vla_zenoh.lab.benchmark.episode_clock import (
@@ -29,6 +29,7 @@ from vla_zenoh.lab.benchmark.process import BenchmarkProcess, BenchmarkSetting
 from vla_zenoh.lab.benchmark.result import summary, write_page, write_videos
 from vla_zenoh.lab.benchmark.run import BenchmarkStage, Does, LocalRun, run_at_places
 from vla_zenoh.lab.cli.bench_file import write_json
+from vla_zenoh.lab.cli.output import print_json, progress_bars
 from vla_zenoh.lab.cli.output_path import check_folder
 
 REPLAY = "replay"

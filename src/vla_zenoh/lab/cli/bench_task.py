@@ -16,13 +16,14 @@ from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
     JsonOption,
     ModelOptions,
-    SimulatedProfileOption,
     effective_profile,
     options,
 )
-from vla_zenoh.cli.output import console, new_table, print_json, progress_bars
+from vla_zenoh.cli.output import console, new_table
 from vla_zenoh.lab.bench.task import BASELINES, SCENE, TaskPlan, TaskScore
 from vla_zenoh.lab.cli.bench_file import running_nodes, write_json
+from vla_zenoh.lab.cli.options import SimulatedProfileOption
+from vla_zenoh.lab.cli.output import print_json, progress_bars
 from vla_zenoh.lab.cli.output_path import ForceOption, if_wanted, output_folder, require_free_folder
 from vla_zenoh.lab.tasks import FAMILIES, LIFT, LIMIT_S
 from vla_zenoh.policy.loader import find_model

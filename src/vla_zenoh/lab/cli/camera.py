@@ -11,8 +11,9 @@ import cv2
 import typer
 
 from vla_zenoh.cli.options import JsonOption, options
-from vla_zenoh.cli.output import console, new_table, print_json, progress
+from vla_zenoh.cli.output import console, new_table
 from vla_zenoh.errors import MissingExtraError, VlaZenohError, in_words
+from vla_zenoh.lab.cli.output import print_json, progress
 from vla_zenoh.lab.cli.output_path import ForceOption, output_folder
 from vla_zenoh.nodes.camera.node import make_source
 from vla_zenoh.nodes.camera.realsense import connected, sdk

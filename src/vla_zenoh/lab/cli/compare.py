@@ -9,7 +9,8 @@ import typer
 from rich.table import Table
 
 from vla_zenoh.cli.options import JsonOption
-from vla_zenoh.cli.output import console, fail, new_table, print_json, progress
+from vla_zenoh.cli.output import console, fail, new_table
+from vla_zenoh.lab.cli.output import print_json, progress
 from vla_zenoh.lab.evaluation.disagreement import (
     AXES,
     DEFAULT_TOLERANCE_S,

@@ -10,8 +10,9 @@ from typing import Annotated
 import typer
 
 from vla_zenoh.cli.options import JsonOption
-from vla_zenoh.cli.output import console, errors, fail, print_json, progress
+from vla_zenoh.cli.output import console, errors, fail
 from vla_zenoh.errors import RecordingError, counted, nearest
+from vla_zenoh.lab.cli.output import print_json, progress
 from vla_zenoh.lab.cli.output_path import ForceOption, output_file, output_folder
 from vla_zenoh.lab.dataset.label import EpisodeLabel
 from vla_zenoh.lab.evaluation.evaluate import MCAP, recordings

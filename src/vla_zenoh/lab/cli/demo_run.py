@@ -8,9 +8,10 @@ from typing import Any
 
 import typer
 
-from vla_zenoh.cli.output import console, new_table, print_json, styled
+from vla_zenoh.cli.output import console, new_table, styled
 from vla_zenoh.lab.cli.demo_options import DemoOptions
 from vla_zenoh.lab.cli.demo_stage import Stage, latency_line, open_stage, refusals, run_folder
+from vla_zenoh.lab.cli.output import print_json
 from vla_zenoh.lab.demo.chunk_file import write_chunks
 from vla_zenoh.lab.demo.runner import MotionRunner
 from vla_zenoh.lab.demo.segments import DemoSegment, SegmentOutcome, latencies

@@ -17,9 +17,10 @@ from typing import Any
 from rich.progress import Progress
 
 from vla_zenoh.cli.options import effective_profile
-from vla_zenoh.cli.output import Screen, errors, progress_bars
+from vla_zenoh.cli.output import Screen, errors
 from vla_zenoh.lab.cli.bench_file import running_nodes
 from vla_zenoh.lab.cli.loopback import own_address
+from vla_zenoh.lab.cli.output import progress_bars
 from vla_zenoh.lab.cli.output_path import RUNS, output_folder
 from vla_zenoh.lab.evaluation.mcap_file import evaluate_parts
 from vla_zenoh.lab.evaluation.plot_image import write_plot

@@ -9,13 +9,14 @@ from typing import Any
 import typer
 from rich.text import Text
 
-from vla_zenoh.cli.output import console, new_table, print_json, styled
+from vla_zenoh.cli.output import console, new_table, styled
 from vla_zenoh.errors import ResourceError, nearest
 from vla_zenoh.lab.bench.task import SCENE, DemoPlan, TaskOutcome, is_judged, order_of
 from vla_zenoh.lab.bench.task_runner import TaskRunner
 from vla_zenoh.lab.bench.task_sheet import sheet
 from vla_zenoh.lab.cli.demo_options import DemoOptions
 from vla_zenoh.lab.cli.demo_stage import Stage, latency_line, open_stage, refusals, run_folder
+from vla_zenoh.lab.cli.output import print_json
 from vla_zenoh.lab.demo.segments import latencies
 from vla_zenoh.lab.episode import Interrupted
 from vla_zenoh.lab.evaluation.result import TASKS

@@ -20,8 +20,9 @@ from vla_zenoh.cli.options import (
     JsonOption,
     effective_profile,
 )
-from vla_zenoh.cli.output import console, new_table, print_json, progress, styled
+from vla_zenoh.cli.output import console, new_table, styled
 from vla_zenoh.errors import SecurityError, SessionError
+from vla_zenoh.lab.cli.output import print_json, progress
 from vla_zenoh.lab.doctor import HostFinding, Needs, examine, needs_of
 from vla_zenoh.lab.doctor.access import AccessVerdict, access
 from vla_zenoh.lab.doctor.access_check import check_access, read_access, try_identity

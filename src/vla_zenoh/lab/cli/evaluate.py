@@ -13,15 +13,8 @@ from typing import Annotated
 import typer
 
 from vla_zenoh.cli.options import JsonOption
-from vla_zenoh.cli.output import (
-    console,
-    errors,
-    fail,
-    new_table,
-    plain_types,
-    print_json,
-    progress_bars,
-)
+from vla_zenoh.cli.output import console, errors, fail, new_table
+from vla_zenoh.lab.cli.output import plain_types, print_json, progress_bars
 from vla_zenoh.lab.cli.output_path import ForceOption, output_file
 from vla_zenoh.lab.evaluation import tables
 from vla_zenoh.lab.evaluation.evaluate import EMPTY, combined, evaluate, recordings, to_mapping

@@ -20,12 +20,13 @@ from vla_zenoh.bus.buffers import CallbackRing, bytes_of, header_of
 from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.cli.options import JsonOption, options
-from vla_zenoh.cli.output import console, fail, new_table, print_json, styled
+from vla_zenoh.cli.output import console, fail, new_table, styled
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.codec import message
 from vla_zenoh.codec.image import MAX_IMAGE_BYTES
 from vla_zenoh.errors import CodecError, ProfileError
 from vla_zenoh.keys import Keys
+from vla_zenoh.lab.cli.output import print_json
 from vla_zenoh.sanitize import one_line
 from vla_zenoh.types import NodeStatus
 

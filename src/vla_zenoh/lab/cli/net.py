@@ -13,8 +13,9 @@ from rich.table import Table
 from vla_zenoh.bus.clock import Clock
 from vla_zenoh.bus.clock_sync import ClockSync
 from vla_zenoh.cli.options import JsonOption, options
-from vla_zenoh.cli.output import console, fail, new_table, print_json, progress, styled
+from vla_zenoh.cli.output import console, fail, new_table, styled
 from vla_zenoh.cli.target import RobotTarget
+from vla_zenoh.lab.cli.output import print_json, progress
 from vla_zenoh.sanitize import one_line
 from vla_zenoh.types import NodeStatus
 

@@ -9,9 +9,10 @@ import typer
 from rich.syntax import Syntax
 
 from vla_zenoh.cli.options import ConnectOption, HostOption, JsonOption, ListenOption
-from vla_zenoh.cli.output import console, errors, fail, new_table, print_json, styled
+from vla_zenoh.cli.output import console, errors, fail, new_table, styled
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.lab.cli.bridge_config import bridge_config
+from vla_zenoh.lab.cli.output import print_json
 from vla_zenoh.lab.profile.check import check_profile
 from vla_zenoh.profile import load_profile, profile_file, profile_names, to_yaml
 from vla_zenoh.resources import shipped

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from vla_zenoh.cli.options import JsonOption, options
-from vla_zenoh.cli.output import console, errors, fail, print_json
+from vla_zenoh.cli.output import console, errors, fail
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import counted
+from vla_zenoh.lab.cli.output import print_json
 from vla_zenoh.lab.cli.output_path import RUNS, ForceOption, output_file
 from vla_zenoh.runtime.process import run_node
 

@@ -8,9 +8,10 @@ from typing import Annotated
 import typer
 
 from vla_zenoh.cli.options import JsonOption, options
-from vla_zenoh.cli.output import console, errors, fail, print_json
+from vla_zenoh.cli.output import console, errors, fail
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import counted
+from vla_zenoh.lab.cli.output import print_json
 from vla_zenoh.profile import Profile, as_robot
 from vla_zenoh.runtime.process import run_node
 from vla_zenoh.security.identity import Role

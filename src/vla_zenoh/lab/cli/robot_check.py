@@ -7,8 +7,9 @@ from typing import Annotated
 import typer
 
 from vla_zenoh.cli.options import DEFAULT_PROFILE, JsonOption, effective_profile
-from vla_zenoh.cli.output import fail, progress
+from vla_zenoh.cli.output import fail
 from vla_zenoh.lab.cli.doctor import report
+from vla_zenoh.lab.cli.output import progress
 from vla_zenoh.lab.doctor.fci import fci_arm
 from vla_zenoh.lab.doctor.ur import ur_arm
 

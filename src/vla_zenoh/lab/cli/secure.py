@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 import typer
 
 from vla_zenoh.cli.options import DEFAULT_PROFILE, HostOption, JsonOption, ProfileOption
-from vla_zenoh.cli.output import console, errors, fail, print_json
+from vla_zenoh.cli.output import console, errors, fail
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import SecurityError, VlaZenohError
 from vla_zenoh.lab.certificates.authority import AUTHORITY_DAYS, CERTIFICATE_DAYS
@@ -26,6 +26,7 @@ from vla_zenoh.lab.certificates.secure_profile import (
 )
 from vla_zenoh.lab.cli.addresses import is_own
 from vla_zenoh.lab.cli.certificate_table import certificate_row, print_certificates
+from vla_zenoh.lab.cli.output import print_json
 from vla_zenoh.lab.cli.output_path import ForceOption, output_file
 from vla_zenoh.lab.cli.secure_copying import copy_commands
 from vla_zenoh.profile import Profile, load_profile, profile_file

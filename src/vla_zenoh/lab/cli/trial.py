@@ -11,9 +11,10 @@ from typing import Annotated, Any
 import typer
 
 from vla_zenoh.cli.options import JsonOption, options
-from vla_zenoh.cli.output import console, errors, fail, new_table, print_json
+from vla_zenoh.cli.output import console, errors, fail, new_table
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import RecordingError
+from vla_zenoh.lab.cli.output import print_json
 from vla_zenoh.lab.cli.output_path import check_folder
 from vla_zenoh.lab.trial.folder import TrialFolder
 from vla_zenoh.lab.trial.plan import TrialPlan

@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from vla_zenoh.cli.options import options
-from vla_zenoh.cli.output import errors, fail, progress
+from vla_zenoh.cli.output import errors, fail
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import MissingExtraError, OutputError, ProfileError, counted
 from vla_zenoh.lab.cli.loopback import require_loopback
+from vla_zenoh.lab.cli.output import progress
 from vla_zenoh.lab.cli.output_path import ForceOption, if_wanted, output_file
 from vla_zenoh.lab.view.viewer import Viewer, open_server, open_window
 from vla_zenoh.profile import Profile, read_profile

@@ -40,11 +40,7 @@ def choose_cameras(profile: Profile, cameras: tuple[str, ...] | None) -> dict[st
     Raises:
         NodeError: unknown camera, a camera of ROS 2, or no camera at all.
     """
-    ours = {
-        name: camera
-        for name, camera in profile.cameras.items()
-        if not camera.source.startswith(ROS2)
-    }
+    ours = {name: one for name, one in profile.cameras.items() if not one.source.startswith(ROS2)}
     known = f"this node can serve: {', '.join(ours) or 'none'}"
     for name in cameras or ():
         if name not in profile.cameras:
@@ -211,12 +207,12 @@ class CameraNode:
         self._specs: ZenohRing | None = None
         if any(settings.fit_for_workers for settings in chosen.values()):
             self._specs = self.node.subscribe(self.node.keys.all_specs, ZenohRing(SPECS_A_TICK))
+        self._sim: Any = None
         views = [
             (settings.source.removeprefix(SIM), self._publishers[camera])
             for camera, settings in chosen.items()
             if settings.source.startswith(SIM)
         ]
-        self._sim: Any = None
         if views:
             from vla_zenoh.nodes.camera.sim_cameras import SimCameras
 

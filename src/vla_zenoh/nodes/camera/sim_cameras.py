@@ -20,11 +20,10 @@ from vla_zenoh.nodes.camera.camera_publisher import OK, CameraPublisher
 from vla_zenoh.nodes.camera.geometry import Intrinsics
 from vla_zenoh.nodes.camera.source import STALL_S
 from vla_zenoh.profile import Profile
-from vla_zenoh.simulation.render import AUTO, Renderer, choose_backend
+from vla_zenoh.simulation.render import AUTO, RAYCAST, Renderer, choose_backend
 from vla_zenoh.simulation.robot_model import robot_models
 from vla_zenoh.types import SceneState, Stamped
 
-RAYCAST = "raycast"
 WAKE_S = 0.1
 IDLE_PERIOD_S = 1.0
 """Without subscribers one image in this time is drawn, to prove that rendering works."""
@@ -49,21 +48,15 @@ class RenderBudget:
 
     def add(self, seconds: float) -> None:
         """Account for an image that took this long to draw."""
-        mean_s = seconds if self._mean_s is None else self._mean_s
-        mean_s = MEMORY * mean_s + (1 - MEMORY) * seconds
-        self._mean_s = mean_s
-        if mean_s > TOO_SLOW * self._period_s and self.step < COARSEST:
-            self._change(self.step + 1)
-        elif self.step > 1:
-            finer = self.step - 1
-            if mean_s * (self.step / finer) ** 2 < WITH_EASE * self._period_s:
-                self._change(finer)
-
-    def _change(self, step: int) -> None:
+        before_s = seconds if self._mean_s is None else self._mean_s
+        mean_s = MEMORY * before_s + (1 - MEMORY) * seconds
+        step = self.step
+        if mean_s > TOO_SLOW * self._period_s and step < COARSEST:
+            step += 1
+        elif step > 1 and mean_s * (step / (step - 1)) ** 2 < WITH_EASE * self._period_s:
+            step -= 1
         # Time is about proportional to the number of pixels.
-        if self._mean_s is not None:
-            self._mean_s *= (self.step / step) ** 2
-        self.step = step
+        self._mean_s, self.step = mean_s * (self.step / step) ** 2, step
 
 
 class SimCameras:

@@ -39,6 +39,8 @@ class V4l2Source(CaptureSource):
         profile: size, rate and locks to request; the device may choose another size and rate.
     """
 
+    same_s = SAME_S
+
     def __init__(self, device: str, profile: CameraProfile) -> None:
         super().__init__()
         self._device, self._path, self._profile = device, DEV, profile
