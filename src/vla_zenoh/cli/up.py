@@ -16,7 +16,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -34,11 +34,13 @@ from vla_zenoh.cli.output import console, errors, fail, styled
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import NodeError
 from vla_zenoh.keys import ROLLING
-from vla_zenoh.profile import Profile, load_profile, profile_file
-from vla_zenoh.resources import is_path
-from vla_zenoh.runtime.launch import Host, HostLock, choose_host
+from vla_zenoh.resources import is_path, profile_file
 from vla_zenoh.runtime.process import DETAIL, FATAL, die_with_parent, stop_on_signals
 from vla_zenoh.runtime.systemd_unit import systemd_unit
+
+if TYPE_CHECKING:
+    from vla_zenoh.profile import Profile
+    from vla_zenoh.runtime.launch import Host
 
 LOG_BYTES = 10 * 1024 * 1024
 COLOURS = ("cyan", "magenta", "green", "yellow", "blue", "bright_cyan", "bright_magenta")
@@ -82,6 +84,8 @@ def up(
     """
     endpoints = repeated({"--connect": connect, "--listen": listen})
     if print_unit:
+        from vla_zenoh.runtime.launch import choose_host
+
         loaded = effective_profile(profile, connect, listen)
         name, _ = choose_host(loaded, host)
         words = [sys.executable, "-m", "vla_zenoh", "up", absolute(profile), "--host", name]
@@ -95,6 +99,8 @@ def up(
         return
     named = [] if host is None else ["--host", host]
     with profile_check([profile, *named, *endpoints]) as check:
+        from vla_zenoh.runtime.launch import Host, HostLock, choose_host  # meanwhile
+
         loaded = effective_profile(profile, connect, listen)
         name, _ = choose_host(loaded, host)
         once = HostLock(loaded, name)
@@ -226,14 +232,13 @@ def reject_wrong(profile: str, check: subprocess.Popen[str]) -> None:
 
 def repeated(options: Mapping[str, Sequence[str] | None]) -> list[str]:
     """Words of a command line for options that may be given several times."""
-    return [
-        word for name, values in options.items() for value in values or () for word in (name, value)
-    ]
+    given = ((name, value) for name, values in options.items() for value in values or ())
+    return [word for pair in given for word in pair]
 
 
 def target_of(profile: str, running: Host) -> RobotTarget:
     """Options that reach this robot from any folder and terminal of this computer."""
     there = running.profile.session.connect
     name = str(profile_file(profile)) if is_path(profile) else profile
-    own = load_profile(profile).session.connect
+    own = effective_profile(profile).session.connect
     return RobotTarget(name, None if there == own else list(there))
