@@ -24,7 +24,17 @@ from vla_zenoh.policy import (
     StatePart,
 )
 from vla_zenoh.policy.spec import STREAM_OF
-from vla_zenoh.types import ActionChunk, Depth, Image, Stamped, Task
+from vla_zenoh.types import (
+    ActionChunk,
+    Depth,
+    GripperState,
+    Image,
+    JointState,
+    PoseState,
+    PrivilegedState,
+    Stamped,
+    Task,
+)
 from vla_zenoh.types.states import MAX_COUNT
 
 MAX_STATES, MAX_PICTURES = 4096, 128
@@ -73,14 +83,25 @@ class History:
         """Stamp of the newest; 0 without records."""
         return _stamp_ns(self.entries[-1]) if self.entries else 0
 
-    def nearest(self, stamp_ns: int) -> Stamped[Any]:
-        """The entry whose stamp is nearest; there must be one."""
+    def nearest(self, stamp_ns: int) -> Stamped[Any] | None:
+        """The entry whose stamp is nearest; None without entries."""
+        if not self.entries:
+            return None
         newest = self.entries[-1]
         if newest.header.stamp_wall_ns <= stamp_ns:
             return newest
         right = bisect_left(self.entries, stamp_ns, key=_stamp_ns)
         before, after = self.entries[max(right - 1, 0)], self.entries[right]
         return after if _stamp_ns(after) - stamp_ns < stamp_ns - _stamp_ns(before) else before
+
+
+STATE_KINDS: dict[str, type[Any]] = {
+    "joint": JointState,
+    "pose": PoseState,
+    "gripper": GripperState,
+    "privileged": PrivilegedState,
+}
+"""Records of the state. Their keys are ``state_joint`` etc. of `Keys`."""
 
 
 def state_names(
@@ -124,7 +145,8 @@ _IMAGE, _DEPTH, _STATE = "camera {!r}", "depth of camera {!r}", "state/{}"
 """Names of streams in messages."""
 
 
-class Streams(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class Streams:
     """What a worker has received of the streams that its model observes.
 
     Args:
@@ -169,7 +191,8 @@ class Streams(NamedTuple):
     def at(self, stamp_ns: int) -> Moment:
         """What was received nearest to this time; nothing may be `silent`."""
         images, depth, states = (
-            {name: one.nearest(stamp_ns) for name, one in streams.items()} for streams in self
+            {name: near for name, one in streams.items() if (near := one.nearest(stamp_ns))}
+            for streams in (self.images, self.depth, self.states)
         )
         return Moment(stamp_ns, images, depth, states)
 
@@ -304,7 +327,8 @@ def _history(
                 f"history: {name} has nothing within {most_s:g} s of the time {ago_s:g} s "
                 f"ago, the nearest is {apart_s:.3f} s away"
             )
-        lead = min((one.nearest(moment.stamp_ns) for one in leading), key=_stamp_ns).header
+        near = [near for one in leading if (near := one.nearest(moment.stamp_ns))]
+        lead = min(near, key=_stamp_ns).header
         first = lead.stamp_wall_ns, lead.seq, now.task
         then = _observation(wanted, moment, first, now.robot)
         if isinstance(then, NotReady):

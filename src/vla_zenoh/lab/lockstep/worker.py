@@ -9,26 +9,16 @@ from vla_zenoh.keys import worker_node
 from vla_zenoh.lab.lockstep.records import Delays
 from vla_zenoh.policy import ActionSteps, Policy, check_steps, reset_of
 from vla_zenoh.policy.chunk_prefix import ChunkPrefix
-from vla_zenoh.policy.observation import NotReady, Streams, assemble, make_chunk, state_names
-from vla_zenoh.profile import Profile
-from vla_zenoh.types import (
-    ActionChunk,
-    Depth,
-    GripperState,
-    Image,
-    JointState,
-    PoseState,
-    PrivilegedState,
-    Stamped,
-    Task,
+from vla_zenoh.policy.observation import (
+    STATE_KINDS,
+    NotReady,
+    Streams,
+    assemble,
+    make_chunk,
+    state_names,
 )
-
-STATE_KINDS: dict[str, type[Any]] = {
-    "joint": JointState,
-    "pose": PoseState,
-    "gripper": GripperState,
-    "privileged": PrivilegedState,
-}
+from vla_zenoh.profile import Profile
+from vla_zenoh.types import ActionChunk, Depth, Image, Stamped, Task
 
 
 class LockstepWorker:

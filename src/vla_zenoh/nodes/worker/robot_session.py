@@ -24,7 +24,7 @@ from vla_zenoh.codec import records
 from vla_zenoh.codec.image import MAX_IMAGE_BYTES
 from vla_zenoh.codec.records import SMALL_BYTES
 from vla_zenoh.errors import CodecError, PeerError, SpecError, in_words
-from vla_zenoh.keys import Keys, Kind, worker_node
+from vla_zenoh.keys import Kind, worker_node
 from vla_zenoh.nodes.worker.camera_subscriber import (
     STREAM_PATIENCE_S,
     CameraSubscriber,
@@ -37,6 +37,7 @@ from vla_zenoh.policy import ActionSteps, Observation, Policy, check_steps, rese
 from vla_zenoh.policy.chunk_prefix import ChunkPrefix
 from vla_zenoh.policy.observation import (
     MAX_STATES,
+    STATE_KINDS,
     History,
     NotReady,
     Streams,
@@ -45,16 +46,7 @@ from vla_zenoh.policy.observation import (
     state_names,
 )
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import (
-    Depth,
-    GripperState,
-    Image,
-    JointState,
-    PoseState,
-    PrivilegedState,
-    Stamped,
-    Task,
-)
+from vla_zenoh.types import Depth, Image, Stamped, Task
 from vla_zenoh.types.stream import SingleWriterFilter
 
 SPEC_PERIOD_S = 1.0
@@ -64,21 +56,6 @@ FRESH_PATIENCE_S = 0.05
 SILENT_S = 0.5
 FRESH_TOLERANCE_S = 0.005
 MAX_COMPLAINT = 500
-STATE_KINDS: dict[str, type[Any]] = {
-    "joint": JointState,
-    "pose": PoseState,
-    "gripper": GripperState,
-    "privileged": PrivilegedState,
-}
-
-
-def _state_key(keys: Keys, what: str) -> str:
-    return {
-        "joint": keys.state_joint,
-        "pose": keys.state_pose,
-        "gripper": keys.state_gripper,
-        "privileged": keys.state_privileged,
-    }[what]
 
 
 class _Feed(NamedTuple):
@@ -199,7 +176,7 @@ class RobotSession:
         self._states = [
             _StateStream(
                 node,
-                _state_key(keys.of_part(part), what),
+                getattr(keys.of_part(part), f"state_{what}"),
                 STATE_KINDS[what],
                 self._streams.states[name],
                 MAX_STATES if history_s else 256,
