@@ -72,17 +72,12 @@ class ClockOffset:
     round_trip_s: float
 
     def exceeds(self, bound_s: float) -> bool:
-        """Whether the clock is off by more than is compensated."""
-        return _beyond(self.offset_s, bound_s)
+        """Whether the clock is off by more than is compensated, by the estimate alone.
 
-
-def _beyond(offset_s: float, bound_s: float) -> bool:
-    """By the estimate alone: an offset is either corrected or rejected.
-
-    However long a link is, the estimate is near zero if the clocks agree and both directions take
-    the same time. It is off by half of their difference.
-    """
-    return abs(offset_s) > bound_s
+        However long a link is, that is near zero if the clocks agree and both directions take the
+        same time. It is off by half of their difference.
+        """
+        return abs(self.offset_s) > bound_s
 
 
 class ClockOffsetFilter:
@@ -110,12 +105,7 @@ class ClockOffsetFilter:
         return True
 
     def offset(self, wall_minus_mono_ns: int, now_mono_ns: int) -> ClockOffset | None:
-        """The offset now; None before the first exchange.
-
-        Args:
-            wall_minus_mono_ns: our own wall clock minus our monotonic one, now.
-            now_mono_ns: on our monotonic clock.
-        """
+        """The offset at a time of our monotonic clock; None before the first exchange."""
         best = self._best
         if best is None:
             return None
@@ -139,7 +129,7 @@ class ClockOffsetFilter:
             return self._applied_ns
         self._applied_for = best, wall_minus_mono_ns
         offset_ns = best.ahead_ns - wall_minus_mono_ns
-        if _beyond(offset_ns / 1e9, self._bound_s):
+        if abs(offset_ns / 1e9) > self._bound_s:
             self._applied_ns = 0
         elif abs(offset_ns - self._applied_ns) > self._uncertainty_ns(best, now_mono_ns):
             self._applied_ns = offset_ns
@@ -164,7 +154,7 @@ def shift_stamps(header: Header, record: Record, ahead_ns: int) -> tuple[Header,
     Args:
         header: of the record.
         record: any; a chunk has stamps of its own.
-        ahead_ns: how far the writer's clock is ahead of ours.
+        ahead_ns: the writer's clock minus ours.
     """
 
     def here(stamp_ns: int) -> int:

@@ -9,9 +9,8 @@ import pytest
 import zenoh
 from camera_rig import free_endpoint, until
 
-from vla_zenoh.bus.client import MAX_WHY, Client
+from vla_zenoh.bus.client import MAX_OTHERS, MAX_WHY, Client
 from vla_zenoh.bus.node import Node
-from vla_zenoh.bus.node_registry import MAX_OTHERS
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import MAX_JPEG_BYTES

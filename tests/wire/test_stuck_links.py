@@ -13,8 +13,7 @@ import zenoh
 from camera_rig import free_endpoint, until
 
 from vla_zenoh.bus.node import Node
-from vla_zenoh.bus.session import open_session, session_config
-from vla_zenoh.bus.tcp_user_timeout import TcpUserTimeout
+from vla_zenoh.bus.session import TcpUserTimeout, open_session, session_config
 from vla_zenoh.keys import Kind
 from vla_zenoh.profile import SessionProfile, load_profile, override
 

@@ -61,12 +61,9 @@ def header_of(sample: zenoh.Sample) -> Header:
 
 
 class ReceivedSample(NamedTuple):
-    """A sample and its time of arrival.
+    """A sample and its time of arrival, monotonic clock.
 
-    Args:
-        sample: as received from Zenoh.
-        mono_ns: time of arrival, monotonic clock.
-        nth: number of samples its buffer had received by then, this one included; 0: not counted.
+    `nth`: samples its buffer had received by then, this one included; 0: not counted.
     """
 
     sample: zenoh.Sample
@@ -75,14 +72,7 @@ class ReceivedSample(NamedTuple):
 
 
 class RejectedSample(NamedTuple):
-    """Samples that a buffer rejected for one reason.
-
-    Args:
-        reason: short stable name.
-        key: of the newest.
-        why: a sentence about the newest.
-        times: number of samples.
-    """
+    """Samples that a buffer rejected for one reason; key and sentence are of the newest."""
 
     reason: str
     key: str
@@ -91,11 +81,7 @@ class RejectedSample(NamedTuple):
 
 
 class SampleBuffer:
-    """Base of all buffers: rejects samples that are too large.
-
-    Args:
-        limit: bytes of payload and attachment together.
-    """
+    """Base of all buffers: rejects samples that have more than `limit` bytes altogether."""
 
     def __init__(self, limit: int) -> None:
         self._limit = limit
@@ -147,9 +133,7 @@ class Wake:
 class LatestSample(SampleBuffer):
     """Keeps the newest sample; a thread can wait for it.
 
-    Args:
-        limit: bytes of payload and attachment together.
-        changed: set at every sample; several buffers may share one.
+    Every sample sets `changed`; several buffers may share one.
     """
 
     def __init__(self, limit: int = MAX_RECORD_BYTES, changed: Wake | None = None) -> None:
@@ -196,10 +180,7 @@ class LatestSample(SampleBuffer):
 class CallbackRing(SampleBuffer):
     """Keeps the newest `size` samples in order; older ones are dropped and counted.
 
-    Args:
-        size: samples.
-        limit: bytes of one.
-        arrival: set whenever a sample is added; several buffers may share one.
+    Every sample sets `arrival`; several buffers may share one.
     """
 
     def __init__(

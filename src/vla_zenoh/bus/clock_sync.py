@@ -74,11 +74,8 @@ class ClockSync:
         self._next_look_s = 0.0
 
     # -- queries ------------------------------------------------------------------------------
-    def track(self, node: str) -> None:
-        """Measure the clock of `node`, which is alive, from now on; invalid names are ignored."""
-        self._track(node, alive=True)
-
-    def _track(self, node: str, *, alive: bool) -> None:
+    def track(self, node: str, *, alive: bool = True) -> None:
+        """Measure the clock of `node` from now on; invalid names are ignored."""
         known = self._peers.get(node)
         if known is not None:
             known.alive = known.alive or alive
@@ -158,7 +155,7 @@ class ClockSync:
     def _ahead_ns(self, node: str) -> int:
         peer = self._peers.get(node)
         if peer is None:
-            self._track(node, alive=False)
+            self.track(node, alive=False)
             return 0
         with self._lock:
             return peer.filter.applied_ns(self._clock.offset_ns, time.monotonic_ns())

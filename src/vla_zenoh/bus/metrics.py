@@ -6,7 +6,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
 
 import zenoh
 
@@ -74,17 +74,6 @@ OTHERS = "others"
 MAX_LINKS = 8
 
 
-class Sender(Protocol):
-    """Counts what it has published."""
-
-    @property
-    def key(self) -> str: ...
-    @property
-    def seq(self) -> int: ...
-    @property
-    def sent_bytes(self) -> int: ...
-
-
 class Traffic:
     """Rates of published records, from one status to the next, and records that were lost.
 
@@ -107,15 +96,10 @@ class Traffic:
         self._sessions.append(session)
 
     def received(self, key: str, header: Header, arrivals: int) -> None:
-        """Count a received record.
+        """Count a received record, when its buffer had received `arrivals` samples; 0: unknown.
 
         Records that a buffer dropped are not lost: they arrived. If several sources share a buffer
         too few are counted, never too many.
-
-        Args:
-            key: of the record.
-            header: of the record.
-            arrivals: samples its buffer had received by then; 0: unknown, the count begins anew.
         """
         who = (key, header.source)
         if arrivals == 0:
@@ -130,8 +114,8 @@ class Traffic:
         if len(self._received) > MAX_SENDERS:
             del self._received[next(iter(self._received))]
 
-    def sent(self, streams: Iterable[Sender]) -> dict[str, list[float]]:
-        """Key -> records and bytes per second since the last call, of keys with traffic."""
+    def sent(self, streams: Iterable[Any]) -> dict[str, list[float]]:
+        """Key -> records and bytes per second of these `Publisher`, since the last call."""
         now_s = time.monotonic()
         took_s = max(now_s - self._reported_s, 1e-3)
         out: dict[str, list[float]] = {}
@@ -186,12 +170,7 @@ class EventThrottle:
         self._answers: dict[Kind, Event] = {}
 
     def emit(self, event: Event, about: str = "") -> None:
-        """Publish an event, or count it.
-
-        Args:
-            event: what happened.
-            about: what it is about; each is throttled by itself.
-        """
+        """Publish an event, or count it; each `about` is throttled by itself."""
         answers = event.what.endswith("_refused")
         if answers:  # a client gets every reason against its setting, not only the first
             about = event.why

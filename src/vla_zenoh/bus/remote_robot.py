@@ -18,14 +18,7 @@ from vla_zenoh.codec.primitives import DEFAULT_TIMEOUT_S, Answer
 from vla_zenoh.codec.records import MAX_RECORD_BYTES
 from vla_zenoh.errors import SessionError
 from vla_zenoh.profile import Profile, as_robot, load_profile, override
-from vla_zenoh.types import (
-    ActionChunk,
-    GripperState,
-    Image,
-    JointState,
-    PoseState,
-    Stamped,
-)
+from vla_zenoh.types import ActionChunk, GripperState, Image, JointState, PoseState, Stamped
 
 
 def _list(numbers: Sequence[float] | None) -> list[float] | None:
@@ -39,8 +32,8 @@ TIMEOUT_S = 2.0
 class RemoteRobot(Client):
     """A robot on the bus: reads its streams and drives it. Made by `connect`.
 
-    Each stream is subscribed to at the first call for it. Messages that cannot be decoded raise
-    `CodecError`.
+    Each stream is subscribed to at the first call for it. Where nothing arrives within `timeout_s`,
+    `SessionError` is raised; messages that cannot be decoded raise `CodecError`.
     """
 
     def __init__(self, profile: Profile, session: zenoh.Session) -> None:
@@ -49,35 +42,19 @@ class RemoteRobot(Client):
         self._newest: dict[str, Stamped[Any]] = {}
 
     def joint_state(self, timeout_s: float = TIMEOUT_S) -> Stamped[JointState]:
-        """Newest joint state; waits for the first.
-
-        Raises:
-            SessionError: none arrived within `timeout_s`.
-        """
+        """Newest joint state; waits for the first."""
         return self._record(JointState, self.keys.state_joint, timeout_s)
 
     def pose_state(self, timeout_s: float = TIMEOUT_S) -> Stamped[PoseState]:
-        """Newest measured pose of the TCP in the base frame; waits for the first.
-
-        Raises:
-            SessionError: none arrived within `timeout_s`.
-        """
+        """Newest measured pose of the TCP in the base frame; waits for the first."""
         return self._record(PoseState, self.keys.state_pose, timeout_s)
 
     def gripper_state(self, timeout_s: float = TIMEOUT_S) -> Stamped[GripperState]:
-        """Newest gripper state; waits for the first.
-
-        Raises:
-            SessionError: none arrived within `timeout_s`.
-        """
+        """Newest gripper state; waits for the first."""
         return self._record(GripperState, self.keys.state_gripper, timeout_s)
 
     def chunk(self, worker: str, timeout_s: float = TIMEOUT_S) -> Stamped[ActionChunk]:
-        """Next action chunk of a worker, one that was not returned before.
-
-        Raises:
-            SessionError: none arrived within `timeout_s`.
-        """
+        """Next action chunk of a worker, one that was not returned before."""
         key = self.keys.delta(worker)
         return self._decoded(ActionChunk, self._next(key, MAX_RECORD_BYTES, timeout_s))
 
@@ -86,13 +63,7 @@ class RemoteRobot(Client):
     ) -> Stamped[Image]:
         """Next image of a camera, one that was not returned before; older ones are skipped.
 
-        Args:
-            camera: its name in the profile.
-            jpeg: take JPEG, a tenth of the bandwidth, instead of pixels.
-            timeout_s: how long to wait for it.
-
-        Raises:
-            SessionError: none arrived within `timeout_s`.
+        `jpeg` takes a tenth of the bandwidth of pixels.
         """
         key = self.keys.camera_jpeg(camera) if jpeg else self.keys.camera_raw(camera)
         sample = self._next(key, MAX_IMAGE_BYTES, timeout_s)

@@ -12,8 +12,7 @@ from typing import Any
 import zenoh
 
 from vla_zenoh.bus.node import Node
-from vla_zenoh.bus.session import open_session, session_config
-from vla_zenoh.bus.tcp_user_timeout import TcpUserTimeout
+from vla_zenoh.bus.session import TcpUserTimeout, open_session, session_config
 from vla_zenoh.errors import NodeError
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.session import address_of, is_loopback

@@ -27,6 +27,17 @@ CHUNKS = 64
 ANYTHING = MAX_MESSAGE_BYTES
 """Payload of a stop: any; it is not decoded."""
 WORDS = settings.MAX_SETTING_BYTES
+SETTINGS: tuple[tuple[str, int, int, Callable[[bytes], Any]], ...] = (
+    ("stop", 8, ANYTHING, lambda _: None),
+    ("reset", 8, ANYTHING, lambda _: None),
+    ("prompt", 16, WORDS, settings.decode_text),
+    ("worker", 16, WORDS, settings.decode_name),
+    ("rate", 16, WORDS, settings.decode_rate),
+    ("speed", 16, WORDS, settings.decode_percent),
+    ("slower", 16, WORDS, settings.decode_percent),
+    ("active", 16, WORDS, settings.decode_activation),
+)
+"""Name of each key, samples buffered between two ticks, largest payload, and decoder."""
 CLOCK_PERIOD_S = 0.1
 JOINT_PERIOD_S = 0.025
 """Period of decoding joints, except when an activation is requested."""
@@ -49,19 +60,9 @@ class CommandInputs:
         self._chunks = node.subscribe(keys.all_deltas, ring)
         names = node.profile.part_names
         self._parts = {name: _PartInputs(node, keys.of_part(name)) for name in names}
-        self._settings: list[tuple[str, ZenohRing, Callable[[bytes], Any]]] = [
-            ("stop", node.subscribe(keys.stop, ZenohRing(8, ANYTHING)), lambda _: None),
-            ("reset", node.subscribe(keys.reset, ZenohRing(8, ANYTHING)), lambda _: None),
-            ("prompt", node.subscribe(keys.prompt, ZenohRing(16, WORDS)), settings.decode_text),
-            ("worker", node.subscribe(keys.worker, ZenohRing(16, WORDS)), settings.decode_name),
-            ("rate", node.subscribe(keys.rate, ZenohRing(16, WORDS)), settings.decode_rate),
-            ("speed", node.subscribe(keys.speed, ZenohRing(16, WORDS)), settings.decode_percent),
-            ("slower", node.subscribe(keys.slower, ZenohRing(16, WORDS)), settings.decode_percent),
-            (
-                "active",
-                node.subscribe(keys.active, ZenohRing(16, WORDS)),
-                settings.decode_activation,
-            ),
+        self._settings = [
+            (name, node.subscribe(getattr(keys, name), ZenohRing(size, limit)), decode)
+            for name, size, limit, decode in SETTINGS
         ]
         self._last_clock = 0.0
 
@@ -86,9 +87,7 @@ class CommandInputs:
     def poll_streams(self, settings_put: Sequence[Setting] = ()) -> Inputs:
         """The chunks and states among them."""
         chunks = [self._chunk(arrival) for arrival in self._chunks.drain()]
-        inputs = Inputs(
-            chunks=[chunk for chunk in chunks if chunk is not None],
-        )
+        inputs = Inputs(chunks=[chunk for chunk in chunks if chunk is not None])
         requested = any(setting.name in ("active", "worker") for setting in settings_put)
         states = {name: part.poll(requested) for name, part in self._parts.items()}
         if "" in states:
@@ -133,15 +132,11 @@ class CommandInputs:
         owner = self._peer_monitor.owner(worker)
         try:
             header = header_of(arrival.sample)
+            if owner is not None and header.source != owner:  # first: there may be a flood of them
+                by, ours = header.source[:60], owner[:60]
+                raise CodecError("foreign", f"by {by!r}; the source of this worker is {ours!r}")
         except CodecError as error:
             self._node.reject(error.reason, f"delta/{worker}: {error}")
-            return None
-        source = header.source
-        if owner is not None and source != owner:  # before decoding: there may be a flood of them
-            self._node.reject(
-                "foreign",
-                f"delta/{worker} by {source[:60]!r}; the source of this worker is {owner[:60]!r}",
-            )
             return None
         chunk = self._node.decode(ActionChunk, arrival, header=header)
         if chunk is not None and chunk.record.worker != worker:
@@ -165,29 +160,32 @@ class _PartInputs:
 
     def __init__(self, node: Node, keys: Keys) -> None:
         self._node = node
-        self._pose = node.subscribe(keys.state_pose, CallbackRing(STATES, SMALL_BYTES))
-        self._gripper = node.subscribe(keys.state_gripper, CallbackRing(STATES, SMALL_BYTES))
-        self._joint = node.subscribe(keys.state_joint, CallbackRing(STATES, SMALL_BYTES))
-        self.held = node.subscribe(keys.held, ZenohRing(16, WORDS))
-        self._writers = {
-            kind: SingleWriterFilter(node.profile.timing.state_timeout_s)
-            for kind in (PoseState, JointState, GripperState)
+        self._rings: dict[type[Any], CallbackRing] = {
+            kind: node.subscribe(key, CallbackRing(STATES, SMALL_BYTES))
+            for kind, key in (
+                (PoseState, keys.state_pose),
+                (JointState, keys.state_joint),
+                (GripperState, keys.state_gripper),
+            )
         }
+        silence_s = node.profile.timing.state_timeout_s
+        self._writers = {kind: SingleWriterFilter(silence_s) for kind in self._rings}
+        self.held = node.subscribe(keys.held, ZenohRing(16, WORDS))
         self._last_joint = 0.0
 
     def poll(self, requested: bool) -> NewStates:
         """The newest states since the last call; `requested`: an activation is to use these
         joints."""
         return NewStates(
-            self._state(PoseState, self._pose),
+            self._state(PoseState),
             joint=self._joints(requested),
-            gripper=self._state(GripperState, self._gripper),
+            gripper=self._state(GripperState),
         )
 
-    def _state(self, kind: type[Any], slot: CallbackRing) -> Stamped[Any] | None:
+    def _state(self, kind: type[Any]) -> Stamped[Any] | None:
         """The newest state from the robot's source, whatever other sources publish."""
         newest: Stamped[Any] | None = None
-        for arrival in slot.drain():
+        for arrival in self._rings[kind].drain():
             newest = self._node.decode(kind, arrival, self._writers[kind]) or newest
         return newest
 
@@ -195,7 +193,7 @@ class _PartInputs:
         """The newest joints, at `JOINT_PERIOD_S`: decoding them is expensive."""
         if not requested and time.monotonic() - self._last_joint < JOINT_PERIOD_S:
             return None
-        for arrival in reversed(self._joint.drain()):
+        for arrival in reversed(self._rings[JointState].drain()):
             found = self._node.decode(JointState, arrival, self._writers[JointState])
             if found is not None:
                 self._last_joint = time.monotonic()

@@ -21,11 +21,6 @@ class InferenceDebugPublisher:
     """Publishes observation and answer of each inference, while there are subscribers.
 
     It runs after the chunk was published, so it never delays one.
-
-    Args:
-        node: of the worker.
-        worker: its name.
-        spec: of its model.
     """
 
     def __init__(self, node: Node, worker: str, spec: ModelSpec) -> None:
@@ -50,15 +45,7 @@ class InferenceDebugPublisher:
         chunk: Header,
         inference_ms: float,
     ) -> None:
-        """Publish one inference.
-
-        Args:
-            observation: input of the model.
-            answer: its output.
-            steps: (H, D) of the answer, validated.
-            chunk: header of the published chunk.
-            inference_ms: duration.
-        """
+        """Publish one inference: its validated steps (H, D), and the header of its chunk."""
         stamp_ns, seq = observation.stamp_wall_ns, chunk.seq
         try:
             for camera in self._spec.observation.cameras:
