@@ -1,4 +1,4 @@
-"""A robot's state as the numbers a policy was trained on.
+"""A robot's state as the numbers a policy was trained on, and back.
 
 For model environments: numpy alone. Parts are joined by ``+``, as in ``position+rotvec+gripper_m``:
 
@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,7 +118,7 @@ def parts_of(names: Sequence[str]) -> tuple[StatePart, ...]:
     return tuple(dict.fromkeys(part for name in names if (part := PARTS[name][0]) is not None))
 
 
-# -- out ------------------------------------------------------------------------------------------
+# -- a state as numbers ---------------------------------------------------------------------------
 def state_vector(
     names: Sequence[str], observation: Observation, max_width_m: float
 ) -> NDArray[np.float32]:
@@ -133,23 +134,64 @@ def state_vector(
     for name in names:
         whole, index = _WHOLE.get(name, (name, None))
         if joint is not None and name in JOINTS:
-            numbers = JOINTS[name](joint.position_rad).tolist()
+            in_degrees = name == "joint_deg"
+            numbers = (np.rad2deg if in_degrees else np.asarray)(joint.position_rad).tolist()
         elif pose is not None and whole == "position":
             numbers = pose.position_m.tolist()
         elif pose is not None and whole in ROTATIONS:
-            numbers = ROTATIONS[whole](pose.quat_xyzw)
+            numbers = ROTATIONS[whole][0](pose.quat_xyzw)
         elif name == "wrench" and observation.wrench is not None:
             numbers = observation.wrench.tolist()
         elif name == "effort" and observation.effort_nm is not None:
             numbers = observation.effort_nm.tolist()
         elif gripper is not None and name in GRIPPERS:
-            numbers = GRIPPERS[name](gripper.width_m, max_width_m)
+            numbers = GRIPPERS[name][0](gripper.width_m, max_width_m)
         else:
             numbers = [0.0]
         out += numbers if index is None else [numbers[index]]
     return np.array(out, np.float32)
 
 
+def state_of(
+    names: Sequence[str], numbers: NDArray[np.float64], joints: int, max_width_m: float
+) -> dict[str, Any]:
+    """The inverse of `state_vector`: what the numbers say of the robot.
+
+    Args:
+        names: of `read_parts`; single coordinates (``x``, ``roll``) are not read back.
+        numbers: (n,).
+        joints: how many the arm has.
+        max_width_m: of the open gripper.
+
+    Returns:
+        any of ``joint`` (n,) rad, ``position_m`` (3,), ``quat_xyzw`` (4,), ``width_m``.
+
+    Raises:
+        SpecError: another count of numbers, or a part that cannot be read back.
+    """
+    sizes = [size_of(name, joints) for name in names]
+    if numbers.shape != (sum(sizes),):
+        raise SpecError(
+            f"{'+'.join(names)} has shape {numbers.shape}, wanted ({sum(sizes)},)", "shape"
+        )
+    out: dict[str, Any] = {}
+    at = 0
+    for name, size in zip(names, sizes, strict=True):
+        values, at = numbers[at : at + size], at + size
+        if name in JOINTS:
+            out["joint"] = np.deg2rad(values) if name == "joint_deg" else values
+        elif name == "position":
+            out["position_m"] = values
+        elif name in ROTATIONS:
+            out["quat_xyzw"] = np.array(ROTATIONS[name][1](values.tolist()))
+        elif name in GRIPPERS:
+            out["width_m"] = GRIPPERS[name][1](float(values[0]), max_width_m)
+        elif name != "zero":
+            raise SpecError(f"{name} alone says too little; give position and rpy or quat_xyzw")
+    return out
+
+
+# -- forms ----------------------------------------------------------------------------------------
 def quat_xyzw(quaternion: Numbers) -> list[float]:
     """The same rotation, x, y, z, w with w >= 0."""
     sign = -1.0 if quaternion[3] < 0 else 1.0
@@ -182,23 +224,48 @@ def rpy(quaternion: Numbers) -> list[float]:
     return [roll, pitch, math.atan2(aside, ahead)]
 
 
+def _of_rotvec(turn_rad: Numbers) -> list[float]:
+    angle_rad = math.hypot(*turn_rad)
+    factor = math.sin(angle_rad / 2) / angle_rad if angle_rad > 0 else 0.5
+    return [*(factor * value for value in turn_rad), math.cos(angle_rad / 2)]
+
+
+def _of_rpy(turns_rad: Numbers) -> list[float]:
+    (sr, cr), (sp, cp), (sy, cy) = ((math.sin(a / 2), math.cos(a / 2)) for a in turns_rad)
+    return [
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+        cr * cp * cy + sr * sp * sy,
+    ]
+
+
 def _open(width_m: float, max_width_m: float) -> float:
     return min(max(width_m / max_width_m, 0.0), 1.0)
 
 
-JOINTS: Mapping[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
-    "joint": np.asarray,
-    "joint_deg": np.rad2deg,
+JOINTS = ("joint", "joint_deg")
+ROTATIONS: Mapping[
+    str, tuple[Callable[[Numbers], list[float]], Callable[[list[float]], list[float]]]
+] = {
+    "rpy": (rpy, _of_rpy),
+    "rotvec": (rotvec, _of_rotvec),
+    "quat_xyzw": (quat_xyzw, list),
+    "quat_wxyz": (quat_wxyz, lambda values: [*values[1:], values[0]]),
 }
-ROTATIONS: Mapping[str, Callable[[Numbers], list[float]]] = {
-    "rpy": rpy,
-    "rotvec": rotvec,
-    "quat_xyzw": quat_xyzw,
-    "quat_wxyz": quat_wxyz,
+"""Name -> numbers of a quaternion x, y, z, w, and the other way round."""
+GRIPPERS: Mapping[
+    str, tuple[Callable[[float, float], list[float]], Callable[[float, float], float]]
+] = {
+    "gripper_m": (lambda width_m, _: [width_m], lambda value, _: value),
+    "fingers_m": (lambda width_m, _: [width_m / 2, -width_m / 2], lambda value, _: 2.0 * value),
+    "gripper_open": (
+        lambda width_m, most_m: [_open(width_m, most_m)],
+        lambda value, most_m: value * most_m,
+    ),
+    "gripper_closed": (
+        lambda width_m, most_m: [1 - _open(width_m, most_m)],
+        lambda value, most_m: (1.0 - value) * most_m,
+    ),
 }
-GRIPPERS: Mapping[str, Callable[[float, float], list[float]]] = {
-    "gripper_m": lambda width_m, _: [width_m],
-    "fingers_m": lambda width_m, _: [width_m / 2, -width_m / 2],
-    "gripper_open": lambda width_m, most_m: [_open(width_m, most_m)],
-    "gripper_closed": lambda width_m, most_m: [1 - _open(width_m, most_m)],
-}
+"""Name -> numbers of an opening, and the opening by their first, both with that of the open one."""

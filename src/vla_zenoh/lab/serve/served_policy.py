@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from vla_zenoh.errors import PeerError, RecordError, SpecError
 from vla_zenoh.lab.policy_servers.field_mapping import FieldSource, read_map
-from vla_zenoh.lab.policy_servers.state_vector import ROTATIONS, parts_of, read_parts
-from vla_zenoh.lab.serve.state_parts import state_of
+from vla_zenoh.lab.policy_servers.state_vector import ROTATIONS, parts_of, read_parts, state_of
 from vla_zenoh.policy import (
     ActionSteps,
     ModelSpec,

@@ -15,7 +15,7 @@ from vla_zenoh.errors import SpecError
 from vla_zenoh.kinematics.so3 import exp3, quat_from_rotation, rotation_from_quat, rotation_from_rpy
 from vla_zenoh.lab.check.examples import example_observation
 from vla_zenoh.lab.policy_servers import state_vector
-from vla_zenoh.lab.serve.state_parts import state_of
+from vla_zenoh.lab.policy_servers.state_vector import state_of
 from vla_zenoh.policy import ActionSpec, ModelSpec, Observation, ObservationSpec
 from vla_zenoh.types import GripperState, JointState, PoseState
 
