@@ -9,7 +9,6 @@ Servers that send pickles are rejected.
 
 from __future__ import annotations
 
-import time
 from contextlib import suppress
 from typing import Any, cast, get_args
 
@@ -34,7 +33,7 @@ class Groot(Adapter):
         layout: see lab/policy_servers/field_mapping.py. Images are video.NAME, states state.NAME.
     """
 
-    joints = True
+    name, presets, joints = "groot", wire.PRESETS, True
     lost = (zmq.ZMQError,)
 
     def __init__(
@@ -48,14 +47,11 @@ class Groot(Adapter):
         **mapping: str,
     ) -> None:
         super().__init__(
-            "groot",
             address(url, "tcp").geturl(),
-            wire.PRESETS,
             preset,
             mapping,
             timeout_s=timeout_s,
             profile=profile,
-            clock_s=time.monotonic,
         )
         one_of("version", version, get_args(wire.Version))
         self._version: wire.Version = cast(wire.Version, version)

@@ -42,7 +42,7 @@ class LeRobotServer(Adapter):
             state observation.state, the prompt task; size none: as the camera gives it.
     """
 
-    joints = True
+    name, presets, joints = "lerobot_server", wire.PRESETS, True
 
     def __init__(
         self,
@@ -58,14 +58,11 @@ class LeRobotServer(Adapter):
     ) -> None:
         server = address(url, "grpc")
         super().__init__(
-            "lerobot_server",
             server.geturl(),
-            wire.PRESETS,
             preset,
             mapping,
             timeout_s=timeout_s,
             profile=profile,
-            clock_s=time.monotonic,
         )
         one_of("policy", policy, wire.POLICIES)
         if not checkpoint:

@@ -9,7 +9,6 @@ vllm-omni and ``vla-zenoh lab serve`` implement it as well.
 
 from __future__ import annotations
 
-import time
 import uuid
 from typing import Any
 
@@ -36,7 +35,7 @@ class OpenPi(Adapter):
         layout: see lab/policy_servers/field_mapping.py.
     """
 
-    joints = True
+    name, presets, joints = "openpi", wire.PRESETS, True
     lost = WebSocketClient.lost
 
     def __init__(
@@ -51,14 +50,11 @@ class OpenPi(Adapter):
     ) -> None:
         server = address(url, "ws", "wss")
         super().__init__(
-            "openpi",
             server.geturl(),
-            wire.PRESETS,
             preset,
             mapping,
             timeout_s=timeout_s,
             profile=profile,
-            clock_s=time.monotonic,
         )
         one_of("dialect", dialect, ("auto", "openpi", "vllm"))
         by_path = server.path == wire.VLLM_PATH

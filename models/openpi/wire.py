@@ -139,14 +139,7 @@ def mismatches(metadata: Mapping[str, Any], mapping: FieldMapping) -> list[str]:
 
     openpi's own server does not describe its actions; vllm-omni's and ours do.
     """
-    out: list[str] = []
-    wanted = mapping.width
-    dim = metadata.get("action_dim")
-    if isinstance(dim, int):
-        if mapping.columns is not None and max(mapping.columns) >= dim:
-            out.append(f"it gives {dim} columns, column {max(mapping.columns)} is wanted")
-        elif mapping.columns is None and wanted is not None and dim != wanted:
-            out.append(f"it gives {dim} columns, {wanted} are wanted (columns=)")
+    out = mapping.wrong_columns(metadata.get("action_dim"))
     space = metadata.get("action_space")
     if isinstance(space, str) and space.startswith("joint") is not mapping.semantics.needs_joints:
         out.append(f"its action_space is {space}, action={mapping.semantics.action} is set")

@@ -12,7 +12,6 @@ from __future__ import annotations
 import http.client
 import socket
 import threading
-import time
 from contextlib import suppress
 from typing import Any
 
@@ -35,6 +34,7 @@ class OpenVlaRest(Adapter):
         layout: see lab/policy_servers/field_mapping.py.
     """
 
+    name, presets = "openvla_rest", wire.PRESETS
     lost = (OSError, http.client.HTTPException)
 
     def __init__(
@@ -49,14 +49,11 @@ class OpenVlaRest(Adapter):
     ) -> None:
         self._url = address(url, "http", "https")
         super().__init__(
-            "openvla_rest",
             self._url.geturl(),
-            wire.PRESETS,
             preset,
             mapping,
             timeout_s=timeout_s,
             profile=profile,
-            clock_s=time.monotonic,
             normalisation=unnorm_key or None,
         )
         self._unnorm_key, self._encoded = unnorm_key, yes_no("encoded", encoded)

@@ -37,7 +37,7 @@ class Origami(Adapter):
         layout: see lab/policy_servers/field_mapping.py.
     """
 
-    joints = True
+    name, presets, joints = "origami", wire.PRESETS, True
 
     def __init__(
         self,
@@ -51,14 +51,11 @@ class Origami(Adapter):
         if not session_id:
             raise SpecError("session_id is empty; a policy is started for one")
         super().__init__(
-            "origami",
             f"the policy behind {url}",
-            wire.PRESETS,
             preset,
             mapping,
             timeout_s=timeout_s,
             profile=profile,
-            clock_s=time.monotonic,
         )
         self._url, self._session_id = url, session_id
         self._session: zenoh.Session | None = None

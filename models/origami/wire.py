@@ -94,21 +94,17 @@ def mismatches(metadata: Any, mapping: FieldMapping) -> list[str]:
     """Contradictions between the server's metadata and the layout, one sentence each."""
     if not isinstance(metadata, dict):
         return [f"its metadata is no map: {shown(metadata)}"]
-    out: list[str] = []
-    dim, kind, units = (metadata.get(n) for n in ("action_dim", "action_type", "action_units"))
-    if isinstance(dim, int):
-        if mapping.columns is not None and max(mapping.columns) >= dim:
-            out.append(f"it gives {dim} columns, column {max(mapping.columns)} is wanted")
-        elif mapping.columns is None and mapping.width not in (None, dim):
-            out.append(f"it gives {dim} columns, {mapping.width} are wanted (columns=)")
-    if kind == "absolute_joint_position" and mapping.semantics.action != "joint_position":
-        out.append(f"its actions are joint positions, action={mapping.semantics.action} is set")
-    if kind == "absolute_joint_position" and units not in (None, "radians"):
-        out.append(f"its joints are in {shown(units)}, wanted radians")
-    if (
-        isinstance(kind, str)
-        and kind != "absolute_joint_position"
-        and mapping.semantics.needs_joints
-    ):
-        out.append(f"its actions are {kind}, action={mapping.semantics.action} is set")
+    out = mapping.wrong_columns(metadata.get("action_dim"))
+    kind, units, action = (
+        metadata.get("action_type"),
+        metadata.get("action_units"),
+        mapping.semantics,
+    )
+    if kind == "absolute_joint_position":
+        if action.action != "joint_position":
+            out.append(f"its actions are joint positions, action={action.action} is set")
+        if units not in (None, "radians"):
+            out.append(f"its joints are in {shown(units)}, wanted radians")
+    elif isinstance(kind, str) and action.needs_joints:
+        out.append(f"its actions are {kind}, action={action.action} is set")
     return out

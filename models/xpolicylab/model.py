@@ -10,7 +10,6 @@ An activation is a trial: the server gets ``reset`` when it begins and, with the
 
 from __future__ import annotations
 
-import time
 import uuid
 from collections.abc import Mapping
 from dataclasses import replace
@@ -36,7 +35,7 @@ class XPolicyLab(Adapter):
         layout: see lab/policy_servers/field_mapping.py. A name a/b/c is nested: c in b in a.
     """
 
-    joints = True
+    name, presets, joints = "xpolicylab", wire.PRESETS, True
     lost = WebSocketClient.lost
 
     def __init__(
@@ -49,14 +48,11 @@ class XPolicyLab(Adapter):
         **mapping: str,
     ) -> None:
         super().__init__(
-            "xpolicylab",
             address(url, "ws", "wss").geturl(),
-            wire.PRESETS,
             preset,
             mapping,
             timeout_s=timeout_s,
             profile=profile,
-            clock_s=time.monotonic,
         )
         wire.check_names(self.mapping, whole=preset != NONE)
         self._line = WebSocketClient(self.where, self.timeout_s, wire.MAX_BYTES)

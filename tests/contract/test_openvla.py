@@ -238,7 +238,7 @@ def test_the_native_worker_and_the_server_of_the_same_weights_ask_for_the_same(
     native = make(write(tmp_path / "a", statistics={"libero_goal_no_noops": {"action": LIBERO}}))
     served: Any = make_policy(find_model("openvla_rest"), {"preset": "libero"})
     rows = np.array([[0.5, -0.25, 0.125, 0.1, -0.2, 0.3, 1.0]])
-    theirs = served.mapping.steps(rows)
+    theirs = served.mapping.read(rows).steps
     np.testing.assert_allclose(steps_of(native, rows), theirs, atol=ATOL)
     assert native.spec.action.controller == served.spec.action.controller
     assert native.spec.action.rotation == served.spec.action.rotation

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from vla_zenoh.errors import PeerError
 from vla_zenoh.lab.check.examples import example_observation
 from vla_zenoh.lab.policy_servers.action_semantics import read_action_semantics
-from vla_zenoh.lab.serve import openpi_frames
-from vla_zenoh.lab.serve.openpi_conversation import OpenPiConversation
+from vla_zenoh.lab.serve import openpi_server
+from vla_zenoh.lab.serve.openpi_server import OpenPiConversation
 from vla_zenoh.lab.serve.policy_server import PolicyServer
 from vla_zenoh.lab.serve.served_policy import make_served_policy
 from vla_zenoh.policy import (
@@ -71,8 +71,8 @@ def served(model: Remembers) -> Iterator[Any]:
         lambda: OpenPiConversation(offer),
         "127.0.0.1",
         0,
-        health=openpi_frames.HEALTH_PATH,
-        max_bytes=openpi_frames.MAX_BYTES,
+        health=openpi_server.HEALTH_PATH,
+        max_bytes=openpi_server.MAX_BYTES,
     )
     thread = threading.Thread(target=server.serve_forever)
     thread.start()
@@ -126,7 +126,7 @@ def test_a_served_model_that_takes_no_prefix_is_asked_without_it() -> None:
 )
 def test_a_prefix_of_another_form_is_rejected_with_what_is_wanted(wrong: Any) -> None:
     with pytest.raises(PeerError, match=r"vla_zenoh_committed .* wanted"):
-        openpi_frames.read_committed({"vla_zenoh_committed": wrong}, Remembers().spec.action)
+        openpi_server.read_committed({"vla_zenoh_committed": wrong}, Remembers().spec.action)
 
 
 @pytest.mark.parametrize("name", MEANINGS)

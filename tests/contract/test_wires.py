@@ -28,7 +28,7 @@ from model_wires import (
 
 from vla_zenoh.errors import PeerError
 from vla_zenoh.lab.policy_servers.field_mapping import read_field_mapping
-from vla_zenoh.lab.serve import openpi_frames
+from vla_zenoh.lab.serve import openpi_server
 from vla_zenoh.policy import ActionSpec
 
 EXAMPLES, MUTATIONS = 20, 60
@@ -87,7 +87,7 @@ def test_openvlas_values_come_back(value: dict[str, Any]) -> None:
 @settings(max_examples=EXAMPLES)
 @given(maps)
 def test_openpis_observations_come_back(fields: dict[str, Any]) -> None:
-    assert same(openpi_frames.read_observation(openpi.request(fields)), fields)
+    assert same(openpi_server.read_observation(openpi.request(fields)), fields)
 
 
 @settings(max_examples=EXAMPLES)
@@ -137,14 +137,14 @@ def xpolicylab_answer(payload: Any, **changes: Any) -> bytes:
 
 
 ANSWERS: dict[str, tuple[bytes, Callable[[bytes], Any]]] = {
-    "openpi": (openpi_frames.answer(ACTIONS, 1.0, None), openpi.read_answer),
+    "openpi": (openpi_server.pack_answer(ACTIONS, 1.0, None), openpi.read_answer),
     "openpi metadata": (
-        openpi_frames.metadata(SERVED, {"a": "b"}),
+        openpi_server.metadata(SERVED, {"a": "b"}),
         openpi.read_metadata,
     ),
     "openpi request": (
         openpi.request({"image": np.zeros((2, 2, 3), np.uint8), "prompt": "up"}),
-        openpi_frames.read_observation,
+        openpi_server.read_observation,
     ),
     "groot": (groot.pack([{"x": ACTIONS}, {}]), groot.read_actions),
     "groot modalities": (groot.pack({"video": MODALITY}), groot.read_answer),
@@ -179,7 +179,7 @@ READ: dict[str, Any] = {
         "action_horizon": 1,
         "observation": {"a": "b"},
         openpi.SPEC: SERVED.model_dump(mode="json"),
-        openpi_frames.TAKES_COMMITTED: False,
+        openpi_server.TAKES_COMMITTED: False,
     },
     "openpi request": {"image": np.zeros((2, 2, 3), np.uint8), "prompt": "up"},
     "groot": {"x": ACTIONS},

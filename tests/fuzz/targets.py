@@ -39,7 +39,7 @@ from vla_zenoh.lab.inference_views import InferenceView
 from vla_zenoh.lab.primitives.requests import decode_request
 from vla_zenoh.lab.recording.record_json import record_from_json, record_to_json
 from vla_zenoh.lab.recording.record_types import RECORDS
-from vla_zenoh.lab.serve import mcp, openpi_frames
+from vla_zenoh.lab.serve import mcp, openpi_server
 from vla_zenoh.lab.tasks.wording import parse_prompt
 from vla_zenoh.policy import ActionSpec, ModelSpec, ObservationSpec
 from vla_zenoh.policy.loader import find_model, make_policy
@@ -387,7 +387,7 @@ def _targets() -> Iterator[Target]:
     )
     yield Target(
         "openpi",
-        _all_of(openpi.read_metadata, openpi.read_answer, openpi_frames.read_observation),
+        _all_of(openpi.read_metadata, openpi.read_answer, openpi_server.read_observation),
         peer,
         lambda: [message.pack({"actions": np.zeros((2, 7), np.float32)})],
     )

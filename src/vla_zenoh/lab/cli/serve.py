@@ -18,7 +18,7 @@ from vla_zenoh.cli.options import (
 )
 from vla_zenoh.cli.output import console
 from vla_zenoh.lab.cli.loopback import require_loopback
-from vla_zenoh.lab.serve import openpi_frames
+from vla_zenoh.lab.serve import openpi_server
 from vla_zenoh.lab.serve.served_policy import DefaultNames, make_served_policy
 from vla_zenoh.policy.loader import make_policy
 from vla_zenoh.runtime.environments import run_in_own_environment
@@ -46,7 +46,7 @@ def serve(
     ] = "127.0.0.1",
     port: Annotated[
         int, typer.Option(min=0, max=65535, help="0: any free one.")
-    ] = openpi_frames.PORT,
+    ] = openpi_server.PORT,
     api_key: Annotated[
         str, typer.Option(envvar="VLA_ZENOH_API_KEY", help="Key that clients must send.")
     ] = "",
@@ -69,8 +69,7 @@ def serve(
     robot, chosen = loaded.robot, model.choose(loaded, worker)
     run_in_own_environment(chosen.model, model.python, extra="serve")
     from vla_zenoh.lab.serve import vla_eval
-    from vla_zenoh.lab.serve.openpi_conversation import OpenPiConversation
-    from vla_zenoh.lab.serve.policy_server import PolicyServer
+    from vla_zenoh.lab.serve.policy_server import Conversation, PolicyServer
 
     openpi = wire == "openpi"
     policy = make_policy(chosen.model, chosen.options, profile=profile)
@@ -84,14 +83,18 @@ def serve(
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     getattr(policy, "load", lambda: None)()
     stop = stop_on_signals()
+
+    def converse() -> Conversation:
+        if openpi:
+            return openpi_server.OpenPiConversation(offer)
+        return vla_eval.VlaEvalConversation(offer, execute)
+
     server = PolicyServer(
-        lambda: (
-            OpenPiConversation(offer) if openpi else vla_eval.VlaEvalConversation(offer, execute)
-        ),
+        converse,
         host,
         port,
-        health=openpi_frames.HEALTH_PATH if openpi else vla_eval.HEALTH_PATH,
-        max_bytes=openpi_frames.MAX_BYTES,
+        health=openpi_server.HEALTH_PATH if openpi else vla_eval.HEALTH_PATH,
+        max_bytes=openpi_server.MAX_BYTES,
         api_key=api_key,
     )
     threading.Thread(target=server.serve_forever, daemon=True).start()

@@ -7,6 +7,7 @@ for that of a later request; a lost server is retried with `Backoff`.
 
 from __future__ import annotations
 
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
@@ -54,24 +55,22 @@ class Adapter(ABC):
     """A model that queries a policy server; each subclass in models/ implements one protocol.
 
     Args:
-        name: of the model, for its spec.
         where: the server, for messages.
-        presets: name -> options.
-        preset: name of the preset.
+        preset: one of `presets`, or ``none``.
         mapping: options that override it, see `vla_zenoh.lab.policy_servers.field_mapping`.
         timeout_s: for connecting, and for each answer.
         profile: of the robot: its gripper and, if answers are joints, its arm.
-        clock_s: seconds that only go forwards.
         normalisation: for the spec.
-
-    Attributes:
-        spec: of the model.
+        clock_s: seconds that only go forwards.
 
     Raises:
         SpecError: unknown or invalid option; names what is allowed.
         ProfileError: invalid profile.
     """
 
+    name: ClassVar[str]
+    """Of the model, for its spec."""
+    presets: ClassVar[Presets]
     joints: ClassVar[bool] = False
     """Whether its server may answer with joints."""
     lost: ClassVar[tuple[type[Exception], ...]] = (OSError,)
@@ -79,16 +78,14 @@ class Adapter(ABC):
 
     def __init__(
         self,
-        name: str,
         where: str,
-        presets: Presets,
         preset: str,
         mapping: Mapping[str, str],
         *,
         timeout_s: str,
         profile: str,
-        clock_s: Callable[[], float],
         normalisation: str | None = None,
+        clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self.where, self.timeout_s = where, number("timeout_s", timeout_s)
         if not MIN_TIMEOUT_S <= self.timeout_s <= MAX_TIMEOUT_S:
@@ -98,8 +95,8 @@ class Adapter(ABC):
             )
         robot = load_profile(profile).robot
         self.mapping = read_field_mapping(
-            name,
-            presets,
+            self.name,
+            self.presets,
             preset,
             mapping,
             max_width_m=robot.gripper.max_width_m,
@@ -156,35 +153,23 @@ class Adapter(ABC):
         if wait_s > 0:
             raise PeerError("peer_gone", f"{self.where} was lost; retrying in {wait_s:.1f} s")
         try:
-            return self.mapping.read(self._answer(observation))
-        except Exception as error:  # after any failure, nothing left on the wire may be read
-            self._drop(answers=isinstance(error, PeerError) and error.reason in ANSWERED)
-            reported = self._as_peer_error(error)
-            if reported is error:
-                raise
-            raise reported from error
-
-    def _as_peer_error(self, error: Exception) -> Exception:
-        if isinstance(error, TimeoutError):
-            why = f"{self.where} did not answer within {self.timeout_s:g} s"
-            return PeerError("peer_timeout", why)
-        if isinstance(error, self.lost):
-            why = f"no connection to {self.where}: {str(error) or type(error).__name__}"
-            return PeerError("peer_gone", why)
-        return error
-
-    def _answer(self, observation: Observation) -> Any:
-        wrong = self._connect()
-        if wrong:
-            raise PeerError("peer_mismatch", f"{self.where} does not match: {'; '.join(wrong)}")
-        answer = self._ask(self.mapping.request(observation), begins=self._begins)
-        self._begins = False
-        self._backoff.succeeded()
-        return answer
-
-    def _drop(self, *, answers: bool = False) -> None:
-        self._lose()
-        self.reset()
-        if answers:
+            wrong = self._connect()
+            if wrong:
+                raise PeerError("peer_mismatch", f"{self.where} does not match: {'; '.join(wrong)}")
+            answer = self._ask(self.mapping.request(observation), begins=self._begins)
+            self._begins = False
             self._backoff.succeeded()
-        self._backoff.failed(self._clock_s())
+            return self.mapping.read(answer)
+        except Exception as error:  # after any failure, nothing left on the wire may be read
+            self._lose()
+            self.reset()
+            if isinstance(error, PeerError) and error.reason in ANSWERED:
+                self._backoff.succeeded()
+            self._backoff.failed(self._clock_s())
+            if isinstance(error, TimeoutError):
+                why = f"{self.where} did not answer within {self.timeout_s:g} s"
+                raise PeerError("peer_timeout", why) from error
+            if isinstance(error, self.lost):
+                why = f"no connection to {self.where}: {str(error) or type(error).__name__}"
+                raise PeerError("peer_gone", why) from error
+            raise

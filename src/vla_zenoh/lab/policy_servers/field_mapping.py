@@ -80,10 +80,17 @@ class FieldMapping:
     semantics: ActionSemantics
     max_width_m: float
 
-    @property
-    def width(self) -> int:
-        """Columns of an answer that are used."""
-        return sum(self.semantics.parts().values()) if self.columns is None else len(self.columns)
+    def wrong_columns(self, given: Any) -> list[str]:
+        """Why an answer of `given` columns does not fit, if it is a number at all."""
+        if not isinstance(given, int):
+            return []
+        if self.columns is not None:
+            last = max(self.columns)
+            return [f"it gives {given} columns, column {last} is wanted"] if last >= given else []
+        wanted = sum(self.semantics.parts().values())
+        if given == wanted:
+            return []
+        return [f"it gives {given} columns, {wanted} are wanted (columns=)"]
 
     # -- out ----------------------------------------------------------------------------------
     def request(self, observation: Observation) -> dict[str, Any]:
@@ -136,22 +143,14 @@ class FieldMapping:
         return rows[: self.spec.action.horizon]
 
     def read(self, answer: Any) -> ActionSteps:
-        """Action steps of an answer, with its first row as raw output for debugging."""
-        first = self.gather(answer)[0].tolist()
-        return ActionSteps(self.steps(answer), raw={"first_step": first})
-
-    def steps(self, answer: Any) -> NDArray[np.float64]:
-        """Action steps (H, D) as `spec` declares them.
-
-        Args:
-            answer: see `gather`.
+        """Action steps of an answer as `spec` declares them, with its first row as raw output.
 
         Raises:
             PeerError: see `gather`; also a wrong number of columns.
         """
         rows = self.gather(answer)
         try:
-            return self.semantics.steps(rows)
+            return ActionSteps(self.semantics.steps(rows), raw={"first_step": rows[0].tolist()})
         except SpecError as error:
             hint = "; choose them with columns=" if error.reason == "shape" else ""
             raise PeerError("peer_reply", f"{error}{hint}") from error

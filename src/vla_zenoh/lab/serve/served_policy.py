@@ -86,7 +86,7 @@ class ServedPolicy:
         missing = [f"{name} ({what})" for name, what in described.items() if name not in given]
         if missing:
             raise PeerError("peer_request", f"the observation lacks {', '.join(missing)}")
-        prompt, state, images = "", {}, {}
+        prompt, state, images = "", dict[str, Any](), dict[str, NDArray[np.uint8]]()
         cameras = {camera.camera: camera for camera in self.spec.observation.cameras}
         try:
             for name, source in self.fields.items():
@@ -161,29 +161,24 @@ def make_served_policy(
     if any(senses.values()):
         lacking = ", ".join(name for name, needed in senses.items() if needed)
         raise SpecError(f"the model needs {lacking}, which is not among what is served")
-    fields = {name: source for name, source in read_map(map_option).items() if source is not None}
-    own = list(fields.values())
-    if any(source.blank for source in own):
+    own = {name: source for name, source in read_map(map_option).items() if source is not None}
+    if any(source.blank for source in own.values()):
         raise SpecError("blank is for what is sent, not for what is asked for")
-    named = {source.camera for source in own if source.camera}
-    for camera in spec.observation.cameras:
-        if camera.camera not in named:
-            fields[names.camera.format(camera.camera)] = FieldSource(camera=camera.camera)
-    unknown = named - {camera.camera for camera in spec.observation.cameras}
-    if unknown:
+    cameras = [camera.camera for camera in spec.observation.cameras]
+    named = {source.camera for source in own.values() if source.camera}
+    if unknown := named - set(cameras):
         raise SpecError(f"the model has no camera {', '.join(sorted(unknown))}")
-    covered = {part for source in own for part in parts_of(source.parts)}
+    covered = {part for source in own.values() for part in parts_of(source.parts)}
+    fields = dict(own)
+    for camera in cameras:
+        if camera not in named:
+            fields[names.camera.format(camera)] = FieldSource(camera=camera)
     for part in spec.observation.state:
         if part not in covered:
-            parts = read_parts(_OF_PART[part])
-            fields[names.state.format(part)] = FieldSource(parts=parts)
-    _check_whole(spec, fields)
-    if not any(source.prompt for source in own):
+            fields[names.state.format(part)] = FieldSource(parts=read_parts(_OF_PART[part]))
+    if not any(source.prompt for source in own.values()):
         fields[names.prompt] = FieldSource(prompt=True)
-    return ServedPolicy(policy, fields, joints, max_width_m)
-
-
-def _check_whole(spec: ModelSpec, fields: Mapping[str, FieldSource]) -> None:
     parts = {part for source in fields.values() for part in source.parts}
     if "pose" in spec.observation.state and not ("position" in parts and parts & set(ROTATIONS)):
         raise SpecError(f"map must give the whole pose: position and one of {', '.join(ROTATIONS)}")
+    return ServedPolicy(policy, fields, joints, max_width_m)

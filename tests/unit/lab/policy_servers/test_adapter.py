@@ -20,6 +20,7 @@ SOON_S = 0.05
 class Wired(Adapter):
     """An adapter whose wire is a function, and whose time goes on when it is told to."""
 
+    name, presets = "wired", openpi.PRESETS
     lost = (ConnectionError,)
 
     def __init__(self, answer: Callable[[], Any], **options: str) -> None:
@@ -27,9 +28,7 @@ class Wired(Adapter):
         self.connections, self.begun = 0, list[bool]()
         self._open = False
         super().__init__(
-            "wired",
             "the wire",
-            openpi.PRESETS,
             "libero",
             options,
             timeout_s="1",

@@ -22,7 +22,7 @@ from vla_zenoh.lab.policy_servers.field_mapping import (
     read_field_mapping,
 )
 from vla_zenoh.lab.policy_servers.presets import Presets
-from vla_zenoh.lab.serve import openpi_frames
+from vla_zenoh.lab.serve import openpi_server
 from vla_zenoh.policy import Observation
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import GripperState, JointState, PoseState
@@ -47,6 +47,10 @@ def layout(
 ) -> FieldMapping:
     joints = load_profile("panda_sim").robot.arm_joints
     return read_field_mapping("x", presets, preset, options, max_width_m=WIDTH_M, joints=joints)
+
+
+def steps_of(of: FieldMapping, answer: Any) -> np.ndarray[Any, Any]:
+    return np.asarray(of.read(answer).steps)
 
 
 def seen(of: FieldMapping, rotvec: Any = (0.1, -0.2, 0.3), width_m: float = 0.06) -> Observation:
@@ -98,7 +102,7 @@ def test_every_preset_makes_a_spec_and_a_question(name: str) -> None:
 def test_one_unit_of_libero_is_5_cm_and_half_a_radian_and_more_is_clipped() -> None:
     of = layout()
     answer = {"actions": np.array([[1, -0.5, 0, 0, 0.5, 0, -1], [9, 0, 0, 0, 0, -9, 1]])}
-    steps = of.steps(answer)
+    steps = steps_of(of, answer)
     expected = [[0.05, -0.025, 0, 0, 0.25, 0, -1], [0.05, 0, 0, 0, 0, -0.5, 1]]
     np.testing.assert_allclose(steps, expected, atol=ATOL)
     action = of.spec.action
@@ -115,14 +119,14 @@ def test_what_the_server_said_is_kept_for_people() -> None:
     answer = np.array([[1.0, 0, 0, 0, 0, 0, -1]])
     result = of.read(answer)
     assert result.raw == {"first_step": answer[0].tolist()}
-    np.testing.assert_array_equal(result.steps, of.steps(answer))
+    np.testing.assert_array_equal(result.steps, steps_of(of, answer))
 
 
 def test_joint_deltas_stay_joint_deltas_in_the_units_of_the_arm() -> None:
     of = layout(preset="droid")
     answer = np.zeros((3, 8))
     answer[:, 1], answer[:, 7] = 0.5, 1.0
-    np.testing.assert_allclose(of.steps({"actions": answer}), [[0, 0.1, 0, 0, 0, 0, 0, 1]] * 3)
+    np.testing.assert_allclose(steps_of(of, {"actions": answer}), [[0, 0.1, 0, 0, 0, 0, 0, 1]] * 3)
     action = of.spec.action
     assert (action.space, action.kind, action.anchor) == ("joint", "delta", "goal")
     assert action.joints == load_profile("panda_sim").robot.arm_joints
@@ -148,7 +152,7 @@ def test_a_gripper_among_the_joints_of_an_action_is_a_fraction_of_its_range(
     """LeRobot's SO-101: joints in degrees, and the gripper in percent, or in rad."""
     told = {**MINE, "joint_scale_rad": "0.0174533", "gripper_range": ends, "gripper_open": ""}
     of = layout(preset="none", **told)
-    (step,) = of.steps({"actions": np.array([[90.0, *[0.0] * 6, number]])})
+    (step,) = steps_of(of, {"actions": np.array([[90.0, *[0.0] * 6, number]])})
     np.testing.assert_allclose(step, [np.pi / 2, *[0.0] * 6, fraction], atol=1e-5)
     assert of.spec.action.gripper_open_is_high
 
@@ -170,7 +174,7 @@ def test_a_range_or_scale_that_cannot_be_is_rejected(told: dict[str, str], why: 
 def test_each_joint_may_have_a_unit_of_its_own() -> None:
     scales = ",".join(["0.001", *["1"] * 6])
     of = layout(preset="none", **{**MINE, "joint_scale_rad": scales})
-    (step,) = of.steps({"actions": np.array([[250.0, *[0.5] * 6, 0.0]])})
+    (step,) = steps_of(of, {"actions": np.array([[250.0, *[0.5] * 6, 0.0]])})
     np.testing.assert_allclose(step, [0.25, *[0.5] * 6, 0.0], atol=1e-6)
 
 
@@ -187,24 +191,24 @@ def test_origami_takes_the_columns_of_one_arm() -> None:
     assert observation.joint is not None
     assert state.shape == (65,)
     np.testing.assert_allclose(state[29:36], observation.joint.position_rad, atol=ATOL_F32)
-    joints_rad = of.steps(state[None].astype(float))
+    joints_rad = steps_of(of, state[None].astype(float))
     np.testing.assert_allclose(joints_rad, [observation.joint.position_rad], atol=1e-5)
 
 
 def test_a_quaternion_may_begin_with_w() -> None:
     of = layout(**ABSOLUTE, rotation="quat_wxyz")
     answer = np.array([[0.4, 0, 0.3, 2**-0.5, 2**-0.5, 0, 0, 1]])
-    steps = of.steps(answer)
+    steps = steps_of(of, answer)
     np.testing.assert_allclose(steps, [[0.4, 0, 0.3, 2**-0.5, 0, 0, 2**-0.5, 1]], atol=ATOL)
     with pytest.raises(PeerError, match="quaternion of norm"):
-        of.steps(np.array([[0.4, 0, 0.3, 0.1, 0, 0, 0, 1]]))
+        steps_of(of, np.array([[0.4, 0, 0.3, 0.1, 0, 0, 0, 1]]))
 
 
 def test_named_parts_stand_side_by_side_whatever_their_shape() -> None:
     of = layout(groot.PRESETS, "bridge", keys="move,gripper", horizon="3")
     move = np.arange(24.0).reshape(1, 4, 6) / 100
     for grip in (np.ones((1, 4, 1)), np.ones((4, 1)), np.ones(4)):
-        steps = of.steps({"move": move, "gripper": grip, "more": "x"})
+        steps = steps_of(of, {"move": move, "gripper": grip, "more": "x"})
         assert steps.shape == (3, 7)
         np.testing.assert_allclose(steps[:, :6], move[0, :3], atol=ATOL)
 
@@ -226,7 +230,7 @@ def test_named_parts_stand_side_by_side_whatever_their_shape() -> None:
 def test_an_answer_of_another_form_is_refused_by_name(answer: Any, why: str) -> None:
     of = layout()
     with pytest.raises(PeerError, match=why) as raised:
-        of.steps(answer)
+        steps_of(of, answer)
     assert raised.value.reason == "peer_reply"
 
 
@@ -278,7 +282,7 @@ def test_a_server_of_ones_own_is_told_with_every_option_and_no_name_of_a_preset(
     of = layout(preset="none", **MINE)
     assert set(of.fields) == {"image", "state", "prompt"}
     home_rad = load_profile("panda_sim").robot.home_rad
-    steps = of.steps({"actions": np.array([[*home_rad, 0.25]])})
+    steps = steps_of(of, {"actions": np.array([[*home_rad, 0.25]])})
     np.testing.assert_allclose(steps, [[*home_rad, 0.25]], atol=ATOL)
     assert (of.spec.action.space, of.spec.action.kind) == ("joint", "absolute")
 
@@ -298,9 +302,9 @@ def test_another_action_than_the_presets_keeps_nothing_of_what_it_says_of_number
     home_rad = np.array(load_profile("panda_sim").robot.home_rad)
     for preset in ("libero", "droid"):  # LIBERO's clip, DROID's 0.2 rad to the unit
         of = layout(preset=preset, action="joint_position", **told)
-        np.testing.assert_allclose(of.steps(home_rad[None]), home_rad[None], atol=ATOL)
+        np.testing.assert_allclose(steps_of(of, home_rad[None]), home_rad[None], atol=ATOL)
     of = layout(action="absolute", rotation="rpy", **told)
-    steps = of.steps(np.array([[0.5, 0, 0.3, 0, 0, 2.0]]))
+    steps = steps_of(of, np.array([[0.5, 0, 0.3, 0, 0, 2.0]]))
     np.testing.assert_allclose(steps, [[0.5, 0, 0.3, 0, 0, 2.0]], atol=ATOL)
     with pytest.raises(
         SpecError, match="joint_position is not that of preset droid, so the meaning"
@@ -337,7 +341,7 @@ def test_the_spec_of_every_option_has_its_default_documented() -> None:
 # -- what servers say of themselves ---------------------------------------------------------------
 def test_a_server_that_says_what_is_set_fits() -> None:
     of = layout(preset="own")
-    said = openpi.read_metadata(openpi_frames.metadata(of.spec.action, {}))
+    said = openpi.read_metadata(openpi_server.metadata(of.spec.action, {}))
     assert openpi.mismatches(said, of) == []
     assert openpi.mismatches({}, of) == []
 

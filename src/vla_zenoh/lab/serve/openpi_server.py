@@ -1,14 +1,21 @@
-"""Frames of a server of openpi's protocol; for its clients see `models/openpi/wire.py`."""
+"""A model of ours in the form of openpi: metadata first, then an answer to each observation.
+
+A new connection, a new prompt or a reset starts an episode. An error is told as text, and ends it.
+For the clients see `models/openpi/wire.py`.
+"""
 
 from __future__ import annotations
 
+import logging
+import time
 from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
 
 from vla_zenoh.codec import message
-from vla_zenoh.errors import CodecError, PeerError
+from vla_zenoh.errors import CodecError, PeerError, SpecError, in_words
+from vla_zenoh.lab.serve.served_policy import ServedPolicy
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.policy.chunk_prefix import Committed
 from vla_zenoh.types import shown
@@ -24,18 +31,53 @@ COMMITTED = "vla_zenoh_committed"
 """Field of an observation: the steps in execution, see `read_committed`."""
 RESET: Final = {"endpoint": "reset"}
 """Request that starts an episode, as vllm-omni takes it."""
+MAX_ERROR = 1000
+LOG = logging.getLogger("vla_zenoh.serve")
 
 
-def metadata(
-    action: ActionSpec, names: Mapping[str, str], *, takes_committed: bool = False
-) -> bytes:
-    """The first frame of a server of ours.
+class OpenPiConversation:
+    """One connection of an openpi client.
 
     Args:
-        action: what its actions mean.
-        names: name of an observation -> its content, as text.
-        takes_committed: the model uses the steps in execution.
+        policy: what is served.
     """
+
+    def __init__(self, policy: ServedPolicy) -> None:
+        self._policy = policy
+        self._prompt: str | None = None
+        self._previous_ms: float | None = None
+
+    def greeting(self) -> bytes:
+        """What the model's numbers mean."""
+        policy = self._policy
+        return metadata(policy.spec.action, policy.described(), policy.takes_committed)
+
+    def reply(self, frame: bytes | str) -> bytes | str:
+        """The actions for an observation; text: why there are none."""
+        began_s = time.monotonic()
+        try:
+            given = read_observation(frame)
+            if given == RESET:
+                self._prompt = None
+                return message.pack({"status": "reset"})
+            observation = self._policy.observe(given, time.time_ns())
+            if observation.prompt != self._prompt:
+                self._prompt = observation.prompt
+                self._policy.reset()
+            committed = read_committed(given, self._policy.spec.action)
+            actions = self._policy.infer(observation, committed)
+        except Exception as error:  # sent to the client as openpi does; it may reconnect
+            why = error if isinstance(error, (PeerError, SpecError)) else repr(error)
+            LOG.warning("request rejected: %s", why)
+            return in_words(error)[:MAX_ERROR]
+        answer = pack_answer(actions, (time.monotonic() - began_s) * 1e3, self._previous_ms)
+        self._previous_ms = (time.monotonic() - began_s) * 1e3
+        return answer
+
+
+# -- frames ---------------------------------------------------------------------------------------
+def metadata(action: ActionSpec, names: Mapping[str, str], takes_committed: bool = False) -> bytes:
+    """The first frame of a server of ours; `names`: of an observation, with their contents."""
     return message.pack(
         {
             "action_dim": action.dimension,
@@ -93,14 +135,9 @@ def read_committed(given: Mapping[str, Any], action: ActionSpec) -> Committed | 
     return Committed(steps.astype(np.float32), frozen)
 
 
-def answer(actions: Any, infer_ms: float, previous_ms: float | None) -> bytes:
+def pack_answer(actions: Any, infer_ms: float, previous_ms: float | None) -> bytes:
     """One reply of a server of ours; `previous_ms`: the whole request before this one took."""
     timing = {"infer_ms": infer_ms}
     if previous_ms is not None:
         timing["prev_total_ms"] = previous_ms
     return message.pack({"actions": actions, "server_timing": timing})
-
-
-def reset_done() -> bytes:
-    """Reply to `RESET`."""
-    return message.pack({"status": "reset"})
