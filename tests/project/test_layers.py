@@ -207,6 +207,11 @@ def test_importing_the_core_loads_nothing_heavy(name: str) -> None:
     assert loaded_after(f"vla_zenoh.{name}").isdisjoint(HEAVY)
 
 
+def test_importing_what_adapters_share_loads_nothing_that_their_environments_lack() -> None:
+    loaded = loaded_after("vla_zenoh.lab.policy_servers.adapter")
+    assert loaded.isdisjoint({*HEAVY, *OPTIONAL, "cv2", "rosbags"})
+
+
 def test_importing_the_package_loads_no_library_at_all() -> None:
     assert loaded_after("vla_zenoh").isdisjoint({*HEAVY, "numpy", "cv2", "pydantic", "pinocchio"})
 
