@@ -65,30 +65,21 @@ def ask(
         SessionError: no node answers, or only with an error.
     """
     holder = f"{who}-{secrets.token_hex(4)}"
+    key, replies, over = client.keys.primitive(primitive), list[zenoh.Reply](), threading.Event()
+    timeout_s = fields.get("timeout_s", DEFAULT_TIMEOUT_S)
+    known = isinstance(timeout_s, (int, float)) and 0 < timeout_s <= 3600  # else it is rejected
     token: Any = client.session.liveliness().declare_token(client.keys.holding(holder))
     with ExitStack() as held:
         held.callback(token.undeclare)
-        return _ask(
-            client, primitive, {**fields, "holder": holder}, lambda: cancelled() and held.close()
+        client.session.get(
+            key,
+            handler=zenoh.handlers.Callback(replies.append, over.set, indirect=False),
+            payload=encode_request({**fields, "holder": holder}),
+            timeout=(timeout_s if known else 0.0) + MARGIN_S,
         )
-
-
-def _ask(
-    client: Client, primitive: str, fields: Mapping[str, Any], poll: Callable[[], object]
-) -> Answer:
-    replies: list[zenoh.Reply] = []
-    over = threading.Event()
-    key = client.keys.primitive(primitive)
-    timeout_s = fields.get("timeout_s", DEFAULT_TIMEOUT_S)
-    known = isinstance(timeout_s, (int, float)) and 0 < timeout_s <= 3600  # else it is rejected
-    client.session.get(
-        key,
-        handler=zenoh.handlers.Callback(replies.append, over.set, indirect=False),
-        payload=encode_request(fields),
-        timeout=(timeout_s if known else 0.0) + MARGIN_S,
-    )
-    while not over.wait(POLL_S):
-        poll()
+        while not over.wait(POLL_S):
+            if cancelled():
+                held.close()
     for reply in replies:
         if reply.ok is not None:
             return decode_answer(bytes_of(reply.ok.payload, MAX_ANSWER_BYTES))

@@ -39,19 +39,9 @@ def models(context: Any) -> Iterable[str]:
     return [*_profile(context).workers, *names("models")]
 
 
-def workers(context: Any) -> Iterable[str]:
-    """Workers of the profile."""
-    return _profile(context).workers
-
-
-def hosts(context: Any) -> Iterable[str]:
-    """Hosts of the profile."""
-    return _profile(context).hosts
-
-
-def cameras(context: Any) -> Iterable[str]:
-    """Cameras of the profile."""
-    return _profile(context).cameras
+def of_profile(section: str) -> Callable[[Any], Iterable[str]]:
+    """What the profile has in a section: workers, hosts or cameras."""
+    return lambda context: getattr(_profile(context), section)
 
 
 def prompts(context: Any) -> Iterable[str]:
@@ -83,34 +73,20 @@ class Candidate(NamedTuple):
 
 
 COMPLETIONS: Mapping[str, Callable[[Any], Iterable[str]]] = {
-    "profile": profiles,
-    "also": profiles,
-    "profile show.name": profiles,
-    "profile check.names": profiles,
+    **dict.fromkeys(("profile", "also", "profile show.name", "profile check.names"), profiles),
     "model": models,
-    "worker": workers,
-    "workers": workers,
-    "lab compare.a": workers,
-    "lab compare.b": workers,
-    "host": hosts,
-    "cameras": cameras,
-    "prompt": prompts,
-    "prompts": prompts,
-    "prompt.text": prompts,
-    "key": keys,
-    "keys": keys,
+    **dict.fromkeys(("worker", "workers", "lab compare.a", "lab compare.b"), of_profile("workers")),
+    "host": of_profile("hosts"),
+    "cameras": of_profile("cameras"),
+    **dict.fromkeys(("prompt", "prompts", "prompt.text"), prompts),
+    **dict.fromkeys(("key", "keys"), keys),
 }
 """What completes a parameter, by its name, or by command words and its name."""
 NO_HOST_OF_A_LAB = "lab serve.host"
 
 
 def add_completion(parameter: Any, command: str) -> None:
-    """Let the shell complete a parameter of a command.
-
-    Args:
-        parameter: of the command line's library.
-        command: its words.
-    """
+    """Let the shell complete a parameter of the command of these words."""
     name = f"{command}.{parameter.name}"
     words = COMPLETIONS.get(name) or COMPLETIONS.get(parameter.name)
     if words is None or name == NO_HOST_OF_A_LAB:

@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     import typer
 
     from vla_zenoh.bus.client import Client
+    from vla_zenoh.cli.options import AnswerOption
     from vla_zenoh.profile import Profile
     from vla_zenoh.types import Task
 
-JSON_HELP = "Print the answer as JSON on stdout."
 PATIENCE_S = 3.0
 DISCOVERY_S, POLL_S = 1.0, 0.05
 """A router's first answers may lack robots that are alive: `stop --all` asks for this long."""
@@ -48,7 +48,7 @@ def _answered(command: Callable[..., None]) -> Callable[..., None]:
 def prompt(
     text: Annotated[str, typer.Argument(help="Instruction for the model.")],
     target: RobotTarget,
-    as_json: Annotated[bool, typer.Option("--json", help=JSON_HELP)] = False,
+    as_json: AnswerOption = False,
 ) -> None:
     """Set the prompt. Any Zenoh client can: put the text on <root>/<robot>/prompt."""
     from vla_zenoh.codec.settings import decode_text
@@ -56,8 +56,8 @@ def prompt(
     decode_text(text.encode())  # rejects it before a router is asked
     with target.operator("prompt", text) as client:
         task = client.set_prompt(text)
-        text = f"prompt: {task.prompt!r} (worker {task.worker}, {task.rate_hz:g} Hz)"
-        _show(target, client, text)
+        said = f"prompt: {task.prompt!r} (worker {task.worker}, {task.rate_hz:g} Hz)"
+        _show(target, client, said)
 
 
 @_answered
@@ -67,15 +67,13 @@ def activate(
         bool,
         typer.Option("--hold", help="Stay: the arm is active only while this runs (deadman)."),
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help=JSON_HELP)] = False,
+    as_json: AnswerOption = False,
 ) -> None:
     """Let the worker move the arm. Rejected with every reason while something is not ready."""
-    with target.operator("activate") as client:
-        stop = None
-        if held:
-            from vla_zenoh.runtime.process import stop_on_signals
+    from vla_zenoh.runtime.process import stop_on_signals
 
-            stop = stop_on_signals()
+    with target.operator("activate") as client:
+        stop = stop_on_signals() if held else None
         task = client.activate() if stop is None else client.activate_with_deadman("person")
         what = f"worker {task.worker}, prompt {task.prompt!r}, {task.rate_hz:g} Hz"
         _show(target, client, f"{_mode(client)} | active: {what}")
@@ -117,10 +115,7 @@ def _inactive(client: Client, activated: Task) -> str:
 
 
 @_answered
-def deactivate(
-    target: RobotTarget,
-    as_json: Annotated[bool, typer.Option("--json", help=JSON_HELP)] = False,
-) -> None:
+def deactivate(target: RobotTarget, as_json: AnswerOption = False) -> None:
     """Brake the arm; then no worker moves it."""
     with target.client(stop=True) as client:
         _deactivate(target, client)
@@ -136,7 +131,7 @@ def _deactivate(target: RobotTarget, client: Client) -> None:
 def use(
     worker: Annotated[str, typer.Argument(help="Worker whose chunks move the arm.")],
     target: RobotTarget,
-    as_json: Annotated[bool, typer.Option("--json", help=JSON_HELP)] = False,
+    as_json: AnswerOption = False,
 ) -> None:
     """Select the worker that moves the arm; the others keep running."""
     from vla_zenoh.codec.settings import decode_name
@@ -164,7 +159,7 @@ def _require_worker(client: Client, worker: str) -> None:
 def rate(
     rate_hz: Annotated[float, typer.Argument(help="Chunks per second.")],
     target: RobotTarget,
-    as_json: Annotated[bool, typer.Option("--json", help=JSON_HELP)] = False,
+    as_json: AnswerOption = False,
 ) -> None:
     """Set how often the workers infer."""
     from vla_zenoh.codec.settings import decode_rate
@@ -181,7 +176,7 @@ def speed(
         str | None,
         typer.Argument(help="0 to 100; at 0 the arm stands, still active. Default: show it."),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help=JSON_HELP)] = False,
+    as_json: AnswerOption = False,
 ) -> None:
     """Slow the arm down on the same path. Lowering needs only the right to stop."""
     from vla_zenoh.codec.settings import decode_percent
@@ -217,7 +212,7 @@ def stop(
             "--wait-key", help="Stay: every key stops the robot, and so does leaving (Ctrl-C)."
         ),
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help=JSON_HELP)] = False,
+    as_json: AnswerOption = False,
 ) -> None:
     """Emergency stop: brake now and stay stopped until `vla-zenoh reset`."""
     if wait_key:
@@ -242,10 +237,7 @@ def confirm_stop(target: RobotTarget, client: Client, *, every: bool) -> None:
 
 
 @_answered
-def reset(
-    target: RobotTarget,
-    as_json: Annotated[bool, typer.Option("--json", help=JSON_HELP)] = False,
-) -> None:
+def reset(target: RobotTarget, as_json: AnswerOption = False) -> None:
     """Clear an emergency stop or a fault. The arm stays inactive."""
     with target.operator("reset") as client:
         client.reset()
@@ -257,13 +249,12 @@ def reset(
         _show(target, client, "reset; inactive", ": ")
 
 
-def _state(client: Client) -> str:
-    status = client.status("command")
-    return status.state if status is not None else ""
-
-
 def _stops(client: Client) -> bool:
-    return _reaches(client, lambda: _state(client) == "stopped")
+    def stopped() -> bool:
+        status = client.status("command")
+        return status is not None and status.state == "stopped"
+
+    return _reaches(client, stopped)
 
 
 def _reaches(client: Client, done: Callable[[], bool]) -> bool:

@@ -52,6 +52,7 @@ AlsoOption = Annotated[
     typer.Option("--also", help="Profile of another robot that the router serves; repeatable."),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+AnswerOption = Annotated[bool, typer.Option("--json", help="Print the answer as JSON on stdout.")]
 
 
 def options(command: Callable[..., None]) -> Callable[..., None]:
@@ -131,13 +132,7 @@ class NodeOptions:
 
 @dataclass(frozen=True)
 class WorkerChoice:
-    """The worker to run.
-
-    Args:
-        name: in its keys.
-        model: file that it runs.
-        options: of the model: the profile's, overridden by those of the command line.
-    """
+    """The worker to run: its name in keys, its model file, and the options of the model."""
 
     name: str
     model: ModelFile

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from vla_zenoh.bus.primitives import ask
-from vla_zenoh.cli.options import NodeOptions, options
+from vla_zenoh.cli.options import AnswerOption, NodeOptions, options
 from vla_zenoh.cli.plain import fail, say
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.codec.primitives import DEFAULT_TIMEOUT_S, Answer
@@ -23,7 +23,6 @@ from vla_zenoh.runtime.process import run_node
 TimeoutOption = Annotated[
     float, typer.Option("--timeout", min=0.1, max=3600, help="Seconds until the arm is braked.")
 ]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print the answer as JSON on stdout.")]
 CONDITIONS = "gripper=closed|open, inside=X,Y,Z:X,Y,Z (m), force=N, still=S, done"
 
 
@@ -54,7 +53,7 @@ def move_to(
         typer.Option("--joints", help="All joints in rad, or NAME=RAD,.., instead of a pose."),
     ] = None,
     timeout_s: TimeoutOption = DEFAULT_TIMEOUT_S,
-    as_json: JsonOption = False,
+    as_json: AnswerOption = False,
 ) -> None:
     """Go straight to a pose, or to joints; rejected before it moves where that cannot be."""
     fields: dict[str, Any] = {}
@@ -71,7 +70,7 @@ def move_to(
 
 @options
 def home(
-    target: RobotTarget, timeout_s: TimeoutOption = DEFAULT_TIMEOUT_S, as_json: JsonOption = False
+    target: RobotTarget, timeout_s: TimeoutOption = DEFAULT_TIMEOUT_S, as_json: AnswerOption = False
 ) -> None:
     """Go to the joints robot.home_rad of the profile."""
     _carry_out(target, "home", {}, timeout_s, as_json=as_json)
@@ -88,7 +87,7 @@ def grip(
         ),
     ] = None,
     timeout_s: TimeoutOption = DEFAULT_TIMEOUT_S,
-    as_json: JsonOption = False,
+    as_json: AnswerOption = False,
 ) -> None:
     """Open or close the gripper while the arm stands."""
     word = {"close": "closed"}.get(width, width)
@@ -110,7 +109,7 @@ def run(
         str | None, typer.Option("--prompt", help="For the worker; default: the present one.")
     ] = None,
     timeout_s: TimeoutOption = DEFAULT_TIMEOUT_S,
-    as_json: JsonOption = False,
+    as_json: AnswerOption = False,
 ) -> None:
     """Let a worker move the arm until a condition holds or the time is over."""
     fields = {"worker": worker, "prompt": prompt, "until": _until(until or [])}
