@@ -36,7 +36,7 @@ COMMANDS: Mapping[str, Mapping[str, str | Group]] = {
     "Run": {
         "demo": "lab.cli.demo:demo",
         "up": "cli.up:up",
-        "worker": "cli.worker:worker",
+        "worker": "cli.nodes:worker",
         "teleop": "lab.cli.teleop:teleop",
         "node": Group(
             "Run one node by hand; `up` runs all nodes of a host, `worker` a model.",

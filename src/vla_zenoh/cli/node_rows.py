@@ -20,7 +20,6 @@ MODE_WORDS = {
 }
 """Mode -> (prefix of what moves, sentence, style)."""
 MISSING, DEAD = "missing", "dead"
-ON_BEHALF = frozenset({CRASHED, STARTING})
 
 
 class NodeRow(NamedTuple):
@@ -65,7 +64,7 @@ def node_rows(
             continue
         status, age_s, lives = said[name]
         state, why = status.state, ""
-        if not lives and state in ON_BEHALF:
+        if not lives and state in (CRASHED, STARTING):  # by `up`, in its name
             why = str(status.detail.get("complaint", ""))
         elif not lives:
             state, why = DEAD, "it exited, or lost its connection; see the output of `up` there"

@@ -1,12 +1,13 @@
-"""vla-zenoh node: router, sim, ros2, arm, camera, command: one node until Ctrl-C."""
+"""vla-zenoh worker, and node: router, sim, ros2, arm, camera, command: one node until Ctrl-C."""
 
 from __future__ import annotations
 
 import json
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -15,11 +16,14 @@ from vla_zenoh.cli.options import (
     AlsoOption,
     HostOption,
     ListenOption,
+    ModelOptions,
     NodeOptions,
     ProfileOption,
     effective_profile,
     options,
 )
+from vla_zenoh.cli.plain import say
+from vla_zenoh.keys import worker_node
 from vla_zenoh.runtime.process import (
     RUN_FOLDER_VARIABLE,
     die_with_parent,
@@ -153,3 +157,55 @@ def command(
         identity="command",
         preferred=True,
     )
+
+
+@options
+def worker(
+    model: Annotated[
+        str, typer.Argument(help="A worker of the profile, name of a model, or path to one.")
+    ],
+    node: NodeOptions,
+    model_options: ModelOptions,
+    name: Annotated[
+        str | None, typer.Option("--name", help="Name in its keys; default: the model's name.")
+    ] = None,
+    delay_ms: Annotated[
+        float, typer.Option("--delay", min=0, help="Milliseconds added to every inference.")
+    ] = 0.0,
+    host: HostOption = None,
+) -> None:
+    """Run a model: observations in, action chunks out on its delta key."""
+    from vla_zenoh.nodes.worker.node import WorkerNode
+    from vla_zenoh.policy.loader import make_policy
+    from vla_zenoh.runtime.environments import run_in_own_environment
+
+    profile = effective_profile(node.profile, node.connect, host=host)
+    chosen = model_options.choose(profile, model, name)
+    # Returns only if this environment has what the model's header asks for.
+    run_in_own_environment(chosen.model, model_options.python)
+    policy = make_policy(chosen.model, chosen.options, profile=node.profile)
+    if sys.stdout.isatty():
+        say(f"worker {chosen.name} of robot {profile.robot.name} is running; Ctrl-C stops it")
+    run_node(
+        profile,
+        lambda session, stop: WorkerNode(
+            profile,
+            session,
+            policy,
+            chosen.name,
+            images=_image_form(profile, host),
+            host=host,
+            delay_s=delay_ms / 1e3,
+            robots=profile.serves.get(chosen.name, ()),
+            another=lambda: make_policy(chosen.model, chosen.options, profile=node.profile),
+        ).run(stop),
+        identity=worker_node(chosen.name),
+    )
+    os._exit(0)  # threads of a model's library may keep the process alive
+
+
+def _image_form(profile: Profile, host: str | None) -> Literal["raw", "jpeg"]:
+    """Raw images within a host, JPEG from another one."""
+    if host is None or host not in profile.hosts:
+        return "raw"
+    return "raw" if "camera" in profile.hosts[host].nodes else "jpeg"

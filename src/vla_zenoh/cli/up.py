@@ -88,7 +88,8 @@ def up(
 
         loaded = effective_profile(profile, connect, listen)
         name, _ = choose_host(loaded, host)
-        words = [sys.executable, "-m", "vla_zenoh", "up", absolute(profile), "--host", name]
+        named = str(profile_file(profile).absolute()) if is_path(profile) else profile
+        words = [sys.executable, "-m", "vla_zenoh", "up", named, "--host", name]
         words += [*endpoints, *repeated({"--also": also})]
         words += ["--dry-run"] * dry_run + ["--verbose"] * verbose + ["--json"] * as_json
         words += ["--no-record"] * no_record
@@ -97,8 +98,8 @@ def up(
         what = f"robot {loaded.robot.name}, host {name}"
         print(systemd_unit(what, words, getpass.getuser(), kept), end="")
         return
-    named = [] if host is None else ["--host", host]
-    with profile_check([profile, *named, *endpoints]) as check:
+    hosts = [] if host is None else ["--host", host]
+    with profile_check([profile, *hosts, *endpoints]) as check:
         from vla_zenoh.runtime.launch import Host, HostLock, choose_host  # meanwhile
 
         loaded = effective_profile(profile, connect, listen)
@@ -135,7 +136,8 @@ def up(
         show(node, sentence, "bold")
 
     others = [effective_profile(name, host=host) for name in also or ()]
-    record = None if no_record or lacks_mcap() else rolling_folder(logs, loaded)
+    can_record = all(find_spec(name) for name in ("mcap", "rosbags", "zstandard"))
+    record = rolling_folder(logs, loaded) if can_record and not no_record else None
     given: dict[str, Any] = {"also": others, "dry_run": dry_run, "rolling": record}
     with Host(loaded, host, log=log, tell=tell, **given) as running:
         where = ", ".join(running.profile.session.connect)
@@ -145,7 +147,7 @@ def up(
         tell("up", f"log: {file}")
         if ROLLING in {child.command.kind for child in running.supervisor.children}:
             tell("up", f"rolling record: {record}")
-        elif not no_record and lacks_mcap():
+        elif not (no_record or can_record):
             tell("up", "no rolling record: it needs the extra record, as in vla-zenoh[record]")
         target = target_of(profile, running)
         status, activate, end = (target.typed(word) for word in ("status", "activate", "stop"))
@@ -153,11 +155,6 @@ def up(
         running.serve(stop)
         tell("up", "braking the arm, then stopping every node")
     tell("up", "all nodes have stopped")
-
-
-def absolute(profile: str) -> str:
-    """A profile's name, or its absolute path."""
-    return str(profile_file(profile).absolute()) if is_path(profile) else profile
 
 
 def default_log_folder() -> Path:
@@ -168,11 +165,6 @@ def default_log_folder() -> Path:
 def rolling_folder(logs: Path, profile: Profile) -> Path:
     """Where `up` keeps the rolling record of a robot, beside its log."""
     return logs.absolute() / f"rolling-{profile.robot.name}"
-
-
-def lacks_mcap() -> bool:
-    """Whether the library that writes recordings is missing."""
-    return any(find_spec(name) is None for name in ("mcap", "rosbags", "zstandard"))
 
 
 def log_file(folder: Path, name: str) -> tuple[Path, logging.Logger]:

@@ -12,8 +12,7 @@ import pytest
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from vla_zenoh.cli.completion import COMPLETIONS
-from vla_zenoh.cli.help import examples
+from vla_zenoh.cli.help import COMPLETIONS, examples
 from vla_zenoh.cli.main import COMMANDS, _short_help, app
 
 LEAST_EXAMPLES = 2

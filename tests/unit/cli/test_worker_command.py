@@ -10,7 +10,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from vla_zenoh.cli.worker import worker
+from vla_zenoh.cli.nodes import worker
 from vla_zenoh.lab.cli.check import check
 from vla_zenoh.lab.cli.serve import serve
 from vla_zenoh.profile import load_profile
