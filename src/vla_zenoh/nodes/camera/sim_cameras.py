@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.bus.buffers import LatestSample, ReceivedSample
-from vla_zenoh.errors import MissingExtraError, NodeError, RecordError, VlaZenohError, in_words
+from vla_zenoh.errors import MissingExtraError, RecordError, VlaZenohError, in_words
 from vla_zenoh.nodes.camera.camera_publisher import OK, CameraPublisher
 from vla_zenoh.nodes.camera.geometry import Intrinsics
 from vla_zenoh.nodes.camera.source import STALL_S
@@ -97,10 +97,9 @@ class SimCameras:
             except Exception as error:  # drivers raise anything, and none of it may end the thread
                 if stop.is_set():
                     return
-                why = in_words(error)
-                self.renderer = f"none: {why}"
+                self.renderer = f"none: {in_words(error)}"
                 for _, publisher in self._views:
-                    publisher.lose(why)
+                    publisher.lose(in_words(error))
             if any(publisher.state == OK for _, publisher in self._views):
                 backoff_s = BACKOFF_S
             stop.wait(backoff_s)
@@ -214,8 +213,6 @@ class SimCameras:
         if step > 1:
             scaled = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_LINEAR)
             rgb = np.asarray(scaled, np.uint8)
-        if rgb.shape != (height, width, 3):
-            raise NodeError(f"the renderer drew an image of shape {rgb.shape}")
         if renderer.backend.name == RAYCAST:
             budget.add(time.perf_counter() - began)
             publisher.backend = RAYCAST if budget.step == 1 else f"{RAYCAST} 1/{budget.step}"
