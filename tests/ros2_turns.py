@@ -112,7 +112,7 @@ class Turns:
         for _ in range(round(duration_s / TICK_S)):
             self.up()
             self.turn()
-        assert self.arm.follower.following
+        assert self.arm.follower.guard.following
 
     @property
     def heights_m(self) -> FloatArray:

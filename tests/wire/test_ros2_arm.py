@@ -139,7 +139,7 @@ def test_what_was_heard_before_the_arm_was_moved_by_somebody_else_is_not_new_aft
     turns.seq = 10
     turns.up(moves=False)
     turns.turn()
-    assert turns.arm.follower.following
+    assert turns.arm.follower.guard.following
 
 
 @pytest.mark.parametrize("turns", [JOINT_GOALS], indirect=True)

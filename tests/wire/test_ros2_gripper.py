@@ -17,11 +17,11 @@ from ros2_rig import write_profile
 from vla_zenoh.bus.clock import Clock
 from vla_zenoh.bus.node import Node, Publisher
 from vla_zenoh.bus.session import open_session
+from vla_zenoh.guard.arm_guard import ArmGuard
 from vla_zenoh.guard.gripper_guard import OLDEST_NS
 from vla_zenoh.keys import Kind
 from vla_zenoh.profile import load_profile
 from vla_zenoh.robots.arm import GripperCommands
-from vla_zenoh.robots.command_follower import CommandFollower
 from vla_zenoh.robots.driver import RobotDriver
 from vla_zenoh.robots.ros2.gripper import Gripper
 from vla_zenoh.robots.ros2.ros_graph import RosGraph
@@ -67,8 +67,8 @@ class Rig:
 
     def turn_at(self, now_ns: int, writer: str, *, leads: bool) -> None:
         self.gripper.poll(writer, writer_active=leads)
-        follower = SimpleNamespace(writer=writer, writer_active=leads)
-        self.commands.update(now_ns, cast("CommandFollower", follower))
+        arm = SimpleNamespace(writer=writer, writer_active=leads)
+        self.commands.update(now_ns, cast("ArmGuard", arm))
 
     def turn_until(self, what: str, name: str, count: int, writer: str = "command#1") -> None:
         """Turn until counter `name` stands at `count`."""

@@ -152,6 +152,6 @@ def test_a_loop_that_is_too_slow_to_brake_ends_in_time_and_says_so(loop: Loop) -
 
     loop.script[MOVING] = slow
     loop.run()
-    assert loop.turns.arm.follower.moving
+    assert loop.turns.arm.follower.guard.moving
     (event,) = loop.turns.told("not_braked")
     assert "the loop was late too often" in event.why

@@ -9,7 +9,7 @@ from vla_zenoh.bus.buffers import CallbackRing
 from vla_zenoh.bus.node import Node, Publisher, publish_together
 from vla_zenoh.codec.records import SMALL_BYTES
 from vla_zenoh.errors import CodecError
-from vla_zenoh.guard.arm_guard import Measured
+from vla_zenoh.guard.arm_guard import ArmGuard, Measured
 from vla_zenoh.guard.gripper_guard import GripperGuard
 from vla_zenoh.keys import Kind
 from vla_zenoh.kinematics.so3 import quat_from_rotation
@@ -24,19 +24,11 @@ FAULT_AGAIN_NS = 100_000_000
 
 
 class Arm:
-    """Runs one arm through its driver, tick by tick.
-
-    Args:
-        node: on the bus.
-        driver: of the robot.
-
-    Attributes:
-        follower: of the command streams.
-    """
+    """Runs one arm through its driver, tick by tick; its `follower` follows the command streams."""
 
     def __init__(self, node: Node, driver: RobotDriver) -> None:
         self._node, self._driver, profile = node, driver, driver.profile
-        self.follower = CommandFollower(node, driver, profile)
+        self.follower = CommandFollower(node, driver)
         self._gripper_commands = GripperCommands(node, driver)
         keys = profile.keys
         self._joint_out = node.declare_publisher(keys.state_joint, Kind.STATE)
@@ -54,35 +46,29 @@ class Arm:
         self.begin_step(now_ns, mono_ns, stall_s)
         self.end_step(mono_ns)
 
-    def begin_step(self, now_ns: int, mono_ns: int, stall_s: float) -> None:
+    def begin_step(
+        self, now_ns: int, mono_ns: int, stall_s: float, *, reading: bool = True
+    ) -> None:
         """Read a real robot, and move it or a simulated one.
 
         Args:
             now_ns: wall clock, for stamps.
             mono_ns: the same time on the monotonic clock.
             stall_s: how late the tick is.
+            reading: False: only move it, to bring the arm to rest.
         """
         self._mono_ns = mono_ns
         self.follower.begin(mono_ns, stall_s)
-        if not self._driver.simulated:
+        if reading and not self._driver.simulated:
             self._read(mono_ns)
-        self._follow(now_ns, mono_ns)
+        self.follower.update(now_ns, mono_ns, away=self._driver.away, silent=self._silent)
         if self.follower.accepting:
-            self._gripper_commands.update(now_ns, self.follower)
+            self._gripper_commands.update(now_ns, self.follower.guard)
 
     def end_step(self, mono_ns: int) -> None:
         """Read a simulated robot once all its parts have been moved: their commands act at once."""
         if self._driver.simulated:
             self._read(mono_ns)
-
-    def brake_step(self, now_ns: int, mono_ns: int, stall_s: float) -> None:
-        """Run one tick of nothing but `move`, to bring the arm to rest."""
-        self._mono_ns = mono_ns
-        self.follower.begin(mono_ns, stall_s)
-        self._follow(now_ns, mono_ns)
-
-    def _follow(self, now_ns: int, mono_ns: int) -> None:
-        self.follower.update(now_ns, mono_ns, away=self._driver.away, silent=self._silent)
 
     def _read(self, mono_ns: int) -> None:
         measurement = self._driver.read(mono_ns)
@@ -140,15 +126,12 @@ class Arm:
 
     # -- state --------------------------------------------------------------------------------
     @property
-    def age_s(self) -> float | None:
-        """Age of the newest valid measurement, None before the first."""
-        measured_ns = self._driver.measured_ns
-        return None if measured_ns is None else max(0, self._mono_ns - measured_ns) / 1e9
-
-    @property
     def _silent(self) -> bool:
-        age_s = None if self._driver.simulated else self.age_s
-        return age_s is not None and age_s > self._driver.profile.timing.state_timeout_s
+        measured_ns = self._driver.measured_ns
+        if self._driver.simulated or measured_ns is None:
+            return False
+        age_s = (self._mono_ns - measured_ns) / 1e9
+        return age_s > self._driver.profile.timing.state_timeout_s
 
     @property
     def state(self) -> str:
@@ -159,11 +142,11 @@ class Arm:
             return "waiting"
         if self._silent:
             return "silent"
-        if self.follower.braking:
+        if self.follower.guard.braking:
             return "braking"
         if self.follower.stalled:
             return "stalled"
-        return "unheeded" if self.follower.unheeded else "running"
+        return "unheeded" if self.follower.guard.unheeded else "running"
 
     def changed(self) -> bool:
         """Whether the state changed since the last call; a transition is emitted as an event."""
@@ -190,19 +173,15 @@ class Arm:
         return {
             "fault": self._driver.fault,
             "silent": self._driver.silent_why,
-            "braking": f"no command/{self.follower.mode} for {timeout_s:g} s while the arm moved",
+            "braking": f"no command/{self.follower.guard.mode} for {timeout_s:g} s "
+            "while the arm moved",
             "unheeded": "command stream rejected: its first set-point does not match the arm's "
             "current pose, or its beginning was lost",
         }.get(state, "")
 
 
 class GripperCommands:
-    """Gripper commands of the arm's writer, from the bus to the driver.
-
-    Args:
-        node: on the bus; its counters get the rejections.
-        driver: of the robot.
-    """
+    """Gripper commands of the arm's writer, from the bus to the driver."""
 
     def __init__(self, node: Node, driver: RobotDriver) -> None:
         self._node, self._driver = node, driver
@@ -210,12 +189,10 @@ class GripperCommands:
         self._commands = node.subscribe(key, CallbackRing(16, SMALL_BYTES))
         self._guard = GripperGuard(driver.profile.robot.gripper)
 
-    def update(self, now_ns: int, follower: CommandFollower) -> None:
-        """Accept or reject the commands that arrived.
+    def update(self, now_ns: int, arm: ArmGuard) -> None:
+        """Accept or reject the commands that arrived; `now_ns` (wall clock) says their age.
 
-        Args:
-            now_ns: wall clock, for their age.
-            follower: of the arm; a gripper command of another writer is rejected.
+        One whose writer is not that of the arm is rejected.
         """
         for arrival in self._commands.drain():
             command = self._node.decode(GripperCommand, arrival)
@@ -227,9 +204,9 @@ class GripperCommands:
             try:
                 accepted = self._guard.accept(
                     command,
-                    follower.writer,
+                    arm.writer,
                     0 if self._driver.lockstep else now_ns,  # in lockstep a command has no age
-                    writer_active=follower.writer_active,
+                    writer_active=arm.writer_active,
                 )
             except CodecError as error:
                 self._node.reject(error.reason, f"command/gripper {error}")

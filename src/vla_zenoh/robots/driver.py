@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Mapping
 from functools import cached_property
@@ -29,7 +28,6 @@ from vla_zenoh.types.commands import JointReference, PoseReference
 if TYPE_CHECKING:
     from vla_zenoh.bus.node import Node
     from vla_zenoh.kinematics.kinematics import Kinematics
-    from vla_zenoh.robots.command_follower import CommandFollower
 
 STREAMING = "streaming"
 """State in the commands for a driver: the guard has already checked the writer's."""
@@ -68,13 +66,8 @@ class Reporter(Protocol):
     clock: Clock
     counters: Counter[str]
 
-    def emit(self, event: Event) -> None:
-        """Report an event."""
-        ...
-
-    def reject(self, reason: str, why: str, about: str = "") -> None:
-        """Count and report a rejection, see `vla_zenoh.bus.node.Node.reject`."""
-        ...
+    def emit(self, event: Event) -> None: ...
+    def reject(self, reason: str, why: str, about: str = "") -> None: ...
 
 
 class Report:
@@ -86,41 +79,21 @@ class Report:
         self.events: list[Event] = []
 
     def emit(self, event: Event) -> None:
-        """Keep an event."""
         self.events.append(event)
 
     def reject(self, reason: str, why: str, about: str = "") -> None:
-        """Count a rejection, and keep its event."""
         self.counters[f"refused.{reason}"] += 1
         self.emit(Event("warning", "refusal", reason, why))
 
 
-class SteppedNode(Protocol):
-    """The node as a driver runs it in lockstep."""
-
-    def publish_state(self, measurement: Measurement, mono_ns: int, part: str = "") -> None:
-        """Publish a measurement of a part."""
-        ...
-
-    def step(self, tick: Tick) -> None:
-        """Run one tick."""
-        ...
-
-    def watch(self) -> None:
-        """Publish the status when it is due."""
-        ...
-
-
 class Pace(Protocol):
-    """Clock of the node's loop."""
+    """Clock of the node's loop; `wait` sleeps until the next tick."""
 
-    def wait(self) -> Tick:
-        """Sleep until the next tick."""
-        ...
+    def wait(self) -> Tick: ...
 
 
-class RobotDriver(ABC):
-    """One kind of robot as `RobotNode` drives it; a subclass needs `read` and `move`.
+class RobotDriver:
+    """One kind of robot as `RobotNode` drives it; the drivers of its parts have `read` and `move`.
 
     One thread, the node's loop, calls everything. A call must return within a fraction of
     `period_s`. An exception ends the node after it braked the arm by further calls of `move`.
@@ -168,17 +141,13 @@ class RobotDriver(ABC):
         self.report: Reporter = Report()
 
     # -- required -----------------------------------------------------------------------------
-    @abstractmethod
     def read(self, mono_ns: int) -> Measurement | None:
-        """The newest state; None: nothing new, or nothing valid.
+        """The newest state at this tick; None: nothing new, or nothing valid."""
+        raise NotImplementedError
 
-        Args:
-            mono_ns: time of this tick on the monotonic clock.
-        """
-
-    @abstractmethod
     def move(self, reference: PoseReference | JointReference, now_ns: int) -> None:
         """Set the set-point of the robot's controller; `now_ns` is its time on the wall clock."""
+        raise NotImplementedError
 
     # -- optional -----------------------------------------------------------------------------
     @property
@@ -186,11 +155,8 @@ class RobotDriver(ABC):
         """Driver of each part, by name; of a robot with one arm this driver, by an empty name."""
         return {"": self}
 
-    def attach(self, node: Node, follower: CommandFollower | None) -> None:
-        """Called when the node is on the bus; `follower` is None if there is no arm.
-
-        Only a driver with keys of its own overrides it.
-        """
+    def attach(self, node: Node, follower: Any) -> None:
+        """Called when the node is on the bus, with the `CommandFollower` of the (first) arm."""
         self.report = node
 
     def connect(self) -> None:
@@ -213,8 +179,8 @@ class RobotDriver(ABC):
         """Whether the status should be published before it is due."""
         return False
 
-    def serve_lockstep(self, node: SteppedNode, stop: threading.Event) -> None:
-        """Run the node's ticks when simulated time advances, until `stop` is set."""
+    def serve_lockstep(self, node: Any, stop: threading.Event) -> None:
+        """Run the ticks of the `RobotNode` when simulated time advances, until `stop` is set."""
         raise NodeError("this driver has no simulated time")
 
     def close(self) -> None:

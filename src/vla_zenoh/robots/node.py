@@ -22,7 +22,7 @@ from vla_zenoh.codec.settings import MAX_SETTING_BYTES
 from vla_zenoh.errors import NodeError
 from vla_zenoh.guard.arm_guard import max_braking_time_s
 from vla_zenoh.robots.arm import Arm
-from vla_zenoh.robots.driver import Measurement, Pace, RobotDriver
+from vla_zenoh.robots.driver import Pace, RobotDriver
 from vla_zenoh.runtime.scheduling import realtime_thread
 from vla_zenoh.sanitize import one_line
 from vla_zenoh.types import Event
@@ -56,7 +56,7 @@ class RobotNode:
         self.arm = next(iter(self.arms.values()), None)
         driver.attach(node, self.arm.follower if self.arm is not None else None)
         for name, arm in self.arms.items():
-            if name:
+            if driver.parts[name] is not driver:
                 driver.parts[name].attach(node, arm.follower)
         self._resets: CallbackRing | None = None
         if driver.recovers:
@@ -134,11 +134,6 @@ class RobotNode:
                 self.node.emit(Event("error", "fault", "broken", why))
             raise
 
-    def publish_state(self, measurement: Measurement, mono_ns: int, part: str = "") -> None:
-        """Publish a measurement of a part."""
-        if part in self.arms:
-            self.arms[part].publish(measurement, mono_ns)
-
     def step(self, tick: Tick) -> None:
         """Run one tick."""
         if tick.periods > 1:
@@ -161,8 +156,8 @@ class RobotNode:
         if self.arm is None or self.driver.simulated:
             return True
         follower = self.arm.follower
-        follower.stop_accepting()
-        if not follower.moving:
+        follower.accepting = False
+        if not follower.guard.moving:
             return True
         patience_s = max(LEAST_S, max_braking_time_s(self.node.profile) + SLACK_S)
         self._brake_until_ns = self._brake_until_ns or mono_ns + round(patience_s * 1e9)
@@ -176,13 +171,14 @@ class RobotNode:
 
     def _brake_to_stop(self, arm: Arm, pace: Pace) -> bool:
         """Brake after an exception, tolerating single failures; whether the arm came to rest."""
-        arm.follower.stop_accepting()
+        arm.follower.accepting = False
         failures = 0
-        while arm.follower.moving:
+        while arm.follower.guard.moving:
             tick = pace.wait()
             try:
                 mono_ns = tick.nominal_ns
-                arm.brake_step(self.node.clock.wall_at(mono_ns), mono_ns, tick.stall_s)
+                now_ns = self.node.clock.wall_at(mono_ns)
+                arm.begin_step(now_ns, mono_ns, tick.stall_s, reading=False)
                 failures = 0
             except Exception as error:
                 failures += 1
@@ -191,7 +187,7 @@ class RobotNode:
                     return False
             if self._may_end(tick.nominal_ns):
                 break
-        return not arm.follower.moving
+        return not arm.follower.guard.moving
 
     def _emit_not_braked(self, why: str) -> None:
         self.node.emit(Event("error", "fault", "not_braked", why))
@@ -214,18 +210,17 @@ class RobotNode:
 
     def watch(self, *, now: bool = False) -> None:
         """Follow the system's clock, and publish the status when it is due, or `now`."""
-        self.node.adopt_system_time()
-        if self.node.status_due(self.state) or now:
-            self.publish_status(now=now)
-
-    def publish_status(self, *, now: bool = False) -> None:
-        """Publish the status."""
-        node, driver, found = self.node, self.driver, self.driver.status()
+        node, driver = self.node, self.driver
+        node.adopt_system_time()
+        if not (node.status_due(self.state) or now):
+            return
+        found = driver.status()
         detail = {**found.detail, "realtime": self._realtime}
         followers = [arm.follower for arm in self.arms.values()]
         if followers:
-            detail["following"] = all(follower.following for follower in followers)
-            node.counters[f"{node.name}.stream_silences"] = sum(one.silences for one in followers)
+            guards = [follower.guard for follower in followers]
+            detail["following"] = all(guard.following for guard in guards)
+            node.counters[f"{node.name}.stream_silences"] = sum(one.silences for one in guards)
             if not driver.simulated:
                 node.counters[f"{node.name}.stalls"] = sum(one.stalls for one in followers)
         if len(followers) > 1:

@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import zenoh
@@ -26,17 +26,13 @@ from vla_zenoh.keys import Kind
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import Profile
 from vla_zenoh.robots.command_follower import CommandFollower
-from vla_zenoh.robots.driver import (
-    DriverStatus,
-    Measurement,
-    Pace,
-    Reporter,
-    RobotDriver,
-    SteppedNode,
-)
+from vla_zenoh.robots.driver import DriverStatus, Measurement, Pace, Reporter, RobotDriver
 from vla_zenoh.simulation.world import STEP_NS, World, build_world
 from vla_zenoh.types import FloatArray, GripperCommand, ObjectPoses, SceneState
 from vla_zenoh.types.commands import JointReference, PoseReference
+
+if TYPE_CHECKING:
+    from vla_zenoh.robots.node import RobotNode
 
 CATCH_UP_NS = 50_000_000
 
@@ -74,90 +70,46 @@ class SimDriver(RobotDriver):
         self.world = build_world(profile)
         self.lockstep = lockstep
         self.modes, self.period_s = ("pose", "joint"), STEP_NS / 1e9
-        self._ticks = self._stamp_ns = 0
+        self.ticks = self.stamp_ns = 0
         self._was_reset = False
-        self._newest: dict[str, Measurement] = {}
         self._step_lock = threading.Lock()
-        self._state_every = _every(profile.timing.state_hz)
         self._keys: _SimKeys | None = None
-        self._parts = {name: SimPart(self, name) for name in profile.parts}
-        self._followers: dict[str, CommandFollower] = {}
-        self._references: dict[str, PoseReference | JointReference] = {
-            name: part.hold_reference() for name, part in self.world.parts.items()
-        }
+        self._parts = {name: SimPart(self, name) for name in profile.part_names}
 
     @property
-    def parts(self) -> Mapping[str, RobotDriver]:
-        return self._parts or super().parts
+    def parts(self) -> Mapping[str, SimPart]:
+        return self._parts
 
-    def attach(self, node: Node, follower: CommandFollower | None) -> None:
+    def attach(self, node: Node, follower: CommandFollower) -> None:
         """Subscribe to resets, and publish the scene."""
         super().attach(node, follower)
         self._node, self._keys = node, _SimKeys(node)
-        if not self._parts:
-            self.lead("", follower)
-
-    def lead(self, part: str, follower: CommandFollower | None) -> None:
-        """Attach the follower of a part and start at its reference."""
-        assert follower is not None
-        assert follower.reference is not None
-        self._followers[part], self._references[part] = follower, follower.reference
 
     # -- one millisecond ----------------------------------------------------------------------
     def poll(self, mono_ns: int) -> None:
         """Execute resets."""
         for seed in self._keys.resets() if self._keys else ():
-            if any(one.following for one in self._followers.values()) and not self.fault:
+            guards = [part.follower.guard for part in self._parts.values()]
+            if any(guard.following for guard in guards) and not self.fault:
                 why = "sim/reset: the arm is being commanded; deactivate first"
                 self.report.reject("reset_refused", why)
             else:
                 self.reset(seed)
-                for follower in self._followers.values():
-                    follower.restart()
-
-    def move(self, reference: PoseReference | JointReference, now_ns: int, part: str = "") -> None:
-        """Set the reference and the stamp of the next step."""
-        self._references[part], self._stamp_ns = reference, now_ns
-
-    def grip(self, command: GripperCommand, now_ns: int, part: str = "") -> None:
-        """Open or close."""
-        force_n = max(command.force_n, LEAST_FORCE_N)
-        self.world.parts[part].set_gripper(command.width_m, command.speed_m_s, force_n)
-
-    def read(self, mono_ns: int) -> Measurement | None:
-        """Step the world; its state at multiples of the period of ``timing.state_hz``."""
-        self.step_world(mono_ns)
-        return self.measure()
+                for guard in guards:
+                    guard.reset()
 
     def step_world(self, mono_ns: int) -> None:
         """Step the world towards the references of all parts."""
-        self._ticks += 1
+        self.ticks += 1
         self.measured_ns = mono_ns
         if not self.fault:
             try:
-                self.world.tick(self._references)
+                self.world.tick({name: part.reference for name, part in self._parts.items()})
             except NodeError as error:
                 self.fault = str(error)
                 self.report.reject("simulation_fault", self.fault)
         if self._keys is not None:
-            self._keys.publish(self.world, self._ticks, self._stamp_ns)
-
-    def measure(self, part: str = "") -> Measurement | None:
-        """State of a part, if this step has one."""
-        return None if self._ticks % self._state_every else self._measure(self._stamp_ns, part)
-
-    def _measure(self, stamp_ns: int, part: str = "") -> Measurement:
-        if self.fault and part in self._newest:  # a diverged state may not be finite
-            return self._newest[part]._replace(stamp_ns=stamp_ns)
-        arm = self.world.parts[part]
-        self._newest[part] = Measurement(
-            stamp_ns,
-            arm.joint_state(),
-            Pose(*arm.tcp()),
-            arm.pose_state(self._references[part]),
-            arm.gripper_state(),
-        )
-        return self._newest[part]
+            self._keys.publish(self.world, self.ticks, self.stamp_ns)
 
     def reset(self, seed: int | None) -> None:
         """Reset arm and objects to their initial state; `seed` None: that of the profile."""
@@ -171,34 +123,23 @@ class SimDriver(RobotDriver):
         was_reset, self._was_reset = self._was_reset, False
         return was_reset
 
-    # -- geometry -----------------------------------------------------------------------------
-    def state_now(self, part: str = "") -> Measured:
-        """State of the world."""
-        arm = self.world.parts[part]
-        state = arm.joint_state()
-        return Measured(Pose(*arm.tcp()), state.position_rad, state.velocity_rad_s)
-
-    @property
-    def joint_range_rad(self) -> tuple[FloatArray, FloatArray]:
-        """Joint limits of the world's robot."""
-        return self.world.joint_range_rad
-
     # -- time ---------------------------------------------------------------------------------
     def pace(self) -> Pace:
         """Ticks of 1 ms that keep to the clock."""
         return RealTimePace(self.report)
 
-    def serve_lockstep(self, node: SteppedNode, stop: threading.Event) -> None:
+    def serve_lockstep(self, node: RobotNode, stop: threading.Event) -> None:
         """Publish the first state, and answer ``sim/step`` until `stop` is set."""
         self.measured_ns = 0
-        for part in self.world.parts:
-            node.publish_state(self._measure(0, part), 0, part)
+        for name, part in self._parts.items():
+            part.measured_ns = 0
+            node.arms[name].publish(part.measure(), 0)
         self._node.serve(self._node.keys.sim_step, lambda query: self._answer_step(node, query))
         while not stop.wait(WATCH_S):
             with self._step_lock:
                 node.watch()
 
-    def _answer_step(self, node: SteppedNode, query: zenoh.Query) -> None:
+    def _answer_step(self, node: RobotNode, query: zenoh.Query) -> None:
         """Advance by a msgpack map ``{"ns": ..}``; the reply is the state after it."""
         payload = query.payload
         try:
@@ -214,15 +155,15 @@ class SimDriver(RobotDriver):
             return
         with self._step_lock:
             for _ in range(duration_ns // STEP_NS):
-                node.step(Tick(1, (self._ticks + 1) * STEP_NS, 0.0, 0.0))
-            state: dict[str, Any] = {"time_ns": self._ticks * STEP_NS}
-            for part, arm in self.world.parts.items():
+                node.step(Tick(1, (self.ticks + 1) * STEP_NS, 0.0, 0.0))
+            state: dict[str, Any] = {"time_ns": self.ticks * STEP_NS}
+            for name, arm in self.world.parts.items():
                 found = {
                     "joint": records.encode(arm.joint_state()),
-                    "pose": records.encode(arm.pose_state(self._references[part])),
+                    "pose": records.encode(arm.pose_state(self._parts[name].reference)),
                     "gripper": records.encode(arm.gripper_state()),
                 }
-                state |= {part: found} if part else found
+                state |= {name: found} if name else found
         query.reply(self._node.keys.sim_step, message.pack(state))
 
     # -- status -------------------------------------------------------------------------------
@@ -232,9 +173,7 @@ class SimDriver(RobotDriver):
         return DriverStatus(
             {
                 "scene": self.profile.sim.scene,
-                "command": next(
-                    (one.mode for one in self._followers.values()), self.profile.robot.command
-                ),
+                "command": next(iter(self._parts.values())).follower.guard.mode,
                 "lockstep": self.lockstep,
                 "fault": self.fault,
             }
@@ -242,50 +181,63 @@ class SimDriver(RobotDriver):
 
 
 class SimPart(RobotDriver):
-    """One of several arms of the simulated robot.
+    """One arm of the simulated robot; the first one steps the world of all.
 
-    Args:
-        sim: the driver of all of them.
-        part: its name.
+    Attributes:
+        follower: of its command streams, once the node is on the bus.
+        reference: towards which the next step goes.
     """
 
     name, simulated = "sim", True
 
     def __init__(self, sim: SimDriver, part: str) -> None:
         super().__init__(sim.profile.of_part(part))
-        self._sim, self._part = sim, part
-        self._is_first = part == next(iter(sim.profile.parts))
+        self._sim, self._arm = sim, sim.world.parts[part]
+        self._is_first = part == sim.profile.part_names[0]
+        self._state_every = _every(sim.profile.timing.state_hz)
+        self._newest: Measurement | None = None
         self.modes, self.period_s, self.lockstep = sim.modes, sim.period_s, sim.lockstep
+        self.reference: PoseReference | JointReference = self._arm.hold_reference()
 
-    def attach(self, node: Node, follower: CommandFollower | None) -> None:
+    def attach(self, node: Node, follower: CommandFollower) -> None:
         """Begin where the arm stands."""
         super().attach(node, follower)
-        self._sim.lead(self._part, follower)
+        self.follower, self.reference = follower, follower.guard.reference
 
     def move(self, reference: PoseReference | JointReference, now_ns: int) -> None:
         """Set the reference and the stamp of the next step."""
-        self._sim.move(reference, now_ns, self._part)
+        self.reference, self._sim.stamp_ns = reference, now_ns
 
     def grip(self, command: GripperCommand, now_ns: int) -> None:
-        """Open or close."""
-        self._sim.grip(command, now_ns, self._part)
+        force_n = max(command.force_n, LEAST_FORCE_N)
+        self._arm.set_gripper(command.width_m, command.speed_m_s, force_n)
 
     def read(self, mono_ns: int) -> Measurement | None:
-        """State of the arm; the first part steps the world of all."""
+        """State of the arm at multiples of the period of ``timing.state_hz``."""
         sim = self._sim
         if self._is_first:
             sim.step_world(mono_ns)
         self.fault, self.measured_ns = sim.fault, sim.measured_ns
-        return sim.measure(self._part)
+        return None if sim.ticks % self._state_every else self.measure()
+
+    def measure(self) -> Measurement:
+        """State of the arm after the last step."""
+        arm, stamp_ns = self._arm, self._sim.stamp_ns
+        if self.fault and self._newest is not None:  # a diverged state may not be finite
+            return self._newest._replace(stamp_ns=stamp_ns)
+        pose = arm.pose_state(self.reference)
+        self._newest = Measurement(
+            stamp_ns, arm.joint_state(), Pose(*arm.tcp()), pose, arm.gripper_state()
+        )
+        return self._newest
 
     def state_now(self) -> Measured:
-        """State of the arm in the world."""
-        return self._sim.state_now(self._part)
+        state = self._arm.joint_state()
+        return Measured(Pose(*self._arm.tcp()), state.position_rad, state.velocity_rad_s)
 
     @property
     def joint_range_rad(self) -> tuple[FloatArray, FloatArray]:
-        """Joint limits of the arm."""
-        return self._sim.world.parts[self._part].joint_range_rad
+        return self._arm.joint_range_rad
 
 
 class _SimKeys:

@@ -22,39 +22,44 @@ def driver() -> SimDriver:
 
 
 def run(driver: SimDriver, reference: PoseReference | JointReference, steps: int = 1500) -> None:
+    arm = driver.parts[""]
     for step in range(1, steps + 1):
         driver.poll(step * STEP_NS)
-        driver.move(reference, step * STEP_NS)
-        driver.read(step * STEP_NS)
+        arm.move(reference, step * STEP_NS)
+        arm.read(step * STEP_NS)
 
 
 def test_it_goes_to_a_pose(driver: SimDriver) -> None:
     driver.reset(None)
-    here = driver.state_now().pose
+    here = driver.parts[""].state_now().pose
     wanted_m = here.position_m + [0.0, 0.0, 0.02]
     run(driver, PoseReference(wanted_m, here.rotation, STILL, STILL))
-    np.testing.assert_allclose(driver.state_now().pose.position_m, wanted_m, atol=SETTLED_M)
+    np.testing.assert_allclose(
+        driver.parts[""].state_now().pose.position_m, wanted_m, atol=SETTLED_M
+    )
 
 
 def test_it_goes_to_joint_positions(driver: SimDriver) -> None:
     driver.reset(None)
-    wanted_rad = driver.state_now().position_rad + 0.05
+    wanted_rad = driver.parts[""].state_now().position_rad + 0.05
     zeros = np.zeros(len(wanted_rad))
     run(driver, JointReference(wanted_rad, zeros, zeros))
-    np.testing.assert_allclose(driver.state_now().position_rad, wanted_rad, atol=SETTLED_RAD)
+    np.testing.assert_allclose(
+        driver.parts[""].state_now().position_rad, wanted_rad, atol=SETTLED_RAD
+    )
 
 
 def test_measurements_come_at_the_state_rate(driver: SimDriver) -> None:
     driver.reset(None)
-    found = [driver.read(step * STEP_NS) for step in range(1, 1001)]
+    found = [driver.parts[""].read(step * STEP_NS) for step in range(1, 1001)]
     count = sum(measurement is not None for measurement in found)
     assert count == pytest.approx(driver.profile.timing.state_hz, rel=0.01)
 
 
 def test_the_gripper_closes(driver: SimDriver) -> None:
     driver.reset(None)
-    driver.grip(GripperCommand(0.0, 0.1, 20.0), 0)
-    here = driver.state_now().pose
+    driver.parts[""].grip(GripperCommand(0.0, 0.1, 20.0), 0)
+    here = driver.parts[""].state_now().pose
     run(driver, PoseReference(here.position_m, here.rotation, STILL, STILL))
     assert driver.world.gripper_state().width_m < SHUT_M
 
@@ -67,7 +72,7 @@ def test_a_reset_puts_the_arm_home_and_is_counted(driver: SimDriver) -> None:
     driver.status_changed()
     driver.reset(5)
     home_rad = driver.profile.robot.home_rad
-    np.testing.assert_allclose(driver.state_now().position_rad, home_rad, atol=1e-9)
+    np.testing.assert_allclose(driver.parts[""].state_now().position_rad, home_rad, atol=1e-9)
     assert report.counters["sim.resets"] == before + 1
     assert driver.status_changed()
     assert not driver.status_changed()

@@ -175,8 +175,8 @@ class Ros2Driver(RobotDriver):
             self.away = "" if heard else "not_heard"
             self.gripper_mode = "ready" if heard else f"not listening at {self._output.topic[:100]}"
             if self._follower.accepting:
-                follower = self._follower
-                self.gripper.poll(follower.writer, writer_active=follower.writer_active)
+                guard = self._follower.guard
+                self.gripper.poll(guard.writer, writer_active=guard.writer_active)
         while self._deferred:
             self._deferred.popleft()()
         self._check_peers()
