@@ -41,11 +41,7 @@ class StampFilter:
         self._stamp_ns = -1
 
     def check(self, stamp_ns: int) -> None:
-        """Validate a stamp.
-
-        Raises:
-            CodecError: ``frozen`` (the same again) or ``out_of_order``.
-        """
+        """Raise a `CodecError` if it is ``frozen`` (the same again) or ``out_of_order``."""
         if stamp_ns == self._stamp_ns:
             raise CodecError("frozen", f"the stamp {stamp_ns} came again")
         if self._stamp_ns - RESTARTED_NS < stamp_ns < self._stamp_ns:
@@ -88,10 +84,6 @@ class RobotClock:
 class JointReading:
     """Newest state of one arm and its gripper, from its joint states.
 
-    Args:
-        profile: of the robot.
-        kinematics: of the robot.
-
     Attributes:
         joints: the newest, None before the first; `stamp_ns` is theirs.
         width_m: opening of the gripper, None before the first; `width_stamp_ns` is its.
@@ -117,11 +109,7 @@ class JointReading:
         self.efforts_missing = 0
 
     def take(self, joints: Joints, stamp_ns: int) -> JointState | None:
-        """Process a message; returns the arm's joints in it, None if it has none of the arm.
-
-        Args:
-            joints: the message.
-            stamp_ns: its own, or when it arrived where it has none.
+        """Process a message of `stamp_ns`; the arm's joints in it, None if it has none of them.
 
         Raises:
             CodecError: ``frozen``, ``out_of_order``, ``partial`` (some of the arm's joints), or
@@ -222,18 +210,10 @@ class JointReading:
         return GripperState(min(max(self.width_m, 0.0), 1.0), moving, held and not moving)
 
 
-def pose_state(
-    pose: Pose, twist: FloatArray, wrench: FloatArray | None, reference: Pose | None
-) -> PoseState:
-    """A record of a TCP pose."""
-    return PoseState(
-        pose.position_m,
-        quat_from_rotation(pose.rotation),
-        twist,
-        wrench,
-        None if reference is None else reference.position_m,
-        None if reference is None else quat_from_rotation(reference.rotation),
-    )
+def pose_state(pose: Pose, twist: FloatArray, wrench: FloatArray | None) -> PoseState:
+    """A record of a TCP pose, without its reference."""
+    quat_xyzw = quat_from_rotation(pose.rotation)
+    return PoseState(pose.position_m, quat_xyzw, twist, wrench, None, None)
 
 
 def _finite(what: str, values: FloatArray) -> FloatArray:

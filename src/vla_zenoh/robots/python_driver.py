@@ -8,21 +8,34 @@ from __future__ import annotations
 import operator
 import time
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from vla_zenoh.bus.metrics import RateMeter
 from vla_zenoh.errors import NodeError, ProfileError, in_words
+from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.policy.loader import make_robot
 from vla_zenoh.profile import Profile
-from vla_zenoh.robot import Reading
+from vla_zenoh.robot import Reading, numbers
 from vla_zenoh.robots.driver import DriverStatus, Measurement, RobotDriver, command_of
-from vla_zenoh.robots.python_reading import MAX_WORDS, Fault, PythonReading
+from vla_zenoh.robots.joint_reading import JointReading, pose_state
+from vla_zenoh.ros2.samples import Joints
 from vla_zenoh.sanitize import one_line
-from vla_zenoh.types import Event, GripperCommand, GripperState
+from vla_zenoh.types import Event, FloatArray, GripperCommand, GripperState
 from vla_zenoh.types.commands import JointReference, PoseReference
 
 FUTURE_NS = 100_000_000
+MAX_WORDS = 300
+FAULT_NS = 200_000_000
+"""A fault lasts at least this long: only the newest state is used, and a single one could be
+missed."""
+BUILT_IN = {
+    "franka": ("franka.arm", "FrankaArm"),
+    "ur": ("ur_arm", "UrArm"),
+    "lerobot": ("lerobot_arm", "LeRobotArm"),
+}
+"""Modules and classes, imported when used: the library of each is an extra."""
 RELEASED_M = 0.002
 """Fingers that are this much wider apart than around an object were opened."""
 
@@ -75,11 +88,9 @@ class PythonDriver(RobotDriver):
             raise NodeError(f"{self._called}: {name}: {words}") from error
 
     def connect(self) -> None:
-        """Connect."""
         self._call("connect")
 
     def recover(self) -> None:
-        """Begin to clear the robot's errors."""
         self._call("recover")
 
     def read(self, mono_ns: int) -> Measurement | None:
@@ -131,17 +142,14 @@ class PythonDriver(RobotDriver):
             self.report.emit(Event("warning", "notice", "object_lost", why))
 
     def move(self, reference: PoseReference | JointReference, now_ns: int) -> None:
-        """Give the robot its set-point."""
         self._call("move", command_of(reference, self.profile.robot.arm_joints))
         self.report.counters["arm.commands_given"] += 1
 
     def grip(self, command: GripperCommand, now_ns: int) -> None:
-        """Ask for an opening."""
         self._asked_m = command.width_m
         self._call("grip", command.width_m, command.speed_m_s, command.force_n)
 
     def close(self) -> None:
-        """Disconnect."""
         self._call("close")
 
     def status(self) -> DriverStatus:
@@ -170,18 +178,9 @@ def file_of(profile: Profile) -> Path | None:
 
 def make_arm(profile: Profile) -> tuple[Any, str]:
     """The robot of a profile, and its name in messages."""
-    if profile.robot.driver == "franka":
-        from vla_zenoh.robots.franka.arm import FrankaArm  # its library is an extra
-
-        return FrankaArm(profile), "franka"
-    if profile.robot.driver == "ur":
-        from vla_zenoh.robots.ur_arm import UrArm
-
-        return UrArm(profile), "ur"
-    if profile.robot.driver == "lerobot":
-        from vla_zenoh.robots.lerobot_arm import LeRobotArm
-
-        return LeRobotArm(profile), "lerobot"
+    if (driver := profile.robot.driver) in BUILT_IN:
+        module, name = BUILT_IN[driver]
+        return getattr(import_module(f"vla_zenoh.robots.{module}"), name)(profile), driver
     if profile.arm is None:
         raise ProfileError(
             f"profile {profile.name!r} has no section arm, which names a Python file: "
@@ -205,3 +204,57 @@ def _measured_ns(reading: Reading) -> int:
     if measured_ns > now_ns + FUTURE_NS:
         raise ValueError("measured_ns is in the future; use time.monotonic_ns()")
     return measured_ns
+
+
+class PythonReading:
+    """Validates the readings of one arm, and converts them to our records."""
+
+    def __init__(self, profile: Profile, kinematics: Kinematics) -> None:
+        self._names = profile.robot.arm_joints
+        self._state = JointReading(profile, kinematics)
+
+    def take(self, reading: Reading, stamp_ns: int, asked_m: float) -> Measurement:
+        """Convert a reading that was measured at `stamp_ns` (wall clock).
+
+        If it has no width, that is `asked_m`, the last commanded one.
+
+        Raises:
+            ValueError: a value is not a number, or impossible for this arm; it rejects all.
+        """
+        count = len(self._names)
+
+        def maybe(name: str, size: int) -> FloatArray | None:
+            given = getattr(reading, name)
+            return None if given is None else numbers(name, given, size)
+
+        joints = Joints(
+            stamp_ns,
+            self._names,
+            numbers("position_rad", reading.position_rad, count),
+            maybe("velocity_rad_s", count),
+            maybe("effort_nm", count),
+        )
+        wrench = maybe("wrench", 6)
+        width_m = asked_m if reading.width_m is None else reading.width_m
+        gripper = GripperState(width_m, reading.moving, reading.holding)
+        taken = self._state.take(joints, stamp_ns)
+        assert taken is not None
+        tcp, twist = self._state.tcp()
+        return Measurement(stamp_ns, taken, tcp, pose_state(tcp, twist, wrench), gripper)
+
+
+class Fault:
+    """Why the robot does not move: from a reading that reports a fault until one that does not."""
+
+    def __init__(self) -> None:
+        self.words = ""
+        self._since_ns = 0
+
+    def say(self, words: object, now_ns: int) -> bool:
+        """Update from a reading's fault, empty or None if it has none; whether `words` changed."""
+        before = self.words
+        if words:
+            self.words, self._since_ns = one_line(words, MAX_WORDS)[:MAX_WORDS], now_ns
+        elif now_ns - self._since_ns >= FAULT_NS:
+            self.words = ""
+        return self.words != before

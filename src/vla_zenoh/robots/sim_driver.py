@@ -119,7 +119,6 @@ class SimDriver(RobotDriver):
         self._was_reset = True
 
     def status_changed(self) -> bool:
-        """Whether there was a reset."""
         was_reset, self._was_reset = self._was_reset, False
         return was_reset
 

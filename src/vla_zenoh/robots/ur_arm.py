@@ -83,6 +83,7 @@ class UrArm:
     def __init__(self, profile: Profile) -> None:
         assert profile.ur is not None
         self._profile, self._settings = profile, profile.ur
+        self.address = profile.ur.address
         self._library = load_ur_rtde()
         self._period_s = 1.0 / profile.timing.command_hz
         kinematics = make_kinematics(profile)
@@ -180,7 +181,7 @@ class UrArm:
             NodeError: the robot has been silent for too long; the node restarts.
         """
         self._update()
-        if self._lost(self._receive):
+        if self._silent_s > LOST_S:
             raise NodeError(
                 f"{self.address}: connection lost; the robot's watchdog stops its program, and "
                 "holds the arm"
@@ -212,13 +213,9 @@ class UrArm:
         if robot_s != self._robot_s:  # unchanged: the robot is silent
             self._robot_s, self._measured_ns = robot_s, time.monotonic_ns()
 
-    def _lost(self, receive: Any) -> bool:
-        """Silence, because the library's own connection flag means nothing for the first
-        seconds."""
-        return receive is not None and self._silent_s > LOST_S
-
     @property
     def _silent_s(self) -> float:
+        """Silence: the library's own connection flag means nothing for the first seconds."""
         return (time.monotonic_ns() - self._measured_ns) / 1e9
 
     def _fault(self) -> str:
@@ -227,9 +224,12 @@ class UrArm:
             return ""
         return f"safety mode {safety}" + (f": {self._stopped}" if self._stopped else "")
 
+    @property
+    def _busy(self) -> bool:
+        return self._starting is not None and self._starting.is_alive()
+
     def _stopped_why(self) -> str:
-        busy = self._starting is not None and self._starting.is_alive()
-        if self._started or busy or self._mode() != RUNNING:
+        if self._started or self._busy or self._mode() != RUNNING:
             return ""
         return f"{self._stopped}; `vla-zenoh reset` starts it"
 
@@ -272,7 +272,7 @@ class UrArm:
         if not (self._started and self._watched):
             return  # reported as a fault; only `recover` ends it
         self._update()
-        if self._lost(self._receive):
+        if self._silent_s > LOST_S:
             raise NodeError(f"{self.address}: connection lost")
         settings, self._sent_ns = self._settings, time.monotonic_ns()
         # Speed and acceleration are not used by servoj.
@@ -287,8 +287,7 @@ class UrArm:
 
     def recover(self) -> None:
         """Release a protective stop and start the control program, in a thread."""
-        busy = self._starting is not None and self._starting.is_alive()
-        if not busy and not self._started:
+        if not self._busy and not self._started:
             self._starting = threading.Thread(target=self._recover, name="recovery", daemon=True)
             self._starting.start()
 
@@ -309,11 +308,6 @@ class UrArm:
             self._start()
 
     # -- for `robot check` --------------------------------------------------------------------
-    @property
-    def address(self) -> str:
-        """Address of the control box."""
-        return self._settings.address
-
     @property
     def safety_mode(self) -> str:
         """UR's name of the safety mode."""
@@ -340,15 +334,9 @@ def _wait(for_it: Any, timeout_s: float) -> bool:
 
 
 def load_ur_rtde() -> Mapping[str, Any]:
-    """Modules of the library.
-
-    Raises:
-        MissingExtraError: it is not installed.
-    """
+    """Modules of the library, or a `MissingExtraError`."""
+    modules = "rtde_control", "rtde_receive", "dashboard_client"
     try:
-        return {
-            name: import_module(name)
-            for name in ("rtde_control", "rtde_receive", "dashboard_client")
-        }
+        return {name: import_module(name) for name in modules}
     except ImportError as error:
         raise MissingExtraError("ur_rtde", "ur") from error

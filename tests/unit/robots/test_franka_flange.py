@@ -8,7 +8,7 @@ import pytest
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.lab.doctor.franka_limits import BY_FCI, Published
 from vla_zenoh.profile import Profile, load_profile
-from vla_zenoh.robots.franka.flange import flange_pose
+from vla_zenoh.robots.franka.arm import flange_pose
 
 EXACT_M = EXACT_RAD = 1e-9
 FINGERS_M = 0.1034

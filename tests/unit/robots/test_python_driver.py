@@ -11,8 +11,7 @@ import pytest
 from vla_zenoh.errors import NodeError
 from vla_zenoh.profile import load_profile
 from vla_zenoh.robots.driver import Report
-from vla_zenoh.robots.python_driver import PythonDriver
-from vla_zenoh.robots.python_reading import FAULT_NS
+from vla_zenoh.robots.python_driver import FAULT_NS, PythonDriver
 from vla_zenoh.types import Event, GripperCommand, JointCommand
 from vla_zenoh.types.commands import JointReference
 

@@ -11,7 +11,7 @@ import pytest
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.profile import load_profile
 from vla_zenoh.robot import Reading
-from vla_zenoh.robots.python_reading import FAULT_NS, MAX_WORDS, Fault, PythonReading
+from vla_zenoh.robots.python_driver import FAULT_NS, MAX_WORDS, Fault, PythonReading
 
 PROFILE = load_profile("panda_sim")
 KINEMATICS = make_kinematics(PROFILE)

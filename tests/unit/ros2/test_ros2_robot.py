@@ -122,7 +122,7 @@ def test_whatever_joints_are_told_a_pose_can_be_made_of_what_is_taken(
     )
     with contextlib.suppress(CodecError):
         arm.take(told, 1 + later_ns)
-    pose_state(*arm.tcp(), None, None)
+    pose_state(*arm.tcp(), None)
     arm.gripper(busy=False, wanted_m=None, held=False)
 
 

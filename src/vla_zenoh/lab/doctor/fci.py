@@ -21,8 +21,7 @@ from vla_zenoh.lab.doctor.finding import HostFinding, Level
 from vla_zenoh.lab.doctor.franka_limits import BY_FCI, JOINTS
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.robot import FrankaProfile
-from vla_zenoh.robots.franka.arm import FrankaArm, error_names
-from vla_zenoh.robots.franka.flange import flange_pose
+from vla_zenoh.robots.franka.arm import FrankaArm, error_names, flange_pose
 
 REALTIME_KERNEL = Path("/sys/kernel/realtime")
 NETWORK = Path("/sys/class/net")

@@ -8,6 +8,7 @@ controller holds the arm where it stands.
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -24,9 +25,7 @@ from vla_zenoh.kinematics.so3 import exp3, log3, quat_from_rotation, rotation_fr
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.robot import FrankaLoad
 from vla_zenoh.robot import Command, Reading
-from vla_zenoh.robots.franka.flange import flange_pose
 from vla_zenoh.robots.franka.hand import Hand
-from vla_zenoh.robots.franka.trim import Trim
 from vla_zenoh.runtime.scheduling import realtime_children
 from vla_zenoh.types import FloatArray, JointCommand
 
@@ -40,6 +39,23 @@ MOST_JOINT_NM = np.array([40.0, 40.0, 40.0, 40.0, 9.0, 9.0, 9.0])
 """Torque limits of the joints' springs."""
 LONGEST_S = 0.02
 """Longest time between two set-points that the trim integrates over."""
+_TURN = math.pi / 2
+CRAIG = (
+    # a (m), d (m), alpha (rad)
+    (0.0, 0.333, 0.0),
+    (0.0, 0.0, -_TURN),
+    (0.0, 0.316, _TURN),
+    (0.0825, 0.0, _TURN),
+    (-0.0825, 0.384, -_TURN),
+    (0.0, 0.0, _TURN),
+    (0.088, 0.0, _TURN),
+)
+"""Denavit-Hartenberg parameters of joint 1 to 7, in Craig's convention."""
+FLANGE_M = 0.107
+"""From the frame of joint 7 to the flange, along z."""
+INTEGRAL_S, PROPORTION = 0.2, 1.5
+MOST_M, MOST_RAD, MOST_JOINT_RAD = 0.008, 0.03, 0.008
+"""Limits. Friction of an FR3 takes half of them at the stiffness of its profile."""
 READY = frozenset({"Idle", "Move"})
 STOPPED = frozenset({"Reflex", "UserStopped"})
 """Robot modes that are a fault. In the others the robot is healthy but follows no commands."""
@@ -78,12 +94,10 @@ class FrankaArm:
         franky, address = self._franky, self._settings.address
         enforce = self._settings.realtime == "enforce"
         realtime = franky.RealtimeConfig.Enforce if enforce else franky.RealtimeConfig.Ignore
-
-        def reach() -> Any:
-            return franky.Robot(address, realtime_config=realtime)
-
         try:
-            self._robot = _in_time(reach, f"{address}: connecting")
+            self._robot = _in_time(
+                lambda: franky.Robot(address, realtime_config=realtime), f"{address}: connecting"
+            )
             if self._settings.hand:
                 gripper = _in_time(lambda: franky.Gripper(address), f"{address}: the hand")
                 self._hand = Hand(gripper)
@@ -344,11 +358,7 @@ def at_rest(command: Command) -> Command:
 
 
 def _in_time(make: Callable[[], Any], what: str) -> Any:
-    """Result of `make`, with a timeout: the library itself waits for ever.
-
-    Raises:
-        NodeError: it took longer than `CONNECT_S`.
-    """
+    """Result of `make`, or a `NodeError` after `CONNECT_S`: the library itself waits for ever."""
     done: list[Any] = []
     failed: list[BaseException] = []
 
@@ -369,11 +379,7 @@ def _in_time(make: Callable[[], Any], what: str) -> Any:
 
 
 def load_franky() -> Any:
-    """The library.
-
-    Raises:
-        MissingExtraError: it is not installed.
-    """
+    """The library, or a `MissingExtraError`."""
     try:
         return import_module("franky")
     except ImportError as error:
@@ -389,3 +395,56 @@ def inertia_rows(load: FrankaLoad) -> list[float]:
     """The (3, 3) inertia of a load, row by row."""
     xx, yy, zz, xy, xz, yz = load.inertia_kg_m2
     return [xx, xy, xz, xy, yy, yz, xz, yz, zz]
+
+
+def flange_pose(position_rad: FloatArray) -> FloatArray:
+    """(4, 4): the flange in the base frame, with the joints at `position_rad` (7,).
+
+    Source: "Robot and interface specifications" of the Franka Control Interface documentation; the
+    same for Panda and FR3.
+    """
+    pose = np.eye(4)
+    for (a, d, alpha), theta in zip(CRAIG, position_rad, strict=True):
+        ct, st, ca, sa = math.cos(theta), math.sin(theta), math.cos(alpha), math.sin(alpha)
+        pose = pose @ np.array(
+            [
+                [ct, -st, 0.0, a],
+                [st * ca, ct * ca, -sa, -d * sa],
+                [st * sa, ct * sa, ca, d * ca],
+                [0.0, 0.0, 0.0, 1.0],
+            ]
+        )
+    pose[:3, 3] += FLANGE_M * pose[:3, 2]
+    return pose
+
+
+class Trim:
+    """Compensates joint friction: a bounded correction that is added to a motion's set-points.
+
+    A spring stops short of its goal by the friction divided by its stiffness. The integral part
+    removes that over time; alone it overshoots and creeps from side to side, which the proportional
+    part prevents. `columns` are 6 for a pose (m, rad), 7 for joints (rad).
+    """
+
+    def __init__(self, columns: int) -> None:
+        self._poses = columns == 6
+        self._integral: FloatArray = np.zeros(columns)
+
+    def update(self, left: FloatArray, elapsed_s: float) -> FloatArray:
+        """The correction for `left`, set-point minus measured value, `elapsed_s` after the last."""
+        self._integral = self._bounded(self._integral + elapsed_s / INTEGRAL_S * left)
+        return self._bounded(self._integral + PROPORTION * left)
+
+    def emptied(self) -> Trim:
+        """A correction that starts from zero."""
+        return Trim(len(self._integral))
+
+    def _bounded(self, trim: FloatArray) -> FloatArray:
+        if not self._poses:
+            return np.clip(trim, -MOST_JOINT_RAD, MOST_JOINT_RAD)
+        return np.concatenate((_shortened(trim[:3], MOST_M), _shortened(trim[3:], MOST_RAD)))
+
+
+def _shortened(vector: FloatArray, most: float) -> FloatArray:
+    """`vector` (3,), shortened to a length of `most`."""
+    return vector * min(1.0, most / max(float(np.linalg.norm(vector)), 1e-12))

@@ -28,8 +28,6 @@ class GripRequest(NamedTuple):
 
 
 class HandState(NamedTuple):
-    """Newest state of the hand."""
-
     width_m: float
     moving: bool
     holding: bool
@@ -38,11 +36,8 @@ class HandState(NamedTuple):
 class Hand:
     """Runs the motions of a hand.
 
-    The library's calls block until the fingers arrive, so they run here. A new request interrupts
-    the one in progress; requests in between are dropped.
-
-    Args:
-        gripper: franky's.
+    The calls of franky's `gripper` block until the fingers arrive, so they run here. A new request
+    interrupts the one in progress; requests in between are dropped.
 
     Attributes:
         fault: why the hand does not answer; empty: it does.

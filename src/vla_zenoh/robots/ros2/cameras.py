@@ -35,8 +35,7 @@ class Camera:
         node: on the bus; the thread uses only its publishers and clock.
         graph: the ROS graph.
         messages: of the robot's distribution, for this thread alone.
-        emit: emits an event; may be called from any thread.
-        reject: counts a rejection; may be called from any thread.
+        emit, reject: report an event or a rejection; may be called from any thread.
     """
 
     def __init__(

@@ -131,11 +131,10 @@ class Ros2Driver(RobotDriver):
         Raises:
             ProfileError: the type cannot carry the commands.
         """
-        posture_rad = np.array(self.profile.robot.home_rad)
         if self.profile.robot.command == "joint":
             lead_ns = round(LEAD_PERIODS * self.period_s * 1e9)
             return joint_writer(self._messages, output.type, lead_ns)
-        return pose_writer(self._messages, output.type, posture_rad)
+        return pose_writer(self._messages, output.type, np.array(self.profile.robot.home_rad))
 
     # -- for the threads ----------------------------------------------------------------------
     def _emit(self, event: Event) -> None:
@@ -193,7 +192,7 @@ class Ros2Driver(RobotDriver):
         assert joints is not None
         try:
             tcp, twist = states.state.tcp()
-            record = pose_state(tcp, twist, states.wrench(stamp_ns), None)
+            record = pose_state(tcp, twist, states.wrench(stamp_ns))
         except RecordError as error:  # finite, but too large for a record
             topic = self._ros2.joint_states
             self._node.reject("invalid", f"{topic}: {error}", topic)
@@ -203,12 +202,11 @@ class Ros2Driver(RobotDriver):
     def move(self, reference: PoseReference | JointReference, now_ns: int) -> None:
         """Publish a set-point."""
         command = command_of(reference, self.profile.robot.arm_joints)
-        stamp = Stamp(now_ns, self._frame)
-        self._writer.publish(self._messages.encode(self._write(command, stamp)))
+        message = self._write(command, Stamp(now_ns, self._frame))
+        self._writer.publish(self._messages.encode(message))
         self._node.counters["ros2.commands_sent"] += 1
 
     def grip(self, command: GripperCommand, now_ns: int) -> None:
-        """Send the gripper a goal."""
         self.gripper.move(command, now_ns)
 
     def _width_m(self) -> float | None:

@@ -11,7 +11,7 @@ from typing import Any
 from vla_zenoh.bus.node import Node
 from vla_zenoh.errors import CodecError
 from vla_zenoh.profile.ros2 import GRIPPER_ACTIONS, Ros2Gripper
-from vla_zenoh.robots.ros2.ros_graph import RosGraph, ServiceClient
+from vla_zenoh.robots.ros2.ros_graph import CALL_S, RosGraph, ServiceClient
 from vla_zenoh.ros2 import gripper_actions
 from vla_zenoh.ros2.gripper_actions import GRASP, ActionGoal, GoalSequencer, GoalStep
 from vla_zenoh.ros2.keys import COMMAND
@@ -52,9 +52,7 @@ class Gripper:
         self._measured_m, self._sent_m = width, self._limits.max_width_m
         self._goals = GoalSequencer(GOAL_TIMEOUT_S, self._limits.max_width_m)
         self._answers: deque[Callable[[], None]] = deque()
-        self._goal_id = b""
-        self._action = ""
-        self._writer = ""
+        self._goal_id, self._action, self._writer = b"", "", ""
         self.wanted_m: float | None = None
         self._held = False
         self._clients: dict[str, dict[str, ServiceClient]] = {}
@@ -91,9 +89,7 @@ class Gripper:
     def poll(self, writer: str, *, writer_active: bool) -> None:
         """Handle answers, and send or cancel the goal that is due.
 
-        Args:
-            writer: source whose commands the arm follows; empty: none.
-            writer_active: see `ArmGuard.writer_active`.
+        The arm follows the commands of `writer`, see `ArmGuard.writer` and ``writer_active``.
         """
         if self._writer and not writer_active:
             self._drop_waiting()
@@ -165,7 +161,7 @@ class Gripper:
         part: str,
         request: Any,
         done: Callable[[bytes | None], None],
-        timeout_s: float | None = None,
+        timeout_s: float = CALL_S,
     ) -> None:
         # Answers come on Zenoh's thread and are handled by the next `poll`.
         self._clients[self._action][part].call(

@@ -40,10 +40,11 @@ _COMMANDS: dict[str, Any] = {
 }
 MAX_ATTACHMENT_BYTES = 1024
 _CDR = zenoh.Encoding("application/cdr")
+_ALL_COMPLETE = zenoh.QueryTarget.ALL_COMPLETE
 
 
 class RosPublisher:
-    """Publishes one topic."""
+    """Publishes CDR bytes on one topic."""
 
     def __init__(self, session: zenoh.Session, key: str, gid: bytes | None) -> None:
         self._publisher = session.declare_publisher(key, encoding=_CDR, **_COMMANDS)
@@ -56,28 +57,22 @@ class RosPublisher:
         return self._publisher.matching_status.matching  # pyright: ignore  # stub says bool
 
     def publish(self, payload: bytes) -> None:
-        """Publish CDR bytes."""
         self._publisher.put(payload, attachment=_attachment(self._gid, self._seq))
 
 
 class ServiceClient:
     """Client of one service."""
 
-    def __init__(
-        self, session: zenoh.Session, key: str, gid: bytes | None, timeout_s: float
-    ) -> None:
-        self._session, self._key, self._gid, self._timeout_s = session, key, gid, timeout_s
+    def __init__(self, session: zenoh.Session, key: str, gid: bytes | None) -> None:
+        self._session, self._key, self._gid = session, key, gid
         self._seq = itertools.count(1)
 
     def call(
-        self, request: bytes, done: Callable[[bytes | None], None], timeout_s: float | None = None
+        self, request: bytes, done: Callable[[bytes | None], None], timeout_s: float = CALL_S
     ) -> None:
-        """Call the service; `done` is called once, on Zenoh's thread.
+        """Call the service with a `request` in CDR.
 
-        Args:
-            request: CDR bytes.
-            done: receives the answer in CDR, or None after the timeout.
-            timeout_s: None: that of the client.
+        `done` is called once, on Zenoh's thread, with the answer in CDR, or None after the timeout.
         """
         answers: list[bytes] = []
 
@@ -95,12 +90,9 @@ class ServiceClient:
             payload=request,
             encoding=_CDR,
             attachment=_attachment(self._gid, self._seq),
-            timeout=self._timeout_s if timeout_s is None else timeout_s,
+            timeout=timeout_s,
             target=zenoh.QueryTarget.BEST_MATCHING if self._gid is None else _ALL_COMPLETE,
         )
-
-
-_ALL_COMPLETE = zenoh.QueryTarget.ALL_COMPLETE
 
 
 def _attachment(gid: bytes | None, seq: itertools.count[int]) -> bytes | None:
@@ -114,8 +106,7 @@ class Request:
 
     def __init__(self, query: zenoh.Query, key: str, with_attachment: bool) -> None:
         self._query, self._key = query, key
-        payload = query.payload
-        self.payload = bytes_of(payload)
+        self.payload = bytes_of(query.payload)
         self._attachment: Attachment | None = None
         if with_attachment:
             attachment = query.attachment
@@ -125,8 +116,7 @@ class Request:
 
     def answer(self, response: bytes) -> None:
         """Reply with CDR bytes, and with number and gid of the request."""
-        given = self._attachment
-        attachment = None
+        given, attachment = self._attachment, None
         if given is not None:
             attachment = attachments.encode(Attachment(given.seq, time.time_ns(), given.gid))
         with self._query:
@@ -192,7 +182,7 @@ class RosGraph:
             return len(self._others)
 
     def _declare(self, endpoint: Endpoint) -> tuple[str, bytes | None]:
-        """Declare an endpoint; returns its key, and its gid if the wire format has gids."""
+        """Declare an endpoint; its key, and its gid if the wire format has gids."""
         token = self._wire.token(endpoint, next(self._numbers))
         self._declared.append(self.session.liveliness().declare_token(token))
         return self._wire.key(endpoint), attachments.gid_of(token) if self._rmw else None
@@ -225,20 +215,20 @@ class RosGraph:
         handler = zenoh.handlers.Callback(handle, indirect=False)
         self._declared.append(self.session.declare_queryable(key, handler, complete=True))
 
-    def client(self, name: str, kind: str, timeout_s: float = CALL_S) -> ServiceClient:
+    def client(self, name: str, kind: str) -> ServiceClient:
         """Client of a service."""
         endpoint = Endpoint(EntityRole.CLIENT, name, kind)
-        return ServiceClient(self.session, *self._declare(endpoint), timeout_s)
+        return ServiceClient(self.session, *self._declare(endpoint))
 
     def action_client(self, name: str, kind: str) -> dict[str, ServiceClient]:
         """Clients of an action's services: ``send_goal``, ``get_result``, ``cancel_goal``."""
         action = Endpoint(EntityRole.ACTION_CLIENT, name, kind)
         parts = parts_of(action)
         if self._rmw:  # there every part is declared; a bridge needs only the action
-            return {part: self.client(end.name, end.type, CALL_S) for part, end in parts.items()}
+            return {part: self.client(end.name, end.type) for part, end in parts.items()}
         self._declare(action)
         return {
-            part: ServiceClient(self.session, self._wire.key(end), None, CALL_S)
+            part: ServiceClient(self.session, self._wire.key(end), None)
             for part, end in parts.items()
         }
 

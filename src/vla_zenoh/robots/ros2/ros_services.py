@@ -51,11 +51,7 @@ class EstopOrder:
     """Times of the last emergency stops, of this process and of others.
 
     A reset or an activation that waits, while another call is answered or this process does not
-    run, must not undo a stop that came later and was sent at once.
-
-    Args:
-        session: to subscribe to the stops of others.
-        key: of stops.
+    run, must not undo a stop that came later and was sent at once. Those of others come on `key`.
     """
 
     def __init__(self, session: zenoh.Session, key: str) -> None:
@@ -81,20 +77,12 @@ class EstopOrder:
         return max(self._ours_ns, self._others_ns) > asked_ns
 
     def check(self, asked_ns: int) -> None:
-        """Check that no stop came after `asked_ns`.
-
-        Raises:
-            SessionError: one came.
-        """
+        """Raise a `SessionError` if a stop came after `asked_ns`."""
         if self.overtook(asked_ns):
             raise SessionError("an emergency stop came after this request; send it again")
 
     def unless_stopped(self, asked_ns: int, publish: Callable[[], None]) -> None:
-        """Call `publish`, with no stop of this process between the check and the call.
-
-        Raises:
-            SessionError: a stop came after `asked_ns`.
-        """
+        """Call `publish` after a `check`, with no stop of this process between the two."""
         with self._lock:
             self.check(asked_ns)
             publish()
@@ -127,7 +115,7 @@ class RosServices:
         self._calls: queue.Queue[tuple[Service, Request, int]] = queue.Queue(MAX_WAITING)
         self._called_ns = 0
         self._handlers: dict[str, Callable[[Any], str]] = {
-            SET_ACTIVE.name: self._set_active,
+            SET_ACTIVE.name: lambda asked: self._activate(bool(asked.data)),
             STOP.name: self._stop,
             RESET.name: self._reset,
             SET_PROMPT.name: self._set_prompt,
@@ -162,8 +150,7 @@ class RosServices:
                 self._publish_status()
 
     def _poll_prompts(self) -> None:
-        """Apply the prompts of the topic; a repeated one only if the task has a different one
-        now."""
+        """Apply the prompts of the topic; a repeated one only if the task has another one now."""
         for arrival in self._prompts.drain():
             try:
                 payload = arrival.sample.payload.to_bytes()
@@ -198,9 +185,6 @@ class RosServices:
             text, success = str(error), False
         response = self._messages.new(response_of(service.type), success=success, message=text)
         request.answer(self._messages.encode(response))
-
-    def _set_active(self, asked: Any) -> str:
-        return self._activate(bool(asked.data))
 
     def _activate(self, wanted: bool) -> str:
         if wanted:
@@ -263,9 +247,5 @@ class RosServices:
 
 
 def prompt_text(value: str) -> str:
-    """A prompt as the command node accepts it.
-
-    Raises:
-        CodecError: it is not acceptable.
-    """
+    """A prompt as the command node accepts it, or a `CodecError`."""
     return settings.decode_text(value.encode("utf-8", "surrogatepass"))

@@ -27,13 +27,6 @@ WRENCH_TIMEOUT_NS = 200_000_000
 class StateSubscriber:
     """State of the arm and gripper from the robot's topics.
 
-    Args:
-        node: on the bus; its counters get the rejections.
-        graph: the ROS graph.
-        messages: of the robot's distribution.
-        ros2: the profile's section.
-        kinematics: of the arm.
-
     Attributes:
         state: newest joint states of arm and gripper.
         clock: of the robot.
@@ -63,11 +56,6 @@ class StateSubscriber:
         if ros2.wrench is not None:
             self._wrenches = graph.subscribe(ros2.wrench.topic, WRENCH, CallbackRing(4), SENSOR)
 
-    def update(self) -> bool:
-        """Process the messages that arrived; whether there is a new state of the arm's joints."""
-        self._update_wrench()
-        return self._update_joints()
-
     def wrench(self, stamp_ns: int) -> FloatArray | None:
         """(6,) external wrench in N and Nm, None if there is none for that time."""
         found = self._wrench
@@ -82,7 +70,9 @@ class StateSubscriber:
     def _decode(self, kind: str, arrival: ReceivedSample) -> Any:
         return read(self._messages, kind, arrival.sample.payload.to_bytes())
 
-    def _update_joints(self) -> bool:
+    def update(self) -> bool:
+        """Process the messages that arrived; whether there is a new state of the arm's joints."""
+        self._update_wrench()
         fresh = False
         for buffer in self._joint_states:
             for arrival in buffer.drain():
