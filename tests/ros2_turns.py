@@ -81,7 +81,8 @@ class Turns:
 
     def step(self, stall_s: float = 0.0) -> None:
         self.robot.driver.poll(self.mono_ns)
-        self.arm.step(self.wall_ns, self.mono_ns, stall_s)
+        self.arm.begin_step(self.wall_ns, self.mono_ns, stall_s)
+        self.arm.end_step(self.mono_ns)
 
     def sleep(self, duration_s: float) -> None:
         for ns in ("mono_ns", "wall_ns"):

@@ -11,7 +11,7 @@ from panda_arm import ARM_JOINTS, HOME_RAD, panda
 from ros2_turns import RAMP_S, SPEED_M_S, TICK_NS, TICK_S, Turns, ros2_turns
 
 from vla_zenoh.guard.arm_guard import UNHEEDED_NS
-from vla_zenoh.robots.command_follower import STALLED_NS
+from vla_zenoh.robots.arm import STALLED_NS
 from vla_zenoh.types import GripperState, JointCommand, JointState, PoseCommand, PoseState
 
 STEP_M = 2e-4

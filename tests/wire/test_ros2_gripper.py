@@ -17,8 +17,7 @@ from ros2_rig import write_profile
 from vla_zenoh.bus.clock import Clock
 from vla_zenoh.bus.node import Node, Publisher
 from vla_zenoh.bus.session import open_session
-from vla_zenoh.guard.arm_guard import ArmGuard
-from vla_zenoh.guard.gripper_guard import OLDEST_NS
+from vla_zenoh.guard.arm_guard import OLDEST_NS, ArmGuard
 from vla_zenoh.keys import Kind
 from vla_zenoh.profile import load_profile
 from vla_zenoh.robots.arm import GripperCommands

@@ -1,4 +1,4 @@
-"""Guard of one arm that is commanded by TCP poses or by joint positions, one stream at a time."""
+"""Guards of one arm, commanded by TCP poses or joint positions, and of its gripper."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from vla_zenoh.control.smoothing import ROTATION_BOX
 from vla_zenoh.control.states import OBEYING
+from vla_zenoh.errors import CodecError
 from vla_zenoh.guard.command_guards import (
     JointGuard,
     PoseGuard,
@@ -19,9 +20,10 @@ from vla_zenoh.guard.command_guards import (
 from vla_zenoh.guard.reference_governor import BRAKE_MARGIN
 from vla_zenoh.guard.stream_guard import ACCELERATE_S
 from vla_zenoh.kinematics.so3 import Pose, pose_distance
-from vla_zenoh.profile import Profile
-from vla_zenoh.types import FloatArray, JointCommand, PoseCommand, Stamped
+from vla_zenoh.profile import GripperProfile, Profile
+from vla_zenoh.types import FloatArray, GripperCommand, JointCommand, PoseCommand, Stamped
 from vla_zenoh.types.commands import JointReference, PoseReference
+from vla_zenoh.types.stream import SingleWriterFilter
 
 STANDING_RAD_S = 0.02
 """An arm whose joints are all slower than this stands: its control law may be exchanged."""
@@ -37,6 +39,12 @@ SETTLE_NS = 500_000_000
 MOVED_M, MOVED_RAD = 0.005, 0.02
 """An arm at rest that moves further than this, TCP or any joint, is moved by something else; its
 elbow may move while the TCP stays."""
+
+OLDEST_NS = 1_000_000_000
+"""An older command is rejected: its source may have died or stopped the arm while the command
+waited on a stuck link or in a suspended process."""
+MAX_SOURCES = 64
+"""Sources whose last sequence number is remembered; each start of a command node is one."""
 
 Mode = Literal["pose", "joint"]
 
@@ -84,12 +92,11 @@ class ArmGuard:
 
     @property
     def following(self) -> bool:
-        """A command stream is being followed."""
         return self._active.following
 
     @property
     def moving(self) -> bool:
-        """A stream is being followed, or the last one is still being brought to rest."""
+        """A stream is followed, or the last one is still being brought to rest."""
         return self._active.moving
 
     @property
@@ -133,15 +140,14 @@ class ArmGuard:
     def offer_pose(self, command: Stamped[PoseCommand], now_ns: int) -> str | None:
         """Accept a pose, or return the reason why it is rejected.
 
-        Returns:
-            None, ``inactive`` (no stream begins in a state in which its writer brakes or stands),
-            ``other_mode`` (joints are followed), ``moving`` (the arm moves, so its control law
-            cannot be exchanged), or what `PoseGuard.offer` returns.
+        That is ``inactive`` (no stream begins in a state in which its writer brakes or stands),
+        ``other_mode`` (joints are followed), ``moving`` (the arm moves, so its control law cannot
+        be exchanged), or what `StreamGuard.offer` returns.
         """
         return self._offer("pose", command, now_ns)
 
     def offer_joint(self, command: Stamped[JointCommand], now_ns: int) -> str | None:
-        """Accept joint positions, or return the reason why they are rejected, as `offer_pose`."""
+        """Accept joint positions, or return the reason against them, as `offer_pose`."""
         return self._offer("joint", command, now_ns)
 
     def _offer(self, mode: Mode, command: Stamped[Any], now_ns: int) -> str | None:
@@ -200,13 +206,9 @@ def make_arm_guard(
     joint_range_rad: tuple[FloatArray, FloatArray],
     dt_s: float,
 ) -> ArmGuard:
-    """Make the guard of a profile's robot; it holds the arm where it stands.
+    """The guard of a profile's robot; it holds the arm where it stands.
 
-    Args:
-        profile: of the robot.
-        measure: reads the state of the arm.
-        joint_range_rad: lower and upper ends of the joint ranges, (n,) each.
-        dt_s: period of the controller.
+    `joint_range_rad` are the ends of the joint ranges, (n,) each, `dt_s` the controller's period.
     """
     here = measure()
     joint_limits = joint_guard_limits(profile, *joint_range_rad)
@@ -253,6 +255,50 @@ class HeldReference:
         if apart_m > MOVED_M or max(apart_rad, turned_rad) > MOVED_RAD:
             self.invalidate()
         return self.held
+
+
+class GripperGuard:
+    """Checks commands between the bus and a gripper, and clamps them to the limits of its profile.
+
+    Gripper commands are rare, so silence of their writer means nothing: a replay is rejected
+    however much later it comes. `bounded` counts the commands that were clamped.
+    """
+
+    def __init__(self, profile: GripperProfile) -> None:
+        self._profile = profile
+        self._filter = SingleWriterFilter(sources=MAX_SOURCES)
+        self.bounded = 0
+
+    def accept(
+        self, order: Stamped[GripperCommand], writer: str, now_ns: int, *, writer_active: bool
+    ) -> GripperCommand:
+        """The command to execute, within the limits of the profile.
+
+        Args:
+            order: as received.
+            writer: source of the command stream that the arm follows, empty if it follows none.
+            now_ns: wall clock, as in the header.
+            writer_active: that source is active, see `ArmGuard.writer_active`.
+
+        Raises:
+            CodecError: ``foreign`` (another source moves the arm), ``replayed``, ``stale``, or
+                ``outlived`` (its source was stopped in the meantime).
+        """
+        self._filter.check(order.header, writer=writer)
+        self._filter.accept(order.header)
+        age_ns = now_ns - order.header.stamp_wall_ns
+        if age_ns > OLDEST_NS:
+            raise CodecError("stale", f"is {age_ns / 1e9:.1f} s old")
+        if writer and not writer_active:
+            raise CodecError("outlived", "its source has been stopped")
+        command, limits = order.record, self._profile
+        clamped = GripperCommand(
+            min(command.width_m, limits.max_width_m),
+            min(command.speed_m_s, limits.speed_m_s),
+            min(command.force_n, limits.force_n),
+        )
+        self.bounded += clamped != command
+        return clamped
 
 
 def max_braking_time_s(profile: Profile) -> float:

@@ -130,9 +130,8 @@ class Extrapolation(Generic[Reference]):
 
     Args:
         space: of the references.
-        command: where it begins.
-        before: the command before that one, if it belongs to the same stream.
-        gap_s: time between these two.
+        command, before: where it begins, and the command before it, `gap_s` earlier, if that
+            belongs to the same stream.
         brake: limits of the robot's own stop, `BRAKE_MARGIN` times those of the stream.
     """
 
@@ -251,12 +250,11 @@ class StreamGuard(ABC, Generic[Reference]):
 
     @property
     def following(self) -> bool:
-        """A command stream is being followed."""
         return self._stream.newest is not None
 
     @property
     def moving(self) -> bool:
-        """A stream is being followed, or the last one is still being brought to rest."""
+        """A stream is followed, or the last one is still being brought to rest."""
         return self.following or self._governor.moving
 
     @property

@@ -197,7 +197,6 @@ class RobotDriver:
 
     @cached_property
     def kinematics(self) -> Kinematics:
-        """Kinematics of the arm."""
         from vla_zenoh.kinematics.kinematics import make_kinematics  # a simulation has its own
 
         return make_kinematics(self.profile)

@@ -23,7 +23,7 @@ from vla_zenoh.errors import NodeError, in_words
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.profile import Profile
 from vla_zenoh.robot import Command, Reading
-from vla_zenoh.types import FloatArray, JointCommand
+from vla_zenoh.types import JointCommand
 
 LOST_S = 1.0
 """Motors that did not answer for this long count as lost."""
@@ -115,14 +115,12 @@ class LeRobotArm:
                 raise NodeError(f"{self._settings.port}: {in_words(error)}") from error
             return None
         self._read_s = now_s
-        position_rad = self._radians(np.array([found[key] for key in self._keys]))
+        units = np.array([found[key] for key in self._keys])
+        position_rad = (units - self._zero) * self._unit_rad
         if not self._gripper:
             return Reading(position_rad)
         width, moving, holding = self._grip(float(found[self._gripper]), now_s)
         return Reading(position_rad, width_m=width, moving=moving, holding=holding)
-
-    def _radians(self, units: FloatArray) -> FloatArray:
-        return (units - self._zero) * self._unit_rad
 
     def _grip(self, opening: float, now_s: float) -> tuple[float, bool, bool]:
         """Width, whether a commanded motion is in progress, whether an object is held."""
@@ -166,19 +164,16 @@ def make_lerobot(profile: Profile) -> Any:
     lerobot = import_module("lerobot.robots")
     settings = profile.lerobot
     assert settings is not None
+    folder = Path(settings.calibration_dir).expanduser() if settings.calibration_dir else None
     try:
         kind = lerobot.RobotConfig.get_choice_class(settings.robot)
-        robot = lerobot.make_robot_from_config(
-            kind(
-                port=settings.port,
-                id=settings.id,
-                calibration_dir=Path(settings.calibration_dir).expanduser()
-                if settings.calibration_dir
-                else None,
-                use_degrees=settings.units == "degrees",
-                disable_torque_on_disconnect=settings.limp_at_end,
-            )
+        config = kind(
+            port=settings.port,
+            id=settings.id,
+            calibration_dir=folder,
+            use_degrees=settings.units == "degrees",
+            disable_torque_on_disconnect=settings.limp_at_end,
         )
+        return lerobot.make_robot_from_config(config)
     except Exception as error:
         raise NodeError(f"LeRobot's {settings.robot}: {in_words(error)}") from error
-    return robot

@@ -37,11 +37,7 @@ WATCH_S = 0.05
 
 
 class RobotNode:
-    """A robot on the bus.
-
-    Args:
-        driver: of the robot; the node takes name and profile from it.
-        session: open session, closed by its owner.
+    """A robot on the bus, with name and profile of its `driver`; the owner closes the `session`.
 
     Raises:
         NodeError: a node of this name is alive already.
@@ -89,8 +85,7 @@ class RobotNode:
             gc.unfreeze()  # so that the interpreter frees everything at exit
 
     def _connect(self) -> None:
-        """Connect the driver, publishing the status meanwhile: without it the node counts as
-        hung."""
+        """Connect the driver, publishing the status meanwhile: else the node counts as hung."""
         self.node.publish_status("connecting", now=True)
         done = threading.Event()
 

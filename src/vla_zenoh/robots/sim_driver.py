@@ -10,7 +10,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,7 +24,7 @@ from vla_zenoh.guard.arm_guard import Measured
 from vla_zenoh.keys import Kind
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import Profile
-from vla_zenoh.robots.command_follower import CommandFollower
+from vla_zenoh.robots.arm import CommandFollower
 from vla_zenoh.robots.driver import DriverStatus, Measurement, Pace, Reporter, RobotDriver
 from vla_zenoh.simulation.world import STEP_NS, World, build_world
 from vla_zenoh.types import FloatArray, GripperCommand, ObjectPoses, SceneState
@@ -51,11 +50,7 @@ LEAST_FORCE_N = 0.1
 
 
 class SimDriver(RobotDriver):
-    """The simulated robot of a profile.
-
-    Args:
-        profile: the effective profile.
-        lockstep: advance time by queries on ``sim/step`` only.
+    """The simulated robot of a profile; in `lockstep` only queries on ``sim/step`` advance time.
 
     Raises:
         ResourceError: scene or robot description are missing.
@@ -253,9 +248,10 @@ class _SimKeys:
     def resets(self) -> Iterator[int | None]:
         """Seeds of the resets that arrived; None: that of the profile."""
         for arrival in self._resets.drain():
-            seed = self._node.decode_text(_decode_seed, arrival)
-            if seed is not None:
-                yield seed.value
+            # In a tuple: no seed is a valid one, no tuple a rejection.
+            found = self._node.decode_text(lambda text: (settings.decode_seed(text),), arrival)
+            if found is not None:
+                yield found[0]
 
     def publish(self, world: World, ticks: int, stamp_ns: int) -> None:
         """Publish what is due and has subscribers, after `ticks` steps."""
@@ -278,8 +274,7 @@ class _SimKeys:
 class RealTimePace:
     """Ticks of 1 ms on the monotonic clock; late ones follow each other at once.
 
-    Args:
-        report: its counters get the late ticks and the time given up.
+    The counters of `report` get the late ticks and the time given up.
     """
 
     def __init__(self, report: Reporter) -> None:
@@ -299,14 +294,3 @@ class RealTimePace:
         elif late_ns > STEP_NS:
             self._counters["sim.overruns"] += 1
         return Tick(1, self._next_ns, 0.0, 0.0)
-
-
-@dataclass(frozen=True, slots=True)
-class _Seed:
-    """A seed; None for that of the profile."""
-
-    value: int | None
-
-
-def _decode_seed(payload: bytes) -> _Seed:
-    return _Seed(settings.decode_seed(payload))

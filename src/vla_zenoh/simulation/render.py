@@ -102,15 +102,10 @@ def why_no_opengl() -> str:
 
 
 class Renderer:
-    """Renders a scene with its robot. Use it from the thread that made it.
-
-    Args:
-        scene: name or path of the scene, as the world's.
-        robot: the robot or its parts, as the world's.
-        backend: how to render; None: `choose_backend` chooses.
+    """Renders the scene and robot of a `World`. Use it from the thread that made it.
 
     Raises:
-        ResourceError: scene or robot are missing.
+        ResourceError: scene, robot or, in its methods, a camera are missing.
         NodeError: the back end does not work here.
     """
 
@@ -161,28 +156,15 @@ class Renderer:
         self._update()
 
     def render(self, camera: str, width: int, height: int) -> NDArray[np.uint8]:
-        """Image of `camera`: RGB uint8, (height, width, 3), C-contiguous.
-
-        Raises:
-            ResourceError: there is no such camera.
-        """
+        """Image of `camera`: RGB uint8, (height, width, 3), C-contiguous."""
         return self._canvas.draw(self._data, self._known(camera), width, height)
 
     def render_depth(self, camera: str, width: int, height: int) -> NDArray[np.float64]:
-        """Distance along the optical axis of `camera` in m, (height, width); infinite where
-        nothing is.
-
-        Raises:
-            ResourceError: there is no such camera.
-        """
+        """Depth of `camera` along its axis in m, (height, width); infinite where nothing is."""
         return self._canvas.draw_depth(self._data, self._known(camera), width, height)
 
     def focal_px(self, camera: str, height: int) -> float:
-        """Focal length in pixels of an image of this height; the axis goes through its middle.
-
-        Raises:
-            ResourceError: there is no such camera.
-        """
+        """Focal length in pixels of an image of this height; the axis goes through its middle."""
         fovy_rad = np.radians(self._model.cam_fovy[self._model.camera(self._known(camera)).id])
         return float(height / 2.0 / np.tan(fovy_rad / 2.0))
 

@@ -58,11 +58,6 @@ def build_model(
 ) -> mujoco.MjModel:
     """Compile `scene` with a robot in it, or the parts of one.
 
-    Args:
-        scene: name or path of the scene.
-        robots: the robot; its parts, where it has several.
-        joint_friction_nm: dry friction in every arm joint.
-
     Raises:
         ResourceError: scene or robot are missing, or MuJoCo rejects them.
     """

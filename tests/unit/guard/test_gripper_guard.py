@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from vla_zenoh.errors import CodecError
-from vla_zenoh.guard.gripper_guard import MAX_SOURCES, OLDEST_NS, GripperGuard
+from vla_zenoh.guard.arm_guard import MAX_SOURCES, OLDEST_NS, GripperGuard
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import GripperCommand, Header, Stamped
 

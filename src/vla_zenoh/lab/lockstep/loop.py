@@ -18,8 +18,7 @@ from vla_zenoh.control.commander_io import NewStates
 from vla_zenoh.control.preflight import PeerSnapshot
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.errors import CodecError
-from vla_zenoh.guard.arm_guard import Measured, make_arm_guard
-from vla_zenoh.guard.gripper_guard import GripperGuard
+from vla_zenoh.guard.arm_guard import GripperGuard, Measured, make_arm_guard
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.lab.lockstep.records import Delays, LockstepTrace, Message, Tamper
 from vla_zenoh.lab.lockstep.worker import LockstepWorker

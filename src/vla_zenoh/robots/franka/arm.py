@@ -23,7 +23,6 @@ from vla_zenoh.errors import MissingExtraError, NodeError, in_words
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.kinematics.so3 import exp3, log3, quat_from_rotation, rotation_from_quat
 from vla_zenoh.profile import Profile
-from vla_zenoh.profile.robot import FrankaLoad
 from vla_zenoh.robot import Command, Reading
 from vla_zenoh.robots.franka.hand import Hand
 from vla_zenoh.runtime.scheduling import realtime_children
@@ -125,15 +124,15 @@ class FrankaArm:
         self._robot = self._hand = None
 
     def _configure(self) -> None:
-        """Apply the profile's load, tool and collision settings; only an arm at rest accepts
-        them."""
+        """Apply load, tool and collision settings; only an arm at rest accepts them."""
         settings, robot = self._settings, self._robot
         torque = list(settings.collision_joint_nm)
         force = [settings.collision_force_n] * 3 + [settings.collision_torque_nm] * 3
         robot.set_collision_behavior(torque, torque, force, force)
-        robot.set_load(
-            settings.load.mass_kg, list(settings.load.centre_m), inertia_rows(settings.load)
-        )
+        load = settings.load
+        xx, yy, zz, xy, xz, yz = load.inertia_kg_m2
+        inertia = [xx, xy, xz, xy, yy, yz, xz, yz, zz]  # (3, 3), row by row
+        robot.set_load(load.mass_kg, list(load.centre_m), inertia)
         hand = np.linalg.inv(self._state.F_T_NE.matrix) @ self.flange_to_tcp()
         robot.set_ee(list(hand.T.ravel()))
         robot.set_k(list(np.eye(4).ravel()))
@@ -141,11 +140,9 @@ class FrankaArm:
 
     def flange_to_tcp(self) -> FloatArray:
         """(4, 4) pose of the profile's TCP in the flange frame, by the robot description."""
-        home_rad = np.array(self._profile.robot.home_rad)
+        names, home_rad = self._profile.robot.arm_joints, np.array(self._profile.robot.home_rad)
+        pose = self._kinematics.forward(self._kinematics.ordered(names, home_rad))
         tcp = np.eye(4)
-        pose = self._kinematics.forward(
-            self._kinematics.ordered(self._profile.robot.arm_joints, home_rad)
-        )
         tcp[:3, :3], tcp[:3, 3] = pose.rotation, pose.position_m
         return np.linalg.inv(flange_pose(home_rad)) @ tcp
 
@@ -337,7 +334,6 @@ class FrankaArm:
         else:
             self._ended = ""
 
-    # -- the hand -----------------------------------------------------------------------------
     def grip(self, width_m: float, speed_m_s: float, force_n: float) -> None:
         """Move the fingers: closing grasps with `force_n`."""
         if self._hand is not None:
@@ -389,12 +385,6 @@ def load_franky() -> Any:
 def error_names(errors: Any) -> list[str]:
     """Franka's names of the errors that are set."""
     return [name for name in dir(errors) if not name.startswith("_") and getattr(errors, name)]
-
-
-def inertia_rows(load: FrankaLoad) -> list[float]:
-    """The (3, 3) inertia of a load, row by row."""
-    xx, yy, zz, xy, xz, yz = load.inertia_kg_m2
-    return [xx, xy, xz, xy, yy, yz, xz, yz, zz]
 
 
 def flange_pose(position_rad: FloatArray) -> FloatArray:

@@ -11,30 +11,34 @@ import time
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import zenoh
 
+from vla_zenoh.bus.buffers import CallbackRing, ReceivedSample
+from vla_zenoh.bus.metrics import RateMeter
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import open_session
-from vla_zenoh.errors import ProfileError, RecordError
+from vla_zenoh.errors import CodecError, ProfileError, RecordError
+from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.profile import Profile, SessionProfile
 from vla_zenoh.profile.ros2 import Ros2Output, Ros2Profile
 from vla_zenoh.profile.session import TRUSTED_PROTOCOLS
-from vla_zenoh.robots.command_follower import CommandFollower
+from vla_zenoh.robots.arm import CommandFollower
 from vla_zenoh.robots.driver import DriverStatus, Measurement, RobotDriver, command_of
-from vla_zenoh.robots.joint_reading import pose_state
+from vla_zenoh.robots.joint_reading import JointReading, RobotClock, pose_state
 from vla_zenoh.robots.ros2.cameras import Camera
 from vla_zenoh.robots.ros2.gripper import Gripper
 from vla_zenoh.robots.ros2.ros_graph import RosGraph
 from vla_zenoh.robots.ros2.ros_services import RosServices
-from vla_zenoh.robots.ros2.state_subscriber import StateSubscriber
-from vla_zenoh.ros2.keys import COMMAND
+from vla_zenoh.ros2.keys import COMMAND, SENSOR
 from vla_zenoh.ros2.messages import Messages
-from vla_zenoh.ros2.samples import Stamp
+from vla_zenoh.ros2.readers import JOINT_STATE, WRENCH, read
+from vla_zenoh.ros2.samples import Stamp, Wrench
 from vla_zenoh.ros2.writers import Write, joint_writer, pose_writer
 from vla_zenoh.runtime.process import ROUTER_PATIENCE_S
-from vla_zenoh.types import Event, GripperCommand, GripperState
+from vla_zenoh.types import Event, FloatArray, GripperCommand, GripperState
 from vla_zenoh.types.commands import JointReference, PoseReference
 
 NAME = "ros2"
@@ -42,6 +46,8 @@ JOIN_S = 0.3
 MAX_DEFINITION_BYTES = 65_536
 FINGERS_TIMEOUT_NS = 1_000_000_000
 """Gripper nodes publish more slowly than arms."""
+BUFFER = 64
+WRENCH_TIMEOUT_NS = 200_000_000
 LEAD_PERIODS = 2
 """A trajectory's point lies this many command periods ahead."""
 
@@ -289,6 +295,90 @@ class Ros2Driver(RobotDriver):
                 ages_s["joint_states"] = (time.monotonic_ns() - self.measured_ns) / 1e9
         latency_ms = {name: late for name, (_, late) in figures.items() if late is not None}
         return DriverStatus(detail, ages_s, rates_hz, latency_ms)
+
+
+class StateSubscriber:
+    """State of the arm and gripper from the robot's topics.
+
+    Attributes:
+        state: newest joint states of arm and gripper.
+        clock: of the robot.
+        rate: of joint states.
+        received_ns: monotonic time of the newest joint state, None before the first.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        graph: RosGraph,
+        messages: Messages,
+        ros2: Ros2Profile,
+        kinematics: Kinematics,
+    ) -> None:
+        self._node, self._messages, self._ros2 = node, messages, ros2
+        self.state = JointReading(node.profile, kinematics)
+        self.clock = RobotClock()
+        self.rate = RateMeter()
+        self.received_ns: int | None = None
+        self._wrench: Wrench | None = None
+        topics = dict.fromkeys((ros2.joint_states, ros2.finger_states or ros2.joint_states))
+        self._joint_states = [
+            graph.subscribe(topic, JOINT_STATE, CallbackRing(BUFFER), SENSOR) for topic in topics
+        ]
+        self._wrenches = None
+        if ros2.wrench is not None:
+            self._wrenches = graph.subscribe(ros2.wrench.topic, WRENCH, CallbackRing(4), SENSOR)
+
+    def wrench(self, stamp_ns: int) -> FloatArray | None:
+        """(6,) external wrench in N and Nm, None if there is none for that time."""
+        found = self._wrench
+        if found is None or abs(stamp_ns - found.stamp_ns) > WRENCH_TIMEOUT_NS:
+            return None
+        return found.wrench
+
+    # -- topics -------------------------------------------------------------------------------
+    def _reject(self, topic: str, error: CodecError) -> None:
+        self._node.reject(error.reason, f"{topic}: {error}", topic)
+
+    def _decode(self, kind: str, arrival: ReceivedSample) -> Any:
+        return read(self._messages, kind, arrival.sample.payload.to_bytes())
+
+    def update(self) -> bool:
+        """Process the messages that arrived; whether there is a new state of the arm's joints."""
+        self._update_wrench()
+        fresh = False
+        for buffer in self._joint_states:
+            for arrival in buffer.drain():
+                try:
+                    joints = self._decode(JOINT_STATE, arrival)
+                    arrived_ns = self._node.arrival_wall_ns(arrival)
+                    if self.state.take(joints, joints.stamp_ns or arrived_ns) is None:
+                        continue  # of the fingers alone, or of another robot
+                except CodecError as error:
+                    self._reject(str(arrival.sample.key_expr), error)
+                    continue
+                fresh = True
+                self.clock.take(joints.stamp_ns, arrived_ns)
+                self.received_ns = arrival.mono_ns
+                self.rate.tick()
+        return fresh
+
+    def _update_wrench(self) -> None:
+        if self._wrenches is None or self._ros2.wrench is None:
+            return
+        frame = self._ros2.wrench.frame or self._node.profile.robot.base_frame
+        for arrival in self._wrenches.drain():
+            try:
+                found: Wrench = self._decode(WRENCH, arrival)
+                if found.frame != frame:
+                    raise CodecError("frame", f"in frame {found.frame[:60]!r}, wanted {frame!r}")
+                if not np.isfinite(found.wrench).all():
+                    raise CodecError("invalid", "a wrench that is NaN or infinite")
+            except CodecError as error:
+                self._reject(self._ros2.wrench.topic, error)
+            else:
+                stamp_ns = found.stamp_ns or self._node.arrival_wall_ns(arrival)
+                self._wrench = found._replace(stamp_ns=stamp_ns)
 
 
 def read_messages(ros2: Ros2Profile) -> Messages:
