@@ -30,7 +30,7 @@ MAX_DRAWS = 1000
 
 
 class Place(NamedTuple):
-    """Where an object stands: metres in the base frame and a turn about the vertical."""
+    """Where an object stands, in the base frame, and its turn about the vertical."""
 
     x_m: float
     y_m: float

@@ -69,9 +69,10 @@ class SimulatedPart:
         if [int(joint.dofadr[0]) - first_dof for joint in joints] != list(range(len(joints))):
             raise ResourceError("the arm's joints do not follow each other in the URDF")
         self._dofs = slice(first_dof, first_dof + len(joints))
-        self._actuators = [
-            int(model.actuator(prefix_of(robot) + name).id) for name in robot.arm_joints
-        ]
+        self._ctrl = data.ctrl
+        self._actuators = np.array(
+            [model.actuator(prefix_of(robot) + name).id for name in robot.arm_joints]
+        )
         # Views of the state: as fresh as the last MuJoCo call of the code that steps it.
         self._qpos = slice(first_q, first_q + len(joints))
         self._position_rad = data.qpos[self._qpos]
@@ -145,14 +146,14 @@ class SimulatedPart:
             output = self._cartesian.torque(reference, state)
         if not math.isfinite(sum(output.torque_nm.tolist())):
             raise NodeError(f"the reference is not finite: {reference}")
-        self._data.ctrl[self._actuators] = output.torque_nm
+        self._ctrl[self._actuators] = output.torque_nm
         self.gripper.step()
         return output.saturated
 
     def _switch_to(self, law: CartesianImpedance | JointImpedance, state: ArmDynamics) -> None:
         if self._active_law is not law:
             if self._active_law is not None:
-                law.take_over(self._data.ctrl[self._actuators], state)
+                law.take_over(self._ctrl[self._actuators], state)
             self._active_law = law
 
     def _dynamics(self) -> ArmDynamics:

@@ -61,6 +61,7 @@ class World:
         self.seed: int | None = None
         self.model = build_model(scene, robot, joint_friction_nm=joint_friction_nm)
         self._data = mujoco.MjData(self.model)
+        self._warnings = self._data.warning.number  # a view
         one = isinstance(robot, RobotModel)
         homes: Sequence[Any] = [home_rad] if one else list(home_rad)  # pyright: ignore
         self.parts: dict[str, SimulatedPart] = {
@@ -120,7 +121,7 @@ class World:
         self._fresh = False
         for part in self.parts.values():
             part.filter_wrench()
-        if self._data.warning.number.any():
+        if self._warnings.any():
             self._raise_diverged()
 
     @property
@@ -176,7 +177,7 @@ class World:
     def _raise_diverged(self) -> None:
         raised = [
             mujoco.mjtWarning(kind).name.removeprefix("mjWARN_").lower()
-            for kind in np.flatnonzero(self._data.warning.number)
+            for kind in np.flatnonzero(self._warnings)
         ]
         raise NodeError(
             f"the simulation diverged after {self.time_ns / 1e9:.3f} s ({', '.join(raised)}); "
