@@ -17,7 +17,8 @@ states", RSS 2021.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from copy import copy
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -156,6 +157,14 @@ class AxisSmoother:
         self._again: tuple[Shares, bool] | None = None
         self._too_fast = zeros > 0.0
         self.braking = False
+
+    def fork(self) -> Self:
+        """A copy that moves by itself."""
+        return copy(self)
+
+    def adopt(self, fork: Self) -> None:
+        """Take over the motion of a `fork` that was made of the present state."""
+        vars(self).update(vars(fork))
 
     @property
     def state(self) -> AxisState:

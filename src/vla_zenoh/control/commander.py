@@ -81,6 +81,7 @@ class Commander:
             CommandedPart(profile.of_part(name), reaches.get(name)) for name in profile.part_names
         )
         self.dry_run = dry_run
+        self._period_ns = round(1e9 / profile.timing.command_hz)
         self.state = State.INACTIVE
         self.why = "not activated yet"
         self._ended = ""  # why the last activation did, if not on request
@@ -118,14 +119,23 @@ class Commander:
         for chunk in inputs.chunks:
             self._submit_chunk(chunk, next_ns)
         self._plan_chunks(next_ns)
+        self._plan_ahead(next_ns)
 
     def look_ahead(self, now_ns: int) -> None:
-        """Bound steps that are due later; to be called when the commands of a tick are published.
+        """Bound steps that are due later, and plan the motion to the next one.
 
-        Without it they are bounded when they are due. Its events are among the next outputs.
+        To be called when the commands of a tick are published. Without it both are done when they
+        are due. Its events are among the next outputs.
         """
         for part in self.parts if self.state is State.ACTIVE else ():
-            self._out.events += part.tagged(part.motion.look_ahead(now_ns))
+            events = part.motion.look_ahead(now_ns)
+            if events:
+                self._out.events += part.tagged(events)
+        self._plan_ahead(now_ns + self._period_ns)
+
+    def _plan_ahead(self, next_ns: int) -> None:
+        for part in self.parts if self.state is State.ACTIVE else ():
+            part.motion.plan_ahead(self.task, self._watchdog.deadline_ns, next_ns)
 
     def _begin_planning(self) -> None:
         for part in self.parts:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Generator, Iterable
 from copy import copy
+from typing import Self
 
 import numpy as np
 
@@ -274,6 +275,11 @@ class JointPath(AxisSmoother):
         """It braked before a bound, on the way to what was asked for last."""
         home_rad = self.kinematics.ordered(profile.robot.arm_joints, profile.robot.home_rad)
         super().__init__(home_rad, 1.0 / profile.timing.command_hz, np.array(bounds.motion))
+
+    def fork(self) -> Self:
+        fork = super().fork()
+        fork._hits = self._hits.copy()
+        return fork
 
     def stand(self, position: FloatArray) -> None:
         super().stand(position)

@@ -77,6 +77,24 @@ class Leashed(NamedTuple):
     hits: list[LimitHit]
 
 
+class _Ahead(NamedTuple):
+    """The motion to a goal, computed before the tick in which it is expected to begin.
+
+    Args:
+        of: what it depends on: objects that do not change,
+        at: and numbers.
+        timing: with the goal taken.
+        mover: on its way to it.
+        enough: the shares suffice.
+    """
+
+    of: tuple[object, ...]
+    at: tuple[float, ...]
+    timing: StepTiming
+    mover: Smoother | JointPath
+    enough: bool
+
+
 class MotionPipeline:
     """Follows the goals of the timeline, or brakes, in a smooth command stream.
 
@@ -138,6 +156,7 @@ class MotionPipeline:
         self._measured_ns = 0
         self._timings: list[StepTiming] = []
         """Of poses, and of joints."""
+        self._ahead: _Ahead | None = None
         self._cause: Cause | None = None
         self._rest_since_ns: int | None = None
         self._sent: PoseCommand | None = None
@@ -482,9 +501,7 @@ class MotionPipeline:
             return events
         slowed = self._slowing and _within(mover, self._override)
         short, hits = self._on_leash(mover, goal, ticks * self._dt_s)
-        slower = slowest(
-            goal.slowdown, self.contact_slowdown, self.joint_slowdown, self.part_slowdown
-        )
+        slower = self._slowest(goal)
         slowed |= (slower.share if slower else 1.0) != self.speed
         if goal is not self.goal or hits or slowed:
             if hits:
@@ -493,13 +510,87 @@ class MotionPipeline:
                     events.append(make_event("warning", "limit", name, "leash", value, limit))
                 goal = self._shorten(plans, goal, short, now_ns)
             events += self._slow_down(slower)
-            shares = self._shares(mover, goal, timeline.plan, task, overdue_ns, now_ns)
-            hard = self._slowing and (self._joints is None or self.in_joints)
-            enough = _move(mover, goal, shares, hard=hard)
+            enough = self._set_out(mover, goal, timeline.plan, task, overdue_ns, now_ns)
             self._slowing &= not (enough and _within(mover, self._override))
             self.goal = goal
             self.gripper.request(goal.width_m)
         return events
+
+    def plan_ahead(self, task: Task, overdue_ns: int, next_ns: int) -> None:
+        """Compute the motion to the goal that comes into force at the next tick.
+
+        That takes it over if nothing that the motion depends on has changed by then.
+
+        Args:
+            task: its rate.
+            overdue_ns: when the watchdog brakes unless a chunk arrives.
+            next_ns: time of the next tick.
+        """
+        timeline, mover = self.timeline, self._mover
+        self._ahead = None
+        if timeline is None or mover is None or self.held or self._override == 0.0:
+            return
+        plans = self._aggregator.plans(timeline, next_ns)
+        if len(plans) > 1:  # their mix is another goal in every tick
+            return
+        goal = self._aggregator.goal(plans, next_ns)
+        if goal is self.goal or (goal.arm is not None) is not self.in_joints:
+            return
+        if self._on_leash(mover, goal, self._dt_s).hits:
+            return
+        slower, speed = self._slowest(goal), self.speed
+        self.speed = 1.0 if slower is None else slower.share
+        self._ahead = self._motion_to(mover, goal, plans[0], task, overdue_ns, next_ns)
+        self.speed = speed
+
+    def _slowest(self, goal: Goal) -> Slowdown | None:
+        """What slows the arm down most on the way to `goal`."""
+        return slowest(
+            goal.slowdown, self.contact_slowdown, self.joint_slowdown, self.part_slowdown
+        )
+
+    def _set_out(
+        self,
+        mover: Smoother | JointPath,
+        goal: Goal,
+        plan: Plan,
+        task: Task,
+        overdue_ns: int,
+        now_ns: int,
+    ) -> bool:
+        """Move to `goal`; whether the shares suffice."""
+        ahead, self._ahead = self._ahead, None
+        if (
+            ahead is None
+            or ahead.at != self._numbers(plan, task, overdue_ns, now_ns)
+            or not all(map(is_, ahead.of, (goal, plan, mover, mover.state)))
+        ):
+            ahead = self._motion_to(mover, goal, plan, task, overdue_ns, now_ns)
+        self._timings[self.in_joints] = ahead.timing
+        mover.adopt(ahead.mover)  # pyright: ignore
+        return ahead.enough
+
+    def _numbers(self, plan: Plan, task: Task, overdue_ns: int, now_ns: int) -> tuple[float, ...]:
+        """All numbers that the motion to a goal depends on, beside those of its objects."""
+        index, rate_hz = plan.index_at(now_ns), task.rate_hz
+        return (now_ns, overdue_ns, rate_hz, index, self.speed, self._override, self._slowing)
+
+    def _motion_to(
+        self,
+        mover: Smoother | JointPath,
+        goal: Goal,
+        plan: Plan,
+        task: Task,
+        overdue_ns: int,
+        now_ns: int,
+    ) -> _Ahead:
+        """The motion to a goal from the present state."""
+        of = goal, plan, mover, mover.state
+        at = self._numbers(plan, task, overdue_ns, now_ns)
+        timing, mover = self._timings[self.in_joints].fork(), mover.fork()
+        shares = self._shares(timing, mover, goal, plan, task, overdue_ns, now_ns)
+        hard = self._slowing and (self._joints is None or self.in_joints)
+        return _Ahead(of, at, timing, mover, _move(mover, goal, shares, hard=hard))
 
     def _on_leash(self, mover: Smoother | JointPath, goal: Goal, ahead_s: float) -> Leashed:
         """`goal`, or a nearer one that is no further ahead than the leash allows.
@@ -554,6 +645,7 @@ class MotionPipeline:
 
     def _shares(
         self,
+        timing: StepTiming,
         mover: Smoother | JointPath,
         goal: Goal,
         plan: Plan,
@@ -568,7 +660,7 @@ class MotionPipeline:
             way = mover.way_to(goal) if joints else mover.way_to(goal.pose)
             velocity, _ = mover.axis_rates()
             index, left_s = plan.index_at(now_ns), (overdue_ns - now_ns) / 1e9
-            share = self._timings[self.in_joints].share(
+            share = timing.share(
                 plan, index, now_ns, 1.0 / task.rate_hz, left_s, way, velocity
             )
             speed = min(speed, share)

@@ -23,6 +23,7 @@ Only the speed is bounded by this. Which goal is in force when, and where the ar
 from __future__ import annotations
 
 import math
+from copy import copy
 
 import numpy as np
 
@@ -105,6 +106,12 @@ class StepTiming:
         self._took_ns = 0
         self._begun_ns = self._late_ns = 0.0
         self._gone = self._stretch = self._spare_ns = 0.0
+
+    def fork(self) -> StepTiming:
+        """A copy that goes on by itself."""
+        fork = copy(self)
+        fork._arrivals = copy(self._arrivals)
+        return fork
 
     def share(
         self,
