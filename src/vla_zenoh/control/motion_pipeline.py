@@ -660,9 +660,7 @@ class MotionPipeline:
             way = mover.way_to(goal) if joints else mover.way_to(goal.pose)
             velocity, _ = mover.axis_rates()
             index, left_s = plan.index_at(now_ns), (overdue_ns - now_ns) / 1e9
-            share = timing.share(
-                plan, index, now_ns, 1.0 / task.rate_hz, left_s, way, velocity
-            )
+            share = timing.share(plan, index, now_ns, 1.0 / task.rate_hz, left_s, way, velocity)
             speed = min(speed, share)
         # The same motion in more time: acceleration scales with the square of the override, jerk
         # with the cube. Until a faster arm has slowed down it brakes as hard as it may.
