@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping
 from functools import cache, lru_cache
+from math import isfinite
 from struct import Struct
 from typing import Any, NamedTuple, TypeVar
 
@@ -14,6 +15,7 @@ from vla_zenoh import keys
 from vla_zenoh.codec import message
 from vla_zenoh.errors import CodecError, RecordError, SpecError
 from vla_zenoh.types import Header, shown
+from vla_zenoh.types.checks import set_field
 
 Record = TypeVar("Record")
 
@@ -233,12 +235,18 @@ class _Frame(NamedTuple):
         constants: the pieces that are no numbers.
         fields: of a record that was read from such bytes.
         numbers: names of the fields that are floats or vectors, and how each is read.
+        rotations: names of those that are quaternions.
+        normalised: a quaternion in its final form.
+        floats: some of the numbers are floats, which may have a range.
     """
 
     split: Struct
     constants: tuple[bytes, ...]
     fields: dict[str, Any]
     numbers: tuple[tuple[str, Callable[[bytes], Any]], ...]
+    rotations: tuple[str, ...]
+    normalised: Callable[[str, Any], Any]
+    floats: bool
 
 
 _MAX_FRAMES = 64
@@ -250,6 +258,8 @@ _newest: dict[type, tuple[bytes, Any]] = {}
 def _keep_frame(record: Any, payload: bytes) -> None:
     """Remember how `payload` is divided, if it is written as we would."""
     from numpy import frombuffer
+
+    from vla_zenoh.types.arrays import unit_quaternion
 
     pieces = _pieces(record)
     split = Struct("".join(f"{len(piece)}s" for piece in pieces))
@@ -265,7 +275,12 @@ def _keep_frame(record: Any, payload: bytes) -> None:
         for name, value in values
         if type(value) is float or hasattr(value, "ndim")
     ]
-    _frames[type(record), len(payload)] = _Frame(split, constants, dict(values), tuple(numbers))
+    rotations = tuple(name for name, _ in numbers if name.endswith("quat_xyzw"))
+    floats = any(read is _float for _, read in numbers)
+    frame = _Frame(
+        *(split, constants, dict(values), tuple(numbers), rotations, unit_quaternion, floats)
+    )
+    _frames[type(record), len(payload)] = frame
 
 
 def _float(number: bytes) -> float:
@@ -273,11 +288,23 @@ def _float(number: bytes) -> float:
 
 
 def _refilled(kind: type[Record], frame: _Frame, pieces: tuple[bytes, ...]) -> Record:
-    """A record like that of the frame with other numbers, checked like any other."""
-    fields = frame.fields.copy()
+    """A record like that of the frame with other numbers, which are checked like any others."""
+    fields, total = frame.fields.copy(), 0.0
     for (name, read), piece in zip(frame.numbers, pieces, strict=True):
-        fields[name] = read(piece)
-    return _made(kind, fields)
+        fields[name] = value = read(piece)
+        if not frame.floats:
+            total += sum(value.tolist())
+    if frame.floats or not isfinite(total):
+        return _made(kind, fields)
+    try:
+        for name in frame.rotations:
+            fields[name] = frame.normalised(name, fields[name])
+    except RecordError:
+        return _made(kind, fields)
+    record = object.__new__(kind)
+    for name, value in fields.items():
+        set_field(record, name, value)
+    return record
 
 
 def _record(kind: type[Record], data: Mapping[Any, Any]) -> Record:
