@@ -240,28 +240,40 @@ class CommandedPart:
             return ""
         return f"robot state lost: joints {silent_s:.3f} s old, at most {patience_s:g} s"
 
-    def monitor_late(self, now_ns: int) -> bool:
-        """Monitoring of the joints is long overdue."""
-        return self._joint_monitor is not None and self._joint_monitor.late(now_ns)
-
-    def monitor_joints(self, now_ns: int, *, obeying: bool) -> LimitHit | None:
-        """Slow the arm down if its measured joints come near a bound; returns a bound to brake at.
+    def follow_elbow(self, *, obeying: bool) -> None:
+        """Begin to bound the next step with the elbow of the commanded or measured joints.
 
         Raises:
             RecordError: joints of another arm.
         """
         monitor, reach, motion = self._joint_monitor, self.reach, self.motion
         if monitor is None or reach is None or self.joint is None:
-            return None
+            return
         if not obeying or not motion.streaming:
             monitor.reset()
-            return None
-        commanded_rad, hit = motion.joints_rad, None
-        measured_rad = reach.kinematics.joints_of(self.joint.record)
-        if now_ns >= monitor.next_ns:
-            hit = monitor.update(measured_rad, commanded_rad, now_ns, in_joints=motion.in_joints)
-            motion.joint_slowdown = monitor.slowdown
+            return
+        measured_rad, commanded_rad = (
+            reach.kinematics.joints_of(self.joint.record),
+            motion.joints_rad,
+        )
         reach.set_elbow(measured_rad if commanded_rad is None else commanded_rad)
+
+    def monitor_due(self, now_ns: int) -> bool:
+        """The next check of the measured joints is due."""
+        return self._joint_monitor is not None and now_ns >= self._joint_monitor.next_ns
+
+    def monitor_late(self, now_ns: int) -> bool:
+        """It is long overdue."""
+        return self._joint_monitor is not None and self._joint_monitor.late(now_ns)
+
+    def monitor_joints(self, now_ns: int) -> LimitHit | None:
+        """Slow a moving arm down if its measured joints come near a bound; returns a bound to brake
+        at."""
+        monitor, motion, measured_rad = self._joint_monitor, self.motion, self.measured_rad
+        if monitor is None or measured_rad is None or not motion.streaming:
+            return None
+        hit = monitor.update(measured_rad, motion.joints_rad, now_ns, in_joints=motion.in_joints)
+        motion.joint_slowdown = monitor.slowdown
         return hit
 
     def _obstructed(self, events: list[Event]) -> str:

@@ -122,11 +122,14 @@ class Commander:
         self._plan_ahead(next_ns)
 
     def look_ahead(self, now_ns: int) -> None:
-        """Bound steps that are due later, and plan the motion to the next one.
+        """Monitor the measured joints, bound steps that are due later, plan the motion to the next.
 
-        To be called when the commands of a tick are published. Without it both are done when they
-        are due. Its events are among the next outputs.
+        To be called when the commands of a tick are published. Without it all of that is done when
+        it is due, or overdue. Its events are among the next outputs.
         """
+        for part in self.parts:
+            if part.monitor_due(now_ns):
+                self._monitor_joints(part, now_ns)
         for part in self.parts if self.state is State.ACTIVE else ():
             events = part.motion.look_ahead(now_ns)
             if events:
@@ -163,7 +166,9 @@ class Commander:
         self._plan_chunks(now_ns)
         self._supervise(now_ns)
         for part in parts:
-            if not planned or part.monitor_late(now_ns):  # a new goal is work enough
+            if not planned:
+                self._follow_elbow(part)
+            if part.monitor_late(now_ns):  # `look_ahead` is not called in time
                 self._monitor_joints(part, now_ns)
         if self._spacing is not None:
             self._monitor_distance(self._spacing, now_ns)
@@ -604,13 +609,15 @@ class Commander:
         for part in self.parts:
             part.motion.part_slowdown, part.motion.held = slowdown, hit is not None
 
-    def _monitor_joints(self, part: CommandedPart, now_ns: int) -> None:
-        """Slow a part down, or brake, if its measured joints come too near to a bound."""
+    def _follow_elbow(self, part: CommandedPart) -> None:
         try:
-            hit = part.monitor_joints(now_ns, obeying=self.state in OBEYING)
+            part.follow_elbow(obeying=self.state in OBEYING)
         except RecordError as error:
             self._change(Trigger.LOSE, part.says(str(error)))
-            return
+
+    def _monitor_joints(self, part: CommandedPart, now_ns: int) -> None:
+        """Slow a part down, or brake, if its measured joints come too near to a bound."""
+        hit = part.monitor_joints(now_ns) if self.state in OBEYING else None
         if hit is not None:
             self._brake_at(hit, part)
 
