@@ -153,8 +153,8 @@ def slide(
     loop.run(LASTS_S)
     trace = loop.trace
     told = [command.position_m for command in trace.commands[since:] if command is not None]
-    if command == "joint" and loop.commander.reach is not None:
-        kinematics = loop.commander.reach.kinematics
+    if command == "joint" and loop.commander.parts[0].reach is not None:
+        kinematics = loop.commander.parts[0].reach.kinematics
         told = [
             kinematics.forward(joint.position_rad).position_m
             for joint in trace.joints[since:]

@@ -163,7 +163,7 @@ class Rig:
 
     def joint_state(self) -> Stamped[JointState] | None:
         """Those of the test, wherever its TCP is said to be, else where the shadow stands."""
-        reach, joints_rad = self.commander.reach, self.joints_rad
+        reach, joints_rad = self.commander.parts[0].reach, self.joints_rad
         names = self.profile.robot.arm_joints
         if joints_rad is None and reach is not None and self.joints_of_shadow:
             joints_rad, names = reach.joints_rad, reach.kinematics.arm_joints

@@ -200,7 +200,7 @@ class Rig:
             if event.what.endswith("->fault") and not event.why.startswith("the robot reports"):
                 self.trace.faults.append((at, event.why))
         record = out.joint if self.case.joint else out.pose
-        goal = self.commander.goal
+        goal = self.commander.parts[0].motion.goal
         self.trace.ticks.append(
             Tick(
                 self._now_ns,
@@ -345,7 +345,7 @@ class Rig:
         self._next_chunk = at + max(1, round(gap_s * 1e9 / self._period_ns))
         if self.commander.state.value not in OBEYING:
             return
-        goal = self.commander.goal
+        goal = self.commander.parts[0].motion.goal
         if self.case.in_joints:
             asked_rad = goal.joints_rad if goal is not None else None
             here_rad = self._held_joints if asked_rad is None else asked_rad

@@ -51,7 +51,7 @@ def test_measured_joints_that_are_not_where_they_are_commanded_stop_the_arm() ->
     loop = begin("0 0 0.01")
     loop.run(1.0)
     assert speed_m_s(loop)[-1] > 0.03
-    assert loop.commander.elbow_rad < 0.05
+    assert loop.commander.parts[0].elbow_rad < 0.05
 
     def astray(sent: Message) -> list[Message]:
         if sent.kind is not JointState:

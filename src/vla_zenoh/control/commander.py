@@ -25,11 +25,9 @@ from vla_zenoh.control.commander_io import (
     limit_events,
     make_event,
 )
-from vla_zenoh.control.contact import Contact
-from vla_zenoh.control.gripper_arbiter import GripperArbiter
-from vla_zenoh.control.limits import LimitHit, Slowdown
+from vla_zenoh.control.limits import LimitHit
 from vla_zenoh.control.part_spacing import PartSpacing
-from vla_zenoh.control.plan_timeline import EpisodeProgress, Goal, Plan
+from vla_zenoh.control.plan_timeline import EpisodeProgress, Plan
 from vla_zenoh.control.preflight import PeerSnapshot, reasons_of_worker
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.states import DEACTIVATED, OBEYING, State, Trigger, after
@@ -40,10 +38,7 @@ from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     MAX_TEXT,
     ActionChunk,
-    GripperState,
     HeldBox,
-    JointState,
-    PoseState,
     Stamped,
     Task,
 )
@@ -195,68 +190,7 @@ class Commander:
         self._out = Outputs()
         return out
 
-    # -- of the first part, which a robot that is one arm has alone ----------------------------
-    @property
-    def reach(self) -> ReachabilityFilter | None:
-        """Bounds goals by the arm's kinematics."""
-        return self.parts[0].reach
-
-    @property
-    def pose(self) -> Stamped[PoseState] | None:
-        """Newest TCP pose."""
-        return self.parts[0].pose
-
-    @property
-    def joint(self) -> Stamped[JointState] | None:
-        """Newest joints."""
-        return self.parts[0].joint
-
-    @property
-    def gripper_state(self) -> Stamped[GripperState] | None:
-        """Newest state of the gripper."""
-        return self.parts[0].gripper_state
-
-    @property
-    def contact(self) -> Contact:
-        """Its external load."""
-        return self._motion.contact
-
-    @property
-    def goal(self) -> Goal | None:
-        """The goal that the arm follows, None before the first activation."""
-        return self._motion.goal
-
-    @property
-    def gripper(self) -> GripperArbiter:
-        """The gripper's commands."""
-        return self._motion.gripper
-
-    @property
-    def speed(self) -> float:
-        """Share of the speed limits in use; less than 1 near a bound."""
-        return self._motion.speed
-
-    @property
-    def slower(self) -> Slowdown | None:
-        """What slows the arm down near a bound; None: nothing, or it is not commanded."""
-        return self._motion.slower if self._motion.streaming else None
-
-    @property
-    def tracking_m(self) -> float:
-        """Distance of the measured TCP from the commanded one."""
-        return self._watchdog.tracking_m
-
-    @property
-    def tracking_rad(self) -> float:
-        """Angle of the measured TCP from the commanded one."""
-        return self._watchdog.tracking_rad
-
-    @property
-    def elbow_rad(self) -> float:
-        """Greatest distance of a measured joint from where it is expected, see `JointMonitor`."""
-        return self.parts[0].elbow_rad
-
-    # -- of all parts ---------------------------------------------------------------------------
+    # -- state of the arms ---------------------------------------------------------------------
     @property
     def at_rest(self) -> bool:
         """The commanded motion stands still, and will."""

@@ -75,7 +75,7 @@ def test_its_goal_is_on_a_leash_of_metres(tmp_path: Path) -> None:
         arm.send(*[[0.02, 0.0, 0.0, 0.0]] * 8)
         for _ in range(40):
             arm.tick()
-            goal = arm.rig.commander.goal
+            goal = arm.rig.commander.parts[0].motion.goal
             if goal is not None and goal.joints_rad is not None:
                 ahead.append(abs(goal.joints_rad[0] - arm.joints_rad[0]))
     assert max(ahead) < arm.profile.limits.lead_m + 1e-3

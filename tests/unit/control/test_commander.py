@@ -94,8 +94,10 @@ def test_a_dry_run_computes_everything_and_streams_nothing() -> None:
         assert out.accepted is not None
         rig.run(0.2)
     assert rig.commander.progress.steps == 5
-    assert rig.commander.goal is not None
-    np.testing.assert_allclose(rig.commander.goal.pose.position_m, START_M + [0, 0, 0.05])
+    assert rig.commander.parts[0].motion.goal is not None
+    np.testing.assert_allclose(
+        rig.commander.parts[0].motion.goal.pose.position_m, START_M + [0, 0, 0.05]
+    )
     assert rig.commands == []
     assert rig.widths_m == []
 
@@ -222,7 +224,7 @@ def test_overlapping_chunks_give_the_speed_that_was_asked_for(period_s: float) -
     for _ in range(round(asked_s / period_s)):
         rig.send([UP] * 10)
         rig.run(period_s - 0.004)
-    goal = rig.commander.goal
+    goal = rig.commander.parts[0].motion.goal
     assert goal is not None
     spent_s = round(asked_s / period_s) * period_s
     # The goal in force leads what was asked until now by a step at most.
@@ -316,7 +318,7 @@ def test_the_leash_keeps_a_backlog_from_building_up_and_what_was_cut_does_not_co
     for _ in range(10):
         rig.send([[0.0, 0.04, 0.0, 0, 0, 0, 0]])
         rig.run(0.02)
-    goal = rig.commander.goal
+    goal = rig.commander.parts[0].motion.goal
     assert goal is not None
     ahead_m = norm3(goal.pose.position_m - rig.position_m)
     assert ahead_m <= 0.06 + 1e-9

@@ -123,7 +123,7 @@ def play(rig: Rig, script: list[Any]) -> None:
 
 
 def check_goal(rig: Rig) -> None:
-    goal = rig.commander.goal
+    goal = rig.commander.parts[0].motion.goal
     if goal is not None:
         assert into_workspace(rig.profile.limits, goal.pose.position_m)[1] <= BORDER_M
         assert 0.0 <= goal.width_m <= rig.profile.robot.gripper.max_width_m

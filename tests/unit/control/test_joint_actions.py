@@ -277,7 +277,7 @@ def test_the_goal_stays_inside_the_box_when_the_leash_cuts_it_or_plans_are_avera
         arm.send(*(rng.uniform(-0.3, 0.3, (1, 7)) * np.ones((8, 1))))
         for _ in range(40):
             arm.tick()
-            goal = arm.rig.commander.goal
+            goal = arm.rig.commander.parts[0].motion.goal
             if goal is not None:
                 at_m = goal.pose.position_m
                 worst_m = max(worst_m, float(np.abs(at_m - np.clip(at_m, low, high)).max()))

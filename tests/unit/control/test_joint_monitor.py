@@ -178,7 +178,7 @@ def test_the_measured_arm_ends_the_activation_with_an_event_that_names_joint_val
     for _ in range(400):
         arm.joints_rad = joints_rad = joints_rad - 0.002 * JOINT["panda_joint4"]
         arm.tick()
-        slowest = min(slowest, arm.commander.speed)
+        slowest = min(slowest, arm.commander.parts[0].motion.speed)
         if arm.state != "active":
             break
     assert arm.state == "inactive"
@@ -208,7 +208,7 @@ def test_a_step_is_judged_by_the_elbow_that_the_arm_really_has() -> None:
     """The elbow is swivelled; the same TCP, but not the same room."""
     arm = Arm()
     arm.activate()
-    shadow = arm.commander.reach
+    shadow = arm.commander.parts[0].reach
     assert shadow is not None
     joints_rad = HOME_RAD.copy()
     for _ in range(40):

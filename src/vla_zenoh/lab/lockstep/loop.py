@@ -241,7 +241,7 @@ class Lockstep:
             self._send(SIM, gripper, partial(self._take_gripper_state, part), part=part)
             looks = [worker.spec.observation for worker in self.workers.values()]
             wanted = {what for each in looks for what in each.state_streams}
-            if self.commander.reach is not None or "joint" in wanted:
+            if self.commander.parts[0].reach is not None or "joint" in wanted:
                 joints = arm.joint_state()
                 self._send(SIM, joints, partial(self._take_joint_state, part), part=part)
 
