@@ -63,6 +63,8 @@ class CommandedPart:
         self.motion = MotionPipeline(profile, reach, self.planner)
         self.contact, self.retreat = self.motion.contact, self.motion.retreat
         self.watchdog = Watchdog(profile)
+        self.too_near: LimitHit | None = None
+        """The bound that the measured joints are too near to: the arm has to brake."""
         self._joint_monitor = None if reach is None else JointMonitor(profile, reach)
         self.held = None if reach is None else reach.barriers.collisions.held
         """What the gripper holds."""
@@ -195,6 +197,7 @@ class CommandedPart:
     def activate(self, lease: Lease, now_ns: int) -> None:
         """Start the motion where the arm stands; its states are known."""
         assert self.pose is not None and self.gripper_state is not None
+        self.too_near = None
         self.contact.begin()
         self.planner.restart(self.pose, self.joint)
         measured, joint = self.pose.record, self.joint.record if self.joint else None
@@ -266,15 +269,14 @@ class CommandedPart:
         """It is long overdue."""
         return self._joint_monitor is not None and self._joint_monitor.late(now_ns)
 
-    def monitor_joints(self, now_ns: int) -> LimitHit | None:
-        """Slow a moving arm down if its measured joints come near a bound; returns a bound to brake
-        at."""
+    def monitor_joints(self, now_ns: int) -> None:
+        """Slow a moving arm down if its measured joints come near a bound, see `too_near`."""
         monitor, motion, measured_rad = self._joint_monitor, self.motion, self.measured_rad
         if monitor is None or measured_rad is None or not motion.streaming:
-            return None
-        hit = monitor.update(measured_rad, motion.joints_rad, now_ns, in_joints=motion.in_joints)
+            return
+        commanded_rad, in_joints = motion.joints_rad, motion.in_joints
+        self.too_near = monitor.update(measured_rad, commanded_rad, now_ns, in_joints=in_joints)
         motion.joint_slowdown = monitor.slowdown
-        return hit
 
     def _obstructed(self, events: list[Event]) -> str:
         """Why the arm is blocked or in contact, empty otherwise; it then brakes and retreats."""

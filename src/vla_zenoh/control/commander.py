@@ -122,9 +122,9 @@ class Commander:
         To be called when the commands of a tick are published. Without it all of that is done when
         it is due, or overdue. Its events are among the next outputs.
         """
-        for part in self.parts:
+        for part in self.parts if self.state in OBEYING else ():
             if part.monitor_due(now_ns):
-                self._monitor_joints(part, now_ns)
+                part.monitor_joints(now_ns)
         for part in self.parts if self.state is State.ACTIVE else ():
             events = part.motion.look_ahead(now_ns)
             if events:
@@ -163,8 +163,11 @@ class Commander:
         for part in parts:
             if not planned:
                 self._follow_elbow(part)
-            if part.monitor_late(now_ns):  # `look_ahead` is not called in time
-                self._monitor_joints(part, now_ns)
+            if self.state in OBEYING:
+                if part.monitor_late(now_ns):  # `look_ahead` is not called in time
+                    part.monitor_joints(now_ns)
+                if part.too_near is not None:
+                    self._brake_at(part.too_near, part)
         if self._spacing is not None:
             self._monitor_distance(self._spacing, now_ns)
             self._keep_apart(self._spacing, now_ns, ticks)
@@ -548,12 +551,6 @@ class Commander:
             part.follow_elbow(obeying=self.state in OBEYING)
         except RecordError as error:
             self._change(Trigger.LOSE, part.says(str(error)))
-
-    def _monitor_joints(self, part: CommandedPart, now_ns: int) -> None:
-        """Slow a part down, or brake, if its measured joints come too near to a bound."""
-        hit = part.monitor_joints(now_ns) if self.state in OBEYING else None
-        if hit is not None:
-            self._brake_at(hit, part)
 
     def _monitor_distance(self, spacing: PartSpacing, now_ns: int) -> None:
         """Brake if the measured parts come too near to each other."""
