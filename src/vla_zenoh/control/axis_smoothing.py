@@ -148,8 +148,9 @@ class AxisSmoother:
     def stand(self, position: FloatArray) -> None:
         """Stand at `position` (n,) without any motion; only while nothing is streamed."""
         zeros = np.zeros(len(position))
-        self._state = AxisState(np.array(position, dtype=np.float64), zeros, zeros)
-        self._target = self._state.position
+        self.state = AxisState(np.array(position, dtype=np.float64), zeros, zeros)
+        """The present state."""
+        self._target = self.state.position
         self._plan: _Plan | None = None
         self._elapsed_s = 0.0
         self._jerk, self._sign = zeros, zeros
@@ -165,11 +166,6 @@ class AxisSmoother:
     def adopt(self, fork: Self) -> None:
         """Take over the motion of a `fork` that was made of the present state."""
         vars(self).update(vars(fork))
-
-    @property
-    def state(self) -> AxisState:
-        """The present state."""
-        return self._state
 
     def move_to(
         self, target: FloatArray, shares: Shares = FULL, *, all_to_stop: bool = False
@@ -194,11 +190,11 @@ class AxisSmoother:
         self.braking = False
         self._target = target
         limits, unreversed = self._limits(shares)
-        way = self._target - self._state.position
+        way = self._target - self.state.position
         way[np.abs(way) < QUIET[0]] = 0.0
         plan, enough = self._towards(way, limits, unreversed, all_to_stop)
         self._begin(plan)
-        self._too_fast = self._slows() & (np.abs(self._state.velocity) > limits[0])
+        self._too_fast = self._slows() & (np.abs(self.state.velocity) > limits[0])
         again = self._too_fast.any() and not self.braking
         self._again = (shares, all_to_stop) if again else None
         return enough
@@ -230,7 +226,7 @@ class AxisSmoother:
             self.braking = True
             plan = self._stop(self.box, together=False)
         if plan is None:
-            self.stand(self._state.position)
+            self.stand(self.state.position)
             return
         self._plan = plan
 
@@ -265,7 +261,7 @@ class AxisSmoother:
                 path = self._calculated(ask)
                 if path is None:
                     continue
-                found = _Plan(self._state.position, basis, path, self._pace_of(most))
+                found = _Plan(self.state.position, basis, path, self._pace_of(most))
                 overshoots = self._overshoots(path, basis.T @ way, (basis, may_take, parts))
                 if not overshoots and not self._leaves(found):
                     if most is not limits:
@@ -279,7 +275,7 @@ class AxisSmoother:
         if self.bounds_m is None:
             return False
         low, high = self.bounds_m
-        start, end = self._state.position[:3], plan.end[:3]
+        start, end = self.state.position[:3], plan.end[:3]
         inside = (
             np.minimum(start, end) >= low - OVERSHOOT,
             np.maximum(start, end) <= high + OVERSHOOT,
@@ -296,7 +292,7 @@ class AxisSmoother:
         One, if the motion is already along `way`. Otherwise those of each group: the line and the
         directions beside it if the motion there is small, or the axes.
         """
-        _, velocity, acceleration = self._state
+        _, velocity, acceleration = self.state
         whole = line_of(way, velocity, acceleration, self._pace)
         if whole is not None:
             return whole[:, None], [1.0]
@@ -314,7 +310,7 @@ class AxisSmoother:
     ) -> tuple[FloatArray, list[float]]:
         """The same for m axes: (m, k), with `way` (m,) and `limits` (3, m)."""
         size = len(way)
-        motion = np.array([self._state.velocity[axes], self._state.acceleration[axes]])
+        motion = np.array([self.state.velocity[axes], self.state.acceleration[axes]])
         line = line_of(way, motion[0], motion[1], self._pace)
         if line is not None:
             return (line[:, None], [1.0]) if line.any() else (np.zeros((size, 0)), [])
@@ -373,7 +369,7 @@ class AxisSmoother:
             ask.synchronization = synchronization
             path = self._calculated(ask)
             if path is not None:
-                return _Plan(self._state.position, basis, path, self._pace_of(limits))
+                return _Plan(self.state.position, basis, path, self._pace_of(limits))
         return None
 
     def _input(
@@ -388,7 +384,7 @@ class AxisSmoother:
             slowly: what is too fast brakes so that it does not fall below half its velocity limit.
                 With all of its acceleration it would have to reverse before that has ended.
         """
-        _, velocity, acceleration = self._state
+        _, velocity, acceleration = self.state
         paces = self._pace_of(limits) ** np.array([1.0, 2.0, 3.0])
         with np.errstate(divide="ignore"):
             along = (limits[:, :, None] / np.abs(basis)).min(axis=1) * np.array(parts)
@@ -438,7 +434,7 @@ class AxisSmoother:
         reverses, too. An axis keeps what it needed until its acceleration ends: with less again it
         would pass its target.
         """
-        _, velocity, acceleration = self._state
+        _, velocity, acceleration = self.state
         speed = np.abs(velocity)
         slows = velocity * acceleration < 0
         least = REST_VELOCITY * self._pace
@@ -455,7 +451,7 @@ class AxisSmoother:
 
     def _slows(self) -> NDArray[np.bool_]:
         """(n,) which axes slow down, by more than rounding noise."""
-        _, velocity, acceleration = self._state
+        _, velocity, acceleration = self.state
         noise = QUIET[2] * self._pace**2
         return (velocity * acceleration < 0) & (np.abs(acceleration) > noise)
 
@@ -468,7 +464,7 @@ class AxisSmoother:
         if self._plan is None:
             return False
         self._elapsed_s += pace * self._dt_s
-        self._state = self._plan.at(self._elapsed_s)
+        self.state = self._plan.at(self._elapsed_s)
         if self._elapsed_s >= self._plan.duration_s:
             self._plan = None
         return True
@@ -480,12 +476,12 @@ class AxisSmoother:
         """Brake, and return where (n,) the brake will end."""
         if not self.at_rest:
             self.brake()
-        return self._state.position if self._plan is None else self._plan.end
+        return self.state.position if self._plan is None else self._plan.end
 
     def halfway_to_rest(self) -> FloatArray:
         """Position (n,) after half of the time that is left of the motion in progress."""
         if self._plan is None:
-            return self._state.position
+            return self.state.position
         return self._plan.at(0.5 * (self._elapsed_s + self._plan.duration_s)).position
 
     @property
@@ -498,19 +494,19 @@ class AxisSmoother:
             return False
         if self.braking:
             return float(np.abs(acceleration).max()) < 1e-3
-        return float(np.abs(self._target - self._state.position).max()) < REST_OFFSET
+        return float(np.abs(self._target - self.state.position).max()) < REST_OFFSET
 
     @property
     def _rates(self) -> tuple[FloatArray, FloatArray]:
-        return self._state[1:]
+        return self.state[1:]
 
     def _settle(self) -> None:
         """Set noise to zero, before the motion is planned."""
-        position, velocity, acceleration = self._state
+        position, velocity, acceleration = self.state
         velocity, acceleration = velocity.copy(), acceleration.copy()
         velocity[np.abs(velocity) < QUIET[1] * self._pace] = 0.0
         acceleration[np.abs(acceleration) < QUIET[2] * self._pace**2] = 0.0
-        self._state = AxisState(position, velocity, acceleration)
+        self.state = AxisState(position, velocity, acceleration)
 
 
 def stop_way(

@@ -22,26 +22,22 @@ class GripperArbiter:
         self.requested_m: float | None = None
         self.sent_m: float | None = None
         self._sent_ns = 0
-        self._in_flight = False
+        self.in_flight = False
+        """A command was sent and the gripper has not come to rest since."""
         self.timeouts = 0
 
     def restart(self, width_m: float) -> None:
         """Start at `width_m`, with nothing to send."""
         self.requested_m = self.sent_m = width_m
-        self._in_flight = False
+        self.in_flight = False
 
     def request(self, width_m: float) -> None:
         """Request a width; replaces an earlier one that was not sent."""
         self.requested_m = min(max(width_m, 0.0), self._profile.max_width_m)
 
-    @property
-    def in_flight(self) -> bool:
-        """A command was sent and the gripper has not come to rest since."""
-        return self._in_flight
-
     def step(self, now_ns: int, state: Stamped[GripperState] | None) -> GripperCommand | None:
         """The command to send now, None without one."""
-        if self._in_flight:
+        if self.in_flight:
             settled = (
                 state is not None
                 and state.received_ns > self._sent_ns + SETTLE_NS
@@ -49,14 +45,14 @@ class GripperArbiter:
             )
             late = now_ns - self._sent_ns > self._profile.command_timeout_s * 1e9
             if settled or late:
-                self._in_flight = False
+                self.in_flight = False
                 self.timeouts += int(late and not settled)
-        if self._in_flight or self.requested_m is None:
+        if self.in_flight or self.requested_m is None:
             return None
         if (
             self.sent_m is not None
             and abs(self.requested_m - self.sent_m) <= self._profile.dead_band_m
         ):
             return None
-        self.sent_m, self._sent_ns, self._in_flight = self.requested_m, now_ns, True
+        self.sent_m, self._sent_ns, self.in_flight = self.requested_m, now_ns, True
         return GripperCommand(self.requested_m, self._profile.speed_m_s, self._profile.force_n)

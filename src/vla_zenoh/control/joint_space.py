@@ -346,12 +346,12 @@ class JointPath(AxisSmoother):
         if self._ticks % CHECK_TICKS == 0 and not self.braking and not self.at_rest:
             stop_rad = self.state.position + self.stop_way(CHECK_TICKS * self._dt_s)
             self._brake_at(self._bounds.distance_hit(self.state.position, stop_rad))
-        before = self._state
+        before = self.state
         moves = self.advance(pace)
         if moves and not self.braking and not self._stops_inside(pace):
             hit = self._stop_hit()
             if hit is not None:
-                self._state = before  # a stop from there was found to end inside
+                self.state = before  # a stop from there was found to end inside
                 self._brake_at(hit)
                 self.advance(pace)
         if moves:

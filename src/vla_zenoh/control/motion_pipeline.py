@@ -12,7 +12,7 @@ import numpy as np
 from vla_zenoh.control.aggregate import PlanAggregator
 from vla_zenoh.control.chunk_planner import LOOK_AHEAD, ChunkPlanner
 from vla_zenoh.control.commander_io import MotionCommands, limit_events, make_event
-from vla_zenoh.control.contact import Contact
+from vla_zenoh.control.contact import Contact, Retreat
 from vla_zenoh.control.gripper_arbiter import GripperArbiter
 from vla_zenoh.control.joint_space import JointPath
 from vla_zenoh.control.limits import (
@@ -27,7 +27,6 @@ from vla_zenoh.control.limits import (
 from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan, joint_goal
 from vla_zenoh.control.pose_to_joint import PoseToJoint
 from vla_zenoh.control.reachability import ReachabilityFilter
-from vla_zenoh.control.retreat import Retreat
 from vla_zenoh.control.smoothing import FULL, Motion, Shares, Smoother, motion_limits
 from vla_zenoh.control.states import OBEYING, State
 from vla_zenoh.control.step_timing import StepTiming
@@ -68,13 +67,6 @@ SAME_POSE = 1e-6
 """m and rad: joints whose TCP is this near to a pose reach it."""
 SETTLED, SETTLED_NS = 5e-4, 100_000_000
 """A robot that moves by less than this, in m and rad, for this long stands."""
-
-
-class Leashed(NamedTuple):
-    """A goal on the leash, and the limits that acted."""
-
-    goal: Goal
-    hits: list[LimitHit]
 
 
 class _Ahead(NamedTuple):
@@ -536,7 +528,7 @@ class MotionPipeline:
         goal = self._aggregator.goal(plans, next_ns)
         if goal is self.goal or (goal.arm is not None) is not self.in_joints:
             return
-        if self._on_leash(mover, goal, self._dt_s).hits:
+        if self._on_leash(mover, goal, self._dt_s)[1]:
             return
         slower, speed = self._slowest(goal), self.speed
         self.speed = 1.0 if slower is None else slower.share
@@ -592,17 +584,19 @@ class MotionPipeline:
         hard = self._slowing and (self._joints is None or self.in_joints)
         return _Ahead(of, at, timing, mover, _move(mover, goal, shares, hard=hard))
 
-    def _on_leash(self, mover: Smoother | JointPath, goal: Goal, ahead_s: float) -> Leashed:
+    def _on_leash(
+        self, mover: Smoother | JointPath, goal: Goal, ahead_s: float
+    ) -> tuple[Goal, list[LimitHit]]:
         """`goal`, or a nearer one that is no further ahead than the leash allows.
 
         The leash starts where the arm is in this tick: it may be moving away from the last goal.
         """
         if isinstance(mover, JointPath):
-            return Leashed(*mover.leash(goal, ahead_s))
+            return mover.leash(goal, ahead_s)
         if self._well_within_leash(mover.motion, goal.pose, ahead_s):
-            return Leashed(goal, [])
+            return goal, []
         pose, hits = leash(self._limits, goal.pose, _ahead(mover.motion, ahead_s))
-        return Leashed(replace(goal, pose=pose, joints_rad=None) if hits else goal, hits)
+        return replace(goal, pose=pose, joints_rad=None) if hits else goal, hits
 
     def _well_within_leash(self, motion: Motion, goal: Pose, ahead_s: float) -> bool:
         """Whether the leash is long enough wherever the arm will be; cheaper than computing where.

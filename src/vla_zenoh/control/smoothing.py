@@ -89,7 +89,7 @@ class Smoother(AxisSmoother):
 
     def stand(self, position: FloatArray) -> None:
         super().stand(position)
-        pose = Pose(self._state.position[:3], self._anchor)
+        pose = Pose(self.state.position[:3], self._anchor)
         self.motion = Motion(pose, np.zeros(6), np.zeros(6))
 
     def target(self, pose: Pose, shares: Shares = FULL, *, all_to_stop: bool = False) -> bool:
@@ -130,7 +130,7 @@ class Smoother(AxisSmoother):
         (velocity, spin), (change, spin_change) = (
             (values[:3], body @ values[3:]) for values in (motion.twist, motion.acceleration)
         )
-        self._state = self._state._replace(
+        self.state = self.state._replace(
             velocity=np.concatenate([velocity, spin]),
             acceleration=np.concatenate([change, spin_change]),
         )
@@ -147,7 +147,7 @@ class Smoother(AxisSmoother):
         """
         if not self.advance(pace):
             return self.motion
-        position, velocity, acceleration = self._state
+        position, velocity, acceleration = self.state
         rotation = self._anchor @ exp3(position[3:])
         spin, spin_change = spatial_rates(position[3:], velocity[3:], acceleration[3:])
         twist, change = velocity.copy(), acceleration.copy()
@@ -161,10 +161,10 @@ class Smoother(AxisSmoother):
 
     def _settle(self) -> None:
         """Move the anchor to the present rotation, and set noise to zero."""
-        position, velocity, acceleration = self._state
+        position, velocity, acceleration = self.state
         spin, spin_change = body_rates(position[3:], velocity[3:], acceleration[3:])
         self._anchor = orthonormal(self._anchor @ exp3(position[3:]))
-        self._state = AxisState(
+        self.state = AxisState(
             np.concatenate([position[:3], np.zeros(3)]),
             np.concatenate([velocity[:3], spin]),
             np.concatenate([acceleration[:3], spin_change]),

@@ -10,7 +10,7 @@ from command_rig import START_M, Rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vla_zenoh.control.retreat import RELIEF_M, SPACE_M, CommandTrail
+from vla_zenoh.control.contact import RELIEF_M, SPACE_M, CommandTrail
 from vla_zenoh.control.watchdog import Watchdog
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.types import PoseState, Stamped
