@@ -117,23 +117,30 @@ class Commander:
         self._plan_ahead(next_ns)
 
     def look_ahead(self, now_ns: int) -> None:
-        """Monitor the measured joints, bound steps that are due later, plan the motion to the next.
+        """Bound steps that are due later, plan the motion to the next, monitor the measured joints.
 
         To be called when the commands of a tick are published. Without it all of that is done when
         it is due, or overdue. Its events are among the next outputs.
         """
-        for part in self.parts if self.state in OBEYING else ():
-            if part.monitor_due(now_ns):
-                part.monitor_joints(now_ns)
         for part in self.parts if self.state is State.ACTIVE else ():
             events = part.motion.look_ahead(now_ns)
             if events:
                 self._out.events += part.tagged(events)
-        self._plan_ahead(now_ns + self._period_ns)
+        planned = self._plan_ahead(now_ns + self._period_ns)
+        for part in self.parts if self.state in OBEYING else ():
+            # One of them is work enough for one tick.
+            busy = planned or part.planner.spent
+            if part.monitor_late(now_ns) if busy else part.monitor_due(now_ns):
+                part.monitor_joints(now_ns)
 
-    def _plan_ahead(self, next_ns: int) -> None:
-        for part in self.parts if self.state is State.ACTIVE else ():
+    def _plan_ahead(self, next_ns: int) -> bool:
+        """Plan the motion to the goals of the next tick; returns whether they are new."""
+        new = [
             part.motion.plan_ahead(self.task, self._watchdog.deadline_ns, next_ns)
+            for part in self.parts
+            if self.state is State.ACTIVE
+        ]
+        return any(new)
 
     def _begin_planning(self) -> None:
         for part in self.parts:

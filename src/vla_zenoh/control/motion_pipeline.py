@@ -508,10 +508,10 @@ class MotionPipeline:
             self.gripper.request(goal.width_m)
         return events
 
-    def plan_ahead(self, task: Task, overdue_ns: int, next_ns: int) -> None:
-        """Compute the motion to the goal that comes into force at the next tick.
+    def plan_ahead(self, task: Task, overdue_ns: int, next_ns: int) -> bool:
+        """Compute the motion to the goal that comes into force at the next tick, if one does.
 
-        That takes it over if nothing that the motion depends on has changed by then.
+        That tick takes it over if nothing that the motion depends on has changed by then.
 
         Args:
             task: its rate.
@@ -521,19 +521,20 @@ class MotionPipeline:
         timeline, mover = self.timeline, self._mover
         self._ahead = None
         if timeline is None or mover is None or self.held or self._override == 0.0:
-            return
+            return False
         plans = self._aggregator.plans(timeline, next_ns)
         if len(plans) > 1:  # their mix is another goal in every tick
-            return
+            return False
         goal = self._aggregator.goal(plans, next_ns)
         if goal is self.goal or (goal.arm is not None) is not self.in_joints:
-            return
+            return False
         if self._on_leash(mover, goal, self._dt_s)[1]:
-            return
+            return False
         slower, speed = self._slowest(goal), self.speed
         self.speed = 1.0 if slower is None else slower.share
         self._ahead = self._motion_to(mover, goal, plans[0], task, overdue_ns, next_ns)
         self.speed = speed
+        return True
 
     def _slowest(self, goal: Goal) -> Slowdown | None:
         """What slows the arm down most on the way to `goal`."""
