@@ -46,6 +46,9 @@ from vla_zenoh.types import (
 LATE_NS = 10_000_000_000
 """A setting that was put before a stop arrives at most this long after it. Stamps that say so later
 are those of a clock that was set."""
+PLANNING_NS = 2_000_000
+"""A chunk and the motion to its first goal are planned within this. In less time only the chunk is,
+so that the next tick is not missed."""
 
 __all__ = ["Commander", "Inputs", "Outputs", "Setting"]
 
@@ -114,7 +117,8 @@ class Commander:
         for chunk in inputs.chunks:
             self._submit_chunk(chunk, next_ns)
         self._plan_chunks(next_ns)
-        self._plan_ahead(next_ns)
+        if self._period_ns >= PLANNING_NS:
+            self._plan_ahead(next_ns)
 
     def look_ahead(self, now_ns: int) -> None:
         """Bound steps that are due later, plan the motion to the next, monitor the measured joints.
