@@ -5,7 +5,6 @@ from __future__ import annotations
 import unicodedata
 
 _NOT_PRINTED = {"Cc", "Cf", "Cs", "Zl", "Zp"}
-_TO_SPACES = {ord("\n"): " ", ord("\t"): " "}
 
 
 def printable(text: str) -> str:
@@ -21,12 +20,7 @@ def printable(text: str) -> str:
 
 
 def one_line(value: object, most: int = 200) -> str:
-    """A value as one safe line of limited length.
-
-    Args:
-        value: text, or anything that has a text.
-        most: characters that are kept.
-    """
+    """The text of a value as one safe line of at most `most` characters."""
     text = str(value)
     cut = text if len(text) <= most else f"{text[:most]}..."
-    return printable(cut.translate(_TO_SPACES))
+    return printable(cut.replace("\n", " ").replace("\t", " "))

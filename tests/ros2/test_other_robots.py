@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from vla_zenoh.errors import SessionError
-from vla_zenoh.lab.profile.ros2_endpoints import endpoints
+from vla_zenoh.lab.profile.ros2_bridge import endpoints
 
 ros = pytest.importorskip("ros_messages", exc_type=ImportError)
 

@@ -9,7 +9,7 @@ from camera_rig import until
 from ros2_rig import write_profile
 
 from vla_zenoh.bus.session import open_session
-from vla_zenoh.lab.profile.ros2_endpoints import endpoints
+from vla_zenoh.lab.profile.ros2_bridge import endpoints
 from vla_zenoh.profile import load_profile
 from vla_zenoh.robots.node import RobotNode
 from vla_zenoh.robots.ros2.driver import Ros2Driver

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import datetime as dt
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from vla_zenoh.errors import MissingExtraError, SecurityError
+from vla_zenoh.errors import MissingExtraError, SecurityError, counted
 from vla_zenoh.security.store import AUTHORITY, Store, open_to_others
 
 try:
@@ -30,14 +29,7 @@ WARN_DAYS = 30
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
-    """Contents of a certificate.
-
-    Args:
-        common_name: of its subject.
-        not_before: valid from, UTC.
-        not_after: valid until, UTC.
-        addresses: host names and IP addresses that it is valid for as a server.
-    """
+    """Contents of a certificate; times are UTC, `addresses` those it is valid for as a server."""
 
     common_name: str
     not_before: dt.datetime
@@ -59,9 +51,8 @@ class Certificate:
     def warning(self, now: dt.datetime) -> str:
         """Warning of an expiry within `WARN_DAYS`; empty if there is none."""
         left = self.days_left(now)
-        if self.fault(now) or left >= WARN_DAYS:
-            return ""
-        return f"ends in {left} day{'s' if left != 1 else ''}; renew it"
+        soon = left < WARN_DAYS and not self.fault(now)
+        return f"ends in {counted(left, 'day')}; renew it" if soon else ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,8 +62,8 @@ class Entry:
     Args:
         host: empty: the authority itself.
         node: or ``operator``, ``viewer``, ``ca``.
-        path: of the certificate.
-        certificate: its contents; None if it cannot be read.
+        path: of its file.
+        certificate: None if it cannot be read.
         faults: why it is unusable or unsafe.
         warning: of its expiry.
     """
@@ -100,41 +91,30 @@ class CheckedStore(Store):
         return out
 
     def _entry(self, path: Path, signer: Path, host: str, now: dt.datetime) -> Entry:
-        node, found, warning = path.stem, None, ""
+        node, key, found, warning = path.stem, path.with_suffix(".key"), None, ""
         faults: list[str] = []
         try:
             pem = read_file(path)
             found = read(pem)
-            faults += [fault] if (fault := found.fault(now)) else []
+            faults.append(found.fault(now))
             warning = found.warning(now)
             if not signed_by(pem, read_file(signer)):
                 faults.append("was signed by another authority")
             if host and found.common_name != f"{node}@{host}":
                 faults.append(f"is about {found.common_name!r}")
-            faults += self._key_faults(path, host)
+            if key.exists():
+                faults.append(open_to_others(key))
+                if not key_fits(pem, read_file(key)):
+                    faults.append(f"{key.name} belongs to another certificate")
+            elif host:
+                faults.append(f"{key.name} is not there")
         except SecurityError as error:
             faults.append(str(error))
-        return Entry(host, node, path, found, tuple(faults), warning)
-
-    @staticmethod
-    def _key_faults(path: Path, host: str) -> Iterator[str]:
-        key = path.with_suffix(".key")
-        if not key.exists():
-            if host:
-                yield f"{key.name} is not there"
-            return
-        if fault := open_to_others(key):
-            yield fault
-        if not key_fits(read_file(path), read_file(key)):
-            yield f"{key.name} belongs to another certificate"
+        return Entry(host, node, path, found, tuple(filter(None, faults)), warning)
 
 
 def read(pem: bytes) -> Certificate:
-    """Contents of a certificate.
-
-    Raises:
-        SecurityError: not a certificate.
-    """
+    """Contents of a certificate, or a `SecurityError`."""
     found, extensions = _parsed(pem)
     names = found.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     try:
@@ -150,11 +130,7 @@ def read(pem: bytes) -> Certificate:
 
 
 def signed_by(pem: bytes, authority: bytes) -> bool:
-    """Whether `authority` signed the certificate `pem`.
-
-    Raises:
-        SecurityError: one of them is not a certificate.
-    """
+    """Whether `authority` signed the certificate `pem`; a `SecurityError` if one is none."""
     (found, _), (signer, _) = _parsed(pem), _parsed(authority)
     try:
         found.verify_directly_issued_by(signer)
@@ -172,11 +148,7 @@ def _parsed(pem: bytes) -> tuple[x509.Certificate, x509.Extensions]:
 
 
 def key_fits(certificate: bytes, key: bytes) -> bool:
-    """Whether the private key belongs to the certificate, both as PEM text.
-
-    Raises:
-        SecurityError: one of them cannot be read.
-    """
+    """Whether the private key belongs to the certificate; see `load_pair`."""
     found, private = load_pair(certificate, key)
     return found.public_key() == private.public_key()
 
@@ -200,11 +172,7 @@ def load_pair(
 
 
 def read_file(path: Path) -> bytes:
-    """Content of a file.
-
-    Raises:
-        SecurityError: it cannot be read.
-    """
+    """Content of a file, or a `SecurityError`."""
     try:
         return path.read_bytes()
     except OSError as error:

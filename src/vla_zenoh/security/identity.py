@@ -5,6 +5,7 @@ An identity is the common name of a certificate, ``NODE@HOST``; the router's rul
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING
@@ -71,21 +72,15 @@ class Identity:
 
 def operator_role(profile: Profile, host: str) -> Role | None:
     """Role of a person at `host`; None: the profile does not know that host."""
-    security = profile.session.security
-    if security is not None and host in security.people:
-        return Role(security.people[host])
-    part = profile.hosts.get(host)
-    if part is None:
+    if host in (people := _people(profile)):
+        return Role(people[host])
+    if host not in profile.hosts:
         return None
-    return Role.OPERATOR if "command" in part.nodes else Role.VIEWER
+    return Role.OPERATOR if "command" in profile.hosts[host].nodes else Role.VIEWER
 
 
 def identities_of(profile: Profile, host: str) -> list[Identity]:
-    """All identities at `host`: its nodes and its operators.
-
-    Raises:
-        ProfileError: it is neither in hosts nor in session.security.people.
-    """
+    """All identities at `host`, or a `ProfileError`: its nodes and its operators."""
     role = operator_role(profile, host)
     if role is None:
         known = ", ".join(sorted({*profile.hosts, *_people(profile)}))
@@ -123,9 +118,8 @@ def expected_nodes(profile: Profile) -> dict[str, str]:
     return found
 
 
-def _people(profile: Profile) -> tuple[str, ...]:
-    security = profile.session.security
-    return tuple(security.people) if security is not None else ()
+def _people(profile: Profile) -> Mapping[str, str]:
+    return profile.session.security.people if profile.session.security is not None else {}
 
 
 def _nodes(profile: Profile, host: str) -> list[Identity]:

@@ -37,11 +37,7 @@ class Files(NamedTuple):
 
 
 class Store:
-    """Folder of a lab's certificates and keys.
-
-    Args:
-        folder: may begin with ``~``.
-    """
+    """Folder of a lab's certificates and keys; its path may begin with ``~``."""
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder).expanduser()
@@ -94,13 +90,10 @@ class Store:
     def identity_files(
         self, host: str | None, node: str | None, people: Mapping[str, str] | None = None
     ) -> Files:
-        """Files of a node of this computer or, without a node, of its operator.
+        """Files of a node of this computer, or of its operator if `node` is None.
 
-        Args:
-            host: that this computer is; None: `known_host`.
-            node: name; None: the operator.
-            people: ``session.security.people``. Where it names the host, only the certificate of
-                that role is used: the router drops messages of others.
+        Where `people`, which is ``session.security.people``, names the host, only the certificate
+        of that role is used: the router drops messages of others.
 
         Raises:
             SecurityError: they are missing, or others can read the key.

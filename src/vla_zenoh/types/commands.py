@@ -44,16 +44,12 @@ class ActionChunk:
     """What a model asks for: `H` steps of `D` numbers whose meaning its spec declares.
 
     Args:
-        worker: name of the worker.
-        spec_hash: hash of the spec its steps are to be read with.
+        spec_hash: of the spec its steps are to be read with.
         episode: the episode (see `Task`) the policy was reset for.
         observation_stamp_ns: capture time of the observation, wall clock.
-        observation_seq: its sequence number.
         valid_until_ns: after this wall time the chunk must not be started.
         steps: (H, D) float32.
         observed_ns: wall time at which the worker took the observation.
-        inference_start_ns: wall time.
-        inference_end_ns: wall time.
         done: the policy reports that its task is finished when these steps are.
     """
 
@@ -82,14 +78,11 @@ class InferenceDebug:
     """One inference, for debugging. Its images travel beside it, one key per camera.
 
     Args:
-        worker: name of the worker.
         chunk_seq: number of the resulting chunk; the images have the same.
         spec_hash: what the steps are to be read with.
         episode: as in the chunk.
         observation_stamp_ns: capture time, wall clock; the images have the same.
-        prompt: input of the model.
         steps: (H, D) float32, the final action.
-        inference_ms: time the model took.
         raw: output before the steps: tokens, normalised action, whatever the model reports.
         done: the policy reports that its task is finished with these steps.
     """

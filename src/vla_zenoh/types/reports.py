@@ -44,10 +44,8 @@ class NodeStatus:
     """Status of a node, published by itself.
 
     Args:
-        node: its name.
         state: one word.
         host: where it runs: of the profile where it knows that, else the computer's own name.
-        pid: process number.
         started_wall_ns: when it started; shows a restart.
         ages_s: age of the newest of every input.
         rates_hz: of its publishers and loops.
@@ -90,8 +88,8 @@ class Event:
     """Something that happened once.
 
     Args:
-        level: ``info``, ``warning`` or ``error``.
-        kind: ``refusal``, ``transition``, ``limit``, ``fault`` or ``notice``.
+        level: one of `EVENT_LEVELS`.
+        kind: one of `EVENT_KINDS`.
         what: short stable name, for example ``stale_chunk``.
         why: a sentence.
         value: the value that led to it, where there is one.
@@ -128,8 +126,7 @@ class Task:
         episode: grows with every activation and every change of prompt or worker; a policy is reset
             with it, and a chunk of an older episode is rejected.
         active: the arm follows the worker.
-        prompt: plain text.
-        worker: name of the worker whose chunks are executed.
+        worker: whose chunks are executed.
         rate_hz: chunks per second requested of the workers.
         speed_percent: speed override, percent of the planned speed; 0: the arm stands, active.
     """

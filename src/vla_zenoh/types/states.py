@@ -36,7 +36,6 @@ class JointState:
     In rad and Nm, of a joint that slides in m and N.
 
     Args:
-        names: of the joints.
         position_rad: (n,) measured.
         velocity_rad_s: (n,) measured.
         effort_nm: (n,) motor effort: of the simulator and of ROS 2's joint states the total,
@@ -98,8 +97,6 @@ class GripperState:
 
     Args:
         width_m: opening between the fingers.
-        moving: the fingers move.
-        holding: an object is held.
         mode: the robot's name for its mode, ``ready`` when it will move.
         faults: reported by the robot, empty if there are none.
     """
@@ -119,11 +116,7 @@ class GripperState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PrivilegedState:
-    """What only a simulation can know: true poses, the observation of a benchmark's own expert.
-
-    Args:
-        values: name -> its numbers, (n,) each.
-    """
+    """What only a simulation can know, for a benchmark's own expert: name -> (n,) numbers."""
 
     values: Mapping[str, FloatArray]
 
@@ -136,7 +129,6 @@ class SceneState:
     """All generalised positions of a simulation, enough for a renderer to draw it.
 
     Args:
-        scene: name of the scene.
         qpos: (nq,), the simulator's own order and units, then positions and quaternions of mocap
             bodies.
         seed: of the last reset, which determines how a scene with a varied look appears; or None.

@@ -10,6 +10,7 @@ from __future__ import annotations
 import datetime as dt
 import ipaddress
 from collections.abc import Iterable
+from contextlib import suppress
 from typing import NamedTuple
 
 from vla_zenoh.errors import SecurityError
@@ -36,12 +37,7 @@ class KeyPair(NamedTuple):
 
 
 def make_authority(name: str, now: dt.datetime, days: int = AUTHORITY_DAYS) -> KeyPair:
-    """A new authority: a key and a self-signed certificate.
-
-    Args:
-        name: of the lab, at most 64 characters.
-        now: UTC.
-        days: validity.
+    """A new authority of the lab `name`: a key and a self-signed certificate; `now` is UTC.
 
     Raises:
         SecurityError: invalid name.
@@ -62,7 +58,7 @@ def issue(
 
     Args:
         authority: of the lab.
-        common_name: at most 64 characters.
+        common_name: of the holder.
         now: UTC.
         days: validity, limited by that of the authority.
         addresses: host names and IP addresses of a server; None: it may only connect.
@@ -88,10 +84,8 @@ def issue(
 
 
 def _address(address: str) -> x509.GeneralName:
-    try:
+    with suppress(ValueError):
         return x509.IPAddress(ipaddress.ip_address(address.partition("%")[0]))
-    except ValueError:
-        pass
     try:
         return x509.DNSName(address)
     except ValueError as error:

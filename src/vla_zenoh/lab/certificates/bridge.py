@@ -23,11 +23,9 @@ for no name that begins with an @."""
 
 
 def bridges(profile: Profile, host: str | None = None) -> list[Identity]:
-    """The bridge, with the host that runs the node ``ros2``; none where only that host reaches it.
+    """The bridge, with the host (or only this one) that runs the node ``ros2``.
 
-    Args:
-        profile: the lab, secured or not yet.
-        host: leave out all others.
+    None where only that host reaches it.
     """
     places = profile.ros2.connect if profile.ros2 is not None else None
     if all(_is_open_here(endpoint) for endpoint in places or ()):
@@ -43,9 +41,7 @@ def bridges(profile: Profile, host: str | None = None) -> list[Identity]:
 def bridge_locks(profile: Profile, folder: Path) -> dict[str, Any]:
     """Zenoh's sections ``transport`` and ``access_control`` for the bridge.
 
-    Args:
-        profile: the lab.
-        folder: where ``ca.pem``, ``bridge.pem`` and ``bridge.key`` are on the bridge's computer.
+    On its computer `folder` has ``ca.pem``, ``bridge.pem`` and ``bridge.key``.
     """
     names = [f"{USER}@{host}" for host in _users(profile)]
     return {

@@ -47,35 +47,27 @@ class LabCertificates(CheckedStore):
             identities: of nodes and operators.
             now: UTC.
             days: validity.
-            addresses: of routers, for clients.
+            addresses: at which clients look for routers.
             renew: replace existing ones; routers keep the addresses of those as well.
 
         Raises:
             SecurityError: one exists already, the authority's key is missing, or a file cannot be
                 written. Nothing is written then.
         """
-        identities, serving = list(identities), tuple(addresses)
+        identities, routers = list(identities), tuple(addresses)
         if not renew:
             for identity in identities:
                 self._refuse_to_overwrite(self.files(identity.host, identity.node))
-        authority = self._authority()
-        pairs = [
-            (
-                identity,
-                ca.issue(
-                    authority,
-                    identity.common_name,
-                    now,
-                    days=days,
-                    addresses=(*serving, *self._served(identity))
-                    if identity.role is Role.ROUTER
-                    else identity.addresses or None,
-                ),
+        authority, pairs = self._authority(), list[KeyPair]()
+        for identity in identities:
+            served = identity.addresses or None
+            if identity.role is Role.ROUTER:
+                served = (*routers, *self._served(identity))
+            pairs.append(
+                ca.issue(authority, identity.common_name, now, days=days, addresses=served)
             )
-            for identity in identities
-        ]
         made: list[Path] = []
-        for identity, pair in pairs:
+        for identity, pair in zip(identities, pairs, strict=True):
             made.append(self._keep(identity.host, identity.node, pair))
             _write(self.files(identity.host, "").authority, authority.certificate, 0o644)
         return made
@@ -121,11 +113,7 @@ class LabCertificates(CheckedStore):
                 )
 
     def remember_host(self, host: str) -> Path:
-        """Note that this computer is `host`.
-
-        Raises:
-            SecurityError: the folder cannot be written.
-        """
+        """Note that this computer is `host`."""
         path = self.folder / THIS_HOST
         _write(path, f"{host}\n".encode(), 0o644)
         return path
@@ -149,10 +137,6 @@ def unused_certificates(profile: Profile, entries: Iterable[Entry]) -> dict[Path
     """Certificates whose traffic the router drops: file -> what to do.
 
     There are some after a role was reduced or a node was removed from the profile.
-
-    Args:
-        profile: secured.
-        entries: of its folder.
     """
     security = profile.session.security
     people = security.people if security is not None else {}

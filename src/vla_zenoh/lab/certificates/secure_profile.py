@@ -21,12 +21,7 @@ PEOPLE = "    people:"
 
 
 def tls_endpoint(endpoint: str, places: Mapping[str, str] | None = None) -> str:
-    """An endpoint with TLS in place of a plain protocol.
-
-    Args:
-        endpoint: as in a profile.
-        places: ``HOST:PORT`` -> where that is now, see `moved_hosts`.
-    """
+    """An endpoint with TLS in place of a plain protocol, moved as by `moved_hosts`."""
     protocol, _, rest = endpoint.partition("/")
     address = address_of(endpoint)
     rest = (places or {}).get(address, address) + rest[len(address) :]
@@ -38,7 +33,7 @@ def moved_hosts(profile: Profile, at: Mapping[str, str]) -> dict[str, str]:
 
     Args:
         profile: as it is.
-        at: host of the profile that runs a router -> its address on the network.
+        at: host that runs a router -> its address on the network.
 
     Raises:
         SecurityError: no router runs there.
@@ -77,7 +72,8 @@ def profile_text(
         folder: of the certificates.
         places: see `moved_hosts`.
     """
-    shown = _with_tilde(folder)
+    home = Path.home()
+    shown = f"~/{folder.relative_to(home)}" if folder.is_relative_to(home) else str(folder)
 
     def secure(endpoints: Sequence[str]) -> list[str]:
         return [tls_endpoint(endpoint, places) for endpoint in endpoints]
@@ -124,10 +120,3 @@ def with_operator(text: str, host: str, role: Role) -> str:
 def _host(host: HostProfile, secure: Callable[[Sequence[str]], list[str]]) -> dict[str, Any]:
     out = host.model_dump(mode="json", exclude_none=True)
     return out | {name: secure(out[name]) for name in ("connect", "listen", "link") if name in out}
-
-
-def _with_tilde(folder: Path) -> str:
-    try:
-        return f"~/{folder.relative_to(Path.home())}"
-    except ValueError:
-        return str(folder)

@@ -8,16 +8,12 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 from vla_zenoh.cli.options import effective_profile
-from vla_zenoh.errors import (
-    ProfileError,
-    VlaZenohError,
-    nearest,
-)
+from vla_zenoh.errors import ProfileError, VlaZenohError, nearest
 from vla_zenoh.lab.profile.advice import advice
 from vla_zenoh.lab.profile.robot_check import (
     ProfileFault,
@@ -30,7 +26,7 @@ from vla_zenoh.lab.profile.robot_check import (
 )
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.policy.loader import find_worker, make_policy
-from vla_zenoh.profile import Profile, load_with_lines
+from vla_zenoh.profile import HostProfile, Profile, load_with_lines
 from vla_zenoh.profile.section import located, located_fault
 from vla_zenoh.profile.session import address_of, host_of
 
@@ -75,31 +71,29 @@ def check_profile(
         known = ", ".join(profile.hosts)
         where = located(("hosts",), f"has no {host!r}{nearest(host, profile.hosts)}", lines)
         return ProfileReport([f"{where} It has: {known}"], [])
-    here = _nodes(profile, host)
+    found = [*arm(profile), *simulator(profile), *robot_file(profile), *ros2(profile)]
+    found += _workers(profile, name)
+    here: set[str] = set()  # nodes and workers of this computer, as far as its host is known
+    if host is not None:
+        part = profile.hosts[host]
+        here = {*part.nodes, *profile.workers_of(part)}
+        found += [*_cameras(profile, part), *_router(profile, host), *_certificates(profile, host)]
     errors: list[str] = []
     hints = advice(profile)
-    for check in CHECKS:
-        for place, why, node, other in check(profile, name, host):
-            if not node or node in here:
-                fault = (place, why, ((other, why),)) if other else (place, why)
-                errors.append(located_fault(fault, lines))
-            else:
-                hints.append(f"{'.'.join(place)}: on this computer: {why}")
+    for place, why, node, other in found:
+        if not node or node in here:
+            fault = (place, why, ((other, why),)) if other else (place, why)
+            errors.append(located_fault(fault, lines))
+        else:
+            hints.append(f"{'.'.join(place)}: on this computer: {why}")
     hints += [*joints_advice(profile), *braking_advice(profile)]
     return ProfileReport(list(dict.fromkeys(errors)), list(dict.fromkeys(hints)))
 
 
-def _nodes(profile: Profile, host: str | None) -> set[str]:
-    """Kinds of nodes, and workers, that this computer runs as far as its host is known."""
-    part = profile.hosts.get(host or "")
-    return set() if part is None else {*part.nodes, *profile.workers_of(part)}
-
-
 # -- cameras ----------------------------------------------------------------------------------
-def _cameras(profile: Profile, name: str, host: str | None) -> Iterator[ProfileFault]:
+def _cameras(profile: Profile, part: HostProfile) -> Iterator[ProfileFault]:
     """Files of recorded cameras."""
-    part = profile.hosts.get(host or "")
-    for camera in () if part is None else profile.cameras_of(part):
+    for camera in profile.cameras_of(part):
         source = profile.cameras[camera].source
         path = Path(source.removeprefix(FILE)).expanduser()
         if source.startswith(FILE) and not path.exists():
@@ -108,7 +102,7 @@ def _cameras(profile: Profile, name: str, host: str | None) -> Iterator[ProfileF
 
 
 # -- workers ----------------------------------------------------------------------------------
-def _workers(profile: Profile, name: str, host: str | None) -> Iterator[ProfileFault]:
+def _workers(profile: Profile, name: str) -> Iterator[ProfileFault]:
     """Models, made as a worker makes them, and what they need of the profile."""
     for worker in profile.workers:
         place = ("models", worker) if worker in profile.models else ("workers",)
@@ -141,16 +135,15 @@ def _spec_faults(profile: Profile, worker: str, spec: ModelSpec) -> Iterator[Pro
 
 
 # -- network ----------------------------------------------------------------------------------
-def _router(profile: Profile, name: str, host: str | None) -> Iterator[ProfileFault]:
+def _router(profile: Profile, host: str) -> Iterator[ProfileFault]:
     """The router of this host, and whether its own nodes find it."""
-    part = profile.hosts.get(host or "")
-    session = profile.session
-    if part is None or "router" not in part.nodes:
+    part, session = profile.hosts[host], profile.session
+    if "router" not in part.nodes:
         return
     listen = session.listen if part.listen is None else part.listen
     connect = session.connect if part.connect is None else part.connect
     if not any(_ends_at(target, endpoint) for target in connect for endpoint in listen):
-        place = ("session", "connect") if part.connect is None else ("hosts", str(host), "connect")
+        place = ("session", "connect") if part.connect is None else ("hosts", host, "connect")
         yield ProfileFault(
             place,
             f"leads to {', '.join(connect)}, and the router of this host listens on "
@@ -167,10 +160,10 @@ def _ends_at(target: str, listening: str) -> bool:
     return same_protocol and there.rpartition(":")[2] == here.rpartition(":")[2]
 
 
-def _certificates(profile: Profile, name: str, host: str | None) -> Iterator[ProfileFault]:
+def _certificates(profile: Profile, host: str) -> Iterator[ProfileFault]:
     """Certificates of the nodes of this host."""
     security = profile.session.security
-    if security is None or host is None:
+    if security is None:
         return
     from vla_zenoh.security.identity import PEOPLE, identities_of
     from vla_zenoh.security.store import Store
@@ -184,15 +177,3 @@ def _certificates(profile: Profile, name: str, host: str | None) -> Iterator[Pro
         except VlaZenohError as error:
             yield ProfileFault(("session", "security"), str(error))
             return
-
-
-CHECKS: Sequence[Callable[[Profile, str, str | None], Iterator[ProfileFault]]] = (
-    arm,
-    simulator,
-    robot_file,
-    ros2,
-    _cameras,
-    _workers,
-    _router,
-    _certificates,
-)

@@ -42,7 +42,7 @@ class ProfileFault(NamedTuple):
 
 
 # -- command node -----------------------------------------------------------------------------
-def arm(profile: Profile, name: str, host: str | None) -> Iterator[ProfileFault]:
+def arm(profile: Profile) -> Iterator[ProfileFault]:
     """The arm as the command node makes it."""
     place = ("robot", "description")
     try:
@@ -56,11 +56,8 @@ def arm(profile: Profile, name: str, host: str | None) -> Iterator[ProfileFault]
     except ImportError as error:
         yield ProfileFault(("robot",), f"its joints and links were not checked: {error}", "command")
         return
-    except ProfileError as error:
-        yield ProfileFault(error.place or ("robot",), str(error))
-        return
-    except RecordError as error:
-        yield ProfileFault(("robot",), str(error))
+    except (ProfileError, RecordError) as error:
+        yield ProfileFault(getattr(error, "place", ()) or ("robot",), str(error))
         return
     except ValueError as error:  # from Pinocchio, for a file that is no URDF
         yield ProfileFault(place, f"{profile.robot.description!r} cannot be read: {error}")
@@ -112,7 +109,7 @@ def joints_advice(profile: Profile) -> Iterator[str]:
 
 
 # -- robot node -------------------------------------------------------------------------------
-def simulator(profile: Profile, name: str, host: str | None) -> Iterator[ProfileFault]:
+def simulator(profile: Profile) -> Iterator[ProfileFault]:
     """The world as the simulator makes it."""
     simulated = any(camera.source.startswith(SIM) for camera in profile.cameras.values())
     running = {kind for part in profile.hosts.values() for kind in part.nodes}
@@ -175,7 +172,7 @@ def _not_simulated(profile: Profile, error: VlaZenohError) -> Iterator[ProfileFa
     )
 
 
-def robot_file(profile: Profile, name: str, host: str | None) -> Iterator[ProfileFault]:
+def robot_file(profile: Profile) -> Iterator[ProfileFault]:
     """The class in `arm.file`, which is not made: that may move something."""
     if profile.arm is None or profile.robot.driver != "arm":
         return
@@ -191,7 +188,7 @@ def robot_file(profile: Profile, name: str, host: str | None) -> Iterator[Profil
         yield ProfileFault(("arm",), str(error), "arm")
 
 
-def ros2(profile: Profile, name: str, host: str | None) -> Iterator[ProfileFault]:
+def ros2(profile: Profile) -> Iterator[ProfileFault]:
     """Messages of the node ros2."""
     if profile.ros2 is None:
         return

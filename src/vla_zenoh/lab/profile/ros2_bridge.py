@@ -1,24 +1,27 @@
-"""Configuration of zenoh-bridge-ros2dds for a profile: an allow-list of the names it uses."""
+"""What a profile uses of a ROS graph, and the zenoh-bridge-ros2dds that lets only that through."""
 
 from __future__ import annotations
 
 import ipaddress
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.lab.profile.ros2_endpoints import endpoints
 from vla_zenoh.profile import Profile
-from vla_zenoh.profile.ros2 import Ros2Profile
+from vla_zenoh.profile.ros2 import GRIPPER_ACTIONS, Ros2Gripper, Ros2Profile
 from vla_zenoh.profile.session import (
     TRUSTED_PROTOCOLS,
     endpoint_faults,
     host_of,
     is_loopback,
 )
-from vla_zenoh.ros2.keys import EntityRole
+from vla_zenoh.ros2 import diagnostics
+from vla_zenoh.ros2.gripper_actions import GRASP
+from vla_zenoh.ros2.keys import Endpoint, EntityRole
+from vla_zenoh.ros2.names import PROMPT_TOPIC, SERVICES, STATUS_TOPIC
+from vla_zenoh.ros2.readers import JOINT_STATE, TEXT, WRENCH
 
 PROGRAM = "zenoh-bridge-ros2dds"
 ALLOWED_AS = {
@@ -67,22 +70,18 @@ def bridge_config(
             "router of its own, as tcp/127.0.0.1:7450"
         )
     places = ros2.connect or profile.session.connect
-    config: dict[str, Any] = {
+    waits = {
+        "timeout_ms": -1,
+        "exit_on_failure": False,
+        "retry": {"period_init_ms": 100, "period_max_ms": 500},
+    }
+    return {
         "mode": "client" if beside else "router",
         "listen": {"endpoints": [] if beside else [_listening(profile, e) for e in places]},
-        "connect": {"endpoints": list(places) if beside else []},
+        "connect": {"endpoints": list(places), **waits} if beside else {"endpoints": []},
         "scouting": {"multicast": {"enabled": False}},
         # The status of an action is kept for those who come late, which needs them.
         "timestamping": {"enabled": True},
-    }
-    if beside:
-        config["connect"] |= {
-            "timeout_ms": -1,
-            "exit_on_failure": False,
-            "retry": {"period_init_ms": 100, "period_max_ms": 500},
-        }
-    return {
-        **config,
         **(locks or {}),
         "plugins": {
             "ros2dds": {
@@ -107,13 +106,11 @@ def _json(value: Any, margin: str = "") -> str:
         return flat
     inner = f"{margin}  "
     if isinstance(value, list):
-        parts, (opening, closing) = [_json(each, inner) for each in value], "[]"
+        parts, ends = [_json(each, inner) for each in value], "[]"
     else:
-        parts, (opening, closing) = (
-            [f"{json.dumps(key)}: {_json(each, inner)}" for key, each in value.items()],
-            "{}",
-        )
-    return f",\n{inner}".join(parts).join((f"{opening}\n{inner}", f"\n{margin}{closing}"))
+        parts = [f"{json.dumps(key)}: {_json(each, inner)}" for key, each in value.items()]
+        ends = "{}"
+    return f",\n{inner}".join(parts).join((f"{ends[0]}\n{inner}", f"\n{margin}{ends[1]}"))
 
 
 def bridge_command(profile: Profile, file: str = "bridge.json5") -> str:
@@ -146,23 +143,17 @@ def _listening(profile: Profile, endpoint: str) -> str:
         plain = profile.session.model_copy(update={"security": None})
         (_, why), *_ = endpoint_faults([endpoint], plain, listen=True)
         raise ProfileError(f"profile {profile.name}: a bridge that listens at {endpoint} {why}")
-    if is_loopback(endpoint) or _is_number(host_of(endpoint)):
-        return endpoint
-    # A computer often resolves its own name to an address that others cannot reach.
-    port = endpoint.rpartition(":")[2]
-    return f"{endpoint.partition('/')[0]}/[::]:{port}"
+    try:
+        ipaddress.ip_address(host_of(endpoint))
+    except ValueError:
+        if not is_loopback(endpoint):
+            # A computer often resolves its own name to an address that others cannot reach.
+            return f"{endpoint.partition('/')[0]}/[::]:{endpoint.rpartition(':')[2]}"
+    return endpoint
 
 
 def _is_trusted(endpoint: str) -> bool:
     return endpoint.partition("/")[0] in TRUSTED_PROTOCOLS
-
-
-def _is_number(host: str) -> bool:
-    try:
-        ipaddress.ip_address(host)
-    except ValueError:
-        return False
-    return True
 
 
 def _allowed(profile: Profile) -> dict[str, list[str]]:
@@ -171,3 +162,48 @@ def _allowed(profile: Profile) -> dict[str, list[str]]:
     for end in endpoints(profile):
         out[ALLOWED_AS[end.role]].append(f"^{re.escape(end.name)}$")
     return {kind: sorted(set(names)) for kind, names in out.items()}
+
+
+def endpoints(profile: Profile) -> tuple[Endpoint, ...]:
+    """Our ends in the ROS graph, each once; none where the profile has no section ros2.
+
+    Quality of service is left at its default: it is the node's.
+    """
+    ros2 = profile.ros2
+    if ros2 is None:
+        return ()
+    found = [
+        Endpoint(EntityRole.SUBSCRIBER, c.topic, c.type) for c in profile.ros2_cameras().values()
+    ]
+    if profile.robot.driver == "ros2":
+        found += _arm(ros2, profile.robot.command)
+        found += [] if ros2.gripper is None else _gripper(ros2.gripper)
+    if ros2.services is not None:
+        found += _services(ros2.services)
+    return tuple(dict.fromkeys(found))
+
+
+def _arm(ros2: Ros2Profile, command: str) -> Iterator[Endpoint]:
+    for topic in (ros2.joint_states, ros2.finger_states or ros2.joint_states):
+        yield Endpoint(EntityRole.SUBSCRIBER, topic, JOINT_STATE)
+    if ros2.wrench is not None:
+        yield Endpoint(EntityRole.SUBSCRIBER, ros2.wrench.topic, WRENCH)
+    output = ros2.joint_command if command == "joint" else ros2.pose_command
+    if output is not None:
+        yield Endpoint(EntityRole.PUBLISHER, output.topic, output.type)
+
+
+def _gripper(gripper: Ros2Gripper) -> Iterator[Endpoint]:
+    if gripper.type not in GRIPPER_ACTIONS:
+        yield Endpoint(EntityRole.PUBLISHER, gripper.topic, gripper.type)
+        return
+    yield Endpoint(EntityRole.ACTION_CLIENT, gripper.topic, gripper.type)
+    if gripper.grasp is not None:
+        yield Endpoint(EntityRole.ACTION_CLIENT, gripper.grasp, GRASP)
+
+
+def _services(prefix: str) -> Iterator[Endpoint]:
+    for service in SERVICES:
+        yield Endpoint(EntityRole.SERVER, f"{prefix}/{service.name}", service.type)
+    yield Endpoint(EntityRole.SUBSCRIBER, f"{prefix}/{PROMPT_TOPIC}", TEXT)
+    yield Endpoint(EntityRole.PUBLISHER, f"{prefix}/{STATUS_TOPIC}", diagnostics.TYPE)
