@@ -1,21 +1,4 @@
-"""Every error the package raises on purpose.
-
-::
-
-    VlaZenohError
-    ├── RecordError        a value cannot be a valid record (shape, finiteness, range)
-    ├── CodecError         bytes from the wire are not what their key promises
-    ├── ProfileError       a profile file is wrong; names file, line and path
-    ├── SpecError          a model's spec is wrong or does not fit the profile
-    ├── ResourceError      a model, scene, profile or robot description was not found
-    ├── MissingExtraError  an optional dependency is not installed
-    ├── SessionError       no Zenoh session could be opened
-    ├── WorkerError        a model worker cannot be loaded or broke its contract
-    ├── RecordingError     a recorded run cannot be written or read
-    ├── OutputError        an output file cannot be written, or would overwrite something
-    ├── PeerError          a policy server gave no usable answer
-    ├── NodeError          a node cannot start or continue (a second command node, a dead device)
-    └── SecurityError      a certificate or key cannot be made or used
+"""Every error the package raises on purpose: all are a `VlaZenohError`.
 
 A message says what is wrong, what is allowed and what to do. Errors of libraries are turned into
 these at the edge, with ``from``.
@@ -35,7 +18,7 @@ class VlaZenohError(Exception):
 
 
 class RecordError(VlaZenohError, ValueError):
-    """A value cannot be a valid record."""
+    """A value cannot be a valid record: its shape, range, or NaN."""
 
 
 class CodecError(VlaZenohError, ValueError):
@@ -51,7 +34,7 @@ class CodecError(VlaZenohError, ValueError):
 
 
 class ProfileError(VlaZenohError, ValueError):
-    """A profile file is wrong.
+    """A profile file is wrong; the message names file, line and path.
 
     Attributes:
         place: keys from the top of the profile down to what is wrong, where the message has none.
@@ -134,7 +117,7 @@ class PeerError(VlaZenohError):
 
 
 class NodeError(VlaZenohError):
-    """A node cannot start or continue."""
+    """A node cannot start or continue: a second command node, a dead device."""
 
 
 class SecurityError(VlaZenohError):

@@ -27,12 +27,11 @@ ROBOT_DATA_PREFIX = "example-robot-data:"
 def shipped(kind: str) -> Path:
     """The folder that holds what the package ships of `kind`."""
     package = Path(__file__).resolve().parent
-    inside_wheel = package / "_data" / kind
+    inside_wheel, checkout = package / "_data" / kind, package.parents[1]
     if inside_wheel.is_dir():
         return inside_wheel
-    checkout = package.parents[1] / kind
-    if checkout.is_dir() and (package.parents[1] / "pyproject.toml").is_file():
-        return checkout
+    if (checkout / kind).is_dir() and (checkout / "pyproject.toml").is_file():
+        return checkout / kind
     raise ResourceError(f"the installation of vla-zenoh is damaged: its {kind}/ folder is missing")
 
 
@@ -113,26 +112,18 @@ def extended_profile(path: Path, parent: str) -> Path:
     if parent == path.stem:
         return _next(path, parent)
     try:
-        names = (
-            [parent]
-            if Path(parent).suffix in PROFILE_SUFFIXES
-            else [parent + s for s in PROFILE_SUFFIXES]
-        )
-        for name in names:
-            if (path.parent / name).is_file():
-                return path.parent / name
+        whole = Path(parent).suffix in PROFILE_SUFFIXES
+        for suffix in ("",) if whole else PROFILE_SUFFIXES:
+            if (beside := path.parent / f"{parent}{suffix}").is_file():
+                return beside
     except (OSError, ValueError) as error:
         raise ProfileError(f"{parent[:80]!r} cannot be the name of a profile") from error
     return profile_file(parent)
 
 
 def _next(path: Path, name: str) -> Path:
-    candidates = [
-        file
-        for folder in folders("profiles")
-        for suffix in PROFILE_SUFFIXES
-        if (file := folder / f"{name}{suffix}").is_file()
-    ]
+    files = (f / f"{name}{suffix}" for f in folders("profiles") for suffix in PROFILE_SUFFIXES)
+    candidates = [file for file in files if file.is_file()]
     own = [index for index, file in enumerate(candidates) if file.samefile(path)]
     after = candidates[own[0] + 1 :] if own else candidates
     if not after:

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from vla_zenoh.profile.section import Fault, Name, Range, Section
+from vla_zenoh.profile.section import Fault, Name, Range, Section, Vector3
 
 
 def _one_for_all(value: Any) -> Any:
@@ -107,7 +107,6 @@ Edge = Annotated[float, Field(gt=0, le=2 * REACH_M)]
 Coordinate = Annotated[float, Field(ge=-REACH_M, le=REACH_M)]
 Point = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(strict=False)]
 Edges = Annotated[tuple[Edge, Edge, Edge], Field(strict=False)]
-Direction = Annotated[tuple[float, float, float], Field(strict=False)]
 
 
 class KeepOut(Section):
@@ -127,10 +126,9 @@ class KeepOut(Section):
     box_m: Edges | None = None
     yaw_rad: float = Field(default=0.0, ge=-6.3, le=6.3)
     radius_m: float | None = Field(default=None, gt=0, le=REACH_M)
-    normal: Direction | None = None
+    normal: Vector3 | None = None
 
     def contradictions(self) -> Iterator[Fault]:
-        """Not one shape, or a plane without a direction."""
         shapes = {"box_m": self.box_m, "radius_m": self.radius_m, "normal": self.normal}
         given = [name for name, value in shapes.items() if value is not None]
         if len(given) != 1:
@@ -177,7 +175,6 @@ class ReachLimits(Section):
     part_stop_m: float = Field(default=0.03, ge=0.005, le=1)
 
     def contradictions(self) -> Iterator[Fault]:
-        """A stop that lies before its slow."""
         for name in ("singularity{}", "collision{}_m", "table{}_m", "part{}_m"):
             slow, stop = name.format("_slow"), name.format("_stop")
             before, at = getattr(self, slow), getattr(self, stop)
@@ -211,7 +208,6 @@ class ContactLimits(Section):
     retreat_m_s: float = Field(default=0.15, gt=0, le=0.5)
 
     def contradictions(self) -> Iterator[Fault]:
-        """A stop that does not lie above its slow."""
         for name in ("force{}_n", "torque{}_nm", "effort{}_nm"):
             slow, stop = name.format("_slow"), name.format("_stop")
             before, at = getattr(self, slow), getattr(self, stop)
@@ -263,7 +259,6 @@ class Limits(Section):
     elbow_rad: float = Field(default=0.35, gt=0, le=1.5)
 
     def contradictions(self) -> Iterator[Fault]:
-        """A step that is longer than the leash."""
         for step, lead in (("step_m", "lead_m"), ("step_rad", "lead_rad")):
             value, limit = getattr(self, step), getattr(self, lead)
             if value > limit:

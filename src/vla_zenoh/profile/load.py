@@ -53,25 +53,13 @@ def followed(name: str) -> list[tuple[Path, str]]:
 
 
 def read_profile(text: str, where: str) -> Profile:
-    """Parse a profile that `to_yaml` wrote.
-
-    Args:
-        text: YAML without ``extends``.
-        where: origin, for messages.
-
-    Raises:
-        ProfileError: every fault, each with `where`, line, path and what is allowed.
-    """
+    """Parse a profile that `to_yaml` wrote; a `ProfileError` names its origin, `where`."""
     data, lines = yaml_text.read(text.encode(), where)
     return _checked(data, lines)
 
 
 def override(profile: Profile, changes: Mapping[str, Any]) -> Profile:
-    """A copy of `profile` with some values replaced, validated.
-
-    Args:
-        profile: the original.
-        changes: as in a profile file: ``{"session": {"connect": [...]}}``.
+    """A copy of `profile` with `changes`, as in a profile file: ``{"session": {...}}``.
 
     Raises:
         ProfileError: the result is invalid.
@@ -81,12 +69,9 @@ def override(profile: Profile, changes: Mapping[str, Any]) -> Profile:
 
 
 def as_robot(profile: Profile, name: str) -> Profile:
-    """The profile of another robot of the same kind.
+    """The profile of another robot of the same kind, or a `ProfileError`: an invalid name.
 
     A worker of several robots serves it only if its list in ``serves`` contains it.
-
-    Raises:
-        ProfileError: invalid name.
     """
     others = [worker for worker, robots in profile.serves.items() if name not in robots]
     return override(profile, {"robot": {"name": name}, "serves": dict.fromkeys(others)})

@@ -8,7 +8,7 @@ from typing import Annotated, Literal, NamedTuple
 
 from pydantic import AfterValidator, Field
 
-from vla_zenoh.profile.section import Fault, Name, Section, Text, Word, Words
+from vla_zenoh.profile.section import Fault, Name, Pair, Section, Text, Vector3, Word, Words
 
 MAX_JOINTS = 16
 """Joints that an arm has at most."""
@@ -61,7 +61,6 @@ class GripperProfile(Section):
         return None
 
     def contradictions(self) -> Iterator[Fault]:
-        """Ends of a finger joint that do not make one joint."""
         turning = (("joint_open_rad", self.joint_open_rad), ("joint_shut_rad", self.joint_shut_rad))
         sliding = (("joint_open_m", self.joint_open_m), ("joint_shut_m", self.joint_shut_m))
         for name, angle in turning:
@@ -110,9 +109,7 @@ class RobotProfile(Section):
     base_frame: Word
     tcp_frame: Word
     arm_joints: Words = Field(min_length=1)
-    joint_range_rad: tuple[Annotated[tuple[float, float], Field(strict=False)], ...] = Field(
-        default=(), strict=False
-    )
+    joint_range_rad: Annotated[tuple[Pair, ...], Field(strict=False)] = ()
     finger_joints: Words = ()
     home_rad: tuple[float, ...] = Field(strict=False)
     posture: Literal["start", "home"] = "start"
@@ -124,19 +121,17 @@ class RobotProfile(Section):
         return self.driver if self.driver in ("sim", "ros2") else "arm"
 
     def contradictions(self) -> Iterator[Fault]:
-        """Lists that do not fit the arm's joints, and values in other units."""
-        joints = len(self.arm_joints)
+        joints, home, ranges = len(self.arm_joints), len(self.home_rad), len(self.joint_range_rad)
         if joints > MAX_JOINTS:
             yield ("arm_joints",), f"has {joints} joints: at most {MAX_JOINTS} are commanded"
-        if len(self.home_rad) != joints:
-            yield ("home_rad",), f"has {len(self.home_rad)} angles for {joints} arm_joints"
-        if self.joint_range_rad and len(self.joint_range_rad) != joints:
-            why = f"has {len(self.joint_range_rad)} pairs for {joints} arm_joints"
-            yield ("joint_range_rad",), why
+        if home != joints:
+            yield ("home_rad",), f"has {home} angles for {joints} arm_joints"
+        if ranges not in (0, joints):
+            yield ("joint_range_rad",), f"has {ranges} pairs for {joints} arm_joints"
         for index, (low, high) in enumerate(self.joint_range_rad):
             if low >= high:
-                why = f"is [{low:g}, {high:g}]: give the lower end first"
-                yield ("joint_range_rad", str(index)), why
+                given = f"[{low:g}, {high:g}]"
+                yield ("joint_range_rad", str(index)), f"is {given}: give the lower end first"
         for index, angle in enumerate(self.home_rad):
             if abs(angle) > 2 * math.pi:
                 yield ("home_rad", str(index)), f"is {angle:g}: more than a turn; give radians"
@@ -155,7 +150,7 @@ class PartBase(Section):
         yaw_rad: its turn about the vertical.
     """
 
-    position_m: tuple[float, float, float] = Field(default=(0.0, 0.0, 0.0), strict=False)
+    position_m: Vector3 = (0.0, 0.0, 0.0)
     yaw_rad: float = Field(default=0.0, ge=-6.3, le=6.3)
 
 
@@ -198,7 +193,7 @@ class FrankaLoad(Section):
     """
 
     mass_kg: float = Field(default=0.0, ge=0, le=7)
-    centre_m: tuple[float, float, float] = Field(default=(0.0, 0.0, 0.0), strict=False)
+    centre_m: Vector3 = (0.0, 0.0, 0.0)
     inertia_kg_m2: tuple[float, float, float, float, float, float] = Field(
         default=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0), strict=False
     )
@@ -256,10 +251,10 @@ class UrProfile(Section):
     address: Word
     lookahead_s: float = Field(default=0.1, ge=0.03, le=0.2)
     gain: float = Field(default=300.0, ge=100, le=2000)
-    tcp_m: tuple[float, float, float] = Field(default=(0.0, 0.0, 0.0), strict=False)
-    tcp_rotvec: tuple[float, float, float] = Field(default=(0.0, 0.0, 0.0), strict=False)
+    tcp_m: Vector3 = (0.0, 0.0, 0.0)
+    tcp_rotvec: Vector3 = (0.0, 0.0, 0.0)
     payload_kg: float = Field(default=0.0, ge=0, le=50)
-    payload_centre_m: tuple[float, float, float] = Field(default=(0.0, 0.0, 0.0), strict=False)
+    payload_centre_m: Vector3 = (0.0, 0.0, 0.0)
     watchdog_hz: float = Field(default=5.0, ge=1, le=50)
 
 

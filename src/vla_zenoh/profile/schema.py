@@ -74,7 +74,6 @@ class Timing(Section):
     max_clock_offset_s: float = Field(default=0.1, gt=0, le=1)
 
     def contradictions(self) -> Iterator[Fault]:
-        """A timeout that does not span enough periods."""
         for name, rate in (
             ("command_timeout_s", "command_hz"),
             ("watchdog_s", "command_hz"),
@@ -201,7 +200,6 @@ class CameraProfile(Section):
     check: CameraCheck = CameraCheck()
 
     def contradictions(self) -> Iterator[Fault]:
-        """What this kind of source cannot do."""
         kind = self.source.partition(":")[0]
         if self.depth_unit_m is not None and kind not in DEPTH_SOURCES:
             known = ", ".join(CAMERA_SOURCES[one] for one in DEPTH_SOURCES)

@@ -148,7 +148,6 @@ class SessionProfile(Section):
     insecure: bool = False
 
     def contradictions(self) -> Iterator[Fault]:
-        """Endpoints that cannot be used, or not with this security."""
         if not self.connect:
             yield ("connect",), "is empty: nodes need a router, as tcp/10.0.0.2:7447"
         if not self.listen:

@@ -57,23 +57,19 @@ def access_control(profiles: Iterable[Profile]) -> dict[str, Any]:
     Whatever is not named is denied.
     """
     rules: dict[str, dict[str, Any]] = {}
-    subjects: dict[str, dict[str, Any]] = {}
-    of_subject: dict[str, list[str]] = {}
+    of_subject: dict[str, dict[str, None]] = {}
     for profile in profiles:
         for identity in identities(profile):
-            name = identity.common_name
-            subjects[name] = {"id": name, "cert_common_names": [name]}
-            own = of_subject.setdefault(name, [])
+            own = of_subject.setdefault(identity.common_name, {})
             for made in _rules(identity, profile.keys_of_all_parts):
                 rules.setdefault(made["id"], made)
-                if made["id"] not in own:
-                    own.append(made["id"])
+                own[made["id"]] = None
     return {
         "enabled": True,
         "default_permission": "deny",
         "rules": list(rules.values()),
-        "subjects": list(subjects.values()),
-        "policies": [{"rules": own, "subjects": [name]} for name, own in of_subject.items()],
+        "subjects": [{"id": name, "cert_common_names": [name]} for name in of_subject],
+        "policies": [{"rules": list(own), "subjects": [name]} for name, own in of_subject.items()],
     }
 
 

@@ -82,8 +82,6 @@ def float32_table(name: str, value: ArrayLike, most: int) -> NDArray[np.float32]
 
 def to_float32(array: NDArray[Any]) -> NDArray[np.float32]:
     """Copy numbers into float32, row by row; what float32 cannot hold becomes infinite."""
-    if array.dtype == np.float32:
-        return np.array(array, order="C")
     with np.errstate(over="ignore"):
         return np.array(array, dtype=np.float32, order="C")
 
