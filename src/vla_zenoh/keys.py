@@ -41,11 +41,7 @@ class Kind(Enum):
 
 
 def key_chunk(name: str, what: str) -> str:
-    """Check that `name` can stand between two slashes of a key.
-
-    Raises:
-        ProfileError: it cannot; says what is allowed.
-    """
+    """`name` if it can stand between two slashes of a key, else a `ProfileError`."""
     if len(name) > MAX_CHUNK or not _CHUNK.fullmatch(name):
         shown = name if len(name) <= MAX_CHUNK else f"{name[:MAX_CHUNK]}..."
         raise ProfileError(

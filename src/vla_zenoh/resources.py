@@ -88,11 +88,7 @@ def find(kind: str, name: str) -> Path:
 
 
 def profile_file(name: str) -> Path:
-    """File of the profile `name`, which may be a path.
-
-    Raises:
-        ProfileError: not found; lists the profiles that exist.
-    """
+    """File of the profile `name`, which may be a path, or a `ProfileError` with those there are."""
     try:
         return find("profiles", name)
     except ResourceError as error:
@@ -104,10 +100,8 @@ def profile_file(name: str) -> Path:
 def extended_profile(path: Path, parent: str) -> Path:
     """File that the profile at `path` extends: beside it, or first on the search path.
 
-    A profile that extends its own name means the next one on the search path.
-
-    Raises:
-        ProfileError: there is none.
+    A profile that extends its own name means the next one on the search path. If there is none, a
+    `ProfileError`.
     """
     if parent == path.stem:
         return _next(path, parent)
@@ -170,11 +164,7 @@ def _robot_data() -> Path | None:
 
 
 def meshes_of(urdf: Path) -> Path:
-    """The collision meshes beside a URDF: ``../meshes/collision``, or ``../meshes/<its name>``.
-
-    Raises:
-        ResourceError: neither is a folder.
-    """
+    """Collision meshes of a URDF: ``../meshes/collision``, or ``../meshes/<its name>``."""
     folders = [urdf.parent.parent / "meshes" / name for name in ("collision", urdf.stem)]
     for folder in folders:
         if folder.is_dir():

@@ -111,9 +111,6 @@ def computed(kind: type[Record], *values: Any) -> Record:
     """A record of values that this program has just computed, all in their final form.
 
     Only whether vectors are finite is checked, and they are not copied: a record for every tick.
-
-    Raises:
-        RecordError: a vector is not finite.
     """
     record, total = object.__new__(kind), 0.0
     for name, value in zip(kind.__match_args__, values, strict=True):  # pyright: ignore
