@@ -83,8 +83,7 @@ class ClockOffset:
 class ClockOffsetFilter:
     """Combines exchanges into one offset, and a steady one to convert stamps with.
 
-    Args:
-        bound_s: a clock that is off by more is wrong, and its stamps are not converted.
+    A clock that is off by more than `bound_s` is wrong, and its stamps are not converted.
     """
 
     def __init__(self, bound_s: float) -> None:

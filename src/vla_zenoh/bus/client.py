@@ -384,11 +384,7 @@ class NodeRegistry:
     """Live nodes and their last status, of any name; safe to use from several threads.
 
     Any client that may publish a status may do so under any name. So there is always a place for
-    the nodes of the profile, and a quota for all others; `up` runs for weeks.
-
-    Args:
-        expected: nodes of the profile, which always have a place.
-        clock: seconds that never go back.
+    the `expected` nodes of the profile, and a quota for all others; `up` runs for weeks.
     """
 
     def __init__(
@@ -413,7 +409,7 @@ class NodeRegistry:
         return self._dropped
 
     def token_appeared(self, name: str) -> None:
-        """Note that a liveliness token appeared."""
+        """A liveliness token appeared."""
         with self._lock:
             others = len(self._alive - self._expected)
             if not self._fit(name) or (name not in self._expected and others >= MAX_OTHERS):
@@ -422,7 +418,7 @@ class NodeRegistry:
             self._alive.add(name)
 
     def token_gone(self, name: str) -> None:
-        """Note that a liveliness token is gone."""
+        """A liveliness token is gone."""
         with self._lock:
             self._alive.discard(name)
 

@@ -54,14 +54,9 @@ class _Peer:
 
 
 class ClockSync:
-    """Clock offsets of other nodes, and stamps converted with them.
+    """Clock offsets of the nodes other than `name`, and stamps converted with them.
 
-    Args:
-        session: open session.
-        keys: of the robot.
-        clock: of this node.
-        name: of this node, which needs no query.
-        bound_s: a clock that is off by more is wrong; its stamps are not converted.
+    A clock that is off by more than `bound_s` is wrong; its stamps are not converted.
     """
 
     def __init__(
@@ -175,9 +170,8 @@ def decode_stamps(payload: bytes) -> tuple[int, int]:
         CodecError: the payload is something else.
     """
     found = message.unpack(payload)
-    heard, said = (
-        (found.get("heard_ns"), found.get("said_ns")) if isinstance(found, dict) else (None, None)
-    )
+    found = found if isinstance(found, dict) else {}
+    heard, said = found.get("heard_ns"), found.get("said_ns")
     if type(heard) is not int or type(said) is not int:
         raise CodecError("shape", "a clock replies with heard_ns and said_ns")
     return heard, said

@@ -75,11 +75,7 @@ MAX_LINKS = 8
 
 
 class Traffic:
-    """Rates of published records, from one status to the next, and records that were lost.
-
-    Args:
-        session: whose links are listed.
-    """
+    """Rates of published records from one status to the next, records that were lost, and links."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self._sessions = [session]

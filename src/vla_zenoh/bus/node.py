@@ -60,7 +60,7 @@ class Publisher:
         """Publish a record, or encoded bytes.
 
         Args:
-            record: what to publish.
+            record: record or bytes.
             stamp_wall_ns: time of capture; None: now.
             seq: sequence number; None: one more than the last.
             encoding: of the payload.
@@ -174,13 +174,7 @@ class Node:
         self._events.emit(event)
 
     def reject(self, reason: str, why: str, about: str = "") -> None:
-        """Count a rejection and emit an event.
-
-        Args:
-            reason: short stable name.
-            why: a sentence.
-            about: what is rejected; each is throttled by itself.
-        """
+        """Count a rejection and emit an event; what each is `about` is throttled by itself."""
         self.counters[f"refused.{reason}"] += 1
         self._events.emit(Event("warning", "refusal", reason, why[:1000]), about)
 
@@ -238,14 +232,10 @@ class Node:
 
     # -- subscribing --------------------------------------------------------------------------
     def subscribe(self, key: str, buffer: AnyBuffer, kind: Kind = Kind.STATE) -> AnyBuffer:
-        """Subscribe to `key`; samples go to `buffer`, which is returned.
+        """Subscribe to a key expression; samples go to `buffer`, which is returned.
 
-        Samples that the buffer rejects are counted and reported with the next status.
-
-        Args:
-            key: key expression.
-            buffer: where samples go.
-            kind: of the key; it matters for images only, which may have their own connection.
+        Samples that the buffer rejects are counted and reported with the next status. `kind`
+        matters for images only, which may have their own connection.
 
         Raises:
             SessionError: the router does not answer at the port for images.
@@ -304,10 +294,6 @@ class Node:
         if step_s:
             self.reject("clock_step", f"the wall clock was set by {step_s:+.3f} s")
 
-    def arrival_wall_ns(self, arrival: ReceivedSample) -> int:
-        """Arrival time of a sample on this node's wall clock."""
-        return self.clock.wall_at(arrival.mono_ns)
-
     def decode(
         self,
         kind: type[Record],
@@ -339,7 +325,7 @@ class Node:
         if writer_filter is not None:
             writer_filter.accept(header, arrival.mono_ns)
         self.traffic.received(key, header, arrival.nth)
-        return Stamped(here, record, self.arrival_wall_ns(arrival))
+        return Stamped(here, record, self.clock.wall_at(arrival.mono_ns))
 
     def decode_text(
         self, decode: Callable[[bytes], Record], arrival: ReceivedSample

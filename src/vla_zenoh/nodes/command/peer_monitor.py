@@ -58,14 +58,12 @@ class PeerMonitor:
             self._changed = True
             if alive:
                 self._down.pop(name, None)
-            else:
-                self._status_sources.pop(name, None)
-                self._hosts.pop(name, None)
-            if not alive and name.startswith("worker-"):
-                worker = name.removeprefix("worker-")
-                self._specs.pop(worker, None)
-                self._spec_sources.pop(worker, None)
-                self._complaints.pop(worker, None)
+                return
+            for known in (self._status_sources, self._hosts):
+                known.pop(name, None)
+            if name.startswith("worker-"):
+                for known in (self._specs, self._spec_sources, self._complaints):
+                    known.pop(name.removeprefix("worker-"), None)
 
     def _on_holding(self, name: str, present: bool) -> None:
         with self._lock:
@@ -78,12 +76,7 @@ class PeerMonitor:
                 self._node.counters["refused.holder"] += 1
 
     def update(self, now_ns: int, *, news: bool = True) -> PeerSnapshot | None:
-        """A new snapshot, or None if nothing changed.
-
-        Args:
-            now_ns: time of this tick.
-            news: read status and specs; the liveliness of nodes is known without.
-        """
+        """A new snapshot, or None if nothing changed; `news`: read status and specs first."""
         if news:
             for arrival in self._statuses.drain():
                 self._receive_status(arrival, now_ns)
@@ -93,7 +86,7 @@ class PeerMonitor:
         with self._lock:
             if not self._changed:
                 return None
-            self._changed = False
+            self._changed, here = False, self._node.host_id
             return PeerSnapshot(
                 frozenset(self._alive),
                 self._robot_node,
@@ -106,11 +99,7 @@ class PeerMonitor:
                 },
                 {camera: self._servers[camera] for camera in self._cameras},
                 {name: place.host for name, place in self._hosts.items()},
-                frozenset(
-                    name
-                    for name, place in self._hosts.items()
-                    if place.shares_clock(self._node.host_id)
-                ),
+                frozenset(n for n, place in self._hosts.items() if place.shares_clock(here)),
                 self._node.clocks.offsets(),
                 frozenset(self._holders),
                 dict(self._camera_faults),
@@ -142,8 +131,8 @@ class PeerMonitor:
             return
         source = header.source
         with self._lock:
-            ours = name in self._alive and self._status_sources.get(name, source) == source
             alive = name in self._alive
+            ours = alive and self._status_sources.get(name, source) == source
         # `up` may see a node start later than we do.
         if source.startswith(ON_BEHALF) if alive else name in self._expected:
             self._receive_on_behalf(name, arrival, header)
@@ -180,8 +169,7 @@ class PeerMonitor:
         worker, header = self._name_and_header(arrival)
         if header is None:
             return
-        source = header.source
-        node = worker_node(worker)
+        source, node = header.source, worker_node(worker)
         with self._lock:
             known = self._spec_sources.get(worker)
             ours = node in self._alive and known in (None, source)

@@ -80,33 +80,26 @@ class CameraSubscriber:
     def pop(self) -> ReceivedImage | None:
         """The newest image, once; of a queue the oldest."""
         arrival = self._preferred.buffer.pop()
+        stream = self._preferred
         if arrival is not None:
             self._received_s = time.monotonic()
-            self._drop_fallback()
-            return ReceivedImage(arrival, self._preferred.writer, self._preferred.key)
-        if self._fallback is None:
-            self._fall_back()
-            return None
-        arrival = self._fallback.buffer.pop()
-        if arrival is None:
-            return None
-        return ReceivedImage(arrival, self._fallback.writer, self._fallback.key)
+            if self._fallback is not None:
+                self._drop_fallback(self._fallback)
+        elif self._fallback is not None:
+            stream = self._fallback
+            arrival = stream.buffer.pop()
+        elif self._fallback_key and time.monotonic() - self._received_s >= self._patience_s:
+            self._fall_back(self._fallback_key)
+        return None if arrival is None else ReceivedImage(arrival, stream.writer, stream.key)
 
-    def _fall_back(self) -> None:
-        silent_s = time.monotonic() - self._received_s
-        if self._fallback_key is None or silent_s < self._patience_s:
-            return
-        self._fallback = self._subscribe(self._fallback_key)
-        preferred, common = (
-            self._node.keys.short(one.key) for one in (self._preferred, self._fallback)
-        )
+    def _fall_back(self, key: str) -> None:
+        self._fallback = self._subscribe(key)
+        preferred, common = map(self._node.keys.short, (self._preferred.key, key))
         why = f"no image on {preferred} for {self._patience_s:g} s; subscribing to {common} as well"
         self._node.emit(Event("warning", "notice", f"{self._camera}:plain_pictures", why))
 
-    def _drop_fallback(self) -> None:
-        if self._fallback is None:
-            return
-        self._node.unsubscribe(self._fallback.buffer)
+    def _drop_fallback(self, fallback: _Stream) -> None:
+        self._node.unsubscribe(fallback.buffer)
         self._fallback = None
         why = f"there are images on {self._node.keys.short(self._preferred.key)} again"
         self._node.emit(Event("info", "notice", f"{self._camera}:own_pictures", why))
@@ -130,7 +123,7 @@ def subscribe_to_camera(
         camera: of the model's spec.
         node: of the worker.
         jpeg: JPEG rather than raw images.
-        changed: set when an image arrives.
+        changed: set by every image.
         history_s: images this much older than the newest are needed as well.
 
     Raises:
@@ -154,13 +147,8 @@ def subscribe_to_camera(
 def subscribe_to_depth(
     camera: str, node: Node, *, changed: Wake, history_s: float
 ) -> CameraSubscriber:
-    """Subscribe to the depth stream of a camera, of which there is one.
-
-    Raises:
-        SessionError: the router does not answer at the port for images.
-    """
-    key = node.keys.camera_depth(camera)
-    queue = _queue(node, camera, history_s)
+    """Subscribe to the depth stream of a camera, as `subscribe_to_camera`."""
+    key, queue = node.keys.camera_depth(camera), _queue(node, camera, history_s)
     return CameraSubscriber(
         node, camera, key, None, patience_s=PATIENCE_S, changed=changed, queue=queue
     )

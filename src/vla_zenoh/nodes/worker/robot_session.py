@@ -163,14 +163,12 @@ class RobotSession:
             for one in self.spec.observation.depth
         }
         self._feeds = [
-            *(
-                _Feed(name, camera, self._streams.images[name], self._image_of)
-                for name, camera in self._cameras.items()
-            ),
-            *(
-                _Feed(name, camera, self._streams.depth[name], _depth_of)
-                for name, camera in depths.items()
-            ),
+            _Feed(name, camera, streams[name], decode)
+            for cameras, streams, decode in (
+                (self._cameras, self._streams.images, self._image_of),
+                (depths, self._streams.depth, _depth_of),
+            )
+            for name, camera in cameras.items()
         ]
         self._every_state = bool(history_s) or not self._feeds
         self._states = [
@@ -274,7 +272,7 @@ class RobotSession:
         writer.accept(header, mono_ns)
         node.traffic.received(key, header, arrival.nth)
         header, image = node.clocks.to_local_clock(header, image)
-        feed.images.add(Stamped(header, image, node.arrival_wall_ns(arrival)))
+        feed.images.add(Stamped(header, image, node.clock.wall_at(arrival.mono_ns)))
         self._received_s[feed.camera] = mono_ns / 1e9
 
     def _image_of(self, payload: bytes, encoding: str) -> Image:
@@ -333,7 +331,7 @@ class RobotSession:
             observation: input of the inference.
             answer: of the model.
             times_ns: observation complete, inference started, inference ended; wall clock.
-            batch: number of robots in this inference.
+            batch: robots in this inference.
         """
         try:
             steps, done = check_steps(self.spec.action, answer.steps), bool(answer.done)
@@ -371,11 +369,10 @@ class RobotSession:
 
     def failed(self, error: Exception, reason: str = "") -> Literal[False]:
         """Count and report an inference that failed; the next one is due a little later."""
-        if not reason:
-            if isinstance(error, SpecError):
-                reason = "contract"
-            else:
-                reason = error.reason if isinstance(error, PeerError) else "inference_failed"
+        if not reason and isinstance(error, PeerError):
+            reason = error.reason
+        elif not reason:
+            reason = "contract" if isinstance(error, SpecError) else "inference_failed"
         why = in_words(error)
         self.complaint = f"{reason}: {why}"
         self.node.reject(reason, why)
