@@ -19,7 +19,7 @@ from vla_zenoh.bus.clock_sync import MAX_HEARD
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import open_session, second_link
 from vla_zenoh.codec.image import decode_jpeg
-from vla_zenoh.control.preflight import PeerSnapshot, reasons_not_to_activate
+from vla_zenoh.control.preflight import PeerSnapshot, reasons_of_worker
 from vla_zenoh.keys import Kind
 from vla_zenoh.lab.doctor.access_check import check_access
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, ObservationSpec
@@ -105,8 +105,8 @@ def test_a_clock_beyond_the_bound_is_told_and_its_stamps_stay() -> None:
         set_ahead(far, 2_000_000_000)
         found = asked(near, "sim")
         peers = PeerSnapshot(frozenset({"sim"}), clocks=near.clocks.offsets())
-        reasons = reasons_not_to_activate(
-            near.profile, "scripted", "hold", peers, None, None, None, time.time_ns()
+        reasons = reasons_of_worker(
+            near.profile, "scripted", "hold", peers, None, time.time_ns(), 1.0
         )
         said = [reason for reason in reasons if "clock of node 'sim'" in reason]
         assert len(said) == 1

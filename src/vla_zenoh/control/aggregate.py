@@ -53,8 +53,7 @@ class PlanAggregator:
         self._blend_ns = round(composition.blend_s * 1e9)
         self._max_plans = composition.ensemble_plans
         self._weights = np.exp(-composition.ensemble_decay * np.arange(self._max_plans))
-        self._waypoints: list[Goal] = []
-        self._mean: Goal | None = None
+        self._mean: tuple[list[Goal], Goal] | None = None
 
     def plans(self, timeline: GoalTimeline, now_ns: int) -> list[Plan]:
         """The plans that F(now) depends on, the newest last."""
@@ -76,13 +75,11 @@ class PlanAggregator:
             for older, plan, waypoint in zip(plans, plans[1:], waypoints[1:], strict=False):
                 mixed = mixed.between(waypoint, self._weight(older, plan, now_ns))
             return _with_rest(mixed, waypoints)
-        same = len(waypoints) == len(self._waypoints) and all(
-            ours is theirs for ours, theirs in zip(waypoints, self._waypoints, strict=True)
-        )
-        if self._mean is None or not same:
-            self._waypoints = waypoints
-            self._mean = _with_rest(mean_goal(waypoints, self._weights), waypoints)
-        return self._mean
+        known = self._mean
+        if known is None or [*map(id, known[0])] != [*map(id, waypoints)]:
+            mean = _with_rest(_mean_goal(waypoints, self._weights), waypoints)
+            known = self._mean = waypoints, mean
+        return known[1]
 
     def _blended(self, timeline: GoalTimeline, now_ns: int) -> list[Plan]:
         episode_plans = timeline.episode_plans()
@@ -110,7 +107,7 @@ def _with_rest(mixed: Goal, waypoints: Sequence[Goal]) -> Goal:
     return replace(mixed, width_m=waypoints[-1].width_m, slowdown=slower)
 
 
-def mean_goal(goals: Sequence[Goal], weights: FloatArray) -> Goal:
+def _mean_goal(goals: Sequence[Goal], weights: FloatArray) -> Goal:
     """Weighted mean of goals, in the space (poses or joints) of the last of them."""
     last, weights = goals[-1], weights[: len(goals)]
     joints = [goal.joints_rad for goal in goals if goal.joints_rad is not None]

@@ -123,6 +123,12 @@ class Barriers:
         pair = self.collisions.pairs[index - 1]
         return pair.first if pair.limit == "table_distance" else str(pair)
 
+    def hit(self, index: int, left: float, least: float = 0.0) -> LimitHit:
+        """Barrier `index` as a limit that acted: `left` of it, where it must be `least`."""
+        stop = float(self.stop[index])
+        where = self.where(index)
+        return LimitHit(self.names[index], float(left) + stop, float(least) + stop, where=where)
+
     def slowdown(self, before: FloatArray, after: FloatArray) -> Slowdown | None:
         """The slowdown of a step from barriers `before` to `after`, None for full speed."""
         if (after >= self._zone).all():
@@ -194,16 +200,14 @@ class DistanceConstraints:
         """The constraint of this row as a limit that acted, `left_m` from the arm."""
         if row < 6 or self._barriers is None:
             return LimitHit("workspace", -left_m, 0.0)
-        index = int(self._near[row - 6]) + 1
-        barriers, stop_m = self._barriers, float(self._barriers.stop[index])
-        return LimitHit(barriers.names[index], left_m + stop_m, stop_m, where=barriers.where(index))
+        return self._barriers.hit(int(self._near[row - 6]) + 1, left_m)
 
     def at(
         self, joints_rad: FloatArray, position_m: FloatArray, jacobian: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Rows (m, n) and distances left (m,) at these joints (n,), their TCP and its Jacobian."""
-        rows, left_m = [jacobian[:3], -jacobian[:3]], [self._high_m - position_m]
-        left_m.append(position_m - self._low_m)
+        rows = [jacobian[:3], -jacobian[:3]]
+        left_m = [self._high_m - position_m, position_m - self._low_m]
         if self._at_rad is not None and len(self._rows):
             rows.append(self._rows)
             left_m.append(self._left_m - self._rows @ (joints_rad - self._at_rad))

@@ -43,6 +43,7 @@ from vla_zenoh.control.limits import (
     bound_step,
     full_speed_s,
     keep_slowdown,
+    slowest,
 )
 from vla_zenoh.control.plan_timeline import (
     ChunkPlan,
@@ -382,8 +383,7 @@ class ChunkPlanner:
                 # The limit that cuts most comes first.
                 hits = [*found.hits, *hits] if cut > step.cut else [*hits, *found.hits]
                 plan.computed = index + 1
-        if step.slowdown is not None and (slower is None or step.slowdown.share < slower.share):
-            slower = step.slowdown
+        slower = slowest(slower, step.slowdown)
         most_s = self._limits.lead_m / self._limits.translation.velocity_m_s
         slower = keep_slowdown(step.start.slowdown, slower, plan.dt_ns / 1e9, most_s)
         state = step.response

@@ -91,19 +91,13 @@ def validate_chunk(
     if lease is None:
         return None
     if header.seq <= lease.last_seq:
-        return Rejection(
-            "replayed",
-            f"chunk {header.seq} came twice or out of order",
-            header.seq,
-            lease.last_seq,
-        )
+        why = f"chunk {header.seq} came twice or out of order"
+        return Rejection("replayed", why, header.seq, lease.last_seq)
     lease.last_seq = header.seq
     agreed = lease.spec.hash
     if record.spec_hash != agreed:
-        return Rejection(
-            "spec_mismatch",
-            f"chunk of spec {record.spec_hash!r}, agreed at activation was {agreed}",
-        )
+        why = f"chunk of spec {record.spec_hash!r}, agreed at activation was {agreed}"
+        return Rejection("spec_mismatch", why)
     if record.episode != task.episode:
         return Rejection(
             "superseded",
@@ -130,16 +124,11 @@ def _validate_times(
     if age_s < -FUTURE_TOLERANCE_NS / 1e9:
         return Rejection("future", f"its observation is {-age_s:.3f} s in the future", age_s, 0.0)
     if record.observation_stamp_ns < lease.since_ns:
-        return Rejection(
-            "before_activation", "its observation was taken before this activation", quiet=True
-        )
+        why = "its observation was taken before this activation"
+        return Rejection("before_activation", why, quiet=True)
     if age_s > max_age_s:
-        return Rejection(
-            "stale",
-            f"its observation is {age_s:.3f} s old, at most {max_age_s:g} s",
-            age_s,
-            max_age_s,
-        )
+        why = f"its observation is {age_s:.3f} s old, at most {max_age_s:g} s"
+        return Rejection("stale", why, age_s, max_age_s)
     if now_ns > record.valid_until_ns:
         late_s = (now_ns - record.valid_until_ns) / 1e9
         return Rejection("expired", f"it was valid until {late_s:.3f} s ago", late_s, 0.0)
@@ -151,16 +140,9 @@ def _validate_times(
 def validate_steps(
     action: ActionSpec, steps: FloatArray, start: Goal, limits: Limits, max_width_m: float
 ) -> Rejection | None:
-    """Why these numbers are impossible for steps of this meaning, None if all are possible.
+    """Why numbers (n, D) are impossible for steps of this meaning, None if all are possible.
 
-    All steps are checked before the arm follows the first one.
-
-    Args:
-        action: the meaning of the numbers.
-        steps: (n, D).
-        start: the goal that the first step starts from.
-        limits: of the robot.
-        max_width_m: of its gripper.
+    All steps are checked before the arm follows the first one, which starts from `start`.
     """
     rotations = steps[:, 3 : 3 + ROTATION_SIZE[action.rotation]]
     try:
@@ -184,19 +166,18 @@ def validate_steps(
         most_rad = 2.0 * np.arccos(np.clip(np.abs(rotations[:, 3]) - ROUNDING, 0.0, 1.0))
     else:  # three angles, or one: together at most as large as this
         most_rad = np.abs(rotations).sum(axis=1)
-    suspect = np.linalg.norm(lengths_m, axis=1) > limits.step_m * REJECT_FACTOR * (1 - ROUNDING)
+    most_m = np.abs(lengths_m).sum(axis=1)
+    suspect = most_m > limits.step_m * REJECT_FACTOR * (1 - ROUNDING)
     suspect |= most_rad > limits.step_rad * REJECT_FACTOR * (1 - ROUNDING)
     for index in suspect.nonzero()[0]:
         asked = step_pose(action, steps[index], start.pose)
         for hit in bound_step(limits, start.pose, asked)[1]:
             if hit.fatal:
-                return Rejection(
-                    hit.name,
-                    f"a step of {hit.value:.4g} is over {REJECT_FACTOR:g} times its "
-                    "limit; is its unit right?",
-                    hit.value,
-                    hit.limit,
+                why = (
+                    f"a step of {hit.value:.4g} is over {REJECT_FACTOR:g} times its limit; "
+                    "is its unit right?"
                 )
+                return Rejection(hit.name, why, hit.value, hit.limit)
     return None
 
 
@@ -206,12 +187,10 @@ def _validate_targets(positions_m: FloatArray, limits: Limits) -> Rejection | No
     away_m = np.linalg.norm(positions_m - np.clip(positions_m, *workspace_corners(limits)), axis=1)
     for index in (away_m > most_m).nonzero()[0]:
         at = ", ".join(f"{value:.4g}" for value in positions_m[index])
-        return Rejection(
-            "workspace",
+        why = (
             f"a target at ({at}) m, {away_m[index]:.4g} m outside the workspace x {box.x_m} "
             f"y {box.y_m} z {box.z_m}: are its numbers metres (position_scale_m), and is it in "
-            "the base frame?",
-            float(away_m[index]),
-            most_m,
+            "the base frame?"
         )
+        return Rejection("workspace", why, float(away_m[index]), most_m)
     return None

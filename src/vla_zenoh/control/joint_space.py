@@ -86,10 +86,15 @@ class JointBounds:
 
     def ways(self, start_rad: FloatArray, way_rad: FloatArray) -> tuple[float, float]:
         """Lengths of a straight motion: of the TCP or a sliding joint, m, of others, rad."""
-        slides = self.kinematics.slides
+        slides, jacobian = self.kinematics.slides, self.kinematics.jacobian
         turned_rad = float(np.abs(way_rad[~slides]).max(initial=0.0))
         slid_m = float(np.abs(way_rad[slides]).max(initial=0.0))
-        return max(self.curve_m(start_rad, way_rad, turned_rad), slid_m), turned_rad
+        # The TCP's curve, were all of it as fast as its fastest piece: no less than its length,
+        # and much more than the distance of its ends where joints turn far.
+        pieces = 1 + int(turned_rad / ARC_RAD)
+        places = (np.arange(pieces) + 0.5) / pieces
+        rates = [jacobian(start_rad + place * way_rad) @ way_rad for place in places]
+        return max(slid_m, *(norm3(rate[:3]) for rate in rates)), turned_rad
 
     def leashes(self) -> FloatArray:
         """(n,) how far each joint's goal may be ahead."""
@@ -98,16 +103,6 @@ class JointBounds:
     def full_speed_s(self, way_rad: FloatArray) -> float:
         """Time (s) of a straight motion by `way_rad` (n,) at full speed of the joints."""
         return float(np.max(np.abs(way_rad) / self.motion.velocity_rad_s))
-
-    def curve_m(self, start_rad: FloatArray, way_rad: FloatArray, turned_rad: float) -> float:
-        """Length (m) of the TCP's curve, were all of it as fast as its fastest piece.
-
-        No less than its length, and much more than the distance of its ends where joints turn far.
-        """
-        pieces = 1 + int(turned_rad / ARC_RAD)
-        places = (np.arange(pieces) + 0.5) / pieces
-        jacobian = self.kinematics.jacobian
-        return max(norm3((jacobian(start_rad + place * way_rad) @ way_rad)[:3]) for place in places)
 
     def in_chain_order(self, action: ActionSpec, steps: FloatArray) -> FloatArray:
         """Steps (n, D) of joints with their columns in the order of the kinematics."""
@@ -141,16 +136,15 @@ class JointBounds:
 
         Yields before every evaluation of the distances.
         """
-        kinematics, barriers = self.kinematics, self.barriers
+        barriers = self.barriers
         target_rad, hits = self.into_ranges(start_rad, asked_rad)
         yield
         before = self._barriers_at(start_rad)
         floor = barriers.floor(before)
         yield
         after, found = self._try(start_rad, target_rad, floor)
-        low, high = 0.0, 1.0
         if found is not None:
-            whole, after = target_rad, before
+            low, high, whole, after = 0.0, 1.0, target_rad, before
             for _ in range(HALVINGS):
                 middle = 0.5 * (low + high)
                 part_rad = start_rad + middle * (whole - start_rad)
@@ -163,7 +157,7 @@ class JointBounds:
             hits = [found, *hits]
             target_rad = start_rad + low * (whole - start_rad)
         slower = barriers.slowdown(before, after)
-        return BoundedStep(kinematics.forward(target_rad), hits, target_rad, slower)
+        return BoundedStep(self.kinematics.forward(target_rad), hits, target_rad, slower)
 
     def _barriers_at(self, joints_rad: FloatArray) -> FloatArray:
         """Barriers of the distances; a singularity is none."""
@@ -205,18 +199,14 @@ class JointBounds:
     ) -> tuple[FloatArray, LimitHit | None]:
         """Barriers at the end of a step, and the limit that forbids it."""
         after = self._barriers_at(end_rad)
-        hit = self.box_hit(start_rad, end_rad)
+        hit = self._box_hit(start_rad, end_rad)
         short = after - floor
         index = int(np.argmin(short[1:])) + 1 if len(short) > 1 else 0
         if hit is None and short[index] < 0:
-            stop = float(self.barriers.stop[index])
-            value, limit = float(after[index]) + stop, float(floor[index]) + stop
-            hit = LimitHit(
-                self.barriers.names[index], value, limit, where=self.barriers.where(index)
-            )
+            hit = self.barriers.hit(index, after[index], floor[index])
         return after, hit
 
-    def box_hit(self, start_rad: FloatArray, end_rad: FloatArray) -> LimitHit | None:
+    def _box_hit(self, start_rad: FloatArray, end_rad: FloatArray) -> LimitHit | None:
         """The face of the box that the straight motion between two joints would cross."""
         start_m = self.kinematics.forward(start_rad).position_m
         return self.face_hit(start_m, start_rad + PLACES[:, None] * (end_rad - start_rad))
@@ -232,7 +222,7 @@ class JointBounds:
 
     def ahead_hit(self, start_rad: FloatArray, end_rad: FloatArray) -> LimitHit | None:
         """The bound that the straight motion between two joints would violate."""
-        hit = self.box_hit(start_rad, end_rad)
+        hit = self._box_hit(start_rad, end_rad)
         return self.distance_hit(start_rad, end_rad) if hit is None else hit
 
     def distance_hit(self, start_rad: FloatArray, end_rad: FloatArray) -> LimitHit | None:
@@ -242,15 +232,7 @@ class JointBounds:
         before, after = self._barriers_at(start_rad), self._barriers_at(end_rad)
         short = after - np.minimum(before, 0.0) + NEARER_M
         index = int(np.argmin(short))
-        if short[index] >= 0:
-            return None
-        stop = float(self.barriers.stop[index])
-        return LimitHit(
-            self.barriers.names[index],
-            float(after[index]) + stop,
-            stop,
-            where=self.barriers.where(index),
-        )
+        return self.barriers.hit(index, after[index]) if short[index] < 0 else None
 
 
 class JointPath(AxisSmoother):
@@ -366,8 +348,7 @@ class JointPath(AxisSmoother):
     def _is_straight(self) -> bool:
         """The joints move in proportion, so that a stop can end on their straight line.
 
-        Where they do not, each stops by itself: one that waited for another to stop would pass its
-        target.
+        Else each stops by itself: one that waited for another to stop would pass its target.
         """
         return line_of(np.zeros(len(self.state.position)), *self.state[1:], 1.0) is not None
 

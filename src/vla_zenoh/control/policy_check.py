@@ -12,7 +12,6 @@ from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vla_zenoh.control.actions import (
     FURTHEST_RAD,
@@ -23,7 +22,7 @@ from vla_zenoh.control.actions import (
 )
 from vla_zenoh.policy import ROTATION_SIZE, ActionSpec, ModelSpec
 from vla_zenoh.profile import POSE_JOINTS, REACH_M, REJECT_FACTOR, Limits, Profile
-from vla_zenoh.types import QUATERNION_NORM_TOLERANCE
+from vla_zenoh.types import QUATERNION_NORM_TOLERANCE, FloatArray
 
 BINARY_SPAN = 2.0
 """A number further than this from the threshold is not a choice of two but another quantity."""
@@ -55,11 +54,11 @@ def spec_errors(profile: Profile, spec: ModelSpec) -> Iterator[Finding]:
     seen = spec.observation
     for name in seen.camera_names:
         if name not in profile.cameras:
+            given = ", ".join(profile.cameras) or "none"
             yield error(
                 "camera",
-                f"needs camera {name!r}, the profile has: "
-                f"{', '.join(profile.cameras) or 'none'}; add it to cameras, or name another in "
-                "the model's options",
+                f"needs camera {name!r}, the profile has: {given}; add it to cameras, or name "
+                "another in the model's options",
             )
     for wanted in seen.depth:
         camera = profile.cameras.get(wanted.camera)
@@ -87,11 +86,11 @@ def spec_errors(profile: Profile, spec: ModelSpec) -> Iterator[Finding]:
                 f"camera {wanted.camera!r} gives an image every {1 / camera.rate_hz:.3f} s, the "
                 f"spec's history allows none further than {apart_s:g} s from its time",
             )
-        if spec.observation.max_age_s * camera.rate_hz < 1.0:
+        if seen.max_age_s * camera.rate_hz < 1.0:
             yield error(
                 "camera_rate",
                 f"camera {wanted.camera!r} gives an image every {1 / camera.rate_hz:.2f} s, the "
-                f"spec allows none older than {spec.observation.max_age_s:g} s",
+                f"spec allows none older than {seen.max_age_s:g} s",
             )
     if set(spec.parts) != set(profile.part_names):
         names = [", ".join(filter(None, each)) for each in (spec.parts, profile.part_names)]
@@ -148,15 +147,16 @@ def chunk_errors(
         limits: of the robot.
         max_width_m: of its gripper.
     """
-    width = steps[:, -1].astype(np.float64)
+    steps = steps.astype(np.float64)
     if spec.gripper != "binary":  # any number is a valid choice of two
-        yield from (error("gripper_range", why) for why in beyond_gripper(spec, width, max_width_m))
+        for why in beyond_gripper(spec, steps[:, -1], max_width_m):
+            yield error("gripper_range", why)
     if spec.space == "joint":
         beyond = beyond_radians(spec, steps, limits)
         if beyond is not None:
             yield error("joint_units", beyond[0])
         return
-    rotation = steps[:, 3 : 3 + ROTATION_SIZE[spec.rotation]].astype(np.float64)
+    rotation = steps[:, 3 : 3 + ROTATION_SIZE[spec.rotation]]
     if spec.rotation == "quaternion":
         norms = np.linalg.norm(rotation, axis=1)
         worst = float(norms[np.argmax(np.abs(norms - 1.0))])
@@ -223,7 +223,7 @@ def _too_far_a_turn(most_rad: float, limits: Limits) -> Finding:
     )
 
 
-def _quaternion(rotation: NDArray[np.float64], limits: Limits) -> Iterator[Finding]:
+def _quaternion(rotation: FloatArray, limits: Limits) -> Iterator[Finding]:
     largest, swapped = (
         2 * math.acos(min(float(np.abs(rotation[:, index]).min()), 1.0)) for index in (3, 0)
     )
@@ -239,9 +239,7 @@ def _quaternion(rotation: NDArray[np.float64], limits: Limits) -> Iterator[Findi
         yield _too_far_a_turn(largest, limits)
 
 
-def beyond_gripper(
-    spec: ActionSpec, value: NDArray[np.float64], max_width_m: float
-) -> Iterator[str]:
+def beyond_gripper(spec: ActionSpec, value: FloatArray, max_width_m: float) -> Iterator[str]:
     """A sentence about gripper numbers that cannot have the declared meaning."""
     low, high = {
         "none": (-math.inf, math.inf),
@@ -270,7 +268,7 @@ LOST_SHARE = 0.3
 
 
 def joints_as_pose(
-    spec: ActionSpec, steps: Steps, joints_rad: NDArray[np.float64], limits: Limits
+    spec: ActionSpec, steps: Steps, joints_rad: FloatArray, limits: Limits
 ) -> list[Finding]:
     """An error if absolute poses look like joint positions, of which a step has as many numbers.
 
@@ -306,10 +304,7 @@ def joints_as_pose(
 
 
 def beyond_joints(
-    spec: ActionSpec,
-    steps: Steps,
-    jacobian: NDArray[np.float64],
-    rotation: NDArray[np.float64],
+    spec: ActionSpec, steps: Steps, jacobian: FloatArray, rotation: FloatArray
 ) -> list[str]:
     """Axes along which a chunk of deltas asks an arm for what its joints cannot do, with amounts.
 
@@ -327,8 +322,7 @@ def beyond_joints(
     asked[3:] = steps[:, 3:6].sum(axis=0) * (2.0 if spec.rotation == "quaternion" else 1.0)
     if spec.frame == "tcp":
         asked = np.concatenate([rotation @ asked[:3], rotation @ asked[3:]])
-    lost = float(np.linalg.norm(_WEIGHTS * lost_motion(jacobian, asked)))
-    if lost <= LOST_SHARE * float(np.linalg.norm(_WEIGHTS * asked)):
+    if _lost(jacobian, asked) <= LOST_SHARE * float(np.linalg.norm(_WEIGHTS * asked)):
         return []  # together the axes are one motion of the joints, as those of a model for it
     blocked = immovable_axes(jacobian)
     return [
@@ -338,23 +332,22 @@ def beyond_joints(
     ]
 
 
-def lost_motion(jacobian: NDArray[np.float64], twist: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Part of a twist (6,) m and rad that no velocity of the joints (6, n) gives."""
+def _lost(jacobian: FloatArray, twist: FloatArray) -> float:
+    """Size of the part of a twist (6,) m and rad that no velocity of the joints (6, n) gives."""
     joints = np.linalg.lstsq(_WEIGHTS[:, None] * jacobian, _WEIGHTS * twist, rcond=1e-6)[0]
-    return twist - jacobian @ joints
+    return float(np.linalg.norm(_WEIGHTS * (twist - jacobian @ joints)))
 
 
-def immovable_axes(jacobian: NDArray[np.float64]) -> tuple[str, ...]:
+def immovable_axes(jacobian: FloatArray) -> tuple[str, ...]:
     """Axes along or about which the TCP cannot move without other motion."""
     return tuple(
         name
         for index, name in enumerate(AXES)
-        if float(np.linalg.norm(_WEIGHTS * lost_motion(jacobian, np.eye(6)[index])))
-        > LOST_SHARE * _WEIGHTS[index]
+        if _lost(jacobian, np.eye(6)[index]) > LOST_SHARE * _WEIGHTS[index]
     )
 
 
-def outside_workspace_m(spec: ActionSpec, steps: Steps, limits: Limits) -> NDArray[np.float64]:
+def outside_workspace_m(spec: ActionSpec, steps: Steps, limits: Limits) -> FloatArray:
     """(H,) distance of absolute targets to the workspace box along the worst axis; inside below 0.
 
     Without `control.limits`, which needs Ruckig: models are also checked where that is missing.

@@ -69,36 +69,6 @@ class PeerSnapshot:
         return f": {why}" if why else ""
 
 
-def reasons_not_to_activate(
-    profile: Profile,
-    worker: str,
-    prompt: str,
-    peers: PeerSnapshot,
-    pose: Stamped[PoseState] | None,
-    gripper: Stamped[GripperState] | None,
-    chunk: Stamped[ActionChunk] | None,
-    now_ns: int,
-    rate_hz: float = 1.0,
-) -> list[str]:
-    """All reasons against an activation as sentences, empty if the arm may move.
-
-    Args:
-        profile: the effective profile.
-        worker: the worker that gets the lease.
-        prompt: the prompt in force.
-        peers: see `PeerSnapshot`.
-        pose: newest TCP pose.
-        gripper: newest gripper state.
-        chunk: newest chunk of that worker, published without the lease.
-        now_ns: same clock as the records' ``received_ns``.
-        rate_hz: chunks per second requested of the worker.
-    """
-    return [
-        *reasons_of_part(profile, peers, pose, gripper, now_ns),
-        *reasons_of_worker(profile, worker, prompt, peers, chunk, now_ns, rate_hz),
-    ]
-
-
 def reasons_of_part(
     profile: Profile,
     peers: PeerSnapshot,
@@ -106,7 +76,15 @@ def reasons_of_part(
     gripper: Stamped[GripperState] | None,
     now_ns: int,
 ) -> list[str]:
-    """Those of `reasons_not_to_activate` that are about one arm and gripper."""
+    """Reasons against an activation that are about one arm and gripper, as sentences.
+
+    Args:
+        profile: the effective profile.
+        peers: see `PeerSnapshot`.
+        pose: newest TCP pose.
+        gripper: newest gripper state.
+        now_ns: same clock as the records' ``received_ns``.
+    """
     return [*_robot(profile, peers, pose, now_ns), *_gripper(profile, gripper, now_ns)]
 
 
@@ -119,14 +97,24 @@ def reasons_of_worker(
     now_ns: int,
     rate_hz: float,
 ) -> list[str]:
-    """Those of `reasons_not_to_activate` that are about the worker, for all parts of a robot."""
-    return [
-        *_worker(worker, prompt, peers),
-        *_spec(profile, worker, peers),
-        *_chunk(profile, worker, peers, chunk, now_ns, rate_hz),
-        *_cameras(profile, worker, peers),
-        *_clocks(profile, worker, peers),
-    ]
+    """Those that are about the worker, for all parts of a robot.
+
+    Args:
+        profile: the effective profile.
+        worker: the worker that gets the lease.
+        prompt: the prompt in force.
+        peers: see `PeerSnapshot`.
+        chunk: newest chunk of that worker, published without the lease.
+        now_ns: same clock as the records' ``received_ns``.
+        rate_hz: chunks per second requested of the worker.
+    """
+    spec = peers.specs.get(worker)
+    reasons = _worker(worker, prompt, peers, spec)
+    if spec is not None:
+        reasons += _spec(profile, worker, spec)
+        reasons += _chunk(profile, worker, spec, peers, chunk, now_ns, rate_hz)
+        reasons += _cameras(profile, spec, peers)
+    return [*reasons, *_clocks(profile, worker, spec, peers)]
 
 
 def reasons_by_joints(
@@ -137,16 +125,7 @@ def reasons_by_joints(
     bounds: JointBounds,
     joint: Stamped[JointState],
 ) -> list[str]:
-    """Reasons against a worker whose newest chunk is not for the joints of this arm.
-
-    Args:
-        profile: the effective profile.
-        worker: the worker that gets the lease.
-        spec: its spec.
-        chunk: its newest chunk.
-        bounds: of the arm.
-        joint: newest joint state.
-    """
+    """Reasons against a worker whose newest chunk is not for the joints of this arm."""
     kinematics = bounds.kinematics
     try:
         joints_rad = kinematics.joints_of(joint.record)
@@ -174,10 +153,7 @@ def reasons_by_joints(
 
 
 def _robot(
-    profile: Profile,
-    peers: PeerSnapshot,
-    pose: Stamped[PoseState] | None,
-    now_ns: int,
+    profile: Profile, peers: PeerSnapshot, pose: Stamped[PoseState] | None, now_ns: int
 ) -> list[str]:
     reasons: list[str] = []
     if peers.robot_node not in peers.alive:
@@ -222,7 +198,7 @@ def _too_old(what: str, state: Stamped[Any], profile: Profile, now_ns: int) -> l
     return [f"the {what} is {age_s:.2f} s old, at most {limit_s:g} s is allowed"]
 
 
-def _worker(worker: str, prompt: str, peers: PeerSnapshot) -> list[str]:
+def _worker(worker: str, prompt: str, peers: PeerSnapshot, spec: ModelSpec | None) -> list[str]:
     node = worker_node(worker)
     if node not in peers.alive:
         others = sorted(
@@ -230,7 +206,6 @@ def _worker(worker: str, prompt: str, peers: PeerSnapshot) -> list[str]:
         )
         alive = ", ".join(others) or "none"
         return [f"worker {worker!r} is not alive{peers.why_down(node)}; alive are: {alive}"]
-    spec = peers.specs.get(worker)
     if spec is None:
         return [f"worker {worker!r} has not published its spec"]
     reasons: list[str] = []
@@ -242,11 +217,8 @@ def _worker(worker: str, prompt: str, peers: PeerSnapshot) -> list[str]:
     return reasons
 
 
-def _spec(profile: Profile, worker: str, peers: PeerSnapshot) -> list[str]:
+def _spec(profile: Profile, worker: str, spec: ModelSpec) -> list[str]:
     """Requirements of its spec that the profile does not meet."""
-    spec = peers.specs.get(worker)
-    if spec is None:
-        return []
     return [
         f"worker {worker!r} {why}" if name == "camera" else f"worker {worker!r}: {name}: {why}"
         for _, name, why in policy_check.spec_errors(profile, spec)
@@ -256,13 +228,13 @@ def _spec(profile: Profile, worker: str, peers: PeerSnapshot) -> list[str]:
 def _chunk(
     profile: Profile,
     worker: str,
+    spec: ModelSpec,
     peers: PeerSnapshot,
     chunk: Stamped[ActionChunk] | None,
     now_ns: int,
     rate_hz: float,
 ) -> list[str]:
-    spec = peers.specs.get(worker)
-    if spec is None or worker_node(worker) not in peers.alive:
+    if worker_node(worker) not in peers.alive:
         return []
     oldest_s = profile.timing.max_observation_age_s
     patience_s = max(CHUNK_PATIENCE_S, oldest_s) + 1.0 / rate_hz
@@ -305,10 +277,7 @@ def _chunk(
     ]
 
 
-def _cameras(profile: Profile, worker: str, peers: PeerSnapshot) -> list[str]:
-    spec = peers.specs.get(worker)
-    if spec is None:
-        return []
+def _cameras(profile: Profile, spec: ModelSpec, peers: PeerSnapshot) -> list[str]:
     reasons: list[str] = []
     for camera in spec.observation.camera_names:
         if camera not in profile.cameras:
@@ -331,9 +300,10 @@ def _cameras(profile: Profile, worker: str, peers: PeerSnapshot) -> list[str]:
     return reasons
 
 
-def _clocks(profile: Profile, worker: str, peers: PeerSnapshot) -> list[str]:
+def _clocks(
+    profile: Profile, worker: str, spec: ModelSpec | None, peers: PeerSnapshot
+) -> list[str]:
     """Clocks with too large an offset, or an unknown one on another host."""
-    spec = peers.specs.get(worker)
     cameras = spec.observation.camera_names if spec is not None else ()
     nodes = [peers.robot_node, worker_node(worker)]
     nodes += [peers.camera_nodes[name] for name in cameras if name in peers.camera_nodes]

@@ -36,6 +36,7 @@ from vla_zenoh.control.limits import (
     Slowdown,
     full_speed_s,
     joint_margins,
+    slowest,
 )
 from vla_zenoh.errors import RecordError
 from vla_zenoh.kinematics.ik import TOLERANCE_M, Approach, InverseKinematics, pose_error
@@ -68,7 +69,7 @@ class _Configuration(NamedTuple):
 
 
 class _Start(NamedTuple):
-    """The start of a step, and the bounds of its end: barriers, and ranges of the joints."""
+    """The start of a step, and the bounds of its end: least barriers, and ranges of the joints."""
 
     here: _Configuration
     floor: FloatArray
@@ -154,8 +155,7 @@ class ReachabilityFilter:
 
     def solve(self, pose: Pose, joints_rad: FloatArray) -> FloatArray | None:
         """Joints (n,) for `pose`, solved from `joints_rad` (n,); None without a solution."""
-        found = self._solver.approach(pose, joints_rad, bounded=False)
-        return found.joints_rad if found.solved else None
+        return self._solver.solve(pose, joints_rad, bounded=False)
 
     def joints_at(self, pose: Pose) -> FloatArray:
         """Joints (n,) of `pose`, or as near to it as they get, with the robot's elbow."""
@@ -163,9 +163,8 @@ class ReachabilityFilter:
         joints_rad = self._here.joints_rad if measured_rad is None else measured_rad
         for _ in range(NEWTON_STEPS):
             here, jacobian = self.kinematics.pose_and_jacobian(joints_rad)
-            joints_rad = (
-                joints_rad + np.linalg.lstsq(jacobian, pose_error(pose, here), rcond=1e-3)[0]
-            )
+            step = np.linalg.lstsq(jacobian, pose_error(pose, here), rcond=1e-3)[0]
+            joints_rad = joints_rad + step
         return joints_rad
 
     @property
@@ -179,11 +178,7 @@ class ReachabilityFilter:
         return self.barriers.margins(self._here.joints_rad, self._here.barriers)
 
     def bound(
-        self,
-        before: Pose,
-        asked: Pose,
-        dt_s: float = 0.1,
-        start_rad: FloatArray | None = None,
+        self, before: Pose, asked: Pose, dt_s: float = 0.1, start_rad: FloatArray | None = None
     ) -> tuple[Pose, list[LimitHit]]:
         """`bound_in_pieces` at once: the end of the step, and the limits that acted."""
         pieces = self.bound_in_pieces(before, asked, dt_s, start_rad)
@@ -191,7 +186,7 @@ class ReachabilityFilter:
             try:
                 next(pieces)
             except StopIteration as end:
-                return end.value.pose, end.value.hits
+                return end.value[:2]
 
     def bound_in_pieces(
         self, before: Pose, asked: Pose, dt_s: float, start_rad: FloatArray | None = None
@@ -217,7 +212,10 @@ class ReachabilityFilter:
             here = self._configuration_at(
                 before, here.joints_rad if start_rad is None else start_rad
             )
-        start = _Start(here, self._floor(here), *self._solver.bounds(here.joints_rad))
+        floor = self.barriers.floor(here.barriers)
+        if here.error > 0:  # an arm stretched towards a pose out of reach is singular
+            floor[0] = -np.inf
+        start = _Start(here, floor, *self._solver.bounds(here.joints_rad))
         yield
         end, hits = self._try(start, asked, dt_s)
         if not hits:
@@ -249,12 +247,11 @@ class ReachabilityFilter:
         self, start: _Start, end: _Configuration, pose: Pose, hits: list[LimitHit], dt_s: float
     ) -> BoundedStep:
         self._here = end
-        slower = self.barriers.slowdown(start.here.barriers, end.barriers)
-        late = self._late(start.here, end, dt_s)
-        if slower is None or (late is not None and late.share < slower.share):
-            slower = late
-        self.slowdown = slower
-        return BoundedStep(pose, hits, end.joints_rad, slower)
+        self.slowdown = slowest(
+            self.barriers.slowdown(start.here.barriers, end.barriers),
+            self._late(start.here, end, dt_s),
+        )
+        return BoundedStep(pose, hits, end.joints_rad, self.slowdown)
 
     def _guess(self, start: _Start, end: _Configuration, hits: Sequence[LimitHit]) -> float:
         """First guess of the feasible part, from how the whole step failed."""
@@ -287,18 +284,14 @@ class ReachabilityFilter:
         found = self._approach(pose, here.joints_rad)
         # From a start without a solution, a step that comes nearer to one is allowed.
         if not found.solved and found.error_m + found.error_rad >= here.error * (1 - 1e-6):
-            return here, [self._out_of_range(start, found.wanted_rad) or self._out_of_reach(found)]
+            apart = LimitHit("reach", found.error_m + found.error_rad, TOLERANCE_M)
+            return here, [self._out_of_range(start, found.wanted_rad) or apart]
         outside = self._out_of_range(start, found.joints_rad)
         if outside is not None:
             return here, [outside]
         end = self._configuration(pose, found)
         hits = [
-            LimitHit(
-                self.barriers.names[index],
-                float(end.barriers[index] + self.barriers.stop[index]),
-                float(start.floor[index] + self.barriers.stop[index]),
-                where=self.barriers.where(index),
-            )
+            self.barriers.hit(index, end.barriers[index], start.floor[index])
             for index in (end.barriers < start.floor).nonzero()[0].tolist()
         ]
         leaving = here.barriers[0] < 0 and end.barriers[0] > here.barriers[0]
@@ -307,13 +300,6 @@ class ReachabilityFilter:
             if late is not None and late.value > late.limit / SLOWEST:
                 hits = [LimitHit(late.name, late.value, late.limit, where=late.where)]
         return end, hits
-
-    def _floor(self, start: _Configuration) -> FloatArray:
-        """The least values of the barriers after one step from `start`."""
-        floor = self.barriers.floor(start.barriers)
-        if start.error > 0:  # an arm stretched towards a pose out of reach is singular
-            floor[0] = -np.inf
-        return floor
 
     def _approach(self, pose: Pose, start_rad: FloatArray) -> Approach:
         found = self._solver.approach(pose, start_rad, bounded=self._free_elbow)
@@ -329,9 +315,6 @@ class ReachabilityFilter:
         value = float(joints_rad[joint])
         bound = float(lower[joint] if value < lower[joint] else upper[joint])
         return LimitHit("joint_limit", value, bound, where=self.kinematics.arm_joints[joint])
-
-    def _out_of_reach(self, found: Approach) -> LimitHit:
-        return LimitHit("reach", found.error_m + found.error_rad, TOLERANCE_M)
 
     def _late(self, start: _Configuration, end: _Configuration, dt_s: float) -> Slowdown | None:
         """The slowdown of a step whose joints need longer than `dt_s`, None where they do not."""

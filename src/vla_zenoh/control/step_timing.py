@@ -52,13 +52,8 @@ class Arrivals:
     """When the next chunk is expected, in plan time."""
 
     def __init__(self) -> None:
-        self.restart()
-
-    def restart(self) -> None:
-        """Nothing has arrived yet."""
         self._last_ns: float | None = None
-        self._period_ns = 0.0
-        self._deviation_ns = 0.0
+        self._period_ns = self._deviation_ns = 0.0
         self._intervals = 0
 
     def arrived(self, now_ns: int, asked_period_ns: float) -> None:
@@ -96,12 +91,11 @@ class StepTiming:
 
     def __init__(self, box: FloatArray) -> None:
         self._box = box
-        self._arrivals = Arrivals()
         self.restart()
 
     def restart(self) -> None:
         """The arm stands, nothing was asked of it yet."""
-        self._arrivals.restart()
+        self._arrivals = Arrivals()
         self._plan: Plan | None = None
         self._took_ns = 0
         self._begun_ns = self._late_ns = 0.0
@@ -169,21 +163,17 @@ class StepTiming:
         self._begun_ns = plan_ns + self._late_ns - late_ns
 
     def _paced(
-        self,
-        way: FloatArray,
-        velocity: FloatArray,
-        time_s: float,
-        left_s: float,
-        override: float,
+        self, way: FloatArray, velocity: FloatArray, time_s: float, left_s: float, override: float
     ) -> float:
         """Share of the velocity limits that takes `time_s` and half a stop for a way (6,)."""
         limits = self._box[0]
-        length = float(np.max(np.abs(way) / limits))  # s at full speed
+        ways_s = np.abs(way) / limits
+        leading = int(ways_s.argmax())
+        length = float(ways_s[leading])  # s at full speed
         if length <= 0.0:
             return 1.0
-        now = float(np.max(np.abs(velocity) / limits))
+        now = float((np.abs(velocity) / limits).max())
         # In units of the velocity limits along the way, as the limits of the other orders are.
-        leading = int(np.argmax(np.abs(way) / limits))
         most, jerk = self._box[1:, leading] / limits[leading]
         most, jerk = most * override**2, jerk * override**3
         share = least = length / time_s

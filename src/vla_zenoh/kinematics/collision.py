@@ -9,8 +9,7 @@ the shapes: adjacent, never and default in MoveIt's setup assistant.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import coal
@@ -86,10 +85,19 @@ class CollisionModel:
         self._held_pairs: list[tuple[int, int]] = []
         self._geometry: Any = _one_hull_a_link(kinematics)
         if table_z_m is not None:
-            self._geometry.addGeometryObject(_table(kinematics, table_z_m))
+            at = kinematics.base_placement * pin.SE3(np.eye(3), np.array([0.0, 0.0, table_z_m]))
+            half_space = coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0)
+            self._geometry.addGeometryObject(pin.GeometryObject(TABLE, 0, 0, at, half_space))
         self._links = links = len(self._geometry.geometryObjects) - (table_z_m is not None)
-        pairs = _pairs_that_move(self._geometry)
-        distances = self._sample(kinematics, pairs)
+        shapes = self._geometry.geometryObjects
+        pairs = [
+            (first, second)
+            for first, second in itertools.combinations(range(len(shapes)), 2)
+            if shapes[first].parentJoint != shapes[second].parentJoint
+        ]
+        random = np.random.default_rng(0)  # the same pairs at every start
+        lower, span = kinematics.lower_rad, kinematics.upper_rad - kinematics.lower_rad
+        distances = self._at(lower + span * random.random((SAMPLES, kinematics.size)), pairs)
         good = self._at(known_good_rad, pairs)
         wanted = (distances.max(axis=0) > near_m) & (distances.min(axis=0) < near_m + NEVER_SPARE_M)
         if len(good):
@@ -100,9 +108,7 @@ class CollisionModel:
         self._pairs, self._held_pairs = [*used, *apart], self._add_held(kinematics)
         self._use(self._pairs)
         last = kinematics.model.njoints - 1
-        self.pairs: tuple[CollisionPair, ...] = tuple(
-            self._pair(first, second, last) for first, second in [*self._pairs, *self._held_pairs]
-        )
+        self.pairs = tuple(self._pair(*pair, last) for pair in [*self._pairs, *self._held_pairs])
 
     def links(self) -> Any:
         """A geometry model of the arm's links alone, a hull each."""
@@ -218,27 +224,21 @@ class CollisionModel:
         self._geometry.removeAllCollisionPairs()
         for first, second in pairs:
             self._geometry.addCollisionPair(pin.CollisionPair(first, second))
-        self._work: Any = self._geometry.createData()
+        self._work = self._geometry.createData()
         for request in self._work.distanceRequests:
             # The last separating direction: the next configuration is a small step away.
             request.gjk_initial_guess = coal.GJKInitialGuess.CachedGuess
         self._results: list[Any] = list(self._work.distanceResults)
 
     def _at(
-        self, configurations: Sequence[FloatArray], pairs: Sequence[tuple[int, int]]
+        self, configurations: Iterable[FloatArray], pairs: Sequence[tuple[int, int]]
     ) -> FloatArray:
         self._use(pairs)
-        return np.array([self.distances(np.asarray(joints)) for joints in configurations])
-
-    def _sample(self, kinematics: Kinematics, pairs: Sequence[tuple[int, int]]) -> FloatArray:
-        random = np.random.default_rng(0)  # the same pairs at every start
-        shape = (SAMPLES, kinematics.size)
-        span = kinematics.upper_rad - kinematics.lower_rad
-        return self._at(list(kinematics.lower_rad + span * random.random(shape)), pairs)
+        return np.array([self.distances(joints_rad) for joints_rad in configurations])
 
 
 def _load(kinematics: Kinematics) -> Any:
-    urdf: Path = kinematics.urdf
+    urdf = kinematics.urdf
     try:
         geometry = pin.buildGeomFromUrdf(
             kinematics.full_model,
@@ -249,17 +249,13 @@ def _load(kinematics: Kinematics) -> Any:
         )
     except (ValueError, RuntimeError) as error:
         raise ResourceError(
-            f"the collision shapes of {urdf.name} cannot be loaded: {_one_line(error)}. "
-            "package://NAME/... is looked for as NAME/... beside the URDF and in every folder "
-            "above it"
+            f"the collision shapes of {urdf.name} cannot be loaded: "
+            f"{' '.join(str(error).split())}. package://NAME/... is looked for as NAME/... "
+            "beside the URDF and in every folder above it"
         ) from error
     if geometry.ngeoms == 0:
         raise ResourceError(f"{urdf.name} has no collision shapes; give it some, or do without")
     return geometry
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())
 
 
 def _one_hull_a_link(kinematics: Kinematics) -> Any:
@@ -323,12 +319,6 @@ def _prism(ring: FloatArray, heights: FloatArray) -> FloatArray:
     )
 
 
-def _table(kinematics: Kinematics, table_z_m: float) -> Any:
-    placement = kinematics.base_placement * pin.SE3(np.eye(3), np.array([0.0, 0.0, table_z_m]))
-    half_space = coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0)
-    return pin.GeometryObject(TABLE, 0, 0, placement, half_space)
-
-
 def _keep_out(kinematics: Kinematics, name: str, shape: KeepOut) -> Any:
     turn = np.eye(3)
     if shape.box_m is not None:
@@ -341,12 +331,3 @@ def _keep_out(kinematics: Kinematics, name: str, shape: KeepOut) -> Any:
         solid = coal.Halfspace(normal / np.linalg.norm(normal), 0.0)
     placement = kinematics.base_placement * pin.SE3(turn, np.array(shape.centre_m))
     return pin.GeometryObject(name, 0, 0, placement, solid)
-
-
-def _pairs_that_move(geometry: Any) -> list[tuple[int, int]]:
-    shapes = geometry.geometryObjects
-    return [
-        (first, second)
-        for first, second in itertools.combinations(range(len(shapes)), 2)
-        if shapes[first].parentJoint != shapes[second].parentJoint
-    ]

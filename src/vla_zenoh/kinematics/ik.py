@@ -105,24 +105,22 @@ class InverseKinematics:
                 f"posture_rad has shape {self.posture_rad.shape}, wanted ({kinematics.size},)"
             )
 
-    def solve(self, pose: Pose, start_rad: FloatArray) -> FloatArray | None:
+    def solve(
+        self, pose: Pose, start_rad: FloatArray, *, bounded: bool = True
+    ) -> FloatArray | None:
         """Joints (n,) that put the TCP there, near `start_rad`; None where there are none.
 
-        A start outside the bounds is taken as it is: no joint goes further out than it was. The
-        search is local: a pose that needs several joints on the very ends of their ranges, or the
-        arm in another branch than at the start, may be missed.
+        The search is local: a pose that needs several joints on the very ends of their ranges, or
+        the arm in another branch than at the start, may be missed. `bounded`: see `approach`.
         """
-        found = self.approach(pose, start_rad)
+        found = self.approach(pose, start_rad, bounded=bounded)
         return found.joints_rad if found.solved else None
 
     def approach(self, pose: Pose, start_rad: FloatArray, *, bounded: bool = True) -> Approach:
         """Like `solve`, and how near it came where there is no solution.
 
-        Args:
-            pose: of the TCP.
-            start_rad: (n,).
-            bounded: keep every joint within its bounds, the other joints taking over. If not, pose
-                and posture alone decide where the joints go.
+        `bounded` keeps every joint within its bounds, the other joints taking over; else pose and
+        posture alone decide where the joints go.
         """
         lower, upper = self.bounds(start_rad)
         joints = wanted = start_rad

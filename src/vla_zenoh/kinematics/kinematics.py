@@ -72,9 +72,7 @@ class Kinematics:
         )
         self.data: Any = self.model.createData()
         self.arm_joints: tuple[str, ...] = tuple(self.model.names)[1:]
-        self.slides = np.array(
-            [_slides(joint) for joint in list(self.model.joints)[1:]], dtype=bool
-        )
+        self.slides = np.array([_slides(joint) for joint in list(self.model.joints)[1:]], bool)
         """(n,) joints that slide: their positions are m."""
         self._tcp = _frame(self.model, urdf, tcp_frame)
         self.base_placement = _base_placement(self.model, self.data, urdf, base_frame)
@@ -90,10 +88,9 @@ class Kinematics:
             )
             self.lower_rad = np.maximum(self.lower_rad, lower)
             self.upper_rad = np.minimum(self.upper_rad, upper)
+        moves = (self.lower_rad < self.upper_rad) & (self.velocity_rad_s > 0)
         for index, name in enumerate(self.arm_joints):
-            if not (
-                self.lower_rad[index] < self.upper_rad[index] and self.velocity_rad_s[index] > 0
-            ):
+            if not moves[index]:
                 unit = self.unit(index)
                 raise ProfileError(
                     f"joint {name!r} of {urdf.name} has no room to move: its <limit> needs "
@@ -157,7 +154,7 @@ class Kinematics:
         return jacobian if self._base_turn is None else self._base_turn @ jacobian
 
     def pose_and_jacobian(self, joints_rad: FloatArray) -> tuple[Pose, FloatArray]:
-        """Both of the above for the price of one."""
+        """Both for the price of one."""
         jacobian = self.jacobian(joints_rad)  # leaves the joints' placements behind
         return self._tcp_pose(), jacobian
 
@@ -190,10 +187,8 @@ def make_kinematics(profile: Profile) -> Kinematics:
 
 def smallest_singular_value(jacobian: FloatArray) -> float:
     """How slow the TCP's slowest direction is (m and rad alike) per rad/s; 0 when singular."""
-    squared = (
-        jacobian @ jacobian.T if jacobian.shape[0] <= jacobian.shape[1] else jacobian.T @ jacobian
-    )
-    return math.sqrt(max(float(np.linalg.eigvalsh(squared)[0]), 0.0))
+    wide = jacobian if jacobian.shape[0] <= jacobian.shape[1] else jacobian.T
+    return math.sqrt(max(float(np.linalg.eigvalsh(wide @ wide.T)[0]), 0.0))
 
 
 def _locked(

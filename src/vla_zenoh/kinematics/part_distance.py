@@ -93,12 +93,7 @@ class PlacedArm:
 
 
 class PartDistance:
-    """Distances between two arms.
-
-    Args:
-        first: one of them.
-        second: the other one.
-    """
+    """Distances between two arms."""
 
     def __init__(self, first: PlacedArm, second: PlacedArm) -> None:
         self._first, self._second = first, second
@@ -108,12 +103,9 @@ class PartDistance:
     def nearest(
         self, first_rad: Sequence[FloatArray], second_rad: Sequence[FloatArray], within_m: float
     ) -> Nearest:
-        """The nearest links with the arms at any two of these joints.
+        """The nearest links with the arms at any two of these configurations (n,).
 
-        Args:
-            first_rad: configurations (n,) of the first arm.
-            second_rad: configurations (n,) of the second arm.
-            within_m: links further apart than this are not looked for.
+        Links further apart than `within_m` are not looked for.
         """
         ones = [self._first.place(joints_rad) for joints_rad in first_rad]
         others = [self._second.place(joints_rad) for joints_rad in second_rad]

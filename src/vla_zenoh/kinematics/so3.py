@@ -14,10 +14,8 @@ from vla_zenoh.types import FloatArray, PoseState
 
 
 class _Pinocchio:
-    """Pinocchio, imported at first use.
-
-    The command line must load also in the environment of a model, which has no Pinocchio. Found
-    attributes are kept, so later calls cost nothing.
+    """Pinocchio, imported at first use: the command line must load also where a model runs, which
+    has no Pinocchio. Found attributes are kept, so later calls cost nothing.
     """
 
     def __getattr__(self, name: str) -> Any:
@@ -31,9 +29,6 @@ class _Pinocchio:
 
 
 pin = _Pinocchio()
-
-_ORIGIN = np.zeros(3)
-_AXES = range(3)
 
 
 class Pose(NamedTuple):
@@ -172,15 +167,7 @@ def spatial_rates(
         Jl'r' = B' [r]r' + C' [r][r]r' + C [r'][r]r'
 
     Closed form, because finite differences of Jl show as spikes in the jerk; written out, because
-    it runs in every tick.
-
-    Args:
-        rotvec: r, rad, (3,).
-        rate: r', (3,).
-        rate_change: r'', (3,).
-
-    Returns:
-        w (rad/s) and alpha (rad/s^2), both (3,).
+    it runs in every tick. r is in rad; all are (3,).
 
     Source: Sola, Deray, Atchuthan, "A micro Lie theory", 2018, eq. 145, differentiated.
     """
@@ -201,9 +188,9 @@ def _rates(
     bends = r1[0] * r1[0] + r1[1] * r1[1] + r1[2] * r1[2]
     bends += r[0] * r2[0] + r[1] * r2[1] + r[2] * r2[2]
     own, of_r, of_r1 = 1.0 - c * squared, c * bends + c_rate * along, c_rate * squared + c * along
-    velocity = [own * r1[i] + b * p[i] + c * along * r[i] for i in _AXES]
+    velocity = [own * r1[i] + b * p[i] + c * along * r[i] for i in range(3)]
     acceleration = [
-        own * r2[i] + b * s[i] + b_rate * p[i] + of_r * r[i] - of_r1 * r1[i] for i in _AXES
+        own * r2[i] + b * s[i] + b_rate * p[i] + of_r * r[i] - of_r1 * r1[i] for i in range(3)
     ]
     return np.array(velocity), np.array(acceleration)
 
@@ -241,5 +228,5 @@ def rates_of(
         return np.array([of[i] - 0.5 * p[i] + d * q[i] for i in range(3)])
 
     rate = inverse(velocity.tolist())
-    _, of_rate = spatial_rates(rotvec, rate, _ORIGIN)
+    _, of_rate = spatial_rates(rotvec, rate, np.zeros(3))
     return rate, inverse((acceleration - of_rate).tolist())

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from command_rig import MS, START_NS, WORKER, Rig, model_spec
 
-from vla_zenoh.control.preflight import PeerSnapshot, reasons_not_to_activate
+from vla_zenoh.control.preflight import PeerSnapshot, reasons_of_part, reasons_of_worker
 from vla_zenoh.ntp import ClockOffset
 from vla_zenoh.policy import CameraSpec
 from vla_zenoh.types import GripperState, Header, PoseState, Stamped
@@ -28,17 +28,13 @@ class Ready:
         self.now_ns = self.chunk.received_ns
 
     def reasons(self) -> list[str]:
-        return reasons_not_to_activate(
-            self.profile,
-            self.worker,
-            self.prompt,
-            self.peers,
-            self.pose,
-            self.gripper,
-            self.chunk,
-            self.now_ns,
-            self.rate_hz,
-        )
+        now_ns, peers = self.now_ns, self.peers
+        return [
+            *reasons_of_part(self.profile, peers, self.pose, self.gripper, now_ns),
+            *reasons_of_worker(
+                self.profile, self.worker, self.prompt, peers, self.chunk, now_ns, self.rate_hz
+            ),
+        ]
 
 
 def without(peers: PeerSnapshot, *nodes: str) -> PeerSnapshot:
