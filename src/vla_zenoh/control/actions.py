@@ -39,7 +39,7 @@ from vla_zenoh.kinematics.so3 import (
     rotation_from_quat,
     rotation_from_rpy,
 )
-from vla_zenoh.policy import ROTATION_SIZE, ActionSpec, ControllerSpec, Frame
+from vla_zenoh.policy import ROTATION_SIZE, ActionSpec, ControllerSpec
 from vla_zenoh.types import FloatArray, unit_quaternion
 
 Steps = NDArray[np.float32] | NDArray[np.float64]
@@ -67,17 +67,11 @@ def rotation_of(spec: ActionSpec, numbers: FloatArray) -> FloatArray:
 
 
 def step_pose(spec: ActionSpec, step: FloatArray, before: Pose, start: Pose | None = None) -> Pose:
-    """The pose that a step asks for, covered whole.
+    """The pose that a step (D,) asks for, covered whole.
 
     A delta in the base frame is ``p + dp, dR R``; in the TCP frame ``p + R dp, R dR``, of the step
-    before or of the chunk's start as `ActionSpec.relative_to` says. A velocity is the delta
+    `before` or of the chunk's `start` as `ActionSpec.relative_to` says. A velocity is the delta
     ``v dt, exp(w dt)``. An absolute step is the pose itself.
-
-    Args:
-        spec: the meaning of the numbers.
-        step: (D,).
-        before: end of the step before.
-        start: the anchor of the chunk; None: `before` is.
     """
     translation = np.asarray(step[:3], np.float64) * spec.position_scale_m
     turn = np.asarray(step[3 : 3 + ROTATION_SIZE[spec.rotation]], np.float64)
@@ -99,13 +93,8 @@ def step_pose(spec: ActionSpec, step: FloatArray, before: Pose, start: Pose | No
 def step_joints(
     spec: ActionSpec, step: FloatArray, before_rad: FloatArray, start_rad: FloatArray
 ) -> FloatArray:
-    """The joints (n,) that a step (D,) asks for.
-
-    Args:
-        spec: the meaning of the numbers.
-        step: (D,).
-        before_rad: (n,) end of the step before.
-        start_rad: (n,) anchor of the chunk.
+    """The joints (n,) that a step (D,) asks for, after joints `before_rad` in a chunk from
+    `start_rad`.
     """
     numbers = np.asarray(step[: spec.arm_size], np.float64)
     if spec.kind == "absolute":
@@ -118,14 +107,10 @@ def step_joints(
 def covered_step(
     spec: ActionSpec, step: FloatArray, before: Pose, start: Pose, state: Response | None
 ) -> tuple[Pose, Response | None]:
-    """Where a step ends, of which `ActionSpec.controller` may cover only a part.
+    """Where a step (D,) ends, of which `ActionSpec.controller` may cover only a part.
 
-    Args:
-        spec: the meaning of the numbers.
-        step: (D,).
-        before: end of the step before.
-        start: the anchor of the chunk.
-        state: of the controller's response at `before`; None: at rest.
+    With the state of the controller's response there, as `state` is that at `before`; None: at
+    rest.
     """
     asked = step_pose(spec, step, before, start)
     if spec.controller is None:
@@ -156,34 +141,27 @@ def as_deltas(spec: ActionSpec, steps: Steps) -> tuple[ActionSpec, FloatArray]:
         own = {p.part: as_deltas(p.action, steps[:, spec.columns(p.part)]) for p in spec.parts}
         action = ActionSpec.of_parts({part: meant for part, (meant, _) in own.items()})
         return action, np.concatenate([rows for _, rows in own.values()], axis=1)
+    size = spec.arm_size
     if spec.kind == "velocity":
-        size = spec.arm_size
         scaled = np.concatenate([steps[:, :size] * spec.dt_s, steps[:, size:]], axis=1)
         return spec.model_copy(update={"kind": "delta"}), scaled
     if spec.relative_to == "previous":
         return spec, steps
     if spec.space == "joint":
-        size = spec.arm_size
-        rows = np.diff(steps[:, :size], axis=0, prepend=np.zeros((1, size)))
+        ways = np.diff(steps[:, :size], axis=0, prepend=np.zeros((1, size)))
         changed = {"relative_to": "previous"}
-        return spec.model_copy(update=changed), np.concatenate([rows, steps[:, size:]], axis=1)
+        return spec.model_copy(update=changed), np.concatenate([ways, steps[:, size:]], axis=1)
     origin = Pose(np.zeros(3), np.eye(3))
-    poses = [origin, *chunk_poses(spec, steps, origin)]
-    rows = [
-        np.concatenate([into @ (after.position_m - before.position_m), turn])
-        for before, after in pairwise(poses)
-        for into, turn in [_relative(spec.frame, before, after)]
-    ]
+    rows: list[FloatArray] = []
+    for before, after in pairwise([origin, *chunk_poses(spec, steps, origin)]):
+        way_m = after.position_m - before.position_m
+        turn = log3(after.rotation @ before.rotation.T)
+        if spec.frame == "tcp":
+            way_m = before.rotation.T @ way_m
+            turn = log3(before.rotation.T @ after.rotation)
+        rows.append(np.concatenate([way_m, turn]))
     changed = {"relative_to": "previous", "rotation": "rotvec", "position_scale_m": 1.0}
-    size = spec.arm_size
     return spec.model_copy(update=changed), np.concatenate([rows, steps[:, size:]], axis=1)
-
-
-def _relative(frame: Frame, before: Pose, after: Pose) -> tuple[FloatArray, FloatArray]:
-    """Axes of a frame in the base, inverted, and the turn between two poses in them."""
-    if frame == "tcp":
-        return before.rotation.T, log3(before.rotation.T @ after.rotation)
-    return np.eye(3), log3(after.rotation @ before.rotation.T)
 
 
 def step_width(
@@ -283,14 +261,9 @@ def respond(
 def between(
     before: Pose, after: Pose, state: Response, dt_s: float, share: float
 ) -> tuple[Pose, Response]:
-    """Pose and state at `share` (0 to 1) of a step.
+    """Pose and state at `share` (0 to 1) of a step of `dt_s` that ends at `after` in `state`.
 
-    Args:
-        before: where the step begins.
-        after: where it ends; what a limit cut off is cut off evenly.
-        state: at its end.
-        dt_s: its duration.
-        share: of it that has passed.
+    What a limit cut off of it is cut off evenly.
     """
     whole, whole_rate = _motion(state.controller, state.start_rate, state.way, dt_s)
     moved, rate = _motion(state.controller, state.start_rate, state.way, share * dt_s)

@@ -4,15 +4,13 @@
 2. `ChunkPlanner.plan` puts its steps on top of what was asked for when its observation was taken.
 3. `ChunkPlanner.bound` shortens each step to its limits and to what the arm can do.
 4. `ChunkPlanner.advance` does 2 and 3 with the newest chunk of the queue, and adds the plan to the
-   `GoalTimeline`.
-5. `ChunkPlanner.bound_due` bounds the steps that follow, in time for them.
+   `GoalTimeline`. `ChunkPlanner.bound_due` bounds the steps that follow, in time for them.
 
 The cost of one evaluation of the arm is known, their number per step is not: one in free space,
 about ten where a limit cuts. So every tick has a budget of evaluations. A plan comes into force as
-soon as the step that is due is bounded, in free space before the tick after its arrival. A few
-steps are bounded ahead, after the commands of a tick were published. A step that is due before it
-is bounded waits: the one before it stays the goal. The plan does not depend on how the work is
-divided among ticks.
+soon as the step that is due is bounded, in free space before the tick after its arrival. A step
+that is due before it is bounded waits: the one before it stays the goal. The plan does not depend
+on how the work is divided among ticks.
 """
 
 from __future__ import annotations
@@ -86,8 +84,8 @@ class ChunkOutcome(NamedTuple):
 
     Args:
         chunk: as received.
-        rejection: why it is not executed; None: it is.
-        plan: in force; None: rejected.
+        rejection: why it is not executed.
+        plan: in force, unless it is rejected.
         hits: limits that acted on the steps bounded so far.
     """
 
@@ -195,7 +193,7 @@ class ChunkPlanner:
             beside: planners and timelines of the other parts.
 
         Returns:
-            chunks rejected, and chunks whose plan came into force, in this order of events.
+            chunks rejected, and chunks whose plan came into force, in the order of events.
         """
         outcomes: list[ChunkOutcome] = []
         parts = [(self, timeline), *beside]
@@ -251,7 +249,11 @@ class ChunkPlanner:
         if action.anchor == "measured":
             measured = self._measured(action, observed_ns, base.width_m)
             if measured is None:
-                return _not_measured(self._gap_ns)
+                why = (
+                    f"the arm was not measured within {self._gap_ns / 1e9:g} s before its "
+                    "observation, which the first step is added to (anchor: measured)"
+                )
+                return Rejection("not_measured", why)
             base = measured
         steps = np.asarray(record.steps[:count, columns], np.float64)
         bounds = self.joint_bounds
@@ -337,23 +339,17 @@ class ChunkPlanner:
     def bound_due(self, plans: Sequence[Plan], now_ns: int, ahead: int = 0) -> list[LimitHit]:
         """Bound the steps of `plans` (the newest last) that are due, and `ahead` steps after them.
 
-        Later goals move with what is cut off.
-
-        Returns:
-            limits that acted on them since the last call.
+        Later goals move with what is cut off. Returns the limits that acted since the last call.
         """
-        chunks = [
-            (plan, plan.due_index(now_ns))
-            for plan in reversed(plans)
-            if isinstance(plan, ChunkPlan)
-        ]
-        for plan, due in chunks:
+        chunks = [plan for plan in reversed(plans) if isinstance(plan, ChunkPlan)]
+        for plan in chunks:
+            due = plan.due_index(now_ns)
             if plan.action.targets and plan.bounded > due:
                 plan.computed = plan.bounded  # the leash does not shift targets
             until = min(due + 1 + ahead, len(plan.goals))
             while plan.bounded < until and self._bound_step(plan) is not None:
                 pass
-        return [hit for plan, _ in chunks for hit in plan.unreported_hits()]
+        return [hit for plan in chunks for hit in plan.unreported_hits()]
 
     def _bound_step(self, plan: ChunkPlan) -> list[LimitHit] | None:
         """Limits that acted on the next step of `plan`; None: not bounded, the budget is spent."""
@@ -501,14 +497,6 @@ def _superseded(chunk: Stamped[ActionChunk], episode: int | None) -> Rejection |
     if chunk.record.episode == episode:
         return None
     return Rejection("superseded", "the arm was stopped or got a new task meanwhile", quiet=True)
-
-
-def _not_measured(gap_ns: int) -> Rejection:
-    return Rejection(
-        "not_measured",
-        f"the arm was not measured within {gap_ns / 1e9:g} s before its observation, which "
-        "the first step is added to (anchor: measured)",
-    )
 
 
 def _planned(

@@ -120,13 +120,9 @@ def workspace_corners(limits: Limits) -> tuple[FloatArray, FloatArray]:
 def into_workspace(
     limits: Limits, position_m: FloatArray, before_m: FloatArray | None = None
 ) -> tuple[FloatArray, float]:
-    """The nearest position inside the workspace box, and the distance to it (m).
+    """The nearest position (3,) inside the workspace box, and the distance to it (m).
 
-    Args:
-        limits: the box.
-        position_m: (3,) in the base frame.
-        before_m: (3,) start of the step. From outside the box a step may lead back or stay, but no
-            further out.
+    A step that starts at `before_m`, outside the box, may lead back or stay, but no further out.
     """
     box = limits.workspace
     x, y, z = position_m.tolist()
@@ -212,13 +208,9 @@ def full_speed_s(limits: Limits, before: Pose, after: Pose) -> float:
 def keep_slowdown(
     before: Slowdown | None, now: Slowdown | None, dt_s: float, most_s: float
 ) -> Slowdown | None:
-    """The slowdown of a step that the arm starts late.
+    """The slowdown of a step of `dt_s` that the arm starts late, `before` being that of the last.
 
-    Args:
-        before: of the step before it.
-        now: of the step itself.
-        dt_s: duration of the step.
-        most_s: greatest lateness at full speed, which the leash bounds.
+    `now` is that of the step itself, `most_s` the greatest lateness at full speed by the leash.
     """
     if before is None or before.late_s <= 0.0:
         return now

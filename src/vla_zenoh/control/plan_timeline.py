@@ -381,10 +381,8 @@ class GoalTimeline:
 
     def in_force(self, t_ns: int) -> Plan:
         """The newest plan that was in force at `t_ns`."""
-        for plan in reversed(self._plans):
-            if plan.effective_ns <= t_ns:
-                return plan
-        return self._plans[0]
+        in_force = (plan for plan in reversed(self._plans) if plan.effective_ns <= t_ns)
+        return next(in_force, self._plans[0])
 
     def at(self, t_ns: int) -> Goal:
         """G(t) of the plan that was in force at `t_ns`."""

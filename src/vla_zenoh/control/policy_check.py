@@ -158,8 +158,7 @@ def chunk_errors(
         return
     rotation = steps[:, 3 : 3 + ROTATION_SIZE[spec.rotation]]
     if spec.rotation == "quaternion":
-        norms = np.linalg.norm(rotation, axis=1)
-        worst = float(norms[np.argmax(np.abs(norms - 1.0))])
+        worst = max(np.linalg.norm(rotation, axis=1).tolist(), key=lambda norm: abs(norm - 1.0))
         if abs(worst - 1.0) > QUATERNION_NORM_TOLERANCE:
             yield error("quaternion", f"a quaternion of norm {worst:.4g}, wanted 1")
             return
@@ -179,11 +178,8 @@ def chunk_errors(
         )
     if spec.rotation == "quaternion" and not spec.targets:
         yield from _quaternion(rotation, limits)
-    elif spec.targets and float(np.abs(rotation).max()) > 2 * math.pi:
-        yield error(
-            "rotation_units",
-            f"an angle of {float(np.abs(rotation).max()):.4g}, more than a turn; give radians",
-        )
+    elif spec.targets and (largest := float(np.abs(rotation).max())) > 2 * math.pi:
+        yield error("rotation_units", f"an angle of {largest:.4g}, more than a turn; give radians")
     elif spec.kind != "absolute" and most_rad > REJECT_FACTOR * limits.step_rad:
         yield _too_far_a_turn(most_rad, limits)
 
@@ -193,11 +189,9 @@ def largest_step(spec: ActionSpec, steps: Steps) -> tuple[float, float]:
     spec, steps = as_deltas(spec, steps)
     position_m = steps[:, :3] * spec.position_scale_m
     rotation = steps[:, 3 : 3 + ROTATION_SIZE[spec.rotation]]
-    angles = (
-        2 * np.arccos(np.clip(np.abs(rotation[:, 3]), 0.0, 1.0))
-        if spec.rotation == "quaternion"
-        else np.linalg.norm(rotation, axis=1)
-    )
+    angles = np.linalg.norm(rotation, axis=1)
+    if spec.rotation == "quaternion":
+        angles = 2 * np.arccos(np.clip(np.abs(rotation[:, 3]), 0.0, 1.0))
     return float(np.linalg.norm(position_m, axis=1).max()), float(angles.max())
 
 
@@ -279,20 +273,17 @@ def joints_as_pose(
         limits: of the robot.
     """
     count = len(joints_rad)
-    if spec.space == "joint" or spec.kind != "absolute":
+    absolute = spec.space != "joint" and spec.kind == "absolute"
+    if not absolute or spec.dimension not in (count, count + 1):
         return []
-    if spec.dimension not in (count, count + 1):
+    outside_m = float(outside_workspace_m(spec, steps, limits).min())
+    away_rad = float(np.abs(steps[0, :count].astype(np.float64) - joints_rad).max())
+    if away_rad <= NEAR_RAD:
+        like = f"its first {count} numbers are within {away_rad:.2f} of the joints in rad"
+    elif outside_m > FAR_M:
+        like = f"every pose is {outside_m:.2f} m or more outside the workspace"
+    else:
         return []
-    first = steps[:, :count].astype(np.float64)
-    outside_m = outside_workspace_m(spec, steps, limits)
-    away_rad = float(np.abs(first[0] - joints_rad).max())
-    if away_rad > NEAR_RAD and float(outside_m.min()) <= FAR_M:
-        return []
-    like = (
-        f"its first {count} numbers are within {away_rad:.2f} of the joints in rad"
-        if away_rad <= NEAR_RAD
-        else f"every pose is {float(outside_m.min()):.2f} m or more outside the workspace"
-    )
     return [
         error(
             "joints_as_pose",

@@ -53,7 +53,7 @@ CREEPING, STUCK_S = 0.05, 0.5
 """A pose that advances at less than this pace for this long will not be reached."""
 OUTSIDE_M = 1e-3
 """An arm further outside the box than this started there, and is moved inside."""
-DAMPING = 1e-5
+DAMPING = 1e-5 * np.eye(6)
 LAGS = 0.5
 """Joints that lag by this much, see `PoseToJoint._lag`, may stop by themselves."""
 RESTING_STEPS = 2
@@ -116,13 +116,9 @@ class PoseToJoint:
         self._waiting_s = 0.0
 
     def shares(self, motion: Motion, goal: Pose, box: FloatArray, *, bend: float = BEND) -> Shares:
-        """Shares of the limits of a straight motion to a pose that the joints can follow.
+        """Shares of the limits `Smoother.box` of a straight motion that the joints can follow.
 
-        Args:
-            motion: its start, near to the joints.
-            goal: its end.
-            box: (3, 6) velocity, acceleration and jerk of every axis, see `Smoother.box`.
-            bend: see `BEND`.
+        It begins near to the joints, and ends at `goal`.
         """
         (position_m, rotation), twist, _ = motion
         turn = log3(rotation.T @ goal.rotation)
@@ -133,16 +129,14 @@ class PoseToJoint:
         return followed_shares(ways, box, speed, joint_ways, bends, limits, bend)
 
     def _ways(self, way: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Joint displacements (n,) of a displacement (6,) of the TCP, and their change (n,).
+        """Joint displacements (n,) of a straight path of the TCP by `way` (6,), and their change.
 
         Both for the whole path in one unit of time.
         """
         found: list[FloatArray] = []
         joints = self._now.position_rad
         for _ in range(PLACES):
-            jacobian = self._kinematics.jacobian(joints)
-            square = jacobian @ jacobian.T + DAMPING * np.eye(6)
-            found.append(jacobian.T @ np.linalg.solve(square, way))
+            found.append(_joint_way(self._kinematics.jacobian(joints), way))
             joints = joints + found[-1] / (PLACES - 1)
         bends = np.abs(np.diff(found, axis=0)).max(axis=0) * (PLACES - 1)
         return np.abs(found).max(axis=0), bends
@@ -169,15 +163,12 @@ class PoseToJoint:
             ahead.tick(self.pace * ahead_s / self._dt_s)
             self.brake(ahead)
         rest = ahead.resting_pose()
-        jacobian = self._kinematics.jacobian(joints)
-        square = jacobian @ jacobian.T + DAMPING * np.eye(6)
-        velocity = self._now.velocity_rad_s
-        elbow = velocity - jacobian.T @ np.linalg.solve(square, jacobian @ velocity)
+        jacobian, velocity = self._kinematics.jacobian(joints), self._now.velocity_rad_s
+        elbow = velocity - _joint_way(jacobian, jacobian @ velocity)
         at_rest = joints + (ahead_s + ELBOW_S) * elbow
         for _ in range(RESTING_STEPS):
             here, jacobian = self._kinematics.pose_and_jacobian(at_rest)
-            square = jacobian @ jacobian.T + DAMPING * np.eye(6)
-            at_rest = at_rest + jacobian.T @ np.linalg.solve(square, pose_error(rest, here))
+            at_rest = at_rest + _joint_way(jacobian, pose_error(rest, here))
         if self._lag(self._kinematics.forward(joints), smoother.motion.pose) < LAGS:
             return between(joints, at_rest)
         box = np.array(self.limits)
@@ -194,7 +185,9 @@ class PoseToJoint:
         """
         here = self._kinematics.forward(self._now.position_rad)
         lag = self._lag(here, smoother.motion.pose)
-        self._update_constraints()
+        if self._ticks % CONSTRAINT_TICKS == 0:
+            self._constraints.update(self._now.position_rad)
+        self._ticks += 1
         # Held joints approach a standing pose for as long as it takes.
         lags = lag > 1.0 or (bool(self._held) and smoother.at_rest)
         self._stopping = braking and (self._stopping or lags)
@@ -235,11 +228,6 @@ class PoseToJoint:
         apart_m, apart_rad = pose_distance(here, self._inside(here, pose))
         return max(apart_m / NEAR_M, apart_rad / NEAR_RAD)
 
-    def _update_constraints(self) -> None:
-        if self._ticks % CONSTRAINT_TICKS == 0:
-            self._constraints.update(self._now.position_rad)
-        self._ticks += 1
-
     def _stop(self, smoother: Smoother) -> None:
         """Stop the joints within their limits; the pose follows them."""
         self._now = self._follower.brake(self._now, self._dt_s)
@@ -278,3 +266,8 @@ class PoseToJoint:
     def _acceleration(self) -> FloatArray:
         known = self._now.acceleration_rad_s2
         return np.zeros(len(self._now.position_rad)) if known is None else known
+
+
+def _joint_way(jacobian: FloatArray, way: FloatArray) -> FloatArray:
+    """The least joint displacement (n,) that moves the TCP by `way` (6,)."""
+    return jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + DAMPING, way)
