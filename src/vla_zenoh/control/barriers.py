@@ -95,9 +95,7 @@ class Barriers:
             keep_out=limits.keep_out,
         )
         pairs = self.collisions.pairs
-        hand = np.array(
-            [pair.limit == "table_distance" and pair.is_hand for pair in pairs], dtype=bool
-        )
+        hand = np.array([pair.is_hand and pair.limit == "table_distance" for pair in pairs], bool)
         self.names = ["singularity", *(pair.limit for pair in pairs)]
         stops_m = np.where(hand, limits.table_stop_m, limits.collision_stop_m)
         slows_m = np.where(hand, limits.table_slow_m, limits.collision_slow_m)
@@ -146,19 +144,18 @@ class Barriers:
         kinematics = self._kinematics
         room = np.minimum(joints_rad - kinematics.lower_rad, kinematics.upper_rad - joints_rad)
         tightest = int(np.argmin(room))
-        values = barriers + self.stop
+        values = (barriers + self.stop).tolist()
         nearest: dict[str, tuple[float, str]] = dict.fromkeys(
             ("self_collision", "table_distance", "keep_out"), (np.inf, "")
         )
         for index, value in enumerate(values[1:], start=1):
-            if value >= FREE_M:
-                continue
-            name = self.names[index]
-            nearest[name] = min(nearest[name], (float(value), self.where(index)))
+            if value < FREE_M:
+                name = self.names[index]
+                nearest[name] = min(nearest[name], (value, self.where(index)))
         return Margins(
             float(room[tightest]),
             kinematics.arm_joints[tightest],
-            float(values[0]),
+            values[0],
             *nearest["self_collision"],
             *nearest["table_distance"],
             *nearest["keep_out"],

@@ -57,15 +57,7 @@ from vla_zenoh.errors import RecordError
 from vla_zenoh.kinematics.so3 import interpolate, pose_distance, pose_of
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import (
-    ActionChunk,
-    Cause,
-    FloatArray,
-    JointState,
-    PoseState,
-    Stamped,
-    Task,
-)
+from vla_zenoh.types import ActionChunk, Cause, FloatArray, JointState, PoseState, Stamped, Task
 
 MAX_QUEUED = 4
 """Of a burst of chunks only the newest few are kept; the newest valid one is executed."""
@@ -314,8 +306,7 @@ class ChunkPlanner:
         found = self.poses.around(t_ns, self._gap_ns)
         if found is None:
             return None
-        before, after, share = found
-        pose = pose_of(before)
+        pose, after, share = pose_of(found[0]), found[1], found[2]
         return Goal(interpolate(pose, pose_of(after), share) if share else pose, width_m)
 
     # -- bound --------------------------------------------------------------------------------
@@ -468,7 +459,7 @@ class ChunkPlanner:
     def _approach(
         self, plan: ChunkPlan, far_m: float, far_rad: float, full_s: float
     ) -> tuple[float, Slowdown | None]:
-        """The part of a step to an absolute target that is taken, and its slowdown.
+        """The part of a step to an absolute target that is taken, and the slowdown of an approach.
 
         A target further away than a step is approached.
         """

@@ -79,10 +79,8 @@ class JointBounds:
         margin_rad = joint_margins(self.limits.reach, kinematics)
         self.lower_rad = kinematics.lower_rad + margin_rad
         self.upper_rad = kinematics.upper_rad - margin_rad
-
-    def _of_each(self, turning: float, sliding: float) -> FloatArray:
-        """(n,) a limit of joints that turn, and one of those that slide."""
-        return np.where(self.kinematics.slides, sliding, turning)
+        self.leashes = np.where(kinematics.slides, self.limits.lead_m, self.limits.lead_rad)
+        """(n,) how far each joint's goal may be ahead."""
 
     def ways(self, start_rad: FloatArray, way_rad: FloatArray) -> tuple[float, float]:
         """Lengths of a straight motion: of the TCP or a sliding joint, m, of others, rad."""
@@ -95,10 +93,6 @@ class JointBounds:
         places = (np.arange(pieces) + 0.5) / pieces
         rates = [jacobian(start_rad + place * way_rad) @ way_rad for place in places]
         return max(slid_m, *(norm3(rate[:3]) for rate in rates)), turned_rad
-
-    def leashes(self) -> FloatArray:
-        """(n,) how far each joint's goal may be ahead."""
-        return self._of_each(self.limits.lead_rad, self.limits.lead_m)
 
     def full_speed_s(self, way_rad: FloatArray) -> float:
         """Time (s) of a straight motion by `way_rad` (n,) at full speed of the joints."""
@@ -115,7 +109,8 @@ class JointBounds:
         """Why targets (n, D) in chain order are too far outside their ranges to be intended."""
         asked_rad = np.array([step_joints(action, step, base_rad, base_rad) for step in steps])
         away_rad = np.maximum(self.lower_rad - asked_rad, asked_rad - self.upper_rad)
-        mosts = REJECT_FACTOR * self._of_each(self.limits.step_rad, self.limits.step_m)
+        slides = self.kinematics.slides
+        mosts = REJECT_FACTOR * np.where(slides, self.limits.step_m, self.limits.step_rad)
         step, joint = np.unravel_index(int(np.argmax(away_rad / mosts)), away_rad.shape)
         most_rad = float(mosts[joint])
         if away_rad[step, joint] <= most_rad:
@@ -249,7 +244,6 @@ class JointPath(AxisSmoother):
         tcp = motion_limits(profile.limits)
         box = [[move] * 3 + [turn * ROTATION_BOX] * 3 for move, turn in zip(*tcp, strict=True)]
         self._tcp_box = np.array(box)
-        self._leashes = bounds.leashes()
         self._ticks = 0
         self._hits: list[LimitHit] = []
         self._asked: tuple[Goal, Shares, bool]
@@ -277,7 +271,7 @@ class JointPath(AxisSmoother):
         here_rad, goal_rad = self.state.position, goal.joints_rad
         from_rad = here_rad + ahead_s * self.state.velocity
         hits: list[LimitHit] = []
-        leashes = self._leashes
+        leashes = self._bounds.leashes
         ahead = np.abs(goal_rad - from_rad) / leashes
         joint = int(np.argmax(ahead))
         if ahead[joint] > 1.0:
