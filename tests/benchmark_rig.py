@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from vla_zenoh.lab.benchmark.contract import Benchmark, BenchmarkObservation, make_benchmark
-from vla_zenoh.lab.benchmark.episode_clock import EpisodeRequest
+from vla_zenoh.lab.benchmark.episode import EpisodeRequest
 from vla_zenoh.policy import ActionSpec, ModelSpec, ObservationSpec
 from vla_zenoh.policy.loader import find_model
 from vla_zenoh.types import ActionChunk

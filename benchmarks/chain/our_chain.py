@@ -22,7 +22,7 @@ from vla_zenoh.bus.buffers import CallbackRing, LatestSample
 from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.node import Node
 from vla_zenoh.errors import NodeError, SessionError
-from vla_zenoh.lab.bench.cpu_time import cpu_s
+from vla_zenoh.lab.bench.command_runner import cpu_s
 from vla_zenoh.nodes.camera.camera_publisher import OK, CameraPublisher
 from vla_zenoh.profile import HostProfile, Profile, load_profile
 from vla_zenoh.runtime.launch import Host

@@ -25,7 +25,7 @@ from benchmarks.chain.ways import Load, ServingWay
 from vla_zenoh import __version__
 from vla_zenoh.errors import NodeError
 from vla_zenoh.keys import worker_node
-from vla_zenoh.lab.bench.cpu_time import cpu_s
+from vla_zenoh.lab.bench.command_runner import cpu_s
 
 PERIOD_S = (0.012, 0.020)
 """From one request to the next, evenly drawn: two ticks of 250 Hz wide, so that every phase of the

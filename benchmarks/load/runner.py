@@ -28,7 +28,7 @@ from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec.image import MAX_IMAGE_BYTES
 from vla_zenoh.errors import CodecError, NodeError, SessionError
 from vla_zenoh.keys import worker_node
-from vla_zenoh.lab.bench.cpu_time import cpu_s
+from vla_zenoh.lab.bench.command_runner import cpu_s
 from vla_zenoh.profile import Profile, as_robot, override, to_yaml
 from vla_zenoh.runtime.process import ROUTER_PATIENCE_S
 from vla_zenoh.runtime.supervisor import NodeCommand, Supervisor

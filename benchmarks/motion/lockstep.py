@@ -25,7 +25,7 @@ from benchmarks.motion.protocol import (
 from vla_zenoh.control.reachability import make_reachability_filter
 from vla_zenoh.errors import NodeError
 from vla_zenoh.kinematics.so3 import Pose
-from vla_zenoh.lab.bench.processes import in_processes
+from vla_zenoh.lab.bench.task_lockstep import in_processes
 from vla_zenoh.lab.demo.segments import DemoSegment, RestPose, judge_segment, make_segment
 from vla_zenoh.lab.lockstep import Delays, Lockstep
 from vla_zenoh.policy.loader import find_model, make_policy

@@ -19,9 +19,15 @@ import numpy as np
 
 from vla_zenoh.codec.settings import FALSE_WORDS, TRUE_WORDS
 from vla_zenoh.errors import RecordingError
-from vla_zenoh.lab.evaluation import trajectory
 from vla_zenoh.lab.evaluation.result import Evaluation, PlotTrace
-from vla_zenoh.lab.evaluation.segments import segment
+from vla_zenoh.lab.evaluation.segments import (
+    angles_rad,
+    idle_s,
+    path_m,
+    rotvecs,
+    segment,
+    turned_rad,
+)
 from vla_zenoh.types import FloatArray, shown
 
 TIMES = ("t_client_start", "t_publish", "t_vla_in", "t_vla_out")
@@ -168,14 +174,14 @@ def _motion(run: Evaluation, table: _Table) -> None:
     nothing = np.full((count, 4), np.nan)
     position = table.columns(POSITION) if table.has(*POSITION) else nothing[:, :3]
     turns = _with_w(table.columns(ORIENTATION)) if table.has(*ORIENTATION) else nothing.copy()
-    run.path_m, run.path_rad = trajectory.path_m(position), trajectory.turned_rad(turns)
+    run.path_m, run.path_rad = path_m(position), turned_rad(turns)
     run.width_m = table.column("gw") if table.has("gw") else np.zeros(0)
     run.width_t_s = run.request_t_s if len(run.width_m) else np.zeros(0)
     prompts = table.texts("prompt") if table.has("prompt") else [""] * count
     run.prompts = [prompt for prompt, _ in groupby(prompts) if prompt]
     t_s = run.request_t_s
     if np.isfinite(position).any():
-        run.measured = PlotTrace(t_s, position, trajectory.rotvecs(turns))
+        run.measured = PlotTrace(t_s, position, rotvecs(turns))
     _idle(run, t_s, position, turns)
     at = 0
     for prompt, group in groupby(prompts):
@@ -197,9 +203,7 @@ def _idle(run: Evaluation, t_s: FloatArray, position: FloatArray, turns: FloatAr
     apart_s = np.diff(t_s)
     speed = np.linalg.norm(np.diff(position, axis=0), axis=1) / apart_s
     run.active_s = float(t_s[-1] - t_s[0])
-    run.idle_s = trajectory.idle_s(
-        t_s, speed, trajectory.angles_rad(turns[:-1], turns[1:]) / apart_s
-    )
+    run.idle_s = idle_s(t_s, speed, angles_rad(turns[:-1], turns[1:]) / apart_s)
 
 
 def _span(t_s: Any) -> float:

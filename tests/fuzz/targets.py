@@ -37,10 +37,9 @@ from vla_zenoh.lab.demo.scripted_motions import parse_scripted
 from vla_zenoh.lab.evaluation.mcap_file import evaluate_run
 from vla_zenoh.lab.inference_views import InferenceView
 from vla_zenoh.lab.primitives.requests import decode_request
-from vla_zenoh.lab.recording.record_json import record_from_json, record_to_json
-from vla_zenoh.lab.recording.record_types import RECORDS
+from vla_zenoh.lab.recording.record_types import RECORDS, record_from_json, record_to_json
 from vla_zenoh.lab.serve import mcp, openpi_server
-from vla_zenoh.lab.tasks.wording import parse_prompt
+from vla_zenoh.lab.tasks.order import parse_prompt
 from vla_zenoh.policy import ActionSpec, ModelSpec, ObservationSpec
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import load_profile

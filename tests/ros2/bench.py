@@ -41,7 +41,7 @@ from ros_node import Listener, RosNode, free_domain
 
 from benchmarks.picture import noisy_picture
 from vla_zenoh.codec import records
-from vla_zenoh.lab.bench.cpu_time import cpu_s
+from vla_zenoh.lab.bench.command_runner import cpu_s
 from vla_zenoh.types import PoseCommand
 
 FRONT = CAMERAS["front"]

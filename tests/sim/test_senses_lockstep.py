@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from vla_zenoh.lab.lockstep.loop import Lockstep
-from vla_zenoh.lab.lockstep.records import Delays
+from vla_zenoh.lab.lockstep.worker import Delays
 from vla_zenoh.policy import (
     ActionSpec,
     CameraSpec,

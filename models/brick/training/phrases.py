@@ -10,7 +10,7 @@ from states import draw_order
 from worker import MAX_PIECES, tokens_of
 
 from vla_zenoh.lab.tasks import COLOURS, DIRECTIONS, HELD_OUT, NONSENSE, Order, phrase
-from vla_zenoh.lab.tasks.wording import DIRECTION_PHRASES
+from vla_zenoh.lab.tasks.order import DIRECTION_PHRASES
 
 KINDS = ("put", "stack", *DIRECTIONS)
 NO_TASK = len(KINDS)

@@ -87,7 +87,7 @@ COMMANDS: Mapping[str, Mapping[str, str | Group]] = {
         "profile": "lab.cli.profile:profile_app",
         "robot": Group(
             "Compare a robot with its profile.",
-            {"check": "lab.cli.robot_check:robot_check"},
+            {"check": "lab.cli.doctor:robot_check"},
         ),
         "camera": Group(
             "Cameras of this computer.",

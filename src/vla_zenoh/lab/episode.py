@@ -40,15 +40,9 @@ class EpisodeView:
     """State of an episode, as the command node reports it.
 
     Args:
-        active: the arm is active.
         ours: it still is the episode that was started, with its worker and prompt.
-        state: of the command node.
-        why: its reason for that state.
         done: the policy reports its end, and the arm is at rest.
-        chunks: accepted so far.
-        steps: that came into force so far.
         holds: times the command node braked for want of a chunk.
-        deactivated: a client deactivated the arm.
         recording: what is wrong with the recording, empty: nothing.
     """
 
@@ -68,7 +62,6 @@ class EpisodeLimit:
     """Ends an episode by its time limit, or once the policy has been done for a while.
 
     Args:
-        limit_s: time limit.
         done_s: how long `EpisodeView.done` has to hold.
     """
 
@@ -91,8 +84,6 @@ class EpisodeRunner:
     """Starts episodes on a running robot and follows them.
 
     Args:
-        client: follows the nodes.
-        stop: set by Ctrl-C.
         watch: called while waiting; raises `NodeError` when the nodes cannot be kept alive.
     """
 
@@ -107,12 +98,10 @@ class EpisodeRunner:
         """Wait until the worker has loaded its model and all nodes have data.
 
         Args:
-            worker: its name.
             streams: of each of which there has to be a record.
 
         Raises:
             NodeError: the nodes do not come up in time; with the state of each.
-            Interrupted: Ctrl-C.
         """
         began_s = time.monotonic()
         while True:
@@ -224,7 +213,6 @@ class EpisodeRunner:
 
         Raises:
             NodeError: it did not hold within `timeout_s`; with `otherwise` and every node's state.
-            Interrupted: Ctrl-C.
         """
         give_up_s = time.monotonic() + timeout_s
         while not condition():
@@ -233,12 +221,7 @@ class EpisodeRunner:
             self.pause(POLL_S)
 
     def pause(self, seconds: float) -> None:
-        """Let `seconds` pass.
-
-        Raises:
-            NodeError: the nodes cannot be kept alive.
-            Interrupted: Ctrl-C.
-        """
+        """Let `seconds` pass. Raises NodeError: the nodes cannot be kept alive."""
         end_s = time.monotonic() + seconds
         while True:
             self._watch()

@@ -25,24 +25,14 @@ MAX_WAITING_BYTES = 128 * 1024 * 1024
 
 @dataclass(frozen=True, slots=True)
 class InferenceView:
-    """One inference with its images.
-
-    Args:
-        record: prompt, steps, times.
-        jpegs: camera -> JPEG file of the model's input.
-    """
+    """One inference with its images. `jpegs`: camera -> JPEG file of the model's input."""
 
     record: InferenceDebug
     jpegs: Mapping[str, bytes]
 
 
 class PendingImages:
-    """Bounded store of images that wait for the record of their inference.
-
-    Args:
-        left_out: counts dropped images by reason.
-        limit: total bytes.
-    """
+    """Bounded store of images that wait for the record of their inference. `limit`: total bytes."""
 
     def __init__(self, left_out: Counter[str], limit: int = MAX_WAITING_BYTES) -> None:
         self._left_out, self._limit, self._bytes = left_out, limit, 0
@@ -76,8 +66,6 @@ class InferenceDebugSubscriber:
     """Collects the inferences of one worker or of all; workers publish them while this exists.
 
     Args:
-        session: open session.
-        keys: of the robot.
         worker: its name; None: all workers.
     """
 
@@ -142,6 +130,5 @@ class InferenceDebugSubscriber:
         return InferenceView(record, self._images.pop(worker, header.seq))
 
     def close(self) -> None:
-        """Unsubscribe."""
         for subscriber in self._subscribers:
             subscriber.undeclare()

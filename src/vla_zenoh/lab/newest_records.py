@@ -33,11 +33,7 @@ class StreamSlot(LatestSample):
         return bytes_of(self._arrival.sample.payload) if self._arrival else b""
 
     def read(self, kind: type[Record]) -> tuple[Header, Record]:
-        """Its header and record.
-
-        Raises:
-            NodeError: nothing was received, or no such record.
-        """
+        """Its header and record. Raises NodeError: nothing was received, or no such record."""
         arrival = self._arrival
         if arrival is None:
             raise NodeError(f"no {kind.__name__} received")
@@ -58,10 +54,7 @@ class NewestRecords:
     def __init__(self, session: zenoh.Session, keys: Mapping[type[Any], str]) -> None:
         self._slots = {kind: StreamSlot() for kind in keys}
         self._subscribers = [
-            session.declare_subscriber(
-                key, zenoh.handlers.Callback(self._slots[kind], indirect=False)
-            )
-            for kind, key in keys.items()
+            self._slots[kind].subscribe(session, key) for kind, key in keys.items()
         ]
 
     def missing(self, since_s: float = 0.0) -> list[str]:
@@ -81,6 +74,5 @@ class NewestRecords:
         return self._slots[kind].read(kind)
 
     def close(self) -> None:
-        """Unsubscribe."""
         for subscriber in self._subscribers:
             subscriber.undeclare()

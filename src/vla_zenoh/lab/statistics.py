@@ -19,8 +19,6 @@ class Distribution:
     """How values are distributed; percentiles are interpolated linearly.
 
     Args:
-        count: of the values.
-        mean: of the values.
         std: of a sample (divisor n - 1), 0 for a single value.
         min: smallest.
         p50: median.
@@ -85,14 +83,7 @@ def wilson_95(successes: int, trials: int) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class Paired:
-    """Setups that both did once, by who succeeded. Counts are not negative.
-
-    Args:
-        both: both succeeded.
-        first: the first alone succeeded.
-        second: the second alone succeeded.
-        neither: neither succeeded.
-    """
+    """Setups that both did once, by who succeeded. Counts are not negative."""
 
     both: int
     first: int
@@ -101,7 +92,6 @@ class Paired:
 
     @property
     def setups(self) -> int:
-        """How many there are."""
         return self.both + self.first + self.second + self.neither
 
     @property
@@ -135,7 +125,6 @@ class Paired:
 
     @property
     def p(self) -> float:
-        """`mcnemar_exact` of these setups."""
         return mcnemar_exact(self.first, self.second)
 
     def _phi(self) -> float:

@@ -6,12 +6,28 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_zenoh.errors import MissingExtraError, RecordingError
+from vla_zenoh.codec.image import decode_jpeg
+from vla_zenoh.errors import CodecError, MissingExtraError, RecordingError
 
 CODEC, PIXEL_FORMAT = "libx264", "yuv420p"
+
+
+def at_height(rgb: NDArray[np.uint8], height_px: int) -> NDArray[np.uint8]:
+    """A picture in another height, not distorted."""
+    size = (max(1, round(rgb.shape[1] * height_px / rgb.shape[0])), height_px)
+    return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def decoded_at_height(jpeg: bytes, height_px: int) -> NDArray[np.uint8]:
+    """A JPEG file in this height; a black square if it is none."""
+    try:
+        return at_height(decode_jpeg(jpeg).rgb, height_px)
+    except CodecError:
+        return np.zeros((height_px, height_px, 3), np.uint8)
 
 
 class VideoWriter:
@@ -22,9 +38,6 @@ class VideoWriter:
         rate_hz: frames per second.
         extra: optional dependencies to name where PyAV is missing.
         options: of the encoder, such as ``crf``, the constant rate factor.
-
-    Raises:
-        MissingExtraError: PyAV is not installed.
     """
 
     def __init__(self, path: Path, rate_hz: int, *, extra: str, **options: str) -> None:
@@ -62,7 +75,6 @@ class VideoWriter:
         return cut
 
     def close(self) -> None:
-        """Finish the file."""
         if self._stream is not None:
             self._container.mux(self._stream.encode())
         self._container.close()

@@ -238,8 +238,7 @@ PRINTS = {
     "cli/plain.py": "lines made printable there",
     "cli/up.py": "a systemd unit as a file",
     "cli/nodes.py": "the profile's name, for a program that waits for it",
-    "lab/cli/profile.py": "a profile as a file",
-    "lab/cli/bridge_config.py": "a bridge's configuration as a file",
+    "lab/cli/profile.py": "a profile or a bridge's configuration as a file",
     "lab/web/making.py": "the share that is done, for the server that began it",
     "runtime/environments.py": "the packages of a model that is about to run here",
 }

@@ -14,8 +14,15 @@ from typer.testing import CliRunner
 
 from vla_zenoh.cli.main import app
 from vla_zenoh.errors import RecordingError
-from vla_zenoh.lab.rolling.audit_log import AuditLog, lines_of, verify_folder
-from vla_zenoh.lab.rolling.chain import FIRST, Link, line_after, verify
+from vla_zenoh.lab.rolling.audit_log import (
+    FIRST,
+    AuditLog,
+    Link,
+    line_after,
+    lines_of,
+    verify,
+    verify_folder,
+)
 
 TEXTS = ("red brick", "true", 'a "quoted" prompt\n', "Würfel 🧱", "")
 

@@ -28,8 +28,7 @@ from dataset_rig import write_run as make_run
 
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.dataset.episodes import episodes_of, fps_of, hold
-from vla_zenoh.lab.dataset.feature_statistics import Histogram, of_numbers
-from vla_zenoh.lab.dataset.features import action_names, usual_state
+from vla_zenoh.lab.dataset.features import Histogram, action_names, of_numbers, usual_state
 from vla_zenoh.lab.dataset.lerobot import export
 from vla_zenoh.lab.dataset.openvla import openvla_statistics
 from vla_zenoh.lab.policy_servers.state_vector import read_parts

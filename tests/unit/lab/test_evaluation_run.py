@@ -26,7 +26,7 @@ from vla_zenoh.lab.evaluation.result import TASKS, Evaluation, PlotTrace
 from vla_zenoh.lab.evaluation.timelines import unbroken
 from vla_zenoh.lab.recording.film import Film, write_film
 from vla_zenoh.lab.recording.reader import open_recording
-from vla_zenoh.lab.recording.restamp import Restamper
+from vla_zenoh.lab.recording.replay import Restamper
 from vla_zenoh.lab.recording.run import load_run
 from vla_zenoh.lab.recording.sample import JPEG, MSGPACK, TEXT, Sample
 from vla_zenoh.lab.recording.writer import RecordingWriter

@@ -13,14 +13,14 @@ from vla_zenoh.lab.evaluation.evaluate import recordings
 from vla_zenoh.lab.recording.reader import open_recording
 from vla_zenoh.lab.recording.run import load_run
 from vla_zenoh.lab.recording.writer import RecordingWriter
-from vla_zenoh.lab.rolling.ring import FACTS, PART, Ring, delete_oldest_saved
+from vla_zenoh.lab.rolling.ring import FACTS, PART, Ring, RingLimits, delete_oldest_saved
 from vla_zenoh.types import Task
 
 SEGMENT_S = 30.0
 
 
 def ring(folder: Path, *, keep_s: float = 100.0, max_bytes: int = 10_000) -> Ring:
-    return Ring(folder, keep_s=keep_s, max_bytes=max_bytes, segment_s=SEGMENT_S)
+    return Ring(folder, RingLimits(keep_s, max_bytes, SEGMENT_S))
 
 
 def filled(folder: Path, sizes: list[int], *, seconds: float = SEGMENT_S, **bounds: float) -> Ring:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from vla_zenoh.lab.tasks import COLOURS, DIRECTIONS, NONSENSE, Order, phrase
-from vla_zenoh.lab.tasks.order import PUSH, PUT, STACK
-from vla_zenoh.lab.tasks.wording import is_nonsense, parse_prompt
+from vla_zenoh.lab.tasks.order import PUSH, PUT, STACK, is_nonsense, parse_prompt
 
 ORDERS = [
     *(Order(PUT, x) for x in COLOURS),

@@ -27,8 +27,7 @@ from vla_zenoh.lab.teleop.keyboard import (
     Keystroke,
     KeystrokeParser,
 )
-from vla_zenoh.lab.teleop.leader import LeaderPolicy, LeaderState
-from vla_zenoh.lab.teleop.leader_arm import LeaderArm
+from vla_zenoh.lab.teleop.leader import LeaderArm, LeaderPolicy, LeaderState
 from vla_zenoh.lab.teleop.policy import (
     DEAD_ZONE,
     DT_S,

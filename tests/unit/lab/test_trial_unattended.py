@@ -19,9 +19,8 @@ from vla_zenoh.codec.image import encode_jpeg
 from vla_zenoh.errors import NodeError, OutputError, RecordError
 from vla_zenoh.lab.trial.automatic_judge import Frame, JudgedEpisode, make_judge
 from vla_zenoh.lab.trial.folder import TrialFolder
-from vla_zenoh.lab.trial.unattended import JOURNAL, UnattendedTrial
+from vla_zenoh.lab.trial.unattended import JOURNAL, PAGE, UnattendedTrial, write_page
 from vla_zenoh.lab.trial.unattended_operator import film_strip, strip_path
-from vla_zenoh.lab.trial.unattended_page import PAGE, write_page
 from vla_zenoh.lab.trial.unattended_plan import (
     JudgeChoice,
     StopRules,
@@ -29,8 +28,8 @@ from vla_zenoh.lab.trial.unattended_plan import (
     checked_plan,
     read_plan,
 )
+from vla_zenoh.lab.trial.unattended_runner import Webhook
 from vla_zenoh.lab.trial.verdict import EpisodeVerdict
-from vla_zenoh.lab.trial.webhook import Webhook
 from vla_zenoh.types import Image
 
 PLAN: dict[str, Any] = {

@@ -13,8 +13,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from vla_zenoh.lab.cli.addresses import is_own
-from vla_zenoh.lab.cli.secure import secure_app
+from vla_zenoh.lab.cli.secure import is_own, secure_app
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.security.store import THIS_HOST, Store, operator_hosts
 

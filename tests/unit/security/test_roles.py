@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.keys import KEY_PATHS, NODE_KINDS, Keys, covers
-from vla_zenoh.lab.doctor.access_rules import Passage, allows, missing, passages
+from vla_zenoh.lab.doctor.access_check import Passage, allows, missing, passages
 from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh.security.identity import (
     Identity,

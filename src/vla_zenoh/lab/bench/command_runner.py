@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+import os
 import subprocess
 import sys
 import threading
@@ -11,12 +13,21 @@ from contextlib import contextmanager
 from typing import Any
 
 from vla_zenoh.errors import NodeError
-from vla_zenoh.lab.bench.cpu_time import cpu_s
 from vla_zenoh.lab.demo.runner import MotionRunner
 from vla_zenoh.lab.episode import Interrupted
 from vla_zenoh.nodes.command.node import SPREAD_S
 from vla_zenoh.profile import Profile, override
 from vla_zenoh.runtime.launch import Host
+
+
+def cpu_s(pid: int) -> float:
+    """CPU time of a process so far, ended threads included, s."""
+    clock = ctypes.c_int()
+    error = ctypes.CDLL(None).clock_getcpuclockid(pid, ctypes.byref(clock))
+    if error:
+        raise NodeError(f"process {pid} of the benchmark has ended: {os.strerror(error)}")
+    return time.clock_gettime(clock.value)
+
 
 PROMPT = "HARD: go up within 0.2"
 RATE_HZ = 10.0
@@ -35,16 +46,11 @@ def measure_command(
     """Measure ticks at one rate while the arm moves up and down.
 
     Args:
-        profile: of a simulated robot, at a free endpoint.
         command_hz: ticks per second.
-        seconds: duration.
-        stop: set by Ctrl-C.
         log: called with (node, line) of the nodes' output.
-        busy: number of programs that load the processors.
 
     Raises:
         NodeError: the chain does not come up, or the arm does not stay active.
-        Interrupted: Ctrl-C.
     """
     profile = override(profile, {"timing": {"command_hz": command_hz}})
     with Host(profile, None, log=log, tell=log, own_router=True) as host:

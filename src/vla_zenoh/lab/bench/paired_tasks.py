@@ -19,15 +19,8 @@ from vla_zenoh.lab.statistics import Paired, paired
 ALPHA = 0.05
 """Significance level, as in the intervals at 95 %."""
 CONDITIONS = (
-    "mode",
-    "replan",
-    "profile",
-    "vary",
-    "held_out",
-    "prompt",
-    "delay_ms",
-    "rate_hz",
-    "limit_s",
+    *("mode", "replan", "profile", "vary", "held_out"),
+    *("prompt", "delay_ms", "rate_hz", "limit_s"),
 )
 """What influences the success rate beside the model and its options."""
 
@@ -52,7 +45,6 @@ class PairedOutcome(_Read):
 
     @property
     def task(self) -> str:
-        """The task, without the layout."""
         onto = f"on {self.onto}" if self.onto else ""
         return " ".join(part for part in (self.family, self.target, onto, self.direction) if part)
 
@@ -86,15 +78,7 @@ class TaskResultFile(_Read):
 
 
 def read_run(content: bytes, where: str) -> TaskResultFile:
-    """Parse a result file of `bench task`.
-
-    Args:
-        content: of the file.
-        where: its path, for messages.
-
-    Raises:
-        RecordError: it is no such file.
-    """
+    """Parse a result file of `bench task`. Raises RecordError: it is no such file."""
     try:
         return TaskResultFile.model_validate_json(content)
     except ValidationError as error:
@@ -111,7 +95,6 @@ class Comparison:
     """Paired comparison of two runs.
 
     Args:
-        a: the first run.
         b: the second run; differences are B minus A.
         pairs: episodes with the same task and layout, in A's order.
     """
@@ -155,7 +138,6 @@ class Comparison:
                 }
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain types."""
         only_a, only_b = self.unpaired
         return {
             "a": _shown(self.a),
@@ -174,8 +156,6 @@ def compare(a: TaskResultFile, b: TaskResultFile, differ: Collection[str] = ()) 
     """Pair the episodes of two runs.
 
     Args:
-        a: the first run.
-        b: the second run.
         differ: those of `CONDITIONS` that may differ.
 
     Raises:
@@ -232,15 +212,8 @@ def _counts(pairs: Iterable[tuple[PairedOutcome, PairedOutcome]]) -> Paired:
 
 
 def _shown(run: TaskResultFile) -> Mapping[str, Any]:
-    conditions = {name: getattr(run, name) for name in CONDITIONS}
-    return {
-        "model": run.model,
-        "options": run.options,
-        "scene": run.scene,
-        **conditions,
-        "vary": list(run.vary),
-        "episodes": len(run.all),
-    }
+    conditions = run.model_dump(mode="json", include={"model", "options", "scene", *CONDITIONS})
+    return {**conditions, "episodes": len(run.all)}
 
 
 def _shown_value(value: Any) -> str:

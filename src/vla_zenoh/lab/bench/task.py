@@ -24,13 +24,13 @@ from vla_zenoh.lab.tasks import (
     draw_episode,
     draw_stay,
 )
-from vla_zenoh.lab.tasks.order import PUSH
-from vla_zenoh.lab.tasks.wording import is_nonsense, parse_prompt
+from vla_zenoh.lab.tasks.order import PUSH, is_nonsense, parse_prompt
 from vla_zenoh.types import ObjectPoses
 
 SCENE = "bricks"
 """The scene of the tasks."""
 STAY = "stay"
+PLANNED = ("seed", "held_out", "prompt", "delay_ms", "rate_hz", "limit_s")
 NOT_OBEYED, ARM_LOST, NO_STATE = "not_obeyed", "arm_lost", "no_state"
 CHAIN_FAILURES: Mapping[str, str] = {
     NOT_OBEYED: "activation was rejected to the end",
@@ -52,15 +52,11 @@ class TaskPlan:
 
     Args:
         model: name of the worker, or of one of `BASELINES`.
-        episodes: number of them.
         seed: of the first layout; the others follow.
         family: one of `FAMILIES` or ``stay``; None: all three in turn.
-        held_out: prompts in held-out wordings.
         pairs: every layout twice, the second time with another brick.
         prompt: in place of the episode's own.
-        limit_s: time limit of an episode.
         rate_hz: chunks per second; None: of the profile.
-        delay_ms: added to every inference.
     """
 
     model: str
@@ -76,11 +72,9 @@ class TaskPlan:
 
     @property
     def worker(self) -> str:
-        """Name of the worker."""
         return BASELINES.get(self.model, (self.model, ""))[0]
 
     def requests(self) -> Iterator[TaskRequest]:
-        """Every episode."""
         families = (self.family,) if self.family else FAMILIES
         for index in range(self.episodes):
             layout = index // 2 if self.pairs else index
@@ -100,8 +94,6 @@ class TaskRequest:
     """One episode of a plan, before its layout is known.
 
     Args:
-        seed: of the layout.
-        family: of the task.
         target: colour of the brick, None: any.
     """
 
@@ -135,11 +127,7 @@ class TaskOutcome:
     """Outcome of one episode.
 
     Args:
-        episode: its task.
-        prompt: as published.
-        success: the task was done.
         failure: kind, empty after a success.
-        time_s: from activation to the verdict.
         why: reason, where the chain failed.
         pictures: (start, end) as JPEG, None: no camera.
     """
@@ -153,7 +141,6 @@ class TaskOutcome:
     pictures: tuple[bytes, bytes] | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain types, without pictures."""
         order = {name: value for name, value in asdict(self.episode.order).items() if value}
         return {
             "seed": self.episode.seed,
@@ -171,14 +158,8 @@ class TaskScore:
     """Outcomes of a plan, and their figures.
 
     Args:
-        plan: that was run.
         mode: ``real_time`` or ``lockstep``.
-        profile: its name.
-        vary: what was varied beside the layout.
-        ended: the outcomes.
         latency_ms: stage -> ``[p50, p95]``.
-        wall_s: duration of the run.
-        options: of the model, in force.
     """
 
     plan: TaskPlan
@@ -191,7 +172,6 @@ class TaskScore:
     options: Mapping[str, str] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain types."""
         plan = self.plan
         families = sorted({each.episode.order.family for each in self.ended})
         out: dict[str, Any] = {
@@ -200,14 +180,9 @@ class TaskScore:
             "mode": self.mode,
             "profile": self.profile,
             "scene": SCENE,
-            "seed": plan.seed,
             "family": plan.family or "all",
-            "held_out": plan.held_out,
-            "prompt": plan.prompt,
             "vary": list(self.vary),
-            "delay_ms": plan.delay_ms,
-            "rate_hz": plan.rate_hz,
-            "limit_s": plan.limit_s,
+            **{name: getattr(plan, name) for name in PLANNED},
             **_figures(self.ended),
             "by_family": {
                 family: _figures([e for e in self.ended if e.episode.order.family == family])
@@ -242,7 +217,6 @@ def _figures(ended: Sequence[TaskOutcome]) -> dict[str, Any]:
     }
 
 
-STAY = "stay"
 FIRST_SEED = 1
 """The default layout."""
 
@@ -252,7 +226,6 @@ class PromptedTask(TaskRequest):
     """An episode with a prompt of the user.
 
     Args:
-        prompt: as published.
         order: what it is taken for; None: what its wording says.
     """
 
@@ -278,7 +251,6 @@ class DemoPlan(TaskPlan):
     orders: Mapping[str, Order] = field(default_factory=dict)
 
     def requests(self) -> Iterator[TaskRequest]:
-        """Every episode."""
         for prompt in self.prompts:
             yield PromptedTask(self.seed, STAY, None, prompt, self.orders.get(prompt))
         if not self.prompts:

@@ -15,14 +15,7 @@ DONE_S = 1.5
 
 
 class SceneSnapshot(NamedTuple):
-    """State of the simulated scene.
-
-    Args:
-        stamp_ns: of the object poses.
-        objects: true poses.
-        width_m: opening of the gripper.
-        tcp_m: (3,) measured TCP, base frame.
-    """
+    """State of the simulated scene. `tcp_m`: (3,) measured TCP, base frame."""
 
     stamp_ns: int
     objects: ObjectPoses
@@ -71,7 +64,6 @@ def run_task(stage: TaskStage, plan: TaskPlan, request: TaskRequest) -> TaskOutc
 
     Raises:
         NodeError: the stage broke down, or a client other than this one ended the episode.
-        Interrupted: Ctrl-C.
     """
     task = request.draw(stage.reset(request.seed), held_out=plan.held_out)
     prompt, before = plan.prompt_for(task), stage.picture()

@@ -5,12 +5,17 @@ Pictures are drawn when the policy reads them, from the poses at their capture.
 
 from __future__ import annotations
 
+import multiprocessing
+import os
+import signal
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,24 +23,78 @@ from numpy.typing import NDArray
 from vla_zenoh.codec.image import encode_jpeg
 from vla_zenoh.control.reachability import make_reachability_filter
 from vla_zenoh.errors import NodeError, VlaZenohError, WorkerError, in_words
-from vla_zenoh.lab.bench.processes import in_processes
 from vla_zenoh.lab.bench.task import ARM_LOST, TaskOutcome, TaskPlan, TaskRequest
 from vla_zenoh.lab.bench.task_episode import SceneSnapshot, run_task
 from vla_zenoh.lab.lockstep import Delays, Lockstep
 from vla_zenoh.policy import ActionSteps, ModelSpec, Observation, Policy, reset_of
 from vla_zenoh.policy.loader import find_worker, make_policy
 from vla_zenoh.profile import Profile
+from vla_zenoh.runtime.process import die_with_parent
 from vla_zenoh.simulation.render import AUTO, Renderer, choose_backend
 from vla_zenoh.simulation.robot_model import robot_models
 from vla_zenoh.simulation.world import World, build_world
 from vla_zenoh.types import Image, ObjectPoses
+
+Result = TypeVar("Result")
+POLL_S = 0.2
+"""How often the parent checks for Ctrl-C, and how often activation is tried."""
+
+
+def in_processes(
+    work: Callable[..., Result],
+    jobs: Iterable[tuple[Any, ...]],
+    stop: threading.Event,
+    *,
+    processes: int | None = None,
+    prepare: Callable[..., None] | None = None,
+    prepared: tuple[Any, ...] = (),
+) -> Iterator[Result]:
+    """``work(*job)`` for every job, in the order of the jobs.
+
+    Args:
+        stop: set by Ctrl-C; jobs that have not ended are dropped.
+        processes: at once; None: one per core.
+        prepare: called first in every process, a function of a module.
+
+    Raises:
+        NodeError: a process was killed.
+    """
+    with ProcessPoolExecutor(
+        processes or os.cpu_count() or 1,
+        mp_context=multiprocessing.get_context("spawn"),
+        initializer=_begin,
+        initargs=(prepare, prepared),
+    ) as pool:
+        futures = [pool.submit(work, *job) for job in jobs]
+        try:
+            for future in futures:
+                while not wait([future], POLL_S, FIRST_COMPLETED).done:
+                    if stop.is_set():
+                        return
+                yield future.result()
+        except BrokenProcessPool as error:
+            raise NodeError(
+                "a process of the bench was killed; is there enough memory for so many at once?"
+            ) from error
+        finally:
+            if not all(future.done() for future in futures):  # in the middle of a job
+                for process in multiprocessing.active_children():
+                    process.terminate()
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _begin(prepare: Callable[..., None] | None, prepared: tuple[Any, ...]) -> None:
+    die_with_parent()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
+    if prepare is not None:
+        prepare(*prepared)
+
 
 CAMERA_S, WIRE_S = 0.015, 0.0005
 """Camera stamp to worker, and every other way, about as measured in real time."""
 STEP_S = 0.1
 """Period at which the simulator publishes its objects."""
 WARM_UP_S, ACTIVATE_PATIENCE_S = 0.5, 5.0
-POLL_S = 0.2
 
 
 def run_in_lockstep(
@@ -52,8 +111,6 @@ def run_in_lockstep(
 
     Args:
         profile: with a scene that has what tasks are about.
-        plan: what to run.
-        options: of the model.
         camera: for the pictures of an outcome, None: none.
         stop: set by Ctrl-C; episodes that have not ended are left out.
         processes: at once; None: one per core.
@@ -110,35 +167,24 @@ class _LockstepStage:
         loop = self._running
         loop.put("prompt", prompt)
         loop.run(WARM_UP_S)
-        end_ns = loop.now_ns + round(ACTIVATE_PATIENCE_S * 1e9)
-        while loop.now_ns < end_ns:
-            loop.put("active", True)
-            loop.run(POLL_S)
-            if loop.commander.task.active:
-                return ""
-        reasons = [event.why for event in loop.events if event.what == "activate_refused"]
-        return reasons[-1] if reasons else "activation was rejected"
+        return loop.activate(ACTIVATE_PATIENCE_S, POLL_S)
 
     def step(self) -> None:
         """Run until the next state of the objects."""
         self._running.run(STEP_S)
 
     def time_s(self) -> float:
-        """Virtual time."""
         return self._running.now_ns / 1e9
 
     def scene(self) -> SceneSnapshot:
-        """The world now."""
         width_m = self.world.gripper_state().width_m
         return SceneSnapshot(self._running.now_ns, self._objects(), width_m, self.world.tcp()[0])
 
     def failure(self) -> tuple[str, str] | None:
-        """The arm is inactive."""
         commander = self._running.commander
         return None if commander.task.active else (ARM_LOST, commander.why)
 
     def done(self) -> bool:
-        """As the commander has it."""
         commander = self._running.commander
         return commander.progress.done and commander.at_rest
 

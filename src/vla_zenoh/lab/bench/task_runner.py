@@ -6,8 +6,6 @@ import threading
 import time
 from collections.abc import Iterator
 
-import zenoh
-
 from vla_zenoh.control.states import DEACTIVATED
 from vla_zenoh.errors import NodeError, SessionError
 from vla_zenoh.keys import worker_node
@@ -29,8 +27,6 @@ class TaskRunner:
 
     Args:
         host: up, with a simulator whose scene has the bricks.
-        plan: what to run.
-        stop: set by Ctrl-C.
         camera: for the pictures of an outcome, None: none.
     """
 
@@ -51,15 +47,13 @@ class TaskRunner:
         )
         self._picture = StreamSlot()
         if camera is not None:
-            handler = zenoh.handlers.Callback(self._picture, indirect=False)
-            self._camera = session.declare_subscriber(keys.camera_jpeg(camera), handler)
+            self._camera = self._picture.subscribe(session, keys.camera_jpeg(camera))
 
     def run(self) -> Iterator[TaskOutcome]:
         """One outcome after the other.
 
         Raises:
             NodeError: the chain does not come up, or another client ended an episode.
-            Interrupted: Ctrl-C.
         """
         self._runner.wait_until_ready(self._plan.worker, self._states)
         if self._plan.rate_hz is not None:
@@ -100,7 +94,6 @@ class TaskRunner:
         return ""
 
     def step(self) -> None:
-        """Wait for the next state."""
         self._runner.pause(STEP_S)
 
     def time_s(self) -> float:
@@ -108,7 +101,6 @@ class TaskRunner:
         return time.monotonic()
 
     def scene(self) -> SceneSnapshot:
-        """The newest states."""
         header, objects = self._states.read(ObjectPoses)
         width_m = self._states.read(GripperState)[1].width_m
         tcp_m = self._states.read(PoseState)[1].position_m
@@ -126,7 +118,6 @@ class TaskRunner:
         return None
 
     def done(self) -> bool:
-        """As the command node reports."""
         return self._runner.view().done
 
     def picture(self) -> bytes | None:

@@ -36,17 +36,7 @@ FAILED = ("contract: ", "inference_failed: ", "reset_failed: ")
 
 
 class AskedWorker:
-    """Asks one worker for chunks.
-
-    Args:
-        profile: of the robot that the worker serves.
-        session: open session.
-        worker: its name.
-        patience_s: for one answer.
-
-    Raises:
-        NodeError: the robot's keys are taken by another one.
-    """
+    """Asks one worker for chunks. Raises NodeError: the robot's keys are taken by another one."""
 
     def __init__(
         self, profile: Profile, session: zenoh.Session, worker: str, patience_s: float
@@ -103,7 +93,6 @@ class AskedWorker:
         )
 
     def close(self) -> None:
-        """Leave the bus."""
         self.node.close()
 
     def _publish(self, seen: BenchmarkObservation) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from vla_zenoh.errors import NodeError
 from vla_zenoh.kinematics.so3 import held_pose
-from vla_zenoh.lab.benchmark.episode_clock import EpisodeClock, EpisodeConditions
+from vla_zenoh.lab.benchmark.episode import EpisodeClock, EpisodeConditions
 from vla_zenoh.lab.lockstep import Delays, Lockstep
 from vla_zenoh.policy import ActionSteps, ModelSpec, Observation, ObservationSpec
 from vla_zenoh.profile import load_profile, override
@@ -50,13 +50,8 @@ def run_through_command_node(clock: EpisodeClock, conditions: EpisodeConditions)
     loop.put("rate", min(100.0, 1.0 / (taken * clock.spec.action.dt_s)))
     loop.put("prompt", clock.request.task.prompt or "go")
     loop.run(WARM_UP_S)
-    end_ns = loop.now_ns + round(ACTIVATE_PATIENCE_S * 1e9)
-    while not loop.commander.task.active:
-        if loop.now_ns > end_ns:
-            whys = [event.why for event in loop.events if event.what == "activate_refused"]
-            raise NodeError(f"activation was rejected: {whys[-1] if whys else 'no reason'}")
-        loop.put("active", True)
-        loop.run(POLL_S)
+    if why := loop.activate(ACTIVATE_PATIENCE_S, POLL_S):
+        raise NodeError(f"activation was rejected: {why}")
     while not clock.over:
         loop.run(POLL_S)
         if not loop.commander.task.active:

@@ -2,20 +2,155 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal, Protocol
 
-from vla_zenoh.lab.benchmark.contract import Benchmark, raw_steps
-from vla_zenoh.lab.benchmark.episode_clock import (
-    Asked,
-    EpisodeClock,
-    EpisodeConditions,
-    EpisodeOutcome,
-    EpisodeRequest,
-    state_hash,
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_zenoh.lab.benchmark.contract import (
+    Benchmark,
+    BenchmarkObservation,
+    BenchmarkTask,
+    raw_steps,
+    standing_step,
 )
-from vla_zenoh.types import FloatArray
+from vla_zenoh.policy import ModelSpec
+from vla_zenoh.types import ActionChunk, FloatArray
+
+Mode = Literal["native", "live", "command"]
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeConditions:
+    """What is the same for every episode of a run.
+
+    Args:
+        mode: ``native``: the environment waits for the model, whose steps go into its own
+            controller. ``live``: its clock runs on during inference, and the arm stands meanwhile.
+            ``command``: it runs on too, and our command node is between model and environment.
+        delay_ms: what an inference takes on the environment's clock; None: what it took.
+        replan: steps to carry out of each chunk; 0: all.
+    """
+
+    mode: Mode = "native"
+    delay_ms: float | None = None
+    replan: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeRequest:
+    """An episode to run."""
+
+    suite: str
+    task: BenchmarkTask
+    episode: int
+
+    @property
+    def key(self) -> str:
+        """What tells it from all others of a run."""
+        return f"{self.suite}/{self.task.name}/{self.episode}"
+
+
+@dataclass(slots=True)
+class EpisodeOutcome:
+    """How an episode went.
+
+    Args:
+        ask_ms: time from an observation to its chunk, p50 and p95.
+        end: hash of the simulation's state after the last step, empty: it does not tell.
+        failure: empty, ``steps`` (the limit) or what the command node stopped for.
+        attempts: how often it was begun; those before were lost with their process.
+    """
+
+    suite: str
+    task: str
+    episode: int
+    success: bool = False
+    steps: int = 0
+    chunks: int = 0
+    wall_s: float = 0.0
+    ask_ms: tuple[float, float] = (0.0, 0.0)
+    end: str = ""
+    failure: str = ""
+    attempts: int = 1
+    actions: list[FloatArray] = field(default_factory=list)
+
+    def to_dict(self) -> dict[str, Any]:
+        return {k: v for k, v in asdict(self).items() if k != "actions"}
+
+
+class Asked(Protocol):
+    """Whom an episode asks for chunks, see `AskedWorker`."""
+
+    spec: ModelSpec
+
+    def begin(self, prompt: str) -> None: ...
+
+    def ask(self, seen: BenchmarkObservation) -> ActionChunk: ...
+
+
+class EpisodeClock:
+    """The environment in an episode: its steps, their limit, and what they led to."""
+
+    def __init__(self, benchmark: Benchmark, request: EpisodeRequest, worker: Asked) -> None:
+        self.benchmark, self.request, self.worker = benchmark, request, worker
+        self.spec = worker.spec
+        self.cameras = [one.camera for one in self.spec.observation.cameras]
+        self.outcome = EpisodeOutcome(request.suite, request.task.name, request.episode)
+        self._asked_ms: list[float] = []
+        self._last: FloatArray | None = None
+
+    @property
+    def over(self) -> bool:
+        return self.outcome.success or self.outcome.steps >= self.request.task.max_steps
+
+    def ask(self) -> NDArray[np.float32]:
+        """Steps for what is to see now, in the model's units."""
+        began_s = time.perf_counter()
+        chunk = self.worker.ask(self.benchmark.observe(self.cameras))
+        self._asked_ms.append((time.perf_counter() - began_s) * 1e3)
+        self.outcome.chunks += 1
+        return chunk.steps
+
+    @property
+    def asked_s(self) -> float:
+        """How long the last answer took."""
+        return self._asked_ms[-1] / 1e3
+
+    def step(self, action: FloatArray) -> None:
+        """Carry out a step, unless the episode is over."""
+        if self.over:
+            return
+        self._last = action
+        self.outcome.success = bool(self.benchmark.step(action))
+        self.outcome.steps += 1
+        self.outcome.actions.append(np.array(action))
+
+    def stand(self, steps: int) -> None:
+        for _ in range(steps):
+            self.step(standing_step(self.benchmark, self._last))
+
+    def finish(self, began_s: float) -> EpisodeOutcome:
+        out = self.outcome
+        out.wall_s = time.perf_counter() - began_s
+        p50, p95 = np.percentile(self._asked_ms or [0.0], (50, 95))
+        out.ask_ms = (round(float(p50), 3), round(float(p95), 3))
+        out.end = state_hash(self.benchmark)
+        out.failure = "" if out.success else out.failure or "steps"
+        return out
+
+
+def state_hash(benchmark: Benchmark) -> str:
+    """16 hex digits of the simulation's whole state; empty: the benchmark does not tell it."""
+    physics: Callable[[], NDArray[np.float64]] | None = getattr(benchmark, "physics", None)
+    if physics is None:
+        return ""
+    return hashlib.sha256(np.ascontiguousarray(physics()).tobytes()).hexdigest()[:16]
 
 
 def run_episode(
@@ -57,9 +192,7 @@ def replay_episode(
     """Execute recorded steps from the same initial state, without a model.
 
     Args:
-        benchmark: in which.
         request: whose steps they are.
-        actions: every step.
         look: called with the number of steps so far, 0 first.
     """
     began_s = time.perf_counter()

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from vla_zenoh.errors import OutputError, RecordError
-from vla_zenoh.lab.benchmark.episode_clock import EpisodeOutcome, EpisodeRequest
+from vla_zenoh.lab.benchmark.episode import EpisodeOutcome, EpisodeRequest
 
 PLAN, EPISODES, ACTIONS = "run.json", "episodes.jsonl", "actions"
 
@@ -86,11 +86,7 @@ def read_episodes(folder: Path) -> dict[str, EpisodeOutcome]:
 
 
 def read_json(file: Path) -> Any:
-    """The content of a JSON file.
-
-    Raises:
-        RecordError: it is none.
-    """
+    """The content of a JSON file. Raises RecordError: it is none."""
     try:
         return json.loads(file.read_bytes())
     except (OSError, ValueError) as error:

@@ -25,11 +25,12 @@ from vla_zenoh.codec.image import encode_jpeg
 from vla_zenoh.errors import NodeError, VlaZenohError, WorkerError, in_words
 from vla_zenoh.lab.benchmark.asked_worker import AskedWorker
 from vla_zenoh.lab.benchmark.contract import Benchmark, BenchmarkTask, make_benchmark
-from vla_zenoh.lab.benchmark.episode import replay_episode, run_episode
-from vla_zenoh.lab.benchmark.episode_clock import (
+from vla_zenoh.lab.benchmark.episode import (
     EpisodeConditions,
     EpisodeOutcome,
     EpisodeRequest,
+    replay_episode,
+    run_episode,
 )
 from vla_zenoh.policy.loader import ModelFile, find_model
 from vla_zenoh.profile import as_robot, load_profile
@@ -52,11 +53,7 @@ class BenchmarkSetting:
     """What a child needs to run episodes.
 
     Args:
-        benchmark: name or path of its file.
-        options: of its constructor.
         profile_file: of the robot, with the address of the router.
-        worker: name of the worker to ask.
-        conditions: of every episode.
     """
 
     benchmark: str
@@ -67,11 +64,7 @@ class BenchmarkSetting:
 
     @property
     def file(self) -> ModelFile:
-        """The benchmark's file.
-
-        Raises:
-            ResourceError: there is none.
-        """
+        """The benchmark's file. Raises ResourceError: there is none."""
         return find_model(self.benchmark, BENCHMARKS)
 
 
@@ -79,7 +72,6 @@ class BenchmarkProcess:
     """A benchmark in a process of its own.
 
     Args:
-        setting: of the benchmark.
         robot: in whose keys it runs.
         python: interpreter of a prepared environment; None: the file's header is obeyed.
 
@@ -140,7 +132,6 @@ class BenchmarkProcess:
             request: whose steps they are.
             actions: (n, D), every step.
             camera: empty: nothing is drawn.
-            folder: for the pictures.
 
         Raises:
             BenchmarkLost: the child ended.
@@ -152,7 +143,6 @@ class BenchmarkProcess:
         return _outcome(self._call({**given, "camera": camera, "folder": str(folder)}))
 
     def close(self) -> None:
-        """End the child."""
         assert self._process.stdin is not None
         try:
             self._process.stdin.close()

@@ -5,17 +5,16 @@ from __future__ import annotations
 import tempfile
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vla_zenoh.codec.image import decode_jpeg
-from vla_zenoh.errors import MissingExtraError
-from vla_zenoh.lab.benchmark.episode_clock import EpisodeOutcome, EpisodeRequest
+from vla_zenoh.lab.benchmark.episode import EpisodeOutcome, EpisodeRequest
 from vla_zenoh.lab.benchmark.journal import actions_file
 from vla_zenoh.lab.benchmark.process import FRAME_HZ, BenchmarkProcess
+from vla_zenoh.lab.durable import page_template
 from vla_zenoh.lab.statistics import wilson_95
 from vla_zenoh.lab.video import VideoWriter
 
@@ -57,20 +56,10 @@ def _rates(ended: Collection[EpisodeOutcome]) -> dict[str, Any]:
 
 
 def write_page(folder: Path, result: Mapping[str, Any]) -> None:
-    """Write `index.html` of a run; videos of failures are found in its folder.
-
-    Raises:
-        MissingExtraError: jinja2 is not installed.
-    """
-    try:
-        from jinja2 import Environment
-    except ImportError as error:
-        raise MissingExtraError("jinja2", "record") from error
-    text = files("vla_zenoh.lab.benchmark").joinpath(TEMPLATE).read_text("utf-8")
-    language = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    """Write `index.html` of a run; videos of failures are found in its folder."""
     videos = sorted(each.name for each in (folder / VIDEOS).glob("*.mp4"))
     shown = ("benchmark", "suite", "worker", "options", "mode", "delay_ms", "replan")
-    page = language.from_string(text).render(
+    page = page_template("vla_zenoh.lab.benchmark", TEMPLATE).render(
         title=f"{result['benchmark']} {result['suite']}, {result['worker']}",
         conditions={name: result[name] for name in shown},
         versions=result["versions"],

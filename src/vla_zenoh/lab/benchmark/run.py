@@ -9,10 +9,10 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
-from vla_zenoh.errors import NodeError
-from vla_zenoh.lab.benchmark.episode_clock import EpisodeOutcome, EpisodeRequest
+from vla_zenoh.errors import MissingExtraError, NodeError
+from vla_zenoh.lab.benchmark.episode import EpisodeOutcome, EpisodeRequest
 from vla_zenoh.lab.benchmark.process import BenchmarkLost, BenchmarkProcess, BenchmarkSetting
 from vla_zenoh.lab.cli.bench_file import running_nodes
 from vla_zenoh.lab.cli.loopback import free_port
@@ -37,11 +37,7 @@ class BenchmarkStage:
     """What runs episodes: a benchmark, and a worker that is started beside it or is there.
 
     Args:
-        setting: of the benchmark.
         worker_options: ``name=value`` of the model.
-        worker_model: path of the model, if that was given.
-        worker_python: interpreter of a prepared environment of the model.
-        benchmark_python: the same of the benchmark.
         connect: endpoint of a router with a worker that runs already; empty: both are started.
     """
 
@@ -85,8 +81,6 @@ class LocalRun:
     """Episodes in processes of this computer, all of which ask one worker.
 
     Args:
-        stage: what to run.
-        processes: at once.
         log: file for what the worker says; None: it is not kept.
     """
 
@@ -134,15 +128,11 @@ class LocalRun:
 
 
 def run_at_places(
-    makers: Sequence[Callable[[], Does]],
-    requests: Sequence[EpisodeRequest],
-    stop: threading.Event,
+    makers: Sequence[Callable[[], Does]], requests: Sequence[EpisodeRequest], stop: threading.Event
 ) -> Iterator[Ended]:
     """Share episodes out; one that loses its place is begun again at a new one.
 
     Args:
-        makers: each makes a place.
-        requests: in order.
         stop: set by Ctrl-C; what has not ended is left out.
 
     Raises:
@@ -202,3 +192,64 @@ def _at_a_place(
             if attempt == ATTEMPTS:
                 raise NodeError(f"{request.key}: {attempt} attempts, the last: {error}") from error
     raise AssertionError
+
+
+def connect_ray(address: str) -> Any:
+    """Ray, connected to a cluster. Once in a process, before any `RayPlace`: it is not for threads.
+
+    Args:
+        address: of the cluster, as ``ray start`` tells it.
+
+    Raises:
+        NodeError: no cluster answers.
+    """
+    try:
+        import ray  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise MissingExtraError("ray", "ray") from error
+    try:
+        ray.init(address, log_to_driver=False, logging_level="ERROR")
+    except (ConnectionError, RuntimeError, ValueError) as error:
+        raise NodeError(f"no Ray cluster answers at {address}: {error}") from error
+    return ray
+
+
+class RayPlace(Does):
+    """An actor of a Ray cluster, on the computer that Ray chooses.
+
+    Args:
+        stage: what to run; its files have to be on every computer of the cluster.
+        ray: see `connect_ray`.
+    """
+
+    def __init__(self, stage: BenchmarkStage, ray: Any) -> None:
+        self._ray = ray
+        # Begun again by `run_at_places` and not by Ray, which does not tell how often.
+        actor = ray.remote(num_cpus=1, max_restarts=0, scheduling_strategy="SPREAD")(_OnRay)
+        self._actor: Any = actor.remote(stage)
+
+    def run(self, request: EpisodeRequest) -> EpisodeOutcome:
+        errors = self._ray.exceptions
+        try:
+            return self._ray.get(self._actor.run.remote(request))
+        except errors.RayTaskError as error:
+            raise error.cause from error
+        except errors.RayError as error:  # its process or computer died
+            raise BenchmarkLost(f"a place on Ray was lost: {error}") from error
+
+    def close(self) -> None:
+        """Let the cluster have the place for others."""
+        self._ray.kill(self._actor)
+
+
+class _OnRay:
+    """In a process of Ray."""
+
+    def __init__(self, stage: BenchmarkStage) -> None:
+        self._nodes = LocalRun(stage, 1)  # kept: they end with it
+        self._place: BenchmarkProcess | None = None
+
+    def run(self, request: EpisodeRequest) -> EpisodeOutcome:
+        if self._place is None:
+            self._place = self._nodes.__enter__().place(0)
+        return self._place.run(request)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -34,13 +35,9 @@ class Examination:
     """Examination of one model.
 
     Args:
-        policy: made, not loaded.
-        worker: its name.
-        runner: of its calls.
         profile: to check it against; None: its own spec and default limits.
         rate_hz: requested chunks per second; None: of the profile.
         prompts: the first one most often; None: the model's `example_prompts`, or `PROMPTS`.
-        runs: timed inferences.
         budget_s: time limit for new examples; loading does not count.
     """
 
@@ -103,11 +100,7 @@ class Examination:
             self._reset()
             self._infer(style)
         self._measure()
-        report.memory_mib = (
-            before_kib / 1024,
-            loaded_kib / 1024,
-            self._runner.memory_kib() / 1024,
-        )
+        report.memory_mib = (before_kib / 1024, loaded_kib / 1024, self._runner.memory_kib() / 1024)
         self._judge()
 
     # -- stages -------------------------------------------------------------------------------
@@ -123,22 +116,14 @@ class Examination:
                 return False
         self._loaded_s = self._runner.spent_s()
         if policy.spec.hash != declared:
-            report.findings.append(
-                error(
-                    "spec_changed",
-                    "load() changed the spec, which was published before; declare it in __init__",
-                )
-            )
+            why = "load() changed the spec, which was published before; declare it in __init__"
+            report.findings.append(error("spec_changed", why))
         known = getattr(policy, "normalisation_keys", None)
         key = policy.spec.action.normalisation
         if known is not None and key not in known:
-            report.findings.append(
-                error(
-                    "normalisation",
-                    f"the spec says normalisation {key!r}, the weights came with: "
-                    f"{', '.join(sorted(map(str, known))) or 'none'}",
-                )
-            )
+            there = ", ".join(sorted(map(str, known))) or "none"
+            why = f"the spec says normalisation {key!r}, the weights came with: {there}"
+            report.findings.append(error("normalisation", why))
         return True
 
     def _infer_first(self) -> bool:
@@ -155,32 +140,24 @@ class Examination:
         """Repeat an observation, and change one thing at a time."""
         report, chart = self.report, self._styles[0]
         seen = self._policy.spec.observation
-        cameras = bool(seen.camera_names)
         first, again = self._infer_again(chart), self._infer_again(chart)
         if first is None or again is None:
             return
         report.deterministic = judge.alike(first, again)
         if not report.deterministic:
-            report.findings.append(
-                note(
-                    "random",
-                    "answers to one observation differ after reset(); usual where noise "
-                    "is drawn, and then it is not known what the answer depends on",
-                )
-            )
-        trials = {
-            "pictures": ExampleStyle(chart.name, picture=noise, prompt=chart.prompt)
-            if cameras
-            else None,
-            "colour order": ExampleStyle(chart.name, prompt=chart.prompt, swapped=True)
-            if seen.cameras
-            else None,
-            "prompt": ExampleStyle(chart.name, prompt=self._another_prompt())
-            if self._policy.spec.observation.prompt
-            else None,
-        }
+            why = "answers to one observation differ after reset(); usual where noise is drawn, "
+            why += "and then it is not known what the answer depends on"
+            report.findings.append(note("random", why))
+            return
+        trials: dict[str, ExampleStyle] = {}
+        if seen.camera_names:
+            trials["pictures"] = replace(chart, picture=noise)
+        if seen.cameras:
+            trials["colour order"] = replace(chart, swapped=True)
+        if seen.prompt:
+            trials["prompt"] = replace(chart, prompt=self._another_prompt())
         for name, style in trials.items():
-            if style is None or not report.deterministic or not self._in_budget():
+            if not self._in_budget():
                 continue
             if name == "colour order" and report.depends_on.get("pictures") is False:
                 continue
@@ -192,7 +169,7 @@ class Examination:
         if not judge.takes_batches(self._policy) or not self.report.deterministic:
             return
         chart = self._styles[0]
-        pair = (chart, ExampleStyle(chart.name, picture=noise, prompt=self._another_prompt()))
+        pair = (chart, replace(chart, picture=noise, prompt=self._another_prompt()))
         alone = [self._infer_again(style) for style in pair]
         if any(steps is None for steps in alone):
             return
@@ -218,11 +195,9 @@ class Examination:
             if self._infer(self._styles[index % 2]) is None:
                 return
             kib.append(self._runner.memory_kib())
-        report = self.report
-        if len(kib) < ENOUGH_RUNS:
-            return
-        report.growth_kib_per_run, leaks = judge.growth(kib)
-        report.findings += leaks
+        if len(kib) >= ENOUGH_RUNS:
+            self.report.growth_kib_per_run, leaks = judge.growth(kib)
+            self.report.findings += leaks
 
     # -- one inference ------------------------------------------------------------------------
     def _infer_again(self, style: ExampleStyle) -> Steps | None:
@@ -274,12 +249,8 @@ class Examination:
         if self._runner.spent_s() - self._loaded_s < self._budget_s:
             return True
         if not any(finding.name == "cut_short" for finding in self.report.findings):
-            self.report.findings.append(
-                note(
-                    "cut_short",
-                    f"not everything was tried in {self._budget_s:g} s; --budget gives more",
-                )
-            )
+            why = f"not everything was tried in {self._budget_s:g} s; --budget gives more"
+            self.report.findings.append(note("cut_short", why))
         return False
 
     # -- findings ------------------------------------------------------------------------------

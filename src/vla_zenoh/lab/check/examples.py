@@ -12,21 +12,9 @@ from numpy.typing import NDArray
 from vla_zenoh.policy import CameraSpec, DepthSpec, ModelSpec, Observation
 from vla_zenoh.policy.observation import prepare_depth, prepare_image
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import (
-    Depth,
-    GripperState,
-    Image,
-    JointState,
-    PoseState,
-    PrivilegedState,
-    Task,
-)
+from vla_zenoh.types import Depth, GripperState, Image, JointState, PoseState, PrivilegedState, Task
 
-PROMPTS = (
-    "put the red brick in the box",
-    "push the blue brick to the left",
-    "hold",
-)
+PROMPTS = ("put the red brick in the box", "push the blue brick to the left", "hold")
 """Default prompts: two ask for different motions, one for none."""
 STRANGE_PROMPT = "legt den grünen Klotz in die Kiste \N{PACKAGE}, bitte! " * 8
 """Long, in another language, not ASCII: a model may reject it, and must not break."""
@@ -66,7 +54,6 @@ def noise(height: int, width: int) -> Picture:
 
 
 def plain(value: int) -> Callable[[int, int], Picture]:
-    """A uniform gray."""
     return lambda height, width: np.full((height, width, 3), value, np.uint8)
 
 
@@ -75,14 +62,7 @@ class ExampleStyle:
     """Style of one example observation.
 
     Args:
-        name: in findings.
         picture: of every camera, from height and width, RGB.
-        prompt: of the task.
-        position_m: of the TCP.
-        width_m: of the gripper.
-        holding: the gripper holds an object.
-        swapped: red and blue exchanged.
-        active: the arm is active.
         strange: the model may reject it with a `SpecError`.
     """
 
@@ -119,9 +99,7 @@ class ExampleMaker:
     """Makes observations, each a period later than the last.
 
     Args:
-        spec: of the model.
         profile: for image sizes and joints; None: defaults.
-        seq: of the next one.
     """
 
     spec: ModelSpec
@@ -132,7 +110,6 @@ class ExampleMaker:
         """An observation of this style, with read-only arrays as in a worker.
 
         Args:
-            style: of the example.
             again: use the stamp and number of the first observation.
 
         Raises:

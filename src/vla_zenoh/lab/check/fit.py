@@ -45,9 +45,6 @@ def check_spec(
     """Findings about a spec on a profile.
 
     Args:
-        profile: the effective profile.
-        spec: what the model declares.
-        worker: name of the worker.
         rate_hz: chunks per second requested; None: by the profile.
     """
     return [
@@ -130,10 +127,7 @@ def check_chunk(
     """Findings about the numbers of one chunk.
 
     Args:
-        spec: the declared meaning of the numbers.
         steps: (H, D), as `vla_zenoh.policy.check_steps` gives them.
-        limits: of the robot.
-        max_width_m: of its gripper.
     """
     found = list(chunk_errors(spec, steps, limits, max_width_m))
     if spec.space == "joint":

@@ -23,7 +23,6 @@ Answers = Sequence[tuple[ExampleStyle, Steps]]
 
 
 def alike(a: Steps, b: Steps) -> bool:
-    """Two answers are equal."""
     return a.shape == b.shape and bool(np.abs(a - b).max() <= ALIKE)
 
 
@@ -49,39 +48,23 @@ def slowness(
     """Findings on the duration of an inference.
 
     Args:
-        action: of the spec.
         p50_s: median.
         p95_s: 95th percentile.
-        oldest_s: limit on the age of an observation.
         rate_hz: requested chunks per second; None: unknown.
     """
     found: list[Finding] = []
     if p50_s > oldest_s:
-        found.append(
-            error(
-                "too_slow",
-                f"an inference takes {p50_s:.3g} s; the command node rejects chunks whose "
-                f"observation is older than {oldest_s:g} s (timing.max_observation_age_s)",
-            )
-        )
+        why = f"an inference takes {p50_s:.3g} s; the command node rejects chunks whose "
+        why += f"observation is older than {oldest_s:g} s (timing.max_observation_age_s)"
+        found.append(error("too_slow", why))
     if p50_s > action.horizon * action.dt_s:
         # One step late is still the goal; of many late ones all but the last are lost.
         level = error if action.horizon > 1 else warning
-        found.append(
-            level(
-                "slower_than_chunk",
-                f"an inference takes {p50_s:.3g} s, its {action.horizon} steps of "
-                f"{action.dt_s:g} s are over by then",
-            )
-        )
+        why = f"an inference takes {p50_s:.3g} s, its {action.horizon} steps of "
+        found.append(level("slower_than_chunk", f"{why}{action.dt_s:g} s are over by then"))
     if rate_hz is not None and p95_s > 1.0 / rate_hz:
-        found.append(
-            warning(
-                "slower_than_rate",
-                f"an inference takes up to {p95_s:.3g} s (p95), it is asked for "
-                f"{rate_hz:g} times a second",
-            )
-        )
+        why = f"an inference takes up to {p95_s:.3g} s (p95), it is asked for "
+        found.append(warning("slower_than_rate", f"{why}{rate_hz:g} times a second"))
     return found
 
 
@@ -91,8 +74,6 @@ def behaviour(
     """Findings on what all answers have in common.
 
     Args:
-        action: of the spec.
-        answers: at least one.
         depends_on: pictures, colour order, prompt -> the answer depends on it; None: unknown.
     """
     found = _polarity(action, answers)
@@ -159,7 +140,6 @@ def batch_findings(action: ActionSpec, found: Sequence[Any], alone: Sequence[Any
     """Findings on answers that differ between ``infer_batch`` and ``infer``.
 
     Args:
-        action: of the spec.
         found: answers of ``infer_batch``.
         alone: (H, D) of ``infer`` for the same observations, in their order.
     """
@@ -174,10 +154,7 @@ def batch_findings(action: ActionSpec, found: Sequence[Any], alone: Sequence[Any
         except SpecError as fault:
             out.append(error("batch", f"answer {number} of infer_batch: {fault}"))
             continue
-        if given.shape != wanted.shape or np.abs(given - wanted).max() > NEAR * _size(wanted):
+        largest = max(float(np.abs(wanted).max()), 1e-6)
+        if given.shape != wanted.shape or np.abs(given - wanted).max() > NEAR * largest:
             out.append(error("batch", f"answer {number} of infer_batch is not that of infer"))
     return out
-
-
-def _size(steps: Steps) -> float:
-    return max(float(np.abs(steps).max()), 1e-6)

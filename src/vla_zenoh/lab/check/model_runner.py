@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, TypeVar
@@ -28,11 +28,7 @@ class ModelHung(Exception):
 
 
 class ModelRunner:
-    """Runs a model on one thread, as a worker does, and measures time and memory.
-
-    Args:
-        patience_s: time limit of a call.
-    """
+    """Runs a model on one thread, as a worker does, and measures time and memory."""
 
     def __init__(self, patience_s: float) -> None:
         self._patience_s = patience_s
@@ -62,25 +58,18 @@ class ModelRunner:
         """
         answer: Future[tuple[Result, float]] = Future()
         self._calls.put((function, answer))
-        if not self._wait(answer):
+        if not wait([answer], self._patience_s).done:
             raise ModelHung(f"no answer within {self._patience_s:g} s")
         error = answer.exception()
         if error is not None:
             raise ModelFailed(error) from error
         return answer.result()
 
-    def _wait(self, answer: Future[Any]) -> bool:
-        done = threading.Event()
-        answer.add_done_callback(lambda _: done.set())
-        return done.wait(self._patience_s)
-
     def memory_kib(self) -> float:
-        """Resident memory of this process."""
         for line in Path("/proc/self/status").read_text().splitlines():
             if line.startswith("VmRSS:"):
                 return float(line.split()[1])
         return 0.0
 
     def spent_s(self) -> float:
-        """Seconds since construction."""
         return time.monotonic() - self._began_s

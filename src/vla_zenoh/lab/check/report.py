@@ -61,14 +61,10 @@ class CheckReport:
     """Report of a model check.
 
     Args:
-        worker: its name.
         spec: of the model; None: the model could not be made.
-        findings: errors, warnings and notes.
         shape: (H, D) of the first answer.
         load_s: duration of ``load()``.
-        first_ms: duration of the first inference.
         latency_ms: ``[p50, p95, max]`` of the later ones.
-        runs: number of later inferences.
         memory_mib: resident: before load, after it, after all runs.
         growth_kib_per_run: growth of resident memory per inference, None: too few runs.
         deterministic: the same answer to the same observation after ``reset()``.
@@ -92,22 +88,16 @@ class CheckReport:
 
     @property
     def ok(self) -> bool:
-        """No finding is an error."""
         return not any(finding.level == "error" for finding in self.findings)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain types."""
         return {
             "worker": self.worker,
             "ok": self.ok,
             "findings": [finding._asdict() for finding in self.findings],
             "spec": self.spec.to_dict() if self.spec else None,
             "spec_hash": self.spec.hash if self.spec else None,
-            **{
-                name: getattr(self, name)
-                for name in self.__dataclass_fields__
-                if name not in ("worker", "spec", "findings")
-            },
+            **{name: getattr(self, name) for name in list(self.__dataclass_fields__)[3:]},
         }
 
 

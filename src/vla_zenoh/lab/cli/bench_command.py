@@ -25,8 +25,7 @@ def command(
         float, typer.Option("--seconds", min=8, max=600, help="Duration at each rate.")
     ] = 10.0,
     busy: Annotated[
-        int,
-        typer.Option("--busy", min=0, max=64, help="Busy processes beside it."),
+        int, typer.Option("--busy", min=0, max=64, help="Busy processes beside it.")
     ] = 0,
     profile: SimulatedProfileOption = DEFAULT_PROFILE,
 ) -> None:

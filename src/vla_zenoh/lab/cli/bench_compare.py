@@ -22,8 +22,7 @@ DISAGREEMENTS = 10
 
 def compare(
     a: Annotated[
-        Path,
-        typer.Argument(help="Result of `bench task` or `sim`: folder or JSON.", metavar="A"),
+        Path, typer.Argument(help="Result of `bench task` or `sim`: folder or JSON.", metavar="A")
     ],
     b: Annotated[Path, typer.Argument(help="Another one.", metavar="B")],
     differ: Annotated[

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections import deque
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,6 +55,23 @@ def write_json(file: Path | None, result: Any) -> None:
         file.write_text(json.dumps(result, indent=2) + "\n", "utf-8")
 
 
+def rate_cells(row: Mapping[str, Any]) -> tuple[str, ...]:
+    """Successes, episodes, rate and its interval at 95 %, for a table."""
+    low, high = row["wilson_95"]
+    rate = f"{row['success_rate']:.1%}" if row["episodes"] else ""
+    return str(row["successes"]), str(row["episodes"]), rate, f"{low:.1%}..{high:.1%}"
+
+
+def counts(of: Mapping[str, int]) -> str:
+    """Counts as text: ``dropped 3, fell 1``."""
+    return ", ".join(f"{name} {count}" for name, count in of.items())
+
+
+def shown_camera(cameras: Collection[str]) -> str | None:
+    """The camera whose images show a task; None: there is none."""
+    return "front" if "front" in cameras else next(iter(cameras), None)
+
+
 class Rows(list[dict[str, Any]]):
     """Result rows, and the log lines of the nodes."""
 
@@ -94,7 +111,6 @@ def up_with_last_lines(host: Host, lines: Collection[str]) -> Iterator[Host]:
     """`host`, up; a failure of the block shows the last log lines.
 
     Args:
-        host: not up yet.
         lines: log lines of its nodes, growing.
     """
     from vla_zenoh.lab.episode import Interrupted
@@ -122,7 +138,6 @@ def running_nodes(
     """All nodes of a simulated robot; a failure of the block shows the last log lines.
 
     Args:
-        profile: at an address of its own.
         log_file: for their log; None: it is not kept.
         settings: see `Host`.
     """

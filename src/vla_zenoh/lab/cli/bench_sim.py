@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,22 +18,16 @@ from vla_zenoh.cli.options import JsonOption, ModelOptions, model_options, optio
 from vla_zenoh.cli.output import console, errors, new_table
 from vla_zenoh.errors import ResourceError
 from vla_zenoh.lab.benchmark.contract import BenchmarkTask
-from vla_zenoh.lab.benchmark.episode_clock import (
-    EpisodeConditions,
-    EpisodeOutcome,
-    EpisodeRequest,
-    Mode,
-)
+from vla_zenoh.lab.benchmark.episode import EpisodeConditions, EpisodeOutcome, EpisodeRequest, Mode
 from vla_zenoh.lab.benchmark.journal import PLAN, RunJournal, actions_file, read_episodes, read_json
 from vla_zenoh.lab.benchmark.process import BenchmarkProcess, BenchmarkSetting
 from vla_zenoh.lab.benchmark.result import summary, write_page, write_videos
 from vla_zenoh.lab.benchmark.run import BenchmarkStage, Does, LocalRun, run_at_places
-from vla_zenoh.lab.cli.bench_file import write_json
+from vla_zenoh.lab.cli.bench_file import counts, rate_cells, shown_camera, write_json
 from vla_zenoh.lab.cli.output import print_json, progress_bars
 from vla_zenoh.lab.cli.output_path import check_folder
 
 REPLAY = "replay"
-DRAWN = "front"
 
 
 @dataclass(frozen=True)
@@ -75,17 +69,11 @@ class BenchmarkEpisodes:
 
     @property
     def conditions(self) -> EpisodeConditions:
-        """Of every episode."""
         if self.mode == "native" and self.delay_ms:
             raise typer.BadParameter("--delay: in native mode no time passes; add --mode live")
         return EpisodeConditions(self.mode, self.delay_ms, self.replan)
 
     def requests(self, about: dict[str, Any]) -> list[EpisodeRequest]:
-        """Every episode, task by task.
-
-        Args:
-            about: what the benchmark says of itself.
-        """
         known = [BenchmarkTask(**task) for task in about["tasks"]]
         chosen = known if self.tasks is None else _chosen(self.tasks, known)
         last = self.first + self.episodes
@@ -219,7 +207,8 @@ def sim(
         try:
             left = [each for each in requests if each.key not in journal.ended]
             if left:
-                _run(stage, place, replay, left, journal, stop, len(requests))
+                found = _outcomes(stage, place, replay, left, journal, stop)
+                _run(found, journal, len(requests))
         finally:
             result = _result(requests, journal, replay)
             if result["all"]:
@@ -237,18 +226,12 @@ def sim(
 
 
 def _run(
-    stage: BenchmarkStage,
-    place: BenchmarkPlace,
-    replay: Path | None,
-    left: Sequence[EpisodeRequest],
-    journal: RunJournal,
-    stop: threading.Event,
-    total: int,
+    outcomes: Iterable[tuple[EpisodeRequest, EpisodeOutcome]], journal: RunJournal, total: int
 ) -> None:
     with progress_bars(44) as bars:
         bars.columns = (*bars.columns, TimeRemainingColumn())
-        bar = bars.add_task("starting", total=total, completed=total - len(left))
-        for request, outcome in _outcomes(stage, place, replay, left, journal, stop):
+        bar = bars.add_task("starting", total=total, completed=len(journal.ended))
+        for request, outcome in outcomes:
             journal.add(request, outcome)
             done = sum(each.success for each in journal.ended.values())
             word = "done" if outcome.success else outcome.failure
@@ -268,7 +251,7 @@ def _outcomes(
     stop: threading.Event,
 ) -> Iterator[tuple[EpisodeRequest, EpisodeOutcome]]:
     if place.ray is not None:
-        from vla_zenoh.lab.benchmark.ray_place import RayPlace, connect_ray
+        from vla_zenoh.lab.benchmark.run import RayPlace, connect_ray
 
         if replay is not None or place.connect:
             raise typer.BadParameter("--ray: not with --replay or --connect")
@@ -329,13 +312,12 @@ def _videos(
     ]
     if output.output is None or not about["cameras"]:
         return
-    camera = DRAWN if DRAWN in about["cameras"] else next(iter(about["cameras"]))
+    camera = shown_camera(about["cameras"]) or ""
     for file in write_videos(output.output, teller, failed, camera, output.videos):
         errors().print(f"{file}", soft_wrap=True)
 
 
 def _chosen(text: str, known: Sequence[BenchmarkTask]) -> list[BenchmarkTask]:
-    """Tasks by numbers, ranges and names."""
     names = {task.name: task for task in known}
     out: dict[str, BenchmarkTask] = {}
     for part in text.split(","):
@@ -360,17 +342,9 @@ def _print(result: dict[str, Any]) -> None:
     columns = ("", "done", "of", "rate", "95 %", "steps p50", "failures")
     table = new_table(*columns, title=title, left=("", "failures"))
     for name, row in [("all", result), *result["by_task"].items()]:
-        low, high = row["wilson_95"]
         steps = row["steps_to_success_p50"]
-        table.add_row(
-            name,
-            str(row["successes"]),
-            str(row["episodes"]),
-            f"{row['success_rate']:.1%}",
-            f"{low:.1%}..{high:.1%}",
-            f"{steps:g}" if steps is not None else "",
-            ", ".join(f"{why} {count}" for why, count in row["failures"].items()),
-        )
+        median = f"{steps:g}" if steps is not None else ""
+        table.add_row(name, *rate_cells(row), median, counts(row["failures"]))
     console().print(table)
     if result["begun_again"]:
         console().print(f"{result['begun_again']} episodes were begun again")

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -20,8 +20,8 @@ from vla_zenoh.cli.options import (
     options,
 )
 from vla_zenoh.cli.output import console, new_table
-from vla_zenoh.lab.bench.task import BASELINES, SCENE, TaskPlan, TaskScore
-from vla_zenoh.lab.cli.bench_file import running_nodes, write_json
+from vla_zenoh.lab.bench.task import BASELINES, SCENE, TaskOutcome, TaskPlan, TaskScore
+from vla_zenoh.lab.cli.bench_file import counts, rate_cells, running_nodes, shown_camera, write_json
 from vla_zenoh.lab.cli.options import SimulatedProfileOption
 from vla_zenoh.lab.cli.output import print_json, progress_bars
 from vla_zenoh.lab.cli.output_path import ForceOption, if_wanted, output_folder, require_free_folder
@@ -30,6 +30,7 @@ from vla_zenoh.policy.loader import find_model
 from vla_zenoh.profile import Profile, override
 from vla_zenoh.resources import is_path
 
+Latencies = dict[str, tuple[float, float]]
 VARIATIONS = ("lights", "table", "camera", "distractors")
 UNSEEN_SEED = 1_000_000
 """First seed for measuring; training data has smaller seeds."""
@@ -70,7 +71,6 @@ class EpisodeOptions:
     ] = LIMIT_S
 
     def plan(self, model: str) -> TaskPlan:
-        """The plan for `model`."""
         if self.family not in (None, "stay", LIFT, *FAMILIES):
             raise typer.BadParameter(f"--family is one of {', '.join(FAMILIES)}, stay, {LIFT}")
         return TaskPlan(model, **asdict(self))
@@ -92,17 +92,6 @@ class TaskOutput:
     def open(self) -> AbstractContextManager[Path | None]:
         """The folder to fill, if one is wanted; see `output_folder`."""
         return if_wanted(output_folder, self.output, force=self.force)
-
-
-def _write(folder: Path | None, score: TaskScore) -> None:
-    """Write the result, and images of failures."""
-    from vla_zenoh.lab.bench.task_sheet import failure_sheet
-
-    if folder is not None:
-        write_json(folder / "result.json", score.to_dict())
-        sheet = failure_sheet(score.ended)
-        if sheet is not None:
-            (folder / "failures.jpg").write_bytes(sheet)
 
 
 @options
@@ -140,6 +129,8 @@ def task(
     A task is to put a brick in the box, stack it on another one, or push it. The verdict is by the
     true poses of the objects.
     """
+    from vla_zenoh.lab.bench.task_sheet import failure_sheet
+    from vla_zenoh.lab.episode import Interrupted
     from vla_zenoh.runtime.environments import run_in_own_environment
     from vla_zenoh.runtime.process import stop_on_signals
 
@@ -157,26 +148,37 @@ def task(
     stop = stop_on_signals()
     mode = "lockstep" if lockstep else "real_time"
     score = TaskScore(plan, mode, loaded.name, varied, options=chosen.options)
+    camera = shown_camera(loaded.cameras)
+
+    def outcomes(folder: Path | None) -> Iterator[tuple[TaskOutcome, Latencies]]:
+        if not lockstep:
+            return _real_time(loaded, plan, model_options, folder, stop, camera)
+        from vla_zenoh.lab.bench.task_lockstep import run_in_lockstep
+
+        return run_in_lockstep(loaded, plan, chosen.options, camera, stop, processes, named=profile)
+
     began_s = time.monotonic()
     with output.open() as folder:
         try:
-            with _bar(plan.episodes) as advance:
-                if lockstep:
-                    _lockstep(loaded, profile, score, stop, processes, advance)
-                else:
-                    _real_time(loaded, score, model_options, folder, stop, advance)
+            with progress_bars(44) as bars, suppress(Interrupted):
+                bar = bars.add_task("starting", total=plan.episodes)
+                for ended, latency_ms in outcomes(folder):
+                    score.ended.append(ended)
+                    score.latency_ms = latency_ms
+                    done = sum(each.success for each in score.ended)
+                    outcome = "done" if ended.success else ended.failure
+                    said = f"{done} of {len(score.ended)} done; the last: {outcome}"
+                    bars.update(bar, completed=len(score.ended), description=said)
         finally:
             score.wall_s = time.monotonic() - began_s
             if score.ended:  # printed first: what cannot be written is not lost
                 print_json(score.to_dict()) if output.as_json else _print(score.to_dict())
-                _write(folder, score)
+                if folder is not None:
+                    write_json(folder / "result.json", score.to_dict())
+                    if sheet := failure_sheet(score.ended):
+                        (folder / "failures.jpg").write_bytes(sheet)
     if stop.is_set():
         raise typer.Exit(130)
-
-
-def _camera(profile: Profile) -> str | None:
-    """The camera whose images show the failures."""
-    return "front" if "front" in profile.cameras else next(iter(profile.cameras), None)
 
 
 def _varied(names: list[str]) -> list[str]:
@@ -221,64 +223,20 @@ def _with_bricks(
     )
 
 
-@contextmanager
-def _bar(episodes: int) -> Iterator[Callable[[TaskScore], None]]:
-    with progress_bars(44) as bars:
-        bar = bars.add_task("starting", total=episodes)
-
-        def advance(score: TaskScore) -> None:
-            done = sum(each.success for each in score.ended)
-            last = score.ended[-1]
-            outcome = "done" if last.success else last.failure
-            bars.update(
-                bar,
-                completed=len(score.ended),
-                description=f"{done} of {len(score.ended)} done; the last: {outcome}",
-            )
-
-        yield advance
-
-
-def _lockstep(
-    profile: Profile,
-    named: str,
-    score: TaskScore,
-    stop: threading.Event,
-    processes: int | None,
-    advance: Callable[[TaskScore], None],
-) -> None:
-    from vla_zenoh.lab.bench.task_lockstep import run_in_lockstep
-
-    for ended, latency_ms in run_in_lockstep(
-        profile,
-        score.plan,
-        score.options,
-        _camera(profile),
-        stop,
-        processes,
-        named=named,
-    ):
-        score.ended.append(ended)
-        score.latency_ms = latency_ms
-        advance(score)
-
-
 def _real_time(
     profile: Profile,
-    score: TaskScore,
+    plan: TaskPlan,
     model: ModelOptions,
     out: Path | None,
     stop: threading.Event,
-    advance: Callable[[TaskScore], None],
-) -> None:
+    camera: str | None,
+) -> Iterator[tuple[TaskOutcome, Latencies]]:
     from vla_zenoh.lab.bench.task_runner import TaskRunner
     from vla_zenoh.lab.cli.loopback import own_address
-    from vla_zenoh.lab.episode import Interrupted
     from vla_zenoh.runtime.process import die_with_parent
 
     die_with_parent()
-    plan = score.plan
-    arguments = [*(["--delay", f"{plan.delay_ms:g}"] if plan.delay_ms else [])]
+    arguments = ["--delay", f"{plan.delay_ms:g}"] if plan.delay_ms else []
     arguments += ["--python", model.python] if model.python else []
     nodes = running_nodes(
         own_address(profile),
@@ -286,15 +244,10 @@ def _real_time(
         worker_options={plan.worker: model.settings or []},
         worker_arguments=arguments,
     )
-    try:
-        with nodes as running:
-            run = TaskRunner(running, plan, stop, _camera(profile))
-            for ended in run.run():
-                score.ended.append(ended)
-                score.latency_ms = run.latency_ms()
-                advance(score)
-    except Interrupted:
-        pass
+    with nodes as running:
+        run = TaskRunner(running, plan, stop, camera)
+        for ended in run.run():
+            yield ended, run.latency_ms()
 
 
 def _print(result: dict[str, Any]) -> None:
@@ -302,17 +255,13 @@ def _print(result: dict[str, Any]) -> None:
     table = new_table(*columns, title=_title(result), left=("", "failures"))
     rows = [("all", result), *result["by_family"].items(), *result.get("pairs", {}).items()]
     for name, row in rows:
-        low, high = row["wilson_95"]
         times = row["time_to_success_s"]
         table.add_row(
             name,
-            str(row["successes"]),
-            str(row["episodes"]),
-            f"{row['success_rate']:.1%}" if row["episodes"] else "",
-            f"{low:.1%}..{high:.1%}",
+            *rate_cells(row),
             f"{times['p50']:.1f} s" if times else "",
             f"{times['p95']:.1f} s" if times else "",
-            ", ".join(f"{kind} {count}" for kind, count in row["failures"].items()),
+            counts(row["failures"]),
         )
     out = console()
     out.print(table)

@@ -60,8 +60,6 @@ class CheckPlan:
         """Load the model and test it.
 
         Args:
-            chosen: the worker.
-            named: the profile's name, for models that ask.
             profile: to check it against; None: only against its own spec.
         """
         try:

@@ -2,12 +2,42 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from vla_zenoh.cli.options import DEFAULT_PROFILE, options
-from vla_zenoh.lab.cli.demo_options import DemoOptions
+from vla_zenoh.cli.options import DEFAULT_PROFILE, JsonOption, options
+from vla_zenoh.lab.cli.output_path import ForceOption
+
+
+@dataclass(frozen=True)
+class DemoOptions:
+    """Options of both kinds of demo."""
+
+    rate_hz: Annotated[
+        float, typer.Option("--rate", help="Chunks per second.", min=0.2, max=50)
+    ] = 5.0
+    seconds: Annotated[
+        float | None,
+        typer.Option(
+            "--seconds",
+            help="Time for the steps of a fixed motion; time limit of a task.",
+            min=0.5,
+            max=3600,
+        ),
+    ] = None
+    profile: Annotated[
+        str | None, typer.Option("--profile", "-p", help="Name or path of a simulated profile.")
+    ] = None
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="New folder of the run; default: runs/demo-<time>."),
+    ] = None
+    force: ForceOption = False
+    as_json: JsonOption = False
+
 
 DEFAULT_STEPS = 50
 TASK_PROFILE = "panda_bricks"
@@ -41,7 +71,8 @@ def demo(
     # Imported here: simulation, kinematics and plots take long to load.
     if tour and prompt is not None:
         raise typer.BadParameter("give either --tour or --prompt")
-    if tour or (prompt is not None and _is_fixed_motion(prompt)):
+    fixed = prompt is not None and prompt.strip().lower().startswith(("hard", "hold"))
+    if tour or fixed:
         from vla_zenoh.lab.cli.demo_run import run_demo
         from vla_zenoh.lab.demo.segments import make_segment
         from vla_zenoh.lab.demo.segments import tour as all_motions
@@ -54,7 +85,3 @@ def demo(
 
     prompts, first_seed = [prompt] if prompt else [], FIRST_SEED if seed is None else seed
     run_task_demo(prompts, first_seed, given.profile or TASK_PROFILE, given)
-
-
-def _is_fixed_motion(prompt: str) -> bool:
-    return prompt.strip().lower().startswith(("hard", "hold"))

@@ -2,25 +2,38 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import typer
 
 from vla_zenoh.cli.output import console, new_table, styled
-from vla_zenoh.lab.cli.demo_options import DemoOptions
+from vla_zenoh.lab.cli.demo import DemoOptions
 from vla_zenoh.lab.cli.demo_stage import Stage, latency_line, open_stage, refusals, run_folder
 from vla_zenoh.lab.cli.output import print_json
-from vla_zenoh.lab.demo.chunk_file import write_chunks
 from vla_zenoh.lab.demo.runner import MotionRunner
 from vla_zenoh.lab.demo.segments import DemoSegment, SegmentOutcome, latencies
 from vla_zenoh.lab.episode import Interrupted
 from vla_zenoh.lab.evaluation.result import TASKS
 from vla_zenoh.lab.recording.run import Run
+from vla_zenoh.policy import ModelSpec
 from vla_zenoh.policy.loader import find_worker, make_policy
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import NodeStatus
+
+
+def write_chunks(path: Path, spec: ModelSpec, chunks: Sequence[np.ndarray]) -> None:
+    """Write a chunk file for ``vla-zenoh worker replay``: spec, steps (N, H, D), length (N,)."""
+    horizon, dimension = spec.action.horizon, spec.action.dimension
+    steps = np.zeros((len(chunks), horizon, dimension), np.float32)
+    for index, chunk in enumerate(chunks):
+        steps[index, : len(chunk)] = chunk
+    length = np.array([len(chunk) for chunk in chunks], np.int32)
+    np.savez_compressed(path, spec=json.dumps(spec.to_dict()), steps=steps, length=length)
 
 
 def run_demo(segments: list[DemoSegment], profile: str, given: DemoOptions) -> None:

@@ -38,10 +38,6 @@ class Stage:
     """A profile at an address of its own, and the run folder. Made by `open_stage`.
 
     Args:
-        profile: effective.
-        folder: of the run, under its temporary name.
-        name: of the folder, later.
-        stop: set by Ctrl-C.
         screen: for progress; stdout is for the summary.
         facts: for the end of the recording, such as the verdicts.
     """
@@ -54,23 +50,13 @@ class Stage:
     facts: dict[str, Any] = field(default_factory=dict)
 
     @property
-    def camera(self) -> str | None:
-        """The camera whose images show a task; None: there is none."""
-        cameras = self.profile.cameras
-        return "front" if "front" in cameras else next(iter(cameras), None)
-
-    @property
     def recording(self) -> Path:
         """The recording, from which all other files are made."""
         return self.folder / "run.mcap"
 
     @contextmanager
     def nodes(self, width: int) -> Iterator[tuple[Host, Progress]]:
-        """Run and record all nodes, with progress bars; a failure shows the end of their log.
-
-        Args:
-            width: of the descriptions of the bars, in characters.
-        """
+        """Run and record all nodes, with progress bars; a failure shows the end of their log."""
         with progress_bars(width, self.screen) as bars:
             coming_up = bars.add_task("starting the nodes", total=None)
             with running_nodes(self.profile, self.folder / "nodes.log") as running:
@@ -88,11 +74,9 @@ class Stage:
                     recorder.close(self.facts)
 
     def recorded(self) -> Run:
-        """Load the recording."""
         return load_run(self.recording)
 
     def write(self, summary: Mapping[str, Any]) -> None:
-        """Write profile.yaml and summary.json."""
         (self.folder / "profile.yaml").write_text(to_yaml(self.profile), "utf-8")
         text = json.dumps(summary, indent=2) + "\n"
         (self.folder / "summary.json").write_text(text, "utf-8")

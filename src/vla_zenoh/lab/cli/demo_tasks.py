@@ -14,7 +14,8 @@ from vla_zenoh.errors import ResourceError, nearest
 from vla_zenoh.lab.bench.task import SCENE, DemoPlan, TaskOutcome, is_judged, order_of
 from vla_zenoh.lab.bench.task_runner import TaskRunner
 from vla_zenoh.lab.bench.task_sheet import sheet
-from vla_zenoh.lab.cli.demo_options import DemoOptions
+from vla_zenoh.lab.cli.bench_file import shown_camera
+from vla_zenoh.lab.cli.demo import DemoOptions
 from vla_zenoh.lab.cli.demo_stage import Stage, latency_line, open_stage, refusals, run_folder
 from vla_zenoh.lab.cli.output import print_json
 from vla_zenoh.lab.demo.segments import latencies
@@ -88,7 +89,9 @@ def _run(stage: Stage, plan: DemoPlan) -> tuple[list[TaskOutcome], dict[str, int
         client = running.client
         bar = bars.add_task("waiting for the first task", total=plan.episodes)
         try:
-            for each in TaskRunner(running, plan, stage.stop, stage.camera).run():
+            for each in TaskRunner(
+                running, plan, stage.stop, shown_camera(stage.profile.cameras)
+            ).run():
                 ended.append(each)
                 stage.facts[TASKS].append(_fact(each))
                 said = f"{one_line(each.prompt, 40)}: {_word(each)}"

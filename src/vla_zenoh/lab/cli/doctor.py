@@ -15,12 +15,13 @@ import zenoh
 from vla_zenoh.bus.clock import HOST_VARIABLE
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.cli.options import (
+    DEFAULT_PROFILE,
     PROFILE_VARIABLE,
     AlsoOption,
     JsonOption,
     effective_profile,
 )
-from vla_zenoh.cli.output import console, new_table, styled
+from vla_zenoh.cli.output import console, fail, new_table, styled
 from vla_zenoh.errors import SecurityError, SessionError
 from vla_zenoh.lab.cli.output import print_json, progress
 from vla_zenoh.lab.doctor import HostFinding, Needs, examine, needs_of
@@ -28,6 +29,32 @@ from vla_zenoh.lab.doctor.access import AccessVerdict, access
 from vla_zenoh.lab.doctor.access_check import check_access, read_access, try_identity
 from vla_zenoh.lab.doctor.software import robot
 from vla_zenoh.profile import Profile, SessionProfile
+
+
+def robot_check(
+    profile: Annotated[
+        str, typer.Argument(help="Profile of the robot, by name or path.", metavar="NAME")
+    ] = DEFAULT_PROFILE,
+    as_json: JsonOption = False,
+) -> None:
+    """Connect to a Franka or UR arm, read it, and compare it with its profile. Moves nothing.
+
+    Its kinematics against the profile's description; of a Franka also joint ranges and limits
+    against the profile's, and no other program may be connected to it. Exits with 1 if something is
+    wrong.
+    """
+    from vla_zenoh.lab.doctor.fci import fci_arm
+    from vla_zenoh.lab.doctor.ur import ur_arm
+
+    loaded = effective_profile(profile)
+    check = {"franka": fci_arm, "ur": ur_arm}.get(loaded.robot.driver)
+    if check is None:
+        driver = loaded.robot.driver
+        fail(f"profile {loaded.name} has robot.driver: {driver}; this checks franka and ur")
+    with progress("reading the robot"):
+        findings = list(check(loaded))
+    report(findings, as_json=as_json)
+
 
 COLOURS = {"ok": "green", "warn": "yellow", "fail": "red"}
 

@@ -29,10 +29,7 @@ KINDS = (HTML, CSV, ".json")
 
 
 def evaluation(
-    paths: Annotated[
-        list[Path],
-        typer.Argument(help="Recordings (.mcap), or folders of them."),
-    ],
+    paths: Annotated[list[Path], typer.Argument(help="Recordings (.mcap), or folders of them.")],
     output: Annotated[
         list[Path] | None,
         typer.Option(

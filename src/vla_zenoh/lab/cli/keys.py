@@ -78,7 +78,6 @@ def keys(
 
 
 def table(found: Iterable[KeyTraffic]) -> Table:
-    """A table of keys."""
     out = new_table("key", "type", "writer", "rate", "bytes/s")
     for traffic in found:
         out.add_row(

@@ -53,11 +53,7 @@ def require_loopback(
     A profile with ``insecure: true`` has accepted that its network may do everything.
 
     Args:
-        profile: the effective one.
-        option: that gives the address.
         address: to listen at, without a port.
-        danger: what anyone on that network could do.
-        instead: what to do.
 
     Raises:
         SecurityError: the address is not a loopback address.

@@ -33,14 +33,7 @@ class HostPair:
     """Round trip and clock offset from one host to another.
 
     Args:
-        seen_from: the measuring host.
-        host: the other one.
-        by: node that measured.
-        of: node that answered.
-        round_trip_ms: through the router.
         offset_ms: the other clock minus the measuring one.
-        uncertainty_ms: of the offset.
-        links: of the measuring node, to its router.
     """
 
     seen_from: str
@@ -58,9 +51,7 @@ class Line:
     """Traffic of one node on one key.
 
     Args:
-        key: short.
         node: publisher; "-" where there is none now and records were lost before.
-        host: of the publisher.
         rate_hz: records per second.
         bytes_s: bytes per second, counted once for all subscribers.
         lost: subscriber -> records that did not reach it.
@@ -110,7 +101,6 @@ def net(
 def _own(
     clocks: ClockSync, statuses: Mapping[str, NodeStatus], links: tuple[str, ...]
 ) -> list[HostPair]:
-    """Each host as measured from here."""
     hosts = hosts_of(statuses)
     return [
         HostPair(
@@ -118,12 +108,12 @@ def _own(
             hosts[node],
             "net",
             node,
-            round(found.round_trip_s * 1e3, 3),
-            round(found.offset_s * 1e3, 3),
-            round(found.uncertainty_s * 1e3, 3),
+            round(at.round_trip_s * 1e3, 3),
+            round(at.offset_s * 1e3, 3),
+            round(at.uncertainty_s * 1e3, 3),
             links,
         )
-        for node, found in clocks.offsets().items()
+        for node, at in clocks.offsets().items()
         if node in statuses
     ]
 
@@ -160,25 +150,15 @@ def _measured(statuses: Mapping[str, NodeStatus]) -> list[HostPair]:
     hosts = hosts_of(statuses)
     for name, status in statuses.items():
         for other, found in _map(status.detail.get("clocks")).items():
-            numbers = [
-                _number(_map(found).get(what))
-                for what in ("round_trip_ms", "offset_ms", "uncertainty_ms")
-            ]
-            if hosts.get(other, hosts[name]) != hosts[name] and None not in numbers:
-                round_trip_ms, offset_ms, uncertainty_ms = (n or 0.0 for n in numbers)
-                links = _texts(_map(status.detail.get("net")).get("links"))
-                out.append(
-                    HostPair(
-                        hosts[name],
-                        hosts[other],
-                        name,
-                        other,
-                        round_trip_ms,
-                        offset_ms,
-                        uncertainty_ms,
-                        links,
-                    )
-                )
+            names = ("round_trip_ms", "offset_ms", "uncertainty_ms")
+            found_ms = [_number(_map(found).get(what)) for what in names]
+            known_ms = [each for each in found_ms if each is not None]
+            if hosts.get(other, hosts[name]) != hosts[name] and len(known_ms) == len(names):
+                links = _map(status.detail.get("net")).get("links")
+                texts = tuple(map(str, links)) if isinstance(links, (list, tuple)) else ()
+                trip_ms, ahead_ms, unsure_ms = known_ms
+                pair = (hosts[name], hosts[other], name, other)
+                out.append(HostPair(*pair, trip_ms, ahead_ms, unsure_ms, texts))
     return out
 
 
@@ -211,19 +191,12 @@ def _number(value: Any) -> float | None:
     return float(value) if valid else None
 
 
-def _texts(value: Any) -> tuple[str, ...]:
-    return tuple(map(str, value)) if isinstance(value, (list, tuple)) else ()
-
-
 def tables(
     robot: str, pairs: list[HostPair], lines: list[Line], bound_ms: float
 ) -> tuple[Table, ...]:
     """A table of the pairs of hosts and one of the keys.
 
     Args:
-        robot: its name.
-        pairs: of hosts.
-        lines: of nodes and keys.
         bound_ms: a larger clock offset is marked.
     """
     columns = ("from", "to", "round trip", "clock ahead by", "link", "measured by")

@@ -41,8 +41,6 @@ def output_file(path: Path, *, force: bool = False, inputs: Iterable[Path] = ())
     """A temporary file to write; becomes `path` when the block ends without an exception.
 
     Args:
-        path: of the file.
-        force: an existing file may be overwritten.
         inputs: files that the command reads, which are never overwritten.
 
     Raises:
@@ -107,11 +105,7 @@ def if_wanted(
 
 
 def require_free_folder(path: Path, *, force: bool = False, inputs: Iterable[Path] = ()) -> None:
-    """Check that `output_folder` may make `path`.
-
-    Raises:
-        OutputError: it may not.
-    """
+    """Check that `output_folder` may make `path`. Raises OutputError: it may not."""
     with _sentence(path):
         place = path.resolve()
         if Path.cwd().is_relative_to(place):
@@ -130,7 +124,6 @@ def check_folder(path: Path, *, begun: bool) -> None:
     """Make a folder that a command fills over several calls, and try to write there.
 
     Args:
-        path: of the folder.
         begun: it has the command's own files; otherwise it must be new or empty.
 
     Raises:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -95,13 +96,9 @@ def audit(
     missing = head is not None and not found.has(head)
     if as_json:
         print_json(
-            {
-                "lines": found.lines,
-                "first": found.first,
-                "head": found.head,
+            asdict(found)
+            | {
                 "head_found": None if head is None else not missing,
-                "faults": found.faults,
-                "gaps": found.gaps,
                 "entries": found.entries if show else None,
             }
         )
@@ -135,7 +132,6 @@ def authors_of(entries: list[dict]) -> dict[str, str]:
 
 
 def told(entry: dict, authors: dict[str, str]) -> str:
-    """A line for people."""
     at = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(entry["wall_ns"] / 1e9))
     facts = dict(entry["facts"])
     by = ""

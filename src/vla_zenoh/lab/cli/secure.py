@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import datetime as dt
+import ipaddress
 import os
-from collections.abc import Sequence
+import shlex
+import socket
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
+from rich.text import Text
 
 from vla_zenoh.cli.options import DEFAULT_PROFILE, HostOption, JsonOption, ProfileOption
-from vla_zenoh.cli.output import console, errors, fail
+from vla_zenoh.cli.output import console, errors, fail, new_table, styled
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import SecurityError, VlaZenohError
 from vla_zenoh.lab.certificates.authority import AUTHORITY_DAYS, CERTIFICATE_DAYS
@@ -24,15 +28,128 @@ from vla_zenoh.lab.certificates.secure_profile import (
     serving_addresses,
     with_operator,
 )
-from vla_zenoh.lab.cli.addresses import is_own
-from vla_zenoh.lab.cli.certificate_table import certificate_row, print_certificates
 from vla_zenoh.lab.cli.output import print_json
 from vla_zenoh.lab.cli.output_path import ForceOption, output_file
-from vla_zenoh.lab.cli.secure_copying import copy_commands
 from vla_zenoh.profile import Profile, load_profile, profile_file
+from vla_zenoh.profile.load import followed, paths_in
 from vla_zenoh.profile.session import DEFAULT_FOLDER
-from vla_zenoh.resources import is_path
+from vla_zenoh.resources import is_path, shipped
+from vla_zenoh.security.certificates import Entry
 from vla_zenoh.security.identity import PEOPLE, Role, identities, identities_of, operator_identities
+from vla_zenoh.security.store import Store
+
+
+def is_own(address: str) -> bool:
+    """Whether `address`, or the host name it is, belongs to this computer."""
+    try:
+        found = socket.getaddrinfo(address, 0, type=socket.SOCK_DGRAM)
+    except OSError:
+        return False
+    return any(_can_bind(family, place) for family, _, _, _, place in found)
+
+
+def _can_bind(family: int, place: tuple[Any, ...]) -> bool:
+    if ipaddress.ip_address(str(place[0]).partition("%")[0]).is_unspecified:
+        return False  # any computer can bind 0.0.0.0
+    with socket.socket(family, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind(place)
+        except OSError:
+            return False
+    return True
+
+
+def copy_commands(
+    profile: Profile, file: Path, store: Store, hosts: Collection[str], more: Collection[str] = ()
+) -> Iterator[str]:
+    """Lines to type here, then on the other computers.
+
+    Files beside the profile are copied with it; others that it names are listed.
+
+    Args:
+        profile: the secured one.
+        file: of that profile.
+        store: of the certificates.
+        hosts: get their certificates and the profile.
+        more: get only the profile.
+    """
+    if not (hosts or more):
+        return
+    beside, elsewhere = _files(profile, file)
+    for host in (*hosts, *more):
+        if host in hosts:
+            yield from _certificates(profile, store, host)
+        here = Path.cwd()
+        shown = (path.relative_to(here) if path.is_relative_to(here) else path for path in beside)
+        yield f"  scp {' '.join(shlex.quote(str(path)) for path in shown)} {host}:"
+    for path in elsewhere:
+        yield f"Copy this file as well, to the same place: {path}"
+    there = shlex.quote(f"./{file.name}")
+    if any(host in profile.hosts for host in hosts):
+        yield f"There: vla-zenoh up {there} --host NAME"
+    yield f"To watch, there: vla-zenoh status --profile {there}"
+
+
+def _certificates(profile: Profile, store: Store, host: str) -> Iterator[str]:
+    assert profile.session.security is not None
+    # ssh and scp start in the home folder.
+    target = shlex.quote(profile.session.security.folder.removeprefix("~/"))
+    yield f"  ssh {host} mkdir -p {target}"
+    yield f"  scp -rp {shlex.quote(str(store.folder / host))} {host}:{target}/"
+
+
+def _files(profile: Profile, file: Path) -> tuple[list[Path], list[Path]]:
+    """Files that the profile consists of or names: those beside it, and the others."""
+    chain = [path for path, _ in followed(str(file)) if path.parent != shipped("profiles")]
+    texts = [
+        section[key].removeprefix(prefix) for section, key, prefix in paths_in(profile.model_dump())
+    ]
+    found = [path.absolute() for path in (*chain, *(Path(text).expanduser() for text in texts))]
+    here = file.absolute().parent
+    unique = list(dict.fromkeys(found))
+    return [p for p in unique if p.parent == here], [p for p in unique if p.parent != here]
+
+
+def print_certificates(entries: list[Entry], now: dt.datetime) -> None:
+    """Print a table of certificates, then each fault and warning."""
+    table = new_table("host", "node", "valid until", "days", "serves as")
+    wrong: list[Text] = []
+    for entry in entries:
+        found, colour = entry.certificate, "green"
+        if entry.faults:
+            colour = "bold red"
+        elif entry.warning:
+            colour = "yellow"
+        table.add_row(
+            entry.host or "(the lab)",
+            entry.node,
+            styled(f"{found.not_after:%Y-%m-%d}", colour) if found else "",
+            styled(found.days_left(now), colour) if found else "",
+            ", ".join(found.addresses) if found else "",
+        )
+        named = f"{entry.host or 'the lab'}/{entry.node}"
+        whys = entry.faults or ([entry.warning] if entry.warning else [])
+        wrong += [styled(f"{named}: {why}", colour) for why in whys]
+    screen = console()
+    screen.print(table)
+    for line in wrong:
+        screen.print(line, soft_wrap=True)
+
+
+def certificate_row(entry: Entry, now: dt.datetime) -> dict[str, object]:
+    found = entry.certificate
+    return {
+        "host": entry.host,
+        "node": entry.node,
+        "file": str(entry.path),
+        "common_name": found.common_name if found else None,
+        "not_after": found.not_after.isoformat() if found else None,
+        "days_left": found.days_left(now) if found else None,
+        "addresses": list(found.addresses) if found else [],
+        "faults": list(entry.faults),
+        "warning": entry.warning,
+    }
+
 
 secure_app = typer.Typer(
     help="Certificates for a lab, so that only its hosts connect, with the rights of their roles.",
@@ -126,7 +243,7 @@ def _print_next(
         out.print(f"\nCopy to {which} its own folder, and to all of them the profile:")
     for line in copy_commands(written, file, store, others):
         out.print(line, soft_wrap=True)
-    _print_here(here, RobotTarget(_typed(file)))
+    _print_here(here, RobotTarget(str(file) if "/" in str(file) else f"./{file}"))
     key = store.folder / "ca.key"
     out.print(f"Keep {key} here: anyone with it can make certificates.", soft_wrap=True)
     _warn_of_loopback(written)
@@ -267,11 +384,6 @@ def _this_host(profile: Profile, addresses: dict[str, str]) -> str | None:
     if not addresses and len(profile.hosts) == 1:
         found = list(profile.hosts)
     return found[0] if len(found) == 1 else None
-
-
-def _typed(file: Path) -> str:
-    """A profile's file as a command line names it."""
-    return str(file) if "/" in str(file) else f"./{file}"
 
 
 def _print_here(host: str | None, target: RobotTarget) -> None:

@@ -39,8 +39,7 @@ def teleop(
         typer.Option("--set", help="Option of the leader's class as name=value; repeatable."),
     ] = None,
     frame: Annotated[
-        Literal["base", "tcp"],
-        typer.Option(help="Axes of the motion: robot base or TCP."),
+        Literal["base", "tcp"], typer.Option(help="Axes of the motion: robot base or TCP.")
     ] = "base",
     speed: Annotated[int, typer.Option("--speed", min=1, max=5, help="Initial speed level.")] = 3,
     name: Annotated[str, typer.Option("--name", help="Name of the worker.")] = "teleop",
@@ -50,7 +49,7 @@ def teleop(
     `vla-zenoh use teleop` (or Tab, Y of a gamepad, the second button of a SpaceMouse) selects it,
     also while a model moves the arm; Tab again gives the arm back. It is recorded as any worker is.
     """
-    from vla_zenoh.lab.teleop.leader_arm import LeaderArm
+    from vla_zenoh.lab.teleop.leader import LeaderArm
     from vla_zenoh.lab.teleop.node import Teleop
     from vla_zenoh.lab.teleop.sticks import DEVICES
 

@@ -52,9 +52,10 @@ class PlanOptions:
 
     def asked(self, robot: str) -> dict[str, Any]:
         """Fields of the plan that were given, None for the others."""
+        workers = None if self.workers is None else self.workers.split(",")
         return {
             "robot": robot,
-            "workers": None if self.workers is None else _names(self.workers),
+            "workers": None if workers is None else tuple(map(str.strip, workers)),
             "prompt": None if self.prompt is None else self.prompt.strip(),
             "setups": _setups(self.episodes, self.setups),
             "seconds": self.seconds,
@@ -121,10 +122,6 @@ def trial(
         _show(plan, result)
 
 
-def _names(workers: str) -> tuple[str, ...]:
-    return tuple(name.strip() for name in workers.split(","))
-
-
 def _setups(episodes: int | None, file: Path | None) -> tuple[str, ...] | None:
     if file is None:
         return None if episodes is None else ("",) * episodes
@@ -153,8 +150,7 @@ def _unattended(
     output: Path, plan_file: Path, target: RobotTarget, robot: str, *, as_json: bool
 ) -> None:
     from vla_zenoh.lab.episode import Interrupted
-    from vla_zenoh.lab.trial.unattended import PLAN, UnattendedTrial
-    from vla_zenoh.lab.trial.unattended_page import PAGE
+    from vla_zenoh.lab.trial.unattended import PAGE, PLAN, UnattendedTrial
     from vla_zenoh.lab.trial.unattended_plan import read_plan
     from vla_zenoh.lab.trial.unattended_runner import run_unattended
     from vla_zenoh.runtime.process import stop_on_signals

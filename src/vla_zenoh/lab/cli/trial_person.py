@@ -36,11 +36,7 @@ EXPECTED = {
 
 
 class Lines:
-    """Lines of a file descriptor, with a timeout.
-
-    Args:
-        fd: a terminal, a pipe or a file.
-    """
+    """Lines of a file descriptor, with a timeout."""
 
     def __init__(self, fd: int) -> None:
         self._fd, self._buffer, self._eof = fd, b"", False
@@ -84,9 +80,6 @@ class TrialPerson:
     """The operator at a terminal or behind a pipe; implements `Operator`.
 
     Args:
-        plan: of the trial.
-        fd: source of the lines.
-        stop: set by Ctrl-C.
         lays: setups are prepared: ask only after an episode that something else ended.
     """
 
@@ -99,7 +92,6 @@ class TrialPerson:
 
     # -- questions ----------------------------------------------------------------------------
     def ask(self, episode: EpisodeFsm) -> str:
-        """See `Operator`."""
         phase = episode.phase
         if phase is Phase.SETUP:
             self._say(self._setup(episode), style="bold")
@@ -137,11 +129,7 @@ class TrialPerson:
         return line
 
     def reject_line(self, line: str, phase: Phase) -> None:
-        """See `Operator`.
-
-        Raises:
-            NodeError: it is a line of a script.
-        """
+        """See `Operator`. Raises NodeError: it is a line of a script."""
         said = f"{line[:80]!r} is not valid here: {EXPECTED[phase]}"
         if not self._terminal:
             raise NodeError(f"{said}; the same command continues the trial")
@@ -149,11 +137,7 @@ class TrialPerson:
 
     # -- while the arm moves ------------------------------------------------------------------
     def poll_line(self) -> str | None:
-        """See `Operator`.
-
-        Raises:
-            NodeError: a script has ended, so there is no judge.
-        """
+        """See `Operator`. Raises NodeError: a script has ended, so there is no judge."""
         if self._terminal:
             line = self._lines.take(0.0)
             return "" if line is None and self._lines.over else line
@@ -167,7 +151,6 @@ class TrialPerson:
         return None
 
     def show(self, episode: EpisodeFsm) -> None:
-        """See `Operator`."""
         if not (self._terminal and self._screen.is_terminal):
             return
         if self._live is None:
@@ -184,7 +167,6 @@ class TrialPerson:
             )
 
     def show_end(self, episode: EpisodeFsm) -> None:
-        """See `Operator`."""
         self._calm()
         assert episode.end is not None
         why = self._plan.hide(episode.why)
@@ -192,7 +174,6 @@ class TrialPerson:
         self._say(f"{said}; {episode.time_s:.1f} s, {episode.view.chunks} chunks")
 
     def notify(self, text: str) -> None:
-        """See `Operator`."""
         self._calm()
         self._say(text, style="yellow")
 

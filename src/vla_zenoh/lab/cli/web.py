@@ -13,14 +13,14 @@ from vla_zenoh.cli.options import options
 from vla_zenoh.cli.output import errors
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import NodeError, SecurityError
-from vla_zenoh.lab.web.access import PageRole, People, Person, read_people
+from vla_zenoh.lab.web.access import People, Person, read_people
 from vla_zenoh.profile.session import is_loopback_address
 from vla_zenoh.runtime.process import run_node
 from vla_zenoh.security.identity import Role
 from vla_zenoh.security.store import local_role
 
 if TYPE_CHECKING:
-    from vla_zenoh.profile import Profile
+    pass
 
 PORT = 8088
 
@@ -79,15 +79,12 @@ def web(
 
     def run(session, stop) -> None:  # pyright: ignore  # as run_node gives them
         errors().print(f"page of robot {profile.robot.name}: {url}", soft_wrap=True)
-        serve_page(profile, session, People(found, _most(profile)), listening, names, tls, stop)
+        # No person on the page has more rights than the certificate here.
+        most = "viewer" if local_role(profile) is Role.VIEWER else "operator"
+        serve_page(profile, session, People(found, most), listening, names, tls, stop)
 
     with listening:
         run_node(profile, run, identity=None)
-
-
-def _most(profile: Profile) -> PageRole:
-    """Highest role of a person on the page: that of the certificate here."""
-    return "viewer" if local_role(profile) is Role.VIEWER else "operator"
 
 
 def _require_tls(bind: str, certificate: Path | None, key: Path | None) -> None:

@@ -13,12 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.errors import RecordingError
-from vla_zenoh.kinematics.so3 import (
-    Pose,
-    log3,
-    quat_from_rotation,
-    rotation_from_quat,
-)
+from vla_zenoh.kinematics.so3 import Pose, log3, quat_from_rotation, rotation_from_quat
 from vla_zenoh.lab.policy_servers.state_vector import rpy
 from vla_zenoh.lab.recording.run import Run, newest
 from vla_zenoh.policy import ActionSpec
@@ -45,7 +40,6 @@ class CommandedMotion:
     are those commanded; where poses were commanded, the measured ones.
 
     Args:
-        run: the recorded run.
         spec: of the actions; deltas are added to the step before.
 
     Raises:

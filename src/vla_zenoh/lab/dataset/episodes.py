@@ -37,8 +37,6 @@ class EpisodeFrame:
     Args:
         stamp_ns: wall clock.
         action: (D,) float32, with the meaning of the spec.
-        prompt: in force at that time.
-        intervention: a person led the arm.
     """
 
     stamp_ns: int
@@ -52,9 +50,7 @@ class RecordedEpisode:
     """An interval in which the arm obeyed one worker, and maybe a person, as frames.
 
     Args:
-        run: the recorded run.
         worker: the obeyed worker; the model, where a person took the arm from it.
-        spec: of its actions.
         since_ns: start, wall clock.
         until_ns: end, wall clock.
         frames: oldest first.
@@ -75,7 +71,6 @@ class RecordedEpisode:
 
     @property
     def label(self) -> EpisodeLabel:
-        """What came of it."""
         if self.discarded:
             return EpisodeLabel.DISCARDED
         if self.success is None:
@@ -107,7 +102,6 @@ def episodes_of(run: Run, worker: str | None = None) -> list[RecordedEpisode]:
     """All episodes with frames.
 
     Args:
-        run: the recorded run.
         worker: only episodes of this worker; of a person's, only what the person led.
 
     Raises:
@@ -135,7 +129,6 @@ def episodes_of(run: Run, worker: str | None = None) -> list[RecordedEpisode]:
 
 
 def _people(run: Run) -> set[str]:
-    """Workers that are a person."""
     known = {(chunk.record.worker, chunk.record.spec_hash) for chunk in run.chunks}
     return {
         worker for worker, spec in known if spec in run.specs and run.specs[spec].name == PERSON

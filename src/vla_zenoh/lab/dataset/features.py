@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import copy
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.dataset.episodes import RecordedEpisode
@@ -15,6 +16,78 @@ from vla_zenoh.lab.recording.run import Run, nearest
 from vla_zenoh.policy import ActionSpec, Observation
 from vla_zenoh.policy.spec import STREAM_OF
 from vla_zenoh.types import Task
+
+QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
+STRIDE = 4
+"""Only every fourth row and column of an image counts."""
+
+
+def of_numbers(rows: ArrayLike) -> dict[str, list[Any]]:
+    """min, max, mean, std, count and quantiles of (n,) or (n, D), each of length D."""
+    table = np.asarray(rows, np.float64)
+    table = table.reshape(len(table), -1)
+    out = {
+        "min": table.min(axis=0),
+        "max": table.max(axis=0),
+        "mean": table.mean(axis=0),
+        "std": table.std(axis=0),
+        **{name: np.quantile(table, share, axis=0) for name, share in QUANTILES.items()},
+    }
+    return {name: value.tolist() for name, value in out.items()} | {"count": [len(table)]}
+
+
+class Histogram:
+    """Histogram of images, whose statistics LeRobot keeps for each channel.
+
+    Args:
+        step: value of one level; LeRobot's colours are in [0, 1].
+    """
+
+    def __init__(self, step: float = 1 / 255, channels: int = 3, levels: int = 256) -> None:
+        self.levels = np.zeros((channels, levels), np.int64)
+        self.count, self._step = 0, step
+
+    def add(self, image: NDArray[Any]) -> None:
+        """Count the levels of an image, (H, W, channels) or (H, W)."""
+        seen = image[::STRIDE, ::STRIDE].reshape(-1, len(self.levels))
+        for levels, values in zip(self.levels, seen.T, strict=True):
+            levels += np.bincount(values, minlength=len(levels))
+        self.count += 1
+
+    def join(self, other: Histogram) -> None:
+        """Add the counts of another histogram."""
+        self.levels += other.levels
+        self.count += other.count
+
+    def statistics(self) -> dict[str, list[Any]]:
+        """As `of_numbers`, each of shape (channels, 1, 1); count is the number of images."""
+        values = np.arange(self.levels.shape[1]) * self._step
+        channels: dict[str, list[float]] = {}
+        for levels in self.levels:
+            seen = np.flatnonzero(levels)
+            mean = float(levels @ values / levels.sum())
+            below = np.cumsum(levels) / levels.sum()
+            found = {
+                "min": values[seen[0]],
+                "max": values[seen[-1]],
+                "mean": mean,
+                "std": np.sqrt(levels @ (values - mean) ** 2 / levels.sum()),
+                **{name: values[np.searchsorted(below, q)] for name, q in QUANTILES.items()},
+            }
+            for name, value in found.items():
+                channels.setdefault(name, []).append(float(value))
+        return {name: [[[v]] for v in found] for name, found in channels.items()} | {
+            "count": [self.count]
+        }
+
+
+def joined(histograms: Iterable[Histogram]) -> dict[str, list[Any]]:
+    """Statistics of all `histograms` together; there is at least one."""
+    first, *others = (copy.deepcopy(each) for each in histograms)
+    for other in others:
+        first.join(other)
+    return first.statistics()
+
 
 STATE, ACTION, PICTURE = "observation.state", "action", "observation.images."
 INTERVENTION = "intervention"
@@ -35,24 +108,14 @@ NEAR_NS = 100_000_000
 
 
 def state_names(parts: Sequence[str], joints: Sequence[str]) -> list[str]:
-    """Names of the numbers of a state.
-
-    Args:
-        parts: of the state.
-        joints: names of the arm's joints.
-    """
+    """Names of the numbers of a state."""
     of_arm = {"joint": [*joints], "joint_deg": [f"{name}_deg" for name in joints]}
     of_arm["effort"] = [f"{name}_effort" for name in joints]
     return [name for part in parts for name in {**NAMES, **of_arm}.get(part, [part])]
 
 
 def names_of_state(episode: RecordedEpisode, parts: Sequence[str]) -> list[str]:
-    """Names of the numbers of an episode's state, one part of the robot after the other.
-
-    Args:
-        episode: its recording has the names of the joints.
-        parts: of the state.
-    """
+    """Names of the numbers of an episode's state, one part of the robot after the other."""
     out: list[str] = []
     for part in episode.spec.parts:
         joints = episode.run.of_part(part).joints
@@ -86,8 +149,6 @@ def _of_part(part: str, names: Sequence[str], joints: Sequence[str]) -> list[str
 
     Args:
         part: of the robot; empty: it is one arm, whose names stay.
-        names: of its numbers.
-        joints: that are positions.
     """
     if not part:
         return [*names]

@@ -19,25 +19,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.errors import MissingExtraError, RecordingError
-from vla_zenoh.lab.dataset import feature_statistics
-from vla_zenoh.lab.dataset.depths import DepthColumn
 from vla_zenoh.lab.dataset.episodes import RecordedEpisode, fps_of
-from vla_zenoh.lab.dataset.feature_statistics import joined
 from vla_zenoh.lab.dataset.features import (
     ACTION,
     INTERVENTION,
     PICTURE,
     STATE,
     action_names,
+    joined,
     names_of_state,
+    of_numbers,
     states_of,
 )
-from vla_zenoh.lab.dataset.videos import (
-    EpisodeVideo,
-    chosen,
-    stamps_of,
-    write_videos,
-)
+from vla_zenoh.lab.dataset.videos import DepthColumn, EpisodeVideo, chosen, stamps_of, write_videos
 from vla_zenoh.lab.video import CODEC, PIXEL_FORMAT
 
 VERSION = "v3.0"
@@ -56,16 +50,8 @@ class Written(NamedTuple):
     """Result of an export.
 
     Args:
-        folder: of the dataset.
-        episodes: number of episodes.
-        frames: number of frames.
         fps: frames per second.
-        cameras: names of its cameras.
-        depth: names of its cameras with depth.
-        tasks: all prompts.
         successes: number of successful episodes; None if unknown for all.
-        interventions: number of frames that a person led.
-        labels: number of episodes by label.
     """
 
     folder: Path
@@ -92,7 +78,6 @@ def export(
 
     Args:
         folder: must not exist, or be empty.
-        episodes: in their order.
         cameras: whose images to export.
         parts: of the state, see `vla_zenoh.lab.policy_servers.state_vector`.
         progress: called with what is being written.
@@ -101,7 +86,6 @@ def export(
     Raises:
         RecordingError: the folder is not empty; there are no episodes; their actions differ in
             meaning; a part of them was not recorded.
-        MissingExtraError: pyarrow or PyAV is not installed.
     """
     if not episodes:
         raise RecordingError("the recordings hold no episode: no chunk was executed in them")
@@ -276,7 +260,7 @@ class _Dataset:
                 "worker": episode.worker,
                 "run": episode.run.path.name,
             }
-            found = {name: feature_statistics.of_numbers(values) for name, values in mine.items()}
+            found = {name: of_numbers(values) for name, values in mine.items()}
             chunk, file = divmod(number, FILES_IN_A_CHUNK)
             for camera, of_episodes in videos.items():
                 name = PICTURE + camera
@@ -301,8 +285,7 @@ class _Dataset:
         self, rows: list[dict[str, NDArray[Any]]], videos: dict[str, list[EpisodeVideo]]
     ) -> None:
         stats = {
-            name: feature_statistics.of_numbers(np.concatenate([each[name] for each in rows]))
-            for name in rows[0]
+            name: of_numbers(np.concatenate([each[name] for each in rows])) for name in rows[0]
         }
         for camera, of_episodes in videos.items():
             stats[PICTURE + camera] = joined(video.histogram for video in of_episodes)
@@ -362,10 +345,7 @@ class _Dataset:
                 },
             }
         out |= {depth.name: depth.feature() for depth in self._depths}
-        for name, names in (
-            (STATE, self._state_names),
-            (ACTION, action_names(self._spec.action)),
-        ):
+        for name, names in ((STATE, self._state_names), (ACTION, action_names(self._spec.action))):
             out[name] = {"dtype": "float32", "shape": [len(names)], "names": names}
         for name in (INTERVENTION, *COUNTERS):
             dtype = {INTERVENTION: "bool", "timestamp": "float32"}.get(name, "int64")

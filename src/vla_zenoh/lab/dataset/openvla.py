@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.errors import MissingExtraError, RecordingError
-from vla_zenoh.lab.dataset import feature_statistics
-from vla_zenoh.lab.dataset.features import ACTION, STATE
+from vla_zenoh.lab.dataset.features import ACTION, STATE, of_numbers
 from vla_zenoh.lab.dataset.lerobot import INFO
 
 FIGURES = ("mean", "std", "max", "min", "q01", "q99")
@@ -24,14 +23,13 @@ def openvla_statistics(folder: Path, name: str) -> dict[str, Any]:
 
     Raises:
         RecordingError: the folder holds no such dataset.
-        MissingExtraError: pyarrow is not installed.
     """
     info, columns = read_numbers(folder)
     content: dict[str, Any] = {}
     for part, column in (("action", ACTION), ("proprio", STATE)):
         if column in columns:
             names = info["features"][column]["names"] or []
-            found = feature_statistics.of_numbers(columns[column])
+            found = of_numbers(columns[column])
             content[part] = {figure: found[figure] for figure in FIGURES} | {
                 "mask": ["gripper" not in str(each) for each in names]
             }
@@ -45,7 +43,6 @@ def read_numbers(folder: Path) -> tuple[dict[str, Any], dict[str, NDArray[np.flo
 
     Raises:
         RecordingError: the folder holds no LeRobot dataset.
-        MissingExtraError: pyarrow is not installed.
     """
     try:
         import pyarrow

@@ -7,7 +7,7 @@ from vla_zenoh.lab.dataset.episodes import RecordedEpisode
 from vla_zenoh.lab.recording.run import newest
 from vla_zenoh.lab.tasks import judge_of
 from vla_zenoh.lab.tasks.judge import SETTLED_S
-from vla_zenoh.lab.tasks.wording import parse_prompt
+from vla_zenoh.lab.tasks.order import parse_prompt
 from vla_zenoh.lab.trial.verdict import Verdict, verdict_in
 
 AFTER_NS = int(1.2 * SETTLED_S * 1e9)

@@ -25,13 +25,7 @@ SLACK_S = 15.0
 
 
 class MotionRunner(EpisodeRunner):
-    """Runs motion segments one after the other.
-
-    Args:
-        client: follows the nodes.
-        stop: set by Ctrl-C.
-        watch: see `EpisodeRunner`.
-    """
+    """Runs motion segments one after the other. `watch`: see `EpisodeRunner`."""
 
     def __init__(
         self, client: Client, stop: threading.Event, watch: Callable[[], None] = lambda: None
@@ -48,7 +42,6 @@ class MotionRunner(EpisodeRunner):
         Raises:
             NodeError: the nodes do not come up.
             SessionError: activation is rejected to the end, with every reason.
-            Interrupted: Ctrl-C.
         """
         self.wait_until_ready(self.client.profile.task.worker, self._streams)
         self.start("hold", rate_hz)
@@ -62,13 +55,10 @@ class MotionRunner(EpisodeRunner):
         """Publish a prompt, wait for its end and for rest, and judge.
 
         Args:
-            segment: prompt and steps.
-            rate_hz: at which chunks are requested.
             progress: called with the accepted steps.
 
         Raises:
             NodeError: it does not end, or the arm does not stay active.
-            Interrupted: Ctrl-C.
         """
         before, began_s = self._rest_pose(), time.monotonic()
         prompt, patience_s = segment.prompt_with_count, segment.steps / rate_hz * 2 + SLACK_S

@@ -93,7 +93,6 @@ def make_segment(prompt: str, steps: int) -> DemoSegment:
 
 
 def tour() -> list[DemoSegment]:
-    """The default demo."""
     return [make_segment(prompt, steps) for prompt, steps in TOUR]
 
 
@@ -160,7 +159,6 @@ class SegmentOutcome:
         return out
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers for JSON."""
         faults = self.faults()
         return {
             "prompt": self.segment.prompt,

@@ -15,8 +15,7 @@ from vla_zenoh.lab.doctor.computer import (
     video_devices,
     wall_clock,
 )
-from vla_zenoh.lab.doctor.finding import HostFinding, Level
-from vla_zenoh.lab.doctor.needs import Needs, Role, needs_of
+from vla_zenoh.lab.doctor.needs import HostFinding, Level, Needs, Role, needs_of
 from vla_zenoh.lab.doctor.software import libraries, msgpack_in_c, opengl, python_version
 
 __all__ = ["HostFinding", "Level", "Needs", "Role", "examine", "needs_of"]
@@ -28,7 +27,6 @@ def examine(needs: Needs, try_zenoh: Callable[[str], str]) -> Iterator[HostFindi
     """Run all checks; yields each finding as soon as it is made. Some take seconds.
 
     Args:
-        needs: of this host.
         try_zenoh: opens a session at an endpoint and closes it; returns why that failed, or "".
     """
     yield python_version()

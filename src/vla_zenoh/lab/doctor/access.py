@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from vla_zenoh.errors import MissingExtraError, SecurityError, VlaZenohError
 from vla_zenoh.lab.certificates.bridge import NODE as BRIDGE
 from vla_zenoh.lab.certificates.lab_certificates import unused_certificates
-from vla_zenoh.lab.doctor.finding import HostFinding
+from vla_zenoh.lab.doctor.needs import HostFinding
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.session import is_loopback
 from vla_zenoh.security.identity import Identity
@@ -30,7 +30,6 @@ class AccessVerdict:
     """Result of the access check for one identity.
 
     Args:
-        identity: that verdict.
         must: number of acts that it must be able to do.
         must_not: number of acts that it must not be able to do.
         faults: each a sentence with the rule that is missing or too much.
@@ -51,7 +50,6 @@ def access(
     """Certificates of this computer, rules of the profile, and the running router.
 
     Args:
-        profile: the lab.
         now: UTC.
         check_access: see `vla_zenoh.lab.doctor.access_check`.
         try_identity: presents the certificate of a node of this computer to the running router;
@@ -148,7 +146,6 @@ def router(endpoint: str, *, is_router: bool, try_zenoh: Callable[[str], str]) -
 
     Args:
         endpoint: as Zenoh writes it, ``tcp/127.0.0.1:7447``.
-        is_router: the router runs on this host.
         try_zenoh: opens a session there and closes it; returns why that failed, or "".
     """
     name = f"router {endpoint}"

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -19,11 +20,81 @@ from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import SecurityError
 from vla_zenoh.keys import Keys, covers
 from vla_zenoh.lab.doctor.access import AccessVerdict
-from vla_zenoh.lab.doctor.access_rules import allowing, missing, passages
 from vla_zenoh.profile import Profile
 from vla_zenoh.security.identity import Identity, Role, identities
 from vla_zenoh.security.roles import OWN, TABLE, Act, expressions, rights
-from vla_zenoh.security.rules import access_control
+from vla_zenoh.security.rules import IN, MESSAGES, OUT, access_control
+
+
+@dataclass(frozen=True, slots=True)
+class Passage:
+    """A message of one identity on its way through the router."""
+
+    flow: str
+    message: str
+    key: str
+
+    def __str__(self) -> str:
+        return f"{self.flow} {self.message} {self.key}"
+
+
+def passages(act: Act, key: str) -> list[Passage]:
+    """What has to pass the router for `act` on `key`."""
+    return [Passage(flow, message, key) for flow, message in MESSAGES[act]]
+
+
+def allows(config: Mapping[str, Any], common_name: str, passage: Passage) -> bool:
+    """Whether a section ``access_control`` lets a message of `common_name` pass.
+
+    Reads certificates' names as subjects, which is what `access_control` makes. Of two rules that
+    apply the one that denies wins, as in Zenoh.
+    """
+    if not config.get("enabled", False):
+        return True
+    verdicts = {rule["permission"] for rule in _applying(config, common_name, passage)}
+    if "deny" in verdicts:
+        return False
+    return "allow" in verdicts or config.get("default_permission") == "allow"
+
+
+def allowing(config: Mapping[str, Any], common_name: str, passage: Passage) -> list[str]:
+    """Names of the rules by which a message of `common_name` passes."""
+    found = _applying(config, common_name, passage)
+    return [str(rule["id"]) for rule in found if rule["permission"] == "allow"]
+
+
+def _applying(
+    config: Mapping[str, Any], common_name: str, passage: Passage
+) -> list[Mapping[str, Any]]:
+    subjects = {
+        subject["id"]
+        for subject in config.get("subjects") or ()
+        if common_name in (subject.get("cert_common_names") or (common_name,))
+    }
+    ruled = {
+        rule
+        for policy in config.get("policies") or ()
+        if subjects.intersection(policy["subjects"])
+        for rule in policy["rules"]
+    }
+    return [
+        rule
+        for rule in config.get("rules") or ()
+        if rule["id"] in ruled
+        and passage.flow in (rule.get("flows") or (IN, OUT))
+        and passage.message in rule["messages"]
+        and any(covers(key, passage.key) for key in rule["key_exprs"])
+    ]
+
+
+def missing(config: Mapping[str, Any], identity: Identity, act: Act, key: str) -> list[Passage]:
+    """Messages that `identity` needs for `act` on `key` and `config` drops."""
+    return [
+        passage
+        for passage in passages(act, key)
+        if not allows(config, identity.common_name, passage)
+    ]
+
 
 REPLY_S = 2.0
 RobotIdentity = tuple[Keys, Identity]
@@ -31,14 +102,11 @@ RobotIdentity = tuple[Keys, Identity]
 
 
 def check_access(
-    profile: Profile,
-    access: Mapping[str, Any] | None = None,
-    also: Sequence[Profile] = (),
+    profile: Profile, access: Mapping[str, Any] | None = None, also: Sequence[Profile] = ()
 ) -> list[AccessVerdict]:
     """Check every act on every key for every identity.
 
     Args:
-        profile: the lab.
         access: section ``access_control`` to check; None: the one made of the profiles.
         also: other robots of the router; every identity of each is checked on the keys of all.
     """
@@ -117,7 +185,6 @@ def try_identity(profile: Profile, node: str | None) -> str:
     """Why the running router does not serve this computer's certificate for `node`; empty: it does.
 
     Args:
-        profile: the lab.
         node: of the certificate; None: the operator's.
 
     Raises:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from vla_zenoh.errors import NodeError
-from vla_zenoh.lab.doctor.finding import HostFinding
+from vla_zenoh.lab.doctor.needs import HostFinding
 from vla_zenoh.nodes.camera.v4l2 import DEV, find_device
 
 PRIORITY = 50
@@ -22,12 +22,20 @@ LIMITS_FILE = "/etc/security/limits.d/90-vla-zenoh.conf"
 CPU = Path("/sys/devices/system/cpu")
 
 
-def real_time_priority() -> HostFinding:
-    """This user may use a real-time priority (tried, and undone)."""
+def may_use_priority(priority: int) -> bool:
+    """Whether this user may use a real-time priority (tried, and undone)."""
     policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     except OSError:
+        return False
+    os.sched_setscheduler(0, policy, parameters)
+    return True
+
+
+def real_time_priority() -> HostFinding:
+    """This user may use the priority of nodes that move an arm."""
+    if not may_use_priority(PRIORITY):
         allowed = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
         return HostFinding(
             "real-time priority",
@@ -36,7 +44,6 @@ def real_time_priority() -> HostFinding:
             f"add the line '{_user()} - rtprio {PRIORITY}' to {LIMITS_FILE} and log in again; "
             "in a container: --cap-add=SYS_NICE",
         )
-    os.sched_setscheduler(0, policy, parameters)
     return HostFinding("real-time priority", "ok", f"SCHED_FIFO {PRIORITY} is permitted")
 
 
@@ -142,7 +149,6 @@ def video_devices(needed: Sequence[str] = (), dev: Path = DEV) -> HostFinding:
 
     Args:
         needed: as `find_device` takes them: paths, numbers, serial numbers, names.
-        dev: folder of devices.
     """
     present = sorted(dev.glob("video[0-9]*"))
     try:
@@ -180,14 +186,13 @@ _ADVICE = "sudo apt install chrony (needed when nodes run on more than one host)
 
 def wall_clock() -> HostFinding:
     """The wall clock is synchronised, as the kernel reports: time stamps cross hosts."""
-    state = kernel_state()
+    return clock_finding(kernel_state())
+
+
+def clock_finding(state: int | None) -> HostFinding:
+    """Finding on the return value of adjtimex; None: it cannot be called."""
     if state is None:
         return HostFinding("wall clock", "warn", "unknown here", _ADVICE)
-    return clock_finding(state)
-
-
-def clock_finding(state: int) -> HostFinding:
-    """Finding on the return value of adjtimex."""
     if state == TIME_ERROR:
         return HostFinding("wall clock", "warn", "not synchronised", _ADVICE)
     return HostFinding("wall clock", "ok", "synchronised")

@@ -17,8 +17,9 @@ import numpy as np
 from vla_zenoh.errors import MissingExtraError, NodeError, how_to_install
 from vla_zenoh.kinematics.kinematics import Kinematics, make_kinematics
 from vla_zenoh.kinematics.so3 import Pose, pose_distance
-from vla_zenoh.lab.doctor.finding import HostFinding, Level
+from vla_zenoh.lab.doctor.computer import may_use_priority
 from vla_zenoh.lab.doctor.franka_limits import BY_FCI, JOINTS
+from vla_zenoh.lab.doctor.needs import HostFinding, Level
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.robot import FrankaProfile
 from vla_zenoh.robots.franka.arm import FrankaArm, error_names, flange_pose
@@ -85,15 +86,11 @@ def kernel(franka: FrankaProfile, flag: Path = REALTIME_KERNEL) -> HostFinding:
 
 
 def priority(franka: FrankaProfile) -> HostFinding:
-    """This user may use the priority that libfranka takes (tried, and undone)."""
-    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(HIGHEST_PRIORITY))
-    except OSError:
+    """This user may use the priority that libfranka takes."""
+    if not may_use_priority(HIGHEST_PRIORITY):
         advice = f"allow this user rtprio {HIGHEST_PRIORITY} and memlock unlimited (limits.conf)"
         found = f"SCHED_FIFO {HIGHEST_PRIORITY} is not permitted"
         return HostFinding("FCI: priority", _level(franka), found, advice)
-    os.sched_setscheduler(0, policy, parameters)
     return HostFinding("FCI: priority", "ok", f"SCHED_FIFO {HIGHEST_PRIORITY} is permitted")
 
 

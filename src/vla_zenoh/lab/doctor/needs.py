@@ -8,6 +8,24 @@ from typing import Literal
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.profile import Profile
 
+Level = Literal["ok", "warn", "fail"]
+
+
+@dataclass(frozen=True, slots=True)
+class HostFinding:
+    """Result of one check.
+
+    Args:
+        level: ``ok``; ``warn``: works, with limits; ``fail``: something will not work.
+        advice: the package, command or setting that helps; empty with ``ok``.
+    """
+
+    name: str
+    level: Level
+    found: str
+    advice: str = ""
+
+
 Role = Literal["base", "control", "sim", "ros2"]
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
@@ -20,8 +38,6 @@ class Needs:
     Args:
         roles: sets of libraries that are required; others only give a warning.
         is_router: the router runs here: its port has to be free, or a router's already.
-        endpoints: of the router.
-        devices: required video devices.
     """
 
     roles: frozenset[Role] = frozenset({"base"})

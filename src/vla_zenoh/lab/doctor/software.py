@@ -10,8 +10,7 @@ from collections.abc import Iterator, Mapping
 from importlib import metadata
 
 from vla_zenoh.errors import MissingExtraError, NodeError, VlaZenohError, how_to_install
-from vla_zenoh.lab.doctor.finding import HostFinding
-from vla_zenoh.lab.doctor.needs import Role
+from vla_zenoh.lab.doctor.needs import HostFinding, Role
 from vla_zenoh.profile import Profile
 from vla_zenoh.simulation.render import RAYCAST, VARIABLE, Backend, choose_backend
 
@@ -71,7 +70,6 @@ for name in sys.argv[1:]:
 
 
 def python_version(version: tuple[int, ...] = tuple(sys.version_info[:3])) -> HostFinding:
-    """The Python version."""
     text = ".".join(map(str, version))
     if version < OLDEST_PYTHON:
         return HostFinding("Python", "fail", text, "install Python 3.11 or newer")
@@ -167,7 +165,6 @@ def opengl(wanted: str | None = None) -> HostFinding:
 
 
 def renderer_finding(backend: Backend) -> HostFinding:
-    """Finding on the selected backend."""
     if backend.name != RAYCAST:
         return HostFinding(NAME, "ok", f"drawn by OpenGL through {backend.name}")
     if not backend.reason:
@@ -185,7 +182,6 @@ def robot(profile: Profile, host: str | None = None) -> Iterator[HostFinding]:
     """The robot description loads, with meshes and every name in the profile.
 
     Args:
-        profile: the lab.
         host: which of its hosts this computer is; None: all of them. Hosts without the command
             node have no finding.
     """

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from vla_zenoh.errors import MissingExtraError, NodeError
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.kinematics.so3 import Pose, exp3, pose_distance
-from vla_zenoh.lab.doctor.finding import HostFinding
+from vla_zenoh.lab.doctor.needs import HostFinding
 from vla_zenoh.profile import Profile
 from vla_zenoh.robots.ur_arm import WELL, UrArm
 

@@ -55,7 +55,6 @@ class RequestedPath(NamedTuple):
     """Waypoints that a chunk requests.
 
     Args:
-        dt_s: between two waypoints.
         poses: W_0, the measured pose, to W_H.
         widths_m: openings of the gripper; None where the chunk has no gripper.
     """
@@ -87,15 +86,11 @@ class Disagreement:
         only_a: chunks of A without a partner.
         only_b: chunks of B without a partner.
         unreadable: pairs with a step that does not fit its spec.
-        apart_s: mean time between the observations of a pair.
         after_s: mean time ahead at which the paths are compared.
         mean: (6,) mean of the absolute difference along `AXES`, m and rad.
         p95: (6,) its 95th percentile.
         bias: (6,) mean of B minus A.
-        distance_m: mean distance between the requested positions.
-        angle_rad: mean angle between the orientations.
         cosine: mean cosine between the directions, where both move; None: never.
-        moving: pairs in which both move.
         gripper: share of pairs in which the requested widths differ; None: not both have one.
     """
 
@@ -142,17 +137,7 @@ def disagreement(
     max_width_m: float,
     tolerance_s: float = DEFAULT_TOLERANCE_S,
 ) -> Disagreement:
-    """Difference between workers A and B.
-
-    Args:
-        a: chunks of one worker, in any order.
-        b: of the other.
-        spec_a: of A's steps.
-        spec_b: of B's steps.
-        standing_at: state of the arm at a wall time (ns).
-        max_width_m: of the gripper.
-        tolerance_s: observations further apart are not compared.
-    """
+    """Difference between workers A and B. `standing_at`: state of the arm at a wall time (ns)."""
     pairs = _pairs(a, b, round(tolerance_s * 1e9))
     rows: list[_Row] = []
     unreadable = 0

@@ -22,10 +22,7 @@ _IDENTITY, _SERIES = {"name", "path"}, {"request_t_s", "width_m", "width_t_s"}
 _OF_ONE_RUN = (
     _IDENTITY
     | _SERIES
-    | {
-        *("problems", "measured", "commanded", "marks", "views"),
-        *("about", "film"),
-    }
+    | {*("problems", "measured", "commanded", "marks", "views"), *("about", "film")}
 )
 _OF_A_ROBOT = {"requests", "succeeded", "seconds", "refusals", "skipped", "verdicts"}
 
@@ -56,8 +53,6 @@ def evaluate(
     A robot of parts has an evaluation for each part.
 
     Args:
-        paths: files and folders.
-        pictures: number of moments to show of each camera.
         evaluated: called after each file.
 
     Returns:

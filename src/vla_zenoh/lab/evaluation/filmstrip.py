@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,6 +11,7 @@ from vla_zenoh.codec import image as image_codec
 from vla_zenoh.errors import CodecError, SpecError
 from vla_zenoh.lab.evaluation.result import CameraView
 from vla_zenoh.lab.recording.run import RecordedImage, Run, pictures, seen_pictures
+from vla_zenoh.lab.video import at_height
 from vla_zenoh.policy import CameraSpec
 from vla_zenoh.policy.observation import prepare_image
 from vla_zenoh.types import ActionChunk, Image
@@ -87,8 +87,6 @@ def _views(
 
 
 def _small(rgb: NDArray[np.uint8]) -> bytes:
-    height, width = rgb.shape[:2]
-    if height > HEIGHT_PX:
-        size = (max(1, round(width * HEIGHT_PX / height)), HEIGHT_PX)
-        rgb = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
+    if rgb.shape[0] > HEIGHT_PX:
+        rgb = at_height(rgb, HEIGHT_PX)
     return image_codec.encode_jpeg(Image(np.ascontiguousarray(rgb)), QUALITY)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime as dt
 import tempfile
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -11,16 +12,86 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vla_zenoh.errors import MissingExtraError
-from vla_zenoh.lab.evaluation import trajectory
+from vla_zenoh.errors import MissingExtraError, ProfileError
 from vla_zenoh.lab.evaluation.activations import activations, obeyed_chunks, prompt_intervals
 from vla_zenoh.lab.evaluation.filmstrip import filmstrip
-from vla_zenoh.lab.evaluation.provenance import provenance, verdicts
-from vla_zenoh.lab.evaluation.result import Evaluation, PlotTrace
-from vla_zenoh.lab.evaluation.segments import segment
+from vla_zenoh.lab.evaluation.result import TASKS, Evaluation, PlotTrace, TaskVerdict
+from vla_zenoh.lab.evaluation.segments import (
+    angles_rad,
+    idle_s,
+    path_m,
+    rotvecs,
+    segment,
+    turned_rad,
+)
+from vla_zenoh.lab.policy_servers.model_options import shown
 from vla_zenoh.lab.recording.film import Film, write_film
 from vla_zenoh.lab.recording.run import RecordedSample, Run, load_run
+from vla_zenoh.lab.trial.verdict import FACT
+from vla_zenoh.profile import Profile, read_profile
 from vla_zenoh.types import LATENCY_STAGES, Cause, FloatArray, NodeStatus
+
+
+def provenance(run: Run) -> dict[str, str]:
+    """Name and value of each known fact."""
+    about, ended = run.file.about, run.file.ended or {}
+    began = dt.datetime.fromtimestamp(run.began_ns / 1e9).astimezone()
+    rates = dict.fromkeys(f"{entry.record.rate_hz:g}" for entry in run.tasks if entry.record.active)
+    facts = {
+        "recorded": f"{began:%Y-%m-%d %H:%M:%S %Z}, {run.seconds:.0f} s",
+        "host": about.get("host", ""),
+        "code": about.get("code") or about.get("version", ""),
+        "command": about.get("command", ""),
+        "robot": about["robot"],
+        "profile": about.get("profile", ""),
+        "model": _models(run),
+        "rate": f"{', '.join(rates)} Hz" if rates else "",
+        "seed": str(ended.get("seed", "")),
+    }
+    return {name: value for name, value in facts.items() if value}
+
+
+def _models(run: Run) -> str:
+    """Workers that the arm obeyed, with model and options."""
+    try:
+        profile = read_profile(run.file.profile_yaml, str(run.path))
+    except ProfileError:
+        profile = None
+    workers = dict.fromkeys(worker for _, _, worker in activations(run))
+    return "; ".join(_model(worker, profile) for worker in workers)
+
+
+def _model(worker: str, profile: Profile | None) -> str:
+    if profile is None:
+        return worker
+    model = profile.models.get(worker, worker)
+    options = shown(profile.options.get(worker, {}))
+    words = [model] if model != worker else []
+    words += [f"{name}={value}" for name, value in options.items()]
+    return f"{worker} ({', '.join(words)})" if words else worker
+
+
+def verdicts(run: Run) -> list[TaskVerdict]:
+    """Verdicts in the recording: of a demo's judge, or of the person of a trial."""
+    ended = run.file.ended or {}
+    out: list[TaskVerdict] = []
+    tasks = ended.get(TASKS)
+    for fact in tasks if isinstance(tasks, list) else ():
+        if isinstance(fact, dict):
+            said, success = str(fact.get("said", "")), fact.get("success")
+            out.append(
+                TaskVerdict(
+                    str(fact.get("prompt", "")), success if type(success) is bool else None, said
+                )
+            )
+    trial = ended.get(FACT)
+    if isinstance(trial, dict) and "verdict" in trial:
+        word, note = str(trial["verdict"]), str(trial.get("note", ""))
+        prompt = str(trial.get("prompt", ""))
+        success = None if word == "void" else word == "success"
+        out.append(TaskVerdict(prompt, success, f"{word}: {note}" if note else word))
+    return out
+
 
 FILM, MAX_FILM_S = Film(height_px=270, rate_hz=10, quality=30), 180.0
 """The film of a page, and how long a run may be for one."""
@@ -44,10 +115,6 @@ class MeasuredMotion(NamedTuple):
 
 def evaluate_run(path: Path, *, pictures: int = 0) -> Evaluation:
     """Evaluate a recording of one arm; `Evaluation.problems` lists what cannot be read.
-
-    Args:
-        path: of the file.
-        pictures: number of moments to show of each camera.
 
     Raises:
         RecordingError: the file cannot be opened, or is of another program.
@@ -157,16 +224,16 @@ def _commanded(run: Run, zero_ns: int) -> MeasuredMotion:
 
 
 def _motion(out: Evaluation, measured: MeasuredMotion, commanded: MeasuredMotion) -> None:
-    out.path_m = trajectory.path_m(measured.position_m)
-    out.path_rad = trajectory.turned_rad(measured.quat_xyzw)
-    out.command_path_m = trajectory.path_m(commanded.position_m)
-    out.command_path_rad = trajectory.turned_rad(commanded.quat_xyzw)
+    out.path_m = path_m(measured.position_m)
+    out.path_rad = turned_rad(measured.quat_xyzw)
+    out.command_path_m = path_m(commanded.position_m)
+    out.command_path_rad = turned_rad(commanded.quat_xyzw)
     start = measured if len(measured.t_s) else commanded
     for name, motion in (("measured", measured), ("commanded", commanded)):
         if len(motion.t_s):
             quats = np.vstack([start.quat_xyzw[:1], motion.quat_xyzw])
             speed_m_s = np.linalg.norm(motion.twist[:, :3], axis=1)
-            turns = trajectory.rotvecs(quats)[1:]
+            turns = rotvecs(quats)[1:]
             setattr(out, name, PlotTrace(motion.t_s, motion.position_m, turns, speed_m_s))
     if not (len(measured.t_s) and len(commanded.t_s) > 1):
         return
@@ -180,7 +247,7 @@ def _motion(out: Evaluation, measured: MeasuredMotion, commanded: MeasuredMotion
     )
     off = np.linalg.norm(between - measured.position_m, axis=1)
     nearer = np.where(share < 0.5, later - 1, later)
-    turned = trajectory.angles_rad(commanded.quat_xyzw[nearer], measured.quat_xyzw)
+    turned = angles_rad(commanded.quat_xyzw[nearer], measured.quat_xyzw)
     out.tracking_mm, out.tracking_mrad = off[within] * 1e3, turned[within] * 1e3
 
 
@@ -237,7 +304,7 @@ def _idle(out: Evaluation, run: Run, measured: MeasuredMotion) -> None:
         if len(part.t_s) > 1:
             speed = np.linalg.norm(part.twist[:-1, :3], axis=1)
             turn = np.linalg.norm(part.twist[:-1, 3:], axis=1)
-            out.idle_s += trajectory.idle_s(part.t_s, speed, turn)
+            out.idle_s += idle_s(part.t_s, speed, turn)
 
 
 def _counted(
@@ -257,10 +324,7 @@ def _counted(
 
 # -- prompts --------------------------------------------------------------------------------------
 def _segments(
-    out: Evaluation,
-    run: Run,
-    causes: Sequence[tuple[Cause, int]],
-    measured: MeasuredMotion,
+    out: Evaluation, run: Run, causes: Sequence[tuple[Cause, int]], measured: MeasuredMotion
 ) -> None:
     """A segment for each prompt in force while the arm was active."""
     zero_ns = run.began_ns

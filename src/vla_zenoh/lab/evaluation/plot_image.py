@@ -23,13 +23,6 @@ def write_plot(path: Path, run: Evaluation) -> bool:
     """Draw the curves of a run, one panel below the other; returns whether there were any.
 
     Prompts are numbered; the numbers stand above the curves and are explained in the head.
-
-    Args:
-        path: of the file.
-        run: to draw.
-
-    Raises:
-        MissingExtraError: matplotlib is not installed.
     """
     try:
         import matplotlib

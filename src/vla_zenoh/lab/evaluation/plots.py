@@ -25,11 +25,7 @@ MAX_MARKS = 60
 
 
 def library() -> str:
-    """plotly's JavaScript, for the head of the page.
-
-    Raises:
-        MissingExtraError: plotly is not installed.
-    """
+    """plotly's JavaScript, for the head of the page."""
     try:
         from plotly.offline import get_plotlyjs
     except ImportError as error:

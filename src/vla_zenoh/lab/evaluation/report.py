@@ -5,11 +5,10 @@ from __future__ import annotations
 import datetime as dt
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
-from importlib.resources import files
 from typing import Any
 
 from vla_zenoh import __version__
-from vla_zenoh.errors import MissingExtraError
+from vla_zenoh.lab.durable import page_language, page_template
 from vla_zenoh.lab.evaluation import plots, tables
 from vla_zenoh.lab.evaluation.evaluate import combined
 from vla_zenoh.lab.evaluation.result import STAGES, CameraView, Evaluation
@@ -22,21 +21,12 @@ TABLE = """<table><tr>{% for name in columns %}<th{{ "" if loop.first else ' cla
 
 
 def page(runs: Sequence[Evaluation], faults: Mapping[str, str]) -> str:
-    """The whole page.
+    """The whole page. Raises MissingExtraError: plotly or jinja2 is not installed."""
+    cells = page_language().from_string(TABLE)
+    from markupsafe import Markup
 
-    Raises:
-        MissingExtraError: plotly or jinja2 is not installed.
-    """
-    try:
-        from jinja2 import Environment
-        from markupsafe import Markup
-    except ImportError as error:
-        raise MissingExtraError("jinja2", "record") from error
-    text = files("vla_zenoh.lab.evaluation").joinpath(TEMPLATE).read_text("utf-8")
-    language = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    cells = language.from_string(TABLE)
     together = [combined(runs)] if len(runs) > 1 else []
-    return language.from_string(text).render(
+    return page_template("vla_zenoh.lab.evaluation", TEMPLATE).render(
         title=f"Evaluation of {runs[0].name if len(runs) == 1 else f'{len(runs)} runs'}",
         version=__version__,
         made=f"{dt.datetime.now():%Y-%m-%d %H:%M}",

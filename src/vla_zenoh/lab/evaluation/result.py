@@ -255,10 +255,7 @@ class Evaluation:
                 "min": float(np.nanmin(self.width_m)),
                 "max": float(np.nanmax(self.width_m)),
             },
-            "segments": [
-                {name: getattr(segment, name) for name in PromptSegment.__dataclass_fields__}
-                for segment in self.segments
-            ],
+            "segments": [asdict(segment) for segment in self.segments],
             "problems": self.problems,
             "about": self.about,
             "verdicts": [asdict(verdict) for verdict in self.verdicts],

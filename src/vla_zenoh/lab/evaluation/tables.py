@@ -10,17 +10,8 @@ from vla_zenoh.types import FloatArray
 
 LATENCY_COLUMNS = ("min", "mean", "p50", "p95", "max")
 SUMMARY_COLUMNS = (
-    "run",
-    "n",
-    "ok",
-    "p50 ms",
-    "p95 ms",
-    "path m",
-    "turn rad",
-    "off mm",
-    "track mm",
-    "idle s",
-    "refused",
+    *("run", "n", "ok", "p50 ms", "p95 ms", "path m", "turn rad"),
+    *("off mm", "track mm", "idle s", "refused"),
 )
 """Requests, success rate, end-to-end latency, path of the TCP, largest distance off the requested
 axis, tracking error (p95), time standing while active, rejections."""
@@ -105,13 +96,8 @@ def segment_rows(run: Evaluation) -> list[tuple[str, ...]]:
 
 
 SEGMENT_COLUMNS = (
-    "prompt",
-    "steps",
-    "asked",
-    "reached",
-    "off axis",
-    "rotation off axis",
-    "gripper",
+    *("prompt", "steps", "asked", "reached"),
+    *("off axis", "rotation off axis", "gripper"),
 )
 
 
@@ -133,6 +119,11 @@ HINTS = {
 def figures(run: Evaluation) -> list[tuple[str, str]]:
     """Name and value of every figure; docs/how-to/recording.md says what they mean."""
     jerk_unit = run.jerk_unit.replace("_s3", "/s³")
+    idle = (
+        f"{run.idle_s:.1f} of {run.active_s:.1f} s"
+        if run.idle_s is not None and run.active_s
+        else NONE
+    )
     rows = [
         ("tasks done", tasks_done(run)),
         ("requests", str(run.requests)),
@@ -145,7 +136,7 @@ def figures(run: Evaluation) -> list[tuple[str, str]]:
         ("tracking error, mean / p95 / max", _three(run.tracking_mm, "mm")),
         ("rotation tracking, mean / p95 / max", _three(run.tracking_mrad, "mrad")),
         ("commanded jerk, mean / p95 / max", _three(run.jerk, jerk_unit, 1)),
-        ("idle while active", _share(run.idle_s, run.active_s)),
+        ("idle while active", idle),
         ("chunk seams", str(len(run.seam_goal_mm)) if len(run.seam_goal_mm) else NONE),
         ("goal at seams moves, mean / p95 / max", _three(run.seam_goal_mm, "mm")),
         ("velocity step at seams", _three(run.seam_velocity_mm_s, "mm/s")),
@@ -163,12 +154,6 @@ def _three(values: FloatArray, unit: str, digits: int = 2) -> str:
     return " / ".join(f"{value:.{digits}f}" for value in (found.mean, found.p95, found.max)) + (
         f" {unit}"
     )
-
-
-def _share(part: float | None, whole: float | None) -> str:
-    if part is None or not whole:
-        return NONE
-    return f"{part:.1f} of {whole:.1f} s"
 
 
 def _counts(counts: Sequence[tuple[str, int]]) -> str:

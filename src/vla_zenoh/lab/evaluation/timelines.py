@@ -26,11 +26,9 @@ class Curve(NamedTuple):
     """One curve.
 
     Args:
-        name: for its label.
         colour: ``#rrggbb``.
         t_s: (n,) since the run began.
         values: (n,).
-        halo: drawn broad and faint, behind another curve.
     """
 
     name: str
@@ -41,15 +39,7 @@ class Curve(NamedTuple):
 
 
 class Panel(NamedTuple):
-    """Curves on one axis.
-
-    Args:
-        title: what they show.
-        unit: of the axis.
-        curves: back to front.
-        stacked: on top of one another.
-        note: figures for the title.
-    """
+    """Curves on one axis. `unit`: of the axis."""
 
     title: str
     unit: str

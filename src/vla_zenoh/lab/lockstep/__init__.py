@@ -11,7 +11,7 @@ Fault injection: `Lockstep.tamper` may drop, delay, repeat or change every messa
 from __future__ import annotations
 
 from vla_zenoh.lab.lockstep.loop import CAMERA, COMMAND, SIM, START_NS, TICK_NS, Lockstep
-from vla_zenoh.lab.lockstep.records import Delays, LockstepTrace, Message, Tamper
+from vla_zenoh.lab.lockstep.worker import Delays, LockstepTrace, Message, Tamper
 
 __all__ = [
     "CAMERA",

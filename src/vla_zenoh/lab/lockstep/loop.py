@@ -20,8 +20,7 @@ from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.errors import CodecError
 from vla_zenoh.guard.arm_guard import GripperGuard, Measured, make_arm_guard
 from vla_zenoh.kinematics.so3 import Pose
-from vla_zenoh.lab.lockstep.records import Delays, LockstepTrace, Message, Tamper
-from vla_zenoh.lab.lockstep.worker import LockstepWorker
+from vla_zenoh.lab.lockstep.worker import Delays, LockstepTrace, LockstepWorker, Message, Tamper
 from vla_zenoh.policy import Policy
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
@@ -29,14 +28,9 @@ from vla_zenoh.types import (
     Depth,
     Event,
     GripperCommand,
-    GripperState,
     Header,
     HeldBox,
     Image,
-    JointCommand,
-    JointState,
-    PoseCommand,
-    PoseState,
     Stamped,
     Task,
 )
@@ -55,15 +49,12 @@ class Lockstep:
     """All nodes of one robot in lockstep. `put` publishes a setting, `run` advances time.
 
     Args:
-        profile: limits, timing, cameras.
-        world: the simulated robot.
         policy: the model; its ``load`` is called here if it has one.
         delays: see `Delays`.
         picture: image of a camera, by name; None: small gray images.
         depth: depth picture of a camera, by name; None: half a metre everywhere.
         reach: see `Commander`.
         dry_run: see `Commander`.
-        seed: of the jitter.
         others: more workers, by name; they run without effect until selected.
     """
 
@@ -128,7 +119,6 @@ class Lockstep:
         self._inbox.settings = [*self._inbox.settings, Setting(name, value, part=part)]
 
     def run(self, duration_s: float) -> None:
-        """Advance time by `duration_s`."""
         end_ns = self.now_ns + round(duration_s * 1e9)
         while self.now_ns < end_ns:
             self._tick()
@@ -139,6 +129,17 @@ class Lockstep:
         while not condition() and self.now_ns < end_ns:
             self._tick()
         return condition()
+
+    def activate(self, patience_s: float, period_s: float) -> str:
+        """Activate, again and again; the last rejection, empty: the arm is active."""
+        end_ns = self.now_ns + round(patience_s * 1e9)
+        while not self.commander.task.active:
+            if self.now_ns > end_ns:
+                whys = [event.why for event in self.events if event.what == "activate_refused"]
+                return whys[-1] if whys else "no reason"
+            self.put("active", True)
+            self.run(period_s)
+        return ""
 
     def set_clock(self, node: str, offset_s: float) -> None:
         """Set the wall clock of `node` (its stamps are its source) to this much past the others'.
@@ -222,9 +223,11 @@ class Lockstep:
         for part in self.guards:
             pose, joint, gripper = out.of(part)
             if pose is not None:
-                self._send(COMMAND, pose, partial(self._take_pose_command, part), part=part)
+                offer = self.guards[part].offer_pose
+                self._send(COMMAND, pose, partial(self._take_command, offer), part=part)
             if joint is not None:
-                self._send(COMMAND, joint, partial(self._take_joint_command, part), part=part)
+                offer = self.guards[part].offer_joint
+                self._send(COMMAND, joint, partial(self._take_command, offer), part=part)
             if gripper is not None:
                 self._send(COMMAND, gripper, partial(self._take_gripper_command, part), part=part)
         if out.task_changed or any(worker.task is None for worker in self.workers.values()):
@@ -234,16 +237,16 @@ class Lockstep:
         for part, guard in self.guards.items():
             arm = self._arm(part)
             held = arm.pose_state(guard.reference)
-            self._send(SIM, held, partial(self._take_pose_state, part), part=part)
+            self._send(SIM, held, partial(self._take_state, part, "pose"), part=part)
             gripper = arm.gripper_state()
             if guard.braking or guard.unheeded:
                 gripper = replace(gripper, mode="braking" if guard.braking else "unheeded")
-            self._send(SIM, gripper, partial(self._take_gripper_state, part), part=part)
+            self._send(SIM, gripper, partial(self._take_state, part, "gripper"), part=part)
             looks = [worker.spec.observation for worker in self.workers.values()]
             wanted = {what for each in looks for what in each.state_streams}
             if self.commander.parts[0].reach is not None or "joint" in wanted:
                 joints = arm.joint_state()
-                self._send(SIM, joints, partial(self._take_joint_state, part), part=part)
+                self._send(SIM, joints, partial(self._take_state, part, "joint"), part=part)
 
     def _publish_pictures(self) -> None:
         self._seq[CAMERA] += 1
@@ -298,33 +301,15 @@ class Lockstep:
         self._sent += 1
         heapq.heappush(self._arrivals, (arrival_ns, self._sent, arrive))
 
-    def _take_pose_state(self, part: str, state: Stamped[PoseState]) -> None:
+    def _take_state(self, part: str, name: str, state: Stamped[Any]) -> None:
+        """A state `pose`, `joint` or `gripper`, for commander and workers."""
+        newest = self._at(COMMAND, state)
         if part:
-            self._part_states(part, pose=self._at(COMMAND, state))
+            known = self._inbox.parts.get(part) or NewStates()
+            assert isinstance(known, NewStates)
+            self._inbox.parts = {**self._inbox.parts, part: known._replace(**{name: newest})}
         else:
-            self._inbox.pose = self._at(COMMAND, state)
-        self._take_state(state, part)
-
-    def _take_joint_state(self, part: str, state: Stamped[JointState]) -> None:
-        if part:
-            self._part_states(part, joint=self._at(COMMAND, state))
-        else:
-            self._inbox.joint = self._at(COMMAND, state)
-        self._take_state(state, part)
-
-    def _take_gripper_state(self, part: str, state: Stamped[GripperState]) -> None:
-        if part:
-            self._part_states(part, gripper=self._at(COMMAND, state))
-        else:
-            self._inbox.gripper = self._at(COMMAND, state)
-        self._take_state(state, part)
-
-    def _part_states(self, part: str, **newest: Stamped[Any]) -> None:
-        known = self._inbox.parts.get(part) or NewStates()
-        assert isinstance(known, NewStates)
-        self._inbox.parts = {**self._inbox.parts, part: known._replace(**newest)}
-
-    def _take_state(self, state: Stamped[Any], part: str) -> None:
+            setattr(self._inbox, name, newest)
         for worker in self.workers.values():
             worker.take_state(self._at(worker.source, state), part)
 
@@ -352,13 +337,8 @@ class Lockstep:
         left_ns = self._next_command_ns - self.now_ns
         self.commander.prepare(states, self.wall_ns(COMMAND) + left_ns)
 
-    def _take_pose_command(self, part: str, command: Stamped[PoseCommand]) -> None:
-        refusal = self.guards[part].offer_pose(self._at(SIM, command), self.wall_ns(SIM))
-        if refusal is not None:
-            self.guard_refused[refusal] += 1
-
-    def _take_joint_command(self, part: str, command: Stamped[JointCommand]) -> None:
-        refusal = self.guards[part].offer_joint(self._at(SIM, command), self.wall_ns(SIM))
+    def _take_command(self, offer: Callable[[Any, int], str | None], command: Stamped[Any]) -> None:
+        refusal = offer(self._at(SIM, command), self.wall_ns(SIM))
         if refusal is not None:
             self.guard_refused[refusal] += 1
 
@@ -366,10 +346,7 @@ class Lockstep:
         guard = self.guards[part]
         try:
             order = self._gripper_guards[part].accept(
-                command,
-                guard.writer,
-                self.wall_ns(SIM),
-                writer_active=guard.writer_active,
+                command, guard.writer, self.wall_ns(SIM), writer_active=guard.writer_active
             )
         except CodecError as error:
             self.guard_refused[error.reason] += 1

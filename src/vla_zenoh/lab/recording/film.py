@@ -11,11 +11,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_zenoh.codec import image as image_codec
-from vla_zenoh.errors import CodecError
 from vla_zenoh.lab.recording.run import Run
 from vla_zenoh.lab.recording.sample import JPEG
-from vla_zenoh.lab.video import VideoWriter
+from vla_zenoh.lab.video import VideoWriter, decoded_at_height
 
 STRIP, TEXT = 0.085, 0.026
 """Height of the strip below the images, and of letters in it, as shares of the height."""
@@ -33,7 +31,6 @@ class Film:
     """How a film looks.
 
     Args:
-        height_px: of the images.
         rate_hz: frames per second.
         quality: x264's constant rate factor; lower is better.
     """
@@ -53,14 +50,9 @@ def write_film(
     """Write a film that begins and ends with the recording; returns the number of its frames.
 
     Args:
-        path: of the file.
         run: with images; without any, no file is written.
-        look: of the film.
         verdicts: (wall ns, text, success), oldest first.
         progress: called with (frames done, frames in all).
-
-    Raises:
-        MissingExtraError: PyAV is not installed.
     """
     cameras = sorted(run.picture_counts)
     if not cameras:
@@ -77,7 +69,7 @@ def write_film(
         while done < total and (now_ns := run.began_ns + int(done / look.rate_hz * 1e9)) < until_ns:
             for camera, jpeg in newest.items():
                 if camera not in shown or shown[camera][0] is not jpeg:
-                    shown[camera] = (jpeg, _decoded(jpeg, look.height_px))
+                    shown[camera] = (jpeg, decoded_at_height(jpeg, look.height_px))
             pictures = [shown[camera][1] for camera in cameras if camera in shown]
             writer.add(captions.write(_beside(pictures, len(cameras), look.height_px), now_ns))
             done += 1
@@ -96,15 +88,6 @@ def write_film(
     return done
 
 
-def _decoded(jpeg: bytes, height_px: int) -> Picture:
-    try:
-        rgb = image_codec.decode_jpeg(jpeg).rgb
-    except CodecError:
-        return np.zeros((height_px, height_px, 3), np.uint8)
-    size = (max(1, round(rgb.shape[1] * height_px / rgb.shape[0])), height_px)
-    return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
-
-
 def _beside(pictures: Sequence[Picture], count: int, height_px: int) -> Picture:
     missing = [np.zeros_like(pictures[0])] * (count - len(pictures))
     strip = np.zeros((round(STRIP * height_px), sum(p.shape[1] for p in (*pictures, *missing)), 3))
@@ -112,12 +95,7 @@ def _beside(pictures: Sequence[Picture], count: int, height_px: int) -> Picture:
 
 
 class _Captions:
-    """Text of the strip at a time.
-
-    Args:
-        run: for prompt and state.
-        verdicts: as of `write_film`.
-    """
+    """Text of the strip at a time. `verdicts`: as of `write_film`."""
 
     def __init__(self, run: Run, verdicts: Sequence[tuple[int, str, bool]]) -> None:
         self._began_ns, self._tasks, self._verdicts = run.began_ns, run.tasks, verdicts
@@ -140,9 +118,7 @@ class _Captions:
         width = cv2.getTextSize(right, FONT, scale, 1)[0][0]
         margin = round(TEXT * picture.shape[0])
         below = picture.shape[0] - margin
-        for text, x, ink in (
-            (left, margin, WHITE),
-            (right, picture.shape[1] - width - margin, colour),
-        ):
+        end = picture.shape[1] - width - margin
+        for text, x, ink in ((left, margin, WHITE), (right, end, colour)):
             cv2.putText(picture, text, (x, below), FONT, scale, ink, 1, cv2.LINE_AA)
         return picture

@@ -11,6 +11,7 @@ import struct
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
@@ -23,8 +24,7 @@ from zstandard import ZstdError
 from vla_zenoh.errors import CodecError, RecordError, RecordingError
 from vla_zenoh.keys import Keys
 from vla_zenoh.lab.recording import ros2_messages
-from vla_zenoh.lab.recording.record_json import bytes_from_json, record_from_json
-from vla_zenoh.lab.recording.record_types import RECORDS
+from vla_zenoh.lab.recording.record_types import RECORDS, bytes_from_json, record_from_json
 from vla_zenoh.lab.recording.sample import Sample, received_sample
 from vla_zenoh.lab.recording.writer import ABOUT, BYTES, ENDED, PROFILE_FILE
 from vla_zenoh.types import Header
@@ -46,8 +46,6 @@ class Recording:
 
     Args:
         path: of the file, or of a folder of segments.
-        about: metadata from its start: robot, root, version, ...
-        profile_yaml: the profile that was in force.
     """
 
     def __init__(self, path: Path, about: dict[str, str], profile_yaml: str) -> None:
@@ -77,11 +75,16 @@ class Recording:
         schemas: dict[int, Schema] = {}
         channels: dict[int, _Source | None] = {}
         with path.open("rb") as file:
-            for record in _whole(file, self._note_damage):
+            for record in _whole(file, partial(setattr, self, "damage")):
                 if isinstance(record, Message):
                     source = channels.get(record.channel_id)
-                    entry = None if source is None else self._read(source, record)
-                    if entry is not None:
+                    if source is None:
+                        continue
+                    try:
+                        entry = source.sample(record)
+                    except CodecError as error:
+                        self.damage = self.damage or f"{source.key}: {error}"
+                    else:
                         yield entry
                 elif isinstance(record, Schema):
                     schemas[record.id] = record
@@ -89,14 +92,11 @@ class Recording:
                     source = _source(record, schemas)
                     channels[record.id] = source if source and wanted(source.key) else None
                 elif isinstance(record, Metadata) and record.name == ENDED:
-                    self.ended = self._facts(record)
-
-    def _facts(self, record: Metadata) -> dict[str, Any] | None:
-        try:
-            return {name: json.loads(value) for name, value in record.metadata.items()}
-        except (ValueError, RecursionError) as error:
-            self.damage = self.damage or f"its last facts are not JSON: {error}"
-            return None
+                    facts = record.metadata.items()
+                    try:
+                        self.ended = {name: json.loads(value) for name, value in facts}
+                    except (ValueError, RecursionError) as error:
+                        self.damage = self.damage or f"its last facts are not JSON: {error}"
 
     @property
     def dropped(self) -> int:
@@ -108,26 +108,13 @@ class Recording:
         counted = counts.items() if isinstance(counts, dict) else ()
         return {key: count for key, count in counted if type(count) is int}
 
-    def _note_damage(self, why: str) -> None:
-        self.damage = why
-
-    def _read(self, source: _Source, message: Message) -> Sample | None:
-        try:
-            return source.sample(message)
-        except CodecError as error:
-            self.damage = self.damage or f"{source.key}: {error}"
-            return None
-
 
 @dataclass(frozen=True, slots=True)
 class _Source:
     """A channel of one key and writer.
 
     Args:
-        key: the whole key.
         writer: source in its headers; empty for settings.
-        encoding: of the payloads.
-        schema: type of the messages.
         json_of: name of the record whose JSON a message holds, or `BYTES`; empty for the rest.
     """
 
@@ -195,7 +182,6 @@ def open_recording(path: Path) -> Recording:
 
     Raises:
         RecordingError: the file cannot be read, is no MCAP file, or is of another program.
-        MissingExtraError: rosbags is not installed.
     """
     segments = segments_of(path)
     if segments:
@@ -214,9 +200,9 @@ def open_recording(path: Path) -> Recording:
                 if isinstance(record, Metadata) and record.name == ABOUT:
                     about = record.metadata
                 elif isinstance(record, Attachment) and about and record.name == PROFILE_FILE:
-                    return Recording(
-                        path, _checked(path, about), record.data.decode("utf-8", "replace")
-                    )
+                    if not {"robot", "root"} <= about.keys():
+                        raise RecordingError(f"{path} does not say of which robot it is")
+                    return Recording(path, about, record.data.decode("utf-8", "replace"))
                 elif isinstance(record, Channel):
                     topics[record.topic] += 1
     except OSError as error:
@@ -228,9 +214,3 @@ def open_recording(path: Path) -> Recording:
         f"{path} is an MCAP file of another program (topics: {names or 'none'}); only those of "
         "`vla-zenoh record` say which key a message was on"
     )
-
-
-def _checked(path: Path, about: dict[str, str]) -> dict[str, str]:
-    if not {"robot", "root"} <= about.keys():
-        raise RecordingError(f"{path} does not say of which robot it is")
-    return about

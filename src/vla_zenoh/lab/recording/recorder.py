@@ -61,11 +61,6 @@ class RecordingResult:
     """Result of a recording.
 
     Args:
-        path: of the file.
-        seconds: duration.
-        size_bytes: of the file.
-        cpu_s: processor time of the writing thread.
-        samples: by key.
         dropped: samples by key that the disk was too slow for.
         failure: why it ended early; empty if it did not.
     """
@@ -83,10 +78,8 @@ def recorded_keys(keys: Keys, given: Sequence[str] = (), *, raw: bool = False) -
     """Key expressions to record.
 
     Args:
-        keys: of the robot.
         given: only these, below ``<root>/<robot>/`` or whole; empty: all keys of the robot but raw
             images, which are 1 MB each.
-        raw: raw images as well.
     """
     found = dict.fromkeys(map(keys.full, given)) or dict.fromkeys(keys.without_raw_images)
     if raw:
@@ -103,7 +96,6 @@ class Recorder:
     Args:
         profile: the effective profile; it is kept in the file.
         session: an open session; the caller closes it.
-        path: of the file.
         expressions: keys to record; None: the default of `recorded_keys`.
         name: node name; a second recorder needs another one.
         queue_bytes: payloads in memory at most.
@@ -111,7 +103,6 @@ class Recorder:
 
     Raises:
         RecordingError: the file exists or cannot be created.
-        NodeError: a node of this name is already alive.
     """
 
     def __init__(
@@ -152,11 +143,7 @@ class Recorder:
 
     # -- life ---------------------------------------------------------------------------------
     def start(self) -> Recorder:
-        """Subscribe and begin to record.
-
-        Raises:
-            RecordingError: not a key expression.
-        """
+        """Subscribe and begin to record. Raises RecordingError: not a key expression."""
         # With Python's default of 5 ms, Zenoh's thread may wait that long for the writing thread.
         sys.setswitchinterval(SWITCH_INTERVAL_S)
         self._queue.subscribe(self._expressions)
@@ -191,11 +178,7 @@ class Recorder:
         self._queue.close()
 
     def close(self, ended: Mapping[str, Any] | None = None) -> RecordingResult:
-        """Unsubscribe, write the queued samples and finish the file.
-
-        Args:
-            ended: further metadata for the end of the file.
-        """
+        """Unsubscribe, write the queued samples and finish the file."""
         self.stop_listening()
         self._ended = ended or {}
         self._closing.set()

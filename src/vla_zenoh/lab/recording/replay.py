@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
@@ -19,36 +19,82 @@ import zenoh
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import alive_nodes
 from vla_zenoh.codec import image as image_codec
+from vla_zenoh.codec import message
 from vla_zenoh.errors import CodecError, NodeError, RecordingError
+from vla_zenoh.keys import Keys
 from vla_zenoh.lab.recording.reader import Recording
-from vla_zenoh.lab.recording.restamp import Restamper
 from vla_zenoh.lab.recording.sample import JPEG, Sample
 from vla_zenoh.lab.statistics import percentiles
 from vla_zenoh.profile import Profile
 from vla_zenoh.runtime.scheduling import realtime_thread
+from vla_zenoh.types import Header
+
+STAMP = "_ns"
+
+
+class Restamper:
+    """Moves samples of one pass over a file.
+
+    Args:
+        began_ns: start of the recording, wall clock of its recorder.
+        starts_ns: start of the pass, wall clock here.
+        speed: 2 is twice as fast.
+        suffix: of the sources, another one in each pass: subscribers drop repeated sequence numbers
+            of the same source.
+    """
+
+    def __init__(
+        self, began_ns: int, starts_ns: int, speed: float, here: Keys, there: Keys, suffix: str
+    ) -> None:
+        self._began_ns, self._starts_ns, self._speed = began_ns, starts_ns, speed
+        self._here, self._there, self._suffix = here, there, suffix
+
+    def moved_ns(self, stamp_ns: int) -> int:
+        """A stamp of the recording moved to the pass; 0 means none and stays."""
+        if stamp_ns == 0:
+            return 0
+        since_ns = stamp_ns - self._began_ns
+        if self._speed != 1.0:
+            since_ns = round(since_ns / self._speed)
+        return max(0, self._starts_ns + since_ns)
+
+    def move(self, entry: Sample) -> Sample:
+        """The sample to publish, at the time `received_ns`."""
+        header = entry.header
+        if header is not None:
+            node, _, _ = header.source.partition("#")
+            source = f"{node}#{self._suffix}"
+            header = Header(self.moved_ns(header.stamp_wall_ns), header.seq, source)
+        payload = entry.payload
+        if entry.fields is not None:
+            payload = message.pack(_stamps_moved(entry.fields, self.moved_ns))
+        return Sample(
+            self._there.full(self._here.short(entry.key)),
+            payload,
+            entry.encoding,
+            header,
+            self.moved_ns(entry.received_ns),
+            entry.attachment,
+        )
+
+
+def _stamps_moved(fields: Mapping[str, Any], moved_ns: Callable[[int], int]) -> dict[str, Any]:
+    """Fields with moved stamps, also in the only nested map of records, the cause of a command."""
+    out = dict(fields)
+    for name, value in fields.items():
+        if name.endswith(STAMP) and type(value) is int:
+            out[name] = moved_ns(value)
+        elif name == "cause" and isinstance(value, Mapping):
+            out[name] = _stamps_moved(value, moved_ns)
+    return out
+
 
 NAME = "replay"
 CAMERAS = "camera"
 GROUPS = (
-    CAMERAS,
-    "state",
-    "command",
-    "delta",
-    "spec",
-    "seen",
-    "task",
-    "prompt",
-    "active",
-    "worker",
-    "rate",
-    "speed",
-    "slower",
-    "held",
-    "stop",
-    "reset",
-    "status",
-    "event",
-    "sim",
+    *(CAMERAS, "state", "command", "delta", "spec", "seen", "task"),
+    *("prompt", "active", "worker", "rate", "speed", "slower", "held", "stop", "reset"),
+    *("status", "event", "sim"),
 )
 """Parts of a recording that can be selected: the first chunk of a key after the robot."""
 AHEAD = 400
@@ -73,15 +119,10 @@ class ReplayResult:
     """Result of a replay.
 
     Args:
-        samples: published, by key.
-        seconds: duration.
-        passes: over the file.
         left_out: samples not published, by node that is alive and publishes its own.
         late_ms: lateness of samples: p50, p95, max.
         interval_error_ms: difference to the recorded interval between two samples of a key: p50,
             p95, max.
-        damage: why reading the file ended early.
-        failure: why the replay ended early.
     """
 
     samples: Counter[str] = field(default_factory=Counter)
@@ -100,10 +141,8 @@ class Replay:
     Args:
         profile: of the robot that the recording is replayed as.
         session: an open session; the caller closes it.
-        file: the recording.
         groups: parts to replay, of `GROUPS`.
         speed: 2 is twice as fast.
-        loop: start again at the end.
 
     Raises:
         NodeError: a robot is alive on these keys and `groups` is more than cameras; or the
@@ -138,11 +177,8 @@ class Replay:
     def _on_alive(self, name: str, alive: bool) -> None:
         (self._alive.add if alive else self._alive.discard)(name)
 
-    def _live_robot(self) -> list[str]:
-        return sorted(name for name in list(self._alive) if not name.startswith(_BYSTANDERS))
-
     def _reject_live_robot(self) -> None:
-        live = self._live_robot()
+        live = sorted(name for name in list(self._alive) if not name.startswith(_BYSTANDERS))
         if live and self._groups != {CAMERAS}:
             raise NodeError(
                 f"robot {self._there.robot!r} is alive ({', '.join(live)}): a replay would command "

@@ -30,11 +30,7 @@ DISTRIBUTION = "humble"
 
 @cache
 def messages() -> Messages:
-    """The message types of ROS 2.
-
-    Raises:
-        MissingExtraError: rosbags is not installed.
-    """
+    """The message types of ROS 2. Raises MissingExtraError: rosbags is not installed."""
     try:
         from vla_zenoh.ros2.messages import Messages
     except ImportError as error:
@@ -57,20 +53,12 @@ def serialize(name: str, *values: Any) -> bytes:
 
 
 def deserialize(name: str, data: bytes) -> Any:
-    """The message that `serialize` was given.
-
-    Raises:
-        CodecError: other bytes.
-    """
+    """The message that `serialize` was given. Raises CodecError: other bytes."""
     return messages().decode(name, data, MAX_MESSAGE_BYTES)
 
 
 def header(stamp_ns: int, frame: str) -> Any:
-    """A std_msgs/Header.
-
-    Raises:
-        CodecError: the stamp lies after 2038 and does not fit.
-    """
+    """A std_msgs/Header. Raises CodecError: the stamp lies after 2038 and does not fit."""
     types = messages().types
     seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
     if not 0 <= seconds < LAST_SECOND:

@@ -106,12 +106,10 @@ class Run:
 
     @property
     def path(self) -> Path:
-        """Of the file."""
         return self.file.path
 
     @property
     def keys(self) -> Keys:
-        """Of the robot."""
         return self.file.keys
 
     @property
@@ -190,7 +188,6 @@ def load_run(path: Path) -> Run:
 
     Raises:
         RecordingError: the file cannot be opened, or is of another program.
-        MissingExtraError: rosbags is not installed.
     """
     file = open_recording(path)
     run, keys, rejected = Run(file), file.keys, Counter[str]()

@@ -24,7 +24,6 @@ class Sample:
     """Payload, encoding and header of one sample of a key.
 
     Args:
-        key: the whole key.
         payload: bytes.
         encoding: as Zenoh writes it, for example ``image/jpeg``.
         header: its header, None for settings.
@@ -56,7 +55,6 @@ class Sample:
 
     @property
     def text(self) -> str:
-        """The text of a setting."""
         return self.payload.decode("utf-8", "replace")
 
     def record(self) -> Any:

@@ -21,7 +21,6 @@ class SampleQueue:
         session: an open session; the caller closes it.
         max_bytes: payloads and attachments kept at most, the samples last taken included.
         max_samples: samples kept at most.
-        clock: for the time of reception.
     """
 
     def __init__(
@@ -44,11 +43,7 @@ class SampleQueue:
         self._subscribers: list[zenoh.Subscriber[None]] = []
 
     def subscribe(self, expressions: Iterable[str]) -> None:
-        """Receive the samples of key expressions.
-
-        Raises:
-            RecordingError: not a key expression.
-        """
+        """Receive the samples of key expressions. Raises RecordingError: not a key expression."""
         handler = zenoh.handlers.Callback(self.receive, indirect=False)
         for expression in expressions:
             try:

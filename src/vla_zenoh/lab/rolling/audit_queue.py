@@ -12,6 +12,7 @@ import zenoh
 
 from vla_zenoh.bus.buffers import bytes_of
 from vla_zenoh.bus.clock import Clock
+from vla_zenoh.lab.rate_limit import RateLimit
 
 MAX_BYTES = 64 * 1024
 BURST, RATE_HZ = 256, 5.0
@@ -19,31 +20,17 @@ BURST, RATE_HZ = 256, 5.0
 another, and does not push out what the log has."""
 
 
-class Allowance:
-    """Token bucket: a burst at once, then a rate."""
-
-    def __init__(self) -> None:
-        self._left, self._at_s = float(BURST), time.monotonic()
-
-    def take(self) -> bool:
-        """Whether one more may pass."""
-        now_s = time.monotonic()
-        self._left = min(self._left + RATE_HZ * (now_s - self._at_s), BURST)
-        self._at_s = now_s
-        if self._left < 1:
-            return False
-        self._left -= 1
-        return True
+def allowance() -> RateLimit:
+    """How many lines of one kind are let through."""
+    return RateLimit(RATE_HZ, BURST, time.monotonic())
 
 
 class Put(NamedTuple):
     """A sample of an audited key.
 
     Args:
-        key: the whole key.
         payload: bytes; empty where there were more than `MAX_BYTES`.
         size: of the payload as it came, bytes.
-        deleted: it was a deletion.
         client: number of the Zenoh session that put it, as that session says; empty: it does not.
         received_ns: wall clock of this computer.
     """
@@ -61,14 +48,13 @@ class AuditQueue:
 
     Args:
         session: an open session; the caller closes it.
-        clock: for the time of reception.
     """
 
     def __init__(self, session: zenoh.Session, clock: Clock) -> None:
         self._session, self._clock = session, clock
         self._lock = threading.Lock()
         self._puts: deque[Put] = deque()
-        self._allowances: dict[str, Allowance] = {}
+        self._allowances: dict[str, RateLimit] = {}
         self._lost: Counter[str] = Counter()
         self._subscribers: list[zenoh.Subscriber[None]] = []
 
@@ -86,7 +72,7 @@ class AuditQueue:
         deleted = sample.kind != zenoh.SampleKind.PUT
         key = str(sample.key_expr)
         with self._lock:
-            if not self._allowances.setdefault(key, Allowance()).take():
+            if not self._allowances.setdefault(key, allowance()).take(time.monotonic()):
                 self._lost[key] += 1
                 return
             now_ns = self._clock.wall_ns()
@@ -100,7 +86,6 @@ class AuditQueue:
         return taken, lost
 
     def close(self) -> None:
-        """Receive no more."""
         for subscriber in self._subscribers:
             subscriber.undeclare()
         self._subscribers.clear()

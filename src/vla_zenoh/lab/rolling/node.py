@@ -20,7 +20,7 @@ import threading
 import time
 from collections import Counter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import zenoh
 
@@ -32,18 +32,14 @@ from vla_zenoh.lab.recording.recorder import COMMIT_S, SWITCH_INTERVAL_S, WRITE_
 from vla_zenoh.lab.recording.sample_queue import SampleQueue
 from vla_zenoh.lab.recording.writer import RecordingWriter
 from vla_zenoh.lab.rolling.audit_log import PATTERN, AuditLog
-from vla_zenoh.lab.rolling.audit_queue import Allowance, AuditQueue, Put
-from vla_zenoh.lab.rolling.ring import PART, Ring, delete_oldest_saved
+from vla_zenoh.lab.rolling.audit_queue import AuditQueue, Put, allowance
+from vla_zenoh.lab.rolling.ring import PART, Ring, RingLimits, delete_oldest_saved
 from vla_zenoh.profile import Profile, to_yaml
 from vla_zenoh.types import MAX_TEXT, Event, NodeStatus
 
 NICE = 10
 """Everything that moves the arm goes first."""
-KEEP_S, SEGMENT_S = 600.0, 30.0
-MAX_BYTES = 2 * 1024**3
 QUEUE_BYTES, QUEUE_SAMPLES = 64 * 1024 * 1024, 50_000
-AFTER_S = 3.0
-"""A saved record goes on for this long after what it was saved for."""
 APART_S = 60.0
 """Between two automatic savings for rejected activations: a person who tries again and again."""
 AGAIN_S = 5.0
@@ -59,22 +55,6 @@ ENDED = "ended"
 SEGMENT_WORDS = re.compile(r"[^A-Za-z0-9]+")
 
 
-class RingLimits(NamedTuple):
-    """Sizes of the record.
-
-    Args:
-        keep_s: of the ring.
-        max_bytes: of the ring's finished files.
-        segment_s: of one file.
-        after_s: that a saved record goes on.
-    """
-
-    keep_s: float = KEEP_S
-    max_bytes: int = MAX_BYTES
-    segment_s: float = SEGMENT_S
-    after_s: float = AFTER_S
-
-
 USUAL = RingLimits()
 
 
@@ -82,14 +62,11 @@ class RollingRecord:
     """The node `rolling`: keeps a ring of recordings on disk and writes the audit log.
 
     Args:
-        profile: the effective profile.
         session: an open session; the caller closes it.
         folder: of the record: ``ring/``, ``saved/`` and the audit log.
-        limits: its sizes.
 
     Raises:
         RecordingError: the folder cannot be used.
-        NodeError: a node of this name is alive.
     """
 
     def __init__(
@@ -98,12 +75,7 @@ class RollingRecord:
         self.node = Node(ROLLING, profile, session)
         self._profile, self._folder, self._limits = profile, folder, limits
         self._log = AuditLog(folder)
-        self._ring = Ring(
-            folder / "ring",
-            keep_s=limits.keep_s,
-            max_bytes=limits.max_bytes,
-            segment_s=limits.segment_s,
-        )
+        self._ring = Ring(folder / "ring", limits)
         for part in (folder / "saved").glob(f"*{PART}"):
             shutil.rmtree(part, ignore_errors=True)
         self._queue = SampleQueue(
@@ -117,7 +89,7 @@ class RollingRecord:
         self._why = self._audit_why = ""
         self._lost: Counter[str] = Counter()
         self._lost_s = 0.0
-        self._allowed = Allowance()
+        self._allowed = allowance()
         self._clients: dict[str, tuple[str, str, str]] = {}
         self._reasons: list[str] = []
         self._save_s, self._asked, self._refused_s = 0.0, False, -1e9
@@ -125,7 +97,6 @@ class RollingRecord:
 
     # -- life ---------------------------------------------------------------------------------
     def run(self, stop: threading.Event) -> None:
-        """Record until `stop` is set."""
         sys.setswitchinterval(SWITCH_INTERVAL_S)
         self._note_beginning()
         keys = self.node.keys
@@ -253,7 +224,7 @@ class RollingRecord:
                 continue
             certificate, address = map(str, told)
             known = (router, certificate, address)
-            if self._clients.get(number) != known and self._allowed.take():
+            if self._clients.get(number) != known and self._allowed.take(time.monotonic()):
                 self._clients[number] = known
                 self._add(
                     "client", client=number, certificate=certificate, address=address, by=router

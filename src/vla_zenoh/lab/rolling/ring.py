@@ -19,39 +19,43 @@ FACTS = "saved.json"
 
 
 class Segment(NamedTuple):
-    """A file of the ring.
-
-    Args:
-        path: of the file.
-        seconds: that it covers.
-        size_bytes: of the file.
-    """
+    """A file of the ring."""
 
     path: Path
     seconds: float
     size_bytes: int
 
 
-class Ring:
-    """The files of a folder, the newest last. What was there before is taken over.
+class RingLimits(NamedTuple):
+    """Sizes of the record.
 
     Args:
-        folder: made if it is not there.
         keep_s: how much is kept, at least, if `max_bytes` allows.
         max_bytes: of all files, but for the one that is being written.
         segment_s: longest of one file.
+        after_s: a saved record goes on for this long after what it was saved for.
+    """
+
+    keep_s: float = 600.0
+    max_bytes: int = 2 * 1024**3
+    segment_s: float = 30.0
+    after_s: float = 3.0
+
+
+class Ring:
+    """The files of a folder, the newest last. What was there before is taken over.
 
     Raises:
         RecordingError: the folder cannot be used.
     """
 
-    def __init__(self, folder: Path, *, keep_s: float, max_bytes: int, segment_s: float) -> None:
-        self._folder, self._keep_s, self._max_bytes = folder, keep_s, max_bytes
+    def __init__(self, folder: Path, limits: RingLimits) -> None:
+        self._folder, self._limits = folder, limits
         try:
             folder.mkdir(parents=True, exist_ok=True)
             # Of an earlier process; how much of its longest time a file covers is not known.
             self.segments = [
-                Segment(path, segment_s, path.stat().st_size) for path in segments_of(folder)
+                Segment(path, limits.segment_s, path.stat().st_size) for path in segments_of(folder)
             ]
         except OSError as error:
             raise RecordingError(f"{folder} cannot be used: {error.strerror}") from error
@@ -59,12 +63,10 @@ class Ring:
 
     @property
     def seconds(self) -> float:
-        """Covered by the finished files."""
         return sum(each.seconds for each in self.segments)
 
     @property
     def size_bytes(self) -> int:
-        """Of the finished files."""
         return sum(each.size_bytes for each in self.segments)
 
     def next_path(self) -> Path:
@@ -78,8 +80,8 @@ class Ring:
         with suppress(OSError):
             self.segments.append(Segment(path, seconds, path.stat().st_size))
         while len(self.segments) > 1 and (
-            self.seconds - self.segments[0].seconds >= self._keep_s
-            or self.size_bytes > self._max_bytes
+            self.seconds - self.segments[0].seconds >= self._limits.keep_s
+            or self.size_bytes > self._limits.max_bytes
         ):
             self.drop_oldest()
 
@@ -94,11 +96,6 @@ class Ring:
         """Keep the finished files in a new folder, which is there as a whole or not at all.
 
         They are linked, so they take no more room until the ring has deleted them.
-
-        Args:
-            folder: to make.
-            extra: further files, copied.
-            facts: of the saving, as JSON.
 
         Returns:
             Number of files.

@@ -10,11 +10,21 @@ and feed a `TaskJudge`::
     verdict = verdict or judge.end()
 """
 
-from vla_zenoh.lab.tasks.bar import BarJudge
 from vla_zenoh.lab.tasks.episode import TaskEpisode, draw_episode, draw_stay
-from vla_zenoh.lab.tasks.judge import FAILURES, LIMIT_S, TaskJudge, Verdict
-from vla_zenoh.lab.tasks.order import COLOURS, DIRECTIONS, FAMILIES, LIFT, Order, brick
-from vla_zenoh.lab.tasks.wording import HELD_OUT, LIFT_PROMPT, NONSENSE, TRAINING, phrase
+from vla_zenoh.lab.tasks.judge import FAILURES, LIMIT_S, BarJudge, TaskJudge, Verdict
+from vla_zenoh.lab.tasks.order import (
+    COLOURS,
+    DIRECTIONS,
+    FAMILIES,
+    HELD_OUT,
+    LIFT,
+    LIFT_PROMPT,
+    NONSENSE,
+    TRAINING,
+    Order,
+    brick,
+    phrase,
+)
 from vla_zenoh.types import FloatArray, ObjectPoses
 
 

@@ -19,8 +19,8 @@ from vla_zenoh.lab.tasks.order import (
     STAY,
     Order,
     brick,
+    phrase,
 )
-from vla_zenoh.lab.tasks.wording import phrase
 from vla_zenoh.types import FloatArray, ObjectPoses
 
 PUSH_BEHIND_M, PUSH_AHEAD_M = 0.06, 0.11
@@ -35,13 +35,7 @@ _STREAM = 0x7A5C
 
 @dataclass(frozen=True, slots=True)
 class TaskEpisode:
-    """One task in one layout.
-
-    Args:
-        seed: of the layout and of the draw.
-        order: goal.
-        prompt: the same in words.
-    """
+    """One task in one layout."""
 
     seed: int
     order: Order
@@ -59,8 +53,6 @@ def draw_episode(
     """Draw a feasible task; deterministic in its arguments.
 
     Args:
-        seed: the layout's, or any number.
-        objects: true poses after the reset.
         family: one of `FAMILIES`; None: any.
         target: colour of the brick to move; None: any.
         held_out: use a wording that no model may be trained with.

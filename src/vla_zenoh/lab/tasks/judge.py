@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from vla_zenoh.errors import RecordError
+from vla_zenoh.kinematics.so3 import rotation_from_quat
 from vla_zenoh.lab.tasks.order import BOX, COLOURS, DIRECTIONS, PUSH, PUT, STACK, STAY, Order, brick
 from vla_zenoh.types import FloatArray, ObjectPoses
 
@@ -33,14 +35,8 @@ TABLE_EDGE_Z_M = -0.01
 STAYED_M = 0.01
 
 WRONG_BRICK, FELL, DROPPED, MISSED_GRASP = "wrong_brick", "fell", "dropped", "missed_grasp"
-KNOCKED, OFF_COURSE, NOT_MOVED, TIMEOUT, MOVED = (
-    "knocked",
-    "off_course",
-    "not_moved",
-    "timeout",
-    "moved",
-)
-TILTED = "tilted"
+KNOCKED, OFF_COURSE, NOT_MOVED, TIMEOUT = "knocked", "off_course", "not_moved", "timeout"
+MOVED, TILTED = "moved", "tilted"
 FAILURES = {
     WRONG_BRICK: "another brick was lifted, moved or put in the box",
     FELL: "a brick fell off the table",
@@ -61,7 +57,6 @@ class Verdict:
     """How an episode ended.
 
     Args:
-        success: the order was executed.
         failure: one of `FAILURES`; empty after a success.
         time_s: of the verdict, on the caller's clock.
     """
@@ -75,8 +70,6 @@ class TaskJudge:
     """Judges one task from the poses of the objects.
 
     Args:
-        order: goal.
-        before: all objects at the start.
         tcp_m: (3,) TCP at the start; only ``stay`` needs it.
 
     Raises:
@@ -102,17 +95,11 @@ class TaskJudge:
         self._width_m = 1.0
 
     def update(
-        self,
-        objects: ObjectPoses,
-        width_m: float,
-        time_s: float,
-        tcp_m: FloatArray | None = None,
+        self, objects: ObjectPoses, width_m: float, time_s: float, tcp_m: FloatArray | None = None
     ) -> Verdict | None:
         """Process the current state; call it several times a second.
 
         Args:
-            objects: true poses.
-            width_m: opening of the gripper.
             time_s: monotonic.
             tcp_m: (3,) measured TCP; only ``stay`` needs it.
 
@@ -198,3 +185,65 @@ class TaskJudge:
 
 def _places(objects: ObjectPoses) -> dict[str, FloatArray]:
     return dict(zip(objects.names, objects.position_m, strict=True))
+
+
+BAR = "bar"
+BAR_LIFTED_M = 0.10
+"""The middle of a bar that counts as lifted is this much higher than at first."""
+LEVEL_RAD = 0.1
+"""Its tilt then, at most."""
+HELD_S = 1.0
+"""So long it has to stay lifted and level."""
+TOUCHED_M = 0.01
+
+
+class BarJudge:
+    """Judges ``lift the bar``; used as a `vla_zenoh.lab.tasks.TaskJudge`.
+
+    Raises:
+        RecordError: there is no bar.
+    """
+
+    def __init__(self, order: Order, before: ObjectPoses) -> None:
+        self.order = order
+        if BAR not in before.names:
+            raise RecordError(
+                f"there is no {BAR} among the objects {', '.join(before.names)}; it is lifted in "
+                "the scene 'pair'"
+            )
+        self._z_m = self._begin_z_m = self._highest_m = self._pose(before)[0][2]
+        self._tilt_rad = self._time_s = 0.0
+        self._good_since_s: float | None = None
+
+    def update(
+        self, objects: ObjectPoses, width_m: float, time_s: float, tcp_m: FloatArray | None = None
+    ) -> Verdict | None:
+        """The verdict as soon as it is certain; only the objects matter."""
+        position_m, rotation = self._pose(objects)
+        self._z_m, self._time_s = float(position_m[2]), time_s
+        self._highest_m = max(self._highest_m, self._z_m)
+        self._tilt_rad = math.asin(min(abs(float(rotation[2, 0])), 1.0))
+        if self._z_m < TABLE_EDGE_Z_M:
+            return Verdict(False, FELL, time_s)
+        lifted = self._z_m - self._begin_z_m > BAR_LIFTED_M
+        if not lifted or self._tilt_rad > LEVEL_RAD:
+            self._good_since_s = None
+        elif self._good_since_s is None:
+            self._good_since_s = time_s
+        elif time_s - self._good_since_s >= HELD_S:
+            return Verdict(True, "", time_s)
+        return None
+
+    def end(self) -> Verdict:
+        """The verdict at the time limit."""
+        if self._good_since_s is not None:
+            return Verdict(False, TIMEOUT, self._time_s)
+        if self._tilt_rad > LEVEL_RAD:
+            return Verdict(False, TILTED, self._time_s)
+        touched = self._highest_m - self._begin_z_m > TOUCHED_M
+        return Verdict(False, DROPPED if touched else NOT_MOVED, self._time_s)
+
+    @staticmethod
+    def _pose(objects: ObjectPoses) -> tuple[FloatArray, FloatArray]:
+        index = objects.names.index(BAR)
+        return np.array(objects.position_m[index]), rotation_from_quat(objects.quat_xyzw[index])

@@ -69,7 +69,6 @@ class Keystroke(NamedTuple):
     Args:
         key: its name (`w`, `space`, `enter`, `ctrl+c`); or `releases`: this terminal reports them;
             or `unfocused`: the window has lost the focus.
-        event: what happened to it.
     """
 
     key: str
@@ -172,7 +171,6 @@ class Keyboard:
         self._until_s[key] = now_s + HOLD_S if event is KeyEvent.TYPED else float("inf")
 
     def release_all(self) -> None:
-        """Release every key."""
         self._until_s.clear()
         self._new.clear()
 

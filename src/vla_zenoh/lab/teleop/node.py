@@ -28,8 +28,7 @@ from vla_zenoh.lab.teleop.keyboard import (
     Keyboard,
     KeystrokeParser,
 )
-from vla_zenoh.lab.teleop.leader import LeaderPolicy
-from vla_zenoh.lab.teleop.leader_arm import LeaderArm
+from vla_zenoh.lab.teleop.leader import LeaderArm, LeaderPolicy
 from vla_zenoh.lab.teleop.policy import InputDevice, OperatorInput, TeleopPolicy, combined
 from vla_zenoh.nodes.worker.node import WorkerNode
 from vla_zenoh.policy import Frame
@@ -44,12 +43,7 @@ class Teleop:
     """The teleoperation worker with its keyboard and status line.
 
     Args:
-        profile: the effective profile.
-        session: with the rights of a worker.
         operator: session with the rights of an operator; None: keys for settings do nothing.
-        name: of the worker.
-        device: beside the keyboard.
-        frame: axes of a step.
         level: initial speed, from 0.
         leader: arm whose joints are followed, in place of keys and device that move; for a robot of
             one arm.
@@ -241,11 +235,9 @@ class Terminal:
             self._read(data)
 
     def show(self, line: str) -> None:
-        """Replace the status line."""
         os.write(self._out, f"\r\x1b[K{line}".encode())
 
     def print(self, line: str) -> None:
-        """Print a line above it."""
         os.write(self._out, f"\r\x1b[K{line}\r\n".encode())
 
     def __exit__(self, *_: object) -> None:

@@ -60,11 +60,7 @@ class InputDevice(Protocol):
     name: str
 
     def read(self) -> OperatorInput:
-        """Current input.
-
-        Raises:
-            PeerError: the device is gone.
-        """
+        """Current input. Raises PeerError: the device is gone."""
         ...
 
     def close(self) -> None:
@@ -73,7 +69,6 @@ class InputDevice(Protocol):
 
 
 def combined(one: OperatorInput, other: OperatorInput) -> OperatorInput:
-    """Sum of two inputs, clipped."""
     twist = [a + b for a, b in zip(one.twist, other.twist, strict=True)]
     opening = _clipped(one.opening + other.opening)
     toggles, part = one.toggles + other.toggles, one.part + other.part
@@ -126,11 +121,7 @@ class TeleopPolicy:
     at a time, and the others stand.
 
     Args:
-        profile: for limits and gripper.
-        name: of the worker.
         read: current input; called once per chunk.
-        level: index of the selected speed.
-        frame: axes of a step.
     """
 
     example_prompts = ("by hand",)
@@ -190,7 +181,6 @@ class TeleopPolicy:
 
     @property
     def _moved(self) -> str:
-        """The part that is moved."""
         return self._parts[self.last.part % len(self._parts)]
 
     def _steps(

@@ -32,7 +32,6 @@ class Gamepad:
     the gripper; A: toggle it; Y: take the arm, and give it back.
 
     Raises:
-        MissingExtraError: pygame-ce is not installed.
         NodeError: no gamepad.
     """
 
@@ -61,7 +60,6 @@ class Gamepad:
         self._toggle, self._takeover = Button(), Button()
 
     def read(self) -> OperatorInput:
-        """See `InputDevice`."""
         pygame, pad = self._pygame, self._pad
         pygame.event.pump()
         pygame.event.clear()
@@ -95,7 +93,6 @@ class Gamepad:
         )
 
     def close(self) -> None:
-        """See `InputDevice`."""
         self._pygame.quit()
 
 
@@ -105,7 +102,6 @@ class SpaceMouse:
     Its first button toggles the gripper, its second takes the arm and gives it back.
 
     Raises:
-        MissingExtraError: pyspacemouse is not installed.
         NodeError: no SpaceMouse, it cannot be opened, or the library hidapi is missing.
     """
 
@@ -126,7 +122,6 @@ class SpaceMouse:
         self._toggle, self._takeover = Button(), Button()
 
     def read(self) -> OperatorInput:
-        """See `InputDevice`."""
         try:
             state = self._mouse.read()
             for _ in range(MAX_READS):
@@ -146,7 +141,6 @@ class SpaceMouse:
         )
 
     def close(self) -> None:
-        """See `InputDevice`."""
         self._mouse.close()
 
 

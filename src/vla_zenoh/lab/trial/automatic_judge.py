@@ -27,12 +27,7 @@ MAX_NOTE = 300
 
 
 class Frame(NamedTuple):
-    """Pictures at one time of an episode.
-
-    Args:
-        time_s: since activation.
-        jpegs: camera -> JPEG.
-    """
+    """Pictures at one time of an episode. `jpegs`: camera -> JPEG."""
 
     time_s: float
     jpegs: Mapping[str, bytes]
@@ -42,7 +37,6 @@ class StateSample(NamedTuple):
     """Measured state at one time of an episode.
 
     Args:
-        time_s: since activation.
         pose: of the TCP, base frame.
         gripper: None: none was received.
     """
@@ -57,7 +51,6 @@ class JudgedEpisode:
     """What a judge sees of an episode.
 
     Args:
-        prompt: task.
         end: ``policy`` or ``time``, as in `vla_zenoh.lab.trial.verdict`.
         frames: oldest first, about one each second; the last is from after the brake.
         states: oldest first, about 20 each second.
@@ -69,11 +62,7 @@ class JudgedEpisode:
     states: list[StateSample] = field(default_factory=list)
 
     def picture(self, camera: str, index: int = -1) -> NDArray[np.uint8]:
-        """(h, w, 3) RGB of a camera.
-
-        Raises:
-            KeyError: the camera had none then.
-        """
+        """(h, w, 3) RGB of a camera. Raises KeyError: the camera had none then."""
         return decode_jpeg(self.frames[index].jpegs[camera]).rgb
 
     def chosen(self) -> list[Frame]:
@@ -89,10 +78,6 @@ Judge = Callable[[JudgedEpisode], tuple[bool, str]]
 
 def make_judge(choice: JudgeChoice, folder: Path) -> Judge | None:
     """The judge of finished episodes; None: the simulator's, which judges while the arm moves.
-
-    Args:
-        choice: of the plan.
-        folder: of the plan's file.
 
     Raises:
         NodeError: the file has no such function.

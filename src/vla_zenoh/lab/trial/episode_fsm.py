@@ -35,13 +35,7 @@ class Phase(StrEnum):
 
 
 class EpisodeFsm:
-    """State machine of one trial episode.
-
-    Args:
-        due: setup and worker.
-        seconds: time limit.
-        after: what ended the previous episode of this run.
-    """
+    """State machine of one trial episode."""
 
     def __init__(self, due: DueEpisode, seconds: float, after: End | None = None) -> None:
         self.due, self.seconds, self.after = due, seconds, after
@@ -85,7 +79,6 @@ class EpisodeFsm:
         return True
 
     def rejected(self, reasons: str) -> None:
-        """Activation was rejected."""
         self.reasons, self.phase = reasons, Phase.BLOCKED
 
     def started(
@@ -129,7 +122,6 @@ class EpisodeFsm:
         self.phase = Phase.JUDGE if self._verdict is None else Phase.OVER
 
     def abort(self) -> None:
-        """End the episode as void."""
         self.end = "broken_off"
         self._judge("void", "")
 
@@ -140,13 +132,7 @@ class EpisodeFsm:
         self._verdict, self._note, self.phase = verdict, note, Phase.OVER
 
     def verdict(self, number: int, recording: str, dropped: int) -> EpisodeVerdict:
-        """The record of an episode in phase OVER.
-
-        Args:
-            number: of the attempt.
-            recording: file name, empty: none.
-            dropped: samples missing from it.
-        """
+        """The record of an episode in phase OVER. `recording`: file name, empty: none."""
         assert self._verdict is not None and self.end is not None
         return EpisodeVerdict(
             number,

@@ -6,7 +6,6 @@ truncated is repeated.
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import re
@@ -21,6 +20,7 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from vla_zenoh.errors import RecordingError
+from vla_zenoh.lab.durable import lock_folder, write_whole
 from vla_zenoh.lab.trial.plan import TrialPlan
 from vla_zenoh.lab.trial.verdict import EpisodeVerdict
 
@@ -36,11 +36,7 @@ def _adapter(kind: type) -> TypeAdapter[Any]:
 
 
 class TrialFolder:
-    """Folder of a trial.
-
-    Args:
-        path: of the folder.
-    """
+    """Folder of a trial."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -100,11 +96,7 @@ class TrialFolder:
         return plan
 
     def episodes(self) -> list[EpisodeVerdict]:
-        """Verdicts in the order of the episodes.
-
-        Raises:
-            RecordingError: a line cannot be read.
-        """
+        """Verdicts in the order of the episodes. Raises RecordingError: a line cannot be read."""
         try:
             whole, _, rest = (self.path / TRIALS).read_bytes().rpartition(b"\n")
         except FileNotFoundError:
@@ -151,43 +143,29 @@ class TrialFolder:
         """
         try:
             self.path.mkdir(exist_ok=True)
-            folder = os.open(self.path, os.O_RDONLY)
+            folder = lock_folder(self.path)
+        except BlockingIOError as error:
+            raise RecordingError(
+                f"another `vla-zenoh lab trial` is at work in {self.path}"
+            ) from error
         except OSError as error:
             raise self._cannot(self.path, error) from error
         try:
-            try:
-                fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
-                raise RecordingError(
-                    f"another `vla-zenoh lab trial` is at work in {self.path}"
-                ) from error
             yield
         finally:
             os.close(folder)
 
     def begin(self, plan: TrialPlan) -> None:
-        """Write the plan.
-
-        Raises:
-            RecordingError: it cannot be written.
-        """
-        path, part = self.path / PLAN, self.path / f"{PLAN}.part"
+        """Write the plan. Raises RecordingError: it cannot be written."""
+        path = self.path / PLAN
         try:
-            with part.open("wb") as file:
-                file.write((json.dumps(asdict(plan), indent=2) + "\n").encode())
-                file.flush()
-                os.fsync(file.fileno())
-            part.replace(path)
+            write_whole(path, json.dumps(asdict(plan), indent=2) + "\n")
             self._sync_folder()
         except OSError as error:
             raise self._cannot(path, error) from error
 
     def append(self, verdict: EpisodeVerdict) -> None:
-        """Append a verdict and sync it to the disk.
-
-        Raises:
-            RecordingError: it cannot be written.
-        """
+        """Append a verdict and sync it to the disk. Raises RecordingError: it cannot be written."""
         path = self.path / TRIALS
         line = (json.dumps(asdict(verdict)) + "\n").encode()
         try:

@@ -24,7 +24,6 @@ class DueEpisode:
     Args:
         setup: number of its setup, from 1.
         turn: which of that setup's episodes, from 1.
-        worker: to activate.
     """
 
     setup: int
@@ -37,13 +36,7 @@ class TrialPlan:
     """Every worker does every setup once.
 
     Args:
-        robot: its name.
-        workers: each once.
-        prompt: of every episode.
         setups: a description of each; empty: its number is enough.
-        seconds: time limit of an episode.
-        seed: of the order.
-        blind: hide from the operator which worker is active.
 
     Raises:
         RecordError: a value is not allowed.
@@ -71,7 +64,6 @@ class TrialPlan:
 
     @property
     def episodes(self) -> int:
-        """Number of episodes."""
         return len(self.setups) * len(self.workers)
 
     def words(self, setup: int) -> str:

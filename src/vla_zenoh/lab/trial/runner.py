@@ -44,11 +44,7 @@ class Operator(Protocol):
     """The person, or script, that sets scenes up and judges episodes."""
 
     def ask(self, episode: EpisodeFsm) -> str:
-        """Wait for a line in phase SETUP, BLOCKED or JUDGE.
-
-        Raises:
-            Interrupted: Ctrl-C.
-        """
+        """Wait for a line in phase SETUP, BLOCKED or JUDGE. Raises Interrupted: Ctrl-C."""
         ...
 
     def poll_line(self) -> str | None:
@@ -76,11 +72,7 @@ class TrialRunner:
     """Runs the episodes of a trial that have no verdict yet.
 
     Args:
-        client: follows the nodes.
-        plan: of the trial.
         folder: created, and locked by this process.
-        operator: judges.
-        stop: set by Ctrl-C.
     """
 
     def __init__(

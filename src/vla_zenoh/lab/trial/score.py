@@ -16,14 +16,9 @@ class WorkerScore:
     """Score of one worker; void episodes count in `void` alone.
 
     Args:
-        worker: its name.
-        successes: number of them.
-        episodes: judged.
         wilson_95: interval of the success rate.
         time_to_success_s: median; None: no success.
-        brakes: times the command node braked.
         interventions: episodes ended by an emergency stop or another client.
-        void: number of void episodes.
     """
 
     worker: str
@@ -43,14 +38,7 @@ class WorkerScore:
 
 @dataclass(frozen=True, slots=True)
 class TrialScore:
-    """Score of a trial.
-
-    Args:
-        workers: in the plan's order.
-        paired: setups that both of two workers did; None: not two workers.
-        done: judged episodes.
-        of: all episodes of the plan.
-    """
+    """Score of a trial. `paired`: setups that both of two workers did; None: not two workers."""
 
     workers: tuple[WorkerScore, ...]
     paired: Paired | None

@@ -10,11 +10,65 @@ from pathlib import Path
 from typing import Any
 
 from vla_zenoh.errors import OutputError
+from vla_zenoh.lab.durable import page_template, write_whole
 from vla_zenoh.lab.trial.folder import TrialFolder
 from vla_zenoh.lab.trial.plan import TrialPlan
 from vla_zenoh.lab.trial.score import TrialScore, score
+from vla_zenoh.lab.trial.unattended_operator import strip_path
 from vla_zenoh.lab.trial.unattended_plan import UnattendedPlan, UnattendedTask, checked_plan
-from vla_zenoh.lab.trial.verdict import EpisodeVerdict
+from vla_zenoh.lab.trial.verdict import END_WORDS, EpisodeVerdict
+
+TEMPLATE, PAGE = "unattended.html.j2", "index.html"
+
+
+def write_page(trial: UnattendedTrial) -> None:
+    """Write the page of a trial; a reader sees the old one or the new one, never half of one.
+
+    Raises:
+        OutputError: the page cannot be written.
+    """
+    tasks = [
+        {
+            "task": task,
+            "score": score,
+            "episodes": [_row(trial.trial(task)[0], each) for each in found],
+        }
+        for task, score, found in trial.scores()
+    ]
+    done, of = (sum(getattr(each["score"], name) for each in tasks) for name in ("done", "of"))
+    journal = [{**line, "at": f"{_at(line['time_s']):%F %T}"} for line in trial.journal()]
+    page = page_template("vla_zenoh.lab.trial", TEMPLATE).render(
+        title=trial.path.name,
+        robot=trial.robot,
+        plan=trial.plan,
+        tasks=tasks,
+        done=done,
+        of=of,
+        journal=journal,
+    )
+    file = trial.path / PAGE
+    try:
+        write_whole(file, page)
+    except OSError as error:
+        raise OutputError(f"{file} cannot be written: {error.strerror}") from error
+
+
+def _row(folder: TrialFolder, each: EpisodeVerdict) -> dict[str, Any]:
+    strip = strip_path(folder, each.setup, each.worker)
+    has_strip = each.verdict != "void" and strip.exists()
+    recorded = bool(each.recording) and (folder.path / each.recording).exists()
+    return {
+        "of": each,
+        "end": END_WORDS[each.end],
+        "at": f"{_at(each.began_ns / 1e9):%F %T}" if each.began_ns else "",
+        "strip": f"{folder.path.name}/{strip.name}" if has_strip else "",
+        "recording": f"{folder.path.name}/{each.recording}" if recorded else "",
+    }
+
+
+def _at(time_s: float) -> datetime:
+    return datetime.fromtimestamp(time_s)
+
 
 PLAN, JOURNAL = "unattended.json", "unattended.jsonl"
 
@@ -23,9 +77,7 @@ class UnattendedTrial:
     """An unattended trial and its folder.
 
     Args:
-        path: of the folder.
         plan: of a new trial or of the one in the folder; None: the one in the folder.
-        robot: its name.
 
     Raises:
         OutputError: the folder has another plan, or none was given.
@@ -60,12 +112,7 @@ class UnattendedTrial:
         file = self.path / PLAN
         try:
             if not file.exists():
-                part = file.with_suffix(".part")
-                with part.open("w", encoding="utf-8") as out:
-                    out.write(self.plan.model_dump_json(indent=2) + "\n")
-                    out.flush()
-                    os.fsync(out.fileno())
-                part.replace(file)
+                write_whole(file, self.plan.model_dump_json(indent=2) + "\n")
         except OSError as error:
             raise OutputError(f"{file} cannot be written: {error.strerror}") from error
         self.note("begun")

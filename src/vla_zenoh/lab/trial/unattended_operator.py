@@ -8,15 +8,12 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-import cv2
 import numpy as np
-import zenoh
-from numpy.typing import NDArray
 
 from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.primitives import ask
-from vla_zenoh.codec.image import decode_jpeg, encode_jpeg
-from vla_zenoh.errors import CodecError, NodeError, RecordingError
+from vla_zenoh.codec.image import encode_jpeg
+from vla_zenoh.errors import NodeError, RecordingError
 from vla_zenoh.lab.episode import EpisodeRunner
 from vla_zenoh.lab.newest_records import NewestRecords, StreamSlot
 from vla_zenoh.lab.tasks import TaskJudge
@@ -25,6 +22,7 @@ from vla_zenoh.lab.trial.episode_fsm import EpisodeFsm, Phase
 from vla_zenoh.lab.trial.folder import TrialFolder
 from vla_zenoh.lab.trial.plan import TrialPlan
 from vla_zenoh.lab.trial.unattended_plan import UnattendedPlan, UnattendedTask, is_contact_loss
+from vla_zenoh.lab.video import decoded_at_height
 from vla_zenoh.types import GripperState, Image, ObjectPoses, PoseState
 
 FRAME_S, STATE_S = 1.0, 0.05
@@ -44,13 +42,8 @@ class UnattendedOperator:
     """Implements `Operator` without a person.
 
     Args:
-        client: follows the nodes.
-        plan: of the whole trial.
         task: whose episodes are run.
-        trial: its plan.
-        folder: of its episodes.
         judge: of finished episodes; None: the simulator's.
-        stop: set by Ctrl-C.
         due_to_stop: called before each episode: why the trial has to stop, empty: go on.
         warn: called with warnings.
     """
@@ -78,9 +71,7 @@ class UnattendedOperator:
         self._states = NewestRecords(session, wanted)
         self._pictures = {camera: StreamSlot() for camera in client.profile.cameras}
         self._subscribers = [
-            session.declare_subscriber(
-                keys.camera_jpeg(camera), zenoh.handlers.Callback(slot, indirect=False)
-            )
+            slot.subscribe(session, keys.camera_jpeg(camera))
             for camera, slot in self._pictures.items()
         ]
         self._seen = JudgedEpisode(task.prompt)
@@ -92,7 +83,6 @@ class UnattendedOperator:
         self._over = ""
 
     def close(self) -> None:
-        """Unsubscribe."""
         self._states.close()
         for subscriber in self._subscribers:
             subscriber.undeclare()
@@ -104,7 +94,6 @@ class UnattendedOperator:
         Raises:
             TrialStopped: a rule, or a person.
             NodeError: no reset, or no verdict.
-            Interrupted: Ctrl-C.
         """
         if episode.phase is Phase.SETUP:
             return self._set_up(episode)
@@ -131,21 +120,18 @@ class UnattendedOperator:
         return "y" if verdict.success else f"n {verdict.failure}"
 
     def reject_line(self, line: str, phase: Phase) -> None:
-        """See `Operator`."""
         raise NodeError(f"{line!r} in phase {phase}")
 
     def show(self, episode: EpisodeFsm) -> None:
         """See `Operator`."""
 
     def show_end(self, episode: EpisodeFsm) -> None:
-        """See `Operator`."""
         if episode.end == "stopped":
             self._over = f"an emergency stop: {episode.why}"
         elif episode.end == "taken":
             self._over = f"another client: {episode.why}"
 
     def notify(self, text: str) -> None:
-        """See `Operator`."""
         self._warn(text)
 
     # -- phases -------------------------------------------------------------------------------
@@ -281,19 +267,10 @@ def film_strip(frames: Sequence[Frame]) -> bytes | None:
     """A JPEG with the frames from left to right, cameras below each other; None: no picture."""
     rows = []
     for camera in sorted({name for frame in frames for name in frame.jpegs}):
-        row = [_small(frame.jpegs[camera]) for frame in frames if camera in frame.jpegs]
-        rows.append(np.hstack(row))
+        jpegs = [frame.jpegs[camera] for frame in frames if camera in frame.jpegs]
+        rows.append(np.hstack([decoded_at_height(jpeg, STRIP_HEIGHT_PX) for jpeg in jpegs]))
     if not rows:
         return None
     width = max(row.shape[1] for row in rows)
     padded = [np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0))) for row in rows]
     return encode_jpeg(Image(np.ascontiguousarray(np.vstack(padded))))
-
-
-def _small(jpeg: bytes) -> NDArray[np.uint8]:
-    try:
-        rgb = decode_jpeg(jpeg).rgb
-    except CodecError:
-        return np.zeros((STRIP_HEIGHT_PX, STRIP_HEIGHT_PX, 3), np.uint8)
-    size = (max(1, round(rgb.shape[1] * STRIP_HEIGHT_PX / rgb.shape[0])), STRIP_HEIGHT_PX)
-    return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)

@@ -31,10 +31,6 @@ class UnattendedTask(_Part):
     """A task that every worker does `episodes` times.
 
     Args:
-        name: of its folder.
-        prompt: of its episodes.
-        episodes: of each worker.
-        seconds: time limit of an episode.
         order: goal for the simulator's judge, as `vla_zenoh.lab.tasks.Order`.
     """
 
@@ -76,7 +72,6 @@ class JudgeChoice(_Part):
         simulator: true poses of the objects; every task needs an `order`.
         file: Python file with ``judge(episode)``, beside the plan.
         url: OpenAI-compatible endpoint (``.../v1/chat/completions``) that is asked with pictures.
-        model: name for that endpoint.
         question: for it; ``{prompt}`` is replaced.
     """
 
@@ -104,8 +99,6 @@ class StopRules(_Part):
     Args:
         contacts: episodes that ended by contact or a blocked arm.
         refusals: episodes whose activation was rejected to the end.
-        failures_in_a_row: of whichever worker.
-        voids_in_a_row: episodes that nodes broke off.
         at: local time of day, ``HH:MM``.
     """
 
@@ -144,12 +137,6 @@ class UnattendedPlan(_Part):
     """Every worker does every task, in layouts and an order drawn from the seed.
 
     Args:
-        workers: each once.
-        tasks: each once.
-        reset: before each episode.
-        judge: of each episode.
-        stop: rules.
-        seed: of order and layouts.
         webhook: is sent JSON at start, trouble and end; empty: none is sent.
     """
 
@@ -203,11 +190,7 @@ def read_plan(path: Path) -> UnattendedPlan:
 
 
 def checked_plan(data: Any, where: str) -> UnattendedPlan:
-    """A plan of plain data.
-
-    Raises:
-        RecordError: a value is not allowed; names it.
-    """
+    """A plan of plain data. Raises RecordError: a value is not allowed; names it."""
     try:
         return UnattendedPlan.model_validate(data)
     except ValidationError as error:

@@ -6,8 +6,13 @@ disk, and one without a verdict is repeated.
 
 from __future__ import annotations
 
+import json
+import queue
 import threading
-from collections.abc import Callable
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import asdict
 from pathlib import Path
@@ -18,10 +23,63 @@ from vla_zenoh.errors import NodeError, OutputError, RecordingError, SessionErro
 from vla_zenoh.lab.episode import Interrupted
 from vla_zenoh.lab.trial.automatic_judge import make_judge
 from vla_zenoh.lab.trial.runner import TrialRunner
-from vla_zenoh.lab.trial.unattended import UnattendedTrial
+from vla_zenoh.lab.trial.unattended import UnattendedTrial, write_page
 from vla_zenoh.lab.trial.unattended_operator import TrialStopped, UnattendedOperator
-from vla_zenoh.lab.trial.unattended_page import write_page
-from vla_zenoh.lab.trial.webhook import Webhook
+
+PATIENCE_S, ATTEMPTS, BACK_OFF_S = 5.0, 3, 1.0
+MAX_WAITING = 50
+
+
+class Webhook:
+    """Posts messages on a thread of its own, in order; a full queue drops the newest.
+
+    Args:
+        url: where to; empty: nowhere.
+        warn: called with what could not be sent.
+    """
+
+    def __init__(self, url: str, warn: Callable[[str], None]) -> None:
+        self._url, self._warn = url, warn
+        self._waiting: queue.Queue[dict[str, Any] | None] = queue.Queue(MAX_WAITING)
+        self._thread = threading.Thread(target=self._send, name="webhook", daemon=True)
+        if url:
+            self._thread.start()
+
+    def tell(self, what: str, fields: Mapping[str, Any]) -> None:
+        """Post ``{"what": what, "time": Unix seconds, ...}``."""
+        if not self._url:
+            return
+        try:
+            self._waiting.put_nowait({"what": what, "time": round(time.time(), 3), **fields})
+        except queue.Full:
+            self._warn(f"webhook: too many messages wait, dropped {what!r}")
+
+    def close(self, timeout_s: float = 2 * PATIENCE_S) -> None:
+        """Send what waits, for `timeout_s` at most."""
+        if self._url:
+            try:
+                self._waiting.put(None, timeout=timeout_s)
+            except queue.Full:
+                return
+            self._thread.join(timeout_s)
+
+    def _send(self) -> None:
+        while (message := self._waiting.get()) is not None:
+            body = json.dumps(message).encode()
+            for attempt in range(ATTEMPTS):
+                request = urllib.request.Request(
+                    self._url, body, {"content-type": "application/json"}
+                )
+                try:
+                    with urllib.request.urlopen(request, timeout=PATIENCE_S):
+                        break
+                except (OSError, ValueError) as error:
+                    if isinstance(error, urllib.error.HTTPError):
+                        error.close()
+                    if attempt == ATTEMPTS - 1:
+                        self._warn(f"webhook: {message['what']!r} was not delivered: {error}")
+                    time.sleep(BACK_OFF_S)
+
 
 RETRY_S, MAX_TROUBLE = 5.0, 20
 """Between two attempts after trouble, and how many without an episode in between."""
@@ -40,7 +98,6 @@ def run_unattended(
         trial: its folder is locked by this process.
         open_client: a client of the running robot; opened again after trouble.
         plan_folder: where a Python judge is looked for.
-        stop: set by Ctrl-C.
         warn: called with warnings.
 
     Raises:

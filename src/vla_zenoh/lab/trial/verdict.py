@@ -25,13 +25,8 @@ END_WORDS: dict[End, str] = {
     "broken_off": "aborted",
 }
 INTERVENTIONS: frozenset[End] = frozenset({"stopped", "taken"})
-_VERDICTS: dict[str, Verdict] = {
-    "y": "success",
-    "yes": "success",
-    "n": "failure",
-    "no": "failure",
-    "x": "void",
-}
+_VERDICTS: dict[str, Verdict] = {"y": "success", "n": "failure", "x": "void"}
+_VERDICTS |= {"yes": "success", "no": "failure"}
 
 
 @dataclass(frozen=True, slots=True)

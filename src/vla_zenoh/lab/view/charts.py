@@ -23,7 +23,6 @@ class Charts:
     """Logs time series at the current time of a Rerun stream.
 
     Args:
-        stream: to log into.
         joints: names of the arm joints, in the order of the profile.
         part: of the robot; empty: it is one arm.
     """
@@ -85,7 +84,6 @@ class Charts:
         self._put(f"{self._own(paths.TRACKING)}/distance", apart_m * 1e3)
 
     def joints(self, names: Sequence[str], position_rad: FloatArray) -> None:
-        """Measured arm joints."""
         for name, value in zip(names, position_rad.tolist(), strict=True):
             if name in self._joints:
                 self._put(paths.below(self._own(paths.JOINTS), name), value)

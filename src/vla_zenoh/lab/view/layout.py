@@ -19,19 +19,13 @@ SHARE_RANGE = (0.0, 105.0)
 
 
 def blueprint(
-    cameras: Collection[str],
-    seen: Mapping[str, Collection[str]],
-    *,
-    widest_mm: float,
-    live: bool,
+    cameras: Collection[str], seen: Mapping[str, Collection[str]], *, widest_mm: float, live: bool
 ) -> rrb.Blueprint:
     """The blueprint for these cameras.
 
     Args:
-        cameras: of the robot.
         seen: worker -> cameras that its model uses.
         widest_mm: largest opening of the gripper.
-        live: follow the newest data.
     """
     views = _camera_views(cameras, seen)
     above: Any = _scene()

@@ -20,7 +20,6 @@ class ViewListener(SampleQueue):
 
     Args:
         session: an open session; the caller closes it.
-        profile: of the robot.
         queue_bytes: payloads kept at most; samples that do not fit are dropped and counted.
     """
 

@@ -36,7 +36,6 @@ def plot(origin: str, part: str) -> str:
 
 
 def picture(camera: str) -> str:
-    """Images of a camera."""
     return below(CAMERA, camera)
 
 

@@ -69,10 +69,7 @@ class RerunLogger:
     Samples that cannot be shown are counted in `rejected`, which the view displays.
 
     Args:
-        profile: of the robot.
-        stream: a Rerun stream, with its sink.
         keys: of the samples; None: those of the profile.
-        live: the view follows the newest data.
     """
 
     def __init__(
@@ -165,7 +162,6 @@ class RerunLogger:
             self._reject(sample.key, UNFIT)
 
     def _arm(self, sample: Sample) -> _Arm:
-        """Whose state or command it is."""
         arm = self._arms.get(self.keys.part_of(sample.key))
         if arm is None:
             raise CodecError("invalid", f"{sample.key} is of no part of the profile's robot")
@@ -205,7 +201,8 @@ class RerunLogger:
         if group == paths.CAMERA and second != "jpeg" and not depth:
             return
         if depth:
-            shown, suffix = _depth_of(sample), " depth"
+            metre, suffix = 1.0 / sample.depth().unit_m, " depth"
+            shown: Any = rr.EncodedDepthImage(sample.payload, media_type="image/png", meter=metre)
         elif second and sample.encoding == JPEG and sample.payload.startswith(JPEG_BEGINS):
             shown, suffix = rr.EncodedImage(contents=sample.payload, media_type=JPEG), ""
         else:
@@ -341,8 +338,3 @@ class RerunLogger:
 
     def _event(self, sample: Sample, stamp_ns: int, event: Event) -> None:
         self._texts.event(last_chunk(sample.key), stamp_ns, event)
-
-
-def _depth_of(sample: Sample) -> Any:
-    meter = 1.0 / sample.depth().unit_m
-    return rr.EncodedDepthImage(blob=sample.payload, media_type="image/png", meter=meter)

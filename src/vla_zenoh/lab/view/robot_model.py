@@ -36,13 +36,9 @@ MEDIA_TYPES = {
 class RobotMeshes:
     """Shapes of the profile's robot, and the poses of their links in the base frame.
 
-    Args:
-        profile: its robot's description is read.
-
     Raises:
         ResourceError: the description or all of its shapes are missing.
         ProfileError: frames or joints that the description does not have.
-        MissingExtraError: the package that carries the description is not installed.
     """
 
     def __init__(self, profile: Profile) -> None:
@@ -121,11 +117,7 @@ def _load_shapes(urdf: Path) -> list[tuple[str, Any, Any]]:
 
 
 def archetype_of(shape: Any) -> Any:
-    """What Rerun draws for a shape of Pinocchio.
-
-    Raises:
-        ResourceError: Rerun cannot draw it.
-    """
+    """What Rerun draws for a shape of Pinocchio. Raises ResourceError: Rerun cannot draw it."""
     geometry, colour = shape.geometry, [int(255 * part) for part in shape.meshColor.ravel()]
     solid: dict[str, Any] = {"colors": [colour], "fill_mode": "solid"}
     suffix = Path(shape.meshPath).suffix.lower()

@@ -85,11 +85,7 @@ def _drawn(shape: KeepOut) -> rr.Boxes3D | rr.Ellipsoids3D:
     if shape.normal is not None:
         turn = pin.Quaternion.FromTwoVectors(up, np.array(shape.normal))
     return rr.Boxes3D(
-        centers=centres,
-        sizes=[edges],
-        quaternions=[turn.coeffs()],
-        colors=colors,
-        fill_mode=fill,
+        centers=centres, sizes=[edges], quaternions=[turn.coeffs()], colors=colors, fill_mode=fill
     )
 
 
@@ -97,8 +93,6 @@ class Scene:
     """Logs the 3-D view in the base frame of an arm, at the current time of a Rerun stream.
 
     Args:
-        stream: to log into.
-        profile: of the arm, for the workspace.
         robot: its model; None: only poses are shown.
     """
 
@@ -147,7 +141,10 @@ class Scene:
         self._trails[name].add(stamp_ns, pose.position_m)
         if name == paths.MEASURED:
             self._measured = pose
-            self._remove_stale_ribbons(stamp_ns)
+            for worker, drawn_ns in list(self._ribbons.items()):
+                if not 0 <= stamp_ns - drawn_ns < STALE_NS:
+                    del self._ribbons[worker]
+                    self._stream.log(self._ribbon(worker), rr.Clear(recursive=True))
 
     def goal(self, stamp_ns: int, pose: Pose) -> None:
         """Keep a goal of the command stream: chunks start at the goal of their observation."""
@@ -166,11 +163,7 @@ class Scene:
         """Draw the waypoints of a chunk, from the goal in force at its observation.
 
         Args:
-            stamp_ns: of the chunk.
-            chunk: of which model, from which observation.
-            action: what the arm's numbers are.
             steps: (H, D) the arm's numbers.
-            obeyed: the arm follows this model.
         """
         measured = action.anchor == "measured"
         start = self._measured if measured else self._start_of(chunk)
@@ -206,12 +199,6 @@ class Scene:
         ends = plan.goals[plan.index_at(seen_ns)].pose.position_m
         return Pose(goal.position_m + plan.goal_at(seen_ns).pose.position_m - ends, goal.rotation)
 
-    def _remove_stale_ribbons(self, stamp_ns: int) -> None:
-        for worker, drawn_ns in list(self._ribbons.items()):
-            if not 0 <= stamp_ns - drawn_ns < STALE_NS:
-                del self._ribbons[worker]
-                self._stream.log(self._ribbon(worker), rr.Clear(recursive=True))
-
     # -- objects ------------------------------------------------------------------------------
     def objects(self, objects: ObjectPoses) -> None:
         """Draw the simulator's objects; those that are parked away from the robot are left out."""
@@ -229,5 +216,4 @@ class Scene:
 
 
 def pose_of(position_m: FloatArray, quat_xyzw: FloatArray) -> Pose:
-    """A record's pose."""
     return Pose(position_m, rotation_from_quat(quat_xyzw))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping
 from typing import Any
 
 import rerun as rr
@@ -24,8 +23,6 @@ class TextPanels:
     """Logs texts at the current time of a Rerun stream.
 
     Args:
-        stream: to log into.
-        profile_yaml: the profile in force.
         missing: why the robot itself is not shown; empty if it is.
     """
 
@@ -55,11 +52,12 @@ class TextPanels:
         """Log the current state if it has changed.
 
         Args:
-            stamp_ns: now.
             rejected: samples that cannot be shown, by key and reason.
             dropped: samples that came faster than they could be shown.
         """
-        lines = [*self._of_task(), "", *self._of_bounds(stamp_ns), *self._of_refusals()]
+        acting = [text for since, text in self._bounds.values() if 0 <= stamp_ns - since < BOUND_NS]
+        bounds = f"- Bounds acting: {', '.join(acting) or 'none'}"
+        lines = [*self._of_task(), "", bounds, *self._of_refusals()]
         if self._missing:
             lines.append(f"- The robot itself is not shown: {plain(self._missing)}")
         if rejected:
@@ -88,10 +86,6 @@ class TextPanels:
             f"{f', speed {task.speed_percent:g} %' if task.speed_percent < 100 else ''}",
         ]
 
-    def _of_bounds(self, stamp_ns: int) -> list[str]:
-        acting = [text for since, text in self._bounds.values() if 0 <= stamp_ns - since < BOUND_NS]
-        return [f"- Bounds acting: {', '.join(acting) or 'none'}"]
-
     def _of_refusals(self) -> list[str]:
         counters = self._status.counters if self._status is not None else {}
         refused = [
@@ -103,7 +97,6 @@ class TextPanels:
 
     # -- log ----------------------------------------------------------------------------------
     def event(self, node: str, stamp_ns: int, event: Event) -> None:
-        """Log an event."""
         if event.kind == "limit":
             self._bounds[event.what] = (stamp_ns, plain(f"{event.what} {event.why}".strip()))
         parts = [f"{node}: {event.what}"]
@@ -118,7 +111,6 @@ class TextPanels:
         self._stream.log(paths.below(paths.EVENTS, node), rr.TextLog(" ".join(parts), level=level))
 
     def setting(self, name: str, text: str) -> None:
-        """Log a published setting."""
         line = f"{name}: {text}" if text else name
         self._stream.log(f"{paths.EVENTS}/settings", rr.TextLog(line, level="INFO"))
 
@@ -126,9 +118,9 @@ class TextPanels:
         """Log a request to a model and its answer.
 
         Args:
-            seen: both.
             spec: of the model; None: not received yet, its numbers have no names.
         """
+        raw = json.dumps(seen.raw) if seen.raw else ""
         lines = [
             f"**{plain(seen.prompt)}**",
             "",
@@ -136,7 +128,11 @@ class TextPanels:
             + (", the last ones" if seen.done else ""),
             "",
             _first_step(seen, spec),
-            *_raw(seen.raw),
+            *(
+                ["", f"raw `{raw if len(raw) <= MAX_RAW else f'{raw[:MAX_RAW]}...'}`"]
+                if raw
+                else []
+            ),
         ]
         self._document(paths.answer(seen.worker), "\n".join(lines))
 
@@ -173,13 +169,5 @@ def _of_arm(part: str, action: ActionSpec, step: NDArray[Any]) -> str:
     return text
 
 
-def _raw(raw: Mapping[str, Any]) -> list[str]:
-    if not raw:
-        return []
-    text = json.dumps(raw)
-    return ["", f"raw `{text if len(text) <= MAX_RAW else f'{text[:MAX_RAW]}...'}`"]
-
-
 def plain(text: str) -> str:
-    """Text with Markdown characters escaped."""
     return "".join(f"\\{c}" if c in "\\`*_{}[]<>()#+!|~" else c for c in " ".join(text.split()))

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from vla_zenoh.errors import MissingExtraError, NodeError
+from vla_zenoh.lab.cli.loopback import free_port
 
 READY_PATIENCE_S = 30.0
 CLOSE_PATIENCE_S = 5.0
@@ -23,13 +24,7 @@ MEMORY = "25%"
 
 @dataclass(slots=True)
 class Viewer:
-    """A running viewer.
-
-    Args:
-        data_url: for the data of a Rerun stream.
-        page_url: for a browser; empty for a window.
-        process: of the viewer.
-    """
+    """A running viewer. `page_url`: for a browser; empty for a window."""
 
     data_url: str
     page_url: str
@@ -58,7 +53,6 @@ def open_window(*more: str) -> Viewer:
 
     Raises:
         NodeError: there is no screen, or the viewer does not start.
-        MissingExtraError: rerun-sdk is not installed.
     """
     screen = "--headless" in more or sys.platform != "linux"
     if not screen and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
@@ -66,7 +60,7 @@ def open_window(*more: str) -> Viewer:
             "there is no screen here (neither DISPLAY nor WAYLAND_DISPLAY is set); look with a "
             "browser: --serve, or write a file for later: -o FILE.rrd"
         )
-    port = _free_port()
+    port = free_port()
     arguments = ("--bind", HERE, "--port", str(port), "--hide-welcome-screen", "--expect-data-soon")
     return Viewer(_data_url(HERE, port), "", _start((*arguments, *more), HERE, port))
 
@@ -80,7 +74,6 @@ def open_server(address: str, port: int) -> Viewer:
 
     Raises:
         NodeError: a port is taken, or the server does not start.
-        MissingExtraError: rerun-sdk is not installed.
     """
     for each in (port, port + 1):
         _check_port_free(address, each)
@@ -130,12 +123,6 @@ def _start(arguments: Sequence[str], host: str, port: int) -> subprocess.Popen[b
         f"Rerun's viewer did not start (exit code {process.returncode}); its output is above. "
         "Look with a browser: --serve, or write a file for later: -o FILE.rrd"
     )
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind((HERE, 0))
-        return probe.getsockname()[1]
 
 
 def _check_port_free(address: str, port: int) -> None:

@@ -25,7 +25,6 @@ class Person(NamedTuple):
     Args:
         name: in messages and in the name of a deadman.
         role: rights, as in `vla_zenoh.security.roles`.
-        token: secret.
     """
 
     name: str
@@ -37,7 +36,6 @@ class People:
     """The people of a page, found by their tokens.
 
     Args:
-        people: with different tokens.
         most: highest role: that of the certificate with which the page is on the bus.
     """
 
@@ -118,26 +116,3 @@ def host_is_ours(host: str, names: Iterable[str]) -> bool:
 def origin_is_ours(origin: str, host: str, *, secure: bool) -> bool:
     """Whether the header ``Origin`` says that the page itself asks, not a page of another site."""
     return bool(host) and origin.lower() == f"http{'s' if secure else ''}://{host}".lower()
-
-
-class RateLimit:
-    """Limits how many messages are taken: `rate_hz` for long, `burst` at once.
-
-    Args:
-        rate_hz: of messages.
-        burst: messages.
-        now_s: monotonic.
-    """
-
-    def __init__(self, rate_hz: float, burst: float, now_s: float = 0.0) -> None:
-        self._rate_hz, self._burst = rate_hz, burst
-        self._left, self._at_s = burst, now_s
-
-    def take(self, now_s: float) -> bool:
-        """Whether one more is within the limit."""
-        self._left = min(self._burst, self._left + (now_s - self._at_s) * self._rate_hz)
-        self._at_s = now_s
-        if self._left < 1:
-            return False
-        self._left -= 1
-        return True

@@ -71,19 +71,11 @@ class ArmLines:
         return rounded([np.zeros(3), *joints, tcp.position_m])
 
     def links_of(self, state: JointState) -> Line:
-        """The same, measured.
-
-        Raises:
-            RecordError: it is not of this arm.
-        """
+        """The same, measured. Raises RecordError: it is not of this arm."""
         return self.links(self._kinematics.joints_of(state))
 
     def tcp(self, names: Sequence[str], joints_rad: FloatArray) -> list[float]:
-        """Position of the TCP, m.
-
-        Raises:
-            RecordError: it is not of this arm.
-        """
+        """Position of the TCP, m. Raises RecordError: it is not of this arm."""
         pose = self._kinematics.forward(self._kinematics.ordered(names, joints_rad))
         return rounded([pose.position_m])[0]
 
@@ -94,7 +86,6 @@ class ArmLines:
 
         Args:
             steps: (H, D) of a chunk, those of this arm.
-            action: what they mean.
             start: where it begins, with poses.
             state: where it begins, with joints; None: unknown.
 

@@ -24,11 +24,6 @@ START_S = 5.0
 class HandWorker:
     """The worker ``teleop``, while a person has taken the arm on the page.
 
-    Args:
-        profile: of the robot.
-        client: that selects the worker.
-        read: input now.
-
     Attributes:
         parts: of the robot, of which one is moved at a time; of one arm one without a name.
     """
@@ -79,7 +74,6 @@ class HandWorker:
             return task
 
     def close(self) -> None:
-        """End the worker."""
         with self._lock:
             self._end()
 

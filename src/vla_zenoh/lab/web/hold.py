@@ -20,7 +20,6 @@ class Held(NamedTuple):
 
     Args:
         page: that holds; number of its connection.
-        press: number of the press on that page.
         until_s: when it ends without a newer echo.
     """
 
@@ -65,7 +64,6 @@ class Hold:
             self.held = None
 
     def forget(self, page: int) -> None:
-        """A page is gone."""
         self.release(page)
         self._last_press.pop(page, None)
 

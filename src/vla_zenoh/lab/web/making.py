@@ -16,12 +16,7 @@ NICENESS, PICTURES, EVERY = 10, 8, 15
 
 
 def main(kind: str, run: Path, out: Path, *, pictures: bool) -> None:
-    """Make it.
-
-    Raises:
-        RecordingError: the run cannot be read, or has no pictures.
-        MissingExtraError: a library is not installed.
-    """
+    """Make it. Raises RecordingError: the run cannot be read, or has no pictures."""
     if kind == FILM:
         from vla_zenoh.lab.recording.film import Film, write_film
         from vla_zenoh.lab.recording.run import load_run

@@ -103,13 +103,6 @@ def _numbers(value: Any) -> Iterator[tuple[str, float]]:
 
 
 def families(rows: Iterable[NodeRow], web: Mapping[str, int], pages: int) -> list[Any]:
-    """Families of metrics.
-
-    Args:
-        rows: every node seen or expected.
-        web: counters of the page.
-        pages: that are open.
-    """
     out = _Families()
     for row in rows:
         _of_node(out, row)

@@ -36,11 +36,6 @@ CHUNK_S = 2.0
 class PartStreams:
     """Streams of a part of a robot, or of a robot that is one arm. Belongs to one thread.
 
-    Args:
-        profile: of the part.
-        session: open.
-        counters: counts what cannot be read.
-
     Attributes:
         no_arm: why the arm cannot be drawn; empty: it can.
     """
@@ -157,6 +152,5 @@ class PartStreams:
         return found
 
     def close(self) -> None:
-        """Unsubscribe."""
         for subscriber in self._subscribers:
             subscriber.undeclare()

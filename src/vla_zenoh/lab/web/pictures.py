@@ -32,7 +32,6 @@ class Picture(NamedTuple):
     """A picture.
 
     Args:
-        jpeg: the file.
         stamp_wall_ns: capture, clock of its camera.
         said: which distances its colours mean, of a depth picture.
     """
@@ -52,11 +51,6 @@ class _Stream:
 class Pictures:
     """Subscriptions to pictures, each while at least one page wants it: cameras and workers publish
     them because of these. Safe to use from several threads.
-
-    Args:
-        session: open.
-        keys: of the robot.
-        cameras: of the profile.
 
     Attributes:
         offered: streams of the cameras: ``camera/NAME``, and ``depth/NAME`` where it measures it.
@@ -117,7 +111,6 @@ class Pictures:
         return self._streams.pop(name) if stream.users == 0 else None
 
     def count(self, name: str) -> int:
-        """Pictures that came so far."""
         stream = self._streams.get(name)
         return 0 if stream is None else stream.latest.count
 

@@ -18,13 +18,7 @@ from vla_zenoh.profile import Profile
 
 
 class Recordings:
-    """The recording that runs, if one does. Its methods may be called from several threads.
-
-    Args:
-        profile: of the robot.
-        session: open, with the rights of an operator.
-        folder: for the files.
-    """
+    """The recording that runs, if one does. Its methods may be called from several threads."""
 
     def __init__(self, profile: Profile, session: zenoh.Session, folder: Path = RUNS) -> None:
         self._profile, self._session, self._folder = profile, session, folder
@@ -62,9 +56,7 @@ class Recordings:
         """Finish it.
 
         Args:
-            worker: that had the arm.
             verdict: ``success``, ``failure``, ``void``, or empty.
-            note: of the person.
 
         Raises:
             NodeError: none runs.
@@ -83,6 +75,5 @@ class Recordings:
             return f"{path}: {found.samples.total()} samples in {found.seconds:.0f} s"
 
     def close(self) -> None:
-        """Finish the one that runs."""
         if self._running is not None:
             self.end("", "", "")

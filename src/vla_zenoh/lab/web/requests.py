@@ -18,12 +18,7 @@ AXES = 6
 
 
 class PageRequest(NamedTuple):
-    """A checked request.
-
-    Args:
-        do: its name, of `FIELDS`.
-        values: its fields.
-    """
+    """A checked request. `do`: its name, of `FIELDS`."""
 
     do: str
     values: Mapping[str, Any]
@@ -59,20 +54,8 @@ def _level(value: Any) -> bool:
     return type(value) is int and 0 <= value < 5
 
 
-def _frame(value: Any) -> bool:
-    return value in ("base", "tcp")
-
-
-def _verdict(value: Any) -> bool:
-    return value in ("success", "failure", "void", "")
-
-
-def _made(value: Any) -> bool:
-    return value in (REPORT, FILM)
-
-
-def _primitive(value: Any) -> bool:
-    return value in ("home", "open", "closed")
+def _word(*allowed: str) -> Callable[[Any], bool]:
+    return lambda value: value in allowed
 
 
 def _streams(value: Any) -> bool:
@@ -91,11 +74,11 @@ FIELDS: Mapping[str, Mapping[str, Callable[[Any], bool]]] = {
     "activate": {},
     "deactivate": {},
     "hold": {"press": _count, "tick": _count},
-    "primitive": {"press": _count, "tick": _count, "name": _primitive},
+    "primitive": {"press": _count, "tick": _count, "name": _word("home", "open", "closed")},
     "beat": {"press": _count, "tick": _count, "twist": _twist, "opening": _share},
     "release": {},
-    "jog": {"on": _flag, "frame": _frame, "level": _level, "part": _text},
-    "record": {"on": _flag, "verdict": _verdict, "note": _text},
+    "jog": {"on": _flag, "frame": _word("base", "tcp"), "level": _level, "part": _text},
+    "record": {"on": _flag, "verdict": _word("success", "failure", "void", ""), "note": _text},
     "save": {"note": _text},
     "trial": {
         "name": _text,
@@ -109,7 +92,7 @@ FIELDS: Mapping[str, Mapping[str, Callable[[Any], bool]]] = {
     "watched": {"tick": _count},
     "end_trial": {},
     "runs": {},
-    "make": {"name": _text, "kind": _made},
+    "make": {"name": _text, "kind": _word(REPORT, FILM)},
     "look": {"streams": _streams, "hz": _number},
     "drawn": {"frame": _count},
 }
@@ -117,11 +100,7 @@ FIELDS: Mapping[str, Mapping[str, Callable[[Any], bool]]] = {
 
 
 def parse(text: str) -> PageRequest:
-    """Read a message of a browser.
-
-    Raises:
-        CodecError: it is no request; says what is wrong.
-    """
+    """Read a message of a browser. Raises CodecError: it is no request; says what is wrong."""
     if len(text) > MAX_BYTES:
         raise CodecError("oversize", f"{len(text)} characters, at most {MAX_BYTES} are accepted")
     try:

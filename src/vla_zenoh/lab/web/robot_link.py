@@ -28,11 +28,7 @@ from vla_zenoh.lab.web.recordings import Recordings
 from vla_zenoh.lab.web.trial import PageTrial
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import (
-    ActionChunk,
-    PoseState,
-    Task,
-)
+from vla_zenoh.types import ActionChunk, PoseState, Task
 
 STILL_M_S = 0.005
 """A measured arm that is slower stands: an impedance controller still settles."""
@@ -47,10 +43,6 @@ class RobotLink:
 
     `poll` and `arm` belong to one thread; what waits for the robot (`stop`, `activate_held`) is
     called from others.
-
-    Args:
-        profile: of the robot.
-        session: open, with the rights of a person.
     """
 
     def __init__(self, profile: Profile, session: zenoh.Session) -> None:
@@ -62,10 +54,7 @@ class RobotLink:
             for name in profile.part_names
         }
         self.no_arm = next((part.no_arm for part in self._parts.values()), "")
-        self._rings: dict[type[Any], ZenohRing] = {
-            ActionChunk: ZenohRing(16),
-            ModelSpec: ZenohRing(16),
-        }
+        self._rings = {ActionChunk: ZenohRing(16), ModelSpec: ZenohRing(16)}
         self._subscribers = [
             self._rings[ActionChunk].subscribe(session, self.keys.all_deltas),
             self._rings[ModelSpec].subscribe(session, self.keys.all_specs),
@@ -106,12 +95,9 @@ class RobotLink:
         if len(self._specs) >= SPECS:
             del self._specs[next(iter(self._specs))]
         self._specs[record.hash] = record
-        self._take_seen(last_chunk(str(sample.sample.key_expr)), record)
-
-    def _take_seen(self, worker: str, spec: ModelSpec) -> None:
-        """Note which pictures show what a worker's model sees."""
-        if worker in self._seen or len(self._seen) < SPECS:
-            seen = [f"seen/{worker}/{camera.camera}" for camera in spec.observation.cameras]
+        worker = last_chunk(str(sample.sample.key_expr))
+        if worker in self._seen or len(self._seen) < SPECS:  # pictures of what its model sees
+            seen = [f"seen/{worker}/{camera.camera}" for camera in record.observation.cameras]
             self._seen[worker] = seen
 
     def _take_chunk(self, chunk: ActionChunk, now_s: float) -> None:
@@ -151,7 +137,6 @@ class RobotLink:
 
     # -- nodes --------------------------------------------------------------------------------
     def rows(self) -> list[NodeRow]:
-        """Every node seen or expected."""
         client = self.client
         return node_rows(client.snapshot(), client.expected, client.alive)
 
@@ -271,8 +256,6 @@ class RobotLink:
         """Go home, open or close the gripper, for as long as this page holds; waits for the end.
 
         Args:
-            page: that holds.
-            name: of the person.
             what: ``home``, ``open`` or ``closed``.
 
         Raises:
@@ -295,11 +278,7 @@ class RobotLink:
         return f"{what}: {answer.reason} after {answer.took_s:.1f} s"
 
     def save(self, note: str) -> str:
-        """Have the rolling record keep its last minutes.
-
-        Raises:
-            SessionError: none runs.
-        """
+        """Have the rolling record keep its last minutes. Raises SessionError: none runs."""
         if ROLLING not in self.client.alive:
             raise SessionError("no rolling record runs; `vla-zenoh up` keeps one")
         self.client.publish(self.keys.save, note or "asked on the page")
@@ -314,9 +293,6 @@ class RobotLink:
         """Extend a hold by the echo of a tick; False if it is not in force.
 
         Args:
-            page: that holds.
-            press: of its button.
-            tick_ms: echoed.
             hand: motion by hand, for as long as the hold is in force.
         """
         with self._hold_lock:
@@ -333,12 +309,10 @@ class RobotLink:
     def release(self, page: int, *, gone: bool = False) -> None:
         """End the hold of a page, if it has it: the arm brakes."""
         with self._hold_lock:
-            self._let_go = self._let_go or (self._held_by(page) and not gone)
+            held = self._hold.held
+            self._let_go = self._let_go or (held is not None and held.page == page and not gone)
             (self._hold.forget if gone else self._hold.release)(page)
         self._wake.set()
-
-    def _held_by(self, page: int) -> bool:
-        return self._hold.held is not None and self._hold.held.page == page
 
     def _watch_hold(self) -> None:
         """Keep the liveliness token only while a page holds, whatever the server is doing."""
@@ -365,11 +339,7 @@ class RobotLink:
         return self._confirmed and (task is None or not task.active)
 
     def deactivate(self) -> str:
-        """Brake the arm, and wait until it stands.
-
-        Raises:
-            SessionError: it does not in time.
-        """
+        """Brake the arm, and wait until it stands. Raises SessionError: it does not in time."""
         with self._hold_lock:
             self._hold.held = None
         if not self.client.deactivate(STAND_S):
@@ -396,7 +366,6 @@ class RobotLink:
         return "cleared; inactive"
 
     def close(self) -> None:
-        """End a hold, and unsubscribe."""
         self._closed.set()
         self._wake.set()
         self._watcher.join()

@@ -22,7 +22,7 @@ from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.cli.output_path import RUNS
 from vla_zenoh.lab.evaluation.evaluate import recordings
 from vla_zenoh.lab.trial.folder import PLAN, TrialFolder
-from vla_zenoh.lab.trial.unattended_page import PAGE
+from vla_zenoh.lab.trial.unattended import PAGE
 from vla_zenoh.lab.web.making import FILM, REPORT
 
 MADE = ".web"
@@ -54,7 +54,6 @@ class Ticket(NamedTuple):
 
     Args:
         path: a file, or the folder of a page with its pictures.
-        pictures: whether pictures in that folder are served, too.
         until_s: monotonic.
     """
 
@@ -133,9 +132,7 @@ class Runs:
         hold up the echo of ticks.
 
         Args:
-            name: of the list.
             kind: `REPORT` or `FILM`.
-            pictures: of cameras, on the page.
             told: called with the share that is done, where that is known.
 
         Returns:

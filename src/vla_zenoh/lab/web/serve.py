@@ -49,13 +49,9 @@ def serve_page(
     """Serve the page of a robot until `stop` is set; then a hold ends and the arm brakes.
 
     Args:
-        profile: of the robot.
-        session: open, with the rights of a person.
-        people: who may use it.
         listening: bound socket.
         names: of this server, for the header ``Host``.
         tls: None: plain HTTP.
-        stop: ends it.
     """
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     link = RobotLink(profile, session)

@@ -18,10 +18,11 @@ from pathlib import Path
 from typing import Any
 
 from vla_zenoh.errors import CodecError, MissingExtraError, RecordingError, VlaZenohError
+from vla_zenoh.lab.rate_limit import RateLimit
 from vla_zenoh.lab.teleop.policy import OperatorInput
 from vla_zenoh.lab.trial.plan import MAX_SETUPS
 from vla_zenoh.lab.web import metrics
-from vla_zenoh.lab.web.access import People, Person, RateLimit, host_is_ours, origin_is_ours
+from vla_zenoh.lab.web.access import People, Person, host_is_ours, origin_is_ours
 from vla_zenoh.lab.web.arm import surroundings
 from vla_zenoh.lab.web.making import FILM
 from vla_zenoh.lab.web.pictures import Pictures
@@ -86,8 +87,6 @@ class Page:
     """One open page: what waits to be sent to it.
 
     Args:
-        number: of its connection.
-        person: who it is.
         masked: what may be told of a message; None: nothing.
     """
 
@@ -101,7 +100,6 @@ class Page:
 
     @property
     def drives(self) -> bool:
-        """Whether this person may drive."""
         return self.person.role == "operator"
 
     def tell(self, message: dict[str, Any]) -> None:
@@ -113,14 +111,7 @@ class Page:
 
 
 class PageServer:
-    """Application of the page of one robot.
-
-    Args:
-        link: to the robot.
-        people: who may use it.
-        names: of this server, for the header ``Host``.
-        secure: it is served by TLS.
-    """
+    """Application of the page of one robot. `names`: of this server, for the header ``Host``."""
 
     def __init__(
         self, link: RobotLink, people: People, names: Iterable[str], *, secure: bool
@@ -531,11 +522,7 @@ class PageServer:
 
 
 class Look:
-    """What a page looks at.
-
-    Args:
-        now_s: monotonic.
-    """
+    """What a page looks at. `now_s`: monotonic."""
 
     def __init__(self, now_s: float) -> None:
         self.streams: tuple[str, ...] = ()
@@ -571,11 +558,7 @@ def _trial(page: int, given: Mapping[str, Any]) -> tuple[int, str, dict[str, Any
 
 
 async def _receive(socket: WebSocket) -> str:
-    """The next text of a browser.
-
-    Raises:
-        WebSocketDisconnect: it is gone.
-    """
+    """The next text of a browser. Raises WebSocketDisconnect: it is gone."""
     message = await socket.receive()
     if message["type"] == "websocket.disconnect":
         raise WebSocketDisconnect(message.get("code") or 1006)

@@ -35,11 +35,7 @@ UNMASKED = frozenset({"is", "phase"})
 
 
 class PageTrial:
-    """The trial that runs, if one does; implements `Operator`. Safe to use from several threads.
-
-    Args:
-        profile: of the robot.
-    """
+    """The trial that runs, if one does; implements `Operator`. Safe to use from several threads."""
 
     def __init__(self, profile: Profile) -> None:
         self._profile = profile
@@ -57,7 +53,6 @@ class PageTrial:
     # -- for pages ----------------------------------------------------------------------------
     @property
     def runs(self) -> bool:
-        """Whether one does."""
         return self._thread is not None and self._thread.is_alive()
 
     def state(self) -> dict[str, Any]:
@@ -87,8 +82,6 @@ class PageTrial:
         """Begin or continue the trial in the folder `name` of the runs.
 
         Args:
-            page: that runs it.
-            name: of the folder.
             asked: fields of its plan, None: as the folder has them.
 
         Raises:
@@ -140,7 +133,6 @@ class PageTrial:
             self._watched_s = sent_s
 
     def gone(self, page: int) -> None:
-        """A page is closed."""
         if page == self._page:
             self._page = NO_PAGE
 
@@ -184,7 +176,6 @@ class PageTrial:
         return self._shown.get("text", "")
 
     def ask(self, episode: EpisodeFsm) -> str:
-        """See `Operator`."""
         text = self._text()
         if episode.phase is Phase.BLOCKED:
             text = episode.reasons
@@ -216,15 +207,12 @@ class PageTrial:
         return self._next(0.001)
 
     def reject_line(self, line: str, phase: Phase) -> None:
-        """See `Operator`."""
         self.notify(f"{line[:80]!r} is not valid in phase {phase}")
 
     def show(self, episode: EpisodeFsm) -> None:
-        """See `Operator`."""
         self._show(episode)
 
     def show_end(self, episode: EpisodeFsm) -> None:
-        """See `Operator`."""
         assert episode.end is not None
         said = f"{self._text()}; " if self._text() else ""
         why = f": {episode.why}" if episode.why else ""
@@ -232,7 +220,6 @@ class PageTrial:
         self._show(episode, text=text)
 
     def notify(self, text: str) -> None:
-        """See `Operator`."""
         with self._lock:
             self._shown = {**self._shown, "text": text}
 

@@ -351,7 +351,7 @@ class StateSubscriber:
             for arrival in buffer.drain():
                 try:
                     joints = self._decode(JOINT_STATE, arrival)
-                    arrived_ns = self._node.arrival_wall_ns(arrival)
+                    arrived_ns = self._node.clock.wall_at(arrival.mono_ns)
                     if self.state.take(joints, joints.stamp_ns or arrived_ns) is None:
                         continue  # of the fingers alone, or of another robot
                 except CodecError as error:
@@ -377,7 +377,7 @@ class StateSubscriber:
             except CodecError as error:
                 self._reject(self._ros2.wrench.topic, error)
             else:
-                stamp_ns = found.stamp_ns or self._node.arrival_wall_ns(arrival)
+                stamp_ns = found.stamp_ns or self._node.clock.wall_at(arrival.mono_ns)
                 self._wrench = found._replace(stamp_ns=stamp_ns)
 
 
