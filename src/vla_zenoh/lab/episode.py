@@ -1,9 +1,4 @@
-"""An episode: a prompt that the arm follows until something ends it.
-
-`EpisodeRunner` does with a running robot what every episode needs. What judges an episode is up to
-its users: measured poses (`vla_zenoh.lab.demo.runner`), the objects of the simulator
-(`vla_zenoh.lab.bench.task_runner`), a person (`vla_zenoh.lab.trial.runner`).
-"""
+"""An episode: a prompt that the arm follows until something ends it."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Runs the task benchmark in lockstep: the same policy, commander and world on a virtual clock.
-
-Pictures are drawn when the policy reads them, from the poses at their capture.
-"""
+"""Runs the task benchmark in lockstep: the same policy, commander and world on a virtual clock."""
 
 from __future__ import annotations
 

@@ -199,10 +199,7 @@ def _joint_names(spec: ModelSpec, part: str) -> tuple[str, ...]:
 def example_observation(
     spec: ModelSpec, *, prompt: str = "put the red brick in the box"
 ) -> Observation:
-    """A valid observation of the declared form, gray images and an arm at rest: for dry runs.
-
-    It has the parts of the state that the spec asks for, and no others.
-    """
+    """A valid observation of the declared form, gray images and an arm at rest: for dry runs."""
     asked = spec.observation.state
     images = {
         camera.camera: np.full((camera.height or 480, camera.width or 640, 3), 128, np.uint8)

@@ -1,7 +1,3 @@
-"""Evaluation of recorded runs.
-
-`evaluate.evaluate` makes a `result.Evaluation` of each file, `evaluate.combined` one of all
-of them, and `report` a page with plots.
-"""
+"""Evaluation of recorded runs."""
 
 from __future__ import annotations

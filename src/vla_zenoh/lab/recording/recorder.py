@@ -1,8 +1,4 @@
-"""Records the keys of a robot into a file, as a node with its own status and events.
-
-Zenoh's callback only adds a sample to a bounded queue; a thread writes. Dropped samples are counted
-by key, in the status and in the file.
-"""
+"""Records the keys of a robot into a file, as a node with its own status and events."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""Runs a trial on a robot: activates, records every episode, and keeps the operator's verdicts.
-
-`EpisodeFsm` decides what comes next; clock, session and recorder are here. Whatever ends a run, the
-arm is braked first.
-"""
+"""Runs a trial on a robot: activates, records every episode, and keeps the operator's verdicts."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""Runs an unattended trial: task by task, until all is judged or a rule stops.
-
-Whatever ends the process, the same command goes on: an episode counts once its verdict is on the
-disk, and one without a verdict is repeated.
-"""
+"""Runs an unattended trial: task by task, until all is judged or a rule stops."""
 
 from __future__ import annotations
 

@@ -1,7 +1,3 @@
-"""Live and recorded runs in Rerun.
-
-`rerun_logger.RerunLogger` logs samples into a Rerun stream, `layout` arranges the views, `viewer`
-starts the viewer, `listener` receives the samples of a live robot.
-"""
+"""Live and recorded runs in Rerun."""
 
 from __future__ import annotations

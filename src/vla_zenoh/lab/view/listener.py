@@ -16,8 +16,6 @@ REPLY_TIMEOUT_S = 1.0
 class ViewListener(SampleQueue):
     """Queue of all samples of a robot but raw images.
 
-    Cameras encode JPEG, and workers publish what their models see, because of its subscribers.
-
     Args:
         session: an open session; the caller closes it.
         queue_bytes: payloads kept at most; samples that do not fit are dropped and counted.
