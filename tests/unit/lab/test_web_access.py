@@ -11,14 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vla_zenoh.errors import CodecError, SecurityError
-from vla_zenoh.lab.web.access import (
-    People,
-    Person,
-    RateLimit,
-    host_is_ours,
-    origin_is_ours,
-    read_people,
-)
+from vla_zenoh.lab.rate_limit import RateLimit
+from vla_zenoh.lab.web.access import People, Person, host_is_ours, origin_is_ours, read_people
 from vla_zenoh.lab.web.hold import HOLD_S, Hold
 from vla_zenoh.lab.web.requests import FIELDS, MAX_BYTES, parse
 
