@@ -12,7 +12,7 @@ import numpy as np
 import typer
 
 from vla_zenoh.cli.output import console, new_table, styled
-from vla_zenoh.lab.cli.demo import DemoOptions
+from vla_zenoh.lab.cli.demo_options import DemoOptions
 from vla_zenoh.lab.cli.demo_stage import Stage, latency_line, open_stage, refusals, run_folder
 from vla_zenoh.lab.cli.output import print_json
 from vla_zenoh.lab.demo.runner import MotionRunner
