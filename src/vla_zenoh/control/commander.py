@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from vla_zenoh.control.chunk_planner import ChunkOutcome
 from vla_zenoh.control.chunk_validation import Lease, Rejection
@@ -26,14 +27,12 @@ from vla_zenoh.control.commander_io import (
     make_event,
 )
 from vla_zenoh.control.limits import LimitHit
-from vla_zenoh.control.part_spacing import PartSpacing
 from vla_zenoh.control.plan_timeline import EpisodeProgress, Plan
 from vla_zenoh.control.preflight import PeerSnapshot, reasons_of_worker
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.states import DEACTIVATED, OBEYING, State, Trigger, after
 from vla_zenoh.control.watchdog import Deadman
 from vla_zenoh.errors import RecordError
-from vla_zenoh.kinematics.part_distance import Nearest
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     MAX_TEXT,
@@ -42,6 +41,10 @@ from vla_zenoh.types import (
     Stamped,
     Task,
 )
+
+if TYPE_CHECKING:
+    from vla_zenoh.control.part_spacing import PartSpacing
+    from vla_zenoh.kinematics.part_distance import Nearest
 
 LATE_NS = 10_000_000_000
 """A setting that was put before a stop arrives at most this long after it. Stamps that say so later
@@ -91,7 +94,11 @@ class Commander:
         self._peers = PeerSnapshot()
         self._latest: dict[str, Stamped[ActionChunk]] = {}
         known = bool(profile.parts) and all(part.reach for part in self.parts)
-        self._spacing = PartSpacing(profile, self.parts) if known else None
+        self._spacing: PartSpacing | None = None
+        if known:
+            from vla_zenoh.control.part_spacing import PartSpacing  # of robots of parts alone
+
+            self._spacing = PartSpacing(profile, self.parts)
         first = self.parts[0]
         # All parts have the same chunks at the same time: one queue, one deadline.
         self._planner, self._motion, self._watchdog = first.planner, first.motion, first.watchdog

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from operator import is_
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -25,7 +25,6 @@ from vla_zenoh.control.limits import (
     workspace_corners,
 )
 from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan, joint_goal
-from vla_zenoh.control.pose_to_joint import PoseToJoint
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.smoothing import FULL, Motion, Shares, Smoother, motion_limits
 from vla_zenoh.control.states import OBEYING, State
@@ -53,6 +52,9 @@ from vla_zenoh.types import (
     Task,
     computed,
 )
+
+if TYPE_CHECKING:
+    from vla_zenoh.control.pose_to_joint import PoseToJoint
 
 LINGER_NS = 500_000_000
 """The stream continues for this long after the arm stands, so that its last pose is not lost."""
@@ -111,6 +113,8 @@ class MotionPipeline:
         if profile.robot.command == "joint":
             if reach is None:
                 raise ProfileError("robot.command is joint, which needs the robot's kinematics")
+            from vla_zenoh.control.pose_to_joint import PoseToJoint
+
             self._joints = PoseToJoint(profile, reach.kinematics, reach.barriers)
         self._path: JointPath | None = None
         if planner.joint_bounds is not None:
