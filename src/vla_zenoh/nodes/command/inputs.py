@@ -184,21 +184,21 @@ class _PartInputs:
 
     def _state(self, kind: type[Any]) -> Stamped[Any] | None:
         """The newest state from the robot's source, whatever other sources publish."""
-        newest: Stamped[Any] | None = None
-        for arrival in self._rings[kind].drain():
-            newest = self._node.decode(kind, arrival, self._writers[kind]) or newest
-        return newest
+        for arrival in reversed(self._rings[kind].drain()):
+            found = self._node.decode(kind, arrival, self._writers[kind])
+            if found is not None:
+                return found
+        return None
 
     def _joints(self, requested: bool) -> Stamped[JointState] | None:
         """The newest joints, at `JOINT_PERIOD_S`: decoding them is expensive."""
-        if not requested and time.monotonic() - self._last_joint < JOINT_PERIOD_S:
+        now_s = time.monotonic()
+        if not requested and now_s - self._last_joint < JOINT_PERIOD_S:
             return None
-        for arrival in reversed(self._rings[JointState].drain()):
-            found = self._node.decode(JointState, arrival, self._writers[JointState])
-            if found is not None:
-                self._last_joint = time.monotonic()
-                return found
-        return None
+        found = self._state(JointState)
+        if found is not None:
+            self._last_joint = now_s
+        return found
 
 
 def _put_ns(arrival: ReceivedSample) -> int | None:

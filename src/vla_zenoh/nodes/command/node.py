@@ -34,7 +34,7 @@ TASK_PERIOD_S = 0.2
 BRAKE_BEFORE_EXIT_S = 1.0
 SWITCH_INTERVAL_S = 5e-4
 MAX_WHY, MAX_LIMIT = 2000, 200
-CHORES_S = 0.02
+CHORES_S = 0.05
 """Period of tasks that no motion depends on: status, clock queries, reading other nodes' status."""
 PLANNING_NS = 1_500_000
 """A chunk is planned this long before the next tick, or at once if it arrives later. Its other
