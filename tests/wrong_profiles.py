@@ -575,5 +575,5 @@ EXTENDED: list[tuple[str, str]] = [
     ),
     ("options: {third: {a: b}}", "lab.yaml:2: options.third: 'third' is not among workers. Known"),
     ("task: {worker: first}", "lab.yaml:2: task.worker: 'first' is not among workers. Known: scri"),
-    ("cameras: {front: {depth: true}}", "cameras.front.depth: cameras give colour images only; de"),
+    ("cameras: {front: {depth: true}}", "cameras.front.depth: depth images are published where"),
 ]

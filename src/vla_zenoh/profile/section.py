@@ -77,7 +77,7 @@ Distinct = AfterValidator(_differ)
 REPLACED_WHOLE = {("hosts",)}
 WITH_REMOVABLE = {("cameras",), ("ros2", "cameras"), ("models",), ("serves",), ("options",)}
 """Maps of which null removes an inherited entry; null in place of the map: all of them."""
-NOT_MADE = {"depth": "cameras give colour images only; depth is not read."}
+NOT_MADE = {"depth": "depth images are published where depth_unit_m is set."}
 """Key that looks like a slip of another one but asks for more than exists -> what there is."""
 _NO_VALUE_SHOWN = {"missing", "extra_forbidden", "too_long", "too_short", "value_error"}
 
