@@ -203,6 +203,10 @@ def test_importing_the_core_loads_nothing_heavy(name: str) -> None:
     assert loaded_after(f"vla_zenoh.{name}").isdisjoint(HEAVY)
 
 
+def test_doctor_starts_where_opencv_does_not_load() -> None:
+    assert loaded_after("vla_zenoh.lab.cli.doctor").isdisjoint({"cv2"})
+
+
 def test_importing_what_adapters_share_loads_nothing_that_their_environments_lack() -> None:
     loaded = loaded_after("vla_zenoh.lab.policy_servers.adapter")
     assert loaded.isdisjoint({*HEAVY, *OPTIONAL, "cv2", "rosbags"})

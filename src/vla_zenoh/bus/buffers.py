@@ -227,8 +227,8 @@ class ZenohRing(SampleBuffer):
     """A `CallbackRing` that Zenoh fills by itself, without running Python for each sample.
 
     A flood of samples then costs the loop that drains it nothing. The price: the time of arrival is
-    that of `drain`, and samples that are too large are dropped only there. Samples of a full ring
-    are not counted, since others may have been dropped.
+    that of `drain`, and samples that are too large are dropped only there: until then `size` of
+    them are kept. Samples of a full ring are not counted, since others may have been dropped.
     """
 
     def __init__(self, size: int, limit: int = MAX_RECORD_BYTES) -> None:

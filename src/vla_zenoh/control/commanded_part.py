@@ -137,6 +137,7 @@ class CommandedPart:
                 "robot.tcp_frame and robot.arm_joints in the profile"
             )
         self.reach.hold(box)
+        self.motion.forget_ahead()
         self.held = box
         gripper = self.gripper_state
         self._grasp_m = np.inf if gripper is None else gripper.record.width_m
@@ -198,6 +199,8 @@ class CommandedPart:
         """Start the motion where the arm stands; its states are known."""
         assert self.pose is not None and self.gripper_state is not None
         self.too_near = None
+        if self._joint_monitor is not None:
+            self._joint_monitor.reset()
         self.contact.begin()
         self.planner.restart(self.pose, self.joint)
         measured, joint = self.pose.record, self.joint.record if self.joint else None
@@ -275,7 +278,8 @@ class CommandedPart:
         if monitor is None or measured_rad is None or not motion.streaming:
             return
         commanded_rad, in_joints = motion.joints_rad, motion.in_joints
-        self.too_near = monitor.update(measured_rad, commanded_rad, now_ns, in_joints=in_joints)
+        found = monitor.update(measured_rad, commanded_rad, now_ns, in_joints=in_joints)
+        self.too_near = found or self.too_near  # until the arm brakes for it
         motion.joint_slowdown = monitor.slowdown
 
     def _obstructed(self, events: list[Event]) -> str:

@@ -179,7 +179,7 @@ class Commander:
         self._plan_chunks(now_ns)
         self._supervise(now_ns)
         for part in parts:
-            if not planned:
+            if not planned or self.state not in OBEYING or part.monitor_late(now_ns):
                 self._follow_elbow(part)
             if self.state in OBEYING:
                 if part.monitor_late(now_ns):  # `look_ahead` is not called in time

@@ -490,7 +490,7 @@ class MotionPipeline:
         self._changing = joints is not self.in_joints
         mover = self._mover
         assert mover is not None
-        if self.held:
+        if self.held and not self._changing:
             self._cut_lead(mover, plans, goal, now_ns)
         if self._override == 0.0 or self._changing or self.held:
             self._pause(mover)
@@ -539,6 +539,10 @@ class MotionPipeline:
         self._ahead = self._motion_to(mover, goal, plans[0], task, overdue_ns, next_ns)
         self.speed = speed
         return True
+
+    def forget_ahead(self) -> None:
+        """Compute the motion to the next goal again: its bounds have changed."""
+        self._ahead = None
 
     def _slowest(self, goal: Goal) -> Slowdown | None:
         """What slows the arm down most on the way to `goal`."""

@@ -33,7 +33,7 @@ PARENT_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG
 WATCH = "watch over the supervisor"
 LOOK_PERIOD_S = 0.25
 LAST_WORDS_S = 1.5
-ROUTER_PATIENCE_S = 10.0
+ROUTER_PATIENCE_S = 20.0
 
 
 def die_with_parent() -> None:

@@ -149,10 +149,10 @@ class Supervisor:
         self._log, self._tell = log, tell
         self.given_up: Child | None = None
 
-    def start(self) -> None:
-        """Start the nodes that do not run yet."""
+    def start(self, kind: str = "") -> None:
+        """Start the nodes that do not run yet, of one kind or all."""
         for child in self.children:
-            if child.process is None:
+            if child.process is None and kind in ("", child.command.kind):
                 self._spawn(child)
 
     def poll(self, spare: Sequence[str] = ()) -> bool:

@@ -145,7 +145,7 @@ class _Integral:
         """Integrate; where `held`, towards zero only: the arm is blocked, or a torque is cut."""
         step = self._rate * error
         if held is not False:
-            step[held & (step * self.value >= 0.0)] = 0.0
+            step[held & ~(step * self.value < 0.0)] = 0.0  # NaN as well
         self.put(self.value + step)
 
 

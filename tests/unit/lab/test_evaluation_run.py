@@ -193,6 +193,38 @@ def test_seams_tell_how_far_the_goal_went(recording: Path) -> None:
     assert run.seam_velocity_mm_s.max() == pytest.approx(50.0, abs=0.01), "it stops at once"
 
 
+def motion_out_of_rest(rest_gap_ns: int) -> Iterable[Sample]:
+    """Commands at rest for a second, this far apart, then a jerk of one size in every tick."""
+    rest_ns, moving_ns = 1_000_000_000, 100_000_000
+    stamps_ns = [*range(0, rest_ns, rest_gap_ns), *range(rest_ns, rest_ns + moving_ns, TICK_NS)]
+    for seq, at_ns in enumerate(stamps_ns):
+        t_s = max(at_ns - rest_ns + TICK_NS, 0) / 1e9
+        values = (JERK_M_S3 * np.array([t_s**3 / 6, t_s**2 / 2, t_s])).tolist()
+        position, twist, acceleration = (np.array([value, 0, 0, 0, 0, 0]) for value in values)
+        of = cause(int(t_s > 0))
+        command = PoseCommand(
+            position[:3], QUAT, twist, acceleration, position[:3], QUAT, "active", of
+        )
+        yield put(KEYS.command_pose, command, at_ns, seq)
+
+
+def test_commands_that_are_rarer_at_rest_change_neither_jerk_nor_seams(tmp_path: Path) -> None:
+    runs = []
+    for gap_ns in (TICK_NS, 5 * TICK_NS):
+        path = tmp_path / f"{gap_ns}" / "run.mcap"
+        out = RecordingWriter(path, KEYS, profile_yaml="", base_frame="base", began_ns=ZERO_NS)
+        samples = [*motion_out_of_rest(gap_ns), *states(), *others()]
+        for sample in sorted(samples, key=lambda each: each.received_ns):
+            out.write(sample)
+        out.finish({"dropped": {}})
+        runs.append(evaluate_run(path))
+    often, rarely = runs
+    assert rarely.seam_velocity_mm_s == pytest.approx(often.seam_velocity_mm_s, abs=1e-6)
+    assert often.seam_velocity_mm_s.max() < 0.01
+    # The last gap of the rest counts as one period, in which the motion begins.
+    assert rarely.jerk.mean() == pytest.approx(often.jerk.mean(), rel=0.02)
+
+
 def test_refusals_are_those_of_the_recorded_time(recording: Path) -> None:
     run = evaluate_run(recording)
     assert (run.refusals, run.skipped) == ({"stale": SECONDS}, {"superseded": SECONDS})

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from vla_zenoh.errors import NodeError
-from vla_zenoh.nodes.camera.v4l2 import find_device, list_devices
+from vla_zenoh.nodes.camera.v4l2_devices import find_device, list_devices
 
 
 class Host:

@@ -57,8 +57,8 @@ def test_every_kind_of_node_has_a_role() -> None:
 @pytest.mark.parametrize("member", TABLE)
 def test_every_key_is_written_by_somebody_and_read_by_somebody(member: str) -> None:
     allowed = TABLE[member]
-    said = [allowed[act] for act in (Act.PUT, Act.ANSWER, Act.ANNOUNCE) if act in allowed]
-    heard = [allowed[act] for act in (Act.SUBSCRIBE, Act.ASK, Act.WATCH) if act in allowed]
+    said = [role for act in (Act.PUT, Act.ANSWER, Act.ANNOUNCE) for role in allowed.get(act, ())]
+    heard = [role for act in (Act.SUBSCRIBE, Act.ASK, Act.WATCH) for role in allowed.get(act, ())]
     assert said
     assert heard
 

@@ -51,7 +51,7 @@ def run_through_command_node(clock: EpisodeClock, conditions: EpisodeConditions)
     loop.put("prompt", clock.request.task.prompt or "go")
     loop.run(WARM_UP_S)
     if why := loop.activate(ACTIVATE_PATIENCE_S, POLL_S):
-        raise NodeError(f"activation was rejected: {why}")
+        raise NodeError(f"the arm was not activated: {why}")
     while not clock.over:
         loop.run(POLL_S)
         if not loop.commander.task.active:

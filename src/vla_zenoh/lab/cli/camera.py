@@ -17,7 +17,7 @@ from vla_zenoh.lab.cli.output import print_json, progress
 from vla_zenoh.lab.cli.output_path import ForceOption, output_folder
 from vla_zenoh.nodes.camera.node import make_source
 from vla_zenoh.nodes.camera.realsense import connected, sdk
-from vla_zenoh.nodes.camera.v4l2 import list_devices
+from vla_zenoh.nodes.camera.v4l2_devices import list_devices
 from vla_zenoh.profile.schema import CameraProfile
 
 WARM_UP = 15

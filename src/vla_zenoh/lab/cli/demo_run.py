@@ -127,10 +127,10 @@ def _fact(outcome: SegmentOutcome) -> dict[str, Any]:
 
 
 def _rate(entries: list[Any]) -> float:
-    if len(entries) < 2:
-        return 0.0
-    span_s = (entries[-1].received_ns - entries[0].received_ns) / 1e9
-    return round((len(entries) - 1) / span_s, 2) if span_s > 0 else 0.0
+    """Rate of a stream while it is not thinned out, as that of commands is at rest."""
+    gaps_ns = np.diff([entry.header.stamp_wall_ns for entry in entries])
+    gap_ns = float(np.quantile(gaps_ns, 0.25)) if len(gaps_ns) else 0.0
+    return round(1e9 / gap_ns, 2) if gap_ns > 0 else 0.0
 
 
 def _write_chunks(stage: Stage, run: Run) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import secrets
 import socket
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -18,9 +18,6 @@ from vla_zenoh.profile.session import is_loopback_address
 from vla_zenoh.runtime.process import run_node
 from vla_zenoh.security.identity import Role
 from vla_zenoh.security.store import local_role
-
-if TYPE_CHECKING:
-    pass
 
 PORT = 8088
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from vla_zenoh.errors import NodeError
 from vla_zenoh.lab.doctor.needs import HostFinding
-from vla_zenoh.nodes.camera.v4l2 import DEV, find_device
+from vla_zenoh.nodes.camera.v4l2_devices import DEV, find_device
 
 PRIORITY = 50
 NICENESS = -10

@@ -5,10 +5,10 @@ from __future__ import annotations
 import datetime as dt
 import tempfile
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -29,7 +29,14 @@ from vla_zenoh.lab.recording.film import Film, write_film
 from vla_zenoh.lab.recording.run import RecordedSample, Run, load_run
 from vla_zenoh.lab.trial.verdict import FACT
 from vla_zenoh.profile import Profile, read_profile
-from vla_zenoh.types import LATENCY_STAGES, Cause, FloatArray, NodeStatus
+from vla_zenoh.types import (
+    LATENCY_STAGES,
+    Cause,
+    FloatArray,
+    JointCommand,
+    NodeStatus,
+    PoseCommand,
+)
 
 
 def provenance(run: Run) -> dict[str, str]:
@@ -97,6 +104,8 @@ FILM, MAX_FILM_S = Film(height_px=270, rate_hz=10, quality=30), 180.0
 """The film of a page, and how long a run may be for one."""
 GAP_S = 0.05
 """A longer gap in a stream is an interruption; nothing is derived across it."""
+PERIOD_QUANTILE = 0.05
+"""Of the gaps between commands: the period of the stream in motion."""
 
 
 class MeasuredMotion(NamedTuple):
@@ -256,13 +265,9 @@ def _seams(out: Evaluation, commands: Sequence[RecordedSample]) -> None:
     jerk: list[float] = []
     goal_mm: list[float] = []
     velocity_mm_s: list[float] = []
-    for one, two in pairwise(commands):
-        apart_s = (two.header.stamp_wall_ns - one.header.stamp_wall_ns) / 1e9
-        if not 0 < apart_s < GAP_S:
-            continue
-        before, after = one.record, two.record
+    for before, after, apart_s, times in _neighbours(commands):
         change = after.acceleration[:3] - before.acceleration[:3]
-        jerk.append(float(np.linalg.norm(change)) / apart_s)
+        jerk += [float(np.linalg.norm(change)) / apart_s] * times
         if before.cause and after.cause and _chunk(before.cause) != _chunk(after.cause):
             goal = after.goal_position_m - before.goal_position_m
             goal_mm.append(float(np.linalg.norm(goal)) * 1e3)
@@ -274,17 +279,42 @@ def _seams(out: Evaluation, commands: Sequence[RecordedSample]) -> None:
     out.seam_goal_mm, out.seam_velocity_mm_s = np.array(goal_mm), np.array(velocity_mm_s)
 
 
+def _neighbours(commands: Sequence[RecordedSample]) -> Iterator[tuple[Any, Any, float, int]]:
+    """Commands that follow each other, the time the motion had between them in s, and how often.
+
+    At rest commands are rarer than in motion: a motion begins one period of the stream before its
+    first command, and two commands at rest count once for every period between them.
+    """
+    stamps_ns = np.array([sample.header.stamp_wall_ns for sample in commands], dtype=np.int64)
+    gaps_s = np.diff(stamps_ns) / 1e9
+    if not (gaps_s > 0).any():
+        return
+    period_s = float(np.quantile(gaps_s[gaps_s > 0], PERIOD_QUANTILE))
+    for (one, two), gap_s in zip(pairwise(commands), gaps_s.tolist(), strict=True):
+        if not 0 < gap_s < GAP_S:
+            continue
+        if _rests(one.record):
+            times = max(round(gap_s / period_s), 1) if _rests(two.record) else 1
+            yield one.record, two.record, min(gap_s, period_s), times
+        else:
+            yield one.record, two.record, gap_s, 1
+
+
+def _rests(command: PoseCommand | JointCommand) -> bool:
+    if isinstance(command, PoseCommand):
+        return not (command.twist.any() or command.acceleration.any())
+    return not (command.velocity_rad_s.any() or command.acceleration_rad_s2.any())
+
+
 def _chunk(cause: Cause) -> tuple[str, int]:
     return cause.worker, cause.chunk_seq
 
 
 def _joint_jerk(out: Evaluation, commands: Sequence[RecordedSample]) -> None:
     jerk: list[float] = []
-    for one, two in pairwise(commands):
-        apart_s = (two.header.stamp_wall_ns - one.header.stamp_wall_ns) / 1e9
-        if 0 < apart_s < GAP_S:
-            change = two.record.acceleration_rad_s2 - one.record.acceleration_rad_s2
-            jerk.append(float(np.abs(change).max()) / apart_s)
+    for before, after, apart_s, times in _neighbours(commands):
+        change = after.acceleration_rad_s2 - before.acceleration_rad_s2
+        jerk += [float(np.abs(change).max()) / apart_s] * times
     if jerk and not len(out.jerk):
         out.jerk, out.jerk_unit = np.array(jerk), "rad_s3"
 

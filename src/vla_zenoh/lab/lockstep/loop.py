@@ -134,9 +134,9 @@ class Lockstep:
         """Activate, again and again; the last rejection, empty: the arm is active."""
         end_ns = self.now_ns + round(patience_s * 1e9)
         while not self.commander.task.active:
-            if self.now_ns > end_ns:
+            if self.now_ns >= end_ns:
                 whys = [event.why for event in self.events if event.what == "activate_refused"]
-                return whys[-1] if whys else "no reason"
+                return whys[-1] if whys else "activation was rejected"
             self.put("active", True)
             self.run(period_s)
         return ""

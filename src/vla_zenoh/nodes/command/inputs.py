@@ -21,7 +21,7 @@ from vla_zenoh.nodes.command.peer_monitor import PeerMonitor
 from vla_zenoh.types import ActionChunk, GripperState, JointState, PoseState, Stamped
 from vla_zenoh.types.stream import SingleWriterFilter
 
-STATES = 16
+STATES = 32
 """States buffered between two ticks: the robot's, and room for those of another source."""
 CHUNKS = 64
 ANYTHING = MAX_MESSAGE_BYTES

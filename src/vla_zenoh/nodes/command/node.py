@@ -42,6 +42,8 @@ readers get it first: planning at a real-time priority keeps a processor from th
 REST_S, REST_TIMEOUTS = 0.02, 5
 """Period of the ticks while the arm rests, and how many of them a command timeout has at least."""
 REST_AFTER_NS = 100_000_000
+LONGEST_PLAN_NS = 600_000_000_000
+"""A step that is due later than this is due before the wall clock was set."""
 ACTING_S = 1.0
 """Limits that shorten steps act once for each chunk."""
 SPREAD_S = 8.0
@@ -149,7 +151,10 @@ class CommandNode:
     def _prepare(self, next_mono_ns: int) -> None:
         """Plan chunks that arrived, so that the next tick need not."""
         began = time.perf_counter()
-        self.commander.prepare(self._inputs.poll_streams(), self.node.clock.wall_at(next_mono_ns))
+        inputs = self._inputs.poll_streams()
+        if inputs.chunks:
+            self._busy_ns = next_mono_ns
+        self.commander.prepare(inputs, self.node.clock.wall_at(next_mono_ns))
         self._status.add_preparation(time.perf_counter() - began)
 
     def _on_tick(self, extra: list[Setting], tick: Tick) -> bool:
@@ -172,14 +177,19 @@ class CommandNode:
         if chores or out.events or out.task_changed:
             self._report_latch_failure()
             self._status.publish(out, self._inputs.chunks_dropped)
-        if inputs.chunks or inputs.settings or not self.commander.at_rest:
-            self._busy_ns = now_ns
-        return now_ns - max(self._busy_ns, self._planned_until_ns()) > REST_AFTER_NS
+        busy = inputs.chunks or inputs.settings or not self.commander.at_rest
+        if busy or any(self._awaits(part, now_ns) for part in self.commander.parts):
+            self._busy_ns = tick.nominal_ns
+        return tick.nominal_ns - self._busy_ns > REST_AFTER_NS
 
-    def _planned_until_ns(self) -> int:
-        """When the last step that is planned ends."""
-        timelines = (part.motion.timeline for part in self.commander.parts)
-        return max((timeline.plan.end_ns for timeline in timelines if timeline), default=0)
+    def _awaits(self, part: CommandedPart, now_ns: int) -> bool:
+        """Whether a part at rest has a step or a chunk to come, or loads that a filter smooths."""
+        if part.planner.waiting or (self.commander.state is State.ACTIVE and part.contact.known):
+            return True
+        timeline = part.motion.timeline
+        if timeline is None or timeline.clock.override <= 0.0:
+            return False
+        return 0 < timeline.plan.end_ns - now_ns < LONGEST_PLAN_NS
 
     def _update_latch(self) -> None:
         if self._latch is None:

@@ -21,7 +21,7 @@ from vla_zenoh.types import Header, NodeStatus
 MAX_WORKERS, MAX_HOLDERS = 32, 32
 MAX_WHY = 300
 CLOCKS_PERIOD_S = 0.25
-STATUSES_AT_ONCE, SPECS_AT_ONCE = 8, 4
+STATUSES_AT_ONCE, SPECS_AT_ONCE = 32, 16
 """More than our nodes publish between two updates: each does so twice a second."""
 
 

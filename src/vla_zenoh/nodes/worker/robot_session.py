@@ -96,14 +96,14 @@ class _StateStream:
                 self._states.add(state)
 
     def _first(self, arrivals: Sequence[ReceivedSample], since_ns: int) -> int:
-        """The last that the writer measured before `since_ns`, or its first."""
+        """The last that the writer measured before `since_ns`, or its first; not a repetition."""
         first = 0
         for number in range(len(arrivals) - 1, -1, -1):
             try:
                 header = header_of(arrivals[number].sample)
             except CodecError:
                 continue
-            if header.source == self._writer.writer:
+            if self._writer.is_next(header):
                 first = number
                 header, _ = self._node.clocks.to_local_clock(header, None)
                 if header.stamp_wall_ns <= since_ns:
@@ -236,7 +236,8 @@ class RobotSession:
 
     def poll_states(self) -> None:
         """Decode the states received since the last call, unless the cameras fell silent."""
-        if not self._every_state and self._received_s and self.cameras_silent:
+        known = all(states.entries for states in self._streams.states.values())
+        if known and not self._every_state and self._received_s and self.cameras_silent:
             return  # those near the next image are in their rings when it comes
         since_ns = min((feed.images.newest_ns for feed in self._feeds), default=0)
         for stream in self._states:
