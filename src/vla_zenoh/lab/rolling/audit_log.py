@@ -1,4 +1,8 @@
-"""An audit log on disk: lines that are chained by hash, written at once, bounded in size."""
+"""An audit log on disk: lines that are chained by hash, written at once, bounded in size.
+
+A line is JSON with sorted keys: ``number``, ``wall_ns``, ``what``, ``facts``, ``before`` (hash of
+the line before) and ``hash``, SHA-256 of the same JSON without it.
+"""
 
 from __future__ import annotations
 
