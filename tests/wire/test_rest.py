@@ -14,7 +14,7 @@ from vla_zenoh.nodes.command.node import REST_S
 
 REST_HZ = 1.0 / REST_S
 WINDOW_S = 2.0
-RARELY_HZ = 0.1
+UNKNOWN = "a prompt that the scripted model does not know"
 SLOW, FAST = 1.2, 0.5
 """Shares of a rate: the most at rest, and the least that a busy computer reaches."""
 SAME_M = 1e-4
@@ -40,26 +40,28 @@ def loop_hz(chain: Chain) -> float:
     return status.rates_hz["loop"] if status else 0.0
 
 
-def test_an_arm_that_rests_gets_fewer_commands_until_a_chunk_moves_it(chain: Chain) -> None:
+def hold_still(chain: Chain) -> None:
+    """Activate, and let the model fall silent, until the command node ticks slowly."""
     chain.activate_when_ready()
-    chain.client.set_rate(RARELY_HZ)
-    chain.until("it rests", lambda: loop_hz(chain) < SLOW * REST_HZ, 2 / RARELY_HZ)
+    chain.client.set_prompt(UNKNOWN)
+    chain.until("holding", lambda: chain.state() == "holding")
+    chain.until("it rests", lambda: loop_hz(chain) < SLOW * REST_HZ)
     assert chain.detail("streaming")
+
+
+def test_an_arm_that_rests_gets_fewer_commands_until_a_chunk_moves_it(chain: Chain) -> None:
+    hold_still(chain)
     missed = chain.counter("command.missed_ticks")
-    resting_hz = min(commands_hz(chain) for _ in range(2))  # a chunk falls into one at most
-    assert FAST * REST_HZ < resting_hz < SLOW * REST_HZ
+    assert FAST * REST_HZ < commands_hz(chain) < SLOW * REST_HZ
     assert chain.counter("command.missed_ticks") - missed < SLOW * REST_HZ
-    chain.client.set_rate(chain.profile.task.rate_hz)
     assert chain.go("up", 10) == pytest.approx(0.1, abs=0.005)
     chain.move()
-    moving_hz = commands_hz(chain)
-    assert moving_hz > FAST * chain.profile.timing.command_hz
+    assert commands_hz(chain) > FAST * chain.profile.timing.command_hz
     chain.settle()
 
 
 def test_a_motion_out_of_rest_begins_without_a_step(chain: Chain) -> None:
-    chain.activate_when_ready()
-    time.sleep(0.5)
+    hold_still(chain)
     since_ns = time.time_ns()
     chain.move()
     positions_m = np.array([pose.position_m for _, pose in chain.recorder.commands(since_ns)])
@@ -70,8 +72,7 @@ def test_a_motion_out_of_rest_begins_without_a_step(chain: Chain) -> None:
 
 
 def test_a_stop_is_obeyed_while_the_arm_rests(chain: Chain) -> None:
-    chain.activate_when_ready()
-    time.sleep(0.5)
+    hold_still(chain)
     chain.session.put(chain.profile.keys.stop, b"")
     chain.until("stopped", lambda: chain.state() == "stopped")
     chain.settle()
