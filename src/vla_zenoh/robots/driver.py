@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Mapping
 from functools import cached_property
@@ -92,8 +93,8 @@ class Pace(Protocol):
     def wait(self) -> Tick: ...
 
 
-class RobotDriver:
-    """One kind of robot as `RobotNode` drives it; the drivers of its parts have `read` and `move`.
+class RobotDriver(ABC):
+    """One kind of robot as `RobotNode` drives it; a subclass needs `read` and `move`.
 
     One thread, the node's loop, calls everything. A call must return within a fraction of
     `period_s`. An exception ends the node after it braked the arm by further calls of `move`.
@@ -141,13 +142,13 @@ class RobotDriver:
         self.report: Reporter = Report()
 
     # -- required -----------------------------------------------------------------------------
+    @abstractmethod
     def read(self, mono_ns: int) -> Measurement | None:
         """The newest state at this tick; None: nothing new, or nothing valid."""
-        raise NotImplementedError
 
+    @abstractmethod
     def move(self, reference: PoseReference | JointReference, now_ns: int) -> None:
         """Set the set-point of the robot's controller; `now_ns` is its time on the wall clock."""
-        raise NotImplementedError
 
     # -- optional -----------------------------------------------------------------------------
     @property

@@ -70,10 +70,20 @@ class SimDriver(RobotDriver):
         self._step_lock = threading.Lock()
         self._keys: _SimKeys | None = None
         self._parts = {name: SimPart(self, name) for name in profile.part_names}
+        first = next(iter(self._parts.values()))
+        self._read, self._move = first.read, first.move
 
     @property
     def parts(self) -> Mapping[str, SimPart]:
         return self._parts
+
+    def read(self, mono_ns: int) -> Measurement | None:
+        """The state of the first part."""
+        return self._read(mono_ns)
+
+    def move(self, reference: PoseReference | JointReference, now_ns: int) -> None:
+        """Move the first part."""
+        self._move(reference, now_ns)
 
     def attach(self, node: Node, follower: CommandFollower) -> None:
         """Subscribe to resets, and publish the scene."""
