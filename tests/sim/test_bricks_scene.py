@@ -26,8 +26,9 @@ from vla_zenoh.simulation.appearance import (
     check_variations,
     draw_appearance,
 )
+from vla_zenoh.simulation.backend import Backend, why_no_opengl
 from vla_zenoh.simulation.objects import draw_places, footprint_m, objects_of
-from vla_zenoh.simulation.render import Backend, Renderer, why_no_opengl
+from vla_zenoh.simulation.render import Renderer
 from vla_zenoh.simulation.robot_model import RobotModel
 from vla_zenoh.simulation.scene import build_model
 from vla_zenoh.simulation.world import World

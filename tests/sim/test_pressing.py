@@ -81,7 +81,7 @@ def test_a_free_arm_tells_no_force_whatever_its_fingers_squeeze() -> None:
     world.set_gripper(0.0, 1.0, 25.0)
     told = waited(world, 0.6)
     assert world.gripper_state().holding
-    assert world.grip_force_n > HELD_N
+    assert world.parts[""].gripper.force_n > HELD_N
     assert norm3(told[:3]) < WEIGHT_N
     assert told[2] == pytest.approx(-0.012 * 9.81, rel=0.05)
 

@@ -11,15 +11,15 @@ import pytest
 from motions import SCENE, make_world
 
 from vla_zenoh.errors import NodeError, RecordError, ResourceError
-from vla_zenoh.simulation.render import (
+from vla_zenoh.simulation.backend import (
     EGL,
     RAYCAST,
     VARIABLE,
     Backend,
-    Renderer,
     choose_backend,
     why_no_opengl,
 )
+from vla_zenoh.simulation.render import Renderer
 from vla_zenoh.simulation.robot_model import RobotModel
 
 SIZE = (640, 480)
@@ -155,6 +155,11 @@ def test_a_camera_that_does_not_exist_is_refused_with_the_names_that_do(rays: Re
         rays.render("left", *SIZE)
 
 
+def test_poses_of_another_scene_are_refused(rays: Renderer) -> None:
+    with pytest.raises(RecordError, match=r"shape \(23,\), got \(3,\)"):
+        rays.set_qpos(np.zeros(3))
+
+
 def test_poses_that_are_not_finite_are_refused(rays: Renderer) -> None:
     poses = make_world().qpos()
     poses[3] = np.nan
@@ -197,8 +202,8 @@ def test_a_driver_that_fails_is_noticed_in_a_process_of_its_own(
 
 def test_choosing_a_back_end_does_not_import_mujoco() -> None:
     code = (
-        "import sys; from vla_zenoh.simulation.render import choose_backend; choose_backend(); "
-        "import vla_zenoh.simulation.render; sys.exit('mujoco' in sys.modules)"
+        "import sys; from vla_zenoh.simulation.backend import choose_backend; choose_backend(); "
+        "import vla_zenoh.simulation.backend; sys.exit('mujoco' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], check=False, timeout=120)
     assert done.returncode == 0

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from motions import HOME_RAD, circle, follow, line, make_world, wait
+from motions import HOME_RAD, circle, line, make_world, wait
 
-from vla_zenoh.errors import NodeError, RecordError, ResourceError
+from vla_zenoh.errors import NodeError, ResourceError
 from vla_zenoh.simulation.objects import draw_places, footprint_m, objects_of, regions_of
 from vla_zenoh.simulation.robot_model import RobotModel
 from vla_zenoh.simulation.world import World
@@ -134,20 +134,6 @@ def test_the_pose_state_carries_the_reference_it_was_given() -> None:
     assert np.allclose(state.position_m, state.reference_position_m, atol=POSE_ATOL)
     assert np.allclose(state.quat_xyzw, state.reference_quat_xyzw, atol=POSE_ATOL)
     assert np.allclose(np.abs(state.quat_xyzw), (1.0, 0.0, 0.0, 0.0), atol=1e-6)
-
-
-def test_poses_can_be_taken_over_by_an_equal_world() -> None:
-    first, second = make_world(seed=5), make_world(seed=9)
-    follow(first, line(first.hold_reference(), (0.05, 0.0, 0.1), 0.5))
-    second.set_qpos(first.qpos())
-    assert np.array_equal(first.qpos(), second.qpos())
-    assert np.allclose(first.tcp()[0], second.tcp()[0], atol=POSE_ATOL)
-    assert np.array_equal(first.objects()["box"][0], second.objects()["box"][0])
-
-
-def test_poses_of_another_scene_are_refused() -> None:
-    with pytest.raises(RecordError, match=r"shape \(23,\), got \(3,\)"):
-        make_world().set_qpos(np.zeros(3))
 
 
 def test_a_reference_that_is_not_finite_stops_the_world_with_a_clear_error() -> None:

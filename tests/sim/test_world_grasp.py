@@ -102,7 +102,7 @@ def test_the_width_runs_at_the_commanded_speed() -> None:
 def test_the_fingers_press_with_the_commanded_force(force_n: float) -> None:
     world = make_world()
     grasp(world, force_n=force_n)
-    assert world.grip_force_n == pytest.approx(force_n, rel=FORCE_RTOL)
+    assert world.parts[""].gripper.force_n == pytest.approx(force_n, rel=FORCE_RTOL)
 
 
 def test_a_gripper_command_without_speed_is_refused() -> None:

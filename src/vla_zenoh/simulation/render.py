@@ -3,102 +3,38 @@
 Rendering belongs in a process of its own: it would disturb the control loop. That process makes a
 `Renderer` of the same scene and robot as the `World` and gives it `World.qpos`.
 
-OpenGL is fast but needs a system library; ray casting needs nothing. With ``MUJOCO_GL`` naming a
-missing library ``import mujoco`` itself fails, and a broken driver can crash the process: so this
-module does not import MuJoCo, and `choose_backend` tries OpenGL in another process.
+``python -m vla_zenoh.simulation.render`` renders one small test image by OpenGL and exits with 0
+when it is right; `vla_zenoh.simulation.backend` runs that, since a broken driver can crash it.
 """
 
 from __future__ import annotations
 
-import ctypes.util
 import os
-import subprocess
 import sys
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_zenoh.errors import NodeError, ResourceError
+from vla_zenoh.errors import NodeError, RecordError, ResourceError, in_words
+from vla_zenoh.simulation.appearance import AppearanceSwitcher
+from vla_zenoh.simulation.backend import RAYCAST, Backend, choose_backend
+from vla_zenoh.simulation.raycast import RaycastCanvas
 from vla_zenoh.simulation.robot_model import RobotModel
+from vla_zenoh.simulation.scene import POSES, build_model
 
-VARIABLE = "VLA_ZENOH_RENDERER"
-EGL, RAYCAST = "egl", "raycast"
-AUTO = "auto"
-PROBE_LIMIT_S = 60.0
-
-_LIBRARIES = ("EGL", "OpenGL")
-"""Libraries that PyOpenGL and MuJoCo load."""
-_PACKAGES = "libegl1 libopengl0 libgl1-mesa-dri"
-"""Debian packages that have them; Mesa renders on the CPU where there is no GPU."""
-_GL_VARIABLES = ("MUJOCO_GL", "PYOPENGL_PLATFORM")
-
-
-@dataclass(frozen=True, slots=True)
-class Backend:
-    """A way to render.
-
-    Args:
-        name: ``egl`` or ``raycast``.
-        reason: why OpenGL does not work here; empty if ray casting was requested.
-        install: Debian packages that OpenGL needs; may be empty.
-    """
-
-    name: str
-    reason: str = ""
-    install: str = ""
-
-
-def choose_backend(wanted: str | None = None) -> Backend:
-    """OpenGL if it works on this machine, else ray casting; or the requested one.
-
-    Args:
-        wanted: ``egl``, ``raycast`` or ``auto``; None: the environment variable
-            ``VLA_ZENOH_RENDERER``, and ``auto`` where that is not set.
-
-    Raises:
-        NodeError: `wanted` is unknown, or is asked for by name and does not work here.
-    """
-    name = wanted if wanted is not None else os.environ.get(VARIABLE) or AUTO
-    if name not in (AUTO, EGL, RAYCAST):
-        raise NodeError(f"no renderer called {name!r}; there are: {AUTO}, {EGL}, {RAYCAST}")
-    if name == RAYCAST:
-        return Backend(RAYCAST)
-    failure = why_no_opengl()
-    if not failure:
-        return Backend(EGL)
-    if name == EGL:
-        raise NodeError(
-            f"the renderer {name!r} does not work here: {failure}; "
-            f"on Debian: apt-get install {_PACKAGES}"
-        )
-    return Backend(RAYCAST, f"{EGL}: {failure}", _PACKAGES)
-
-
-def why_no_opengl() -> str:
-    """Why OpenGL does not work here without a window system; empty when it does."""
-    missing = [part for part in _LIBRARIES if ctypes.util.find_library(part) is None]
-    if missing:
-        return f"the library lib{missing[0]} is not installed"
-    # The caller's own choice of a platform must not decide what the probe tries.
-    environment = {key: value for key, value in os.environ.items() if key not in _GL_VARIABLES}
-    environment["PYTHONPATH"] = os.pathsep.join(part for part in sys.path if part)
-    try:
-        done = subprocess.run(
-            [sys.executable, "-m", "vla_zenoh.simulation.opengl"],
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=PROBE_LIMIT_S,
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
-        return f"rendering a test image took longer than {PROBE_LIMIT_S:g} s"
-    if done.returncode == 0:
-        return ""
-    errors = done.stderr.strip().splitlines()
-    return errors[-1] if errors else f"rendering a test image exited with code {done.returncode}"
+MAX_GEOMS = 1000
+PROBE_SIZE = 16
+PROBE_SCENE = """
+<mujoco>
+  <visual><headlight ambient="1 1 1"/></visual>
+  <worldbody>
+    <camera name="eye" pos="0 0 1"/>
+    <geom type="box" size="2 2 0.1" rgba="1 0 0 1"/>
+  </worldbody>
+</mujoco>
+"""
 
 
 class Renderer:
@@ -113,19 +49,10 @@ class Renderer:
         self, scene: str, robot: RobotModel | Sequence[RobotModel], backend: Backend | None = None
     ) -> None:
         self.backend = choose_backend() if backend is None else backend
-        # After the choice: with a bad MUJOCO_GL in the environment the import itself fails.
-        import mujoco
-
-        from vla_zenoh.simulation.appearance import AppearanceSwitcher
-        from vla_zenoh.simulation.scene import build_model
-
         self._model = build_model(scene, robot)
         self._data = mujoco.MjData(self._model)
-        if self.backend.name == RAYCAST:
-            from vla_zenoh.simulation.raycast import RaycastCanvas as Canvas
-        else:
-            from vla_zenoh.simulation.opengl import OpenGlCanvas as Canvas
-        self._canvas = Canvas(self._model)
+        canvas = RaycastCanvas if self.backend.name == RAYCAST else OpenGlCanvas
+        self._canvas = canvas(self._model)
         self._appearance = AppearanceSwitcher(self._model)
         self._update()
 
@@ -140,9 +67,14 @@ class Renderer:
         Raises:
             RecordError: the vector is of another scene, or not finite.
         """
-        from vla_zenoh.simulation.scene import write_pose_vector
-
-        write_pose_vector(self._model, self._data, vector)
+        size = mujoco.mj_stateSize(self._model, POSES)
+        if vector.shape != (size,):
+            raise RecordError(
+                f"a pose vector of this scene has shape ({size},), got {vector.shape}"
+            )
+        if not np.isfinite(vector).all():
+            raise RecordError("the pose vector is not finite")
+        mujoco.mj_setState(self._model, self._data, vector, POSES)
         self._update()
 
     def vary(self, seed: int | None, vary: Collection[str]) -> None:
@@ -184,8 +116,107 @@ class Renderer:
         self.close()
 
     def _update(self) -> None:
-        import mujoco
-
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_comPos(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
+
+
+class OpenGlCanvas:
+    """Off-screen OpenGL context of one model; use it from the thread that made it.
+
+    Raises:
+        NodeError: OpenGL does not work this way here.
+    """
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self._model = model
+        other = os.environ.get("PYOPENGL_PLATFORM")
+        if other not in (None, "", "egl"):
+            raise NodeError(
+                f"this process already renders with PYOPENGL_PLATFORM={other}; EGL needs a process "
+                "of its own"
+            )
+        try:
+            # MuJoCo's own Renderer takes its context from MUJOCO_GL as it was at `import mujoco`.
+            from mujoco.egl import GLContext
+
+            self._context = GLContext(64, 64)
+            self._context.make_current()
+            self._gl = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        except Exception as error:  # drivers raise exceptions of many types here
+            raise NodeError(f"no OpenGL through EGL: {in_words(error)}") from error
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._gl)
+        self._scene = mujoco.MjvScene(model, MAX_GEOMS)
+        for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+            self._scene.flags[flag] = False  # each costs several times the rest of the frame
+        self._option, self._perturb = mujoco.MjvOption(), mujoco.MjvPerturb()
+        self._camera = mujoco.MjvCamera()
+        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self._size = (0, 0)
+
+    def draw(self, data: mujoco.MjData, camera: str, width: int, height: int) -> NDArray[np.uint8]:
+        """Image of `camera`, (height, width, 3) RGB."""
+        viewport = self._render(data, camera, width, height)
+        rgb = np.empty((height, width, 3), np.uint8)
+        mujoco.mjr_readPixels(rgb, None, viewport, self._gl)
+        return np.ascontiguousarray(rgb[::-1])  # OpenGL's first row is the lowest
+
+    def draw_depth(
+        self, data: mujoco.MjData, camera: str, width: int, height: int
+    ) -> NDArray[np.float64]:
+        """Distance along the optical axis in m, (height, width); infinite where nothing is."""
+        viewport = self._render(data, camera, width, height)
+        buffer = np.empty((height, width), np.float32)
+        mujoco.mjr_readPixels(None, buffer, viewport, self._gl)
+        # As MuJoCo's projection wrote it, between the clipping planes of the scene.
+        extent, visual = self._model.stat.extent, self._model.vis.map
+        near_m, far_m = visual.znear * extent, visual.zfar * extent
+        share = buffer[::-1].astype(np.float64)
+        if self._gl.readDepthMap == mujoco.mjtDepthMap.mjDEPTH_ZERONEAR:
+            share = 1.0 - share
+        with np.errstate(divide="ignore"):
+            depth_m = near_m * far_m / (near_m + share * (far_m - near_m))
+        return np.where(share <= 0.0, np.inf, depth_m)
+
+    def _render(self, data: mujoco.MjData, camera: str, width: int, height: int) -> mujoco.MjrRect:
+        if self._size != (width, height):
+            mujoco.mjr_resizeOffscreen(width, height, self._gl)
+            self._size = (width, height)
+        self._camera.fixedcamid = self._model.camera(camera).id
+        mujoco.mjv_updateScene(
+            self._model,
+            data,
+            self._option,
+            self._perturb,
+            self._camera,
+            mujoco.mjtCatBit.mjCAT_ALL.value,
+            self._scene,
+        )
+        viewport = mujoco.MjrRect(0, 0, width, height)
+        mujoco.mjr_render(viewport, self._scene, self._gl)
+        return viewport
+
+    def refresh(self) -> None:
+        """Nothing to do: every image reads the model."""
+
+    def close(self) -> None:
+        """Free the context."""
+        self._gl.free()
+        self._context.free()
+
+
+def main() -> None:
+    """Exit with 0 when a red box is rendered red, else print the reason on stderr."""
+    model = mujoco.MjModel.from_xml_string(PROBE_SCENE)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    canvas = OpenGlCanvas(model)
+    image = canvas.draw(data, "eye", PROBE_SIZE, PROBE_SIZE)
+    red, green, _ = image[PROBE_SIZE // 2, PROBE_SIZE // 2].tolist()
+    canvas.close()
+    if not red > 2 * green:
+        sys.exit(f"the test image has the wrong colour: {red}, {green}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,4 +1,4 @@
-"""Builds the MuJoCo model of a scene in ``sim/`` with the robot in it, and copies its poses.
+"""Builds the MuJoCo model of a scene in ``sim/`` with the robot in it.
 
 The process that steps the world and those that render it build their models with `build_model` from
 the same arguments, so that a pose vector of one fits the other.
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh import resources
-from vla_zenoh.errors import RecordError, ResourceError
+from vla_zenoh.errors import ResourceError
 from vla_zenoh.simulation.robot_model import MountedCamera, RobotModel
 from vla_zenoh.types import FloatArray
 
@@ -24,6 +24,12 @@ STEP_S = 1e-3
 PREFIX = "robot/"
 TCP_SITE = "tcp"
 GRIPPER = "gripper"
+POSES = int(
+    mujoco.mjtState.mjSTATE_QPOS
+    | mujoco.mjtState.mjSTATE_MOCAP_POS
+    | mujoco.mjtState.mjSTATE_MOCAP_QUAT
+)
+"""MuJoCo's state of every pose: joint coordinates, then 7 numbers per mocap body."""
 STATIC_GROUP = 0
 MOVING_GROUP = 1
 HIDDEN_GROUP = 3  # MuJoCo's own convention: groups from here on are not drawn
@@ -92,28 +98,6 @@ def _meet_other_parts(arm: mujoco.MjSpec, index: int, parts: int) -> None:
     others = sum(1 << (other + 1) for other in range(parts) if other != index)
     for geom in arm.geoms:
         geom.contype, geom.conaffinity = 1 | own, others
-
-
-def read_pose_vector(data: mujoco.MjData) -> FloatArray:
-    """Every pose of the world in one vector: joint coordinates, then 7 numbers per mocap body."""
-    return np.concatenate([data.qpos, data.mocap_pos.ravel(), data.mocap_quat.ravel()])
-
-
-def write_pose_vector(model: mujoco.MjModel, data: mujoco.MjData, vector: FloatArray) -> None:
-    """Copy the poses into `data`; the caller computes the positions that depend on them.
-
-    Raises:
-        RecordError: `vector` is of another model, or not finite.
-    """
-    size = model.nq + 7 * model.nmocap
-    if vector.shape != (size,):
-        raise RecordError(f"a pose vector of this scene has shape ({size},), got {vector.shape}")
-    if not np.isfinite(vector).all():
-        raise RecordError("the pose vector is not finite")
-    split = model.nq + 3 * model.nmocap
-    data.qpos[:] = vector[: model.nq]
-    data.mocap_pos[:] = vector[model.nq : split].reshape(-1, 3)
-    data.mocap_quat[:] = vector[split:].reshape(-1, 4)
 
 
 def _robot_spec(robot: RobotModel, joint_friction_nm: float) -> mujoco.MjSpec:

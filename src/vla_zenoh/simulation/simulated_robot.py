@@ -119,15 +119,12 @@ class SimulatedPart:
         self._position_rad[:] = self._home_rad
         self.gripper.open()
 
-    def reset_laws(self, *, home: bool) -> None:
-        """Forget what the controllers have accumulated, and with `home` what was measured."""
-        self._cartesian.reset(self._home_rad if home else None)
+    def reset_laws(self) -> None:
+        """Forget what the controllers have accumulated and measured."""
+        self._cartesian.reset(self._home_rad)
         self._joint.reset()
         self._active_law = self._held_rad = None
-        if home:
-            self._filtered_wrench = np.zeros(6)
-        else:
-            self.gripper.stand()
+        self._filtered_wrench = np.zeros(6)
 
     def torque(self, reference: PoseReference | JointReference) -> bool:
         """Set the torques of this tick; whether an effort limit cut them.
@@ -290,20 +287,13 @@ class SimulatedGripper:
         # Each opens as far as the others.
         self._open = self._max_width_m / self._scale_m / len(fingers)
         self._actuator = int(model.actuator(prefix_of(robot) + GRIPPER).id)
-        self._hold_at(self._max_width_m)
+        self.open()
 
     def open(self) -> None:
         """Put the fingers at their widest, as after a reset."""
         for joint in self._q:
             joint[:] = self._open
-        self._hold_at(self._max_width_m)
-
-    def stand(self) -> None:
-        """Stay at the measured width."""
-        self._hold_at(self._opening()[0])
-
-    def _hold_at(self, width_m: float) -> None:
-        self._target_m = self._set_m = self._measured_m = width_m
+        self._target_m = self._set_m = self._measured_m = self._max_width_m
         self._step_m = 0.0
         self._rest_ticks = AT_REST_TICKS
         self._bound_force(DEFAULT_FORCE_N)

@@ -15,7 +15,7 @@ from vla_zenoh.simulation.appearance import DISTRACTORS, check_variations
 from vla_zenoh.simulation.impedance import ImpedanceGains
 from vla_zenoh.simulation.objects import SimulatedObjects
 from vla_zenoh.simulation.robot_model import RobotModel, robot_models
-from vla_zenoh.simulation.scene import STEP_S, build_model, read_pose_vector, write_pose_vector
+from vla_zenoh.simulation.scene import POSES, STEP_S, build_model
 from vla_zenoh.simulation.simulated_robot import SimulatedPart
 from vla_zenoh.types import FloatArray, vector
 from vla_zenoh.types.commands import JointReference, PoseReference
@@ -97,7 +97,7 @@ class World:
         if seed is not None:
             self._objects.draw(seed, distractors=DISTRACTORS in self._vary)
         for part in self.parts.values():
-            part.reset_laws(home=True)
+            part.reset_laws()
         self._ticks = self.saturated = 0
         mujoco.mj_forward(model, data)
         self._fresh = True
@@ -134,11 +134,6 @@ class World:
         """See `SimulatedPart.wrench`."""
         return self._first.wrench
 
-    @property
-    def grip_force_n(self) -> float:
-        """Force of either finger, inwards positive."""
-        return self._first.gripper.force_n
-
     def objects(self) -> dict[str, tuple[FloatArray, FloatArray]]:
         """Position (3,) and quaternion x, y, z, w (4,) of every object, copies."""
         self._refresh()
@@ -156,16 +151,9 @@ class World:
 
     def qpos(self) -> FloatArray:
         """Every pose of the world in one vector, for a renderer of the same scene."""
-        return read_pose_vector(self._data)
-
-    def set_qpos(self, vector: FloatArray) -> None:
-        """Set all poses from `qpos` of a world of the same scene, at rest."""
-        write_pose_vector(self.model, self._data, vector)
-        self._data.qvel[:] = 0.0
-        for part in self.parts.values():
-            part.reset_laws(home=False)
-        mujoco.mj_forward(self.model, self._data)
-        self._fresh = True
+        vector = np.empty(mujoco.mj_stateSize(self.model, POSES))
+        mujoco.mj_getState(self.model, self._data, vector, POSES)
+        return vector
 
     def _refresh(self) -> None:
         """Compute positions after the last step; contacts and forces stay those of that step."""

@@ -46,7 +46,7 @@ from vla_zenoh.lab.doctor.software import (
 from vla_zenoh.lab.doctor.software import renderer_finding as judge_backend
 from vla_zenoh.profile import SessionProfile, load_profile
 from vla_zenoh.profile.robot import FrankaProfile
-from vla_zenoh.simulation.render import Backend
+from vla_zenoh.simulation.backend import Backend
 
 TIBIBYTE_MIB = 1024 * 1024
 SEGMENT_BYTES = 3 * 1024 * 1024

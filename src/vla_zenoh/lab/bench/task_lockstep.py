@@ -27,7 +27,8 @@ from vla_zenoh.policy import ActionSteps, ModelSpec, Observation, Policy, reset_
 from vla_zenoh.policy.loader import find_worker, make_policy
 from vla_zenoh.profile import Profile
 from vla_zenoh.runtime.process import die_with_parent
-from vla_zenoh.simulation.render import AUTO, Renderer, choose_backend
+from vla_zenoh.simulation.backend import AUTO, choose_backend
+from vla_zenoh.simulation.render import Renderer
 from vla_zenoh.simulation.robot_model import robot_models
 from vla_zenoh.simulation.world import World, build_world
 from vla_zenoh.types import Image, ObjectPoses

@@ -12,7 +12,7 @@ from importlib import metadata
 from vla_zenoh.errors import MissingExtraError, NodeError, VlaZenohError, how_to_install
 from vla_zenoh.lab.doctor.needs import HostFinding, Role
 from vla_zenoh.profile import Profile
-from vla_zenoh.simulation.render import RAYCAST, VARIABLE, Backend, choose_backend
+from vla_zenoh.simulation.backend import RAYCAST, VARIABLE, Backend, choose_backend
 
 OLDEST_PYTHON = (3, 11)
 LIMIT_S = 60

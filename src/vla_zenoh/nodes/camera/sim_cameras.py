@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -20,9 +21,12 @@ from vla_zenoh.nodes.camera.camera_publisher import OK, CameraPublisher
 from vla_zenoh.nodes.camera.geometry import Intrinsics
 from vla_zenoh.nodes.camera.source import STALL_S
 from vla_zenoh.profile import Profile
-from vla_zenoh.simulation.render import AUTO, RAYCAST, Renderer, choose_backend
+from vla_zenoh.simulation.backend import AUTO, RAYCAST, choose_backend
 from vla_zenoh.simulation.robot_model import robot_models
 from vla_zenoh.types import SceneState, Stamped
+
+if TYPE_CHECKING:
+    from vla_zenoh.simulation.render import Renderer
 
 WAKE_S = 0.1
 IDLE_PERIOD_S = 1.0
@@ -111,6 +115,9 @@ class SimCameras:
         try:
             # "auto" leaves the choice to the environment variable, if it is set.
             backend = choose_backend(None if wanted == AUTO else wanted)
+            # After the choice: with a bad MUJOCO_GL in the environment this import itself fails.
+            from vla_zenoh.simulation.render import Renderer
+
             renderer = Renderer(self._profile.sim.scene, robot, backend)
         except ImportError as error:
             if isinstance(error, VlaZenohError):
