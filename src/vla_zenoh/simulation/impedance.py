@@ -131,25 +131,36 @@ class ImpedanceGains:
     limit_margin_rad: float = 0.1
 
 
-class _Integral:
-    """Integral action, clamped to `limit`; `rate` is ki K dt."""
+class _Impedance:
+    """What both laws have: torque limits, and integral action clamped to `limit`.
 
-    def __init__(self, rate: FloatArray, limit: FloatArray) -> None:
+    Args:
+        effort_nm: (n,) torque limits.
+        rate: ki K dt.
+        limit: of the integral.
+
+    Attributes:
+        integral: torque (n,) in Nm, or wrench (6,) in N and Nm, of the integral action.
+    """
+
+    def __init__(self, effort_nm: FloatArray, rate: FloatArray, limit: FloatArray) -> None:
+        self._effort_nm = np.array(effort_nm, float)
         self._rate, self._limit = rate, limit
-        self.value = np.zeros(len(limit))
+        self.integral = np.zeros(len(limit))
 
-    def put(self, value: FloatArray | float) -> None:
-        self.value = np.minimum(np.maximum(value, -self._limit), self._limit)
-
-    def add(self, error: FloatArray, held: bool | NDArray[np.bool_]) -> None:
+    def _integrate(self, error: FloatArray, held: bool | NDArray[np.bool_]) -> None:
         """Integrate; where `held`, towards zero only: the arm is blocked, or a torque is cut."""
         step = self._rate * error
         if held is not False:
-            step[held & ~(step * self.value < 0.0)] = 0.0  # NaN as well
-        self.put(self.value + step)
+            step[held & ~(step * self.integral < 0.0)] = 0.0  # NaN as well
+        self.integral = _bounded(self.integral + step, self._limit)
 
 
-class CartesianImpedance:
+def _bounded(values: FloatArray, limit: FloatArray) -> FloatArray:
+    return np.minimum(np.maximum(values, -limit), limit)  # faster than np.clip
+
+
+class CartesianImpedance(_Impedance):
     """Cartesian impedance controller; its only state is the integral wrench.
 
     Args:
@@ -173,24 +184,18 @@ class CartesianImpedance:
         self.gains = gains
         self._soft_lower_rad = np.asarray(lower_rad, float) + gains.limit_margin_rad
         self._soft_upper_rad = np.asarray(upper_rad, float) - gains.limit_margin_rad
-        self._effort_nm = np.array(effort_nm, float)
         self._posture_rad = np.array(posture_rad, float)
         self._posture_damping = 2.0 * math.sqrt(gains.posture_nm_rad)
         self._stiffness = _per_axis(gains.translational_n_m, gains.rotational_nm_rad)
         # zeta * sqrt(K_j) scales the columns of Lambda^1/2; its transpose gives the other half.
         self._damping_scale = gains.damping_ratio * np.sqrt(self._stiffness)
         rate = gains.integral_1_s * period_s * self._stiffness
-        self._integral = _Integral(rate, _per_axis(gains.max_integral_n, gains.max_integral_nm))
+        super().__init__(effort_nm, rate, _per_axis(gains.max_integral_n, gains.max_integral_nm))
         self._task_space: _TaskSpace | None = None
-
-    @property
-    def integral(self) -> FloatArray:
-        """(6,) N and Nm of the integral action."""
-        return self._integral.value
 
     def reset(self, posture_rad: FloatArray | None = None) -> None:
         """Clear the integral; set the posture where `posture_rad` (n,) is given."""
-        self._integral.put(np.zeros(6))
+        self.integral = np.zeros(6)
         self._task_space = None
         if posture_rad is not None:
             self._posture_rad = np.array(posture_rad, float)
@@ -201,7 +206,8 @@ class CartesianImpedance:
         The part of that torque beyond the model (friction, payload) goes into the integral, so that
         the first torque of this law equals the last of the other at the TCP.
         """
-        self._integral.put(self._seen(state).consistent @ (torque_nm - state.bias_nm))
+        beyond = self._seen(state).consistent @ (torque_nm - state.bias_nm)
+        self.integral = _bounded(beyond, self._limit)
         self._posture_rad = state.position_rad.copy()
 
     def torque(self, reference: PoseReference, state: ArmDynamics) -> ImpedanceOutput:
@@ -215,14 +221,14 @@ class CartesianImpedance:
         _, inertia, damping, consistent = self._seen(state)
 
         slip = feed * reference.twist - jacobian @ state.velocity_rad_s
-        wrench = self._stiffness * spring_error + damping @ slip + self._integral.value
+        wrench = self._stiffness * spring_error + damping @ slip + self.integral
         wrench += inertia @ (feed * reference.acceleration - state.drift)
 
         posture = self._posture_torque(state)
         wanted = transposed @ (wrench - consistent @ posture) + posture + state.bias_nm
-        torque = np.minimum(np.maximum(wanted, -self._effort_nm), self._effort_nm)
+        torque = _bounded(wanted, self._effort_nm)
         saturated = bool((torque != wanted).any())
-        self._integral.add(spring_error, saturated or feed <= 0.0)
+        self._integrate(spring_error, saturated or feed <= 0.0)
         return ImpedanceOutput(torque, saturated, error, wrench)
 
     def _seen(self, state: ArmDynamics) -> _TaskSpace:
@@ -269,7 +275,7 @@ def _per_axis(translational: float, rotational: float) -> FloatArray:
     return np.array([translational] * 3 + [rotational] * 3)
 
 
-class JointImpedance:
+class JointImpedance(_Impedance):
     """Joint impedance controller; its only state is the integral torque.
 
     Args:
@@ -280,26 +286,20 @@ class JointImpedance:
 
     def __init__(self, gains: JointGains, *, effort_nm: FloatArray, period_s: float) -> None:
         self.gains = gains
-        self._effort_nm = np.array(effort_nm, float)
-        joints = len(self._effort_nm)
+        joints = len(effort_nm)
         self._stiffness = _per_joint(gains.stiffness_nm_rad, joints)
         # zeta * sqrt(K_j) scales the columns of M^1/2; its transpose gives the other half.
         self._damping_scale = gains.damping_ratio * np.sqrt(self._stiffness)
         rate = gains.integral_1_s * period_s * self._stiffness
-        self._integral = _Integral(rate, _per_joint(gains.max_integral_nm, joints))
-
-    @property
-    def integral_nm(self) -> FloatArray:
-        """(n,) torque of the integral action."""
-        return self._integral.value
+        super().__init__(effort_nm, rate, _per_joint(gains.max_integral_nm, joints))
 
     def reset(self) -> None:
         """Clear the integral."""
-        self._integral.put(np.zeros(len(self._effort_nm)))
+        self.integral = np.zeros(len(self._limit))
 
     def take_over(self, torque_nm: FloatArray, state: ArmDynamics) -> None:
         """Take over from the other law, see `CartesianImpedance.take_over`."""
-        self._integral.put(torque_nm - state.bias_nm)
+        self.integral = _bounded(torque_nm - state.bias_nm, self._limit)
 
     def torque(self, reference: JointReference, state: ArmDynamics) -> ImpedanceOutput:
         """One control period: joint torques that pull the arm to `reference`."""
@@ -317,12 +317,12 @@ class JointImpedance:
             + self._stiffness * spring_error
             + half_damping @ slip
             + half_damping.T @ slip
-            + self._integral.value
+            + self.integral
             + state.bias_nm
         )
-        torque = np.minimum(np.maximum(wanted, -self._effort_nm), self._effort_nm)
+        torque = _bounded(wanted, self._effort_nm)
         cut = torque != wanted
-        self._integral.add(spring_error, cut | (stretch >= 1.0))
+        self._integrate(spring_error, cut | (stretch >= 1.0))
         return ImpedanceOutput(torque, bool(cut.any()), error)
 
 

@@ -53,8 +53,9 @@ class Background(NamedTuple):
 
 
 class Viewpoint(NamedTuple):
-    """A camera's pose, with axes (3, 3), its focal length in pixels and its size in pixels."""
+    """A camera's id and pose, with axes (3, 3), its focal length and its size in pixels."""
 
+    camera: int
     position_m: FloatArray
     axes: FloatArray
     focal_px: float
@@ -82,36 +83,33 @@ class RaycastCanvas:
 
     def draw(self, data: mujoco.MjData, camera: str, width: int, height: int) -> Pixels:
         """Image of `camera`, (height, width, 3) RGB."""
-        index, view = self._view(data, camera, width, height)
-        if self._stands(index):
-            return self._over_background(data, view, (index, width, height)).rgb
+        view = self._view(data, camera, width, height)
+        if self._stands(view.camera):
+            return self._over_background(data, view).rgb
         return self._coarse_to_fine(data, view)
 
     def draw_depth(self, data: mujoco.MjData, camera: str, width: int, height: int) -> FloatArray:
         """Distance along the optical axis in m, (height, width); infinite where nothing is."""
-        index, view = self._view(data, camera, width, height)
-        if self._stands(index):
-            return self._over_background(data, view, (index, width, height)).distance
+        view = self._view(data, camera, width, height)
+        if self._stands(view.camera):
+            return self._over_background(data, view).distance
         return self._depth_coarse_to_fine(data, view)
 
-    def _view(
-        self, data: mujoco.MjData, camera: str, width: int, height: int
-    ) -> tuple[int, Viewpoint]:
+    def _view(self, data: mujoco.MjData, camera: str, width: int, height: int) -> Viewpoint:
         index = self._model.camera(camera).id
-        focal = height / 2.0 / math.tan(math.radians(self._model.cam_fovy[index]) / 2.0)
+        focal_px = height / 2.0 / math.tan(math.radians(self._model.cam_fovy[index]) / 2.0)
         axes = data.cam_xmat[index].reshape(3, 3)
-        return index, Viewpoint(data.cam_xpos[index].copy(), axes.copy(), focal, width, height)
+        return Viewpoint(index, data.cam_xpos[index], axes, focal_px, width, height)
 
-    def _stands(self, index: int) -> bool:
-        body = self._model.cam_bodyid[index]
+    def _stands(self, camera: int) -> bool:
+        body = self._model.cam_bodyid[camera]
         return self._model.body_weldid[body] == 0 and self._model.body_mocapid[body] < 0
 
     def close(self) -> None:
         """Nothing to free."""
 
-    def _over_background(
-        self, data: mujoco.MjData, view: Viewpoint, key: tuple[int, int, int]
-    ) -> Background:
+    def _over_background(self, data: mujoco.MjData, view: Viewpoint) -> Background:
+        key = view.camera, view.width, view.height
         if key not in self._backgrounds:
             rays = self._directions(view).reshape(-1, 3)
             hits = self._cast(data, view, rays, {STATIC_GROUP})

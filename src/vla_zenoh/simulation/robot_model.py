@@ -42,7 +42,6 @@ class JointGains:
     max_error_rad: float = 0.05
 
 
-PANDA_GAINS = JointGains()
 PANDA_WRIST = MountedCamera(
     name="wrist",
     link="panda_hand",
@@ -76,7 +75,6 @@ class RobotModel:
         camera: the camera mounted on the robot, or None.
         gripper_stiffness_n_m, gripper_damping_ns_m: of the width servo; the force bound of a
             command caps it.
-        pad_friction: sliding, torsional, rolling friction of the fingers.
         colours, colour: rgba of links by name, and of every other link.
         part: which part of a robot it is; empty: all of it.
         base_m, base_yaw_rad: where it stands in the world, and its turn about the vertical.
@@ -87,7 +85,7 @@ class RobotModel:
     arm_joints: tuple[str, ...] = tuple(f"panda_joint{i}" for i in range(1, 8))
     armature_kg_m2: float = 0.0
     effort_nm: float | None = None
-    gains: JointGains = PANDA_GAINS
+    gains: JointGains = JointGains()
     finger_joints: tuple[str, ...] = ("panda_finger_joint1", "panda_finger_joint2")
     finger_scale_m: float = 1.0
     max_width_m: float = 0.08
@@ -96,7 +94,6 @@ class RobotModel:
     camera: MountedCamera | None = PANDA_WRIST
     gripper_stiffness_n_m: float = 4000.0
     gripper_damping_ns_m: float = 25.0
-    pad_friction: Vector3 = (1.5, 0.02, 0.001)
     colours: tuple[tuple[str, Rgba], ...] = (
         ("panda_link5", (0.80, 0.81, 0.83, 1.0)),
         ("panda_link7", (0.62, 0.64, 0.67, 1.0)),

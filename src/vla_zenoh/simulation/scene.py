@@ -37,6 +37,7 @@ HIDDEN_GROUP = 3  # MuJoCo's own convention: groups from here on are not drawn
 # Creep of a held brick in 10 s, measured: 1.06 mm with a pyramidal cone and impratio 1, 0.03 mm so.
 IMPRATIO = 10.0
 STIFF_SOLREF = (0.004, 1.0)
+PAD_FRICTION = (1.5, 0.02, 0.001)  # sliding, torsional, rolling
 PAD_CONDIM = 4
 PAD_SOLIMP = (0.99, 0.999, 0.001, 0.5, 2.0)  # the fingers are light, hence soft otherwise
 
@@ -124,14 +125,13 @@ def _robot_spec(robot: RobotModel, joint_friction_nm: float) -> mujoco.MjSpec:
         geom.contype, geom.conaffinity = 1, 0
         if link in robot.finger_links:
             geom.priority = 1  # the pads' friction counts, not the object's
-            geom.friction = robot.pad_friction
+            geom.friction = PAD_FRICTION
             geom.condim = PAD_CONDIM
             geom.solref, geom.solimp = STIFF_SOLREF, PAD_SOLIMP
     for equality in spec.equalities:
         equality.solref = STIFF_SOLREF
     for name in robot.arm_joints:
-        _named(spec.joint(name), "joint", name, [joint.name for joint in spec.joints])
-        joint = spec.joint(name)
+        joint = _named(spec.joint(name), "joint", name, [joint.name for joint in spec.joints])
         joint.frictionloss, joint.armature = joint_friction_nm, robot.armature_kg_m2
 
     links = [body.name for body in spec.bodies]

@@ -34,15 +34,8 @@ class SimulatedPart:
     """One arm with its gripper in a `World`, under impedance control of its TCP or joints.
 
     At rest either law takes over from the other with the same torque; a change between them in
-    motion jolts the arm. All poses are of the TCP in the base frame of the arm.
-
-    Args:
-        model: the scene with the robot in it.
-        data: its state.
-        robot: the arm.
-        home_rad: (n,) joints after a reset; also the posture that the nullspace prefers.
-        gains: of the Cartesian impedance controller.
-        refresh: computes positions after a step.
+    motion jolts the arm. All poses are of the TCP in the base frame of the arm. `refresh` computes
+    positions after a step; see `World` for the others.
 
     Attributes:
         joint_range_rad: lower and upper limit of every arm joint, (n,) each.
@@ -114,10 +107,11 @@ class SimulatedPart:
         self._filtered_wrench = np.zeros(6)
 
     # -- time ---------------------------------------------------------------------------------
-    def go_home(self) -> None:
-        """Put the joints at home and open the gripper."""
+    def reset(self) -> None:
+        """Put the joints at home, at rest, with the gripper open."""
         self._position_rad[:] = self._home_rad
         self.gripper.open()
+        self.reset_laws()
 
     def reset_laws(self) -> None:
         """Forget what the controllers have accumulated and measured."""
@@ -134,24 +128,18 @@ class SimulatedPart:
         """
         state = self._dynamics()
         if isinstance(reference, JointReference):
-            self._held_rad = reference.position_rad
-            self._switch_to(self._joint, state)
-            output = self._joint.torque(reference, state)
+            law, self._held_rad = self._joint, reference.position_rad
         else:
-            self._held_rad = None
-            self._switch_to(self._cartesian, state)
-            output = self._cartesian.torque(reference, state)
+            law, self._held_rad = self._cartesian, None
+        if self._active_law not in (None, law):
+            law.take_over(self._ctrl[self._actuators], state)
+        self._active_law = law
+        output = law.torque(reference, state)  # pyright: ignore[reportArgumentType]  # of its law
         if not math.isfinite(sum(output.torque_nm.tolist())):
             raise NodeError(f"the reference is not finite: {reference}")
         self._ctrl[self._actuators] = output.torque_nm
         self.gripper.step()
         return output.saturated
-
-    def _switch_to(self, law: CartesianImpedance | JointImpedance, state: ArmDynamics) -> None:
-        if self._active_law is not law:
-            if self._active_law is not None:
-                law.take_over(self._ctrl[self._actuators], state)
-            self._active_law = law
 
     def _dynamics(self) -> ArmDynamics:
         """State for an impedance law; some arrays are views, valid until the next step."""

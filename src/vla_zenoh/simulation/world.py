@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
@@ -9,11 +10,11 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vla_zenoh.errors import NodeError
+from vla_zenoh.errors import NodeError, ResourceError
 from vla_zenoh.profile import Profile
 from vla_zenoh.simulation.appearance import DISTRACTORS, check_variations
 from vla_zenoh.simulation.impedance import ImpedanceGains
-from vla_zenoh.simulation.objects import SimulatedObjects
+from vla_zenoh.simulation.objects import draw_places, objects_of
 from vla_zenoh.simulation.robot_model import RobotModel, robot_models
 from vla_zenoh.simulation.scene import POSES, STEP_S, build_model
 from vla_zenoh.simulation.simulated_robot import SimulatedPart
@@ -80,7 +81,7 @@ class World:
         self.hold_reference, self.set_gripper = arm.hold_reference, arm.set_gripper
         self.joint_state, self.pose_state = arm.joint_state, arm.pose_state
         self.gripper_state = arm.gripper_state
-        self._objects = SimulatedObjects(self.model, self._data)
+        self._bodies = objects_of(self.model)
         self.reset(seed)
 
     def reset(self, seed: int | None = None) -> None:
@@ -93,11 +94,14 @@ class World:
         self.seed = seed
         mujoco.mj_resetData(model, data)
         for part in self.parts.values():
-            part.go_home()
+            part.reset()
         if seed is not None:
-            self._objects.draw(seed, distractors=DISTRACTORS in self._vary)
-        for part in self.parts.values():
-            part.reset_laws()
+            places = draw_places(model, seed, distractors=DISTRACTORS in self._vary)
+            for name, place in places.items():
+                height_m = float(model.body_pos[self._bodies[name], 2])
+                half_rad = place.yaw_rad / 2.0
+                turn = (0.0, 0.0, math.sin(half_rad), math.cos(half_rad))
+                self._put(self._bodies[name], (place.x_m, place.y_m, height_m), turn)
         self._ticks = self.saturated = 0
         mujoco.mj_forward(model, data)
         self._fresh = True
@@ -137,7 +141,11 @@ class World:
     def objects(self) -> dict[str, tuple[FloatArray, FloatArray]]:
         """Position (3,) and quaternion x, y, z, w (4,) of every object, copies."""
         self._refresh()
-        return self._objects.poses()
+        data = self._data
+        return {
+            name: (data.xpos[body].copy(), np.roll(data.xquat[body], -1))
+            for name, body in self._bodies.items()
+        }
 
     def place(self, name: str, position_m: ArrayLike, quat_xyzw: ArrayLike = (0, 0, 0, 1)) -> None:
         """Put an object at a pose, at rest.
@@ -145,9 +153,25 @@ class World:
         Raises:
             ResourceError: the scene has no such object.
         """
-        self._objects.place(name, position_m, quat_xyzw)
+        if name not in self._bodies:
+            raise ResourceError(
+                f"the scene has no object {name!r}; it has: {', '.join(self._bodies) or 'none'}"
+            )
+        self._put(self._bodies[name], position_m, quat_xyzw)
         mujoco.mj_forward(self.model, self._data)
         self._fresh = True
+
+    def _put(self, body: int, position_m: ArrayLike, quat_xyzw: ArrayLike) -> None:
+        model, data = self.model, self._data
+        quat_wxyz = np.roll(np.asarray(quat_xyzw, float), 1)
+        mocap = model.body_mocapid[body]
+        if mocap >= 0:
+            data.mocap_pos[mocap], data.mocap_quat[mocap] = position_m, quat_wxyz
+            return
+        joint = model.body_jntadr[body]
+        q, dof = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
+        data.qpos[q : q + 3], data.qpos[q + 3 : q + 7] = position_m, quat_wxyz
+        data.qvel[dof : dof + 6] = 0.0
 
     def qpos(self) -> FloatArray:
         """Every pose of the world in one vector, for a renderer of the same scene."""

@@ -149,12 +149,12 @@ def test_the_integral_grows_to_its_bound_and_a_reset_forgets_it(model: pin.Model
     off = np.full(JOINTS, 0.01)
     law.torque(ahead(off), state)
     one_tick = gains.integral_1_s * PERIOD_S * 0.01 * np.array(FRANKA_NM_RAD)
-    np.testing.assert_allclose(law.integral_nm, one_tick, atol=1e-12)
+    np.testing.assert_allclose(law.integral, one_tick, atol=1e-12)
     for _ in range(3000):
         law.torque(ahead(off), state)
-    np.testing.assert_array_equal(law.integral_nm, gains.max_integral_nm)
+    np.testing.assert_array_equal(law.integral, gains.max_integral_nm)
     law.reset()
-    assert not law.integral_nm.any()
+    assert not law.integral.any()
 
 
 def test_a_blocked_joint_winds_nothing_up_but_unwinds_and_its_neighbours_go_on(
@@ -164,13 +164,13 @@ def test_a_blocked_joint_winds_nothing_up_but_unwinds_and_its_neighbours_go_on(
     off = np.array([0.2, 0.01, 0, 0, 0, 0, 0])
     for _ in range(100):
         law.torque(ahead(off), state)
-    assert law.integral_nm[0] == 0.0
-    assert law.integral_nm[1] > 1.0
+    assert law.integral[0] == 0.0
+    assert law.integral[1] > 1.0
     for _ in range(100):
         law.torque(ahead(off * [0.05, 1, 1, 1, 1, 1, 1]), state)
-    wound = law.integral_nm[0]
+    wound = law.integral[0]
     law.torque(ahead(-off), state)
-    assert 0.0 < law.integral_nm[0] < wound
+    assert 0.0 < law.integral[0] < wound
 
 
 def test_a_joint_at_its_torque_limit_winds_nothing_up(model: pin.Model) -> None:
@@ -180,8 +180,8 @@ def test_a_joint_at_its_torque_limit_winds_nothing_up(model: pin.Model) -> None:
     output = law.torque(ahead(off), state)
     assert output.saturated
     assert (np.abs(output.torque_nm) <= 5.0).all()
-    assert law.integral_nm[0] == 0.0
-    assert law.integral_nm[6] > 0.0
+    assert law.integral[0] == 0.0
+    assert law.integral[6] > 0.0
 
 
 @pytest.mark.parametrize(
@@ -229,4 +229,4 @@ def test_the_cartesian_law_takes_over_a_load_at_the_tcp_and_the_posture(model: p
 def test_what_is_taken_over_stays_within_the_integrals_bounds(model: pin.Model) -> None:
     state, law = resting(model), controller()
     law.take_over(state.bias_nm + 50.0, state)
-    np.testing.assert_array_equal(law.integral_nm, JointGains().max_integral_nm)
+    np.testing.assert_array_equal(law.integral, JointGains().max_integral_nm)
