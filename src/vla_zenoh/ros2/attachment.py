@@ -26,16 +26,11 @@ class Attachment(NamedTuple):
 
 
 def encode(attachment: Attachment) -> bytes:
-    """The 33 bytes."""
     return _LAYOUT.pack(attachment.seq, attachment.stamp_ns, GID_BYTES, attachment.gid)
 
 
 def decode(payload: bytes | None) -> Attachment:
-    """Read the 33 bytes.
-
-    Raises:
-        CodecError: ``no_attachment``, or ``malformed``.
-    """
+    """Read the 33 bytes, or raise a `CodecError`: ``no_attachment``, or ``malformed``."""
     if payload is None:
         raise CodecError("no_attachment", "rmw_zenoh sends an attachment with everything")
     if len(payload) != ATTACHMENT_BYTES:

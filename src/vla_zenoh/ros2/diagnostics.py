@@ -25,20 +25,11 @@ def write(
     nodes: Mapping[str, tuple[NodeStatus, float, bool]],
     stamp: Stamp,
 ) -> Any:
-    """One entry a node.
-
-    Args:
-        messages: of the robot's distribution.
-        robot: its name.
-        nodes: node -> (its status, age of it in s, alive).
-        stamp: of the header.
-    """
+    """One entry for each node of a robot; `nodes` has their status, its age in s, and alive."""
     return messages.new(
         TYPE,
         header=header(messages, stamp),
-        status=[
-            _entry(messages, robot, status, age_s, alive) for status, age_s, alive in nodes.values()
-        ],
+        status=[_entry(messages, robot, *node) for node in nodes.values()],
     )
 
 

@@ -16,7 +16,6 @@ from vla_zenoh.kinematics.fingers import Fingers
 from vla_zenoh.profile import GripperProfile
 from vla_zenoh.profile.ros2 import Ros2Gripper
 from vla_zenoh.ros2.messages import Messages
-from vla_zenoh.ros2.names import request_of, send_goal_of
 from vla_zenoh.types import GripperCommand
 
 MOVE, GRASP = "franka_msgs/action/Move", "franka_msgs/action/Grasp"
@@ -27,7 +26,7 @@ SUCCEEDED = 4
 
 
 class GripperOutcome(NamedTuple):
-    """Result of a goal: reached, holding an object, and the driver's message."""
+    """Result of a goal, with the driver's message."""
 
     reached: bool
     holding: bool
@@ -50,26 +49,15 @@ def send_goal(
     position: float,
     max_width_m: float,
 ) -> Any:
-    """The request that begins a goal.
+    """The request that begins a goal with an id of 16 bytes.
 
-    Args:
-        messages: of the robot's distribution.
-        action: one of the four.
-        goal_id: 16 bytes.
-        command: opening, speed and force.
-        position: the opening as the driver takes it, see `position`; `MOVE`, `GRASP` take widths.
-        max_width_m: a grasp succeeds at whatever width up to this.
+    `position` is the opening as the driver takes it, see the function; `MOVE` and `GRASP` take
+    widths. A grasp succeeds at whatever width up to `max_width_m`.
     """
-    if action == MOVE:
-        goal = {"width": command.width_m, "speed": command.speed_m_s}
-    elif action == GRASP:
+    goal: dict[str, Any] = {"width": command.width_m, "speed": command.speed_m_s}
+    if action == GRASP:
         epsilon = messages.new("franka_msgs/msg/GraspEpsilon", inner=max_width_m, outer=max_width_m)
-        goal = {
-            "width": command.width_m,
-            "epsilon": epsilon,
-            "speed": command.speed_m_s,
-            "force": command.force_n,
-        }
+        goal |= {"epsilon": epsilon, "force": command.force_n}
     elif action == PARALLEL_COMMAND:
         # It has one joint, which needs no name; its speed, in the joint's unit, is the driver's.
         order = messages.new(
@@ -78,13 +66,13 @@ def send_goal(
             effort=np.array([command.force_n]),
         )
         goal = {"command": order}
-    else:
+    elif action == GRIPPER_COMMAND:
         order = messages.new(
             "control_msgs/msg/GripperCommand", position=position, max_effort=command.force_n
         )
         goal = {"command": order}
     return messages.new(
-        request_of(send_goal_of(action)),
+        f"{action}_SendGoal_Request",
         goal_id=uuid(messages, goal_id),
         goal=messages.new(f"{action}_Goal", **goal),
     )
@@ -115,14 +103,12 @@ def outcome(action: str, response: Any) -> GripperOutcome:
 
 # -- order of goals -------------------------------------------------------------------------------
 class GoalStep(Enum):
-    """Next action of the sequencer."""
-
     SEND = "send"
     CANCEL = "cancel"
 
 
 class ActionGoal(NamedTuple):
-    """A goal in flight, identified by its number."""
+    """A goal, identified by its number."""
 
     number: int
     command: GripperCommand
@@ -141,8 +127,7 @@ class GoalSequencer:
         self._timeout_ns, self._stroke_m = int(timeout_s * 1e9), stroke_m
         self._wish: GripperCommand | None = None
         self._accepted = self._cancelling = False
-        self._since_ns = 0
-        self._number = 0
+        self._since_ns = self._number = 0
         self.goal: ActionGoal | None = None
         self.timeouts = 0
 

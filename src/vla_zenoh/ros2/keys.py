@@ -1,4 +1,4 @@
-"""Every key expression of the ROS 2 side, for both transports. The only file with such text.
+"""Names and key expressions of the ROS 2 side, for both transports. The only file with such text.
 
 ``ros2dds``: the names zenoh-bridge-ros2dds gives to topics and services, and the liveliness tokens
 by which bridges tell each other what to route. ``rmw_zenoh``: those of robots that run rmw_zenoh.
@@ -6,25 +6,58 @@ by which bridges tell each other what to route. ``rmw_zenoh``: those of robots t
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
+from typing import NamedTuple
 
-from vla_zenoh.ros2.names import dds_type, get_result_of, send_goal_of
+from vla_zenoh.errors import ProfileError
 
+_TYPE = re.compile(r"([a-z][a-z0-9_]*)/(msg|srv|action)/([A-Za-z][A-Za-z0-9_]*)")
 CANCEL_GOAL = "action_msgs/srv/CancelGoal"
 _SLASH_OF_BRIDGES = "§"
 _SLASH_OF_RMW = "%"
 
 
+def split_type(kind: str) -> tuple[str, str, str]:
+    """``package/msg/Name`` in its three parts; a `ProfileError` if it is no such name."""
+    match = _TYPE.fullmatch(kind)
+    if match is None:
+        raise ProfileError(
+            f"{kind[:80]!r} is not a ROS type: write package/msg/Name, package/srv/Name or "
+            "package/action/Name"
+        )
+    return match[1], match[2], match[3]
+
+
+def dds_type(kind: str) -> str:
+    """``sensor_msgs/msg/Image`` -> ``sensor_msgs::msg::dds_::Image_``."""
+    package, room, name = split_type(kind)
+    return f"{package}::{room}::dds_::{name}_"
+
+
+class Service(NamedTuple):
+    """A service of ours: the last part of its name, and its type."""
+
+    name: str
+    type: str
+
+
+SET_ACTIVE = Service("set_active", "std_srvs/srv/SetBool")
+STOP = Service("stop", "std_srvs/srv/Trigger")
+RESET = Service("reset", "std_srvs/srv/Trigger")
+SET_PROMPT = Service("set_prompt", "vla_msgs/srv/SetPrompt")
+SET_REQUEST = Service("set_request", "vla_msgs/srv/SetRequest")
+SERVICES = (SET_ACTIVE, STOP, RESET, SET_PROMPT, SET_REQUEST)
+
+PROMPT_TOPIC, STATUS_TOPIC = "prompt", "status"
+
+
+# -- endpoints -----------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class Qos:
-    """The used part of a ROS 2 QoS profile; history is always the last `depth`.
-
-    Args:
-        depth: samples kept.
-        reliable: they must arrive.
-    """
+    """The used part of a ROS 2 QoS profile; history is always the last `depth` samples."""
 
     depth: int = 10
     reliable: bool = True
@@ -59,13 +92,9 @@ class EntityRole(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """One of our ends in the ROS graph.
+    """One of our ends in the ROS graph: of a topic, service or action.
 
-    Args:
-        role: what we are there.
-        name: full name of topic, service or action, with its leading slash.
-        type: ROS type.
-        qos: of a topic.
+    `name` is the full one with its leading slash, `type` the ROS type; `qos` is that of a topic.
     """
 
     role: EntityRole
@@ -76,11 +105,14 @@ class Endpoint:
 
 def parts_of(action: Endpoint) -> dict[str, Endpoint]:
     """The services an action client uses: send_goal, get_result and cancel_goal."""
-    at = f"{action.name}/_action"
+    kinds = {
+        "send_goal": f"{action.type}_SendGoal",
+        "get_result": f"{action.type}_GetResult",
+        "cancel_goal": CANCEL_GOAL,
+    }
     return {
-        "send_goal": Endpoint(EntityRole.CLIENT, f"{at}/send_goal", send_goal_of(action.type)),
-        "get_result": Endpoint(EntityRole.CLIENT, f"{at}/get_result", get_result_of(action.type)),
-        "cancel_goal": Endpoint(EntityRole.CLIENT, f"{at}/cancel_goal", CANCEL_GOAL),
+        part: Endpoint(EntityRole.CLIENT, f"{action.name}/_action/{part}", kind)
+        for part, kind in kinds.items()
     }
 
 
@@ -88,9 +120,7 @@ def parts_of(action: Endpoint) -> dict[str, Endpoint]:
 class Ros2Dds:
     """zenoh-bridge-ros2dds: a key is the name without its first slash, payloads are plain CDR.
 
-    Args:
-        session_id: of our Zenoh session, in its own spelling.
-        type_hash: hash of a type; None where the distribution has none.
+    `type_hash` gives the hash of a type; None where the distribution has none.
     """
 
     session_id: str
@@ -123,11 +153,8 @@ class Ros2Dds:
 class RmwZenoh:
     """rmw_zenoh: a key is domain, name, type and hash.
 
-    Args:
-        session_id: of our Zenoh session.
-        node: our name in the ROS graph, in the root namespace.
-        domain: ROS domain id.
-        type_hash: hash of a type, or what stands in its place.
+    `node` is our name in the ROS graph, in the root namespace; `type_hash` gives the hash of a
+    type, or what stands in its place.
     """
 
     session_id: str
@@ -136,9 +163,7 @@ class RmwZenoh:
     type_hash: Callable[[str], str]
 
     def key(self, endpoint: Endpoint) -> str:
-        """The key of its samples or queries."""
-        kind = endpoint.type
-        name = endpoint.name.strip("/")
+        name, kind = endpoint.name.strip("/"), endpoint.type
         return f"{self.domain}/{name}/{dds_type(kind)}/{self.type_hash(kind)}"
 
     def token(self, endpoint: Endpoint, number: int) -> str:

@@ -20,7 +20,7 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
 from vla_zenoh.errors import CodecError, ProfileError, nearest
-from vla_zenoh.ros2.names import request_of, response_of, split_type
+from vla_zenoh.ros2.keys import split_type
 
 STORES = {
     "humble": Stores.ROS2_HUMBLE,
@@ -33,12 +33,9 @@ STORES = {
 
 NO_HASH = "TypeHashNotSupported"
 """In place of a hash where the distribution has none (Humble)."""
-
 MAX_MESSAGE_BYTES = 4 * 1024 * 1024
 MAX_PICTURE_BYTES = 128 * 1024 * 1024
-
 _EVENT_INFO = "service_msgs/msg/ServiceEventInfo"
-
 _SEPARATOR = "---"
 _SUFFIXES = (".msg", ".srv", ".action")
 _PARTS = {"srv": ("_Request", "_Response"), "action": ("_Goal", "_Result", "_Feedback")}
@@ -65,11 +62,12 @@ class Messages:
             )
         self.distribution = distribution
         self._store = get_typestore(STORES[distribution])
-        texts = shipped() | dict(extra or {})
-        definitions: dict[str, Any] = {}
-        for kind, text in texts.items():
-            if kind not in self._store.fielddefs or kind in (extra or {}):
-                definitions |= parse(kind, text)
+        shipped_too = {
+            kind: text for kind, text in shipped().items() if kind not in self._store.fielddefs
+        }
+        definitions: Definitions = {}
+        for kind, text in (shipped_too | dict(extra or {})).items():
+            definitions |= parse(kind, text)
         self._register(definitions)
         self._hash_chars_as_ros_does()
 
@@ -95,7 +93,7 @@ class Messages:
 
     # -- values -------------------------------------------------------------------------------
     def __contains__(self, kind: str) -> bool:
-        return kind in self._store.fielddefs or request_of(kind) in self._store.fielddefs
+        return kind in self._store.fielddefs or f"{kind}_Request" in self._store.fielddefs
 
     def require(self, kind: str) -> None:
         """Make sure that `kind` is a known message or service.
@@ -183,31 +181,24 @@ class Messages:
         """Type hash of a message or service (REP-2016), as ROS 2 of this distribution has it."""
         if self.distribution == "humble":
             return NO_HASH
-        if request_of(kind) in self._store.fielddefs:
+        if f"{kind}_Request" in self._store.fielddefs and kind not in self._store.fielddefs:
             self._define_service(kind)
         return self._store.hash_rihs01(kind)
 
     def _define_service(self, service: str) -> None:
         """The types that exist for the sake of the hash: the service itself, and its event."""
-        if service in self._store.fielddefs:
-            return
-        request, response, event = request_of(service), response_of(service), f"{service}_Event"
-
-        def one(kind: str) -> Any:
-            return (Nodetype.NAME, kind)
-
-        def at_most_one(kind: str) -> Any:
-            return (Nodetype.SEQUENCE, (one(kind), 1))
-
+        request = (Nodetype.NAME, f"{service}_Request")
+        response = (Nodetype.NAME, f"{service}_Response")
+        event = f"{service}_Event"
         of_event = [
-            ("info", one(_EVENT_INFO)),
-            ("request", at_most_one(request)),
-            ("response", at_most_one(response)),
+            ("info", (Nodetype.NAME, _EVENT_INFO)),
+            ("request", (Nodetype.SEQUENCE, (request, 1))),
+            ("response", (Nodetype.SEQUENCE, (response, 1))),
         ]
         of_service = [
-            ("request_message", one(request)),
-            ("response_message", one(response)),
-            ("event_message", one(event)),
+            ("request_message", request),
+            ("response_message", response),
+            ("event_message", (Nodetype.NAME, event)),
         ]
         self._store.fielddefs |= {event: ([], of_event), service: ([], of_service)}
 
@@ -240,11 +231,7 @@ def shipped() -> dict[str, str]:
 
 
 def parse(kind: str, text: str) -> Definitions:
-    """Definitions of all messages that `kind` consists of.
-
-    Args:
-        kind: ``package/msg/Name``, ``package/srv/Name`` or ``package/action/Name``.
-        text: of its file.
+    """Definitions of all messages that `kind` consists of, by the text of its file.
 
     Raises:
         ProfileError: the text is no such definition.
@@ -287,7 +274,8 @@ def _around_action(kind: str) -> Definitions:
         "_GetResult_Response": f"int8 status\n{kind}_Result result\n",
         "_FeedbackMessage": f"{goal_id}{kind}_Feedback feedback\n",
     }
-    found: Definitions = {}
-    for suffix, lines in text.items():
-        found |= _message(f"{kind}{suffix}", lines)
-    return found
+    return {
+        name: found
+        for suffix, lines in text.items()
+        for name, found in _message(f"{kind}{suffix}", lines).items()
+    }

@@ -16,14 +16,10 @@ SECOND_NS = 1_000_000_000
 
 
 class Joints(NamedTuple):
-    """A sensor_msgs/JointState.
+    """A sensor_msgs/JointState of any n joints, in rad or m.
 
-    Args:
-        stamp_ns: of its header, 0 where the robot did not stamp it.
-        names: of any joints.
-        position: (n,) rad or m.
-        velocity: (n,), or None if the robot does not report it.
-        effort: (n,), or None.
+    `stamp_ns` is 0 where the robot did not stamp it; velocity and effort (n,) are None where it
+    does not report them.
     """
 
     stamp_ns: int
@@ -34,13 +30,7 @@ class Joints(NamedTuple):
 
 
 class RosImage(NamedTuple):
-    """An image of a camera.
-
-    Args:
-        stamp_ns: of its header.
-        frame: of its header.
-        rgb: (H, W, 3) uint8; may be a read-only view.
-    """
+    """Image of a camera, with stamp and frame of its header; `rgb` may be a read-only view."""
 
     stamp_ns: int
     frame: str

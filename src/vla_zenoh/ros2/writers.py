@@ -46,11 +46,8 @@ def _time_fields(time_ns: int) -> dict[str, int]:
 def joint_writer(messages: Messages, kind: str, lead_ns: int) -> Write:
     """How joint positions are written as `kind`.
 
-    Args:
-        messages: of the robot's distribution.
-        kind: a trajectory of one point, or plain numbers, which the position controllers of
-            ros2_control take in the order of the profile's arm_joints.
-        lead_ns: how far ahead the trajectory's point lies.
+    That is a trajectory of one point, which lies `lead_ns` ahead, or plain numbers, which the
+    position controllers of ros2_control take in the order of the profile's arm_joints.
 
     Raises:
         ProfileError: it is another type.
@@ -88,12 +85,7 @@ def position_message(messages: Messages, kind: str, position: float) -> Any:
 
 # -- poses ----------------------------------------------------------------------------------------
 def pose_writer(messages: Messages, kind: str, posture_rad: FloatArray) -> Write:
-    """How poses are written as `kind`.
-
-    Args:
-        messages: of the robot's distribution.
-        kind: any type with a pose in it.
-        posture_rad: (n,) what the nullspace prefers.
+    """How poses are written as `kind`, any type with a pose in it.
 
     Raises:
         ProfileError: it is no type, or has no field for a pose.
@@ -137,11 +129,12 @@ def _fill(
         return messages.new(POSE_STAMPED, header=header(messages, stamp), pose=pose)
     if what != _TWIST:
         return None
-    linear, angular = (
-        _xyz(messages, "geometry_msgs/msg/Vector3", part)
-        for part in (command.twist[:3], command.twist[3:])
+    linear, angular = np.split(command.twist, 2)
+    return messages.new(
+        _TWIST,
+        linear=_xyz(messages, "geometry_msgs/msg/Vector3", linear),
+        angular=_xyz(messages, "geometry_msgs/msg/Vector3", angular),
     )
-    return messages.new(_TWIST, linear=linear, angular=angular)
 
 
 def _pose(messages: Messages, command: PoseCommand) -> Any:

@@ -17,9 +17,9 @@ from vla_zenoh.ros2.keys import (
     EntityRole,
     RmwZenoh,
     Ros2Dds,
+    dds_type,
     parts_of,
 )
-from vla_zenoh.ros2.names import dds_type
 
 HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 ZID = "f9980ee0495eaafb3e38f0d19e2eae12"

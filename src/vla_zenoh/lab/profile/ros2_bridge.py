@@ -19,8 +19,7 @@ from vla_zenoh.profile.session import (
 )
 from vla_zenoh.ros2 import diagnostics
 from vla_zenoh.ros2.gripper_actions import GRASP
-from vla_zenoh.ros2.keys import Endpoint, EntityRole
-from vla_zenoh.ros2.names import PROMPT_TOPIC, SERVICES, STATUS_TOPIC
+from vla_zenoh.ros2.keys import PROMPT_TOPIC, SERVICES, STATUS_TOPIC, Endpoint, EntityRole
 from vla_zenoh.ros2.readers import JOINT_STATE, TEXT, WRENCH
 
 PROGRAM = "zenoh-bridge-ros2dds"

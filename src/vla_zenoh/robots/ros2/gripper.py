@@ -16,7 +16,6 @@ from vla_zenoh.ros2 import gripper_actions
 from vla_zenoh.ros2.gripper_actions import GRASP, ActionGoal, GoalSequencer, GoalStep
 from vla_zenoh.ros2.keys import COMMAND
 from vla_zenoh.ros2.messages import Messages
-from vla_zenoh.ros2.names import get_result_of, request_of, response_of, send_goal_of
 from vla_zenoh.ros2.writers import position_message
 from vla_zenoh.types import Event, GripperCommand
 
@@ -171,7 +170,7 @@ class Gripper:
         )
 
     def _on_accepted(self, goal: ActionGoal, answer: bytes | None) -> None:
-        response = self._decode(response_of(send_goal_of(self._action)), answer)
+        response = self._decode(f"{self._action}_SendGoal_Response", answer)
         if response is None or not response.accepted:
             if self._goals.ended(goal.number):
                 what = "rejected the goal" if response is not None else "does not answer"
@@ -179,7 +178,7 @@ class Gripper:
             return
         self._goals.accepted(goal.number, time.monotonic_ns())
         request = self._messages.new(
-            request_of(get_result_of(self._action)),
+            f"{self._action}_GetResult_Request",
             goal_id=gripper_actions.uuid(self._messages, self._goal_id),
         )
         # As long as the goal may take, and the cancellation after it.
@@ -191,7 +190,7 @@ class Gripper:
     def _on_result(self, number: int, answer: bytes | None) -> None:
         if not self._goals.ended(number):
             return
-        response = self._decode(response_of(get_result_of(self._action)), answer)
+        response = self._decode(f"{self._action}_GetResult_Response", answer)
         if response is None:
             self._emit_failure("does not report the result of the goal")
             return

@@ -22,8 +22,7 @@ from vla_zenoh.errors import CodecError, SessionError
 from vla_zenoh.profile import Profile
 from vla_zenoh.robots.ros2.ros_graph import Request, RosGraph
 from vla_zenoh.ros2 import diagnostics
-from vla_zenoh.ros2.messages import Messages
-from vla_zenoh.ros2.names import (
+from vla_zenoh.ros2.keys import (
     PROMPT_TOPIC,
     RESET,
     SERVICES,
@@ -33,9 +32,8 @@ from vla_zenoh.ros2.names import (
     STATUS_TOPIC,
     STOP,
     Service,
-    request_of,
-    response_of,
 )
+from vla_zenoh.ros2.messages import Messages
 from vla_zenoh.ros2.readers import TEXT, read
 from vla_zenoh.ros2.samples import Stamp
 
@@ -167,7 +165,7 @@ class RosServices:
     # -- services -----------------------------------------------------------------------------
     def _answer(self, service: Service, request: Request, called_ns: int) -> None:
         try:
-            asked = self._messages.decode(request_of(service.type), request.payload)
+            asked = self._messages.decode(f"{service.type}_Request", request.payload)
         except CodecError as error:
             self._reject(error.reason, f"{service.name}: {error}", service.name)
             request.drop(str(error))
@@ -183,7 +181,7 @@ class RosServices:
             text, success = str(error), False
         except (SessionError, zenoh.ZError) as error:
             text, success = str(error), False
-        response = self._messages.new(response_of(service.type), success=success, message=text)
+        response = self._messages.new(f"{service.type}_Response", success=success, message=text)
         request.answer(self._messages.encode(response))
 
     def _activate(self, wanted: bool) -> str:
