@@ -17,8 +17,6 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from vla_zenoh.bus.primitives import PrimitiveError
-    from vla_zenoh.bus.remote_robot import RemoteRobot, connect
     from vla_zenoh.errors import (
         CodecError,
         ProfileError,
@@ -28,6 +26,8 @@ if TYPE_CHECKING:
         SpecError,
         VlaZenohError,
     )
+    from vla_zenoh.lab.primitives.client import PrimitiveError
+    from vla_zenoh.lab.primitives.remote_robot import RemoteRobot, connect
     from vla_zenoh.policy import (
         ActionSpec,
         ActionSteps,
@@ -92,7 +92,7 @@ def lazy_names(package: str, *modules: str) -> Callable[[str], Any]:
 
 
 _find = lazy_names(
-    __name__, "errors", "types", "robot", "policy", "profile", "bus.primitives", "bus.remote_robot"
+    __name__, "errors", "types", "robot", "policy", "profile", "lab.primitives.remote_robot"
 )
 
 

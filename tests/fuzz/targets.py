@@ -25,7 +25,7 @@ from vla_zenoh.bus.clock_sync import decode_stamps
 from vla_zenoh.cli import status_table as cli_status
 from vla_zenoh.cli.options import model_options
 from vla_zenoh.cli.output import Screen
-from vla_zenoh.codec import image, message, primitives, records, settings
+from vla_zenoh.codec import image, message, records, settings
 from vla_zenoh.errors import CodecError, PeerError, ProfileError, SpecError, VlaZenohError
 from vla_zenoh.keys import Keys
 from vla_zenoh.lab.cli import inspect as cli_inspect
@@ -36,6 +36,7 @@ from vla_zenoh.lab.cli.output import plain_types
 from vla_zenoh.lab.demo.scripted_motions import parse_scripted
 from vla_zenoh.lab.evaluation.mcap_file import evaluate_run
 from vla_zenoh.lab.inference_views import InferenceView
+from vla_zenoh.lab.primitives import answer
 from vla_zenoh.lab.primitives.requests import decode_request
 from vla_zenoh.lab.recording.record_types import RECORDS, record_from_json, record_to_json
 from vla_zenoh.lab.serve import mcp, openpi_server
@@ -179,8 +180,8 @@ def _prompt(data: bytes) -> None:
 
 
 def _peer_actions(data: bytes) -> None:
-    for answer in (groot.read_answer, groot.read_actions):
-        answer(data)
+    for read in (groot.read_answer, groot.read_actions):
+        read(data)
 
 
 def _all_of(*reads: Callable[[bytes], Any]) -> Callable[[bytes], None]:
@@ -364,9 +365,9 @@ def _targets() -> Iterator[Target]:
         )
     yield Target(
         "primitive-answer",
-        primitives.decode_answer,
+        answer.decode_answer,
         codec,
-        lambda: [primitives.Answer(True, "reached", position_m=(0.1, 0.2, 0.3)).encode()],
+        lambda: [answer.Answer(True, "reached", position_m=(0.1, 0.2, 0.3)).encode()],
     )
     yield Target("prompt", _prompt, codec, lambda: [b"HARD: go up x3", b"put the red brick down"])
     yield Target("depth", _depth, codec, _depths)

@@ -15,11 +15,11 @@ import pytest
 from camera_rig import until
 from chain import Chain, command_line, running_chain
 
-from vla_zenoh.bus.primitives import PrimitiveError, ask
-from vla_zenoh.bus.remote_robot import RemoteRobot, connect
-from vla_zenoh.codec.primitives import Answer, decode_answer
 from vla_zenoh.keys import PRIMITIVES, worker_node
 from vla_zenoh.kinematics.so3 import Pose, pose_distance, pose_of, rotation_from_quat
+from vla_zenoh.lab.primitives.answer import Answer, decode_answer
+from vla_zenoh.lab.primitives.client import PrimitiveError, ask
+from vla_zenoh.lab.primitives.remote_robot import RemoteRobot, connect
 
 NEAR_M, NEAR_RAD = 1e-3, 2e-3
 HOSTS = "hosts: {here: {nodes: [router, sim, camera, command, worker, primitives]}}\n"

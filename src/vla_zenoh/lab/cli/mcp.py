@@ -5,10 +5,10 @@ from __future__ import annotations
 import os
 import sys
 
-from vla_zenoh.bus.remote_robot import RemoteRobot
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.cli.options import options
 from vla_zenoh.cli.target import RobotTarget
+from vla_zenoh.lab.primitives.remote_robot import RemoteRobot
 from vla_zenoh.lab.serve.mcp_server import McpServer
 from vla_zenoh.security.identity import Role
 from vla_zenoh.security.store import local_role

@@ -8,15 +8,15 @@ from typing import Annotated, Any
 
 import typer
 
-from vla_zenoh.bus.primitives import ask
 from vla_zenoh.cli.options import AnswerOption, NodeOptions, options
 from vla_zenoh.cli.plain import fail, say
 from vla_zenoh.cli.target import RobotTarget
-from vla_zenoh.codec.primitives import DEFAULT_TIMEOUT_S, Answer
 from vla_zenoh.codec.settings import MAX_HELD_M, MIN_HELD_M
 from vla_zenoh.errors import SessionError
 from vla_zenoh.keys import PRIMITIVES, worker_node
 from vla_zenoh.lab.cli.options import number_list
+from vla_zenoh.lab.primitives.answer import DEFAULT_TIMEOUT_S, Answer
+from vla_zenoh.lab.primitives.client import ask
 from vla_zenoh.lab.primitives.requests import FURTHEST_M, FURTHEST_RAD
 from vla_zenoh.runtime.process import run_node
 

@@ -1,1 +1,1 @@
-"""The node of the guarded primitives: a worker whose chunks go to one target."""
+"""The node of the guarded primitives, a worker whose chunks go to one target, and its clients."""

@@ -18,15 +18,15 @@ import numpy as np
 import zenoh
 
 from vla_zenoh.bus.buffers import Wake, bytes_of
-from vla_zenoh.bus.remote_robot import RemoteRobot
-from vla_zenoh.codec.primitives import Answer
 from vla_zenoh.control.reachability import make_reachability_filter
 from vla_zenoh.control.states import DEACTIVATED
 from vla_zenoh.errors import CodecError, SessionError
 from vla_zenoh.keys import PRIMITIVES, last_chunk, worker_node
 from vla_zenoh.kinematics.so3 import Pose, pose_of, rotation_from_quat
+from vla_zenoh.lab.primitives.answer import Answer
 from vla_zenoh.lab.primitives.endings import NEAR_RAD, Arrival, Ending, Gripped, RunEnding, Sight
 from vla_zenoh.lab.primitives.policy import CHUNK_HZ, Target, TargetPolicy
+from vla_zenoh.lab.primitives.remote_robot import RemoteRobot
 from vla_zenoh.lab.primitives.requests import (
     MAX_REQUEST_BYTES,
     Grip,

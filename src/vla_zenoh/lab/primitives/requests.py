@@ -1,6 +1,6 @@
 """Requests for guarded primitives: JSON, from clients in any language.
 
-An invalid request is answered with what is wrong with which field; see `codec.primitives.Answer`.
+An invalid request is answered with what is wrong with which field; see `answer.Answer`.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from pydantic import (
     model_validator,
 )
 
-from vla_zenoh.codec.primitives import DEFAULT_TIMEOUT_S
 from vla_zenoh.codec.settings import MAX_HELD_M, MIN_HELD_M
 from vla_zenoh.errors import CodecError, ProfileError, describe_faults, nearest
 from vla_zenoh.keys import key_chunk
+from vla_zenoh.lab.primitives.answer import DEFAULT_TIMEOUT_S
 from vla_zenoh.policy.spec import MAX_JOINTS
 from vla_zenoh.types import MAX_TEXT
 

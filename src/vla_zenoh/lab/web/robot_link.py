@@ -14,12 +14,12 @@ import zenoh
 
 from vla_zenoh.bus.buffers import LatestSample, ReceivedSample, ZenohRing, bytes_of
 from vla_zenoh.bus.client import Client
-from vla_zenoh.bus.primitives import ask
 from vla_zenoh.cli.node_rows import NodeRow, acting_limits, mode_of, node_rows
 from vla_zenoh.codec import records
 from vla_zenoh.codec.settings import decode_held
 from vla_zenoh.errors import CodecError, RecordError, SessionError, VlaZenohError
 from vla_zenoh.keys import PRIMITIVES, ROLLING, last_chunk, worker_node
+from vla_zenoh.lab.primitives.client import ask
 from vla_zenoh.lab.teleop.policy import OperatorInput
 from vla_zenoh.lab.web.hand import HandWorker
 from vla_zenoh.lab.web.hold import Hold

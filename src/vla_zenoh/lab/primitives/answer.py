@@ -1,6 +1,6 @@
-"""A client's side of the guarded primitives: requests and answers as JSON.
+"""Requests and answers of the guarded primitives as JSON.
 
-`lab.primitives.requests` has what a request may contain.
+`requests` has what a request may contain.
 """
 
 from __future__ import annotations

@@ -12,14 +12,14 @@ import zenoh
 
 from vla_zenoh.bus.buffers import bytes_of
 from vla_zenoh.bus.client import Client
-from vla_zenoh.codec.primitives import (
+from vla_zenoh.errors import SessionError
+from vla_zenoh.lab.primitives.answer import (
     DEFAULT_TIMEOUT_S,
     MAX_ANSWER_BYTES,
     Answer,
     decode_answer,
     encode_request,
 )
-from vla_zenoh.errors import SessionError
 
 MARGIN_S = 20.0
 """On top of a primitive's own time: for activation, brake and answer."""
