@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -63,13 +64,10 @@ class Arm:
     def begin_step(
         self, now_ns: int, mono_ns: int, stall_s: float, *, reading: bool = True
     ) -> None:
-        """Read a real robot, and move it or a simulated one.
+        """Read a real robot, and move it or a simulated one, in a tick that is `stall_s` late.
 
-        Args:
-            now_ns: wall clock, for stamps.
-            mono_ns: the same time on the monotonic clock.
-            stall_s: how late the tick is.
-            reading: False: only move it, to bring the arm to rest.
+        `now_ns` (wall clock, for stamps) and `mono_ns` (monotonic) are one time. Without `reading`
+        it only moves the robot, to bring the arm to rest.
         """
         self._mono_ns = mono_ns
         self.follower.begin(mono_ns, stall_s)
@@ -99,44 +97,34 @@ class Arm:
 
         The gripper state carries the fault, even without a valid measurement.
         """
-        fault_changed = self._driver.fault != self._published_fault
-        elapsed_ns = mono_ns - self._published_ns
+        driver, gripper = self._driver, self._gripper
+        elapsed_ns, again_ns = mono_ns - self._published_ns, self._period_ns
         if measurement is None:
-            if fault_changed or (self._driver.fault and elapsed_ns >= FAULT_AGAIN_NS):
-                stamp_ns = mono_ns if self._driver.lockstep else self._node.clock.wall_at(mono_ns)
-                self._publish(stamp_ns, mono_ns, self._gripper)
+            again_ns = FAULT_AGAIN_NS if driver.fault else math.inf
+        if driver.fault == self._published_fault and elapsed_ns < again_ns:
             return
-        if not fault_changed and elapsed_ns < self._period_ns:
-            return
-        joints, pose, stamp_ns = measurement.joints, measurement.pose, measurement.stamp_ns
-        tcp, held_rad = self.follower.held()
-        if tcp is not None:
-            pose = replace(
-                pose,
-                reference_position_m=tcp.position_m,
-                reference_quat_xyzw=quat_from_rotation(tcp.rotation),
-            )
-        if held_rad is not None:
-            joints = replace(joints, reference_rad=held_rad)
-        states = (self._joint_out, joints), (self._pose_out, pose)
-        self._publish(stamp_ns, mono_ns, measurement.gripper, *states)
-
-    def _publish(
-        self,
-        stamp_ns: int,
-        mono_ns: int,
-        gripper: GripperState | None,
-        *states: tuple[Publisher, Any],
-    ) -> None:
-        """Publish states of one time, that of the gripper with fault and mode among them."""
-        fault, state = self._driver.fault, self.state
+        states: list[tuple[Publisher, Any]] = []
+        if measurement is None:
+            stamp_ns = mono_ns if driver.lockstep else self._node.clock.wall_at(mono_ns)
+        else:
+            stamp_ns, joints, _, pose, gripper = measurement
+            tcp, held_rad = self.follower.held()
+            if tcp is not None:
+                pose = replace(
+                    pose,
+                    reference_position_m=tcp.position_m,
+                    reference_quat_xyzw=quat_from_rotation(tcp.rotation),
+                )
+            if held_rad is not None:
+                joints = replace(joints, reference_rad=held_rad)
+            states += (self._joint_out, joints), (self._pose_out, pose)
         if gripper is not None:
-            mode = state if state in NOT_READY else self._driver.gripper_mode
-            gripper = replace(gripper, mode=mode, faults=(fault,) if fault else ())
-            states = *states, (self._gripper_out, gripper)
+            mode = self.state if self.state in NOT_READY else driver.gripper_mode
+            faults = (driver.fault,) if driver.fault else ()
+            states.append((self._gripper_out, replace(gripper, mode=mode, faults=faults)))
         publish_together(stamp_ns, self._seq, *states)
         self._seq += 1
-        self._published_ns, self._published_fault = mono_ns, fault
+        self._published_ns, self._published_fault = mono_ns, driver.fault
 
     # -- state --------------------------------------------------------------------------------
     @property
@@ -242,12 +230,10 @@ class CommandFollower:
         return self._driver.state_now() or self._measured or self._unknown
 
     def begin(self, mono_ns: int, stall_s: float) -> None:
-        """Begin a tick.
+        """Begin a tick that is `stall_s` late.
 
-        Args:
-            mono_ns: on the monotonic clock.
-            stall_s: how late the tick is. After a long stall the robot is held at its last
-                set-point, and motion resumes from there, at rest.
+        After a long stall the robot is held at its last set-point, and motion resumes from there,
+        at rest.
         """
         if stall_s <= self._timeout_s:
             if mono_ns >= self._stalled_until_ns:
@@ -268,11 +254,8 @@ class CommandFollower:
     def update(self, now_ns: int, mono_ns: int, *, away: str = "", silent: bool = False) -> None:
         """Accept or reject the commands that arrived, and move the robot.
 
-        Args:
-            now_ns: wall clock.
-            mono_ns: the same time on the monotonic clock.
-            away: reason to reject commands, one word, while the robot cannot be moved.
-            silent: the robot's state is not known.
+        Commands are rejected for the reason `away`, one word, while the robot cannot be moved;
+        `silent`: its state is not known.
         """
         if self._driver.idle and not self.guard.moving:
             self._hold.invalidate()
@@ -353,8 +336,7 @@ class GripperCommands:
     """Gripper commands of the arm's writer, from the bus to the driver."""
 
     def __init__(self, node: Node, driver: RobotDriver) -> None:
-        self._node, self._driver = node, driver
-        key = driver.profile.keys.command_gripper
+        self._node, self._driver, key = node, driver, driver.profile.keys.command_gripper
         self._commands = node.subscribe(key, CallbackRing(16, SMALL_BYTES))
         self._guard = GripperGuard(driver.profile.robot.gripper)
 

@@ -61,18 +61,8 @@ class DriverStatus(NamedTuple):
     latency_ms: Mapping[str, tuple[float, float]] = {}
 
 
-class Reporter(Protocol):
-    """What a driver reports to; a `vla_zenoh.bus.node.Node` publishes it."""
-
-    clock: Clock
-    counters: Counter[str]
-
-    def emit(self, event: Event) -> None: ...
-    def reject(self, reason: str, why: str, about: str = "") -> None: ...
-
-
 class Report:
-    """A `Reporter` for a driver without a bus: keeps what is reported."""
+    """What a driver without a bus reports to, in place of a node: keeps what is reported."""
 
     def __init__(self) -> None:
         self.clock = Clock()
@@ -139,7 +129,7 @@ class RobotDriver(ABC):
         self.profile = profile
         self.period_s = 1.0 / profile.timing.command_hz
         self.modes: tuple[str, ...] = (profile.robot.command,)
-        self.report: Reporter = Report()
+        self.report: Node | Report = Report()
 
     # -- required -----------------------------------------------------------------------------
     @abstractmethod

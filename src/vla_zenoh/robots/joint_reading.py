@@ -53,9 +53,7 @@ class StampFilter:
 class RobotClock:
     """Offset of the robot's clock from ours, by stamps and arrivals, both in ns since the epoch.
 
-    A message cannot arrive before it was sent: the minimum of (arrival - stamp) over the last
-    messages is the offset of the clocks plus the shortest delay, and that of small messages is
-    short.
+    It is the minimum of (arrival - stamp) over the last messages, less the shortest delay.
     """
 
     def __init__(self) -> None:
@@ -82,12 +80,7 @@ class RobotClock:
 
 
 class JointReading:
-    """Newest state of one arm and its gripper, from its joint states.
-
-    Attributes:
-        joints: the newest, None before the first; `stamp_ns` is theirs.
-        width_m: opening of the gripper, None before the first; `width_stamp_ns` is its.
-    """
+    """Newest state of one arm and its gripper, from its joint states; None before the first."""
 
     def __init__(self, profile: Profile, kinematics: Kinematics) -> None:
         robot = profile.robot
@@ -196,10 +189,8 @@ class JointReading:
     def gripper(self, *, busy: bool, wanted_m: float | None, held: bool) -> GripperState | None:
         """State of the gripper, None where it is not known.
 
-        Args:
-            busy: a goal is in flight.
-            wanted_m: last commanded width, used if no finger joints are described.
-            held: the gripper reports that it holds an object.
+        While `busy` a goal is in flight. `wanted_m` is the last commanded width, used if no finger
+        joints are described; `held`: the gripper reports that it holds an object.
         """
         if not self._finger_names:
             width_m = self._max_width_m if wanted_m is None else wanted_m

@@ -64,11 +64,7 @@ class LeRobotArm:
 
     # -- connection ---------------------------------------------------------------------------
     def connect(self) -> None:
-        """Connect to the motors. LeRobot releases them for a moment while it configures them.
-
-        Raises:
-            NodeError: they do not answer, are not calibrated, or are not those of the profile.
-        """
+        """Connect to the motors, or raise a `NodeError`; they go limp for a moment."""
         settings = self._settings
         robot = self._robot = make_lerobot(self._profile)
         missing = {*self._keys, *filter(None, [self._gripper])} - set(robot.action_features)
@@ -91,21 +87,13 @@ class LeRobotArm:
         self._read_s = time.monotonic()
 
     def close(self) -> None:
-        """Disconnect; the motors hold the arm where it stands, unless the profile says otherwise.
-
-        Raises:
-            ConnectionError: they do not answer.
-        """
+        """Disconnect; the motors hold the arm, unless the profile says otherwise."""
         if self._robot is not None and self._robot.is_connected:
             self._robot.disconnect()
 
     # -- state --------------------------------------------------------------------------------
     def read(self) -> Reading | None:
-        """The newest state; None if the motors missed an answer.
-
-        Raises:
-            NodeError: they have not answered for too long; the node restarts.
-        """
+        """The newest state; None if the motors missed an answer, a `NodeError` if for too long."""
         now_s = time.monotonic()
         try:
             found = self._robot.get_observation()
@@ -119,19 +107,18 @@ class LeRobotArm:
         position_rad = (units - self._zero) * self._unit_rad
         if not self._gripper:
             return Reading(position_rad)
-        width, moving, holding = self._grip(float(found[self._gripper]), now_s)
-        return Reading(position_rad, width_m=width, moving=moving, holding=holding)
-
-    def _grip(self, opening: float, now_s: float) -> tuple[float, bool, bool]:
-        """Width, whether a commanded motion is in progress, whether an object is held."""
+        opening = float(found[self._gripper])
         if abs(opening - self._grip_was) > STILL:
             self._grip_was, self._grip_moved_s = opening, now_s
         if now_s - self._grip_moved_s > STILL_S:
             self._gripping = False
         asked = opening if self._asked is None else self._asked
-        share = min(max(opening / OPEN, 0.0), 1.0)
-        holding = not self._gripping and opening > asked + HELD
-        return share * self._width_m, self._gripping, holding
+        return Reading(
+            position_rad,
+            width_m=min(max(opening / OPEN, 0.0), 1.0) * self._width_m,
+            moving=self._gripping,
+            holding=not self._gripping and opening > asked + HELD,
+        )
 
     def status(self) -> Mapping[str, Any]:
         """Which robot it is, and how many answers of its motors were missed."""
@@ -156,11 +143,7 @@ class LeRobotArm:
 
 
 def make_lerobot(profile: Profile) -> Any:
-    """LeRobot's robot of a profile, not connected.
-
-    Raises:
-        NodeError: LeRobot has no robot of this name, or it does not accept these settings.
-    """
+    """LeRobot's robot of a profile, not connected; a `NodeError` if it has none of this name."""
     lerobot = import_module("lerobot.robots")
     settings = profile.lerobot
     assert settings is not None

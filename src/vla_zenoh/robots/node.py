@@ -64,11 +64,7 @@ class RobotNode:
 
     # -- running ------------------------------------------------------------------------------
     def run(self, stop: threading.Event) -> None:
-        """Drive the robot until `stop` is set.
-
-        Raises:
-            NodeError: the driver failed.
-        """
+        """Drive the robot until `stop` is set; a `NodeError` if the driver failed."""
         driver = self.driver
         sys.setswitchinterval(driver.switch_interval_s)
         try:
@@ -171,9 +167,8 @@ class RobotNode:
         while arm.follower.guard.moving:
             tick = pace.wait()
             try:
-                mono_ns = tick.nominal_ns
-                now_ns = self.node.clock.wall_at(mono_ns)
-                arm.begin_step(now_ns, mono_ns, tick.stall_s, reading=False)
+                now_ns = self.node.clock.wall_at(tick.nominal_ns)
+                arm.begin_step(now_ns, tick.nominal_ns, tick.stall_s, reading=False)
                 failures = 0
             except Exception as error:
                 failures += 1

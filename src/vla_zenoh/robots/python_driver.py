@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import operator
 import time
-from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -45,9 +44,6 @@ class PythonDriver(RobotDriver):
 
     Exceptions of the class become a `NodeError` with the names of class and method.
 
-    Args:
-        profile: the effective profile.
-
     Raises:
         ProfileError: the section of the robot is missing.
         WorkerError: the file is missing, or has no robot class.
@@ -66,20 +62,16 @@ class PythonDriver(RobotDriver):
         self._width_m: float | None = None
         self._held_m: float | None = None
         """Width at which an object is held."""
-        self.recovers = self._method("recover") is not None
-        if self._method("grip") is None:
+        self.recovers = callable(getattr(self.robot, "recover", None))
+        if not callable(getattr(self.robot, "grip", None)):
             self.no_gripper = f"{self._called} has no method grip"
         self.silent_why = f"{self._called}: read returns nothing new"
         self.stalled_hint = f"; does {self._called} wait for something?"
 
     # -- calls --------------------------------------------------------------------------------
-    def _method(self, name: str) -> Callable[..., Any] | None:
-        method = getattr(self.robot, name, None)
-        return method if callable(method) else None
-
     def _call(self, name: str, *given: Any) -> Any:
-        method = self._method(name)
-        if method is None:
+        method = getattr(self.robot, name, None)
+        if not callable(method):
             return None
         try:
             return method(*given)
@@ -106,7 +98,11 @@ class PythonDriver(RobotDriver):
             if self.fault:
                 self.report.emit(Event("error", "fault", "robot_fault", self.fault))
         self.idle = reading.idle
-        self._set_mode(one_line(reading.mode, MAX_WORDS) or "ready")
+        mode, was = one_line(reading.mode, MAX_WORDS) or "ready", self.gripper_mode
+        if mode != was:
+            level = "info" if mode == "ready" else "warning"
+            self.report.emit(Event(level, "transition", f"robot:{was}->{mode}"))
+        self.gripper_mode = mode
         self.away = "fault" if self.fault else "not_ready" if self.gripper_mode != "ready" else ""
         try:
             measured_ns = _measured_ns(reading)
@@ -125,12 +121,6 @@ class PythonDriver(RobotDriver):
             self._set_held(gripper)
         self._rate.tick()
         return measured
-
-    def _set_mode(self, mode: str) -> None:
-        if mode != self.gripper_mode:
-            level = "info" if mode == "ready" else "warning"
-            self.report.emit(Event(level, "transition", f"robot:{self.gripper_mode}->{mode}"))
-            self.gripper_mode = mode
 
     def _set_held(self, gripper: GripperState) -> None:
         width_m, held_m = gripper.width_m, self._held_m
@@ -155,15 +145,9 @@ class PythonDriver(RobotDriver):
     def status(self) -> DriverStatus:
         """Class, fault, width, and the robot's own entries."""
         width_m = self._asked_m if self._width_m is None else self._width_m
-        return DriverStatus(
-            {
-                "arm": self._called,
-                "fault": self.fault,
-                "width_m": width_m,
-                **(self._call("status") or {}),
-            },
-            rates_hz={"readings": self._rate.rate_hz},
-        )
+        detail = {"arm": self._called, "fault": self.fault, "width_m": width_m}
+        own = self._call("status") or {}
+        return DriverStatus({**detail, **own}, rates_hz={"readings": self._rate.rate_hz})
 
 
 def file_of(profile: Profile) -> Path | None:
@@ -191,12 +175,7 @@ def make_arm(profile: Profile) -> tuple[Any, str]:
 
 
 def _measured_ns(reading: Reading) -> int:
-    """Time of the measurement on the monotonic clock.
-
-    Raises:
-        TypeError: it is not a whole number.
-        ValueError: it is in the future.
-    """
+    """Monotonic time; a `TypeError` if it is no whole number, a `ValueError` in the future."""
     now_ns = time.monotonic_ns()
     if reading.measured_ns is None:
         return now_ns

@@ -25,7 +25,7 @@ from vla_zenoh.keys import Kind
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import Profile
 from vla_zenoh.robots.arm import CommandFollower
-from vla_zenoh.robots.driver import DriverStatus, Measurement, Pace, Reporter, RobotDriver
+from vla_zenoh.robots.driver import DriverStatus, Measurement, Pace, Report, RobotDriver
 from vla_zenoh.simulation.world import STEP_NS, World, build_world
 from vla_zenoh.types import FloatArray, GripperCommand, ObjectPoses, SceneState
 from vla_zenoh.types.commands import JointReference, PoseReference
@@ -70,20 +70,17 @@ class SimDriver(RobotDriver):
         self._step_lock = threading.Lock()
         self._keys: _SimKeys | None = None
         self._parts = {name: SimPart(self, name) for name in profile.part_names}
-        first = next(iter(self._parts.values()))
-        self._read, self._move = first.read, first.move
+        self._first = next(iter(self._parts.values()))
 
     @property
     def parts(self) -> Mapping[str, SimPart]:
         return self._parts
 
     def read(self, mono_ns: int) -> Measurement | None:
-        """The state of the first part."""
-        return self._read(mono_ns)
+        return self._first.read(mono_ns)
 
     def move(self, reference: PoseReference | JointReference, now_ns: int) -> None:
-        """Move the first part."""
-        self._move(reference, now_ns)
+        self._first.move(reference, now_ns)
 
     def attach(self, node: Node, follower: CommandFollower) -> None:
         """Subscribe to resets, and publish the scene."""
@@ -177,7 +174,7 @@ class SimDriver(RobotDriver):
         return DriverStatus(
             {
                 "scene": self.profile.sim.scene,
-                "command": next(iter(self._parts.values())).follower.guard.mode,
+                "command": self._first.follower.guard.mode,
                 "lockstep": self.lockstep,
                 "fault": self.fault,
             }
@@ -287,7 +284,7 @@ class RealTimePace:
     The counters of `report` get the late ticks and the time given up.
     """
 
-    def __init__(self, report: Reporter) -> None:
+    def __init__(self, report: Node | Report) -> None:
         self._counters = report.counters
         self._counters["sim.overruns"] = 0
         self._next_ns = time.monotonic_ns()

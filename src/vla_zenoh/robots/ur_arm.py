@@ -113,15 +113,11 @@ class UrArm:
             self._control = control(address, self._rate_hz, control.FLAG_NO_WAIT)
         except RuntimeError as error:
             raise NodeError(f"{address}: {in_words(error)}") from error
-        if not self._fault() and self._mode() == RUNNING:
+        if self.safety_mode in WELL and self._mode() == RUNNING:
             self._start()
 
     def open(self) -> None:
-        """Connect for reading only.
-
-        Raises:
-            NodeError: the robot does not answer.
-        """
+        """Connect for reading only; a `NodeError` if the robot does not answer."""
         address = self.address
         for port in PORTS:  # the library holds the GIL while it waits for an answer
             try:
@@ -175,11 +171,7 @@ class UrArm:
 
     # -- state --------------------------------------------------------------------------------
     def read(self) -> Reading:
-        """The newest state.
-
-        Raises:
-            NodeError: the robot has been silent for too long; the node restarts.
-        """
+        """The newest state; a `NodeError`, and so a restart, after too long a silence."""
         self._update()
         if self._silent_s > LOST_S:
             raise NodeError(
@@ -197,12 +189,11 @@ class UrArm:
         if self._started and now_ns - self._sent_ns > KICK_S * 1e9:
             self._sent_ns = now_ns
             self._send(self._control.kickWatchdog)
-        wrench = np.array(receive.getActualTCPForce())
         return Reading(
             receive.getActualQ(),
             receive.getActualQd(),
-            wrench=np.concatenate((self._turn @ wrench[:3], self._turn @ wrench[3:])),
-            fault=self._fault() or self._stopped_why(),
+            wrench=(np.reshape(receive.getActualTCPForce(), (2, 3)) @ self._turn).ravel(),
+            fault=self._fault(),
             mode=self._not_ready(),
             measured_ns=self._measured_ns,
             idle=not self._started,
@@ -219,19 +210,15 @@ class UrArm:
         return (time.monotonic_ns() - self._measured_ns) / 1e9
 
     def _fault(self) -> str:
-        safety = self.safety_mode
-        if safety in WELL:
+        if (safety := self.safety_mode) not in WELL:
+            return f"safety mode {safety}" + (f": {self._stopped}" if self._stopped else "")
+        if self._started or self._busy or self._mode() != RUNNING:
             return ""
-        return f"safety mode {safety}" + (f": {self._stopped}" if self._stopped else "")
+        return f"{self._stopped}; `vla-zenoh reset` starts it"
 
     @property
     def _busy(self) -> bool:
         return self._starting is not None and self._starting.is_alive()
-
-    def _stopped_why(self) -> str:
-        if self._started or self._busy or self._mode() != RUNNING:
-            return ""
-        return f"{self._stopped}; `vla-zenoh reset` starts it"
 
     def _not_ready(self) -> str:
         if self._mode() != RUNNING:
@@ -263,11 +250,7 @@ class UrArm:
 
     # -- motion -------------------------------------------------------------------------------
     def move(self, command: Command) -> None:
-        """Send the set-point.
-
-        Raises:
-            NodeError: the connection is lost, so nothing brakes but the robot itself.
-        """
+        """Send the set-point; a `NodeError` if the connection is lost."""
         assert isinstance(command, JointCommand)
         if not (self._started and self._watched):
             return  # reported as a fault; only `recover` ends it

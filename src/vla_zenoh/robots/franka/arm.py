@@ -61,14 +61,18 @@ STOPPED = frozenset({"Reflex", "UserStopped"})
 
 
 class FrankaArm:
-    """The arm of a profile with a section franka; see `vla_zenoh.robot.Robot`."""
+    """The arm of a profile with a section franka; see `vla_zenoh.robot.Robot`.
+
+    Attributes:
+        robot: franky's, once connected.
+    """
 
     def __init__(self, profile: Profile) -> None:
         assert profile.franka is not None
         self._profile, self._settings = profile, profile.franka
         self._franky = load_franky()
         self._kinematics = make_kinematics(profile)
-        self._robot: Any = None
+        self.robot: Any = None
         self._hand: Hand | None = None
         self._motion: Any = None
         self._command: Any = None
@@ -94,7 +98,7 @@ class FrankaArm:
         enforce = self._settings.realtime == "enforce"
         realtime = franky.RealtimeConfig.Enforce if enforce else franky.RealtimeConfig.Ignore
         try:
-            self._robot = _in_time(
+            self.robot = _in_time(
                 lambda: franky.Robot(address, realtime_config=realtime), f"{address}: connecting"
             )
             if self._settings.hand:
@@ -110,7 +114,7 @@ class FrankaArm:
                 f"{address}: {in_words(error)}. Are the joints unlocked, and is FCI activated in "
                 "Desk? Is no other program connected?"
             ) from error
-        self._update(self._robot.state)
+        self._update(self.robot.state)
         threading.Thread(target=self._hold, name="hold", daemon=True).start()
 
     def close(self) -> None:
@@ -118,14 +122,14 @@ class FrankaArm:
         self._closed.set()
         if self._hand is not None:
             self._hand.close()
-        if self._robot is not None and self._robot.is_in_control:
-            self._robot.move(self._franky.TorqueStopMotion(), asynchronous=True)
-            self._robot.join_motion(CLOSE_S)
-        self._robot = self._hand = None
+        if self.robot is not None and self.robot.is_in_control:
+            self.robot.move(self._franky.TorqueStopMotion(), asynchronous=True)
+            self.robot.join_motion(CLOSE_S)
+        self.robot = self._hand = None
 
     def _configure(self) -> None:
         """Apply load, tool and collision settings; only an arm at rest accepts them."""
-        settings, robot = self._settings, self._robot
+        settings, robot = self._settings, self.robot
         torque = list(settings.collision_joint_nm)
         force = [settings.collision_force_n] * 3 + [settings.collision_torque_nm] * 3
         robot.set_collision_behavior(torque, torque, force, force)
@@ -148,12 +152,8 @@ class FrankaArm:
 
     # -- state --------------------------------------------------------------------------------
     def read(self) -> Reading:
-        """The newest state; an arm that stands is also sent its settings, or released.
-
-        Raises:
-            NodeError: the robot does not answer any more.
-        """
-        robot = self._robot
+        """The newest state; an arm that stands is also sent its settings, or released."""
+        robot = self.robot
         try:
             with self._referring:
                 in_control, state = robot.is_in_control, robot.state
@@ -165,20 +165,19 @@ class FrankaArm:
         if self._was_in_control and not in_control:
             self._ended = self._why_ended()
         self._was_in_control = in_control
-        if in_control and time.monotonic_ns() - self._moved_ns > REST_S * 1e9:
-            self._release()
+        still_ns = time.monotonic_ns() - self._moved_ns
+        if in_control and still_ns > REST_S * 1e9 and self._motion is not None:
+            self._motion = None  # the robot's own controller holds the arm from here
+            robot.move(self._franky.TorqueStopMotion(), asynchronous=True)
         self._update(state)
         mode = state.robot_mode.name
         if mode == "Idle" and not self._configured:
             self._configure()
-        hand = self._hand.state() if self._hand is not None else None
         return Reading(
             state.q,
             state.dq,
             state.tau_ext_hat_filtered,
-            width_m=None if hand is None else hand.width_m,
-            moving=hand is not None and hand.moving,
-            holding=hand is not None and hand.holding,
+            **({} if self._hand is None else self._hand.state()._asdict()),
             wrench=state.O_F_ext_hat_K,
             fault=self._fault(mode),
             mode="" if mode in READY | STOPPED else mode,
@@ -207,7 +206,7 @@ class FrankaArm:
         """Why the loop ended by itself; empty: it was released."""
         self._motion = None
         try:
-            self._robot.poll_motion()
+            self.robot.poll_motion()
         except self._franky.Exception as error:
             return in_words(error)
         return ""
@@ -243,7 +242,7 @@ class FrankaArm:
             self._command, self._led = command, True
         if starts:
             with realtime_children():
-                self._robot.move(self._motion, asynchronous=True)
+                self.robot.move(self._motion, asynchronous=True)
             self._was_in_control = True
 
     def _hold(self) -> None:
@@ -256,14 +255,13 @@ class FrankaArm:
             if self._motion is None or not self._overdue:
                 continue
             with self._referring, suppress(RuntimeError):  # `read` reports the failure
-                motion, robot = self._motion, self._robot
-                if motion is None or robot is None or not self._overdue:
+                motion, robot = self._motion, self.robot
+                if motion is None or robot is None or not self._overdue or not robot.is_in_control:
                     continue
-                if robot.is_in_control:
-                    if self._led:  # the trim for friction in motion would now push beyond it
-                        self._led, self._trim = False, self._trim.emptied()
-                    still = at_rest(self._command)
-                    motion.set_reference(self._reference(still, robot.state, period_s))
+                if self._led:  # the trim for friction in motion would now push beyond it
+                    self._led, self._trim = False, self._trim.emptied()
+                still = at_rest(self._command)
+                motion.set_reference(self._reference(still, robot.state, period_s))
 
     @property
     def _overdue(self) -> bool:
@@ -310,12 +308,6 @@ class FrankaArm:
             franky.TwistAcceleration(acceleration[:3], acceleration[3:]),
         )
 
-    def _release(self) -> None:
-        """Let the robot's own controller hold the arm, which stands."""
-        if self._motion is not None:
-            self._motion = None
-            self._robot.move(self._franky.TorqueStopMotion(), asynchronous=True)
-
     def recover(self) -> None:
         """Clear the robot's errors, in a thread: it may take seconds."""
         if self._recovery is None or not self._recovery.is_alive():
@@ -328,7 +320,7 @@ class FrankaArm:
             return
         try:
             if mode == "Reflex":
-                self._robot.recover_from_errors()
+                self.robot.recover_from_errors()
         except self._franky.Exception as error:
             self._ended = f"recovery: {in_words(error)}"
         else:
@@ -338,11 +330,6 @@ class FrankaArm:
         """Move the fingers: closing grasps with `force_n`."""
         if self._hand is not None:
             self._hand.ask(width_m, speed_m_s, force_n)
-
-    @property
-    def robot(self) -> Any:
-        """franky's robot, once connected."""
-        return self._robot
 
 
 def at_rest(command: Command) -> Command:

@@ -20,8 +20,6 @@ NO_STOP_S = 2.0
 
 
 class GripRequest(NamedTuple):
-    """A request of the gripper: opening, speed and force."""
-
     width_m: float
     speed_m_s: float
     force_n: float
@@ -34,10 +32,9 @@ class HandState(NamedTuple):
 
 
 class Hand:
-    """Runs the motions of a hand.
+    """Runs the motions of a hand: calls of franky's `gripper` block until the fingers arrive.
 
-    The calls of franky's `gripper` block until the fingers arrive, so they run here. A new request
-    interrupts the one in progress; requests in between are dropped.
+    A new request interrupts the one in progress; requests in between are dropped.
 
     Attributes:
         fault: why the hand does not answer; empty: it does.

@@ -27,15 +27,9 @@ SAME_S = 2.0
 
 
 class Camera:
-    """One camera topic: `run` is the body of its thread.
+    """One camera topic: `run` is the body of its thread, the only user of `messages`.
 
-    Args:
-        name: of the camera.
-        topic: of its images.
-        node: on the bus; the thread uses only its publishers and clock.
-        graph: the ROS graph.
-        messages: of the robot's distribution, for this thread alone.
-        emit, reject: report an event or a rejection; may be called from any thread.
+    It uses publishers and clock of the `node`; `emit` and `reject` may be called from any thread.
     """
 
     def __init__(

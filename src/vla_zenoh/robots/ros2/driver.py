@@ -55,9 +55,6 @@ LEAD_PERIODS = 2
 class Ros2Driver(RobotDriver):
     """The ROS 2 robot of a profile; with another ``robot.driver``, only its cameras and services.
 
-    Args:
-        profile: the effective profile, with its section ros2.
-
     Raises:
         ProfileError: the section ros2 is missing or has an unknown name in it.
     """
@@ -108,7 +105,13 @@ class Ros2Driver(RobotDriver):
         if self.has_arm:
             self.gripper = Gripper(node, graph, self._messages, ros2.gripper, self._width_m)
             self.states = StateSubscriber(node, graph, self._messages, ros2, self.kinematics)
-            self._declare_output(graph)
+            command = profile.robot.command
+            output = ros2.joint_command if command == "joint" else ros2.pose_command
+            if output is None:
+                raise ProfileError(f"ros2 lacks {command}_command")
+            self._output, self._frame = output, output.frame or profile.robot.base_frame
+            self._write = self.writing(output)
+            self._writer = graph.publisher(output.topic, output.type, COMMAND)
         self._cameras = [
             Camera(camera, topic, node, graph, read_messages(ros2), self._emit, self._reject)
             for camera, topic in profile.ros2_cameras().items()
@@ -121,22 +124,8 @@ class Ros2Driver(RobotDriver):
         for buffer in graph.buffers:
             node.watch_buffer(buffer)
 
-    def _declare_output(self, graph: RosGraph) -> None:
-        ros2, command = self._ros2, self.profile.robot.command
-        output = ros2.joint_command if command == "joint" else ros2.pose_command
-        if output is None:
-            raise ProfileError(f"ros2 lacks {command}_command")
-        self._output = output
-        self._frame = output.frame or self.profile.robot.base_frame
-        self._write = self.writing(output)
-        self._writer = graph.publisher(output.topic, output.type, COMMAND)
-
     def writing(self, output: Ros2Output) -> Write:
-        """Function that fills a message of the output's type.
-
-        Raises:
-            ProfileError: the type cannot carry the commands.
-        """
+        """Function that fills a message of the output's type, or a `ProfileError`."""
         if self.profile.robot.command == "joint":
             lead_ns = round(LEAD_PERIODS * self.period_s * 1e9)
             return joint_writer(self._messages, output.type, lead_ns)
@@ -221,12 +210,11 @@ class Ros2Driver(RobotDriver):
 
     def _gripper_state(self, stamp_ns: int) -> GripperState | None:
         gripper, fingers = self.gripper, self.profile.robot.finger_joints
-        record = self.states.state.gripper(
-            busy=gripper.busy, wanted_m=gripper.wanted_m, held=gripper.holding
-        )
+        state = self.states.state
+        record = state.gripper(busy=gripper.busy, wanted_m=gripper.wanted_m, held=gripper.holding)
         if record is None:
             return None
-        silent_ns = stamp_ns - self.states.state.width_stamp_ns
+        silent_ns = stamp_ns - state.width_stamp_ns
         lost = bool(fingers) and silent_ns > FINGERS_TIMEOUT_NS
         if lost and not self._fingers_lost:
             why = f"no joint state of {', '.join(fingers)}"
@@ -300,11 +288,7 @@ class Ros2Driver(RobotDriver):
 class StateSubscriber:
     """State of the arm and gripper from the robot's topics.
 
-    Attributes:
-        state: newest joint states of arm and gripper.
-        clock: of the robot.
-        rate: of joint states.
-        received_ns: monotonic time of the newest joint state, None before the first.
+    `received_ns` is the monotonic time of the newest joint state, None before the first.
     """
 
     def __init__(
@@ -336,7 +320,6 @@ class StateSubscriber:
             return None
         return found.wrench
 
-    # -- topics -------------------------------------------------------------------------------
     def _reject(self, topic: str, error: CodecError) -> None:
         self._node.reject(error.reason, f"{topic}: {error}", topic)
 
@@ -382,11 +365,7 @@ class StateSubscriber:
 
 
 def read_messages(ros2: Ros2Profile) -> Messages:
-    """Messages of the profile's distribution, and those of its definition files.
-
-    Raises:
-        ProfileError: a file is missing or is not a definition.
-    """
+    """Messages of the distribution and the definition files, or a `ProfileError` about one."""
     texts: dict[str, str] = {}
     for kind, path in ros2.messages.items():
         try:
@@ -399,10 +378,7 @@ def read_messages(ros2: Ros2Profile) -> Messages:
 
 def _session_settings(profile: Profile, endpoints: tuple[str, ...]) -> SessionProfile:
     """Settings of the session to the robot's own bridge or router."""
-    lease_ms = profile.session.lease_ms
+    more: dict[str, Any] = {}
     if all(endpoint.partition("/")[0] in TRUSTED_PROTOCOLS for endpoint in endpoints):
-        security = profile.session.security
-        return SessionProfile(
-            connect=endpoints, listen=endpoints, lease_ms=lease_ms, security=security
-        )
-    return SessionProfile(connect=endpoints, lease_ms=lease_ms)
+        more = {"listen": endpoints, "security": profile.session.security}
+    return SessionProfile(connect=endpoints, lease_ms=profile.session.lease_ms, **more)

@@ -25,17 +25,10 @@ ID_BYTES = 16
 
 
 class Gripper:
-    """Sends accepted gripper commands to the robot.
+    """Sends accepted gripper commands to the robot; without a `profile` it has no gripper.
 
-    Args:
-        node: on the bus.
-        graph: the ROS graph.
-        messages: of the robot's distribution.
-        profile: the gripper's section; None: this robot has no gripper to command.
-        width: opening between the fingers (m), None while unknown.
-
-    Attributes:
-        wanted_m: width of the newest command, None before the first.
+    `width` measures the opening between the fingers (m), None while unknown; `wanted_m` is that of
+    the newest command, None before the first.
     """
 
     def __init__(
@@ -86,10 +79,7 @@ class Gripper:
         return at_m is not None and at_m > self._sent_m + self._limits.dead_band_m
 
     def poll(self, writer: str, *, writer_active: bool) -> None:
-        """Handle answers, and send or cancel the goal that is due.
-
-        The arm follows the commands of `writer`, see `ArmGuard.writer` and ``writer_active``.
-        """
+        """Handle answers, and send or cancel the goal that is due; see `ArmGuard.writer`."""
         if self._writer and not writer_active:
             self._drop_waiting()
         self._writer = writer if writer_active else ""
@@ -100,11 +90,12 @@ class Gripper:
     def _advance(self) -> None:
         step = self._goals.step(time.monotonic_ns())
         self._node.counters["ros2.gripper_timeouts"] = self._goals.timeouts
-        goal = self._goals.goal
-        if step is GoalStep.SEND and goal is not None:
-            self._send(goal)
-        elif step is GoalStep.CANCEL and goal is not None:
-            self._cancel()
+        if step is GoalStep.SEND and self._goals.goal is not None:
+            self._send(self._goals.goal)
+        elif step is GoalStep.CANCEL:
+            self._node.counters["ros2.gripper_cancelled"] += 1
+            request = gripper_actions.cancel(self._messages, self._goal_id)
+            self._call("cancel_goal", request, lambda _: None)  # the goal's result follows
 
     def _drop_waiting(self) -> None:
         """Drop a command that waits for the goal in flight: the motion it belonged to is over."""
@@ -133,7 +124,10 @@ class Gripper:
     # -- the action ---------------------------------------------------------------------------
     def _send(self, goal: ActionGoal) -> None:
         assert self._profile is not None
-        use_grasp = GRASP in self._clients and self._closes(goal.command.width_m)
+        measured_m = self._measured_m()
+        at_m = self._sent_m if measured_m is None else measured_m
+        closes = goal.command.width_m < at_m - self._limits.dead_band_m
+        use_grasp = closes and GRASP in self._clients
         self._sent_m = goal.command.width_m
         self._action = GRASP if use_grasp else self._profile.type
         self._goal_id = secrets.token_bytes(ID_BYTES)
@@ -148,12 +142,6 @@ class Gripper:
         )
         self._node.counters["ros2.gripper_goals"] += 1
         self._call("send_goal", request, lambda answer: self._on_accepted(goal, answer))
-
-    def _closes(self, width_m: float) -> bool:
-        """Whether the fingers have to close, from the measured width or the one sent last."""
-        measured_m = self._measured_m()
-        at_m = self._sent_m if measured_m is None else measured_m
-        return width_m < at_m - self._limits.dead_band_m
 
     def _call(
         self,
@@ -199,11 +187,6 @@ class Gripper:
         if not (outcome.reached or outcome.holding):
             self._emit_failure(f"did not get there (status {response.status}) {outcome.message}")
 
-    def _cancel(self) -> None:
-        self._node.counters["ros2.gripper_cancelled"] += 1
-        request = gripper_actions.cancel(self._messages, self._goal_id)
-        self._call("cancel_goal", request, lambda _: None)  # the goal's result follows
-
     def _decode(self, kind: str, answer: bytes | None) -> Any:
         if answer is None:
             return None
@@ -215,6 +198,6 @@ class Gripper:
 
     def _emit_failure(self, what: str) -> None:
         assert self._profile is not None
-        where = self._profile.topic if self._action != GRASP else self._profile.grasp
-        why = f"the gripper at {where or self._profile.topic} {what}"
+        where = (self._action == GRASP and self._profile.grasp) or self._profile.topic
+        why = f"the gripper at {where} {what}"
         self._node.emit(Event("warning", "fault", "gripper", why[:1000]))

@@ -81,12 +81,11 @@ class ServiceClient:
                 with contextlib.suppress(CodecError):  # too large
                     answers.append(bytes_of(reply.ok.payload))
 
-        def on_end() -> None:
-            done(answers[0] if answers else None)
-
         self._session.get(
             self._key,
-            zenoh.handlers.Callback(on_reply, on_end, indirect=False),
+            zenoh.handlers.Callback(
+                on_reply, lambda: done(next(iter(answers), None)), indirect=False
+            ),
             payload=request,
             encoding=_CDR,
             attachment=_attachment(self._gid, self._seq),
@@ -131,14 +130,7 @@ class Request:
 class RosGraph:
     """A node of a ROS graph: declares its publishers, subscribers, services and clients.
 
-    Args:
-        session: to the bridge or the router of the robot.
-        profile: the section ros2.
-        messages: of the robot's distribution.
-        node: its name.
-
-    Attributes:
-        buffers: of all subscribers.
+    The `session` is to the bridge or the router of the robot; `buffers` are of all subscribers.
     """
 
     def __init__(
@@ -195,7 +187,6 @@ class RosGraph:
         return buffer
 
     def publisher(self, name: str, kind: str, qos: Qos = DEFAULT) -> RosPublisher:
-        """Publisher of a topic."""
         endpoint = Endpoint(EntityRole.PUBLISHER, name, kind, qos)
         return RosPublisher(self.session, *self._declare(endpoint))
 
@@ -216,7 +207,6 @@ class RosGraph:
         self._declared.append(self.session.declare_queryable(key, handler, complete=True))
 
     def client(self, name: str, kind: str) -> ServiceClient:
-        """Client of a service."""
         endpoint = Endpoint(EntityRole.CLIENT, name, kind)
         return ServiceClient(self.session, *self._declare(endpoint))
 
@@ -233,7 +223,6 @@ class RosGraph:
         }
 
     def close(self) -> None:
-        """Leave the graph."""
         for declared in reversed(self._declared):
             declared.undeclare()
         self._declared.clear()

@@ -89,13 +89,8 @@ class EstopOrder:
 class RosServices:
     """Serves the control services, applies the prompt topic, and publishes the status topic.
 
-    Args:
-        profile: the effective profile.
-        session: to our own router.
-        graph: the ROS graph.
-        messages: of the robot's distribution, for this thread alone.
-        prefix: of the names of services and topics.
-        reject: counts a rejection; may be called from any thread.
+    The `session` is to our own router; `prefix` begins the names of services and topics. `run` is
+    the body of a thread, the only user of `messages`; `reject` may be called from any thread.
     """
 
     def __init__(
