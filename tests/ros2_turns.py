@@ -113,7 +113,7 @@ class Turns:
         for _ in range(round(duration_s / TICK_S)):
             self.up()
             self.turn()
-        assert self.arm.follower.guard.following
+        assert self.arm.guard.following
 
     @property
     def heights_m(self) -> FloatArray:

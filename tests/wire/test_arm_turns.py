@@ -291,7 +291,7 @@ def test_after_a_brief_stall_the_arm_is_given_its_last_set_point_at_rest_and_no_
     turns.last = MOVING + 50
     turns.run()
     assert turns.node.arm is not None
-    assert turns.node.arm.follower.stalls == 1
+    assert turns.node.arm.stalls == 1
     assert len(turns.arm.moves) == MOVING + given
     if given:
         np.testing.assert_array_equal(turns.arm.moves[-1], turns.arm.moves[-2])

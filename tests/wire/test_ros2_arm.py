@@ -45,7 +45,7 @@ def test_after_a_stall_it_stands_where_it_sent_the_arm_last_and_says_that_it_is_
         turns.up()
     turns.turn(stall_s)
     assert turns.refused("pose_stalled") == 30
-    assert turns.arm.follower.stalls == 1
+    assert turns.arm.stalls == 1
     for _ in range(STALLED_NS // TICK_NS - 1):
         turns.up()
         turns.turn()
@@ -85,7 +85,7 @@ def test_a_late_turn_goes_on_from_what_was_sent_last(turns: Turns, stall_s: floa
         turns.up()
     turns.turn(stall_s)
     turns.rise(0.6)
-    assert turns.arm.follower.stalls == 0
+    assert turns.arm.stalls == 0
     assert turns.steps_m[50:].min() > 0.5 * SPEED_M_S * TICK_S
     assert np.abs(np.diff(turns.steps_m)).max() < STEP_M
     home_m = panda().forward(HOME_RAD).position_m[2]
@@ -131,7 +131,7 @@ def test_what_was_heard_before_the_arm_was_moved_by_somebody_else_is_not_new_aft
     for _ in range(100):
         turns.turn()
     turns.turn(10.0)
-    assert not turns.arm.follower.holds
+    assert not turns.arm.holds
     turns.seq = 0
     turns.up(moves=False)
     turns.turn()
@@ -139,7 +139,7 @@ def test_what_was_heard_before_the_arm_was_moved_by_somebody_else_is_not_new_aft
     turns.seq = 10
     turns.up(moves=False)
     turns.turn()
-    assert turns.arm.follower.guard.following
+    assert turns.arm.guard.following
 
 
 @pytest.mark.parametrize("turns", [JOINT_GOALS], indirect=True)

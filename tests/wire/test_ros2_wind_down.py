@@ -130,7 +130,7 @@ def test_an_arm_that_stood_while_the_loop_did_is_not_moved_again_by_its_brake(
     loop.script[MOVING] = breaks
     loop.script[MOVING + 1] = lambda: setattr(loop, "stall_s", STALL_S)
     assert ends_broken(loop).endswith(": braked, and ends")
-    assert loop.turns.arm.follower.stalls == 1
+    assert loop.turns.arm.stalls == 1
     assert len(loop.turns.goals) == MOVING + 2, "after that in which it broke, once more at rest"
     assert loop.turns.steps_m[-1] == 0.0
 
@@ -152,6 +152,6 @@ def test_a_loop_that_is_too_slow_to_brake_ends_in_time_and_says_so(loop: Loop) -
 
     loop.script[MOVING] = slow
     loop.run()
-    assert loop.turns.arm.follower.guard.moving
+    assert loop.turns.arm.guard.moving
     (event,) = loop.turns.told("not_braked")
     assert "the loop was late too often" in event.why

@@ -44,146 +44,7 @@ FAULT_AGAIN_NS = 100_000_000
 
 
 class Arm:
-    """Runs one arm through its driver, tick by tick; its `follower` follows the command streams."""
-
-    def __init__(self, node: Node, driver: RobotDriver) -> None:
-        self._node, self._driver, profile = node, driver, driver.profile
-        self.follower = CommandFollower(node, driver)
-        self._gripper_commands = GripperCommands(node, driver)
-        keys = profile.keys
-        self._joint_out = node.declare_publisher(keys.state_joint, Kind.STATE)
-        self._pose_out = node.declare_publisher(keys.state_pose, Kind.STATE)
-        self._gripper_out = node.declare_publisher(keys.state_gripper, Kind.STATE)
-        # A little less than the period: readings come at multiples of another one.
-        self._period_ns = 0.9e9 / profile.timing.state_hz
-        self._seq = self._published_ns = self._mono_ns = 0
-        self._gripper = GripperState(profile.robot.gripper.max_width_m, False, False)
-        self._published_fault = self._was = ""
-
-    # -- one tick -----------------------------------------------------------------------------
-    def begin_step(
-        self, now_ns: int, mono_ns: int, stall_s: float, *, reading: bool = True
-    ) -> None:
-        """Read a real robot, and move it or a simulated one, in a tick that is `stall_s` late.
-
-        `now_ns` (wall clock, for stamps) and `mono_ns` (monotonic) are one time. Without `reading`
-        it only moves the robot, to bring the arm to rest.
-        """
-        self._mono_ns = mono_ns
-        self.follower.begin(mono_ns, stall_s)
-        if reading and not self._driver.simulated:
-            self._read(mono_ns)
-        self.follower.update(now_ns, mono_ns, away=self._driver.away, silent=self._silent)
-        if self.follower.accepting:
-            self._gripper_commands.update(now_ns, self.follower.guard)
-
-    def end_step(self, mono_ns: int) -> None:
-        """Read a simulated robot once all its parts have been moved: their commands act at once."""
-        if self._driver.simulated:
-            self._read(mono_ns)
-
-    def _read(self, mono_ns: int) -> None:
-        measurement = self._driver.read(mono_ns)
-        if measurement is not None:
-            joints, self._gripper = measurement.joints, measurement.gripper or self._gripper
-            self.follower.on_measured(
-                Measured(measurement.tcp, joints.position_rad, joints.velocity_rad_s)
-            )
-        self.publish(measurement, mono_ns)
-
-    # -- states out ---------------------------------------------------------------------------
-    def publish(self, measurement: Measurement | None, mono_ns: int) -> None:
-        """Publish a measurement when it is due; a fault, and its end, at once.
-
-        The gripper state carries the fault, even without a valid measurement.
-        """
-        driver, gripper = self._driver, self._gripper
-        elapsed_ns, again_ns = mono_ns - self._published_ns, self._period_ns
-        if measurement is None:
-            again_ns = FAULT_AGAIN_NS if driver.fault else math.inf
-        if driver.fault == self._published_fault and elapsed_ns < again_ns:
-            return
-        states: list[tuple[Publisher, Any]] = []
-        if measurement is None:
-            stamp_ns = mono_ns if driver.lockstep else self._node.clock.wall_at(mono_ns)
-        else:
-            stamp_ns, joints, _, pose, gripper = measurement
-            tcp, held_rad = self.follower.held()
-            if tcp is not None:
-                pose = replace(
-                    pose,
-                    reference_position_m=tcp.position_m,
-                    reference_quat_xyzw=quat_from_rotation(tcp.rotation),
-                )
-            if held_rad is not None:
-                joints = replace(joints, reference_rad=held_rad)
-            states += (self._joint_out, joints), (self._pose_out, pose)
-        if gripper is not None:
-            mode = self.state if self.state in NOT_READY else driver.gripper_mode
-            faults = (driver.fault,) if driver.fault else ()
-            states.append((self._gripper_out, replace(gripper, mode=mode, faults=faults)))
-        publish_together(stamp_ns, self._seq, *states)
-        self._seq += 1
-        self._published_ns, self._published_fault = mono_ns, driver.fault
-
-    # -- state --------------------------------------------------------------------------------
-    @property
-    def _silent(self) -> bool:
-        measured_ns = self._driver.measured_ns
-        if self._driver.simulated or measured_ns is None:
-            return False
-        age_s = (self._mono_ns - measured_ns) / 1e9
-        return age_s > self._driver.profile.timing.state_timeout_s
-
-    @property
-    def state(self) -> str:
-        """State of the arm, one word."""
-        if self._driver.fault:
-            return "fault"
-        if self._driver.measured_ns is None:
-            return "waiting"
-        if self._silent:
-            return "silent"
-        if self.follower.guard.braking:
-            return "braking"
-        if self.follower.stalled:
-            return "stalled"
-        return "unheeded" if self.follower.guard.unheeded else "running"
-
-    def changed(self) -> bool:
-        """Whether the state changed since the last call; a transition is emitted as an event."""
-        if self._driver.simulated and self._published_ns != self._mono_ns:
-            return False  # ticks are frequent: checked only when a state is published
-        state, was = self.state, self._was
-        if state == was:
-            return False
-        self._was = state
-        if was:
-            level = "info" if state == "running" else "warning"
-            part, why = self._driver.profile.part, self._why(state)
-            why = f"{part}: {why}".rstrip(": ") if part else why
-            self._node.emit(Event(level, "transition", f"{was}->{state}", why))
-        return True
-
-    def _why(self, state: str) -> str:
-        if state == "stalled":
-            return (
-                f"the loop stood still for {self.follower.stall_s:.3f} s while it moved the arm; "
-                f"the motion is not resumed{self._driver.stalled_hint}"
-            )
-        timeout_s = self._driver.profile.timing.command_timeout_s
-        return {
-            "fault": self._driver.fault,
-            "silent": self._driver.silent_why,
-            "braking": f"no command/{self.follower.guard.mode} for {timeout_s:g} s "
-            "while the arm moved",
-            "unheeded": "command stream rejected: its first set-point does not match the arm's "
-            "current pose, or its beginning was lost",
-        }.get(state, "")
-
-
-class CommandFollower:
-    """Follows the command streams of an arm: subscribes to them, guards them, moves the driver.
+    """Runs one arm through its driver, tick by tick: guards its command streams, moves the driver.
 
     When a stream falls silent in motion, the guard brakes the arm. Then a real robot is sent
     nothing more: its controller holds the last set-point, until the driver reports that it is idle.
@@ -217,28 +78,56 @@ class CommandFollower:
         """The robot must be sent its last set-point at rest: it may have kept a velocity."""
         self.stall_s, self.stalls = 0.0, 0
         self.accepting = True
+        self._gripper_commands = GripperCommands(node, driver)
+        self._joint_out = node.declare_publisher(keys.state_joint, Kind.STATE)
+        self._pose_out = node.declare_publisher(keys.state_pose, Kind.STATE)
+        self._gripper_out = node.declare_publisher(keys.state_gripper, Kind.STATE)
+        # A little less than the period: readings come at multiples of another one.
+        self._period_ns = 0.9e9 / profile.timing.state_hz
+        self._seq = self._published_ns = self._mono_ns = 0
+        self._gripper = GripperState(profile.robot.gripper.max_width_m, False, False)
+        self._published_fault = self._was = ""
 
     # -- one tick -----------------------------------------------------------------------------
-    def on_measured(self, measured: Measured) -> None:
-        """Update the state of the arm; needed once before a stream can be followed."""
-        first = self._measured is None
-        self._measured = measured
-        if first:
-            self.guard.anchor()
+    def begin_step(
+        self, now_ns: int, mono_ns: int, stall_s: float, *, reading: bool = True
+    ) -> None:
+        """Read a real robot, and move it or a simulated one, in a tick that is `stall_s` late.
+
+        `now_ns` (wall clock, for stamps) and `mono_ns` (monotonic) are one time. Without `reading`
+        it only moves the robot, to bring the arm to rest.
+        """
+        self._mono_ns = mono_ns
+        if stall_s > self._timeout_s:
+            self._hold_after_stall(mono_ns, stall_s)
+        elif mono_ns >= self._stalled_until_ns:
+            self._stalled_until_ns = 0
+        if reading and not self._driver.simulated:
+            self._read(mono_ns)
+        self._follow(now_ns, mono_ns)
+        if self.accepting:
+            self._gripper_commands.update(now_ns, self.guard)
+
+    def end_step(self, mono_ns: int) -> None:
+        """Read a simulated robot once all its parts have been moved: their commands act at once."""
+        if self._driver.simulated:
+            self._read(mono_ns)
+
+    def _read(self, mono_ns: int) -> None:
+        measurement = self._driver.read(mono_ns)
+        if measurement is not None:
+            joints, self._gripper = measurement.joints, measurement.gripper or self._gripper
+            first = self._measured is None
+            self._measured = Measured(measurement.tcp, joints.position_rad, joints.velocity_rad_s)
+            if first:
+                self.guard.anchor()
+        self.publish(measurement, mono_ns)
 
     def _state_now(self) -> Measured:
         return self._driver.state_now() or self._measured or self._unknown
 
-    def begin(self, mono_ns: int, stall_s: float) -> None:
-        """Begin a tick that is `stall_s` late.
-
-        After a long stall the robot is held at its last set-point, and motion resumes from there,
-        at rest.
-        """
-        if stall_s <= self._timeout_s:
-            if mono_ns >= self._stalled_until_ns:
-                self._stalled_until_ns = 0
-            return
+    def _hold_after_stall(self, mono_ns: int, stall_s: float) -> None:
+        """Hold the robot at its last set-point; motion resumes from there, at rest."""
         brief = stall_s * 1e9 <= SETTLE_NS
         if not brief:
             self._hold.invalidate()  # the arm may have been moved by other means meanwhile
@@ -251,15 +140,12 @@ class CommandFollower:
             for _ in buffer.drain():
                 self._reject(mode, "stalled")
 
-    def update(self, now_ns: int, mono_ns: int, *, away: str = "", silent: bool = False) -> None:
-        """Accept or reject the commands that arrived, and move the robot.
-
-        Commands are rejected for the reason `away`, one word, while the robot cannot be moved;
-        `silent`: its state is not known.
-        """
+    def _follow(self, now_ns: int, mono_ns: int) -> None:
+        """Accept or reject the commands that arrived, and move the robot."""
         if self._driver.idle and not self.guard.moving:
             self._hold.invalidate()
             self._resting = False
+        away = self._driver.away
         reason = away or ("stalled" if self.stalled else "")
         for mode, buffer in self._streams:
             for arrival in buffer.drain():
@@ -271,7 +157,7 @@ class CommandFollower:
                     self._offer(mode, arrival, mono_ns)
         if self._measured is not None:
             self._lead(self._measured, now_ns, mono_ns, away)
-        if silent or away:
+        if away or self._silent:
             self._hold.invalidate()
 
     def _offer(self, mode: str, arrival: ReceivedSample, mono_ns: int) -> None:
@@ -308,6 +194,95 @@ class CommandFollower:
             self._driver.move(reference, now_ns)
         else:
             self._hold.update(measured, mono_ns)
+
+    # -- states out ---------------------------------------------------------------------------
+    def publish(self, measurement: Measurement | None, mono_ns: int) -> None:
+        """Publish a measurement when it is due; a fault, and its end, at once.
+
+        The gripper state carries the fault, even without a valid measurement.
+        """
+        driver, gripper = self._driver, self._gripper
+        elapsed_ns, again_ns = mono_ns - self._published_ns, self._period_ns
+        if measurement is None:
+            again_ns = FAULT_AGAIN_NS if driver.fault else math.inf
+        if driver.fault == self._published_fault and elapsed_ns < again_ns:
+            return
+        states: list[tuple[Publisher, Any]] = []
+        if measurement is None:
+            stamp_ns = mono_ns if driver.lockstep else self._node.clock.wall_at(mono_ns)
+        else:
+            stamp_ns, joints, _, pose, gripper = measurement
+            tcp, held_rad = self.held()
+            if tcp is not None:
+                pose = replace(
+                    pose,
+                    reference_position_m=tcp.position_m,
+                    reference_quat_xyzw=quat_from_rotation(tcp.rotation),
+                )
+            if held_rad is not None:
+                joints = replace(joints, reference_rad=held_rad)
+            states += (self._joint_out, joints), (self._pose_out, pose)
+        if gripper is not None:
+            mode = self.state if self.state in NOT_READY else driver.gripper_mode
+            faults = (driver.fault,) if driver.fault else ()
+            states.append((self._gripper_out, replace(gripper, mode=mode, faults=faults)))
+        publish_together(stamp_ns, self._seq, *states)
+        self._seq += 1
+        self._published_ns, self._published_fault = mono_ns, driver.fault
+
+    # -- state --------------------------------------------------------------------------------
+    @property
+    def _silent(self) -> bool:
+        measured_ns = self._driver.measured_ns
+        if self._driver.simulated or measured_ns is None:
+            return False
+        age_s = (self._mono_ns - measured_ns) / 1e9
+        return age_s > self._driver.profile.timing.state_timeout_s
+
+    @property
+    def state(self) -> str:
+        """State of the arm, one word."""
+        if self._driver.fault:
+            return "fault"
+        if self._driver.measured_ns is None:
+            return "waiting"
+        if self._silent:
+            return "silent"
+        if self.guard.braking:
+            return "braking"
+        if self.stalled:
+            return "stalled"
+        return "unheeded" if self.guard.unheeded else "running"
+
+    def changed(self) -> bool:
+        """Whether the state changed since the last call; a transition is emitted as an event."""
+        if self._driver.simulated and self._published_ns != self._mono_ns:
+            return False  # ticks are frequent: checked only when a state is published
+        state, was = self.state, self._was
+        if state == was:
+            return False
+        self._was = state
+        if was:
+            level = "info" if state == "running" else "warning"
+            part, why = self._driver.profile.part, self._why(state)
+            why = f"{part}: {why}".rstrip(": ") if part else why
+            self._node.emit(Event(level, "transition", f"{was}->{state}", why))
+        return True
+
+    def _why(self, state: str) -> str:
+        if state == "stalled":
+            return (
+                f"the loop stood still for {self.stall_s:.3f} s while it moved the arm; "
+                f"the motion is not resumed{self._driver.stalled_hint}"
+            )
+        timeout_s = self._driver.profile.timing.command_timeout_s
+        return {
+            "fault": self._driver.fault,
+            "silent": self._driver.silent_why,
+            "braking": f"no command/{self.guard.mode} for {timeout_s:g} s while the arm moved",
+            "unheeded": "command stream rejected: its first set-point does not match the arm's "
+            "current pose, or its beginning was lost",
+        }.get(state, "")
 
     @property
     def stalled(self) -> bool:

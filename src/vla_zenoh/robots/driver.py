@@ -146,8 +146,8 @@ class RobotDriver(ABC):
         """Driver of each part, by name; of a robot with one arm this driver, by an empty name."""
         return {"": self}
 
-    def attach(self, node: Node, follower: Any) -> None:
-        """Called when the node is on the bus, with the `CommandFollower` of the (first) arm."""
+    def attach(self, node: Node, arm: Any) -> None:
+        """Called when the node is on the bus, with the (first) `Arm` that moves this driver."""
         self.report = node
 
     def connect(self) -> None:

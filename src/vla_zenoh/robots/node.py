@@ -50,10 +50,10 @@ class RobotNode:
         if driver.has_arm:
             self.arms = {name: Arm(node, part) for name, part in driver.parts.items()}
         self.arm = next(iter(self.arms.values()), None)
-        driver.attach(node, self.arm.follower if self.arm is not None else None)
+        driver.attach(node, self.arm)
         for name, arm in self.arms.items():
             if driver.parts[name] is not driver:
-                driver.parts[name].attach(node, arm.follower)
+                driver.parts[name].attach(node, arm)
         self._resets: CallbackRing | None = None
         if driver.recovers:
             self._resets = node.subscribe(node.keys.reset, CallbackRing(4, MAX_SETTING_BYTES))
@@ -146,9 +146,8 @@ class RobotNode:
         """Whether the node may end at this tick; commands are rejected from the first call on."""
         if self.arm is None or self.driver.simulated:
             return True
-        follower = self.arm.follower
-        follower.accepting = False
-        if not follower.guard.moving:
+        self.arm.accepting = False
+        if not self.arm.guard.moving:
             return True
         patience_s = max(LEAST_S, max_braking_time_s(self.node.profile) + SLACK_S)
         self._brake_until_ns = self._brake_until_ns or mono_ns + round(patience_s * 1e9)
@@ -162,9 +161,9 @@ class RobotNode:
 
     def _brake_to_stop(self, arm: Arm, pace: Pace) -> bool:
         """Brake after an exception, tolerating single failures; whether the arm came to rest."""
-        arm.follower.accepting = False
+        arm.accepting = False
         failures = 0
-        while arm.follower.guard.moving:
+        while arm.guard.moving:
             tick = pace.wait()
             try:
                 now_ns = self.node.clock.wall_at(tick.nominal_ns)
@@ -177,7 +176,7 @@ class RobotNode:
                     return False
             if self._may_end(tick.nominal_ns):
                 break
-        return not arm.follower.guard.moving
+        return not arm.guard.moving
 
     def _emit_not_braked(self, why: str) -> None:
         self.node.emit(Event("error", "fault", "not_braked", why))
@@ -206,14 +205,14 @@ class RobotNode:
             return
         found = driver.status()
         detail = {**found.detail, "realtime": self._realtime}
-        followers = [arm.follower for arm in self.arms.values()]
-        if followers:
-            guards = [follower.guard for follower in followers]
+        arms = self.arms.values()
+        if arms:
+            guards = [arm.guard for arm in arms]
             detail["following"] = all(guard.following for guard in guards)
             node.counters[f"{node.name}.stream_silences"] = sum(one.silences for one in guards)
             if not driver.simulated:
-                node.counters[f"{node.name}.stalls"] = sum(one.stalls for one in followers)
-        if len(followers) > 1:
+                node.counters[f"{node.name}.stalls"] = sum(arm.stalls for arm in arms)
+        if len(arms) > 1:
             detail["parts"] = {name: arm.state for name, arm in self.arms.items()}
         node.publish_status(
             self.state,

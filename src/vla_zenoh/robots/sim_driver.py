@@ -24,7 +24,7 @@ from vla_zenoh.guard.arm_guard import Measured
 from vla_zenoh.keys import Kind
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import Profile
-from vla_zenoh.robots.arm import CommandFollower
+from vla_zenoh.robots.arm import Arm
 from vla_zenoh.robots.driver import DriverStatus, Measurement, Pace, Report, RobotDriver
 from vla_zenoh.simulation.world import STEP_NS, World, build_world
 from vla_zenoh.types import FloatArray, GripperCommand, ObjectPoses, SceneState
@@ -82,16 +82,16 @@ class SimDriver(RobotDriver):
     def move(self, reference: PoseReference | JointReference, now_ns: int) -> None:
         self._first.move(reference, now_ns)
 
-    def attach(self, node: Node, follower: CommandFollower) -> None:
+    def attach(self, node: Node, arm: Arm) -> None:
         """Subscribe to resets, and publish the scene."""
-        super().attach(node, follower)
+        super().attach(node, arm)
         self._node, self._keys = node, _SimKeys(node)
 
     # -- one millisecond ----------------------------------------------------------------------
     def poll(self, mono_ns: int) -> None:
         """Execute resets."""
         for seed in self._keys.resets() if self._keys else ():
-            guards = [part.follower.guard for part in self._parts.values()]
+            guards = [part.guard for part in self._parts.values()]
             if any(guard.following for guard in guards) and not self.fault:
                 why = "sim/reset: the arm is being commanded; deactivate first"
                 self.report.reject("reset_refused", why)
@@ -174,7 +174,7 @@ class SimDriver(RobotDriver):
         return DriverStatus(
             {
                 "scene": self.profile.sim.scene,
-                "command": self._first.follower.guard.mode,
+                "command": self._first.guard.mode,
                 "lockstep": self.lockstep,
                 "fault": self.fault,
             }
@@ -185,7 +185,7 @@ class SimPart(RobotDriver):
     """One arm of the simulated robot; the first one steps the world of all.
 
     Attributes:
-        follower: of its command streams, once the node is on the bus.
+        guard: of its command streams, once the node is on the bus.
         reference: towards which the next step goes.
     """
 
@@ -200,10 +200,10 @@ class SimPart(RobotDriver):
         self.modes, self.period_s, self.lockstep = sim.modes, sim.period_s, sim.lockstep
         self.reference: PoseReference | JointReference = self._arm.hold_reference()
 
-    def attach(self, node: Node, follower: CommandFollower) -> None:
+    def attach(self, node: Node, arm: Arm) -> None:
         """Begin where the arm stands."""
-        super().attach(node, follower)
-        self.follower, self.reference = follower, follower.guard.reference
+        super().attach(node, arm)
+        self.guard, self.reference = arm.guard, arm.guard.reference
 
     def move(self, reference: PoseReference | JointReference, now_ns: int) -> None:
         """Set the reference and the stamp of the next step."""

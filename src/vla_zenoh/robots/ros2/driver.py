@@ -25,7 +25,7 @@ from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.profile import Profile, SessionProfile
 from vla_zenoh.profile.ros2 import Ros2Output, Ros2Profile
 from vla_zenoh.profile.session import TRUSTED_PROTOCOLS
-from vla_zenoh.robots.arm import CommandFollower
+from vla_zenoh.robots.arm import Arm
 from vla_zenoh.robots.driver import DriverStatus, Measurement, RobotDriver, command_of
 from vla_zenoh.robots.joint_reading import JointReading, RobotClock, pose_state
 from vla_zenoh.robots.ros2.cameras import Camera
@@ -84,7 +84,7 @@ class Ros2Driver(RobotDriver):
         self._clock_reported = self._fingers_lost = False
         self._own_session: zenoh.Session | None = None
 
-    def attach(self, node: Node, follower: CommandFollower | None) -> None:
+    def attach(self, node: Node, arm: Arm | None) -> None:
         """Join the ROS graph.
 
         Raises:
@@ -92,9 +92,9 @@ class Ros2Driver(RobotDriver):
             SessionError: ros2.connect does not answer.
             SecurityError: it is reached by TLS, and this node's certificate is missing.
         """
-        super().attach(node, follower)
+        super().attach(node, arm)
         profile, ros2 = self.profile, self._ros2
-        self._node, self._follower, session = node, follower, node.session
+        self._node, self._arm, session = node, arm, node.session
         if ros2.connect is not None:
             settings = _session_settings(profile, ros2.connect)
             self._own_session = open_session(settings, identity=NAME, wait_s=ROUTER_PATIENCE_S)
@@ -163,13 +163,13 @@ class Ros2Driver(RobotDriver):
     # -- the arm ------------------------------------------------------------------------------
     def poll(self, mono_ns: int) -> None:
         """Handle answers of the gripper, and events of the threads."""
-        if self._follower is not None:
+        if self._arm is not None:
             # With no subscriber a set-point is dropped: then no controller holds it.
             heard = self._writer.has_subscribers
             self.away = "" if heard else "not_heard"
             self.gripper_mode = "ready" if heard else f"not listening at {self._output.topic[:100]}"
-            if self._follower.accepting:
-                guard = self._follower.guard
+            if self._arm.accepting:
+                guard = self._arm.guard
                 self.gripper.poll(guard.writer, writer_active=guard.writer_active)
         while self._deferred:
             self._deferred.popleft()()
@@ -269,12 +269,12 @@ class Ros2Driver(RobotDriver):
             "others": self.graph.others,
         }
         ages_s, rates_hz = {}, {name: rate_hz for name, (rate_hz, _) in figures.items()}
-        if self._follower is not None:
+        if self._arm is not None:
             states = self.states
             node.counters["ros2.unstamped"] = states.clock.unstamped
             node.counters["ros2.efforts_missing"] = states.state.efforts_missing
             detail |= {
-                "held": self._follower.holds,
+                "held": self._arm.holds,
                 "robot_clock_behind_s": states.clock.offset_s,
                 "width_m": states.state.width_m,
             }
