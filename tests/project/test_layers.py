@@ -17,7 +17,7 @@ PACKAGE = Path(vla_zenoh.__file__).parent
 ORDER = (
     # A folder, or a module beside them, imports those of the lines above and of its own line.
     ("errors",),
-    ("keys", "ntp", "resources", "robot", "sanitize", "types"),
+    ("keys", "resources", "robot", "sanitize", "types"),
     ("policy",),
     ("profile",),
     ("codec",),

@@ -19,9 +19,8 @@ from vla_zenoh.bus.node import Node, Publisher
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec.image import decode_jpeg, encode_jpeg
 from vla_zenoh.keys import Kind
-from vla_zenoh.nodes.camera import fitted_streams as asked
 from vla_zenoh.nodes.camera import node as camera_node
-from vla_zenoh.nodes.camera.fitted_streams import MAX_SIZES
+from vla_zenoh.nodes.camera.camera_publisher import MAX_SIZES
 from vla_zenoh.nodes.worker.camera_subscriber import CameraSubscriber, subscribe_to_camera
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, ObservationSpec
 from vla_zenoh.policy.observation import size_variant
@@ -106,7 +105,7 @@ def stage(folder: Path) -> Iterator[tuple[Rig, Models, Callable[[int], list[Any]
 def test_the_ninth_size_is_told_and_made_as_soon_as_another_one_is_not_asked_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(asked, "SILENCE_S", SILENCE_S)
+    monkeypatch.setattr(camera_node, "SILENCE_S", SILENCE_S)
     with stage(tmp_path) as (rig, models, listen):
         heard = [listen(16 + 2 * number) for number in range(MAX_SIZES)]
         for number in range(MAX_SIZES):
@@ -128,7 +127,7 @@ def test_the_ninth_size_is_told_and_made_as_soon_as_another_one_is_not_asked_for
 def test_who_changes_his_mind_takes_one_place(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(asked, "SILENCE_S", SILENCE_S)
+    monkeypatch.setattr(camera_node, "SILENCE_S", SILENCE_S)
     monkeypatch.setattr(camera_node, "SIZES_PERIOD_S", TURN_S / 4)
     with stage(tmp_path) as (rig, models, listen):
         for number in range(MAX_SIZES + 4):

@@ -17,7 +17,7 @@ from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import records
 from vla_zenoh.control.preflight import PeerSnapshot
 from vla_zenoh.keys import ON_BEHALF, STARTING
-from vla_zenoh.nodes.command.peer_monitor import MAX_WORKERS, PeerMonitor
+from vla_zenoh.nodes.command.inputs import MAX_WORKERS, PeerMonitor
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.types import Header, NodeStatus
 

@@ -2,14 +2,19 @@
 
 A node queries the nodes it knows to be alive, and those whose streams it receives; it never waits
 for a reply. A header may name any source, so names known from headers alone have a separate quota.
+
+One exchange of four stamps, as in NTP, gives the offset up to half its round trip (RFC 5905,
+section 8): the delays there and back cannot be told apart. So of the last exchanges the quickest
+counts, and half its round trip is the uncertainty: a bound, not a guess.
 """
 
 from __future__ import annotations
 
 import threading
 import time
-from dataclasses import dataclass
-from typing import TypeVar
+from collections import deque
+from dataclasses import dataclass, replace
+from typing import NamedTuple, TypeVar
 
 import zenoh
 
@@ -19,8 +24,7 @@ from vla_zenoh.bus.session import QOS
 from vla_zenoh.codec import message
 from vla_zenoh.errors import CodecError, ProfileError
 from vla_zenoh.keys import Keys, Kind
-from vla_zenoh.ntp import ClockOffset, ClockOffsetFilter, Exchange, shift_stamps
-from vla_zenoh.types import Header
+from vla_zenoh.types import ActionChunk, Header
 
 ASK_PERIOD_S = 1.0
 FIRST_ASKS, FIRST_PERIOD_S = 8, 0.1
@@ -33,7 +37,133 @@ HEARD_PATIENCE_S = 2.0
 MAX_PEERS, MAX_HEARD = 64, 32
 """Nodes known to be alive, and names known from headers alone."""
 MAX_STAMPS_BYTES = 1024
+WINDOW = 8
+"""Exchanges from which the quickest is taken, as in NTP's clock filter."""
+DRIFT = 50e-6
+"""Two clocks of ordinary computers run apart by this much, s per s."""
+LAST_NS = 2**63 - 1
+"""The greatest stamp that a record takes."""
+_STAMPS_OF_A_CHUNK = (
+    "observation_stamp_ns",
+    "valid_until_ns",
+    "observed_ns",
+    "inference_start_ns",
+    "inference_end_ns",
+)
+
 Record = TypeVar("Record")
+
+
+class Exchange(NamedTuple):
+    """One query and its reply, ns: `asked` and `got` on our monotonic clock, `heard` and `said` on
+    the peer's wall clock."""
+
+    asked: int
+    heard: int
+    said: int
+    got: int
+
+    @property
+    def round_trip_ns(self) -> int:
+        """Round trip without the time the peer took to reply."""
+        return (self.got - self.asked) - (self.said - self.heard)
+
+    @property
+    def ahead_ns(self) -> int:
+        """The peer's wall clock minus our monotonic clock."""
+        return ((self.heard - self.asked) + (self.said - self.got)) // 2
+
+
+class ClockOffset(NamedTuple):
+    """The peer's wall clock minus ours: the truth is within `uncertainty_s` of `offset_s`.
+
+    `round_trip_s`: of the newest exchange.
+    """
+
+    offset_s: float
+    uncertainty_s: float
+    round_trip_s: float
+
+
+class ClockOffsetFilter:
+    """Combines exchanges into one offset, and a steady one to convert stamps with.
+
+    A clock that is off by more than `bound_s` is wrong; its stamps are not converted.
+    """
+
+    def __init__(self, bound_s: float) -> None:
+        self._bound_s = bound_s
+        self._window: deque[Exchange] = deque(maxlen=WINDOW)
+        self._best: Exchange | None = None
+        self._applied_ns = 0
+        self._applied_for: tuple[Exchange, int] | None = None
+
+    def add(self, exchange: Exchange) -> bool:
+        """Add an exchange; False: it is impossible, and ignored."""
+        if exchange.round_trip_ns < 0 or exchange.said < exchange.heard:
+            return False
+        if self._best is not None and self._differ(self._best, exchange):
+            self._window.clear()  # one of the clocks was set
+        self._window.append(exchange)
+        self._best = min(self._window, key=lambda one: self._uncertainty_ns(one, exchange.got))
+        return True
+
+    def offset(self, wall_minus_mono_ns: int, now_mono_ns: int) -> ClockOffset | None:
+        """The offset at a time of our monotonic clock; None before the first exchange."""
+        best = self._best
+        if best is None:
+            return None
+        return ClockOffset(
+            (best.ahead_ns - wall_minus_mono_ns) / 1e9,
+            self._uncertainty_ns(best, now_mono_ns) / 1e9,
+            self._window[-1].round_trip_ns / 1e9,
+        )
+
+    def applied_ns(self, wall_minus_mono_ns: int, now_mono_ns: int) -> int:
+        """Offset to subtract from the peer's stamps to convert them to our clock.
+
+        It changes only when it is certainly wrong, so that stamps do not jitter with every
+        exchange; it is zero for a clock beyond the bound.
+        """
+        best = self._best
+        if best is None:
+            return 0
+        # Only these make a difference: with its age an exchange only gets less certain.
+        if self._applied_for == (best, wall_minus_mono_ns):
+            return self._applied_ns
+        self._applied_for = best, wall_minus_mono_ns
+        offset_ns = best.ahead_ns - wall_minus_mono_ns
+        if abs(offset_ns / 1e9) > self._bound_s:
+            self._applied_ns = 0
+        elif abs(offset_ns - self._applied_ns) > self._uncertainty_ns(best, now_mono_ns):
+            self._applied_ns = offset_ns
+        return self._applied_ns
+
+    @staticmethod
+    def _uncertainty_ns(exchange: Exchange, now_mono_ns: int) -> int:
+        age_ns = max(now_mono_ns - exchange.got, 0)
+        return exchange.round_trip_ns // 2 + int(age_ns * DRIFT) + 1
+
+    def _differ(self, one: Exchange, other: Exchange) -> bool:
+        apart_ns = abs(one.ahead_ns - other.ahead_ns)
+        return apart_ns > self._uncertainty_ns(one, other.got) + other.round_trip_ns // 2 + 1
+
+
+def shift_stamps(header: Header, record: Record, ahead_ns: int) -> tuple[Header, Record]:
+    """Header and record, of a writer whose clock is `ahead_ns` of ours, with their stamps on ours.
+
+    A stamp at an end of what a record takes ("at once", "for ever") stays within it: whether that
+    is stale or never expires is for the receiver to decide.
+    """
+
+    def here(stamp_ns: int) -> int:
+        return min(max(stamp_ns - ahead_ns, 0), LAST_NS)
+
+    header = replace(header, stamp_wall_ns=here(header.stamp_wall_ns))
+    if isinstance(record, ActionChunk):
+        stamps = {name: here(getattr(record, name)) for name in _STAMPS_OF_A_CHUNK}
+        record = replace(record, **stamps)
+    return header, record
 
 
 @dataclass(slots=True)
@@ -54,10 +184,8 @@ class _Peer:
 
 
 class ClockSync:
-    """Clock offsets of the nodes other than `name`, and stamps converted with them.
-
-    A clock that is off by more than `bound_s` is wrong; its stamps are not converted.
-    """
+    """Clock offsets of the nodes other than `name`, and stamps converted with them, see
+    `ClockOffsetFilter`."""
 
     def __init__(
         self, session: zenoh.Session, keys: Keys, clock: Clock, name: str, bound_s: float
@@ -68,7 +196,6 @@ class ClockSync:
         self._peers: dict[str, _Peer] = {}
         self._next_look_s = 0.0
 
-    # -- queries ------------------------------------------------------------------------------
     def track(self, node: str, *, alive: bool = True) -> None:
         """Measure the clock of `node` from now on; invalid names are ignored."""
         known = self._peers.get(node)
@@ -127,7 +254,6 @@ class ClockSync:
             **QOS[Kind.CONTROL],
         )
 
-    # -- results ------------------------------------------------------------------------------
     def offsets(self) -> dict[str, ClockOffset]:
         """Node -> its clock minus ours, of those that replied lately."""
         now_ns, now_s = time.monotonic_ns(), time.monotonic()
@@ -142,18 +268,13 @@ class ClockSync:
     def to_local_clock(self, header: Header, record: Record) -> tuple[Header, Record]:
         """Header and record with their stamps converted to our clock."""
         node = header.source.partition("#")[0]
-        ahead_ns = self._ahead_ns(node)
-        if not ahead_ns:
-            return header, record
-        return shift_stamps(header, record, ahead_ns)
-
-    def _ahead_ns(self, node: str) -> int:
         peer = self._peers.get(node)
         if peer is None:
             self.track(node, alive=False)
-            return 0
+            return header, record
         with self._lock:
-            return peer.filter.applied_ns(self._clock.offset_ns, time.monotonic_ns())
+            ahead_ns = peer.filter.applied_ns(self._clock.offset_ns, time.monotonic_ns())
+        return shift_stamps(header, record, ahead_ns) if ahead_ns else (header, record)
 
 
 def reply_with_stamps(clock: Clock, key: str, query: zenoh.Query) -> None:

@@ -320,7 +320,7 @@ class Node:
             record = records.decode(kind, bytes_of(arrival.sample.payload))
             here, record = self.clocks.to_local_clock(header, record)
         except CodecError as error:
-            self._reject_sample(key, error)
+            self.reject_sample(key, error)
             return None
         if writer_filter is not None:
             writer_filter.accept(header, arrival.mono_ns)
@@ -334,10 +334,10 @@ class Node:
         try:
             return decode(bytes_of(arrival.sample.payload))
         except CodecError as error:
-            self._reject_sample(str(arrival.sample.key_expr), error)
+            self.reject_sample(str(arrival.sample.key_expr), error)
             return None
 
-    def _reject_sample(self, key: str, error: CodecError) -> None:
+    def reject_sample(self, key: str, error: CodecError) -> None:
         short = self.keys.short(key)
         self.reject(error.reason, f"{short}: {error}", short)
 

@@ -14,7 +14,6 @@ from vla_zenoh.control.joint_space import JointBounds
 from vla_zenoh.control.limits import into_workspace
 from vla_zenoh.errors import RecordError, SpecError
 from vla_zenoh.keys import worker_node
-from vla_zenoh.ntp import ClockOffset
 from vla_zenoh.policy import ModelSpec, check_steps
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import ActionChunk, GripperState, JointState, PoseState, Stamped
@@ -40,7 +39,8 @@ class PeerSnapshot:
         camera_nodes: camera -> the node that serves it.
         hosts: node -> its host, by its status.
         same_host: nodes that certainly run on the command node's host and share its clock.
-        clocks: node -> its clock minus that of the command node, where measured.
+        clocks: node -> its clock minus that of the command node and how uncertain that is, s, where
+            measured.
         holders: clients present as a deadman.
         camera_reasons: camera -> why it sends no images, by its node's status.
         camera_faults: camera -> why its images are invalid, by its node's status: the rest of a
@@ -57,7 +57,7 @@ class PeerSnapshot:
     camera_nodes: Mapping[str, str] = field(default_factory=dict)
     hosts: Mapping[str, str] = field(default_factory=dict)
     same_host: frozenset[str] = frozenset()
-    clocks: Mapping[str, ClockOffset] = field(default_factory=dict)
+    clocks: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     holders: frozenset[str] = frozenset()
     camera_faults: Mapping[str, str] = field(default_factory=dict)
     camera_reasons: Mapping[str, str] = field(default_factory=dict)
@@ -309,14 +309,16 @@ def _clocks(
     nodes += [peers.camera_nodes[name] for name in cameras if name in peers.camera_nodes]
     bound_s, reasons = profile.timing.max_clock_offset_s, []
     for node in dict.fromkeys(nodes):
-        found = peers.clocks.get(node)
-        if found is not None and found.exceeds(bound_s):
+        offset_s, uncertainty_s = peers.clocks.get(node, (None, 0.0))
+        # By the estimate alone: however long a link is, that is near zero if the clocks agree and
+        # both directions take the same time.
+        if offset_s is not None and abs(offset_s) > bound_s:
             reasons.append(
-                f"the clock of node {node!r} is {found.offset_s:+.3f} s off this one's "
-                f"(+-{found.uncertainty_s:.4f} s), at most {bound_s:g} s is allowed "
+                f"the clock of node {node!r} is {offset_s:+.3f} s off this one's "
+                f"(+-{uncertainty_s:.4f} s), at most {bound_s:g} s is allowed "
                 "(timing.max_clock_offset_s); synchronise the clocks of both hosts (chrony or ptp)"
             )
-        elif found is None and node in peers.alive - peers.same_host:
+        elif offset_s is None and node in peers.alive - peers.same_host:
             where = f" on {peers.hosts[node]}" if node in peers.hosts else ""
             reasons.append(
                 f"the clock of node {node!r}{where} is not known: it has not answered yet"

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vla_zenoh.ntp import LAST_NS, ClockOffsetFilter, Exchange, shift_stamps
+from vla_zenoh.bus.clock_sync import LAST_NS, ClockOffsetFilter, Exchange, shift_stamps
 from vla_zenoh.types import ActionChunk, Header
 
 MS = 1_000_000
@@ -89,7 +89,7 @@ def test_a_clock_is_refused_where_it_is_not_corrected_and_nowhere_else(
     said = found.offset(WALL_MINUS_MONO_NS, now_ns)
     assert said is not None
     applied_ns = found.applied_ns(WALL_MINUS_MONO_NS, now_ns)
-    if said.exceeds(BOUND_S):
+    if abs(said.offset_s) > BOUND_S:
         assert applied_ns == 0
     else:  # what is left as it is may be right as it is
         assert abs(said.offset_s - applied_ns / 1e9) <= said.uncertainty_s + 1e-9
@@ -110,7 +110,7 @@ def test_clocks_that_agree_are_never_refused_for_a_long_link(
         said = found.offset(WALL_MINUS_MONO_NS, second * 10**9 + 500 * MS)
         assert said is not None
         assert abs(said.offset_s) <= varying_ms / 1e3 + ROUNDING_S
-        assert not said.exceeds(BOUND_S)
+        assert not abs(said.offset_s) > BOUND_S
 
 
 def test_a_clock_that_is_set_is_noticed_at_the_next_exchange() -> None:

@@ -17,9 +17,8 @@ from hypothesis import strategies as st
 
 from vla_zenoh.errors import NodeError
 from vla_zenoh.nodes.camera import v4l2
-from vla_zenoh.nodes.camera.camera_publisher import to_rgb
+from vla_zenoh.nodes.camera.camera_publisher import EARLY, LATE, RateLimiter, to_rgb
 from vla_zenoh.nodes.camera.file import FileSource, natural, open_frames
-from vla_zenoh.nodes.camera.fitted_streams import EARLY, LATE, RateLimiter
 from vla_zenoh.nodes.camera.geometry import resize
 from vla_zenoh.nodes.camera.node import choose_cameras, make_source
 from vla_zenoh.nodes.camera.rtsp import RtspSource

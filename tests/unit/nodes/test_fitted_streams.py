@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from vla_zenoh.nodes.camera.fitted_streams import MAX_MODELS, SILENCE_S, RequestedSizes
+from vla_zenoh.nodes.camera.node import MAX_MODELS, SILENCE_S, RequestedSizes
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, ObservationSpec
 
 

@@ -1,4 +1,4 @@
-"""Publishes the images of one camera, and tracks its state, rate, latency and faults."""
+"""Publishes the images of one camera, also in the input sizes of models, and tracks its state."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -14,19 +14,133 @@ import zenoh
 from numpy.typing import NDArray
 
 from vla_zenoh.bus.metrics import Percentiles, RateMeter
-from vla_zenoh.bus.node import Node
+from vla_zenoh.bus.node import Node, Publisher
 from vla_zenoh.codec.image import depth_schema, encode_depth, encode_jpeg, encode_raw, raw_schema
 from vla_zenoh.errors import NodeError
 from vla_zenoh.keys import Kind
-from vla_zenoh.nodes.camera.fitted_streams import FittedStreams, RateLimiter, shrink
 from vla_zenoh.nodes.camera.geometry import Geometry, Intrinsics, Pixels
 from vla_zenoh.nodes.camera.image_check import ImageCheck, ImageFault
+from vla_zenoh.policy import CameraSpec
+from vla_zenoh.policy.observation import prepare_image
 from vla_zenoh.profile.schema import CameraProfile
 from vla_zenoh.types import Depth, Event, Image
 
 WAITING, OK, LOST, ENDED = "waiting", "ok", "lost", "ended"
 _SOURCE_LIMIT = 200
 _TO_RGB = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGB}
+
+EARLY, LATE = 0.25, 0.2
+"""Periods by which an image may be early, and by which lateness is carried over."""
+MAX_SIZES = 8
+"""Model input sizes served for one camera; further models use the common streams."""
+
+
+class RateLimiter:
+    """Lets at most `rate_hz` images a second through, evenly spaced; None: all.
+
+    An image may be `EARLY` periods early, so that a source of exactly this rate loses none to
+    jitter. At most `LATE` periods of lateness are carried over. The two add up to less than half a
+    period, so a source of twice the rate always passes every other image.
+    """
+
+    def __init__(self, rate_hz: float | None) -> None:
+        self._period_ns = None if rate_hz is None else 1e9 / rate_hz
+        self._next_ns: float | None = None
+
+    def due(self, now_ns: int) -> bool:
+        """Whether the image of this time, on any one clock, passes."""
+        if self._period_ns is None:
+            return True
+        next_ns = now_ns if self._next_ns is None else self._next_ns
+        if next_ns - now_ns > 2 * self._period_ns:  # the clock was set back
+            next_ns = now_ns
+        if next_ns - now_ns > EARLY * self._period_ns:
+            return False
+        self._next_ns = max(next_ns, now_ns - LATE * self._period_ns) + self._period_ns
+        return True
+
+
+class FittedStream(NamedTuple):
+    """A JPEG stream of images prepared for the model input `spec`."""
+
+    stream: Publisher
+    limiter: RateLimiter
+    spec: CameraSpec
+
+
+class FittedStreams:
+    """Fitted streams of one camera. One thread publishes images, another sets the sizes."""
+
+    def __init__(
+        self, camera: str, profile: CameraProfile, node: Node, emit: Callable[[Event], None]
+    ) -> None:
+        self._camera, self._profile, self._node, self._emit = camera, profile, node, emit
+        self._lock = threading.Lock()  # no image is published on a stream that is being removed
+        self._streams: dict[str, FittedStream] = {}
+        self._left_out: frozenset[str] = frozenset()
+
+    @property
+    def has_subscribers(self) -> bool:
+        """Whether any of the streams has a subscriber."""
+        with self._lock:
+            return any(one.stream.has_subscribers for one in self._streams.values())
+
+    def due(self, mono_ns: int) -> list[FittedStream]:
+        """Streams that have a subscriber and are due for the image of this time."""
+        if not self._streams:
+            return []
+        with self._lock:
+            return [
+                one
+                for one in self._streams.values()
+                if one.stream.has_subscribers and one.limiter.due(mono_ns)
+            ]
+
+    def publish(self, fitted: FittedStream, image: Image, stamp_wall_ns: int) -> None:
+        """Publish an image on one of the streams, unless it was removed in the meantime."""
+        jpeg = encode_jpeg(Image(prepare_image(image, fitted.spec)), self._profile.jpeg_quality)
+        with self._lock:
+            if any(fitted is one for one in self._streams.values()):
+                fitted.stream.publish(
+                    jpeg, stamp_wall_ns=stamp_wall_ns, encoding=zenoh.Encoding.IMAGE_JPEG
+                )
+
+    def serve(self, requested: Mapping[str, CameraSpec]) -> None:
+        """Serve these sizes, by variant name, at most `MAX_SIZES`.
+
+        A size that is neither requested nor subscribed to is removed. One that is only subscribed
+        to is removed if a requested one needs its place.
+        """
+        missing = [name for name in requested if name not in self._streams]
+        with self._lock:
+            unrequested = {
+                name: one.stream.has_subscribers
+                for name, one in self._streams.items()
+                if name not in requested
+            }
+        ended = [name for name, subscribed in unrequested.items() if not subscribed]
+        short = len(self._streams) - len(ended) + len(missing) - MAX_SIZES
+        ended += [name for name, subscribed in unrequested.items() if subscribed][: max(short, 0)]
+        for name in ended:
+            with self._lock:
+                self._node.undeclare(self._streams.pop(name).stream)
+            why = f"images are no longer published as {name}: no live model requests this size"
+            self._emit(Event("info", "notice", f"{self._camera}:size_given_back", why))
+        room = MAX_SIZES - len(self._streams)
+        for name in missing[:room]:
+            key = self._node.keys.camera_fitted(self._camera, name)
+            stream = self._node.declare_publisher(key, Kind.FRAME)
+            limiter = RateLimiter(self._profile.jpeg_rate_hz)
+            spec = requested[name].model_copy(update={"colour": "rgb"})
+            with self._lock:
+                self._streams[name] = FittedStream(stream, limiter, spec)
+        before, self._left_out = self._left_out, frozenset(missing[room:])
+        if self._left_out - before:
+            why = (
+                f"images are published in at most {MAX_SIZES} model sizes; models that request "
+                f"{', '.join(missing[room:])} receive the common stream"
+            )
+            self._emit(Event("warning", "notice", f"{self._camera}:too_many_sizes", why[:1000]))
 
 
 class CameraPublisher:
@@ -40,8 +154,7 @@ class CameraPublisher:
         shown: its source, without passwords.
         node: publishes the streams.
         emit: emits an event; callable from any thread.
-        same_s: how long its source may repeat an identical image, s; 0: indefinitely.
-        references: see `ImageCheck`.
+        same_s, references: see `ImageCheck`.
     """
 
     def __init__(
@@ -68,8 +181,9 @@ class CameraPublisher:
             self._depth = node.declare_publisher(node.keys.camera_depth(name), Kind.FRAME)
         self._measured_share = 0.0
         self._geometry: Geometry | None = None
-        self.intrinsics: Intrinsics | None = None
-        """Of published images, where they are known; for status."""
+        self._source_shape: tuple[int, ...] = ()
+        self.intrinsics: dict[str, float] = {}
+        """Of published images, as status shows them; empty: unknown."""
         self.fitted = FittedStreams(name, profile, node, emit)
         self._limiter = RateLimiter(profile.rate_hz)
         self._jpeg_limiter = RateLimiter(profile.jpeg_rate_hz)
@@ -127,15 +241,11 @@ class CameraPublisher:
     def opened(self, backend: str, same_s: float, intrinsics: Intrinsics | None = None) -> None:
         """The source was (re)opened: start the image check from scratch.
 
-        Args:
-            backend: of the source.
-            same_s: how long it may repeat an identical image, s; 0: indefinitely.
-            intrinsics: of its images, if it knows them.
-
         Raises:
             NodeError: the profile's intrinsics cannot be read.
         """
         self.backend, self._geometry = backend, Geometry(self.profile, intrinsics)
+        self._source_shape = ()
         self._check = ImageCheck(self.name, self.profile.check, same_s, self._references)
 
     def check(self, image: Pixels, mono_ns: int, stamp_ns: int | None = None) -> None:
@@ -162,12 +272,9 @@ class CameraPublisher:
         return self._depth is not None and self._depth.has_subscribers
 
     def publish(self, image: Pixels, mono_ns: int, depth_m: Pixels | None = None) -> None:
-        """Publish an image of OpenCV, captured at `mono_ns`, as the profile wants it.
+        """Publish an image of an opened source, captured at `mono_ns`, as the profile wants it.
 
-        Args:
-            image: of the source.
-            mono_ns: time of capture, monotonic clock.
-            depth_m: (H, W) of the same pixels, m.
+        `depth_m`: (H, W) of the same pixels.
 
         Raises:
             NodeError: unknown image format, or a crop beyond the image.
@@ -175,11 +282,13 @@ class CameraPublisher:
         width, height, crop = self.profile.width, self.profile.height, self.profile.crop
         if image.shape[:2] != (height, width) and crop is None:
             self._count_resized(image.shape[:2])
-        geometry = self._geometry or Geometry(self.profile)
-        image = geometry.apply(image)
-        self.intrinsics = geometry.intrinsics()
+        assert self._geometry is not None
+        shape, image = image.shape, self._geometry.apply(image)
+        if shape != self._source_shape:
+            self._source_shape, intrinsics = shape, self._geometry.intrinsics()
+            self.intrinsics = {} if intrinsics is None else intrinsics.shown()
         if depth_m is not None:
-            depth_m = geometry.apply(depth_m, depth=True)
+            depth_m = self._geometry.apply(depth_m, depth=True)
         stamp_ns = self._clock.wall_ns() - (time.monotonic_ns() - mono_ns)
         self.publish_rgb(to_rgb(image), mono_ns, stamp_ns, depth_m)
 
@@ -190,13 +299,10 @@ class CameraPublisher:
         stamp_wall_ns: int,
         depth_m: NDArray[Any] | None = None,
     ) -> None:
-        """Publish an image of the profile's size on every stream that has subscribers.
+        """Publish an image (H, W, 3) of the profile's size on every stream that has subscribers.
 
-        Args:
-            rgb: (H, W, 3).
-            mono_ns: time of capture, monotonic clock.
-            stamp_wall_ns: the same on the wall clock.
-            depth_m: (H, W) of the same view at the same time, in m, see `Depth.of_metres`.
+        The time of capture is given on the monotonic and on the wall clock; `depth_m` (H, W) is of
+        the same view and time, see `Depth.of_metres`.
         """
         image, raw = Image(rgb), self._raw.has_subscribers
         if raw:  # first: subscribers on this host need not wait for the rest
@@ -213,7 +319,7 @@ class CameraPublisher:
             # A thinned stream numbers its own images.
             thinned = self.profile.jpeg_rate_hz is not None
             self._jpeg.publish(
-                encode_jpeg(shrink(image, self.profile.jpeg_width), self.profile.jpeg_quality),
+                encode_jpeg(_shrink(image, self.profile.jpeg_width), self.profile.jpeg_quality),
                 stamp_wall_ns=stamp_wall_ns,
                 seq=None if thinned else self._seq,
                 encoding=zenoh.Encoding.IMAGE_JPEG,
@@ -258,13 +364,13 @@ class CameraPublisher:
             "backend": self.backend,
             "age_s": None if newest is None else (time.monotonic_ns() - newest) / 1e9,
         }
-        if self.intrinsics is not None:
-            detail["intrinsics"] = self.intrinsics.shown()
+        if self.intrinsics:
+            detail["intrinsics"] = self.intrinsics
         if self._depth is not None:
             detail["depth_measured_share"] = round(self._measured_share, 3)
         if (bad := self.fault) is not None:
-            names = ("why", "check", "value", "limit")
-            detail["bad"] = {name: getattr(bad, name) for name in names}
+            shown = {"why": bad.why, "check": bad.check, "value": bad.value, "limit": bad.limit}
+            detail["bad"] = shown
         return detail | ({"why": self.why} if self.why else {})
 
     def figures(self) -> tuple[float, tuple[float, float] | None]:
@@ -278,6 +384,16 @@ class CameraPublisher:
         if self._depth is not None:
             counts["depth"] = self._depth.seq
         return {f"{self.name}.{what}": count for what, count in counts.items()}
+
+
+def _shrink(image: Image, max_width: int | None) -> Image:
+    """The image scaled down to `max_width`, with its aspect ratio, if it is wider."""
+    height, width = image.rgb.shape[:2]
+    if max_width is None or width <= max_width:
+        return image
+    height = max(8, round(height * max_width / width))
+    smaller = CameraSpec(camera="any", width=max_width, height=height, resize="stretch")
+    return Image(prepare_image(image, smaller))
 
 
 def to_rgb(image: Pixels) -> NDArray[np.uint8]:

@@ -23,12 +23,9 @@ MAX_VIDEO_HZ = 1000.0
 
 
 class Frames(NamedTuple):
-    """The images of a file or folder, once, in order.
+    """The images of a file or folder, once, in order; `rate_hz` of a video.
 
-    Args:
-        images: each decodes one image, None where it is corrupt. Closing it closes the file.
-        backend: name of the library that reads them.
-        rate_hz: of a video; None: unknown.
+    Each of `images` decodes one, None where it is corrupt. Closing them closes the file.
     """
 
     images: Generator[Callable[[], Pixels | None]]
@@ -37,11 +34,7 @@ class Frames(NamedTuple):
 
 
 def open_video(path: Path) -> Frames:
-    """The images of a video.
-
-    Raises:
-        NodeError: not a readable video.
-    """
+    """The images of a video; `NodeError`: it cannot be read."""
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     if not capture.isOpened():
         raise NodeError(f"{path} is neither an image nor a video that can be read")
@@ -69,11 +62,7 @@ def natural(path: Path) -> list[tuple[int, str]]:
 
 
 def open_frames(path: Path) -> Frames:
-    """The images of the video, folder or image at `path`.
-
-    Raises:
-        NodeError: missing, or nothing that can be shown.
-    """
+    """The images of the video, folder or image at `path`; `NodeError`: there are none."""
     if not path.exists():
         raise NodeError(f"there is no file or folder {path}; waiting until it exists")
     if path.is_file() and not cv2.haveImageReader(str(path)):
@@ -86,13 +75,8 @@ def open_frames(path: Path) -> Frames:
 
 
 class FileSource(Source):
-    """Replays a file in real time: a video at its own rate, images at `rate_hz`.
-
-    Args:
-        path: video, folder of images (in natural order of their names), or image.
-        rate_hz: of images, and of a video without a rate of its own.
-        loop: start again at the end.
-    """
+    """Replays in real time a video at its own rate, or an image or a folder of images (in natural
+    order of their names) at `rate_hz`; `loop`: again from the start."""
 
     def __init__(self, path: str, rate_hz: float, loop: bool) -> None:
         self._path = Path(path).expanduser()

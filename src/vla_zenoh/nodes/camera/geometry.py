@@ -25,12 +25,9 @@ class Intrinsics(Section):
     """Pinhole model of a camera, as in the file that ``cameras.NAME.intrinsics`` names.
 
     Args:
-        width: of the calibration images, pixels.
-        height: of the calibration images, pixels.
-        fx_px: focal length along x, pixels.
-        fy_px: focal length along y, pixels.
-        cx_px: x of the principal point; (0, 0) is the outer corner of the first pixel.
-        cy_px: y of the principal point.
+        width, height: of the calibration images, pixels.
+        fx_px, fy_px: focal lengths.
+        cx_px, cy_px: principal point; (0, 0) is the outer corner of the first pixel.
         distortion: k1, k2, p1, p2, k3 of OpenCV; empty: none.
     """
 
@@ -70,11 +67,7 @@ class Intrinsics(Section):
 
 
 def read_intrinsics(path: Path) -> Intrinsics:
-    """The intrinsics in a YAML file.
-
-    Raises:
-        NodeError: it cannot be read, or a value is wrong; says which.
-    """
+    """The intrinsics in a YAML file, or a `NodeError` that says what is wrong there."""
     try:
         with path.open("rb") as file:
             data = yaml.safe_load(file.read(MAX_FILE_BYTES))
@@ -89,11 +82,7 @@ def read_intrinsics(path: Path) -> Intrinsics:
 
 class Geometry:
     """Processing of a camera's images before publication: undistortion in the camera's own size,
-    crop, flip, then resizing to the profile's size.
-
-    Args:
-        profile: of the camera.
-        intrinsics: of the camera's own images; None: unknown.
+    crop, flip, then resizing to the profile's size. `intrinsics` are of the camera's own images.
 
     Raises:
         NodeError: the profile's file of intrinsics is wrong, or missing for an undistortion.
@@ -175,7 +164,8 @@ def resize(image: Pixels, width: int, height: int, *, depth: bool = False) -> Pi
     had_height, had_width = image.shape[:2]
     if (had_height, had_width) == (height, width):
         return image
-    shrinks = width * height < had_width * had_height
-    method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-    method = cv2.INTER_NEAREST_EXACT if depth else method
+    if depth:
+        method = cv2.INTER_NEAREST_EXACT
+    else:
+        method = cv2.INTER_AREA if width * height < had_width * had_height else cv2.INTER_LINEAR
     return cv2.resize(image, (width, height), interpolation=method)

@@ -40,12 +40,10 @@ class ImageFault(NamedTuple):
     """Why a camera cannot be trusted.
 
     Args:
-        check: the field of `vla_zenoh.profile.schema.CameraCheck` that is violated.
-        what: a stable identifier: ``same``, ``stamps``, ``black``, ``white``, ``flat``, ``even``,
-            ``swapped``.
-        why: continues a sentence that begins with ``camera NAME``; has value and limit.
-        value: measured, in the unit of the field.
-        limit: value of the field.
+        check: the field of `vla_zenoh.profile.schema.CameraCheck` that is violated; `value` and
+            `limit` are in its unit.
+        what: ``same``, ``stamps``, ``black``, ``white``, ``flat``, ``even`` or ``swapped``.
+        why: continues a sentence that begins with ``camera NAME``.
     """
 
     check: str
@@ -59,7 +57,7 @@ class ImageCheck:
     """Checks the images of one camera, from the opening of its source to its end.
 
     Args:
-        name: of the camera, for messages.
+        name: of the camera.
         limits: of the profile.
         same_s: default of `CameraCheck.same_s` for this kind of source.
         references: of the cameras that have one, see `read_references`.
@@ -85,15 +83,12 @@ class ImageCheck:
     def update(
         self, image: NDArray[Any], now_ns: int, stamp_ns: int | None = None
     ) -> ImageFault | None:
-        """Check an image.
+        """The first fault of an image, None if the camera looks right.
 
         Args:
             image: (H, W) or (H, W, 1, 3 or 4), uint8 or uint16, channels in any order.
             now_ns: monotonic clock.
-            stamp_ns: the driver's time stamp, on any clock; None if there is none.
-
-        Returns:
-            The first fault found; None: the camera looks right.
+            stamp_ns: the driver's time stamp, on any clock.
         """
         if self._looked_ns is not None and 0 <= now_ns - self._looked_ns < PERIOD_NS:
             return self.finding
@@ -110,14 +105,13 @@ class ImageCheck:
 
     # -- checks over several images ------------------------------------------------------------
     def _same_image(self, sample: NDArray[Any], now_ns: int) -> ImageFault | None:
-        before, self._sample = self._sample, sample
-        again = before is not None and np.array_equal(before, sample)
+        again = self._sample is not None and np.array_equal(self._sample, sample)
+        self._sample = sample
         self._same = self._same.then(again, now_ns)
         return self._same.finding("same_s", "same", "shows the same image", now_ns, self._same_s)
 
     def _frozen_stamps(self, stamp_ns: int | None, now_ns: int) -> ImageFault | None:
-        newest = self._stamp_ns
-        again = False
+        newest, again = self._stamp_ns, False
         if stamp_ns is not None and newest is not None:
             again = newest - CLOCK_SET_NS <= stamp_ns <= newest
         if not again:
@@ -192,11 +186,7 @@ def _thumbnail(sample: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def read_references(cameras: Mapping[str, CameraProfile]) -> dict[str, NDArray[np.float64]]:
-    """Thumbnails of the references of those cameras that have one.
-
-    Raises:
-        NodeError: a file that is not an image.
-    """
+    """Thumbnails of the references of those cameras that have one; `NodeError`: not an image."""
     found: dict[str, NDArray[np.float64]] = {}
     for name, camera in cameras.items():
         path = camera.check.reference

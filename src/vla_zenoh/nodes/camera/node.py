@@ -14,7 +14,6 @@ from vla_zenoh.bus.node import Node
 from vla_zenoh.errors import NodeError, in_words
 from vla_zenoh.keys import last_chunk
 from vla_zenoh.nodes.camera.camera_publisher import ENDED, OK, CameraPublisher
-from vla_zenoh.nodes.camera.fitted_streams import MAX_MODELS, RequestedSizes
 from vla_zenoh.nodes.camera.image_check import read_references
 from vla_zenoh.nodes.camera.source import (
     LOOK_S,
@@ -23,7 +22,8 @@ from vla_zenoh.nodes.camera.source import (
     prepare_opencv,
     without_password,
 )
-from vla_zenoh.policy import ModelSpec
+from vla_zenoh.policy import CameraSpec, ModelSpec
+from vla_zenoh.policy.observation import size_variant
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.schema import CameraProfile
 from vla_zenoh.types import Event, SceneState, Stamped
@@ -82,12 +82,7 @@ def make_source(profile: CameraProfile) -> Source:
 
 
 class Grabber:
-    """Reads one source and reopens it after every failure; `run` is the body of a thread.
-
-    Args:
-        source: of the images.
-        publisher: publishes them.
-    """
+    """Reads one source and reopens it after every failure; `run` is the body of a thread."""
 
     def __init__(self, source: Source, publisher: CameraPublisher) -> None:
         self._source, self._publisher = source, publisher
@@ -149,6 +144,41 @@ class Grabber:
                 self._backoff_s = BACKOFF_S
 
 
+SILENCE_S = 5.0
+"""A worker publishes its spec once a second; after this silence it counts as gone."""
+MAX_MODELS = 64
+
+
+class RequestedSizes:
+    """Image sizes that live workers ask for, from the newest spec of each; `now_s`: monotonic."""
+
+    def __init__(self) -> None:
+        self._specs: dict[str, tuple[float, ModelSpec]] = {}
+
+    def add(self, worker: str, spec: ModelSpec, now_s: float) -> bool:
+        """Keep a worker's spec; False if there are `MAX_MODELS` of other workers already."""
+        self._forget(now_s)
+        if worker not in self._specs and len(self._specs) >= MAX_MODELS:
+            return False
+        self._specs[worker] = (now_s, spec)
+        return True
+
+    def sizes(self, camera: str, now_s: float) -> dict[str, CameraSpec]:
+        """Variant name -> spec of the camera, in the order in which workers appeared."""
+        self._forget(now_s)
+        return {
+            variant: one
+            for _, spec in self._specs.values()
+            for one in spec.observation.cameras
+            if one.camera == camera and (variant := size_variant(one)) is not None
+        }
+
+    def _forget(self, now_s: float) -> None:
+        self._specs = {
+            worker: heard for worker, heard in self._specs.items() if now_s - heard[0] <= SILENCE_S
+        }
+
+
 TICK_S = 0.05
 SPECS_A_TICK = 8
 SIZES_PERIOD_S = 0.5
@@ -162,9 +192,9 @@ class CameraNode:
 
     Args:
         profile: the effective profile.
-        session: an open session; the caller closes it.
+        session: open session, which the caller closes.
         name: of the node; a second camera host needs another one.
-        cameras: of the profile, to be served; None: all except those of ROS 2.
+        cameras: names of those to serve; None: all except those of ROS 2.
 
     Raises:
         NodeError: unknown camera, a reference that is not an image, or a node of this name is alive
@@ -185,40 +215,32 @@ class CameraNode:
         self._node_lock = threading.Lock()  # a Node is used by one thread at a time
         self._halt = threading.Event()
         references = read_references(chosen)
-        self._publishers = {
-            camera: CameraPublisher(
-                camera,
-                settings,
-                without_password(settings.source),
-                self.node,
-                self._emit,
+        self._publishers: dict[str, CameraPublisher] = {}
+        self._threads: list[threading.Thread] = []
+        views: list[tuple[str, CameraPublisher]] = []
+        for camera, settings in chosen.items():
+            source = settings.source
+            publisher = self._publishers[camera] = CameraPublisher(
+                *(camera, settings, without_password(source), self.node, self._emit),
                 references=references,
             )
-            for camera, settings in chosen.items()
-        }
+            if source.startswith(SIM):
+                views.append((source.removeprefix(SIM), publisher))
+            else:
+                self._add_thread(camera, Grabber(make_source(settings), publisher).run)
         self._reported: tuple[tuple[str, ...], tuple[bool, ...]] = ((), ())
-        self._threads = [
-            self._thread(camera, Grabber(make_source(settings), self._publishers[camera]).run)
-            for camera, settings in chosen.items()
-            if not settings.source.startswith(SIM)
-        ]
         self._requested = RequestedSizes()
         self._sized_s = -1e9
         self._specs: ZenohRing | None = None
         if any(settings.fit_for_workers for settings in chosen.values()):
             self._specs = self.node.subscribe(self.node.keys.all_specs, ZenohRing(SPECS_A_TICK))
         self._sim: Any = None
-        views = [
-            (settings.source.removeprefix(SIM), self._publishers[camera])
-            for camera, settings in chosen.items()
-            if settings.source.startswith(SIM)
-        ]
         if views:
             from vla_zenoh.nodes.camera.sim_cameras import SimCameras
 
             scenes = self.node.subscribe(self.node.keys.sim_scene, LatestSample())
             self._sim = SimCameras(profile, views, scenes, self._decode_scene, self._reject)
-            self._threads.append(self._thread("sim", self._sim.run))
+            self._add_thread("sim", self._sim.run)
 
     def run(self, stop: threading.Event) -> None:
         """Publish until `stop` is set; ends within half a second of it."""
@@ -237,9 +259,11 @@ class CameraNode:
                 self.node.publish_status("stopped", now=True)
                 self.node.close()
 
-    def _thread(self, name: str, body: Callable[[threading.Event], None]) -> threading.Thread:
+    def _add_thread(self, name: str, body: Callable[[threading.Event], None]) -> None:
         # A daemon: a driver that hangs must not keep the process alive.
-        return threading.Thread(target=body, args=(self._halt,), name=f"camera {name}", daemon=True)
+        self._threads.append(
+            threading.Thread(target=body, args=(self._halt,), name=f"camera {name}", daemon=True)
+        )
 
     # -- called by the threads ----------------------------------------------------------------
     def _emit(self, event: Event) -> None:
@@ -279,7 +303,11 @@ class CameraNode:
         publishers = self._publishers
         states = tuple(one.state for one in publishers.values())
         bad = tuple(one.fault is not None for one in publishers.values())
-        state = "degraded" if any(bad) else _summary(states)
+        if all(state == ENDED for state in states) and not any(bad):
+            state = "ended"
+        else:
+            good = all(state in (OK, ENDED) for state in states) and not any(bad)
+            state = "running" if good else "degraded"
         with self._node_lock:
             changed = (states, bad) != self._reported
             if not changed and not self.node.status_due(state):
@@ -300,9 +328,3 @@ class CameraNode:
                 latency_ms={name: late for name, (_, late) in figures.items() if late is not None},
                 now=changed,
             )
-
-
-def _summary(states: tuple[str, ...]) -> str:
-    if all(state == ENDED for state in states):
-        return "ended"
-    return "running" if all(state in (OK, ENDED) for state in states) else "degraded"

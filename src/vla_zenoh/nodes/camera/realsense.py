@@ -34,11 +34,7 @@ SET_S = 0.5
 
 
 def sdk() -> Any:
-    """The module ``pyrealsense2``.
-
-    Raises:
-        MissingExtraError: it is not installed.
-    """
+    """The module ``pyrealsense2``; `MissingExtraError`: it is not installed."""
     try:
         return import_module("pyrealsense2")
     except ImportError as error:
@@ -51,12 +47,7 @@ def connected(context: Any = None) -> list[Any]:
 
 
 def find_device(serial: str) -> Any:
-    """The camera with this serial number.
-
-    Raises:
-        NodeError: it is not connected.
-        MissingExtraError: the library is not installed.
-    """
+    """The camera with this serial number; `NodeError`: it is not connected."""
     rs = sdk()
     serials = {one.get_info(rs.camera_info.serial_number): one for one in connected()}
     if serial not in serials:
@@ -78,12 +69,7 @@ class DeviceClock:
         self._offsets: deque[tuple[int, int]] = deque()  # arrival, arrival - stamp; both ascending
 
     def host_ns(self, device_ns: int, arrival_ns: int) -> int:
-        """Time of capture on the clock of `arrival_ns`, never later than that.
-
-        Args:
-            device_ns: stamp of the camera, on its own clock.
-            arrival_ns: when the image arrived, on the clock of this computer.
-        """
+        """Time of capture on the clock of `arrival_ns`, never later than that."""
         offset_ns = arrival_ns - device_ns
         offsets = self._offsets
         if offsets and abs(offset_ns - offsets[0][1]) > SET_S * 1e9:
@@ -97,13 +83,7 @@ class DeviceClock:
 
 
 class RealsenseSource(Source):
-    """A RealSense camera.
-
-    Args:
-        serial: its serial number.
-        profile: size, rate, depth, locks; the camera's nearest size is taken.
-        device_of: finds the camera; raises `NodeError` if it is missing.
-    """
+    """A RealSense camera by its serial number, in the size nearest to the profile's."""
 
     same_s = SAME_S
 

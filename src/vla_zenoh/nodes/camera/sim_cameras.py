@@ -39,11 +39,7 @@ MEMORY = 0.8
 
 
 class RenderBudget:
-    """Adapts the resolution of ray casting to the time it takes: every `step`-th pixel is drawn.
-
-    Args:
-        rate_hz: of the camera.
-    """
+    """Adapts the resolution of ray casting to the time it takes: every `step`-th pixel is drawn."""
 
     def __init__(self, rate_hz: float) -> None:
         self._period_s = 1.0 / rate_hz
@@ -70,7 +66,7 @@ class SimCameras:
         profile: scene, robot and choice of renderer.
         views: name of each camera in the scene, and its publisher.
         buffer: the newest scene.
-        decode: decodes a scene; None if it was rejected.
+        decode: None if the scene was rejected.
         reject: counts and reports a rejection: reason, why.
     """
 
@@ -84,7 +80,7 @@ class SimCameras:
     ) -> None:
         self._profile, self._views, self._buffer = profile, tuple(views), buffer
         self._decode, self._reject = decode, reject
-        self._drawn_ns = {one.name: 0 for _, one in self._views}
+        self._drawn_ns: dict[str, int] = {}
         self._budgets = {one.name: RenderBudget(one.profile.rate_hz) for _, one in self._views}
         self._received_ns = time.monotonic_ns()
         self._seed: int | None = None
@@ -94,7 +90,7 @@ class SimCameras:
         """Render until `stop` is set; a renderer that fails is replaced."""
         backoff_s = BACKOFF_S
         while not stop.is_set():
-            self._drawn_ns = dict.fromkeys(self._drawn_ns, 0)
+            self._drawn_ns = {publisher.name: 0 for _, publisher in self._views}
             try:
                 with self._make_renderer() as renderer:
                     self._render_scenes(renderer, stop)
@@ -152,7 +148,7 @@ class SimCameras:
                 fy_px=focal_px,
                 cx_px=width / 2,
                 cy_px=height / 2,
-            )
+            ).shown()
             publisher.set_waiting_reason(f"no scene on {key} yet")
         while not stop.is_set():
             if not self._buffer.wait(WAKE_S):

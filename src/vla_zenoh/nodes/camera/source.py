@@ -42,22 +42,14 @@ class Source(ABC):
 
     @abstractmethod
     def open(self) -> None:
-        """Open the source.
-
-        Raises:
-            NodeError: missing or not readable; says what to do.
-        """
+        """Open the source, or raise a `NodeError` that says what to do."""
 
     @abstractmethod
     def grab(self, stop: threading.Event) -> int | None:
         """Wait for the next image, decoding as little of it as possible.
 
-        Returns:
-            Time of capture, ns of the monotonic clock; None if the source has ended or `stop` was
-            set.
-
-        Raises:
-            NodeError: the source is gone.
+        Returns its time of capture, ns of the monotonic clock; None if the source has ended or
+        `stop` was set. `NodeError`: the source is gone.
         """
 
     @abstractmethod

@@ -69,27 +69,18 @@ class V4l2Source(CaptureSource):
 
     def _lock(self) -> None:
         """Fix what the profile fixes; the rest stays as it was set on the device."""
-        exposure = self._profile.exposure_us
-        for name, value, switch, manual, quantity in (
-            (
-                "exposure_us",
-                exposure and exposure / EXPOSURE_UNIT_US,
-                cv2.CAP_PROP_AUTO_EXPOSURE,
-                MANUAL_EXPOSURE,
-                cv2.CAP_PROP_EXPOSURE,
-            ),
-            (
-                "white_balance_k",
-                self._profile.white_balance_k,
-                cv2.CAP_PROP_AUTO_WB,
-                0,
-                cv2.CAP_PROP_WB_TEMPERATURE,
-            ),
-        ):
-            if value is None:
-                continue
-            if not (self._capture.set(switch, manual) and self._capture.set(quantity, value)):
-                raise NodeError(f"{self._path} does not take {name}: leave it out of the profile")
+        exposure_us, white_k = self._profile.exposure_us, self._profile.white_balance_k
+        if exposure_us is not None:
+            exposure = exposure_us / EXPOSURE_UNIT_US
+            self._fix("exposure_us", cv2.CAP_PROP_AUTO_EXPOSURE, MANUAL_EXPOSURE)
+            self._fix("exposure_us", cv2.CAP_PROP_EXPOSURE, exposure)
+        if white_k is not None:
+            self._fix("white_balance_k", cv2.CAP_PROP_AUTO_WB, 0)
+            self._fix("white_balance_k", cv2.CAP_PROP_WB_TEMPERATURE, white_k)
+
+    def _fix(self, name: str, quantity: int, value: float) -> None:
+        if not self._capture.set(quantity, value):
+            raise NodeError(f"{self._path} does not take {name}: leave it out of the profile")
 
     def grab(self, stop: threading.Event) -> int | None:
         if not self._capture.grab():
@@ -100,23 +91,14 @@ class V4l2Source(CaptureSource):
 
 
 def captured_ns(position_ms: float, now_ns: int) -> int:
-    """Time of capture: the kernel's stamp if it is on the monotonic clock, else `now_ns`.
-
-    Args:
-        position_ms: the driver's stamp; some drivers give 0, or wall time.
-        now_ns: monotonic time right after the image was grabbed.
-    """
+    """Time of capture: the kernel's stamp if it is on the monotonic clock, else `now_ns`, right
+    after the image was grabbed. Some drivers give 0 or wall time."""
     stamp_ns = round(position_ms * 1e6)
     return stamp_ns if 0 <= now_ns - stamp_ns < SANE_AGE_S * 1e9 else now_ns
 
 
 def is_virtual(path: Path, sys: Path = SYS) -> bool:
-    """Whether `path` is a software device such as v4l2loopback, whose images may have no noise.
-
-    Args:
-        path: of the device, may be a link.
-        sys: the kernel's folder of video devices.
-    """
+    """Whether `path` is a software device such as v4l2loopback, whose images may have no noise."""
     return (sys / path.resolve().name).resolve().is_relative_to(VIRTUAL)
 
 

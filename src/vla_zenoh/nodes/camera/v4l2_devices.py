@@ -11,7 +11,7 @@ from vla_zenoh.errors import NodeError
 DEV, SYS = Path("/dev"), Path("/sys/class/video4linux")
 NUMBER_DIGITS = 3
 """More digits are a serial number."""
-_FIRST = re.compile(r"usb-(?P<id>.+)-video-index0")
+_FIRST = re.compile(r"^usb-(.+)-video-index0$")
 
 
 class V4l2Device(NamedTuple):
@@ -36,12 +36,7 @@ class V4l2Device(NamedTuple):
 
 
 def list_devices(dev: Path = DEV, sys: Path = SYS) -> list[V4l2Device]:
-    """Every camera, by its first device: the others of one camera give no images.
-
-    Args:
-        dev: folder of devices.
-        sys: the kernel's folder of video devices.
-    """
+    """Every camera, by its first device: the others of one camera give no images."""
     links = {link.resolve().name: link.name for link in _entries(dev / "v4l" / "by-id")}
     found: list[V4l2Device] = []
     for folder in sorted(_entries(sys), key=lambda one: (len(one.name), one.name)):
@@ -56,12 +51,8 @@ def list_devices(dev: Path = DEV, sys: Path = SYS) -> list[V4l2Device]:
 
 
 def find_device(wanted: str, dev: Path = DEV, sys: Path = SYS) -> Path:
-    """The device that a profile means.
-
-    Args:
-        wanted: path, number of ``/dev/videoN``, serial number, or name in ``/dev/v4l/by-id``.
-        dev: folder of devices.
-        sys: the kernel's folder of video devices.
+    """The device that a profile means by a path, a number of ``/dev/videoN``, a serial number, or a
+    name in ``/dev/v4l/by-id``.
 
     Raises:
         NodeError: no camera has this serial number, or two have; says which there are.
@@ -71,7 +62,9 @@ def find_device(wanted: str, dev: Path = DEV, sys: Path = SYS) -> Path:
     if wanted.isdecimal() and len(wanted) <= NUMBER_DIGITS:
         return dev / f"video{wanted}"
     devices = list_devices(dev, sys)
-    named = [one for one in devices if wanted in (one.serial, one.by_id, _id_of(one.by_id))]
+    named = [
+        one for one in devices if wanted in (one.serial, one.by_id, _FIRST.sub(r"\1", one.by_id))
+    ]
     if len(named) > 1:
         paths = ", ".join(str(one.path) for one in named)
         raise NodeError(
@@ -84,11 +77,6 @@ def find_device(wanted: str, dev: Path = DEV, sys: Path = SYS) -> Path:
             f"there is no camera with the serial number or name {wanted!r}; cameras here: {there}"
         )
     return named[0].path
-
-
-def _id_of(by_id: str) -> str:
-    match = _FIRST.fullmatch(by_id)
-    return "" if match is None else match["id"]
 
 
 def _entries(folder: Path) -> list[Path]:

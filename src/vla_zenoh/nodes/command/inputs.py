@@ -1,24 +1,35 @@
-"""Inputs of the command node at every tick: settings, chunks, states, and steps of its clock."""
+"""Inputs of the command node at every tick: settings, chunks, states, steps of its clock, and what
+the other nodes say about themselves."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from operator import itemgetter
 from typing import Any
 
-from vla_zenoh import keys as key_names
 from vla_zenoh.bus.buffers import CallbackRing, ReceivedSample, ZenohRing, header_of
+from vla_zenoh.bus.clock import HostId
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import MAX_MESSAGE_BYTES
 from vla_zenoh.codec import settings
 from vla_zenoh.codec.records import SMALL_BYTES
 from vla_zenoh.control.commander_io import Inputs, NewStates, Setting
+from vla_zenoh.control.preflight import PeerSnapshot
 from vla_zenoh.errors import CodecError
-from vla_zenoh.keys import Keys
-from vla_zenoh.nodes.command.peer_monitor import PeerMonitor
-from vla_zenoh.types import ActionChunk, GripperState, JointState, PoseState, Stamped
+from vla_zenoh.keys import CRASHED, ON_BEHALF, Keys, last_chunk, worker_node
+from vla_zenoh.policy import ModelSpec
+from vla_zenoh.security.identity import expected_nodes
+from vla_zenoh.types import (
+    ActionChunk,
+    GripperState,
+    Header,
+    JointState,
+    NodeStatus,
+    PoseState,
+    Stamped,
+)
 from vla_zenoh.types.stream import SingleWriterFilter
 
 STATES = 32
@@ -40,19 +51,19 @@ SETTINGS: tuple[tuple[str, int, int, Callable[[bytes], Any]], ...] = (
 """Name of each key, samples buffered between two ticks, largest payload, and decoder."""
 CLOCK_PERIOD_S = 0.1
 JOINT_PERIOD_S = 0.025
-"""Period of decoding joints, except when an activation is requested."""
+
+MAX_WORKERS, MAX_HOLDERS = 32, 32
+MAX_WHY = 300
+CLOCKS_PERIOD_S = 0.25
+STATUSES_AT_ONCE, SPECS_AT_ONCE = 32, 16
+"""More than our nodes publish between two updates: each does so twice a second."""
 
 
 class CommandInputs:
-    """Subscriptions to the robot, the workers and the clients' settings.
-
-    Args:
-        node: the command node; it counts and reports rejected samples.
-    """
+    """Subscriptions of the command node to the robot, the workers and the clients' settings."""
 
     def __init__(self, node: Node) -> None:
-        self._node = node
-        keys = node.keys
+        self._node, keys = node, node.keys
         self._peer_monitor = PeerMonitor(node)
         self.chunk_arrival = threading.Event()
         """Set when a chunk arrives."""
@@ -72,11 +83,9 @@ class CommandInputs:
         return self._chunks.dropped
 
     def poll(self, now_ns: int, *, news: bool = True) -> Inputs:
-        """Everything received since the last call.
+        """Everything received since the last call, for the tick at `now_ns`, wall clock.
 
-        Args:
-            now_ns: nominal time of this tick on the node's wall clock.
-            news: read what other nodes publish; their liveliness is always up to date.
+        `news`: read what other nodes publish; their liveliness is always up to date.
         """
         settings_put = self._poll_settings()
         peers = self._peer_monitor.update(now_ns, news=news)
@@ -128,7 +137,7 @@ class CommandInputs:
 
     def _chunk(self, arrival: ReceivedSample) -> Stamped[ActionChunk] | None:
         """A chunk from the source of the worker whose key it came on, None for any other."""
-        worker = key_names.last_chunk(str(arrival.sample.key_expr))
+        worker = last_chunk(str(arrival.sample.key_expr))
         owner = self._peer_monitor.owner(worker)
         try:
             header = header_of(arrival.sample)
@@ -174,13 +183,14 @@ class _PartInputs:
         self._last_joint = 0.0
 
     def poll(self, requested: bool) -> NewStates:
-        """The newest states since the last call; `requested`: an activation is to use these
-        joints."""
-        return NewStates(
-            self._state(PoseState),
-            joint=self._joints(requested),
-            gripper=self._state(GripperState),
-        )
+        """The newest states; joints, which are expensive to decode, every `JOINT_PERIOD_S` and when
+        an activation is `requested`."""
+        joint, now_s = None, time.monotonic()
+        if requested or now_s - self._last_joint >= JOINT_PERIOD_S:
+            joint = self._state(JointState)
+            if joint is not None:
+                self._last_joint = now_s
+        return NewStates(self._state(PoseState), joint=joint, gripper=self._state(GripperState))
 
     def _state(self, kind: type[Any]) -> Stamped[Any] | None:
         """The newest state from the robot's source, whatever other sources publish."""
@@ -190,18 +200,222 @@ class _PartInputs:
                 return found
         return None
 
-    def _joints(self, requested: bool) -> Stamped[JointState] | None:
-        """The newest joints, at `JOINT_PERIOD_S`: decoding them is expensive."""
-        now_s = time.monotonic()
-        if not requested and now_s - self._last_joint < JOINT_PERIOD_S:
-            return None
-        found = self._state(JointState)
-        if found is not None:
-            self._last_joint = now_s
-        return found
-
 
 def _put_ns(arrival: ReceivedSample) -> int | None:
     """When the router first saw a sample, on its clock."""
     stamp = arrival.sample.timestamp
     return None if stamp is None else round(stamp.get_time().timestamp() * 1e9)
+
+
+class PeerMonitor:
+    """Collects status, specs and liveliness into a `PeerSnapshot`."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._lock = threading.Lock()
+        self._alive: set[str] = set()
+        self._holders: set[str] = set()
+        self._changed = True
+        self._specs: dict[str, ModelSpec] = {}
+        self._spec_sources: dict[str, str] = {}
+        self._status_sources: dict[str, str] = {}
+        self._complaints: dict[str, str] = {}
+        self._servers = node.profile.camera_servers()
+        self._cameras: dict[str, tuple[float, int]] = {}
+        self._camera_faults: dict[str, str] = {}
+        self._camera_reasons: dict[str, str] = {}
+        self._expected = frozenset(expected_nodes(node.profile))
+        self._down: dict[str, str] = {}
+        self._hosts: dict[str, HostId] = {}
+        self._next_clocks_s = 0.0
+        self._statuses = node.subscribe(node.keys.all_status, ZenohRing(STATUSES_AT_ONCE))
+        self._new_specs = node.subscribe(node.keys.all_specs, ZenohRing(SPECS_AT_ONCE))
+        node.on_tokens(node.keys.all_alive, self._on_alive)
+        node.on_tokens(node.keys.all_holding, self._on_holding)
+        self._robot_node = node.profile.robot.node
+
+    def _on_alive(self, name: str, alive: bool) -> None:
+        with self._lock:
+            (self._alive.add if alive else self._alive.discard)(name)
+            self._changed = True
+            if alive:
+                self._down.pop(name, None)
+                return
+            for known in (self._status_sources, self._hosts):
+                known.pop(name, None)
+            if name.startswith("worker-"):
+                for known in (self._specs, self._spec_sources, self._complaints):
+                    known.pop(name.removeprefix("worker-"), None)
+
+    def _on_holding(self, name: str, present: bool) -> None:
+        with self._lock:
+            self._changed = True
+            if not present:
+                self._holders.discard(name)
+            elif len(self._holders) < MAX_HOLDERS:
+                self._holders.add(name)
+            else:
+                self._node.counters["refused.holder"] += 1
+
+    def update(self, now_ns: int, *, news: bool = True) -> PeerSnapshot | None:
+        """A new snapshot, or None if nothing changed; `news`: read status and specs first."""
+        if news:
+            for arrival in self._statuses.drain():
+                self._receive_status(arrival, now_ns)
+            for arrival in self._new_specs.drain():
+                self._receive_spec(arrival)
+            self._track_clocks()
+        with self._lock:
+            if not self._changed:
+                return None
+            self._changed, here = False, self._node.host_id
+            return PeerSnapshot(
+                frozenset(self._alive),
+                self._robot_node,
+                dict(self._specs),
+                dict(self._spec_sources),
+                dict(self._complaints),
+                {
+                    camera: age_s + (now_ns - received_ns) / 1e9
+                    for camera, (age_s, received_ns) in self._cameras.items()
+                },
+                {camera: self._servers[camera] for camera in self._cameras},
+                {name: place.host for name, place in self._hosts.items()},
+                frozenset(n for n, place in self._hosts.items() if place.shares_clock(here)),
+                {node: at[:2] for node, at in self._node.clocks.offsets().items()},
+                frozenset(self._holders),
+                dict(self._camera_faults),
+                dict(self._camera_reasons),
+                dict(self._down),
+            )
+
+    def _track_clocks(self) -> None:
+        """Keep measuring the clock offsets of all nodes."""
+        if time.monotonic() < self._next_clocks_s:
+            return
+        self._next_clocks_s = time.monotonic() + CLOCKS_PERIOD_S
+        with self._lock:
+            for name in self._alive:
+                self._node.clocks.track(name)
+            self._changed = True
+
+    def owner(self, worker: str) -> str | None:
+        """The source of a worker: the one that published its spec."""
+        with self._lock:
+            return self._spec_sources.get(worker)
+
+    # The source is checked before the payload: messages of other sources are not decoded, and no
+    # clock is measured for a made-up name.
+    def _receive_status(self, arrival: ReceivedSample, now_ns: int) -> None:
+        """Accept a node's status on its own key, while it is alive, from the first source of it."""
+        name, header = self._name_and_header(arrival)
+        if header is None:
+            return
+        source = header.source
+        with self._lock:
+            alive = name in self._alive
+            ours = alive and self._status_sources.get(name, source) == source
+        # `up` may see a node start later than we do.
+        if source.startswith(ON_BEHALF) if alive else name in self._expected:
+            self._receive_on_behalf(name, arrival, header)
+            return
+        stamped = self._node.decode(NodeStatus, arrival, header=header) if ours else None
+        if ours and stamped is None:
+            return  # rejected and counted already
+        status = stamped.record if stamped is not None and stamped.record.node == name else None
+        with self._lock:
+            # A node that is gone must not block a restarted one of the same name.
+            if status is not None and name in self._alive:
+                self._status_sources[name] = source
+                self._update_from_status(status)
+            else:
+                self._node.counters["refused.foreign_status"] += 1
+                return
+        cameras = status.detail.get("cameras")
+        for camera, fields in cameras.items() if isinstance(cameras, dict) else ():
+            if camera in self._servers and isinstance(fields, dict):
+                self._update_camera(name, camera, fields, now_ns)
+
+    def _receive_on_behalf(self, name: str, arrival: ReceivedSample, header: Header) -> None:
+        """Keep why a node is down, as its host's `up` reports it; for display only."""
+        stamped = self._node.decode(NodeStatus, arrival, header=header)
+        why = None if stamped is None else stamped.record.detail.get("complaint")
+        if stamped is None or stamped.record.state != CRASHED or not isinstance(why, str):
+            return
+        with self._lock:
+            if name not in self._alive and self._down.get(name) != why[:MAX_WHY]:
+                self._down[name], self._changed = why[:MAX_WHY], True
+
+    def _receive_spec(self, arrival: ReceivedSample) -> None:
+        """Accept a worker's spec on its own key, while it is alive, from the first source of it."""
+        worker, header = self._name_and_header(arrival)
+        if header is None:
+            return
+        source, node = header.source, worker_node(worker)
+        with self._lock:
+            known = self._spec_sources.get(worker)
+            ours = node in self._alive and known in (None, source)
+            if ours and known is None and len(self._specs) >= MAX_WORKERS:
+                self._node.counters["refused.more_workers"] += 1
+                return
+        stamped = self._node.decode(ModelSpec, arrival, header=header) if ours else None
+        if ours and stamped is None:
+            return
+        with self._lock:
+            if stamped is not None and node in self._alive:
+                if self._specs.get(worker) != stamped.record:
+                    self._specs[worker] = stamped.record
+                    self._spec_sources[worker] = source
+                    self._changed = True
+                return
+        self._node.counters["refused.foreign_spec"] += 1
+
+    def _name_and_header(self, arrival: ReceivedSample) -> tuple[str, Header | None]:
+        """Node or worker name from the sample's key, and the header; None: it is rejected."""
+        key = str(arrival.sample.key_expr)
+        try:
+            return last_chunk(key), header_of(arrival.sample)
+        except CodecError as error:
+            self._node.reject_sample(key, error)
+            return last_chunk(key), None
+
+    def _update_from_status(self, status: NodeStatus) -> None:
+        self._hosts[status.node] = HostId(status.host, status.boot)
+        if status.node.startswith("worker-"):
+            complaint = status.detail.get("complaint", "")
+            worker = status.node.removeprefix("worker-")
+            if not isinstance(complaint, str):
+                return
+            known, self._changed = self._complaints, True
+            if not complaint:
+                known.pop(worker, None)
+            elif worker in known or len(known) < MAX_WORKERS:
+                known[worker] = complaint[:MAX_WHY]
+            else:
+                self._node.counters["refused.more_workers"] += 1
+
+    def _update_camera(
+        self, node: str, camera: str, fields: Mapping[Any, Any], now_ns: int
+    ) -> None:
+        """Update a camera from the status of the node that serves it by the profile."""
+        server = self._servers[camera]
+        if node != server:
+            self._node.reject(
+                "foreign_camera",
+                f"node {node!r} reports camera {camera!r}, which node {server!r} serves by the "
+                "profile (hosts.HOST.cameras; --name of `vla-zenoh node camera`)",
+                node,
+            )
+            return
+        age_s, bad, reason = (fields.get(name) for name in ("age_s", "bad", "why"))
+        reason = reason[:MAX_WHY] if isinstance(reason, str) else ""
+        if self._camera_reasons.get(camera, "") != reason:
+            self._camera_reasons[camera], self._changed = reason, True
+        why = bad.get("why") if isinstance(bad, Mapping) else None
+        if isinstance(why, str):
+            self._camera_faults[camera], self._changed = why[:MAX_WHY], True
+        elif self._camera_faults.pop(camera, None) is not None:
+            self._changed = True
+        if isinstance(age_s, (int, float)) and not isinstance(age_s, bool):
+            self._cameras[camera] = (max(float(age_s), 0.0), now_ns)
+            self._changed = True
