@@ -31,24 +31,18 @@ _STREAM = 0x100C
 
 
 class Appearance(NamedTuple):
-    """Differences from the scene file, of which a reset applies those that are varied.
+    """Differences from the scene file, (3,) each; a reset applies those that are varied.
 
-    Args:
-        ambient, head: (3,) ambient and diffuse colour of the head light.
-        key: (3,) diffuse colour of the scene's light.
-        key_turn_rad: rotation vector (3,) of the direction of that light, world frame.
-        table: (3,) colour of the table.
-        shift_m: (3,) offset of the front camera, world frame, at most 3 cm.
-        turn_rad: (3,) rotation vector of the front camera, world frame, at most 5 degrees.
+    Offset and rotation vectors are in the world frame.
     """
 
-    ambient: FloatArray
-    head: FloatArray
-    key: FloatArray
-    key_turn_rad: FloatArray
-    table: FloatArray
-    shift_m: FloatArray
-    turn_rad: FloatArray
+    ambient: FloatArray  # colour of the head light
+    head: FloatArray  # its diffuse colour
+    key: FloatArray  # diffuse colour of the scene's light
+    key_turn_rad: FloatArray  # of the direction of that light
+    table: FloatArray  # colour
+    shift_m: FloatArray  # of the front camera
+    turn_rad: FloatArray  # of the front camera
 
 
 def draw_appearance(seed: int) -> Appearance:
@@ -62,11 +56,7 @@ def draw_appearance(seed: int) -> Appearance:
 
 
 def check_variations(vary: Collection[str]) -> None:
-    """Make sure that everything in `vary` is one of `VARIATIONS`.
-
-    Raises:
-        ResourceError: an unknown name.
-    """
+    """Raise a `ResourceError` unless everything in `vary` is one of `VARIATIONS`."""
     unknown = sorted(set(vary) - set(VARIATIONS))
     if unknown:
         raise ResourceError(f"nothing called {unknown[0]!r} to vary; {', '.join(VARIATIONS)}")

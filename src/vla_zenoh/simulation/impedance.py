@@ -54,27 +54,16 @@ SAME_RAD = 1e-4
 
 
 class ArmDynamics(NamedTuple):
-    """State and dynamics of an arm of n joints, input of an impedance law; in the base frame.
+    """State and dynamics of an arm of n joints, input of an impedance law; in the base frame."""
 
-    Args:
-        position_rad: (n,).
-        velocity_rad_s: (n,).
-        tcp_position_m: (3,).
-        tcp_rotation: (3, 3).
-        jacobian: (6, n) of the TCP, linear rows first, base axes.
-        drift: (6,) m/s^2 and rad/s^2, the TCP's acceleration from joint velocity alone, Jd qd.
-        inertia: (n, n) joint-space inertia, kg m^2.
-        bias_nm: (n,) Coriolis, centrifugal and gravity torques.
-    """
-
-    position_rad: FloatArray
-    velocity_rad_s: FloatArray
-    tcp_position_m: FloatArray
-    tcp_rotation: FloatArray
-    jacobian: FloatArray
-    drift: FloatArray
-    inertia: FloatArray
-    bias_nm: FloatArray
+    position_rad: FloatArray  # (n,)
+    velocity_rad_s: FloatArray  # (n,)
+    tcp_position_m: FloatArray  # (3,)
+    tcp_rotation: FloatArray  # (3, 3)
+    jacobian: FloatArray  # (6, n) of the TCP, linear rows first, base axes
+    drift: FloatArray  # (6,) m/s^2 and rad/s^2: Jd qd, the TCP's acceleration at constant qd
+    inertia: FloatArray  # (n, n) joint-space inertia, kg m^2
+    bias_nm: FloatArray  # (n,) Coriolis, centrifugal and gravity torques
 
 
 class _TaskSpace(NamedTuple):
@@ -87,60 +76,38 @@ class _TaskSpace(NamedTuple):
 
 
 class ImpedanceOutput(NamedTuple):
-    """Result of one control period.
+    """Result of one control period."""
 
-    Args:
-        torque_nm: (n,) within the effort limits.
-        saturated: an effort limit cut the torque.
-        error: to the reference, before the clamp: of the TCP (6,) m and rad, or of joints (n,) rad.
-        wrench: (6,) N and Nm that the TCP should exert, without the nullspace part; None: in joint
-            control.
-    """
-
-    torque_nm: FloatArray
-    saturated: bool
-    error: FloatArray
-    wrench: FloatArray | None = None
+    torque_nm: FloatArray  # (n,) within the effort limits
+    saturated: bool  # an effort limit cut the torque
+    error: FloatArray  # before the clamp: of the TCP (6,) in m and rad, or of joints (n,) in rad
+    wrench: FloatArray | None = None  # (6,) N and Nm of the TCP; None in joint control
 
 
 @dataclass(frozen=True, slots=True)
 class ImpedanceGains:
     """Gains of the law: by default it follows within a millimetre, and presses with at most 55 N.
 
-    Args:
-        translational_n_m, rotational_nm_rad: stiffness.
-        damping_ratio: zeta, 1 is critical.
-        integral_1_s: ki, 0 switches integral action off.
-        max_integral_n, max_integral_nm: bounds of the integral force and moment, per axis.
-        max_error_m, max_error_rad: largest stretch of the spring, which bounds the pressing force.
-        posture_nm_rad: nullspace stiffness towards the posture.
-        limit_nm_rad: stiffness with which the nullspace leaves a joint limit.
-        limit_margin_rad: distance to a joint limit at which that begins.
+    The largest stretch of the spring, `max_error_*`, bounds the pressing force.
     """
 
-    translational_n_m: float = 2000.0
+    translational_n_m: float = 2000.0  # stiffness
     rotational_nm_rad: float = 120.0
-    damping_ratio: float = 1.0
-    integral_1_s: float = 4.0
-    max_integral_n: float = 15.0
+    damping_ratio: float = 1.0  # zeta, 1 is critical
+    integral_1_s: float = 4.0  # ki, 0 switches integral action off
+    max_integral_n: float = 15.0  # per axis
     max_integral_nm: float = 3.0
     max_error_m: float = 0.02
     max_error_rad: float = 0.2
-    posture_nm_rad: float = 20.0
-    limit_nm_rad: float = 30.0
-    limit_margin_rad: float = 0.1
+    posture_nm_rad: float = 20.0  # nullspace stiffness towards the posture
+    limit_nm_rad: float = 30.0  # stiffness with which the nullspace leaves a joint limit
+    limit_margin_rad: float = 0.1  # distance to a joint limit at which that begins
 
 
 class _Impedance:
     """What both laws have: torque limits, and integral action clamped to `limit`.
 
-    Args:
-        effort_nm: (n,) torque limits.
-        rate: ki K dt.
-        limit: of the integral.
-
-    Attributes:
-        integral: torque (n,) in Nm, or wrench (6,) in N and Nm, of the integral action.
+    `rate` is ki K dt; `integral` the torque (n,) in Nm, or the wrench (6,) in N and Nm.
     """
 
     def __init__(self, effort_nm: FloatArray, rate: FloatArray, limit: FloatArray) -> None:
@@ -163,12 +130,8 @@ def _bounded(values: FloatArray, limit: FloatArray) -> FloatArray:
 class CartesianImpedance(_Impedance):
     """Cartesian impedance controller; its only state is the integral wrench.
 
-    Args:
-        gains: stiffness, damping, bounds.
-        lower_rad, upper_rad: (n,) joint limits.
-        effort_nm: (n,) torque limits.
-        posture_rad: (n,) joints that the nullspace prefers.
-        period_s: time between two calls of `torque`.
+    Limits and `posture_rad`, which the nullspace prefers, are (n,); `period_s` is the time between
+    two calls of `torque`.
     """
 
     def __init__(
@@ -276,13 +239,7 @@ def _per_axis(translational: float, rotational: float) -> FloatArray:
 
 
 class JointImpedance(_Impedance):
-    """Joint impedance controller; its only state is the integral torque.
-
-    Args:
-        gains: stiffness, damping, bounds.
-        effort_nm: (n,) torque limits.
-        period_s: time between two calls of `torque`.
-    """
+    """Joint impedance controller; its only state is the integral torque."""
 
     def __init__(self, gains: JointGains, *, effort_nm: FloatArray, period_s: float) -> None:
         self.gains = gains

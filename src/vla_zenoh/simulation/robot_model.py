@@ -56,43 +56,25 @@ PANDA_WRIST = MountedCamera(
 class RobotModel:
     """An arm with a gripper of parallel fingers, or of one jaw that turns.
 
-    Kinematics, inertia and joint limits are those of the URDF.
-
-    Args:
-        description: the URDF, see `vla_zenoh.resources.robot_urdf`.
-        mesh_grid_m: details of the meshes smaller than this are merged, for a description whose
-            meshes have too many faces to draw; None: they stay as they are.
-        arm_joints: the joints under torque control, base to tip.
-        armature_kg_m2: inertia of each motor, seen through its gear. Without it Pinocchio and
-            MuJoCo compute the same dynamics.
-        effort_nm: limit of every joint; None: that of the URDF.
-        gains: of the joint impedance controller.
-        finger_joints: the opening is ``finger_scale_m`` times the sum of their positions.
-        finger_scale_m: opening per metre of a joint that slides or radian of one that turns.
-        max_width_m: largest opening.
-        finger_links: links whose geoms touch the object.
-        tcp_link: link whose frame is the TCP.
-        camera: the camera mounted on the robot, or None.
-        gripper_stiffness_n_m, gripper_damping_ns_m: of the width servo; the force bound of a
-            command caps it.
-        colours, colour: rgba of links by name, and of every other link.
-        part: which part of a robot it is; empty: all of it.
-        base_m, base_yaw_rad: where it stands in the world, and its turn about the vertical.
+    Kinematics, inertia and joint limits are those of the URDF, `description`, see
+    `vla_zenoh.resources.robot_urdf`. Details of its meshes that are smaller than `mesh_grid_m` are
+    merged, where they have too many faces to draw. Armature is the inertia of each motor, seen
+    through its gear; without it Pinocchio and MuJoCo compute the same dynamics.
     """
 
     description: str = "example-robot-data:panda_description/urdf/panda.urdf"
     mesh_grid_m: float | None = None
-    arm_joints: tuple[str, ...] = tuple(f"panda_joint{i}" for i in range(1, 8))
+    arm_joints: tuple[str, ...] = tuple(f"panda_joint{i}" for i in range(1, 8))  # base to tip
     armature_kg_m2: float = 0.0
-    effort_nm: float | None = None
+    effort_nm: float | None = None  # limit of every joint; None: that of the URDF
     gains: JointGains = JointGains()
     finger_joints: tuple[str, ...] = ("panda_finger_joint1", "panda_finger_joint2")
-    finger_scale_m: float = 1.0
+    finger_scale_m: float = 1.0  # opening by the sum of their positions, in m or rad
     max_width_m: float = 0.08
-    finger_links: tuple[str, ...] = ("panda_leftfinger", "panda_rightfinger")
+    finger_links: tuple[str, ...] = ("panda_leftfinger", "panda_rightfinger")  # touch the object
     tcp_link: str = "panda_hand_tcp"
     camera: MountedCamera | None = PANDA_WRIST
-    gripper_stiffness_n_m: float = 4000.0
+    gripper_stiffness_n_m: float = 4000.0  # of the width servo, capped by a command's force
     gripper_damping_ns_m: float = 25.0
     colours: tuple[tuple[str, Rgba], ...] = (
         ("panda_link5", (0.80, 0.81, 0.83, 1.0)),
@@ -101,9 +83,9 @@ class RobotModel:
         ("panda_leftfinger", (0.16, 0.17, 0.19, 1.0)),
         ("panda_rightfinger", (0.16, 0.17, 0.19, 1.0)),
     )
-    colour: Rgba = (0.88, 0.89, 0.90, 1.0)
-    part: str = ""
-    base_m: Vector3 = (0.0, 0.0, 0.0)
+    colour: Rgba = (0.88, 0.89, 0.90, 1.0)  # of every other link
+    part: str = ""  # of a robot; empty: all of it
+    base_m: Vector3 = (0.0, 0.0, 0.0)  # in the world
     base_yaw_rad: float = 0.0
 
 

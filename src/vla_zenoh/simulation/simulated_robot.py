@@ -106,7 +106,6 @@ class SimulatedPart:
         self._held_rad: FloatArray | None = None
         self._filtered_wrench = np.zeros(6)
 
-    # -- time ---------------------------------------------------------------------------------
     def reset(self) -> None:
         """Put the joints at home, at rest, with the gripper open."""
         self._position_rad[:] = self._home_rad
@@ -287,13 +286,7 @@ class SimulatedGripper:
         self._bound_force(DEFAULT_FORCE_N)
 
     def command(self, width_m: float, speed_m_s: float, force_n: float) -> None:
-        """Go to `width_m` at `speed_m_s`, pressing with at most `force_n` (N).
-
-        Replaces the command before.
-
-        Raises:
-            RecordError: speed or force are not above zero.
-        """
+        """Go to `width_m` at `speed_m_s`, pressing with at most `force_n`; both above zero."""
         if not speed_m_s > 0.0 or not force_n > 0.0:
             raise RecordError(
                 f"a gripper needs speed and force above 0, got {speed_m_s} and {force_n}"

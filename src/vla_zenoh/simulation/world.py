@@ -87,8 +87,7 @@ class World:
     def reset(self, seed: int | None = None) -> None:
         """Return to the home pose with the gripper open and the clock at zero.
 
-        Args:
-            seed: places objects at random in the scene's regions; None: as in the scene file.
+        With a `seed` objects stand at random places in the scene's regions.
         """
         model, data = self.model, self._data
         self.seed = seed
