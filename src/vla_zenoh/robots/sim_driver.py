@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,7 +26,7 @@ from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import Profile
 from vla_zenoh.robots.arm import Arm
 from vla_zenoh.robots.driver import DriverStatus, Measurement, Pace, Report, RobotDriver
-from vla_zenoh.simulation.world import STEP_NS, World, build_world
+from vla_zenoh.simulation.world import STEP_NS, build_world
 from vla_zenoh.types import FloatArray, GripperCommand, ObjectPoses, SceneState
 from vla_zenoh.types.commands import JointReference, PoseReference
 
@@ -68,7 +68,7 @@ class SimDriver(RobotDriver):
         self.ticks = self.stamp_ns = 0
         self._was_reset = False
         self._step_lock = threading.Lock()
-        self._keys: _SimKeys | None = None
+        self._node: Node | None = None
         self._parts = {name: SimPart(self, name) for name in profile.part_names}
         self._first = next(iter(self._parts.values()))
 
@@ -85,18 +85,29 @@ class SimDriver(RobotDriver):
     def attach(self, node: Node, arm: Arm) -> None:
         """Subscribe to resets, and publish the scene."""
         super().attach(node, arm)
-        self._node, self._keys = node, _SimKeys(node)
+        keys, limit = node.keys, settings.MAX_SETTING_BYTES
+        self._node = node
+        self._resets = node.subscribe(keys.sim_reset, CallbackRing(4, limit))
+        self._scene = node.declare_publisher(keys.sim_scene, Kind.STATE)
+        self._objects = node.declare_publisher(keys.sim_objects, Kind.TELEMETRY)
+        self._scene_wanted = self._objects_wanted = False
 
     # -- one millisecond ----------------------------------------------------------------------
     def poll(self, mono_ns: int) -> None:
         """Execute resets."""
-        for seed in self._keys.resets() if self._keys else ():
+        if self._node is None:
+            return
+        for arrival in self._resets.drain():
+            # In a tuple: no seed is a valid one, no tuple a rejection.
+            found = self._node.decode_text(lambda text: (settings.decode_seed(text),), arrival)
+            if found is None:
+                continue
             guards = [part.guard for part in self._parts.values()]
             if any(guard.following for guard in guards) and not self.fault:
                 why = "sim/reset: the arm is being commanded; deactivate first"
                 self.report.reject("reset_refused", why)
             else:
-                self.reset(seed)
+                self.reset(found[0])
                 for guard in guards:
                     guard.reset()
 
@@ -110,8 +121,26 @@ class SimDriver(RobotDriver):
             except NodeError as error:
                 self.fault = str(error)
                 self.report.reject("simulation_fault", self.fault)
-        if self._keys is not None:
-            self._keys.publish(self.world, self.ticks, self.stamp_ns)
+        if self._node is not None:
+            self._publish_scene()
+
+    def _publish_scene(self) -> None:
+        """Publish what is due and has subscribers."""
+        ticks, world = self.ticks, self.world
+        if ticks % LOOK_EVERY == 0:
+            self._scene_wanted = self._scene.has_subscribers
+            self._objects_wanted = self._objects.has_subscribers
+        if self._scene_wanted and ticks % SCENE_EVERY == 0:
+            scene = SceneState(self.profile.sim.scene, world.qpos(), world.seed)
+            self._scene.publish(scene, stamp_wall_ns=self.stamp_ns)
+        if self._objects_wanted and ticks % OBJECTS_EVERY == 0:
+            objects = world.objects()
+            poses = ObjectPoses(
+                tuple(objects),
+                np.array([position_m for position_m, _ in objects.values()]).reshape(-1, 3),
+                np.array([quat_xyzw for _, quat_xyzw in objects.values()]).reshape(-1, 4),
+            )
+            self._objects.publish(poses, stamp_wall_ns=self.stamp_ns)
 
     def reset(self, seed: int | None) -> None:
         """Reset arm and objects to their initial state; `seed` None: that of the profile."""
@@ -135,7 +164,7 @@ class SimDriver(RobotDriver):
         for name, part in self._parts.items():
             part.measured_ns = 0
             node.arms[name].publish(part.measure(), 0)
-        self._node.serve(self._node.keys.sim_step, lambda query: self._answer_step(node, query))
+        node.node.serve(node.node.keys.sim_step, lambda query: self._answer_step(node, query))
         while not stop.wait(WATCH_S):
             with self._step_lock:
                 node.watch()
@@ -165,7 +194,7 @@ class SimDriver(RobotDriver):
                     "gripper": records.encode(arm.gripper_state()),
                 }
                 state |= {name: found} if name else found
-        query.reply(self._node.keys.sim_step, message.pack(state))
+        query.reply(node.node.keys.sim_step, message.pack(state))
 
     # -- status -------------------------------------------------------------------------------
     def status(self) -> DriverStatus:
@@ -239,43 +268,6 @@ class SimPart(RobotDriver):
     @property
     def joint_range_rad(self) -> tuple[FloatArray, FloatArray]:
         return self._arm.joint_range_rad
-
-
-class _SimKeys:
-    """Keys that only the simulator has: resets in, scene and objects out."""
-
-    def __init__(self, node: Node) -> None:
-        keys = node.keys
-        self._node, self._scene_name = node, node.profile.sim.scene
-        self._resets = node.subscribe(keys.sim_reset, CallbackRing(4, settings.MAX_SETTING_BYTES))
-        self._scene = node.declare_publisher(keys.sim_scene, Kind.STATE)
-        self._objects = node.declare_publisher(keys.sim_objects, Kind.TELEMETRY)
-        self._scene_wanted = self._objects_wanted = False
-
-    def resets(self) -> Iterator[int | None]:
-        """Seeds of the resets that arrived; None: that of the profile."""
-        for arrival in self._resets.drain():
-            # In a tuple: no seed is a valid one, no tuple a rejection.
-            found = self._node.decode_text(lambda text: (settings.decode_seed(text),), arrival)
-            if found is not None:
-                yield found[0]
-
-    def publish(self, world: World, ticks: int, stamp_ns: int) -> None:
-        """Publish what is due and has subscribers, after `ticks` steps."""
-        if ticks % LOOK_EVERY == 0:
-            self._scene_wanted = self._scene.has_subscribers
-            self._objects_wanted = self._objects.has_subscribers
-        if self._scene_wanted and ticks % SCENE_EVERY == 0:
-            scene = SceneState(self._scene_name, world.qpos(), world.seed)
-            self._scene.publish(scene, stamp_wall_ns=stamp_ns)
-        if self._objects_wanted and ticks % OBJECTS_EVERY == 0:
-            objects = world.objects()
-            poses = ObjectPoses(
-                tuple(objects),
-                np.array([position_m for position_m, _ in objects.values()]).reshape(-1, 3),
-                np.array([quat_xyzw for _, quat_xyzw in objects.values()]).reshape(-1, 4),
-            )
-            self._objects.publish(poses, stamp_wall_ns=stamp_ns)
 
 
 class RealTimePace:

@@ -11,7 +11,7 @@ import ctypes.util
 import os
 import subprocess
 import sys
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from vla_zenoh.errors import NodeError
 
@@ -27,27 +27,18 @@ _PACKAGES = "libegl1 libopengl0 libgl1-mesa-dri"
 _GL_VARIABLES = ("MUJOCO_GL", "PYOPENGL_PLATFORM")
 
 
-@dataclass(frozen=True, slots=True)
-class Backend:
-    """A way to render.
-
-    Args:
-        name: ``egl`` or ``raycast``.
-        reason: why OpenGL does not work here; empty if ray casting was requested.
-        install: Debian packages that OpenGL needs; may be empty.
-    """
+class Backend(NamedTuple):
+    """A way to render, ``egl`` or ``raycast``."""
 
     name: str
-    reason: str = ""
-    install: str = ""
+    reason: str = ""  # why OpenGL does not work here; empty if ray casting was requested
+    install: str = ""  # Debian packages that OpenGL needs
 
 
 def choose_backend(wanted: str | None = None) -> Backend:
-    """OpenGL if it works on this machine, else ray casting; or the requested one.
+    """OpenGL if it works on this machine, else ray casting; or the one that is `wanted` by name.
 
-    Args:
-        wanted: ``egl``, ``raycast`` or ``auto``; None: the environment variable
-            ``VLA_ZENOH_RENDERER``, and ``auto`` where that is not set.
+    None is what the environment variable ``VLA_ZENOH_RENDERER`` says, or ``auto``.
 
     Raises:
         NodeError: `wanted` is unknown, or is asked for by name and does not work here.

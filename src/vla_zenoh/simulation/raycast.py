@@ -161,10 +161,10 @@ class RaycastCanvas:
         return depth_m
 
     def _directions(self, view: Viewpoint, step_px: int = 1) -> FloatArray:
-        """Rays through every `step_px`-th pixel, in the camera's own axes, one unit deep.
+        """(rows, columns, 3) rays through every `step_px`-th pixel, in the camera's own axes.
 
-        (height, width, 3) for a step of 1; else the grid reaches over the image's edge, so that
-        every pixel lies in one of its cells.
+        They are one unit deep. A coarse grid reaches over the image's edge, so that every pixel
+        lies in one of its cells.
         """
         key = (view.focal_px, view.width, view.height, step_px)
         if key not in self._rays:
@@ -187,20 +187,9 @@ class RaycastCanvas:
         if count:
             wanted = np.array([group in groups for group in range(GROUPS)], np.uint8)
             world = np.ascontiguousarray(rays @ view.axes.T)
-            mujoco.mj_multiRay(
-                self._model,
-                data,
-                view.position_m,
-                world.reshape(-1),
-                wanted,
-                True,
-                -1,
-                geom,
-                distance,
-                normal.reshape(-1),
-                count,
-                FAR,
-            )
+            rays_in = (view.position_m, world.reshape(-1), wanted, True, -1)
+            hits_out = (geom, distance, normal.reshape(-1))
+            mujoco.mj_multiRay(self._model, data, *rays_in, *hits_out, count, FAR)
         return Hits(geom, distance, normal)
 
     def _shade(self, data: mujoco.MjData, view: Viewpoint, rays: FloatArray, hits: Hits) -> Pixels:

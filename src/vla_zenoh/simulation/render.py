@@ -149,9 +149,10 @@ class OpenGlCanvas:
         self._scene = mujoco.MjvScene(model, MAX_GEOMS)
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
             self._scene.flags[flag] = False  # each costs several times the rest of the frame
-        self._option, self._perturb = mujoco.MjvOption(), mujoco.MjvPerturb()
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        everything = mujoco.mjtCatBit.mjCAT_ALL.value
+        self._shown = mujoco.MjvOption(), mujoco.MjvPerturb(), self._camera, everything
         self._size = (0, 0)
 
     def draw(self, data: mujoco.MjData, camera: str, width: int, height: int) -> NDArray[np.uint8]:
@@ -183,15 +184,7 @@ class OpenGlCanvas:
             mujoco.mjr_resizeOffscreen(width, height, self._gl)
             self._size = (width, height)
         self._camera.fixedcamid = self._model.camera(camera).id
-        mujoco.mjv_updateScene(
-            self._model,
-            data,
-            self._option,
-            self._perturb,
-            self._camera,
-            mujoco.mjtCatBit.mjCAT_ALL.value,
-            self._scene,
-        )
+        mujoco.mjv_updateScene(self._model, data, *self._shown, self._scene)
         viewport = mujoco.MjrRect(0, 0, width, height)
         mujoco.mjr_render(viewport, self._scene, self._gl)
         return viewport

@@ -182,29 +182,15 @@ def _add_actuators(spec: mujoco.MjSpec, robot: RobotModel) -> None:
         limit = spec.joint(name).actfrcrange  # the URDF's effort limit
         if robot.effort_nm is not None:
             limit = (-robot.effort_nm, robot.effort_nm)
-        spec.add_actuator(
-            name=name,
-            trntype=mujoco.mjtTrn.mjTRN_JOINT,
-            target=name,
-            ctrllimited=True,
-            ctrlrange=limit,
-        )
+        motor = spec.add_actuator(name=name, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=name)
+        motor.ctrllimited, motor.ctrlrange = True, limit
     width = spec.add_tendon(name=GRIPPER)
     for name in robot.finger_joints:
         width.wrap_joint(name, robot.finger_scale_m)
     # A servo of the opening; its whole force acts on either finger.
-    stiffness, damping = robot.gripper_stiffness_n_m, robot.gripper_damping_ns_m
-    spec.add_actuator(
-        name=GRIPPER,
-        trntype=mujoco.mjtTrn.mjTRN_TENDON,
-        target=GRIPPER,
-        gaintype=mujoco.mjtGain.mjGAIN_FIXED,
-        gainprm=[stiffness] + [0.0] * 9,
-        biastype=mujoco.mjtBias.mjBIAS_AFFINE,
-        biasprm=[0.0, -stiffness, -damping] + [0.0] * 7,
-        forcelimited=True,
-        forcerange=(-1.0, 1.0),
-    )
+    servo = spec.add_actuator(name=GRIPPER, trntype=mujoco.mjtTrn.mjTRN_TENDON, target=GRIPPER)
+    servo.set_to_position(kp=robot.gripper_stiffness_n_m, kv=robot.gripper_damping_ns_m)
+    servo.forcelimited, servo.forcerange = True, (-1.0, 1.0)
 
 
 def _set_solver(spec: mujoco.MjSpec) -> None:

@@ -12,6 +12,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import replace
 from importlib import import_module
@@ -342,23 +343,20 @@ def at_rest(command: Command) -> Command:
 
 def _in_time(make: Callable[[], Any], what: str) -> Any:
     """Result of `make`, or a `NodeError` after `CONNECT_S`: the library itself waits for ever."""
-    done: list[Any] = []
-    failed: list[BaseException] = []
+    made: Future[Any] = Future()
 
     def run() -> None:
         try:
-            done.append(make())
+            made.set_result(make())
         except BaseException as error:
-            failed.append(error)
+            made.set_exception(error)
 
-    thread = threading.Thread(target=run, name="connection", daemon=True)
-    thread.start()
-    thread.join(CONNECT_S)
-    if failed:
-        raise failed[0]
-    if not done:
-        raise NodeError(f"{what}: no answer within {CONNECT_S:g} s; restart its control box?")
-    return done[0]
+    threading.Thread(target=run, name="connection", daemon=True).start()
+    try:
+        return made.result(CONNECT_S)
+    except TimeoutError as error:
+        why = f"{what}: no answer within {CONNECT_S:g} s; restart its control box?"
+        raise NodeError(why) from error
 
 
 def load_franky() -> Any:
