@@ -21,7 +21,7 @@ from vla_zenoh.codec.image import decode_jpeg, encode_jpeg
 from vla_zenoh.keys import Kind
 from vla_zenoh.nodes.camera import node as camera_node
 from vla_zenoh.nodes.camera.camera_publisher import MAX_SIZES
-from vla_zenoh.nodes.worker.camera_subscriber import CameraSubscriber, subscribe_to_camera
+from vla_zenoh.nodes.worker.streams import CameraSubscriber, subscribe_to_camera
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, ObservationSpec
 from vla_zenoh.policy.observation import size_variant
 from vla_zenoh.profile import load_profile, override

@@ -23,11 +23,7 @@ from vla_zenoh.types import Header
 
 
 def bytes_of(payload: zenoh.ZBytes | None, limit: int = MAX_RECORD_BYTES) -> bytes:
-    """The bytes of a payload, empty if there is none.
-
-    Raises:
-        CodecError: ``oversize``, more than `limit`.
-    """
+    """The bytes of a payload, empty if there is none; more than `limit` raise a `CodecError`."""
     if payload is None:
         return b""
     if len(payload) > limit:
@@ -36,11 +32,8 @@ def bytes_of(payload: zenoh.ZBytes | None, limit: int = MAX_RECORD_BYTES) -> byt
 
 
 def check_size(sample: zenoh.Sample, limit: int) -> None:
-    """Check that a sample is a put of limited size. A deletion would look like an empty setting.
-
-    Raises:
-        CodecError: ``deleted``, or ``oversize``: payload and attachment together exceed `limit`.
-    """
+    """Raise a `CodecError` unless a sample is a put, and payload and attachment together have at
+    most `limit` bytes. A deletion would look like an empty setting."""
     if sample.kind != zenoh.SampleKind.PUT:
         raise CodecError("deleted", "a deletion; only puts are accepted")
     attachment = sample.attachment
@@ -50,11 +43,7 @@ def check_size(sample: zenoh.Sample, limit: int) -> None:
 
 
 def header_of(sample: zenoh.Sample) -> Header:
-    """Header of a sample.
-
-    Raises:
-        CodecError: there is none that can be decoded.
-    """
+    """Header of a sample; `CodecError`: there is none that can be decoded."""
     attachment = sample.attachment
     given = None if attachment is None else bytes_of(attachment, records.MAX_HEADER_BYTES)
     return records.decode_header(given)
@@ -99,9 +88,9 @@ class SampleBuffer:
         try:
             check_size(sample, self._limit)
         except CodecError as error:
-            rejected, reason = self._rejected, error.reason
-            times = rejected[reason].times + 1 if reason in rejected else 1
-            rejected[reason] = RejectedSample(reason, str(sample.key_expr), str(error), times)
+            reason, before = error.reason, self._rejected.get(error.reason)
+            times = 1 if before is None else before.times + 1
+            self._rejected[reason] = RejectedSample(reason, str(sample.key_expr), str(error), times)
             return False
         return True
 

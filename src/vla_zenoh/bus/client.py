@@ -52,12 +52,7 @@ class Client:
             robot.set_prompt("pick up the red brick")
             robot.activate_with_deadman("my script")
 
-    Args:
-        profile: of the robot.
-        session: open session.
-
-    Attributes:
-        expected: nodes that the profile assigns to hosts, each with its host.
+    `expected` has the nodes that the profile assigns to hosts, each with its host.
     """
 
     def __init__(self, profile: Profile, session: zenoh.Session) -> None:
@@ -131,7 +126,6 @@ class Client:
             with self._lock:
                 self.task = None
 
-    # -- state --------------------------------------------------------------------------------
     @property
     def alive(self) -> frozenset[str]:
         """Names of live nodes."""
@@ -185,15 +179,11 @@ class Client:
         status = self.status("command")
         if status is None or status.state not in ("", "stopped", "fault"):
             return status is not None
-        late = time.monotonic() - self._reset_s > RESET_AGAIN_S
-        if late and status.state == "fault" and not self._faulty():
-            self.reset()
+        if status.state == "fault" and time.monotonic() - self._reset_s > RESET_AGAIN_S:
+            others = self.snapshot().items()
+            if not any(s.state == "fault" for name, (s, _, _) in others if name != "command"):
+                self.reset()
         return False
-
-    def _faulty(self) -> bool:
-        """A robot reports a fault."""
-        found = self.snapshot().items()
-        return any(s.state == "fault" for name, (s, _, _) in found if name != "command")
 
     # -- settings -----------------------------------------------------------------------------
     def publish(self, key: str, text: str) -> None:
@@ -207,9 +197,7 @@ class Client:
             SessionError: it was rejected, with the reasons, or not accepted in time.
         """
         wanted = settings.decode_text(prompt.encode())
-        return self._set(
-            self.keys.prompt, prompt, lambda task: task.prompt == wanted, "prompt", timeout_s
-        )
+        return self._set("prompt", prompt, lambda task: task.prompt == wanted, timeout_s)
 
     def set_rate(self, rate_hz: float, timeout_s: float = 2.0) -> Task:
         """Set the rate of action chunks, as `set_prompt`.
@@ -222,22 +210,22 @@ class Client:
             return math.isclose(task.rate_hz, rate_hz, rel_tol=1e-5)
 
         settings.decode_rate(f"{rate_hz:g}".encode())
-        return self._set(self.keys.rate, f"{rate_hz:g}", taken, "rate", timeout_s)
+        return self._set("rate", f"{rate_hz:g}", taken, timeout_s)
 
     def set_speed(self, percent: float, timeout_s: float = 2.0) -> Task:
         """Set the speed override, 0 to 100 percent of the planned speed, as `set_prompt`."""
-        return self._set_speed(self.keys.speed, percent, "speed", timeout_s)
+        return self._set_speed("speed", percent, timeout_s)
 
     def slow_down(self, percent: float, timeout_s: float = 2.0) -> Task:
         """Lower the speed override; rejected if that would make the arm faster."""
-        return self._set_speed(self.keys.slower, percent, "slower", timeout_s)
+        return self._set_speed("slower", percent, timeout_s)
 
-    def _set_speed(self, key: str, percent: float, what: str, timeout_s: float) -> Task:
+    def _set_speed(self, what: str, percent: float, timeout_s: float) -> Task:
         def taken(task: Task) -> bool:
             return math.isclose(task.speed_percent, percent, rel_tol=1e-5, abs_tol=1e-9)
 
         settings.decode_percent(f"{percent:g}".encode())
-        return self._set(key, f"{percent:g}", taken, what, timeout_s)
+        return self._set(what, f"{percent:g}", taken, timeout_s)
 
     def set_worker(self, worker: str, timeout_s: float = 2.0) -> Task:
         """Choose the worker whose chunks are executed, as `set_prompt`.
@@ -246,9 +234,7 @@ class Client:
             CodecError: it cannot be a worker's name.
         """
         settings.decode_name(worker.encode())
-        return self._set(
-            self.keys.worker, worker, lambda task: task.worker == worker, "worker", timeout_s
-        )
+        return self._set("worker", worker, lambda task: task.worker == worker, timeout_s)
 
     def activate(self, timeout_s: float = 3.0, holder: str = "") -> Task:
         """Activate the arm, and wait until it is active.
@@ -268,10 +254,7 @@ class Client:
 
         If the process ends before `deactivate`, also by kill -9 or a pulled cable, the arm brakes:
         at once if the router sees the connection close, else when it gives up the link
-        (``session.lease_ms``).
-
-        Args:
-            what: name of this client, for messages.
+        (``session.lease_ms``). `what` names this client in messages.
 
         Raises:
             SessionError: rejected, with every reason.
@@ -291,9 +274,7 @@ class Client:
                     raise
 
     def _activate(self, text: str, timeout_s: float) -> Task:
-        return self._set(
-            self.keys.active, text, lambda task: task.active, "activate", timeout_s, undo="false"
-        )
+        return self._set("activate", text, lambda task: task.active, timeout_s)
 
     def latch_reason(self) -> str:
         """Latched stop or fault that has to be reset before activation; empty if there is none."""
@@ -327,22 +308,13 @@ class Client:
             and status.detail.get("at_rest") is True
         )
 
-    def _set(
-        self,
-        key: str,
-        text: str,
-        taken: Callable[[Task], bool],
-        what: str,
-        timeout_s: float,
-        *,
-        undo: str | None = None,
-    ) -> Task:
+    def _set(self, what: str, text: str, taken: Callable[[Task], bool], timeout_s: float) -> Task:
         """Put a setting, and wait for a newer task that has it, or a newer rejection.
 
-        If neither comes in time, `undo` is put after it: a setting reported as failed must not
-        take effect later.
+        If neither comes in time, an activation is taken back: it must not take effect later.
         """
-        began_s = time.monotonic()
+        activates = what == "activate"
+        began_s, key = time.monotonic(), self.keys.active if activates else getattr(self.keys, what)
         self.publish(key, text)
         self.wait_for(
             lambda: self._refused(what, began_s) or self._taken(taken, began_s), timeout_s
@@ -354,8 +326,8 @@ class Client:
         task = self._taken(taken, began_s)
         if task is not None:
             return task
-        if undo is not None:
-            self.publish(key, undo)
+        if activates:
+            self.publish(key, "false")
         if "command" not in self.alive:
             raise SessionError(f"{what}: no command node of robot {self.keys.robot!r} is running")
         status = self.status("command")
@@ -384,7 +356,8 @@ class NodeRegistry:
     """Live nodes and their last status, of any name; safe to use from several threads.
 
     Any client that may publish a status may do so under any name. So there is always a place for
-    the `expected` nodes of the profile, and a quota for all others; `up` runs for weeks.
+    the `expected` nodes of the profile, and a quota for all others; `up` runs for weeks. `dropped`
+    counts statuses and tokens that were not kept, or made room for others.
     """
 
     def __init__(
@@ -395,7 +368,7 @@ class NodeRegistry:
         self._lock = threading.Lock()
         self._alive: set[str] = set()
         self._statuses: dict[str, tuple[NodeStatus, float]] = {}  # the newest comes last
-        self._dropped = 0
+        self.dropped = 0
 
     @property
     def alive(self) -> frozenset[str]:
@@ -403,17 +376,12 @@ class NodeRegistry:
         with self._lock:
             return frozenset(self._alive)
 
-    @property
-    def dropped(self) -> int:
-        """Statuses and tokens that were not kept, or made room for others."""
-        return self._dropped
-
     def token_appeared(self, name: str) -> None:
         """A liveliness token appeared."""
         with self._lock:
             others = len(self._alive - self._expected)
             if not self._fit(name) or (name not in self._expected and others >= MAX_OTHERS):
-                self._dropped += 1
+                self.dropped += 1
                 return
             self._alive.add(name)
 
@@ -425,14 +393,13 @@ class NodeRegistry:
     def status_received(self, name: str, status: NodeStatus, size: int) -> None:
         """Keep the status of the node that its key names; `size`: in bytes."""
         with self._lock:
-            if not self._fit(name) or size > MAX_STATUS_BYTES:
-                self._dropped += 1
-                return
-            self._statuses.pop(name, None)
-            if name in self._expected or self._make_room():
+            fits = self._fit(name) and size <= MAX_STATUS_BYTES
+            if fits:
+                self._statuses.pop(name, None)
+            if fits and (name in self._expected or self._make_room()):
                 self._statuses[name] = (status, self._clock())
             else:
-                self._dropped += 1
+                self.dropped += 1
 
     def status(self, name: str) -> tuple[NodeStatus, float] | None:
         """The last status of a node and when it was received; None before the first."""
@@ -464,5 +431,5 @@ class NodeRegistry:
         if oldest is None:
             return False
         del self._statuses[oldest]
-        self._dropped += 1
+        self.dropped += 1
         return True

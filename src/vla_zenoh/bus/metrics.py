@@ -39,6 +39,9 @@ class RateMeter:
         return (len(self._times) - 1) / max(span_s + overdue_s, 1e-6)
 
 
+SHARES = (("p50", 0.5), ("p95", 0.95), ("p99", 0.99), ("max", 1.0))
+
+
 class Percentiles:
     """Percentiles of the last values."""
 
@@ -51,19 +54,16 @@ class Percentiles:
 
     def summary(self) -> tuple[float, float] | None:
         """(p50, p95), None without values."""
-        found = self._at(0.5, 0.95)
-        return (found[0], found[1]) if found else None
+        found = self._shares()
+        return (found["p50"], found["p95"]) if found else None
 
     def spread(self) -> dict[str, float]:
         """p50, p95, p99 and max; empty without values."""
-        found = self._at(0.5, 0.95, 0.99, 1.0)
-        names = ("p50", "p95", "p99", "max")
-        return {name: round(value, 1) for name, value in zip(names, found, strict=False)}
+        return {name: round(value, 1) for name, value in self._shares().items()}
 
-    def _at(self, *shares: float) -> list[float]:
-        """The values below which these shares lie; empty without values."""
+    def _shares(self) -> dict[str, float]:
         ordered = sorted(self._values)
-        return [ordered[round(share * (len(ordered) - 1))] for share in shares if ordered]
+        return {name: ordered[round(at * (len(ordered) - 1))] for name, at in SHARES if ordered}
 
 
 LINKS_PERIOD_S = 5.0
@@ -151,10 +151,6 @@ class EventThrottle:
 
     Transitions always are. The rejection of a setting is published late rather than never, because
     a client waits for the answer.
-
-    Args:
-        publish: publishes an event.
-        clock: seconds that never go back.
     """
 
     def __init__(

@@ -37,19 +37,12 @@ MAX_MESSAGE_BYTES = 160 * 1024 * 1024
 
 _DROP = zenoh.CongestionControl.DROP
 _BLOCK = zenoh.CongestionControl.BLOCK
+_EXPRESS = {"priority": zenoh.Priority.REAL_TIME, "express": True}
 QOS: dict[Kind, dict[str, Any]] = {
     Kind.FRAME: {"congestion_control": _DROP, "priority": zenoh.Priority.DATA_LOW},
     Kind.STATE: {"congestion_control": _DROP, "priority": zenoh.Priority.INTERACTIVE_HIGH},
-    Kind.CONTROL: {
-        "congestion_control": _DROP,
-        "priority": zenoh.Priority.REAL_TIME,
-        "express": True,
-    },
-    Kind.ORDER: {
-        "congestion_control": _BLOCK,
-        "priority": zenoh.Priority.REAL_TIME,
-        "express": True,
-    },
+    Kind.CONTROL: {"congestion_control": _DROP, **_EXPRESS},
+    Kind.ORDER: {"congestion_control": _BLOCK, **_EXPRESS},
     Kind.TELEMETRY: {"congestion_control": _DROP, "priority": zenoh.Priority.DATA},
 }
 
@@ -88,11 +81,7 @@ def session_config(
             # A router starts at once, and keeps trying to reach the others.
             "timeout_ms": -1 if routes else 0,
             "exit_on_failure": not routes,
-            "retry": {
-                "period_init_ms": 100,
-                "period_max_ms": 500,
-                "period_increase_factor": 2,
-            },
+            "retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
         },
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "transport": {
@@ -102,9 +91,7 @@ def session_config(
                 "tx": {
                     "lease": leases * profile.lease_ms,
                     "keep_alive": 4,
-                    "queue": {
-                        "congestion_control": {"block": {"wait_before_close": blocks_us}},
-                    },
+                    "queue": {"congestion_control": {"block": {"wait_before_close": blocks_us}}},
                 },
             },
         },
@@ -221,12 +208,7 @@ ANSWERS = 2
 
 
 def alive_nodes(session: zenoh.Session, keys: Keys, name: str | None = None) -> set[str]:
-    """Names of a robot's nodes that are alive.
-
-    Args:
-        session: an open session.
-        keys: of the robot.
-        name: look for this node only.
+    """Names of a robot's nodes that are alive; with `name`, of this one only.
 
     Raises:
         NodeError: the router does not answer in time, so more nodes may be alive.
@@ -249,15 +231,8 @@ def alive_nodes(session: zenoh.Session, keys: Keys, name: str | None = None) -> 
 
 
 def alive_robots(session: zenoh.Session, keys: Keys) -> list[str]:
-    """Robots below this root whose command node is alive and visible to us, in order.
-
-    Args:
-        session: an open session.
-        keys: of any robot there.
-
-    Returns:
-        Names; incomplete if the router does not answer in time.
-    """
+    """Names of robots below the root of `keys` whose command node is alive and visible to us, in
+    order; incomplete if the router does not answer in time."""
     found: set[str] = set()
     for _ in range(ANSWERS):
         replies = session.liveliness().get(keys.all_robots, timeout=PATIENCE_S)
@@ -278,9 +253,6 @@ class TcpUserTimeout:
     (eclipse-zenoh/zenoh#2806). So the kernel has to drop such data.
 
     The sockets belong to Zenoh; they are found among the open files of the process.
-
-    Args:
-        timeout_s: see `socket.TCP_USER_TIMEOUT`.
     """
 
     def __init__(self, timeout_s: float) -> None:
@@ -304,10 +276,8 @@ class TcpUserTimeout:
 
     def _set_timeout(self, descriptor: int) -> bool:
         with socket.socket(fileno=os.dup(descriptor)) as known:
-            tcp = (
-                known.family in (socket.AF_INET, socket.AF_INET6)
-                and known.type == socket.SOCK_STREAM
-            )
-            if tcp:
+            internet = known.family in (socket.AF_INET, socket.AF_INET6)
+            if internet and known.type == socket.SOCK_STREAM:
                 known.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, self._timeout_ms)
-            return tcp
+                return True
+            return False

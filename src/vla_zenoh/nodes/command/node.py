@@ -9,20 +9,19 @@ import threading
 import time
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import zenoh
 
 from vla_zenoh.bus.clock import FixedRate, Tick
 from vla_zenoh.bus.metrics import Percentiles, RateMeter
-from vla_zenoh.bus.node import Node
+from vla_zenoh.bus.node import Node, Publisher
 from vla_zenoh.codec import records
 from vla_zenoh.control.commanded_part import CommandedPart
 from vla_zenoh.control.commander import Commander, Outputs, Setting
-from vla_zenoh.control.commander_io import MotionCommands
 from vla_zenoh.control.reachability import make_reachability_filter
 from vla_zenoh.control.states import State
-from vla_zenoh.keys import Keys, Kind
+from vla_zenoh.keys import Kind
 from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.nodes.command.inputs import CommandInputs
 from vla_zenoh.profile import Profile
@@ -84,7 +83,14 @@ class CommandNode:
         keys = node.keys
         self._inputs = CommandInputs(node)
         self._status = CommandStatus(node, self.commander)
-        self._outs = {name: _CommandPublishers(node, part.keys) for name, part in parts.items()}
+        self._outs = {
+            name: _CommandPublishers(
+                node.declare_publisher(part.keys.command_pose, Kind.CONTROL),
+                node.declare_publisher(part.keys.command_joint, Kind.CONTROL),
+                node.declare_publisher(part.keys.command_gripper, Kind.ORDER),
+            )
+            for name, part in parts.items()
+        }
         self._task_out = node.declare_publisher(keys.task, Kind.CONTROL)
         self._last_task = 0.0
         self._next_chores_ns = self._busy_ns = 0
@@ -133,7 +139,10 @@ class CommandNode:
             tick = loop.wait()
             if tick.periods > 1:
                 self.node.counters["command.missed_ticks"] += tick.periods - 1
-            extra = self._stall_settings(tick)
+            extra: list[Setting] = []
+            if tick.stall_s > timing.command_timeout_s:
+                why = f"the command loop stood still for {tick.stall_s:.3f} s"
+                extra = [Setting("lose", f"{why}, {tick.computed_s:.3f} s of it computing")]
             if stop.is_set():
                 give_up = give_up or time.monotonic() + BRAKE_BEFORE_EXIT_S
                 extra.append(Setting("active", False))
@@ -142,12 +151,6 @@ class CommandNode:
             if self._on_tick(extra, tick):
                 loop.skip(rest_periods)
 
-    def _stall_settings(self, tick: Tick) -> list[Setting]:
-        if tick.stall_s <= self.node.profile.timing.command_timeout_s:
-            return []
-        why = f"the command loop stood still for {tick.stall_s:.3f} s"
-        return [Setting("lose", f"{why}, {tick.computed_s:.3f} s of it computing")]
-
     def _prepare(self, next_mono_ns: int) -> None:
         """Plan chunks that arrived, so that the next tick need not."""
         began = time.perf_counter()
@@ -155,7 +158,7 @@ class CommandNode:
         if inputs.chunks:
             self._busy_ns = next_mono_ns
         self.commander.prepare(inputs, self.node.clock.wall_at(next_mono_ns))
-        self._status.add_preparation(time.perf_counter() - began)
+        self._status.chunk_us.add((time.perf_counter() - began) * 1e6)
 
     def _on_tick(self, extra: list[Setting], tick: Tick) -> bool:
         """Returns whether the arm rests."""
@@ -170,8 +173,9 @@ class CommandNode:
         limit = max(1, int(timing.command_timeout_s * timing.command_hz))
         out = self.commander.step(inputs, now_ns, min(tick.periods, limit))
         self._publish(out, now_ns)
-        if any(event.kind == "transition" for event in out.events):
-            self._update_latch()
+        if self._latch is not None and any(event.kind == "transition" for event in out.events):
+            latched = self.commander.state in (State.STOPPED, State.FAULT)
+            self._latch.set(self.commander.why if latched else None)
         self._status.add_tick(now_ns, tick.stall_s, time.perf_counter() - began)
         self.commander.look_ahead(now_ns)
         if chores or out.events or out.task_changed:
@@ -191,12 +195,6 @@ class CommandNode:
             return False
         return 0 < timeline.plan.end_ns - now_ns < LONGEST_PLAN_NS
 
-    def _update_latch(self) -> None:
-        if self._latch is None:
-            return
-        latched = self.commander.state in (State.STOPPED, State.FAULT)
-        self._latch.set(self.commander.why if latched else None)
-
     def _report_latch_failure(self) -> None:
         why = None if self._latch is None else self._latch.failure()
         if why is not None:
@@ -205,7 +203,13 @@ class CommandNode:
 
     def _publish(self, out: Outputs, now_ns: int) -> None:
         for name, publishers in self._outs.items():
-            publishers.publish(out.of(name), now_ns)
+            commands = out.of(name)
+            if commands.pose is not None:
+                publishers.pose.publish(commands.pose, stamp_wall_ns=now_ns)
+            if commands.joint is not None:
+                publishers.joint.publish(commands.joint, stamp_wall_ns=now_ns)
+            if commands.gripper is not None:
+                publishers.gripper.publish(commands.gripper)
         for rejection in out.rejections:
             kind = "skipped" if rejection.quiet else "refused"
             self.node.counters[f"{kind}.{rejection.reason}"] += 1
@@ -219,31 +223,16 @@ class CommandNode:
             self._task_out.publish(self.commander.task)
 
 
-class _CommandPublishers:
+class _CommandPublishers(NamedTuple):
     """Publishers of the commands to one part."""
 
-    def __init__(self, node: Node, keys: Keys) -> None:
-        self._pose = node.declare_publisher(keys.command_pose, Kind.CONTROL)
-        self._joint = node.declare_publisher(keys.command_joint, Kind.CONTROL)
-        self._gripper = node.declare_publisher(keys.command_gripper, Kind.ORDER)
-
-    def publish(self, commands: MotionCommands, now_ns: int) -> None:
-        """Publish the commands that are set."""
-        if commands.pose is not None:
-            self._pose.publish(commands.pose, stamp_wall_ns=now_ns)
-        if commands.joint is not None:
-            self._joint.publish(commands.joint, stamp_wall_ns=now_ns)
-        if commands.gripper is not None:
-            self._gripper.publish(commands.gripper)
+    pose: Publisher
+    joint: Publisher
+    gripper: Publisher
 
 
 class CommandStatus:
-    """Collects tick costs and chunk latencies, and publishes the status of the command node.
-
-    Args:
-        node: the command node.
-        commander: its commander.
-    """
+    """Collects tick costs and chunk latencies, and publishes the status of the command node."""
 
     def __init__(self, node: Node, commander: Commander) -> None:
         self._node, self._commander = node, commander
@@ -251,7 +240,8 @@ class CommandStatus:
         self._latency = {stage: Percentiles(CHUNKS) for stage in LATENCY_STAGES}
         self._cost_us, self._late_us = Percentiles(ticks), Percentiles(ticks)
         self._pose_age_ms = Percentiles(ticks)
-        self._chunk_us = Percentiles(CHUNKS)
+        self.chunk_us = Percentiles(CHUNKS)
+        """Cost of planning chunks between two ticks."""
         self._rate = RateMeter()
         self._was_at_rest = True
         self._limits: dict[str, tuple[str, float]] = {}
@@ -267,10 +257,6 @@ class CommandStatus:
         self._late_us.add(late_s * 1e6)
         self._rate.tick()
         self._cost_us.add(cost_s * 1e6)
-
-    def add_preparation(self, cost_s: float) -> None:
-        """Add the planning of chunks between two ticks, which took `cost_s`."""
-        self._chunk_us.add(cost_s * 1e6)
 
     def add_chunk(self, cause: Cause) -> None:
         """Add the latencies of a chunk that came into force."""
@@ -328,7 +314,7 @@ class CommandStatus:
                 "tracking_mrad": _most(part.watchdog.tracking_rad for part in commander.parts),
                 "elbow_mrad": _most(part.elbow_rad for part in commander.parts),
                 "tick_us": self._cost_us.spread(),
-                "chunk_us": self._chunk_us.spread(),
+                "chunk_us": self.chunk_us.spread(),
                 "late_us": self._late_us.spread(),
                 "pose_age_ms": self._pose_age_ms.spread(),
                 "realtime": self.realtime,

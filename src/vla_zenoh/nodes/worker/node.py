@@ -7,9 +7,11 @@ command node follows it, so that it can be inspected and compared before it gets
 
 from __future__ import annotations
 
+import itertools
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from typing import Any, Literal
 
 import zenoh
@@ -36,7 +38,7 @@ class WorkerNode:
     the others.
 
     Args:
-        profile: cameras, timing, session.
+        profile: of the robots.
         session: open session.
         policy: the model, not loaded yet.
         name: of the worker.
@@ -75,18 +77,14 @@ class WorkerNode:
         profiles = [as_robot(profile, robot) for robot in robots] or [profile]
         self.policy, self.name, self.spec = policy, name, policy.spec
         self.sessions: list[RobotSession] = []
-        try:
-            for number, part in enumerate(profiles):
-                shared = self._policies[number % len(self._policies)]
-                self.sessions.append(
-                    RobotSession(
-                        part, session, shared, name, images=images, host=host, changed=self._changed
-                    )
+        with ExitStack() as opened:
+            for one, shared in zip(profiles, itertools.cycle(self._policies), strict=False):
+                robot = RobotSession(
+                    one, session, shared, name, images=images, host=host, changed=self._changed
                 )
-        except BaseException:
-            for robot in self.sessions:
-                robot.close()
-            raise
+                opened.callback(robot.close)
+                self.sessions.append(robot)
+            opened.pop_all()
         self.node = self.sessions[0].node
 
     def _one_for_each(
@@ -109,23 +107,25 @@ class WorkerNode:
         for robot in self.sessions:
             robot.report(now=True)
         began = time.monotonic()
-        for policy in self._policies:
-            load = getattr(policy, "load", None)
-            if callable(load):
-                load()
+        loaded = self._call("load")
         took_s = time.monotonic() - began
         for robot in self.sessions:
-            if callable(getattr(self.policy, "load", None)):
+            if loaded:
                 robot.node.emit(Event("info", "notice", "loaded", f"in {took_s:.1f} s"))
             robot.complaint, robot.due_s = "", time.monotonic()
         while not stop.is_set():
             self._step(stop)
         for robot in self.sessions:
             robot.close()
-        for policy in self._policies:
-            close = getattr(policy, "close", None)
-            if callable(close):
-                close()
+        self._call("close")
+
+    def _call(self, name: str) -> bool:
+        """Call an optional method of every copy of the model; whether it has that."""
+        methods = [getattr(policy, name, None) for policy in self._policies]
+        for method in methods:
+            if callable(method):
+                method()
+        return callable(methods[0])
 
     def _step(self, stop: threading.Event) -> None:
         now_s = time.monotonic()

@@ -3,42 +3,42 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Literal
 
+import numpy as np
 import zenoh
+from numpy.typing import NDArray
 
-from vla_zenoh.bus.buffers import (
-    CallbackRing,
-    LatestSample,
-    ReceivedSample,
-    Wake,
-    ZenohRing,
-    bytes_of,
-    header_of,
-)
+from vla_zenoh.bus.buffers import LatestSample, Wake, bytes_of, header_of
 from vla_zenoh.bus.metrics import Percentiles, RateMeter
 from vla_zenoh.bus.node import Node
 from vla_zenoh.codec import image as image_codec
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import MAX_IMAGE_BYTES
 from vla_zenoh.codec.records import SMALL_BYTES
-from vla_zenoh.errors import CodecError, PeerError, SpecError, in_words
+from vla_zenoh.errors import CodecError, PeerError, RecordError, SpecError, in_words
 from vla_zenoh.keys import Kind, worker_node
-from vla_zenoh.nodes.worker.camera_subscriber import (
-    STREAM_PATIENCE_S,
+from vla_zenoh.nodes.worker.streams import (
     CameraSubscriber,
+    Feed,
     ReceivedImage,
+    StateStream,
     subscribe_to_camera,
     subscribe_to_depth,
 )
-from vla_zenoh.nodes.worker.inference_debug import InferenceDebugPublisher
-from vla_zenoh.policy import ActionSteps, Observation, Policy, check_steps, reset_of
+from vla_zenoh.policy import (
+    ActionSteps,
+    CameraSpec,
+    ModelSpec,
+    Observation,
+    Policy,
+    check_steps,
+    reset_of,
+)
 from vla_zenoh.policy.chunk_prefix import ChunkPrefix
 from vla_zenoh.policy.observation import (
     MAX_STATES,
     STATE_KINDS,
-    History,
     NotReady,
     Streams,
     assemble,
@@ -46,7 +46,8 @@ from vla_zenoh.policy.observation import (
     state_names,
 )
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import Depth, Image, Stamped, Task
+from vla_zenoh.types import Depth, Header, Image, InferenceDebug, Stamped, Task
+from vla_zenoh.types.commands import plain_values
 from vla_zenoh.types.stream import SingleWriterFilter
 
 SPEC_PERIOD_S = 1.0
@@ -56,71 +57,20 @@ FRESH_PATIENCE_S = 0.05
 SILENT_S = 0.5
 FRESH_TOLERANCE_S = 0.005
 MAX_COMPLAINT = 500
-
-
-class _Feed(NamedTuple):
-    """One camera's colour or depth images, from the subscriber to what is kept of them."""
-
-    name: str
-    camera: CameraSubscriber
-    images: History
-    decode: Callable[[bytes, str], Any]
-
-
-class _StateStream:
-    """One stream of states, from its samples to what is kept of them.
-
-    Args:
-        node: of the worker.
-        key: of the stream.
-        kind: of its records.
-        states: where they go.
-        size: samples received between two calls of `poll`.
-        every: decode all; otherwise those that no image needs are skipped.
-    """
-
-    def __init__(
-        self, node: Node, key: str, kind: type[Any], states: History, size: int, *, every: bool
-    ) -> None:
-        self._node, self._kind, self._states, self._every = node, kind, states, every
-        self._writer = SingleWriterFilter(STREAM_PATIENCE_S)
-        ring = CallbackRing if every else ZenohRing
-        self._ring: CallbackRing | ZenohRing = node.subscribe(key, ring(size, SMALL_BYTES))
-
-    def poll(self, since_ns: int) -> None:
-        """Decode what was received since the last call: the last before `since_ns`, and later."""
-        arrivals = self._ring.drain()
-        for arrival in arrivals if self._every else arrivals[self._first(arrivals, since_ns) :]:
-            state = self._node.decode(self._kind, arrival, self._writer)
-            if state is not None:
-                self._states.add(state)
-
-    def _first(self, arrivals: Sequence[ReceivedSample], since_ns: int) -> int:
-        """The last that the writer measured before `since_ns`, or its first; not a repetition."""
-        first = 0
-        for number in range(len(arrivals) - 1, -1, -1):
-            try:
-                header = header_of(arrivals[number].sample)
-            except CodecError:
-                continue
-            if self._writer.is_next(header):
-                first = number
-                header, _ = self._node.clocks.to_local_clock(header, None)
-                if header.stamp_wall_ns <= since_ns:
-                    break
-        return first
+SEEN_QUALITY = 95
+"""Of the JPEG images a model was given."""
 
 
 class RobotSession:
     """One robot's side of a worker: its own node, prompt, episode, activation and rate.
 
     Args:
-        profile: of the robot: its name, cameras, timing.
+        profile: of the robot.
         session: open session.
         policy: the model, not loaded yet; several sessions may share it.
         name: of the worker.
         images: image streams to subscribe to.
-        host: of the profile, on which this runs; it may have its own streams.
+        host: of the profile, on which this runs.
         changed: set when an image arrives.
     """
 
@@ -163,7 +113,7 @@ class RobotSession:
             for one in self.spec.observation.depth
         }
         self._feeds = [
-            _Feed(name, camera, streams[name], decode)
+            Feed(name, camera, streams[name], decode)
             for cameras, streams, decode in (
                 (self._cameras, self._streams.images, self._image_of),
                 (depths, self._streams.depth, _depth_of),
@@ -172,7 +122,7 @@ class RobotSession:
         ]
         self._every_state = bool(history_s) or not self._feeds
         self._states = [
-            _StateStream(
+            StateStream(
                 node,
                 getattr(keys.of_part(part), f"state_{what}"),
                 STATE_KINDS[what],
@@ -259,7 +209,7 @@ class RobotSession:
             except Exception as error:
                 self.failed(error, "reset_failed")
 
-    def _receive(self, feed: _Feed, received: ReceivedImage) -> None:
+    def _receive(self, feed: Feed, received: ReceivedImage) -> None:
         (arrival, writer, key), node = received, self.node
         sample, mono_ns = arrival.sample, arrival.mono_ns
         try:
@@ -340,9 +290,7 @@ class RobotSession:
             return self.failed(error)
         observed_ns, start_ns, end_ns = times_ns
         chunk = make_chunk(
-            self.name,
-            self._spec_hash,
-            self.spec.action.dt_s,
+            *(self.name, self._spec_hash, self.spec.action.dt_s),
             observation,
             ActionSteps(steps, done),
             patience_s=self.node.profile.timing.max_observation_age_s,
@@ -391,17 +339,16 @@ class RobotSession:
             return
         task = self.task
         inference = self._inference_ms.summary()
-        detail: Mapping[str, Any] = {
-            "complaint": self.complaint[:MAX_COMPLAINT].encode("utf-8", "replace").decode(),
-            "spec": self._spec_hash,
-            "episode": self._episode,
-            "prompt": task.prompt if task else "",
-            "obeyed": bool(task and task.active and task.worker == self.name),
-            "batch": self._batch,
-        }
         self.node.publish_status(
             state,
-            detail=detail,
+            detail={
+                "complaint": self.complaint[:MAX_COMPLAINT].encode("utf-8", "replace").decode(),
+                "spec": self._spec_hash,
+                "episode": self._episode,
+                "prompt": task.prompt if task else "",
+                "obeyed": bool(task and task.active and task.worker == self.name),
+                "batch": self._batch,
+            },
             rates_hz={"chunks": self._rate.rate_hz},
             latency_ms={"inference": inference} if inference else {},
             now=now,
@@ -415,3 +362,74 @@ class RobotSession:
 
 def _depth_of(payload: bytes, encoding: str) -> Depth:
     return image_codec.decode_depth(payload, encoding.partition(";")[2])
+
+
+class InferenceDebugPublisher:
+    """Publishes observation and answer of each inference, while there are subscribers.
+
+    It runs after the chunk was published, so it never delays one.
+    """
+
+    def __init__(self, node: Node, worker: str, spec: ModelSpec) -> None:
+        self._node, self._worker, self._spec = node, worker, spec
+        keys = node.keys
+        # One priority for all: the images arrive before the record.
+        self._record = node.declare_publisher(keys.seen_record(worker), Kind.FRAME)
+        self._images = [
+            (one, node.declare_publisher(keys.seen(worker, one.camera), Kind.FRAME))
+            for one in spec.observation.cameras
+        ]
+        self._depths = [
+            (one, node.declare_publisher(keys.seen_depth(worker, one.camera), Kind.FRAME))
+            for one in spec.observation.depth
+        ]
+
+    def publish(
+        self,
+        observation: Observation,
+        answer: ActionSteps,
+        steps: NDArray[np.float32],
+        chunk: Header,
+        inference_ms: float,
+    ) -> None:
+        """Publish one inference: its validated steps (H, D), and the header of its chunk."""
+        stamp_ns, seq = observation.stamp_wall_ns, chunk.seq
+        try:
+            for camera, stream in self._images:
+                if stream.has_subscribers:
+                    image = Image(_rgb(camera, observation, answer))
+                    stream.publish(
+                        image_codec.encode_jpeg(image, SEEN_QUALITY),
+                        stamp_wall_ns=stamp_ns,
+                        seq=seq,
+                        encoding=zenoh.Encoding.IMAGE_JPEG,
+                    )
+            for camera, stream in self._depths:
+                if stream.has_subscribers:
+                    depth = Depth(observation.depth[camera.camera], camera.unit_m)
+                    stream.publish(
+                        image_codec.encode_depth(depth),
+                        stamp_wall_ns=stamp_ns,
+                        seq=seq,
+                        encoding=zenoh.Encoding.IMAGE_PNG.with_schema(
+                            image_codec.depth_schema(depth)
+                        ),
+                    )
+            if self._record.has_subscribers:
+                seen = InferenceDebug(
+                    *(self._worker, seq, self._spec.hash, observation.task.episode, stamp_ns),
+                    *(observation.prompt, steps, inference_ms),
+                    plain_values(answer.raw),
+                    bool(answer.done),
+                )
+                self._record.publish(seen, stamp_wall_ns=stamp_ns, seq=seq)
+        except (RecordError, CodecError) as error:
+            self._node.reject("seen", f"the inference cannot be published: {error}")
+
+
+def _rgb(camera: CameraSpec, observation: Observation, answer: ActionSteps) -> NDArray[np.uint8]:
+    own = (answer.pictures or {}).get(camera.camera)
+    if own is not None:
+        return np.asarray(own)
+    image = observation.images[camera.camera]
+    return np.ascontiguousarray(image[..., ::-1]) if camera.colour == "bgr" else image

@@ -1,17 +1,28 @@
-"""Subscribes to the image stream of a camera that suits a model best."""
+"""What a worker receives of a robot: the image stream of each camera that suits the model best, and
+its states."""
 
 from __future__ import annotations
 
 import math
 import time
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
-from vla_zenoh.bus.buffers import CallbackRing, LatestSample, ReceivedSample, Wake
+from vla_zenoh.bus.buffers import (
+    CallbackRing,
+    LatestSample,
+    ReceivedSample,
+    Wake,
+    ZenohRing,
+    header_of,
+)
 from vla_zenoh.bus.node import Node
 from vla_zenoh.codec.image import MAX_IMAGE_BYTES
+from vla_zenoh.codec.records import SMALL_BYTES
+from vla_zenoh.errors import CodecError
 from vla_zenoh.keys import Kind
 from vla_zenoh.policy import CameraSpec
-from vla_zenoh.policy.observation import size_variant
+from vla_zenoh.policy.observation import History, size_variant
 from vla_zenoh.types import Event
 from vla_zenoh.types.stream import SingleWriterFilter
 
@@ -44,8 +55,8 @@ class CameraSubscriber:
         node: of the worker.
         camera: its name.
         key: of the preferred stream.
-        fallback_key: of the common stream; None if that is the preferred one.
-        patience_s: silence on `key` after which `fallback_key` is subscribed to.
+        fallback_key: of the common stream, subscribed to after a silence of `patience_s` on `key`;
+            None if that is the preferred one.
         changed: set when an image arrives.
         queue: images kept until they are taken; 1: the newest only.
 
@@ -84,7 +95,10 @@ class CameraSubscriber:
         if arrival is not None:
             self._received_s = time.monotonic()
             if self._fallback is not None:
-                self._drop_fallback(self._fallback)
+                self._node.unsubscribe(self._fallback.buffer)
+                self._fallback = None
+                why = f"there are images on {self._node.keys.short(stream.key)} again"
+                self._node.emit(Event("info", "notice", f"{self._camera}:own_pictures", why))
         elif self._fallback is not None:
             stream = self._fallback
             arrival = stream.buffer.pop()
@@ -97,12 +111,6 @@ class CameraSubscriber:
         preferred, common = map(self._node.keys.short, (self._preferred.key, key))
         why = f"no image on {preferred} for {self._patience_s:g} s; subscribing to {common} as well"
         self._node.emit(Event("warning", "notice", f"{self._camera}:plain_pictures", why))
-
-    def _drop_fallback(self, fallback: _Stream) -> None:
-        self._node.unsubscribe(fallback.buffer)
-        self._fallback = None
-        why = f"there are images on {self._node.keys.short(self._preferred.key)} again"
-        self._node.emit(Event("info", "notice", f"{self._camera}:own_pictures", why))
 
     def _subscribe(self, key: str) -> _Stream:
         buffer = (
@@ -125,9 +133,6 @@ def subscribe_to_camera(
         jpeg: JPEG rather than raw images.
         changed: set by every image.
         history_s: images this much older than the newest are needed as well.
-
-    Raises:
-        SessionError: the router does not answer at the port for images.
     """
     keys, name = node.keys, camera.camera
     settings = node.profile.cameras.get(name)
@@ -160,3 +165,56 @@ def _queue(node: Node, camera: str, history_s: float) -> int:
     if history_s == 0.0 or settings is None:
         return 1
     return min(MAX_QUEUE, 1 + math.ceil((history_s + PATIENCE_S) * settings.rate_hz))
+
+
+class Feed(NamedTuple):
+    """One camera's colour or depth images, from the subscriber to what is kept of them."""
+
+    name: str
+    camera: CameraSubscriber
+    images: History
+    decode: Callable[[bytes, str], Any]
+
+
+class StateStream:
+    """One stream of states, from its samples to what is kept of them.
+
+    Args:
+        node: of the worker.
+        key: of the stream.
+        kind: of its records.
+        states: where they go.
+        size: samples received between two calls of `poll`.
+        every: decode all; otherwise those that no image needs are skipped.
+    """
+
+    def __init__(
+        self, node: Node, key: str, kind: type[Any], states: History, size: int, *, every: bool
+    ) -> None:
+        self._node, self._kind, self._states, self._every = node, kind, states, every
+        self._writer = SingleWriterFilter(STREAM_PATIENCE_S)
+        ring = CallbackRing if every else ZenohRing
+        self._ring: CallbackRing | ZenohRing = node.subscribe(key, ring(size, SMALL_BYTES))
+
+    def poll(self, since_ns: int) -> None:
+        """Decode what was received since the last call: the last before `since_ns`, and later."""
+        arrivals = self._ring.drain()
+        for arrival in arrivals if self._every else arrivals[self._first(arrivals, since_ns) :]:
+            state = self._node.decode(self._kind, arrival, self._writer)
+            if state is not None:
+                self._states.add(state)
+
+    def _first(self, arrivals: Sequence[ReceivedSample], since_ns: int) -> int:
+        """The last that the writer measured before `since_ns`, or its first; not a repetition."""
+        first = 0
+        for number in range(len(arrivals) - 1, -1, -1):
+            try:
+                header = header_of(arrivals[number].sample)
+            except CodecError:
+                continue
+            if self._writer.is_next(header):
+                first = number
+                header, _ = self._node.clocks.to_local_clock(header, None)
+                if header.stamp_wall_ns <= since_ns:
+                    break
+        return first
