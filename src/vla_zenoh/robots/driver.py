@@ -35,21 +35,13 @@ STREAMING = "streaming"
 
 
 class Measurement(NamedTuple):
-    """Checked state of a robot at one time.
+    """Checked state of a robot at one time."""
 
-    Args:
-        stamp_ns: wall clock.
-        joints: of the arm.
-        tcp: pose of the TCP in the base frame.
-        pose: the same with twist and wrench; a simulation adds its reference.
-        gripper: its mode and faults are set by the node; None: unknown.
-    """
-
-    stamp_ns: int
+    stamp_ns: int  # wall clock
     joints: JointState
-    tcp: Pose
-    pose: PoseState
-    gripper: GripperState | None
+    tcp: Pose  # in the base frame
+    pose: PoseState  # the same with twist and wrench; a simulation adds its reference
+    gripper: GripperState | None  # the node sets its mode and faults; None: unknown
 
 
 class DriverStatus(NamedTuple):

@@ -110,22 +110,20 @@ class JointReading:
         """
         places = {name: index for index, name in enumerate(joints.names)}
         self._take_fingers(joints, places, stamp_ns)
-        found = [name for name in self._arm if name in places]
-        if not found:
+        missing = [name for name in self._arm if name not in places]
+        if len(missing) == len(self._arm):
             return None
-        if len(found) < len(self._arm):
-            missing = ", ".join(name for name in self._arm if name not in places)
-            raise CodecError("partial", f"joint states of this arm without {missing}")
+        if missing:
+            raise CodecError("partial", f"joint states of this arm without {', '.join(missing)}")
         at = [places[name] for name in self._arm]
         position = _finite("position", joints.position[at])
         self._check(position - self._middle_rad, self._furthest_rad, position, "rad")
-        velocity = None
-        if joints.velocity is not None:
+        if joints.velocity is None:
+            velocity = self._velocity(position, stamp_ns)
+        else:
             velocity = _finite("velocity", joints.velocity[at])
             self._check(velocity, self._fastest_rad_s, velocity, "rad/s")
         self._arm_newness.check(stamp_ns)
-        if velocity is None:
-            velocity = self._velocity(position, stamp_ns)
         try:
             state = JointState(self._arm, position, velocity, self._effort(joints, at))
         except RecordError as error:
@@ -154,9 +152,8 @@ class JointReading:
 
     def _effort(self, joints: Joints, at: list[int]) -> FloatArray | None:
         """Efforts of the arm; ros2_control publishes NaN if it has none."""
-        effort = None if joints.effort is None else joints.effort[at]
-        if effort is not None and np.isfinite(effort).all():
-            return effort
+        if joints.effort is not None and np.isfinite(joints.effort[at]).all():
+            return joints.effort[at]
         self.efforts_missing += 1
         return None
 
@@ -203,8 +200,7 @@ class JointReading:
 
 def pose_state(pose: Pose, twist: FloatArray, wrench: FloatArray | None) -> PoseState:
     """A record of a TCP pose, without its reference."""
-    quat_xyzw = quat_from_rotation(pose.rotation)
-    return PoseState(pose.position_m, quat_xyzw, twist, wrench, None, None)
+    return PoseState(pose.position_m, quat_from_rotation(pose.rotation), twist, wrench, None, None)
 
 
 def _finite(what: str, values: FloatArray) -> FloatArray:

@@ -82,14 +82,17 @@ class UrArm:
 
     def __init__(self, profile: Profile) -> None:
         assert profile.ur is not None
-        self._profile, self._settings = profile, profile.ur
-        self.address = profile.ur.address
-        self._library = load_ur_rtde()
+        self._settings, self.address = profile.ur, profile.ur.address
+        modules = "rtde_control", "rtde_receive", "dashboard_client"
+        try:
+            self._library: dict[str, Any] = {name: import_module(name) for name in modules}
+        except ImportError as error:
+            raise MissingExtraError("ur_rtde", "ur") from error
+        self._rate_hz = min(profile.timing.command_hz, 500.0)
         self._period_s = 1.0 / profile.timing.command_hz
         kinematics = make_kinematics(profile)
         reached = kinematics.forward(np.zeros(len(profile.robot.arm_joints))).position_m
-        # With all joints at 0 a UR reaches along -x of its own base; ROS rotates that base by 180
-        # degrees.
+        # With all joints at 0 a UR reaches along -x of its own base; ROS turns that base by pi.
         self._turn = np.diag([-1.0, -1.0, 1.0] if reached[0] > 0 else [1.0, 1.0, 1.0])
         self._control: Any = None
         self._receive: Any = None
@@ -297,10 +300,6 @@ class UrArm:
         mode = self._receive.getSafetyMode()
         return SAFETY_MODES.get(mode, f"UNKNOWN_{mode}")
 
-    @property
-    def _rate_hz(self) -> float:
-        return min(self._profile.timing.command_hz, 500.0)
-
     def measured(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Joints (6,), and position (3,) and rotation vector (3,) of its own TCP, in our base."""
         pose = np.array(self._receive.getActualTCPPose())
@@ -314,12 +313,3 @@ def _wait(for_it: Any, timeout_s: float) -> bool:
             return False
         time.sleep(0.01)
     return True
-
-
-def load_ur_rtde() -> Mapping[str, Any]:
-    """Modules of the library, or a `MissingExtraError`."""
-    modules = "rtde_control", "rtde_receive", "dashboard_client"
-    try:
-        return {name: import_module(name) for name in modules}
-    except ImportError as error:
-        raise MissingExtraError("ur_rtde", "ur") from error

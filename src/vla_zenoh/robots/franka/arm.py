@@ -71,19 +71,20 @@ class FrankaArm:
     def __init__(self, profile: Profile) -> None:
         assert profile.franka is not None
         self._profile, self._settings = profile, profile.franka
-        self._franky = load_franky()
+        try:
+            self._franky: Any = import_module("franky")
+        except ImportError as error:
+            raise MissingExtraError("franky", "franka") from error
         self._kinematics = make_kinematics(profile)
         self.robot: Any = None
         self._hand: Hand | None = None
         self._motion: Any = None
         self._command: Any = None
-        self._led = False
-        self._trim = Trim(6)
-        self._configured = self._was_in_control = False
-        self._ended = ""
-        self._time: Any = None
-        self._measured_ns = self._moved_ns = 0
         self._state: Any = None
+        self._time: Any = None
+        self._trim, self._ended = Trim(6), ""
+        self._led = self._configured = self._was_in_control = False
+        self._measured_ns = self._moved_ns = 0
         self._recovery: threading.Thread | None = None
         self._timeout_s = profile.timing.command_timeout_s
         self._referring, self._closed = threading.Lock(), threading.Event()
@@ -192,9 +193,8 @@ class FrankaArm:
         self._state = state
 
     def _fault(self, mode: str) -> str:
-        names = error_names(self._state.current_errors) or error_names(
-            self._state.last_motion_errors
-        )
+        state = self._state
+        names = error_names(state.current_errors) or error_names(state.last_motion_errors)
         if mode == "Reflex":
             return f"Reflex: {', '.join(names) or self._ended or 'no error named'}"
         if mode == "UserStopped":
@@ -300,11 +300,9 @@ class FrankaArm:
         )
         trim = self._trim.update(left, elapsed_s)
         twist, acceleration = command.twist, command.acceleration
+        quat_xyzw = quat_from_rotation(exp3(trim[3:]) @ rotation)
         return franky.CartesianReference(
-            franky.Affine(
-                command.position_m + trim[:3],
-                quat_from_rotation(exp3(trim[3:]) @ rotation),
-            ),
+            franky.Affine(command.position_m + trim[:3], quat_xyzw),
             franky.Twist(twist[:3], twist[3:]),
             franky.TwistAcceleration(acceleration[:3], acceleration[3:]),
         )
@@ -357,14 +355,6 @@ def _in_time(make: Callable[[], Any], what: str) -> Any:
     except TimeoutError as error:
         why = f"{what}: no answer within {CONNECT_S:g} s; restart its control box?"
         raise NodeError(why) from error
-
-
-def load_franky() -> Any:
-    """The library, or a `MissingExtraError`."""
-    try:
-        return import_module("franky")
-    except ImportError as error:
-        raise MissingExtraError("franky", "franka") from error
 
 
 def error_names(errors: Any) -> list[str]:

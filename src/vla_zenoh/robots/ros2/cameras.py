@@ -94,10 +94,8 @@ class Camera:
         return True
 
     def _decode(self, arrival: ReceivedSample) -> RosImage:
-        payload = arrival.sample.payload.to_bytes()
+        payload, wanted = arrival.sample.payload.to_bytes(), self._topic.frame
         image: RosImage = read(self._messages, self._topic.type, payload)
-        if self._topic.frame is not None and image.frame != self._topic.frame:
-            raise CodecError(
-                "frame", f"in frame {image.frame[:60]!r}, wanted {self._topic.frame!r}"
-            )
+        if wanted is not None and image.frame != wanted:
+            raise CodecError("frame", f"in frame {image.frame[:60]!r}, wanted {wanted!r}")
         return image

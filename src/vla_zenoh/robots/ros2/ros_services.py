@@ -65,7 +65,6 @@ class EstopOrder:
             self._others_ns = time.monotonic_ns()
 
     def stop(self, publish: Callable[[], None]) -> None:
-        """Stop by calling `publish`."""
         with self._lock:
             self._ours_ns = time.monotonic_ns()
             publish()
@@ -200,14 +199,12 @@ class RosServices:
         return "inactive"
 
     def _await_state(self, wanted: str) -> None:
-        def reached() -> bool:
+        def state() -> str:
             status = self._client.status("command")
-            return status is not None and status.state == wanted
+            return "silent" if status is None else status.state
 
-        if not self._client.wait_for(reached, STATE_TIMEOUT_S):
-            status = self._client.status("command")
-            now = "silent" if status is None else status.state
-            raise SessionError(f"the command node is {now}, not {wanted}")
+        if not self._client.wait_for(lambda: state() == wanted, STATE_TIMEOUT_S):
+            raise SessionError(f"the command node is {state()}, not {wanted}")
 
     def _set_prompt(self, asked: Any) -> str:
         return f"prompt {self._client.set_prompt(prompt_text(asked.prompt)).prompt!r}"
