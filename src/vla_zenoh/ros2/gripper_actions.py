@@ -117,10 +117,8 @@ class ActionGoal(NamedTuple):
 class GoalSequencer:
     """Decides when a goal is sent or cancelled. Time is given in ns of any clock.
 
-    Args:
-        timeout_s: a goal without any response is abandoned after this; an accepted one has in
-            addition the travel time of the fingers.
-        stroke_m: the longest way of the fingers, which they go at the speed of the goal.
+    A goal without any response is abandoned after `timeout_s`; an accepted one has in addition the
+    time in which the fingers go `stroke_m`, their longest way, at its speed.
     """
 
     def __init__(self, timeout_s: float, stroke_m: float) -> None:

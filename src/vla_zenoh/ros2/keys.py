@@ -133,7 +133,7 @@ class Ros2Dds:
     def token(self, endpoint: Endpoint, number: int) -> str:
         """The liveliness token that makes it seen; an action has one for all its parts."""
         kind, key = endpoint.type, self.key(endpoint)
-        chunks = ["@", self.session_id, "@ros2_lv", endpoint.role.value]
+        chunks = [self.node_token(), endpoint.role.value]
         chunks += [text.replace("/", _SLASH_OF_BRIDGES) for text in (key, kind)]
         if endpoint.role in (EntityRole.PUBLISHER, EntityRole.SUBSCRIBER):
             known = None if self.type_hash is None else self.type_hash(kind)
@@ -168,15 +168,9 @@ class RmwZenoh:
 
     def token(self, endpoint: Endpoint, number: int) -> str:
         """The liveliness token that makes it seen; each endpoint has another `number`."""
-        return "/".join(
-            (
-                self._at(number, endpoint.role.value),
-                endpoint.name.replace("/", _SLASH_OF_RMW),
-                dds_type(endpoint.type),
-                self.type_hash(endpoint.type),
-                endpoint.qos.as_rmw_zenoh(),
-            )
-        )
+        at, name = self._at(number, endpoint.role.value), endpoint.name.replace("/", _SLASH_OF_RMW)
+        kind, hashed = dds_type(endpoint.type), self.type_hash(endpoint.type)
+        return f"{at}/{name}/{kind}/{hashed}/{endpoint.qos.as_rmw_zenoh()}"
 
     def node_token(self) -> str:
         """Liveliness token of the node itself."""
@@ -187,9 +181,10 @@ class RmwZenoh:
         return f"@ros2_lv/{self.domain}/*/*/*/NN/**"
 
     def _at(self, number: int, role: str) -> str:
-        enclave = namespace = _SLASH_OF_RMW
-        start = f"@ros2_lv/{self.domain}/{self.session_id}/0/{number}/{role}"
-        return f"{start}/{enclave}/{namespace}/{self.node}"
+        root = _SLASH_OF_RMW  # enclave and namespace
+        return (
+            f"@ros2_lv/{self.domain}/{self.session_id}/0/{number}/{role}/{root}/{root}/{self.node}"
+        )
 
 
 Wire = Ros2Dds | RmwZenoh

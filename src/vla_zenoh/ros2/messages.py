@@ -96,11 +96,7 @@ class Messages:
         return kind in self._store.fielddefs or f"{kind}_Request" in self._store.fielddefs
 
     def require(self, kind: str) -> None:
-        """Make sure that `kind` is a known message or service.
-
-        Raises:
-            ProfileError: it is not; names the nearest one.
-        """
+        """Raise a `ProfileError` unless `kind` is a known message or service."""
         split_type(kind)
         if kind not in self:
             known = sorted(self._store.fielddefs)
@@ -152,11 +148,7 @@ class Messages:
 
     # -- CDR ----------------------------------------------------------------------------------
     def encode(self, message: Any) -> bytes:
-        """CDR, little-endian, with its header of four bytes.
-
-        Raises:
-            CodecError: a value that does not fit its field.
-        """
+        """CDR, little-endian, with its header; a `CodecError` if a value does not fit its field."""
         kind: str = message.__msgtype__
         try:
             return bytes(self._store.serialize_cdr(message, kind, little_endian=True))

@@ -23,11 +23,7 @@ _JPEG = b"\xff\xd8\xff"
 
 
 def read(messages: Messages, kind: str, payload: bytes) -> Any:
-    """Decode CDR bytes of a type in `READERS`.
-
-    Raises:
-        CodecError: whatever else the bytes are.
-    """
+    """Decode CDR bytes of a type in `READERS`; a `CodecError` whatever else the bytes are."""
     limit = MAX_PICTURE_BYTES if kind in (IMAGE, COMPRESSED_IMAGE) else MAX_MESSAGE_BYTES
     message = messages.decode(kind, payload, limit)
     try:

@@ -16,10 +16,8 @@ from typing import NamedTuple
 from vla_zenoh.errors import NodeError
 
 VARIABLE = "VLA_ZENOH_RENDERER"
-EGL, RAYCAST = "egl", "raycast"
-AUTO = "auto"
+EGL, RAYCAST, AUTO = "egl", "raycast", "auto"
 PROBE_LIMIT_S = 60.0
-
 _LIBRARIES = ("EGL", "OpenGL")
 """Libraries that PyOpenGL and MuJoCo load."""
 _PACKAGES = "libegl1 libopengl0 libgl1-mesa-dri"

@@ -149,11 +149,12 @@ class CartesianImpedance(_Impedance):
         self._soft_upper_rad = np.asarray(upper_rad, float) - gains.limit_margin_rad
         self._posture_rad = np.array(posture_rad, float)
         self._posture_damping = 2.0 * math.sqrt(gains.posture_nm_rad)
-        self._stiffness = _per_axis(gains.translational_n_m, gains.rotational_nm_rad)
+        self._stiffness = np.repeat([gains.translational_n_m, gains.rotational_nm_rad], 3)
         # zeta * sqrt(K_j) scales the columns of Lambda^1/2; its transpose gives the other half.
         self._damping_scale = gains.damping_ratio * np.sqrt(self._stiffness)
         rate = gains.integral_1_s * period_s * self._stiffness
-        super().__init__(effort_nm, rate, _per_axis(gains.max_integral_n, gains.max_integral_nm))
+        most = np.repeat([gains.max_integral_n, gains.max_integral_nm], 3)
+        super().__init__(effort_nm, rate, most)
         self._task_space: _TaskSpace | None = None
 
     def reset(self, posture_rad: FloatArray | None = None) -> None:
@@ -182,11 +183,9 @@ class CartesianImpedance(_Impedance):
         spring_error, feed = self._clamp(error)
 
         _, inertia, damping, consistent = self._seen(state)
-
         slip = feed * reference.twist - jacobian @ state.velocity_rad_s
         wrench = self._stiffness * spring_error + damping @ slip + self.integral
         wrench += inertia @ (feed * reference.acceleration - state.drift)
-
         posture = self._posture_torque(state)
         wanted = transposed @ (wrench - consistent @ posture) + posture + state.bias_nm
         torque = _bounded(wanted, self._effort_nm)
@@ -232,10 +231,6 @@ class CartesianImpedance(_Impedance):
             - self._posture_damping * state.velocity_rad_s
             + self.gains.limit_nm_rad * (inside - position)
         )
-
-
-def _per_axis(translational: float, rotational: float) -> FloatArray:
-    return np.array([translational] * 3 + [rotational] * 3)
 
 
 class JointImpedance(_Impedance):

@@ -58,10 +58,8 @@ def regions_of(model: mujoco.MjModel, prefix: str = REGION_PREFIX) -> dict[str, 
     """
     known = objects_of(model)
     regions: dict[str, Region] = {}
-    for index in range(model.nnumeric):
-        entry = model.numeric(index)
-        if not entry.name.startswith(prefix):
-            continue
+    entries = [model.numeric(index) for index in range(model.nnumeric)]
+    for entry in (entry for entry in entries if entry.name.startswith(prefix)):
         name = entry.name.removeprefix(prefix)
         if name not in known:
             raise ResourceError(
@@ -120,7 +118,10 @@ def draw_places(model: mujoco.MjModel, seed: int, *, distractors: bool = False) 
                 name: Place(*random.uniform(region.low, region.high).tolist())
                 for name, region in wanted.items()
             }
-            if _apart(beside | drawn, radii, gap_m):
+            if all(
+                math.hypot(a.x_m - b.x_m, a.y_m - b.y_m) >= radii[one] + radii[other] + gap_m
+                for (one, a), (other, b) in combinations((beside | drawn).items(), 2)
+            ):
                 return drawn
         raise ResourceError(
             f"no room for {', '.join(wanted)} in their regions with {gap_m:g} m between them; "
@@ -133,10 +134,3 @@ def draw_places(model: mujoco.MjModel, seed: int, *, distractors: bool = False) 
             del fixed[name]
             places |= draw({name: region}, fixed | places)
     return places
-
-
-def _apart(places: dict[str, Place], radii: dict[str, float], gap_m: float) -> bool:
-    return all(
-        math.hypot(a.x_m - b.x_m, a.y_m - b.y_m) >= radii[one] + radii[other] + gap_m
-        for (one, a), (other, b) in combinations(places.items(), 2)
-    )

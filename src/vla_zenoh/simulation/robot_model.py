@@ -12,18 +12,14 @@ Vector3 = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class MountedCamera:
-    """A camera fixed to a link of the robot, described in that link's frame.
-
-    The optical axis goes through `look_at_m`, the vertical field of view is `fovy_rad`, and `up` in
-    the image is this direction.
-    """
+    """A camera fixed to a link of the robot, described in that link's frame."""
 
     name: str
     link: str
     position_m: Vector3
-    look_at_m: Vector3
-    up: Vector3
-    fovy_rad: float
+    look_at_m: Vector3  # on the optical axis
+    up: Vector3  # in the image
+    fovy_rad: float  # vertical
 
 
 @dataclass(frozen=True, slots=True)

@@ -74,8 +74,10 @@ def build_model(
         spec = mujoco.MjSpec.from_file(str(path))
         for index, robot in enumerate(parts):
             arm = _robot_spec(robot, joint_friction_nm)
-            if len(parts) > 1:
-                _meet_other_parts(arm, index, len(parts))
+            # A part meets the scene (1) and the other parts, but not itself.
+            masks = [2 << other for other in range(len(parts))] if len(parts) > 1 else [0]
+            for geom in arm.geoms:
+                geom.contype, geom.conaffinity = 1 | masks[index], sum(masks) - masks[index]
             half_rad = robot.base_yaw_rad / 2
             frame = spec.worldbody.add_frame(
                 pos=robot.base_m, quat=(math.cos(half_rad), 0.0, 0.0, math.sin(half_rad))
@@ -91,14 +93,6 @@ def build_model(
         raise ResourceError(f"MuJoCo rejects scene {path} with {described}: {error}") from error
     _sort_groups(model)
     return model
-
-
-def _meet_other_parts(arm: mujoco.MjSpec, index: int, parts: int) -> None:
-    """Contact masks of a part that meets the scene and the other parts, but not itself."""
-    own = 1 << (index + 1)
-    others = sum(1 << (other + 1) for other in range(parts) if other != index)
-    for geom in arm.geoms:
-        geom.contype, geom.conaffinity = 1 | own, others
 
 
 def _robot_spec(robot: RobotModel, joint_friction_nm: float) -> mujoco.MjSpec:
@@ -121,8 +115,6 @@ def _robot_spec(robot: RobotModel, joint_friction_nm: float) -> mujoco.MjSpec:
     for geom in spec.geoms:
         link = geom.parent.name
         geom.rgba = colours.get(link, robot.colour)
-        # Masks that meet the scene (contype 1, conaffinity 1) but not the robot itself.
-        geom.contype, geom.conaffinity = 1, 0
         if link in robot.finger_links:
             geom.priority = 1  # the pads' friction counts, not the object's
             geom.friction = PAD_FRICTION

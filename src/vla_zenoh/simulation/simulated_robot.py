@@ -93,14 +93,8 @@ class SimulatedPart:
         lower_rad, upper_rad = np.array([joint.range for joint in joints]).T
         self.joint_range_rad = lower_rad, upper_rad
         effort_nm = model.actuator_ctrlrange[self._actuators, 1]
-        self._cartesian = CartesianImpedance(
-            gains,
-            lower_rad=lower_rad,
-            upper_rad=upper_rad,
-            effort_nm=effort_nm,
-            posture_rad=home_rad,
-            period_s=STEP_S,
-        )
+        limits = {"lower_rad": lower_rad, "upper_rad": upper_rad, "effort_nm": effort_nm}
+        self._cartesian = CartesianImpedance(gains, **limits, posture_rad=home_rad, period_s=STEP_S)
         self._joint = JointImpedance(robot.gains, effort_nm=effort_nm, period_s=STEP_S)
         self._active_law: CartesianImpedance | JointImpedance | None = None
         self._held_rad: FloatArray | None = None
@@ -238,21 +232,19 @@ class SimulatedPart:
         """
         position, rotation = self.tcp()
         if isinstance(reference, JointReference):
-            data = self._scratch
+            data, tcp = self._scratch, self._tcp
             data.qpos[self._qpos] = reference.position_rad
             mujoco.mj_kinematics(self._model, data)
-            held_m, held_rotation = self._in_base(
-                data.site_xpos[self._tcp], data.site_xmat[self._tcp].reshape(3, 3)
-            )
+            held = self._in_base(data.site_xpos[tcp], data.site_xmat[tcp].reshape(3, 3))
         else:
-            held_m, held_rotation = reference.position_m, reference.rotation
+            held = reference.position_m, reference.rotation
         return PoseState(
             position_m=position,
             quat_xyzw=_quat_xyzw(rotation),
             twist=self._tcp_jacobian() @ self._velocity_rad_s,
             wrench=self._filtered_wrench.copy(),
-            reference_position_m=held_m,
-            reference_quat_xyzw=_quat_xyzw(held_rotation),
+            reference_position_m=held[0],
+            reference_quat_xyzw=_quat_xyzw(held[1]),
         )
 
 

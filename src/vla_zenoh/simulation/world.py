@@ -125,7 +125,14 @@ class World:
         for part in self.parts.values():
             part.filter_wrench()
         if self._warnings.any():
-            self._raise_diverged()
+            raised = [
+                mujoco.mjtWarning(kind).name.removeprefix("mjWARN_").lower()
+                for kind in np.flatnonzero(self._warnings)
+            ]
+            raise NodeError(
+                f"the simulation diverged after {self.time_ns / 1e9:.3f} s ({', '.join(raised)}); "
+                "reset it, and check gains, limits and the scene"
+            )
 
     @property
     def time_ns(self) -> int:
@@ -185,28 +192,13 @@ class World:
             mujoco.mj_comPos(self.model, self._data)
             self._fresh = True
 
-    def _raise_diverged(self) -> None:
-        raised = [
-            mujoco.mjtWarning(kind).name.removeprefix("mjWARN_").lower()
-            for kind in np.flatnonzero(self._warnings)
-        ]
-        raise NodeError(
-            f"the simulation diverged after {self.time_ns / 1e9:.3f} s ({', '.join(raised)}); "
-            "reset it, and check gains, limits and the scene"
-        )
-
 
 def build_world(profile: Profile) -> World:
-    """The world that a profile describes.
-
-    Raises:
-        ResourceError: scene or robot description are missing.
-    """
-    homes = [profile.of_part(name).robot.home_rad for name in profile.part_names]
+    """The world that a profile describes; a `ResourceError` if scene or description are missing."""
     return World(
         profile.sim.scene,
         robot_models(profile),
-        home_rad=homes,
+        home_rad=[profile.of_part(name).robot.home_rad for name in profile.part_names],
         joint_friction_nm=profile.sim.joint_friction_nm,
         seed=profile.sim.seed,
         vary=profile.sim.vary,
