@@ -37,7 +37,7 @@ from vla_zenoh.types import (
     SceneState,
     Task,
 )
-from vla_zenoh.types.reports import EVENT_KINDS, EVENT_LEVELS
+from vla_zenoh.types.stream import EVENT_KINDS, EVENT_LEVELS
 
 MAX_COMPONENT = 1e6
 

@@ -29,10 +29,6 @@ if TYPE_CHECKING:
     from vla_zenoh.types.commands import InferenceDebug as InferenceDebug
     from vla_zenoh.types.commands import JointCommand as JointCommand
     from vla_zenoh.types.commands import PoseCommand as PoseCommand
-    from vla_zenoh.types.reports import Event as Event
-    from vla_zenoh.types.reports import HeldBox as HeldBox
-    from vla_zenoh.types.reports import NodeStatus as NodeStatus
-    from vla_zenoh.types.reports import Task as Task
     from vla_zenoh.types.states import Depth as Depth
     from vla_zenoh.types.states import GripperState as GripperState
     from vla_zenoh.types.states import Image as Image
@@ -41,7 +37,11 @@ if TYPE_CHECKING:
     from vla_zenoh.types.states import PoseState as PoseState
     from vla_zenoh.types.states import PrivilegedState as PrivilegedState
     from vla_zenoh.types.states import SceneState as SceneState
+    from vla_zenoh.types.stream import Event as Event
     from vla_zenoh.types.stream import Header as Header
+    from vla_zenoh.types.stream import HeldBox as HeldBox
+    from vla_zenoh.types.stream import NodeStatus as NodeStatus
     from vla_zenoh.types.stream import Stamped as Stamped
+    from vla_zenoh.types.stream import Task as Task
 
-__getattr__ = lazy_names(__name__, "checks", "stream", "reports", "commands", "states", "arrays")
+__getattr__ = lazy_names(__name__, "checks", "stream", "commands", "states", "arrays")

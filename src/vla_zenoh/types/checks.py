@@ -150,6 +150,4 @@ def keep(record: Any, check: Callable[..., Any], *names: str, **bounds: Any) -> 
 
 def keep_given(record: Any, check: Callable[..., Any], *names: str, **bounds: Any) -> None:
     """`keep` for fields that may be None."""
-    for name in names:
-        if getattr(record, name) is not None:
-            keep(record, check, name, **bounds)
+    keep(record, check, *(name for name in names if getattr(record, name) is not None), **bounds)

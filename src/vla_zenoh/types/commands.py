@@ -46,10 +46,10 @@ class ActionChunk:
     Args:
         spec_hash: of the spec its steps are to be read with.
         episode: the episode (see `Task`) the policy was reset for.
-        observation_stamp_ns: capture time of the observation, wall clock.
-        valid_until_ns: after this wall time the chunk must not be started.
+        observation_stamp_ns: capture time of the observation, wall clock, as all times here.
+        valid_until_ns: after this time the chunk must not be started.
         steps: (H, D) float32.
-        observed_ns: wall time at which the worker took the observation.
+        observed_ns: when the worker took the observation.
         done: the policy reports that its task is finished when these steps are.
     """
 
@@ -108,10 +108,8 @@ class InferenceDebug:
 
 
 def plain_values(raw: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Raw output of a model as plain text, numbers and lists.
-
-    Arrays of any library become lists; what is too large or has no such form is described.
-    """
+    """Raw output of a model as plain text, numbers and lists, of arrays of any library too; what is
+    too large or has no such form is described."""
     return {str(name)[:256]: _plain(value, 2) for name, value in list((raw or {}).items())[:64]}
 
 
@@ -174,12 +172,9 @@ class PoseCommand:
     """Where the TCP has to be now, in the base frame, with feed-forward.
 
     Args:
-        position_m: (3,).
-        quat_xyzw: (4,) unit.
-        twist: (6,) m/s and rad/s.
-        acceleration: (6,) m/s^2 and rad/s^2.
-        goal_position_m: (3,) where the smoothed motion is heading.
-        goal_quat_xyzw: (4,) unit.
+        position_m, quat_xyzw: (3,), (4,) unit.
+        twist, acceleration: (6,) m/s and rad/s, m/s^2 and rad/s^2.
+        goal_position_m, goal_quat_xyzw: where the smoothed motion is heading.
         state: the command node's state.
         cause: the chunk being executed, None: none is.
     """
@@ -209,9 +204,7 @@ class JointCommand:
 
     Args:
         names: of the arm's joints, in any order.
-        position_rad: (n,).
-        velocity_rad_s: (n,).
-        acceleration_rad_s2: (n,).
+        position_rad, velocity_rad_s, acceleration_rad_s2: (n,).
         state: the command node's state.
         cause: the chunk being executed, None: none is.
     """
@@ -257,8 +250,7 @@ class PoseReference(NamedTuple):
     Args:
         position_m: (3,).
         rotation: (3, 3), columns are the TCP's axes.
-        twist: (6,) m/s and rad/s.
-        acceleration: (6,) m/s^2 and rad/s^2.
+        twist, acceleration: (6,) m/s and rad/s, m/s^2 and rad/s^2.
     """
 
     position_m: FloatArray
@@ -268,13 +260,7 @@ class PoseReference(NamedTuple):
 
 
 class JointReference(NamedTuple):
-    """Where the joints have to be now, in the order along the arm.
-
-    Args:
-        position_rad: (n,).
-        velocity_rad_s: (n,).
-        acceleration_rad_s2: (n,).
-    """
+    """Where the joints have to be now, in the order along the arm: (n,) each."""
 
     position_rad: FloatArray
     velocity_rad_s: FloatArray

@@ -36,8 +36,7 @@ class JointState:
     In rad and Nm, of a joint that slides in m and N.
 
     Args:
-        position_rad: (n,) measured.
-        velocity_rad_s: (n,) measured.
+        position_rad, velocity_rad_s: (n,) measured.
         effort_nm: (n,) motor effort: of the simulator and of ROS 2's joint states the total,
             including the arm's own weight. A robot class may report the external torque instead,
             and its profile then bounds it (``limits.contact.effort_stop_nm``). None if the robot
@@ -69,8 +68,8 @@ class PoseState:
         twist: (6,) m/s and rad/s, base axes.
         wrench: (6,) N and Nm that the surroundings exert on the arm, as if they did at the TCP,
             base axes; without the weight of arm and tool. None where the robot does not know it.
-        reference_position_m: (3,) pose the robot's controller holds right now, or None.
-        reference_quat_xyzw: (4,), or None. Both or neither.
+        reference_position_m, reference_quat_xyzw: pose the robot's controller holds right now, or
+            neither.
     """
 
     position_m: FloatArray
@@ -146,13 +145,7 @@ class SceneState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObjectPoses:
-    """True poses of a simulation's objects in the base frame.
-
-    Args:
-        names: one per object.
-        position_m: (n, 3).
-        quat_xyzw: (n, 4).
-    """
+    """True poses of a simulation's objects in the base frame: (n, 3) and (n, 4)."""
 
     names: tuple[str, ...]
     position_m: FloatArray
@@ -215,11 +208,7 @@ class Depth:
 
     @staticmethod
     def of_metres(depth_m: ArrayLike, unit_m: float) -> Depth:
-        """The image of distances in m, (H, W); what no count can represent is not measured.
-
-        Raises:
-            RecordError: another shape, or a unit out of range.
-        """
+        """The image of distances in m, (H, W); what no count can represent is not measured."""
         with np.errstate(invalid="ignore"):
             counts = np.rint(np.asarray(depth_m, np.float64) / unit_m)
             counts = np.where((counts >= 1) & (counts <= MAX_COUNT), counts, 0)

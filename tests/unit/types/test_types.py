@@ -26,7 +26,7 @@ from vla_zenoh.types import (
     SceneState,
     Task,
     checks,
-    reports,
+    stream,
     vector,
 )
 from vla_zenoh.types.arrays import MAX_VECTOR
@@ -292,8 +292,8 @@ def test_an_error_can_always_be_written(make: Callable[[], Any]) -> None:
 
 
 def test_an_event_is_of_a_known_kind_and_level() -> None:
-    for level in reports.EVENT_LEVELS:
-        for kind in reports.EVENT_KINDS:
+    for level in stream.EVENT_LEVELS:
+        for kind in stream.EVENT_KINDS:
             assert Event(level, kind, "x").level == level
     with pytest.raises(RecordError, match="level is 'debug', allowed: info, warning, error"):
         Event("debug", "notice", "x")
