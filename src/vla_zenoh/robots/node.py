@@ -46,14 +46,13 @@ class RobotNode:
     def __init__(self, driver: RobotDriver, session: zenoh.Session) -> None:
         self.driver = driver
         node = self.node = Node(driver.name, driver.profile, session)
-        self.arms: dict[str, Arm] = {}
-        if driver.has_arm:
-            self.arms = {name: Arm(node, part) for name, part in driver.parts.items()}
+        parts = driver.parts if driver.has_arm else {}
+        self.arms = {name: Arm(node, part) for name, part in parts.items()}
         self.arm = next(iter(self.arms.values()), None)
         driver.attach(node, self.arm)
-        for name, arm in self.arms.items():
-            if driver.parts[name] is not driver:
-                driver.parts[name].attach(node, arm)
+        for name, part in parts.items():
+            if part is not driver:
+                part.attach(node, self.arms[name])
         self._resets: CallbackRing | None = None
         if driver.recovers:
             self._resets = node.subscribe(node.keys.reset, CallbackRing(4, MAX_SETTING_BYTES))

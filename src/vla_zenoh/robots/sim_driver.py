@@ -200,22 +200,15 @@ class SimDriver(RobotDriver):
     def status(self) -> DriverStatus:
         """Scene, command mode and fault."""
         self.report.counters["sim.torque_saturated"] = self.world.saturated
-        return DriverStatus(
-            {
-                "scene": self.profile.sim.scene,
-                "command": self._first.guard.mode,
-                "lockstep": self.lockstep,
-                "fault": self.fault,
-            }
-        )
+        detail = {"scene": self.profile.sim.scene, "command": self._first.guard.mode}
+        return DriverStatus({**detail, "lockstep": self.lockstep, "fault": self.fault})
 
 
 class SimPart(RobotDriver):
     """One arm of the simulated robot; the first one steps the world of all.
 
-    Attributes:
-        guard: of its command streams, once the node is on the bus.
-        reference: towards which the next step goes.
+    It has a `guard` of its command streams once the node is on the bus; the next step goes towards
+    `reference`.
     """
 
     name, simulated = "sim", True

@@ -140,15 +140,13 @@ class Ros2Driver(RobotDriver):
 
     def connect(self) -> None:
         """Start the threads of cameras and services."""
-        bodies = [camera.run for camera in self._cameras]
-        if self._services is not None:
-            bodies.append(self._services.run)
-        for index, body in enumerate(bodies):
-            thread = threading.Thread(
-                target=body, args=(self._halt,), name=f"ros2 {index}", daemon=True
-            )
+        bodies = [each.run for each in (*self._cameras, self._services) if each is not None]
+        self._threads = [
+            threading.Thread(target=body, args=(self._halt,), name=f"ros2 {index}", daemon=True)
+            for index, body in enumerate(bodies)
+        ]
+        for thread in self._threads:
             thread.start()
-            self._threads.append(thread)
 
     def close(self) -> None:
         """Stop the threads and leave the ROS graph."""
@@ -243,12 +241,11 @@ class Ros2Driver(RobotDriver):
         if bool(others) == bool(before):
             return
         what = "bridge" if self._ros2.bridge == "ros2dds" else "ROS 2 node"
-        level, change, why = (
-            ("info", "bridge:gone->there", f"a {what} is there")
-            if others
-            else ("warning", "bridge:there->gone", f"no {what} is there any more")
-        )
-        self._node.emit(Event(level, "transition", change, why))
+        event = Event("info", "transition", "bridge:gone->there", f"a {what} is there")
+        if not others:
+            why = f"no {what} is there any more"
+            event = Event("warning", "transition", "bridge:there->gone", why)
+        self._node.emit(event)
 
     def status_changed(self) -> bool:
         """Whether a camera went bad or recovered."""

@@ -114,12 +114,9 @@ class Gripper:
             self._goals.want(command)
             self._advance()
             return
-        message = position_message(self._messages, self._profile.type, self._position(command))
+        position = gripper_actions.position(self._profile, self._limits, command.width_m)
+        message = position_message(self._messages, self._profile.type, position)
         self._topic.publish(self._messages.encode(message))
-
-    def _position(self, command: GripperCommand) -> float:
-        assert self._profile is not None
-        return gripper_actions.position(self._profile, self._limits, command.width_m)
 
     # -- the action ---------------------------------------------------------------------------
     def _send(self, goal: ActionGoal) -> None:
@@ -137,7 +134,7 @@ class Gripper:
             self._action,
             self._goal_id,
             goal.command,
-            position=self._position(goal.command),
+            position=gripper_actions.position(self._profile, self._limits, self._sent_m),
             max_width_m=self._limits.max_width_m,
         )
         self._node.counters["ros2.gripper_goals"] += 1
@@ -161,8 +158,7 @@ class Gripper:
         response = self._decode(f"{self._action}_SendGoal_Response", answer)
         if response is None or not response.accepted:
             if self._goals.ended(goal.number):
-                what = "rejected the goal" if response is not None else "does not answer"
-                self._emit_failure(what)
+                self._emit_failure("does not answer" if response is None else "rejected the goal")
             return
         self._goals.accepted(goal.number, time.monotonic_ns())
         request = self._messages.new(

@@ -33,11 +33,6 @@ Buffer = TypeVar("Buffer", LatestSample, CallbackRing)
 CALL_S = 5.0
 """Timeout of a service call."""
 
-_COMMANDS: dict[str, Any] = {
-    "congestion_control": zenoh.CongestionControl.DROP,
-    "priority": zenoh.Priority.REAL_TIME,
-    "express": True,
-}
 MAX_ATTACHMENT_BYTES = 1024
 _CDR = zenoh.Encoding("application/cdr")
 _ALL_COMPLETE = zenoh.QueryTarget.ALL_COMPLETE
@@ -47,7 +42,10 @@ class RosPublisher:
     """Publishes CDR bytes on one topic."""
 
     def __init__(self, session: zenoh.Session, key: str, gid: bytes | None) -> None:
-        self._publisher = session.declare_publisher(key, encoding=_CDR, **_COMMANDS)
+        drop, first = zenoh.CongestionControl.DROP, zenoh.Priority.REAL_TIME
+        self._publisher = session.declare_publisher(
+            key, encoding=_CDR, congestion_control=drop, priority=first, express=True
+        )
         self._gid = gid
         self._seq = itertools.count(1)
 
@@ -108,10 +106,9 @@ class Request:
         self.payload = bytes_of(query.payload)
         self._attachment: Attachment | None = None
         if with_attachment:
-            attachment = query.attachment
-            self._attachment = attachments.decode(
-                None if attachment is None else bytes_of(attachment, MAX_ATTACHMENT_BYTES)
-            )
+            given = query.attachment
+            payload = None if given is None else bytes_of(given, MAX_ATTACHMENT_BYTES)
+            self._attachment = attachments.decode(payload)
 
     def answer(self, response: bytes) -> None:
         """Reply with CDR bytes, and with number and gid of the request."""
@@ -139,12 +136,10 @@ class RosGraph:
         self.session = session
         self._rmw = profile.bridge == "rmw_zenoh"
         session_id = str(session.zid())
-        self._wire: Wire
+        hashed = messages.hash if messages.distribution != "humble" else None
+        self._wire: Wire = Ros2Dds(session_id, hashed)
         if self._rmw:
             self._wire = RmwZenoh(session_id, node, profile.domain, messages.hash)
-        else:
-            hashed = messages.distribution != "humble"
-            self._wire = Ros2Dds(session_id, messages.hash if hashed else None)
         self._numbers = itertools.count(1)
         self._lock = threading.Lock()
         self._others: set[str] = set()
@@ -161,11 +156,9 @@ class RosGraph:
                 else:
                     self._others.discard(token)
 
-        self._declared.append(
-            session.liveliness().declare_subscriber(
-                self._wire.others(), zenoh.handlers.Callback(on_token, indirect=False), history=True
-            )
-        )
+        handler = zenoh.handlers.Callback(on_token, indirect=False)
+        tokens = session.liveliness().declare_subscriber(self._wire.others(), handler, history=True)
+        self._declared.append(tokens)
 
     @property
     def others(self) -> int:
