@@ -34,9 +34,8 @@ def decode(payload: bytes | None) -> Attachment:
     if payload is None:
         raise CodecError("no_attachment", "rmw_zenoh sends an attachment with everything")
     if len(payload) != ATTACHMENT_BYTES:
-        raise CodecError(
-            "malformed", f"an attachment of {len(payload)} bytes, wanted {ATTACHMENT_BYTES}"
-        )
+        why = f"an attachment of {len(payload)} bytes, wanted {ATTACHMENT_BYTES}"
+        raise CodecError("malformed", why)
     seq, stamp_ns, length, gid = _LAYOUT.unpack(payload)
     if length != GID_BYTES or seq < 0 or stamp_ns < 0:
         raise CodecError("malformed", "an attachment of another layout")

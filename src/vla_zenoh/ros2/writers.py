@@ -93,9 +93,8 @@ def pose_writer(messages: Messages, kind: str, posture_rad: FloatArray) -> Write
     messages.require(kind)
     named = [what for node, what in messages.fields(kind).values() if node == Nodetype.NAME]
     if kind != POSE and not {POSE, POSE_STAMPED} & set(named):
-        raise ProfileError(
-            f"{kind} has no field of type {POSE} or {POSE_STAMPED} to put a pose into"
-        )
+        wanted = f"{POSE} or {POSE_STAMPED}"
+        raise ProfileError(f"{kind} has no field of type {wanted} to put a pose into")
 
     def write(command: PoseCommand, stamp: Stamp) -> Any:
         if kind == POSE:

@@ -77,8 +77,6 @@ class AppearanceSwitcher:
     def apply(self, seed: int | None, vary: Collection[str]) -> None:
         """Apply what `vary` names of the appearance of `seed`; None: that of the scene file.
 
-        The caller recomputes the positions in its data.
-
         Raises:
             ResourceError: an unknown name in `vary`, or the scene lacks what it varies.
         """
@@ -107,9 +105,8 @@ class AppearanceSwitcher:
         try:
             return int(getattr(self._model, kind)(name).id)
         except KeyError as error:
-            raise ResourceError(
-                f"the scene has no {kind} {name!r} that could be varied; see sim/bricks/README.md"
-            ) from error
+            why = f"the scene has no {kind} {name!r} that could be varied"
+            raise ResourceError(f"{why}; see sim/bricks/README.md") from error
 
 
 def _tinted(random: np.random.Generator, low: float, high: float) -> FloatArray:

@@ -62,14 +62,12 @@ def regions_of(model: mujoco.MjModel, prefix: str = REGION_PREFIX) -> dict[str, 
     for entry in (entry for entry in entries if entry.name.startswith(prefix)):
         name = entry.name.removeprefix(prefix)
         if name not in known:
-            raise ResourceError(
-                f"the scene places {name!r}, but can only place: {', '.join(known) or 'nothing'}"
-            )
+            can = ", ".join(known) or "nothing"
+            raise ResourceError(f"the scene places {name!r}, but can only place: {can}")
         data = entry.data.tolist()
         if len(data) != 6 or not all(data[i] <= data[i + 1] for i in (0, 2, 4)):
-            raise ResourceError(
-                f"{entry.name} is {data}, wanted x_min x_max y_min y_max yaw_min yaw_max"
-            )
+            wanted = "x_min x_max y_min y_max yaw_min yaw_max"
+            raise ResourceError(f"{entry.name} is {data}, wanted {wanted}")
         regions[name] = Region(Place(*data[0::2]), Place(*data[1::2]))
     return regions
 

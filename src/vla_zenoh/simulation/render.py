@@ -1,7 +1,6 @@
-"""Renders images of a simulated world from a copy of its poses.
+"""Renders images of a simulated world from a copy of its poses, `World.qpos`.
 
-Rendering belongs in a process of its own: it would disturb the control loop. That process makes a
-`Renderer` of the same scene and robot as the `World` and gives it `World.qpos`.
+Rendering belongs in a process of its own: it would disturb the control loop.
 
 ``python -m vla_zenoh.simulation.render`` renders one small test image by OpenGL and exits with 0
 when it is right; `vla_zenoh.simulation.backend` runs that, since a broken driver can crash it.
@@ -69,9 +68,8 @@ class Renderer:
         """
         size = mujoco.mj_stateSize(self._model, POSES)
         if vector.shape != (size,):
-            raise RecordError(
-                f"a pose vector of this scene has shape ({size},), got {vector.shape}"
-            )
+            why = f"a pose vector of this scene has shape ({size},), got {vector.shape}"
+            raise RecordError(why)
         if not np.isfinite(vector).all():
             raise RecordError("the pose vector is not finite")
         mujoco.mj_setState(self._model, self._data, vector, POSES)
@@ -132,10 +130,8 @@ class OpenGlCanvas:
         self._model = model
         other = os.environ.get("PYOPENGL_PLATFORM")
         if other not in (None, "", "egl"):
-            raise NodeError(
-                f"this process already renders with PYOPENGL_PLATFORM={other}; EGL needs a process "
-                "of its own"
-            )
+            why = f"this process already renders with PYOPENGL_PLATFORM={other}"
+            raise NodeError(f"{why}; EGL needs a process of its own")
         try:
             # MuJoCo's own Renderer takes its context from MUJOCO_GL as it was at `import mujoco`.
             from mujoco.egl import GLContext

@@ -24,11 +24,8 @@ STEP_S = 1e-3
 PREFIX = "robot/"
 TCP_SITE = "tcp"
 GRIPPER = "gripper"
-POSES = int(
-    mujoco.mjtState.mjSTATE_QPOS
-    | mujoco.mjtState.mjSTATE_MOCAP_POS
-    | mujoco.mjtState.mjSTATE_MOCAP_QUAT
-)
+_STATE = mujoco.mjtState
+POSES = int(_STATE.mjSTATE_QPOS | _STATE.mjSTATE_MOCAP_POS | _STATE.mjSTATE_MOCAP_QUAT)
 """MuJoCo's state of every pose: joint coordinates, then 7 numbers per mocap body."""
 STATIC_GROUP = 0
 MOVING_GROUP = 1
@@ -43,11 +40,7 @@ PAD_SOLIMP = (0.99, 0.999, 0.001, 0.5, 2.0)  # the fingers are light, hence soft
 
 
 def scene_file(scene: str) -> Path:
-    """MJCF file of `scene`, a name below ``sim/`` or the path of such a folder.
-
-    Raises:
-        ResourceError: no such folder, or no ``scene.xml`` in it.
-    """
+    """MJCF file of `scene`, a name below ``sim/`` or a path; a `ResourceError` without one."""
     folder = resources.find("sim", scene)
     path = folder / "scene.xml" if folder.is_dir() else folder
     if not path.is_file():
@@ -151,9 +144,8 @@ def coarse_stl(file: Path, grid_m: float) -> tuple[FloatArray, NDArray[np.int32]
 
 def _named(element: Any, kind: str, name: str, known: list[str]) -> Any:
     if element is None:
-        raise ResourceError(
-            f"the robot description has no {kind} {name!r}; it has: {', '.join(known)}"
-        )
+        has = ", ".join(known)
+        raise ResourceError(f"the robot description has no {kind} {name!r}; it has: {has}")
     return element
 
 

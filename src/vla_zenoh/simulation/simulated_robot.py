@@ -37,9 +37,6 @@ class SimulatedPart:
     motion jolts the arm. All poses are of the TCP in the base frame of the arm. `refresh` computes
     positions after a step; see `World` for the others.
 
-    Attributes:
-        joint_range_rad: lower and upper limit of every arm joint, (n,) each.
-
     Raises:
         ResourceError: the arm's joints are not one chain.
     """
@@ -62,7 +59,6 @@ class SimulatedPart:
         if [int(joint.dofadr[0]) - first_dof for joint in joints] != list(range(len(joints))):
             raise ResourceError("the arm's joints do not follow each other in the URDF")
         self._dofs = slice(first_dof, first_dof + len(joints))
-        self._ctrl = data.ctrl
         self._actuators = np.array(
             [model.actuator(prefix_of(robot) + name).id for name in robot.arm_joints]
         )
@@ -91,7 +87,7 @@ class SimulatedPart:
         self._scratch = mujoco.MjData(model)
 
         lower_rad, upper_rad = np.array([joint.range for joint in joints]).T
-        self.joint_range_rad = lower_rad, upper_rad
+        self.joint_range_rad = lower_rad, upper_rad  # (n,) each
         effort_nm = model.actuator_ctrlrange[self._actuators, 1]
         limits = {"lower_rad": lower_rad, "upper_rad": upper_rad, "effort_nm": effort_nm}
         self._cartesian = CartesianImpedance(gains, **limits, posture_rad=home_rad, period_s=STEP_S)
@@ -125,12 +121,12 @@ class SimulatedPart:
         else:
             law, self._held_rad = self._cartesian, None
         if self._active_law not in (None, law):
-            law.take_over(self._ctrl[self._actuators], state)
+            law.take_over(self._data.ctrl[self._actuators], state)
         self._active_law = law
         output = law.torque(reference, state)  # pyright: ignore[reportArgumentType]  # of its law
         if not math.isfinite(sum(output.torque_nm.tolist())):
             raise NodeError(f"the reference is not finite: {reference}")
-        self._ctrl[self._actuators] = output.torque_nm
+        self._data.ctrl[self._actuators] = output.torque_nm
         self.gripper.step()
         return output.saturated
 
@@ -195,8 +191,7 @@ class SimulatedPart:
     # -- measurements -------------------------------------------------------------------------
     def hold_reference(self) -> PoseReference:
         """Reference at the measured TCP, at rest."""
-        position, rotation = self.tcp()
-        return PoseReference(position, rotation, np.zeros(6), np.zeros(6))
+        return PoseReference(*self.tcp(), np.zeros(6), np.zeros(6))
 
     @property
     def wrench(self) -> FloatArray:
@@ -280,9 +275,8 @@ class SimulatedGripper:
     def command(self, width_m: float, speed_m_s: float, force_n: float) -> None:
         """Go to `width_m` at `speed_m_s`, pressing with at most `force_n`; both above zero."""
         if not speed_m_s > 0.0 or not force_n > 0.0:
-            raise RecordError(
-                f"a gripper needs speed and force above 0, got {speed_m_s} and {force_n}"
-            )
+            why = f"a gripper needs speed and force above 0, got {speed_m_s} and {force_n}"
+            raise RecordError(why)
         target = min(max(width_m, 0.0), self._max_width_m)
         # Squeezing continues from the ramp, else a repeated command would release for a moment; a
         # reversal starts at the fingers, else it would lag by the whole squeeze.
@@ -304,8 +298,7 @@ class SimulatedGripper:
 
     def state(self) -> GripperState:
         """Opening between the fingers, and whether they move or hold an object."""
-        width_m, _ = self._opening()
-        return GripperState(width_m, moving=self._moving, holding=self._holding)
+        return GripperState(self._opening()[0], moving=self._moving, holding=self._holding)
 
     @property
     def force_n(self) -> float:

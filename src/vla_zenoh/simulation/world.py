@@ -85,10 +85,7 @@ class World:
         self.reset(seed)
 
     def reset(self, seed: int | None = None) -> None:
-        """Return to the home pose with the gripper open and the clock at zero.
-
-        With a `seed` objects stand at random places in the scene's regions.
-        """
+        """Return home, gripper open, clock at zero; with a `seed` objects are placed at random."""
         model, data = self.model, self._data
         self.seed = seed
         mujoco.mj_resetData(model, data)
@@ -154,11 +151,7 @@ class World:
         }
 
     def place(self, name: str, position_m: ArrayLike, quat_xyzw: ArrayLike = (0, 0, 0, 1)) -> None:
-        """Put an object at a pose, at rest.
-
-        Raises:
-            ResourceError: the scene has no such object.
-        """
+        """Put an object at a pose, at rest; a `ResourceError` if the scene has no such object."""
         if name not in self._bodies:
             raise ResourceError(
                 f"the scene has no object {name!r}; it has: {', '.join(self._bodies) or 'none'}"
