@@ -51,11 +51,7 @@ def encode_raw(image: Image) -> bytes:
 
 
 def decode_raw(payload: bytes, schema: str) -> Image:
-    """An image from its pixels, without copying.
-
-    Raises:
-        CodecError: schema or length do not fit.
-    """
+    """An image from its pixels, without copying; `CodecError`: schema or length do not fit."""
     height, width = _raw_size(schema)
     if len(payload) != height * width * 3:
         raise CodecError("truncated", f"{len(payload)} bytes for an rgb8 image of {height}x{width}")
@@ -73,11 +69,7 @@ def _raw_size(schema: str) -> tuple[int, int]:
 
 
 def encode_jpeg(image: Image, quality: int = DEFAULT_JPEG_QUALITY) -> bytes:
-    """A JPEG file.
-
-    Raises:
-        CodecError: the image is larger than `decode_jpeg` reads.
-    """
+    """A JPEG file; `CodecError`: the image is larger than `decode_jpeg` reads."""
     height, width, _ = image.rgb.shape
     check_size(height, width)
     ok, data = cv2.imencode(
@@ -89,11 +81,7 @@ def encode_jpeg(image: Image, quality: int = DEFAULT_JPEG_QUALITY) -> bytes:
 
 
 def decode_jpeg(payload: bytes) -> Image:
-    """A JPEG file to RGB pixels.
-
-    Raises:
-        CodecError: not a whole JPEG file, or larger than we read.
-    """
+    """A JPEG file to RGB pixels; `CodecError`: not a whole one, or larger than we read."""
     if len(payload) > MAX_JPEG_BYTES:
         raise CodecError("oversize", f"a JPEG of {len(payload)} bytes, at most {MAX_JPEG_BYTES}")
     if payload[:3] != b"\xff\xd8\xff":
@@ -105,18 +93,20 @@ def decode_jpeg(payload: bytes) -> Image:
 
 
 def decode_png(payload: bytes) -> Image:
-    """A PNG file to RGB pixels, for images of others.
-
-    Raises:
-        CodecError: not a PNG file, or larger than we read.
-    """
+    """A PNG file of others to RGB pixels; `CodecError`: not one, or larger than we read."""
     if len(payload) > MAX_JPEG_BYTES:
         raise CodecError("oversize", f"a PNG of {len(payload)} bytes, at most {MAX_JPEG_BYTES}")
     if len(payload) < 24 or not payload.startswith(PNG_BEGINS):
         raise CodecError("malformed", "not a PNG file")
+    _checked_png_size(payload)
+    return _decode(payload, "PNG")
+
+
+def _checked_png_size(payload: bytes) -> tuple[int, int]:
+    """Height and width, read before any memory is taken for pixels."""
     width, height = (int.from_bytes(payload[at : at + 4], "big") for at in (16, 20))
     check_size(height, width)
-    return _decode(payload, "PNG")
+    return height, width
 
 
 def _decode(payload: bytes, kind: str) -> Image:
@@ -136,11 +126,7 @@ def depth_schema(depth: Depth) -> str:
 
 
 def encode_depth(depth: Depth) -> bytes:
-    """A PNG file of 16 bits that `decode_depth` reads, pixel for pixel.
-
-    Raises:
-        CodecError: the image is larger than that.
-    """
+    """A PNG file of 16 bits; `CodecError`: the image is larger than `decode_depth` reads."""
     check_size(*depth.counts.shape)
     ok, data = cv2.imencode(".png", depth.counts, _PNG_WAY)
     if not ok:
@@ -165,16 +151,14 @@ def decode_depth(payload: bytes, schema: str) -> Depth:
         raise CodecError("malformed", "not a PNG file")
     if payload[-8:] != PNG_ENDS:
         raise CodecError("truncated", "a PNG file without its end")
-    # Read before any memory is taken for pixels.
-    width, height = (int.from_bytes(payload[at : at + 4], "big") for at in (16, 20))
-    check_size(height, width)
+    size = _checked_png_size(payload)
     if payload[24:29] != _GREY_16:
         raise CodecError("invalid", "a depth image is a PNG file of one channel of 16 bits")
     try:
         counts = cv2.imdecode(np.frombuffer(payload, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise CodecError("malformed", f"not a PNG file: {error.err}") from error
-    if counts is None or counts.shape != (height, width) or counts.dtype != np.uint16:
+    if counts is None or counts.shape != size or counts.dtype != np.uint16:
         raise CodecError("malformed", "not a PNG file that can be decoded as depth")
     try:
         return Depth(np.asarray(counts, np.uint16), float(match[1]))
@@ -183,11 +167,7 @@ def decode_depth(payload: bytes, schema: str) -> Depth:
 
 
 def check_size(height: int, width: int) -> None:
-    """Make sure that an image of this size may be decoded.
-
-    Raises:
-        CodecError: it has no pixels, or too many.
-    """
+    """Raise a `CodecError` for an image without pixels, or with too many to be decoded."""
     sides_fit = 1 <= height <= MAX_SIDE and 1 <= width <= MAX_SIDE
     if not sides_fit or height * width > MAX_PIXELS:
         raise CodecError(

@@ -64,12 +64,8 @@ def _malformed(why: str) -> CodecError:
 def pack(value: Any, to_map: Callable[[Any], Any] | None = None) -> bytes:
     """Encode maps, lists, text, numbers, bytes, numpy arrays and numpy scalars.
 
-    Args:
-        value: to encode.
-        to_map: form of an array, see `array_parts`; None: openpi's.
-
-    Raises:
-        CodecError: a value of another type.
+    `to_map` gives the form of an array, see `array_parts`; None: openpi's. Other types raise a
+    `CodecError`.
     """
     try:
         packed = msgpack.packb(value, default=to_map or _to_map, use_bin_type=True)
@@ -82,12 +78,8 @@ def pack(value: Any, to_map: Callable[[Any], Any] | None = None) -> bytes:
 def unpack(payload: bytes, from_map: Callable[[dict[Any, Any]], Any] | None = None) -> Any:
     """Decode what `pack` (or openpi) wrote. Arrays are views into `payload` and read-only.
 
-    Args:
-        payload: to decode.
-        from_map: makes the array of a map that stands for one, see `make_array`; None: openpi's.
-
-    Raises:
-        CodecError: the bytes are anything else.
+    `from_map` makes the array of a map that stands for one, see `make_array`; None: openpi's.
+    Anything else raises a `CodecError`.
     """
     if len(payload) > MAX_PAYLOAD_BYTES:
         raise CodecError(
@@ -122,11 +114,8 @@ def unpack(payload: bytes, from_map: Callable[[dict[Any, Any]], Any] | None = No
 
 
 def count_containers(error: Callable[[str], Exception] = _malformed) -> Callable[[Any], Any]:
-    """A hook that returns its argument, and raises when there are more than `MAX_CONTAINERS`.
-
-    Args:
-        error: makes the exception of a sentence.
-    """
+    """A hook that returns its argument, and raises `error` of a sentence when there are more than
+    `MAX_CONTAINERS`."""
     left = itertools.repeat(None, MAX_CONTAINERS)
 
     def hook(found: Any) -> Any:
@@ -185,11 +174,7 @@ def _from_map(value: dict[Any, Any]) -> Any:
 
 
 def make_array(data: Any, dtype_name: Any, shape: Any) -> np.ndarray[Any, Any]:
-    """A read-only view of received bytes.
-
-    Raises:
-        CodecError: bytes, dtype and shape do not fit each other, or are something else.
-    """
+    """A read-only view of received bytes; `CodecError`: dtype or shape do not fit them."""
     np = _numpy()
     dtype = _dtype(dtype_name)
     if not isinstance(data, bytes) or not isinstance(shape, list):

@@ -64,11 +64,7 @@ def decode(kind: type[Record], payload: bytes) -> Record:
 
 
 def from_map(kind: type[Record], data: Any) -> Record:
-    """The record of what `encode` packs.
-
-    Raises:
-        CodecError: reason ``malformed`` or ``invalid``, as of `decode`.
-    """
+    """The record of what `encode` packs; raises as `decode`."""
     if not isinstance(data, dict):
         raise CodecError("malformed", f"{kind.__name__} is a map, this is a {type(data).__name__}")
     from_dict = getattr(kind, "from_dict", None)
@@ -102,19 +98,15 @@ def _layout(kind: type) -> _Layout:
     names = tuple(field.name for field in fields)
     missing = dataclasses.MISSING
     required = tuple(
-        field.name
-        for field in fields
-        if field.default is missing and field.default_factory is missing
+        f.name for f in fields if f.default is missing and f.default_factory is missing
     )
     head = msgpack.Packer().pack_map_header(len(names))
     return _Layout(head, names, frozenset(names), required)
 
 
 def _fields(record: Any) -> dict[str, Any]:
-    fields = {name: getattr(record, name) for name in _layout(type(record)).names}
-    return {
-        name: dict(value) if hasattr(value, "keys") else value for name, value in fields.items()
-    }
+    fields = ((name, getattr(record, name)) for name in _layout(type(record)).names)
+    return {name: dict(value) if hasattr(value, "keys") else value for name, value in fields}
 
 
 _STREAMED = {"GripperState", "JointCommand", "JointState", "PoseCommand", "PoseState"}
@@ -277,10 +269,9 @@ def _keep_frame(record: Any, payload: bytes) -> None:
     ]
     rotations = tuple(name for name, _ in numbers if name.endswith("quat_xyzw"))
     floats = any(read is _float for _, read in numbers)
-    frame = _Frame(
+    _frames[type(record), len(payload)] = _Frame(
         *(split, constants, dict(values), tuple(numbers), rotations, unit_quaternion, floats)
     )
-    _frames[type(record), len(payload)] = frame
 
 
 def _float(number: bytes) -> float:
@@ -316,8 +307,13 @@ def _record(kind: type[Record], data: Mapping[Any, Any]) -> Record:
         missing = [name for name in layout.required if name not in data]
         if missing:
             raise CodecError("malformed", f"{kind.__name__} lacks {', '.join(missing)}")
-    if data.get("cause") is not None:
-        data = {**data, "cause": _cause(data["cause"])}
+    cause = data.get("cause")
+    if cause is not None:
+        if not isinstance(cause, dict):
+            raise CodecError("malformed", "cause is a map or nothing")
+        from vla_zenoh.types import Cause  # brings numpy
+
+        data = {**data, "cause": _record(Cause, cause)}
     return _made(kind, data)
 
 
@@ -328,14 +324,6 @@ def _made(kind: type[Record], data: Mapping[Any, Any]) -> Record:
         raise CodecError("invalid", f"{kind.__name__}: {error}") from error
     except (TypeError, ValueError, AttributeError, OverflowError) as error:
         raise CodecError("malformed", f"{kind.__name__}: {error}") from error
-
-
-def _cause(value: Any) -> Any:
-    if not isinstance(value, dict):
-        raise CodecError("malformed", "cause is a map or nothing")
-    from vla_zenoh.types import Cause  # brings numpy
-
-    return _record(Cause, value)
 
 
 MAX_HEADER_BYTES = 1024
@@ -403,19 +391,15 @@ def decode_header(attachment: bytes | None) -> Header:
         raise CodecError("malformed", f"a header of {len(attachment)} bytes")
     try:
         header = _header_of_ours(attachment)
-    except RecordError as error:
-        raise CodecError("invalid", str(error)) from error
-    if header is not None:
-        return header
-    data = message.unpack(attachment)
-    if not isinstance(data, dict):
-        raise CodecError("malformed", f"the header is a {type(data).__name__}, wanted a map")
-    schema = data.get("schema")
-    if type(schema) is not int or schema != keys.SCHEMA:
-        raise CodecError(
-            "schema", f"schema {shown(schema)} is not ours ({keys.SCHEMA}); update one side"
-        )
-    try:
+        if header is not None:
+            return header
+        data = message.unpack(attachment)
+        if not isinstance(data, dict):
+            raise CodecError("malformed", f"the header is a {type(data).__name__}, wanted a map")
+        schema = data.get("schema")
+        if type(schema) is not int or schema != keys.SCHEMA:
+            why = f"schema {shown(schema)} is not ours ({keys.SCHEMA}); update one side"
+            raise CodecError("schema", why)
         return Header(data["stamp_wall_ns"], data["seq"], data["source"])
     except KeyError as error:
         raise CodecError("malformed", f"the header lacks {error}") from error
