@@ -119,57 +119,10 @@ class Wake:
         return self._asleep.acquire(timeout=max(timeout_s, 0.0))
 
 
-class LatestSample(SampleBuffer):
-    """Keeps the newest sample; a thread can wait for it.
-
-    Every sample sets `changed`; several buffers may share one.
-    """
-
-    def __init__(self, limit: int = MAX_RECORD_BYTES, changed: Wake | None = None) -> None:
-        super().__init__(limit)
-        self._changed = changed or Wake()
-        self._lock = threading.Lock()
-        self._arrival: ReceivedSample | None = None
-        self._count = self._popped = 0
-
-    def __call__(self, sample: zenoh.Sample) -> None:
-        if not self._accepts(sample):
-            return
-        with self._lock:
-            self._count += 1
-            self._arrival = ReceivedSample(sample, time.monotonic_ns(), self._count)
-        self._changed.set()
-
-    @property
-    def count(self) -> int:
-        """Number of samples received so far."""
-        return self._count
-
-    @property
-    def has_new(self) -> bool:
-        """Whether there is a sample that was not popped."""
-        return self._popped != self._count
-
-    def pop(self) -> ReceivedSample | None:
-        """The newest sample, once."""
-        if self._popped == self._count:
-            return None
-        with self._lock:
-            self._popped = self._count
-            return self._arrival
-
-    def wait(self, timeout_s: float) -> bool:
-        """Wait for a sample that was not popped; False after `timeout_s`."""
-        give_up_s = time.monotonic() + timeout_s
-        while not self.has_new and self._changed.wait(give_up_s - time.monotonic()):
-            pass
-        return self.has_new
-
-
 class CallbackRing(SampleBuffer):
     """Keeps the newest `size` samples in order; older ones are dropped and counted.
 
-    Every sample sets `arrival`; several buffers may share one.
+    Every sample sets `arrival`; several buffers may share one. `count` samples came in all.
     """
 
     def __init__(
@@ -182,16 +135,15 @@ class CallbackRing(SampleBuffer):
         self._arrival = arrival
         self._arrivals: deque[ReceivedSample] = deque(maxlen=size)
         self._size = size
-        self._count = 0
-        self.dropped = 0
+        self.count = self.dropped = 0
 
     def __call__(self, sample: zenoh.Sample) -> None:
         if not self._accepts(sample):
             return
-        self._count += 1
+        self.count += 1
         if len(self._arrivals) == self._size:
             self.dropped += 1
-        self._arrivals.append(ReceivedSample(sample, time.monotonic_ns(), self._count))
+        self._arrivals.append(ReceivedSample(sample, time.monotonic_ns(), self.count))
         if self._arrival is not None:
             self._arrival.set()
 
@@ -212,6 +164,21 @@ class CallbackRing(SampleBuffer):
         return drained
 
 
+class LatestSample(CallbackRing):
+    """Keeps the newest sample; a thread can wait for it."""
+
+    def __init__(self, limit: int = MAX_RECORD_BYTES, changed: Wake | None = None) -> None:
+        self._changed = changed or Wake()
+        super().__init__(1, limit, self._changed)
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait for a sample that was not popped; False after `timeout_s`."""
+        give_up_s = time.monotonic() + timeout_s
+        while not self.has_new and self._changed.wait(give_up_s - time.monotonic()):
+            pass
+        return self.has_new
+
+
 class ZenohRing(SampleBuffer):
     """A `CallbackRing` that Zenoh fills by itself, without running Python for each sample.
 
@@ -222,7 +189,7 @@ class ZenohRing(SampleBuffer):
 
     def __init__(self, size: int, limit: int = MAX_RECORD_BYTES) -> None:
         super().__init__(limit)
-        self._size, self._count = size, 0
+        self._size, self.count = size, 0
         self._receive: Callable[[], zenoh.Sample | None] = lambda: None
 
     def subscribe(self, session: zenoh.Session, key: str) -> zenoh.Subscriber[Any]:
@@ -238,8 +205,8 @@ class ZenohRing(SampleBuffer):
             if sample is None:
                 break
             if self._accepts(sample):
-                self._count += 1
-                drained.append(ReceivedSample(sample, time.monotonic_ns(), self._count))
+                self.count += 1
+                drained.append(ReceivedSample(sample, time.monotonic_ns(), self.count))
         else:
             return [arrival._replace(nth=0) for arrival in drained]
         return drained

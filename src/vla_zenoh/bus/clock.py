@@ -54,7 +54,7 @@ class Tick(NamedTuple):
     """One cycle of a fixed-rate loop.
 
     Args:
-        periods: periods since the last cycle, at least 1.
+        periods: since the last cycle, at least 1.
         nominal_ns: nominal time of this cycle, monotonic clock.
         stall_s: how late it begins, plus how long the computer was suspended.
         computed_s: processor time of this thread in the last cycle. If that is short and the stall
@@ -86,26 +86,22 @@ class FixedRate:
     def __init__(self, rate_hz: float) -> None:
         self._suspended_ns = max(suspended_ns() for _ in range(3))
         self._period_ns = round(1e9 / rate_hz)
-        self._next_ns = time.monotonic_ns() + self._period_ns
-        self._computed_ns = time.thread_time_ns()
-
-    @property
-    def next_ns(self) -> int:
+        self.next_ns = time.monotonic_ns() + self._period_ns
         """Time of the next cycle, monotonic clock."""
-        return self._next_ns
+        self._computed_ns = time.thread_time_ns()
 
     def skip(self, periods: int) -> None:
         """Let the next cycle be the `periods`-th from now; those before are not missed."""
-        self._next_ns += (periods - 1) * self._period_ns
+        self.next_ns += (periods - 1) * self._period_ns
 
     def resume(self) -> None:
         """End a skip: the next cycle is at the next multiple."""
-        early = (self._next_ns - time.monotonic_ns()) // self._period_ns
-        self._next_ns -= max(early, 0) * self._period_ns
+        early = (self.next_ns - time.monotonic_ns()) // self._period_ns
+        self.next_ns -= max(early, 0) * self._period_ns
 
     def wait_for(self, arrival: threading.Event) -> bool:
         """Wait for `arrival`, at most until the next cycle; returns whether it came; clears it."""
-        left_ns = self._next_ns - time.monotonic_ns()
+        left_ns = self.next_ns - time.monotonic_ns()
         if left_ns <= 0 or not arrival.wait(left_ns / 1e9):
             return False
         arrival.clear()
@@ -113,26 +109,25 @@ class FixedRate:
 
     def wait_until(self, before_ns: int) -> None:
         """Sleep until `before_ns` before the next cycle."""
-        left_ns = self._next_ns - before_ns - time.monotonic_ns()
+        left_ns = self.next_ns - before_ns - time.monotonic_ns()
         if left_ns > 0:
             time.sleep(left_ns / 1e9)
 
     def wait(self) -> Tick:
         """Sleep until the next multiple."""
-        computed_ns = time.thread_time_ns()
-        computed_s = (computed_ns - self._computed_ns) / 1e9
-        self._computed_ns = computed_ns
+        before_ns, self._computed_ns = self._computed_ns, time.thread_time_ns()
+        computed_s = (self._computed_ns - before_ns) / 1e9
         now_ns = time.monotonic_ns()
-        if now_ns < self._next_ns:
-            time.sleep((self._next_ns - now_ns) / 1e9)
+        if now_ns < self.next_ns:
+            time.sleep((self.next_ns - now_ns) / 1e9)
             now_ns = time.monotonic_ns()
-        late_ns = max(now_ns - self._next_ns, 0)
+        late_ns = max(now_ns - self.next_ns, 0)
         asleep_ns = max(suspended_ns() - self._suspended_ns, 0)
         self._suspended_ns += asleep_ns
         periods = 1 + late_ns // self._period_ns
-        self._next_ns += periods * self._period_ns
+        self.next_ns += periods * self._period_ns
         stall_s = (late_ns + asleep_ns) / 1e9
-        return Tick(int(periods), self._next_ns - self._period_ns, stall_s, computed_s)
+        return Tick(int(periods), self.next_ns - self._period_ns, stall_s, computed_s)
 
 
 HOST_VARIABLE = "VLA_ZENOH_HOST"
@@ -157,11 +152,7 @@ class HostId(NamedTuple):
 
 
 def own_host_id(session: SessionProfile, host: str | None = None) -> HostId:
-    """Identity of this host.
-
-    Args:
-        session: of the profile; a secured host is named by its certificates.
-        host: name in the profile, if given by an option.
+    """Identity of this host; `host` is given by an option, a secured one named by its certificates.
 
     Raises:
         ProfileError: the name cannot be part of a key.

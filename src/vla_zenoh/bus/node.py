@@ -57,14 +57,8 @@ class Publisher:
         seq: int | None = None,
         encoding: Any = MSGPACK,
     ) -> Header:
-        """Publish a record, or encoded bytes.
-
-        Args:
-            record: record or bytes.
-            stamp_wall_ns: time of capture; None: now.
-            seq: sequence number; None: one more than the last.
-            encoding: of the payload.
-        """
+        """Publish a record, or encoded bytes, with its time of capture (None: now) and sequence
+        number (None: one more than the last)."""
         header = Header(
             self._clock.wall_ns() if stamp_wall_ns is None else stamp_wall_ns,
             self.seq if seq is None else seq,
@@ -82,8 +76,8 @@ class Publisher:
             self._encoded = record, records.encode(record)
         return self._encoded[1]
 
-    def close(self) -> None:
-        """Undeclare the publisher."""
+    def undeclare(self) -> None:
+        """Close it."""
         self._publisher.undeclare()
 
 
@@ -103,7 +97,7 @@ class Node:
     Args:
         name: unique for this robot.
         profile: the effective profile.
-        session: an open session; the caller closes it.
+        session: open session, which the caller closes.
         host: name of this host in the profile, if known.
 
     Raises:
@@ -142,7 +136,6 @@ class Node:
         events = self.declare_publisher(self.keys.event(name), Kind.TELEMETRY)
         self._events = EventThrottle(events.publish)
 
-    # -- publishing ---------------------------------------------------------------------------
     def declare_publisher(self, key: str, kind: Kind) -> Publisher:
         """A publisher on `key`.
 
@@ -156,7 +149,7 @@ class Node:
     def undeclare(self, publisher: Publisher) -> None:
         """Close a publisher."""
         self._publishers.remove(publisher)
-        publisher.close()
+        publisher.undeclare()
 
     def _session_for(self, kind: Kind) -> zenoh.Session:
         """Images have a connection of their own if the profile says so."""
@@ -230,7 +223,6 @@ class Node:
             for node, found in self.clocks.offsets().items()
         }
 
-    # -- subscribing --------------------------------------------------------------------------
     def subscribe(self, key: str, buffer: AnyBuffer, kind: Kind = Kind.STATE) -> AnyBuffer:
         """Subscribe to a key expression; samples go to `buffer`, which is returned.
 
@@ -303,14 +295,7 @@ class Node:
     ) -> Stamped[Record] | None:
         """Decode a sample, with its stamps on this node's clock, see `ClockSync`.
 
-        Args:
-            kind: type of the record.
-            arrival: the sample.
-            writer_filter: of its key.
-            header: of the sample, if it is decoded already.
-
-        Returns:
-            None if the sample was rejected, which is counted and reported.
+        None if it was rejected, which is counted and reported. `header`: if it is decoded already.
         """
         key = str(arrival.sample.key_expr)
         try:

@@ -21,20 +21,20 @@ class StreamSlot(LatestSample):
     @property
     def arrival(self) -> ReceivedSample | None:
         """The sample and its time of arrival; None before the first."""
-        return self._arrival
+        return self._arrivals[0] if self._arrivals else None
 
     @property
     def mono_s(self) -> float:
         """When it was received, by the monotonic clock; 0 before the first."""
-        return self._arrival.mono_ns / 1e9 if self._arrival else 0.0
+        return self.arrival.mono_ns / 1e9 if self.arrival else 0.0
 
     def payload(self) -> bytes:
         """Its bytes, empty before the first."""
-        return bytes_of(self._arrival.sample.payload) if self._arrival else b""
+        return bytes_of(self.arrival.sample.payload) if self.arrival else b""
 
     def read(self, kind: type[Record]) -> tuple[Header, Record]:
         """Its header and record. Raises NodeError: nothing was received, or no such record."""
-        arrival = self._arrival
+        arrival = self.arrival
         if arrival is None:
             raise NodeError(f"no {kind.__name__} received")
         try:

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 from vla_zenoh.bus.buffers import (
     CallbackRing,
-    LatestSample,
     ReceivedSample,
     Wake,
     ZenohRing,
@@ -44,7 +43,7 @@ class ReceivedImage(NamedTuple):
 
 class _Stream(NamedTuple):
     key: str
-    buffer: LatestSample | CallbackRing
+    buffer: CallbackRing
     writer: SingleWriterFilter
 
 
@@ -113,13 +112,9 @@ class CameraSubscriber:
         self._node.emit(Event("warning", "notice", f"{self._camera}:plain_pictures", why))
 
     def _subscribe(self, key: str) -> _Stream:
-        buffer = (
-            LatestSample(MAX_IMAGE_BYTES, self._changed)
-            if self._queue == 1
-            else CallbackRing(self._queue, MAX_IMAGE_BYTES, self._changed)
-        )
-        self._node.subscribe(key, buffer, Kind.FRAME)
-        return _Stream(key, buffer, SingleWriterFilter(STREAM_PATIENCE_S))
+        ring = CallbackRing(self._queue, MAX_IMAGE_BYTES, self._changed)
+        self._node.subscribe(key, ring, Kind.FRAME)
+        return _Stream(key, ring, SingleWriterFilter(STREAM_PATIENCE_S))
 
 
 def subscribe_to_camera(
