@@ -150,7 +150,7 @@ class Turns:
         )
 
     def run(self) -> None:
-        self.node._loop(self, self.stop)  # pyright: ignore[reportArgumentType]
+        self.node._loop(self.wait, self.stop)
 
     def say(self, **said: Any) -> Callable[[], None]:
         return lambda: self.arm.said.update(said)

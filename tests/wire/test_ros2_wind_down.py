@@ -48,7 +48,7 @@ class Loop:
         return Tick(1, turns.mono_ns, stall_s, 0.0)
 
     def run(self) -> None:
-        self.turns.robot._loop(self, self.stop)  # pyright: ignore[reportArgumentType]
+        self.turns.robot._loop(self.wait, self.stop)
 
 
 @pytest.fixture

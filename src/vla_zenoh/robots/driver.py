@@ -5,9 +5,9 @@ from __future__ import annotations
 import threading
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from vla_zenoh.bus.clock import Clock, FixedRate, Tick
 from vla_zenoh.errors import NodeError
@@ -67,12 +67,6 @@ class Report:
     def reject(self, reason: str, why: str, about: str = "") -> None:
         self.counters[f"refused.{reason}"] += 1
         self.emit(Event("warning", "refusal", reason, why))
-
-
-class Pace(Protocol):
-    """Clock of the node's loop; `wait` sleeps until the next tick."""
-
-    def wait(self) -> Tick: ...
 
 
 class RobotDriver(ABC):
@@ -169,9 +163,9 @@ class RobotDriver(ABC):
     def close(self) -> None:
         """Disconnect; the arm stands."""
 
-    def pace(self) -> Pace:
-        """Clock of the loop."""
-        return FixedRate(self.profile.timing.command_hz)
+    def pace(self) -> Callable[[], Tick]:
+        """Clock of the loop: sleeps until the next tick."""
+        return FixedRate(self.profile.timing.command_hz).wait
 
     # -- geometry -----------------------------------------------------------------------------
     def state_now(self) -> Measured | None:

@@ -15,6 +15,7 @@ from vla_zenoh.kinematics.fingers import Fingers
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import Pose, quat_from_rotation
 from vla_zenoh.profile import Profile
+from vla_zenoh.robots.driver import Measurement
 from vla_zenoh.ros2.samples import Joints
 from vla_zenoh.types import FloatArray, GripperState, JointState, PoseState
 
@@ -183,6 +184,14 @@ class JointReading:
         velocity = self._kinematics.ordered(self.joints.names, self.joints.velocity_rad_s)
         return pose, jacobian @ velocity
 
+    def measurement(self, wrench: FloatArray | None, gripper: GripperState | None) -> Measurement:
+        """The newest `joints` as records, or a `RecordError`: finite, but too large for one."""
+        assert self.joints is not None
+        tcp, twist = self.tcp()
+        quat_xyzw = quat_from_rotation(tcp.rotation)
+        pose = PoseState(tcp.position_m, quat_xyzw, twist, wrench, None, None)
+        return Measurement(self.stamp_ns, self.joints, tcp, pose, gripper)
+
     def gripper(self, *, busy: bool, wanted_m: float | None, held: bool) -> GripperState | None:
         """State of the gripper, None where it is not known.
 
@@ -196,11 +205,6 @@ class JointReading:
             return None
         moving = busy or self._finger_speed_m_s > MOVING_M_S
         return GripperState(min(max(self.width_m, 0.0), 1.0), moving, held and not moving)
-
-
-def pose_state(pose: Pose, twist: FloatArray, wrench: FloatArray | None) -> PoseState:
-    """A record of a TCP pose, without its reference."""
-    return PoseState(pose.position_m, quat_from_rotation(pose.rotation), twist, wrench, None, None)
 
 
 def _finite(what: str, values: FloatArray) -> FloatArray:

@@ -11,6 +11,7 @@ import gc
 import sys
 import threading
 import time
+from collections.abc import Callable
 
 import zenoh
 
@@ -22,7 +23,7 @@ from vla_zenoh.codec.settings import MAX_SETTING_BYTES
 from vla_zenoh.errors import NodeError
 from vla_zenoh.guard.arm_guard import max_braking_time_s
 from vla_zenoh.robots.arm import Arm
-from vla_zenoh.robots.driver import Pace, RobotDriver
+from vla_zenoh.robots.driver import RobotDriver
 from vla_zenoh.runtime.scheduling import realtime_thread
 from vla_zenoh.sanitize import one_line
 from vla_zenoh.types import Event
@@ -105,17 +106,17 @@ class RobotNode:
             self.node.publish_status("stopped", now=True)
             self.node.close()
 
-    def _loop(self, pace: Pace, stop: threading.Event) -> None:
+    def _loop(self, wait: Callable[[], Tick], stop: threading.Event) -> None:
         try:
             while True:
-                tick = pace.wait()
+                tick = wait()
                 if stop.is_set() and self._may_end(tick.nominal_ns):
                     return
                 self.step(tick)
         except Exception as error:
             how = "ends"
             if self.arm is not None and not self.driver.simulated:
-                braked = self._brake_to_stop(self.arm, pace)
+                braked = self._brake_to_stop(self.arm, wait)
                 how = "braked, and ends" if braked else "not braked, and ends"
             if isinstance(error, NodeError):
                 self.node.reject("robot_failed", str(error))
@@ -158,12 +159,12 @@ class RobotNode:
         )
         return True
 
-    def _brake_to_stop(self, arm: Arm, pace: Pace) -> bool:
+    def _brake_to_stop(self, arm: Arm, wait: Callable[[], Tick]) -> bool:
         """Brake after an exception, tolerating single failures; whether the arm came to rest."""
         arm.accepting = False
         failures = 0
         while arm.guard.moving:
-            tick = pace.wait()
+            tick = wait()
             try:
                 now_ns = self.node.clock.wall_at(tick.nominal_ns)
                 arm.begin_step(now_ns, tick.nominal_ns, tick.stall_s, reading=False)

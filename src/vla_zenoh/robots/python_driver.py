@@ -18,7 +18,7 @@ from vla_zenoh.policy.loader import make_robot
 from vla_zenoh.profile import Profile
 from vla_zenoh.robot import Reading, numbers
 from vla_zenoh.robots.driver import DriverStatus, Measurement, RobotDriver, command_of
-from vla_zenoh.robots.joint_reading import JointReading, pose_state
+from vla_zenoh.robots.joint_reading import JointReading
 from vla_zenoh.ros2.samples import Joints
 from vla_zenoh.sanitize import one_line
 from vla_zenoh.types import Event, FloatArray, GripperCommand, GripperState
@@ -216,10 +216,8 @@ class PythonReading:
         wrench = maybe("wrench", 6)
         width_m = asked_m if reading.width_m is None else reading.width_m
         gripper = GripperState(width_m, reading.moving, reading.holding)
-        taken = self._state.take(joints, stamp_ns)
-        assert taken is not None
-        tcp, twist = self._state.tcp()
-        return Measurement(stamp_ns, taken, tcp, pose_state(tcp, twist, wrench), gripper)
+        self._state.take(joints, stamp_ns)
+        return self._state.measurement(wrench, gripper)
 
 
 class Fault:

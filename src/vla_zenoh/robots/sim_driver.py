@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,7 +25,7 @@ from vla_zenoh.keys import Kind
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import Profile
 from vla_zenoh.robots.arm import Arm
-from vla_zenoh.robots.driver import DriverStatus, Measurement, Pace, Report, RobotDriver
+from vla_zenoh.robots.driver import DriverStatus, Measurement, Report, RobotDriver
 from vla_zenoh.simulation.world import STEP_NS, build_world
 from vla_zenoh.types import FloatArray, GripperCommand, ObjectPoses, SceneState
 from vla_zenoh.types.commands import JointReference, PoseReference
@@ -154,9 +154,9 @@ class SimDriver(RobotDriver):
         return was_reset
 
     # -- time ---------------------------------------------------------------------------------
-    def pace(self) -> Pace:
+    def pace(self) -> Callable[[], Tick]:
         """Ticks of 1 ms that keep to the clock."""
-        return RealTimePace(self.report)
+        return RealTimePace(self.report).wait
 
     def serve_lockstep(self, node: RobotNode, stop: threading.Event) -> None:
         """Publish the first state, and answer ``sim/step`` until `stop` is set."""

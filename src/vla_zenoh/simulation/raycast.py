@@ -116,12 +116,13 @@ class RaycastCanvas:
             rgb = self._shade(data, view, rays, hits).reshape(view.height, view.width, 3)
             distance = np.where(hits.geom < 0, np.inf, hits.distance)
             self._backgrounds[key] = Background(rgb, distance.reshape(rgb.shape[:2]))
-        image, distance = (each.copy() for each in self._backgrounds[key])
+        background = self._backgrounds[key]
+        image, distance = background.rgb.copy(), background.distance.copy()
         rows, columns = np.nonzero(self._covered(data, view))
         rays = self._directions(view)[rows, columns]
         hits = self._cast(data, view, rays, {MOVING_GROUP})
         seen = (hits.geom >= 0) & (hits.distance < distance[rows, columns])
-        front = Hits(*(each[seen] for each in hits))
+        front = Hits(hits.geom[seen], hits.distance[seen], hits.normal[seen])
         pixels = rows[seen], columns[seen]
         image[pixels] = self._shade(data, view, rays[seen], front)
         distance[pixels] = front.distance

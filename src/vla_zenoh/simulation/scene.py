@@ -24,8 +24,8 @@ STEP_S = 1e-3
 PREFIX = "robot/"
 TCP_SITE = "tcp"
 GRIPPER = "gripper"
-_STATE = mujoco.mjtState
-POSES = int(_STATE.mjSTATE_QPOS | _STATE.mjSTATE_MOCAP_POS | _STATE.mjSTATE_MOCAP_QUAT)
+_MOCAP = mujoco.mjtState.mjSTATE_MOCAP_POS.value | mujoco.mjtState.mjSTATE_MOCAP_QUAT.value
+POSES = mujoco.mjtState.mjSTATE_QPOS.value | _MOCAP
 """MuJoCo's state of every pose: joint coordinates, then 7 numbers per mocap body."""
 STATIC_GROUP = 0
 MOVING_GROUP = 1

@@ -21,7 +21,6 @@ from vla_zenoh.robots.joint_reading import (
     JointReading,
     RobotClock,
     StampFilter,
-    pose_state,
 )
 from vla_zenoh.ros2.gripper_actions import GoalSequencer, GoalStep
 from vla_zenoh.ros2.samples import Joints
@@ -122,7 +121,7 @@ def test_whatever_joints_are_told_a_pose_can_be_made_of_what_is_taken(
     )
     with contextlib.suppress(CodecError):
         arm.take(told, 1 + later_ns)
-    pose_state(*arm.tcp(), None)
+    arm.measurement(None, None)
     arm.gripper(busy=False, wanted_m=None, held=False)
 
 

@@ -27,7 +27,7 @@ from vla_zenoh.profile.ros2 import Ros2Output, Ros2Profile
 from vla_zenoh.profile.session import TRUSTED_PROTOCOLS
 from vla_zenoh.robots.arm import Arm
 from vla_zenoh.robots.driver import DriverStatus, Measurement, RobotDriver, command_of
-from vla_zenoh.robots.joint_reading import JointReading, RobotClock, pose_state
+from vla_zenoh.robots.joint_reading import JointReading, RobotClock
 from vla_zenoh.robots.ros2.cameras import Camera
 from vla_zenoh.robots.ros2.gripper import Gripper
 from vla_zenoh.robots.ros2.ros_graph import RosGraph
@@ -181,16 +181,14 @@ class Ros2Driver(RobotDriver):
         self._check_clock()
         if not fresh:
             return None
-        joints, stamp_ns = states.state.joints, states.state.stamp_ns
-        assert joints is not None
+        stamp_ns = states.state.stamp_ns
         try:
-            tcp, twist = states.state.tcp()
-            record = pose_state(tcp, twist, states.wrench(stamp_ns))
+            measured = states.state.measurement(states.wrench(stamp_ns), None)
         except RecordError as error:  # finite, but too large for a record
             topic = self._ros2.joint_states
             self._node.reject("invalid", f"{topic}: {error}", topic)
             return None
-        return Measurement(stamp_ns, joints, tcp, record, self._gripper_state(stamp_ns))
+        return measured._replace(gripper=self._gripper_state(stamp_ns))
 
     def move(self, reference: PoseReference | JointReference, now_ns: int) -> None:
         """Publish a set-point."""
