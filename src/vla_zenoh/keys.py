@@ -54,9 +54,7 @@ def key_chunk(name: str, what: str) -> str:
 class KeyPath:
     """A key of a robot, or with ``*`` an expression of several; `Keys` makes its text.
 
-    Args:
-        path: below the robot; parameters are in braces.
-        payload: what is published or asked there.
+    `path` is below the robot, with parameters in braces; `payload` is what is published or asked.
     """
 
     def __init__(self, path: str, payload: str = "") -> None:
@@ -236,10 +234,8 @@ class Keys:
 
     @property
     def without_raw_images(self) -> tuple[str, ...]:
-        """All keys, but only JPEG images: a subscriber to raw ones makes cameras send 1 MB each.
-
-        Keys of one or two parts that are added later are among them, too.
-        """
+        """All keys, also later ones of one or two chunks, but only JPEG images: a subscriber to raw
+        ones makes cameras send 1 MB each."""
         pictures = ("camera/*/jpeg", "camera/*/depth", "seen/*/*", "seen/*/*/depth")
         parts = (f"{self.part}/state/*", f"{self.part}/command/*") if self.part else ()
         return tuple(map(self.full, ("*", "*/*", *pictures, *parts)))
@@ -300,21 +296,6 @@ NOT_PARTS = frozenset(path.path.split("/")[0] for path in KEY_PATHS.values())
 def last_chunk(key: str) -> str:
     """The last part of a key: the name of the node, worker or camera."""
     return key.rsplit("/", 1)[-1]
-
-
-def covers(wide: str, narrow: str) -> bool:
-    """Whether the expression `wide` includes every key of `narrow`; both may have * and **."""
-    return _covers(wide.split("/"), narrow.split("/"))
-
-
-def _covers(wide: list[str], narrow: list[str]) -> bool:
-    if not wide:
-        return not narrow
-    if wide[0] == "**":
-        return any(_covers(wide[1:], narrow[at:]) for at in range(len(narrow) + 1))
-    if not narrow or narrow[0] == "**":
-        return False
-    return wide[0] in ("*", narrow[0]) and _covers(wide[1:], narrow[1:])
 
 
 NO_DEADMAN_TOKEN = "is not there (a liveliness token on the key holding/NAME)"

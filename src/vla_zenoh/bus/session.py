@@ -202,6 +202,14 @@ def put_text(session: zenoh.Session, key: str, text: str) -> None:
     session.put(key, text, encoding=encoding, source_info=author, **QOS[Kind.ORDER])
 
 
+def covers(wide: str, narrow: str) -> bool:
+    """Whether the expression `wide` includes every key of `narrow`; no invalid one does."""
+    try:
+        return zenoh.KeyExpr.autocanonize(wide).includes(zenoh.KeyExpr.autocanonize(narrow))
+    except zenoh.ZError:
+        return False
+
+
 PATIENCE_S, ATTEMPTS = 1.0, 5
 ANSWERS = 2
 """A single answer in time may lack a node that is alive; this has been observed."""

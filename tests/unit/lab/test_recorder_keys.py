@@ -6,7 +6,8 @@ from itertools import product
 
 import pytest
 
-from vla_zenoh.keys import Keys, covers
+from vla_zenoh.bus.session import covers
+from vla_zenoh.keys import Keys
 from vla_zenoh.lab.recording.record_types import RecordTypes
 from vla_zenoh.lab.recording.recorder import recorded_keys
 from vla_zenoh.profile import load_profile

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from vla_zenoh.keys import Keys, covers
+from vla_zenoh.bus.session import covers
+from vla_zenoh.keys import Keys
 from vla_zenoh.profile import load_profile
 from vla_zenoh.security.identity import Identity, identities
 from vla_zenoh.security.roles import Act, rights

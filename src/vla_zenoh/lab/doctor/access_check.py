@@ -16,9 +16,9 @@ from typing import Any
 
 import zenoh
 
-from vla_zenoh.bus.session import open_session
+from vla_zenoh.bus.session import covers, open_session
 from vla_zenoh.errors import SecurityError
-from vla_zenoh.keys import Keys, covers
+from vla_zenoh.keys import Keys
 from vla_zenoh.lab.doctor.access import AccessVerdict
 from vla_zenoh.profile import Profile
 from vla_zenoh.security.identity import Identity, Role, identities

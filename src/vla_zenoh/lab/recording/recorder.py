@@ -18,8 +18,9 @@ import zenoh
 from vla_zenoh import __version__
 from vla_zenoh.bus.buffers import bytes_of
 from vla_zenoh.bus.node import Node
+from vla_zenoh.bus.session import covers
 from vla_zenoh.errors import RecordingError
-from vla_zenoh.keys import Keys, covers
+from vla_zenoh.keys import Keys
 from vla_zenoh.lab.recording.sample import TEXT
 from vla_zenoh.lab.recording.sample_queue import SampleQueue
 from vla_zenoh.lab.recording.writer import RecordingWriter

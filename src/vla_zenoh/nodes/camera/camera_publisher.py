@@ -146,15 +146,8 @@ class FittedStreams:
 class CameraPublisher:
     """Publisher of one camera: raw, JPEG, depth and fitted streams, each while it has subscribers.
 
-    Used by the camera's own thread; another thread may read its status.
-
-    Args:
-        name: of the camera.
-        profile: its section of the profile.
-        shown: its source, without passwords.
-        node: publishes the streams.
-        emit: emits an event; callable from any thread.
-        same_s, references: see `ImageCheck`.
+    Used by the camera's own thread; another thread may read its status. `shown` is its source
+    without passwords; for `same_s` and `references` see `ImageCheck`.
     """
 
     def __init__(
@@ -194,7 +187,6 @@ class CameraPublisher:
         self._rate = RateMeter()
         self._latency_ms = Percentiles(256)
 
-    # -- state --------------------------------------------------------------------------------
     def set_state(self, state: str, why: str = "") -> None:
         """Enter `state`; emits an event on a new state, or on a new reason for a bad one."""
         if (state, why) == (self.state, self.why):
@@ -203,10 +195,8 @@ class CameraPublisher:
         if state == ENDED:
             self.fault = None
         level = "info" if state in (OK, ENDED) else "warning"
-        if state != was:
-            self._emit(Event(level, "transition", f"{self.name}:{was}->{state}", why[:1000]))
-        else:
-            self._emit(Event(level, "fault", f"{self.name}:{state}", why[:1000]))
+        kind, change = ("fault", state) if state == was else ("transition", f"{was}->{state}")
+        self._emit(Event(level, kind, f"{self.name}:{change}", why[:1000]))
 
     def set_waiting_reason(self, why: str) -> None:
         """Change the reason of `WAITING`, without an event."""
@@ -237,7 +227,6 @@ class CameraPublisher:
             self._rate.tick()
         return True
 
-    # -- image faults -------------------------------------------------------------------------
     def opened(self, backend: str, same_s: float, intrinsics: Intrinsics | None = None) -> None:
         """The source was (re)opened: start the image check from scratch.
 
@@ -259,7 +248,6 @@ class CameraPublisher:
             _, what, why, value, limit = self.fault
             self._emit(Event("warning", "fault", f"{self.name}:{what}", why, value, limit))
 
-    # -- images -------------------------------------------------------------------------------
     @property
     def has_subscribers(self) -> bool:
         """Whether any stream has a subscriber."""
@@ -354,7 +342,6 @@ class CameraPublisher:
         )
         self._emit(Event("info", "notice", f"{self.name}:resized", why))
 
-    # -- status -------------------------------------------------------------------------------
     def detail(self) -> dict[str, Any]:
         """For status: state, source, back end, age of the newest image in s, fault, intrinsics."""
         newest = self._newest_mono_ns

@@ -56,11 +56,8 @@ class ImageFault(NamedTuple):
 class ImageCheck:
     """Checks the images of one camera, from the opening of its source to its end.
 
-    Args:
-        name: of the camera.
-        limits: of the profile.
-        same_s: default of `CameraCheck.same_s` for this kind of source.
-        references: of the cameras that have one, see `read_references`.
+    `same_s` is the default of `CameraCheck.same_s` for this kind of source, see `Source`;
+    `references` are of the cameras that have one, see `read_references`.
     """
 
     def __init__(
@@ -103,7 +100,6 @@ class ImageCheck:
             self.finding = self.finding._replace(why=why)
         return self.finding
 
-    # -- checks over several images ------------------------------------------------------------
     def _same_image(self, sample: NDArray[Any], now_ns: int) -> ImageFault | None:
         again = self._sample is not None and np.array_equal(self._sample, sample)
         self._sample = sample

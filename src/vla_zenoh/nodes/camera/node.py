@@ -265,7 +265,7 @@ class CameraNode:
             threading.Thread(target=body, args=(self._halt,), name=f"camera {name}", daemon=True)
         )
 
-    # -- called by the threads ----------------------------------------------------------------
+    # Called by the threads.
     def _emit(self, event: Event) -> None:
         with self._node_lock:
             if not self._halt.is_set():
@@ -279,7 +279,7 @@ class CameraNode:
         with self._node_lock:
             return self.node.decode(SceneState, arrival, self._scene_writer)
 
-    # -- called by `run` ----------------------------------------------------------------------
+    # Called by `run`.
     def _apply_specs(self) -> None:
         """Publish cameras with ``fit_for_workers`` in the sizes that models request."""
         if self._specs is None:
@@ -318,12 +318,14 @@ class CameraNode:
             for one in publishers.values():
                 for counter, count in one.counters().items():
                     self.node.counters[counter] = count
+            detail: dict[str, Any] = {
+                "cameras": {name: one.detail() for name, one in publishers.items()}
+            }
+            if self._sim is not None:
+                detail["renderer"] = self._sim.renderer
             self.node.publish_status(
                 state,
-                detail={
-                    "cameras": {name: one.detail() for name, one in publishers.items()},
-                    **({} if self._sim is None else {"renderer": self._sim.renderer}),
-                },
+                detail=detail,
                 rates_hz={name: rate_hz for name, (rate_hz, _) in figures.items()},
                 latency_ms={name: late for name, (_, late) in figures.items() if late is not None},
                 now=changed,

@@ -62,12 +62,8 @@ class RenderBudget:
 class SimCameras:
     """All simulated cameras of a node; `run` is the body of a thread.
 
-    Args:
-        profile: scene, robot and choice of renderer.
-        views: name of each camera in the scene, and its publisher.
-        buffer: the newest scene.
-        decode: None if the scene was rejected.
-        reject: counts and reports a rejection: reason, why.
+    `views` has the name of each camera in the scene and its publisher, `buffer` the newest scene;
+    `decode` returns None if it was rejected.
     """
 
     def __init__(

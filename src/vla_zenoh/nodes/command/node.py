@@ -57,8 +57,7 @@ class CommandNode:
     While the arm rests and no step is due, it ticks every `REST_S`; a chunk ends that at once.
 
     Args:
-        profile: limits, timing, initial settings.
-        session: open session.
+        profile, session: the caller closes the session.
         dry_run: compute everything, publish no command.
         latch: file that exists while an emergency stop or a fault is latched, so that a restarted
             command node is stopped as well.
@@ -110,7 +109,6 @@ class CommandNode:
             keys.task, lambda query: query.reply(keys.task, records.encode(commander.task))
         )
 
-    # -- running ------------------------------------------------------------------------------
     def run(self, stop: threading.Event) -> None:
         """Run until `stop` is set, then brake and exit."""
         sys.setswitchinterval(SWITCH_INTERVAL_S)

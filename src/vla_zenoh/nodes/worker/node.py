@@ -38,8 +38,7 @@ class WorkerNode:
     the others.
 
     Args:
-        profile: of the robots.
-        session: open session.
+        profile, session: of the robots; the caller closes the session.
         policy: the model, not loaded yet.
         name: of the worker.
         images: image streams to subscribe to. Within a host raw images travel through shared

@@ -12,9 +12,16 @@ from numpy.typing import NDArray
 from vla_zenoh.bus.buffers import LatestSample, Wake, bytes_of, header_of
 from vla_zenoh.bus.metrics import Percentiles, RateMeter
 from vla_zenoh.bus.node import Node
-from vla_zenoh.codec import image as image_codec
 from vla_zenoh.codec import records
-from vla_zenoh.codec.image import MAX_IMAGE_BYTES
+from vla_zenoh.codec.image import (
+    MAX_IMAGE_BYTES,
+    decode_depth,
+    decode_jpeg,
+    decode_raw,
+    depth_schema,
+    encode_depth,
+    encode_jpeg,
+)
 from vla_zenoh.codec.records import SMALL_BYTES
 from vla_zenoh.errors import CodecError, PeerError, RecordError, SpecError, in_words
 from vla_zenoh.keys import Kind, worker_node
@@ -64,14 +71,8 @@ SEEN_QUALITY = 95
 class RobotSession:
     """One robot's side of a worker: its own node, prompt, episode, activation and rate.
 
-    Args:
-        profile: of the robot.
-        session: open session.
-        policy: the model, not loaded yet; several sessions may share it.
-        name: of the worker.
-        images: image streams to subscribe to.
-        host: of the profile, on which this runs.
-        changed: set when an image arrives.
+    Several may share a `policy`, which is not loaded yet; every image sets `changed`. See
+    `vla_zenoh.nodes.worker.node.WorkerNode` for the rest.
     """
 
     def __init__(
@@ -100,11 +101,11 @@ class RobotSession:
         )
         self._tasks = node.subscribe(keys.task, LatestSample(SMALL_BYTES))
         history_s = self._history_s = self.spec.observation.history_span_s
-        self._jpeg = images == "jpeg"
+        jpeg = images == "jpeg"
         self._streams = Streams.of(self.spec.observation, self.spec.parts)
         self._cameras = {
             one.camera: subscribe_to_camera(
-                one, node, jpeg=self._jpeg, changed=changed, history_s=history_s
+                one, node, jpeg=jpeg, changed=changed, history_s=history_s
             )
             for one in self.spec.observation.cameras
         }
@@ -115,8 +116,8 @@ class RobotSession:
         self._feeds = [
             Feed(name, camera, streams[name], decode)
             for cameras, streams, decode in (
-                (self._cameras, self._streams.images, self._image_of),
-                (depths, self._streams.depth, _depth_of),
+                (self._cameras, self._streams.images, _decode_jpeg if jpeg else decode_raw),
+                (depths, self._streams.depth, decode_depth),
             )
             for name, camera in cameras.items()
         ]
@@ -147,7 +148,6 @@ class RobotSession:
         self.due_s = 0.0
         """When the next inference is due, monotonic clock."""
 
-    # -- observation --------------------------------------------------------------------------
     @property
     def has_images(self) -> bool:
         """Whether an image was not polled yet, and every camera has one since the last chunk."""
@@ -216,7 +216,7 @@ class RobotSession:
             header = header_of(sample)
             writer.check(header, mono_ns)
             payload = bytes_of(sample.payload, MAX_IMAGE_BYTES)
-            image = feed.decode(payload, str(sample.encoding))
+            image = feed.decode(payload, str(sample.encoding).partition(";")[2])
         except CodecError as error:
             node.reject(error.reason, f"camera {feed.name}: {error}")
             return
@@ -225,11 +225,6 @@ class RobotSession:
         header, image = node.clocks.to_local_clock(header, image)
         feed.images.add(Stamped(header, image, node.clock.wall_at(arrival.mono_ns)))
         self._received_s[feed.camera] = mono_ns / 1e9
-
-    def _image_of(self, payload: bytes, encoding: str) -> Image:
-        if self._jpeg:
-            return image_codec.decode_jpeg(payload)
-        return image_codec.decode_raw(payload, encoding.partition(";")[2])
 
     def observe(self) -> Observation | None:
         """Poll and assemble an observation; None if there is none yet.
@@ -268,7 +263,6 @@ class RobotSession:
                 return None
         return observation
 
-    # -- action chunks ------------------------------------------------------------------------
     def publish(
         self,
         observation: Observation,
@@ -279,8 +273,7 @@ class RobotSession:
         """Validate an answer and publish it as a chunk; False if it was rejected.
 
         Args:
-            observation: input of the inference.
-            answer: of the model.
+            observation, answer: of the model.
             times_ns: observation complete, inference started, inference ended; wall clock.
             batch: robots in this inference.
         """
@@ -328,7 +321,6 @@ class RobotSession:
         self.due_s = time.monotonic() + AFTER_A_FAILURE_S
         return False
 
-    # -- status -------------------------------------------------------------------------------
     def report(self, *, now: bool = False) -> None:
         """Publish spec and status when they are due, or `now`."""
         if now or time.monotonic() - self._last_spec_s > SPEC_PERIOD_S:
@@ -360,8 +352,8 @@ class RobotSession:
         self.node.close()
 
 
-def _depth_of(payload: bytes, encoding: str) -> Depth:
-    return image_codec.decode_depth(payload, encoding.partition(";")[2])
+def _decode_jpeg(payload: bytes, _schema: str) -> Image:
+    return decode_jpeg(payload)
 
 
 class InferenceDebugPublisher:
@@ -399,7 +391,7 @@ class InferenceDebugPublisher:
                 if stream.has_subscribers:
                     image = Image(_rgb(camera, observation, answer))
                     stream.publish(
-                        image_codec.encode_jpeg(image, SEEN_QUALITY),
+                        encode_jpeg(image, SEEN_QUALITY),
                         stamp_wall_ns=stamp_ns,
                         seq=seq,
                         encoding=zenoh.Encoding.IMAGE_JPEG,
@@ -408,12 +400,10 @@ class InferenceDebugPublisher:
                 if stream.has_subscribers:
                     depth = Depth(observation.depth[camera.camera], camera.unit_m)
                     stream.publish(
-                        image_codec.encode_depth(depth),
+                        encode_depth(depth),
                         stamp_wall_ns=stamp_ns,
                         seq=seq,
-                        encoding=zenoh.Encoding.IMAGE_PNG.with_schema(
-                            image_codec.depth_schema(depth)
-                        ),
+                        encoding=zenoh.Encoding.IMAGE_PNG.with_schema(depth_schema(depth)),
                     )
             if self._record.has_subscribers:
                 seen = InferenceDebug(

@@ -48,16 +48,10 @@ class _Stream(NamedTuple):
 
 
 class CameraSubscriber:
-    """Subscriber of one camera: its preferred stream, and the common one as long as that is silent.
+    """Subscriber of one camera: its preferred stream `key`, and after a silence of `patience_s` the
+    common one, `fallback_key`, too.
 
-    Args:
-        node: of the worker.
-        camera: its name.
-        key: of the preferred stream.
-        fallback_key: of the common stream, subscribed to after a silence of `patience_s` on `key`;
-            None if that is the preferred one.
-        changed: set when an image arrives.
-        queue: images kept until they are taken; 1: the newest only.
+    `queue` images are kept until they are taken; each sets `changed`.
 
     Raises:
         SessionError: the router does not answer at the port for images.
@@ -122,12 +116,7 @@ def subscribe_to_camera(
 ) -> CameraSubscriber:
     """Subscribe to the stream that suits a model: raw, JPEG, or JPEG in its input size.
 
-    Args:
-        camera: of the model's spec.
-        node: of the worker.
-        jpeg: JPEG rather than raw images.
-        changed: set by every image.
-        history_s: images this much older than the newest are needed as well.
+    `history_s`: images this much older than the newest are needed as well.
     """
     keys, name = node.keys, camera.camera
     settings = node.profile.cameras.get(name)
@@ -172,16 +161,8 @@ class Feed(NamedTuple):
 
 
 class StateStream:
-    """One stream of states, from its samples to what is kept of them.
-
-    Args:
-        node: of the worker.
-        key: of the stream.
-        kind: of its records.
-        states: where they go.
-        size: samples received between two calls of `poll`.
-        every: decode all; otherwise those that no image needs are skipped.
-    """
+    """One stream of states, of at most `size` samples between two calls of `poll`, from these to
+    `states`. Unless `every` one is needed, those that no image needs are not decoded."""
 
     def __init__(
         self, node: Node, key: str, kind: type[Any], states: History, size: int, *, every: bool
