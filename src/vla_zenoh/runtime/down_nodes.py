@@ -101,8 +101,8 @@ class _Voice:
         )
 
     def close(self) -> None:
-        self._status.close()
-        self._event.close()
+        self._status.undeclare()
+        self._event.undeclare()
         if self._own is not None:
             self._own.close()
 
