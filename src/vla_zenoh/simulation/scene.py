@@ -21,9 +21,7 @@ from vla_zenoh.simulation.robot_model import MountedCamera, RobotModel
 from vla_zenoh.types import FloatArray
 
 STEP_S = 1e-3
-PREFIX = "robot/"
-TCP_SITE = "tcp"
-GRIPPER = "gripper"
+PREFIX, TCP_SITE, GRIPPER = "robot/", "tcp", "gripper"
 _MOCAP = mujoco.mjtState.mjSTATE_MOCAP_POS.value | mujoco.mjtState.mjSTATE_MOCAP_QUAT.value
 POSES = mujoco.mjtState.mjSTATE_QPOS.value | _MOCAP
 """MuJoCo's state of every pose: joint coordinates, then 7 numbers per mocap body."""

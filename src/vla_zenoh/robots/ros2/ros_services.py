@@ -11,6 +11,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import zenoh
@@ -114,21 +115,18 @@ class RosServices:
             SET_REQUEST.name: self._set_request,
         }
         for service in SERVICES:
-            graph.serve(f"{prefix}/{service.name}", service.type, self._enqueue(service))
+            graph.serve(f"{prefix}/{service.name}", service.type, partial(self._enqueue, service))
         self._prompt_topic, self._prompt = f"{prefix}/{PROMPT_TOPIC}", ""
         self._prompts = graph.subscribe(self._prompt_topic, TEXT, CallbackRing(MAX_WAITING))
         self._status = graph.publisher(f"{prefix}/{STATUS_TOPIC}", diagnostics.TYPE)
 
-    def _enqueue(self, service: Service) -> Callable[[Request], None]:
-        def enqueue(request: Request) -> None:
-            if service is STOP:  # overtakes the calls in the queue
-                self._stops.stop(lambda: self._client.publish(self._client.keys.stop, ""))
-            try:
-                self._calls.put_nowait((service, request, time.monotonic_ns()))
-            except queue.Full:
-                request.drop("too many calls at once")
-
-        return enqueue
+    def _enqueue(self, service: Service, request: Request) -> None:
+        if service is STOP:  # overtakes the calls in the queue
+            self._stops.stop(lambda: self._client.publish(self._client.keys.stop, ""))
+        try:
+            self._calls.put_nowait((service, request, time.monotonic_ns()))
+        except queue.Full:
+            request.drop("too many calls at once")
 
     def run(self, stop: threading.Event) -> None:
         """Serve until `stop` is set."""
