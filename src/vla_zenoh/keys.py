@@ -90,11 +90,8 @@ class _KeyOf(KeyPath):
 class Keys:
     """The keys of one robot.
 
-    Args:
-        robot: the robot's name.
-        root: what stands before it, may hold slashes.
-        part: part whose states and commands are meant, of a robot of several; ``*`` is any. Empty:
-            the robot has one part, without a name.
+    `root` stands before its name and may hold slashes; `part` is the one whose states and commands
+    are meant, ``*`` any, empty of a robot with one part, which has no name.
     """
 
     robot: str
@@ -257,16 +254,6 @@ class Keys:
         """Inverse of `short`; a key that begins with the root is taken as whole already."""
         return key if key.startswith(f"{self.root}/") else f"{self.root}/{self.robot}/{key}"
 
-    def part_of(self, key: str) -> str:
-        """The robot's part whose state or command `key` is; empty: it is of no part by name."""
-        first, _, rest = self.short(key).partition("/")
-        return first if rest and first not in NOT_PARTS and self.short(key) != key else ""
-
-    def group(self, key: str) -> str:
-        """What follows robot and part: ``camera``, ``state``, ``prompt``; empty for other keys."""
-        own = self.short(key).removeprefix(f"{self.part_of(key)}/")
-        return own.split("/")[0] if self.short(key) != key else ""
-
     @staticmethod
     def of(key: str, root: str) -> Keys | None:
         """The keys of the robot that `key` belongs to, None if it belongs to none below `root`."""
@@ -286,7 +273,6 @@ KEY_PATHS: Mapping[str, KeyPath] = {
 }
 """Member of `Keys` -> its path, for all single keys: the whole wire protocol."""
 
-
 PART_KEYS = frozenset(name for name, path in KEY_PATHS.items() if isinstance(path, _PartKey))
 """Members of `Keys` that every part of a robot has."""
 NOT_PARTS = frozenset(path.path.split("/")[0] for path in KEY_PATHS.values())
@@ -300,7 +286,6 @@ def last_chunk(key: str) -> str:
 
 NO_DEADMAN_TOKEN = "is not there (a liveliness token on the key holding/NAME)"
 """Why a deadman is not accepted."""
-
 
 PRIMITIVES = "primitives"
 """Kind of the node that answers on `Keys.primitive`, and its name as a worker."""

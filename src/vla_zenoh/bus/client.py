@@ -185,7 +185,6 @@ class Client:
                 self.reset()
         return False
 
-    # -- settings -----------------------------------------------------------------------------
     def publish(self, key: str, text: str) -> None:
         """Put plain text on a key, as any Zenoh client could."""
         put_text(self.session, key, text)
@@ -239,9 +238,7 @@ class Client:
     def activate(self, timeout_s: float = 3.0, holder: str = "") -> Task:
         """Activate the arm, and wait until it is active.
 
-        Args:
-            timeout_s: how long to wait.
-            holder: another client, whose liveliness token on `Keys.holding` makes it the deadman.
+        `holder`: another client, whose liveliness token on `Keys.holding` makes it the deadman.
 
         Raises:
             SessionError: rejected, with every reason.
@@ -323,8 +320,7 @@ class Client:
             time.sleep(0.1)  # the other reasons follow the first
             reasons = dict.fromkeys(self._refused(what, began_s))
             raise SessionError(f"{what} rejected:\n  - " + "\n  - ".join(reasons))
-        task = self._taken(taken, began_s)
-        if task is not None:
+        if (task := self._taken(taken, began_s)) is not None:
             return task
         if activates:
             self.publish(key, "false")

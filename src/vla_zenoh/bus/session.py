@@ -142,10 +142,9 @@ def open_session(
     wait_s: float = 0.0,
     stop: threading.Event | None = None,
 ) -> zenoh.Session:
-    """Open a session of a profile.
+    """Open a session of a profile, see `session_config`.
 
     Args:
-        profile: the session section; for the other arguments see `session_config`.
         wait_s: retry for this long.
         stop: gives up as soon as it is set.
 

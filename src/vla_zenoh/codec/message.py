@@ -57,10 +57,6 @@ def _numpy() -> Any:
     return numpy
 
 
-def _malformed(why: str) -> CodecError:
-    return CodecError("malformed", why)
-
-
 def pack(value: Any, to_map: Callable[[Any], Any] | None = None) -> bytes:
     """Encode maps, lists, text, numbers, bytes, numpy arrays and numpy scalars.
 
@@ -88,7 +84,7 @@ def unpack(payload: bytes, from_map: Callable[[dict[Any, Any]], Any] | None = No
     read = from_map or _from_map
     of_map, of_list = read, None
     if len(payload) > MAX_CONTAINERS:  # fewer bytes cannot hold more; a hook costs time
-        count = of_list = count_containers()
+        count = of_list = _container_counter()
         of_map = lambda found: read(count(found))  # noqa: E731
     try:
         value = msgpack.unpackb(
@@ -113,15 +109,14 @@ def unpack(payload: bytes, from_map: Callable[[dict[Any, Any]], Any] | None = No
     return value
 
 
-def count_containers(error: Callable[[str], Exception] = _malformed) -> Callable[[Any], Any]:
-    """A hook that returns its argument, and raises `error` of a sentence when there are more than
-    `MAX_CONTAINERS`."""
+def _container_counter() -> Callable[[Any], Any]:
+    """A hook that returns its argument, and raises when there are more than `MAX_CONTAINERS`."""
     left = itertools.repeat(None, MAX_CONTAINERS)
 
     def hook(found: Any) -> Any:
         for _ in left:
             return found
-        raise error(f"more than {MAX_CONTAINERS} lists and maps")
+        raise CodecError("malformed", f"more than {MAX_CONTAINERS} lists and maps")
 
     return hook
 

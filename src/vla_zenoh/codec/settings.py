@@ -22,7 +22,7 @@ MIN_HELD_M, MAX_HELD_M = 0.001, 1.0
 """Of an edge of what a gripper holds, and of the distance of its centre."""
 
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?")
-_SEED = re.compile(r"[0-9]{1,10}")
+MAX_SEED_DIGITS = 10
 
 
 def decode_text(payload: bytes) -> str:
@@ -129,7 +129,7 @@ def decode_seed(payload: bytes) -> int | None:
     word = decode_text(payload)
     if not word:
         return None
-    if not _SEED.fullmatch(word):
+    if not (word.isascii() and word.isdigit() and len(word) <= MAX_SEED_DIGITS):
         raise CodecError("invalid", f"{word[:40]!r} is not a seed: give nothing or a whole number")
     return int(word)
 

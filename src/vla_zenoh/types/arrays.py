@@ -16,7 +16,7 @@ Record = TypeVar("Record")
 _FLOAT64 = np.dtype(np.float64)
 
 QUATERNION_NORM_TOLERANCE = 1e-3
-MAX_VECTOR = 10_000
+MAX_VECTOR, MAX_CHUNK_NUMBERS = 10_000, 100_000
 FEW = 64
 """Records are made at every tick: on so few numbers Python is faster than numpy."""
 _NUMBER_KINDS = "iuf"
@@ -66,13 +66,13 @@ def vector(name: str, value: ArrayLike, size: int | None = None) -> FloatArray:
     return array
 
 
-def float32_table(name: str, value: ArrayLike, most: int) -> NDArray[np.float32]:
-    """Copy `value` into a finite, read-only float32 array (H, D) of at most `most` numbers."""
+def float32_table(name: str, value: ArrayLike) -> NDArray[np.float32]:
+    """Copy `value` into a finite, read-only float32 array (H, D) of `MAX_CHUNK_NUMBERS` at most."""
     array = numbers(name, value)
     if array.ndim != 2 or 0 in array.shape:
         raise RecordError(f"{name} has shape {array.shape}, wanted (H, D)")
-    if array.size > most:
-        raise RecordError(f"{name} has {array.size} numbers, at most {most}")
+    if array.size > MAX_CHUNK_NUMBERS:
+        raise RecordError(f"{name} has {array.size} numbers, at most {MAX_CHUNK_NUMBERS}")
     table = to_float32(array)
     if not is_finite(table):
         raise RecordError(f"{name} holds NaN or infinity")

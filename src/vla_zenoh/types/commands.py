@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from vla_zenoh.errors import RecordError
 from vla_zenoh.types.arrays import FloatArray, float32_table, unit_quaternion, vector
 from vla_zenoh.types.checks import (
-    MAX_CHUNK_NUMBERS,
     MAX_ENTRIES,
     MAX_TEXT,
     boolean,
@@ -70,21 +69,18 @@ class ActionChunk:
         keep(self, integer, "episode", "observation_stamp_ns", "observation_seq", "valid_until_ns")
         keep(self, integer, "observed_ns", "inference_start_ns", "inference_end_ns")
         keep(self, boolean, "done")
-        keep(self, float32_table, "steps", most=MAX_CHUNK_NUMBERS)
+        keep(self, float32_table, "steps")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InferenceDebug:
-    """One inference, for debugging. Its images travel beside it, one key per camera.
+    """One inference, for debugging; fields of its `ActionChunk` are as there.
+
+    Its images travel beside it, one key per camera, with the same stamp and number.
 
     Args:
-        chunk_seq: number of the resulting chunk; the images have the same.
-        spec_hash: what the steps are to be read with.
-        episode: as in the chunk.
-        observation_stamp_ns: capture time, wall clock; the images have the same.
-        steps: (H, D) float32, the final action.
+        chunk_seq: number of the chunk.
         raw: output before the steps: tokens, normalised action, whatever the model reports.
-        done: the policy reports that its task is finished with these steps.
     """
 
     worker: str
@@ -103,7 +99,7 @@ class InferenceDebug:
         keep(self, text, "prompt")
         keep(self, integer, "chunk_seq", "episode", "observation_stamp_ns")
         keep(self, number, "inference_ms", minimum=0.0)
-        keep(self, float32_table, "steps", most=MAX_CHUNK_NUMBERS)
+        keep(self, float32_table, "steps")
         keep(self, entries, "raw", of=details)
 
 

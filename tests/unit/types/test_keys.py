@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.keys import DEFAULT_ROOT, KEY_PATHS, MAX_CHUNK, Keys, key_chunk, last_chunk
+from vla_zenoh.lab.recording.record_types import group_of, part_of
 
 MAX_SENTENCE = 1000  # characters of an error message
 
@@ -126,13 +127,13 @@ def test_a_key_is_told_from_those_of_other_robots() -> None:
     assert Keys.of(key, "lab/b") is None
     assert Keys.of("lab/a/panda", "lab/a") is None
     assert Keys.of("lab/a/-/prompt", "lab/a") is None
-    assert ours.group(key) == "camera"
-    assert ours.group(ours.prompt) == "prompt"
-    assert theirs.group(key) == ""
+    assert group_of(ours, key) == "camera"
+    assert group_of(ours, ours.prompt) == "prompt"
+    assert group_of(theirs, key) == ""
     left = ours.of_part("left").state_pose
-    assert (ours.group(left), ours.part_of(left)) == ("state", "left")
-    assert [ours.part_of(each) for each in (key, ours.prompt, ours.state_pose)] == ["", "", ""]
-    assert theirs.part_of(left) == ""
+    assert (group_of(ours, left), part_of(ours, left)) == ("state", "left")
+    assert [part_of(ours, each) for each in (key, ours.prompt, ours.state_pose)] == ["", "", ""]
+    assert part_of(theirs, left) == ""
     assert theirs.full(ours.short(key)) == theirs.camera_jpeg("front")
 
 

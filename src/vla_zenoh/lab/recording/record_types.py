@@ -51,6 +51,18 @@ RECORDS: tuple[type, ...] = (
 """Every record that has a key."""
 
 
+def part_of(keys: Keys, key: str) -> str:
+    """The robot's part whose state or command `key` is; empty: it is of no part by name."""
+    first, _, rest = keys.short(key).partition("/")
+    return first if rest and first not in NOT_PARTS and keys.short(key) != key else ""
+
+
+def group_of(keys: Keys, key: str) -> str:
+    """What follows robot and part: ``camera``, ``state``, ``prompt``; empty for other keys."""
+    own = keys.short(key).removeprefix(f"{part_of(keys, key)}/")
+    return own.split("/")[0] if keys.short(key) != key else ""
+
+
 class RecordTypes:
     """Record types of the keys of one robot; look-ups are cached."""
 

@@ -23,6 +23,7 @@ from vla_zenoh.codec import message
 from vla_zenoh.errors import CodecError, NodeError, RecordingError
 from vla_zenoh.keys import Keys
 from vla_zenoh.lab.recording.reader import Recording
+from vla_zenoh.lab.recording.record_types import group_of
 from vla_zenoh.lab.recording.sample import JPEG, Sample
 from vla_zenoh.lab.statistics import percentiles
 from vla_zenoh.profile import Profile
@@ -257,7 +258,7 @@ class Replay:
         _hand_over(ready, None, ending)
 
     def _chosen(self) -> Iterator[Sample]:
-        for entry in self._file.entries(lambda key: self._here.group(key) in self._groups):
+        for entry in self._file.entries(lambda key: group_of(self._here, key) in self._groups):
             writer = "" if entry.header is None else entry.header.source.partition("#")[0]
             if writer in self._alive:
                 self.replayed.left_out[writer] += 1
@@ -268,7 +269,7 @@ class Replay:
         if key not in self._publishers:
             self._publishers[key] = self.node.session.declare_publisher(key, **QOS)
             camera = key.split("/")[-2]
-            if self._there.group(key) == CAMERAS and key == self._there.camera_jpeg(camera):
+            if group_of(self._there, key) == CAMERAS and key == self._there.camera_jpeg(camera):
                 raw = self._there.camera_raw(camera)
                 self._raw[key] = self.node.session.declare_publisher(raw, **QOS)
         return self._publishers[key]

@@ -14,6 +14,7 @@ import yaml
 from vla_zenoh.errors import CodecError
 from vla_zenoh.keys import Keys, last_chunk
 from vla_zenoh.lab.recording.reader import Recording, open_recording
+from vla_zenoh.lab.recording.record_types import group_of, part_of
 from vla_zenoh.lab.recording.sample import DEPTH, JPEG, Sample
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.types import (
@@ -131,7 +132,7 @@ class Run:
     def part_names(self) -> tuple[str, ...]:
         """Names of the parts that sent states, in alphabetical order; of one arm one empty name."""
         keys = {entry.key for entry in (*self.poses, *self.joints, *self.grippers)}
-        found = {self.keys.part_of(key) for key in keys}
+        found = {part_of(self.keys, key) for key in keys}
         return (self.part,) if self.part else tuple(sorted(found)) or ("",)
 
     def of_part(self, name: str) -> Run:
@@ -139,7 +140,7 @@ class Run:
         if not name:
             return self
         every = {entry.key for stream in PART_STREAMS for entry in getattr(self, stream)}
-        keys = {key for key in every if self.keys.part_of(key) == name}
+        keys = {key for key in every if part_of(self.keys, key) == name}
         own = {
             stream: [entry for entry in getattr(self, stream) if entry.key in keys]
             for stream in PART_STREAMS
@@ -237,7 +238,7 @@ def _of_interest(keys: Keys) -> Callable[[str], bool]:
     """All keys of the robot but raw images and the input images of models."""
 
     def wanted(key: str) -> bool:
-        group = keys.group(key)
+        group = group_of(keys, key)
         if group == "camera":
             camera = _camera(keys, key)
             return key in (keys.camera_jpeg(camera), keys.camera_depth(camera))

@@ -14,7 +14,7 @@ from vla_zenoh.codec import records, settings
 from vla_zenoh.errors import CodecError, RecordError, SpecError
 from vla_zenoh.keys import Keys, last_chunk
 from vla_zenoh.kinematics.kinematics import Kinematics
-from vla_zenoh.lab.recording.record_types import RecordTypes
+from vla_zenoh.lab.recording.record_types import RecordTypes, group_of, part_of
 from vla_zenoh.lab.recording.sample import DEPTH, JPEG, Sample
 from vla_zenoh.lab.view import paths
 from vla_zenoh.lab.view.charts import Charts
@@ -141,7 +141,7 @@ class RerunLogger:
     # -- in -----------------------------------------------------------------------------------
     def log(self, sample: Sample) -> None:
         """Log what a sample shows; whatever it holds, nothing is raised."""
-        group, kind = self.keys.group(sample.key), self._types.of(sample.key)
+        group, kind = group_of(self.keys, sample.key), self._types.of(sample.key)
         if not group or kind is SceneState:
             return
         stamp_ns = self._stamp_ns(sample)
@@ -162,7 +162,7 @@ class RerunLogger:
             self._reject(sample.key, UNFIT)
 
     def _arm(self, sample: Sample) -> _Arm:
-        arm = self._arms.get(self.keys.part_of(sample.key))
+        arm = self._arms.get(part_of(self.keys, sample.key))
         if arm is None:
             raise CodecError("invalid", f"{sample.key} is of no part of the profile's robot")
         return arm
