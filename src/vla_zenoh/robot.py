@@ -110,11 +110,7 @@ class Robot(Protocol):
 
 
 def numbers(name: str, given: ArrayLike, count: int) -> FloatArray:
-    """`given` as a (count,) array of float64, which may contain NaN.
-
-    Raises:
-        ValueError: it has another shape or type.
-    """
+    """`given` as a (count,) array of float64, which may contain NaN; else a `ValueError`."""
     try:
         array = np.asarray(given, np.float64)
     except (TypeError, ValueError) as error:

@@ -78,7 +78,8 @@ class Traffic:
     """Rates of published records from one status to the next, records that were lost, and links."""
 
     def __init__(self, session: zenoh.Session) -> None:
-        self._sessions = [session]
+        self.sessions = [session]
+        """Whose links are listed."""
         self._reported_s = time.monotonic()
         self._sent: dict[str, tuple[int, int]] = {}
         # (key, source) -> its first seq, our count then, losses since; the newest comes last
@@ -86,10 +87,6 @@ class Traffic:
         self._lost: Counter[str] = Counter()
         self._links: list[str] = []
         self._links_s = -1e9
-
-    def add(self, session: zenoh.Session) -> None:
-        """List the links of this session as well."""
-        self._sessions.append(session)
 
     def received(self, key: str, header: Header, arrivals: int) -> None:
         """Count a received record, when its buffer had received `arrivals` samples; 0: unknown.
@@ -114,6 +111,7 @@ class Traffic:
         """Key -> records and bytes per second of these `Publisher`, since the last call."""
         now_s = time.monotonic()
         took_s = max(now_s - self._reported_s, 1e-3)
+        self._reported_s = now_s
         out: dict[str, list[float]] = {}
         before, self._sent = self._sent, {}
         for stream in streams:
@@ -122,7 +120,6 @@ class Traffic:
             if stream.seq > count:
                 rates = ((stream.seq - count) / took_s, (stream.sent_bytes - size) / took_s)
                 out[stream.key] = [round(rate, 2) for rate in rates]
-        self._reported_s = now_s
         return out
 
     def lost(self) -> dict[str, int]:
@@ -133,7 +130,7 @@ class Traffic:
         """Endpoints this node is connected to, as Zenoh writes them."""
         if time.monotonic() - self._links_s > LINKS_PERIOD_S:
             self._links_s = time.monotonic()
-            found = {str(link.dst) for one in self._sessions for link in one.info.links()}
+            found = {str(link.dst) for one in self.sessions for link in one.info.links()}
             self._links = sorted(found)[:MAX_LINKS]
         return self._links
 

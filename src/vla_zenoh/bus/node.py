@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import secrets
 import time
@@ -116,8 +117,7 @@ class Node:
         self.started_wall_ns = time.time_ns()
         self._declared: list[Any] = []
         self._publishers: list[Publisher] = []
-        self._buffers: list[SampleBuffer] = []
-        self._subscribers: list[tuple[SampleBuffer, Any]] = []
+        self._buffers: dict[SampleBuffer, list[Any]] = {}  # with their subscribers
         self._image_session: zenoh.Session | None = None
         self.traffic = Traffic(session)
         self._status_s, self._last_state = 0.0, ""
@@ -159,7 +159,7 @@ class Node:
             self._image_session = open_session(
                 self.profile.session, identity=self.name, images=True, wait_s=IMAGE_LINK_TIMEOUT_S
             )
-            self.traffic.add(self._image_session)
+            self.traffic.sessions.append(self._image_session)
         return self._image_session
 
     def emit(self, event: Event) -> None:
@@ -233,21 +233,19 @@ class Node:
             SessionError: the router does not answer at the port for images.
         """
         self.watch_buffer(buffer)
-        self._subscribers.append((buffer, buffer.subscribe(self._session_for(kind), key)))
+        self._buffers[buffer].append(buffer.subscribe(self._session_for(kind), key))
         return buffer
 
     def unsubscribe(self, buffer: SampleBuffer) -> None:
         """Undeclare the subscribers of `buffer`."""
-        for found, subscriber in self._subscribers:
-            if found is buffer:
-                subscriber.undeclare()
-        self._subscribers = [pair for pair in self._subscribers if pair[0] is not buffer]
+        for subscriber in self._buffers[buffer]:
+            subscriber.undeclare()
         self._report_rejected()
-        self._buffers.remove(buffer)
+        del self._buffers[buffer]
 
     def watch_buffer(self, buffer: SampleBuffer) -> None:
         """Count and report the samples that `buffer` rejects."""
-        self._buffers.append(buffer)
+        self._buffers.setdefault(buffer, [])
 
     def _report_rejected(self) -> None:
         for buffer in self._buffers:
@@ -329,10 +327,10 @@ class Node:
     def close(self) -> None:
         """Leave the bus. The liveliness token goes first, so that others notice at once."""
         self._token.undeclare()
-        for declared in (*self._declared, *(subscriber for _, subscriber in self._subscribers)):
+        for declared in (*self._declared, *itertools.chain(*self._buffers.values())):
             declared.undeclare()
         self._declared.clear()
-        self._subscribers.clear()
+        self._buffers.clear()
         if self._image_session is not None:
             self._image_session.close()
             self._image_session = None

@@ -97,7 +97,7 @@ class GripperState:
     Args:
         width_m: opening between the fingers.
         mode: the robot's name for its mode, ``ready`` when it will move.
-        faults: reported by the robot, empty if there are none.
+        faults: reported by the robot.
     """
 
     width_m: float
@@ -128,8 +128,7 @@ class SceneState:
     """All generalised positions of a simulation, enough for a renderer to draw it.
 
     Args:
-        qpos: (nq,), the simulator's own order and units, then positions and quaternions of mocap
-            bodies.
+        qpos: (nq,), the simulator's own, then positions and quaternions of mocap bodies.
         seed: of the last reset, which determines how a scene with a varied look appears; or None.
     """
 
@@ -187,12 +186,8 @@ def _locked(array: NDArray[Any]) -> NDArray[Any]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Depth:
-    """A depth image: distance of what each pixel shows, along the camera's optical axis.
-
-    Args:
-        counts: (height, width) uint16, row by row from the top left; 0: not measured.
-        unit_m: metres of one count.
-    """
+    """A depth image: distance of what each pixel shows, along the camera's optical axis, in counts
+    of `unit_m`, (height, width) uint16, row by row from the top left; 0: not measured."""
 
     counts: NDArray[np.uint16]
     unit_m: float

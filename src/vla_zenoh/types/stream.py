@@ -61,17 +61,12 @@ class Stamped(Generic[Record]):
 class SingleWriterFilter:
     """Passes the samples of one source at a time, and each of them once.
 
-    The first source becomes the writer. Samples of any other source are rejected until the writer
-    is released or has been silent, so no other source can interfere with a live stream. Times are
-    of any clock that never goes back.
+    The first source becomes the `writer`. Samples of any other source are rejected until the writer
+    is released or has been silent for `silence_s`, so no other source can interfere with a live
+    stream. Times are of any clock that never goes back.
 
-    Args:
-        silence_s: a writer that is silent for this long is forgotten; None: never.
-        sources: sources whose last sequence number is remembered, at least 1. With more than one
-            no source becomes the writer: they may take turns.
-
-    Attributes:
-        writer: source whose samples pass, empty if any may begin.
+    `sources` are remembered by their last sequence number. With more than one no source becomes the
+    writer: they may take turns.
     """
 
     def __init__(self, silence_s: float | None = None, sources: int = 1) -> None:
@@ -100,11 +95,7 @@ class SingleWriterFilter:
         return header.source == self.writer and header.seq > self._last_seq.get(header.source, -1)
 
     def check(self, header: Header, now_ns: int = 0, writer: str = "") -> None:
-        """Raise an error for a sample that is to be rejected, see `objection`.
-
-        Raises:
-            CodecError: ``foreign`` or ``replayed``.
-        """
+        """Raise a `CodecError` for a sample that is to be rejected, see `objection`."""
         reason = self.objection(header, now_ns, writer)
         if reason == "foreign":
             writer = writer or self.writer
@@ -139,12 +130,7 @@ class SingleWriterFilter:
 
 
 class HeldBox(NamedTuple):
-    """What a gripper holds, as a box whose axes are those of the TCP.
-
-    Args:
-        size_m: of its edges along x, y, z.
-        centre_m: from the TCP.
-    """
+    """What a gripper holds: a box along the axes of the TCP, and its centre from there."""
 
     size_m: tuple[float, float, float]
     centre_m: tuple[float, float, float] = (0.0, 0.0, 0.0)

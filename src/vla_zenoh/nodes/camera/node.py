@@ -35,11 +35,7 @@ BROKEN_IN_A_ROW = 5
 
 
 def choose_cameras(profile: Profile, cameras: tuple[str, ...] | None) -> dict[str, CameraProfile]:
-    """The named cameras, or all except those of ROS 2.
-
-    Raises:
-        NodeError: unknown camera, a camera of ROS 2, or no camera at all.
-    """
+    """The named cameras, or all except those of ROS 2; `NodeError`: there is none of that name."""
     ours = {name: one for name, one in profile.cameras.items() if not one.source.startswith(ROS2)}
     known = f"this node can serve: {', '.join(ours) or 'none'}"
     for name in cameras or ():
@@ -54,11 +50,7 @@ def choose_cameras(profile: Profile, cameras: tuple[str, ...] | None) -> dict[st
 
 
 def make_source(profile: CameraProfile) -> Source:
-    """The source of a camera, not open yet. Call it before threads start: it configures OpenCV.
-
-    Raises:
-        NodeError: unknown kind of source.
-    """
+    """The source of a camera, not open yet. Call it before threads start: it configures OpenCV."""
     prepare_opencv()
     kind, _, rest = profile.source.partition(":")
     if kind == "v4l2":
