@@ -21,7 +21,7 @@ import numpy as np
 import typer
 from model_wires import groot, lerobot_server, npy, openpi, openvla_rest, origami, xpolicylab
 
-from vla_zenoh.bus.clock_sync import decode_stamps
+from vla_zenoh.bus.clock import decode_stamps
 from vla_zenoh.cli import status_table as cli_status
 from vla_zenoh.cli.options import model_options
 from vla_zenoh.cli.output import Screen

@@ -15,7 +15,7 @@ from access_rehearsal import surprises
 from camera_rig import camera_rig, free_endpoint, grey, until
 
 from vla_zenoh.bus.buffers import LatestSample
-from vla_zenoh.bus.clock_sync import MAX_HEARD
+from vla_zenoh.bus.clock import MAX_HEARD
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import open_session, second_link
 from vla_zenoh.codec.image import decode_jpeg

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 from camera_rig import await_match, free_endpoint, until
 
-from vla_zenoh.bus import clock_sync as offsets
-from vla_zenoh.bus.clock_sync import MAX_HEARD, MAX_PEERS
+from vla_zenoh.bus import clock as offsets
+from vla_zenoh.bus.clock import MAX_HEARD, MAX_PEERS
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import records

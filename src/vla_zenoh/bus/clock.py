@@ -1,24 +1,61 @@
-"""Wall clock that does not jump, a timer for fixed-rate loops, and the host whose clock it is."""
+"""Clocks: wall time that does not jump, a timer for fixed-rate loops, and the offsets of other
+nodes' clocks, with which their stamps are converted.
+
+A node queries the nodes it knows to be alive, and those whose streams it receives; it never waits
+for a reply. A header may name any source, so names known from headers alone have a separate quota.
+
+One exchange of four stamps, as in NTP, gives the offset up to half its round trip (RFC 5905,
+section 8): the delays there and back cannot be told apart. So of the last exchanges the quickest
+counts, and half its round trip is the uncertainty: a bound, not a guess.
+"""
 
 from __future__ import annotations
 
-import os
-import socket
 import threading
 import time
-from functools import cache
-from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from collections import deque
+from dataclasses import dataclass, replace
+from typing import NamedTuple, TypeVar
 
-from vla_zenoh.keys import key_chunk
+import zenoh
 
-if TYPE_CHECKING:
-    from vla_zenoh.profile import SessionProfile
+from vla_zenoh.bus.buffers import bytes_of
+from vla_zenoh.bus.session import QOS
+from vla_zenoh.codec import message
+from vla_zenoh.errors import CodecError, ProfileError
+from vla_zenoh.keys import Keys, Kind
+from vla_zenoh.types import Header
 
 ADOPT_S = 0.005
 """A smaller difference to the system's wall clock is slewing, and is followed silently."""
 NOISE_S = 0.001
 """A still smaller one is mostly the time between reading two clocks; following it would jitter."""
+ASK_PERIOD_S = 1.0
+FIRST_ASKS, FIRST_PERIOD_S = 8, 0.1
+"""The first queries follow each other quickly: one of them will be undisturbed."""
+PATIENCE_S = 2.0
+FORGET_S = 30.0
+"""An offset is discarded after this time without a reply."""
+HEARD_PATIENCE_S = 2.0
+"""A name known from headers alone that never replied makes room after this time."""
+MAX_PEERS, MAX_HEARD = 64, 32
+"""Nodes known to be alive, and names known from headers alone."""
+MAX_STAMPS_BYTES = 1024
+WINDOW = 8
+"""Exchanges from which the quickest is taken, as in NTP's clock filter."""
+DRIFT = 50e-6
+"""Two clocks of ordinary computers run apart by this much, s per s."""
+LAST_NS = 2**63 - 1
+"""The greatest stamp that a record takes."""
+_STAMPS_OF_A_CHUNK = (
+    "observation_stamp_ns",
+    "valid_until_ns",
+    "observed_ns",
+    "inference_start_ns",
+    "inference_end_ns",
+)
+
+Record = TypeVar("Record")
 
 
 class Clock:
@@ -130,46 +167,247 @@ class FixedRate:
         return Tick(int(periods), self.next_ns - self._period_ns, stall_s, computed_s)
 
 
-HOST_VARIABLE = "VLA_ZENOH_HOST"
-"""Name of this host in the profile, unless an option gives it."""
-BOOT_FILE = Path("/proc/sys/kernel/random/boot_id")
+class Exchange(NamedTuple):
+    """One query and its reply, ns: `asked` and `got` on our monotonic clock, `heard` and `said` on
+    the peer's wall clock."""
+
+    asked: int
+    heard: int
+    said: int
+    got: int
+
+    @property
+    def round_trip_ns(self) -> int:
+        """Round trip without the time the peer took to reply."""
+        return (self.got - self.asked) - (self.said - self.heard)
+
+    @property
+    def ahead_ns(self) -> int:
+        """The peer's wall clock minus our monotonic clock."""
+        return ((self.heard - self.asked) + (self.said - self.got)) // 2
 
 
-class HostId(NamedTuple):
-    """Host on which a node runs.
+class ClockOffset(NamedTuple):
+    """The peer's wall clock minus ours: the truth is within `uncertainty_s` of `offset_s`.
 
-    Args:
-        host: name in the profile if known, else the computer's own name, which need not be unique.
-        boot: unique id of this boot; empty if the system has none.
+    `round_trip_s`: of the newest exchange.
     """
 
-    host: str
-    boot: str
-
-    def shares_clock(self, other: HostId) -> bool:
-        """Whether both certainly run on the same computer; False if unknown."""
-        return bool(self.boot) and self == other
+    offset_s: float
+    uncertainty_s: float
+    round_trip_s: float
 
 
-def own_host_id(session: SessionProfile, host: str | None = None) -> HostId:
-    """Identity of this host; `host` is given by an option, a secured one named by its certificates.
+class ClockOffsetFilter:
+    """Combines exchanges into one offset, and a steady one to convert stamps with.
+
+    A clock that is off by more than `bound_s` is wrong; its stamps are not converted.
+    """
+
+    def __init__(self, bound_s: float) -> None:
+        self._bound_s = bound_s
+        self._window: deque[Exchange] = deque(maxlen=WINDOW)
+        self._best: Exchange | None = None
+        self._applied_ns = 0
+        self._applied_for: tuple[Exchange, int] | None = None
+
+    def add(self, exchange: Exchange) -> bool:
+        """Add an exchange; False: it is impossible, and ignored."""
+        if exchange.round_trip_ns < 0 or exchange.said < exchange.heard:
+            return False
+        if self._best is not None and self._differ(self._best, exchange):
+            self._window.clear()  # one of the clocks was set
+        self._window.append(exchange)
+        self._best = min(self._window, key=lambda one: self._uncertainty_ns(one, exchange.got))
+        return True
+
+    def offset(self, wall_minus_mono_ns: int, now_mono_ns: int) -> ClockOffset | None:
+        """The offset at a time of our monotonic clock; None before the first exchange."""
+        best = self._best
+        if best is None:
+            return None
+        return ClockOffset(
+            (best.ahead_ns - wall_minus_mono_ns) / 1e9,
+            self._uncertainty_ns(best, now_mono_ns) / 1e9,
+            self._window[-1].round_trip_ns / 1e9,
+        )
+
+    def applied_ns(self, wall_minus_mono_ns: int, now_mono_ns: int) -> int:
+        """Offset to subtract from the peer's stamps to convert them to our clock.
+
+        It changes only when it is certainly wrong, so that stamps do not jitter with every
+        exchange; it is zero for a clock beyond the bound.
+        """
+        best = self._best
+        if best is None:
+            return 0
+        # Only these make a difference: with its age an exchange only gets less certain.
+        if self._applied_for == (best, wall_minus_mono_ns):
+            return self._applied_ns
+        self._applied_for = best, wall_minus_mono_ns
+        offset_ns = best.ahead_ns - wall_minus_mono_ns
+        if abs(offset_ns / 1e9) > self._bound_s:
+            self._applied_ns = 0
+        elif abs(offset_ns - self._applied_ns) > self._uncertainty_ns(best, now_mono_ns):
+            self._applied_ns = offset_ns
+        return self._applied_ns
+
+    @staticmethod
+    def _uncertainty_ns(exchange: Exchange, now_mono_ns: int) -> int:
+        age_ns = max(now_mono_ns - exchange.got, 0)
+        return exchange.round_trip_ns // 2 + int(age_ns * DRIFT) + 1
+
+    def _differ(self, one: Exchange, other: Exchange) -> bool:
+        apart_ns = abs(one.ahead_ns - other.ahead_ns)
+        return apart_ns > self._uncertainty_ns(one, other.got) + other.round_trip_ns // 2 + 1
+
+
+def shift_stamps(header: Header, record: Record, ahead_ns: int) -> tuple[Header, Record]:
+    """Header and record, of a writer whose clock is `ahead_ns` of ours, with their stamps on ours.
+
+    A stamp at an end of what a record takes ("at once", "for ever") stays within it: whether that
+    is stale or never expires is for the receiver to decide.
+    """
+
+    from vla_zenoh.types.commands import ActionChunk  # brings numpy
+
+    def here(stamp_ns: int) -> int:
+        return min(max(stamp_ns - ahead_ns, 0), LAST_NS)
+
+    header = replace(header, stamp_wall_ns=here(header.stamp_wall_ns))
+    if isinstance(record, ActionChunk):
+        stamps = {name: here(getattr(record, name)) for name in _STAMPS_OF_A_CHUNK}
+        record = replace(record, **stamps)
+    return header, record
+
+
+@dataclass(slots=True)
+class _Peer:
+    key: str
+    filter: ClockOffsetFilter
+    since_s: float
+    alive: bool
+    asks: int = 0
+    next_ask_s: float = 0.0
+    answered_s: float = -1e9
+
+    def forgotten(self, now_s: float) -> bool:
+        """Silent for so long that another peer may take its place."""
+        real = self.alive or self.answered_s > 0
+        silent_s = now_s - max(self.answered_s, self.since_s)
+        return silent_s > (FORGET_S if real else HEARD_PATIENCE_S)
+
+
+class ClockSync:
+    """Clock offsets of the nodes other than `name`, and stamps converted with them, see
+    `ClockOffsetFilter`."""
+
+    def __init__(
+        self, session: zenoh.Session, keys: Keys, clock: Clock, name: str, bound_s: float
+    ) -> None:
+        self._session, self._keys, self._clock, self._name = session, keys, clock, name
+        self._bound_s = bound_s
+        self._lock = threading.Lock()
+        self._peers: dict[str, _Peer] = {}
+        self._next_look_s = 0.0
+
+    def track(self, node: str, *, alive: bool = True) -> None:
+        """Measure the clock of `node` from now on; invalid names are ignored."""
+        known = self._peers.get(node)
+        if known is not None:
+            known.alive = known.alive or alive
+            return
+        others = sum(peer.alive is alive for peer in list(self._peers.values()))
+        if node == self._name or others >= (MAX_PEERS if alive else MAX_HEARD):
+            return
+        try:
+            key = self._keys.clock(node)
+        except ProfileError:
+            return
+        with self._lock:
+            self._peers[node] = _Peer(
+                key, ClockOffsetFilter(self._bound_s), time.monotonic(), alive
+            )
+        self._next_look_s = 0.0
+
+    def poll(self) -> None:
+        """Send the queries that are due. Cheap; call it from the loop of the node."""
+        now_s = time.monotonic()
+        if now_s < self._next_look_s:
+            return
+        self._next_look_s = now_s + FIRST_PERIOD_S / 2
+        for node, peer in list(self._peers.items()):
+            if now_s >= peer.next_ask_s:
+                peer.asks += 1
+                peer.next_ask_s = now_s + (
+                    FIRST_PERIOD_S if peer.asks <= FIRST_ASKS else ASK_PERIOD_S
+                )
+                self._ask(peer)
+            if peer.forgotten(now_s):
+                with self._lock:  # room for others; it comes back with its next sample
+                    del self._peers[node]
+
+    def _ask(self, peer: _Peer) -> None:
+        asked_ns = time.monotonic_ns()
+
+        def on_reply(reply: zenoh.Reply) -> None:
+            got_ns = time.monotonic_ns()
+            if reply.ok is None:
+                return
+            try:
+                heard_ns, said_ns = decode_stamps(bytes_of(reply.ok.payload, MAX_STAMPS_BYTES))
+            except CodecError:
+                return  # not one of our nodes' clocks
+            with self._lock:
+                if peer.filter.add(Exchange(asked_ns, heard_ns, said_ns, got_ns)):
+                    peer.answered_s = time.monotonic()
+
+        self._session.get(
+            peer.key,
+            zenoh.handlers.Callback(on_reply, indirect=False),
+            timeout=PATIENCE_S,
+            **QOS[Kind.CONTROL],
+        )
+
+    def offsets(self) -> dict[str, ClockOffset]:
+        """Node -> its clock minus ours, of those that replied lately."""
+        now_ns, now_s = time.monotonic_ns(), time.monotonic()
+        with self._lock:
+            found = {
+                node: peer.filter.offset(self._clock.offset_ns, now_ns)
+                for node, peer in self._peers.items()
+                if now_s - peer.answered_s < FORGET_S
+            }
+        return {node: offset for node, offset in found.items() if offset is not None}
+
+    def to_local_clock(self, header: Header, record: Record) -> tuple[Header, Record]:
+        """Header and record with their stamps converted to our clock."""
+        node = header.source.partition("#")[0]
+        peer = self._peers.get(node)
+        if peer is None:
+            self.track(node, alive=False)
+            return header, record
+        with self._lock:
+            ahead_ns = peer.filter.applied_ns(self._clock.offset_ns, time.monotonic_ns())
+        return shift_stamps(header, record, ahead_ns) if ahead_ns else (header, record)
+
+
+def reply_with_stamps(clock: Clock, key: str, query: zenoh.Query) -> None:
+    """Reply to a clock query with the times of its arrival and of this reply."""
+    heard_ns = clock.wall_ns()
+    reply = {"heard_ns": heard_ns, "said_ns": clock.wall_ns()}
+    query.reply(key, message.pack(reply))
+
+
+def decode_stamps(payload: bytes) -> tuple[int, int]:
+    """Times of arrival and reply of a clock query, on the peer's wall clock, ns.
 
     Raises:
-        ProfileError: the name cannot be part of a key.
+        CodecError: the payload is something else.
     """
-    security = session.security
-    named = host or (security.host if security else None) or os.environ.get(HOST_VARIABLE)
-    if not named and security is not None:
-        from vla_zenoh.security.store import Store
-
-        named = Store(security.folder).known_host()
-    return HostId(key_chunk(named, "host") if named else socket.gethostname(), own_boot_id())
-
-
-@cache
-def own_boot_id() -> str:
-    """Id of this boot; empty if the system has none."""
-    try:
-        return BOOT_FILE.read_text("ascii").strip()
-    except OSError:
-        return ""
+    found = message.unpack(payload)
+    found = found if isinstance(found, dict) else {}
+    heard, said = found.get("heard_ns"), found.get("said_ns")
+    if type(heard) is not int or type(said) is not int:
+        raise CodecError("shape", "a clock replies with heard_ns and said_ns")
+    return heard, said

@@ -13,8 +13,8 @@ from typing import Any, TypeVar
 import zenoh
 
 from vla_zenoh.bus.buffers import ReceivedSample, SampleBuffer, bytes_of, header_of
-from vla_zenoh.bus.clock import Clock, own_host_id
-from vla_zenoh.bus.clock_sync import ClockSync, reply_with_stamps
+from vla_zenoh.bus.clock import Clock, ClockSync, reply_with_stamps
+from vla_zenoh.bus.host import own_host_id
 from vla_zenoh.bus.metrics import EventThrottle, Traffic
 from vla_zenoh.bus.session import QOS, alive_nodes, open_session
 from vla_zenoh.codec import records

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
-from vla_zenoh.bus.clock import HOST_VARIABLE
+from vla_zenoh.bus.host import HOST_VARIABLE
 from vla_zenoh.cli.words import DEFAULT_PROFILE, PROFILE_VARIABLE
 
 if TYPE_CHECKING:  # Pydantic and the schema: `up` has more to do while it loads them

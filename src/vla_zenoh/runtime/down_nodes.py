@@ -14,7 +14,8 @@ from collections.abc import Callable, Sequence
 
 import zenoh
 
-from vla_zenoh.bus.clock import Clock, HostId, own_host_id
+from vla_zenoh.bus.clock import Clock
+from vla_zenoh.bus.host import HostId, own_host_id
 from vla_zenoh.bus.node import Publisher
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import VlaZenohError

@@ -16,7 +16,7 @@ from typing import Any
 import zenoh
 
 from vla_zenoh.bus.client import Client
-from vla_zenoh.bus.clock import HOST_VARIABLE, own_boot_id
+from vla_zenoh.bus.host import HOST_VARIABLE, own_boot_id
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import NodeError, ProfileError, SessionError
 from vla_zenoh.keys import NODE_KINDS, ROLLING, worker_node

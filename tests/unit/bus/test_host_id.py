@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from vla_zenoh.bus.clock import HOST_VARIABLE, HostId, own_boot_id, own_host_id
+from vla_zenoh.bus.host import HOST_VARIABLE, HostId, own_boot_id, own_host_id
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.profile import SessionProfile
 from vla_zenoh.profile.session import SecurityProfile

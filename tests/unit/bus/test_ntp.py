@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vla_zenoh.bus.clock_sync import LAST_NS, ClockOffsetFilter, Exchange, shift_stamps
+from vla_zenoh.bus.clock import LAST_NS, ClockOffsetFilter, Exchange, shift_stamps
 from vla_zenoh.types import ActionChunk, Header
 
 MS = 1_000_000

@@ -11,7 +11,7 @@ from typing import Any, cast, get_args
 import pytest
 
 from vla_zenoh.bus.client import Client
-from vla_zenoh.bus.clock import own_boot_id
+from vla_zenoh.bus.host import own_boot_id
 from vla_zenoh.cli.main import COMMANDS, Group
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.keys import NODE_KINDS

@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 import zenoh
 
-from vla_zenoh.bus.clock import HOST_VARIABLE
+from vla_zenoh.bus.host import HOST_VARIABLE
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,

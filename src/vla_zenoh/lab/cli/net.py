@@ -10,8 +10,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from vla_zenoh.bus.clock import Clock
-from vla_zenoh.bus.clock_sync import ClockSync
+from vla_zenoh.bus.clock import Clock, ClockSync
 from vla_zenoh.cli.options import JsonOption, options
 from vla_zenoh.cli.output import console, fail, new_table, styled
 from vla_zenoh.cli.target import RobotTarget

@@ -10,7 +10,7 @@ from operator import itemgetter
 from typing import Any
 
 from vla_zenoh.bus.buffers import CallbackRing, ReceivedSample, ZenohRing, header_of
-from vla_zenoh.bus.clock import HostId
+from vla_zenoh.bus.host import HostId
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import MAX_MESSAGE_BYTES
 from vla_zenoh.codec import settings
@@ -227,6 +227,7 @@ class PeerMonitor:
         self._expected = frozenset(expected_nodes(node.profile))
         self._down: dict[str, str] = {}
         self._hosts: dict[str, HostId] = {}
+        self._same_host: set[str] = set()
         self._next_clocks_s = 0.0
         self._statuses = node.subscribe(node.keys.all_status, ZenohRing(STATUSES_AT_ONCE))
         self._new_specs = node.subscribe(node.keys.all_specs, ZenohRing(SPECS_AT_ONCE))
@@ -243,6 +244,7 @@ class PeerMonitor:
                 return
             for known in (self._status_sources, self._hosts):
                 known.pop(name, None)
+            self._same_host.discard(name)
             if name.startswith("worker-"):
                 for known in (self._specs, self._spec_sources, self._complaints):
                     known.pop(name.removeprefix("worker-"), None)
@@ -268,7 +270,7 @@ class PeerMonitor:
         with self._lock:
             if not self._changed:
                 return None
-            self._changed, here = False, self._node.host_id
+            self._changed = False
             return PeerSnapshot(
                 frozenset(self._alive),
                 self._robot_node,
@@ -281,7 +283,7 @@ class PeerMonitor:
                 },
                 {camera: self._servers[camera] for camera in self._cameras},
                 {name: place.host for name, place in self._hosts.items()},
-                frozenset(n for n, place in self._hosts.items() if place.shares_clock(here)),
+                frozenset(self._same_host),
                 {node: at[:2] for node, at in self._node.clocks.offsets().items()},
                 frozenset(self._holders),
                 dict(self._camera_faults),
@@ -380,7 +382,11 @@ class PeerMonitor:
             return last_chunk(key), None
 
     def _update_from_status(self, status: NodeStatus) -> None:
-        self._hosts[status.node] = HostId(status.host, status.boot)
+        place = HostId(status.host, status.boot)
+        if self._hosts.get(status.node) != place:
+            self._hosts[status.node] = place
+            same = place.shares_clock(self._node.host_id)
+            (self._same_host.add if same else self._same_host.discard)(status.node)
         if status.node.startswith("worker-"):
             complaint = status.detail.get("complaint", "")
             worker = status.node.removeprefix("worker-")
