@@ -328,7 +328,7 @@ class PeerMonitor:
         with self._lock:
             # A node that is gone must not block a restarted one of the same name.
             if status is not None and name in self._alive:
-                self._status_sources[name] = source
+                self._status_sources[name], self._changed = source, True
                 self._update_from_status(status)
             else:
                 self._node.counters["refused.foreign_status"] += 1
@@ -345,7 +345,7 @@ class PeerMonitor:
         if stamped is None or stamped.record.state != CRASHED or not isinstance(why, str):
             return
         with self._lock:
-            if name not in self._alive and self._down.get(name) != why[:MAX_WHY]:
+            if name not in self._alive:
                 self._down[name], self._changed = why[:MAX_WHY], True
 
     def _receive_spec(self, arrival: ReceivedSample) -> None:
@@ -392,11 +392,10 @@ class PeerMonitor:
             worker = status.node.removeprefix("worker-")
             if not isinstance(complaint, str):
                 return
-            known, self._changed = self._complaints, True
             if not complaint:
-                known.pop(worker, None)
-            elif worker in known or len(known) < MAX_WORKERS:
-                known[worker] = complaint[:MAX_WHY]
+                self._complaints.pop(worker, None)
+            elif worker in self._complaints or len(self._complaints) < MAX_WORKERS:
+                self._complaints[worker] = complaint[:MAX_WHY]
             else:
                 self._node.counters["refused.more_workers"] += 1
 
@@ -414,14 +413,11 @@ class PeerMonitor:
             )
             return
         age_s, bad, reason = (fields.get(name) for name in ("age_s", "bad", "why"))
-        reason = reason[:MAX_WHY] if isinstance(reason, str) else ""
-        if self._camera_reasons.get(camera, "") != reason:
-            self._camera_reasons[camera], self._changed = reason, True
+        self._camera_reasons[camera] = reason[:MAX_WHY] if isinstance(reason, str) else ""
         why = bad.get("why") if isinstance(bad, Mapping) else None
         if isinstance(why, str):
-            self._camera_faults[camera], self._changed = why[:MAX_WHY], True
-        elif self._camera_faults.pop(camera, None) is not None:
-            self._changed = True
+            self._camera_faults[camera] = why[:MAX_WHY]
+        else:
+            self._camera_faults.pop(camera, None)
         if isinstance(age_s, (int, float)) and not isinstance(age_s, bool):
             self._cameras[camera] = (max(float(age_s), 0.0), now_ns)
-            self._changed = True
