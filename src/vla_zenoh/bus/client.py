@@ -199,11 +199,7 @@ class Client:
         return self._set("prompt", prompt, lambda task: task.prompt == wanted, timeout_s)
 
     def set_rate(self, rate_hz: float, timeout_s: float = 2.0) -> Task:
-        """Set the rate of action chunks, as `set_prompt`.
-
-        Raises:
-            CodecError: it is not allowed.
-        """
+        """Set the rate of action chunks, as `set_prompt`; `CodecError`: it is not allowed."""
 
         def taken(task: Task) -> bool:
             return math.isclose(task.rate_hz, rate_hz, rel_tol=1e-5)

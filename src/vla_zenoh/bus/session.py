@@ -59,8 +59,7 @@ def session_config(
     """Configuration of a Zenoh session, as plain data for its strict parser.
 
     Args:
-        profile: the session section.
-        mode: of the session.
+        profile, mode: of the session.
         connect: overrides the profile's endpoints; of a router: other routers.
         identity: node whose certificate is used; None: the operator at this computer.
         access: section ``access_control`` of a router.

@@ -356,8 +356,8 @@ class CameraPublisher:
         if self._depth is not None:
             detail["depth_measured_share"] = round(self._measured_share, 3)
         if (bad := self.fault) is not None:
-            shown = {"why": bad.why, "check": bad.check, "value": bad.value, "limit": bad.limit}
-            detail["bad"] = shown
+            names = ("why", "check", "value", "limit")
+            detail["bad"] = {name: getattr(bad, name) for name in names}
         return detail | ({"why": self.why} if self.why else {})
 
     def figures(self) -> tuple[float, tuple[float, float] | None]:

@@ -68,7 +68,7 @@ class CommandInputs:
         self.chunk_arrival = threading.Event()
         """Set when a chunk arrives."""
         ring = CallbackRing(CHUNKS, arrival=self.chunk_arrival)
-        self._chunks = node.subscribe(keys.all_deltas, ring)
+        self.chunks = node.subscribe(keys.all_deltas, ring)
         names = node.profile.part_names
         self._parts = {name: _PartInputs(node, keys.of_part(name)) for name in names}
         self._settings = [
@@ -76,11 +76,6 @@ class CommandInputs:
             for name, size, limit, decode in SETTINGS
         ]
         self._last_clock = 0.0
-
-    @property
-    def chunks_dropped(self) -> int:
-        """Chunks dropped because they arrived faster than they were processed."""
-        return self._chunks.dropped
 
     def poll(self, now_ns: int, *, news: bool = True) -> Inputs:
         """Everything received since the last call, for the tick at `now_ns`, wall clock.
@@ -95,7 +90,7 @@ class CommandInputs:
 
     def poll_streams(self, settings_put: Sequence[Setting] = ()) -> Inputs:
         """The chunks and states among them."""
-        chunks = [self._chunk(arrival) for arrival in self._chunks.drain()]
+        chunks = [self._chunk(arrival) for arrival in self.chunks.drain()]
         inputs = Inputs(chunks=[chunk for chunk in chunks if chunk is not None])
         requested = any(setting.name in ("active", "worker") for setting in settings_put)
         states = {name: part.poll(requested) for name, part in self._parts.items()}

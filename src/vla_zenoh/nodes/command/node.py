@@ -178,7 +178,7 @@ class CommandNode:
         self.commander.look_ahead(now_ns)
         if chores or out.events or out.task_changed:
             self._report_latch_failure()
-            self._status.publish(out, self._inputs.chunks_dropped)
+            self._status.publish(out, self._inputs.chunks.dropped)
         busy = inputs.chunks or inputs.settings or not self.commander.at_rest
         if busy or any(self._awaits(part, now_ns) for part in self.commander.parts):
             self._busy_ns = tick.nominal_ns
