@@ -9,7 +9,7 @@ import numpy as np
 
 from vla_zenoh.control.chunk_planner import ChunkPlanner
 from vla_zenoh.control.chunk_validation import Lease
-from vla_zenoh.control.commander_io import PartStates, make_event
+from vla_zenoh.control.commander_io import NewStates, make_event
 from vla_zenoh.control.joint_monitor import JOINT_PATIENCE_S, JointMonitor, joint_state_faults
 from vla_zenoh.control.limits import LimitHit
 from vla_zenoh.control.motion_pipeline import MotionPipeline
@@ -99,7 +99,7 @@ class CommandedPart:
             return None  # reported by the monitor of its joints
 
     # -- states -------------------------------------------------------------------------------
-    def update(self, states: PartStates) -> None:
+    def update(self, states: NewStates) -> None:
         """Take the newest states."""
         if states.pose is not None:
             same = self.pose is not None and states.pose.record is self.pose.record

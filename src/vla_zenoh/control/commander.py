@@ -27,7 +27,7 @@ from vla_zenoh.control.commander_io import (
     make_event,
 )
 from vla_zenoh.control.limits import LimitHit
-from vla_zenoh.control.plan_timeline import EpisodeProgress, Plan
+from vla_zenoh.control.plan_timeline import EpisodeProgress
 from vla_zenoh.control.preflight import PeerSnapshot, reasons_of_worker
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.states import DEACTIVATED, OBEYING, State, Trigger, after
@@ -493,7 +493,8 @@ class Commander:
             if outcome.plan is not None:
                 self._resumed_ns = resumed_ns
                 self._latest[outcome.chunk.record.worker] = outcome.chunk
-                self._expect_next(outcome.plan, now_ns)
+                rate_hz, speed = self.task.rate_hz, self.task.speed
+                self._watchdog.expect_next(outcome.plan.left_ns(now_ns), now_ns, rate_hz, speed)
                 self.progress.chunks += 1
                 self._change(Trigger.FRESH, "fresh chunk")
 
@@ -508,10 +509,6 @@ class Commander:
             reason, why, value, limit, _ = rejection
             why = f"{outcome.chunk.record.worker}: {why}"
             self._emit("warning", "refusal", reason, why, value, limit)
-
-    def _expect_next(self, plan: Plan, now_ns: int) -> None:
-        rate_hz, speed = self.task.rate_hz, self.task.speed
-        self._watchdog.expect_next(plan.left_ns(now_ns), now_ns, rate_hz, speed)
 
     # -- supervision --------------------------------------------------------------------------
     def _measure(self) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from vla_zenoh.control.chunk_validation import Rejection
 from vla_zenoh.control.limits import APPROACH, LimitHit
@@ -43,19 +43,8 @@ class Setting(NamedTuple):
     part: str = ""
 
 
-class PartStates(Protocol):
-    """Newest states of one part since the last tick; None: none, or none decoded."""
-
-    @property
-    def pose(self) -> Stamped[PoseState] | None: ...
-    @property
-    def gripper(self) -> Stamped[GripperState] | None: ...
-    @property
-    def joint(self) -> Stamped[JointState] | None: ...
-
-
 class NewStates(NamedTuple):
-    """Newest states of one part, see `PartStates`."""
+    """Newest states of one part since the last tick; None: none, or none decoded."""
 
     pose: Stamped[PoseState] | None = None
     gripper: Stamped[GripperState] | None = None
@@ -90,11 +79,13 @@ class Inputs:
     gripper: Stamped[GripperState] | None = None
     peers: PeerSnapshot | None = None
     joint: Stamped[JointState] | None = None
-    parts: Mapping[str, PartStates] = field(default_factory=dict)
+    parts: Mapping[str, NewStates] = field(default_factory=dict)
 
-    def of(self, part: str) -> PartStates:
+    def of(self, part: str) -> NewStates:
         """States of `part`; of no name: of the robot."""
-        return self.parts.get(part, NewStates()) if part else self
+        if part:
+            return self.parts.get(part, NewStates())
+        return NewStates(self.pose, self.gripper, self.joint)
 
 
 @dataclass(slots=True)

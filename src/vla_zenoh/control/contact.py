@@ -331,18 +331,6 @@ class _Begun(NamedTuple):
     measured: Pose
 
 
-class RetreatStep(NamedTuple):
-    """The command of one tick.
-
-    Args:
-        target: the pose to move to; None: brake, or stand.
-        event: the end of the retreat, None: it continues or did not run.
-    """
-
-    target: Pose | None
-    event: Event | None = None
-
-
 class Retreat:
     """Where a blocked arm moves to, from `begin` until it is free.
 
@@ -383,8 +371,10 @@ class Retreat:
         """Stop the retreat: the arm brakes and stands."""
         self._begun = self._target = None
 
-    def step(self, commanded: Pose, now_ns: int, *, at_rest: bool) -> RetreatStep:
-        """The target of this tick.
+    def step(
+        self, commanded: Pose, now_ns: int, *, at_rest: bool
+    ) -> tuple[Pose | None, Event | None]:
+        """The pose to move to in this tick, None: brake, or stand; and the event of its end.
 
         Args:
             commanded: the present command.
@@ -393,24 +383,26 @@ class Retreat:
         """
         begun, measured = self._begun, self._measured
         if begun is None or measured is None:
-            return RetreatStep(None)
+            return None, None
         if not at_rest:
             self._rest_ns = now_ns
             if self._target is not None and now_ns > self._until_ns:
                 return self._finish("it took too long")
-            return RetreatStep(self._target)
+            return self._target, None
         if self._target is None:
             return self._set_out(begun, commanded, measured, now_ns)
         if now_ns - self._rest_ns < SETTLE_NS:
-            return RetreatStep(self._target)
+            return self._target, None
         known = self._contact.known
         if known and self._contact.quiet:
             return self._finish("it stands")
         if not self._ahead or now_ns > self._until_ns:
             return self._finish("something still presses" if known else "it stands")
-        return RetreatStep(self._step_back(self._target, STEP_M if known else RELIEF_M))
+        return self._step_back(self._target, STEP_M if known else RELIEF_M), None
 
-    def _set_out(self, begun: _Begun, commanded: Pose, measured: Pose, now_ns: int) -> RetreatStep:
+    def _set_out(
+        self, begun: _Begun, commanded: Pose, measured: Pose, now_ns: int
+    ) -> tuple[Pose | None, Event | None]:
         if self._contact.known and self._contact.quiet:
             return self._finish("no further than the brake, nothing presses any more")
         apart_m, apart_rad = pose_distance(commanded, measured)
@@ -421,7 +413,7 @@ class Retreat:
             self.end()
             where = f"{apart_m:.3f} m and {apart_rad:.2f} rad from its command"
             why = f"the arm does not retreat: it is {where}"
-            return RetreatStep(None, make_event("warning", "notice", "retreat", why))
+            return None, make_event("warning", "notice", "retreat", why)
         on_m = norm3(measured.position_m - begun.measured.position_m)
         # It does not return to a pose from which a person has pushed it away since.
         here = np.array(_place(measured))
@@ -437,7 +429,7 @@ class Retreat:
         self._until_ns = now_ns + round(2e9 * way_s) + SPARE_NS
         self._rest_ns = now_ns
         self._target = measured
-        return RetreatStep(measured)
+        return measured, None
 
     def _step_back(self, target: Pose, step_m: float) -> Pose:
         start = _place(target)
@@ -448,9 +440,9 @@ class Retreat:
         self._target = target
         return target
 
-    def _finish(self, why: str) -> RetreatStep:
+    def _finish(self, why: str) -> tuple[Pose | None, Event | None]:
         self.end()
         force_n = self._contact.force_n
         force = "" if force_n is None else f", external force {force_n:.1f} N"
         why = f"the arm retreated: {why}{force}"
-        return RetreatStep(None, make_event("info", "notice", "retreat", why))
+        return None, make_event("info", "notice", "retreat", why)

@@ -71,6 +71,16 @@ SETTLED, SETTLED_NS = 5e-4, 100_000_000
 """A robot that moves by less than this, in m and rad, for this long stands."""
 
 
+class _Order(NamedTuple):
+    """Where to go, from when on, and when the watchdog brakes unless a chunk arrives."""
+
+    goal: Goal
+    plan: Plan
+    task: Task
+    overdue_ns: int
+    now_ns: int
+
+
 class _Ahead(NamedTuple):
     """The motion to a goal, computed before the tick in which it is expected to begin.
 
@@ -316,13 +326,9 @@ class MotionPipeline:
         assert self._smoother is not None
         if self.in_joints and self._path is not None:
             return joint_goal(self._path.kinematics, self._path.braked(), width_m)
-        return Goal(self._resting_pose(self._smoother, actual), width_m)
-
-    def _resting_pose(self, smoother: Smoother, actual: Pose) -> Pose:
-        """Where a brake will end, inside the box or no further outside than the arm is."""
-        rest, (low, high) = smoother.resting_pose(), workspace_corners(self._limits)
+        rest, (low, high) = self._smoother.resting_pose(), workspace_corners(self._limits)
         least, most = np.minimum(low, actual.position_m), np.maximum(high, actual.position_m)
-        return Pose(np.clip(rest.position_m, least, most), rest.rotation)
+        return Goal(Pose(np.clip(rest.position_m, least, most), rest.rotation), width_m)
 
     def measure(self, measured: PoseState, joint: JointState | None, received_ns: int) -> None:
         """Track whether the robot still moves while the stream stands.
@@ -473,12 +479,7 @@ class MotionPipeline:
             self.goal, self._slowing = None, override > 0.0
 
     def _follow(
-        self,
-        timeline: GoalTimeline,
-        task: Task,
-        overdue_ns: int,
-        now_ns: int,
-        ticks: int,
+        self, timeline: GoalTimeline, task: Task, overdue_ns: int, now_ns: int, ticks: int
     ) -> list[Event]:
         plans = self._aggregator.plans(timeline, now_ns)
         found = self._planner.bound_due(plans, now_ns)
@@ -506,7 +507,8 @@ class MotionPipeline:
                     events.append(make_event("warning", "limit", name, "leash", value, limit))
                 goal = self._shorten(plans, goal, short, now_ns)
             events += self._slow_down(slower)
-            enough = self._set_out(mover, goal, timeline.plan, task, overdue_ns, now_ns)
+            order = _Order(goal, timeline.plan, task, overdue_ns, now_ns)
+            enough = self._set_out(mover, order)
             self._slowing &= not (enough and _within(mover, self._override))
             self.goal = goal
             self.gripper.request(goal.width_m)
@@ -536,7 +538,7 @@ class MotionPipeline:
             return False
         slower, speed = self._slowest(goal), self.speed
         self.speed = 1.0 if slower is None else slower.share
-        self._ahead = self._motion_to(mover, goal, plans[0], task, overdue_ns, next_ns)
+        self._ahead = self._motion_to(mover, _Order(goal, plans[0], task, overdue_ns, next_ns))
         self.speed = speed
         return True
 
@@ -550,48 +552,32 @@ class MotionPipeline:
             goal.slowdown, self.contact_slowdown, self.joint_slowdown, self.part_slowdown
         )
 
-    def _set_out(
-        self,
-        mover: Smoother | JointPath,
-        goal: Goal,
-        plan: Plan,
-        task: Task,
-        overdue_ns: int,
-        now_ns: int,
-    ) -> bool:
-        """Move to `goal`; whether the shares suffice."""
+    def _set_out(self, mover: Smoother | JointPath, order: _Order) -> bool:
+        """Carry out an order; whether the shares suffice."""
         ahead, self._ahead = self._ahead, None
-        if (
-            ahead is None
-            or ahead.at != self._numbers(plan, task, overdue_ns, now_ns)
-            or not all(map(is_, ahead.of, (goal, plan, mover, mover.state)))
-        ):
-            ahead = self._motion_to(mover, goal, plan, task, overdue_ns, now_ns)
+        of, at = self._depends_on(mover, order)
+        if ahead is None or ahead.at != at or not all(map(is_, ahead.of, of)):
+            ahead = self._motion_to(mover, order)
         self._timings[self.in_joints] = ahead.timing
         mover.adopt(ahead.mover)  # pyright: ignore
         return ahead.enough
 
-    def _numbers(self, plan: Plan, task: Task, overdue_ns: int, now_ns: int) -> tuple[float, ...]:
-        """All numbers that the motion to a goal depends on, beside those of its objects."""
-        index, rate_hz = plan.index_at(now_ns), task.rate_hz
-        return (now_ns, overdue_ns, rate_hz, index, self.speed, self._override, self._slowing)
-
-    def _motion_to(
-        self,
-        mover: Smoother | JointPath,
-        goal: Goal,
-        plan: Plan,
-        task: Task,
-        overdue_ns: int,
-        now_ns: int,
-    ) -> _Ahead:
-        """The motion to a goal from the present state."""
+    def _depends_on(
+        self, mover: Smoother | JointPath, order: _Order
+    ) -> tuple[tuple[object, ...], tuple[float, ...]]:
+        """The objects and numbers that the motion of an order depends on."""
+        goal, plan, task, overdue_ns, now_ns = order
+        index, shares = plan.index_at(now_ns), (self.speed, self._override, self._slowing)
         of = goal, plan, mover, mover.state
-        at = self._numbers(plan, task, overdue_ns, now_ns)
+        return of, (now_ns, overdue_ns, task.rate_hz, index, *shares)
+
+    def _motion_to(self, mover: Smoother | JointPath, order: _Order) -> _Ahead:
+        """The motion of an order from the present state."""
+        of, at = self._depends_on(mover, order)
         timing, mover = self._timings[self.in_joints].fork(), mover.fork()
-        shares = self._shares(timing, mover, goal, plan, task, overdue_ns, now_ns)
+        shares = self._shares(timing, mover, order)
         hard = self._slowing and (self._joints is None or self.in_joints)
-        return _Ahead(of, at, timing, mover, _move(mover, goal, shares, hard=hard))
+        return _Ahead(of, at, timing, mover, _move(mover, order.goal, shares, hard=hard))
 
     def _on_leash(
         self, mover: Smoother | JointPath, goal: Goal, ahead_s: float
@@ -646,17 +632,9 @@ class MotionPipeline:
             self._joints.brake(mover)
         self.goal = None
 
-    def _shares(
-        self,
-        timing: StepTiming,
-        mover: Smoother | JointPath,
-        goal: Goal,
-        plan: Plan,
-        task: Task,
-        overdue_ns: int,
-        now_ns: int,
-    ) -> Shares:
+    def _shares(self, timing: StepTiming, mover: Smoother | JointPath, order: _Order) -> Shares:
         """Shares of the limits that the arm has on the way to a goal."""
+        goal, plan, task, overdue_ns, now_ns = order
         override, speed = self._override, self.speed * self._override
         if not plan.soonest:
             joints = isinstance(mover, JointPath)

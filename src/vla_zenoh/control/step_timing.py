@@ -134,9 +134,27 @@ class StepTiming:
         if plan is not self._plan:
             self._take(plan, plan_ns, asked_period_s)
         due_ns = self._begun_ns + (index + 1 - self._gone) * plan.dt_ns * self._stretch
-        time_s = max(due_ns - plan_ns + self._spare_ns, SOON_NS) / 1e9
         override = plan.clock.override
-        return self._paced(way, velocity, time_s / override, left_s, override)
+        time_s = max(due_ns - plan_ns + self._spare_ns, SOON_NS) / 1e9 / override
+        limits = self._box[0]
+        ways_s = np.abs(way) / limits
+        leading = int(ways_s.argmax())
+        length = float(ways_s[leading])  # s at full speed
+        if length <= 0.0:
+            return 1.0
+        now = float((np.abs(velocity) / limits).max())
+        # In units of the velocity limits along the way, as the limits of the other orders are.
+        most, jerk = self._box[1:, leading] / limits[leading]
+        most, jerk = most * override**2, jerk * override**3
+        share = least = length / time_s
+        for _ in range(3):
+            stop_s = _stop_s(min(share, 1.0), most, jerk)
+            share = length / (time_s + 0.5 * stop_s)
+            least = length / max(left_s - 0.6 * stop_s, 1e-3)
+        if MOVING * share < now:
+            share = now + CHANGE * (share - now)
+        share = max(share, least)
+        return min(max(share, SLOWEST), 1.0)
 
     def _take(self, plan: Plan, plan_ns: int, asked_period_s: float) -> None:
         self._arrivals.arrived(plan_ns, asked_period_s * 1e9)
@@ -161,30 +179,6 @@ class StepTiming:
         self._late_ns = max(late_ns, kept_ns)
         self._plan, self._took_ns = plan, plan_ns
         self._begun_ns = plan_ns + self._late_ns - late_ns
-
-    def _paced(
-        self, way: FloatArray, velocity: FloatArray, time_s: float, left_s: float, override: float
-    ) -> float:
-        """Share of the velocity limits that takes `time_s` and half a stop for a way (6,)."""
-        limits = self._box[0]
-        ways_s = np.abs(way) / limits
-        leading = int(ways_s.argmax())
-        length = float(ways_s[leading])  # s at full speed
-        if length <= 0.0:
-            return 1.0
-        now = float((np.abs(velocity) / limits).max())
-        # In units of the velocity limits along the way, as the limits of the other orders are.
-        most, jerk = self._box[1:, leading] / limits[leading]
-        most, jerk = most * override**2, jerk * override**3
-        share = least = length / time_s
-        for _ in range(3):
-            stop_s = _stop_s(min(share, 1.0), most, jerk)
-            share = length / (time_s + 0.5 * stop_s)
-            least = length / max(left_s - 0.6 * stop_s, 1e-3)
-        if MOVING * share < now:
-            share = now + CHANGE * (share - now)
-        share = max(share, least)
-        return min(max(share, SLOWEST), 1.0)
 
 
 def _stop_s(speed: float, most: float, jerk: float) -> float:

@@ -38,11 +38,11 @@ class Watchdog:
         """The nodes, worker and lease that nothing was missing of."""
 
     # -- chunks -------------------------------------------------------------------------------
-    def expect_first(self, now_ns: int, rate_hz: float, speed: float = 1.0) -> None:
+    def expect_first(self, now_ns: int, rate_hz: float, speed: float) -> None:
         """Set the deadline of the first chunk of an episode that begins at `now_ns`."""
         self._expect(0, now_ns, rate_hz, speed, FIRST_CHUNK_PATIENCE_S)
 
-    def expect_next(self, left_ns: int, now_ns: int, rate_hz: float, speed: float = 1.0) -> None:
+    def expect_next(self, left_ns: int, now_ns: int, rate_hz: float, speed: float) -> None:
         """Set the deadline after a chunk with `left_ns` of plan time, or ``max_open_loop_s``."""
         open_loop_ns = int(self._timing.max_open_loop_s * 1e9)
         self._expect(min(left_ns, open_loop_ns), now_ns, rate_hz, speed)
