@@ -31,6 +31,7 @@ from vla_zenoh.control.chunk_validation import (
     validate_chunk,
     validate_steps,
 )
+from vla_zenoh.control.commander_io import StateHistory
 from vla_zenoh.control.joint_space import JointBounds
 from vla_zenoh.control.limits import (
     APPROACH,
@@ -52,7 +53,6 @@ from vla_zenoh.control.plan_timeline import (
     joint_goal,
 )
 from vla_zenoh.control.reachability import ReachabilityFilter
-from vla_zenoh.control.state_history import StateHistory
 from vla_zenoh.errors import RecordError
 from vla_zenoh.kinematics.so3 import interpolate, pose_distance, pose_of
 from vla_zenoh.policy import ActionSpec

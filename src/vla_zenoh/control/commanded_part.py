@@ -258,10 +258,8 @@ class CommandedPart:
         if not obeying or not motion.streaming:
             monitor.reset()
             return
-        measured_rad, commanded_rad = (
-            reach.kinematics.joints_of(self.joint.record),
-            motion.joints_rad,
-        )
+        measured_rad = reach.kinematics.joints_of(self.joint.record)
+        commanded_rad = motion.joints_rad
         reach.set_elbow(measured_rad if commanded_rad is None else commanded_rad)
 
     def monitor_due(self, now_ns: int) -> bool:

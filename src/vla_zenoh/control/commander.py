@@ -180,7 +180,10 @@ class Commander:
         self._supervise(now_ns)
         for part in parts:
             if not planned or self.state not in OBEYING or part.monitor_late(now_ns):
-                self._follow_elbow(part)
+                try:
+                    part.follow_elbow(obeying=self.state in OBEYING)
+                except RecordError as error:
+                    self._change(Trigger.LOSE, part.says(str(error)))
             if self.state in OBEYING:
                 if part.monitor_late(now_ns):  # `look_ahead` is not called in time
                     part.monitor_joints(now_ns)
@@ -274,10 +277,8 @@ class Commander:
                 return
             overtaken = setting.put_ns is not None and setting.put_ns <= self._stop_put_ns
             if overtaken and 0 <= now_ns - self._stop_came_ns < LATE_NS:
-                late = (
-                    "it was put before the last emergency stop and arrived after it; put it again"
-                )
-                self._reject_setting(name, [late])
+                late = "it was put before the last emergency stop and arrived after it"
+                self._reject_setting(name, [f"{late}; put it again"])
                 return
         try:
             if name == "held":
@@ -449,12 +450,8 @@ class Commander:
                 part.contact.end()
             if old in OBEYING:
                 self._ended = why if trigger is Trigger.LOSE else ""
-        level = (
-            "info"
-            if new in OBEYING or trigger in (Trigger.DEACTIVATE, Trigger.RESET)
-            else "warning"
-        )
-        self._emit(level, "transition", f"{old.value}->{new.value}", why)
+        asked = new in OBEYING or trigger in (Trigger.DEACTIVATE, Trigger.RESET)
+        self._emit("info" if asked else "warning", "transition", f"{old.value}->{new.value}", why)
 
     def _emit(
         self,
@@ -560,12 +557,6 @@ class Commander:
             self._out.events.append(event)
         for part in self.parts:
             part.motion.part_slowdown, part.motion.held = slowdown, hit is not None
-
-    def _follow_elbow(self, part: CommandedPart) -> None:
-        try:
-            part.follow_elbow(obeying=self.state in OBEYING)
-        except RecordError as error:
-            self._change(Trigger.LOSE, part.says(str(error)))
 
     def _monitor_distance(self, spacing: PartSpacing, now_ns: int) -> None:
         """Brake if the measured parts come too near to each other."""

@@ -398,7 +398,14 @@ class Retreat:
             return self._finish("it stands")
         if not self._ahead or now_ns > self._until_ns:
             return self._finish("something still presses" if known else "it stands")
-        return self._step_back(self._target, STEP_M if known else RELIEF_M), None
+        target, step_m = self._target, STEP_M if known else RELIEF_M
+        start = _place(target)
+        while self._ahead:
+            target = self._ahead.pop(0)
+            if math.dist(_place(target), start) >= step_m:
+                break
+        self._target = target
+        return target, None
 
     def _set_out(
         self, begun: _Begun, commanded: Pose, measured: Pose, now_ns: int
@@ -430,15 +437,6 @@ class Retreat:
         self._rest_ns = now_ns
         self._target = measured
         return measured, None
-
-    def _step_back(self, target: Pose, step_m: float) -> Pose:
-        start = _place(target)
-        while self._ahead:
-            target = self._ahead.pop(0)
-            if math.dist(_place(target), start) >= step_m:
-                break
-        self._target = target
-        return target
 
     def _finish(self, why: str) -> tuple[Pose | None, Event | None]:
         self.end()

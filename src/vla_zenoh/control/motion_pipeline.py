@@ -188,9 +188,8 @@ class MotionPipeline:
         """(n,) joints commanded, None where poses are."""
         if self._joints is None:
             return None
-        if self.in_joints and self._path is not None:
-            return self._path.state.position
-        return self._joints.position_rad
+        mover = self._mover
+        return mover.state.position if isinstance(mover, JointPath) else self._joints.position_rad
 
     def stopping_rad(self, ahead_s: float) -> list[FloatArray]:
         """(n,) each, commanded joints on the way to rest and at rest, from a brake in `ahead_s`."""
@@ -547,10 +546,8 @@ class MotionPipeline:
         self._ahead = None
 
     def _slowest(self, goal: Goal) -> Slowdown | None:
-        """What slows the arm down most on the way to `goal`."""
-        return slowest(
-            goal.slowdown, self.contact_slowdown, self.joint_slowdown, self.part_slowdown
-        )
+        others = self.contact_slowdown, self.joint_slowdown, self.part_slowdown
+        return slowest(goal.slowdown, *others)
 
     def _set_out(self, mover: Smoother | JointPath, order: _Order) -> bool:
         """Carry out an order; whether the shares suffice."""
@@ -692,9 +689,8 @@ class MotionPipeline:
             self._brake(mover, timeline, now_ns)
         elif back is not self._back:
             # Whatever the speed override: an arm in contact has to come free.
-            inside_m, _ = into_workspace(
-                self._limits, back.position_m, mover.motion.pose.position_m
-            )
+            here_m = mover.motion.pose.position_m
+            inside_m, _ = into_workspace(self._limits, back.position_m, here_m)
             inside = Goal(Pose(inside_m, back.rotation), 0.0)
             speed = self._followed(mover, inside, Shares(self.retreat.speed))
             _move(mover, inside, speed)
@@ -734,17 +730,8 @@ class MotionPipeline:
         else:
             heads_m, heads_xyzw = goal.pose.position_m, quat_from_rotation(goal.pose.rotation)
         self._made_of = made_of
-        self._sent = computed(
-            PoseCommand,
-            position_m,
-            quat_xyzw,
-            twist,
-            acceleration,
-            heads_m,
-            heads_xyzw,
-            state.value,
-            self._cause,
-        )
+        moves, heads = (position_m, quat_xyzw, twist, acceleration), (heads_m, heads_xyzw)
+        self._sent = computed(PoseCommand, *moves, *heads, state.value, self._cause)
         return self._sent
 
 

@@ -111,7 +111,10 @@ def reasons_of_worker(
     spec = peers.specs.get(worker)
     reasons = _worker(worker, prompt, peers, spec)
     if spec is not None:
-        reasons += _spec(profile, worker, spec)
+        reasons += [
+            f"worker {worker!r} {why}" if name == "camera" else f"worker {worker!r}: {name}: {why}"
+            for _, name, why in policy_check.spec_errors(profile, spec)
+        ]
         reasons += _chunk(profile, worker, spec, peers, chunk, now_ns, rate_hz)
         reasons += _cameras(profile, spec, peers)
     return [*reasons, *_clocks(profile, worker, spec, peers)]
@@ -215,14 +218,6 @@ def _worker(worker: str, prompt: str, peers: PeerSnapshot, spec: ModelSpec | Non
     if complaint:
         reasons.append(f"worker {worker!r} reports: {complaint}")
     return reasons
-
-
-def _spec(profile: Profile, worker: str, spec: ModelSpec) -> list[str]:
-    """Requirements of its spec that the profile does not meet."""
-    return [
-        f"worker {worker!r} {why}" if name == "camera" else f"worker {worker!r}: {name}: {why}"
-        for _, name, why in policy_check.spec_errors(profile, spec)
-    ]
 
 
 def _chunk(

@@ -44,8 +44,8 @@ class Watchdog:
 
     def expect_next(self, left_ns: int, now_ns: int, rate_hz: float, speed: float) -> None:
         """Set the deadline after a chunk with `left_ns` of plan time, or ``max_open_loop_s``."""
-        open_loop_ns = int(self._timing.max_open_loop_s * 1e9)
-        self._expect(min(left_ns, open_loop_ns), now_ns, rate_hz, speed)
+        left_ns = min(left_ns, int(self._timing.max_open_loop_s * 1e9))
+        self._expect(left_ns, now_ns, rate_hz, speed)
 
     def _expect(
         self, left_ns: int, now_ns: int, rate_hz: float, speed: float, extra_s: float = 0.0

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from vla_zenoh.control.actions import as_deltas, chunk_poses, respond
 from vla_zenoh.control.chunk_planner import ChunkPlan, ChunkPlanner
 from vla_zenoh.control.commander import Setting
+from vla_zenoh.control.commander_io import StateHistory
 from vla_zenoh.control.plan_timeline import Goal, GoalTimeline
-from vla_zenoh.control.state_history import StateHistory
 from vla_zenoh.kinematics.so3 import Pose, angle_between, exp3, log3, rotation_from_quat
 from vla_zenoh.policy import ActionSpec, ControllerSpec
 from vla_zenoh.profile.limits import Workspace
