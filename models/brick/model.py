@@ -34,7 +34,7 @@ from vla_zenoh.policy import (
     Observation,
     ObservationSpec,
 )
-from vla_zenoh.policy.chunk_prefix import Committed
+from vla_zenoh.policy.inference import Committed
 from vla_zenoh.types import PoseState
 
 FloatArray = NDArray[np.float64]

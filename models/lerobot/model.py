@@ -57,7 +57,7 @@ from vla_zenoh.policy import (
     ObservationSpec,
     Resize,
 )
-from vla_zenoh.policy.chunk_prefix import Committed
+from vla_zenoh.policy.inference import Committed
 from vla_zenoh.profile import load_profile
 
 

@@ -19,7 +19,7 @@ from vla_zenoh.lab.policy_servers.adapter import Adapter
 from vla_zenoh.lab.policy_servers.model_options import address, one_of
 from vla_zenoh.lab.policy_servers.websocket_client import WebSocketClient
 from vla_zenoh.policy import ActionSteps, Observation
-from vla_zenoh.policy.chunk_prefix import Committed
+from vla_zenoh.policy.inference import Committed
 
 
 class OpenPi(Adapter):

@@ -27,7 +27,7 @@ from vla_zenoh.policy import (
     Observation,
     ObservationSpec,
 )
-from vla_zenoh.policy.chunk_prefix import Committed, rest_of
+from vla_zenoh.policy.inference import Committed, rest_of
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import load_profile
 

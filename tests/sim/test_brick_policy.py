@@ -35,7 +35,7 @@ from vla_zenoh.lab.tasks import (
     phrase,
 )
 from vla_zenoh.policy import ActionSteps, Policy, check_steps
-from vla_zenoh.policy.chunk_prefix import Committed
+from vla_zenoh.policy.inference import Committed
 from vla_zenoh.policy.loader import find_model, import_model, make_policy
 from vla_zenoh.profile import load_profile
 from vla_zenoh.simulation.render import Renderer

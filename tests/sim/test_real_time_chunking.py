@@ -7,7 +7,7 @@ from motions import make_world
 
 from vla_zenoh.lab.lockstep import Delays, Lockstep
 from vla_zenoh.policy import ActionSpec, ActionSteps, ModelSpec, Observation, ObservationSpec
-from vla_zenoh.policy.chunk_prefix import Committed
+from vla_zenoh.policy.inference import Committed
 from vla_zenoh.profile import load_profile
 
 HORIZON, DT_S, RATE_HZ = 8, 0.1, 2.5

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from vla_zenoh.errors import SpecError
 from vla_zenoh.policy import (
-    ActionSteps,
     CameraSpec,
     DepthSpec,
     ModelSpec,
@@ -25,7 +24,6 @@ from vla_zenoh.policy import (
 )
 from vla_zenoh.policy.spec import STREAM_OF
 from vla_zenoh.types import (
-    ActionChunk,
     Depth,
     GripperState,
     Image,
@@ -407,46 +405,3 @@ def prepare_depth(depth: Depth, spec: DepthSpec) -> NDArray[np.uint16]:
     most = min(whole, math.floor(far_m / spec.unit_m + ROUNDING))
     good = (counts > 0) & (out >= least) & (out <= most)
     return np.where(good, out, spec.invalid).astype(np.uint16)
-
-
-def make_chunk(
-    worker: str,
-    spec_hash: str,
-    dt_s: float,
-    observation: Observation,
-    answer: ActionSteps,
-    *,
-    patience_s: float,
-    observed_ns: int,
-    start_ns: int,
-    end_ns: int,
-) -> ActionChunk:
-    """The action chunk of a worker's answer to `observation`.
-
-    Args:
-        worker: its name.
-        spec_hash: of its model.
-        dt_s: duration of a step.
-        observation: input of the inference.
-        answer: with checked steps.
-        patience_s: how long the chunk is valid after its last step.
-        observed_ns: observation complete, wall clock.
-        start_ns: start of inference, wall clock.
-        end_ns: end of inference, wall clock.
-    """
-    steps = np.asarray(answer.steps)
-    valid_ns = int(len(steps) * dt_s * 1e9) + int(patience_s * 1e9)
-    stamp_ns = observation.stamp_wall_ns
-    return ActionChunk(
-        worker,
-        spec_hash,
-        observation.task.episode,
-        stamp_ns,
-        observation.seq,
-        stamp_ns + valid_ns,
-        steps,
-        observed_ns,
-        start_ns,
-        end_ns,
-        answer.done,
-    )

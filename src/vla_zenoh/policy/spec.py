@@ -1,22 +1,17 @@
-"""The model contract: what a model declares, its input and its output.
+"""What a model declares.
 
-A model is a class with a `spec` and ``infer(observation) -> ActionSteps``; `Policy` is the whole
-contract. `ModelSpec` is published before anything moves, and its hash travels in every chunk, so
-that steps are never read with another meaning than the one agreed at activation.
+`ModelSpec` is published before anything moves, and its hash travels in every chunk, so that steps
+are never read with another meaning than the one agreed at activation.
 """
 
 from __future__ import annotations
 
 import hashlib
-import inspect
 import json
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
-from functools import lru_cache, partial
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Protocol, Self, runtime_checkable
+from collections.abc import Iterator, Mapping
+from functools import lru_cache
+from typing import Annotated, Any, ClassVar, Literal, Self
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -30,15 +25,6 @@ from pydantic import (
 )
 
 from vla_zenoh.errors import SpecError, describe_faults
-from vla_zenoh.types import (
-    FloatArray,
-    GripperState,
-    JointState,
-    PoseState,
-    PrivilegedState,
-    Task,
-)
-from vla_zenoh.types.arrays import is_finite, to_float32
 from vla_zenoh.types.states import MAX_DEPTH_UNIT_M, MIN_DEPTH_UNIT_M
 
 StatePart = Literal["joint", "pose", "gripper", "privileged", "wrench", "effort"]
@@ -452,135 +438,3 @@ def _digest(spec: ModelSpec) -> str:
     # Not kept in the spec itself: a copy with other fields would inherit it.
     canonical = json.dumps(spec.to_dict(), sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(canonical.encode()).hexdigest()[:16]
-
-
-class ActionSteps(NamedTuple):
-    """What `Policy.infer` returns.
-
-    Args:
-        steps: (H, D), H at most the declared horizon; anything numpy can read.
-        done: the policy reports that the task is finished with these steps.
-        raw: intermediate output for debugging, as text and numbers: tokens, normalised actions.
-            Shown by ``vla-zenoh lab inspect``, otherwise unused.
-        pictures: camera -> (H, W, 3) RGB uint8 as it went into the network, if the model itself
-            changes what it is given (a crop).
-    """
-
-    steps: ArrayLike
-    done: bool = False
-    raw: Mapping[str, Any] | None = None
-    pictures: Mapping[str, NDArray[np.uint8]] | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Observation:
-    """One coherent observation, in the form the spec declares.
-
-    Args:
-        stamp_wall_ns: capture time of its oldest image (of its state, without images).
-        seq: number of that part.
-        images: camera -> (H, W, 3) uint8 in the declared order and size.
-        depth: camera -> (H, W) uint16 in counts of the declared unit, and in the declared size.
-        joint: arm joints, where asked for.
-        pose: TCP pose, where asked for.
-        gripper: gripper state, where asked for.
-        privileged: state that only a simulated benchmark knows, where asked for; no real robot
-            reports it.
-        wrench: (6,) N and Nm that the surroundings exert on the arm, as in `PoseState`, where asked
-            for.
-        effort_nm: (n,) as in `JointState`, where asked for.
-        history: earlier observations, oldest first, `ObservationSpec.history` - 1 of them.
-        task: prompt, episode and rate.
-        robot: its name, for a model that serves several and keeps state of each.
-        parts: of a robot of several parts, name -> the same with the state of that part, all of one
-            time; the observation itself then has no joint, pose and gripper.
-    """
-
-    stamp_wall_ns: int
-    seq: int
-    task: Task
-    images: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
-    depth: Mapping[str, NDArray[np.uint16]] = field(default_factory=dict)
-    joint: JointState | None = None
-    pose: PoseState | None = None
-    gripper: GripperState | None = None
-    privileged: PrivilegedState | None = None
-    robot: str = ""
-    wrench: FloatArray | None = None
-    effort_nm: FloatArray | None = None
-    history: tuple[Observation, ...] = ()
-    parts: Mapping[str, Observation] = field(default_factory=dict)
-
-    @property
-    def prompt(self) -> str:
-        return self.task.prompt
-
-    @property
-    def rate_hz(self) -> float:
-        return self.task.rate_hz
-
-
-@runtime_checkable
-class Policy(Protocol):
-    """A model. Only `spec` and `infer` are needed; the others are called if they are there.
-
-    ``load()`` runs once before the first inference: heavy imports and weights belong there.
-    ``reset()`` runs at the start of every episode, ``close()`` when the worker ends.
-    ``normalisation_keys``, where a model has it, names the statistics its weights came with:
-    `ActionSpec.normalisation` must be one of them.
-    ``example_prompts``, if present, names known prompts; the first one makes it move.
-    ``takes_committed = True``: it is called as ``infer(observation, committed=...)`` with the
-    steps of its last chunk in execution, see `vla_zenoh.policy.chunk_prefix`.
-    ``infer_batch(observations)`` answers several robots at once, one answer for each in their
-    order, at most ``max_batch`` of them where that is given. `Observation.robot` names the robot of
-    each; ``reset`` then takes that name. With ``takes_committed`` it is called as
-    ``infer_batch(observations, committed=[...])``.
-    """
-
-    @property
-    def spec(self) -> ModelSpec: ...
-
-    def infer(self, observation: Observation) -> ActionSteps: ...
-
-
-def reset_of(policy: Policy, robot: str = "") -> Callable[[], Any] | None:
-    """Function that begins an episode of `robot`; None: the model has no ``reset``."""
-    reset = getattr(policy, "reset", None)
-    if not callable(reset):
-        return None
-    return partial(reset, robot) if takes_robot(policy) else reset
-
-
-def takes_robot(policy: Policy) -> bool:
-    """Whether the model's ``reset`` takes the name of the robot whose episode begins."""
-    reset = getattr(policy, "reset", None)
-    return callable(reset) and len(inspect.signature(reset).parameters) > 0
-
-
-def check_steps(spec: ActionSpec, steps: ArrayLike) -> NDArray[np.float32]:
-    """`steps` as finite float32 (H, D) of the declared shape.
-
-    Raises:
-        SpecError: says what is wrong and what was declared; its reason is ``dtype``, ``shape``,
-            ``horizon`` or ``not_finite``.
-    """
-    try:
-        given = np.asarray(steps)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise SpecError(f"steps are not numbers: {error}", "dtype") from error
-    if given.dtype.kind not in "iuf":
-        raise SpecError(f"steps are not numbers but {given.dtype}", "dtype")
-    array = to_float32(given)
-    if array.ndim == 1 and array.shape[0] == spec.dimension:
-        array = array[None]
-    if array.ndim != 2 or array.shape[1] != spec.dimension:
-        raise SpecError(
-            f"steps have shape {array.shape}, the spec says (H, {spec.dimension})", "shape"
-        )
-    if not 1 <= array.shape[0] <= spec.horizon:
-        raise SpecError(
-            f"a chunk of {array.shape[0]} steps, the spec says 1 to {spec.horizon}", "horizon"
-        )
-    if not is_finite(array):
-        raise SpecError("steps hold NaN or infinity", "not_finite")
-    return array

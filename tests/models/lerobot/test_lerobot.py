@@ -26,7 +26,7 @@ from safetensors.torch import load_file, save_file
 from vla_zenoh.errors import WorkerError
 from vla_zenoh.lab.check.examples import example_observation
 from vla_zenoh.policy import check_steps
-from vla_zenoh.policy.chunk_prefix import Committed
+from vla_zenoh.policy.inference import Committed
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import GripperState, PoseState

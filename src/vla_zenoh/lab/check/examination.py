@@ -23,7 +23,7 @@ from vla_zenoh.lab.check.judge import Steps
 from vla_zenoh.lab.check.model_runner import ModelFailed, ModelHung, ModelRunner
 from vla_zenoh.lab.check.report import CheckReport, distinct
 from vla_zenoh.policy import Policy, check_steps, reset_of
-from vla_zenoh.policy.chunk_prefix import ChunkPrefix
+from vla_zenoh.policy.inference import ChunkPrefix
 from vla_zenoh.profile import Limits, Profile, Timing
 
 DEFAULT_RUNS = 100

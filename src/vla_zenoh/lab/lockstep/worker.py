@@ -9,14 +9,13 @@ from typing import Any
 
 from vla_zenoh.control.commander_io import MotionCommands
 from vla_zenoh.keys import worker_node
-from vla_zenoh.policy import ActionSteps, Policy, check_steps, reset_of
-from vla_zenoh.policy.chunk_prefix import ChunkPrefix
+from vla_zenoh.policy import Policy, check_steps, reset_of
+from vla_zenoh.policy.inference import ChunkPrefix, make_chunk
 from vla_zenoh.policy.observation import (
     STATE_KINDS,
     NotReady,
     Streams,
     assemble,
-    make_chunk,
     state_names,
 )
 from vla_zenoh.profile import Profile
@@ -177,13 +176,7 @@ class LockstepWorker:
         obeyed = self.task.active and self.task.worker == self.name
         self._continuation.published(observation, steps, self._not_before_ns, obeyed=obeyed)
         return make_chunk(
-            self.name,
-            self.spec.hash,
-            self.spec.action.dt_s,
-            observation,
-            ActionSteps(steps, answer.done),
+            *(self.name, self.spec, observation, steps, answer.done),
             patience_s=self._patience_s,
-            observed_ns=wall_ns,
-            start_ns=wall_ns,
-            end_ns=wall_ns + duration_ns,
+            times_ns=(wall_ns, wall_ns, wall_ns + duration_ns),
         )

@@ -17,7 +17,7 @@ from vla_zenoh.codec import message
 from vla_zenoh.errors import CodecError, PeerError, SpecError, in_words
 from vla_zenoh.lab.serve.served_policy import ServedPolicy
 from vla_zenoh.policy import ActionSpec
-from vla_zenoh.policy.chunk_prefix import Committed
+from vla_zenoh.policy.inference import Committed
 from vla_zenoh.types import shown
 
 PORT = 8000

@@ -20,7 +20,7 @@ from vla_zenoh.policy import (
     check_steps,
     reset_of,
 )
-from vla_zenoh.policy.chunk_prefix import Committed
+from vla_zenoh.policy.inference import Committed
 from vla_zenoh.policy.observation import prepare_image
 from vla_zenoh.types import GripperState, Image, JointState, PoseState, Task, shown
 

@@ -42,14 +42,13 @@ from vla_zenoh.policy import (
     check_steps,
     reset_of,
 )
-from vla_zenoh.policy.chunk_prefix import ChunkPrefix
+from vla_zenoh.policy.inference import ChunkPrefix, make_chunk
 from vla_zenoh.policy.observation import (
     MAX_STATES,
     STATE_KINDS,
     NotReady,
     Streams,
     assemble,
-    make_chunk,
     state_names,
 )
 from vla_zenoh.profile import Profile
@@ -89,7 +88,6 @@ class RobotSession:
         self.robot = profile.robot.name
         node = self.node = Node(worker_node(name), profile, session, host=host)
         self.policy, self.name, self.spec = policy, name, policy.spec
-        self._spec_hash = policy.spec.hash
         self.prefix = ChunkPrefix(policy)
         keys = node.keys
         self._chunks = node.declare_publisher(keys.delta(name), Kind.ORDER)
@@ -281,15 +279,12 @@ class RobotSession:
             steps, done = check_steps(self.spec.action, answer.steps), bool(answer.done)
         except Exception as error:
             return self.failed(error)
-        observed_ns, start_ns, end_ns = times_ns
+        _, start_ns, end_ns = times_ns
+        patience_s = self.node.profile.timing.max_observation_age_s
         chunk = make_chunk(
-            *(self.name, self._spec_hash, self.spec.action.dt_s),
-            observation,
-            ActionSteps(steps, done),
-            patience_s=self.node.profile.timing.max_observation_age_s,
-            observed_ns=observed_ns,
-            start_ns=start_ns,
-            end_ns=end_ns,
+            *(self.name, self.spec, observation, steps, done),
+            patience_s=patience_s,
+            times_ns=times_ns,
         )
         header = self._chunks.publish(chunk)
         self._not_before_ns = header.stamp_wall_ns
@@ -306,7 +301,7 @@ class RobotSession:
 
         Call it before the chunk that follows it. The observation part of the spec must not change.
         """
-        self.spec, self._spec_hash = self.policy.spec, self.policy.spec.hash
+        self.spec = self.policy.spec
         self._specs.publish(self.spec)
 
     def failed(self, error: Exception, reason: str = "") -> Literal[False]:
@@ -335,7 +330,7 @@ class RobotSession:
             state,
             detail={
                 "complaint": self.complaint[:MAX_COMPLAINT].encode("utf-8", "replace").decode(),
-                "spec": self._spec_hash,
+                "spec": self.spec.hash,
                 "episode": self._episode,
                 "prompt": task.prompt if task else "",
                 "obeyed": bool(task and task.active and task.worker == self.name),

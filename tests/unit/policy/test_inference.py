@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from vla_zenoh.lab.check.examples import example_observation
 from vla_zenoh.policy import ActionSpec, ActionSteps, ModelSpec, Observation
-from vla_zenoh.policy.chunk_prefix import ChunkPrefix, Committed, rest_of
+from vla_zenoh.policy.inference import ChunkPrefix, Committed, rest_of
 
 ATOL = 1e-6  # steps travel as float32
 MS = 1_000_000
