@@ -105,7 +105,7 @@ class MotionPipeline:
     Args:
         profile: limits, rate, and whether poses or joints are commanded.
         reach: see `Commander`.
-        composer: bounds the goals that come due.
+        planner: bounds the goals that come due.
 
     Raises:
         ProfileError: joints are to be commanded and there are no kinematics.
@@ -194,11 +194,12 @@ class MotionPipeline:
     def stopping_rad(self, ahead_s: float) -> list[FloatArray]:
         """(n,) each, commanded joints on the way to rest and at rest, from a brake in `ahead_s`."""
         assert self._joints is not None
-        if self.in_joints and self._path is not None:
-            return self._path.stopping_rad(ahead_s)
-        if self._smoother is None:
+        mover = self._mover
+        if mover is None:
             return [self._joints.position_rad]
-        return self._joints.stopping_rad(self._smoother, ahead_s)
+        if isinstance(mover, JointPath):
+            return mover.stopping_rad(ahead_s)
+        return self._joints.stopping_rad(mover, ahead_s)
 
     def wanted_rad(self, now_ns: int) -> FloatArray | None:
         """(n,) joints of the goal in force, None where it has none."""
@@ -322,10 +323,11 @@ class MotionPipeline:
 
     def _resting_goal(self, actual: Pose, width_m: float) -> Goal:
         """Where a brake will end, no further outside the box than the arm is."""
-        assert self._smoother is not None
-        if self.in_joints and self._path is not None:
-            return joint_goal(self._path.kinematics, self._path.braked(), width_m)
-        rest, (low, high) = self._smoother.resting_pose(), workspace_corners(self._limits)
+        mover = self._mover
+        assert mover is not None
+        if isinstance(mover, JointPath):
+            return joint_goal(mover.kinematics, mover.braked(), width_m)
+        rest, (low, high) = mover.resting_pose(), workspace_corners(self._limits)
         least, most = np.minimum(low, actual.position_m), np.maximum(high, actual.position_m)
         return Goal(Pose(np.clip(rest.position_m, least, most), rest.rotation), width_m)
 
@@ -408,7 +410,7 @@ class MotionPipeline:
         Returns:
             whether a trajectory was found (if not, the arm brakes), and events.
         """
-        if self._smoother is None or self.timeline is None:
+        if self._mover is None or self.timeline is None:
             return True, []
         self._set_override(task.speed, self.timeline, now_ns)
         if state is State.ACTIVE:
@@ -416,35 +418,32 @@ class MotionPipeline:
             events = self._follow(self.timeline, task, overdue_ns, now_ns, ticks)
         else:
             self._cause = None
-            mover = self._mover or self._smoother
-            events = self._retreat_or_brake(mover, self.timeline, state, now_ns)
+            events = self._retreat_or_brake(self._mover, self.timeline, state, now_ns)
         went_on, self.streaming = self.streaming, self._must_stream(state, now_ns)
         if not self.streaming:
             return True, events
-        failures = self.failures
+        failures, mover = self.failures, self._mover  # which may be another by now
         # A stream that begins must begin at rest: no ticks are made up for.
         for _ in range(ticks if went_on else 1):
-            if self.in_joints and self._path is not None:
-                self._path.tick()
-            elif self._joints is None:
-                self._smoother.tick()
+            if self._joints is None or isinstance(mover, JointPath):
+                mover.tick()
             else:
                 active = state is State.ACTIVE and self._override > 0.0
                 active = active and not self._changing and not self.held
                 braking = not active and self._back is None
-                self._joints.tick(self._smoother, braking=braking, elbow=active)
-        if self.in_joints and self._path is not None:
-            events += limit_events(self._path.taken_hits())
+                self._joints.tick(mover, braking=braking, elbow=active)
+        if isinstance(mover, JointPath):
+            events += limit_events(mover.taken_hits())
         return self.failures == failures, events
 
     def commands(
         self, state: State, now_ns: int, gripper: Stamped[GripperState] | None
     ) -> MotionCommands:
         """The set-points of robot and gripper, while streaming."""
-        if not self.streaming or self._smoother is None:
+        mover = self._mover
+        if not self.streaming or mover is None:
             return MotionCommands()
         pose = joint = width = None
-        mover = self._mover or self._smoother
         if self._joints is None:
             pose = self._pose_command(mover.motion, state)
         elif isinstance(mover, JointPath):
