@@ -270,36 +270,22 @@ def _observation(
     for name, entry in moment.states.items():
         part, _, what = name.rpartition("/")
         records.setdefault(part, {})[what] = entry.record
-    found: dict[str, dict[str, Any]] = {}
+    found: dict[str, dict[str, Any]] = {part: {} for part in records}
     for part, own in records.items():
-        given = _asked_for(wanted, own)
-        for name, value in given.items():
+        for what in wanted.state:
+            stream = STREAM_OF.get(what, what)
+            name = "effort_nm" if what == "effort" else what
+            value = own[stream] if stream == what else getattr(own[stream], name)
             if value is None:
-                key = "/".join(filter(None, ("state", part, _HOLDER[name])))
+                key = "/".join(filter(None, ("state", part, stream)))
                 return NotReady(f"{key} holds no {name}: this robot does not measure it")
-        found[part] = given
+            found[part][name] = value
     images = {c.camera: prepare_image(moment.images[c.camera].record, c) for c in wanted.cameras}
     depth = {c.camera: prepare_depth(moment.depth[c.camera].record, c) for c in wanted.depth}
     whole = Observation(*first, images, depth, robot=robot, **found.pop("", {}))
     if not found:
         return whole
     return replace(whole, parts={part: replace(whole, **own) for part, own in found.items()})
-
-
-_HOLDER = {"wrench": "pose", "effort_nm": "joint"}
-"""Field of an observation that is a field of a record -> that record."""
-
-
-def _asked_for(wanted: ObservationSpec, records: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields of an observation from the records of one arm; None: not measured."""
-    fields: dict[str, Any] = {}
-    for what in wanted.state:
-        if what in STREAM_OF:
-            name = "effort_nm" if what == "effort" else what
-            fields[name] = getattr(records[STREAM_OF[what]], name)
-        else:
-            fields[what] = records[what]
-    return fields
 
 
 def _history(

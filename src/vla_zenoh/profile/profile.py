@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 from pydantic import AfterValidator, BeforeValidator, Field, PrivateAttr, ValidationError
 
@@ -238,7 +238,8 @@ def _robot(profile: Profile) -> Iterator[Fault]:
     driver = profile.robot.driver
     if driver in TO_GIVE and getattr(profile, driver) is None:
         yield (driver,), f"is missing: robot.driver is {driver}{TO_GIVE[driver]}"
-    yield from _lerobot(profile)
+    if driver == "lerobot" and profile.lerobot is not None:
+        yield from _lerobot(profile.lerobot, profile.robot.arm_joints)
     if driver in ("ur", "lerobot") and profile.robot.command != "joint":
         yield ("robot", "command"), f"must be joint: robot.driver is {driver}"
     yield from _joint_limits((), profile.robot, profile.limits)
@@ -254,10 +255,7 @@ def _joint_limits(place: Place, robot: RobotProfile, limits: Limits) -> Iterator
             )
 
 
-_AnySection = TypeVar("_AnySection", bound=Section)
-
-
-def _filled(section: _AnySection, over: Mapping[str, Any]) -> _AnySection:
+def _filled(section: Section, over: Mapping[str, Any]) -> Section:
     """`section` with the values of `over`, map by map."""
     if not over:
         return section
@@ -299,10 +297,7 @@ def _parts(profile: Profile) -> Iterator[Fault]:
             yield from _joint_limits(("parts", name), own.robot, own.limits)
 
 
-def _lerobot(profile: Profile) -> Iterator[Fault]:
-    found, joints = profile.lerobot, profile.robot.arm_joints
-    if found is None or profile.robot.driver != "lerobot":
-        return
+def _lerobot(found: LeRobotProfile, joints: Sequence[str]) -> Iterator[Fault]:
     for name in ("motors", "zero_deg"):
         given = getattr(found, name)
         if given and len(given) != len(joints):

@@ -26,7 +26,7 @@ _HOST_AND_PORT = re.compile(
 
 
 def _endpoint(value: str) -> str:
-    protocol, slash, rest = value.partition("/")
+    protocol, slash, _ = value.partition("/")
     known = (*IP_PROTOCOLS, *FILE_PROTOCOLS)
     if not slash:
         raise ValueError(f"{value!r} is not an endpoint: write tcp/HOST:PORT, as tcp/10.0.0.2:7447")
@@ -34,7 +34,7 @@ def _endpoint(value: str) -> str:
         raise ValueError(
             f"{value!r}: unknown protocol{nearest(protocol, known)} Known: {', '.join(known)}"
         )
-    address = re.split(r"[?#]", rest, maxsplit=1)[0]
+    address = address_of(value)
     if protocol in FILE_PROTOCOLS:
         if not address:
             raise ValueError(f"{value!r}: write {protocol}/PATH")
