@@ -14,11 +14,10 @@ SOURCE = ROOT / "src" / "vla_zenoh"
 PAGE = ROOT / "docs" / "how-to" / "not-activated.md"
 REASONS = {
     "control/preflight.py": {
-        *("reasons_by_joints", "_robot", "_gripper", "_too_old", "_worker", "_spec", "_chunk"),
-        *("_cameras", "_clocks"),
+        *("reasons_by_joints", "reasons_of_worker", "joint_state_faults", "_elbow_is_not_held"),
+        *("_robot", "_gripper", "_too_old", "_worker", "_chunk", "_cameras", "_clocks"),
     },
     "control/commanded_part.py": {"reasons_against"},
-    "control/joint_monitor.py": {"joint_state_faults", "_elbow_is_not_held"},
     "control/watchdog.py": {"reasons_against"},
     "control/motion_pipeline.py": {"unsettled"},
     "control/commander.py": {"_activate", "_preflight", "_ended_before"},

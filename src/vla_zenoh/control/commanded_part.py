@@ -10,17 +10,18 @@ import numpy as np
 from vla_zenoh.control.chunk_planner import ChunkPlanner
 from vla_zenoh.control.chunk_validation import Lease
 from vla_zenoh.control.commander_io import NewStates, make_event
-from vla_zenoh.control.joint_monitor import JOINT_PATIENCE_S, JointMonitor, joint_state_faults
 from vla_zenoh.control.limits import LimitHit
 from vla_zenoh.control.motion_pipeline import MotionPipeline
 from vla_zenoh.control.preflight import (
     CLOCK_TOLERANCE_S,
+    JOINT_PATIENCE_S,
     PeerSnapshot,
+    joint_state_faults,
     reasons_by_joints,
     reasons_of_part,
 )
 from vla_zenoh.control.reachability import ReachabilityFilter
-from vla_zenoh.control.watchdog import Watchdog
+from vla_zenoh.control.watchdog import JointMonitor, Watchdog
 from vla_zenoh.errors import RecordError, SpecError
 from vla_zenoh.kinematics.so3 import Pose, held_pose, pose_of
 from vla_zenoh.policy import ModelSpec

@@ -9,7 +9,7 @@ the first bit of the way towards their goals is free, for one arm alone and for 
 
 Arms that begin too near to each other may only move apart.
 
-That is computed for the commanded joints. The measured ones are monitored as in `joint_monitor`:
+That is computed for the commanded joints. The measured ones are monitored as in `JointMonitor`:
 arms that are nearer than the stop by more than `PAST_M`, and come nearer, have to brake.
 """
 
@@ -23,8 +23,8 @@ import numpy as np
 
 from vla_zenoh.control.axis_smoothing import between
 from vla_zenoh.control.commanded_part import CommandedPart
-from vla_zenoh.control.joint_monitor import BAND_M, PAST_M, PERIOD_NS
 from vla_zenoh.control.limits import LimitHit, Slowdown
+from vla_zenoh.control.watchdog import BAND_M, PAST_M, PERIOD_NS
 from vla_zenoh.kinematics.part_distance import Nearest, PartDistance, PlacedArm
 from vla_zenoh.kinematics.so3 import Pose, rotation_from_rpy
 from vla_zenoh.profile import Profile

@@ -12,8 +12,10 @@ import numpy as np
 from vla_zenoh.control import policy_check
 from vla_zenoh.control.joint_space import JointBounds
 from vla_zenoh.control.limits import into_workspace
-from vla_zenoh.errors import RecordError, SpecError
+from vla_zenoh.errors import RecordError, SpecError, VlaZenohError
 from vla_zenoh.keys import worker_node
+from vla_zenoh.kinematics.kinematics import Kinematics
+from vla_zenoh.kinematics.so3 import held_pose, pose_distance, pose_of
 from vla_zenoh.policy import ModelSpec, check_steps
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import ActionChunk, GripperState, JointState, PoseState, Stamped
@@ -23,6 +25,11 @@ CHUNK_PATIENCE_S = 2.0
 CLOCK_TOLERANCE_S = 0.02
 """A state may be stamped this far in the future before clocks count as different."""
 CAMERA_PATIENCE_S = 1.0
+JOINT_PATIENCE_S = 0.1
+SAME_TCP_M, SAME_TCP_RAD = 0.005, 0.02
+"""Largest difference of the TCP by kinematics from the TCP that the robot reports."""
+HELD_RAD = 0.1
+"""Largest distance of a joint from where its controller holds it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,6 +160,62 @@ def reasons_by_joints(
             "prompt that leaves out these axes, or move the arm"
         )
     return reasons
+
+
+def joint_state_faults(
+    profile: Profile,
+    kinematics: Kinematics,
+    joint: Stamped[JointState] | None,
+    pose: Stamped[PoseState],
+    now_ns: int,
+) -> list[str]:
+    """Whether the kinematics fit this robot: joints are received, their TCP is the reported one.
+
+    Args:
+        profile: the effective profile.
+        kinematics: of the robot it describes.
+        joint: newest joint state.
+        pose: newest TCP pose.
+        now_ns: same clock as the records' ``received_ns``.
+    """
+    if joint is None:
+        return ["the joints are not known: nothing received on state/joint"]
+    age_s = (now_ns - joint.received_ns) / 1e9
+    if age_s > profile.timing.state_timeout_s + JOINT_PATIENCE_S:
+        return [f"the joint state is {age_s:.2f} s old"]
+    try:
+        joints_rad = kinematics.joints_of(joint.record)
+    except VlaZenohError as error:
+        return [str(error)]
+    apart_m, apart_rad = pose_distance(kinematics.forward(joints_rad), pose_of(pose.record))
+    if apart_m <= SAME_TCP_M and apart_rad <= SAME_TCP_RAD:
+        return _elbow_is_not_held(profile, joint.record, pose.record)
+    return [
+        f"the joints put the TCP {apart_m * 1e3:.1f} mm and {apart_rad:.3f} rad from where "
+        "the robot reports it: robot.description or robot.tcp_frame is another robot's"
+    ]
+
+
+def _elbow_is_not_held(profile: Profile, joint: JointState, pose: PoseState) -> list[str]:
+    """Whether joint commands would begin far from the measured joints.
+
+    They begin where the robot's controller holds the joints. If the TCP is far from there the arm
+    is blocked, and retreats with all its joints; otherwise only the elbow was moved, and would be
+    pulled back.
+    """
+    if profile.robot.command != "joint" or joint.reference_rad is None:
+        return []
+    apart_m, apart_rad = pose_distance(held_pose(pose), pose_of(pose))
+    if apart_m > profile.limits.tracking_m or apart_rad > profile.limits.tracking_rad:
+        return []
+    away_rad = np.abs(joint.reference_rad - joint.position_rad)
+    worst = int(np.argmax(away_rad))
+    if float(away_rad[worst]) <= HELD_RAD:
+        return []
+    return [
+        f"joint {joint.names[worst]} is {away_rad[worst]:.2f} rad from where its controller holds "
+        f"it, at most {HELD_RAD:g}: release the arm, or move the robot once by its own means"
+    ]
 
 
 def _robot(

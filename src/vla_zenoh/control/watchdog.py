@@ -1,22 +1,35 @@
-"""Reasons to brake: lost or late messages, overdue chunks, a blocked arm, a deadman gone."""
+"""Reasons to brake: messages lost or late, overdue chunks, a blocked arm, joints near a bound."""
 
 from __future__ import annotations
 
 from collections.abc import Set as AbstractSet
 from operator import is_
+from typing import Any
+
+import numpy as np
 
 from vla_zenoh.control.chunk_validation import Lease
+from vla_zenoh.control.limits import SLOWEST, LimitHit, Slowdown, joint_margins, slowest
 from vla_zenoh.control.preflight import CLOCK_TOLERANCE_S, PeerSnapshot
+from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.keys import NO_DEADMAN_TOKEN, worker_node
 from vla_zenoh.kinematics.so3 import Pose, pose_distance
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import GripperState, PoseState, Stamped
+from vla_zenoh.types import FloatArray, GripperState, PoseState, Stamped
 
 NEVER_NS = 1 << 62
 FIRST_CHUNK_PATIENCE_S = 1.0
 """Extra time for the first chunk after activation: it needs an observation and an inference."""
 BACK_OFF_M, BACK_OFF_RAD = 0.005, 0.02
 """A blocked arm that comes back counts as blocked again if it strays by this much more."""
+PERIOD_NS = 30_000_000
+PAST_M, PAST_SINGULAR = 0.005, 0.005
+PAST_MARGIN = 0.5
+"""Part of ``joint_margin_rad``."""
+BAND_RAD, BAND_M, BAND_SINGULAR = 2e-3, 5e-4, 5e-4
+STEPS = 20
+"""Number of speed shares, so that the share does not change at every update."""
+_NOTHING = (None, None, None)
 
 
 class Watchdog:
@@ -172,6 +185,155 @@ class Watchdog:
             return f"worker {worker!r} was restarted"
         self._present = seen
         return ""
+
+
+class JointMonitor:
+    """Monitors the measured joints: how near the moving arm is to its bounds, and its elbow.
+
+    Goals are bounded on a model of the arm; this monitors the arm itself. For every bound (end of a
+    joint's range, singular value, distances of the arm to itself and to the table)::
+
+        inside its zone (slow to stop) and approaching    speed sqrt(distance left / zone)
+        past the stop by `PAST` and approaching           the arm has to brake
+
+    `PAST` allows for the tracking error of an arm that works at a stop. A value approaches when it
+    leaves a band that follows it: noise within the band does not count, a slow drift does. In
+    addition, no joint may be far from its command or, if poses are commanded, from its place in a
+    model whose TCP follows the measured one: beyond ``limits.elbow_rad`` the arm slows down, at
+    twice that it brakes.
+
+    Args:
+        profile: its limits.
+        reach: the model of the arm.
+    """
+
+    def __init__(self, profile: Profile, reach: ReachabilityFilter) -> None:
+        self._reach = reach
+        barriers, slides = reach.barriers, reach.kinematics.slides
+        limits = profile.limits
+        self._elbow_limits = np.where(slides, limits.tracking_m, limits.elbow_rad)
+        margins, distances = joint_margins(limits.reach, reach.kinematics), len(barriers.stop) - 1
+        self._stop = np.concatenate([margins, barriers.stop])
+        self._slow = np.concatenate([2 * margins, barriers.slow])
+        self._past = _each(PAST_MARGIN * margins, distances, PAST_SINGULAR, PAST_M)
+        self._band = _each(np.where(slides, BAND_M, BAND_RAD), distances, BAND_SINGULAR, BAND_M)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the last values: the arm is not being moved."""
+        self._edge: FloatArray | None = None
+        self._expected_rad: FloatArray | None = None
+        self.next_ns = 0
+        """When the next check is due."""
+        self._elbow_next = False
+        self.elbow_rad = 0.0
+        """Greatest distance of a joint from where it is expected."""
+        self._bound_slowdown: Slowdown | None = None
+        self._elbow_slowdown: Slowdown | None = None
+        # Joints that passed each check, so that an arm at rest is not checked again.
+        self._passed: list[tuple[Any, ...]] = [_NOTHING, _NOTHING]
+
+    @property
+    def slowdown(self) -> Slowdown | None:
+        """The slowdown of the arm, None for full speed."""
+        return slowest(self._bound_slowdown, self._elbow_slowdown)
+
+    def late(self, now_ns: int) -> bool:
+        """A check is overdue by a whole period."""
+        return now_ns >= self.next_ns + PERIOD_NS // 2
+
+    def update(
+        self,
+        measured_rad: FloatArray,
+        commanded_rad: FloatArray | None,
+        now_ns: int,
+        *,
+        in_joints: bool = False,
+    ) -> LimitHit | None:
+        """Check the bounds and the elbow in turn, one of them every half `PERIOD_NS`.
+
+        Args:
+            measured_rad: (n,) in chain order.
+            commanded_rad: (n,) joint commands; None: poses are commanded.
+            now_ns: time of this tick.
+            in_joints: joints are commanded; then singularities do not matter.
+
+        Returns:
+            the bound for which the arm has to brake, None without one.
+        """
+        if now_ns < self.next_ns:
+            return None
+        self.next_ns = now_ns + PERIOD_NS // 2
+        self._elbow_next = not self._elbow_next
+        seen = measured_rad, commanded_rad, in_joints
+        if self.slowdown is None and all(map(is_, seen, self._passed[self._elbow_next])):
+            return None  # nothing moved since they passed this check
+        if self._elbow_next:
+            hit = self._bounds(measured_rad, in_joints=in_joints)
+        else:
+            hit = self._elbow(measured_rad, commanded_rad)
+        self._passed[self._elbow_next] = seen if hit is None else _NOTHING
+        return hit
+
+    def _bounds(self, measured_rad: FloatArray, *, in_joints: bool) -> LimitHit | None:
+        kinematics, barriers = self._reach.kinematics, self._reach.barriers
+        ends = np.minimum(measured_rad - kinematics.lower_rad, kinematics.upper_rad - measured_rad)
+        left = barriers.at(measured_rad, kinematics.jacobian(measured_rad))
+        if in_joints:
+            left[0] = np.inf
+        left = np.concatenate([ends - self._stop[: len(ends)], left])
+        before = left if self._edge is None else self._edge
+        self._edge = np.minimum(np.maximum(before, left), left + self._band)
+        nearer = self._edge < before
+        past = np.where(nearer, left + self._past, 1.0)
+        worst = int(np.argmin(past))
+        if past[worst] < 0:
+            stop = float(self._stop[worst])
+            name, where = self._bound_name(worst)
+            return LimitHit(name, float(left[worst]) + stop, stop, where=where)
+        zone = np.maximum(self._slow - self._stop, 1e-12)
+        shares = np.where(nearer, np.sqrt(np.clip(left / zone, 0.0, 1.0)), 1.0)
+        worst = int(np.argmin(shares))
+        name, where = self._bound_name(worst)
+        value, limit = float(left[worst] + self._stop[worst]), float(self._slow[worst])
+        self._bound_slowdown = _slowdown(name, float(shares[worst]), value, limit, where)
+        return None
+
+    def _elbow(self, measured_rad: FloatArray, commanded_rad: FloatArray | None) -> LimitHit | None:
+        expected_rad = commanded_rad
+        if expected_rad is None:
+            start_rad = measured_rad if self._expected_rad is None else self._expected_rad
+            pose = self._reach.kinematics.forward(measured_rad)
+            expected_rad = self._expected_rad = self._reach.solve(pose, start_rad)
+        if expected_rad is None:
+            return None
+        apart_rad = np.abs(measured_rad - expected_rad)
+        worst = int(np.argmax(apart_rad / self._elbow_limits))
+        self.elbow_rad, limit_rad = float(apart_rad[worst]), float(self._elbow_limits[worst])
+        where = self._reach.kinematics.arm_joints[worst]
+        if self.elbow_rad > 2 * limit_rad:
+            return LimitHit("elbow_rad", self.elbow_rad, 2 * limit_rad, where=where)
+        share = min(2.0 - self.elbow_rad / limit_rad, 1.0)
+        self._elbow_slowdown = _slowdown("elbow_rad", share, self.elbow_rad, limit_rad, where)
+        return None
+
+    def _bound_name(self, index: int) -> tuple[str, str]:
+        joints = self._reach.kinematics.arm_joints
+        if index < len(joints):
+            return "joint_limit", joints[index]
+        index -= len(joints)
+        return self._reach.barriers.names[index], self._reach.barriers.where(index)
+
+
+def _each(
+    of_joints: FloatArray, distances: int, of_singular: float, of_distance: float
+) -> FloatArray:
+    return np.concatenate([of_joints, [of_singular], [of_distance] * distances])
+
+
+def _slowdown(name: str, share: float, value: float, limit: float, where: str) -> Slowdown | None:
+    share = max(float(np.ceil(share * STEPS)) / STEPS, SLOWEST)
+    return None if share >= 1.0 else Slowdown(name, share, value, limit, where)
 
 
 class Deadman:

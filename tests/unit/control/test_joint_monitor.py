@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from command_rig import Rig, profile
 
-from vla_zenoh.control.joint_monitor import JointMonitor
 from vla_zenoh.control.limits import LimitHit
 from vla_zenoh.control.reachability import make_reachability_filter
+from vla_zenoh.control.watchdog import JointMonitor
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.kinematics.so3 import Pose, pose_distance, quat_from_rotation
 from vla_zenoh.types import FloatArray
