@@ -26,7 +26,7 @@ def main(profile: str = "panda_sim_two_hosts") -> None:
             try:
                 with vla_zenoh.connect(profile) as robot:
                     robot.set_prompt("HARD: go up x10")
-                    robot.activate_with_deadman("two hosts")
+                    robot.activate_with_deadman("two-hosts")
                     time.sleep(3)
                     print("z =", robot.pose_state().record.position_m[2])
                     robot.deactivate()

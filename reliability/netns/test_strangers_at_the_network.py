@@ -34,7 +34,7 @@ MOVED_M = 0.05
 """An arm that obeys the attacker goes down 0.1 m."""
 RATE_HZ = float(RATE)
 OTHER = "other"
-NODES = ["camera", "command", "router", "sim", "worker-scripted"]
+NODES = ["camera", "command", "rolling", "router", "sim", "worker-scripted"]
 PLAIN = f"""\
 extends: panda_sim_two_hosts
 cameras:

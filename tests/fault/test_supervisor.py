@@ -381,6 +381,19 @@ def test_when_nothing_else_is_left_or_can_be_spared_it_is_given_up(kind: str) ->
         supervisor.kill()
 
 
+def test_a_node_that_runs_is_down_until_it_was_alive_and_not_when_it_hangs_later() -> None:
+    supervisor, _ = begin(NodeCommand("sim", "sim", ("node", "sim")))
+    try:
+        assert [node.name for node in supervisor.down(())] == ["sim"]
+        assert supervisor.down({"sim"}) == []
+        assert supervisor.down(()) == []
+
+        supervisor.terminate("sim", "hangs")
+        until("its end is seen", lambda: supervisor.poll() and supervisor.down(()) != [])
+    finally:
+        supervisor.kill()
+
+
 def group_runs(group: int) -> bool:
     """Whether any process of that group is more than a zombie."""
     for stat in Path("/proc").glob("[0-9]*/stat"):

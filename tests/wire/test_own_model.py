@@ -84,4 +84,4 @@ def test_a_model_that_cannot_be_made_is_told_by_its_own_last_lines(model: Path) 
     done = command_line(*words, timeout_s=TIMEOUT_S)
     assert done.returncode == 1
     assert "Its options: step_m" in done.stderr
-    assert "error: worker-riser dies again and again: " in done.stderr
+    assert "error: worker-riser keeps crashing: " in done.stderr

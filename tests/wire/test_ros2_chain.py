@@ -45,7 +45,7 @@ def lab(
         stop = threading.Event()
 
         def film() -> None:
-            pixels = np.zeros(3 * WIDTH * HEIGHT, np.uint8)
+            noise = np.random.default_rng(0)
             while not stop.wait(1 / CAMERA_HZ):
                 picture = peer.message(
                     "sensor_msgs/msg/Image",
@@ -54,7 +54,7 @@ def lab(
                     width=WIDTH,
                     encoding="rgb8",
                     step=3 * WIDTH,
-                    data=pixels,
+                    data=noise.integers(60, 200, 3 * WIDTH * HEIGHT, np.uint8),
                 )
                 peer.put(CAMERA, picture)
 

@@ -237,8 +237,11 @@ def test_two_workers_are_compared_while_one_of_them_moves_the_arm(
         infers = "the riser infers"
         chain.until(infers, lambda: chain.state("worker-riser") == "inferring", READY_PATIENCE_S)
         chain.move()
-        words = ("lab", "compare", "scripted", "riser", "--seconds", "2", "--tolerance", "0.2")
-        said = command_line(*words, "--json", profile=chain.profile_file)
+        file = str(tmp_path / "both.mcap")
+        said = command_line("record", "--seconds", "2", "-o", file, profile=chain.profile_file)
+        assert said.returncode == 0, said.stderr
+        words = ("lab", "compare", "scripted", "riser", file, "--tolerance", "0.2", "--json")
+        said = command_line(*words)
         assert said.returncode == 0, said.stderr
         found = json.loads(said.stdout)
         assert found["pairs"] >= 5
@@ -255,13 +258,6 @@ def test_two_workers_are_compared_while_one_of_them_moves_the_arm(
         shown = command_line("status", "--once", profile=chain.profile_file).stdout
         assert "in control" in shown
         assert "shadow mode" in shown
-
-
-@pytest.mark.slow
-def test_a_worker_that_is_not_there_cannot_be_compared(chain: Chain) -> None:
-    said = command_line("lab", "compare", "scripted", "ghost", profile=chain.profile_file)
-    assert said.returncode == 1
-    assert "worker 'ghost' publishes no spec; is it alive?" in said.stderr
 
 
 @pytest.mark.slow

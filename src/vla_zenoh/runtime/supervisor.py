@@ -56,7 +56,10 @@ class NodeCommand(NamedTuple):
 
 @dataclass(slots=True)
 class Child:
-    """A node of this host; `why` it exited, if it said so, what was `told` of that, and how."""
+    """A node of this host; `why` it exited, if it said so, what was `told` of that, and how.
+
+    `was_alive`: others saw this process of it alive.
+    """
 
     command: NodeCommand
     process: subprocess.Popen[str] | None = None
@@ -66,6 +69,7 @@ class Child:
     start_again_s: float = 0.0
     reader: threading.Thread | None = None
     pid: int = 0
+    was_alive: bool = False
     why: str = ""
     told: str = ""
     end: str = ""
@@ -242,7 +246,12 @@ class Supervisor:
             return False
 
     def down(self, alive: Collection[str]) -> list[DownNode]:
-        """Nodes that do not run, or run and are not in `alive` yet."""
+        """Nodes that do not run, or run and have not been in `alive` yet.
+
+        One that was alive and runs is not down: it hangs, and its last status has to grow old.
+        """
+        for child in self.children:
+            child.was_alive |= child.process is not None and child.command.name in alive
         return [
             DownNode(
                 child.command.name,
@@ -253,6 +262,7 @@ class Supervisor:
             )
             for child in self.children
             if child.pid and child.command.name not in alive
+            if child.process is None or not child.was_alive
         ]
 
     def terminate(self, name: str, why: str) -> None:
@@ -275,7 +285,7 @@ class Supervisor:
             start_new_session=True,
         )
         child.started_s, child.start_again_s = time.monotonic(), 0.0
-        child.pid, child.why = child.process.pid, ""
+        child.pid, child.why, child.was_alive = child.process.pid, "", False
         reader = threading.Thread(target=self._forward, args=(child, child.process), daemon=True)
         reader.start()
         child.reader = reader
