@@ -18,7 +18,7 @@ from vla_zenoh.policy import Policy
 from vla_zenoh.profile import Profile
 from vla_zenoh.simulation.world import build_world
 from vla_zenoh.types import FloatArray, GripperState, JointState, PoseState
-from vla_zenoh.types.commands import JointReference, PoseReference
+from vla_zenoh.types.records import JointReference, PoseReference
 
 WARM_UP_S, LOOK_S = 1.2, 0.25
 DAMPING = 1e-6

@@ -30,8 +30,7 @@ from vla_zenoh.guard.command_guards import (
 )
 from vla_zenoh.kinematics.so3 import Pose, exp3, log3, quat_from_rotation
 from vla_zenoh.profile import Profile, load_profile
-from vla_zenoh.types import FloatArray, Header, JointCommand, PoseCommand, Stamped
-from vla_zenoh.types.commands import JointReference
+from vla_zenoh.types import FloatArray, Header, JointCommand, JointReference, PoseCommand, Stamped
 
 PROFILE = load_profile("panda_sim")
 NAMES = PROFILE.robot.arm_joints

@@ -14,8 +14,7 @@ from vla_zenoh.kinematics.so3 import rotation_from_quat
 from vla_zenoh.profile import load_profile
 from vla_zenoh.robot import Command, Reading
 from vla_zenoh.simulation.world import STEP_NS, build_world
-from vla_zenoh.types import GripperState, JointCommand, JointState
-from vla_zenoh.types.commands import JointReference, PoseReference
+from vla_zenoh.types import GripperState, JointCommand, JointReference, JointState, PoseReference
 
 CONNECT_S = 12.0
 """Longer than a node may say nothing."""

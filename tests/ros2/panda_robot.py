@@ -52,7 +52,7 @@ from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.simulation.render import Renderer
 from vla_zenoh.simulation.robot_model import RobotModel
 from vla_zenoh.simulation.world import STEP_NS, World
-from vla_zenoh.types.commands import PoseReference
+from vla_zenoh.types import PoseReference
 
 JOINT_STATES = "/joint_states"
 CURRENT_POSE = "/franka_robot_state_broadcaster/current_pose"

@@ -10,7 +10,7 @@ import pinocchio as pin
 from vla_zenoh.simulation.impedance import ImpedanceGains
 from vla_zenoh.simulation.robot_model import RobotModel
 from vla_zenoh.simulation.world import STEP_S, World
-from vla_zenoh.types.commands import PoseReference
+from vla_zenoh.types import PoseReference
 
 SCENE = "table"
 # TCP at x 0.43, y 0, z 0.16 m, tool straight down; see test_world_home.py.

@@ -24,7 +24,7 @@ from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import load_profile
 from vla_zenoh.simulation.impedance import ImpedanceGains
 from vla_zenoh.simulation.world import World
-from vla_zenoh.types.commands import PoseReference
+from vla_zenoh.types import PoseReference
 
 REACHED_M, OFF_AXIS_M, DRIFT_RAD = 1e-3, 1e-3, 2e-3
 TURNED_RAD = 2e-3

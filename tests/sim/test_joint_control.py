@@ -12,8 +12,7 @@ from motions import HOME_RAD, SCENE, line, make_world, still
 from vla_zenoh.simulation.robot_model import RobotModel
 from vla_zenoh.simulation.scene import PREFIX, STEP_S
 from vla_zenoh.simulation.world import World
-from vla_zenoh.types import FloatArray
-from vla_zenoh.types.commands import JointReference, PoseReference
+from vla_zenoh.types import FloatArray, JointReference, PoseReference
 
 FOLLOW_LIMIT_M, FOLLOW_LIMIT_RAD = 1e-3, 2e-3
 FRICTION_NM = 0.5

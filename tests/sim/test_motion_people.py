@@ -29,8 +29,7 @@ from arm_rig import (
 )
 
 from vla_zenoh.lab.lockstep import Lockstep, Message
-from vla_zenoh.types import FloatArray, GripperCommand, PoseCommand, PoseState
-from vla_zenoh.types.commands import PoseReference
+from vla_zenoh.types import FloatArray, GripperCommand, PoseCommand, PoseReference, PoseState
 
 EXACT_M = 1e-3
 BRAKE_STOP_S, BRAKE_WAY_M = 0.20, 0.021

@@ -15,7 +15,7 @@ from vla_zenoh.profile import load_profile
 from vla_zenoh.simulation.render import Renderer
 from vla_zenoh.simulation.robot_model import robot_model
 from vla_zenoh.simulation.world import World, build_world
-from vla_zenoh.types.commands import JointReference
+from vla_zenoh.types import JointReference
 
 PROFILE = load_profile("so101_sim")
 HOME_RAD = np.array(PROFILE.robot.home_rad)

@@ -13,7 +13,7 @@ from vla_zenoh.errors import NodeError, ResourceError
 from vla_zenoh.simulation.objects import draw_places, footprint_m, objects_of, regions_of
 from vla_zenoh.simulation.robot_model import RobotModel
 from vla_zenoh.simulation.world import World
-from vla_zenoh.types.commands import PoseReference
+from vla_zenoh.types import PoseReference
 
 TABLE_CLEARANCE_M = 2e-4  # how deep a resting brick sinks into the table at most
 SEEDS = range(40)

@@ -10,7 +10,7 @@ from motions import follow, line, make_world, wait
 
 from vla_zenoh.errors import RecordError
 from vla_zenoh.simulation.world import World
-from vla_zenoh.types.commands import PoseReference
+from vla_zenoh.types import PoseReference
 
 BRICK_WIDTH_M = 0.0318
 WIDTH_ATOL_M = 3e-4

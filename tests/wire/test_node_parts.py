@@ -20,8 +20,7 @@ from vla_zenoh.bus.session import MAX_MESSAGE_BYTES, open_session
 from vla_zenoh.errors import CodecError
 from vla_zenoh.profile import SessionProfile, load_profile, override
 from vla_zenoh.runtime.process import is_running
-from vla_zenoh.types import Header
-from vla_zenoh.types.stream import SingleWriterFilter
+from vla_zenoh.types import Header, SingleWriterFilter
 
 SILENCE_NS = 500_000_000
 STEP_TOLERANCE_S = 0.002

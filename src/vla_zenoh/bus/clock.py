@@ -269,7 +269,7 @@ def shift_stamps(header: Header, record: Record, ahead_ns: int) -> tuple[Header,
     is stale or never expires is for the receiver to decide.
     """
 
-    from vla_zenoh.types.commands import ActionChunk  # brings numpy
+    from vla_zenoh.types.records import ActionChunk  # brings numpy
 
     def here(stamp_ns: int) -> int:
         return min(max(stamp_ns - ahead_ns, 0), LAST_NS)

@@ -21,8 +21,7 @@ from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, NodeError
 from vla_zenoh.keys import Kind, last_chunk
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import Event, Header, NodeStatus, Stamped
-from vla_zenoh.types.stream import SingleWriterFilter
+from vla_zenoh.types import Event, Header, NodeStatus, SingleWriterFilter, Stamped
 
 MSGPACK = zenoh.Encoding("application/msgpack")
 STATUS_PERIOD_S = 0.5

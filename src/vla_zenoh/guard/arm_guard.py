@@ -22,7 +22,7 @@ from vla_zenoh.guard.stream_guard import ACCELERATE_S
 from vla_zenoh.kinematics.so3 import Pose, pose_distance
 from vla_zenoh.profile import GripperProfile, Profile
 from vla_zenoh.types import FloatArray, GripperCommand, JointCommand, PoseCommand, Stamped
-from vla_zenoh.types.commands import JointReference, PoseReference
+from vla_zenoh.types.records import JointReference, PoseReference
 from vla_zenoh.types.stream import SingleWriterFilter
 
 STANDING_RAD_S = 0.02

@@ -26,8 +26,7 @@ from vla_zenoh.kinematics.so3 import (
     spatial_rates,
 )
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import FloatArray, JointCommand, PoseCommand
-from vla_zenoh.types.commands import JointReference
+from vla_zenoh.types import FloatArray, JointCommand, JointReference, PoseCommand
 
 TURN_STOP, TURN_BESIDE = 0.55, 0.5
 """Share of a rotation limit for each axis, so that the norm of three stays within it: in a stop,

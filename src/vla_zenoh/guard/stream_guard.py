@@ -21,8 +21,7 @@ from vla_zenoh.guard.reference_governor import (
     ReferenceGovernor,
     Space,
 )
-from vla_zenoh.types import FloatArray, Header, Stamped
-from vla_zenoh.types.stream import SingleWriterFilter
+from vla_zenoh.types import FloatArray, Header, SingleWriterFilter, Stamped
 
 CLOCK_DRIFT = 1e-3
 """Share by which two clocks may drift apart; real ones drift by a tenth of that."""

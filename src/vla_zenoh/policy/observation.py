@@ -33,7 +33,7 @@ from vla_zenoh.types import (
     Stamped,
     Task,
 )
-from vla_zenoh.types.states import MAX_COUNT
+from vla_zenoh.types.records import MAX_COUNT
 
 MAX_STATES, MAX_PICTURES = 4096, 128
 PAIR_S = 0.15

@@ -9,7 +9,7 @@ from pydantic import AfterValidator, Field
 
 from vla_zenoh.profile.section import Distinct, Fault, Name, Names, Section, Text, Word
 from vla_zenoh.profile.session import Endpoints
-from vla_zenoh.types.states import MAX_DEPTH_UNIT_M, MIN_DEPTH_UNIT_M
+from vla_zenoh.types.records import MAX_DEPTH_UNIT_M, MIN_DEPTH_UNIT_M
 
 NodeKind = Literal["router", "sim", "ros2", "arm", "camera", "command", "worker", "primitives"]
 SIMULATED: tuple[NodeKind, ...] = ("router", "sim", "camera", "command", "worker")

@@ -29,9 +29,9 @@ from vla_zenoh.types import (
     GripperCommand,
     GripperState,
     JointCommand,
+    JointReference,
     PoseCommand,
 )
-from vla_zenoh.types.commands import JointReference
 
 BUFFER = 64
 STALLED_NS = 500_000_000

@@ -24,7 +24,7 @@ from vla_zenoh.types import (
     PoseCommand,
     PoseState,
 )
-from vla_zenoh.types.commands import JointReference, PoseReference
+from vla_zenoh.types.records import JointReference, PoseReference
 
 if TYPE_CHECKING:
     from vla_zenoh.bus.node import Node

@@ -22,7 +22,7 @@ from vla_zenoh.robots.joint_reading import JointReading
 from vla_zenoh.ros2.samples import Joints
 from vla_zenoh.sanitize import one_line
 from vla_zenoh.types import Event, FloatArray, GripperCommand, GripperState
-from vla_zenoh.types.commands import JointReference, PoseReference
+from vla_zenoh.types.records import JointReference, PoseReference
 
 FUTURE_NS = 100_000_000
 MAX_WORDS = 300

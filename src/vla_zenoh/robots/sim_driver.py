@@ -28,7 +28,7 @@ from vla_zenoh.robots.arm import Arm
 from vla_zenoh.robots.driver import DriverStatus, Measurement, Report, RobotDriver
 from vla_zenoh.simulation.world import STEP_NS, build_world
 from vla_zenoh.types import FloatArray, GripperCommand, ObjectPoses, SceneState
-from vla_zenoh.types.commands import JointReference, PoseReference
+from vla_zenoh.types.records import JointReference, PoseReference
 
 if TYPE_CHECKING:
     from vla_zenoh.robots.node import RobotNode

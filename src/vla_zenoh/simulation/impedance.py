@@ -43,8 +43,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from vla_zenoh.simulation.robot_model import JointGains
-from vla_zenoh.types import FloatArray
-from vla_zenoh.types.commands import JointReference, PoseReference
+from vla_zenoh.types import FloatArray, JointReference, PoseReference
 
 MIN_MOBILITY = 0.01
 """Task-space mobility (1/kg or 1/(kg m^2)) below which a direction counts as singular: its apparent

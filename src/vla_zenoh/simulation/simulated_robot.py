@@ -19,7 +19,7 @@ from vla_zenoh.simulation.impedance import (
 from vla_zenoh.simulation.robot_model import RobotModel
 from vla_zenoh.simulation.scene import GRIPPER, STEP_S, TCP_SITE, prefix_of
 from vla_zenoh.types import FloatArray, GripperState, JointState, PoseState
-from vla_zenoh.types.commands import JointReference, PoseReference
+from vla_zenoh.types.records import JointReference, PoseReference
 
 WRENCH_FILTER_S = 0.01
 """Time constant of the reported wrench: a robot's own estimate is filtered too."""

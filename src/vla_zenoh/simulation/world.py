@@ -18,8 +18,7 @@ from vla_zenoh.simulation.objects import draw_places, objects_of
 from vla_zenoh.simulation.robot_model import RobotModel, robot_models
 from vla_zenoh.simulation.scene import POSES, STEP_S, build_model
 from vla_zenoh.simulation.simulated_robot import SimulatedPart
-from vla_zenoh.types import FloatArray, vector
-from vla_zenoh.types.commands import JointReference, PoseReference
+from vla_zenoh.types import FloatArray, JointReference, PoseReference, vector
 
 STEP_NS = round(STEP_S * 1e9)
 

@@ -22,26 +22,29 @@ if TYPE_CHECKING:
     from vla_zenoh.types.checks import MAX_NAMES as MAX_NAMES
     from vla_zenoh.types.checks import MAX_TEXT as MAX_TEXT
     from vla_zenoh.types.checks import shown as shown
-    from vla_zenoh.types.commands import LATENCY_STAGES as LATENCY_STAGES
-    from vla_zenoh.types.commands import ActionChunk as ActionChunk
-    from vla_zenoh.types.commands import Cause as Cause
-    from vla_zenoh.types.commands import GripperCommand as GripperCommand
-    from vla_zenoh.types.commands import InferenceDebug as InferenceDebug
-    from vla_zenoh.types.commands import JointCommand as JointCommand
-    from vla_zenoh.types.commands import PoseCommand as PoseCommand
-    from vla_zenoh.types.states import Depth as Depth
-    from vla_zenoh.types.states import GripperState as GripperState
-    from vla_zenoh.types.states import Image as Image
-    from vla_zenoh.types.states import JointState as JointState
-    from vla_zenoh.types.states import ObjectPoses as ObjectPoses
-    from vla_zenoh.types.states import PoseState as PoseState
-    from vla_zenoh.types.states import PrivilegedState as PrivilegedState
-    from vla_zenoh.types.states import SceneState as SceneState
+    from vla_zenoh.types.records import LATENCY_STAGES as LATENCY_STAGES
+    from vla_zenoh.types.records import ActionChunk as ActionChunk
+    from vla_zenoh.types.records import Cause as Cause
+    from vla_zenoh.types.records import Depth as Depth
+    from vla_zenoh.types.records import GripperCommand as GripperCommand
+    from vla_zenoh.types.records import GripperState as GripperState
+    from vla_zenoh.types.records import Image as Image
+    from vla_zenoh.types.records import InferenceDebug as InferenceDebug
+    from vla_zenoh.types.records import JointCommand as JointCommand
+    from vla_zenoh.types.records import JointReference as JointReference
+    from vla_zenoh.types.records import JointState as JointState
+    from vla_zenoh.types.records import ObjectPoses as ObjectPoses
+    from vla_zenoh.types.records import PoseCommand as PoseCommand
+    from vla_zenoh.types.records import PoseReference as PoseReference
+    from vla_zenoh.types.records import PoseState as PoseState
+    from vla_zenoh.types.records import PrivilegedState as PrivilegedState
+    from vla_zenoh.types.records import SceneState as SceneState
     from vla_zenoh.types.stream import Event as Event
     from vla_zenoh.types.stream import Header as Header
     from vla_zenoh.types.stream import HeldBox as HeldBox
     from vla_zenoh.types.stream import NodeStatus as NodeStatus
+    from vla_zenoh.types.stream import SingleWriterFilter as SingleWriterFilter
     from vla_zenoh.types.stream import Stamped as Stamped
     from vla_zenoh.types.stream import Task as Task
 
-__getattr__ = lazy_names(__name__, "checks", "stream", "commands", "states", "arrays")
+__getattr__ = lazy_names(__name__, "checks", "stream", "records", "arrays")

@@ -19,8 +19,7 @@ from vla_zenoh.errors import NodeError
 from vla_zenoh.profile import load_profile
 from vla_zenoh.robots.driver import Report
 from vla_zenoh.robots.python_driver import PythonDriver
-from vla_zenoh.types import GripperCommand
-from vla_zenoh.types.commands import JointReference
+from vla_zenoh.types import GripperCommand, JointReference
 
 pytestmark = pytest.mark.models
 

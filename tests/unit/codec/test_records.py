@@ -71,7 +71,7 @@ def as_map(record: Any) -> Any:
 def test_every_kind_of_record_is_tested_here() -> None:
     kinds = {
         kind
-        for module in (types.commands, types.states, types.stream)
+        for module in (types.records, types.stream)
         for kind in vars(module).values()
         if dataclasses.is_dataclass(kind) and kind.__module__.startswith(f"{types.__name__}.")
     }

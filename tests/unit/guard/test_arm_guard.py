@@ -12,7 +12,7 @@ from vla_zenoh.guard.command_guards import JointGuard, PoseGuard, guard_limits, 
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import Header, JointCommand, PoseCommand, Stamped
-from vla_zenoh.types.commands import JointReference, PoseReference
+from vla_zenoh.types.records import JointReference, PoseReference
 
 PROFILE = load_profile("panda_sim")
 NAMES = PROFILE.robot.arm_joints

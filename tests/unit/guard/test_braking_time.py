@@ -16,7 +16,7 @@ from vla_zenoh.guard.command_guards import guard_limits, joint_motion_limits
 from vla_zenoh.guard.reference_governor import BRAKE_MARGIN
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import Profile, load_profile, override
-from vla_zenoh.types.commands import JointReference
+from vla_zenoh.types import JointReference
 
 SIM = load_profile("panda_sim")
 TICK_S = 0.01

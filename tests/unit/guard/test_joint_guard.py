@@ -17,8 +17,7 @@ from vla_zenoh.guard.command_guards import (
     joint_motion_limits,
 )
 from vla_zenoh.profile import load_profile
-from vla_zenoh.types import FloatArray, Header, JointCommand, Stamped
-from vla_zenoh.types.commands import JointReference
+from vla_zenoh.types import FloatArray, Header, JointCommand, JointReference, Stamped
 
 PROFILE = load_profile("panda_sim")
 NAMES = PROFILE.robot.arm_joints

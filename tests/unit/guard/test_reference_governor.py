@@ -13,8 +13,7 @@ from vla_zenoh.control.smoothing import Motion, MotionLimits
 from vla_zenoh.guard.command_guards import GuardLimits, JointSpace, PoseGuard, PoseSpace
 from vla_zenoh.guard.reference_governor import BRAKE_MARGIN, GovernorLimits, ReferenceGovernor
 from vla_zenoh.kinematics.so3 import Pose, angle_between, exp3
-from vla_zenoh.types import FloatArray, Header, PoseCommand, Stamped
-from vla_zenoh.types.commands import JointReference
+from vla_zenoh.types import FloatArray, Header, JointReference, PoseCommand, Stamped
 
 DT_S = 1e-3
 SOON_S = 0.6

@@ -13,7 +13,7 @@ from vla_zenoh.errors import CodecError, RecordError
 from vla_zenoh.lab.inference_views import MAX_WAITING, PendingImages
 from vla_zenoh.policy import MAX_CAMERAS
 from vla_zenoh.types import InferenceDebug
-from vla_zenoh.types.commands import plain_values
+from vla_zenoh.types.records import plain_values
 
 
 class Tensor:

@@ -12,8 +12,7 @@ from vla_zenoh.errors import NodeError
 from vla_zenoh.profile import load_profile
 from vla_zenoh.robots.driver import Report
 from vla_zenoh.robots.python_driver import FAULT_NS, PythonDriver
-from vla_zenoh.types import Event, GripperCommand, JointCommand
-from vla_zenoh.types.commands import JointReference
+from vla_zenoh.types import Event, GripperCommand, JointCommand, JointReference
 
 ARM = """
 from vla_zenoh.robot import Reading

@@ -9,8 +9,7 @@ from vla_zenoh.profile import load_profile
 from vla_zenoh.robots.driver import Report
 from vla_zenoh.robots.sim_driver import SimDriver
 from vla_zenoh.simulation.world import STEP_NS
-from vla_zenoh.types import GripperCommand
-from vla_zenoh.types.commands import JointReference, PoseReference
+from vla_zenoh.types import GripperCommand, JointReference, PoseReference
 
 SETTLED_M, SETTLED_RAD, SHUT_M = 2e-3, 5e-3, 0.01
 STILL = np.zeros(6)

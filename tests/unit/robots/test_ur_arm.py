@@ -31,7 +31,7 @@ from vla_zenoh.lab.doctor.ur import ur_arm
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.robots.driver import Report
 from vla_zenoh.robots.python_driver import PythonDriver
-from vla_zenoh.types.commands import JointReference
+from vla_zenoh.types import JointReference
 
 AT_HOME_RAD = np.array([0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0])
 NEAR_RAD = 1e-3

@@ -8,7 +8,7 @@ import pytest
 
 from vla_zenoh import resources
 from vla_zenoh.simulation.impedance import ArmDynamics, CartesianImpedance, ImpedanceGains
-from vla_zenoh.types.commands import PoseReference
+from vla_zenoh.types import PoseReference
 
 URDF = "example-robot-data:panda_description/urdf/panda.urdf"
 JOINTS = 7

@@ -14,8 +14,7 @@ from vla_zenoh.simulation.impedance import (
     JointImpedance,
 )
 from vla_zenoh.simulation.robot_model import JointGains
-from vla_zenoh.types import FloatArray
-from vla_zenoh.types.commands import JointReference, PoseReference
+from vla_zenoh.types import FloatArray, JointReference, PoseReference
 
 URDF = "example-robot-data:panda_description/urdf/panda.urdf"
 JOINTS = 7

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from vla_zenoh.types import Header
-from vla_zenoh.types.stream import SingleWriterFilter
+from vla_zenoh.types import Header, SingleWriterFilter
 
 SILENCE_S = 0.5
 MS = 1_000_000

@@ -17,7 +17,7 @@ from vla_zenoh.lab.lockstep import Delays, Lockstep
 from vla_zenoh.policy import ActionSteps, ModelSpec, Observation, ObservationSpec
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.types import FloatArray, GripperState, JointState, PoseState
-from vla_zenoh.types.commands import JointReference, PoseReference
+from vla_zenoh.types.records import JointReference, PoseReference
 
 WARM_UP_S, ACTIVATE_PATIENCE_S, POLL_S = 0.3, 3.0, 0.02
 JOINTS = 7

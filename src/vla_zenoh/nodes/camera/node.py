@@ -26,8 +26,7 @@ from vla_zenoh.policy import CameraSpec, ModelSpec
 from vla_zenoh.policy.observation import size_variant
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.schema import CameraProfile
-from vla_zenoh.types import Event, SceneState, Stamped
-from vla_zenoh.types.stream import SingleWriterFilter
+from vla_zenoh.types import Event, SceneState, SingleWriterFilter, Stamped
 
 SIM, ROS2 = "sim:", "ros2:"
 BACKOFF_S, MAX_BACKOFF_S = 0.2, 2.0

@@ -28,9 +28,9 @@ from vla_zenoh.types import (
     JointState,
     NodeStatus,
     PoseState,
+    SingleWriterFilter,
     Stamped,
 )
-from vla_zenoh.types.stream import SingleWriterFilter
 
 STATES = 32
 """States buffered between two ticks: the robot's, and room for those of another source."""

@@ -52,9 +52,8 @@ from vla_zenoh.policy.observation import (
     state_names,
 )
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import Depth, Header, Image, InferenceDebug, Stamped, Task
-from vla_zenoh.types.commands import plain_values
-from vla_zenoh.types.stream import SingleWriterFilter
+from vla_zenoh.types import Depth, Header, Image, InferenceDebug, SingleWriterFilter, Stamped, Task
+from vla_zenoh.types.records import plain_values
 
 SPEC_PERIOD_S = 1.0
 TASK_PATIENCE_S = 1.5

@@ -22,8 +22,7 @@ from vla_zenoh.errors import CodecError
 from vla_zenoh.keys import Kind
 from vla_zenoh.policy import CameraSpec
 from vla_zenoh.policy.observation import History, size_variant
-from vla_zenoh.types import Event
-from vla_zenoh.types.stream import SingleWriterFilter
+from vla_zenoh.types import Event, SingleWriterFilter
 
 STREAM_PATIENCE_S = 0.5
 """After this silence of a stream's writer another one is accepted."""

@@ -39,7 +39,7 @@ from vla_zenoh.ros2.samples import Stamp, Wrench
 from vla_zenoh.ros2.writers import Write, joint_writer, pose_writer
 from vla_zenoh.runtime.process import ROUTER_PATIENCE_S
 from vla_zenoh.types import Event, FloatArray, GripperCommand, GripperState
-from vla_zenoh.types.commands import JointReference, PoseReference
+from vla_zenoh.types.records import JointReference, PoseReference
 
 NAME = "ros2"
 JOIN_S = 0.3
