@@ -30,23 +30,26 @@ Sys. Meas. Control 108, 1986.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from vla_zenoh.control.barriers import DistanceConstraints
 from vla_zenoh.control.limits import LimitHit
-from vla_zenoh.errors import RecordError
 from vla_zenoh.kinematics.ik import pose_error
 from vla_zenoh.kinematics.kinematics import Kinematics, smallest_singular_value
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.types import FloatArray
 
-_IDENTITY_6 = np.eye(6)
+IDENTITY_6 = np.eye(6)
+POSTURE_1_S, POSTURE_RAD_S = 1.0, 0.2
+"""Rate kp at which a redundant arm goes to its posture, and its greatest speed then."""
+DAMPED_BELOW, DAMPING = 0.03, 4e-4
+"""Singular value s0 below which the inverse is damped, and wmax, at a singularity."""
+SINGULARITY_1_S = 5.0
+"""ka, rate of the approach to a singularity."""
 WATCHED = 4.0
-"""Multiple of `damped_below` under which the rate of the singular value is limited."""
+"""Multiple of `DAMPED_BELOW` under which the rate of the singular value is limited."""
 BACK_SHARE = 0.7
 """Part of the acceleration used towards a far target, whose path is curved in joint space."""
 NEAR_END_RAD = 0.1
@@ -64,49 +67,26 @@ PEEK_RAD = 1e-3
 """Joint displacement for the rate of the singular value."""
 
 
-@dataclass(frozen=True, slots=True)
-class FollowSettings:
-    """Parameters of a `JointFollower`.
-
-    Args:
-        acceleration_rad_s2: of every joint, one number or one per joint.
-        jerk_rad_s3: of every joint; the default has no noticeable effect.
-        velocity_share: part of the URDF's joint velocities that is used.
-        joint_margin_rad: kept from both ends of every joint's range, one number or one per joint.
-        posture_1_s: rate at which a redundant arm goes to its posture.
-        posture_rad_s: greatest speed of that.
-        damped_below: singular value s0 below which the inverse is damped.
-        damping: wmax, at a singularity.
-        singularity_stop: s_stop, below which the arm does not go by itself.
-        singularity_1_s: ka, rate of the approach.
-    """
-
-    acceleration_rad_s2: float | tuple[float, ...] = 10.0
-    jerk_rad_s3: float | tuple[float, ...] = 1e6
-    velocity_share: float = 1.0
-    joint_margin_rad: float | tuple[float, ...] = 0.05
-    posture_1_s: float = 1.0
-    posture_rad_s: float = 0.2
-    damped_below: float = 0.03
-    damping: float = 4e-4
-    singularity_stop: float = 0.015
-    singularity_1_s: float = 5.0
-
-
 class JointMotion(NamedTuple):
     """Motion of the joints, (n,) each.
 
     Args:
         position_rad: positions.
         velocity_rad_s: velocities.
-        acceleration_rad_s2: during the tick before; None: they stood.
-        wanted_rad_s: velocities wanted before the limits; None: the present ones.
+        acceleration_rad_s2: during the tick before.
+        wanted_rad_s: velocities wanted before the limits.
     """
 
     position_rad: FloatArray
     velocity_rad_s: FloatArray
-    acceleration_rad_s2: FloatArray | None = None
-    wanted_rad_s: FloatArray | None = None
+    acceleration_rad_s2: FloatArray
+    wanted_rad_s: FloatArray
+
+    @classmethod
+    def standing(cls, position_rad: FloatArray) -> JointMotion:
+        """Standing there."""
+        zeros = np.zeros(len(position_rad))
+        return cls(np.array(position_rad, dtype=np.float64), zeros, zeros, zeros)
 
 
 class JointFollower:
@@ -115,42 +95,35 @@ class JointFollower:
     Args:
         kinematics: of the arm.
         posture_rad: (n,) preferred joints of a redundant arm.
-        settings: see `FollowSettings`.
         constraints: distances to keep; None: none.
-
-    Raises:
-        RecordError: settings that do not fit the arm.
+        acceleration_rad_s2: greatest of every joint, one number or (n,).
+        jerk_rad_s3: greatest of every joint; the default has no noticeable effect.
+        velocity_share: part of the URDF's joint velocities that is used.
+        margin_rad: kept from both ends of every joint's range, one number or (n,).
+        singularity_stop: s_stop, below which the arm does not go by itself.
     """
 
     def __init__(
         self,
         kinematics: Kinematics,
-        posture_rad: ArrayLike,
-        settings: FollowSettings | None = None,
+        posture_rad: FloatArray,
         constraints: DistanceConstraints | None = None,
+        *,
+        acceleration_rad_s2: float | FloatArray = 10.0,
+        jerk_rad_s3: float | FloatArray = 1e6,
+        velocity_share: float = 1.0,
+        margin_rad: float | FloatArray = 0.05,
+        singularity_stop: float = 0.015,
     ) -> None:
         self.kinematics, self.constraints = kinematics, constraints
-        self.settings = settings = settings or FollowSettings()
-        self.posture_rad = np.array(posture_rad, dtype=np.float64)
-        self.acceleration_rad_s2, self.jerk_rad_s3 = (
-            np.full(kinematics.size, given) if np.ndim(given) == 0 else np.array(given, dtype=float)
-            for given in (settings.acceleration_rad_s2, settings.jerk_rad_s3)
-        )
-        for name in ("posture_rad", "acceleration_rad_s2", "jerk_rad_s3"):
-            values = getattr(self, name)
-            if values.shape != (kinematics.size,) or not np.isfinite(values).all():
-                raise RecordError(
-                    f"{name} must be {kinematics.size} finite numbers, got shape {values.shape}"
-                )
-        bounds = np.concatenate([self.acceleration_rad_s2, self.jerk_rad_s3])
-        if not (bounds > 0).all() or not 0 < settings.velocity_share <= 1:
-            raise RecordError(
-                "acceleration_rad_s2 and jerk_rad_s3 must be positive, velocity_share in (0, 1]"
-            )
+        self.posture_rad = posture_rad
+        self.acceleration_rad_s2 = np.full(kinematics.size, acceleration_rad_s2)
+        self.jerk_rad_s3 = np.full(kinematics.size, jerk_rad_s3)
         self._back_1_s = BACK_JERK * float(np.min(self.jerk_rad_s3 / self.acceleration_rad_s2))
-        self.velocity_rad_s = settings.velocity_share * kinematics.velocity_rad_s
-        self.lower_rad = kinematics.lower_rad + np.array(settings.joint_margin_rad)
-        self.upper_rad = kinematics.upper_rad - np.array(settings.joint_margin_rad)
+        self.velocity_rad_s = velocity_share * kinematics.velocity_rad_s
+        self.lower_rad = kinematics.lower_rad + margin_rad
+        self.upper_rad = kinematics.upper_rad - margin_rad
+        self._singularity_stop = singularity_stop
 
     def step(
         self, now: JointMotion, target: Pose, twist: FloatArray, dt_s: float
@@ -173,8 +146,8 @@ class JointFollower:
         error = pose_error(target, here)
         singular_value = smallest_singular_value(jacobian)
         hits: list[LimitHit] = []
-        if singular_value < self.settings.damped_below:
-            hits.append(LimitHit("singularity", singular_value, self.settings.damped_below))
+        if singular_value < DAMPED_BELOW:
+            hits.append(LimitHit("singularity", singular_value, DAMPED_BELOW))
         low, high = self._allowed(now, dt_s)
         held = np.zeros(len(joints), dtype=bool)
         onto = np.zeros(len(joints))
@@ -305,11 +278,10 @@ class JointFollower:
         onto: FloatArray,
         dt_s: float,
     ) -> FloatArray:
-        settings = self.settings
-        posture = settings.posture_1_s * (self.posture_rad - joints)
+        posture = POSTURE_1_S * (self.posture_rad - joints)
         fastest = float(np.abs(posture).max())
-        if fastest > settings.posture_rad_s:
-            posture *= settings.posture_rad_s / fastest
+        if fastest > POSTURE_RAD_S:
+            posture *= POSTURE_RAD_S / fastest
         free = jacobian
         if held.any():
             posture = np.where(held, 0.0, posture)
@@ -317,11 +289,11 @@ class JointFollower:
             singular_value = smallest_singular_value(free)
         taken = jacobian @ onto
         damping = 1e-12
-        if singular_value < settings.damped_below:
-            share = 1.0 - (singular_value / settings.damped_below) ** 2
-            damping += settings.damping * share * share
+        if singular_value < DAMPED_BELOW:
+            share = 1.0 - (singular_value / DAMPED_BELOW) ** 2
+            damping += DAMPING * share * share
         right = np.stack([error / dt_s - taken, twist - taken, free @ posture], axis=1)
-        solved = free.T @ np.linalg.solve(free @ free.T + damping * _IDENTITY_6, right)
+        solved = free.T @ np.linalg.solve(free @ free.T + damping * IDENTITY_6, right)
         whole, feed = solved[:, 0], solved[:, 1]
         back = min(1.0, self._back_1_s * dt_s) * (whole - feed)
         most = _stoppable(np.abs(back) * dt_s, BACK_SHARE * self.acceleration_rad_s2, dt_s)
@@ -334,23 +306,21 @@ class JointFollower:
         self, joints: FloatArray, wanted: FloatArray, singular_value: float
     ) -> float:
         """Factor on `wanted` at which a singularity is approached slowly enough."""
-        settings = self.settings
         fastest = float(np.abs(wanted).max())
-        if singular_value > WATCHED * settings.damped_below or fastest == 0.0:
+        if singular_value > WATCHED * DAMPED_BELOW or fastest == 0.0:
             return 1.0
         ahead = joints + wanted * (PEEK_RAD / fastest)
         after = smallest_singular_value(self.kinematics.jacobian(ahead))
         # At the speed within the limits, or the rate would be that of an impossible velocity.
         share = 1.0 / max(1.0, float(np.max(np.abs(wanted) / self.velocity_rad_s)))
         fall_1_s = (singular_value - after) / PEEK_RAD * fastest * share
-        allowed = settings.singularity_1_s * max(singular_value - settings.singularity_stop, 0.0)
+        allowed = SINGULARITY_1_S * max(singular_value - self._singularity_stop, 0.0)
         return share * allowed / fall_1_s if fall_1_s > allowed else 1.0
 
     def _reachable(self, wanted: FloatArray, now: JointMotion, dt_s: float) -> FloatArray:
         """Velocity (n,) after one tick towards `wanted`, without overshoot later."""
-        velocity, before = now.velocity_rad_s, now.wanted_rad_s
-        most = self.acceleration_rad_s2
-        rate = (wanted - (velocity if before is None else before)) / dt_s
+        velocity, most = now.velocity_rad_s, self.acceleration_rad_s2
+        rate = (wanted - now.wanted_rad_s) / dt_s
         rate = np.minimum(np.maximum(rate, -most), most)
         left = wanted - velocity - rate * dt_s
         acceleration = rate + np.copysign(self._rampable(np.abs(left), dt_s), left)
@@ -367,9 +337,7 @@ class JointFollower:
         Within jerk and acceleration, and such that each joint can stay within its velocity and
         range. Where these conflict (a joint outside its range, or too fast) the former win.
         """
-        joints, velocity = now.position_rad, now.velocity_rad_s
-        before = now.acceleration_rad_s2
-        before = np.zeros(len(joints)) if before is None else before
+        joints, velocity, before, _ = now
         tick, most = self.jerk_rad_s3 * dt_s, self.acceleration_rad_s2
         least = np.maximum(np.minimum(before - tick, most), -most)
         greatest = np.minimum(np.maximum(before + tick, -most), most)
@@ -406,16 +374,9 @@ def _towards_end(
     jerk: float,
     dt_s: float,
 ) -> float:
-    """Greatest acceleration after which a motion can still stop within `left`, by bisection.
+    """Greatest acceleration after which a motion towards an end can still stop within `left`.
 
-    Args:
-        left: distance to the end.
-        velocity: towards the end.
-        least: least acceleration.
-        greatest: greatest acceleration.
-        most: acceleration for the stop.
-        jerk: for the stop.
-        dt_s: of the tick.
+    Between `least` and `greatest`; the stop has the acceleration `most` and the jerk `jerk`.
     """
 
     def fits(acceleration: float) -> bool:

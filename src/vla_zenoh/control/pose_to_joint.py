@@ -15,7 +15,12 @@ import numpy as np
 
 from vla_zenoh.control.axis_smoothing import Shares, between, stop_way
 from vla_zenoh.control.barriers import Barriers, DistanceConstraints
-from vla_zenoh.control.joint_follower import FollowSettings, JointFollower, JointMotion
+from vla_zenoh.control.joint_follower import (
+    POSTURE_1_S,
+    POSTURE_RAD_S,
+    JointFollower,
+    JointMotion,
+)
 from vla_zenoh.control.joint_space import followed_shares
 from vla_zenoh.control.limits import into_workspace, joint_margins, joint_motion_limits
 from vla_zenoh.control.smoothing import Motion, Smoother
@@ -28,6 +33,8 @@ from vla_zenoh.types import Cause, FloatArray, JointCommand, computed
 REST_RAD_S = 1e-5
 PULL_1_S = 25.0
 """Rate at which the pull to the posture rises and falls, as a critically damped spring."""
+LONGEST_RAD = POSTURE_RAD_S / POSTURE_1_S
+"""A posture further away pulls no faster."""
 PULL_JERK = 1.4
 """Greatest jerk of that when it reverses, in speeds times `PULL_1_S` squared."""
 NEAR_M, NEAR_RAD = 0.002, 0.01
@@ -81,19 +88,20 @@ class PoseToJoint:
         share = float(np.min(velocity / kinematics.velocity_rad_s))
         home_rad = kinematics.ordered(robot.arm_joints, robot.home_rad)
         self._home_rad = home_rad if robot.posture == "home" else None
-        settings = FollowSettings(
-            acceleration_rad_s2=tuple(acceleration.tolist()),
-            jerk_rad_s3=tuple(jerk.tolist()),
-            velocity_share=min(share, 1.0),
-            joint_margin_rad=tuple(joint_margins(limits.reach, kinematics).tolist()),
-            singularity_stop=limits.reach.singularity_stop,
-        )
         self._bounds = limits
         self._constraints = DistanceConstraints(limits, barriers)
-        self._follower = JointFollower(kinematics, home_rad, settings, self._constraints)
-        most = float(jerk.min()) / PULL_JERK / settings.posture_rad_s
+        self._follower = JointFollower(
+            kinematics,
+            home_rad,
+            self._constraints,
+            acceleration_rad_s2=acceleration,
+            jerk_rad_s3=jerk,
+            velocity_share=min(share, 1.0),
+            margin_rad=joint_margins(limits.reach, kinematics),
+            singularity_stop=limits.reach.singularity_stop,
+        )
+        most = float(jerk.min()) / PULL_JERK / POSTURE_RAD_S
         self._pull_1_s = min(PULL_1_S, most**0.5)
-        self._longest_rad = settings.posture_rad_s / settings.posture_1_s
         self._dt_s = 1.0 / profile.timing.command_hz
         self._names = kinematics.arm_joints
         self._held: set[str] = set()
@@ -101,8 +109,7 @@ class PoseToJoint:
 
     def restart(self, joints_rad: FloatArray) -> None:
         """Stand at these joints (n,) in chain order; only while nothing is streamed."""
-        still = np.zeros(len(joints_rad))
-        self._now = JointMotion(np.array(joints_rad, dtype=np.float64), still)
+        self._now = JointMotion.standing(joints_rad)
         self._pull = self._pull_rate_1_s = 0.0
         self._stopping, self._ticks = False, 0
         self.keep_elbow()
@@ -171,8 +178,8 @@ class PoseToJoint:
             at_rest = at_rest + _joint_way(jacobian, pose_error(rest, here))
         if self._lag(self._kinematics.forward(joints), smoother.motion.pose) < LAGS:
             return between(joints, at_rest)
-        box = np.array(self.limits)
-        lagging = joints + stop_way(velocity, self._acceleration, box, ahead_s)
+        acceleration, box = self._now.acceleration_rad_s2, np.array(self.limits)
+        lagging = joints + stop_way(velocity, acceleration, box, ahead_s)
         return [*between(joints, at_rest), *between(joints, lagging)]
 
     def tick(self, smoother: Smoother, *, braking: bool = False, elbow: bool = True) -> None:
@@ -231,11 +238,11 @@ class PoseToJoint:
     def _stop(self, smoother: Smoother) -> None:
         """Stop the joints within their limits; the pose follows them."""
         self._now = self._follower.brake(self._now, self._dt_s)
-        position, velocity = self._now[:2]
+        position, velocity, acceleration, _ = self._now
         self._pull = self._pull_rate_1_s = 0.0
         pose, jacobian = self._kinematics.pose_and_jacobian(position)
         # A motion planned from here must start within its limits.
-        change = np.clip(jacobian @ self._acceleration, -smoother.box[1], smoother.box[1])
+        change = np.clip(jacobian @ acceleration, -smoother.box[1], smoother.box[1])
         smoother.brake_from(Motion(pose, jacobian @ velocity, change))
 
     def _pulled_to(self, share: float) -> FloatArray:
@@ -244,7 +251,7 @@ class PoseToJoint:
         self._pull_rate_1_s += (w * w * (share - self._pull) - 2 * w * self._pull_rate_1_s) * dt_s
         self._pull += self._pull_rate_1_s * dt_s
         way_rad = self._posture_rad - self._now.position_rad
-        shortened = min(1.0, self._longest_rad / max(float(np.abs(way_rad).max()), 1e-9))
+        shortened = min(1.0, LONGEST_RAD / max(float(np.abs(way_rad).max()), 1e-9))
         return self._now.position_rad + self._pull * shortened * way_rad
 
     @property
@@ -259,13 +266,7 @@ class PoseToJoint:
 
     def command(self, state: str, cause: Cause | None) -> JointCommand:
         """The joint command of this tick."""
-        motion = self._now
-        return computed(JointCommand, self._names, *motion[:2], self._acceleration, state, cause)
-
-    @property
-    def _acceleration(self) -> FloatArray:
-        known = self._now.acceleration_rad_s2
-        return np.zeros(len(self._now.position_rad)) if known is None else known
+        return computed(JointCommand, self._names, *self._now[:3], state, cause)
 
 
 def _joint_way(jacobian: FloatArray, way: FloatArray) -> FloatArray:

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from panda_arm import HOME_RAD, moved, panda, tool_down_at
 
-from vla_zenoh.control.joint_follower import FollowSettings, JointFollower, JointMotion
+from vla_zenoh.control.joint_follower import JointFollower, JointMotion
 from vla_zenoh.control.smoothing import MotionLimits, Smoother
 from vla_zenoh.errors import RecordError
 from vla_zenoh.kinematics.ik import InverseKinematics, pose_error
@@ -144,7 +144,7 @@ def follow(goals: list[Pose], ticks_per_goal: int, follower: JointFollower | Non
     dt_s = 1 / STREAM_HZ
     limits = MotionLimits((0.5, 2.0, 20.0), (1.5, 6.0, 60.0))
     smoother = Smoother(KINEMATICS.forward(HOME_RAD), dt_s, limits)
-    joints = JointMotion(HOME_RAD, np.zeros(7))
+    joints = JointMotion.standing(HOME_RAD)
     errors, positions, velocities, names = [], [HOME_RAD], [np.zeros(7)], set()
     for tick in range(len(goals) * ticks_per_goal + STREAM_HZ):
         if tick % ticks_per_goal == 0 and tick // ticks_per_goal < len(goals):
@@ -239,7 +239,7 @@ def test_joints_keep_their_limits_whatever_is_asked(deltas: list[tuple[float, ..
 def test_a_far_target_at_rest_is_reached_without_overshoot() -> None:
     follower = JointFollower(KINEMATICS, HOME_RAD)
     goal = KINEMATICS.forward(tool_down_at(KINEMATICS, 0.5, 0.2, 0.4))
-    joints = JointMotion(HOME_RAD, np.zeros(7))
+    joints = JointMotion.standing(HOME_RAD)
     left = []
     for _ in range(2 * STREAM_HZ):
         joints, _ = follower.step(joints, goal, np.zeros(6), 1 / STREAM_HZ)
@@ -250,7 +250,7 @@ def test_a_far_target_at_rest_is_reached_without_overshoot() -> None:
 
 
 def test_a_share_of_the_velocity_limits_is_kept() -> None:
-    follower = JointFollower(KINEMATICS, HOME_RAD, FollowSettings(velocity_share=0.1))
+    follower = JointFollower(KINEMATICS, HOME_RAD, velocity_share=0.1)
     run = follow([moved(KINEMATICS.forward(HOME_RAD), [0, 0, 0.4], [0, 0, 0])], 500, follower)
     assert np.abs(run.velocity_rad_s).max() <= 0.261 * OVER_LIMIT
     assert "joint_velocity" in run.hits
@@ -258,7 +258,8 @@ def test_a_share_of_the_velocity_limits_is_kept() -> None:
 
 def test_a_brake_stops_the_joints_within_their_acceleration() -> None:
     follower = JointFollower(KINEMATICS, HOME_RAD)
-    joints = JointMotion(HOME_RAD, np.array([1.0, -0.5, 0.2, 0.0, 0.01, -1.0, 2.0]))
+    velocity = np.array([1.0, -0.5, 0.2, 0.0, 0.01, -1.0, 2.0])
+    joints = JointMotion(HOME_RAD, velocity, np.zeros(7), velocity)
     ticks = 0
     while np.abs(joints.velocity_rad_s).max() > 0:
         slower = follower.brake(joints, 1 / STREAM_HZ)
@@ -266,16 +267,3 @@ def test_a_brake_stops_the_joints_within_their_acceleration() -> None:
         assert (change <= follower.acceleration_rad_s2 * OVER_LIMIT).all()
         joints, ticks = slower, ticks + 1
     assert ticks == 50  # 2 rad/s at 10 rad/s^2
-
-
-@pytest.mark.parametrize(
-    ("settings_given", "message"),
-    [
-        (FollowSettings(acceleration_rad_s2=(1.0, 2.0)), "acceleration_rad_s2 must be 7"),
-        (FollowSettings(acceleration_rad_s2=0.0), "must be positive"),
-        (FollowSettings(velocity_share=1.5), "velocity_share"),
-    ],
-)
-def test_settings_that_do_not_fit_are_refused(settings_given: FollowSettings, message: str) -> None:
-    with pytest.raises(RecordError, match=message):
-        JointFollower(KINEMATICS, HOME_RAD, settings_given)
