@@ -74,11 +74,7 @@ BEHIND_S = 0.3
 class ChunkOutcome(NamedTuple):
     """The end of a chunk's path: it is rejected, or its plan has come into force.
 
-    Args:
-        chunk: as received.
-        rejection: why it is not executed.
-        plan: in force, unless it is rejected.
-        hits: limits that acted on the steps bounded so far.
+    With the limits that acted on the steps bounded so far.
     """
 
     chunk: Stamped[ActionChunk]
@@ -88,11 +84,9 @@ class ChunkOutcome(NamedTuple):
 
 
 class ChunkPlanner:
-    """Turns action chunks into bounded plans on a timeline, within a budget per tick.
+    """Turns action chunks for a part into bounded plans on a timeline, within a budget per tick.
 
-    Args:
-        profile: limits, and what happens to a step beyond them; of a part of a robot of several.
-        reach: bounds steps by the arm's kinematics; None: only step limits and workspace do.
+    Without `reach`, the arm's kinematics, only step limits and workspace bound a step.
     """
 
     def __init__(self, profile: Profile, reach: ReachabilityFilter | None) -> None:
@@ -143,10 +137,9 @@ class ChunkPlanner:
         task: Task,
         now_ns: int,
     ) -> ChunkOutcome | None:
-        """Validate a chunk and queue it if its worker has the lease; see `validate_chunk`.
+        """Validate a chunk and queue it if its worker has the lease, see `validate_chunk`.
 
-        Returns:
-            a chunk that was rejected: this one, or the oldest of a full queue.
+        Returns the chunk that was rejected: this one, or the oldest of a full queue.
         """
         rejection = validate_chunk(
             chunk, owner, lease, task, self._timing.max_observation_age_s, now_ns
@@ -183,9 +176,6 @@ class ChunkPlanner:
                 do observations of it: the chunks of a burst after a pause replace each other.
             now_ns: wall time.
             beside: planners and timelines of the other parts.
-
-        Returns:
-            chunks rejected, and chunks whose plan came into force, in the order of events.
         """
         outcomes: list[ChunkOutcome] = []
         parts = [(self, timeline), *beside]
@@ -238,8 +228,9 @@ class ChunkPlanner:
         observed_ns = record.observation_stamp_ns
         previous = timeline.in_force(observed_ns)
         base = previous.goal_at(observed_ns)
+        bounds = self._joint_bounds(action)
         if action.anchor == "measured":
-            measured = self._measured(action, observed_ns, base.width_m)
+            measured = self._measured(bounds, observed_ns, base.width_m)
             if measured is None:
                 why = (
                     f"the arm was not measured within {self._gap_ns / 1e9:g} s before its "
@@ -248,13 +239,12 @@ class ChunkPlanner:
                 return Rejection("not_measured", why)
             base = measured
         steps = np.asarray(record.steps[:count, columns], np.float64)
-        bounds = self.joint_bounds
-        if action.space == "joint" and bounds is not None:
+        if bounds is not None:
             if base.arm is None:  # once: the elbow of a pose depends on the moment
                 base = joint_goal(bounds.kinematics, self._joints_at(base), base.width_m)
             steps = bounds.in_chain_order(action, steps)
         rejection = validate_steps(action, steps, base, self._limits, self._max_width_m)
-        if rejection is None and bounds is not None and action.space == "joint" and action.targets:
+        if rejection is None and bounds is not None and action.targets:
             rejection = bounds.far_out_of_range(action, steps, self._joints_at(base))
         if rejection is not None:
             return rejection
@@ -292,10 +282,10 @@ class ChunkPlanner:
                 )
         return plan
 
-    def _measured(self, action: ActionSpec, t_ns: int, width_m: float) -> Goal | None:
-        """Where the arm was measured at `t_ns`, in the space of the actions; None: it was not."""
-        if action.space == "joint" and self._reach is not None:
-            states, arm = self.joints.around(t_ns, self._gap_ns), self._reach.kinematics
+    def _measured(self, bounds: JointBounds | None, t_ns: int, width_m: float) -> Goal | None:
+        """Where the arm was measured at `t_ns`, its joints if these have bounds; None: nowhere."""
+        if bounds is not None:
+            states, arm = self.joints.around(t_ns, self._gap_ns), bounds.kinematics
             if states is None:
                 return None
             try:
@@ -306,16 +296,16 @@ class ChunkPlanner:
         found = self.poses.around(t_ns, self._gap_ns)
         if found is None:
             return None
-        pose, after, share = pose_of(found[0]), found[1], found[2]
+        before, after, share = found
+        pose = pose_of(before)
         return Goal(interpolate(pose, pose_of(after), share) if share else pose, width_m)
 
     # -- bound --------------------------------------------------------------------------------
     def bound(self, plan: ChunkPlan, now_ns: int) -> Rejection | bool:
         """Bound the steps of `plan` up to the one that is due, as far as the budget goes.
 
-        Returns:
-            whether it may come into force. Where the profile rejects steps that are out of bounds,
-            all of them are bounded first.
+        Returns whether it may come into force. Where the profile rejects steps that are out of
+        bounds, all of them are bounded first.
         """
         until = len(plan.goals) if self._rejecting else plan.due_index(now_ns) + 1
         while plan.bounded < until:
@@ -357,27 +347,25 @@ class ChunkPlanner:
                 return None
             try:
                 next(step.search)
-            except StopIteration as end:
-                found = end.value
+            except StopIteration as last:
+                found = last.value
             self._left -= self._reach.cost
             plan.evaluations += self._reach.cost
-        index, pose, hits, slower, joints_rad = plan.bounded, step.target, step.hits, None, None
+        index, end, hits = plan.bounded, step.end, step.hits
+        pose, joints_rad, slower, state = end.pose, end.joints_rad, end.slowdown, end.response
         plan.computed = max(plan.computed, index + 1)
         if found is not None:
-            pose, joints_rad, slower = found.pose, found.joints_rad, found.slowdown
+            pose, joints_rad, slower = found.pose, found.joints_rad, slowest(found.slowdown, slower)
             if found.hits:
-                cut = sum(pose_distance(pose, step.target))
+                cut = sum(pose_distance(pose, end.pose))
                 # The limit that cuts most comes first.
                 hits = [*found.hits, *hits] if cut > step.cut else [*hits, *found.hits]
                 plan.computed = index + 1
-        slower = slowest(slower, step.slowdown)
         most_s = self._limits.lead_m / self._limits.translation.velocity_m_s
         slower = keep_slowdown(step.start.slowdown, slower, plan.dt_ns / 1e9, most_s)
-        state = step.response
         if state is not None and hits and step.shifted is None:
             state = state.stopped(step.asked, pose)
-        arm = self._reach.kinematics if self._reach and plan.action.space == "joint" else None
-        plan.goals[index] = Goal(pose, step.width_m, joints_rad, slower, state, arm)
+        plan.goals[index] = Goal(pose, end.width_m, joints_rad, slower, state, end.arm)
         plan.bounded, plan.current = index + 1, None
         plan.add_hits(hits)
         return hits
@@ -385,33 +373,31 @@ class ChunkPlanner:
     def _begin_step(self, plan: ChunkPlan) -> StepBounding:
         """The next step of `plan` within the limits of a step, and the search for its end."""
         start, shifted = plan.step_start, plan.shifted_goal
-        bounds = self.joint_bounds if plan.action.space == "joint" else None
+        bounds = self._joint_bounds(plan.action)
         if shifted is not None:
-            step = StepBounding(start, shifted, shifted.pose, shifted.pose, shifted.joints_rad)
-            step.width_m, step.slowdown = shifted.width_m, shifted.slowdown
-            step.response = shifted.response
+            step = StepBounding(start, shifted, shifted.pose, shifted)
         else:
             numbers = plan.steps[plan.bounded]
-            if bounds is None:
-                step = self._pose_step(plan, numbers)
-            else:
-                step = self._joint_step(plan, numbers, bounds)
             width_m = step_width(plan.action, numbers, start.width_m, self._max_width_m)
-            step.width_m = start.width_m if width_m is None else width_m
+            width_m = start.width_m if width_m is None else width_m
+            if bounds is None:
+                step = self._pose_step(plan, numbers, width_m)
+            else:
+                step = self._joint_step(plan, numbers, width_m, bounds)
         if self._reach is None:
             return step
-        if bounds is not None and step.target_rad is not None:
+        end = step.end
+        if bounds is not None and end.joints_rad is not None:
             self._reach.cost = 1
-            step.search = bounds.bound_in_pieces(self._joints_at(start), step.target_rad)
+            step.search = bounds.bound_in_pieces(self._joints_at(start), end.joints_rad)
         else:
-            dt_s = plan.dt_ns / 1e9
             step.search = self._reach.bound_in_pieces(
-                start.pose, step.target, dt_s, start.joints_rad
+                start.pose, end.pose, plan.dt_ns / 1e9, start.joints_rad
             )
         next(step.search)  # up to its first evaluation
         return step
 
-    def _pose_step(self, plan: ChunkPlan, numbers: FloatArray) -> StepBounding:
+    def _pose_step(self, plan: ChunkPlan, numbers: FloatArray, width_m: float) -> StepBounding:
         start, limits = plan.step_start, self._limits
         asked, response = covered_step(
             plan.action, numbers, start.pose, plan.base.pose, start.response
@@ -423,10 +409,11 @@ class ChunkPlanner:
             asked = interpolate(start.pose, asked, part) if slower else asked
         pose, hits = bound_step(limits, start.pose, asked)
         cut = sum(pose_distance(pose, asked)) if hits else 0.0
-        return StepBounding(start, None, asked, pose, None, hits, cut, slower, response)
+        end = Goal(pose, width_m, slowdown=slower, response=response)
+        return StepBounding(start, None, asked, end, hits, cut)
 
     def _joint_step(
-        self, plan: ChunkPlan, numbers: FloatArray, bounds: JointBounds
+        self, plan: ChunkPlan, numbers: FloatArray, width_m: float, bounds: JointBounds
     ) -> StepBounding:
         start, limits = plan.step_start, self._limits
         start_rad = self._joints_at(start)
@@ -446,8 +433,12 @@ class ChunkPlanner:
                     part = min(part, most / far)
         if part < 1.0:
             asked_rad = start_rad + part * way_rad
-        asked = bounds.kinematics.forward(asked_rad)
-        return StepBounding(start, None, asked, asked, asked_rad, hits, slowdown=slower)
+        end = joint_goal(bounds.kinematics, asked_rad, width_m, slower)
+        return StepBounding(start, None, end.pose, end, hits)
+
+    def _joint_bounds(self, action: ActionSpec) -> JointBounds | None:
+        """None: the actions are poses."""
+        return self.joint_bounds if action.space == "joint" else None
 
     def _joints_at(self, goal: Goal) -> FloatArray:
         """(n,) joints of the goal, or those of its pose with the arm's present elbow."""

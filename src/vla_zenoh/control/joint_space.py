@@ -65,13 +65,7 @@ PEEK_RAD = 1e-4
 
 
 class JointBounds:
-    """Bounds of steps and motions of the joints. Independent of time.
-
-    Args:
-        profile: workspace box, limits of the joints and margin of their ranges.
-        kinematics: of the arm.
-        barriers: its distances to itself and the table.
-    """
+    """Bounds of steps and motions of the joints. Independent of time."""
 
     def __init__(self, profile: Profile, kinematics: Kinematics, barriers: Barriers) -> None:
         self.limits, self.kinematics, self.barriers = profile.limits, kinematics, barriers
@@ -131,11 +125,10 @@ class JointBounds:
 
         Yields before every evaluation of the distances.
         """
-        barriers = self.barriers
         target_rad, hits = self.into_ranges(start_rad, asked_rad)
         yield
         before = self._barriers_at(start_rad)
-        floor = barriers.floor(before)
+        floor = self.barriers.floor(before)
         yield
         after, found = self._try(start_rad, target_rad, floor)
         if found is not None:
@@ -151,7 +144,7 @@ class JointBounds:
                     high, found = middle, hit
             hits = [found, *hits]
             target_rad = start_rad + low * (whole - start_rad)
-        slower = barriers.slowdown(before, after)
+        slower = self.barriers.slowdown(before, after)
         return BoundedStep(self.kinematics.forward(target_rad), hits, target_rad, slower)
 
     def _barriers_at(self, joints_rad: FloatArray) -> FloatArray:
@@ -231,19 +224,15 @@ class JointBounds:
 
 
 class JointPath(AxisSmoother):
-    """Smooth motion of the joints themselves, with the motion of their TCP.
-
-    Args:
-        profile: limits, rate.
-        bounds: of the arm.
-    """
+    """Smooth motion of the joints themselves, with the motion of their TCP."""
 
     def __init__(self, profile: Profile, bounds: JointBounds) -> None:
         self.kinematics, self._bounds = bounds.kinematics, bounds
         self._names = bounds.kinematics.arm_joints
         tcp = motion_limits(profile.limits)
-        box = [[move] * 3 + [turn * ROTATION_BOX] * 3 for move, turn in zip(*tcp, strict=True)]
-        self._tcp_box = np.array(box)
+        self._tcp_box = np.array(
+            [[move] * 3 + [turn * ROTATION_BOX] * 3 for move, turn in zip(*tcp, strict=True)]
+        )
         self._ticks = 0
         self._hits: list[LimitHit] = []
         self._asked: tuple[Goal, Shares, bool]
@@ -306,12 +295,12 @@ class JointPath(AxisSmoother):
         hit = self._bounds.ahead_hit(here_rad, end_rad)
         if hit is not None:
             self._hits.append(hit)
-            low, high = 0.0, 1.0
+            way_rad, low, high = end_rad - here_rad, 0.0, 1.0
             for _ in range(HALVINGS):
                 middle = 0.5 * (low + high)
-                found = self._bounds.ahead_hit(here_rad, here_rad + middle * (end_rad - here_rad))
+                found = self._bounds.ahead_hit(here_rad, here_rad + middle * way_rad)
                 low, high = (low, middle) if found else (middle, high)
-            end_rad = here_rad + low * (end_rad - here_rad)
+            end_rad = here_rad + low * way_rad
         return self.move_to(end_rad, shares, all_to_stop=all_to_stop)
 
     def tick(self, pace: float = 1.0) -> Motion:
@@ -320,8 +309,9 @@ class JointPath(AxisSmoother):
         if self._held and self.at_rest:
             self._go_on()
         if self._ticks % CHECK_TICKS == 0 and not self.braking and not self.at_rest:
-            stop_rad = self.state.position + self.stop_way(CHECK_TICKS * self._dt_s)
-            self._brake_at(self._bounds.distance_hit(self.state.position, stop_rad))
+            here_rad = self.state.position
+            stop_rad = here_rad + stop_way(*self.state[1:], self.box, CHECK_TICKS * self._dt_s)
+            self._brake_at(self._bounds.distance_hit(here_rad, stop_rad))
         before = self.state
         moves = self.advance(pace)
         if moves and not self.braking and not self._stops_inside(pace):
@@ -377,13 +367,9 @@ class JointPath(AxisSmoother):
         low, high = workspace_corners(self._bounds.limits)
         place = self.motion.pose.position_m
         room_m = float(np.minimum(place - low, high - place).min())
-        way = np.abs(self.stop_way(pace * self._dt_s))
+        way = np.abs(stop_way(*self.state[1:], self.box, pace * self._dt_s))
         # The TCP is further from an axis by at most its own way.
         return float(way @ self._levers) * math.exp(float(way.sum())) < room_m
-
-    def stop_way(self, ahead_s: float) -> FloatArray:
-        """How far (n,) a stop that begins in `ahead_s` goes at most."""
-        return stop_way(*self.state[1:], self.box, ahead_s)
 
     def stopping_rad(self, ahead_s: float) -> list[FloatArray]:
         """(n,) each, joints on the way of a stop that begins in `ahead_s`, and at its end."""
@@ -453,14 +439,9 @@ def followed_shares(
 ) -> Shares:
     """Shares of the limits of a straight motion that another space can follow.
 
-    Args:
-        ways: (n,) of the axes.
-        box: (3, n) limits of their velocity, acceleration and jerk.
-        speed: norm of their present velocity.
-        other_ways: (m,) of the other space, for the whole motion in one unit of time.
-        bends: (m,) change of them along it.
-        limits: (3, m) of the other space.
-        bend: part of its acceleration that the curvature may take.
+    The motion goes by `ways` (n,) within `box` (3, n), and has the `speed` now. In the other space
+    it goes by `other_ways` (m,) in one unit of time, changing by `bends` (m,); that has the
+    `limits` (3, m), and the curvature may take the part `bend` of its acceleration.
     """
     length = float(np.linalg.norm(ways))
     if length < NOTHING:

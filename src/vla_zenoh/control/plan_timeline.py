@@ -309,26 +309,18 @@ class StepBounding:
         start: the goal it starts from.
         shifted: its end, where that was computed before.
         asked: its end as the numbers say.
-        target: its end within the limits of a step.
-        target_rad: (n,) the same of a step in joint space.
+        end: its end within the limits of a step.
         hits: limits that acted so far.
         cut: m and rad that they cut off.
-        slowdown: of an approach.
-        response: at `target`, of a controller that covers only a part of the step.
-        width_m: of the gripper.
         search: bounds it by the arm's kinematics, in pieces; None: there are no kinematics.
     """
 
     start: Goal
     shifted: Goal | None
     asked: Pose
-    target: Pose
-    target_rad: FloatArray | None
+    end: Goal
     hits: list[LimitHit] = field(default_factory=list)
     cut: float = 0.0
-    slowdown: Slowdown | None = None
-    response: Response | None = None
-    width_m: float = 0.0
     search: Generator[None, None, BoundedStep] | None = None
 
 

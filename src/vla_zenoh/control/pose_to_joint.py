@@ -72,10 +72,7 @@ ELBOW_S = 0.1
 class PoseToJoint:
     """Joints that follow the pose stream by differential inverse kinematics.
 
-    Args:
-        profile: joint limits, home as posture, rate.
-        kinematics: of the arm.
-        barriers: of the arm; None: only its TCP's box bounds the joints.
+    Without `barriers` only the box of the TCP bounds the joints.
     """
 
     def __init__(
