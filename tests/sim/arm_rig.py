@@ -92,6 +92,7 @@ def begin(
     *,
     others: dict[str, Asked] | None = None,
     bounded: bool = False,
+    clear: bool = False,
 ) -> Lockstep:
     """An active loop at home; the arm begins to move as `prompt` says.
 
@@ -102,9 +103,12 @@ def begin(
         rate_hz: of the chunks.
         others: more workers.
         bounded: by the arm's kinematics; where only steps and faults matter it just takes time.
+        clear: the box is out of reach.
     """
     world = _world()
     world.reset()
+    if clear:
+        world.place("box", (0.5, 1.5, 0.0))
     reach = _shadow() if bounded else None
     loop = Lockstep(shipped(), world, Asked(), reach=reach, others=others)
     loop.put("rate", rate_hz)

@@ -92,7 +92,7 @@ def taken_over(
     rng = random.Random(seed)
     now: list[Lockstep] = []
     person = make(rng, lambda: now[0].now_ns / 1e9 if now else 0.0)
-    loop = begin("0 0 0.012", others={"teleop": person.policy()}, bounded=bounded)
+    loop = begin("0 0 0.012", others={"teleop": person.policy()}, bounded=bounded, clear=True)
     now.append(loop)
     wire: list[Message] = []
     loop.tamper = partial(_noted, wire)

@@ -79,6 +79,8 @@ MAX_PICTURE_HZ, IN_FLIGHT, PICTURE_POLL_S = 30.0, 2, 0.01
 """Pictures sent that a page has not drawn yet: with more, a slow one would see the past."""
 POLICY_VIOLATION, TRY_LATER = 1008, 1013
 VIEWERS_TOO = ("runs", "make")
+PICTURES = ("look", "drawn")
+"""Requests of the socket for images."""
 OPERATORS_ONLY = "your token is a viewer's, which may look and nothing else"
 Masked = Callable[[dict[str, Any]], dict[str, Any] | None]
 
@@ -322,6 +324,10 @@ class PageServer:
     async def _read(self, page: Page, text: str) -> None:
         try:
             request = parse(text)
+            if request.do in PICTURES:
+                raise CodecError("malformed", f"{request.do} is no request of this socket")
+            if request.values.get("tick", 0) > time.monotonic() * 1e3:
+                raise CodecError("range", f"{request.do}: tick is newer than the last one sent")
         except CodecError as error:
             self._complain(page, "bad_message", str(error))
             return
@@ -367,10 +373,8 @@ class PageServer:
             self._begin(self._tell_runs(page))
         elif request.do == "make":
             self._begin(self._make(page, values["name"], values["kind"]))
-        elif request.do in SETTINGS:
-            self._change(page, request.do, lambda: SETTINGS[request.do](link, values))
         else:
-            self._complain(page, "bad_message", f"{request.do} is no request of this socket")
+            self._change(page, request.do, lambda: SETTINGS[request.do](link, values))
 
     def _press(self, page: Page, request: PageRequest, call: Callable[[], Any]) -> None:
         """Begin a hold, and `call` with it."""
