@@ -23,7 +23,7 @@ from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import SessionError
 from vla_zenoh.profile import load_profile
 from vla_zenoh.runtime.process import PARENT_VARIABLE
-from vla_zenoh.runtime.supervisor import GIVE_UP_AFTER, NodeCommand, Supervisor
+from vla_zenoh.runtime.supervisor import GIVE_UP_AFTER, NodeCommand, Supervisor, signal_group
 
 END_S = 3.0
 BUSY_S = 1.0
@@ -384,11 +384,11 @@ def test_when_nothing_else_is_left_or_can_be_spared_it_is_given_up(kind: str) ->
 def test_a_node_that_runs_is_down_until_it_was_alive_and_not_when_it_hangs_later() -> None:
     supervisor, _ = begin(NodeCommand("sim", "sim", ("node", "sim")))
     try:
-        assert [node.name for node in supervisor.down(())] == ["sim"]
+        assert [node.command.name for node in supervisor.down(())] == ["sim"]
         assert supervisor.down({"sim"}) == []
         assert supervisor.down(()) == []
 
-        supervisor.terminate("sim", "hangs")
+        signal_group(supervisor.pids()["sim"], signal.SIGKILL)
         until("its end is seen", lambda: supervisor.poll() and supervisor.down(()) != [])
     finally:
         supervisor.kill()

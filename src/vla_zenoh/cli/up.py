@@ -100,13 +100,11 @@ def up(
         return
     hosts = [] if host is None else ["--host", host]
     with profile_check([profile, *hosts, *endpoints]) as check:
-        from vla_zenoh.runtime.launch import Host, HostLock, choose_host  # meanwhile
+        from vla_zenoh.runtime.launch import Host, choose_host, lock_host  # meanwhile
 
         loaded = effective_profile(profile, connect, listen)
         name, _ = choose_host(loaded, host)
-        once = HostLock(loaded, name)
-        once.take()  # reports at once a host that already runs; the host takes it again
-        once.release()
+        lock_host(loaded, name).close()  # says at once that it runs already; `Host` takes it again
         reject_wrong(profile, check)
     logs = log_dir or default_log_folder()
     file, logger = log_file(logs, f"{loaded.robot.name}-{name}")

@@ -18,17 +18,14 @@ TELL_PERIOD_S = 24 * 3600.0
 
 
 class ExpiryOutlook(NamedTuple):
-    """Result of checking the certificates.
-
-    Args:
-        days: until the first expires, negative if it has; None: unknown.
-        wrong: files that are invalid, or soon will be, and why.
-        unknown: why they could not be checked; empty: they were.
-    """
+    """Result of checking the certificates."""
 
     days: int | None = None
+    """Until the first expires, negative if it has; None: unknown."""
     wrong: tuple[str, ...] = ()
+    """Files that are invalid, or soon will be, and why."""
     unknown: str = ""
+    """Why they could not be checked; empty: they were."""
 
 
 def outlook(security: SecurityProfile, now: dt.datetime) -> ExpiryOutlook:
@@ -45,8 +42,7 @@ def outlook(security: SecurityProfile, now: dt.datetime) -> ExpiryOutlook:
     wrong = tuple(
         f"{entry.path.name} {what}"
         for entry in entries
-        for what in (*entry.faults, entry.warning)
-        if what
+        for what in filter(None, (*entry.faults, entry.warning))
     )
     days = [entry.certificate.days_left(now) for entry in entries if entry.certificate]
     return ExpiryOutlook(min(days, default=None), wrong)
@@ -55,10 +51,7 @@ def outlook(security: SecurityProfile, now: dt.datetime) -> ExpiryOutlook:
 class CertificateExpiry:
     """Checks certificates once an hour; faults are reported when they are new, and once a day.
 
-    Args:
-        security: of the profile; None: there are no certificates.
-        clock: seconds that never go back.
-        now: UTC.
+    Without `security` there are none. `now` is UTC.
     """
 
     def __init__(
@@ -82,10 +75,9 @@ class CertificateExpiry:
     def due(self) -> tuple[str, ...]:
         """Sentences to report now."""
         found = self.outlook
-        new = (found.wrong, found.unknown) != (self._told.wrong, self._told.unknown)
-        again = bool(found.wrong) and self._clock() - self._told_s >= TELL_PERIOD_S
-        if not (new or again):
+        new = found[1:] != self._told[1:]  # the days are no news
+        if not new and (not found.wrong or self._clock() - self._told_s < TELL_PERIOD_S):
             return ()
         self._told, self._told_s = found, self._clock()
-        wrong = [f"certificate {what}" for what in found.wrong]
-        return (*wrong, *([found.unknown] if found.unknown and new else []))
+        unknown = (found.unknown,) if found.unknown and new else ()
+        return (*(f"certificate {what}" for what in found.wrong), *unknown)

@@ -11,6 +11,7 @@ import secrets
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 
 import zenoh
 
@@ -21,7 +22,7 @@ from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import VlaZenohError
 from vla_zenoh.keys import CRASHED, ON_BEHALF, STARTING, Kind
 from vla_zenoh.profile import Profile
-from vla_zenoh.runtime.supervisor import DownNode
+from vla_zenoh.runtime.supervisor import Child
 from vla_zenoh.types import Event, NodeStatus
 
 PERIOD_S = 0.5
@@ -43,7 +44,7 @@ class DownNodes:
         profile: Profile,
         session: zenoh.Session,
         host: str,
-        down: Callable[[], Sequence[DownNode]],
+        down: Callable[[], Sequence[Child]],
     ) -> None:
         self._profile, self._session, self._down = profile, session, down
         self._host_id = own_host_id(profile.session, host)
@@ -59,22 +60,19 @@ class DownNodes:
 
     def _run(self) -> None:
         while not self._ended.wait(PERIOD_S):
-            try:
+            # If the router is down, so is every subscriber.
+            with suppress(VlaZenohError, zenoh.ZError):
                 self._publish(self._down())
-            except (VlaZenohError, zenoh.ZError):
-                continue  # the router is down, and every subscriber with it
-        self._forget(())
+        self._publish(())
 
-    def _publish(self, down: Sequence[DownNode]) -> None:
-        self._forget([node.name for node in down])
-        for node in down:
-            if node.name not in self._voices:
-                self._voices[node.name] = _Voice(self._profile, node.name, self._session)
-            self._voices[node.name].publish(node, self._host_id)
-
-    def _forget(self, names: Sequence[str]) -> None:
-        for name in [name for name in self._voices if name not in names]:
+    def _publish(self, down: Sequence[Child]) -> None:
+        for name in self._voices.keys() - {child.command.name for child in down}:
             self._voices.pop(name).close()
+        for child in down:
+            name = child.command.name
+            if name not in self._voices:
+                self._voices[name] = _Voice(self._profile, name, self._session)
+            self._voices[name].publish(child, self._host_id)
 
 
 class _Voice:
@@ -86,32 +84,31 @@ class _Voice:
             session = self._own = open_session(profile.session, identity=name)
         keys, clock = profile.keys, Clock()
         source = f"{ON_BEHALF}{name}#{secrets.token_hex(4)}"
-        self._since_wall_ns, self._crashes = time.time_ns(), 0
+        self._name, self._since_wall_ns, self._crashes = name, time.time_ns(), 0
         self._status = Publisher(session, keys.status(name), Kind.TELEMETRY, source, clock)
         self._event = Publisher(session, keys.event(name), Kind.TELEMETRY, source, clock)
 
-    def publish(self, node: DownNode, on: HostId) -> None:
-        state, why = _state(node)
-        if node.crashes > self._crashes:
+    def publish(self, child: Child, on: HostId) -> None:
+        crashes, state, why = child.deaths_in_a_row, STARTING, ""
+        if crashes:
+            state = CRASHED
+            times = "once" if crashes == 1 else f"{crashes} times"
+            then = (
+                "correct that and restart `up` there" if child.left_alone else "it is started again"
+            )
+            end = child.end.encode("utf-8", "replace").decode()[:MAX_WHY]
+            why = f"crashed {times}: {end}; {then}"
+        if crashes > self._crashes:
             self._event.publish(Event("error", "fault", CRASHED, why))
-        self._crashes = node.crashes
-        detail = {"complaint": why, "crashes": node.crashes, "given_up": node.left_alone}
-        since_ns = self._since_wall_ns
-        self._status.publish(
-            NodeStatus(node.name, state, on.host, node.pid, since_ns, detail=detail, boot=on.boot)
+        self._crashes = crashes
+        detail = {"complaint": why, "crashes": crashes, "given_up": child.left_alone}
+        status = NodeStatus(
+            self._name, state, on.host, child.pid, self._since_wall_ns, detail=detail, boot=on.boot
         )
+        self._status.publish(status)
 
     def close(self) -> None:
         self._status.undeclare()
         self._event.undeclare()
         if self._own is not None:
             self._own.close()
-
-
-def _state(node: DownNode) -> tuple[str, str]:
-    if not node.crashes:
-        return STARTING, ""
-    times = "once" if node.crashes == 1 else f"{node.crashes} times"
-    then = "correct that and restart `up` there" if node.left_alone else "it is started again"
-    why = node.why.encode("utf-8", "replace").decode()[:MAX_WHY]
-    return CRASHED, f"crashed {times}: {why}; {then}"

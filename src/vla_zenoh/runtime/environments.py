@@ -29,10 +29,8 @@ def run_in_own_environment(
     """Replace this process by one in the right environment; returns if this one is right.
 
     Args:
-        model: the file.
-        python: interpreter of a prepared environment, which must have this package.
-        extra: extra of this package that the command needs besides the model's own packages; a
-            prepared environment must have it.
+        python: interpreter of a prepared environment, which must have this package and `extra`.
+        extra: of this package, which the command needs besides the model's own packages.
 
     Raises:
         WorkerError: another environment is needed and cannot be made.
@@ -47,19 +45,19 @@ def run_in_own_environment(
         return
     if python is None and not missing:
         return
-    arguments = ["-m", program, *sys.argv[1:]]
-    environment = {**os.environ, INSIDE_VARIABLE: str(model.path)}
     if python is not None:
         _check_interpreter(python)
-        os.execvpe(python, [python, *arguments], environment)
-    command = environment_command(model, extra=extra)
-    # Not on stdout, where `vla-zenoh check --json` writes its result.
-    said = (
-        f"preparing an environment for {model.name}: {', '.join(model.dependencies)} "
-        "(the first time takes minutes, later ones seconds)"
-    )
-    print(said, file=sys.stderr, flush=True)
-    os.execve(command[0], [*command, "python", *arguments], environment)
+        command = [python]
+    else:
+        command = [*environment_command(model, extra=extra), "python"]
+        print(
+            f"preparing an environment for {model.name}: {', '.join(model.dependencies)} "
+            "(the first time takes minutes, later ones seconds)",
+            file=sys.stderr,  # on stdout `vla-zenoh check --json` writes its result
+            flush=True,
+        )
+    os.environ[INSIDE_VARIABLE] = str(model.path)
+    os.execvp(command[0], [*command, "-m", program, *sys.argv[1:]])
 
 
 def _check_interpreter(python: str) -> None:
@@ -82,19 +80,14 @@ def _check_interpreter(python: str) -> None:
 def environment_command(
     model: ModelFile, more: Sequence[str] = (), *, extra: str = ""
 ) -> list[str]:
-    """Command line that runs a command in the environment that the model's header asks for.
-
-    uv makes it the first time and keeps it.
-
-    Args:
-        model: the file.
-        more: further packages.
-        extra: extra of this package.
+    """Command line that runs a command in the environment that the model's header asks for, with
+    `more` packages and an `extra` of this one; uv makes it the first time and keeps it.
 
     Raises:
         WorkerError: there is no uv.
     """
-    uv = _uv()
+    beside = Path(sysconfig.get_path("scripts")) / "uv"
+    uv = str(beside) if beside.is_file() else shutil.which("uv")
     if uv is None:
         raise WorkerError(
             f"model {model.name!r} needs {', '.join(model.dependencies)}. Install uv (pip install "
@@ -108,18 +101,9 @@ def environment_command(
         command += ["--python", model.requires_python]
     for requirement in (*model.dependencies, *more):
         command += ["--with", requirement]
-    return [*command, *_this_package(extra)]
-
-
-def _uv() -> str | None:
-    beside = Path(sysconfig.get_path("scripts")) / "uv"
-    return str(beside) if beside.is_file() else shutil.which("uv")
-
-
-def _this_package(extra: str) -> list[str]:
-    """How uv gets the package that is running now: the checkout, else the same version."""
+    # The package that is running now: the checkout, else the same version.
     extras = f"[{extra}]" if extra else ""
     checkout = Path(__file__).resolve().parents[3]
     if (checkout / "pyproject.toml").is_file() and (checkout / "src" / "vla_zenoh").is_dir():
-        return ["--with-editable", f"{checkout}{extras}"]
-    return ["--with", f"vla-zenoh{extras}=={__version__}"]
+        return [*command, "--with-editable", f"{checkout}{extras}"]
+    return [*command, "--with", f"vla-zenoh{extras}=={__version__}"]

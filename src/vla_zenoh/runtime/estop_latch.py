@@ -11,11 +11,7 @@ FLUSH_S = 0.5
 
 
 class EstopLatch:
-    """Latch file, written by its own thread: a full or slow disk must not block the command loop.
-
-    Args:
-        path: the file.
-    """
+    """Latch file with a thread that writes: a full or slow disk must not block the command loop."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -55,18 +51,15 @@ class EstopLatch:
                 wanted.set()
                 return
             try:
-                self._write(wanted)
+                if wanted is None:
+                    self._path.unlink(missing_ok=True)
+                    continue
+                # The folder may have been removed in the days since it was made.
+                self._path.parent.mkdir(parents=True, exist_ok=True)
+                self._path.write_text(wanted, "utf-8", errors="replace")
             except OSError as error:
                 done = "removed" if wanted is None else "written"
                 self._failures.put(
                     f"{self._path} cannot be {done} ({error}): a restarted command node "
                     "will not know whether it is stopped"
                 )
-
-    def _write(self, why: str | None) -> None:
-        if why is None:
-            self._path.unlink(missing_ok=True)
-            return
-        # The folder may have been removed in the days since it was made.
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        self._path.write_text(why, "utf-8", errors="replace")

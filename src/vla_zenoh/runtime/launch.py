@@ -5,13 +5,14 @@ from __future__ import annotations
 import fcntl
 import json
 import os
+import signal
 import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import zenoh
 
@@ -23,9 +24,9 @@ from vla_zenoh.keys import NODE_KINDS, ROLLING, worker_node
 from vla_zenoh.profile import HostProfile, Profile, override, to_yaml
 from vla_zenoh.runtime.certificate_expiry import CertificateExpiry
 from vla_zenoh.runtime.down_nodes import DownNodes
-from vla_zenoh.runtime.process import ROUTER_PATIENCE_S
+from vla_zenoh.runtime.process import ROUTER_PATIENCE_S, RUN_FOLDER_VARIABLE
 from vla_zenoh.runtime.router import reject_taken
-from vla_zenoh.runtime.supervisor import DownNode, NodeCommand, Supervisor, hung_nodes
+from vla_zenoh.runtime.supervisor import Child, NodeCommand, Supervisor, hung_nodes, signal_group
 from vla_zenoh.security.identity import Role, operator_role
 
 EXPENDABLE = ("worker", "primitives", ROLLING)
@@ -53,63 +54,45 @@ def choose_host(profile: Profile, host: str | None) -> tuple[str, HostProfile]:
     return host, profile.hosts[host]
 
 
-class HostLock:
-    """Held by the only `vla-zenoh up` of a host and robot until `release`, or its process ends.
+def lock_host(profile: Profile, host: str) -> IO[str]:
+    """Lock of the only `vla-zenoh up` of a host and robot, until it is closed or its process ends.
 
-    Args:
-        profile: of the robot.
-        host: one of its hosts.
+    Raises:
+        NodeError: another process holds it; names it, and since when.
     """
-
-    def __init__(self, profile: Profile, host: str) -> None:
-        router = (profile.hosts[host].connect or profile.session.connect)[0]
-        name = "-".join((profile.root, profile.robot.name, host, router))
-        readable = "".join(c if c.isalnum() or c in "-._" else "_" for c in name)
-        self._path = _own_folder() / f"{readable[:200]}.lock"
-        self._what = f"host {host} of robot {profile.robot.name}"
-        self._file: int | None = None
-
-    def take(self) -> None:
-        """Hold the lock.
-
-        Raises:
-            NodeError: another process holds it; names it, and since when.
-        """
-        number = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o600)
-        try:
-            fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            holder = os.read(number, 4096)
-            os.close(number)
-            raise NodeError(f"{self._what} is already running{_described(holder)}") from None
-        os.ftruncate(number, 0)
-        os.write(number, json.dumps({"pid": os.getpid(), "since_s": time.time()}).encode())
-        self._file = number
-
-    def release(self) -> None:
-        """Release the lock, if it is held."""
-        if self._file is not None:
-            os.close(self._file)  # the file stays: removing it would let two hold it
-            self._file = None
+    # A folder that only this user can access and that is emptied at boot.
+    run = os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir()
+    folder = Path(run) / f"vla-zenoh-{os.getuid()}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    if folder.stat().st_uid != os.getuid():
+        raise NodeError(f"{folder} belongs to another user; set XDG_RUNTIME_DIR")
+    router = (profile.hosts[host].connect or profile.session.connect)[0]
+    name = "-".join((profile.root, profile.robot.name, host, router))
+    readable = "".join(c if c.isalnum() or c in "-._" else "_" for c in name)
+    # It is never removed: then two could hold it.
+    file = (folder / f"{readable[:200]}.lock").open("a+", encoding="utf-8", errors="replace")
+    file.seek(0)
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        holder = _described(file.read(4096))
+        file.close()
+        raise NodeError(
+            f"host {host} of robot {profile.robot.name} is already running{holder}"
+        ) from None
+    file.truncate()
+    file.write(json.dumps({"pid": os.getpid(), "since_s": time.time()}))
+    file.flush()
+    return file
 
 
-def _described(holder: bytes) -> str:
+def _described(holder: str) -> str:
     with suppress(ValueError, KeyError, TypeError):
         found = json.loads(holder)
         pid, since_s = int(found["pid"]), float(found["since_s"])
         since = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(since_s))
         return f": pid {pid}, since {since}. End it there with Ctrl-C, or `kill {pid}`"
     return ""
-
-
-def _own_folder() -> Path:
-    """A folder that only this user can access and that is emptied at boot."""
-    run = os.environ.get("XDG_RUNTIME_DIR")
-    folder = Path(run or tempfile.gettempdir()) / f"vla-zenoh-{os.getuid()}"
-    folder.mkdir(mode=0o700, exist_ok=True)
-    if folder.stat().st_uid != os.getuid():
-        raise NodeError(f"{folder} belongs to another user; set XDG_RUNTIME_DIR")
-    return folder
 
 
 def node_commands(
@@ -166,10 +149,8 @@ class Host:
     """All nodes of one host, up while the context lasts.
 
     Args:
-        profile: the effective profile.
-        host: its name; None if there is only one.
-        log: called with (node, line) for each line that a node writes.
-        tell: called with (node, sentence) for each event of a node.
+        profile, host: the effective profile, and the host's name; None if there is only one.
+        log, tell: called with (node, line) that it writes, and (node, sentence) about it.
         own_router: fail if a router already answers.
         worker_options: worker -> ``name=value`` options.
         worker_arguments: further arguments for the command line of every worker.
@@ -180,8 +161,7 @@ class Host:
     Raises:
         NodeError: this host already runs, or a router already answers although `own_router` is set
             or `also` names robots that it does not know.
-        ProfileError: there is no such host, it has no router for `also`, or it has no command node
-            for `dry_run`.
+        ProfileError: no such host, no router there for `also`, or no command node for `dry_run`.
     """
 
     def __init__(
@@ -205,11 +185,13 @@ class Host:
         if changes:
             profile = override(profile, {"session": changes})
         self.profile, self._part, self._tell = profile, part, tell
-        self._folder = tempfile.TemporaryDirectory(prefix="vla-zenoh-")
+        self._held = ExitStack()
+        self._folder = self._held.enter_context(tempfile.TemporaryDirectory(prefix="vla-zenoh-"))
         # A lab is up for weeks, and systemd-tmpfiles removes files older than 10 days, except below
         # a folder that is locked (tmpfiles.d(5)).
-        self._folder_lock = os.open(self._folder.name, os.O_RDONLY | os.O_DIRECTORY)
-        fcntl.flock(self._folder_lock, fcntl.LOCK_EX)
+        number = os.open(self._folder, os.O_RDONLY | os.O_DIRECTORY)
+        self._held.callback(os.close, number)
+        fcntl.flock(number, fcntl.LOCK_EX)
         # Children read the profile that is in force here, with all options applied.
         self.profile_file = self._write(profile)
         self._also = [self._write(other) for other in also]
@@ -222,11 +204,9 @@ class Host:
             commands,
             log=log,
             tell=tell,
-            folder=Path(self._folder.name),
-            variables={HOST_VARIABLE: self.host},
+            variables={HOST_VARIABLE: self.host, RUN_FOLDER_VARIABLE: self._folder},
         )
         self._own_router = own_router
-        self._once = HostLock(profile, self.host)
         self._down: DownNodes | None = None
         self._ready, self._dry_run = False, dry_run
         self._expiry = CertificateExpiry(profile.session.security)
@@ -234,7 +214,7 @@ class Host:
         self.client: Client | None = None
 
     def _write(self, profile: Profile) -> Path:
-        folder = Path(tempfile.mkdtemp(dir=self._folder.name))
+        folder = Path(tempfile.mkdtemp(dir=self._folder))
         path = folder / f"{profile.name}.yaml"
         path.write_text(to_yaml(profile), "utf-8")
         return path
@@ -247,8 +227,11 @@ class Host:
             raise
         return self
 
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
     def _start(self) -> None:
-        self._once.take()
+        self._held.enter_context(lock_host(self.profile, self.host))
         answers = self._router_answers()
         if answers and self._own_router:
             where = ", ".join(self.profile.session.connect)
@@ -282,12 +265,13 @@ class Host:
         if substitutes:
             open_session(self.profile.session, connect=(own,), wait_s=ROUTER_PATIENCE_S).close()
 
-    def _nodes_down(self) -> list[DownNode]:
+    def _nodes_down(self) -> list[Child]:
         client = self.client
         if client is None:
             return []
         # A client that receives this has reached the only router, so no second one is expected.
-        return [each for each in self.supervisor.down(client.alive) if each.name in client.expected]
+        down = self.supervisor.down(client.alive)
+        return [child for child in down if child.command.name in client.expected]
 
     def _router_answers(self) -> bool:
         # If this host runs a router, its endpoint comes first; the others are substitutes.
@@ -297,9 +281,6 @@ class Host:
         except SessionError:
             return False
         return True
-
-    def __exit__(self, *_: object) -> None:
-        self.stop()
 
     def stop(self) -> None:
         """Brake the arm, then stop every node; within `STOP_BUDGET_S` in all.
@@ -318,28 +299,24 @@ class Host:
             self._brake(client)
         if self._down is not None:
             self._down.close()
-            self._down = None
         if self.session is not None:
             self.session.close()
-            self.session = self.client = None
+        self.session = self.client = None
         self.supervisor.stop(deadline_s)
-        self._once.release()
-        self._folder.cleanup()
-        if self._folder_lock >= 0:
-            os.close(self._folder_lock)
-            self._folder_lock = -1
+        self._held.close()
 
     def _takes_part(self, client: Client) -> bool:
         """Whether a live node is one of ours, and not another one of the same name."""
-        alive = client.alive
-        for name, (kind, _) in self.supervisor.running().items():
+        for name, (kind, pid) in self.supervisor.running().items():
             if kind == "router":  # which starts only if no other one answers
                 return True
-            status = client.status(name) if name in alive else None
+            status = client.status(name) if name in client.alive else None
             if status is None or status.boot != own_boot_id():
                 continue
-            if self.supervisor.owns(name, status.pid):
-                return True
+            # The environment of a model (uv) may be a process between us and the node.
+            with suppress(ProcessLookupError, OverflowError):
+                if os.getpgid(status.pid) == pid:
+                    return True
         return False
 
     def _brake(self, client: Client) -> None:
@@ -359,31 +336,28 @@ class Host:
             NodeError: another node keeps crashing, or only such workers are left here.
         """
         while not stop.wait(0.1):
-            self._kill_hung()
             for sentence in self._expiry.due():
                 self._tell("up", sentence)
-            self._tell_when_ready()
+            if self.client is not None:
+                self._look_at_nodes(self.client)
             self.poll(spare=EXPENDABLE)
 
     def poll(self, spare: Sequence[str] = ()) -> None:
-        """Restart nodes that crashed.
-
-        Args:
-            spare: kinds of nodes that the others do not need.
-
-        Raises:
-            NodeError: another node keeps crashing.
-        """
+        """Restart nodes that crashed; `NodeError`: one that is not of a kind to `spare` keeps
+        crashing, or only such nodes are left here."""
         if not self.supervisor.poll(spare=spare) and (given_up := self.supervisor.given_up):
             why = f": {given_up.why}" if given_up.why else "; its last lines say why"
             raise NodeError(f"{given_up.command.name} keeps crashing{why}")
 
-    def _tell_when_ready(self) -> None:
-        if self._ready or self.client is None:
-            return
-        names = {child.command.name for child in self.supervisor.children}
-        names &= self.client.expected.keys()
-        if not self._nodes_down() and names <= self.client.snapshot().keys():
+    def _look_at_nodes(self, client: Client) -> None:
+        """Kill those that hang; report once that all are ready."""
+        heard, running = client.snapshot(), self.supervisor.running()
+        said = {name: (status.pid, age_s) for name, (status, age_s, _) in heard.items()}
+        for name in hung_nodes(running, said):
+            self._tell(name, f"silent for {said[name][1]:.0f} s; it hangs; killing it")
+            signal_group(running[name][1], signal.SIGKILL)
+        names = client.expected.keys() & {each.command.name for each in self.supervisor.children}
+        if not self._ready and not self._nodes_down() and names <= heard.keys():
             self._ready = True
             self._tell("up", f"{self.mode} | ready: {', '.join(sorted(names))}")
 
@@ -393,13 +367,3 @@ class Host:
         if self._dry_run:
             return "DRY RUN"
         return "SIM" if self.profile.robot.driver == "sim" else "LIVE"
-
-    def _kill_hung(self) -> None:
-        if self.client is None:
-            return
-        heard = self.client.snapshot().items()
-        said = {name: (status.pid, age_s) for name, (status, age_s, _) in heard}
-        for name in hung_nodes(self.supervisor.running(), said):
-            self.supervisor.terminate(
-                name, f"silent for {said[name][1]:.0f} s; it hangs; killing it"
-            )

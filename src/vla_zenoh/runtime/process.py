@@ -6,17 +6,16 @@ before everything else.
 
 from __future__ import annotations
 
-import ctypes
-import ctypes.util
 import os
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from vla_zenoh.runtime.scheduling import prctl, prefer_this_process, realtime_links
 
 if TYPE_CHECKING:
     import zenoh
@@ -46,9 +45,7 @@ def die_with_parent() -> None:
     parent = os.environ.get(PARENT_VARIABLE)
     if parent is None:
         return
-    library = ctypes.util.find_library("c")
-    if library is not None and sys.platform == "linux":
-        ctypes.CDLL(library, use_errno=True).prctl(PARENT_DEATH_SIGNAL, signal.SIGTERM, 0, 0, 0)
+    prctl(PARENT_DEATH_SIGNAL, signal.SIGTERM)
     if not is_running(int(parent)):  # it died before we asked
         os.kill(os.getpid(), signal.SIGTERM)
     if not any(thread.name == WATCH for thread in threading.enumerate()):
@@ -96,7 +93,7 @@ def run_node(
     """Open a session and run a node in it until a signal arrives.
 
     Args:
-        profile: the session section is used.
+        profile: of the session.
         run: makes the node and runs it.
         identity: the node's name, for its certificate; None: the operator at this computer.
         preferred: the node keeps an arm in motion and runs before other programs, where allowed.
@@ -107,7 +104,6 @@ def run_node(
     """
     from vla_zenoh.bus.session import open_session
     from vla_zenoh.errors import SessionError
-    from vla_zenoh.runtime.scheduling import prefer_this_process, realtime_links
 
     stop = stop_on_signals()
     die_with_parent()

@@ -6,7 +6,7 @@ import errno
 import os
 import socket
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import zenoh
@@ -36,8 +36,8 @@ def run_router(
     """Run a Zenoh router until `stop` is set.
 
     Args:
-        profile: the session section and the access rules are used.
-        stop: set to stop the router.
+        profile: of the robot.
+        stop: ends it.
         host: name of this host; it matters if several hosts have a router.
         also: other robots' profiles that this router serves.
 
@@ -45,16 +45,13 @@ def run_router(
         SecurityError: the router's certificate is missing.
         SessionError: the address is in use.
     """
-    profile, name, links = _placed(profile, host)
-    access = _access(profile, also)
+    profile, options = _session_of(profile, host, also)
     os.environ.setdefault(RUNTIME_VARIABLE, RUNTIME)
-    with open_session(
-        profile.session, mode="router", connect=links, identity=name, access=access
-    ) as session:
-        node = Node(name, profile, session, host=host)
+    with open_session(profile.session, **options) as session:
+        node = Node(options["identity"], profile, session, host=host)
         detail: dict[str, Any] = {
             "listen": list(profile.session.listen),
-            "security": security_summary(profile),
+            "security": _security_summary(profile),
         }
         impatience = TcpUserTimeout(profile.session.lease_ms / 1e3)
         expiry = CertificateExpiry(profile.session.security)
@@ -70,13 +67,7 @@ def run_router(
 
 
 class Clients:
-    """Current and recent clients of a router: session number -> certificate and address.
-
-    A CLI command connects only for a moment, so clients that left are remembered.
-
-    Args:
-        session: of the router.
-    """
+    """Clients of a router, with those that left: a CLI command connects only for a moment."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self._lock = threading.Lock()
@@ -85,18 +76,20 @@ class Clients:
         self._listener = session.info.declare_link_events_listener(handler, history=True)
 
     def _heard(self, event: zenoh.LinkEvent) -> None:
-        link = event.link
+        if event.kind != zenoh.SampleKind.PUT:
+            return
+        number = str(event.link.zid)
         with self._lock:
-            if event.kind == zenoh.SampleKind.PUT:
-                self._known.pop(str(link.zid), None)
-                self._known[str(link.zid)] = [link.auth_identifier or "", str(link.dst)]
-            while len(self._known) > MAX_CLIENTS:
+            self._known.pop(number, None)
+            self._known[number] = [event.link.auth_identifier or "", str(event.link.dst)]
+            if len(self._known) > MAX_CLIENTS:
                 del self._known[next(iter(self._known))]
 
     def known(self) -> dict[str, list[str]]:
-        """The last `MAX_CLIENTS` clients: [name of the certificate or empty, address]."""
+        """Session number -> [name of the certificate or empty, address] of the last
+        `MAX_CLIENTS`."""
         with self._lock:
-            return {number: list(told) for number, told in self._known.items()}
+            return dict(self._known)
 
 
 def reject_taken(endpoints: Sequence[str]) -> None:
@@ -135,36 +128,30 @@ def router_config(
     Raises:
         SecurityError: the router's certificate is missing.
     """
-    profile, name, links = _placed(profile, host)
-    return session_config(
-        profile.session,
-        mode="router",
-        connect=links,
-        identity=name,
-        access=_access(profile, also),
-    )
+    profile, options = _session_of(profile, host, also)
+    return session_config(profile.session, **options)
 
 
-def security_summary(profile: Profile) -> str:
+def _security_summary(profile: Profile) -> str:
     """``tls``: certificates are required; ``loopback``: this computer only; ``insecure``: open."""
     if profile.session.security is not None:
         return "tls"
     return "loopback" if all(map(is_loopback, profile.session.listen)) else "insecure"
 
 
-def _placed(profile: Profile, host: str | None) -> tuple[Profile, str, tuple[str, ...]]:
-    """The profile as seen from `host`, the router's name, and the routers it connects to."""
+def _session_of(
+    profile: Profile, host: str | None, also: Sequence[Profile]
+) -> tuple[Profile, dict[str, Any]]:
+    """The profile as seen from `host`, and the router's options for `open_session`."""
+    access = None if profile.session.security is None else access_control((profile, *also))
+    options: dict[str, Any] = {"mode": "router", "identity": "router", "access": access}
     if host is None:
         hosts = [name for name, part in profile.hosts.items() if "router" in part.nodes]
         host = hosts[0] if len(hosts) == 1 else None
     if host is None or host not in profile.hosts:
-        return profile, "router", ()
+        return profile, options
     part = profile.hosts[host]
     if part.listen is not None:
         session = profile.session.model_copy(update={"listen": part.listen})
         profile = profile.model_copy(update={"session": session})
-    return profile, profile.node_name(host, "router"), part.link or ()
-
-
-def _access(profile: Profile, also: Sequence[Profile]) -> Mapping[str, Any] | None:
-    return None if profile.session.security is None else access_control((profile, *also))
+    return profile, {**options, "identity": profile.node_name(host, "router"), "connect": part.link}

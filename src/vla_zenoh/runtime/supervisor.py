@@ -12,11 +12,10 @@ import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 from typing import NamedTuple
 
 from vla_zenoh.keys import NODE_KINDS, ROLLING
-from vla_zenoh.runtime.process import DETAIL, FATAL, PARENT_VARIABLE, RUN_FOLDER_VARIABLE
+from vla_zenoh.runtime.process import DETAIL, FATAL, PARENT_VARIABLE
 
 HANG_S = 10.0
 """Nodes publish their status twice a second; a stall of the whole computer is not their fault."""
@@ -41,56 +40,28 @@ RUST_SOURCE = re.compile(r" at /\S+\.rs:\d+(?=\.?$)")
 
 
 class NodeCommand(NamedTuple):
-    """Command that starts a node.
-
-    Args:
-        name: as in logs and status.
-        kind: one of `NODE_KINDS`, or `ROLLING`.
-        arguments: of the command line, after ``vla-zenoh``.
-    """
+    """Command that starts a node; its `arguments` follow ``vla-zenoh``."""
 
     name: str
-    kind: str
+    kind: str  # one of NODE_KINDS, or ROLLING
     arguments: tuple[str, ...]
 
 
 @dataclass(slots=True)
 class Child:
-    """A node of this host; `why` it exited, if it said so, what was `told` of that, and how.
-
-    `was_alive`: others saw this process of it alive.
-    """
+    """A node of this host, and its process or, while it has none, the last one."""
 
     command: NodeCommand
     process: subprocess.Popen[str] | None = None
-    started_s: float = 0.0
-    deaths_in_a_row: int = 0
-    left_alone: bool = False
-    start_again_s: float = 0.0
-    reader: threading.Thread | None = None
     pid: int = 0
-    was_alive: bool = False
-    why: str = ""
-    told: str = ""
-    end: str = ""
-
-
-class DownNode(NamedTuple):
-    """A node that crashed, or was just started.
-
-    Args:
-        name: of the node.
-        pid: of its last process.
-        crashes: in a row.
-        why: reason of the crash; empty if it did not crash.
-        left_alone: it is not restarted.
-    """
-
-    name: str
-    pid: int
-    crashes: int
-    why: str
-    left_alone: bool
+    reader: threading.Thread | None = None  # of its output
+    started_s: float = 0.0
+    start_again_s: float = 0.0  # 0: never
+    deaths_in_a_row: int = 0
+    was_alive: bool = False  # others saw this process of it alive
+    left_alone: bool = False  # it is not restarted any more
+    why: str = ""  # it exited, in its own words
+    end: str = ""  # of the process before: why, or how
 
 
 def hung_nodes(
@@ -99,11 +70,8 @@ def hung_nodes(
     """Nodes to kill: they run, but their heartbeat (the status) has stopped.
 
     A hung node does no harm, since the arm brakes without it, but a new one cannot start beside it.
-    Workers are exempt: a large model may take long to load or to infer.
-
-    Args:
-        running: node -> kind and pid of the running nodes that this host started.
-        said: node -> pid and age (s) of its last status, of all hosts.
+    Workers are exempt: a large model may take long to load or to infer. `running` nodes of this
+    host have kind and pid; `said` has pid and age (s) of the last status of nodes of all hosts.
     """
     silent = [
         name
@@ -126,7 +94,6 @@ class Supervisor:
         log: called with (node name, line) for every line a node writes; lines that begin with
             `DETAIL` or `FATAL` belong in a log file only, `tell` gets the summary.
         tell: called with (node name, sentence) for what the supervisor does.
-        folder: where nodes may keep what they need after a restart.
         variables: environment of the nodes, added to ours.
     """
 
@@ -136,7 +103,6 @@ class Supervisor:
         *,
         log: Callable[[str, str], None],
         tell: Callable[[str, str], None],
-        folder: Path | None = None,
         variables: Mapping[str, str] | None = None,
     ) -> None:
         self._environment = {
@@ -147,8 +113,6 @@ class Supervisor:
             # Zenoh colours its log even when it writes to our pipe: then it is not recognised.
             "NO_COLOR": "1",
         }
-        if folder is not None:
-            self._environment[RUN_FOLDER_VARIABLE] = str(folder)
         self.children = [Child(command) for command in commands]
         self._log, self._tell = log, tell
         self.given_up: Child | None = None
@@ -160,42 +124,30 @@ class Supervisor:
                 self._spawn(child)
 
     def poll(self, spare: Sequence[str] = ()) -> bool:
-        """Restart nodes that crashed.
+        """Restart nodes that crashed; False if one that the others need keeps crashing.
 
-        Args:
-            spare: kinds of nodes that the others do not need: one that keeps crashing is not
-                restarted, as long as others run.
-
-        Returns:
-            False if a node that the others need keeps crashing.
+        One of a kind to `spare` is then left alone, as long as others run.
         """
         now = time.monotonic()
         for child in self.children:
             if child.process is not None and child.process.poll() is not None:
-                self._mourn(child, child.process.returncode, now)
+                self._mourn(child, child.process, now)
             elif child.process is None and child.start_again_s and now >= child.start_again_s:
                 self._spawn(child)
             if child.deaths_in_a_row < GIVE_UP_AFTER or child.left_alone:
                 continue
-            said = f"crashed {GIVE_UP_AFTER} times in a row"
-            why = f": {child.told}" if child.told else ""
-            child.left_alone = child.command.kind in spare
-            if not child.left_alone or all(each.left_alone for each in self.children):
-                self.given_up = child
-                self._tell(child.command.name, f"{said}; giving up{why}")
-                return False
-            child.start_again_s = 0.0
-            self._tell(
-                child.command.name,
-                f"{said}; not restarting it. The other nodes keep running{why}",
-            )
-        return True
+            child.left_alone, child.start_again_s = True, 0.0
+            then = "not restarting it. The other nodes keep running"
+            if child.command.kind not in spare or all(each.left_alone for each in self.children):
+                self.given_up, then = child, "giving up"
+            why = f": {child.why}" if child.why else ""
+            self._tell(child.command.name, f"crashed {GIVE_UP_AFTER} times in a row; {then}{why}")
+        return self.given_up is None
 
     def stop(self, deadline_s: float) -> None:
-        """Stop all nodes by `deadline_s`: commanding ones first, the router last.
+        """Stop all nodes: commanding ones first, the router last.
 
-        Args:
-            deadline_s: monotonic clock; nodes that still run then are killed.
+        Those that still run at `deadline_s`, monotonic clock, are killed.
         """
         for kinds, left_s in STOP_ORDER:
             processes = [
@@ -205,7 +157,7 @@ class Supervisor:
             ]
             for process in processes:
                 if process.poll() is None:
-                    _signal_group(process, signal.SIGTERM)
+                    signal_group(process.pid, signal.SIGTERM)
             while any(process.poll() is None for process in processes):
                 if time.monotonic() >= deadline_s - left_s:
                     break
@@ -219,7 +171,7 @@ class Supervisor:
         """Kill every node that still runs, at once."""
         for child in self.children:
             if child.process is not None:
-                _signal_group(child.process, signal.SIGKILL)
+                signal_group(child.process.pid, signal.SIGKILL)
                 child.process.wait()
 
     def running(self) -> dict[str, tuple[str, int]]:
@@ -234,18 +186,7 @@ class Supervisor:
         """Node name -> pid of running nodes."""
         return {name: pid for name, (_, pid) in self.running().items()}
 
-    def owns(self, name: str, pid: int) -> bool:
-        """Whether a pid of this computer is this node, started here, and still runs.
-
-        The environment of a model (uv) may be a process between us and the node.
-        """
-        ours = self.pids().get(name)
-        try:
-            return ours is not None and os.getpgid(pid) == ours
-        except (ProcessLookupError, OverflowError):
-            return False
-
-    def down(self, alive: Collection[str]) -> list[DownNode]:
+    def down(self, alive: Collection[str]) -> list[Child]:
         """Nodes that do not run, or run and have not been in `alive` yet.
 
         One that was alive and runs is not down: it hangs, and its last status has to grow old.
@@ -253,24 +194,11 @@ class Supervisor:
         for child in self.children:
             child.was_alive |= child.process is not None and child.command.name in alive
         return [
-            DownNode(
-                child.command.name,
-                child.pid,
-                child.deaths_in_a_row,
-                child.told or child.end,
-                child.left_alone or child is self.given_up,
-            )
+            child
             for child in self.children
             if child.pid and child.command.name not in alive
             if child.process is None or not child.was_alive
         ]
-
-    def terminate(self, name: str, why: str) -> None:
-        """Kill a node at once; `poll` restarts it."""
-        for child in self.children:
-            if child.command.name == name and child.process is not None:
-                self._tell(name, why)
-                _signal_group(child.process, signal.SIGKILL)
 
     def _spawn(self, child: Child) -> None:
         child.process = subprocess.Popen(
@@ -284,16 +212,14 @@ class Supervisor:
             # Ctrl-C in the terminal must reach the supervisor alone: it brakes the arm first.
             start_new_session=True,
         )
-        child.started_s, child.start_again_s = time.monotonic(), 0.0
-        child.pid, child.why, child.was_alive = child.process.pid, "", False
-        reader = threading.Thread(target=self._forward, args=(child, child.process), daemon=True)
-        reader.start()
-        child.reader = reader
-        started = f"started (pid {child.process.pid})"
-        if child.told:  # again, after a reported exit
-            self._log(child.command.name, f"{DETAIL}{started}")
-        else:
-            self._tell(child.command.name, started)
+        again = child.why != ""  # after a reported exit
+        child.why, child.was_alive = "", False
+        child.pid, child.started_s, child.start_again_s = child.process.pid, time.monotonic(), 0.0
+        child.reader = threading.Thread(
+            target=self._forward, args=(child, child.process), daemon=True
+        )
+        child.reader.start()
+        self._report(child, f"started (pid {child.pid})", detail=again)
 
     def _forward(self, child: Child, process: subprocess.Popen[str]) -> None:
         assert process.stdout is not None
@@ -304,35 +230,35 @@ class Supervisor:
                     child.why = text.removeprefix(FATAL)
                 self._log(child.command.name, text)
 
-    def _mourn(self, child: Child, code: int, now: float) -> None:
+    def _mourn(self, child: Child, process: subprocess.Popen[str], now: float) -> None:
         stable = now - child.started_s > STABLE_S
         child.deaths_in_a_row = 1 if stable else child.deaths_in_a_row + 1
         wait_s = BACKOFF_S[min(child.deaths_in_a_row, len(BACKOFF_S)) - 1]
-        if child.process is not None:
-            _signal_group(child.process, signal.SIGKILL)
+        signal_group(process.pid, signal.SIGKILL)  # what it started
         child.process, child.start_again_s = None, now + wait_s
         if child.reader is not None:
             child.reader.join(LAST_LINES_S)
+        code = process.returncode
         how = f"killed by {_signal_name(-code)}" if code < 0 else f"exited with code {code}"
         sentence = how
         if child.deaths_in_a_row < GIVE_UP_AFTER:
             sentence += f"; starting again in {wait_s:g} s"
         if child.why:
             sentence += f": {child.why}"
-        if child.why and child.why == child.told:  # said already
+        self._report(child, sentence, detail=child.why != "" and child.why == child.end)
+        child.end = child.why or how
+
+    def _report(self, child: Child, sentence: str, *, detail: bool) -> None:
+        if detail:
             self._log(child.command.name, f"{DETAIL}{sentence}")
         else:
             self._tell(child.command.name, sentence)
-        child.told, child.end = child.why, how
 
 
-def _signal_group(process: subprocess.Popen[str], number: signal.Signals) -> None:
-    """Signal the process and all that it started, such as the process that made its environment.
-
-    The group has the number of the process (`start_new_session`).
-    """
+def signal_group(pid: int, number: signal.Signals) -> None:
+    """Signal a node and all that it started, as its environment: its group has its number."""
     with suppress(ProcessLookupError):
-        os.killpg(process.pid, number)
+        os.killpg(pid, number)
 
 
 def _signal_name(number: int) -> str:

@@ -37,26 +37,17 @@ WantedBy=multi-user.target
 def systemd_unit(
     what: str, command: Sequence[str], user: str, environment: Mapping[str, str]
 ) -> str:
-    """Text of the unit.
-
-    Args:
-        what: its description.
-        command: absolute path of the program, and its arguments.
-        user: name of the user it runs as.
-        environment: variables that the program needs.
+    """Text of the unit, described by `what`, of a command with an absolute path.
 
     Raises:
         ValueError: a word contains characters that no unit can hold.
     """
-    lines = "".join(
-        f"Environment={_quoted(f'{name}={value}')}\n" for name, value in environment.items()
-    )
-    words = " ".join(_quoted(word.replace("$", "$$")) for word in command)
+    set_here = (_quoted(f"{name}={value}") for name, value in environment.items())
     return UNIT.format(
         what=_line(what),
         user=_line(user),
-        environment=lines,
-        command=words,
+        environment="".join(f"Environment={each}\n" for each in set_here),
+        command=" ".join(_quoted(word.replace("$", "$$")) for word in command),
         stop_s=STOP_S,
         priority=RT_PRIORITY,
     )

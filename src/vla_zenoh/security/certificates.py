@@ -57,21 +57,12 @@ class Certificate:
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A certificate in the folder.
+    """A certificate in the folder, and why it is unusable or unsafe, or will be."""
 
-    Args:
-        host: empty: the authority itself.
-        node: or ``operator``, ``viewer``, ``ca``.
-        path: of its file.
-        certificate: None if it cannot be read.
-        faults: why it is unusable or unsafe.
-        warning: of its expiry.
-    """
-
-    host: str
-    node: str
+    host: str  # empty: the authority itself
+    node: str  # or operator, viewer, ca
     path: Path
-    certificate: Certificate | None
+    certificate: Certificate | None  # None: it cannot be read
     faults: tuple[str, ...]
     warning: str
 
@@ -115,10 +106,10 @@ class CheckedStore(Store):
 
 def read(pem: bytes) -> Certificate:
     """Contents of a certificate, or a `SecurityError`."""
-    found, extensions = _parsed(pem)
+    found = _parsed(pem)
     names = found.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     try:
-        addresses = extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        addresses = found.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     except x509.ExtensionNotFound:
         addresses = ()
     return Certificate(
@@ -131,7 +122,7 @@ def read(pem: bytes) -> Certificate:
 
 def signed_by(pem: bytes, authority: bytes) -> bool:
     """Whether `authority` signed the certificate `pem`; a `SecurityError` if one is none."""
-    (found, _), (signer, _) = _parsed(pem), _parsed(authority)
+    found, signer = _parsed(pem), _parsed(authority)
     try:
         found.verify_directly_issued_by(signer)
     except (ValueError, TypeError, InvalidSignature):
@@ -139,12 +130,13 @@ def signed_by(pem: bytes, authority: bytes) -> bool:
     return True
 
 
-def _parsed(pem: bytes) -> tuple[x509.Certificate, x509.Extensions]:
+def _parsed(pem: bytes) -> x509.Certificate:
     try:
         found = x509.load_pem_x509_certificate(pem)
-        return found, found.extensions
+        _ = found.extensions  # parsed at the first access
     except ValueError as error:
         raise SecurityError(f"is not a certificate: {error}") from error
+    return found
 
 
 def key_fits(certificate: bytes, key: bytes) -> bool:
@@ -156,11 +148,7 @@ def key_fits(certificate: bytes, key: bytes) -> bool:
 def load_pair(
     certificate: bytes, key: bytes
 ) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
-    """A certificate and a private key of PEM text.
-
-    Raises:
-        SecurityError: one of them cannot be read.
-    """
+    """A certificate and a private key of PEM text; `SecurityError`: one cannot be read."""
     try:
         found = x509.load_pem_x509_certificate(certificate)
         private = serialization.load_pem_private_key(key, password=None)

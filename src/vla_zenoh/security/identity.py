@@ -40,24 +40,17 @@ TELEOP = "teleop"
 class Identity:
     """Holder of a certificate.
 
-    Args:
-        role: its rights.
-        node: name on the bus; of a person ``operator``, ``viewer`` or ``replay``.
-        host: in the profile.
-        worker: name, if it is a worker.
-        cameras: that it serves.
-        speaks_for: further roles: the node of a ROS 2 robot publishes the requests of ROS users,
-            the node of the primitives changes settings for those who may ask it.
-        addresses: of a bridge: at which it serves.
+    It `speaks_for` further roles: the node of a ROS 2 robot publishes the requests of ROS users,
+    the node of the primitives changes settings for those who may ask it.
     """
 
     role: Role
-    node: str
-    host: str
+    node: str  # name on the bus; of a person operator, viewer or replay
+    host: str  # in the profile
     worker: str = ""
-    cameras: tuple[str, ...] = ()
+    cameras: tuple[str, ...] = ()  # that it serves
     speaks_for: tuple[Role, ...] = ()
-    addresses: tuple[str, ...] = ()
+    addresses: tuple[str, ...] = ()  # of a bridge: at which it serves
 
     @property
     def roles(self) -> frozenset[Role]:

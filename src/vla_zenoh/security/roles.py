@@ -110,10 +110,7 @@ OWN = frozenset({Act.PUT, Act.ANSWER, Act.ANNOUNCE})
 
 
 def expressions(keys: Keys, member: str, identity: Identity, act: Act) -> Iterator[str]:
-    """Key expressions of a `member` of `Keys` on which `identity` does `act`, if its role may.
-
-    In its own name only if the act is in `OWN`.
-    """
+    """Key expressions of a `member` of `Keys` on which `identity` does `act`, if its role may."""
     path = KEY_PATHS[member]
     for parts in product(*(_choices(name, identity, act) for name in path.parameters)):
         yield path.text(keys, *parts)

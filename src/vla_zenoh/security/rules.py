@@ -17,17 +17,6 @@ from vla_zenoh.security.identity import Identity, Role, identities
 from vla_zenoh.security.roles import LOOKERS, TABLE, Act, expressions, rights
 
 IN, OUT = "ingress", "egress"
-EVERY_MESSAGE = (
-    "put",
-    "delete",
-    "declare_subscriber",
-    "query",
-    "reply",
-    "declare_queryable",
-    "liveliness_token",
-    "liveliness_query",
-    "declare_liveliness_subscriber",
-)
 WISHES = ("declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query")
 """Leave the router with the key of the query, which may be wider than that of the reply."""
 
@@ -49,6 +38,7 @@ MESSAGES: Mapping[Act, Sequence[tuple[str, str]]] = {
         (OUT, "liveliness_token"),
     ),
 }
+EVERY_MESSAGE = tuple(dict.fromkeys(message for ways in MESSAGES.values() for _, message in ways))
 
 
 def access_control(profiles: Iterable[Profile]) -> dict[str, Any]:
@@ -90,7 +80,7 @@ def _rules(identity: Identity, keys: Keys) -> list[dict[str, Any]]:
                 granted[flow, message][keys.all_robots] = None
     who = f"{keys.root}/{keys.robot}:{identity.common_name}"
     return [
-        rule(f"{who}:{flow}:{message}", (flow,), (message,), list(found))
+        rule(f"{who}:{flow}:{message}", (flow,), (message,), found)
         for (flow, message), found in granted.items()
     ]
 
@@ -116,7 +106,7 @@ def wide(keys: Keys, identity: Identity) -> list[str]:
 
 
 def rule(
-    name: str, flows: Sequence[str], messages: Sequence[str], keys: Sequence[str]
+    name: str, flows: Iterable[str], messages: Iterable[str], keys: Iterable[str]
 ) -> dict[str, Any]:
     """A rule of Zenoh that allows `messages` on `keys`."""
     return {

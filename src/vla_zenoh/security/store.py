@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import stat
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -53,8 +54,7 @@ class Store:
         Raises:
             SecurityError: there are no certificates, or those of several hosts.
         """
-        found = host or self.known_host()
-        if found is not None:
+        if found := host or self.known_host():
             return found
         hosts = self.hosts()
         if not hosts:
@@ -70,12 +70,10 @@ class Store:
     def known_host(self) -> str | None:
         """The host that was noted, or the only one there are certificates for; None: unknown."""
         hosts = self.hosts()
-        try:
+        with suppress(OSError, UnicodeDecodeError):
             noted = (self.folder / THIS_HOST).read_text("utf-8").strip()
-        except (OSError, UnicodeDecodeError):
-            noted = ""
-        if noted in hosts:
-            return noted
+            if noted in hosts:
+                return noted
         return hosts[0] if len(hosts) == 1 else None
 
     def hosts(self) -> list[str]:
@@ -99,8 +97,8 @@ class Store:
             SecurityError: they are missing, or others can read the key.
         """
         host = self.this_host(host)
-        role = (people or {}).get(host)
-        names = [node] if node is not None else [role] if role else [one.value for one in PEOPLE]
+        name = node or (people or {}).get(host)
+        names = [name] if name else [role.value for role in PEOPLE]
         for name in names:
             if self.has(host, name):
                 files = self.files(host, name)
@@ -123,17 +121,14 @@ def open_to_others(key: Path) -> str:
     return ""
 
 
-RANK = {Role.OPERATOR: 0, Role.VIEWER: 1}
-"""The role that replays recordings is chosen by name only: it may publish on every key."""
-
-
 def operator_hosts(profile: Profile, *, stop: bool = False) -> list[str]:
     """Hosts whose operator certificates are on this computer, the preferred one first.
 
     This computer's own host if it is known, then operators before viewers, in the order of the
     profile, hosts before people; for a `stop` operators before the own host, as a viewer may not
     stop the arm. Only ``session.security.host`` if it is set, except for a stop. Hosts that the
-    profile does not know are left out: the router would silently drop their messages.
+    profile does not know are left out: the router would silently drop their messages. So are those
+    of a replay, which is chosen by name only: it may publish on every key.
     """
     security = profile.session.security
     if security is None:
@@ -142,16 +137,13 @@ def operator_hosts(profile: Profile, *, stop: bool = False) -> list[str]:
         return [security.host]
     store = Store(security.folder)
     own = security.host or store.known_host()
-    ranks: dict[str, int] = {}
+    ranks: dict[str, tuple[bool, bool]] = {}
     for host in dict.fromkeys([*profile.hosts, *security.people]):
         role = operator_role(profile, host)
-        if role in RANK and store.has(host, role.value):
-            ranks[host] = RANK[role]
-    if stop:
-        found = sorted(ranks, key=lambda host: (ranks[host], host != own))
-    else:
-        found = sorted(ranks, key=lambda host: (host != own, ranks[host]))
-    return found or ([own] if own is not None else [])
+        if role in (Role.OPERATOR, Role.VIEWER) and store.has(host, role.value):
+            elsewhere, watches = host != own, role is Role.VIEWER
+            ranks[host] = (watches, elsewhere) if stop else (elsewhere, watches)
+    return sorted(ranks, key=ranks.__getitem__) or ([own] if own is not None else [])
 
 
 def local_role(profile: Profile) -> Role | None:
