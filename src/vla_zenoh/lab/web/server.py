@@ -327,7 +327,7 @@ class PageServer:
             if request.do in PICTURES:
                 raise CodecError("malformed", f"{request.do} is no request of this socket")
             if request.values.get("tick", 0) > time.monotonic() * 1e3:
-                raise CodecError("range", f"{request.do}: tick is newer than the last one sent")
+                raise CodecError("invalid", f"{request.do}: tick is newer than the last one sent")
         except CodecError as error:
             self._complain(page, "bad_message", str(error))
             return
