@@ -21,12 +21,12 @@ from ruckig import (
 
 from vla_zenoh.control.limits import JointMotionLimits
 from vla_zenoh.control.smoothing import Motion, Smoother, motion_limits
-from vla_zenoh.guard.command_guards import (
+from vla_zenoh.guard.reference_governor import BRAKE_MARGIN
+from vla_zenoh.guard.stream_guard import (
     JointGuard,
     PoseGuard,
-    guard_limits,
-    joint_guard_limits,
     joint_motion_limits,
+    pose_brake_limits,
 )
 from vla_zenoh.kinematics.so3 import Pose, exp3, log3, quat_from_rotation
 from vla_zenoh.profile import Profile, load_profile
@@ -212,11 +212,13 @@ def drive(
     """
     rng = random.Random(seed)
     guard: Any
+    timeout_s = profile.timing.command_timeout_s
     if mode == "pose":
-        guard = PoseGuard(HOME, tick_s, guard_limits(profile))
+        guard = PoseGuard(HOME, tick_s, timeout_s, pose_brake_limits(profile))
     else:
         ends = HOME_RAD - 3, HOME_RAD + 3
-        guard = JointGuard(NAMES, HOME_RAD, tick_s, joint_guard_limits(profile, *ends))
+        brake = joint_motion_limits(profile, BRAKE_MARGIN)
+        guard = JointGuard(NAMES, HOME_RAD, tick_s, timeout_s, brake, ends)
     motions = [guard.motion]
     arrivals: list[tuple[int, Stamped[Any]]] = []
     writer: Any = None

@@ -17,7 +17,7 @@ from motion_case import WORKER, Actions, Case
 from vla_zenoh.control.commander import Commander, Inputs, Setting
 from vla_zenoh.control.preflight import PeerSnapshot
 from vla_zenoh.control.reachability import make_reachability_filter
-from vla_zenoh.guard.arm_guard import Measured, make_arm_guard
+from vla_zenoh.guard.arm_guard import ArmGuard, Measured
 from vla_zenoh.kinematics.so3 import Pose, exp3, log3, quat_from_rotation
 from vla_zenoh.types import (
     ActionChunk,
@@ -118,7 +118,7 @@ class Rig:
         self._held_joints, self._rates = self._joints, np.zeros(len(self._joints))
         self.commander = Commander(profile, reach=reach)
         known = case.arm
-        self.guard = make_arm_guard(
+        self.guard = ArmGuard(
             profile, self._measure, (known.lower_rad, known.upper_rad), 1.0 / case.guard_hz
         )
         self._actions = Actions(case)

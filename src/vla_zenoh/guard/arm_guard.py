@@ -10,15 +10,14 @@ import numpy as np
 from vla_zenoh.control.smoothing import ROTATION_BOX
 from vla_zenoh.control.states import OBEYING
 from vla_zenoh.errors import CodecError
-from vla_zenoh.guard.command_guards import (
+from vla_zenoh.guard.reference_governor import BRAKE_MARGIN
+from vla_zenoh.guard.stream_guard import (
+    ACCELERATE_S,
     JointGuard,
     PoseGuard,
-    guard_limits,
-    joint_guard_limits,
     joint_motion_limits,
+    pose_brake_limits,
 )
-from vla_zenoh.guard.reference_governor import BRAKE_MARGIN
-from vla_zenoh.guard.stream_guard import ACCELERATE_S
 from vla_zenoh.kinematics.so3 import Pose, pose_distance
 from vla_zenoh.profile import GripperProfile, Profile
 from vla_zenoh.types import FloatArray, GripperCommand, JointCommand, PoseCommand, Stamped
@@ -65,26 +64,34 @@ class ArmGuard:
     """Follows one of two streams; the other may begin once none is followed and the arm stands.
 
     The new stream begins where the arm is measured, not at the last reference, so the change itself
-    moves nothing.
+    moves nothing. At first the stream that the profile commands holds the arm where it stands.
 
     Args:
-        poses, joints: guards of the two streams.
+        profile: of the robot.
         measure: reads the state of the arm.
-        mode: the stream that holds the arm at first.
+        joint_range_rad: lower and upper ends of the joint ranges, (n,) each.
+        dt_s: period of the controller.
     """
 
     def __init__(
         self,
-        poses: PoseGuard,
-        joints: JointGuard,
+        profile: Profile,
         measure: Callable[[], Measured],
-        mode: Mode = "pose",
+        joint_range_rad: tuple[FloatArray, FloatArray],
+        dt_s: float,
     ) -> None:
-        self._guards: dict[Mode, PoseGuard | JointGuard] = {"pose": poses, "joint": joints}
+        robot, timeout_s, here = profile.robot, profile.timing.command_timeout_s, measure()
+        brake = joint_motion_limits(profile, BRAKE_MARGIN)
+        self._guards: dict[Mode, PoseGuard | JointGuard] = {
+            "pose": PoseGuard(here.pose, dt_s, timeout_s, pose_brake_limits(profile)),
+            "joint": JointGuard(
+                robot.arm_joints, here.position_rad, dt_s, timeout_s, brake, joint_range_rad
+            ),
+        }
         self._measure = measure
         self._writer = self._state = ""
         self._unheeded_until_ns = self._now_ns = 0
-        self.mode: Mode = mode
+        self.mode: Mode = robot.command
 
     @property
     def _active(self) -> PoseGuard | JointGuard:
@@ -111,7 +118,6 @@ class ArmGuard:
 
     @property
     def braking(self) -> bool:
-        """The stream fell silent in motion."""
         return self._active.braking
 
     @property
@@ -175,7 +181,6 @@ class ArmGuard:
         return None
 
     def tick(self, now_ns: int) -> PoseReference | JointReference:
-        """The set-point at `now_ns`."""
         self._now_ns = now_ns
         self._active.tick(now_ns)
         return self.reference
@@ -200,26 +205,6 @@ class ArmGuard:
             guard.reset(measured.at(mode))
 
 
-def make_arm_guard(
-    profile: Profile,
-    measure: Callable[[], Measured],
-    joint_range_rad: tuple[FloatArray, FloatArray],
-    dt_s: float,
-) -> ArmGuard:
-    """The guard of a profile's robot; it holds the arm where it stands.
-
-    `joint_range_rad` are the ends of the joint ranges, (n,) each, `dt_s` the controller's period.
-    """
-    here = measure()
-    joint_limits = joint_guard_limits(profile, *joint_range_rad)
-    return ArmGuard(
-        PoseGuard(here.pose, dt_s, guard_limits(profile)),
-        JointGuard(profile.robot.arm_joints, here.position_rad, dt_s, joint_limits),
-        measure,
-        profile.robot.command,
-    )
-
-
 class HeldReference:
     """Whether the robot's own controller still holds the last command it was sent.
 
@@ -237,7 +222,6 @@ class HeldReference:
         return self._sent_ns is not None
 
     def on_sent(self, now_ns: int) -> None:
-        """Note that a command was sent."""
         self._sent_ns, self._settled = now_ns, None
 
     def invalidate(self) -> None:
@@ -311,11 +295,8 @@ def max_braking_time_s(profile: Profile) -> float:
         limits = joint_motion_limits(profile, BRAKE_MARGIN)
         stops_s = [_stop_s(*axis, share=1.0) for axis in zip(*limits, strict=True)]
     else:
-        brake = guard_limits(profile).brake
-        stops_s = [
-            _stop_s(*brake.translation, share=1.0),
-            _stop_s(*brake.rotation, share=ROTATION_BOX),
-        ]
+        translation, rotation = pose_brake_limits(profile)
+        stops_s = [_stop_s(*translation, share=1.0), _stop_s(*rotation, share=ROTATION_BOX)]
     return profile.timing.command_timeout_s + float(max(stops_s))
 
 

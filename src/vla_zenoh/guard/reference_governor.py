@@ -31,7 +31,9 @@ from ruckig import (
     Trajectory,
 )
 
-from vla_zenoh.types import FloatArray
+from vla_zenoh.control.smoothing import Motion
+from vla_zenoh.kinematics.so3 import Pose, cross3, exp3, log3, rates_of, spatial_rates
+from vla_zenoh.types import FloatArray, JointReference
 
 BRAKE_MARGIN = 2.0
 """The robot's own stop may use this multiple of the stream's limits."""
@@ -61,6 +63,7 @@ GIVES_WAY = (BRAKE_MARGIN - ORDINARY - SLACK - REVERSAL) / ORDINARY
 """How fast the acceleration of the difference goes back where that of the commanded path begins to
 rise, as a share of how fast this does."""
 GRID = 8
+AT_REST = np.zeros(6)
 
 Reference = TypeVar("Reference")
 
@@ -86,6 +89,66 @@ class Space(Protocol[Reference]):
     def beside(self, base: Reference, way: GovernedPath) -> Reference: ...
     def apart(self, motion: Reference, base: Reference) -> GovernedPath: ...
     def sizes(self, shares: FloatArray) -> FloatArray: ...
+
+
+class PoseSpace:
+    """Space of TCP poses. An offset is a translation and the vector r of ``exp3(r) R``."""
+
+    def rest(self, motion: Motion) -> Motion:
+        return Motion(motion.pose, AT_REST, AT_REST)
+
+    def speed(self, motion: Motion) -> GovernedPath:
+        return GovernedPath(AT_REST, motion.twist, motion.acceleration)
+
+    def beside(self, base: Motion, way: GovernedPath) -> Motion:
+        turn = exp3(way.value[3:])
+        spin, spin_change = spatial_rates(way.value[3:], way.rate[3:], way.change[3:])
+        twist, acceleration = base.twist + way.rate, base.acceleration + way.change
+        if base.twist is not AT_REST:
+            carried = turn @ base.twist[3:]
+            spin_change += turn @ base.acceleration[3:] + cross3(spin, carried)
+            spin += carried
+        twist[3:], acceleration[3:] = spin, spin_change
+        pose = Pose(base.pose.position_m + way.value[:3], turn @ base.pose.rotation)
+        return Motion(pose, twist, acceleration)
+
+    def apart(self, motion: Motion, base: Motion) -> GovernedPath:
+        turn = motion.pose.rotation @ base.pose.rotation.T
+        rotvec = log3(turn)
+        carried = turn @ base.twist[3:]
+        spin = motion.twist[3:] - carried
+        spin_change = motion.acceleration[3:] - turn @ base.acceleration[3:] - cross3(spin, carried)
+        rate, change = motion.twist - base.twist, motion.acceleration - base.acceleration
+        rate[3:], change[3:] = rates_of(rotvec, spin, spin_change)
+        value = np.concatenate([motion.pose.position_m - base.pose.position_m, rotvec])
+        return GovernedPath(value, rate, change)
+
+    def sizes(self, shares: FloatArray) -> FloatArray:
+        """Translation counts per axis, rotation by its norm."""
+        sizes = np.abs(shares)
+        sizes[..., 3:] = np.sqrt((shares[..., 3:] ** 2).sum(axis=-1, keepdims=True))
+        return sizes
+
+
+class JointSpace:
+    """Space of joint positions (n,); an offset is their difference."""
+
+    def rest(self, motion: JointReference) -> JointReference:
+        return JointReference.at_rest(motion.position_rad)
+
+    def speed(self, motion: JointReference) -> GovernedPath:
+        _, velocity_rad_s, acceleration_rad_s2 = motion
+        return GovernedPath(np.zeros(len(velocity_rad_s)), velocity_rad_s, acceleration_rad_s2)
+
+    def beside(self, base: JointReference, way: GovernedPath) -> JointReference:
+        return JointReference(base[0] + way[0], base[1] + way[1], base[2] + way[2])
+
+    def apart(self, motion: JointReference, base: JointReference) -> GovernedPath:
+        return GovernedPath(motion[0] - base[0], motion[1] - base[1], motion[2] - base[2])
+
+    def sizes(self, shares: FloatArray) -> FloatArray:
+        """Every joint counts by itself."""
+        return np.abs(shares)
 
 
 class GovernorLimits(NamedTuple):

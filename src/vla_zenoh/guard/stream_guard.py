@@ -1,27 +1,42 @@
-"""Guard of a command stream on the robot's side, whatever its set-points are.
+"""Guards of command streams on the robot's side: of TCP poses, and of joint positions.
 
-`vla_zenoh.guard.command_guards` says how poses and joint positions are checked. Everything else is
-the same for both and stands here: which samples are accepted, what the arm does between two of
-them, and how it brakes when the stream falls silent in motion.
+A guard decides which commands are accepted, what the arm does between two of them, and how it
+brakes when the stream falls silent in motion.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any, Generic, TypeVar
 
 import numpy as np
 
+from vla_zenoh.control.limits import JointMotionLimits
+from vla_zenoh.control.smoothing import Motion, MotionLimits, motion_limits
 from vla_zenoh.guard.reference_governor import (
+    AT_REST,
     BRAKE_MARGIN,
     GovernedPath,
     GovernorLimits,
+    JointSpace,
+    PoseSpace,
     Reference,
     ReferenceGovernor,
     Space,
 )
-from vla_zenoh.types import FloatArray, Header, SingleWriterFilter, Stamped
+from vla_zenoh.kinematics.so3 import Pose, angle_between, norm3, rotation_from_quat
+from vla_zenoh.profile import Profile
+from vla_zenoh.types import (
+    FloatArray,
+    Header,
+    JointCommand,
+    JointReference,
+    PoseCommand,
+    SingleWriterFilter,
+    Stamped,
+)
 
 CLOCK_DRIFT = 1e-3
 """Share by which two clocks may drift apart; real ones drift by a tenth of that."""
@@ -32,6 +47,17 @@ FADING_S = 0.07
 has to be undone."""
 STILL = 1e-4
 """m/s and rad/s: a stream that ends slower than this has ended on purpose."""
+
+JUMP_M, JUMP_RAD, JUMP_JOINT_RAD = 0.02, 0.1, 0.05
+"""A command may be this far from the reference in force: TCP, or each joint."""
+BEGIN_M, BEGIN_RAD, BEGIN_JOINT_RAD = 0.002, 0.01, 0.004
+"""The first command of a stream may be this far from the reference. A stream that goes on after the
+robot has braked by itself would make it jerk."""
+BEGIN_M_S, BEGIN_RAD_S = 0.03, 0.1
+"""And it may move this fast, TCP or each joint: our streams begin at rest."""
+TURN_STOP, TURN_BESIDE = 0.55, 0.5
+"""Share of a rotation limit for each axis, so that the norm of three stays within it: in a stop,
+and in an offset from a motion that rotates as well."""
 
 Command = TypeVar("Command")
 
@@ -44,7 +70,7 @@ class CommandStream(Generic[Command]):
 
     def __init__(self, timeout_s: float) -> None:
         self.newest: Stamped[Command] | None = None
-        self._timeout_s = timeout_s
+        self._timeout_ns = timeout_s * 1e9
         self._filter = SingleWriterFilter()
         self._base_ns = self._delay_ns = self._ticked_ns = 0
         self._has_new = False
@@ -55,19 +81,18 @@ class CommandStream(Generic[Command]):
         A late command was under way for longer than the stream may be silent: on a link that gets
         ever slower the arm would continue long after the writer has braked.
         """
-        reason = self._filter.objection(header)
-        if reason is None and self.newest is not None and self._late(header, received_ns):
-            went_back = header.stamp_wall_ns < self.newest.header.stamp_wall_ns
-            return None if went_back else "late"  # stamps of a stream go back if a clock was set
-        return reason
+        reason, newest = self._filter.objection(header), self.newest
+        if reason is not None or newest is None:
+            return reason
+        # Stamps of a stream go back if a clock was set.
+        went_back = header.stamp_wall_ns < newest.header.stamp_wall_ns
+        waited_ns = self._waited_ns(newest, header, received_ns)
+        return "late" if waited_ns >= self._timeout_ns and not went_back else None
 
-    def _shortest_ns(self, received_ns: int) -> int:
-        passed_ns = 0 if self.newest is None else received_ns - self.newest.received_ns
-        return self._delay_ns + int(CLOCK_DRIFT * passed_ns)
-
-    def _late(self, header: Header, received_ns: int) -> bool:
-        late_ns = received_ns - header.stamp_wall_ns - self._shortest_ns(received_ns)
-        return late_ns >= self._timeout_s * 1e9
+    def _waited_ns(self, newest: Stamped[Command], header: Header, received_ns: int) -> int:
+        """How much longer than the shortest delay a command was under way."""
+        shortest_ns = self._delay_ns + int(CLOCK_DRIFT * (received_ns - newest.received_ns))
+        return received_ns - header.stamp_wall_ns - shortest_ns
 
     def take(self, command: Stamped[Command]) -> None:
         """Follow `command`, which is put on our clock by its stamp, because arrival times jitter.
@@ -75,16 +100,17 @@ class CommandStream(Generic[Command]):
         The offset of both clocks is the shortest delay seen: a command that was held up on its way
         is not mistaken for one that is meant later.
         """
-        stamp_ns = command.header.stamp_wall_ns
-        delay_ns = command.received_ns - stamp_ns
-        # Later than a stream may be silent: not a delay, one of the clocks was set.
-        if self.newest is not None and not self._late(command.header, command.received_ns):
-            delay_ns = min(delay_ns, self._shortest_ns(command.received_ns))
-        self._delay_ns = delay_ns
-        self._base_ns = stamp_ns + delay_ns
+        header, received_ns = command.header, command.received_ns
+        self._base_ns = received_ns
+        if self.newest is not None:
+            waited_ns = self._waited_ns(self.newest, header, received_ns)
+            # Later than a stream may be silent: not a delay, one of the clocks was set.
+            if 0 < waited_ns < self._timeout_ns:
+                self._base_ns -= waited_ns
+        self._delay_ns = self._base_ns - header.stamp_wall_ns
         self._has_new = True
         self.newest = command
-        self._filter.accept(command.header)
+        self._filter.accept(header)
 
     def may_step(self, now_ns: int, dt_s: float) -> bool:
         """Whether the set-point of this tick may differ from what the last tick predicted.
@@ -98,7 +124,7 @@ class CommandStream(Generic[Command]):
     def live(self, now_ns: int) -> bool:
         """Whether there is a command, and the stream has not timed out."""
         newest = self.newest
-        return newest is not None and now_ns - newest.received_ns <= self._timeout_s * 1e9
+        return newest is not None and now_ns - newest.received_ns <= self._timeout_ns
 
     def ahead_s(self, now_ns: int) -> float:
         """How far `now_ns` is past the time the newest command is meant for.
@@ -113,11 +139,6 @@ class CommandStream(Generic[Command]):
         """Follow no source; commands received before are still replays."""
         self.newest = None
         self._filter.release()
-
-    def forget(self) -> None:
-        """Follow no source, and forget what was received."""
-        self.newest = None
-        self._filter.reset()
 
 
 class Extrapolation(Generic[Reference]):
@@ -227,8 +248,8 @@ class StreamGuard(ABC, Generic[Reference]):
         timeout_s: float,
         brake: GovernorLimits,
     ) -> None:
-        self._space, self._dt_s, self._brake = space, dt_s, brake
-        self._stream: CommandStream[Reference] = CommandStream(timeout_s)
+        self._space, self._dt_s, self._timeout_s, self._brake = space, dt_s, timeout_s, brake
+        self._stream = CommandStream[Reference](timeout_s)
         self._governor = ReferenceGovernor(space, self._standing(here), dt_s, brake)
         self._extrapolation: Extrapolation[Reference] | None = None
         self.braking = False
@@ -275,7 +296,7 @@ class StreamGuard(ABC, Generic[Reference]):
     def reset(self, here: Any) -> None:
         """Follow no stream, forget the last one, and hold this place: the robot was reset."""
         self.anchor(here)
-        self._stream.forget()
+        self._stream = CommandStream(self._timeout_s)
 
     def _rest_at(self, motion: Reference) -> None:
         self._stream.end()
@@ -321,3 +342,117 @@ class StreamGuard(ABC, Generic[Reference]):
         governor.rest()
         self.braking = self.braking and governor.moving
         return governor.motion
+
+
+class PoseGuard(StreamGuard[Motion]):
+    """Guard of a stream of TCP poses.
+
+    Args:
+        pose: where the robot stands.
+        dt_s: period of the controller.
+        timeout_s: silence after which the stream has ended.
+        brake: of its own stop; faster commands are rejected.
+    """
+
+    def __init__(self, pose: Pose, dt_s: float, timeout_s: float, brake: MotionLimits) -> None:
+        self._limits = brake
+        orders = (np.repeat(pair, 3) for pair in zip(*brake, strict=True))
+        shares = (np.repeat([1.0, share], 3) for share in (TURN_STOP, TURN_BESIDE))
+        super().__init__(PoseSpace(), pose, dt_s, timeout_s, GovernorLimits(*orders, *shares))
+
+    def _standing(self, here: Pose) -> Motion:
+        position_m = np.array(here.position_m, dtype=np.float64)
+        return Motion(Pose(position_m, np.array(here.rotation)), AT_REST, AT_REST)
+
+    def _admit(self, record: PoseCommand) -> Motion | str:
+        rotation, expected = rotation_from_quat(record.quat_xyzw), self._expected.pose
+        jump_m, jump_rad = (JUMP_M, JUMP_RAD) if self.following else (BEGIN_M, BEGIN_RAD)
+        if (
+            norm3(record.position_m - expected.position_m) > jump_m
+            or angle_between(expected.rotation, rotation) > jump_rad
+        ):
+            return "jump"
+        for values, order in ((record.twist, 0), (record.acceleration, 1)):
+            if float(np.abs(values[:3]).max()) > self._limits.translation[order]:
+                return "too_fast"
+            if float(np.linalg.norm(values[3:])) > self._limits.rotation[order]:
+                return "too_fast"
+        if not self.following and (
+            norm3(record.twist[:3]) > BEGIN_M_S or norm3(record.twist[3:]) > BEGIN_RAD_S
+        ):
+            return "too_fast"
+        return Motion(Pose(record.position_m, rotation), record.twist, record.acceleration)
+
+
+class JointGuard(StreamGuard[JointReference]):
+    """Guard of a stream of joint positions.
+
+    Args:
+        names: of the joints, in the order of every (n,) here.
+        position_rad: (n,) where the robot stands.
+        dt_s: period of the controller.
+        timeout_s: silence after which the stream has ended.
+        brake: of its own stop; faster commands are rejected.
+        range_rad: lower and upper ends of the joint ranges, (n,) each.
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        position_rad: FloatArray,
+        dt_s: float,
+        timeout_s: float,
+        brake: JointMotionLimits,
+        range_rad: tuple[FloatArray, FloatArray],
+    ) -> None:
+        self._names, self._limits, self._range_rad = tuple(names), brake, range_rad
+        whole = np.ones(len(position_rad))
+        limits = GovernorLimits(*brake, axis=whole, beside=whole)
+        super().__init__(JointSpace(), position_rad, dt_s, timeout_s, limits)
+
+    def _standing(self, here: FloatArray) -> JointReference:
+        return JointReference.at_rest(here)
+
+    def _admit(self, record: JointCommand) -> JointReference | str:
+        """The command in the arm's own order; ``names``, ``out_of_range`` are reasons as well."""
+        wanted = JointReference(
+            record.position_rad, record.velocity_rad_s, record.acceleration_rad_s2
+        )
+        if record.names != self._names:
+            if sorted(record.names) != sorted(self._names):
+                return "names"
+            order = [record.names.index(name) for name in self._names]
+            wanted = JointReference(*(column[order] for column in wanted))
+        here_rad, limits = self.motion.position_rad, self._limits
+        speeds_rad_s = np.abs(wanted.velocity_rad_s)
+        jump_rad = JUMP_JOINT_RAD if self.following else BEGIN_JOINT_RAD
+        if (np.abs(wanted.position_rad - self._expected.position_rad) > jump_rad).any():
+            return "jump"
+        if (speeds_rad_s > limits.velocity_rad_s).any() or (
+            np.abs(wanted.acceleration_rad_s2) > limits.acceleration_rad_s2
+        ).any():
+            return "too_fast"
+        if not self.following and (speeds_rad_s > BEGIN_RAD_S).any():
+            return "too_fast"
+        # An arm outside its range may come back, but go no further out.
+        lower_rad, upper_rad = self._range_rad
+        if (wanted.position_rad < np.minimum(lower_rad, here_rad)).any() or (
+            wanted.position_rad > np.maximum(upper_rad, here_rad)
+        ).any():
+            return "out_of_range"
+        return wanted
+
+
+def pose_brake_limits(profile: Profile) -> MotionLimits:
+    """`BRAKE_MARGIN` times the limits of a profile's pose stream."""
+    translation, rotation = motion_limits(profile.limits)
+    v, a, j = (BRAKE_MARGIN * limit for limit in translation)
+    spin_v, spin_a, spin_j = (BRAKE_MARGIN * limit for limit in rotation)
+    return MotionLimits((v, a, j), (spin_v, spin_a, spin_j))
+
+
+def joint_motion_limits(profile: Profile, margin: float = 1.0) -> JointMotionLimits:
+    """`margin` times the limits of `profile`, in the order of ``robot.arm_joints``."""
+    limits, joints = profile.limits.joint, len(profile.robot.arm_joints)
+    names = ("velocity_rad_s", "acceleration_rad_s2", "jerk_rad_s3")
+    return JointMotionLimits(*(margin * np.array(limits.of(name, joints)) for name in names))

@@ -18,7 +18,6 @@ from vla_zenoh.guard.arm_guard import (
     GripperGuard,
     HeldReference,
     Measured,
-    make_arm_guard,
 )
 from vla_zenoh.keys import Kind
 from vla_zenoh.kinematics.so3 import Pose, quat_from_rotation
@@ -69,7 +68,7 @@ class Arm:
         self._unknown = Measured(Pose(np.zeros(3), np.eye(3)), nowhere, nowhere)
         self._measured = driver.state_now()
         range_rad, period_s = driver.joint_range_rad, driver.period_s
-        self.guard = make_arm_guard(profile, self._state_now, range_rad, period_s)
+        self.guard = ArmGuard(profile, self._state_now, range_rad, period_s)
         self._hold = HeldReference()
         self._timeout_s = profile.timing.command_timeout_s
         self._stalled_until_ns = 0

@@ -12,7 +12,7 @@ from vla_zenoh.control.pose_to_joint import PoseToJoint
 from vla_zenoh.control.reachability import make_reachability_filter
 from vla_zenoh.control.smoothing import Smoother, motion_limits
 from vla_zenoh.control.states import State
-from vla_zenoh.guard.command_guards import joint_motion_limits
+from vla_zenoh.guard.stream_guard import joint_motion_limits
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.kinematics.so3 import Pose, exp3, quat_from_rotation
 from vla_zenoh.profile import load_profile, override

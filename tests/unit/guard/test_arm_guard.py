@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from vla_zenoh.guard.arm_guard import STANDING_RAD_S, UNHEEDED_NS, ArmGuard, Measured, Mode
-from vla_zenoh.guard.command_guards import JointGuard, PoseGuard, guard_limits, joint_guard_limits
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import Header, JointCommand, PoseCommand, Stamped
@@ -28,15 +27,9 @@ class Side:
 
     def __init__(self, mode: Mode = "pose") -> None:
         self.measured = Measured(Pose(np.array([0.43, 0.0, 0.3]), np.eye(3)), HOME_RAD, np.zeros(7))
-        here = self.measured
-        self.guard = ArmGuard(
-            PoseGuard(here.pose, 1e-3, guard_limits(PROFILE)),
-            JointGuard(
-                NAMES, HOME_RAD, 1e-3, joint_guard_limits(PROFILE, HOME_RAD - 1, HOME_RAD + 1)
-            ),
-            lambda: self.measured,
-            mode,
-        )
+        ends = HOME_RAD - 1, HOME_RAD + 1
+        self.guard = ArmGuard(PROFILE, lambda: self.measured, ends, 1e-3)
+        self.guard.mode = mode
         self.now_ns, self.seq = START_NS, 0
 
     def stamped(self, record: Any, source: str) -> Stamped[Any]:

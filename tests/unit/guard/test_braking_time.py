@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from vla_zenoh.control.smoothing import Motion, Smoother
 from vla_zenoh.guard.arm_guard import max_braking_time_s
-from vla_zenoh.guard.command_guards import guard_limits, joint_motion_limits
 from vla_zenoh.guard.reference_governor import BRAKE_MARGIN
+from vla_zenoh.guard.stream_guard import joint_motion_limits, pose_brake_limits
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh.types import JointReference
@@ -36,7 +36,7 @@ def slow(command: str, **limits: Any) -> Profile:
 
 def brake_s(profile: Profile, twist: Any, acceleration: Any) -> float:
     """How long the guard's own stop takes from there."""
-    smoother = Smoother(HERE, TICK_S, guard_limits(profile).brake)
+    smoother = Smoother(HERE, TICK_S, pose_brake_limits(profile))
     smoother.brake_from(Motion(HERE, np.array(twist), np.array(acceleration)))
     ticks = 0
     while not smoother.at_rest:
@@ -89,7 +89,7 @@ def test_no_stop_of_the_joints_takes_longer(axes: list[tuple[float, float, float
 @pytest.mark.parametrize("acceleration", [2.0, 0.25])
 def test_it_is_not_said_to_take_much_longer_than_it_may(acceleration: float) -> None:
     profile = slow("pose", translation={"acceleration_m_s2": acceleration})
-    limits = guard_limits(profile).brake
+    limits = pose_brake_limits(profile)
     speed, change, _ = limits.translation
     spin, spin_change, _ = limits.rotation
     twist, acceleration_now = [speed, 0, 0, spin, 0, 0], [change, 0, 0, spin_change, 0, 0]

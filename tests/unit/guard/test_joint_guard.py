@@ -10,10 +10,12 @@ import pytest
 from guard_rig import stop_from
 
 from vla_zenoh.control.limits import JointMotionLimits
-from vla_zenoh.guard.command_guards import (
+from vla_zenoh.guard.reference_governor import BRAKE_MARGIN
+from vla_zenoh.guard.stream_guard import (
+    BEGIN_JOINT_RAD,
+    BEGIN_RAD_S,
+    JUMP_JOINT_RAD,
     JointGuard,
-    JointGuardLimits,
-    joint_guard_limits,
     joint_motion_limits,
 )
 from vla_zenoh.profile import load_profile
@@ -22,8 +24,9 @@ from vla_zenoh.types import FloatArray, Header, JointCommand, JointReference, St
 PROFILE = load_profile("panda_sim")
 NAMES = PROFILE.robot.arm_joints
 HOME_RAD = np.array(PROFILE.robot.home_rad)
-LOWER_RAD, UPPER_RAD = HOME_RAD - 1.0, HOME_RAD + 1.0
-LIMITS = joint_guard_limits(PROFILE, LOWER_RAD, UPPER_RAD)
+LOWER_RAD, UPPER_RAD = RANGE_RAD = HOME_RAD - 1.0, HOME_RAD + 1.0
+TIMEOUT_S = PROFILE.timing.command_timeout_s
+BRAKE = joint_motion_limits(PROFILE, BRAKE_MARGIN)
 TICK_S = 1e-3
 TICK_NS = 1_000_000
 COMMAND_TICKS = 4
@@ -61,7 +64,7 @@ def stamped(
 
 
 def make_guard() -> JointGuard:
-    return JointGuard(NAMES, HOME_RAD, TICK_S, LIMITS)
+    return JointGuard(NAMES, HOME_RAD, TICK_S, TIMEOUT_S, BRAKE, RANGE_RAD)
 
 
 def begun() -> JointGuard:
@@ -163,7 +166,7 @@ def test_fewer_or_more_joints_than_the_arm_has_are_refused(count: int) -> None:
 
 @pytest.mark.parametrize("joint", range(7))
 def test_a_jump_of_any_joint_is_refused_and_a_small_step_is_not(joint: int) -> None:
-    for limit_rad, followed in ((LIMITS.begin_rad, False), (LIMITS.jump_rad, True)):
+    for limit_rad, followed in ((BEGIN_JOINT_RAD, False), (JUMP_JOINT_RAD, True)):
         step = np.eye(7)[joint] * limit_rad * 1.01
         guard = begun() if followed else make_guard()
         assert refusal(guard, START_NS, still(HOME_RAD + step)) == "jump"
@@ -173,7 +176,7 @@ def test_a_jump_of_any_joint_is_refused_and_a_small_step_is_not(joint: int) -> N
 @pytest.mark.parametrize("joint", range(7))
 def test_a_stream_begins_at_rest(joint: int) -> None:
     for share, reason in ((0.99, None), (1.01, "too_fast")):
-        velocity = np.eye(7)[joint] * -share * LIMITS.begin_rad_s
+        velocity = np.eye(7)[joint] * -share * BEGIN_RAD_S
         given = JointReference(HOME_RAD, velocity, np.zeros(7))
         assert make_guard().offer(stamped(given, 0, START_NS), START_NS) == reason
 
@@ -183,7 +186,8 @@ def test_a_stream_that_goes_on_after_the_robots_own_brake_makes_no_step(
     speed_rad_s: float,
 ) -> None:
     """Lost for a moment, and its writer brakes as well as soon as it hears of it."""
-    guard, dt_s = JointGuard(NAMES, HOME_RAD, STREAM_S, LIMITS), STREAM_S
+    dt_s = STREAM_S
+    guard = JointGuard(NAMES, HOME_RAD, dt_s, TIMEOUT_S, BRAKE, RANGE_RAD)
     velocity = np.eye(7)[0] * speed_rad_s
     slow = joint_motion_limits(PROFILE)
     stop, last, heard_s = None, guard.motion, np.inf
@@ -205,7 +209,7 @@ def test_a_stream_that_goes_on_after_the_robots_own_brake_makes_no_step(
             guard.offer(stamped(sent, k, now_ns), now_ns)
         motion = guard.tick(now_ns)
         step = motion.position_rad - last.position_rad - last.velocity_rad_s * dt_s
-        assert np.abs(step).max() < 0.5 * LIMITS.brake.acceleration_rad_s2[0] * dt_s**2 * 1.1
+        assert np.abs(step).max() < 0.5 * BRAKE.acceleration_rad_s2[0] * dt_s**2 * 1.1
         last = motion
     assert guard.silences == 1
 
@@ -234,7 +238,7 @@ def test_a_side_that_slept_too_long_stands_where_it_sent_the_arm_last() -> None:
 @pytest.mark.parametrize("order", [1, 2])
 def test_a_joint_that_would_be_faster_than_its_own_limit_is_refused(joint: int, order: int) -> None:
     motion = list(still(HOME_RAD))
-    limit = LIMITS.brake[order - 1][joint]
+    limit = BRAKE[order - 1][joint]
     motion[order] = np.eye(7)[joint] * -1.01 * limit
     assert refusal(make_guard(), START_NS, JointReference(*motion)) == "too_fast"
     motion[order] = np.eye(7)[joint] * -0.99 * limit
@@ -243,7 +247,7 @@ def test_a_joint_that_would_be_faster_than_its_own_limit_is_refused(joint: int, 
 
 def test_the_robot_allows_twice_what_the_profile_lets_the_stream_do() -> None:
     limits = PROFILE.limits.joint
-    for name, allowed in zip(JointMotionLimits._fields, LIMITS.brake, strict=True):
+    for name, allowed in zip(JointMotionLimits._fields, BRAKE, strict=True):
         np.testing.assert_allclose(allowed, 2.0 * np.array(limits.of(name, 7)))
 
 
@@ -305,8 +309,8 @@ def test_silence_in_motion_ends_in_a_jerk_limited_stop_of_every_joint() -> None:
     position, velocity, acceleration = (np.array(column) for column in zip(*path, strict=True))
     assert not velocity[-1].any()
     assert not acceleration[-1].any()
-    brake = LIMITS.brake
-    first = round(LIMITS.timeout_s / TICK_S) - COMMAND_TICKS - 1  # before the brake begins
+    brake = BRAKE
+    first = round(TIMEOUT_S / TICK_S) - COMMAND_TICKS - 1  # before the brake begins
     assert not acceleration[first].any()
     assert acceleration[first + COMMAND_TICKS + 2].any()
     assert (np.abs(acceleration[first:]) <= brake.acceleration_rad_s2 * (1 + STEP_RTOL)).all()
@@ -338,12 +342,12 @@ def test_each_joint_stops_by_itself() -> None:
 
 def test_a_stop_that_cannot_be_planned_is_none() -> None:
     broken = JointReference(HOME_RAD, np.full(7, np.nan), np.zeros(7))
-    assert stop_from(broken, LIMITS.brake) is None
+    assert stop_from(broken, BRAKE) is None
 
 
 def test_while_it_brakes_it_obeys_nobody_and_then_again() -> None:
     guard, now_ns = in_motion()
-    silence(guard, now_ns, LIMITS.timeout_s + 0.02)
+    silence(guard, now_ns, TIMEOUT_S + 0.02)
     assert guard.braking
     assert refusal(guard, now_ns, guard.motion) == "braking"
     silence(guard, now_ns + 120 * TICK_NS, 2.0)
@@ -364,7 +368,7 @@ def test_a_stream_that_ends_at_rest_has_ended_on_purpose() -> None:
 
 def test_a_clock_that_jumps_during_the_brake_moves_nothing() -> None:
     guard, now_ns = in_motion()
-    silence(guard, now_ns, LIMITS.timeout_s + 0.02)
+    silence(guard, now_ns, TIMEOUT_S + 0.02)
     path = [guard.motion]
     for step, jump_s in zip(range(200), itertools.cycle([2.0, -2.0])):
         path.append(guard.tick(now_ns + int((0.12 + step * TICK_S + jump_s) * 1e9)))
@@ -386,7 +390,7 @@ def test_a_restart_forgets_the_writer_and_an_anchor_does_not() -> None:
 
 def test_a_restart_in_a_brake_ends_it() -> None:
     guard, now_ns = in_motion()
-    silence(guard, now_ns, LIMITS.timeout_s + 0.02)
+    silence(guard, now_ns, TIMEOUT_S + 0.02)
     assert guard.braking
     guard.reset(HOME_RAD)
     assert not guard.braking
@@ -394,13 +398,9 @@ def test_a_restart_in_a_brake_ends_it() -> None:
 
 
 def test_limits_may_be_given_for_any_arm() -> None:
-    two = JointGuardLimits(
-        0.1,
-        JointMotionLimits(np.ones(2), np.ones(2), np.full(2, 10.0)),
-        np.full(2, -1.0),
-        np.full(2, 1.0),
-    )
-    guard = JointGuard(("a", "b"), np.zeros(2), TICK_S, two)
+    brake = JointMotionLimits(np.ones(2), np.ones(2), np.full(2, 10.0))
+    ends = np.full(2, -1.0), np.full(2, 1.0)
+    guard = JointGuard(("a", "b"), np.zeros(2), TICK_S, 0.1, brake, ends)
     command = JointCommand(("b", "a"), [0.001, 0.002], [0, 0], [0, 0], "active")
     for tick in range(500):
         now_ns = START_NS + tick * TICK_NS

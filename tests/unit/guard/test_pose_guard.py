@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vla_zenoh.control.smoothing import MotionLimits, Smoother, motion_limits
-from vla_zenoh.guard.command_guards import GuardLimits, PoseGuard, guard_limits
+from vla_zenoh.guard.stream_guard import PoseGuard, pose_brake_limits
 from vla_zenoh.kinematics.so3 import Pose, angle_between, exp3, norm3, quat_from_rotation
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import Header, PoseCommand, Stamped
@@ -19,7 +19,7 @@ from vla_zenoh.types import Header, PoseCommand, Stamped
 MS = 1_000_000
 TICK_S, STREAM_S = 0.001, 0.004
 BRAKE = MotionLimits((1.0, 4.0, 40.0), (3.0, 12.0, 120.0))
-LIMITS = GuardLimits(0.1, BRAKE)
+TIMEOUT_S = 0.1
 START = Pose(np.array([0.43, 0.0, 0.3]), exp3(np.array([3.0, 0.1, 0.0])))
 SOURCE = "command-1"
 RAMP_S = 0.4
@@ -81,7 +81,7 @@ def command(
 
 
 def guard() -> PoseGuard:
-    return PoseGuard(START, TICK_S, LIMITS)
+    return PoseGuard(START, TICK_S, TIMEOUT_S, BRAKE)
 
 
 def now(t_ns: int) -> int:
@@ -133,9 +133,9 @@ def test_a_stream_that_comes_later_and_later_ends_as_one_that_fell_silent() -> N
             written_ns = (t - late_ms) * MS
             said.setdefault(side.offer(line.at(written_ns, arrives_ns=t * MS), now(t * MS)), t)
         side.tick(now(t * MS))
-    assert said["late"] == pytest.approx(slow_ms + 2 * LIMITS.timeout_s * 1e3, abs=LATE_ATOL_MS)
+    assert said["late"] == pytest.approx(slow_ms + 2 * TIMEOUT_S * 1e3, abs=LATE_ATOL_MS)
     # What is taken then has been refused for as long as a stream may be silent.
-    assert said["braking"] - said["late"] == pytest.approx(LIMITS.timeout_s * 1e3, abs=LATE_ATOL_MS)
+    assert said["braking"] - said["late"] == pytest.approx(TIMEOUT_S * 1e3, abs=LATE_ATOL_MS)
     assert side.silences == 1
     assert not side.braking
     assert norm3(side.motion.twist[:3]) == 0.0
@@ -275,7 +275,7 @@ def test_silence_in_motion_is_a_brake_within_the_limits() -> None:
         if side.braking:
             braking.append(t * MS - end_ns)
         before = motion
-    assert braking[0] == pytest.approx(LIMITS.timeout_s * 1e9, abs=2 * MS)
+    assert braking[0] == pytest.approx(TIMEOUT_S * 1e9, abs=2 * MS)
     assert side.silences == 1
     assert not side.braking
     np.testing.assert_array_equal(before.twist, np.zeros(6))
@@ -351,7 +351,7 @@ def test_restart_follows_nobody_from_another_place() -> None:
 def test_the_reference_never_steps_whoever_was_late(
     tick_ms: int, speed: float, gaps_ms: list[int], begins_m: float, heard: bool
 ) -> None:
-    side = PoseGuard(START, tick_ms * 1e-3, LIMITS)
+    side = PoseGuard(START, tick_ms * 1e-3, TIMEOUT_S, BRAKE)
     line, t, last = Line(speed), 0, side.motion
     for gap_ms in [0, *gaps_ms]:
         # This side slept: what came meanwhile lies in a heap, or was lost as well.
@@ -375,7 +375,7 @@ def test_the_reference_never_steps_whoever_was_late(
 
 @pytest.mark.parametrize("asleep_ms", [12, 60, 95])
 def test_a_side_that_was_woken_late_goes_on_from_what_it_sent_last(asleep_ms: int) -> None:
-    side, line = PoseGuard(START, STREAM_S, LIMITS), Line(0.2)
+    side, line = PoseGuard(START, STREAM_S, TIMEOUT_S, BRAKE), Line(0.2)
     for t in range(0, 400, 4):
         side.offer(line.at(t * MS), now(t * MS))
         sent = side.tick(now(t * MS))
@@ -408,7 +408,6 @@ def test_a_side_that_slept_too_long_stands_where_it_sent_the_arm_last() -> None:
 
 def test_the_robots_own_stop_may_be_twice_as_hard_as_the_stream() -> None:
     profile = load_profile("panda_sim")
-    limits = guard_limits(profile)
-    assert limits.timeout_s == profile.timing.command_timeout_s
-    assert limits.brake.translation == (1.0, 4.0, 40.0)
-    assert limits.brake.rotation == (3.0, 12.0, 120.0)
+    limits = pose_brake_limits(profile)
+    assert limits.translation == (1.0, 4.0, 40.0)
+    assert limits.rotation == (3.0, 12.0, 120.0)

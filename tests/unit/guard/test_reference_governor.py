@@ -10,8 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vla_zenoh.control.smoothing import Motion, MotionLimits
-from vla_zenoh.guard.command_guards import GuardLimits, JointSpace, PoseGuard, PoseSpace
-from vla_zenoh.guard.reference_governor import BRAKE_MARGIN, GovernorLimits, ReferenceGovernor
+from vla_zenoh.guard.reference_governor import (
+    BRAKE_MARGIN,
+    GovernorLimits,
+    JointSpace,
+    PoseSpace,
+    ReferenceGovernor,
+)
+from vla_zenoh.guard.stream_guard import PoseGuard
 from vla_zenoh.kinematics.so3 import Pose, angle_between, exp3
 from vla_zenoh.types import FloatArray, Header, JointReference, PoseCommand, Stamped
 
@@ -185,8 +191,8 @@ def test_a_pose_is_beside_another_where_it_was_found_to_be(a: FloatArray, b: Flo
 
 def test_a_stream_that_stood_still_for_a_moment_does_not_pull_the_reference_back() -> None:
     start = Pose(np.array([0.4, 0.0, 0.3]), np.eye(3))
-    limits = GuardLimits(0.1, MotionLimits((1.0, 4.0, 40.0), (3.0, 12.0, 120.0)))
-    guard = PoseGuard(start, DT_S, limits)
+    brake = MotionLimits((1.0, 4.0, 40.0), (3.0, 12.0, 120.0))
+    guard = PoseGuard(start, DT_S, 0.1, brake)
     now_ns, sent, way_m, positions = 10**18, 0, 0.0, []
     for tick in range(1000):
         now_ns += TICK_NS

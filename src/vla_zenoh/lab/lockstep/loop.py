@@ -18,7 +18,7 @@ from vla_zenoh.control.commander_io import NewStates
 from vla_zenoh.control.preflight import PeerSnapshot
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.errors import CodecError
-from vla_zenoh.guard.arm_guard import GripperGuard, Measured, make_arm_guard
+from vla_zenoh.guard.arm_guard import ArmGuard, GripperGuard, Measured
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.lab.lockstep.worker import Delays, LockstepTrace, LockstepWorker, Message, Tamper
 from vla_zenoh.policy import Policy
@@ -77,7 +77,7 @@ class Lockstep:
         self.now_ns = START_NS
         self.commander = Commander(profile, reach=reach, dry_run=dry_run)
         self.guards = {
-            name: make_arm_guard(
+            name: ArmGuard(
                 profile.of_part(name),
                 partial(self._measure, name),
                 self._arm(name).joint_range_rad,
