@@ -29,7 +29,7 @@ from vla_zenoh.bus.buffers import CallbackRing
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import records
 from vla_zenoh.profile import Profile, load_profile
-from vla_zenoh.profile.ros2 import Ros2Profile
+from vla_zenoh.profile.robot import Ros2Profile
 from vla_zenoh.robots.node import RobotNode
 from vla_zenoh.robots.ros2.driver import Ros2Driver
 from vla_zenoh.robots.ros2.ros_graph import Request, RosGraph

@@ -188,7 +188,7 @@ def make_policy(
     Raises:
         WorkerError: the file fails to import, has no such class, or rejects the options.
     """
-    maker = _find_maker(model, "MODEL", "infer")
+    maker = find_maker(model, "MODEL", "infer")
     chosen = dict(options or {})
     if profile is not None and "profile" in maker.options.names:
         chosen.setdefault("profile", profile)
@@ -207,53 +207,36 @@ def make_policy(
     return policy
 
 
-def make_by_method(file: ModelFile, named: str, method: str, options: Mapping[str, str]) -> Any:
-    """Construct the only class with `method` of a file, or the one that `named` names there.
-
-    Raises:
-        WorkerError: as `make_policy`.
-    """
-    return _find_maker(file, named, method).make(options)
-
-
 def make_robot(path: Path, options: Mapping[str, str] | None = None) -> Robot:
-    """Construct the robot of a file, without connecting to it.
+    """Construct the robot of a file, without connecting to it; see `find_robot_maker`.
 
-    The robot is the only class in the file with ``move``; of several, the name ``ROBOT`` chooses.
     `options` are keyword arguments of its constructor, as text.
 
     Raises:
         WorkerError: as `make_policy`.
     """
-    maker = _robot_maker(path)
+    maker = find_robot_maker(path)
     robot = maker.make(options or {})
     if not isinstance(robot, Robot):
-        raise WorkerError(f"{maker.where} {_IS_ROBOT}")
+        raise WorkerError(f"{maker.where} {IS_ROBOT}")
     return robot
 
 
-def inspect_robot(path: Path, options: Mapping[str, str]) -> None:
-    """Import the file of a robot and compare its options, without making the robot.
+def find_robot_maker(path: Path) -> Maker:
+    """The only class in a file with ``move``; of several, the name ``ROBOT`` chooses.
 
     Raises:
-        WorkerError: as `make_robot`.
+        WorkerError: there is no such file, or as `find_maker`.
     """
-    maker = _robot_maker(path)
-    maker.options.check(options, maker.where)
-    if not all(callable(getattr(maker.function, method, None)) for method in ("read", "move")):
-        raise WorkerError(f"{maker.where} {_IS_ROBOT}")
-
-
-_IS_ROBOT = "needs methods `read()` and `move(command)`"
-
-
-def _robot_maker(path: Path) -> _Maker:
     if not path.is_file():
         raise WorkerError(f"{path} is not a file; arm.file of the profile names it")
-    return _find_maker(ModelFile(path.stem, path), "ROBOT", "move")
+    return find_maker(ModelFile(path.stem, path), "ROBOT", "move")
 
 
-class _Maker(NamedTuple):
+IS_ROBOT = "needs methods `read()` and `move(command)`"
+
+
+class Maker(NamedTuple):
     """A class or function of a file, with the options it takes."""
 
     path: Path
@@ -266,6 +249,7 @@ class _Maker(NamedTuple):
         return f"{self.path}: {self.name}"
 
     def make(self, options: Mapping[str, str]) -> Any:
+        """Call it with `options`, or a `WorkerError`: it rejects them, or fails."""
         self.options.check(options, self.where)
         try:
             return self.function(**options)
@@ -276,31 +260,34 @@ class _Maker(NamedTuple):
             ) from error
 
 
-def _find_maker(file: ModelFile, named: str, method: str) -> _Maker:
+def find_maker(file: ModelFile, named: str, method: str) -> Maker:
+    """The only class with `method` of a file, or what `named` names there.
+
+    Raises:
+        WorkerError: the file fails to import, or has no such class.
+    """
     module = import_model(file)
-    function = getattr(module, named, None) or _only_class(module, file.path, named, method)
+    function = getattr(module, named, None)
+    if not function:
+        own = [
+            value
+            for value in vars(module).values()
+            if inspect.isclass(value)
+            and value.__module__ == module.__name__
+            and callable(getattr(value, method, None))
+        ]
+        if len(own) != 1:
+            found = ", ".join(each.__name__ for each in own) or "none"
+            raise WorkerError(
+                f"{file.path}: wanted one class with a method {method}, found: {found}; "
+                f"name the right one with {named} = ClassName"
+            )
+        function = own[0]
     if not callable(function):
         raise WorkerError(
             f"{file.path}: {named} must be a class, it is a {type(function).__name__}"
         )
-    return _Maker(file.path, getattr(function, "__name__", named), function, _options_of(function))
-
-
-def _only_class(module: ModuleType, path: Path, named: str, method: str) -> type:
-    candidates = [
-        value
-        for value in vars(module).values()
-        if inspect.isclass(value)
-        and value.__module__ == module.__name__
-        and callable(getattr(value, method, None))
-    ]
-    if len(candidates) != 1:
-        found = ", ".join(c.__name__ for c in candidates) or "none"
-        raise WorkerError(
-            f"{path}: wanted one class with a method {method}, found: {found}; "
-            f"name the right one with {named} = ClassName"
-        )
-    return candidates[0]
+    return Maker(file.path, getattr(function, "__name__", named), function, _options_of(function))
 
 
 # -- options --------------------------------------------------------------------------------------

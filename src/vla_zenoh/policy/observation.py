@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -83,14 +84,9 @@ class History:
 
     def nearest(self, stamp_ns: int) -> Stamped[Any] | None:
         """The entry whose stamp is nearest; None without entries."""
-        if not self.entries:
-            return None
-        newest = self.entries[-1]
-        if newest.header.stamp_wall_ns <= stamp_ns:
-            return newest
-        right = bisect_left(self.entries, stamp_ns, key=_stamp_ns)
-        before, after = self.entries[max(right - 1, 0)], self.entries[right]
-        return after if _stamp_ns(after) - stamp_ns < stamp_ns - _stamp_ns(before) else before
+        right = bisect_right(self.entries, stamp_ns, key=_stamp_ns)
+        around = self.entries[max(right - 1, 0) : right + 1]
+        return min(around, key=lambda entry: abs(_stamp_ns(entry) - stamp_ns), default=None)
 
 
 STATE_KINDS: dict[str, type[Any]] = {
@@ -266,19 +262,17 @@ def _observation(
     wanted: ObservationSpec, moment: Moment, first: tuple[int, int, Task], robot: str
 ) -> Observation | NotReady:
     """The observation of a moment; `first`: its stamp, number and task."""
-    records: dict[str, dict[str, Any]] = {}
-    for name, entry in moment.states.items():
-        part, _, what = name.rpartition("/")
-        records.setdefault(part, {})[what] = entry.record
-    found: dict[str, dict[str, Any]] = {part: {} for part in records}
-    for part, own in records.items():
+    found: dict[str, dict[str, Any]] = defaultdict(dict)
+    for stream, entry in moment.states.items():
+        part, _, kind = stream.rpartition("/")
         for what in wanted.state:
-            stream = STREAM_OF.get(what, what)
+            if STREAM_OF.get(what, what) != kind:
+                continue
             name = "effort_nm" if what == "effort" else what
-            value = own[stream] if stream == what else getattr(own[stream], name)
+            value = entry.record if what == kind else getattr(entry.record, name)
             if value is None:
-                key = "/".join(filter(None, ("state", part, stream)))
-                return NotReady(f"{key} holds no {name}: this robot does not measure it")
+                where = _STATE.format(stream)
+                return NotReady(f"{where} holds no {name}: this robot does not measure it")
             found[part][name] = value
     images = {c.camera: prepare_image(moment.images[c.camera].record, c) for c in wanted.cameras}
     depth = {c.camera: prepare_depth(moment.depth[c.camera].record, c) for c in wanted.depth}
@@ -311,8 +305,8 @@ def _history(
                 f"history: {name} has nothing within {most_s:g} s of the time {ago_s:g} s "
                 f"ago, the nearest is {apart_s:.3f} s away"
             )
-        near = [near for one in leading if (near := one.nearest(moment.stamp_ns))]
-        lead = min(near, key=_stamp_ns).header
+        pictures = [*moment.images.values(), *moment.depth.values()]
+        lead = min(pictures or moment.states.values(), key=_stamp_ns).header
         first = lead.stamp_wall_ns, lead.seq, now.task
         then = _observation(wanted, moment, first, now.robot)
         if isinstance(then, NotReady):
@@ -334,18 +328,15 @@ def prepare_image(image: Image, spec: CameraSpec) -> NDArray[np.uint8]:
     Raises:
         SpecError: it has another size and the spec does not say how to resize it.
     """
-    rgb = image.rgb
-    if spec.width is not None and spec.height is not None:
-        rgb = _resize(rgb, spec)
+    rgb = _resize(image.rgb, spec)
     if spec.colour == "bgr":
         rgb = np.ascontiguousarray(rgb[..., ::-1])
     return rgb
 
 
 def _resize(rgb: NDArray[Any], spec: CameraSpec | DepthSpec) -> NDArray[Any]:
-    assert spec.width is not None and spec.height is not None
     height, width = rgb.shape[:2]
-    if (height, width) == (spec.height, spec.width):
+    if spec.width is None or spec.height is None or (height, width) == (spec.height, spec.width):
         return rgb
     if spec.resize == "none":
         raise SpecError(
@@ -379,9 +370,7 @@ def prepare_depth(depth: Depth, spec: DepthSpec) -> NDArray[np.uint16]:
     Raises:
         SpecError: it has another size and the spec does not say how to resize it.
     """
-    counts = depth.counts
-    if spec.width is not None and spec.height is not None:
-        counts = _resize(counts, spec)
+    counts = _resize(depth.counts, spec)
     whole = MAX_COUNT - (spec.invalid == MAX_COUNT)
     far_m = whole * spec.unit_m if spec.far_m is None else spec.far_m
     # The same unit goes through as it is, bit by bit.

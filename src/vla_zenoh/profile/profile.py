@@ -14,15 +14,18 @@ from vla_zenoh.errors import ProfileError, describe_fault
 from vla_zenoh.keys import NODE_KINDS, NOT_PARTS, PRIMITIVES, Keys, worker_node
 from vla_zenoh.profile.limits import Limits
 from vla_zenoh.profile.robot import (
+    JOINT_COMMANDS,
     ArmProfile,
     FrankaProfile,
     LeRobotProfile,
     Options,
     PartBase,
     RobotProfile,
+    Ros2Camera,
+    Ros2Gripper,
+    Ros2Profile,
     UrProfile,
 )
-from vla_zenoh.profile.ros2 import JOINT_COMMANDS, Ros2Camera, Ros2Gripper, Ros2Profile
 from vla_zenoh.profile.schema import (
     SIMULATED,
     CameraProfile,
@@ -183,11 +186,6 @@ class Profile(Section):
         if "camera" not in host.nodes:
             return ()
         return tuple(self.cameras) if host.cameras is None else host.cameras
-
-    def served_cameras(self, host: HostProfile) -> tuple[str, ...]:
-        """Those of `cameras_of` that its camera node opens: cameras of ROS 2 have another node."""
-        ros2 = self.ros2_cameras()
-        return tuple(name for name in self.cameras_of(host) if name not in ros2)
 
     def ros2_cameras(self) -> dict[str, Ros2Camera]:
         """Camera -> its topic, of all that come from ROS 2."""
@@ -373,13 +371,12 @@ def _way_to_ros2(profile: Profile, places: Sequence[str] | None) -> Iterator[Fau
         )
     trusted = [endpoint.partition("/")[0] in TRUSTED_PROTOCOLS for endpoint in places or ()]
     for index, endpoint in enumerate(places or ()):
-        why = ""
+        place = ("ros2", "connect", str(index))
         if trusted[index] and not secured:
-            why = "needs certificates: make them with `vla-zenoh secure init`"
+            yield place, "needs certificates: make them with `vla-zenoh secure init`"
         elif secured and not trusted[index] and (any(trusted) or not is_loopback(endpoint)):
             why = "lets anyone on the network command the robot: write tls/, or tcp/127.0.0.1:7450"
-        if why:
-            yield ("ros2", "connect", str(index)), why
+            yield place, why
 
 
 def _serves(profile: Profile) -> Iterator[Fault]:
@@ -396,6 +393,7 @@ def _serves(profile: Profile) -> Iterator[Fault]:
 def _hosts(profile: Profile) -> Iterator[Fault]:
     if not profile.hosts:
         yield ("hosts",), "is empty: name at least one host and its nodes"
+    from_ros2 = set(profile.ros2_cameras())
     runs: dict[tuple[str, str], list[str]] = defaultdict(list)
     for name, host in profile.hosts.items():
         place = ("hosts", name)
@@ -413,10 +411,10 @@ def _hosts(profile: Profile) -> Iterator[Fault]:
                 yield (*place, "nodes"), f"has {kind}, and robot.driver is {profile.robot.driver}"
         if "ros2" in host.nodes and profile.ros2 is None:
             yield (*place, "nodes"), "has ros2, which needs a section ros2"
-        named = set(host.cameras or ()) & set(profile.cameras) if "camera" in host.nodes else set()
-        for camera in sorted(named - set(profile.served_cameras(host))):
+        cameras = set(profile.cameras_of(host))
+        for camera in sorted(cameras & from_ros2) if host.cameras is not None else ():
             yield (*place, "cameras"), f"has {camera}, of ROS 2: the node ros2 serves it"
-        if "camera" in host.nodes and not profile.served_cameras(host):
+        if "camera" in host.nodes and not cameras - from_ros2:
             yield (
                 (*place, "nodes"),
                 "has camera, and there is no camera for it to serve: describe one in cameras, or "

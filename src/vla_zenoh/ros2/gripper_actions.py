@@ -14,7 +14,7 @@ import numpy as np
 
 from vla_zenoh.kinematics.fingers import Fingers
 from vla_zenoh.profile import GripperProfile
-from vla_zenoh.profile.ros2 import Ros2Gripper
+from vla_zenoh.profile.robot import Ros2Gripper
 from vla_zenoh.ros2.messages import Messages
 from vla_zenoh.types import GripperCommand
 

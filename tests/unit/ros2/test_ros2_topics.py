@@ -10,7 +10,7 @@ import pytest
 
 from vla_zenoh.errors import CodecError, ProfileError
 from vla_zenoh.profile import GripperProfile
-from vla_zenoh.profile.ros2 import Ros2Gripper
+from vla_zenoh.profile.robot import Ros2Gripper
 from vla_zenoh.ros2 import diagnostics, readers
 from vla_zenoh.ros2.gripper_actions import (
     GRASP,

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from vla_zenoh.errors import SpecError, WorkerError, in_words
 from vla_zenoh.policy import ActionSpec
-from vla_zenoh.policy.loader import ModelFile, make_by_method
+from vla_zenoh.policy.loader import ModelFile, find_maker
 from vla_zenoh.types import FloatArray, GripperState, JointState, PoseState, PrivilegedState
 
 Picture = NDArray[np.uint8]
@@ -100,7 +100,7 @@ def make_benchmark(file: ModelFile, options: Mapping[str, str] | None = None) ->
     Raises:
         WorkerError: the file fails to import, has no such class, or rejects the options.
     """
-    found = make_by_method(file, "BENCHMARK", "observe", dict(options or {}))
+    found = find_maker(file, "BENCHMARK", "observe").make(options or {})
     try:
         fits = isinstance(found, Benchmark)
     except Exception as error:  # a property that fails

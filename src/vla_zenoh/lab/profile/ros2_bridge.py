@@ -10,7 +10,7 @@ from typing import Any
 
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.profile import Profile
-from vla_zenoh.profile.ros2 import GRIPPER_ACTIONS, Ros2Gripper, Ros2Profile
+from vla_zenoh.profile.robot import GRIPPER_ACTIONS, Ros2Gripper, Ros2Profile
 from vla_zenoh.profile.session import (
     TRUSTED_PROTOCOLS,
     endpoint_faults,

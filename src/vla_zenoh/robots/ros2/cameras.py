@@ -12,7 +12,7 @@ from vla_zenoh.errors import CodecError
 from vla_zenoh.nodes.camera.camera_publisher import OK, CameraPublisher
 from vla_zenoh.nodes.camera.geometry import resize
 from vla_zenoh.nodes.camera.source import LOOK_S, STALL_S
-from vla_zenoh.profile.ros2 import Ros2Camera
+from vla_zenoh.profile.robot import Ros2Camera
 from vla_zenoh.robots.joint_reading import StampFilter
 from vla_zenoh.robots.ros2.ros_graph import RosGraph
 from vla_zenoh.ros2.keys import SENSOR

@@ -23,7 +23,7 @@ from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import CodecError, ProfileError, RecordError
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.profile import Profile, SessionProfile
-from vla_zenoh.profile.ros2 import Ros2Output, Ros2Profile
+from vla_zenoh.profile.robot import Ros2Output, Ros2Profile
 from vla_zenoh.profile.session import TRUSTED_PROTOCOLS
 from vla_zenoh.robots.arm import Arm
 from vla_zenoh.robots.driver import DriverStatus, Measurement, RobotDriver, command_of

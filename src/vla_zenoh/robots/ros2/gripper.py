@@ -10,7 +10,7 @@ from typing import Any
 
 from vla_zenoh.bus.node import Node
 from vla_zenoh.errors import CodecError
-from vla_zenoh.profile.ros2 import GRIPPER_ACTIONS, Ros2Gripper
+from vla_zenoh.profile.robot import GRIPPER_ACTIONS, Ros2Gripper
 from vla_zenoh.robots.ros2.ros_graph import CALL_S, RosGraph, ServiceClient
 from vla_zenoh.ros2 import gripper_actions
 from vla_zenoh.ros2.gripper_actions import GRASP, ActionGoal, GoalSequencer, GoalStep

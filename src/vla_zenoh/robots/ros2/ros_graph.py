@@ -13,7 +13,7 @@ import zenoh
 
 from vla_zenoh.bus.buffers import CallbackRing, LatestSample, bytes_of
 from vla_zenoh.errors import CodecError
-from vla_zenoh.profile.ros2 import Ros2Profile
+from vla_zenoh.profile.robot import Ros2Profile
 from vla_zenoh.ros2 import attachment as attachments
 from vla_zenoh.ros2.attachment import Attachment
 from vla_zenoh.ros2.keys import (
