@@ -93,9 +93,7 @@ def step_pose(spec: ActionSpec, step: FloatArray, before: Pose, start: Pose | No
 def step_joints(
     spec: ActionSpec, step: FloatArray, before_rad: FloatArray, start_rad: FloatArray
 ) -> FloatArray:
-    """The joints (n,) that a step (D,) asks for, after joints `before_rad` in a chunk from
-    `start_rad`.
-    """
+    """The joints (n,) that a step (D,) asks for, after `before_rad` in a chunk from `start_rad`."""
     numbers = np.asarray(step[: spec.arm_size], np.float64)
     if spec.kind == "absolute":
         return numbers
@@ -109,8 +107,7 @@ def covered_step(
 ) -> tuple[Pose, Response | None]:
     """Where a step (D,) ends, of which `ActionSpec.controller` may cover only a part.
 
-    With the state of the controller's response there, as `state` is that at `before`; None: at
-    rest.
+    With the controller's response there, as `state` is that at `before`; None: at rest.
     """
     asked = step_pose(spec, step, before, start)
     if spec.controller is None:
@@ -164,6 +161,17 @@ def as_deltas(spec: ActionSpec, steps: Steps) -> tuple[ActionSpec, FloatArray]:
     return spec.model_copy(update=changed), np.concatenate([rows, steps[:, size:]], axis=1)
 
 
+def gripper_range(spec: ActionSpec, max_width_m: float) -> tuple[float, float]:
+    """Least and greatest gripper number of the declared meaning; of a choice of two any is one."""
+    if spec.gripper == "delta_m":
+        return -max_width_m - GRIPPER_SLACK_M, max_width_m + GRIPPER_SLACK_M
+    if spec.gripper == "absolute_m":
+        return -0.01, max_width_m + GRIPPER_SLACK_M
+    if spec.gripper == "open_fraction":
+        return -GRIPPER_SLACK, 1.0 + GRIPPER_SLACK
+    return -math.inf, math.inf
+
+
 def step_width(
     spec: ActionSpec, step: FloatArray, before_m: float, max_width_m: float
 ) -> float | None:
@@ -175,23 +183,19 @@ def step_width(
     """
     if spec.gripper == "none":
         return None
-    value = float(step[-1])
-    if spec.gripper in ("delta_m", "absolute_m"):
-        least_m = -0.01 if spec.gripper == "absolute_m" else -max_width_m - GRIPPER_SLACK_M
-        if not least_m <= value <= max_width_m + GRIPPER_SLACK_M:
-            raise RecordError(
-                f"gripper {spec.gripper} of {value:g} m; this gripper opens to {max_width_m:g} m"
-            )
-        wanted_m = value if spec.gripper == "absolute_m" else before_m + value
+    value, (low, high) = float(step[-1]), gripper_range(spec, max_width_m)
+    if not low <= value <= high:
+        of_width = f" m; this gripper opens to {max_width_m:g} m"
+        wanted = "; wanted a number in [0, 1]" if spec.gripper == "open_fraction" else of_width
+        raise RecordError(f"gripper {spec.gripper} of {value:g}{wanted}")
+    if spec.gripper == "delta_m":
+        wanted_m = before_m + value
+    elif spec.gripper == "absolute_m":
+        wanted_m = value
     else:
-        fraction = float(value > spec.gripper_threshold)
-        if spec.gripper == "open_fraction":
-            if not -GRIPPER_SLACK <= value <= 1 + GRIPPER_SLACK:
-                raise RecordError(f"gripper open_fraction of {value:g}; wanted a number in [0, 1]")
-            fraction = value
-        if not spec.gripper_open_is_high:
-            fraction = 1.0 - fraction
-        wanted_m = fraction * max_width_m
+        binary = spec.gripper == "binary"
+        fraction = float(value > spec.gripper_threshold) if binary else value
+        wanted_m = (fraction if spec.gripper_open_is_high else 1.0 - fraction) * max_width_m
     return min(max(wanted_m, 0.0), max_width_m)
 
 

@@ -1,10 +1,9 @@
-"""The path of an action chunk to the goals the arm follows: validate, plan, bound, enqueue.
+"""From an action chunk to the goals that the arm follows: validate, plan, bound, enqueue.
 
-1. `ChunkPlanner.submit` validates a chunk (`vla_zenoh.control.chunk_validation`) and queues it.
-2. `ChunkPlanner.plan` puts its steps on top of what was asked for when its observation was taken.
-3. `ChunkPlanner.bound` shortens each step to its limits and to what the arm can do.
-4. `ChunkPlanner.advance` does 2 and 3 with the newest chunk of the queue, and adds the plan to the
-   `GoalTimeline`. `ChunkPlanner.bound_due` bounds the steps that follow, in time for them.
+`ChunkPlanner.submit` validates a chunk (`vla_zenoh.control.chunk_validation`) and queues it. `plan`
+puts its steps on top of what was asked for when its observation was taken, `bound` shortens each to
+its limits and to what the arm can do. `advance` does both with the newest chunk of the queue, and
+adds the plan to the `GoalTimeline`; `bound_due` bounds the steps that follow, in time for them.
 
 The cost of one evaluation of the arm is known, their number per step is not: one in free space,
 about ten where a limit cuts. So every tick has a budget of evaluations. A plan comes into force as
@@ -69,6 +68,14 @@ LOOK_AHEAD = 8
 """Steps bounded before they are due."""
 BEHIND_S = 0.3
 """At the end of an approach the arm is up to this late."""
+OVERTAKEN = Rejection("overtaken", "a newer chunk came before it was planned", quiet=True)
+SUPERSEDED = Rejection("superseded", "the arm was stopped or got a new task meanwhile", quiet=True)
+
+
+class _RejectedError(Exception):
+    def __init__(self, rejection: Rejection) -> None:
+        super().__init__(rejection.why)
+        self.rejection = rejection
 
 
 class ChunkOutcome(NamedTuple):
@@ -179,24 +186,26 @@ class ChunkPlanner:
         """
         outcomes: list[ChunkOutcome] = []
         parts = [(self, timeline), *beside]
-        while self._pending is not None or self._queue:
-            if self._pending is None:
-                chunk = self._queue.pop()
-                plans = _superseded(chunk, episode) or _planned(parts, chunk, action)
-                if isinstance(plans, Rejection):
-                    outcomes.append(ChunkOutcome(chunk, plans))
-                    continue
-                outcomes += [ChunkOutcome(older, OVERTAKEN) for older in self._queue]
-                self._queue.clear()
-                self._pending = chunk, plans
-            chunk, plans = self._pending
-            ready = _superseded(chunk, episode) or _bounded(parts, plans, now_ns)
-            if ready is False:
+        while self.waiting:
+            chunk, plans = self._pending or (self._queue.pop(), None)
+            try:
+                if chunk.record.episode != episode:
+                    raise _RejectedError(SUPERSEDED)
+                if plans is None:
+                    plans = [planner.plan(chunk, action, own) for planner, own in parts]
+                    outcomes += [ChunkOutcome(older, OVERTAKEN) for older in self._queue]
+                    self._queue.clear()
+                    self._pending = chunk, plans
+                ready = [
+                    each[0].bound(plan, now_ns) for each, plan in zip(parts, plans, strict=True)
+                ]
+            except _RejectedError as error:
+                self._pending = None
+                outcomes.append(ChunkOutcome(chunk, error.rejection))
+                continue
+            if not all(ready):
                 break
             self._pending = None
-            if isinstance(ready, Rejection):
-                outcomes.append(ChunkOutcome(chunk, ready))
-                continue
             hits: list[LimitHit] = []
             for (planner, own), plan in zip(parts, plans, strict=True):
                 plan.effective_ns = max(plan.effective_ns, earliest_ns)
@@ -206,17 +215,18 @@ class ChunkPlanner:
             outcomes.append(ChunkOutcome(chunk, None, plans[0], hits))
         return outcomes
 
-    def tagged(self, rejection: Rejection) -> Rejection:
-        """A rejection with the part that it is about."""
-        return rejection._replace(why=f"{self._part}: {rejection.why}") if self._part else rejection
+    def _rejected(self, rejection: Rejection) -> _RejectedError:
+        """With the part that it is about."""
+        why = f"{self._part}: {rejection.why}" if self._part else rejection.why
+        return _RejectedError(rejection._replace(why=why))
 
     # -- plan ---------------------------------------------------------------------------------
     def plan(
         self, chunk: Stamped[ActionChunk], action: ActionSpec, timeline: GoalTimeline
-    ) -> ChunkPlan | Rejection:
+    ) -> ChunkPlan:
         """A plan of the part's columns of `chunk` on top of what was asked for at its observation.
 
-        None of its steps is computed yet, see `bound`. Steps later than ``timing.max_open_loop_s``
+        `bound` computes its steps. Steps later than ``timing.max_open_loop_s``
         are left out: the model has seen nothing of what the arm will meet by then.
         """
         record, columns = chunk.record, action.columns(self._part)
@@ -236,7 +246,7 @@ class ChunkPlanner:
                     f"the arm was not measured within {self._gap_ns / 1e9:g} s before its "
                     "observation, which the first step is added to (anchor: measured)"
                 )
-                return Rejection("not_measured", why)
+                raise self._rejected(Rejection("not_measured", why))
             base = measured
         steps = np.asarray(record.steps[:count, columns], np.float64)
         if bounds is not None:
@@ -247,7 +257,7 @@ class ChunkPlanner:
         if rejection is None and bounds is not None and action.targets:
             rejection = bounds.far_out_of_range(action, steps, self._joints_at(base))
         if rejection is not None:
-            return rejection
+            raise self._rejected(rejection)
         # Between two waypoints the joints and the speed are about those of the coming one.
         near = previous.goals[previous.index_at(observed_ns)]
         start_rad = near.joints_rad if base.joints_rad is None else base.joints_rad
@@ -256,7 +266,16 @@ class ChunkPlanner:
             observed_ns,
             max(int(action.dt_s * 1e9), 1),
             [base] * count,
-            _cause(chunk),
+            Cause(
+                record.worker,
+                chunk.header.seq,
+                record.observation_stamp_ns,
+                record.observed_ns,
+                record.inference_start_ns,
+                record.inference_end_ns,
+                chunk.header.stamp_wall_ns,
+                chunk.received_ns,
+            ),
             0,
             record.episode,
             done=done,
@@ -301,7 +320,7 @@ class ChunkPlanner:
         return Goal(interpolate(pose, pose_of(after), share) if share else pose, width_m)
 
     # -- bound --------------------------------------------------------------------------------
-    def bound(self, plan: ChunkPlan, now_ns: int) -> Rejection | bool:
+    def bound(self, plan: ChunkPlan, now_ns: int) -> bool:
         """Bound the steps of `plan` up to the one that is due, as far as the budget goes.
 
         Returns whether it may come into force. Where the profile rejects steps that are out of
@@ -314,7 +333,7 @@ class ChunkPlanner:
                 return plan.evaluations >= PATIENCE and not self._rejecting
             if acted and self._rejecting:
                 why = "out of bounds, and the profile says refuse"
-                return Rejection(acted[0].name, why, *acted[0][1:3])
+                raise self._rejected(Rejection(acted[0].name, why, *acted[0][1:3]))
         return True
 
     def bound_due(self, plans: Sequence[Plan], now_ns: int, ahead: int = 0) -> list[LimitHit]:
@@ -450,10 +469,7 @@ class ChunkPlanner:
     def _approach(
         self, plan: ChunkPlan, far_m: float, far_rad: float, full_s: float
     ) -> tuple[float, Slowdown | None]:
-        """The part of a step to an absolute target that is taken, and the slowdown of an approach.
-
-        A target further away than a step is approached.
-        """
+        """The part of a step to a target that is taken; one further than a step is approached."""
         limits = self._limits
         steps = max(far_m / limits.step_m, far_rad / limits.step_rad)
         if steps <= 1 + ROUNDING:
@@ -469,55 +485,3 @@ class ChunkPlanner:
         has_ns = plan.dt_ns if plan.bounded or plan.first_step_ns < 0 else plan.first_step_ns
         part = min(has_ns / 1e9 / needed_s, 1 / steps)
         return part, Slowdown(APPROACH, share, far, step, "", BEHIND_S)
-
-
-OVERTAKEN = Rejection("overtaken", "a newer chunk came before it was planned", quiet=True)
-
-
-def _superseded(chunk: Stamped[ActionChunk], episode: int | None) -> Rejection | None:
-    """Why a chunk that was valid on arrival no longer is."""
-    if chunk.record.episode == episode:
-        return None
-    return Rejection("superseded", "the arm was stopped or got a new task meanwhile", quiet=True)
-
-
-def _planned(
-    parts: Sequence[tuple[ChunkPlanner, GoalTimeline]],
-    chunk: Stamped[ActionChunk],
-    action: ActionSpec,
-) -> list[ChunkPlan] | Rejection:
-    """A plan for each part, or why a part rejects the chunk."""
-    plans: list[ChunkPlan] = []
-    for planner, timeline in parts:
-        plan = planner.plan(chunk, action, timeline)
-        if isinstance(plan, Rejection):
-            return planner.tagged(plan)
-        plans.append(plan)
-    return plans
-
-
-def _bounded(
-    parts: Sequence[tuple[ChunkPlanner, GoalTimeline]], plans: Sequence[ChunkPlan], now_ns: int
-) -> bool | Rejection:
-    """Whether the plans of all parts may come into force, or why a part rejects the chunk."""
-    ready = True
-    for (planner, _), plan in zip(parts, plans, strict=True):
-        bounded = planner.bound(plan, now_ns)
-        if isinstance(bounded, Rejection):
-            return planner.tagged(bounded)
-        ready = ready and bounded
-    return ready
-
-
-def _cause(chunk: Stamped[ActionChunk]) -> Cause:
-    record = chunk.record
-    return Cause(
-        record.worker,
-        chunk.header.seq,
-        record.observation_stamp_ns,
-        record.observed_ns,
-        record.inference_start_ns,
-        record.inference_end_ns,
-        chunk.header.stamp_wall_ns,
-        chunk.received_ns,
-    )

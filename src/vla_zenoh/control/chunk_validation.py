@@ -22,14 +22,10 @@ SOURCE_CHARS = 60
 
 
 class Rejection(NamedTuple):
-    """Why a chunk is not executed, or a setting not applied.
+    """Why a chunk is not executed, or a setting not applied: a stable name and a sentence.
 
-    Args:
-        reason: short stable name; its counter.
-        why: a sentence.
-        value: the value found, where it is a number.
-        limit: the value allowed.
-        quiet: part of normal operation (a chunk on its way while the prompt changed): no event.
+    With the value found and the one allowed, where they are numbers. ``quiet``: part of normal
+    operation (a chunk on its way while the prompt changed), no event.
     """
 
     reason: str

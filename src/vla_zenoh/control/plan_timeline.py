@@ -18,8 +18,8 @@ taken earlier does not, so the next delta replaces it. Nothing is counted twice 
 whatever the latency. Steps whose time has passed when a chunk arrives are skipped, never replayed:
 waypoints are sums, so skipping them loses no distance.
 
-Where plans overlap, the goal that is followed may be a blend of several, see
-`vla_zenoh.control.aggregate`; ``G`` is that of the newest plan in every mode.
+Where plans overlap, the goal that is followed may be a blend of several
+(`vla_zenoh.control.aggregate`); ``G`` is that of the newest plan in every mode.
 
 A chunk that is replaced halfway counts for the time it had, and for its first step at least: the
 speed a model asks for does not depend on how often it is asked, and a single step is a step. Steps
@@ -57,9 +57,7 @@ WHOLE_STEP = 1e-6
 class PlanClock:
     """Plan time as a function of wall time (both ns): its rate is the speed override.
 
-    Args:
-        override: from the beginning on.
-        now_ns: of the beginning, at which plan time is wall time.
+    At the beginning, `now_ns`, plan time is wall time.
     """
 
     def __init__(self, override: float = 1.0, now_ns: int = 0) -> None:
@@ -78,12 +76,8 @@ class PlanClock:
 
     def at(self, wall_ns: int) -> int:
         """Plan time at a wall time: of the last seconds, or later at the present override."""
-        for mark in reversed(self._marks):
-            if mark[0] <= wall_ns:
-                break
-        else:
-            mark = self._marks[0]
-        since_ns, plan_ns, override = mark
+        before = (mark for mark in reversed(self._marks) if mark[0] <= wall_ns)
+        since_ns, plan_ns, override = next(before, self._marks[0])
         passed_ns = wall_ns - since_ns
         return plan_ns + (passed_ns if override == 1.0 else round(override * passed_ns))
 
@@ -133,8 +127,7 @@ class Goal:
     def shifted(self, old: Goal, new: Goal, limits: Limits) -> Goal:
         """This goal after what moves `old` to `new`, within the workspace box."""
         if self.arm is not None and self.joints_rad is not None:
-            assert old.joints_rad is not None
-            assert new.joints_rad is not None
+            assert old.joints_rad is not None and new.joints_rad is not None
             way_rad = new.joints_rad - old.joints_rad
             return joint_goal(self.arm, self.joints_rad + way_rad, self.width_m)
         way_m = new.pose.position_m - old.pose.position_m
@@ -397,6 +390,5 @@ class EpisodeProgress:
         plan = timeline.plan
         if plan.episode != episode:
             return
-        steps = math.floor(plan.steps_in_force(now_ns) + WHOLE_STEP)
-        self.steps = max(self.steps, steps)
+        self.steps = max(self.steps, math.floor(plan.steps_in_force(now_ns) + WHOLE_STEP))
         self.done = plan.done and plan.index_at(now_ns) == len(plan.goals) - 1

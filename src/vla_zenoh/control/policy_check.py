@@ -15,27 +15,21 @@ import numpy as np
 
 from vla_zenoh.control.actions import (
     FURTHEST_RAD,
-    GRIPPER_SLACK,
-    GRIPPER_SLACK_M,
     Steps,
     as_deltas,
+    gripper_range,
 )
 from vla_zenoh.policy import ROTATION_SIZE, ActionSpec, ModelSpec
 from vla_zenoh.profile import POSE_JOINTS, REACH_M, REJECT_FACTOR, Limits, Profile
 from vla_zenoh.types import QUATERNION_NORM_TOLERANCE, FloatArray
 
-BINARY_SPAN = 2.0
-"""A number further than this from the threshold is not a choice of two but another quantity."""
 Level = Literal["error", "warning", "note"]
 
 
 class Finding(NamedTuple):
-    """One result of a check.
+    """One result of a check: a stable short name, and a sentence with what is found and expected.
 
-    Args:
-        level: ``error``: the model must not get the arm; ``warning``: look at it; ``note``.
-        name: stable short name.
-        why: a sentence with the value found and the value expected.
+    ``error``: the model must not get the arm; ``warning``: look at it.
     """
 
     level: Level
@@ -139,18 +133,11 @@ def few_joints(profile: Profile) -> str:
 def chunk_errors(
     spec: ActionSpec, steps: Steps, limits: Limits, max_width_m: float
 ) -> Iterator[Finding]:
-    """Numbers of one chunk that cannot have the declared meaning.
-
-    Args:
-        spec: the declared meaning of the numbers.
-        steps: (H, D), as `vla_zenoh.policy.check_steps` gives them.
-        limits: of the robot.
-        max_width_m: of its gripper.
-    """
+    """Numbers (H, D) of one chunk, from `check_steps`, that cannot have the declared meaning."""
     steps = steps.astype(np.float64)
-    if spec.gripper != "binary":  # any number is a valid choice of two
-        for why in beyond_gripper(spec, steps[:, -1], max_width_m):
-            yield error("gripper_range", why)
+    wanted = gripper_range(spec, max_width_m)
+    for why in beyond_gripper(spec, steps[:, -1], wanted, max_width_m):
+        yield error("gripper_range", why)
     if spec.space == "joint":
         beyond = beyond_radians(spec, steps, limits)
         if beyond is not None:
@@ -233,15 +220,11 @@ def _quaternion(rotation: FloatArray, limits: Limits) -> Iterator[Finding]:
         yield _too_far_a_turn(largest, limits)
 
 
-def beyond_gripper(spec: ActionSpec, value: FloatArray, max_width_m: float) -> Iterator[str]:
-    """A sentence about gripper numbers that cannot have the declared meaning."""
-    low, high = {
-        "none": (-math.inf, math.inf),
-        "delta_m": (-max_width_m - GRIPPER_SLACK_M, max_width_m + GRIPPER_SLACK_M),
-        "absolute_m": (-0.01, max_width_m + GRIPPER_SLACK_M),
-        "open_fraction": (-GRIPPER_SLACK, 1.0 + GRIPPER_SLACK),
-        "binary": (spec.gripper_threshold - BINARY_SPAN, spec.gripper_threshold + BINARY_SPAN),
-    }[spec.gripper]
+def beyond_gripper(
+    spec: ActionSpec, value: FloatArray, wanted: tuple[float, float], max_width_m: float
+) -> Iterator[str]:
+    """A sentence about gripper numbers (n,) that are not in a range that is wanted of them."""
+    low, high = wanted
     outside = value[(value < low) | (value > high)].tolist()
     if outside:
         yield (
@@ -264,13 +247,9 @@ LOST_SHARE = 0.3
 def joints_as_pose(
     spec: ActionSpec, steps: Steps, joints_rad: FloatArray, limits: Limits
 ) -> list[Finding]:
-    """An error if absolute poses look like joint positions, of which a step has as many numbers.
+    """An error if absolute poses look like joints, of which a step (H, D) has as many numbers.
 
-    Args:
-        spec: the declared meaning of the numbers.
-        steps: (H, D).
-        joints_rad: (n,) of the arm at the observation.
-        limits: of the robot.
+    The joints (n,) of the arm are those at the observation.
     """
     count = len(joints_rad)
     absolute = spec.space != "joint" and spec.kind == "absolute"
@@ -297,13 +276,10 @@ def joints_as_pose(
 def beyond_joints(
     spec: ActionSpec, steps: Steps, jacobian: FloatArray, rotation: FloatArray
 ) -> list[str]:
-    """Axes along which a chunk of deltas asks an arm for what its joints cannot do, with amounts.
+    """Axes along which deltas (H, D) ask an arm for what its joints cannot do, with amounts.
 
-    Args:
-        spec: the declared meaning of the numbers.
-        steps: (H, D).
-        jacobian: (6, n) of the TCP in base axes, linear first.
-        rotation: (3, 3) of the TCP, for deltas in its frame.
+    The Jacobian (6, n) of the TCP is in base axes, linear first; deltas may be in its frame, of
+    that `rotation` (3, 3).
     """
     if spec.space == "joint" or spec.kind == "absolute" or jacobian.shape[1] >= POSE_JOINTS:
         return []

@@ -25,6 +25,8 @@ from vla_zenoh.profile import POSE_JOINTS, REACH_M, REJECT_FACTOR, Limits, Profi
 SHAPE_TOLERANCE = 0.02
 """An image may be stretched by this share of its aspect ratio without a note."""
 ROUNDING = 1e-6
+BINARY_SPAN = 2.0
+"""A number further than this from the threshold is not a choice of two but another quantity."""
 ORIGIN = Pose(np.zeros(3), np.eye(3))
 
 
@@ -138,7 +140,9 @@ def check_chunk(
         found += _steps(spec, steps, limits)
     if spec.gripper == "binary":
         value = steps[:, -1].astype(np.float64)
-        found += (warning("gripper_range", why) for why in beyond_gripper(spec, value, max_width_m))
+        choice = spec.gripper_threshold - BINARY_SPAN, spec.gripper_threshold + BINARY_SPAN
+        beyond = beyond_gripper(spec, value, choice, max_width_m)
+        found += (warning("gripper_range", why) for why in beyond)
     return found
 
 
