@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import zenoh
@@ -31,11 +31,9 @@ from vla_zenoh.nodes.worker.streams import (
     ReceivedImage,
     StateStream,
     subscribe_to_camera,
-    subscribe_to_depth,
 )
 from vla_zenoh.policy import (
     ActionSteps,
-    CameraSpec,
     ModelSpec,
     Observation,
     Policy,
@@ -100,23 +98,32 @@ class RobotSession:
         history_s = self._history_s = self.spec.observation.history_span_s
         jpeg = images == "jpeg"
         self._streams = Streams.of(self.spec.observation, self.spec.parts)
-        self._cameras = {
+        cameras = {
             one.camera: subscribe_to_camera(
                 one, node, jpeg=jpeg, changed=changed, history_s=history_s
             )
             for one in self.spec.observation.cameras
         }
         depths = {
-            one.camera: subscribe_to_depth(one.camera, node, changed=changed, history_s=history_s)
+            one.camera: CameraSubscriber(
+                *(node, one.camera, keys.camera_depth(one.camera)),
+                changed=changed,
+                history_s=history_s,
+            )
             for one in self.spec.observation.depth
         }
+        decode_image = (lambda data, _: decode_jpeg(data)) if jpeg else decode_raw
         self._feeds = [
             Feed(name, camera, streams[name], decode)
-            for cameras, streams, decode in (
-                (self._cameras, self._streams.images, _decode_jpeg if jpeg else decode_raw),
+            for subscribers, streams, decode in (
+                (
+                    cameras,
+                    self._streams.images,
+                    decode_image,
+                ),
                 (depths, self._streams.depth, decode_depth),
             )
-            for name, camera in cameras.items()
+            for name, camera in subscribers.items()
         ]
         self._every_state = bool(history_s) or not self._feeds
         self._states = [
@@ -138,8 +145,7 @@ class RobotSession:
         self._not_before_ns = self._episode_ns = 0
         self._rate = RateMeter(window_s=10.0)
         self._inference_ms = Percentiles(128)
-        self._batch = 0
-        self._last_spec_s = -1e9
+        self._batch, self._last_spec_s = 0, -1e9
         self.complaint = "loading"
         """Why there is no inference; empty if there is."""
         self.due_s = 0.0
@@ -269,10 +275,8 @@ class RobotSession:
     ) -> bool:
         """Validate an answer and publish it as a chunk; False if it was rejected.
 
-        Args:
-            observation, answer: of the model.
-            times_ns: observation complete, inference started, inference ended; wall clock.
-            batch: robots in this inference.
+        `times_ns`: observation complete, inference started and ended, wall clock; `batch`: robots in
+        this inference.
         """
         try:
             steps, done = check_steps(self.spec.action, answer.steps), bool(answer.done)
@@ -346,10 +350,6 @@ class RobotSession:
         self.node.close()
 
 
-def _decode_jpeg(payload: bytes, _schema: str) -> Image:
-    return decode_jpeg(payload)
-
-
 class InferenceDebugPublisher:
     """Publishes observation and answer of each inference, while there are subscribers.
 
@@ -358,16 +358,16 @@ class InferenceDebugPublisher:
 
     def __init__(self, node: Node, worker: str, spec: ModelSpec) -> None:
         self._node, self._worker, self._spec = node, worker, spec
-        keys = node.keys
+        keys, observed = node.keys, spec.observation
         # One priority for all: the images arrive before the record.
         self._record = node.declare_publisher(keys.seen_record(worker), Kind.FRAME)
         self._images = [
-            (one, node.declare_publisher(keys.seen(worker, one.camera), Kind.FRAME))
-            for one in spec.observation.cameras
-        ]
-        self._depths = [
-            (one, node.declare_publisher(keys.seen_depth(worker, one.camera), Kind.FRAME))
-            for one in spec.observation.depth
+            (encode, one, node.declare_publisher(key(worker, one.camera), Kind.FRAME))
+            for cameras, key, encode in (
+                (observed.cameras, keys.seen, _seen_image),
+                (observed.depth, keys.seen_depth, _seen_depth),
+            )
+            for one in cameras
         ]
 
     def publish(
@@ -381,24 +381,10 @@ class InferenceDebugPublisher:
         """Publish one inference: its validated steps (H, D), and the header of its chunk."""
         stamp_ns, seq = observation.stamp_wall_ns, chunk.seq
         try:
-            for camera, stream in self._images:
+            for encode, camera, stream in self._images:
                 if stream.has_subscribers:
-                    image = Image(_rgb(camera, observation, answer))
-                    stream.publish(
-                        encode_jpeg(image, SEEN_QUALITY),
-                        stamp_wall_ns=stamp_ns,
-                        seq=seq,
-                        encoding=zenoh.Encoding.IMAGE_JPEG,
-                    )
-            for camera, stream in self._depths:
-                if stream.has_subscribers:
-                    depth = Depth(observation.depth[camera.camera], camera.unit_m)
-                    stream.publish(
-                        encode_depth(depth),
-                        stamp_wall_ns=stamp_ns,
-                        seq=seq,
-                        encoding=zenoh.Encoding.IMAGE_PNG.with_schema(depth_schema(depth)),
-                    )
+                    payload, encoding = encode(camera, observation, answer)
+                    stream.publish(payload, stamp_wall_ns=stamp_ns, seq=seq, encoding=encoding)
             if self._record.has_subscribers:
                 seen = InferenceDebug(
                     *(self._worker, seq, self._spec.hash, observation.task.episode, stamp_ns),
@@ -411,9 +397,19 @@ class InferenceDebugPublisher:
             self._node.reject("seen", f"the inference cannot be published: {error}")
 
 
-def _rgb(camera: CameraSpec, observation: Observation, answer: ActionSteps) -> NDArray[np.uint8]:
-    own = (answer.pictures or {}).get(camera.camera)
-    if own is not None:
-        return np.asarray(own)
-    image = observation.images[camera.camera]
-    return np.ascontiguousarray(image[..., ::-1]) if camera.colour == "bgr" else image
+def _seen_image(
+    camera: Any, observation: Observation, answer: ActionSteps
+) -> tuple[bytes, zenoh.Encoding]:
+    rgb = (answer.pictures or {}).get(camera.camera)
+    if rgb is None:
+        rgb = observation.images[camera.camera]
+        rgb = np.ascontiguousarray(rgb[..., ::-1]) if camera.colour == "bgr" else rgb
+    return encode_jpeg(Image(np.asarray(rgb)), SEEN_QUALITY), zenoh.Encoding.IMAGE_JPEG
+
+
+def _seen_depth(
+    camera: Any, observation: Observation, _: ActionSteps
+) -> tuple[bytes, zenoh.Encoding]:
+    depth = Depth(observation.depth[camera.camera], camera.unit_m)
+    encoding = zenoh.Encoding.IMAGE_PNG.with_schema(depth_schema(depth))
+    return encode_depth(depth), encoding

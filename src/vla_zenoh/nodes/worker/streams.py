@@ -8,13 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-from vla_zenoh.bus.buffers import (
-    CallbackRing,
-    ReceivedSample,
-    Wake,
-    ZenohRing,
-    header_of,
-)
+from vla_zenoh.bus.buffers import CallbackRing, ReceivedSample, Wake, ZenohRing, header_of
 from vla_zenoh.bus.node import Node
 from vla_zenoh.codec.image import MAX_IMAGE_BYTES
 from vla_zenoh.codec.records import SMALL_BYTES
@@ -50,7 +44,8 @@ class CameraSubscriber:
     """Subscriber of one camera: its preferred stream `key`, and after a silence of `patience_s` the
     common one, `fallback_key`, too.
 
-    `queue` images are kept until they are taken; each sets `changed`.
+    The newest image waits until it is taken; where those `history_s` older are needed as well, all
+    of one inference do. Each sets `changed`.
 
     Raises:
         SessionError: the router does not answer at the port for images.
@@ -61,13 +56,17 @@ class CameraSubscriber:
         node: Node,
         camera: str,
         key: str,
-        fallback_key: str | None,
+        fallback_key: str | None = None,
         *,
-        patience_s: float,
+        patience_s: float = PATIENCE_S,
         changed: Wake,
-        queue: int = 1,
+        history_s: float = 0.0,
     ) -> None:
-        self._node, self._camera, self._changed, self._queue = node, camera, changed, queue
+        self._node, self._camera, self._changed, self._queue = node, camera, changed, 1
+        settings = node.profile.cameras.get(camera)
+        if history_s and settings is not None:
+            images = 1 + math.ceil((history_s + PATIENCE_S) * settings.rate_hz)
+            self._queue = min(MAX_QUEUE, images)
         self._fallback_key, self._patience_s = fallback_key, patience_s
         self._preferred = self._subscribe(key)
         self._fallback: _Stream | None = None
@@ -113,10 +112,7 @@ class CameraSubscriber:
 def subscribe_to_camera(
     camera: CameraSpec, node: Node, *, jpeg: bool, changed: Wake, history_s: float
 ) -> CameraSubscriber:
-    """Subscribe to the stream that suits a model: raw, JPEG, or JPEG in its input size.
-
-    `history_s`: images this much older than the newest are needed as well.
-    """
+    """Subscribe to the stream that suits a model: raw, JPEG, or JPEG in its input size."""
     keys, name = node.keys, camera.camera
     settings = node.profile.cameras.get(name)
     key, fallback = keys.camera_jpeg(name) if jpeg else keys.camera_raw(name), None
@@ -126,28 +122,9 @@ def subscribe_to_camera(
             key, fallback = keys.camera_fitted(name, size), key
     rates_hz = (settings.rate_hz, settings.jpeg_rate_hz if jpeg else None) if settings else ()
     patience_s = max([PATIENCE_S, *(PERIODS / rate for rate in rates_hz if rate)])
-    queue = _queue(node, name, history_s)
     return CameraSubscriber(
-        node, name, key, fallback, patience_s=patience_s, changed=changed, queue=queue
+        node, name, key, fallback, patience_s=patience_s, changed=changed, history_s=history_s
     )
-
-
-def subscribe_to_depth(
-    camera: str, node: Node, *, changed: Wake, history_s: float
-) -> CameraSubscriber:
-    """Subscribe to the depth stream of a camera, as `subscribe_to_camera`."""
-    key, queue = node.keys.camera_depth(camera), _queue(node, camera, history_s)
-    return CameraSubscriber(
-        node, camera, key, None, patience_s=PATIENCE_S, changed=changed, queue=queue
-    )
-
-
-def _queue(node: Node, camera: str, history_s: float) -> int:
-    """Number of images that may arrive during one inference and are needed after it."""
-    settings = node.profile.cameras.get(camera)
-    if history_s == 0.0 or settings is None:
-        return 1
-    return min(MAX_QUEUE, 1 + math.ceil((history_s + PATIENCE_S) * settings.rate_hz))
 
 
 class Feed(NamedTuple):
@@ -182,7 +159,7 @@ class StateStream:
     def _first(self, arrivals: Sequence[ReceivedSample], since_ns: int) -> int:
         """The last that the writer measured before `since_ns`, or its first; not a repetition."""
         first = 0
-        for number in range(len(arrivals) - 1, -1, -1):
+        for number in reversed(range(len(arrivals))):
             try:
                 header = header_of(arrivals[number].sample)
             except CodecError:
