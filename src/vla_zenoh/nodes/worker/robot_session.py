@@ -272,16 +272,17 @@ class RobotSession:
         answer: ActionSteps,
         times_ns: tuple[int, int, int],
         batch: int,
-    ) -> bool:
-        """Validate an answer and publish it as a chunk; False if it was rejected.
+    ) -> None:
+        """Validate an answer and publish it as a chunk, or report why it was rejected.
 
-        `times_ns`: observation complete, inference started and ended, wall clock; `batch`: robots in
-        this inference.
+        `times_ns` (wall clock): observation complete, inference started, inference ended; `batch`:
+        robots in this inference.
         """
         try:
             steps, done = check_steps(self.spec.action, answer.steps), bool(answer.done)
         except Exception as error:
-            return self.failed(error)
+            self.failed(error)
+            return
         _, start_ns, end_ns = times_ns
         patience_s = self.node.profile.timing.max_observation_age_s
         chunk = make_chunk(
@@ -297,7 +298,6 @@ class RobotSession:
         obeyed = observation.task.active and observation.task.worker == self.name
         self.prefix.published(observation, steps, header.stamp_wall_ns, obeyed=obeyed)
         self._debug.publish(observation, answer, steps, header, (end_ns - start_ns) / 1e6)
-        return True
 
     def adopt_spec(self) -> None:
         """Publish the policy's spec after it changed the meaning of its actions.
@@ -307,7 +307,7 @@ class RobotSession:
         self.spec = self.policy.spec
         self._specs.publish(self.spec)
 
-    def failed(self, error: Exception, reason: str = "") -> Literal[False]:
+    def failed(self, error: Exception, reason: str = "") -> None:
         """Count and report an inference that failed; the next one is due a little later."""
         if not reason and isinstance(error, PeerError):
             reason = error.reason
@@ -317,7 +317,6 @@ class RobotSession:
         self.complaint = f"{reason}: {why}"
         self.node.reject(reason, why)
         self.due_s = time.monotonic() + AFTER_A_FAILURE_S
-        return False
 
     def report(self, *, now: bool = False) -> None:
         """Publish spec and status when they are due, or `now`."""
