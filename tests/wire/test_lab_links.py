@@ -26,8 +26,7 @@ from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, ObservationSpec
 from vla_zenoh.policy.observation import prepare_image, size_variant
 from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh.profile.schema import CameraProfile
-from vla_zenoh.security.roles import Act
-from vla_zenoh.security.rules import access_control
+from vla_zenoh.security.roles import Act, access_control
 from vla_zenoh.types import Header, Image, Stamped, Task
 
 AHEAD_NS = 60_000_000
@@ -56,7 +55,7 @@ def two_nodes() -> Iterator[tuple[Node, Node]]:
 
 def set_ahead(node: Node, by_ns: int) -> None:
     """Its clock, as another host's would be."""
-    node.clock._offset_ns += by_ns
+    node.clock.offset_ns += by_ns
 
 
 def asked(node: Node, other: str) -> Any:

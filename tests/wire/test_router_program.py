@@ -23,7 +23,7 @@ from vla_zenoh.lab.certificates.secure_profile import profile_text, serving_addr
 from vla_zenoh.profile import load_profile
 from vla_zenoh.runtime.router import router_config, run_router
 from vla_zenoh.security.identity import identities
-from vla_zenoh.security.rules import access_control
+from vla_zenoh.security.roles import access_control
 
 LIMIT_S = 20.0
 

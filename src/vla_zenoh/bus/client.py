@@ -16,7 +16,6 @@ import zenoh
 from vla_zenoh.bus.buffers import bytes_of, header_of
 from vla_zenoh.bus.session import put_text
 from vla_zenoh.codec import records, settings
-from vla_zenoh.codec.settings import encode_deadman_activation
 from vla_zenoh.errors import CodecError, ProfileError, SessionError
 from vla_zenoh.keys import NO_DEADMAN_TOKEN, key_chunk, last_chunk
 from vla_zenoh.security.identity import expected_nodes, identities
@@ -180,8 +179,10 @@ class Client:
         if status is None or status.state not in ("", "stopped", "fault"):
             return status is not None
         if status.state == "fault" and time.monotonic() - self._reset_s > RESET_AGAIN_S:
-            others = self.snapshot().items()
-            if not any(s.state == "fault" for name, (s, _, _) in others if name != "command"):
+            faults = {
+                name for name, (node, _, _) in self.snapshot().items() if node.state == "fault"
+            }
+            if faults <= {"command"}:
                 self.reset()
         return False
 
@@ -200,27 +201,26 @@ class Client:
 
     def set_rate(self, rate_hz: float, timeout_s: float = 2.0) -> Task:
         """Set the rate of action chunks, as `set_prompt`; `CodecError`: it is not allowed."""
-
-        def taken(task: Task) -> bool:
-            return math.isclose(task.rate_hz, rate_hz, rel_tol=1e-5)
-
         settings.decode_rate(f"{rate_hz:g}".encode())
-        return self._set("rate", f"{rate_hz:g}", taken, timeout_s)
+        return self._set_number("rate", rate_hz, lambda task: task.rate_hz, timeout_s)
 
     def set_speed(self, percent: float, timeout_s: float = 2.0) -> Task:
         """Set the speed override, 0 to 100 percent of the planned speed, as `set_prompt`."""
-        return self._set_speed("speed", percent, timeout_s)
+        settings.decode_percent(f"{percent:g}".encode())
+        return self._set_number("speed", percent, lambda task: task.speed_percent, timeout_s)
 
     def slow_down(self, percent: float, timeout_s: float = 2.0) -> Task:
         """Lower the speed override; rejected if that would make the arm faster."""
-        return self._set_speed("slower", percent, timeout_s)
-
-    def _set_speed(self, what: str, percent: float, timeout_s: float) -> Task:
-        def taken(task: Task) -> bool:
-            return math.isclose(task.speed_percent, percent, rel_tol=1e-5, abs_tol=1e-9)
-
         settings.decode_percent(f"{percent:g}".encode())
-        return self._set(what, f"{percent:g}", taken, timeout_s)
+        return self._set_number("slower", percent, lambda task: task.speed_percent, timeout_s)
+
+    def _set_number(
+        self, what: str, value: float, of: Callable[[Task], float], timeout_s: float
+    ) -> Task:
+        def taken(task: Task) -> bool:
+            return math.isclose(of(task), value, rel_tol=1e-5, abs_tol=1e-9)
+
+        return self._set(what, f"{value:g}", taken, timeout_s)
 
     def set_worker(self, worker: str, timeout_s: float = 2.0) -> Task:
         """Choose the worker whose chunks are executed, as `set_prompt`.
@@ -239,8 +239,8 @@ class Client:
         Raises:
             SessionError: rejected, with every reason.
         """
-        text = encode_deadman_activation(holder).decode() if holder else "true"
-        return self._activate(text, timeout_s)
+        text = settings.encode_deadman_activation(holder).decode() if holder else "true"
+        return self._set("activate", text, lambda task: task.active, timeout_s)
 
     def activate_with_deadman(self, what: str, timeout_s: float = 3.0) -> Task:
         """Activate the arm for as long as this process is alive and connected: as its deadman.
@@ -255,19 +255,15 @@ class Client:
         self.release_deadman()
         holder = f"{what}-{secrets.token_hex(4)}"
         self._token = self.session.liveliness().declare_token(self.keys.holding(holder))
-        text = encode_deadman_activation(holder).decode()
         give_up_s = time.monotonic() + HOLD_PATIENCE_S
         while True:
             try:
-                return self._activate(text, timeout_s)
+                return self.activate(timeout_s, holder)
             except SessionError as error:
                 # The token may still be under way: it may arrive after a later put.
                 if NO_DEADMAN_TOKEN not in str(error) or time.monotonic() > give_up_s:
                     self.release_deadman()
                     raise
-
-    def _activate(self, text: str, timeout_s: float) -> Task:
-        return self._set("activate", text, lambda task: task.active, timeout_s)
 
     def latch_reason(self) -> str:
         """Latched stop or fault that has to be reset before activation; empty if there is none."""
@@ -293,13 +289,11 @@ class Client:
 
     def _stands(self, since_s: float) -> bool:
         """Whether the arm stands, by a status that is newer than the command."""
-        status, heard_s = self._nodes.status("command") or (None, 0.0)
-        return (
-            status is not None
-            and heard_s > since_s
-            and status.state not in ("active", "holding")
-            and status.detail.get("at_rest") is True
-        )
+        if (found := self._nodes.status("command")) is None:
+            return False
+        status, heard_s = found
+        at_rest = status.detail.get("at_rest") is True
+        return heard_s > since_s and at_rest and status.state not in ("active", "holding")
 
     def _set(self, what: str, text: str, taken: Callable[[Task], bool], timeout_s: float) -> Task:
         """Put a setting, and wait for a newer task that has it, or a newer rejection.
@@ -371,11 +365,11 @@ class NodeRegistry:
     def token_appeared(self, name: str) -> None:
         """A liveliness token appeared."""
         with self._lock:
-            others = len(self._alive - self._expected)
-            if not self._fit(name) or (name not in self._expected and others >= MAX_OTHERS):
+            full = len(self._alive - self._expected) >= MAX_OTHERS
+            if self._fit(name) and (name in self._expected or not full):
+                self._alive.add(name)
+            else:
                 self.dropped += 1
-                return
-            self._alive.add(name)
 
     def token_gone(self, name: str) -> None:
         """A liveliness token is gone."""

@@ -62,46 +62,39 @@ class Clock:
     """Wall clock: the monotonic clock plus an offset that is updated now and then."""
 
     def __init__(self) -> None:
-        self._offset_ns = time.time_ns() - time.monotonic_ns()
+        self.offset_ns = time.time_ns() - time.monotonic_ns()
+        """Wall time minus monotonic time."""
 
     def wall_ns(self) -> int:
         """Nanoseconds since the Unix epoch."""
-        return time.monotonic_ns() + self._offset_ns
-
-    @property
-    def offset_ns(self) -> int:
-        """Wall time minus monotonic time."""
-        return self._offset_ns
+        return time.monotonic_ns() + self.offset_ns
 
     def wall_at(self, mono_ns: int) -> int:
         """Wall time of a monotonic time."""
-        return mono_ns + self._offset_ns
+        return mono_ns + self.offset_ns
 
     def adopt_system_time(self) -> float:
         """Adopt the system's wall clock; returns its step in s, 0 if there was none."""
         offset_ns = time.time_ns() - time.monotonic_ns()
-        step_s = (offset_ns - self._offset_ns) / 1e9
+        step_s = (offset_ns - self.offset_ns) / 1e9
         if abs(step_s) < NOISE_S:
             return 0.0
-        self._offset_ns = offset_ns
+        self.offset_ns = offset_ns
         return step_s if abs(step_s) > ADOPT_S else 0.0
 
 
 class Tick(NamedTuple):
-    """One cycle of a fixed-rate loop.
-
-    Args:
-        periods: since the last cycle, at least 1.
-        nominal_ns: nominal time of this cycle, monotonic clock.
-        stall_s: how late it begins, plus how long the computer was suspended.
-        computed_s: processor time of this thread in the last cycle. If that is short and the stall
-            long, the computer was busy with something else.
-    """
+    """One cycle of a fixed-rate loop."""
 
     periods: int
+    """Since the last cycle, at least 1."""
     nominal_ns: int
+    """Monotonic clock."""
     stall_s: float
+    """How late it begins, plus how long the computer was suspended."""
     computed_s: float
+    """Processor time of this thread in the last cycle. If that is short and the stall long, the
+    computer was busy with something else."""
 
 
 def suspended_ns() -> int:
@@ -186,6 +179,11 @@ class Exchange(NamedTuple):
         """The peer's wall clock minus our monotonic clock."""
         return ((self.heard - self.asked) + (self.said - self.got)) // 2
 
+    def uncertainty_ns(self, now_mono_ns: int) -> int:
+        """Half of the round trip, and the drift since then."""
+        age_ns = max(now_mono_ns - self.got, 0)
+        return self.round_trip_ns // 2 + int(age_ns * DRIFT) + 1
+
 
 class ClockOffset(NamedTuple):
     """The peer's wall clock minus ours: the truth is within `uncertainty_s` of `offset_s`.
@@ -215,10 +213,12 @@ class ClockOffsetFilter:
         """Add an exchange; False: it is impossible, and ignored."""
         if exchange.round_trip_ns < 0 or exchange.said < exchange.heard:
             return False
-        if self._best is not None and self._differ(self._best, exchange):
-            self._window.clear()  # one of the clocks was set
+        if (best := self._best) is not None:
+            doubt_ns = best.uncertainty_ns(exchange.got) + exchange.uncertainty_ns(exchange.got)
+            if abs(best.ahead_ns - exchange.ahead_ns) > doubt_ns:
+                self._window.clear()  # one of the clocks was set
         self._window.append(exchange)
-        self._best = min(self._window, key=lambda one: self._uncertainty_ns(one, exchange.got))
+        self._best = min(self._window, key=lambda one: one.uncertainty_ns(exchange.got))
         return True
 
     def offset(self, wall_minus_mono_ns: int, now_mono_ns: int) -> ClockOffset | None:
@@ -228,7 +228,7 @@ class ClockOffsetFilter:
             return None
         return ClockOffset(
             (best.ahead_ns - wall_minus_mono_ns) / 1e9,
-            self._uncertainty_ns(best, now_mono_ns) / 1e9,
+            best.uncertainty_ns(now_mono_ns) / 1e9,
             self._window[-1].round_trip_ns / 1e9,
         )
 
@@ -248,18 +248,9 @@ class ClockOffsetFilter:
         offset_ns = best.ahead_ns - wall_minus_mono_ns
         if abs(offset_ns / 1e9) > self._bound_s:
             self._applied_ns = 0
-        elif abs(offset_ns - self._applied_ns) > self._uncertainty_ns(best, now_mono_ns):
+        elif abs(offset_ns - self._applied_ns) > best.uncertainty_ns(now_mono_ns):
             self._applied_ns = offset_ns
         return self._applied_ns
-
-    @staticmethod
-    def _uncertainty_ns(exchange: Exchange, now_mono_ns: int) -> int:
-        age_ns = max(now_mono_ns - exchange.got, 0)
-        return exchange.round_trip_ns // 2 + int(age_ns * DRIFT) + 1
-
-    def _differ(self, one: Exchange, other: Exchange) -> bool:
-        apart_ns = abs(one.ahead_ns - other.ahead_ns)
-        return apart_ns > self._uncertainty_ns(one, other.got) + other.round_trip_ns // 2 + 1
 
 
 def shift_stamps(header: Header, record: Record, ahead_ns: int) -> tuple[Header, Record]:
@@ -394,17 +385,12 @@ class ClockSync:
 
 def reply_with_stamps(clock: Clock, key: str, query: zenoh.Query) -> None:
     """Reply to a clock query with the times of its arrival and of this reply."""
-    heard_ns = clock.wall_ns()
-    reply = {"heard_ns": heard_ns, "said_ns": clock.wall_ns()}
+    reply = {"heard_ns": clock.wall_ns(), "said_ns": clock.wall_ns()}
     query.reply(key, message.pack(reply))
 
 
 def decode_stamps(payload: bytes) -> tuple[int, int]:
-    """Times of arrival and reply of a clock query, on the peer's wall clock, ns.
-
-    Raises:
-        CodecError: the payload is something else.
-    """
+    """Times (ns) of arrival and reply of a query, on the peer's wall clock, or a `CodecError`."""
     found = message.unpack(payload)
     found = found if isinstance(found, dict) else {}
     heard, said = found.get("heard_ns"), found.get("said_ns")

@@ -19,15 +19,12 @@ BOOT_FILE = Path("/proc/sys/kernel/random/boot_id")
 
 
 class HostId(NamedTuple):
-    """Host on which a node runs.
-
-    Args:
-        host: name in the profile if known, else the computer's own name, which need not be unique.
-        boot: unique id of this boot; empty if the system has none.
-    """
+    """Host on which a node runs."""
 
     host: str
+    """Name in the profile if known, else the computer's own name, which need not be unique."""
     boot: str
+    """Unique id of this boot; empty if the system has none."""
 
     def shares_clock(self, other: HostId) -> bool:
         """Whether both certainly run on the same computer; False if unknown."""

@@ -191,7 +191,7 @@ class Node:
                 rates_hz or {},
                 latency_ms or {},
                 dict(self.counters),
-                {**(detail or {}), "clocks": self._clock_detail(), "net": self._traffic_detail()},
+                {**(detail or {}), **self._bus_detail()},
                 self.host_id.boot,
             )
         )
@@ -204,16 +204,14 @@ class Node:
         due = time.monotonic() - self._status_s >= STATUS_PERIOD_S
         return due or state != self._last_state
 
-    def _traffic_detail(self) -> dict[str, Any]:
+    def _bus_detail(self) -> dict[str, Any]:
         short, traffic = self.keys.short, self.traffic
-        return {
+        net = {
             "sent": {short(key): rates for key, rates in traffic.sent(self._publishers).items()},
             "lost": {short(key): count for key, count in traffic.lost().items()},
             "links": traffic.links(),
         }
-
-    def _clock_detail(self) -> dict[str, dict[str, float]]:
-        return {
+        clocks = {
             node: {
                 "offset_ms": round(found.offset_s * 1e3, 3),
                 "uncertainty_ms": round(found.uncertainty_s * 1e3, 3),
@@ -221,6 +219,7 @@ class Node:
             }
             for node, found in self.clocks.offsets().items()
         }
+        return {"clocks": clocks, "net": net}
 
     def subscribe(self, key: str, buffer: AnyBuffer, kind: Kind = Kind.STATE) -> AnyBuffer:
         """Subscribe to a key expression; samples go to `buffer`, which is returned.

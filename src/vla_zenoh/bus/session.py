@@ -59,7 +59,6 @@ def session_config(
     """Configuration of a Zenoh session, as plain data for its strict parser.
 
     Args:
-        profile, mode: of the session.
         connect: overrides the profile's endpoints; of a router: other routers.
         identity: node whose certificate is used; None: the operator at this computer.
         access: section ``access_control`` of a router.
@@ -72,9 +71,12 @@ def session_config(
     targets = (connect or ()) if routes else (connect or profile.connect)
     leases = (LINKED if targets else FIRST) if routes else CLIENT
     blocks_us = ROUTER_BLOCKS_US if routes else FIRST * profile.lease_ms * 1000
+    listens = profile.listen if routes else ()
+    if profile.separate_links:
+        listens = [link for endpoint in listens for link in (endpoint, second_link(endpoint))]
     settings: dict[str, Any] = {
         "mode": mode,
-        "listen": {"endpoints": _listening(profile) if routes else []},
+        "listen": {"endpoints": list(listens)},
         "connect": {
             "endpoints": [second_link(e) if images else e for e in targets],
             # A router starts at once, and keeps trying to reach the others.
@@ -100,12 +102,6 @@ def session_config(
     if access is not None:
         settings["access_control"] = dict(access)
     return settings
-
-
-def _listening(profile: SessionProfile) -> list[str]:
-    if not profile.separate_links:
-        return list(profile.listen)
-    return [link for endpoint in profile.listen for link in (endpoint, second_link(endpoint))]
 
 
 def second_link(endpoint: str) -> str:
@@ -141,11 +137,7 @@ def open_session(
     wait_s: float = 0.0,
     stop: threading.Event | None = None,
 ) -> zenoh.Session:
-    """Open a session of a profile, see `session_config`.
-
-    Args:
-        wait_s: retry for this long.
-        stop: gives up as soon as it is set.
+    """Open a session, see `session_config`; retry for `wait_s`, or until `stop` is set.
 
     Raises:
         SecurityError: the certificate is missing.
@@ -283,7 +275,7 @@ class TcpUserTimeout:
     def _set_timeout(self, descriptor: int) -> bool:
         with socket.socket(fileno=os.dup(descriptor)) as known:
             internet = known.family in (socket.AF_INET, socket.AF_INET6)
-            if internet and known.type == socket.SOCK_STREAM:
-                known.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, self._timeout_ms)
-                return True
-            return False
+            if not internet or known.type != socket.SOCK_STREAM:
+                return False
+            known.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, self._timeout_ms)
+            return True

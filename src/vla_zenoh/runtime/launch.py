@@ -134,9 +134,8 @@ def node_commands(
             commands.append(NodeCommand(profile.node_name(host, kind), kind, words))
             continue
         for worker in profile.workers_of(part):
-            options = (worker_options or {}).get(worker, ())
-            words = ("worker", worker, *common, "--host", host, *worker_arguments)
-            words += _each("--set", options)
+            options = _each("--set", (worker_options or {}).get(worker, ()))
+            words = ("worker", worker, *common, "--host", host, *worker_arguments, *options)
             commands.append(NodeCommand(worker_node(worker), kind, words))
     return commands
 

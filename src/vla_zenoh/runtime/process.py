@@ -90,11 +90,9 @@ def run_node(
     identity: str | None,
     preferred: bool = False,
 ) -> None:
-    """Open a session and run a node in it until a signal arrives.
+    """Open a session and `run` a node in it until a signal arrives.
 
     Args:
-        profile: of the session.
-        run: makes the node and runs it.
         identity: the node's name, for its certificate; None: the operator at this computer.
         preferred: the node keeps an arm in motion and runs before other programs, where allowed.
 

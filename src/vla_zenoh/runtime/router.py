@@ -17,7 +17,7 @@ from vla_zenoh.errors import NodeError
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.session import address_of, is_loopback
 from vla_zenoh.runtime.certificate_expiry import CertificateExpiry
-from vla_zenoh.security.rules import access_control
+from vla_zenoh.security.roles import access_control
 
 POLL_S = 0.25
 MAX_CLIENTS = 64
@@ -33,13 +33,9 @@ def run_router(
     host: str | None = None,
     also: Sequence[Profile] = (),
 ) -> None:
-    """Run a Zenoh router until `stop` is set.
+    """Run a Zenoh router until `stop` is set, which serves the robots `also` as well.
 
-    Args:
-        profile: of the robot.
-        stop: ends it.
-        host: name of this host; it matters if several hosts have a router.
-        also: other robots' profiles that this router serves.
+    `host` is the name of this one; it matters if several have a router.
 
     Raises:
         SecurityError: the router's certificate is missing.
@@ -49,20 +45,21 @@ def run_router(
     os.environ.setdefault(RUNTIME_VARIABLE, RUNTIME)
     with open_session(profile.session, **options) as session:
         node = Node(options["identity"], profile, session, host=host)
-        detail: dict[str, Any] = {
-            "listen": list(profile.session.listen),
-            "security": _security_summary(profile),
-        }
         impatience = TcpUserTimeout(profile.session.lease_ms / 1e3)
         expiry = CertificateExpiry(profile.session.security)
         clients = Clients(session)
+        detail: dict[str, Any] = {"listen": list(profile.session.listen)}
+        if profile.session.security is not None:
+            detail["security"] = "tls"  # certificates are required
+        else:
+            here = all(map(is_loopback, profile.session.listen))
+            detail["security"] = "loopback" if here else "insecure"
         while not stop.wait(POLL_S):
             impatience.apply()
-            links_now = len(list(session.info.links()))
-            detail["clients"] = clients.known()
+            detail |= {"clients": clients.known(), "links": len(list(session.info.links()))}
             if profile.session.security is not None:
                 detail["certificates"] = expiry.outlook._asdict()
-            node.publish_status("routing", detail={**detail, "links": links_now})
+            node.publish_status("routing", detail=detail)
         node.close()
 
 
@@ -130,13 +127,6 @@ def router_config(
     """
     profile, options = _session_of(profile, host, also)
     return session_config(profile.session, **options)
-
-
-def _security_summary(profile: Profile) -> str:
-    """``tls``: certificates are required; ``loopback``: this computer only; ``insecure``: open."""
-    if profile.session.security is not None:
-        return "tls"
-    return "loopback" if all(map(is_loopback, profile.session.listen)) else "insecure"
 
 
 def _session_of(

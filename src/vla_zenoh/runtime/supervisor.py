@@ -85,12 +85,11 @@ def hung_nodes(
 
 
 class Supervisor:
-    """Starts, restarts and stops the nodes of a host.
+    """Starts the nodes of a host in the order of `commands`, restarts and stops them.
 
     Call `start` and `stop` from one thread that lives as long as the nodes.
 
     Args:
-        commands: in the order to start them.
         log: called with (node name, line) for every line a node writes; lines that begin with
             `DETAIL` or `FATAL` belong in a log file only, `tell` gets the summary.
         tell: called with (node name, sentence) for what the supervisor does.

@@ -19,8 +19,7 @@ from vla_zenoh.security.identity import (
     identities,
     identities_of,
 )
-from vla_zenoh.security.roles import TABLE, Act, Right, expressions, rights
-from vla_zenoh.security.rules import access_control, wide
+from vla_zenoh.security.roles import TABLE, Act, Right, access_control, expressions, rights, wide
 
 KEYS = Keys("panda")
 LAB = {

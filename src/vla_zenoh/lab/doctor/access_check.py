@@ -22,8 +22,17 @@ from vla_zenoh.keys import Keys
 from vla_zenoh.lab.doctor.access import AccessVerdict
 from vla_zenoh.profile import Profile
 from vla_zenoh.security.identity import Identity, Role, identities
-from vla_zenoh.security.roles import OWN, TABLE, Act, expressions, rights
-from vla_zenoh.security.rules import IN, MESSAGES, OUT, access_control
+from vla_zenoh.security.roles import (
+    IN,
+    MESSAGES,
+    OUT,
+    OWN,
+    TABLE,
+    Act,
+    access_control,
+    expressions,
+    rights,
+)
 
 
 @dataclass(frozen=True, slots=True)
