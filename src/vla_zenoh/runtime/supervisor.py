@@ -35,6 +35,7 @@ STOP_ORDER = tuple(
 POLL_S = 0.05
 LAST_LINES_S = 0.5
 """A process that ended may have started another one, which keeps its output open."""
+SIGNAL_NAMES = {each.value: each.name for each in signal.Signals}
 RUST_SOURCE = re.compile(r" at /\S+\.rs:\d+(?=\.?$)")
 """Source location in a line of Zenoh's log: a path of the computer it was built on."""
 
@@ -238,7 +239,8 @@ class Supervisor:
         if child.reader is not None:
             child.reader.join(LAST_LINES_S)
         code = process.returncode
-        how = f"killed by {_signal_name(-code)}" if code < 0 else f"exited with code {code}"
+        killer = SIGNAL_NAMES.get(-code, f"signal {-code}")  # a real-time signal has no name
+        how = f"killed by {killer}" if code < 0 else f"exited with code {code}"
         sentence = how
         if child.deaths_in_a_row < GIVE_UP_AFTER:
             sentence += f"; starting again in {wait_s:g} s"
@@ -258,10 +260,3 @@ def signal_group(pid: int, number: signal.Signals) -> None:
     """Signal a node and all that it started, as its environment: its group has its number."""
     with suppress(ProcessLookupError):
         os.killpg(pid, number)
-
-
-def _signal_name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:  # a real-time signal has no name
-        return f"signal {number}"
