@@ -12,13 +12,7 @@ from vla_zenoh.bus.buffers import CallbackRing, ReceivedSample
 from vla_zenoh.bus.node import Node, Publisher, publish_together
 from vla_zenoh.codec.records import SMALL_BYTES
 from vla_zenoh.errors import CodecError
-from vla_zenoh.guard.arm_guard import (
-    SETTLE_NS,
-    ArmGuard,
-    GripperGuard,
-    HeldReference,
-    Measured,
-)
+from vla_zenoh.guard.arm_guard import SETTLE_NS, ArmGuard, GripperGuard, HeldReference, Measured
 from vla_zenoh.keys import Kind
 from vla_zenoh.kinematics.so3 import Pose, quat_from_rotation
 from vla_zenoh.robots.driver import Measurement, RobotDriver

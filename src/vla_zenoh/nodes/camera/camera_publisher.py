@@ -198,11 +198,6 @@ class CameraPublisher:
         kind, change = ("fault", state) if state == was else ("transition", f"{was}->{state}")
         self._emit(Event(level, kind, f"{self.name}:{change}", why[:1000]))
 
-    def set_waiting_reason(self, why: str) -> None:
-        """Change the reason of `WAITING`, without an event."""
-        if self.state == WAITING:
-            self.why = why
-
     def lose(self, why: str) -> None:
         """Enter `LOST`, or `WAITING` before the first image: the source delivers nothing."""
         if self.state == OK:
@@ -367,10 +362,9 @@ class CameraPublisher:
 
     def counters(self) -> dict[str, int]:
         """Counters for status, each prefixed with the camera's name."""
-        counts = dict(self.counts) | {"raw": self._raw.seq, "jpeg": self._jpeg.seq}
-        if self._depth is not None:
-            counts["depth"] = self._depth.seq
-        return {f"{self.name}.{what}": count for what, count in counts.items()}
+        streams = {"raw": self._raw, "jpeg": self._jpeg, "depth": self._depth}
+        counts = {what: stream.seq for what, stream in streams.items() if stream is not None}
+        return {f"{self.name}.{what}": count for what, count in {**self.counts, **counts}.items()}
 
 
 def _shrink(image: Image, max_width: int | None) -> Image:

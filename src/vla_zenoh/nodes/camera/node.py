@@ -15,13 +15,7 @@ from vla_zenoh.errors import NodeError, in_words
 from vla_zenoh.keys import last_chunk
 from vla_zenoh.nodes.camera.camera_publisher import ENDED, OK, CameraPublisher
 from vla_zenoh.nodes.camera.image_check import read_references
-from vla_zenoh.nodes.camera.source import (
-    LOOK_S,
-    STALL_S,
-    Source,
-    prepare_opencv,
-    without_password,
-)
+from vla_zenoh.nodes.camera.source import LOOK_S, STALL_S, Source, prepare_opencv, without_password
 from vla_zenoh.policy import CameraSpec, ModelSpec
 from vla_zenoh.policy.observation import size_variant
 from vla_zenoh.profile import Profile

@@ -88,10 +88,7 @@ class RealsenseSource(Source):
     same_s = SAME_S
 
     def __init__(
-        self,
-        serial: str,
-        profile: CameraProfile,
-        device_of: Callable[[str], Any] = find_device,
+        self, serial: str, profile: CameraProfile, device_of: Callable[[str], Any] = find_device
     ) -> None:
         self._serial, self._profile, self._device_of = serial, profile, device_of
         self._sensors: list[Any] = []

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from vla_zenoh.bus.buffers import LatestSample, ReceivedSample
 from vla_zenoh.errors import MissingExtraError, RecordError, VlaZenohError, in_words
-from vla_zenoh.nodes.camera.camera_publisher import OK, CameraPublisher
+from vla_zenoh.nodes.camera.camera_publisher import OK, WAITING, CameraPublisher
 from vla_zenoh.nodes.camera.geometry import Intrinsics
 from vla_zenoh.nodes.camera.source import STALL_S
 from vla_zenoh.profile import Profile
@@ -137,15 +137,12 @@ class SimCameras:
         for camera, publisher in views:
             width, height = publisher.profile.width, publisher.profile.height
             focal_px = renderer.focal_px(camera, height)
+            centre_px = {"cx_px": width / 2, "cy_px": height / 2}
             publisher.intrinsics = Intrinsics(
-                width=width,
-                height=height,
-                fx_px=focal_px,
-                fy_px=focal_px,
-                cx_px=width / 2,
-                cy_px=height / 2,
+                width=width, height=height, fx_px=focal_px, fy_px=focal_px, **centre_px
             ).shown()
-            publisher.set_waiting_reason(f"no scene on {key} yet")
+            if publisher.state == WAITING:  # without an event
+                publisher.why = f"no scene on {key} yet"
         while not stop.is_set():
             if not self._buffer.wait(WAKE_S):
                 if time.monotonic_ns() - self._received_ns > STALL_S * 1e9:

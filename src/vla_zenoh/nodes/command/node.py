@@ -9,13 +9,13 @@ import threading
 import time
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import zenoh
 
 from vla_zenoh.bus.clock import FixedRate, Tick
 from vla_zenoh.bus.metrics import Percentiles, RateMeter
-from vla_zenoh.bus.node import Node, Publisher
+from vla_zenoh.bus.node import Node
 from vla_zenoh.codec import records
 from vla_zenoh.control.commanded_part import CommandedPart
 from vla_zenoh.control.commander import Commander, Outputs, Setting
@@ -83,7 +83,7 @@ class CommandNode:
         self._inputs = CommandInputs(node)
         self._status = CommandStatus(node, self.commander)
         self._outs = {
-            name: _CommandPublishers(
+            name: (
                 node.declare_publisher(part.keys.command_pose, Kind.CONTROL),
                 node.declare_publisher(part.keys.command_joint, Kind.CONTROL),
                 node.declare_publisher(part.keys.command_gripper, Kind.ORDER),
@@ -177,7 +177,10 @@ class CommandNode:
         self._status.add_tick(now_ns, tick.stall_s, time.perf_counter() - began)
         self.commander.look_ahead(now_ns)
         if chores or out.events or out.task_changed:
-            self._report_latch_failure()
+            why = None if self._latch is None else self._latch.failure()
+            if why is not None:
+                self.node.counters["command.latch_failed"] += 1
+                self.node.emit(Event("error", "fault", "latch", why))
             self._status.publish(out, self._inputs.chunks.dropped)
         busy = inputs.chunks or inputs.settings or not self.commander.at_rest
         if busy or any(self._awaits(part, now_ns) for part in self.commander.parts):
@@ -193,21 +196,15 @@ class CommandNode:
             return False
         return 0 < timeline.plan.end_ns - now_ns < LONGEST_PLAN_NS
 
-    def _report_latch_failure(self) -> None:
-        why = None if self._latch is None else self._latch.failure()
-        if why is not None:
-            self.node.counters["command.latch_failed"] += 1
-            self.node.emit(Event("error", "fault", "latch", why))
-
     def _publish(self, out: Outputs, now_ns: int) -> None:
-        for name, publishers in self._outs.items():
+        for name, (pose, joint, gripper) in self._outs.items():
             commands = out.of(name)
             if commands.pose is not None:
-                publishers.pose.publish(commands.pose, stamp_wall_ns=now_ns)
+                pose.publish(commands.pose, stamp_wall_ns=now_ns)
             if commands.joint is not None:
-                publishers.joint.publish(commands.joint, stamp_wall_ns=now_ns)
+                joint.publish(commands.joint, stamp_wall_ns=now_ns)
             if commands.gripper is not None:
-                publishers.gripper.publish(commands.gripper)
+                gripper.publish(commands.gripper)
         for rejection in out.rejections:
             kind = "skipped" if rejection.quiet else "refused"
             self.node.counters[f"{kind}.{rejection.reason}"] += 1
@@ -219,14 +216,6 @@ class CommandNode:
         if out.task_changed or due:
             self._last_task = time.monotonic()
             self._task_out.publish(self.commander.task)
-
-
-class _CommandPublishers(NamedTuple):
-    """Publishers of the commands to one part."""
-
-    pose: Publisher
-    joint: Publisher
-    gripper: Publisher
 
 
 class CommandStatus:

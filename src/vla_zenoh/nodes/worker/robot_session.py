@@ -32,14 +32,7 @@ from vla_zenoh.nodes.worker.streams import (
     StateStream,
     subscribe_to_camera,
 )
-from vla_zenoh.policy import (
-    ActionSteps,
-    ModelSpec,
-    Observation,
-    Policy,
-    check_steps,
-    reset_of,
-)
+from vla_zenoh.policy import ActionSteps, ModelSpec, Observation, Policy, check_steps, reset_of
 from vla_zenoh.policy.inference import ChunkPrefix, make_chunk
 from vla_zenoh.policy.observation import (
     MAX_STATES,
@@ -91,8 +84,7 @@ class RobotSession:
         self._specs = node.declare_publisher(keys.spec(name), Kind.TELEMETRY)
         self._debug = InferenceDebugPublisher(node, name, self.spec)
         node.serve(
-            keys.spec(name),
-            lambda query: query.reply(keys.spec(name), records.encode(self.spec)),
+            keys.spec(name), lambda query: query.reply(keys.spec(name), records.encode(self.spec))
         )
         self._tasks = node.subscribe(keys.task, LatestSample(SMALL_BYTES))
         history_s = self._history_s = self.spec.observation.history_span_s
@@ -116,11 +108,7 @@ class RobotSession:
         self._feeds = [
             Feed(name, camera, streams[name], decode)
             for subscribers, streams, decode in (
-                (
-                    cameras,
-                    self._streams.images,
-                    decode_image,
-                ),
+                (cameras, self._streams.images, decode_image),
                 (depths, self._streams.depth, decode_depth),
             )
             for name, camera in subscribers.items()

@@ -260,7 +260,7 @@ class FrankaArm:
                 if motion is None or robot is None or not self._overdue or not robot.is_in_control:
                     continue
                 if self._led:  # the trim for friction in motion would now push beyond it
-                    self._led, self._trim = False, self._trim.emptied()
+                    self._led, self._trim = False, Trim(self._trim.columns)
                 still = at_rest(self._command)
                 motion.set_reference(self._reference(still, robot.state, period_s))
 
@@ -392,7 +392,7 @@ class Trim:
     """
 
     def __init__(self, columns: int) -> None:
-        self._poses = columns == 6
+        self.columns = columns
         self._integral: FloatArray = np.zeros(columns)
 
     def update(self, left: FloatArray, elapsed_s: float) -> FloatArray:
@@ -400,12 +400,8 @@ class Trim:
         self._integral = self._bounded(self._integral + elapsed_s / INTEGRAL_S * left)
         return self._bounded(self._integral + PROPORTION * left)
 
-    def emptied(self) -> Trim:
-        """A correction that starts from zero."""
-        return Trim(len(self._integral))
-
     def _bounded(self, trim: FloatArray) -> FloatArray:
-        if not self._poses:
+        if self.columns != 6:
             return np.clip(trim, -MOST_JOINT_RAD, MOST_JOINT_RAD)
         return np.concatenate((_shortened(trim[:3], MOST_M), _shortened(trim[3:], MOST_RAD)))
 

@@ -68,14 +68,17 @@ class Camera:
     def _handle(self, arrival: ReceivedSample) -> bool:
         """Publish an image, or check it now and then; whether it is a valid one."""
         publisher, now_s = self.publisher, time.monotonic()
-        due = publisher.due(arrival.mono_ns)
-        if not (due and publisher.has_subscribers) and now_s - self._decoded_s < LOOK_S:
+        wanted = publisher.due(arrival.mono_ns) and publisher.has_subscribers
+        if not wanted and now_s - self._decoded_s < LOOK_S:
             if publisher.state == OK:
                 publisher.captured(arrival.mono_ns)
             return publisher.state == OK
         self._decoded_s = now_s
+        payload, frame = arrival.sample.payload.to_bytes(), self._topic.frame
         try:
-            image = self._decode(arrival)
+            image: RosImage = read(self._messages, self._topic.type, payload)
+            if frame is not None and image.frame != frame:
+                raise CodecError("frame", f"in frame {image.frame[:60]!r}, wanted {frame!r}")
             publisher.check(image.rgb, arrival.mono_ns, image.stamp_ns or None)
             if image.stamp_ns:
                 self._stamps.check(image.stamp_ns)
@@ -86,16 +89,9 @@ class Camera:
             return False
         publisher.captured(arrival.mono_ns)
         publisher.set_state(OK)
-        if due and publisher.has_subscribers:
+        if wanted:
             settings = publisher.profile
             rgb = resize(image.rgb, settings.width, settings.height)
             stamp_ns = image.stamp_ns or self._node.clock.wall_at(arrival.mono_ns)
             publisher.publish_rgb(rgb, arrival.mono_ns, stamp_ns)
         return True
-
-    def _decode(self, arrival: ReceivedSample) -> RosImage:
-        payload, wanted = arrival.sample.payload.to_bytes(), self._topic.frame
-        image: RosImage = read(self._messages, self._topic.type, payload)
-        if wanted is not None and image.frame != wanted:
-            raise CodecError("frame", f"in frame {image.frame[:60]!r}, wanted {wanted!r}")
-        return image
