@@ -37,8 +37,7 @@ from benchmarks.lockstep_arm import LOOK_S, activated, in_processes
 from vla_zenoh.control.barriers import Barriers
 from vla_zenoh.control.limits import joint_motion_limits, workspace_corners
 from vla_zenoh.control.reachability import make_reachability_filter
-from vla_zenoh.kinematics.ik import pose_error
-from vla_zenoh.kinematics.kinematics import Kinematics, smallest_singular_value
+from vla_zenoh.kinematics.kinematics import Kinematics, pose_error, smallest_singular_value
 from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.lab.lockstep import Delays, Lockstep
 from vla_zenoh.policy import ActionSpec, ActionSteps, ModelSpec, Observation, ObservationSpec

@@ -24,8 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.errors import WorkerError
-from vla_zenoh.kinematics.ik import pose_error
-from vla_zenoh.kinematics.kinematics import Kinematics, make_kinematics
+from vla_zenoh.kinematics.kinematics import Kinematics, make_kinematics, pose_error
 from vla_zenoh.kinematics.so3 import Pose, rotation_from_rpy
 from vla_zenoh.policy import (
     ActionSpec,

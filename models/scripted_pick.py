@@ -26,8 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.errors import WorkerError
-from vla_zenoh.kinematics.ik import pose_error
-from vla_zenoh.kinematics.kinematics import make_kinematics
+from vla_zenoh.kinematics.kinematics import make_kinematics, pose_error
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.policy import (
     ActionSpec,

@@ -11,7 +11,7 @@ from vla_zenoh.control.commander import Setting
 from vla_zenoh.control.joint_space import JointBounds
 from vla_zenoh.control.limits import workspace_corners
 from vla_zenoh.control.reachability import make_reachability_filter
-from vla_zenoh.kinematics.ik import pose_error
+from vla_zenoh.kinematics.kinematics import pose_error
 from vla_zenoh.kinematics.so3 import Pose, rotation_from_quat
 from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh.types import FloatArray, JointCommand

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vla_zenoh.kinematics.ik import InverseKinematics
-from vla_zenoh.kinematics.kinematics import Kinematics
+from vla_zenoh.kinematics.kinematics import InverseKinematics, Kinematics
 from vla_zenoh.kinematics.so3 import Pose, exp3
 from vla_zenoh.resources import robot_urdf
 from vla_zenoh.types import FloatArray

@@ -17,7 +17,7 @@ import numpy as np
 import zenoh
 from panda_arm import ARM_JOINTS, HOME_RAD, panda
 
-from vla_zenoh.kinematics.ik import InverseKinematics
+from vla_zenoh.kinematics.kinematics import InverseKinematics
 from vla_zenoh.kinematics.so3 import Pose, rotation_from_quat
 from vla_zenoh.ros2.messages import Messages
 

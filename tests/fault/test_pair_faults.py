@@ -23,7 +23,7 @@ from chain import CHAIN_PATIENCE_S, READY_PATIENCE_S, Chain, running_chain
 from netns.flight_log import STILL_M_S, Flight
 from pair_rig import DT_S, HORIZON, PARTS, reach, shipped
 
-from vla_zenoh.kinematics.part_distance import PartDistance, PlacedArm
+from vla_zenoh.kinematics.collision import PartDistance, PlacedArm
 from vla_zenoh.kinematics.so3 import Pose, rotation_from_rpy
 from vla_zenoh.types import FloatArray
 

@@ -11,7 +11,7 @@ from panda_arm import ARM_JOINTS, HOME_RAD, panda
 
 from vla_zenoh.control.limits import workspace_corners
 from vla_zenoh.control.reachability import make_reachability_filter
-from vla_zenoh.kinematics.ik import pose_error
+from vla_zenoh.kinematics.kinematics import pose_error
 from vla_zenoh.lab.lockstep import Lockstep
 from vla_zenoh.policy import (
     ActionSpec,

@@ -44,7 +44,7 @@ from vla_zenoh.types import (
 
 if TYPE_CHECKING:
     from vla_zenoh.control.part_spacing import PartSpacing
-    from vla_zenoh.kinematics.part_distance import Nearest
+    from vla_zenoh.kinematics.collision import Nearest
 
 LATE_NS = 10_000_000_000
 """A setting that was put before a stop arrives at most this long after it. Stamps that say so later

@@ -36,8 +36,7 @@ import numpy as np
 
 from vla_zenoh.control.barriers import DistanceConstraints
 from vla_zenoh.control.limits import LimitHit
-from vla_zenoh.kinematics.ik import pose_error
-from vla_zenoh.kinematics.kinematics import Kinematics, smallest_singular_value
+from vla_zenoh.kinematics.kinematics import Kinematics, pose_error, smallest_singular_value
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.types import FloatArray
 

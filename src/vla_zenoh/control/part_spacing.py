@@ -25,7 +25,7 @@ from vla_zenoh.control.axis_smoothing import between
 from vla_zenoh.control.commanded_part import CommandedPart
 from vla_zenoh.control.limits import LimitHit, Slowdown
 from vla_zenoh.control.watchdog import BAND_M, PAST_M, PERIOD_NS
-from vla_zenoh.kinematics.part_distance import Nearest, PartDistance, PlacedArm
+from vla_zenoh.kinematics.collision import Nearest, PartDistance, PlacedArm
 from vla_zenoh.kinematics.so3 import Pose, rotation_from_rpy
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray

@@ -24,8 +24,7 @@ from vla_zenoh.control.joint_follower import (
 from vla_zenoh.control.joint_space import followed_shares
 from vla_zenoh.control.limits import into_workspace, joint_margins, joint_motion_limits
 from vla_zenoh.control.smoothing import Motion, Smoother
-from vla_zenoh.kinematics.ik import pose_error
-from vla_zenoh.kinematics.kinematics import Kinematics
+from vla_zenoh.kinematics.kinematics import Kinematics, pose_error
 from vla_zenoh.kinematics.so3 import Pose, exp3, log3, pose_distance
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import Cause, FloatArray, JointCommand, computed

@@ -39,8 +39,14 @@ from vla_zenoh.control.limits import (
     slowest,
 )
 from vla_zenoh.errors import RecordError
-from vla_zenoh.kinematics.ik import TOLERANCE_M, Approach, InverseKinematics, pose_error
-from vla_zenoh.kinematics.kinematics import Kinematics, make_kinematics
+from vla_zenoh.kinematics.kinematics import (
+    TOLERANCE_M,
+    Approach,
+    InverseKinematics,
+    Kinematics,
+    make_kinematics,
+    pose_error,
+)
 from vla_zenoh.kinematics.so3 import Pose, exp3, orthonormal
 from vla_zenoh.profile import Limits, Profile
 from vla_zenoh.types import FloatArray, HeldBox

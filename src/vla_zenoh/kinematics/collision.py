@@ -1,4 +1,4 @@
-"""Distances of the arm to itself, to the table and to keep-outs.
+"""Distances of an arm to itself, to the table, to keep-outs and to another arm.
 
 Every link is the convex hull of its collision shapes. The pairs of links to check are found once,
 by sampling the joint space: pairs that are always near are neighbours by construction, pairs that
@@ -18,7 +18,7 @@ import pinocchio as pin
 
 from vla_zenoh.errors import ProfileError, ResourceError
 from vla_zenoh.kinematics.kinematics import Kinematics
-from vla_zenoh.kinematics.so3 import rotation_from_rpy
+from vla_zenoh.kinematics.so3 import Pose, rotation_from_rpy
 from vla_zenoh.profile import KeepOut
 from vla_zenoh.types import FloatArray, HeldBox
 
@@ -27,10 +27,10 @@ NEVER_SPARE_M = 0.03
 """A pair may come nearer than in any of the samples by this much."""
 TABLE = "table"
 HELD = "the held object"
-WRIST = 2
-"""Last joints whose links may touch what the gripper holds."""
 FREE_M = 10.0
 """Distance of a held object while there is none."""
+KEPT = 8
+"""Configurations of an arm whose placements are kept: each is compared with several others."""
 
 
 class CollisionPair(NamedTuple):
@@ -84,11 +84,11 @@ class CollisionModel:
         """What the gripper holds, see `hold`."""
         self._held_pairs: list[tuple[int, int]] = []
         self._geometry: Any = _one_hull_a_link(kinematics)
+        self._links: int = self._geometry.ngeoms
         if table_z_m is not None:
             at = kinematics.base_placement * pin.SE3(np.eye(3), np.array([0.0, 0.0, table_z_m]))
             half_space = coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0)
             self._geometry.addGeometryObject(pin.GeometryObject(TABLE, 0, 0, at, half_space))
-        self._links = links = len(self._geometry.geometryObjects) - (table_z_m is not None)
         shapes = self._geometry.geometryObjects
         pairs = [
             (first, second)
@@ -103,12 +103,14 @@ class CollisionModel:
         if len(good):
             wanted &= good.min(axis=0) > touching_m
         used = [pair for pair, keep in zip(pairs, wanted, strict=True) if keep]
-        apart = self._add_keep_outs(kinematics, keep_out or {}, links)
+        apart: list[tuple[int, int]] = []
+        for name, shape in (keep_out or {}).items():
+            added = self._geometry.addGeometryObject(_keep_out(kinematics, name, shape))
+            apart += [(link, added) for link in range(self._links) if shapes[link].parentJoint]
         self._require_apart(apart, known_good_rad, touching_m)
         self._pairs, self._held_pairs = [*used, *apart], self._add_held(kinematics)
         self._use(self._pairs)
-        last = kinematics.model.njoints - 1
-        self.pairs = tuple(self._pair(*pair, last) for pair in [*self._pairs, *self._held_pairs])
+        self.pairs = tuple(self._pair(*pair) for pair in [*self._pairs, *self._held_pairs])
 
     def links(self) -> Any:
         """A geometry model of the arm's links alone, a hull each."""
@@ -122,7 +124,7 @@ class CollisionModel:
         """Count `box` among the arm's links, at its TCP; None: the gripper holds nothing."""
         self.held = box
         if box is not None:
-            shape = self._geometry.geometryObjects[len(self._geometry.geometryObjects) - 1]
+            shape = self._geometry.geometryObjects[self._geometry.ngeoms - 1]
             shape.geometry = coal.Box(np.array(box.size_m))
             shape.placement = self._tcp * pin.SE3(np.eye(3), np.array(box.centre_m))
         self._use([*self._pairs, *(self._held_pairs if box else ())])
@@ -167,41 +169,26 @@ class CollisionModel:
                 found[row] += sign * (normal @ (jacobian[:3] - pin.skew(arm_m) @ jacobian[3:]))
         return found
 
-    def _pair(self, first: int, second: int, last: int) -> CollisionPair:
+    def _pair(self, first: int, second: int) -> CollisionPair:
         link, other = (self._geometry.geometryObjects[index] for index in (first, second))
         limit = "self_collision"
         if other.parentJoint == 0 and second >= self._links:
             limit = "table_distance" if other.name == TABLE else "keep_out"
-        return CollisionPair(link.name, other.name, limit, link.parentJoint == last)
+        is_hand = link.parentJoint == self._model.njoints - 1
+        return CollisionPair(link.name, other.name, limit, is_hand)
 
     def _add_held(self, kinematics: Kinematics) -> list[tuple[int, int]]:
-        """Add a box that is not there yet; its pairs with all but the wrist."""
+        """Add a box that is not there yet; its pairs with all but the links of the wrist.
+
+        Those of the last two joints may touch what the gripper holds.
+        """
         joint, self._tcp = kinematics.tcp_placement
-        wrist = {joint}
-        for _ in range(WRIST - 1):
-            wrist |= {kinematics.model.parents[each] for each in wrist} - {0}
-        others = [
-            index
-            for index, shape in enumerate(self._geometry.geometryObjects)
-            if shape.parentJoint not in wrist
-        ]
+        wrist = (joint, self._model.parents[joint] or joint)
+        shapes = self._geometry.geometryObjects
+        others = [index for index in range(len(shapes)) if shapes[index].parentJoint not in wrist]
         box = pin.GeometryObject(HELD, joint, 0, self._tcp, coal.Box(np.full(3, 1e-3)))
         added = self._geometry.addGeometryObject(box)
         return [(added, other) for other in others]
-
-    def _add_keep_outs(
-        self, kinematics: Kinematics, keep_out: Mapping[str, KeepOut], links: int
-    ) -> list[tuple[int, int]]:
-        """Add shapes; their pairs with each of the first `links` objects that move."""
-        pairs: list[tuple[int, int]] = []
-        for name, shape in keep_out.items():
-            added = self._geometry.addGeometryObject(_keep_out(kinematics, name, shape))
-            pairs += [
-                (link, added)
-                for link in range(links)
-                if self._geometry.geometryObjects[link].parentJoint
-            ]
-        return pairs
 
     def _require_apart(
         self,
@@ -237,11 +224,11 @@ class CollisionModel:
         return np.array([self.distances(joints_rad) for joints_rad in configurations])
 
 
-def _load(kinematics: Kinematics) -> Any:
-    urdf = kinematics.urdf
+def _one_hull_a_link(kinematics: Kinematics) -> Any:
+    full, urdf = kinematics.full_model, kinematics.urdf
     try:
         geometry = pin.buildGeomFromUrdf(
-            kinematics.full_model,
+            full,
             str(urdf),
             pin.GeometryType.COLLISION,
             # package://name/... is looked for beside the URDF and in every folder above it.
@@ -255,19 +242,13 @@ def _load(kinematics: Kinematics) -> Any:
         ) from error
     if geometry.ngeoms == 0:
         raise ResourceError(f"{urdf.name} has no collision shapes; give it some, or do without")
-    return geometry
-
-
-def _one_hull_a_link(kinematics: Kinematics) -> Any:
-    full, geometry = kinematics.full_model, _load(kinematics)
-    by_link: dict[str, list[Any]] = {}
+    corners: dict[str, list[FloatArray]] = {}
     for shape in geometry.geometryObjects:
-        by_link.setdefault(full.frames[shape.parentFrame].name, []).append(shape)
+        corners.setdefault(full.frames[shape.parentFrame].name, []).append(_corners(shape))
     hulls = pin.GeometryModel()
-    for link, shapes in by_link.items():
-        corners = np.concatenate([_corners(shape) for shape in shapes])
+    for link, found in corners.items():
         points = coal.StdVec_Vec3s()
-        points.extend([corner.copy() for corner in corners])
+        points.extend([corner.copy() for corner in np.concatenate(found)])
         hull = coal.Convex.convexHull(points, True, "Qt")
         frame = full.getFrameId(link)
         parent = full.frames[frame].parentJoint
@@ -331,3 +312,114 @@ def _keep_out(kinematics: Kinematics, name: str, shape: KeepOut) -> Any:
         solid = coal.Halfspace(normal / np.linalg.norm(normal), 0.0)
     placement = kinematics.base_placement * pin.SE3(turn, np.array(shape.centre_m))
     return pin.GeometryObject(name, 0, 0, placement, solid)
+
+
+class Nearest(NamedTuple):
+    """The two links of two arms that are nearest to each other.
+
+    Args:
+        distance_m: between them, negative where they are inside each other.
+        first: link of the first arm; empty: nothing is nearer than `within_m`.
+        second: link of the second arm.
+    """
+
+    distance_m: float
+    first: str = ""
+    second: str = ""
+
+
+class Placement(NamedTuple):
+    """Of the hulls of an arm: transforms into the robot's frame, (m, 3) centres of spheres."""
+
+    transforms: list[Any]
+    centres_m: FloatArray
+
+
+class PlacedArm:
+    """The hulls of an arm's links, placed in the frame of the robot.
+
+    Args:
+        kinematics: of the arm.
+        collisions: has a hull for each link.
+        base: where its base frame stands.
+    """
+
+    def __init__(self, kinematics: Kinematics, collisions: CollisionModel, base: Pose) -> None:
+        self._model = kinematics.model.copy()
+        stands = pin.SE3(base.rotation, base.position_m) * kinematics.base_placement.inverse()
+        self._geometry: Any = collisions.links()
+        for joint, parent in enumerate(self._model.parents):
+            if joint > 0 and parent == 0:
+                self._model.jointPlacements[joint] = stands * self._model.jointPlacements[joint]
+        for shape in self._geometry.geometryObjects:
+            if shape.parentJoint == 0:
+                shape.placement = stands * shape.placement
+        self._data, self._placed = self._model.createData(), self._geometry.createData()
+        shapes = list(self._geometry.geometryObjects)
+        self.names = [shape.name for shape in shapes]
+        self.hulls: list[Any] = [shape.geometry for shape in shapes]
+        for hull in self.hulls:
+            hull.computeLocalAABB()
+        centres = np.array([hull.aabb_center for hull in self.hulls])
+        self._centres_m = np.hstack([centres, np.ones((len(centres), 1))])[:, :, None]
+        self.radii_m = np.array([hull.aabb_radius for hull in self.hulls])
+        self._kept: dict[bytes, Placement] = {}
+
+    def place(self, joints_rad: FloatArray) -> Placement:
+        """Where the hulls are at these joints (n,)."""
+        key = joints_rad.tobytes()
+        if key not in self._kept:
+            pin.updateGeometryPlacements(
+                self._model, self._data, self._geometry, self._placed, joints_rad
+            )
+            frames = list(self._placed.oMg)
+            matrices = np.array([frame.homogeneous for frame in frames])
+            transforms = [coal.Transform3s(frame.rotation, frame.translation) for frame in frames]
+            if len(self._kept) >= KEPT:
+                self._kept.clear()
+            self._kept[key] = Placement(transforms, (matrices @ self._centres_m)[:, :3, 0])
+        return self._kept[key]
+
+
+class PartDistance:
+    """Distances between two arms."""
+
+    def __init__(self, first: PlacedArm, second: PlacedArm) -> None:
+        self._first, self._second = first, second
+        self._spheres_m = first.radii_m[:, None] + second.radii_m[None, :]
+        self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
+
+    def nearest(
+        self, first_rad: Sequence[FloatArray], second_rad: Sequence[FloatArray], within_m: float
+    ) -> Nearest:
+        """The nearest links with the arms at any two of these configurations (n,).
+
+        Links further apart than `within_m` are not looked for.
+        """
+        ones = [self._first.place(joints_rad) for joints_rad in first_rad]
+        others = [self._second.place(joints_rad) for joints_rad in second_rad]
+        one_m = np.array([placed.centres_m for placed in ones])
+        other_m = np.array([placed.centres_m for placed in others])
+        between_m = one_m[:, None, :, None] - other_m[None, :, None, :]
+        apart_m = np.sqrt((between_m * between_m).sum(axis=-1)) - self._spheres_m
+        found = Nearest(within_m)
+        places = np.argwhere(apart_m < within_m)
+        bounds_m = apart_m[apart_m < within_m]
+        order = np.argsort(bounds_m)
+        for (a, b, i, j), bound_m in zip(
+            places[order].tolist(), bounds_m[order].tolist(), strict=True
+        ):
+            if bound_m >= found.distance_m:
+                break
+            self._result.clear()
+            distance_m = coal.distance(
+                self._first.hulls[i],
+                ones[a].transforms[i],
+                self._second.hulls[j],
+                others[b].transforms[j],
+                self._request,
+                self._result,
+            )
+            if distance_m < found.distance_m:
+                found = Nearest(distance_m, self._first.names[i], self._second.names[j])
+        return found

@@ -1,10 +1,9 @@
-"""Forward kinematics and Jacobian of an arm, from its URDF.
+"""Kinematics of an arm, from its URDF: forward, Jacobian, and joints for a pose.
 
 A joint that slides has metres where one that turns has radians; names say ``rad``.
 
-One object serves one thread: it keeps Pinocchio's work space. Joint vectors are in the order of
-`Kinematics.arm_joints`, which is the order along the chain, whatever order a profile or a
-`JointState` lists them in; `Kinematics.ordered` and `Kinematics.joints_of` sort them.
+Joint vectors are in the order of `Kinematics.arm_joints`, which is the order along the chain,
+whatever order a profile or a `JointState` lists them in.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -20,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from vla_zenoh import resources
 from vla_zenoh.errors import ProfileError, RecordError, nearest
-from vla_zenoh.kinematics.so3 import Pose
+from vla_zenoh.kinematics.so3 import Pose, log3
 from vla_zenoh.profile import JointEnds, Profile
 from vla_zenoh.types import FloatArray, JointState
 
@@ -28,9 +27,25 @@ BEYOND_LIMITS = 0.1
 """A declared end of a finger joint may be outside its range by this share of it: drivers and URDFs
 of a gripper differ in the last digits."""
 
+_IDENTITY_6 = np.eye(6)
+HOLDING = 2
+"""Iterations that a round costs in which joints are put on their bounds."""
+TOLERANCE_M, TOLERANCE_RAD = 1e-6, 1e-6
+"""A solution is at most this far off."""
+POSTURE_GAIN = 0.1
+"""Part of the way to the posture taken in a first iteration."""
+MAX_POSTURE_STEP_RAD = 0.01
+"""At most this far: the posture is approached slowly."""
+DAMPING_BIAS = 1e-9
+"""W of an error of zero."""
+MAX_JOINT_STEP_RAD = 0.5
+"""Of one iteration: a far pose is approached in several."""
+
 
 class Kinematics:
     """The arm alone: every joint that is not one of its own is locked, fingers wide open.
+
+    One object serves one thread: it keeps Pinocchio's work space.
 
     Args:
         urdf: robot description.
@@ -64,9 +79,10 @@ class Kinematics:
             self.full_model, urdf, arm_joints, finger_joints, finger_ends
         )
         self.locked_joints: list[int] = [
-            index for index in range(1, self.full_model.njoints)
-            if self.full_model.names[index] not in arm_joints
-        ]  # fmt: skip
+            index
+            for index, name in enumerate(self.full_model.names)
+            if index > 0 and name not in arm_joints
+        ]
         self.model: Any = pin.buildReducedModel(
             self.full_model, self.locked_joints, self.locked_position
         )
@@ -83,11 +99,9 @@ class Kinematics:
         self.upper_rad: FloatArray = np.array(self.model.upperPositionLimit)
         self.velocity_rad_s: FloatArray = np.array(self.model.upperVelocityLimit)
         if joint_range_rad:
-            lower, upper = (
-                self.ordered(arm_joints, ends) for ends in zip(*joint_range_rad, strict=True)
-            )
-            self.lower_rad = np.maximum(self.lower_rad, lower)
-            self.upper_rad = np.minimum(self.upper_rad, upper)
+            lower, upper = zip(*joint_range_rad, strict=True)
+            self.lower_rad = np.maximum(self.lower_rad, self.ordered(arm_joints, lower))
+            self.upper_rad = np.minimum(self.upper_rad, self.ordered(arm_joints, upper))
         moves = (self.lower_rad < self.upper_rad) & (self.velocity_rad_s > 0)
         for index, name in enumerate(self.arm_joints):
             if not moves[index]:
@@ -154,7 +168,6 @@ class Kinematics:
         return jacobian if self._base_turn is None else self._base_turn @ jacobian
 
     def pose_and_jacobian(self, joints_rad: FloatArray) -> tuple[Pose, FloatArray]:
-        """Both for the price of one."""
         jacobian = self.jacobian(joints_rad)  # leaves the joints' placements behind
         return self._tcp_pose(), jacobian
 
@@ -189,6 +202,177 @@ def smallest_singular_value(jacobian: FloatArray) -> float:
     """How slow the TCP's slowest direction is (m and rad alike) per rad/s; 0 when singular."""
     wide = jacobian if jacobian.shape[0] <= jacobian.shape[1] else jacobian.T
     return math.sqrt(max(float(np.linalg.eigvalsh(wide @ wide.T)[0]), 0.0))
+
+
+class Approach(NamedTuple):
+    """How near the arm came to a pose.
+
+    Args:
+        joints_rad: (n,).
+        error_m: distance left.
+        error_rad: the same for rotation.
+        solved: within the tolerances.
+        wanted_rad: (n,) the last iteration's joints before they were put on their bounds.
+        jacobian: (6, n) at `joints_rad`.
+        effort: what it took, in iterations: some 3, and many times that at the ends of ranges.
+    """
+
+    joints_rad: FloatArray
+    error_m: float
+    error_rad: float
+    solved: bool
+    wanted_rad: FloatArray
+    jacobian: FloatArray
+    effort: int
+
+
+def pose_error(goal: Pose, here: Pose) -> FloatArray:
+    """(6,) m and rad in the base frame, from `here` to `goal`."""
+    error = np.empty(6)
+    error[:3] = goal.position_m - here.position_m
+    error[3:] = log3(goal.rotation @ here.rotation.T)
+    return error
+
+
+class InverseKinematics:
+    """Joints for a pose: damped least squares that leaves a redundant arm in its posture.
+
+    One iteration, with e the pose error, z a step towards the posture and W the damping::
+
+        e  = [p_goal - p ; log3(R_goal R^T)]          base frame
+        W  = (|e|^2 / 2 + bias) 1
+        dq = z + J^T (J J^T + W)^-1 (e - J z)
+
+    A damping that follows the error converges quadratically where there is a solution and stays
+    calm where there is none. A joint that would pass its bound is put on it and the others carry on
+    without it. Source: Sugihara, "Solvability-unconcerned inverse kinematics by the
+    Levenberg-Marquardt method", IEEE Trans. Robotics 27(5), 2011; here a metre weighs as much as a
+    radian.
+
+    Args:
+        kinematics: of the arm.
+        posture_rad: (n,) where a redundant arm prefers to be; None: the middle of its ranges.
+        joint_margin_rad: kept from both ends of every joint's range, one number or (n,).
+        max_iterations: after which there is no solution.
+
+    Raises:
+        RecordError: the margin leaves a joint no range, or the posture has the wrong size.
+    """
+
+    def __init__(
+        self,
+        kinematics: Kinematics,
+        posture_rad: ArrayLike | None = None,
+        *,
+        joint_margin_rad: float | FloatArray = 0.05,
+        max_iterations: int = 40,
+    ) -> None:
+        self._kinematics, self._max_iterations = kinematics, max_iterations
+        self.lower_rad = kinematics.lower_rad + joint_margin_rad
+        self.upper_rad = kinematics.upper_rad - joint_margin_rad
+        if np.any(self.lower_rad >= self.upper_rad):
+            name = kinematics.arm_joints[int(np.argmin(self.upper_rad - self.lower_rad))]
+            raise RecordError(f"joint_margin_rad {joint_margin_rad} leaves {name!r} no range")
+        middle = 0.5 * (self.lower_rad + self.upper_rad)
+        self.posture_rad = middle if posture_rad is None else np.array(posture_rad, dtype=float)
+        if self.posture_rad.shape != (kinematics.size,):
+            raise RecordError(
+                f"posture_rad has shape {self.posture_rad.shape}, wanted ({kinematics.size},)"
+            )
+
+    def solve(
+        self, pose: Pose, start_rad: FloatArray, *, bounded: bool = True
+    ) -> FloatArray | None:
+        """Joints (n,) that put the TCP there, near `start_rad`; None where there are none.
+
+        The search is local: a pose that needs several joints on the very ends of their ranges, or
+        the arm in another branch than at the start, may be missed. `bounded`: see `approach`.
+        """
+        found = self.approach(pose, start_rad, bounded=bounded)
+        return found.joints_rad if found.solved else None
+
+    def approach(self, pose: Pose, start_rad: FloatArray, *, bounded: bool = True) -> Approach:
+        """Like `solve`, and how near it came where there is no solution.
+
+        `bounded` keeps every joint within its bounds, the other joints taking over; else pose and
+        posture alone decide where the joints go.
+        """
+        lower, upper = self.bounds(start_rad)
+        joints = wanted = start_rad
+        last, stalls, iteration, effort = math.inf, 0, 0, 0
+        while True:
+            here, jacobian = self._kinematics.pose_and_jacobian(joints)
+            error = pose_error(pose, here)
+            x, y, z, rx, ry, rz = error.tolist()
+            error_m, error_rad = math.hypot(x, y, z), math.hypot(rx, ry, rz)
+            squared = error_m * error_m + error_rad * error_rad
+            solved = error_m <= TOLERANCE_M and error_rad <= TOLERANCE_RAD
+            # At a bound or out of reach the error shrinks by ever less: three rounds are proof.
+            stalls = stalls + 1 if squared > 0.8 * last and iteration > 2 else 0
+            if solved or stalls == 3 or iteration == self._max_iterations:
+                effort += iteration
+                return Approach(joints, error_m, error_rad, solved, wanted, jacobian, effort)
+            last, damping, drift = squared, 0.5 * squared + DAMPING_BIAS, None
+            if iteration == 0:  # afterwards the pose alone decides
+                drift = _shortened(POSTURE_GAIN * (self.posture_rad - joints), MAX_POSTURE_STEP_RAD)
+            step = _damped_step(error, jacobian, drift, damping)
+            wanted = joints + _shortened(step, MAX_JOINT_STEP_RAD)
+            if bounded:
+                joints, rounds = _inside(
+                    wanted, joints, error, jacobian, drift, damping, lower, upper
+                )
+                effort += HOLDING * rounds
+            else:
+                joints = wanted
+            iteration += 1
+
+    def bounds(self, start_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Least and greatest joints (n,): no joint goes further out than it was."""
+        return np.minimum(self.lower_rad, start_rad), np.maximum(self.upper_rad, start_rad)
+
+
+def _shortened(step: FloatArray, most: float) -> FloatArray:
+    largest = max(map(abs, step.tolist()))
+    return step if largest <= most else step * (most / largest)
+
+
+def _damped_step(
+    error: FloatArray, jacobian: FloatArray, drift: FloatArray | None, damping: float
+) -> FloatArray:
+    left = jacobian @ jacobian.T + damping * _IDENTITY_6
+    if drift is None:
+        return jacobian.T @ np.linalg.solve(left, error)
+    return drift + jacobian.T @ np.linalg.solve(left, error - jacobian @ drift)
+
+
+def _inside(
+    wanted: FloatArray,
+    joints: FloatArray,
+    error: FloatArray,
+    jacobian: FloatArray,
+    drift: FloatArray | None,
+    damping: float,
+    lower: FloatArray,
+    upper: FloatArray,
+) -> tuple[FloatArray, int]:
+    """`wanted`, or the best step of the other joints once those past a bound stand on it.
+
+    And in how many rounds.
+    """
+    if ((wanted >= lower) & (wanted <= upper)).all():
+        return wanted, 0
+    held, step, rounds = np.zeros(len(joints), dtype=bool), wanted - joints, 0
+    while True:
+        rounds += 1
+        wanted = joints + step
+        past = ~held & ((wanted < lower) | (wanted > upper))
+        held |= past
+        if held.all() or not past.any():
+            return np.clip(wanted, lower, upper), rounds
+        onto = np.where(held, np.clip(wanted, lower, upper) - joints, 0.0)
+        free = np.where(held, 0.0, jacobian)
+        aside = None if drift is None else np.where(held, 0.0, drift)
+        step = onto + _damped_step(error - jacobian @ onto, free, aside, damping + 1e-6)
 
 
 def _locked(

@@ -155,7 +155,7 @@ def _coefficients(squared: float) -> tuple[float, float, float, float]:
 
 
 def spatial_rates(
-    rotvec: FloatArray, rate: FloatArray, rate_change: FloatArray
+    rotvec: FloatArray, rate: FloatArray, rate_change: FloatArray, side: float = 1.0
 ) -> tuple[FloatArray, FloatArray]:
     """Angular velocity and acceleration of ``exp3(r(t)) R0`` in the fixed axes.
 
@@ -167,17 +167,11 @@ def spatial_rates(
         Jl'r' = B' [r]r' + C' [r][r]r' + C [r'][r]r'
 
     Closed form, because finite differences of Jl show as spikes in the jerk; written out, because
-    it runs in every tick. r is in rad; all are (3,).
+    it runs in every tick. r is in rad; all are (3,). A `side` of -1, the sign of B, gives those of
+    ``exp3(r(t))`` in its own axes: its right Jacobian is ``Jr(r) = Jl(-r)``.
 
     Source: Sola, Deray, Atchuthan, "A micro Lie theory", 2018, eq. 145, differentiated.
     """
-    return _rates(rotvec, rate, rate_change, 1.0)
-
-
-def _rates(
-    rotvec: FloatArray, rate: FloatArray, rate_change: FloatArray, side: float
-) -> tuple[FloatArray, FloatArray]:
-    """`spatial_rates` with a `side` of 1, `body_rates` with -1, the sign of B."""
     r, r1, r2 = rotvec.tolist(), rate.tolist(), rate_change.tolist()
     squared = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
     along = r[0] * r1[0] + r[1] * r1[1] + r[2] * r1[2]
@@ -198,11 +192,8 @@ def _rates(
 def body_rates(
     rotvec: FloatArray, rate: FloatArray, rate_change: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Angular velocity and acceleration of ``exp3(r(t))`` in its own axes: see `spatial_rates`.
-
-    The right Jacobian is ``Jr(r) = Jl(-r)``.
-    """
-    return _rates(rotvec, rate, rate_change, -1.0)
+    """Angular velocity and acceleration of ``exp3(r(t))`` in its own axes: see `spatial_rates`."""
+    return spatial_rates(rotvec, rate, rate_change, side=-1.0)
 
 
 def rates_of(

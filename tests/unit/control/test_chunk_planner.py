@@ -16,7 +16,7 @@ from vla_zenoh.control.chunk_planner import PATIENCE, ChunkPlan, ChunkPlanner
 from vla_zenoh.control.limits import Slowdown, keep_slowdown
 from vla_zenoh.control.plan_timeline import Goal, GoalTimeline
 from vla_zenoh.control.reachability import ReachabilityFilter
-from vla_zenoh.kinematics.ik import Approach
+from vla_zenoh.kinematics.kinematics import Approach
 from vla_zenoh.kinematics.so3 import Pose, angle_between, norm3, rotation_from_quat
 from vla_zenoh.profile import Limits, Profile, ReachLimits
 from vla_zenoh.types import FloatArray

@@ -14,8 +14,7 @@ from panda_arm import ARM_JOINTS, HOME_RAD
 
 from vla_zenoh.control.commander import Setting
 from vla_zenoh.control.limits import workspace_corners
-from vla_zenoh.kinematics.ik import pose_error
-from vla_zenoh.kinematics.kinematics import Kinematics
+from vla_zenoh.kinematics.kinematics import Kinematics, pose_error
 from vla_zenoh.types import FloatArray, JointState, Stamped
 
 EXACT_RAD = 1e-6

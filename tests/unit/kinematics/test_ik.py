@@ -13,8 +13,7 @@ from panda_arm import HOME_RAD, moved, panda, tool_down_at
 from vla_zenoh.control.joint_follower import JointFollower, JointMotion
 from vla_zenoh.control.smoothing import MotionLimits, Smoother
 from vla_zenoh.errors import RecordError
-from vla_zenoh.kinematics.ik import InverseKinematics, pose_error
-from vla_zenoh.kinematics.kinematics import smallest_singular_value
+from vla_zenoh.kinematics.kinematics import InverseKinematics, pose_error, smallest_singular_value
 from vla_zenoh.kinematics.so3 import Pose, angle_between
 from vla_zenoh.types import FloatArray
 
