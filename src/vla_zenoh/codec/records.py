@@ -15,7 +15,7 @@ from vla_zenoh import keys
 from vla_zenoh.codec import message
 from vla_zenoh.errors import CodecError, RecordError, SpecError
 from vla_zenoh.types import Header, shown
-from vla_zenoh.types.checks import set_field
+from vla_zenoh.types.stream import set_field
 
 Record = TypeVar("Record")
 

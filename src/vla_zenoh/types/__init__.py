@@ -19,9 +19,6 @@ if TYPE_CHECKING:
     from vla_zenoh.types.arrays import computed as computed
     from vla_zenoh.types.arrays import unit_quaternion as unit_quaternion
     from vla_zenoh.types.arrays import vector as vector
-    from vla_zenoh.types.checks import MAX_NAMES as MAX_NAMES
-    from vla_zenoh.types.checks import MAX_TEXT as MAX_TEXT
-    from vla_zenoh.types.checks import shown as shown
     from vla_zenoh.types.records import LATENCY_STAGES as LATENCY_STAGES
     from vla_zenoh.types.records import ActionChunk as ActionChunk
     from vla_zenoh.types.records import Cause as Cause
@@ -39,6 +36,8 @@ if TYPE_CHECKING:
     from vla_zenoh.types.records import PoseState as PoseState
     from vla_zenoh.types.records import PrivilegedState as PrivilegedState
     from vla_zenoh.types.records import SceneState as SceneState
+    from vla_zenoh.types.stream import MAX_NAMES as MAX_NAMES
+    from vla_zenoh.types.stream import MAX_TEXT as MAX_TEXT
     from vla_zenoh.types.stream import Event as Event
     from vla_zenoh.types.stream import Header as Header
     from vla_zenoh.types.stream import HeldBox as HeldBox
@@ -46,5 +45,6 @@ if TYPE_CHECKING:
     from vla_zenoh.types.stream import SingleWriterFilter as SingleWriterFilter
     from vla_zenoh.types.stream import Stamped as Stamped
     from vla_zenoh.types.stream import Task as Task
+    from vla_zenoh.types.stream import shown as shown
 
-__getattr__ = lazy_names(__name__, "checks", "stream", "records", "arrays")
+__getattr__ = lazy_names(__name__, "stream", "records", "arrays")

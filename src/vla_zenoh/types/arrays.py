@@ -1,4 +1,4 @@
-"""Checks of record fields that are arrays, see ``checks.py``."""
+"""Checks of record fields that are arrays, see ``stream.py``."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vla_zenoh.errors import RecordError
-from vla_zenoh.types.checks import set_field, shown
+from vla_zenoh.types.stream import set_field, shown
 
 FloatArray = NDArray[np.float64]
 Record = TypeVar("Record")

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vla_zenoh.errors import RecordError
 from vla_zenoh.types.arrays import FloatArray, float32_table, numbers, unit_quaternion, vector
-from vla_zenoh.types.checks import (
+from vla_zenoh.types.stream import (
     MAX_ENTRIES,
     MAX_TEXT,
     boolean,

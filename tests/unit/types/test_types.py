@@ -25,7 +25,6 @@ from vla_zenoh.types import (
     PoseState,
     SceneState,
     Task,
-    checks,
     stream,
     vector,
 )
@@ -137,13 +136,13 @@ def test_a_vector_has_a_bound_even_where_any_size_will_do() -> None:
 )
 def test_what_is_no_number_within_bounds_is_refused(value: Any) -> None:
     with pytest.raises(RecordError, match=r"^x is "):
-        checks.number("x", value, 0.0, 1.0)
+        stream.number("x", value, 0.0, 1.0)
 
 
 @pytest.mark.parametrize("value", [True, np.True_, "1", None, 1.0, np.float64(1), -1, 2**63])
 def test_what_is_no_whole_number_within_bounds_is_refused(value: Any) -> None:
     with pytest.raises(RecordError, match=r"^x is "):
-        checks.integer("x", value)
+        stream.integer("x", value)
 
 
 def test_numbers_of_numpy_become_plain_ones() -> None:
@@ -288,7 +287,7 @@ def deep() -> list[Any]:
     ids=["unprintable", "deep", "long", "wide", "deep map"],
 )
 def test_an_error_can_always_be_written(make: Callable[[], Any]) -> None:
-    assert len(checks.shown(make())) < 400
+    assert len(stream.shown(make())) < 400
 
 
 def test_an_event_is_of_a_known_kind_and_level() -> None:

@@ -16,26 +16,28 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from vla_zenoh.bus.buffers import CallbackRing, ReceivedSample
+from vla_zenoh.bus.buffers import CallbackRing, LatestSample, ReceivedSample
 from vla_zenoh.bus.metrics import RateMeter
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import CodecError, ProfileError, RecordError
 from vla_zenoh.kinematics.kinematics import Kinematics
+from vla_zenoh.nodes.camera.camera_publisher import OK, CameraPublisher
+from vla_zenoh.nodes.camera.geometry import resize
+from vla_zenoh.nodes.camera.source import LOOK_S, STALL_S
 from vla_zenoh.profile import Profile, SessionProfile
-from vla_zenoh.profile.robot import Ros2Output, Ros2Profile
+from vla_zenoh.profile.robot import Ros2Camera, Ros2Output, Ros2Profile
 from vla_zenoh.profile.session import TRUSTED_PROTOCOLS
 from vla_zenoh.robots.arm import Arm
 from vla_zenoh.robots.driver import DriverStatus, Measurement, RobotDriver, command_of
-from vla_zenoh.robots.joint_reading import JointReading, RobotClock
-from vla_zenoh.robots.ros2.cameras import Camera
+from vla_zenoh.robots.joint_reading import JointReading, RobotClock, StampFilter
 from vla_zenoh.robots.ros2.gripper import Gripper
 from vla_zenoh.robots.ros2.ros_graph import RosGraph
 from vla_zenoh.robots.ros2.ros_services import RosServices
 from vla_zenoh.ros2.keys import COMMAND, SENSOR
-from vla_zenoh.ros2.messages import Messages
+from vla_zenoh.ros2.messages import MAX_PICTURE_BYTES, Messages
 from vla_zenoh.ros2.readers import JOINT_STATE, WRENCH, read
-from vla_zenoh.ros2.samples import Stamp, Wrench
+from vla_zenoh.ros2.samples import RosImage, Stamp, Wrench
 from vla_zenoh.ros2.writers import Write, joint_writer, pose_writer
 from vla_zenoh.runtime.process import ROUTER_PATIENCE_S
 from vla_zenoh.types import Event, FloatArray, GripperCommand, GripperState
@@ -48,6 +50,8 @@ FINGERS_TIMEOUT_NS = 1_000_000_000
 """Gripper nodes publish more slowly than arms."""
 BUFFER = 64
 WRENCH_TIMEOUT_NS = 200_000_000
+CAMERA_WAIT_S, CAMERA_SAME_S = 0.1, 2.0
+"""A sensor has noise; a driver that repeats an image for less than the second is tolerated."""
 LEAD_PERIODS = 2
 """A trajectory's point lies this many command periods ahead."""
 
@@ -278,6 +282,77 @@ class Ros2Driver(RobotDriver):
                 ages_s["joint_states"] = (time.monotonic_ns() - self.measured_ns) / 1e9
         latency_ms = {name: late for name, (_, late) in figures.items() if late is not None}
         return DriverStatus(detail, ages_s, rates_hz, latency_ms)
+
+
+class Camera:
+    """One camera topic: `run` is the body of its thread, the only user of `messages`.
+
+    It uses publishers and clock of the `node`; `emit` and `reject` may be called from any thread.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        topic: Ros2Camera,
+        node: Node,
+        graph: RosGraph,
+        messages: Messages,
+        emit: Callable[[Event], None],
+        reject: Callable[[str, str, str], None],
+    ) -> None:
+        self._topic, self._node, self._messages, self._reject = topic, node, messages, reject
+        self.publisher = CameraPublisher(
+            name, node.profile.cameras[name], topic.topic, node, emit, CAMERA_SAME_S
+        )
+        self.publisher.backend = topic.type
+        self._stamps = StampFilter()
+        self._decoded_s = -LOOK_S
+        self._image = graph.subscribe(
+            topic.topic, topic.type, LatestSample(MAX_PICTURE_BYTES), SENSOR
+        )
+
+    def run(self, stop: threading.Event) -> None:
+        """Publish images until `stop` is set."""
+        last_s = time.monotonic()
+        while not stop.is_set():
+            if self._image.wait(CAMERA_WAIT_S):
+                arrival = self._image.pop()
+                if arrival is not None and self._handle(arrival):
+                    last_s = time.monotonic()
+            silent_s = time.monotonic() - last_s
+            if silent_s > STALL_S:
+                self.publisher.lose(f"no image on {self._topic.topic} for {silent_s:.0f} s")
+
+    def _handle(self, arrival: ReceivedSample) -> bool:
+        """Publish an image, or check it now and then; whether it is a valid one."""
+        publisher, now_s = self.publisher, time.monotonic()
+        wanted = publisher.due(arrival.mono_ns) and publisher.has_subscribers
+        if not wanted and now_s - self._decoded_s < LOOK_S:
+            if publisher.state == OK:
+                publisher.captured(arrival.mono_ns)
+            return publisher.state == OK
+        self._decoded_s = now_s
+        payload, frame = arrival.sample.payload.to_bytes(), self._topic.frame
+        try:
+            image: RosImage = read(self._messages, self._topic.type, payload)
+            if frame is not None and image.frame != frame:
+                raise CodecError("frame", f"in frame {image.frame[:60]!r}, wanted {frame!r}")
+            publisher.check(image.rgb, arrival.mono_ns, image.stamp_ns or None)
+            if image.stamp_ns:
+                self._stamps.check(image.stamp_ns)
+        except CodecError as error:
+            self._reject(error.reason, f"{self._topic.topic}: {error}", publisher.name)
+            if error.reason in ("encoding", "frame"):  # true for all further images
+                publisher.lose(str(error))
+            return False
+        publisher.captured(arrival.mono_ns)
+        publisher.set_state(OK)
+        if wanted:
+            settings = publisher.profile
+            rgb = resize(image.rgb, settings.width, settings.height)
+            stamp_ns = image.stamp_ns or self._node.clock.wall_at(arrival.mono_ns)
+            publisher.publish_rgb(rgb, arrival.mono_ns, stamp_ns)
+        return True
 
 
 class StateSubscriber:
