@@ -129,15 +129,11 @@ def chunk_poses(spec: ActionSpec, steps: Steps, start: Pose) -> list[Pose]:
 
 
 def as_deltas(spec: ActionSpec, steps: Steps) -> tuple[ActionSpec, FloatArray]:
-    """The same chunk as deltas that are each added to the step before, with the spec of them.
+    """The same chunk of one arm as deltas, each added to the step before, with the spec of them.
 
     A chunk of deltas on the previous step, or of absolute poses, is returned as it is.
     """
     steps = np.asarray(steps, np.float64)
-    if spec.parts:
-        own = {p.part: as_deltas(p.action, steps[:, spec.columns(p.part)]) for p in spec.parts}
-        action = ActionSpec.of_parts({part: meant for part, (meant, _) in own.items()})
-        return action, np.concatenate([rows for _, rows in own.values()], axis=1)
     size = spec.arm_size
     if spec.kind == "velocity":
         scaled = np.concatenate([steps[:, :size] * spec.dt_s, steps[:, size:]], axis=1)
@@ -238,15 +234,10 @@ def respond(
     before: Pose,
     state: Response | None,
 ) -> tuple[Pose, Response]:
-    """Where the arm is at the end of a step, and how it moves there.
+    """Where the arm is at the end of a step from `before`, and how it moves there.
 
-    Args:
-        controller: its gains.
-        way_m: (3,) delta in base axes.
-        turn: (3, 3) delta in base axes; None: the orientation goal stays.
-        dt_s: duration of the step.
-        before: where the step begins.
-        state: at the end of the step before; None: at rest.
+    The step is the delta `way_m` (3,) and `turn` (3, 3), in base axes; without a turn the
+    orientation goal stays. Without a `state` at the end of the step before, the arm was at rest.
     """
     rate = np.zeros(6) if state is None else state.rate
     if turn is not None:

@@ -332,7 +332,7 @@ class Commander:
         # From the wall clock, so that a restarted node never reuses an episode number.
         episode = max(self.task.episode + 1, now_ns // 1_000_000)
         self.task = replace(self.task, episode=episode, **changes)  # pyright: ignore
-        self.progress.begin()
+        self.progress = EpisodeProgress()
         if changes:
             self._ended = ""
         if self.state in OBEYING:

@@ -127,18 +127,11 @@ class JointFollower:
     def step(
         self, now: JointMotion, target: Pose, twist: FloatArray, dt_s: float
     ) -> tuple[JointMotion, list[LimitHit]]:
-        """The joints one tick later.
+        """The joints one tick later, and the limits that acted.
 
-        Args:
-            now: what the last call returned; at first the measured joints at rest.
-            target: pose of the TCP then.
-            twist: (6,) velocity of the TCP then, m/s and rad/s in base axes.
-            dt_s: of the tick.
-
-        Returns:
-            joints within their ranges, velocities and accelerations, whatever the target; and the
-            limits that acted: ``joint_velocity``, ``joint_limit``, ``singularity``, and those of
-            the distance constraints.
+        They keep to their ranges, velocities and accelerations, whatever the target: the pose of
+        the TCP then, and its `twist` (6,), m/s and rad/s in base axes. The limits are
+        ``joint_velocity``, ``joint_limit``, ``singularity``, and the distance constraints.
         """
         joints, velocity = now.position_rad, now.velocity_rad_s
         here, jacobian = self.kinematics.pose_and_jacobian(joints)

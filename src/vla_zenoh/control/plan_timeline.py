@@ -98,8 +98,6 @@ class Goal:
     """A waypoint: TCP pose, or joints, and gripper width.
 
     Args:
-        pose: of the TCP.
-        width_m: of the gripper.
         joints_rad: (n,) a joint solution of the pose; None: not computed.
         slowdown: why the arm moves there slower than at full speed.
         response: state there of a controller that covers only a part of each step; None: without.
@@ -157,11 +155,9 @@ class Plan:
         bounded: number of goals known to be within what the arm can do, by default all; the last of
             them stays in force, and is all that was asked for, until the next one is bounded.
         computed: number of goals computed; the others are placeholders until they come due.
-        episode: of the chunk.
         steps_before: steps of the episode asked for until its observation was taken.
         steps_total: steps of the episode, as far as the policy has ended it.
         done: the policy reports that these steps are the last.
-        arrival_ns: when the chunk arrived.
         clock: plan time. `dt_ns` is in plan time, the other times are wall time.
         soonest: the arm moves to each goal as fast as it can, and waits there for the next one.
     """
@@ -374,16 +370,13 @@ class GoalTimeline:
         return self.in_force(t_ns).goal_at(t_ns)
 
 
+@dataclass(slots=True)
 class EpisodeProgress:
     """Progress of an episode: `chunks` accepted, `steps` in force, and `done` by the policy."""
 
-    def __init__(self) -> None:
-        self.begin()
-
-    def begin(self) -> None:
-        """Start an episode."""
-        self.chunks = self.steps = 0
-        self.done = False
+    chunks: int = 0
+    steps: int = 0
+    done: bool = False
 
     def update(self, timeline: GoalTimeline, episode: int, now_ns: int) -> None:
         """Count the steps in force, and see whether they were the last ones."""

@@ -23,8 +23,6 @@ from vla_zenoh.policy import ROTATION_SIZE, ActionSpec, ModelSpec
 from vla_zenoh.profile import POSE_JOINTS, REACH_M, REJECT_FACTOR, Limits, Profile
 from vla_zenoh.types import QUATERNION_NORM_TOLERANCE, FloatArray
 
-Level = Literal["error", "warning", "note"]
-
 
 class Finding(NamedTuple):
     """One result of a check: a stable short name, and a sentence with what is found and expected.
@@ -32,7 +30,7 @@ class Finding(NamedTuple):
     ``error``: the model must not get the arm; ``warning``: look at it.
     """
 
-    level: Level
+    level: Literal["error", "warning", "note"]
     name: str
     why: str
 

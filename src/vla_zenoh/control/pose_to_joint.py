@@ -179,12 +179,9 @@ class PoseToJoint:
         return [*between(joints, at_rest), *between(joints, lagging)]
 
     def tick(self, smoother: Smoother, *, braking: bool = False, elbow: bool = True) -> None:
-        """Advance `smoother` by one tick and follow its pose, or stop.
+        """Advance `smoother` by one tick and follow its pose, or come to rest if `braking`.
 
-        Args:
-            smoother: the pose.
-            braking: come to rest, with the elbow where it is.
-            elbow: move the elbow towards the posture.
+        With `elbow` the elbow moves towards the posture; not in a brake.
         """
         here = self._kinematics.forward(self._now.position_rad)
         lag = self._lag(here, smoother.motion.pose)

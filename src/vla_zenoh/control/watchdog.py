@@ -215,8 +215,10 @@ class JointMonitor:
         margins, distances = joint_margins(limits.reach, reach.kinematics), len(barriers.stop) - 1
         self._stop = np.concatenate([margins, barriers.stop])
         self._slow = np.concatenate([2 * margins, barriers.slow])
-        self._past = _each(PAST_MARGIN * margins, distances, PAST_SINGULAR, PAST_M)
-        self._band = _each(np.where(slides, BAND_M, BAND_RAD), distances, BAND_SINGULAR, BAND_M)
+        past_m, band_m = [PAST_M] * distances, [BAND_M] * distances
+        band = np.where(slides, BAND_M, BAND_RAD)
+        self._past = np.concatenate([PAST_MARGIN * margins, [PAST_SINGULAR], past_m])
+        self._band = np.concatenate([band, [BAND_SINGULAR], band_m])
         self.reset()
 
     def reset(self) -> None:
@@ -323,12 +325,6 @@ class JointMonitor:
             return "joint_limit", joints[index]
         index -= len(joints)
         return self._reach.barriers.names[index], self._reach.barriers.where(index)
-
-
-def _each(
-    of_joints: FloatArray, distances: int, of_singular: float, of_distance: float
-) -> FloatArray:
-    return np.concatenate([of_joints, [of_singular], [of_distance] * distances])
 
 
 def _slowdown(name: str, share: float, value: float, limit: float, where: str) -> Slowdown | None:

@@ -217,10 +217,21 @@ def _one_by_one(
         return spec, chunks
     action, out = spec.action, []
     for chunk in chunks:
-        action, steps = as_deltas(spec.action, chunk.record.steps)
+        action, steps = _as_deltas(spec.action, chunk.record.steps)
         record = replace(chunk.record, steps=steps.astype(np.float32))
         out.append(chunk._replace(record=record))
     return spec.model_copy(update={"action": action}), out
+
+
+def _as_deltas(
+    spec: ActionSpec, steps: NDArray[np.float32]
+) -> tuple[ActionSpec, NDArray[np.float64]]:
+    """`as_deltas` of every part."""
+    if not spec.parts:
+        return as_deltas(spec, steps)
+    own = {p.part: as_deltas(p.action, steps[:, spec.columns(p.part)]) for p in spec.parts}
+    action = ActionSpec.of_parts({part: meant for part, (meant, _) in own.items()})
+    return action, np.concatenate([rows for _, rows in own.values()], axis=1)
 
 
 def _frames(
