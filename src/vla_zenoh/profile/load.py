@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -43,13 +44,13 @@ def load_with_lines(name: str) -> tuple[Profile, Lines]:
 
 def followed(name: str) -> list[tuple[Path, str]]:
     """Files of a valid profile along ``extends``, each with its name in the previous one."""
-    out = [(profile_file(name), name)]
-    while True:
-        path = out[-1][0]
+    path, parent = profile_file(name), name
+    out: list[tuple[Path, str]] = []
+    while isinstance(parent, str):
+        path = extended_profile(path, parent) if out else path
+        out.append((path, parent))
         parent = yaml_text.read(_bytes(path), str(path))[0].get("extends")
-        if not isinstance(parent, str):
-            return out
-        out.append((extended_profile(path, parent), parent))
+    return out
 
 
 def read_profile(text: str, where: str) -> Profile:
@@ -138,26 +139,19 @@ PATHS: Mapping[str, Callable[[str], bool]] = {
 """Place of texts in a profile, ``*`` for any name -> whether a text there is the path of a file."""
 
 
-def paths_in(data: Mapping[str, Any]) -> Iterator[tuple[dict[str, Any], str, str]]:
+def paths_in(data: dict[str, Any]) -> Iterator[tuple[dict[str, Any], str, str]]:
     """Paths of files in `data`: (section, key, prefix of the path in the value)."""
     for place, names_file in PATHS.items():
         *above, last = place.split(".")
-        for section in _sections(data, above):
+        sections: list[dict[str, Any]] = [data]
+        for key in above:
+            inside = [each.values() if key == "*" else [each.get(key)] for each in sections]
+            sections = [each for each in chain(*inside) if isinstance(each, dict)]
+        for section in sections:
             for name in list(section) if last == "*" else [last]:
                 text = section.get(name)
                 if isinstance(text, str) and names_file(text):
                     yield section, name, FILE_SOURCE if last == "source" else ""
-
-
-def _sections(data: Any, place: Sequence[str]) -> Iterator[dict[str, Any]]:
-    if not isinstance(data, dict):
-        return
-    if not place:
-        yield data
-        return
-    first, *rest = place
-    for inside in data.values() if first == "*" else (data.get(first),):
-        yield from _sections(inside, rest)
 
 
 def below(folder: Path, path: str) -> str:
