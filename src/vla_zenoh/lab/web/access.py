@@ -1,4 +1,4 @@
-"""Who may use the page: people and their tokens, hosts and origins, rate limits. Pure."""
+"""Who may use the page: people and their tokens, hosts, origins, headers. Pure."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import hmac
 import ipaddress
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from vla_zenoh.errors import ProfileError, SecurityError
 from vla_zenoh.keys import key_chunk
@@ -30,6 +30,10 @@ class Person(NamedTuple):
     name: str
     role: PageRole
     token: str
+
+    @property
+    def drives(self) -> bool:
+        return self.role == "operator"
 
 
 class People:
@@ -116,3 +120,31 @@ def host_is_ours(host: str, names: Iterable[str]) -> bool:
 def origin_is_ours(origin: str, host: str, *, secure: bool) -> bool:
     """Whether the header ``Origin`` says that the page itself asks, not a page of another site."""
     return bool(host) and origin.lower() == f"http{'s' if secure else ''}://{host}".lower()
+
+
+HEADERS = {
+    "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "img-src 'self' blob:; media-src 'self'; connect-src 'self'; base-uri 'none'; "
+    "form-action 'none'; frame-ancestors 'none'",
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+    "permissions-policy": "camera=(), microphone=(), geolocation=()",
+    "cache-control": "no-store",
+}
+
+
+def with_headers(send: Any) -> Any:
+    """`send` with `HEADERS` on every response that has none of its own."""
+
+    async def sending(message: Any) -> None:
+        if message["type"] == "http.response.start":
+            own = list(message.get("headers", ()))
+            given = {name for name, _ in own}
+            more = [(name.encode(), value.encode()) for name, value in HEADERS.items()]
+            own += [(name, value) for name, value in more if name not in given]
+            message = {**message, "headers": own}
+        await send(message)
+
+    return sending

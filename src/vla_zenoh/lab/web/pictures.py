@@ -16,6 +16,7 @@ from vla_zenoh.codec.image import decode_depth, encode_jpeg
 from vla_zenoh.errors import CodecError, ProfileError
 from vla_zenoh.keys import Keys
 from vla_zenoh.lab.newest_records import StreamSlot
+from vla_zenoh.lab.rate_limit import RateLimit
 from vla_zenoh.profile import CameraProfile
 from vla_zenoh.types import Image
 
@@ -24,6 +25,8 @@ MAX_STREAMS = 32
 """Of all pages together."""
 JPEG_START = b"\xff\xd8"
 NEAR_PERCENT, FAR_PERCENT = 1.0, 99.0
+MAX_PICTURE_HZ, IN_FLIGHT = 30.0, 2
+"""Pictures sent that a page has not drawn yet: with more, a slow one would see the past."""
 SPARSE = 4
 """One row and column in this many says how near and far a depth picture goes."""
 
@@ -152,3 +155,26 @@ def _coloured(png: bytes, encoding: str) -> tuple[bytes, str]:
     rgb = np.array(cv2.applyColorMap(shares, cv2.COLORMAP_TURBO)[:, :, ::-1], np.uint8)
     rgb[depth.counts == 0] = 0
     return encode_jpeg(Image(rgb)), f"{near * depth.unit_m:.2f} to {far * depth.unit_m:.2f} m"
+
+
+class Look:
+    """What a page looks at. `now_s`: monotonic."""
+
+    def __init__(self, now_s: float) -> None:
+        self.streams: tuple[str, ...] = ()
+        self.period_s = 0.1
+        self.sent = self.drawn = 0
+        self.limit = RateLimit(4 * MAX_PICTURE_HZ, 100.0, now_s)
+        self._last: dict[str, tuple[int, float]] = {}
+
+    def due(self, now_s: float, pictures: Pictures) -> list[str]:
+        """Streams of which a newer picture may be sent now."""
+        found: list[str] = []
+        for name in self.streams:
+            room = self.sent + len(found) - self.drawn < IN_FLIGHT * len(self.streams)
+            count, sent_s = self._last.get(name, (0, -1e9))
+            newer = pictures.count(name)
+            if room and newer != count and now_s - sent_s >= self.period_s:
+                self._last[name] = (newer, now_s)
+                found.append(name)
+        return found

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from typing import Any
 
@@ -21,6 +21,7 @@ from vla_zenoh.errors import CodecError, RecordError, SessionError, VlaZenohErro
 from vla_zenoh.keys import PRIMITIVES, ROLLING, last_chunk, worker_node
 from vla_zenoh.lab.primitives.client import ask
 from vla_zenoh.lab.teleop.policy import OperatorInput
+from vla_zenoh.lab.trial.plan import MAX_SETUPS
 from vla_zenoh.lab.web.hand import HandWorker
 from vla_zenoh.lab.web.hold import Hold
 from vla_zenoh.lab.web.part_streams import PartStreams
@@ -389,3 +390,37 @@ def task_fields(task: Task) -> dict[str, Any]:
         "active": task.active,
         "episode": task.episode,
     }
+
+
+SETTINGS: dict[str, Callable[[RobotLink, Any], Any]] = {
+    "prompt": lambda link, given: link.client.set_prompt(given["text"]),
+    "worker": lambda link, given: link.client.set_worker(given["name"]),
+    "rate": lambda link, given: link.client.set_rate(given["hz"]),
+    "speed": lambda link, given: link.client.set_speed(given["percent"]),
+    "held": lambda link, given: link.hold_box(given["part"], given["text"]),
+    "activate": lambda link, _: link.client.activate(),
+    "deactivate": lambda link, _: link.deactivate(),
+    "reset": lambda link, _: link.reset(),
+    "jog": lambda link, given: (
+        link.hand.take(given["frame"], given["level"], given["part"])
+        if given["on"]
+        else link.hand.give_back()
+    ),
+    "end_trial": lambda link, _: link.trial.end(),
+    "save": lambda link, given: link.save(given["note"]),
+    "record": lambda link, given: link.record(given["on"], given["verdict"], given["note"]),
+}
+"""Request -> what changes the robot; it waits for the confirmation."""
+
+
+def asked_trial(page: int, given: Mapping[str, Any]) -> tuple[int, str, dict[str, Any]]:
+    """Arguments of `PageTrial.begin`; what is left empty is as the folder has it."""
+    workers = tuple(name.strip() for name in given["workers"].split(",") if name.strip())
+    asked = {
+        "workers": workers or None,
+        "prompt": given["prompt"].strip() or None,
+        "setups": ("",) * min(given["episodes"], MAX_SETUPS + 1) or None,
+        "seconds": float(given["seconds"]) or None,
+        "blind": None if given["blind"] else False,
+    }
+    return page, given["name"], asked

@@ -12,7 +12,7 @@ import contextlib
 import json
 import time
 from collections import Counter, deque
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -20,14 +20,13 @@ from typing import Any
 from vla_zenoh.errors import CodecError, MissingExtraError, RecordingError, VlaZenohError
 from vla_zenoh.lab.rate_limit import RateLimit
 from vla_zenoh.lab.teleop.policy import OperatorInput
-from vla_zenoh.lab.trial.plan import MAX_SETUPS
 from vla_zenoh.lab.web import metrics
-from vla_zenoh.lab.web.access import People, Person, host_is_ours, origin_is_ours
+from vla_zenoh.lab.web.access import People, Person, host_is_ours, origin_is_ours, with_headers
 from vla_zenoh.lab.web.arm import surroundings
 from vla_zenoh.lab.web.making import FILM
-from vla_zenoh.lab.web.pictures import Pictures
+from vla_zenoh.lab.web.pictures import MAX_PICTURE_HZ, Look, Pictures
 from vla_zenoh.lab.web.requests import PageRequest, parse
-from vla_zenoh.lab.web.robot_link import RobotLink
+from vla_zenoh.lab.web.robot_link import SETTINGS, RobotLink, asked_trial
 from vla_zenoh.lab.web.runs import HEADERS as RUN_HEADERS
 from vla_zenoh.lab.web.runs import KINDS, Runs
 from vla_zenoh.lab.web.tables import node_table, noted_event
@@ -36,10 +35,7 @@ try:
     import uvicorn  # noqa: F401  # pyright: ignore[reportMissingImports]
     from starlette.applications import Starlette  # pyright: ignore[reportMissingImports]
     from starlette.requests import Request as HttpRequest  # pyright: ignore[reportMissingImports]
-    from starlette.responses import (  # pyright: ignore[reportMissingImports]
-        FileResponse,
-        Response,
-    )
+    from starlette.responses import FileResponse, Response  # pyright: ignore[reportMissingImports]
     from starlette.routing import Route, WebSocketRoute  # pyright: ignore[reportMissingImports]
     from starlette.websockets import (  # pyright: ignore[reportMissingImports]
         WebSocket,
@@ -54,20 +50,10 @@ FILES = {
     "/page.js": ("page.js", "text/javascript; charset=utf-8"),
     "/page.css": ("page.css", "text/css; charset=utf-8"),
 }
-HEADERS = {
-    "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
-    "img-src 'self' blob:; media-src 'self'; connect-src 'self'; base-uri 'none'; "
-    "form-action 'none'; frame-ancestors 'none'",
-    "x-content-type-options": "nosniff",
-    "referrer-policy": "no-referrer",
-    "cross-origin-opener-policy": "same-origin",
-    "cross-origin-resource-policy": "same-origin",
-    "permissions-policy": "camera=(), microphone=(), geolocation=()",
-    "cache-control": "no-store",
-}
+GONE = (WebSocketDisconnect, RuntimeError)
+"""How the end of a browser shows; RuntimeError: Starlette, sent after the end."""
 STATE_S, NODES_S = 0.05, 1.0
-ENTER_S = 5.0
-DENIED_S = 0.5
+ENTER_S, DENIED_S = 5.0, 0.5
 """A wrong token is answered this late."""
 STOP_AGAIN_S = 0.1
 MAX_PAGES, MAX_ANSWERS, MAX_NEWS = 32, 200, 300
@@ -75,8 +61,7 @@ MAX_WAITING = 8
 """Requests of one page that wait for the robot, in turn."""
 RATE_HZ, BURST = 50.0, 100.0
 """Requests of one page; a stop is always taken."""
-MAX_PICTURE_HZ, IN_FLIGHT, PICTURE_POLL_S = 30.0, 2, 0.01
-"""Pictures sent that a page has not drawn yet: with more, a slow one would see the past."""
+PICTURE_POLL_S = 0.01
 POLICY_VIOLATION, TRY_LATER = 1008, 1013
 VIEWERS_TOO = ("runs", "make")
 PICTURES = ("look", "drawn")
@@ -100,10 +85,6 @@ class Page:
         self.turn, self.waiting = asyncio.Lock(), 0
         self.changed = asyncio.Event()
 
-    @property
-    def drives(self) -> bool:
-        return self.person.role == "operator"
-
     def tell(self, message: dict[str, Any]) -> None:
         """Send a message as soon as the connection takes it; the oldest give way."""
         may = self._masked(message)
@@ -123,18 +104,17 @@ class PageServer:
         self._runs = Runs()
         self._pictures = Pictures(link.session, link.keys, link.profile.cameras)
         self._pages: dict[int, Page] = {}
-        self._next = 0
         self._news: deque[dict[str, Any]] = deque(maxlen=MAX_NEWS)
         self._state = ""
-        self._looking = 0
+        self._next = self._looking = 0
         self.counters: Counter[str] = link.counters
         # Stops have threads of their own: those of other requests may all be waiting.
         self._stops = ThreadPoolExecutor(2, thread_name_prefix="stop")
         self._stopping: asyncio.Future[dict[str, Any]] | None = None
         self._stop_s = 0.0
         self._tasks: set[asyncio.Task[Any]] = set()
-        routes = [Route(path, self._file) for path in FILES]
-        routes += [
+        routes = [
+            *(Route(path, self._file) for path in FILES),
             Route("/favicon.ico", lambda _: Response(status_code=204)),
             Route("/metrics", self._metrics),
             Route("/runs/{ticket}/{rest:path}", self._made),
@@ -162,14 +142,14 @@ class PageServer:
         ):
             why = "another site's page must not use this one"
         if not why:
-            await self._application(scope, receive, _with_headers(send))
+            await self._application(scope, receive, with_headers(send))
             return
         self.counters["foreign"] += 1
         if scope["type"] == "websocket":
             await send({"type": "websocket.close", "code": POLICY_VIOLATION})
             return
         response = Response(f"{why}\n", 403, media_type="text/plain")
-        await response(scope, receive, _with_headers(send))
+        await response(scope, receive, with_headers(send))
 
     async def _person(self, token: str) -> Person | None:
         person = self._people.find(token)
@@ -205,7 +185,7 @@ class PageServer:
     async def _stop_by_post(self, request: HttpRequest) -> Response:
         """The way of a page whose WebSocket is broken."""
         person = await self._bearer(request)
-        if person is None or person.role != "operator":
+        if person is None or not person.drives:
             return Response(OPERATORS_ONLY if person else "no such token", 403)
         return Response(json.dumps(await self._stop(person)), media_type="application/json")
 
@@ -249,8 +229,15 @@ class PageServer:
             page.tell(message)
 
     # -- the control socket -------------------------------------------------------------------
-    async def _enter(self, socket: WebSocket) -> Person | None:
-        """Who is there, by the first message."""
+    async def _enter(
+        self, socket: WebSocket, pages: Callable[[], int], *, viewers: bool
+    ) -> Person | None:
+        """Who is there, by the first message; None: the socket was closed.
+
+        Args:
+            pages: number of those that have such a socket now.
+            viewers: whether they may have one.
+        """
         await socket.accept()
         try:
             request = parse(await asyncio.wait_for(_receive(socket), ENTER_S))
@@ -260,33 +247,28 @@ class PageServer:
         person = await self._person(token)
         if person is None:
             await socket.send_text(json.dumps({"is": "denied", "why": "no such token"}))
-            await socket.close(POLICY_VIOLATION)
+        rejected = person is None or not (viewers or person.drives)
+        if rejected or pages() >= MAX_PAGES:
+            await socket.close(POLICY_VIOLATION if rejected else TRY_LATER)
+            return None
         return person
 
     async def _control(self, socket: WebSocket) -> None:
-        sending = None
-        page = None
-        try:
-            person = await self._enter(socket)
+        with contextlib.suppress(*GONE):
+            person = await self._enter(socket, lambda: len(self._pages), viewers=True)
             if person is None:
-                return
-            if len(self._pages) >= MAX_PAGES:
-                await socket.close(TRY_LATER)
                 return
             self._next += 1
             page = self._pages[self._next] = Page(self._next, person, self._link.trial.masked)
-            self._welcome(page)
             sending = asyncio.create_task(self._send_state(page, socket))
-            while True:
-                await self._read(page, await _receive(socket))
-        except (WebSocketDisconnect, RuntimeError):  # Starlette: sent after the end
-            pass
-        finally:
-            if page is not None:
+            try:
+                self._welcome(page)
+                while True:
+                    await self._read(page, await _receive(socket))
+            finally:
                 self._link.release(page.number, gone=True)
                 self._link.trial.gone(page.number)
                 del self._pages[page.number]
-            if sending is not None:
                 sending.cancel()
 
     def _welcome(self, page: Page) -> None:
@@ -296,8 +278,8 @@ class PageServer:
                 "is": "welcome",
                 "robot": link.keys.robot,
                 "person": page.person.name,
-                "drives": page.drives,
-                "pictures": self._pictures.offered if page.drives else (),
+                "drives": page.person.drives,
+                "pictures": self._pictures.offered if page.person.drives else (),
                 "surroundings": surroundings(link.profile),
                 "no_arm": link.no_arm,
                 "insecure": link.profile.session.insecure,
@@ -309,7 +291,7 @@ class PageServer:
         page.tell(self._node_message())
 
     async def _send_state(self, page: Page, socket: WebSocket) -> None:
-        with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+        with contextlib.suppress(*GONE):
             while True:
                 await page.changed.wait()
                 page.changed.clear()
@@ -335,7 +317,7 @@ class PageServer:
             self._complain(page, "too_fast", f"more than {RATE_HZ:g} messages per second")
             return
         self.counters["message"] += 1
-        if not page.drives and request.do not in VIEWERS_TOO:
+        if not page.person.drives and request.do not in VIEWERS_TOO:
             self._complain(page, "not_allowed", OPERATORS_ONLY)
             return
         await self._obey(page, request)
@@ -348,15 +330,13 @@ class PageServer:
 
     # -- requests -----------------------------------------------------------------------------
     async def _obey(self, page: Page, request: PageRequest) -> None:
-        link, values = self._link, request.values
+        link, values, name = self._link, request.values, page.person.name
         if request.do == "stop":
             self._begin(self._stop(page.person))
         elif request.do == "hold":
-            name = page.person.name
             self._press(page, request, lambda: link.activate_held(page.number, name))
         elif request.do == "primitive":
-            name, what = page.person.name, values["name"]
-            self._press(page, request, lambda: link.primitive(page.number, name, what))
+            self._press(page, request, lambda: link.primitive(page.number, name, values["name"]))
         elif request.do == "beat":
             hand = OperatorInput(tuple(values["twist"]), values["opening"])
             if not link.beat(page.number, values["press"], values["tick"], hand):
@@ -368,7 +348,7 @@ class PageServer:
         elif request.do == "watched":
             link.trial.watched(page.number, values["tick"] / 1e3)
         elif request.do == "trial":
-            self._change(page, "trial", lambda: link.trial.begin(*_trial(page.number, values)))
+            self._change(page, "trial", lambda: link.trial.begin(*asked_trial(page.number, values)))
         elif request.do == "runs":
             self._begin(self._tell_runs(page))
         elif request.do == "make":
@@ -401,10 +381,10 @@ class PageServer:
             loop.call_soon_threadsafe(page.tell, {**message, "share": share})
 
         try:
-            if kind == FILM and not page.drives:
+            if kind == FILM and not page.person.drives:
                 raise RecordingError(OPERATORS_ONLY)
             page.tell(message)
-            url = await asyncio.to_thread(self._runs.make, name, kind, page.drives, told)
+            url = await asyncio.to_thread(self._runs.make, name, kind, page.person.drives, told)
             page.tell({**message, "is": "made", "url": url})
         except (VlaZenohError, OSError) as error:
             page.tell({**message, "is": "made", "why": str(error)})
@@ -442,17 +422,15 @@ class PageServer:
         now_s = time.monotonic()
         if self._stopping is None or self._stopping.done():
             self._stopping = asyncio.ensure_future(self._stop_and_tell(person))
+            self._stop_s = now_s
         elif now_s - self._stop_s > STOP_AGAIN_S:  # it may have been reset meanwhile
             self._stops.submit(self._link.client.stop)
-        else:
-            return await asyncio.shield(self._stopping)
-        self._stop_s = now_s
+            self._stop_s = now_s
         return await asyncio.shield(self._stopping)
 
     async def _stop_and_tell(self, person: Person) -> dict[str, Any]:
         """Stop the robot, and tell every page who did, and when it stood."""
-        loop = asyncio.get_running_loop()
-        report = await loop.run_in_executor(self._stops, self._link.stop)
+        report = await asyncio.get_running_loop().run_in_executor(self._stops, self._link.stop)
         report = {"is": "stopped", "by": person.name, **report}
         self._tell_all(report)
         return report
@@ -464,31 +442,20 @@ class PageServer:
 
     # -- the socket of pictures ---------------------------------------------------------------
     async def _show_pictures(self, socket: WebSocket) -> None:
-        look = Look(time.monotonic())
-        sending = None
-        try:
-            person = await self._enter(socket)
-            if person is None:
-                return
-            if person.role != "operator":  # as `security.roles`: pictures show people
-                await socket.close(POLICY_VIOLATION)
-                return
-            if self._looking >= MAX_PAGES:
-                await socket.close(TRY_LATER)
+        with contextlib.suppress(*GONE):
+            # As `security.roles`: pictures show people.
+            if await self._enter(socket, lambda: self._looking, viewers=False) is None:
                 return
             self._looking += 1
+            look = Look(time.monotonic())
+            sending = asyncio.create_task(self._send_pictures(look, socket))
             try:
-                sending = asyncio.create_task(self._send_pictures(look, socket))
                 while True:
                     self._read_look(look, await _receive(socket))
             finally:
                 self._looking -= 1
-        except (WebSocketDisconnect, RuntimeError):
-            pass
-        finally:
-            if sending is not None:
                 sending.cancel()
-            self._pictures.change(look.streams, ())
+                self._pictures.change(look.streams, ())
 
     def _read_look(self, look: Look, text: str) -> None:
         try:
@@ -506,7 +473,7 @@ class PageServer:
 
     async def _send_pictures(self, look: Look, socket: WebSocket) -> None:
         """Send the newest picture of each stream, as fast as asked and as the page draws them."""
-        with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+        with contextlib.suppress(*GONE):
             while True:
                 for name in look.due(time.monotonic(), self._pictures):
                     picture = await asyncio.to_thread(self._pictures.newest, name)
@@ -525,81 +492,9 @@ class PageServer:
                 await asyncio.sleep(PICTURE_POLL_S)
 
 
-class Look:
-    """What a page looks at. `now_s`: monotonic."""
-
-    def __init__(self, now_s: float) -> None:
-        self.streams: tuple[str, ...] = ()
-        self.period_s = 0.1
-        self.sent = self.drawn = 0
-        self.limit = RateLimit(4 * MAX_PICTURE_HZ, 100.0, now_s)
-        self._last: dict[str, tuple[int, float]] = {}
-
-    def due(self, now_s: float, pictures: Pictures) -> list[str]:
-        """Streams of which a newer picture may be sent now."""
-        found: list[str] = []
-        for name in self.streams:
-            room = self.sent + len(found) - self.drawn < IN_FLIGHT * len(self.streams)
-            count, sent_s = self._last.get(name, (0, -1e9))
-            newer = pictures.count(name)
-            if room and newer != count and now_s - sent_s >= self.period_s:
-                self._last[name] = (newer, now_s)
-                found.append(name)
-        return found
-
-
-def _trial(page: int, given: Mapping[str, Any]) -> tuple[int, str, dict[str, Any]]:
-    """Arguments of `PageTrial.begin`; what is left empty is as the folder has it."""
-    workers = tuple(name.strip() for name in given["workers"].split(",") if name.strip())
-    asked = {
-        "workers": workers or None,
-        "prompt": given["prompt"].strip() or None,
-        "setups": ("",) * min(given["episodes"], MAX_SETUPS + 1) or None,
-        "seconds": float(given["seconds"]) or None,
-        "blind": None if given["blind"] else False,
-    }
-    return page, given["name"], asked
-
-
 async def _receive(socket: WebSocket) -> str:
     """The next text of a browser. Raises WebSocketDisconnect: it is gone."""
     message = await socket.receive()
     if message["type"] == "websocket.disconnect":
         raise WebSocketDisconnect(message.get("code") or 1006)
     return message.get("text") or ""  # bytes are no request, and neither is ""
-
-
-def _with_headers(send: Any) -> Any:
-    """`send` with `HEADERS` on every response that has none of its own."""
-
-    async def sending(message: Any) -> None:
-        if message["type"] == "http.response.start":
-            own = list(message.get("headers", ()))
-            given = {name for name, _ in own}
-            more = [(name.encode(), value.encode()) for name, value in HEADERS.items()]
-            own += [(name, value) for name, value in more if name not in given]
-            message = {**message, "headers": own}
-        await send(message)
-
-    return sending
-
-
-SETTINGS: dict[str, Callable[[RobotLink, Any], Any]] = {
-    "prompt": lambda link, given: link.client.set_prompt(given["text"]),
-    "worker": lambda link, given: link.client.set_worker(given["name"]),
-    "rate": lambda link, given: link.client.set_rate(given["hz"]),
-    "speed": lambda link, given: link.client.set_speed(given["percent"]),
-    "held": lambda link, given: link.hold_box(given["part"], given["text"]),
-    "activate": lambda link, _: link.client.activate(),
-    "deactivate": lambda link, _: link.deactivate(),
-    "reset": lambda link, _: link.reset(),
-    "jog": lambda link, given: (
-        link.hand.take(given["frame"], given["level"], given["part"])
-        if given["on"]
-        else link.hand.give_back()
-    ),
-    "end_trial": lambda link, _: link.trial.end(),
-    "save": lambda link, given: link.save(given["note"]),
-    "record": lambda link, given: link.record(given["on"], given["verdict"], given["note"]),
-}
-"""Request -> what changes the robot; it waits for the confirmation."""
