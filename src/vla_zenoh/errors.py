@@ -24,8 +24,7 @@ class RecordError(VlaZenohError, ValueError):
 class CodecError(VlaZenohError, ValueError):
     """Bytes from the wire are not what their key promises.
 
-    Attributes:
-        reason: short stable name used as a counter in status, for example ``truncated``.
+    `reason` is the stable name of its counter in status, for example ``truncated``.
     """
 
     def __init__(self, reason: str, message: str) -> None:
@@ -36,8 +35,7 @@ class CodecError(VlaZenohError, ValueError):
 class ProfileError(VlaZenohError, ValueError):
     """A profile file is wrong; the message names file, line and path.
 
-    Attributes:
-        place: keys from the top of the profile down to what is wrong, where the message has none.
+    `place` has the keys from the top down to what is wrong, where the message has none.
     """
 
     def __init__(self, message: str, place: tuple[str, ...] = ()) -> None:
@@ -48,8 +46,7 @@ class ProfileError(VlaZenohError, ValueError):
 class SpecError(VlaZenohError, ValueError):
     """A model's spec is wrong, or does not fit the profile, or an answer does not fit the spec.
 
-    Attributes:
-        reason: short stable name of what does not fit, for example ``horizon``.
+    `reason` is a stable name of what does not fit, for example ``horizon``.
     """
 
     def __init__(self, message: str, reason: str = "contract") -> None:
@@ -74,12 +71,7 @@ def how_to_install(extra: str = "") -> str:
 
 
 class MissingExtraError(VlaZenohError, ImportError):
-    """An optional dependency is not installed.
-
-    Args:
-        module: the module that could not be imported.
-        extra: the extra of this package that brings it.
-    """
+    """A Python module is not installed; an extra of this package brings it."""
 
     def __init__(self, module: str, extra: str) -> None:
         super().__init__(
@@ -107,8 +99,7 @@ class OutputError(VlaZenohError):
 class PeerError(VlaZenohError):
     """A policy server gave no usable answer.
 
-    Attributes:
-        reason: short stable name used as a counter in status, for example ``peer_timeout``.
+    `reason` is the stable name of its counter in status, for example ``peer_timeout``.
     """
 
     def __init__(self, reason: str, message: str) -> None:
@@ -211,10 +202,10 @@ def in_words(error: BaseException) -> str:
     if type(error).__name__ == "ValidationError" and callable(getattr(error, "errors", None)):
         title = getattr(error, "title", "it")
         return f"{title} is wrong: {describe_faults(error, '', given=True)}"
-    text = str(error)
+    name, text = type(error).__name__, str(error).strip()
     if "weights_only" in text:
         return (
-            f"{type(error).__name__}: the file holds Python objects beside weights, and loading "
+            f"{name}: the file holds Python objects beside weights, and loading "
             "those runs code from the file. Convert it to safetensors, or save its state_dict() "
             "alone, where you trust it"
         )
@@ -222,7 +213,5 @@ def in_words(error: BaseException) -> str:
         return f"{error.filename}: {error.strerror}"
     if isinstance(error, KeyError) and error.args:
         return f"KeyError: there is no {error.args[0]!r}"
-    name = type(error).__name__
-    text = text.strip()
     short = text if len(text) <= MAX_FOREIGN else f"{text[:MAX_FOREIGN]} ..."
     return f"{name}: {short}" if short else name

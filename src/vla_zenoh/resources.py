@@ -13,12 +13,7 @@ from vla_zenoh.errors import MissingExtraError, ProfileError, ResourceError, nea
 
 PROFILE_SUFFIXES = (".yaml", ".yml")
 BENCHMARKS = "sim/benchmarks"
-KINDS = {
-    "models": (".py", ""),
-    "profiles": PROFILE_SUFFIXES,
-    "sim": ("",),
-    BENCHMARKS: (".py",),
-}
+KINDS = {"models": (".py", ""), "profiles": PROFILE_SUFFIXES, "sim": ("",), BENCHMARKS: (".py",)}
 ONE = {"models": "model", "profiles": "profile", "sim": "scene", BENCHMARKS: "benchmark"}
 SEARCH_PATH_VARIABLE = "VLA_ZENOH_PATH"
 ROBOT_DATA_PREFIX = "example-robot-data:"
@@ -58,7 +53,7 @@ def names(kind: str) -> list[str]:
 
 def is_path(name: str) -> bool:
     """Whether `find` takes `name` as a path and not as a name."""
-    return os.sep in name or Path(name).suffix in (".py", ".yaml", ".yml")
+    return os.sep in name or Path(name).suffix in (".py", *PROFILE_SUFFIXES)
 
 
 def find(kind: str, name: str) -> Path:
@@ -100,11 +95,17 @@ def profile_file(name: str) -> Path:
 def extended_profile(path: Path, parent: str) -> Path:
     """File that the profile at `path` extends: beside it, or first on the search path.
 
-    A profile that extends its own name means the next one on the search path. If there is none, a
-    `ProfileError`.
+    A profile that extends its own name means the next one there. If there is none, `ProfileError`.
     """
     if parent == path.stem:
-        return _next(path, parent)
+        files = [f / f"{parent}{end}" for f in folders("profiles") for end in PROFILE_SUFFIXES]
+        files = [file for file in files if file.is_file()]
+        own = [index for index, file in enumerate(files) if file.samefile(path)]
+        if after := files[own[0] + 1 :] if own else files:
+            return after[0]
+        raise ProfileError(
+            f"{parent!r} is this file, and no other profile of that name comes after it"
+        )
     try:
         whole = Path(parent).suffix in PROFILE_SUFFIXES
         for suffix in ("",) if whole else PROFILE_SUFFIXES:
@@ -113,18 +114,6 @@ def extended_profile(path: Path, parent: str) -> Path:
     except (OSError, ValueError) as error:
         raise ProfileError(f"{parent[:80]!r} cannot be the name of a profile") from error
     return profile_file(parent)
-
-
-def _next(path: Path, name: str) -> Path:
-    files = (f / f"{name}{suffix}" for f in folders("profiles") for suffix in PROFILE_SUFFIXES)
-    candidates = [file for file in files if file.is_file()]
-    own = [index for index, file in enumerate(candidates) if file.samefile(path)]
-    after = candidates[own[0] + 1 :] if own else candidates
-    if not after:
-        raise ProfileError(
-            f"{name!r} is this file, and no other profile of that name comes after it"
-        )
-    return after[0]
 
 
 def robot_urdf(description: str) -> Path:
@@ -139,28 +128,20 @@ def robot_urdf(description: str) -> Path:
         if not path.is_file():
             raise ResourceError(f"robot description {description!r} is not a file")
         return path.resolve()
-    root = _robot_data()
-    if root is None:
-        raise MissingExtraError("example-robot-data", "control")
-    path = root / description.removeprefix(ROBOT_DATA_PREFIX)
-    if not path.is_file():
-        raise ResourceError(
-            f"robot description {description!r} is not in example-robot-data; "
-            f"robots there: {', '.join(sorted(entry.name for entry in root.iterdir()))}"
-        )
-    return path
-
-
-def _robot_data() -> Path | None:
-    """Where the robots are: beside the package, which in a layered environment is in any layer."""
     import importlib.metadata  # only here: it takes 45 ms
 
     try:
         package = importlib.metadata.distribution("example-robot-data")
-    except importlib.metadata.PackageNotFoundError:
-        return None
+    except importlib.metadata.PackageNotFoundError as error:
+        raise MissingExtraError("example-robot-data", "control") from error
     root = Path(str(package.locate_file("cmeel.prefix/share/example-robot-data/robots")))
-    return root if root.is_dir() else None
+    path = root / description.removeprefix(ROBOT_DATA_PREFIX)
+    if not path.is_file():
+        raise ResourceError(
+            f"robot description {description!r} is not in example-robot-data; "
+            f"robots there: {', '.join(sorted(entry.name for entry in root.glob('*')))}"
+        )
+    return path
 
 
 def meshes_of(urdf: Path) -> Path:

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
     from vla_zenoh.bus.client import Client
     from vla_zenoh.cli.options import AnswerOption
-    from vla_zenoh.profile import Profile
     from vla_zenoh.types import Task
 
 PATIENCE_S = 3.0
@@ -293,7 +292,11 @@ def _stop_all(target: RobotTarget, own: Client) -> None:
     if not robots:
         why = target.not_operator(own.profile, "stop")
         fail(f"no robot is visible on this router. {why}".rstrip(". "))
-    clients = [Client(_named(own.profile, robot), own.session).subscribe() for robot in robots]
+    clients: list[Client] = []
+    for robot in robots:
+        named = own.profile.robot.model_copy(update={"name": robot})
+        other = own.profile.model_copy(update={"robot": named})
+        clients.append(Client(other, own.session).subscribe())
     done = [_stops(client) for client in clients]
     for client, stopped in zip(clients, done, strict=True):
         if stopped:
@@ -302,11 +305,6 @@ def _stop_all(target: RobotTarget, own: Client) -> None:
             complain(f"{target.named(client)} does not confirm that it stopped")
     if not all(done):
         fail(target.not_operator(own.profile, "stop", "--all") or "not every robot has stopped")
-
-
-def _named(profile: Profile, robot: str) -> Profile:
-    """The profile of another robot, as far as a client reads it."""
-    return profile.model_copy(update={"robot": profile.robot.model_copy(update={"name": robot})})
 
 
 def _show_stopped(target: RobotTarget, client: Client, own: str) -> None:

@@ -117,14 +117,13 @@ COMPLETIONS: Mapping[str, Callable[[Any], Iterable[str]]] = {
     **dict.fromkeys(("key", "keys"), keys),
 }
 """What completes a parameter, by its name, or by command words and its name."""
-NO_HOST_OF_A_LAB = "lab serve.host"
 
 
 def add_completion(parameter: Any, command: str) -> None:
     """Let the shell complete a parameter of the command of these words."""
     name = f"{command}.{parameter.name}"
     words = COMPLETIONS.get(name) or COMPLETIONS.get(parameter.name)
-    if words is None or name == NO_HOST_OF_A_LAB:
+    if words is None or name == "lab serve.host":  # an address
         return
 
     def complete(context: Any, incomplete: str) -> list[Candidate]:

@@ -21,12 +21,7 @@ NODES = frozenset({"up", "worker", "node"})
 
 
 class Group(NamedTuple):
-    """Several commands under one word.
-
-    Args:
-        help: one line.
-        commands: name -> ``module:function`` inside the package.
-    """
+    """Several commands under one word: name -> ``module:function`` inside the package."""
 
     help: str
     commands: Mapping[str, str]

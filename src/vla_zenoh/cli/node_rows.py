@@ -49,10 +49,7 @@ def node_rows(
 ) -> list[NodeRow]:
     """Every node that published a status, and those expected on hosts that run, by name.
 
-    Args:
-        said: statuses of the nodes.
-        expected: nodes of the profile, each with its host.
-        alive: nodes that have a liveliness token.
+    `expected` has the host of each node of the profile; `alive` nodes have a liveliness token.
     """
     down = hosts_down(said, expected, alive)
     names = {*said, *(name for name, host in expected.items() if host not in down)}
@@ -60,7 +57,11 @@ def node_rows(
     for name in sorted(names):
         host = expected.get(name, "")
         if name not in said:
-            rows.append(_unheard(name, host, lives=name in alive))
+            state, why = STARTING, "it has not published its status yet"
+            if name not in alive:
+                see = f"see the output of `vla-zenoh up` on host {host}"
+                state, why = MISSING, f"not running; {see}, which should start it"
+            rows.append(NodeRow(name, host, state, why, None, None, name in alive))
             continue
         status, age_s, lives = said[name]
         state, why = status.state, ""
@@ -70,12 +71,6 @@ def node_rows(
             state, why = DEAD, "it exited, or lost its connection; see the output of `up` there"
         rows.append(NodeRow(name, status.host, state, why, status, age_s, lives))
     return rows
-
-
-def _unheard(name: str, host: str, *, lives: bool) -> NodeRow:
-    why = f"not running; see the output of `vla-zenoh up` on host {host}, which should start it"
-    state, why = (STARTING, "it has not published its status yet") if lives else (MISSING, why)
-    return NodeRow(name, host, state, why, None, None, lives)
 
 
 def hosts_down(

@@ -7,13 +7,14 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
     AlsoOption,
+    DryRunOption,
     HostOption,
     ListenOption,
     ModelOptions,
@@ -141,9 +142,7 @@ def camera(
 @options
 def command(
     node: NodeOptions,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Compute and check everything, command nothing.")
-    ] = False,
+    dry_run: DryRunOption = False,
 ) -> None:
     """Run the command node: turns action chunks into a bounded, smooth command stream."""
     from vla_zenoh.nodes.command.node import CommandNode
@@ -184,6 +183,7 @@ def worker(
     # Returns only if this environment has what the model's header asks for.
     run_in_own_environment(chosen.model, model_options.python)
     policy = make_policy(chosen.model, chosen.options, profile=node.profile)
+    own = None if host is None else profile.hosts.get(host)
     if sys.stdout.isatty():
         say(f"worker {chosen.name} of robot {profile.robot.name} is running; Ctrl-C stops it")
     run_node(
@@ -193,7 +193,7 @@ def worker(
             session,
             policy,
             chosen.name,
-            images=_image_form(profile, host),
+            images="raw" if own is None or "camera" in own.nodes else "jpeg",
             host=host,
             delay_s=delay_ms / 1e3,
             robots=profile.serves.get(chosen.name, ()),
@@ -202,10 +202,3 @@ def worker(
         identity=worker_node(chosen.name),
     )
     os._exit(0)  # threads of a model's library may keep the process alive
-
-
-def _image_form(profile: Profile, host: str | None) -> Literal["raw", "jpeg"]:
-    """Raw images within a host, JPEG from another one."""
-    if host is None or host not in profile.hosts:
-        return "raw"
-    return "raw" if "camera" in profile.hosts[host].nodes else "jpeg"

@@ -51,6 +51,9 @@ AlsoOption = Annotated[
     list[str] | None,
     typer.Option("--also", help="Profile of another robot that the router serves; repeatable."),
 ]
+DryRunOption = Annotated[
+    bool, typer.Option("--dry-run", help="Compute and check everything, command nothing.")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 AnswerOption = Annotated[bool, typer.Option("--json", help="Print the answer as JSON on stdout.")]
 
@@ -63,15 +66,14 @@ def options(command: Callable[..., None]) -> Callable[..., None]:
     instance made of their values. Fields are annotated as parameters of a Typer command are. The
     annotations may use Typer and the options of this module where theirs does not import them.
     """
-    ours = {**globals(), "typer": typer}
-    hints = get_type_hints(command, {**ours, **command.__globals__}, include_extras=True)
+    hints = get_type_hints(command, {**globals(), **command.__globals__}, include_extras=True)
     groups: dict[str, Any] = {
         name: hint for name, hint in hints.items() if dataclasses.is_dataclass(hint)
     }
     parameters: list[inspect.Parameter] = []
     for name, parameter in inspect.signature(command).parameters.items():
         if name in groups:
-            names = {**ours, **vars(sys.modules[groups[name].__module__])}
+            names = {**globals(), **vars(sys.modules[groups[name].__module__])}
             signature = inspect.signature(groups[name], eval_str=True, globals=names)
             parameters += signature.parameters.values()
         else:
@@ -99,11 +101,7 @@ def effective_profile(
 ) -> Profile:
     """A profile with endpoints of the command line in place of its own.
 
-    Args:
-        profile: its name or path, or a loaded one.
-        connect: in place of session.connect.
-        listen: in place of session.listen.
-        host: which of the profile's hosts this computer is; selects the certificates.
+    `host` is this computer among the profile's hosts; it selects the certificates.
 
     Raises:
         ProfileError: the profile is invalid.
@@ -126,7 +124,6 @@ class NodeOptions:
     connect: ConnectOption = None
 
     def load(self) -> Profile:
-        """Load the effective profile."""
         return effective_profile(self.profile, self.connect)
 
 
@@ -154,12 +151,7 @@ class ModelOptions:
     ] = None
 
     def choose(self, profile: Profile | None, word: str, name: str | None = None) -> WorkerChoice:
-        """Find the worker that `word` names.
-
-        Args:
-            profile: with workers and options; None: without a profile.
-            word: a worker of the profile, the name of a model, or a path to one.
-            name: of the worker, in place of its own.
+        """Find the worker that `word` names: one of the profile, a model's name, or its path.
 
         Raises:
             ResourceError: there is no such model.
@@ -180,11 +172,7 @@ class ModelOptions:
 
 
 def model_options(given: list[str]) -> dict[str, str]:
-    """Parse ``name=value`` texts.
-
-    Raises:
-        typer.BadParameter: one is not of this form.
-    """
+    """Parse ``name=value`` texts; `typer.BadParameter` if one is not of this form."""
     out: dict[str, str] = {}
     for option in given:
         key, equals, value = option.partition("=")

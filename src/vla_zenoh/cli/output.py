@@ -118,13 +118,9 @@ def _aligned(cells: Sequence[RenderableType], *, right: bool) -> list[str]:
 
 
 def new_table(*columns: str, left: Collection[str] | None = None, **settings: Any) -> Grid:
-    """An empty table.
+    """An empty table, with settings of Rich's.
 
-    Args:
-        columns: their names.
-        left: columns of words, which are aligned left and wrap; the others hold figures, which do
-            not. None: all hold words.
-        settings: of Rich's tables.
+    Columns `left`, or all, hold words: aligned left, they wrap. Figures of the others do not.
     """
     table = Grid(**{**LOOK, **settings})
     for column in columns:

@@ -25,11 +25,7 @@ _answers: list[dict[str, list[str]]] = []
 
 @contextmanager
 def json_answer() -> Iterator[None]:
-    """Print what the block says as one JSON object on stdout, instead of lines.
-
-    Raises:
-        SystemExit: with code 1, after an error of this package.
-    """
+    """Print what the block says as one JSON object on stdout; exit with 1 after our own errors."""
     answer: dict[str, list[str]] = {"messages": [], "warnings": [], "errors": [], "reasons": []}
     _answers.append(answer)
     ok = False

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from vla_zenoh.profile import Profile
 
 MAX_OUTLINES = 64
-MAX_BYTES = 1024 * 1024
 
 
 class _Section(dict[str, Any]):
@@ -90,39 +89,31 @@ def _outline_of(profile: Profile) -> dict[str, Any]:
 def cached_profile(name: str, options: Sequence[Any], load: Callable[[], Profile]) -> Profile:
     """An outline of the profile that `load` would return, or that profile.
 
-    Args:
-        name: of the profile, or its path.
-        options: all that `load` depends on beside the files.
-        load: loads and validates the profile.
-
-    Raises:
-        ProfileError: the profile is invalid.
+    `options` are all that `load` depends on beside the files. Its `ProfileError` passes through.
     """
     try:
         file = profile_file(name)
         key = [str(file), list(options), _code()]
-        cache = _folder() / f"{zlib.crc32(json.dumps(key).encode()):08x}.json"
+        root = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
+        cache = root / "vla-zenoh" / "outlines" / f"{zlib.crc32(json.dumps(key).encode()):08x}.json"
         known = _read(cache)
         if known is not None and known["key"] == key and _unchanged(file, known["files"]):
             return cast("Profile", _Outline(known["outline"], load))
+        before = _files(name)
     except (VlaZenohError, OSError, ValueError, KeyError, TypeError):
         return load()  # reports what is wrong
-    before = _files(name)
     profile = load()
-    with suppress(OSError):
-        if before is not None and before == _files(name):  # none was saved meanwhile
+    with suppress(OSError, ValueError):
+        if before == _files(name):  # none was saved meanwhile
             _write(cache, {"key": key, "files": before, "outline": _outline_of(profile)})
     return profile
 
 
-def _files(name: str) -> list[tuple[str, str]] | None:
-    """Name and content of the profile and of those that it extends; None: they are invalid."""
+def _files(name: str) -> list[tuple[str, str]]:
+    """Name and content of the profile and of those that it extends."""
     from vla_zenoh.profile.load import followed
 
-    try:
-        return [(parent, path.read_text("utf-8")) for path, parent in followed(name)]
-    except (OSError, ValueError):
-        return None
+    return [(parent, path.read_text("utf-8")) for path, parent in followed(name)]
 
 
 def _unchanged(file: Path, files: Sequence[Sequence[str]]) -> bool:
@@ -142,11 +133,6 @@ def _code() -> list[Any]:
     return [vla_zenoh.__version__, sys.version, str(package), dates[-1], len(dates)]
 
 
-def _folder() -> Path:
-    root = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    return Path(root) / "vla-zenoh" / "outlines"
-
-
 def _read(path: Path) -> Any:
     """An outline that only this user can have written; None: there is none."""
     for place in (path.parent, path):
@@ -156,8 +142,6 @@ def _read(path: Path) -> Any:
             return None
         if found.st_uid != os.getuid() or found.st_mode & 0o022:
             return None
-    if path.stat().st_size > MAX_BYTES:
-        return None
     return json.loads(path.read_text("utf-8"), object_hook=_Section)
 
 

@@ -83,14 +83,8 @@ def render(
 ) -> Group:
     """The table of nodes and the events. Warnings come first: no table pushes them off the screen.
 
-    Args:
-        robot: its name.
-        nodes: the status of each, by the node name in its key.
-        events: oldest first.
-        insecure: the profile lets anyone command the robot.
-        left_out: statuses of unknown nodes that were not kept.
-        expected: nodes of the profile, each with its host.
-        alive: nodes that have a liveliness token.
+    `left_out` counts statuses of unknown nodes that were not kept; `expected` and `alive` are those
+    of `node_rows`.
     """
     mode, sentence, style = MODE_WORDS[mode_of(nodes)]
     title = Text.assemble((mode, style), printable(f" robot {robot}: {sentence}"))
@@ -153,19 +147,18 @@ def _cells(row: NodeRow, mode: str) -> tuple[str | Text, ...]:
         state = f"{mode} {state}"
     late = age_s is not None and age_s > STALE_S
     rates = found.rates_hz.items() if found is not None and row.alive else ()
-    refused = sorted(found.counters.items()) if found is not None else ()
+    counters = sorted(found.counters.items()) if found is not None else ()
+    refused = [
+        f"{name.removeprefix('refused.')} {count}"
+        for name, count in counters
+        if name.startswith("refused.")
+    ]
     return (
         one_line(row.name),
         styled(state, style),
         styled("" if age_s is None else f"{age_s:.1f} s", "red" if late else "white"),
         _cell([f"{key} {value:.0f} Hz" for key, value in rates]),
-        _cell(
-            [
-                f"{name.removeprefix('refused.')} {count}"
-                for name, count in refused
-                if name.startswith("refused.")
-            ]
-        ),
+        _cell(refused),
         one_line(row.why, MAX_WORDS) if row.why or found is None else _message(row, found, mode),
     )
 

@@ -26,18 +26,15 @@ LEAVING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.
 def stop_by_key(target: RobotTarget, confirm: Callable[[Client], None]) -> None:
     """Stop the robot at every key, and when the person leaves; the session stays open meanwhile.
 
-    Args:
-        target: the robot.
-        confirm: waits until the robot has stopped and reports that; raises `SystemExit` if it does
-            not stop.
+    `confirm` waits until it has stopped and reports that, or raises `SystemExit`.
     """
     with target.client(stop=True) as client, _keys() as pressed:
         try:
             _stand(client, target.named(client), pressed, confirm)
-        except KeyboardInterrupt:
-            _leave(client, confirm)
-            raise
-        _leave(client, confirm)
+        finally:
+            client.stop()
+            with suppress(OSError):  # the terminal may be gone
+                confirm(client)
 
 
 def _stand(
@@ -53,20 +50,11 @@ def _stand(
             with suppress(SystemExit):  # reported already; stay on standby
                 confirm(client)
         if connected != (connected := _connected(client)):
-            _tell(connected, name)
-
-
-def _leave(client: Client, confirm: Callable[[Client], None]) -> None:
-    client.stop()
-    with suppress(OSError):  # the terminal may be gone
-        confirm(client)
-
-
-def _tell(connected: bool, name: str) -> None:
-    if connected:
-        say(f"Connected: every key stops {name}.")
-    else:
-        say_marked("NOT CONNECTED", BOLD_RED, f": its command node is silent, no key stops {name}")
+            if connected:
+                say(f"Connected: every key stops {name}.")
+            else:
+                silent = f": its command node is silent, no key stops {name}"
+                say_marked("NOT CONNECTED", BOLD_RED, silent)
 
 
 def _connected(client: Client) -> bool:

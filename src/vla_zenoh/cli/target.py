@@ -29,14 +29,7 @@ if TYPE_CHECKING:  # Typer and the schema: the commands that drive do without th
 
 @dataclass(frozen=True)
 class RobotTarget:
-    """Options that select a robot, and its client.
-
-    Args:
-        profile: name or path.
-        connect: routers, instead of the profile's.
-        host: which host of the profile this computer is; selects the operator's certificate.
-        robot: instead of the profile's.
-    """
+    """Options that select a robot, and its client."""
 
     profile: ProfileOption = DEFAULT_PROFILE
     connect: ConnectOption = None
@@ -47,13 +40,7 @@ class RobotTarget:
     ] = None
 
     def typed(self, *command: str, host: str | None = None, robot: str | None = None) -> str:
-        """The command line of another command for this robot.
-
-        Args:
-            command: its words, such as ``status``.
-            host: instead of its own.
-            robot: instead of its own.
-        """
+        """The command line of another command for this robot, or for the host or robot given."""
         words = ["vla-zenoh", *command]
         if self.profile != DEFAULT_PROFILE or PROFILE_VARIABLE in os.environ:
             words += ["--profile", self.profile]
@@ -63,13 +50,8 @@ class RobotTarget:
             words += [option, value] if value is not None else []
         return shlex.join(words)
 
-    # -- the profile --------------------------------------------------------------------------
     def load(self) -> Profile:
-        """Load the profile, with the best certificate that this computer has for an operator.
-
-        Raises:
-            ProfileError: the profile is invalid.
-        """
+        """Load the profile, with the best certificate that this computer has for an operator."""
         return _choices(self._load(), stop=False)[0]
 
     def _load(self) -> Profile:
@@ -88,7 +70,6 @@ class RobotTarget:
             self.profile, (list(self.connect or ()), self.host, self.robot), self._load
         )
 
-    # -- sessions -----------------------------------------------------------------------------
     @contextmanager
     def client(self, *, stop: bool = False, stop_now: bool = False) -> Iterator[Client]:
         """A connected client that will know the nodes in a moment.
@@ -115,9 +96,6 @@ class RobotTarget:
     def operator(self, *command: str) -> Iterator[Client]:
         """A connected client that may change settings; errors name the robot and the others.
 
-        Args:
-            command: the words of this command, for the errors.
-
         Raises:
             SecurityError: the certificate here is not an operator's.
             SessionError: the session or the block failed.
@@ -132,7 +110,6 @@ class RobotTarget:
                     raise
                 raise SessionError(self.no_node(client, *command, kind="command node")) from error
 
-    # -- messages -----------------------------------------------------------------------------
     def named(self, client: Client) -> str:
         """Robot and profile."""
         return f"robot {client.keys.robot} (profile {self.profile})"
@@ -192,12 +169,7 @@ def _with_host(profile: Profile, host: str | None) -> Profile:
 
 
 def _first(choices: Sequence[Profile]) -> tuple[Profile, zenoh.Session]:
-    """A session with the first certificate that the router accepts.
-
-    Raises:
-        SecurityError: of the first certificate, where none is accepted.
-        SessionError: the same.
-    """
+    """A session with the first certificate that the router accepts, or the first one's error."""
     failed: list[SecurityError | SessionError] = []
     for profile in choices:
         try:

@@ -25,6 +25,7 @@ from vla_zenoh.cli.options import (
     PROFILE_VARIABLE,
     AlsoOption,
     ConnectOption,
+    DryRunOption,
     HostOption,
     JsonOption,
     ListenOption,
@@ -57,9 +58,7 @@ def up(
     connect: ConnectOption = None,
     listen: ListenOption = None,
     also: AlsoOption = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Compute and check everything, command nothing.")
-    ] = False,
+    dry_run: DryRunOption = False,
     verbose: Annotated[
         bool, typer.Option("--verbose", "-v", help="Also show tracebacks and every restart.")
     ] = False,

@@ -15,13 +15,7 @@ PROFILE_VARIABLE = "VLA_ZENOH_PROFILE"
 
 
 class Word(NamedTuple):
-    """A command that starts at once.
-
-    Args:
-        arguments: their names; those that may be left out end in ``?``.
-        flags: option -> name.
-        module: where its function is.
-    """
+    """A command that starts at once; arguments that may be left out end in ``?``."""
 
     arguments: tuple[str, ...] = ()
     flags: Mapping[str, str] = {}
