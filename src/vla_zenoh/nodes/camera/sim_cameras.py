@@ -137,9 +137,9 @@ class SimCameras:
         for camera, publisher in views:
             width, height = publisher.profile.width, publisher.profile.height
             focal_px = renderer.focal_px(camera, height)
-            centre_px = {"cx_px": width / 2, "cy_px": height / 2}
+            cx_px, cy_px = width / 2, height / 2
             publisher.intrinsics = Intrinsics(
-                width=width, height=height, fx_px=focal_px, fy_px=focal_px, **centre_px
+                width=width, height=height, fx_px=focal_px, fy_px=focal_px, cx_px=cx_px, cy_px=cy_px
             ).shown()
             if publisher.state == WAITING:  # without an event
                 publisher.why = f"no scene on {key} yet"

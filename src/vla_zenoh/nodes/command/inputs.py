@@ -35,12 +35,10 @@ from vla_zenoh.types import (
 STATES = 32
 """States buffered between two ticks: the robot's, and room for those of another source."""
 CHUNKS = 64
-ANYTHING = MAX_MESSAGE_BYTES
-"""Payload of a stop: any; it is not decoded."""
 WORDS = settings.MAX_SETTING_BYTES
 SETTINGS: tuple[tuple[str, int, int, Callable[[bytes], Any]], ...] = (
-    ("stop", 8, ANYTHING, lambda _: None),
-    ("reset", 8, ANYTHING, lambda _: None),
+    ("stop", 8, MAX_MESSAGE_BYTES, lambda _: None),
+    ("reset", 8, MAX_MESSAGE_BYTES, lambda _: None),
     ("prompt", 16, WORDS, settings.decode_text),
     ("worker", 16, WORDS, settings.decode_name),
     ("rate", 16, WORDS, settings.decode_rate),
@@ -48,7 +46,8 @@ SETTINGS: tuple[tuple[str, int, int, Callable[[bytes], Any]], ...] = (
     ("slower", 16, WORDS, settings.decode_percent),
     ("active", 16, WORDS, settings.decode_activation),
 )
-"""Name of each key, samples buffered between two ticks, largest payload, and decoder."""
+"""Name of each key, samples buffered between two ticks, largest payload, and decoder: a stop has
+any payload."""
 CLOCK_PERIOD_S = 0.1
 JOINT_PERIOD_S = 0.025
 
