@@ -222,7 +222,7 @@ class Rig:
         """All of the guard's ticks until now."""
         at = len(self.trace.ticks) - 1
         guard, wire, trace = self.guard, self._wire, self.trace
-        offer = guard.offer_joint if self.case.joint else guard.offer_pose
+        offer = guard.offer
         blocked = at < self._blocked_until
         while self._guard_ns <= self._now_ns:
             while wire and wire[0][0] <= self._guard_ns:

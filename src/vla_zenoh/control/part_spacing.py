@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -45,18 +44,6 @@ STANDS_RAD = 2e-3
 """Arms whose joints go on by less than this stand."""
 PROBE_RAD = 0.01
 """First bit of the way to a goal: the joint that moves furthest."""
-
-
-class Spacing(NamedTuple):
-    """What the distance between the parts allows.
-
-    Args:
-        slowdown: why they are slower; None: they are not.
-        hit: why both stand; None: they may move.
-    """
-
-    slowdown: Slowdown | None = None
-    hit: LimitHit | None = None
 
 
 class PartSpacing:
@@ -95,8 +82,10 @@ class PartSpacing:
             for i, j in itertools.combinations(range(len(placed)), 2)
         ]
 
-    def look(self, now_ns: int, ahead_s: float, *, moves: bool) -> Spacing:
-        """What the distance allows in the coming tick.
+    def look(
+        self, now_ns: int, ahead_s: float, *, moves: bool
+    ) -> tuple[Slowdown | None, LimitHit | None]:
+        """Why the parts are slower in the coming tick, and why all of them stand.
 
         Args:
             now_ns: time of this tick.
@@ -106,18 +95,18 @@ class PartSpacing:
         if not moves:
             self._held = self._slower = False
             self._skip = 0
-            return Spacing()
+            return None, None
         if self._skip > 0 and not self._held:
             self._skip -= 1
-            return Spacing()
+            return None, None
         here = [part.motion.joints_rad for part in self._parts]
-        if any(joints_rad is None for joints_rad in here):
-            return Spacing()
         at = [joints_rad for joints_rad in here if joints_rad is not None]
+        if len(at) < len(here):
+            return None, None
         before, self.nearest = self.nearest, self._nearest(at)
         if self.nearest.distance_m >= self._within_m:
             self._skip, self._held = FAR_TICKS - 1, False
-            return Spacing()
+            return None, None
         floor_m = min(self._stop_m + SPARE_M, self.nearest.distance_m - NOISE_M)
         stops = [part.motion.stopping_rad(ahead_s) for part in self._parts]
         ahead = self._nearest(at, floor_m + NOISE_M, stops)
@@ -133,8 +122,8 @@ class PartSpacing:
         if self._held:
             where = f"{self.nearest.first} and {self.nearest.second}"
             value_m = min(ahead.distance_m, self.nearest.distance_m)
-            return Spacing(None, LimitHit(NAME, value_m, self._stop_m, where=where))
-        return Spacing(self._slow(before))
+            return None, LimitHit(NAME, value_m, self._stop_m, where=where)
+        return self._slow(before), None
 
     def _slow(self, before: Nearest) -> Slowdown | None:
         near = self.nearest
@@ -169,12 +158,9 @@ class PartSpacing:
         within_m: float | None = None,
         stops: Sequence[Sequence[FloatArray]] = (),
     ) -> Nearest:
-        """The nearest links with each part at its joints or anywhere on its way of a stop.
+        """The nearest links with each part at its joints (n,) or at any of its `stops`.
 
-        Args:
-            at: (n,) joints of each part.
-            within_m: links further apart are not looked for.
-            stops: (n,) each, further joints of each part; none: it stands.
+        Links further apart than `within_m` are not looked for.
         """
         found = Nearest(self._within_m if within_m is None else within_m)
         places = [

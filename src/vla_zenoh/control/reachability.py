@@ -11,8 +11,7 @@ number ``h`` that must not become negative: singular value or distance minus its
 which is a control barrier function in discrete time (Agrawal, Sreenath, "Discrete control barrier
 functions for safety-critical control of discrete systems", RSS 2017) with a decay of one half.
 A joint outside its range may only move inwards. The elbow of a redundant arm is where pose and
-posture put it, as with a Cartesian controller: a solution that needs another elbow position does
-not count. `free_elbow` is for arms whose joints are commanded.
+posture put it, as with a Cartesian controller, unless joints are commanded (`free_elbow`).
 
 A step for which only the joints are too slow is kept with a slowdown, see
 `vla_zenoh.control.limits`; it is shortened only if it would take more than ten times as long, for
@@ -66,7 +65,7 @@ NEWTON_STEPS = 8
 
 
 class _Configuration(NamedTuple):
-    """The model at one pose: `pose` is the pose asked for, `barriers` belong to `joints_rad`."""
+    """The model at one pose: the pose asked for, and the barriers at `joints_rad`."""
 
     pose: Pose
     joints_rad: FloatArray
@@ -200,24 +199,25 @@ class ReachabilityFilter:
         """The furthest pose from `before` towards `asked` that the arm can take, in pieces.
 
         Yields before every evaluation (joints of a pose, and their barriers): the cost of one is
-        known, see `cost`, their number is not, about 10 where a limit cuts.
+        known, see `cost`, their number is not, about 10 where a limit cuts. Afterwards the model is
+        at the end of the step.
 
         Args:
             before: start of the step, usually the pose bounded last.
             asked: its end.
             dt_s: its duration.
             start_rad: (n,) joints at `before`; None: near those of the last bounded pose.
-
-        Returns:
-            the step within bounds, at whose end the model is afterwards.
         """
         here = self._here
         is_here = start_rad is None or np.array_equal(start_rad, here.joints_rad)
         if self._measured_rad is not None or not is_here or not _same(before, here.pose):
             yield
-            here = self._configuration_at(
-                before, here.joints_rad if start_rad is None else start_rad
-            )
+            measured_rad, self._measured_rad = self._measured_rad, None
+            found = None if measured_rad is None else self._approach(before, measured_rad)
+            if found is None or not found.solved:
+                near_rad = here.joints_rad if start_rad is None else start_rad
+                found = self._approach(before, near_rad)
+            here = self._here = self._configuration(before, found)
         floor = self.barriers.floor(here.barriers)
         if here.error > 0:  # an arm stretched towards a pose out of reach is singular
             floor[0] = -np.inf
@@ -271,14 +271,6 @@ class ReachabilityFilter:
         return GUESS_SHORT * min(1.0, float((room / fall).min()))
 
     # -- one evaluation -----------------------------------------------------------------------
-    def _configuration_at(self, pose: Pose, start_rad: FloatArray) -> _Configuration:
-        measured_rad, self._measured_rad = self._measured_rad, None
-        found = None if measured_rad is None else self._approach(pose, measured_rad)
-        if found is None or not found.solved:
-            found = self._approach(pose, start_rad)
-        self._here = self._configuration(pose, found)
-        return self._here
-
     def _configuration(self, pose: Pose, found: Approach) -> _Configuration:
         error = 0.0 if found.solved else found.error_m + found.error_rad
         barriers = self.barriers.at(found.joints_rad, found.jacobian)
@@ -360,12 +352,7 @@ def _part(before: Pose, step: FloatArray, fraction: float) -> Pose:
 def make_reachability_filter(
     profile: Profile, kinematics: Kinematics | None = None
 ) -> ReachabilityFilter:
-    """The reachability filter of the profile's robot, at its home pose.
-
-    Raises:
-        ResourceError: description or collision shapes are missing.
-        ProfileError: frames or joints that the description does not have.
-    """
+    """That of the profile's robot, at its home pose; it raises as `make_kinematics` does."""
     kinematics = kinematics or make_kinematics(profile)
     names = profile.robot.arm_joints
     home_rad = kinematics.ordered(names, profile.robot.home_rad)

@@ -143,20 +143,16 @@ class ArmGuard:
             return motion
         return PoseReference(*motion.pose, motion.twist, motion.acceleration)
 
-    def offer_pose(self, command: Stamped[PoseCommand], now_ns: int) -> str | None:
-        """Accept a pose, or return the reason why it is rejected.
+    def offer(
+        self, command: Stamped[PoseCommand] | Stamped[JointCommand], now_ns: int
+    ) -> str | None:
+        """Accept a command, or return the reason why it is rejected.
 
         That is ``inactive`` (no stream begins in a state in which its writer brakes or stands),
-        ``other_mode`` (joints are followed), ``moving`` (the arm moves, so its control law cannot
-        be exchanged), or what `StreamGuard.offer` returns.
+        ``other_mode`` (the other stream is followed), ``moving`` (the arm moves, so its control law
+        cannot be exchanged), or what `StreamGuard.offer` returns.
         """
-        return self._offer("pose", command, now_ns)
-
-    def offer_joint(self, command: Stamped[JointCommand], now_ns: int) -> str | None:
-        """Accept joint positions, or return the reason against them, as `offer_pose`."""
-        return self._offer("joint", command, now_ns)
-
-    def _offer(self, mode: Mode, command: Stamped[Any], now_ns: int) -> str | None:
+        mode: Mode = "joint" if isinstance(command.record, JointCommand) else "pose"
         state = command.record.state
         if not (self.following or self.braking or state in ACTIVE_STATES):
             # The end of a stream to a robot node that was restarted, or that had been silent.

@@ -233,7 +233,8 @@ class StreamGuard(ABC, Generic[Reference]):
         here: where the robot stands.
         dt_s: period of the controller.
         timeout_s: silence after which the stream has ended.
-        brake: limits of its own stop, `BRAKE_MARGIN` times those of the stream.
+        brake: limits of its own stop, `BRAKE_MARGIN` times those of the stream; faster commands
+            are rejected.
 
     Attributes:
         braking: the stream fell silent in motion, and the reference still moves.
@@ -345,14 +346,7 @@ class StreamGuard(ABC, Generic[Reference]):
 
 
 class PoseGuard(StreamGuard[Motion]):
-    """Guard of a stream of TCP poses.
-
-    Args:
-        pose: where the robot stands.
-        dt_s: period of the controller.
-        timeout_s: silence after which the stream has ended.
-        brake: of its own stop; faster commands are rejected.
-    """
+    """Guard of a stream of TCP poses; `pose` is where the robot stands."""
 
     def __init__(self, pose: Pose, dt_s: float, timeout_s: float, brake: MotionLimits) -> None:
         self._limits = brake
@@ -385,15 +379,9 @@ class PoseGuard(StreamGuard[Motion]):
 
 
 class JointGuard(StreamGuard[JointReference]):
-    """Guard of a stream of joint positions.
+    """Guard of a stream of joint positions, which `names` has in the order of every (n,) here.
 
-    Args:
-        names: of the joints, in the order of every (n,) here.
-        position_rad: (n,) where the robot stands.
-        dt_s: period of the controller.
-        timeout_s: silence after which the stream has ended.
-        brake: of its own stop; faster commands are rejected.
-        range_rad: lower and upper ends of the joint ranges, (n,) each.
+    `position_rad` is where the robot stands, `range_rad` the lower and upper ends of its joints.
     """
 
     def __init__(

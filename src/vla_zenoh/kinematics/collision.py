@@ -107,7 +107,16 @@ class CollisionModel:
         for name, shape in (keep_out or {}).items():
             added = self._geometry.addGeometryObject(_keep_out(kinematics, name, shape))
             apart += [(link, added) for link in range(self._links) if shapes[link].parentJoint]
-        self._require_apart(apart, known_good_rad, touching_m)
+        for distances in self._at(known_good_rad, apart) if apart else ():
+            nearest = int(np.argmin(distances))
+            if distances[nearest] <= touching_m:
+                link, shape = (shapes[index].name for index in apart[nearest])
+                raise ProfileError(
+                    f"{link} is {distances[nearest]:.3f} m from the keep-out {shape!r} with the "
+                    f"arm at home, and must be over {touching_m:g} m (collision_stop_m) away; "
+                    "move the keep-out, make it smaller, or give another home_rad",
+                    ("limits", "reach", "keep_out", shape),
+                )
         self._pairs, self._held_pairs = [*used, *apart], self._add_held(kinematics)
         self._use(self._pairs)
         self.pairs = tuple(self._pair(*pair) for pair in [*self._pairs, *self._held_pairs])
@@ -190,23 +199,6 @@ class CollisionModel:
         added = self._geometry.addGeometryObject(box)
         return [(added, other) for other in others]
 
-    def _require_apart(
-        self,
-        pairs: list[tuple[int, int]],
-        known_good_rad: Sequence[FloatArray],
-        touching_m: float,
-    ) -> None:
-        for distances in self._at(known_good_rad, pairs) if pairs else ():
-            nearest = int(np.argmin(distances))
-            if distances[nearest] <= touching_m:
-                link, shape = (self._geometry.geometryObjects[i].name for i in pairs[nearest])
-                raise ProfileError(
-                    f"{link} is {distances[nearest]:.3f} m from the keep-out {shape!r} with the "
-                    f"arm at home, and must be over {touching_m:g} m (collision_stop_m) away; "
-                    "move the keep-out, make it smaller, or give another home_rad",
-                    ("limits", "reach", "keep_out", shape),
-                )
-
     def _use(self, pairs: Sequence[tuple[int, int]]) -> None:
         self._geometry.removeAllCollisionPairs()
         for first, second in pairs:
@@ -262,24 +254,17 @@ def _one_hull_a_link(kinematics: Kinematics) -> Any:
 def _corners(shape: Any) -> FloatArray:
     """(m, 3) points whose hull holds the shape, in its joint's frame."""
     geometry, placement = shape.geometry, shape.placement
-    if isinstance(geometry, coal.BVHModelBase):
-        points = np.array(geometry.vertices()) * shape.meshScale
-    else:
-        points = _primitive(geometry)
-    return points @ placement.rotation.T + placement.translation
-
-
-def _primitive(geometry: Any) -> FloatArray:
-    signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
-    if isinstance(geometry, coal.Box):
-        return signs * geometry.halfSide
     sides = 24
     turn = np.arange(sides) * 2 * np.pi / sides
     around = np.stack([np.cos(turn), np.sin(turn)], axis=1) / np.cos(np.pi / sides)
-    if isinstance(geometry, coal.Cylinder):
+    if isinstance(geometry, coal.BVHModelBase):
+        points = np.array(geometry.vertices()) * shape.meshScale
+    elif isinstance(geometry, coal.Box):
+        points = np.array(list(itertools.product((-1.0, 1.0), repeat=3))) * geometry.halfSide
+    elif isinstance(geometry, coal.Cylinder):
         heights = np.array([-geometry.halfLength, geometry.halfLength])
-        return _prism(around * geometry.radius, heights)
-    if isinstance(geometry, (coal.Sphere, coal.Capsule)):
+        points = _prism(around * geometry.radius, heights)
+    elif isinstance(geometry, (coal.Sphere, coal.Capsule)):
         half = geometry.halfLength if isinstance(geometry, coal.Capsule) else 0.0
         tilt = np.linspace(-0.5, 0.5, 9) * np.pi
         rings = [
@@ -287,11 +272,13 @@ def _primitive(geometry: Any) -> FloatArray:
             for t in tilt
         ]
         ball = np.concatenate(rings) / np.cos(np.pi / 16)
-        return np.concatenate([ball + (0, 0, half), ball - (0, 0, half)])
-    raise ResourceError(
-        f"a collision shape of the kind {type(geometry).__name__} is not known; "
-        "known: mesh, box, cylinder, sphere, capsule"
-    )
+        points = np.concatenate([ball + (0, 0, half), ball - (0, 0, half)])
+    else:
+        raise ResourceError(
+            f"a collision shape of the kind {type(geometry).__name__} is not known; "
+            "known: mesh, box, cylinder, sphere, capsule"
+        )
+    return points @ placement.rotation.T + placement.translation
 
 
 def _prism(ring: FloatArray, heights: FloatArray) -> FloatArray:
@@ -315,12 +302,9 @@ def _keep_out(kinematics: Kinematics, name: str, shape: KeepOut) -> Any:
 
 
 class Nearest(NamedTuple):
-    """The two links of two arms that are nearest to each other.
+    """The two links of two arms that are nearest to each other; negative: inside each other.
 
-    Args:
-        distance_m: between them, negative where they are inside each other.
-        first: link of the first arm; empty: nothing is nearer than `within_m`.
-        second: link of the second arm.
+    The links are empty if nothing is nearer than was looked for.
     """
 
     distance_m: float

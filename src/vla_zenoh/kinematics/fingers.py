@@ -1,4 +1,4 @@
-"""Linear conversion between the positions of finger joints and the opening of a gripper.
+"""Positions of finger joints and the opening of a gripper.
 
 Sliding fingers add up to the opening, unless the profile gives their positions when open and shut;
 revolute fingers need these. Several joints move alike, as those of one motor do.

@@ -205,13 +205,9 @@ def smallest_singular_value(jacobian: FloatArray) -> float:
 
 
 class Approach(NamedTuple):
-    """How near the arm came to a pose.
+    """How near the arm came to a pose: joints (n,), the distances left, and whether that solves it.
 
     Args:
-        joints_rad: (n,).
-        error_m: distance left.
-        error_rad: the same for rotation.
-        solved: within the tolerances.
         wanted_rad: (n,) the last iteration's joints before they were put on their bounds.
         jacobian: (6, n) at `joints_rad`.
         effort: what it took, in iterations: some 3, and many times that at the ends of ranges.

@@ -157,13 +157,12 @@ class Arm:
         if not (guard.following or guard.braking or self.holds):
             guard.anchor()  # no controller holds our set-point: begin where the arm is
         kind: Any = JointCommand if mode == "joint" else PoseCommand
-        offer = guard.offer_joint if mode == "joint" else guard.offer_pose
         command = self._node.decode(kind, arrival)
         if command is None:
             return
         # Silence is measured on the clock of the ticks.
         received_ns = mono_ns if self._driver.lockstep else arrival.mono_ns
-        rejected = offer(replace(command, received_ns=received_ns), mono_ns)
+        rejected = guard.offer(replace(command, received_ns=received_ns), mono_ns)
         if rejected:
             self._reject(mode, rejected, f" by {command.header.source[:60]!r}")
 

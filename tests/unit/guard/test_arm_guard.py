@@ -42,12 +42,12 @@ class Side:
         at = self.measured.pose.position_m + [dx_m, 0.0, 0.0]
         twist = np.array([v_m_s, 0, 0, 0, 0, 0])
         record = PoseCommand(at, UNIT, twist, np.zeros(6), at, UNIT, state)
-        return self.guard.offer_pose(self.stamped(record, source), self.now_ns)
+        return self.guard.offer(self.stamped(record, source), self.now_ns)
 
     def joint(self, by_rad: float = 0.0, v_rad_s: float = 0.0, source: str = "j") -> str | None:
         at = self.measured.position_rad + by_rad
         record = JointCommand(NAMES, at, np.full(7, v_rad_s), np.zeros(7), "active")
-        return self.guard.offer_joint(self.stamped(record, source), self.now_ns)
+        return self.guard.offer(self.stamped(record, source), self.now_ns)
 
     def tick(self, ticks: int = 1) -> PoseReference | JointReference:
         for _ in range(ticks):
@@ -156,18 +156,18 @@ def test_what_was_heard_before_a_change_is_not_new_after_it() -> None:
     side = Side()
     record = JointCommand(NAMES, HOME_RAD, np.zeros(7), np.zeros(7), "active")
     old = side.stamped(record, "j")
-    assert side.guard.offer_joint(old, side.now_ns) is None
+    assert side.guard.offer(old, side.now_ns) is None
     side.tick(SILENT_MS)
     assert side.pose() is None
     side.tick(SILENT_MS)
-    assert side.guard.offer_joint(old, side.now_ns) == "replayed"
+    assert side.guard.offer(old, side.now_ns) == "replayed"
     assert side.guard.mode == "pose"
 
 
 @pytest.mark.parametrize("mode", ["pose", "joint"])
 def test_an_arm_that_somebody_else_moved_stands_there_and_knows_who_spoke(mode: Mode) -> None:
     side = Side(mode)
-    offer = side.guard.offer_pose if mode == "pose" else side.guard.offer_joint
+    offer = side.guard.offer
     at, still = side.measured.pose.position_m, np.zeros(6)
     record: Any = (
         PoseCommand(at, UNIT, still, still, at, UNIT, "active")

@@ -222,12 +222,10 @@ class Lockstep:
         self.refused.update(refusal.reason for refusal in out.rejections)
         for part in self.guards:
             pose, joint, gripper = out.of(part)
-            if pose is not None:
-                offer = self.guards[part].offer_pose
-                self._send(COMMAND, pose, partial(self._take_command, offer), part=part)
-            if joint is not None:
-                offer = self.guards[part].offer_joint
-                self._send(COMMAND, joint, partial(self._take_command, offer), part=part)
+            take = partial(self._take_command, self.guards[part].offer)
+            for command in (pose, joint):
+                if command is not None:
+                    self._send(COMMAND, command, take, part=part)
             if gripper is not None:
                 self._send(COMMAND, gripper, partial(self._take_gripper_command, part), part=part)
         if out.task_changed or any(worker.task is None for worker in self.workers.values()):
