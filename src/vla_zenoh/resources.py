@@ -57,11 +57,7 @@ def is_path(name: str) -> bool:
 
 
 def find(kind: str, name: str) -> Path:
-    """The file or folder called `name`, which may also be a path.
-
-    Raises:
-        ResourceError: nothing there; lists what exists and the nearest name.
-    """
+    """The file or folder called `name`, which may also be a path; a `ResourceError` lists all."""
     if is_path(name):
         path = Path(name).expanduser()
         if path.exists():
@@ -119,9 +115,7 @@ def extended_profile(path: Path, parent: str) -> Path:
 def robot_urdf(description: str) -> Path:
     """The URDF a profile names: a path, or ``example-robot-data:<path below robots/>``.
 
-    Raises:
-        ResourceError: the file is missing.
-        MissingExtraError: the package with the robot descriptions is not installed.
+    A `ResourceError` without that file, a `MissingExtraError` without the package.
     """
     if not description.startswith(ROBOT_DATA_PREFIX):
         path = Path(description).expanduser()

@@ -27,8 +27,6 @@ EXTRA_OF = {
     "rerun": "view",
 }
 """Module -> extra that brings it, for the error of a missing import."""
-
-
 HASTE = -20
 """Niceness of a stop."""
 
