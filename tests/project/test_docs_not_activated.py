@@ -16,10 +16,10 @@ REASONS = {
     "control/preflight.py": {
         *("reasons_by_joints", "reasons_of_worker", "joint_state_faults", "_elbow_is_not_held"),
         *("_robot", "_gripper", "_too_old", "_worker", "_chunk", "_cameras", "_clocks"),
+        "unsettled",
     },
     "control/commanded_part.py": {"reasons_against"},
     "control/watchdog.py": {"reasons_against"},
-    "control/motion_pipeline.py": {"unsettled"},
     "control/commander.py": {"_activate", "_preflight", "_ended_before"},
 }
 """File -> functions that give reasons against an activation."""

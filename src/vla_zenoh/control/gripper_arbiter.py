@@ -5,6 +5,8 @@ from __future__ import annotations
 from vla_zenoh.profile import GripperProfile
 from vla_zenoh.types import GripperCommand, GripperState, Stamped
 
+SAME_WIDTH_M = 0.005
+"""A gripper this near to the width sent last has reached it."""
 SETTLE_NS = 60_000_000
 """Time until a command shows as movement in the state."""
 
@@ -30,6 +32,20 @@ class GripperArbiter:
         """Start at `width_m`, with nothing to send."""
         self.requested_m = self.sent_m = width_m
         self.in_flight = False
+
+    def keep(self, gripper: GripperState) -> float:
+        """Restart at the width sent last while the gripper follows it, else at its width.
+
+        Another width would end a grasp.
+        """
+        width_m = min(max(gripper.width_m, 0.0), self._profile.max_width_m)
+        sent_m = self.sent_m
+        if sent_m is not None:
+            grasps = gripper.holding and sent_m < gripper.width_m
+            if grasps or abs(sent_m - gripper.width_m) < SAME_WIDTH_M:
+                width_m = sent_m
+        self.restart(width_m)
+        return width_m
 
     def request(self, width_m: float) -> None:
         """Request a width; replaces an earlier one that was not sent."""

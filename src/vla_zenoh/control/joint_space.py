@@ -22,6 +22,7 @@ from vla_zenoh.control.axis_smoothing import FULL, AxisSmoother, Shares, line_of
 from vla_zenoh.control.barriers import Barriers
 from vla_zenoh.control.chunk_validation import Rejection
 from vla_zenoh.control.limits import (
+    HELD_LEAD_RAD,
     BoundedStep,
     LimitHit,
     into_workspace,
@@ -32,7 +33,7 @@ from vla_zenoh.control.limits import (
 from vla_zenoh.control.plan_timeline import Goal, joint_goal
 from vla_zenoh.control.smoothing import ROTATION_BOX, Motion, motion_limits
 from vla_zenoh.kinematics.kinematics import Kinematics
-from vla_zenoh.kinematics.so3 import norm3
+from vla_zenoh.kinematics.so3 import Pose, norm3
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.profile import REJECT_FACTOR, Profile
 from vla_zenoh.types import Cause, FloatArray, JointCommand, computed
@@ -281,6 +282,18 @@ class JointPath(AxisSmoother):
             if on_leash and self._outside_m(near) <= ROUNDING:
                 return near, hits
         return joint_goal(self.kinematics, here_rad, goal.width_m, goal.slowdown), hits
+
+    def near(self, goal: Goal) -> Goal:
+        """`goal`, or one so near that the arm can retreat from there."""
+        way_rad = self.way_to(goal)
+        share = HELD_LEAD_RAD / max(float(np.abs(way_rad).max()), HELD_LEAD_RAD)
+        if share >= 1.0:
+            return goal
+        return joint_goal(self.kinematics, self.state.position + share * way_rad, goal.width_m)
+
+    def resting_goal(self, _: Pose, width_m: float) -> Goal:
+        """Brake; where that ends."""
+        return joint_goal(self.kinematics, self.braked(), width_m)
 
     def _outside_m(self, goal: Goal) -> float:
         """How far outside the box a goal is, or further outside than the arm."""

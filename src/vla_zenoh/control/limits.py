@@ -25,6 +25,8 @@ APPROACH = "approach"
 """Name of the slowdown towards a target that is further away than a step."""
 SLOWEST = 0.1
 """Least share of the speed close to a stop: the arm has to be able to work there."""
+HELD_LEAD_M, HELD_LEAD_RAD = 0.01, 0.02
+"""The goal of an arm that another part holds up leads it by this much at most."""
 LEAST = 0.02
 """Least share where the joints are too slow, or a far target is approached."""
 

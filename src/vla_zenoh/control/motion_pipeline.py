@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from operator import is_
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -15,30 +14,22 @@ from vla_zenoh.control.commander_io import MotionCommands, limit_events, make_ev
 from vla_zenoh.control.contact import Contact, Retreat
 from vla_zenoh.control.gripper_arbiter import GripperArbiter
 from vla_zenoh.control.joint_space import JointPath
-from vla_zenoh.control.limits import (
-    APPROACH,
-    LimitHit,
-    Slowdown,
-    into_workspace,
-    leash,
-    slowest,
-    workspace_corners,
-)
+from vla_zenoh.control.limits import APPROACH, Slowdown, into_workspace, slowest
 from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan, joint_goal
+from vla_zenoh.control.pose_path import PosePath
+from vla_zenoh.control.preflight import (
+    FOLLOWS_JOINT_RAD,
+    LINGER_NS,
+    Settling,
+    follows,
+    held_joints,
+)
 from vla_zenoh.control.reachability import ReachabilityFilter
-from vla_zenoh.control.smoothing import FULL, Motion, Shares, Smoother, motion_limits
+from vla_zenoh.control.smoothing import FULL, Motion, Shares
 from vla_zenoh.control.states import OBEYING, State
 from vla_zenoh.control.step_timing import StepTiming
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.kinematics.so3 import (
-    Pose,
-    exp3,
-    held_pose,
-    interpolate,
-    pose_distance,
-    pose_of,
-    quat_from_rotation,
-)
+from vla_zenoh.kinematics.so3 import Pose, held_pose, pose_distance, pose_of, quat_from_rotation
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     Cause,
@@ -56,19 +47,11 @@ from vla_zenoh.types import (
 if TYPE_CHECKING:
     from vla_zenoh.control.pose_to_joint import PoseToJoint
 
-LINGER_NS = 500_000_000
-"""The stream continues for this long after the arm stands, so that its last pose is not lost."""
-SAME_WIDTH_M = 0.005
-"""A gripper this near to the width sent last has reached it."""
-HELD_M, HELD_RAD = 0.002, 0.01
-"""A robot that holds a pose this near to the stream follows it: the stream continues."""
-HELD_JOINT_RAD = 0.004
-HELD_LEAD_M, HELD_LEAD_RAD = 0.01, 0.02
-"""The goal of an arm that another part holds up leads it by this much at most."""
 SAME_POSE = 1e-6
 """m and rad: joints whose TCP is this near to a pose reach it."""
-SETTLED, SETTLED_NS = 5e-4, 100_000_000
-"""A robot that moves by less than this, in m and rad, for this long stands."""
+
+
+Mover = PosePath | JointPath
 
 
 class _Order(NamedTuple):
@@ -95,7 +78,7 @@ class _Ahead(NamedTuple):
     of: tuple[object, ...]
     at: tuple[float, ...]
     timing: StepTiming
-    mover: Smoother | JointPath
+    mover: Mover
     enough: bool
 
 
@@ -114,9 +97,8 @@ class MotionPipeline:
     def __init__(
         self, profile: Profile, reach: ReachabilityFilter | None, planner: ChunkPlanner
     ) -> None:
-        self._limits = profile.limits
+        self._profile, self._limits = profile, profile.limits
         self._dt_s = 1.0 / profile.timing.command_hz
-        self._max_width_m = profile.robot.gripper.max_width_m
         self._reach, self._planner = reach, planner
         self._aggregator = PlanAggregator(profile.composition)
         self._joints: PoseToJoint | None = None
@@ -129,8 +111,6 @@ class MotionPipeline:
         self._path: JointPath | None = None
         if planner.joint_bounds is not None:
             self._path = JointPath(profile, planner.joint_bounds)
-        self.in_joints = False
-        """The arm moves in joints, by `_path`."""
         self._changing = False
         """It brakes, because the goals in force are joints and it moves in poses, or vice versa."""
         self._no_joints = ""
@@ -138,10 +118,8 @@ class MotionPipeline:
         self.timeline: GoalTimeline | None = None
         self.goal: Goal | None = None
         self.streaming = False
-        self.speed = 1.0
-        """Share of the speed limits on the way to the goal, without the speed override."""
         self.slower: Slowdown | None = None
-        """What reduces it."""
+        """What reduces the speed on the way to the goal, besides the speed override."""
         self._override, self._slowing = 1.0, False
         self.contact_slowdown: Slowdown | None = None
         self.joint_slowdown: Slowdown | None = None
@@ -154,12 +132,11 @@ class MotionPipeline:
         self.retreat = Retreat(profile.limits, self.contact)
         self._back: Pose | None = None
         self._slowed_by: set[str] = set()
-        self._smoother: Smoother | None = None
-        self._mover: Smoother | JointPath | None = None
-        """What moves the arm: the smoother of poses, or of joints; None before any activation."""
-        self._standing: tuple[Pose, FloatArray | None, int] | None = None
-        self._measured: tuple[PoseState | None, JointState | None] = None, None
-        self._measured_ns = 0
+        self._poses: PosePath | None = None
+        self._mover: Mover | None = None
+        """What moves the arm: `_poses` or `_path`; None before any activation."""
+        commanded = None if self._joints is None or reach is None else reach.kinematics
+        self._settling = Settling(commanded)
         self._timings: list[StepTiming] = []
         """Of poses, and of joints."""
         self._ahead: _Ahead | None = None
@@ -170,6 +147,16 @@ class MotionPipeline:
         """The pose command made last, and what it was made of."""
 
     # -- state --------------------------------------------------------------------------------
+    @property
+    def in_joints(self) -> bool:
+        """The arm moves in joints."""
+        return isinstance(self._mover, JointPath)
+
+    @property
+    def speed(self) -> float:
+        """Share of the speed limits on the way to the goal, without the speed override."""
+        return 1.0 if self.slower is None else self.slower.share
+
     @property
     def at_rest(self) -> bool:
         """The commanded motion stands still."""
@@ -195,11 +182,7 @@ class MotionPipeline:
         """(n,) each, commanded joints on the way to rest and at rest, from a brake in `ahead_s`."""
         assert self._joints is not None
         mover = self._mover
-        if mover is None:
-            return [self._joints.position_rad]
-        if isinstance(mover, JointPath):
-            return mover.stopping_rad(ahead_s)
-        return self._joints.stopping_rad(mover, ahead_s)
+        return [self._joints.position_rad] if mover is None else mover.stopping_rad(ahead_s)
 
     def wanted_rad(self, now_ns: int) -> FloatArray | None:
         """(n,) joints of the goal in force, None where it has none."""
@@ -220,8 +203,7 @@ class MotionPipeline:
     @property
     def failures(self) -> int:
         """Times Ruckig found no trajectory and the arm braked instead."""
-        smoother, path = self._smoother, self._path
-        return (smoother.failures if smoother else 0) + (path.failures if path else 0)
+        return sum(mover.failures for mover in (self._poses, self._path) if mover)
 
     # -- activation ---------------------------------------------------------------------------
     def anchor(
@@ -256,31 +238,26 @@ class MotionPipeline:
         if standing:
             self._enter(joints=False)
         self._no_joints, self._changing = "", False
-        if self._smoother is None:
-            # Commanded joints have distance constraints of their own.
-            inside = workspace_corners(self._limits) if self._joints is None else None
-            self._smoother = Smoother(start, self._dt_s, motion_limits(self._limits), inside)
-            self._mover = self._smoother
-            self._timings = [
-                StepTiming(mover.box) for mover in (self._smoother, self._path) if mover
-            ]
+        if self._poses is None:
+            self._poses = self._mover = PosePath(start, self._profile, self._joints)
+            self._timings = [StepTiming(mover.box) for mover in (self._poses, self._path) if mover]
         elif standing and not (
-            self.streaming and self._near(*pose_distance(self._smoother.motion.pose, start))
+            self.streaming and follows(*pose_distance(self._poses.motion.pose, start))
         ):
-            self._smoother.reset(start)
-        if self._joints is not None and joint is not None:
-            held_rad = self._held_joints(joint)
+            self._poses.reset(start)
+        if self._joints is not None and self._reach is not None and joint is not None:
+            held_rad = held_joints(self._reach.kinematics, joint)
             apart_rad = float(np.abs(held_rad - self._joints.position_rad).max())
-            if standing and not (self.streaming and apart_rad <= HELD_JOINT_RAD):
+            if standing and not (self.streaming and apart_rad <= FOLLOWS_JOINT_RAD):
                 self._joints.restart(held_rad)
             self._joints.keep_elbow()
         if in_joints and standing:
             self._enter(joints=True)
-        width_m = self._width_to_keep(gripper)
-        self.gripper.restart(width_m)
+        width_m = self.gripper.keep(gripper)
         # The goal of a blocked arm is where it is. Otherwise a brake continues, and the goal is
         # where it ends.
-        goal = self._resting_goal(actual, width_m)
+        assert self._mover is not None
+        goal = self._mover.resting_goal(actual, width_m)
         if blocked and goal.arm is None:
             goal = Goal(actual, width_m)
         elif blocked and self._path is not None and measured_rad is not None:
@@ -298,18 +275,18 @@ class MotionPipeline:
 
     def _enter(self, *, joints: bool) -> None:
         """Act in joints or in poses from now on; only while the arm stands."""
-        path, smoother, reach = self._path, self._smoother, self._reach
-        if joints is self.in_joints or path is None or smoother is None or reach is None:
+        path, poses, reach = self._path, self._poses, self._reach
+        if joints is self.in_joints or path is None or poses is None or reach is None:
             return
         self.goal = None
         if not joints:
-            smoother.reset(path.motion.pose)
+            poses.reset(path.motion.pose)
             if self._joints is not None:
                 self._joints.restart(path.state.position)
         elif self._joints is not None:
             path.stand(self._joints.position_rad)
         else:
-            pose = smoother.motion.pose
+            pose = poses.motion.pose
             path.stand(reach.joints_at(pose))
             apart = pose_distance(path.motion.pose, pose)
             if max(apart) > SAME_POSE:
@@ -318,74 +295,20 @@ class MotionPipeline:
                     f"{apart[1]:.4f} rad are left"
                 )
                 return
-        self.in_joints, self._mover = joints, path if joints else smoother
+        self._mover = path if joints else poses
         self._restart_timing()
 
-    def _resting_goal(self, actual: Pose, width_m: float) -> Goal:
-        """Where a brake will end, no further outside the box than the arm is."""
-        mover = self._mover
-        assert mover is not None
-        if isinstance(mover, JointPath):
-            return joint_goal(mover.kinematics, mover.braked(), width_m)
-        rest, (low, high) = mover.resting_pose(), workspace_corners(self._limits)
-        least, most = np.minimum(low, actual.position_m), np.maximum(high, actual.position_m)
-        return Goal(Pose(np.clip(rest.position_m, least, most), rest.rotation), width_m)
-
     def measure(self, measured: PoseState, joint: JointState | None, received_ns: int) -> None:
-        """Track whether the robot still moves while the stream stands.
-
-        A record that is repeated does not show that the robot stands.
-        """
-        if not self.streaming or not self.at_rest:
-            self._standing = None
-            return
-        before, self._measured = self._measured, (measured, joint)
-        if self._standing is None or not all(map(is_, before, self._measured)):
-            held = held_pose(measured)
-            held_rad = None if self._joints is None or joint is None else self._held_joints(joint)
-            if self._standing is None or max(_apart(held, held_rad, *self._standing[:2])) > SETTLED:
-                self._standing = held, held_rad, received_ns
-        self._measured_ns = received_ns
+        """Track whether the robot still moves while the stream stands."""
+        if self.streaming and self.at_rest:
+            self._settling.measure(measured, joint, received_ns)
+        else:
+            self._settling.restart()
 
     def unsettled(self) -> list[str]:
-        """Reasons against an activation now: the robot still moves to the end of the stream.
-
-        A robot that has braked by itself stands elsewhere: a new stream begins there.
-        """
-        if self._standing is None or self._mover is None:
-            return []
-        held, held_rad, since_ns = self._standing
-        apart = _apart(held, held_rad, self._mover.motion.pose, self.joints_rad)
-        if self._near(*apart) or self._measured_ns - since_ns > SETTLED_NS:
-            return []
-        joints = "" if held_rad is None else f", its joints {apart[2]:.3f} rad"
-        return [
-            f"the robot is still {apart[0]:.3f} m and {apart[1]:.3f} rad from its last "
-            f"command{joints}; activate again in {LINGER_NS / 1e9:g} s"
-        ]
-
-    @staticmethod
-    def _near(apart_m: float, apart_rad: float, joint_rad: float = 0.0) -> bool:
-        """The robot holds the streamed pose: to restart there would be a step in the stream."""
-        return apart_m <= HELD_M and apart_rad <= HELD_RAD and joint_rad <= HELD_JOINT_RAD
-
-    def _held_joints(self, joint: JointState) -> FloatArray:
-        """Joint set-points of the robot's controller, or the measured joints."""
-        assert self._reach is not None
-        kinematics = self._reach.kinematics
-        if joint.reference_rad is not None:
-            return kinematics.ordered(joint.names, joint.reference_rad)
-        return kinematics.joints_of(joint)
-
-    def _width_to_keep(self, gripper: GripperState) -> float:
-        """The width sent last while the gripper follows it: another one would end a grasp."""
-        sent_m = self.gripper.sent_m
-        if sent_m is not None and (
-            abs(sent_m - gripper.width_m) < SAME_WIDTH_M
-            or (gripper.holding and sent_m < gripper.width_m)
-        ):
-            return sent_m
-        return min(max(gripper.width_m, 0.0), self._max_width_m)
+        """Reasons against an activation now: the robot still moves to the end of the stream."""
+        mover = self._mover
+        return [] if mover is None else self._settling.unsettled(mover.motion.pose, self.joints_rad)
 
     # -- one tick -----------------------------------------------------------------------------
     def look_ahead(self, now_ns: int) -> list[Event]:
@@ -425,13 +348,12 @@ class MotionPipeline:
         failures, mover = self.failures, self._mover  # which may be another by now
         # A stream that begins must begin at rest: no ticks are made up for.
         for _ in range(ticks if went_on else 1):
-            if self._joints is None or isinstance(mover, JointPath):
+            if isinstance(mover, JointPath):
                 mover.tick()
             else:
                 active = state is State.ACTIVE and self._override > 0.0
                 active = active and not self._changing and not self.held
-                braking = not active and self._back is None
-                self._joints.tick(mover, braking=braking, elbow=active)
+                mover.tick(braking=not active and self._back is None, elbow=active)
         if isinstance(mover, JointPath):
             events += limit_events(mover.taken_hits())
         return self.failures == failures, events
@@ -462,11 +384,12 @@ class MotionPipeline:
         cause = timeline.plan.cause
         if cause is None or cause.observation_stamp_ns >= oldest_ns:
             return False
-        self._hold(timeline, mover.motion.pose, now_ns)
+        self._hold(mover, timeline, now_ns)
         return True
 
-    def _hold(self, timeline: GoalTimeline, actual: Pose, now_ns: int) -> None:
-        timeline.hold(self._resting_goal(actual, timeline.at(now_ns).width_m), now_ns)
+    def _hold(self, mover: Mover, timeline: GoalTimeline, now_ns: int) -> None:
+        width_m = timeline.at(now_ns).width_m
+        timeline.hold(mover.resting_goal(mover.motion.pose, width_m), now_ns)
         self._restart_timing()
 
     def _set_override(self, override: float, timeline: GoalTimeline, now_ns: int) -> None:
@@ -490,14 +413,18 @@ class MotionPipeline:
         mover = self._mover
         assert mover is not None
         if self.held and not self._changing:
-            self._cut_lead(mover, plans, goal, now_ns)
+            near = mover.near(goal)  # so that the arm can retreat
+            if near is not goal:
+                self._shorten(plans, goal, near, now_ns)
         if self._override == 0.0 or self._changing or self.held:
-            self._pause(mover)
+            mover.brake(FULL)  # on the path, to continue from there later
+            self.goal = None
             return events
         slowed = self._slowing and _within(mover, self._override)
-        short, hits = self._on_leash(mover, goal, ticks * self._dt_s)
+        # The leash starts where the arm is in this tick: it may be moving away from the last goal.
+        short, hits = mover.leash(goal, ticks * self._dt_s)
         slower = self._slowest(goal)
-        slowed |= (slower.share if slower else 1.0) != self.speed
+        slowed |= (1.0 if slower is None else slower.share) != self.speed
         if goal is not self.goal or hits or slowed:
             if hits:
                 if goal is not self.goal:
@@ -532,12 +459,11 @@ class MotionPipeline:
         goal = self._aggregator.goal(plans, next_ns)
         if goal is self.goal or (goal.arm is not None) is not self.in_joints:
             return False
-        if self._on_leash(mover, goal, self._dt_s)[1]:
+        if mover.leash(goal, self._dt_s)[1]:
             return False
-        slower, speed = self._slowest(goal), self.speed
-        self.speed = 1.0 if slower is None else slower.share
+        slower, self.slower = self.slower, self._slowest(goal)
         self._ahead = self._motion_to(mover, _Order(goal, plans[0], task, overdue_ns, next_ns))
-        self.speed = speed
+        self.slower = slower
         return True
 
     def forget_ahead(self) -> None:
@@ -548,7 +474,7 @@ class MotionPipeline:
         others = self.contact_slowdown, self.joint_slowdown, self.part_slowdown
         return slowest(goal.slowdown, *others)
 
-    def _set_out(self, mover: Smoother | JointPath, order: _Order) -> bool:
+    def _set_out(self, mover: Mover, order: _Order) -> bool:
         """Carry out an order; whether the shares suffice."""
         ahead, self._ahead = self._ahead, None
         of, at = self._depends_on(mover, order)
@@ -559,7 +485,7 @@ class MotionPipeline:
         return ahead.enough
 
     def _depends_on(
-        self, mover: Smoother | JointPath, order: _Order
+        self, mover: Mover, order: _Order
     ) -> tuple[tuple[object, ...], tuple[float, ...]]:
         """The objects and numbers that the motion of an order depends on."""
         goal, plan, task, overdue_ns, now_ns = order
@@ -567,75 +493,21 @@ class MotionPipeline:
         of = goal, plan, mover, mover.state
         return of, (now_ns, overdue_ns, task.rate_hz, index, *shares)
 
-    def _motion_to(self, mover: Smoother | JointPath, order: _Order) -> _Ahead:
+    def _motion_to(self, mover: Mover, order: _Order) -> _Ahead:
         """The motion of an order from the present state."""
         of, at = self._depends_on(mover, order)
         timing, mover = self._timings[self.in_joints].fork(), mover.fork()
         shares = self._shares(timing, mover, order)
         hard = self._slowing and (self._joints is None or self.in_joints)
-        return _Ahead(of, at, timing, mover, _move(mover, order.goal, shares, hard=hard))
+        enough = mover.target(order.goal, shares, all_to_stop=hard)
+        return _Ahead(of, at, timing, mover, enough)
 
-    def _on_leash(
-        self, mover: Smoother | JointPath, goal: Goal, ahead_s: float
-    ) -> tuple[Goal, list[LimitHit]]:
-        """`goal`, or a nearer one that is no further ahead than the leash allows.
-
-        The leash starts where the arm is in this tick: it may be moving away from the last goal.
-        """
-        if isinstance(mover, JointPath):
-            return mover.leash(goal, ahead_s)
-        if self._well_within_leash(mover.motion, goal.pose, ahead_s):
-            return goal, []
-        pose, hits = leash(self._limits, goal.pose, _ahead(mover.motion, ahead_s))
-        return replace(goal, pose=pose, joints_rad=None) if hits else goal, hits
-
-    def _well_within_leash(self, motion: Motion, goal: Pose, ahead_s: float) -> bool:
-        """Whether the leash is long enough wherever the arm will be; cheaper than computing where.
-
-        It moves no further than at its speed plus what the acceleration adds.
-        """
-        limits, (pose, twist, acceleration) = self._limits, motion
-        apart_m, apart_rad = pose_distance(goal, pose)
-        x, y, z, rx, ry, rz = map(abs, twist.tolist())
-        ax, ay, az, arx, ary, arz = map(abs, acceleration.tolist())
-        way_m = ahead_s * (x + y + z + ahead_s * (ax + ay + az))
-        turn_rad = ahead_s * (rx + ry + rz + ahead_s * (arx + ary + arz))
-        return apart_m + way_m <= limits.lead_m and apart_rad + turn_rad <= limits.lead_rad
-
-    def _cut_lead(
-        self, mover: Smoother | JointPath, plans: Sequence[Plan], goal: Goal, now_ns: int
-    ) -> None:
-        """Keep the goal of an arm that has to stand close to it, so that the arm can retreat."""
-        if isinstance(mover, JointPath):
-            assert goal.joints_rad is not None
-            here_rad = mover.state.position
-            way_rad = goal.joints_rad - here_rad
-            share = HELD_LEAD_RAD / max(float(np.abs(way_rad).max()), HELD_LEAD_RAD)
-            cut = joint_goal(mover.kinematics, here_rad + share * way_rad, goal.width_m)
-        else:
-            here = mover.motion.pose
-            apart_m, apart_rad = pose_distance(here, goal.pose)
-            share = 1 / max(apart_m / HELD_LEAD_M, apart_rad / HELD_LEAD_RAD, 1.0)
-            cut = replace(goal, pose=interpolate(here, goal.pose, share), joints_rad=None)
-        if share < 1.0:
-            self._shorten(plans, goal, cut, now_ns)
-
-    def _pause(self, mover: Smoother | JointPath) -> None:
-        """Stop on the path, to continue from there later."""
-        if self._joints is None or isinstance(mover, JointPath):
-            mover.brake(FULL)
-        else:
-            self._joints.brake(mover)
-        self.goal = None
-
-    def _shares(self, timing: StepTiming, mover: Smoother | JointPath, order: _Order) -> Shares:
+    def _shares(self, timing: StepTiming, mover: Mover, order: _Order) -> Shares:
         """Shares of the limits that the arm has on the way to a goal."""
         goal, plan, task, overdue_ns, now_ns = order
         override, speed = self._override, self.speed * self._override
         if not plan.soonest:
-            joints = isinstance(mover, JointPath)
-            way = mover.way_to(goal) if joints else mover.way_to(goal.pose)
-            velocity, _ = mover.axis_rates()
+            way, (velocity, _) = mover.way_to(goal), mover.axis_rates()
             index, left_s = plan.index_at(now_ns), (overdue_ns - now_ns) / 1e9
             share = timing.share(plan, index, now_ns, 1.0 / task.rate_hz, left_s, way, velocity)
             speed = min(speed, share)
@@ -643,20 +515,12 @@ class MotionPipeline:
         # with the cube. Until a faster arm has slowed down it brakes as hard as it may.
         slow = _within(mover, override)
         most = Shares(1.0, override**2, override**3) if slow else FULL
-        return self._followed(mover, goal, Shares(speed, most.acceleration, most.jerk))
-
-    def _followed(self, mover: Smoother | JointPath, goal: Goal, shares: Shares) -> Shares:
-        """`shares`, reduced to what commanded joints can follow, or the TCP of a joint motion."""
-        if isinstance(mover, JointPath):
-            return Shares(*map(min, mover.shares(goal), shares))
-        if self._joints is None:
-            return shares
-        joints = self._joints.shares(mover.motion, goal.pose, mover.box)
-        return Shares(*map(min, joints, shares))
+        wanted = Shares(speed, most.acceleration, most.jerk)
+        return Shares(*map(min, mover.shares(goal), wanted))
 
     def _slow_down(self, slower: Slowdown | None) -> list[Event]:
-        """Set the speed share; report each reason once per activation."""
-        self.speed, self.slower = (1.0, None) if slower is None else (slower.share, slower)
+        """Set what reduces the speed; report each reason once per activation."""
+        self.slower = slower
         if slower is None or slower.name in (APPROACH, *self._slowed_by):
             return []
         self._slowed_by.add(slower.name)
@@ -676,14 +540,14 @@ class MotionPipeline:
         return cut
 
     def _retreat_or_brake(
-        self, mover: Smoother | JointPath, timeline: GoalTimeline, state: State, now_ns: int
+        self, mover: Mover, timeline: GoalTimeline, state: State, now_ns: int
     ) -> list[Event]:
         if state is not State.INACTIVE or self.held:
             self.retreat.end()
         back, event = self.retreat.step(mover.motion.pose, now_ns, at_rest=self.at_rest)
-        if back is not None and isinstance(mover, JointPath) and self._smoother is not None:
+        if back is not None and isinstance(mover, JointPath) and self._poses is not None:
             self._enter(joints=False)
-            mover = self._smoother
+            mover = self._poses
         if back is None:
             self._brake(mover, timeline, now_ns)
         elif back is not self._back:
@@ -691,22 +555,17 @@ class MotionPipeline:
             here_m = mover.motion.pose.position_m
             inside_m, _ = into_workspace(self._limits, back.position_m, here_m)
             inside = Goal(Pose(inside_m, back.rotation), 0.0)
-            speed = self._followed(mover, inside, Shares(self.retreat.speed))
-            _move(mover, inside, speed)
+            shares = map(min, mover.shares(inside), Shares(self.retreat.speed))
+            mover.target(inside, Shares(*shares))
         self._back = back
         return [] if event is None else [event]
 
-    def _brake(self, mover: Smoother | JointPath, timeline: GoalTimeline, now_ns: int) -> None:
+    def _brake(self, mover: Mover, timeline: GoalTimeline, now_ns: int) -> None:
         """Stop, and move the goal to where the arm stops, so that nothing pulls it further."""
-        if isinstance(mover, JointPath):
-            mover.brake(FULL)  # on the path, which is known to be free
-        elif self._joints is None:
-            mover.brake()
-        else:
-            self._joints.brake(mover)
+        mover.brake()
         self.goal = None
         if timeline.plan.cause is not None and mover.at_rest:
-            self._hold(timeline, mover.motion.pose, now_ns)
+            self._hold(mover, timeline, now_ns)
 
     def _must_stream(self, state: State, now_ns: int) -> bool:
         if state in OBEYING or self.retreat.busy or not self.at_rest:
@@ -734,31 +593,7 @@ class MotionPipeline:
         return self._sent
 
 
-def _apart(
-    pose: Pose, joints_rad: FloatArray | None, other: Pose, others_rad: FloatArray | None
-) -> tuple[float, float, float]:
-    """Distance of two poses in m and rad, and of the joints in rad where both are known."""
-    joint_rad = 0.0
-    if joints_rad is not None and others_rad is not None:
-        joint_rad = float(np.abs(joints_rad - others_rad).max())
-    return *pose_distance(pose, other), joint_rad
-
-
-def _ahead(motion: Motion, dt_s: float) -> Pose:
-    """The pose of a motion `dt_s` later."""
-    (position_m, rotation), twist, acceleration = motion
-    way = dt_s * (twist + 0.5 * dt_s * acceleration)
-    return Pose(position_m + way[:3], exp3(way[3:]).dot(rotation))
-
-
-def _move(mover: Smoother | JointPath, goal: Goal, shares: Shares, *, hard: bool = False) -> bool:
-    """Move to `goal`; whether the shares suffice."""
-    if isinstance(mover, JointPath):
-        return mover.target(goal, shares, all_to_stop=hard)
-    return mover.target(goal.pose, shares, all_to_stop=hard)
-
-
-def _within(mover: Smoother | JointPath, override: float) -> bool:
+def _within(mover: Mover, override: float) -> bool:
     """Whether the arm moves as slowly as it would at this override, and will continue so."""
     most = mover.box * override ** np.array([[1.0], [2.0], [3.0]])
     speed, change = (np.abs(rates) for rates in mover.axis_rates())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from operator import is_
 from typing import Any
 
 import numpy as np
@@ -15,10 +16,10 @@ from vla_zenoh.control.limits import into_workspace
 from vla_zenoh.errors import RecordError, SpecError, VlaZenohError
 from vla_zenoh.keys import worker_node
 from vla_zenoh.kinematics.kinematics import Kinematics
-from vla_zenoh.kinematics.so3 import held_pose, pose_distance, pose_of
+from vla_zenoh.kinematics.so3 import Pose, held_pose, pose_distance, pose_of
 from vla_zenoh.policy import ModelSpec, check_steps
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import ActionChunk, GripperState, JointState, PoseState, Stamped
+from vla_zenoh.types import ActionChunk, FloatArray, GripperState, JointState, PoseState, Stamped
 
 CHUNK_PATIENCE_S = 2.0
 """Every worker publishes chunks all the time; its newest may be this old, plus one period."""
@@ -30,6 +31,12 @@ SAME_TCP_M, SAME_TCP_RAD = 0.005, 0.02
 """Largest difference of the TCP by kinematics from the TCP that the robot reports."""
 HELD_RAD = 0.1
 """Largest distance of a joint from where its controller holds it."""
+FOLLOWS_M, FOLLOWS_RAD, FOLLOWS_JOINT_RAD = 0.002, 0.01, 0.004
+"""A robot that holds a pose this near to the stream follows it: the stream continues."""
+SETTLED, SETTLED_NS = 5e-4, 100_000_000
+"""A robot that moves by less than this, in m and rad, for this long stands."""
+LINGER_NS = 500_000_000
+"""The stream continues for this long after the arm stands, so that its last pose is not lost."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -382,3 +389,72 @@ def _clocks(
                 f"the clock of node {node!r}{where} is not known: it has not answered yet"
             )
     return reasons
+
+
+def held_joints(kinematics: Kinematics, joint: JointState) -> FloatArray:
+    """(n,) joint set-points of the robot's controller, or the measured joints."""
+    if joint.reference_rad is not None:
+        return kinematics.ordered(joint.names, joint.reference_rad)
+    return kinematics.joints_of(joint)
+
+
+def follows(apart_m: float, apart_rad: float, joint_rad: float = 0.0) -> bool:
+    """The robot holds the streamed pose: to restart there would be a step in the stream."""
+    near = apart_m <= FOLLOWS_M and apart_rad <= FOLLOWS_RAD
+    return near and joint_rad <= FOLLOWS_JOINT_RAD
+
+
+class Settling:
+    """Whether the robot has come to the end of a stream that stands.
+
+    Args:
+        kinematics: of the arm, where joints are commanded.
+    """
+
+    def __init__(self, kinematics: Kinematics | None) -> None:
+        self._kinematics = kinematics
+        self._standing: tuple[Pose, FloatArray | None, int] | None = None
+        self._measured: tuple[PoseState | None, JointState | None] = None, None
+        self._measured_ns = 0
+
+    def restart(self) -> None:
+        """The stream moves."""
+        self._standing = None
+
+    def measure(self, measured: PoseState, joint: JointState | None, received_ns: int) -> None:
+        """Track whether the robot moves; a record that is repeated does not show that it stands."""
+        before, self._measured = self._measured, (measured, joint)
+        if self._standing is None or not all(map(is_, before, self._measured)):
+            held, held_rad = held_pose(measured), None
+            if self._kinematics is not None and joint is not None:
+                held_rad = held_joints(self._kinematics, joint)
+            if self._standing is None or max(_apart(held, held_rad, *self._standing[:2])) > SETTLED:
+                self._standing = held, held_rad, received_ns
+        self._measured_ns = received_ns
+
+    def unsettled(self, commanded: Pose, commanded_rad: FloatArray | None) -> list[str]:
+        """Reasons against an activation now: the robot still moves to the end of the stream.
+
+        A robot that has braked by itself stands elsewhere: a new stream begins there.
+        """
+        if self._standing is None:
+            return []
+        held, held_rad, since_ns = self._standing
+        apart = _apart(held, held_rad, commanded, commanded_rad)
+        if follows(*apart) or self._measured_ns - since_ns > SETTLED_NS:
+            return []
+        joints = "" if held_rad is None else f", its joints {apart[2]:.3f} rad"
+        return [
+            f"the robot is still {apart[0]:.3f} m and {apart[1]:.3f} rad from its last "
+            f"command{joints}; activate again in {LINGER_NS / 1e9:g} s"
+        ]
+
+
+def _apart(
+    pose: Pose, joints_rad: FloatArray | None, other: Pose, others_rad: FloatArray | None
+) -> tuple[float, float, float]:
+    """Distance of two poses in m and rad, and of the joints in rad where both are known."""
+    joint_rad = 0.0
+    if joints_rad is not None and others_rad is not None:
+        joint_rad = float(np.abs(joints_rad - others_rad).max())
+    return *pose_distance(pose, other), joint_rad
