@@ -138,7 +138,7 @@ class CommandedPart:
                 "robot.tcp_frame and robot.arm_joints in the profile"
             )
         self.reach.hold(box)
-        self.motion.forget_ahead()
+        self.motion.pace.forget_ahead()
         self.held = box
         gripper = self.gripper_state
         self._grasp_m = np.inf if gripper is None else gripper.record.width_m
@@ -230,7 +230,7 @@ class CommandedPart:
         """
         assert self.pose is not None and self.gripper_state is not None
         contact, motion = self.contact, self.motion
-        motion.contact_slowdown = contact.slowdown()
+        motion.pace.contact_slowdown = contact.slowdown()
         events = [] if contact.known is self._load_known else [self._load_sensing()]
         why = self.watchdog.lost(self.pose, self.gripper_state, peers, worker, lease, now_ns)
         if not why and motion.streaming and moves:
@@ -279,7 +279,7 @@ class CommandedPart:
         commanded_rad, in_joints = motion.joints_rad, motion.in_joints
         found = monitor.update(measured_rad, commanded_rad, now_ns, in_joints=in_joints)
         self.too_near = found or self.too_near  # until the arm brakes for it
-        motion.joint_slowdown = monitor.slowdown
+        motion.pace.joint_slowdown = monitor.slowdown
 
     def _obstructed(self, events: list[Event]) -> str:
         """Why the arm is blocked or in contact, empty otherwise; it then brakes and retreats."""

@@ -556,7 +556,7 @@ class Commander:
             event = make_event("warning", "limit", hit.name, why, hit.value, hit.limit)
             self._out.events.append(event)
         for part in self.parts:
-            part.motion.part_slowdown, part.motion.held = slowdown, hit is not None
+            part.motion.pace.part_slowdown, part.motion.held = slowdown, hit is not None
 
     def _monitor_distance(self, spacing: PartSpacing, now_ns: int) -> None:
         """Brake if the measured parts come too near to each other."""

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from operator import is_
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,9 +13,9 @@ from vla_zenoh.control.commander_io import MotionCommands, limit_events, make_ev
 from vla_zenoh.control.contact import Contact, Retreat
 from vla_zenoh.control.gripper_arbiter import GripperArbiter
 from vla_zenoh.control.joint_space import JointPath
-from vla_zenoh.control.limits import APPROACH, Slowdown, into_workspace, slowest
+from vla_zenoh.control.limits import into_workspace
 from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan, joint_goal
-from vla_zenoh.control.pose_path import PosePath
+from vla_zenoh.control.pose_path import Mover, PoseCommands, PosePath
 from vla_zenoh.control.preflight import (
     FOLLOWS_JOINT_RAD,
     LINGER_NS,
@@ -25,11 +24,11 @@ from vla_zenoh.control.preflight import (
     held_joints,
 )
 from vla_zenoh.control.reachability import ReachabilityFilter
-from vla_zenoh.control.smoothing import FULL, Motion, Shares
+from vla_zenoh.control.smoothing import FULL, Shares
 from vla_zenoh.control.states import OBEYING, State
-from vla_zenoh.control.step_timing import StepTiming
+from vla_zenoh.control.step_timing import GoalPace, Order
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.kinematics.so3 import Pose, held_pose, pose_distance, pose_of, quat_from_rotation
+from vla_zenoh.kinematics.so3 import Pose, held_pose, pose_distance, pose_of
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     Cause,
@@ -37,11 +36,9 @@ from vla_zenoh.types import (
     FloatArray,
     GripperState,
     JointState,
-    PoseCommand,
     PoseState,
     Stamped,
     Task,
-    computed,
 )
 
 if TYPE_CHECKING:
@@ -49,37 +46,6 @@ if TYPE_CHECKING:
 
 SAME_POSE = 1e-6
 """m and rad: joints whose TCP is this near to a pose reach it."""
-
-
-Mover = PosePath | JointPath
-
-
-class _Order(NamedTuple):
-    """Where to go, from when on, and when the watchdog brakes unless a chunk arrives."""
-
-    goal: Goal
-    plan: Plan
-    task: Task
-    overdue_ns: int
-    now_ns: int
-
-
-class _Ahead(NamedTuple):
-    """The motion to a goal, computed before the tick in which it is expected to begin.
-
-    Args:
-        of: what it depends on: objects that do not change,
-        at: and numbers.
-        timing: with the goal taken.
-        mover: on its way to it.
-        enough: the shares suffice.
-    """
-
-    of: tuple[object, ...]
-    at: tuple[float, ...]
-    timing: StepTiming
-    mover: Mover
-    enough: bool
 
 
 class MotionPipeline:
@@ -118,33 +84,20 @@ class MotionPipeline:
         self.timeline: GoalTimeline | None = None
         self.goal: Goal | None = None
         self.streaming = False
-        self.slower: Slowdown | None = None
-        """What reduces the speed on the way to the goal, besides the speed override."""
-        self._override, self._slowing = 1.0, False
-        self.contact_slowdown: Slowdown | None = None
-        self.joint_slowdown: Slowdown | None = None
-        """Of the measured joints; both apply whatever the goal allows."""
-        self.part_slowdown: Slowdown | None = None
-        """Of the distance to another part of the robot."""
+        self.pace = GoalPace(joints_follow=self._joints is not None)
         self.held = False
         """The arm has to stand: another part is too near."""
         self.contact = Contact(profile.limits.contact)
         self.retreat = Retreat(profile.limits, self.contact)
         self._back: Pose | None = None
-        self._slowed_by: set[str] = set()
         self._poses: PosePath | None = None
         self._mover: Mover | None = None
         """What moves the arm: `_poses` or `_path`; None before any activation."""
         commanded = None if self._joints is None or reach is None else reach.kinematics
         self._settling = Settling(commanded)
-        self._timings: list[StepTiming] = []
-        """Of poses, and of joints."""
-        self._ahead: _Ahead | None = None
         self._cause: Cause | None = None
         self._rest_since_ns: int | None = None
-        self._sent: PoseCommand | None = None
-        self._made_of: tuple[Motion, Goal | None, State, Cause | None] | None = None
-        """The pose command made last, and what it was made of."""
+        self._pose_commands = PoseCommands()
 
     # -- state --------------------------------------------------------------------------------
     @property
@@ -155,7 +108,7 @@ class MotionPipeline:
     @property
     def speed(self) -> float:
         """Share of the speed limits on the way to the goal, without the speed override."""
-        return 1.0 if self.slower is None else self.slower.share
+        return self.pace.speed
 
     @property
     def at_rest(self) -> bool:
@@ -226,8 +179,7 @@ class MotionPipeline:
             blocked: the arm is far from its controller's set-point.
             in_joints: the actions are joints.
         """
-        self._slowed_by.clear()
-        self.joint_slowdown = None
+        self.pace.begin()
         self.retreat.end()
         measured_rad: FloatArray | None = None
         if self._reach is not None and joint is not None:
@@ -240,7 +192,6 @@ class MotionPipeline:
         self._no_joints, self._changing = "", False
         if self._poses is None:
             self._poses = self._mover = PosePath(start, self._profile, self._joints)
-            self._timings = [StepTiming(mover.box) for mover in (self._poses, self._path) if mover]
         elif standing and not (
             self.streaming and follows(*pose_distance(self._poses.motion.pose, start))
         ):
@@ -262,16 +213,12 @@ class MotionPipeline:
             goal = Goal(actual, width_m)
         elif blocked and self._path is not None and measured_rad is not None:
             goal = joint_goal(self._path.kinematics, measured_rad, width_m)
-        self._restart_timing()
+        self.pace.stand()
         if self.timeline is None:
             self.timeline = GoalTimeline(goal, now_ns)
         else:
             self.timeline.restart(goal, now_ns)
         self.goal = None if blocked else goal
-
-    def _restart_timing(self) -> None:
-        for timing in self._timings:
-            timing.restart()
 
     def _enter(self, *, joints: bool) -> None:
         """Act in joints or in poses from now on; only while the arm stands."""
@@ -296,7 +243,7 @@ class MotionPipeline:
                 )
                 return
         self._mover = path if joints else poses
-        self._restart_timing()
+        self.pace.stand()
 
     def measure(self, measured: PoseState, joint: JointState | None, received_ns: int) -> None:
         """Track whether the robot still moves while the stream stands."""
@@ -351,7 +298,7 @@ class MotionPipeline:
             if isinstance(mover, JointPath):
                 mover.tick()
             else:
-                active = state is State.ACTIVE and self._override > 0.0
+                active = state is State.ACTIVE and self.pace.override > 0.0
                 active = active and not self._changing and not self.held
                 mover.tick(braking=not active and self._back is None, elbow=active)
         if isinstance(mover, JointPath):
@@ -367,12 +314,12 @@ class MotionPipeline:
             return MotionCommands()
         pose = joint = width = None
         if self._joints is None:
-            pose = self._pose_command(mover.motion, state)
+            pose = self._pose_commands.of(mover.motion, self.goal, state.value, self._cause)
         elif isinstance(mover, JointPath):
             joint = mover.command(state.value, self._cause)
         else:
             joint = self._joints.command(state.value, self._cause)
-        if state is State.ACTIVE and self._override > 0.0:
+        if state is State.ACTIVE and self.pace.override > 0.0:
             width = self.gripper.step(now_ns, gripper)
         return MotionCommands(pose, joint, width)
 
@@ -390,14 +337,14 @@ class MotionPipeline:
     def _hold(self, mover: Mover, timeline: GoalTimeline, now_ns: int) -> None:
         width_m = timeline.at(now_ns).width_m
         timeline.hold(mover.resting_goal(mover.motion.pose, width_m), now_ns)
-        self._restart_timing()
+        self.pace.stand()
 
     def _set_override(self, override: float, timeline: GoalTimeline, now_ns: int) -> None:
         """Let plan time pass at the speed override, and replan the motion to the goal."""
-        if override != self._override or override != timeline.clock.override:
-            self._override = override
+        if override != self.pace.override or override != timeline.clock.override:
+            self.pace.override, self.pace.slowing = override, override > 0.0
             timeline.clock.set(override, now_ns)
-            self.goal, self._slowing = None, override > 0.0
+            self.goal = None
 
     def _follow(
         self, timeline: GoalTimeline, task: Task, overdue_ns: int, now_ns: int, ticks: int
@@ -416,25 +363,21 @@ class MotionPipeline:
             near = mover.near(goal)  # so that the arm can retreat
             if near is not goal:
                 self._shorten(plans, goal, near, now_ns)
-        if self._override == 0.0 or self._changing or self.held:
+        if self.pace.override == 0.0 or self._changing or self.held:
             mover.brake(FULL)  # on the path, to continue from there later
             self.goal = None
             return events
-        slowed = self._slowing and _within(mover, self._override)
         # The leash starts where the arm is in this tick: it may be moving away from the last goal.
         short, hits = mover.leash(goal, ticks * self._dt_s)
-        slower = self._slowest(goal)
-        slowed |= (1.0 if slower is None else slower.share) != self.speed
-        if goal is not self.goal or hits or slowed:
+        slower = self.pace.slowest(goal)
+        if goal is not self.goal or hits or self.pace.changes(mover, slower):
             if hits:
                 if goal is not self.goal:
                     name, value, limit = hits[0][:3]
                     events.append(make_event("warning", "limit", name, "leash", value, limit))
                 goal = self._shorten(plans, goal, short, now_ns)
-            events += self._slow_down(slower)
-            order = _Order(goal, timeline.plan, task, overdue_ns, now_ns)
-            enough = self._set_out(mover, order)
-            self._slowing &= not (enough and _within(mover, self._override))
+            order = Order(goal, timeline.plan, task.rate_hz, overdue_ns, now_ns)
+            events += self.pace.set_out(mover, order, slower)
             self.goal = goal
             self.gripper.request(goal.width_m)
         return events
@@ -450,8 +393,8 @@ class MotionPipeline:
             next_ns: time of the next tick.
         """
         timeline, mover = self.timeline, self._mover
-        self._ahead = None
-        if timeline is None or mover is None or self.held or self._override == 0.0:
+        self.pace.forget_ahead()
+        if timeline is None or mover is None or self.held or self.pace.override == 0.0:
             return False
         plans = self._aggregator.plans(timeline, next_ns)
         if len(plans) > 1:  # their mix is another goal in every tick
@@ -461,71 +404,8 @@ class MotionPipeline:
             return False
         if mover.leash(goal, self._dt_s)[1]:
             return False
-        slower, self.slower = self.slower, self._slowest(goal)
-        self._ahead = self._motion_to(mover, _Order(goal, plans[0], task, overdue_ns, next_ns))
-        self.slower = slower
+        self.pace.plan_ahead(mover, Order(goal, plans[0], task.rate_hz, overdue_ns, next_ns))
         return True
-
-    def forget_ahead(self) -> None:
-        """Compute the motion to the next goal again: its bounds have changed."""
-        self._ahead = None
-
-    def _slowest(self, goal: Goal) -> Slowdown | None:
-        others = self.contact_slowdown, self.joint_slowdown, self.part_slowdown
-        return slowest(goal.slowdown, *others)
-
-    def _set_out(self, mover: Mover, order: _Order) -> bool:
-        """Carry out an order; whether the shares suffice."""
-        ahead, self._ahead = self._ahead, None
-        of, at = self._depends_on(mover, order)
-        if ahead is None or ahead.at != at or not all(map(is_, ahead.of, of)):
-            ahead = self._motion_to(mover, order)
-        self._timings[self.in_joints] = ahead.timing
-        mover.adopt(ahead.mover)  # pyright: ignore
-        return ahead.enough
-
-    def _depends_on(
-        self, mover: Mover, order: _Order
-    ) -> tuple[tuple[object, ...], tuple[float, ...]]:
-        """The objects and numbers that the motion of an order depends on."""
-        goal, plan, task, overdue_ns, now_ns = order
-        index, shares = plan.index_at(now_ns), (self.speed, self._override, self._slowing)
-        of = goal, plan, mover, mover.state
-        return of, (now_ns, overdue_ns, task.rate_hz, index, *shares)
-
-    def _motion_to(self, mover: Mover, order: _Order) -> _Ahead:
-        """The motion of an order from the present state."""
-        of, at = self._depends_on(mover, order)
-        timing, mover = self._timings[self.in_joints].fork(), mover.fork()
-        shares = self._shares(timing, mover, order)
-        hard = self._slowing and (self._joints is None or self.in_joints)
-        enough = mover.target(order.goal, shares, all_to_stop=hard)
-        return _Ahead(of, at, timing, mover, enough)
-
-    def _shares(self, timing: StepTiming, mover: Mover, order: _Order) -> Shares:
-        """Shares of the limits that the arm has on the way to a goal."""
-        goal, plan, task, overdue_ns, now_ns = order
-        override, speed = self._override, self.speed * self._override
-        if not plan.soonest:
-            way, (velocity, _) = mover.way_to(goal), mover.axis_rates()
-            index, left_s = plan.index_at(now_ns), (overdue_ns - now_ns) / 1e9
-            share = timing.share(plan, index, now_ns, 1.0 / task.rate_hz, left_s, way, velocity)
-            speed = min(speed, share)
-        # The same motion in more time: acceleration scales with the square of the override, jerk
-        # with the cube. Until a faster arm has slowed down it brakes as hard as it may.
-        slow = _within(mover, override)
-        most = Shares(1.0, override**2, override**3) if slow else FULL
-        wanted = Shares(speed, most.acceleration, most.jerk)
-        return Shares(*map(min, mover.shares(goal), wanted))
-
-    def _slow_down(self, slower: Slowdown | None) -> list[Event]:
-        """Set what reduces the speed; report each reason once per activation."""
-        self.slower = slower
-        if slower is None or slower.name in (APPROACH, *self._slowed_by):
-            return []
-        self._slowed_by.add(slower.name)
-        why = f"slower{slower.at}"
-        return [make_event("info", "limit", slower.name, why, slower.value, slower.limit)]
 
     def _shorten(self, plans: Sequence[Plan], goal: Goal, cut: Goal, now_ns: int) -> Goal:
         """Shift all later goals by what the leash cut off, or the cut part would come back.
@@ -574,30 +454,3 @@ class MotionPipeline:
         if self._rest_since_ns is None:
             self._rest_since_ns = now_ns
         return self.streaming and now_ns - self._rest_since_ns < LINGER_NS
-
-    def _pose_command(self, motion: Motion, state: State) -> PoseCommand:
-        made_of = motion, self.goal, state, self._cause
-        if self._made_of and self._sent and all(map(is_, made_of, self._made_of)):
-            return self._sent  # the arm is at rest
-        (position_m, rotation), twist, acceleration = motion
-        goal, quat_xyzw = self.goal, quat_from_rotation(rotation)
-        if goal is None:
-            heads_m, heads_xyzw = position_m, quat_xyzw
-        elif self._sent and self._made_of and goal is self._made_of[1]:
-            heads_m, heads_xyzw = self._sent.goal_position_m, self._sent.goal_quat_xyzw
-        else:
-            heads_m, heads_xyzw = goal.pose.position_m, quat_from_rotation(goal.pose.rotation)
-        self._made_of = made_of
-        moves, heads = (position_m, quat_xyzw, twist, acceleration), (heads_m, heads_xyzw)
-        self._sent = computed(PoseCommand, *moves, *heads, state.value, self._cause)
-        return self._sent
-
-
-def _within(mover: Mover, override: float) -> bool:
-    """Whether the arm moves as slowly as it would at this override, and will continue so."""
-    most = mover.box * override ** np.array([[1.0], [2.0], [3.0]])
-    speed, change = (np.abs(rates) for rates in mover.axis_rates())
-    return bool(
-        (change <= most[1] * 1.001).all()
-        and (speed + change**2 / (2 * most[2]) <= most[0] * 1.001).all()
-    )

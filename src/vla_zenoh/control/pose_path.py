@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import replace
+from operator import is_
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
+from vla_zenoh.control.joint_space import JointPath
 from vla_zenoh.control.limits import (
     HELD_LEAD_M,
     HELD_LEAD_RAD,
@@ -17,9 +19,9 @@ from vla_zenoh.control.limits import (
 )
 from vla_zenoh.control.plan_timeline import Goal
 from vla_zenoh.control.smoothing import FULL, Motion, Shares, Smoother, motion_limits
-from vla_zenoh.kinematics.so3 import Pose, exp3, interpolate, pose_distance
+from vla_zenoh.kinematics.so3 import Pose, exp3, interpolate, pose_distance, quat_from_rotation
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import FloatArray
+from vla_zenoh.types import Cause, FloatArray, PoseCommand, computed
 
 if TYPE_CHECKING:
     from vla_zenoh.control.pose_to_joint import PoseToJoint
@@ -153,3 +155,33 @@ class PosePath:
         """(n,) each, commanded joints on the way to rest and at rest, from a brake in `ahead_s`."""
         assert self._joints is not None
         return self._joints.stopping_rad(self._smoother, ahead_s)
+
+
+Mover = PosePath | JointPath
+"""What moves the arm."""
+
+
+class PoseCommands:
+    """The pose commands of a motion; what stays the same is computed once."""
+
+    def __init__(self) -> None:
+        self._sent: PoseCommand | None = None
+        self._made_of: tuple[Motion, Goal | None, str, Cause | None] | None = None
+
+    def of(self, motion: Motion, goal: Goal | None, state: str, cause: Cause | None) -> PoseCommand:
+        """The command of this tick, on the way to `goal`."""
+        made_of = motion, goal, state, cause
+        if self._made_of and self._sent and all(map(is_, made_of, self._made_of)):
+            return self._sent  # the arm is at rest
+        (position_m, rotation), twist, acceleration = motion
+        quat_xyzw = quat_from_rotation(rotation)
+        if goal is None:
+            heads_m, heads_xyzw = position_m, quat_xyzw
+        elif self._sent and self._made_of and goal is self._made_of[1]:
+            heads_m, heads_xyzw = self._sent.goal_position_m, self._sent.goal_quat_xyzw
+        else:
+            heads_m, heads_xyzw = goal.pose.position_m, quat_from_rotation(goal.pose.rotation)
+        moves, heads = (position_m, quat_xyzw, twist, acceleration), (heads_m, heads_xyzw)
+        self._made_of = made_of
+        self._sent = computed(PoseCommand, *moves, *heads, state, cause)
+        return self._sent

@@ -24,11 +24,18 @@ from __future__ import annotations
 
 import math
 from copy import copy
+from operator import is_
+from typing import NamedTuple
 
 import numpy as np
 
-from vla_zenoh.control.plan_timeline import Plan
-from vla_zenoh.types import FloatArray
+from vla_zenoh.control.commander_io import make_event
+from vla_zenoh.control.joint_space import JointPath
+from vla_zenoh.control.limits import APPROACH, Slowdown, slowest
+from vla_zenoh.control.plan_timeline import Goal, Plan
+from vla_zenoh.control.pose_path import Mover
+from vla_zenoh.control.smoothing import FULL, Shares
+from vla_zenoh.types import Event, FloatArray
 
 PHASE, PERIOD, DEVIATION = 0.3, 0.1, 0.2
 """Gains of the clock of arrivals: its phase, its period, and the mean deviation from it."""
@@ -83,7 +90,7 @@ class Arrivals:
 
 
 class StepTiming:
-    """The speed to each goal.
+    """The speed to each goal of an arm that stands at first.
 
     Args:
         box: (3, 6) velocity, acceleration and jerk limits of every axis.
@@ -91,10 +98,6 @@ class StepTiming:
 
     def __init__(self, box: FloatArray) -> None:
         self._box = box
-        self.restart()
-
-    def restart(self) -> None:
-        """The arm stands, nothing was asked of it yet."""
         self._arrivals = Arrivals()
         self._plan: Plan | None = None
         self._took_ns = 0
@@ -186,3 +189,160 @@ def _stop_s(speed: float, most: float, jerk: float) -> float:
     if speed * jerk < most * most:
         return 2.0 * math.sqrt(speed / jerk)
     return speed / most + most / jerk
+
+
+class Order(NamedTuple):
+    """Where to go.
+
+    Args:
+        goal: of the plan.
+        plan: the newest.
+        rate_hz: of chunks asked for.
+        overdue_ns: when the watchdog brakes unless a chunk arrives.
+        now_ns: when the motion begins.
+    """
+
+    goal: Goal
+    plan: Plan
+    rate_hz: float
+    overdue_ns: int
+    now_ns: int
+
+
+class _Ahead(NamedTuple):
+    """The motion of an order, computed before the tick in which it is expected to begin.
+
+    Args:
+        of: what it depends on: objects that do not change,
+        at: and numbers.
+        timing: with the goal taken.
+        mover: on its way to it.
+        enough: the shares suffice.
+    """
+
+    of: tuple[object, ...]
+    at: tuple[float, ...]
+    timing: StepTiming
+    mover: Mover
+    enough: bool
+
+
+class GoalPace:
+    """The motion to each goal, as fast as steps, slowdowns and the speed override allow.
+
+    Args:
+        joints_follow: the pose, where goals are poses.
+    """
+
+    def __init__(self, *, joints_follow: bool) -> None:
+        self._joints_follow = joints_follow
+        self.override = 1.0
+        self.slowing = False
+        """The arm may still be faster than the override allows."""
+        self.slower: Slowdown | None = None
+        """What reduces the speed to the goal, besides the override."""
+        self.contact_slowdown: Slowdown | None = None
+        self.joint_slowdown: Slowdown | None = None
+        """Of the measured joints; both apply whatever the goal allows."""
+        self.part_slowdown: Slowdown | None = None
+        """Of the distance to another part of the robot."""
+        self._slowed_by: set[str] = set()
+        self._timings: dict[bool, StepTiming] = {}
+        """Of joints, and of poses, since the arm stood."""
+        self._ahead: _Ahead | None = None
+
+    def begin(self) -> None:
+        """Start an activation."""
+        self._slowed_by.clear()
+        self.joint_slowdown = None
+
+    def stand(self) -> None:
+        """The arm stands, nothing was asked of it yet."""
+        self._timings.clear()
+
+    @property
+    def speed(self) -> float:
+        """Share of the speed limits, without the override."""
+        return 1.0 if self.slower is None else self.slower.share
+
+    def slowest(self, goal: Goal) -> Slowdown | None:
+        """What reduces the speed to `goal`."""
+        others = self.contact_slowdown, self.joint_slowdown, self.part_slowdown
+        return slowest(goal.slowdown, *others)
+
+    def changes(self, mover: Mover, slower: Slowdown | None) -> bool:
+        """Whether the motion in progress must be planned again, with `slower` from now on."""
+        if self.slowing and _within(mover, self.override):
+            return True
+        return (1.0 if slower is None else slower.share) != self.speed
+
+    def plan_ahead(self, mover: Mover, order: Order) -> None:
+        """Compute the motion of an order that is expected in the next tick."""
+        before, self.slower = self.slower, self.slowest(order.goal)
+        self._ahead = self._motion_to(mover, order)
+        self.slower = before
+
+    def forget_ahead(self) -> None:
+        """Compute it again: its bounds have changed."""
+        self._ahead = None
+
+    def set_out(self, mover: Mover, order: Order, slower: Slowdown | None) -> list[Event]:
+        """Carry out an order; reports each reason for being `slower` once per activation."""
+        self.slower, events = slower, list[Event]()
+        if slower is not None and slower.name not in (APPROACH, *self._slowed_by):
+            self._slowed_by.add(slower.name)
+            name, _, value, limit, *_ = slower
+            events.append(make_event("info", "limit", name, f"slower{slower.at}", value, limit))
+        ahead, self._ahead = self._ahead, None
+        of, at = self._depends_on(mover, order)
+        if ahead is None or ahead.at != at or not all(map(is_, ahead.of, of)):
+            ahead = self._motion_to(mover, order)
+        self._timings[isinstance(mover, JointPath)] = ahead.timing
+        mover.adopt(ahead.mover)  # pyright: ignore
+        self.slowing &= not (ahead.enough and _within(mover, self.override))
+        return events
+
+    def _depends_on(
+        self, mover: Mover, order: Order
+    ) -> tuple[tuple[object, ...], tuple[float, ...]]:
+        """The objects and numbers that the motion of an order depends on."""
+        goal, plan, rate_hz, overdue_ns, now_ns = order
+        index, shares = plan.index_at(now_ns), (self.speed, self.override, self.slowing)
+        return (goal, plan, mover, mover.state), (now_ns, overdue_ns, rate_hz, index, *shares)
+
+    def _motion_to(self, mover: Mover, order: Order) -> _Ahead:
+        """The motion of an order from the present state."""
+        (of, at), in_joints = self._depends_on(mover, order), isinstance(mover, JointPath)
+        timing, mover = self._timings.get(in_joints), mover.fork()
+        timing = StepTiming(mover.box) if timing is None else timing.fork()
+        shares = self._shares(timing, mover, order)
+        hard = self.slowing and (in_joints or not self._joints_follow)
+        enough = mover.target(order.goal, shares, all_to_stop=hard)
+        return _Ahead(of, at, timing, mover, enough)
+
+    def _shares(self, timing: StepTiming, mover: Mover, order: Order) -> Shares:
+        """Shares of the limits that the arm has on the way to a goal."""
+        goal, plan, rate_hz, overdue_ns, now_ns = order
+        override, speed = self.override, self.speed * self.override
+        if not plan.soonest:
+            way, (velocity, _) = mover.way_to(goal), mover.axis_rates()
+            index, left_s = plan.index_at(now_ns), (overdue_ns - now_ns) / 1e9
+            share = timing.share(plan, index, now_ns, 1.0 / rate_hz, left_s, way, velocity)
+            speed = min(speed, share)
+        # The same motion in more time: acceleration scales with the square of the override, jerk
+        # with the cube. Until a faster arm has slowed down it brakes as hard as it may.
+        most = FULL
+        if _within(mover, override):
+            most = Shares(1.0, override**2, override**3)
+        wanted = Shares(speed, most.acceleration, most.jerk)
+        return Shares(*map(min, mover.shares(goal), wanted))
+
+
+def _within(mover: Mover, override: float) -> bool:
+    """Whether the arm moves as slowly as it would at this override, and will continue so."""
+    most = mover.box * override ** np.array([[1.0], [2.0], [3.0]])
+    speed, change = (np.abs(rates) for rates in mover.axis_rates())
+    return bool(
+        (change <= most[1] * 1.001).all()
+        and (speed + change**2 / (2 * most[2]) <= most[0] * 1.001).all()
+    )

@@ -321,7 +321,7 @@ class CommandStatus:
         self._limits = {name: hit for name, hit in self._limits.items() if hit[1] > oldest_s}
         acting = {name: why for name, (why, _) in self._limits.items()}
         for part in self._commander.parts:
-            slower = part.motion.slower if part.motion.streaming else None
+            slower = part.motion.pace.slower if part.motion.streaming else None
             if slower is not None:
                 acting[slower.name] = part.says(f"{slower.share:.0%} of the speed{slower.at}")
         return [f"{name}: {why}"[:MAX_LIMIT] for name, why in sorted(acting.items())]
