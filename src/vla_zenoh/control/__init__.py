@@ -5,6 +5,7 @@ chunk_validation   every reason to reject a chunk
 chunk_planner      validate, plan, bound and enqueue chunks
 plan_timeline      plans on a time axis: which goal was in force when
 aggregate          the goal where plans overlap
+step_timing        how fast to go to a goal
 motion_pipeline    goals to commands: leash, smoothing, joints, braking
 watchdog           reasons to brake
 preflight          reasons against an activation

@@ -1,9 +1,9 @@
 """Jerk-limited motion of n axes to a target that may change at any tick, by Ruckig.
 
-A motion that is already on the straight line to its target, or stands, is planned as one degree of
-freedom along that line: it stays on it whatever the limits become. The same holds for each group of
-axes alone, if the motion beside the line is small: that gets degrees of freedom of its own. Any
-other motion has one per axis. Those along the line, or of all axes, are synchronised in time.
+A motion on the straight line to its target, or that stands, is planned as one degree of freedom
+along that line: it stays on it whatever the limits become. So is that of each group of axes alone;
+small motion beside the line gets degrees of freedom of its own. Any other motion has one per axis.
+Those along the line, or of all axes, are synchronised in time.
 
 Ruckig finds profiles of a given duration by root finding with a precision of 1e-8. An axis that
 stands at its target with rounding noise (a velocity of 1e-16), while another axis takes long, can
@@ -102,10 +102,8 @@ class _Plan:
 
     def range_m(self) -> tuple[FloatArray, FloatArray]:
         """Bounds (3,) below and above the translation along each axis."""
-        low, high = _extrema(self._path)
-        basis = self._basis[:3]
-        reached = np.stack([basis * low, basis * high])
-        start = self._start[:3]
+        start, basis = self._start[:3], self._basis[:3]
+        reached = np.stack([basis * extreme for extreme in _extrema(self._path)])
         return start + reached.min(axis=0).sum(axis=1), start + reached.max(axis=0).sum(axis=1)
 
     def at(self, time_s: float) -> AxisState:
@@ -182,15 +180,13 @@ class AxisSmoother:
         Returns:
             whether the shares suffice.
         """
-        self._pace = shares.jerk ** (1 / 3)
-        self._settle()
+        self._settle(shares)
         return self._plan_to(target, shares, all_to_stop)
 
     def _plan_to(self, target: FloatArray, shares: Shares, all_to_stop: bool) -> bool:
-        self.braking = False
-        self._target = target
+        self.braking, self._target = False, target
         limits, unreversed = self._limits(shares)
-        way = self._target - self.state.position
+        way = target - self.state.position
         way[np.abs(way) < QUIET[0]] = 0.0
         plan, enough = self._towards(way, limits, unreversed, all_to_stop)
         self._begin(plan)
@@ -209,12 +205,9 @@ class AxisSmoother:
         """
         if self.braking:
             return
-        self._again, self._pace = None, 1.0
-        self._settle()
-        limits = self.box
-        if shares is not None:
-            _, limits = self._limits(shares)
-        self.braking = True
+        self._settle(FULL)
+        limits = self.box if shares is None else self._limits(shares)[1]
+        self._again, self.braking = None, True
         self._begin(self._stop(limits, together=shares is not None))
 
     # -- planning -----------------------------------------------------------------------------
@@ -227,19 +220,15 @@ class AxisSmoother:
             plan = self._stop(self.box, together=False)
         if plan is None:
             self.stand(self.state.position)
-            return
-        self._plan = plan
+        else:
+            self._plan = plan
 
     def _towards(
         self, way: FloatArray, limits: FloatArray, unreversed: FloatArray, all_to_stop: bool
     ) -> tuple[_Plan | None, bool]:
         """The plan of a motion by `way` (n,) without detours, and whether `limits` suffice.
 
-        Args:
-            way: of the motion.
-            limits: (3, n) to keep to.
-            unreversed: (3, n) to keep to where an axis would else reverse for nothing.
-            all_to_stop: see `target`.
+        To `unreversed` (3, n) it keeps where an axis would else reverse for nothing.
         """
         if not np.isfinite(way).all():
             return None, False
@@ -249,11 +238,12 @@ class AxisSmoother:
         attempts = [limits]
         attempts += [unreversed] * bool((limits < unreversed).any())
         attempts += [hardest] * bool((unreversed < hardest).any())
+        along = basis.T @ way
         for most in attempts:
             may_take = hardest if all_to_stop or most is hardest else unreversed
             for synchronization, slowly in _WAYS:
                 ask = self._input(basis, most, parts, slowly=slowly)
-                ask.target_position = (basis.T @ way).tolist()
+                ask.target_position = along.tolist()
                 # Motion beside the line ends as soon as it can, independent of the others.
                 ask.per_dof_synchronization = [
                     Synchronization.No if part == BESIDE else synchronization for part in parts
@@ -262,8 +252,8 @@ class AxisSmoother:
                 if path is None:
                     continue
                 found = _Plan(self.state.position, basis, path, self._pace_of(most))
-                overshoots = self._overshoots(path, basis.T @ way, (basis, may_take, parts))
-                if not overshoots and not self._leaves(found):
+                stop = basis, may_take, parts
+                if not (self._overshoots(path, along, stop) or self._leaves(found)):
                     if most is not limits:
                         self._jerk = most[2] / self.box[2]
                     return found, most is not hardest
@@ -275,25 +265,16 @@ class AxisSmoother:
         if self.bounds_m is None:
             return False
         low, high = self.bounds_m
+        low, high = low - OVERSHOOT, high + OVERSHOOT
         start, end = self.state.position[:3], plan.end[:3]
-        inside = (
-            np.minimum(start, end) >= low - OVERSHOOT,
-            np.maximum(start, end) <= high + OVERSHOOT,
-        )
         least, most = plan.range_m()
-        return bool(
-            (inside[0] & (least < low - OVERSHOOT)).any()
-            or (inside[1] & (most > high + OVERSHOOT)).any()
-        )
+        below = (np.minimum(start, end) >= low) & (least < low)
+        above = (np.maximum(start, end) <= high) & (most > high)
+        return bool(below.any() or above.any())
 
     def _coordinates(self, way: FloatArray, limits: FloatArray) -> tuple[FloatArray, list[float]]:
-        """Basis (n, k) with the fewest directions for a motion by `way`, and their limit shares.
-
-        One, if the motion is already along `way`. Otherwise those of each group: the line and the
-        directions beside it if the motion there is small, or the axes.
-        """
-        _, velocity, acceleration = self.state
-        whole = line_of(way, velocity, acceleration, self._pace)
+        """Basis (n, k) with the fewest directions for a motion by `way`, and their limit shares."""
+        whole = line_of(way, *self.state[1:], self._pace)
         if whole is not None:
             return whole[:, None], [1.0]
         columns: list[FloatArray] = []
@@ -308,15 +289,19 @@ class AxisSmoother:
     def _directions(
         self, way: FloatArray, limits: FloatArray, axes: slice
     ) -> tuple[FloatArray, list[float]]:
-        """The same for m axes: (m, k), with `way` (m,) and `limits` (3, m)."""
+        """The same for m axes: (m, k), with `way` (m,) and `limits` (3, m).
+
+        The line, with the directions beside it if the motion there is small; or the axes.
+        """
         size = len(way)
+        each = np.eye(size), [1.0] * size
         motion = np.array([self.state.velocity[axes], self.state.acceleration[axes]])
         line = line_of(way, motion[0], motion[1], self._pace)
         if line is not None:
             return (line[:, None], [1.0]) if line.any() else (np.zeros((size, 0)), [])
         length = norm3(way) if size == 3 else float(np.linalg.norm(way))
         if length == 0.0:
-            return np.eye(size), [1.0] * size
+            return each
         along = way / length
         beside = motion - np.outer(motion @ along, along)
         others = _across(along)
@@ -329,7 +314,7 @@ class AxisSmoother:
         if (goes < OVERSHOOT).all() and (fast < most[0]).all() and (change < most[1]).all():
             beside_it = [BESIDE] * (size - 1)
             return np.stack([along, *others], axis=1), [1.0 - sum(beside_it), *beside_it]
-        return np.eye(size), [1.0] * size
+        return each
 
     def _overshoots(
         self,
@@ -337,12 +322,9 @@ class AxisSmoother:
         target: FloatArray,
         stop: tuple[FloatArray, FloatArray, list[float]],
     ) -> bool:
-        """Whether a coordinate leaves the range between its start, its target and its stop.
+        """Whether a coordinate leaves the range between its start, its target (k,) and its stop.
 
-        Args:
-            path: the plan.
-            target: (k,).
-            stop: basis, limits and parts of the stop, see `_input`.
+        `stop`: its basis, limits and parts, see `_input`.
         """
         least, most = np.minimum(target, 0.0) - OVERSHOOT, np.maximum(target, 0.0) + OVERSHOOT
         low, high = _extrema(path)
@@ -377,12 +359,8 @@ class AxisSmoother:
     ) -> InputParameter:
         """Ruckig's input along the columns of `basis` (n, k), each with its part of the limits.
 
-        Args:
-            basis: of the motion.
-            limits: (3, n) of the axes.
-            parts: of the limits, for each column.
-            slowly: what is too fast brakes so that it does not fall below half its velocity limit.
-                With all of its acceleration it would have to reverse before that has ended.
+        `slowly`: what is too fast brakes so that it does not fall below half its velocity limit.
+        With all of its acceleration it would have to reverse before that has ended.
         """
         _, velocity, acceleration = self.state
         paces = self._pace_of(limits) ** np.array([1.0, 2.0, 3.0])
@@ -500,8 +478,9 @@ class AxisSmoother:
     def _rates(self) -> tuple[FloatArray, FloatArray]:
         return self.state[1:]
 
-    def _settle(self) -> None:
-        """Set noise to zero, before the motion is planned."""
+    def _settle(self, shares: Shares) -> None:
+        """Set noise to zero, before a motion with these shares is planned."""
+        self._pace = shares.jerk ** (1 / 3)
         position, velocity, acceleration = self.state
         velocity, acceleration = velocity.copy(), acceleration.copy()
         velocity[np.abs(velocity) < QUIET[1] * self._pace] = 0.0

@@ -94,8 +94,7 @@ class Smoother(AxisSmoother):
 
     def target(self, pose: Pose, shares: Shares = FULL, *, all_to_stop: bool = False) -> bool:
         """Move to `pose` from the present state; see `AxisSmoother.move_to`."""
-        self._pace = shares.jerk ** (1 / 3)
-        self._settle()
+        self._settle(shares)
         self._aim = pose
         target = np.array([*pose.position_m, *log3(self._anchor.T @ pose.rotation)])
         return self._plan_to(target, shares, all_to_stop)
@@ -159,7 +158,7 @@ class Smoother(AxisSmoother):
     def _rates(self) -> tuple[FloatArray, FloatArray]:
         return self.motion[1:]
 
-    def _settle(self) -> None:
+    def _settle(self, shares: Shares) -> None:
         """Move the anchor to the present rotation, and set noise to zero."""
         position, velocity, acceleration = self.state
         spin, spin_change = body_rates(position[3:], velocity[3:], acceleration[3:])
@@ -169,4 +168,4 @@ class Smoother(AxisSmoother):
             np.concatenate([velocity[:3], spin]),
             np.concatenate([acceleration[:3], spin_change]),
         )
-        super()._settle()
+        super()._settle(shares)
