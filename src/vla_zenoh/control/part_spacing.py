@@ -64,8 +64,7 @@ class PartSpacing:
         self.nearest = Nearest(self._within_m)
         """Distance of the commanded joints when last computed."""
         self._skip = 0
-        self._held = False
-        self._slower = False
+        self._held = self._slower = False
         self._edge_m, self._monitor_ns = np.inf, 0
 
     def place(self) -> None:
@@ -120,9 +119,8 @@ class PartSpacing:
             self._held and not (stand and self._may_go_on(at, now_ns, floor_m))
         )
         if self._held:
-            where = f"{self.nearest.first} and {self.nearest.second}"
             value_m = min(ahead.distance_m, self.nearest.distance_m)
-            return None, LimitHit(NAME, value_m, self._stop_m, where=where)
+            return None, LimitHit(NAME, value_m, self._stop_m, where=str(self.nearest))
         return self._slow(before), None
 
     def _slow(self, before: Nearest) -> Slowdown | None:
@@ -138,8 +136,7 @@ class PartSpacing:
             return None
         left = max(near.distance_m - self._stop_m, 0.0) / (self._slow_m - self._stop_m)
         share = max(np.ceil(np.sqrt(left) * STEPS) / STEPS, SLOWEST)
-        where = f"{near.first} and {near.second}"
-        return Slowdown(NAME, float(share), near.distance_m, self._slow_m, where)
+        return Slowdown(NAME, float(share), near.distance_m, self._slow_m, str(near))
 
     def _may_go_on(self, at: Sequence[FloatArray], now_ns: int, floor_m: float) -> bool:
         """Whether the first bit of the way to the goals is free."""
@@ -186,10 +183,8 @@ class PartSpacing:
         self._edge_m = min(max(before_m, near.distance_m), near.distance_m + BAND_M)
         if near.distance_m >= within_m or self._edge_m >= before_m:
             return None
-        where = f"{near.first} and {near.second}"
-        return LimitHit(NAME, near.distance_m, self._stop_m, where=where)
+        return LimitHit(NAME, near.distance_m, self._stop_m, where=str(near))
 
     def measured_m(self, joints_rad: Mapping[str, FloatArray]) -> Nearest:
         """The nearest links with the parts at these joints (n,) each."""
-        at = [joints_rad[part.name] for part in self._parts]
-        return self._nearest(at)
+        return self._nearest([joints_rad[part.name] for part in self._parts])

@@ -110,12 +110,12 @@ class CollisionModel:
         for distances in self._at(known_good_rad, apart) if apart else ():
             nearest = int(np.argmin(distances))
             if distances[nearest] <= touching_m:
-                link, shape = (shapes[index].name for index in apart[nearest])
+                link, kept_out = (shapes[index].name for index in apart[nearest])
                 raise ProfileError(
-                    f"{link} is {distances[nearest]:.3f} m from the keep-out {shape!r} with the "
+                    f"{link} is {distances[nearest]:.3f} m from the keep-out {kept_out!r} with the "
                     f"arm at home, and must be over {touching_m:g} m (collision_stop_m) away; "
                     "move the keep-out, make it smaller, or give another home_rad",
-                    ("limits", "reach", "keep_out", shape),
+                    ("limits", "reach", "keep_out", kept_out),
                 )
         self._pairs, self._held_pairs = [*used, *apart], self._add_held(kinematics)
         self._use(self._pairs)
@@ -310,6 +310,9 @@ class Nearest(NamedTuple):
     distance_m: float
     first: str = ""
     second: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.first} and {self.second}"
 
 
 class Placement(NamedTuple):

@@ -126,11 +126,6 @@ class SingleWriterFilter:
         """Let any source begin; samples accepted before are still replays."""
         self.writer = ""
 
-    def reset(self) -> None:
-        """Forget every source."""
-        self.writer = ""
-        self._last_seq.clear()
-
     def _silent(self, now_ns: int) -> bool:
         return self._silence_ns is not None and now_ns - self._accepted_ns >= self._silence_ns
 
