@@ -19,13 +19,7 @@ from typing import TYPE_CHECKING
 from vla_zenoh.control.chunk_planner import ChunkOutcome
 from vla_zenoh.control.chunk_validation import Lease, Rejection
 from vla_zenoh.control.commanded_part import CommandedPart
-from vla_zenoh.control.commander_io import (
-    Inputs,
-    Outputs,
-    Setting,
-    limit_events,
-    make_event,
-)
+from vla_zenoh.control.commander_io import Inputs, Outputs, Setting, limit_events, make_event
 from vla_zenoh.control.limits import LimitHit
 from vla_zenoh.control.plan_timeline import EpisodeProgress
 from vla_zenoh.control.preflight import PeerSnapshot, reasons_of_worker
@@ -34,13 +28,7 @@ from vla_zenoh.control.states import DEACTIVATED, OBEYING, State, Trigger, after
 from vla_zenoh.control.watchdog import Deadman
 from vla_zenoh.errors import RecordError
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import (
-    MAX_TEXT,
-    ActionChunk,
-    HeldBox,
-    Stamped,
-    Task,
-)
+from vla_zenoh.types import MAX_TEXT, ActionChunk, HeldBox, Stamped, Task
 
 if TYPE_CHECKING:
     from vla_zenoh.control.part_spacing import PartSpacing
@@ -93,9 +81,8 @@ class Commander:
         self._resumed_ns = 0
         self._peers = PeerSnapshot()
         self._latest: dict[str, Stamped[ActionChunk]] = {}
-        known = bool(profile.parts) and all(part.reach for part in self.parts)
         self._spacing: PartSpacing | None = None
-        if known:
+        if profile.parts and all(part.reach for part in self.parts):
             from vla_zenoh.control.part_spacing import PartSpacing  # of robots of parts alone
 
             self._spacing = PartSpacing(profile, self.parts)
@@ -119,11 +106,8 @@ class Commander:
             next_ns: `now_ns` of the next call of `step`.
         """
         self._update_states(inputs)
-        self._begin_planning()
+        self._take_chunks(inputs.chunks, next_ns)
         self._prepared = True
-        for chunk in inputs.chunks:
-            self._submit_chunk(chunk, next_ns)
-        self._plan_chunks(next_ns)
         if self._period_ns >= PLANNING_NS:
             self._plan_ahead(next_ns)
 
@@ -146,16 +130,19 @@ class Commander:
 
     def _plan_ahead(self, next_ns: int) -> bool:
         """Plan the motion to the goals of the next tick; returns whether they are new."""
-        new = [
-            part.motion.plan_ahead(self.task, self._watchdog.deadline_ns, next_ns)
-            for part in self.parts
-            if self.state is State.ACTIVE
-        ]
-        return any(new)
+        new = False
+        for part in self.parts if self.state is State.ACTIVE else ():
+            new |= part.motion.plan_ahead(self.task, self._watchdog.deadline_ns, next_ns)
+        return new
 
-    def _begin_planning(self) -> None:
-        for part in self.parts:
-            part.planner.begin_tick()
+    def _take_chunks(self, chunks: Sequence[Stamped[ActionChunk]], now_ns: int) -> None:
+        """Plan what is new; the planning budget begins with the first call for a tick."""
+        if not self._prepared:
+            for part in self.parts:
+                part.planner.begin_tick()
+        for chunk in chunks:
+            self._submit_chunk(chunk, now_ns)
+        self._plan_chunks(now_ns)
 
     def step(self, inputs: Inputs, now_ns: int, ticks: int = 1) -> Outputs:
         """Process the inputs of one tick.
@@ -171,12 +158,8 @@ class Commander:
         if inputs.settings:
             self._apply_settings(inputs.settings, now_ns)
         planned = self._prepared or bool(inputs.chunks)
-        if not self._prepared:
-            self._begin_planning()
+        self._take_chunks(inputs.chunks, now_ns)
         self._prepared = False
-        for chunk in inputs.chunks:
-            self._submit_chunk(chunk, now_ns)
-        self._plan_chunks(now_ns)
         self._supervise(now_ns)
         for part in parts:
             if not planned or self.state not in OBEYING or part.monitor_late(now_ns):
@@ -263,8 +246,7 @@ class Commander:
         stops = [setting for setting in settings if setting.name == "stop"]
         if stops:
             self._change(Trigger.STOP, "emergency stop")
-            self._stop_put_ns = max(stop.put_ns or 0 for stop in stops)
-            self._stop_came_ns = now_ns
+            self._stop_put_ns, self._stop_came_ns = max(stop.put_ns or 0 for stop in stops), now_ns
         for setting in settings:
             self._apply_setting(setting, now_ns, bool(stops))
 
@@ -365,13 +347,11 @@ class Commander:
             self._hold_as_well(holder)
             return
         if self.state is not State.INACTIVE:
-            self._reject_setting(
-                "activate",
-                [
-                    f"the state is {self.state.value} ({self.why}); clear it with `vla-zenoh "
-                    "reset`, or put anything on the key reset"
-                ],
+            why = (
+                f"the state is {self.state.value} ({self.why}); clear it with `vla-zenoh "
+                "reset`, or put anything on the key reset"
             )
+            self._reject_setting("activate", [why])
             return
         lease, reasons = self._preflight(self.task.worker, now_ns)
         reasons += self.deadman.reasons_against(holder, self._peers.holders)
@@ -383,7 +363,7 @@ class Commander:
             self._reject_setting("activate", reasons + self._ended_before())
             return
         self.lease = lease
-        self.deadman.begin(holder)
+        self.deadman.name = holder
         self._resumed_ns = 0
         for part in self.parts:
             part.activate(lease, now_ns)
@@ -402,22 +382,21 @@ class Commander:
         if reasons:
             self._reject_setting("activate", reasons)
         elif holder not in ("", self.deadman.name):
-            self.deadman.begin(holder)
+            self.deadman.name = holder
             self._emit("info", "notice", "held", f"active from now on while {holder!r} holds it")
 
     def _preflight(self, worker: str, now_ns: int) -> tuple[Lease | None, list[str]]:
-        chunk, spec = self._latest.get(worker), self._peers.specs.get(worker)
-        reasons: list[str] = []
+        peers, task, chunk = self._peers, self.task, self._latest.get(worker)
+        spec, reasons = peers.specs.get(worker), list[str]()
         for part in self.parts:
-            reasons += map(part.says, part.reasons_not_to_activate(self._peers, now_ns))
+            reasons += map(part.says, part.reasons_not_to_activate(peers, now_ns))
         reasons += reasons_of_worker(
-            self.profile, worker, self.task.prompt, self._peers, chunk, now_ns, self.task.rate_hz
+            self.profile, worker, task.prompt, peers, chunk, now_ns, task.rate_hz
         )
         for part in self.parts:
             reasons += map(part.says, part.reasons_against(worker, spec, chunk, now_ns))
-        if reasons or chunk is None:
+        if reasons or chunk is None or spec is None:
             return None, reasons
-        spec = self._peers.specs[worker]
         return Lease(spec, chunk.header.source, now_ns, chunk.header.seq), []
 
     def _reject_setting(self, what: str, reasons: list[str]) -> None:
@@ -526,18 +505,16 @@ class Commander:
             return
         assert self.lease is not None
         lost: dict[str, str] = {}
+        worker, moves = self.task.worker, not self.dry_run
         for part in self.parts:
-            why, events = part.lost(
-                self._peers, self.task.worker, self.lease, now_ns, moves=not self.dry_run
-            )
+            why, events = part.lost(self._peers, worker, self.lease, now_ns, moves=moves)
             if events:
                 self._out.events += part.tagged(events)
             if why:
                 lost[part.says(why)] = why
-        why = ""
-        if lost:
-            reasons = set(lost.values()) if len(lost) == len(self.parts) else set(lost)
-            why = "; ".join(reasons if len(reasons) == 1 else lost)[:MAX_TEXT]
+        # What all parts have lost is said once.
+        same = len(lost) == len(self.parts) and len(set(lost.values())) == 1
+        why = "; ".join(set(lost.values()) if same else lost)[:MAX_TEXT]
         if not why and self._watchdog.given_up(now_ns):
             why = f"held for {self.profile.timing.max_hold_s:g} s without a fresh chunk"
         why = why or unheld

@@ -340,11 +340,7 @@ class Deadman:
 
     def __init__(self) -> None:
         self.name = ""
-        """Of the client; empty: none is needed."""
-
-    def begin(self, holder: str) -> None:
-        """Start an activation that depends on `holder`, if not empty."""
-        self.name = holder
+        """Of the client that this activation depends on; empty: none is needed."""
 
     def reasons_against(
         self, holder: str, present: AbstractSet[str], *, obeying: bool = False
