@@ -173,7 +173,6 @@ class Commander:
                 if part.too_near is not None:
                     self._brake_at(part.too_near, part)
         if self._spacing is not None:
-            self._monitor_distance(self._spacing, now_ns)
             self._keep_apart(self._spacing, now_ns, ticks)
         overdue_ns, all_planned = self._watchdog.deadline_ns, True
         for part in parts:
@@ -524,7 +523,11 @@ class Commander:
             self._change(Trigger.STARVE, "no fresh chunk within the watchdog")
 
     def _keep_apart(self, spacing: PartSpacing, now_ns: int, ticks: int) -> None:
-        """Slow the parts down, or let all of them stand, before they come too near."""
+        """Slow the parts down, or let all of them stand, before they come too near; or brake."""
+        if self.state in OBEYING and self._motion.streaming:
+            measured = spacing.monitor(now_ns)
+            if measured is not None:
+                self._brake_at(measured)
         moves = self.state is State.ACTIVE or self.retreating
         ahead_s = ticks / self.profile.timing.command_hz
         slowdown, hit = spacing.look(now_ns, ahead_s, moves=moves)
@@ -534,16 +537,6 @@ class Commander:
             self._out.events.append(event)
         for part in self.parts:
             part.motion.pace.part_slowdown, part.motion.held = slowdown, hit is not None
-
-    def _monitor_distance(self, spacing: PartSpacing, now_ns: int) -> None:
-        """Brake if the measured parts come too near to each other."""
-        if self.state not in OBEYING or not self._motion.streaming:
-            return
-        measured = [part.measured_rad for part in self.parts]
-        known = [joints_rad for joints_rad in measured if joints_rad is not None]
-        hit = spacing.monitor(known, now_ns) if len(known) == len(measured) else None
-        if hit is not None:
-            self._brake_at(hit)
 
     def _brake_at(self, hit: LimitHit, part: CommandedPart | None = None) -> None:
         """End the activation at a bound of the measured arm; `part`: of which, None: of several."""

@@ -172,9 +172,13 @@ class PartSpacing:
                 )
         return found
 
-    def monitor(self, measured_rad: Sequence[FloatArray], now_ns: int) -> LimitHit | None:
-        """Check the measured joints (n,) of each part, every `PERIOD_NS`; returns why to brake."""
+    def monitor(self, now_ns: int) -> LimitHit | None:
+        """Check the measured joints of all parts, every `PERIOD_NS`; returns why to brake."""
         if now_ns < self._monitor_ns:
+            return None
+        found = [part.measured_rad for part in self._parts]
+        measured_rad = [joints_rad for joints_rad in found if joints_rad is not None]
+        if len(measured_rad) < len(found):
             return None
         begins = now_ns - self._monitor_ns > 2 * PERIOD_NS
         self._monitor_ns, within_m = now_ns + PERIOD_NS, self._stop_m - PAST_M
