@@ -491,14 +491,7 @@ class AxisSmoother:
 def stop_way(
     velocity: FloatArray, acceleration: FloatArray, box: FloatArray, ahead_s: float
 ) -> FloatArray:
-    """Longest distance (n,) of a stop of all axes together that begins in `ahead_s`.
-
-    Args:
-        velocity: (n,) of the axes.
-        acceleration: (n,) of the axes.
-        box: (3, n) limits of velocity, acceleration and jerk.
-        ahead_s: until it begins.
-    """
+    """Longest distance (n,) of a stop of all axes together, within `box`, begun in `ahead_s`."""
     _, most, jerk = box
     ramp_s = np.abs(acceleration) / jerk
     later = velocity + 0.5 * acceleration * ramp_s

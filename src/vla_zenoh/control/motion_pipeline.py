@@ -385,12 +385,8 @@ class MotionPipeline:
     def plan_ahead(self, task: Task, overdue_ns: int, next_ns: int) -> bool:
         """Compute the motion to the goal that comes into force at the next tick, if one does.
 
-        That tick takes it over if nothing that the motion depends on has changed by then.
-
-        Args:
-            task: its rate.
-            overdue_ns: when the watchdog brakes unless a chunk arrives.
-            next_ns: time of the next tick.
+        That tick takes it over if nothing that the motion depends on has changed by then; the
+        arguments are those of `advance`.
         """
         timeline, mover = self.timeline, self._mover
         self.pace.forget_ahead()

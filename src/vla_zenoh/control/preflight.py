@@ -92,12 +92,7 @@ def reasons_of_part(
 ) -> list[str]:
     """Reasons against an activation that are about one arm and gripper, as sentences.
 
-    Args:
-        profile: the effective profile.
-        peers: see `PeerSnapshot`.
-        pose: newest TCP pose.
-        gripper: newest gripper state.
-        now_ns: same clock as the records' ``received_ns``.
+    `now_ns`, here and below, is on the clock of the records' ``received_ns``.
     """
     return [*_robot(profile, peers, pose, now_ns), *_gripper(profile, gripper, now_ns)]
 
@@ -111,15 +106,15 @@ def reasons_of_worker(
     now_ns: int,
     rate_hz: float,
 ) -> list[str]:
-    """Those that are about the worker, for all parts of a robot.
+    """Those that are about the worker that gets the lease, for all parts of a robot.
 
     Args:
         profile: the effective profile.
-        worker: the worker that gets the lease.
+        worker: its name.
         prompt: the prompt in force.
-        peers: see `PeerSnapshot`.
-        chunk: newest chunk of that worker, published without the lease.
-        now_ns: same clock as the records' ``received_ns``.
+        peers: the other nodes.
+        chunk: the worker's newest, published without the lease.
+        now_ns: time of this tick.
         rate_hz: chunks per second requested of the worker.
     """
     spec = peers.specs.get(worker)
@@ -176,15 +171,7 @@ def joint_state_faults(
     pose: Stamped[PoseState],
     now_ns: int,
 ) -> list[str]:
-    """Whether the kinematics fit this robot: joints are received, their TCP is the reported one.
-
-    Args:
-        profile: the effective profile.
-        kinematics: of the robot it describes.
-        joint: newest joint state.
-        pose: newest TCP pose.
-        now_ns: same clock as the records' ``received_ns``.
-    """
+    """Whether the kinematics fit this robot: joints are received, their TCP is the reported one."""
     if joint is None:
         return ["the joints are not known: nothing received on state/joint"]
     age_s = (now_ns - joint.received_ns) / 1e9
