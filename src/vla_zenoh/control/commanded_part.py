@@ -221,12 +221,7 @@ class CommandedPart:
     ) -> tuple[str, list[Event]]:
         """Why the arm cannot continue, empty if it can; and events.
 
-        Args:
-            peers: the other nodes.
-            worker: that moves it.
-            lease: its right.
-            now_ns: time of this tick.
-            moves: commands are published: the arm may be blocked.
+        `moves`: commands are published, so the arm may be blocked.
         """
         assert self.pose is not None and self.gripper_state is not None
         contact, motion = self.contact, self.motion

@@ -61,14 +61,7 @@ STRAY_M, STRAY_RAD = 0.01, 0.05
 
 
 class ExternalLoad(NamedTuple):
-    """An external load above its limit.
-
-    Args:
-        name: ``contact_force``, ``contact_torque`` or ``contact_effort``.
-        value: in `unit`.
-        limit: in `unit`.
-        unit: N or Nm.
-    """
+    """``contact_force``, ``contact_torque`` or ``contact_effort`` above its limit, in N or Nm."""
 
     name: str
     value: float
@@ -376,10 +369,7 @@ class Retreat:
     ) -> tuple[Pose | None, Event | None]:
         """The pose to move to in this tick, None: brake, or stand; and the event of its end.
 
-        Args:
-            commanded: the present command.
-            now_ns: time of this tick.
-            at_rest: the command has reached its target.
+        `at_rest`: the command has reached its target.
         """
         begun, measured = self._begun, self._measured
         if begun is None or measured is None:

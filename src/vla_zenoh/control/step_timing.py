@@ -192,15 +192,7 @@ def _stop_s(speed: float, most: float, jerk: float) -> float:
 
 
 class Order(NamedTuple):
-    """Where to go.
-
-    Args:
-        goal: of the plan.
-        plan: the newest.
-        rate_hz: of chunks asked for.
-        overdue_ns: when the watchdog brakes unless a chunk arrives.
-        now_ns: when the motion begins.
-    """
+    """Where to go, from when on, and when the watchdog brakes unless a chunk arrives."""
 
     goal: Goal
     plan: Plan

@@ -69,13 +69,7 @@ class Watchdog:
         self._set_deadline(now_ns, speed)
 
     def override_changed(self, now_ns: int, before: float, speed: float) -> None:
-        """Keep the plan time that is left until the deadline; a pause stops it.
-
-        Args:
-            now_ns: when the speed override changed.
-            before: the override until then, 0 to 1.
-            speed: the override from then on.
-        """
+        """Keep the plan time that is left until the deadline, of an override that was `before`."""
         if before:
             left_ns = self.deadline_ns - self._patience_ns - now_ns
             self._left_ns = left_ns * before if left_ns > 0 else left_ns
@@ -345,12 +339,9 @@ class Deadman:
     def reasons_against(
         self, holder: str, present: AbstractSet[str], *, obeying: bool = False
     ) -> list[str]:
-        """Why `holder` cannot hold the arm active, empty if it can.
+        """Why the client `holder` cannot hold the arm active, empty if it can, or is no name.
 
-        Args:
-            holder: name of the client; empty: none.
-            present: names of the clients whose tokens exist.
-            obeying: the arm is active already.
+        `present`: clients whose tokens exist; `obeying`: the arm is active already.
         """
         reasons = []
         if holder and holder not in present:
