@@ -109,7 +109,11 @@ def extended_profile(path: Path, parent: str) -> Path:
                 return beside
     except (OSError, ValueError) as error:
         raise ProfileError(f"{parent[:80]!r} cannot be the name of a profile") from error
-    return profile_file(parent)
+    try:
+        return profile_file(parent)
+    except ProfileError as error:
+        beside = "" if is_path(parent) else f", or as {parent[:80]}.yaml beside this file"
+        raise ProfileError(f"{error}{beside}") from error
 
 
 def robot_urdf(description: str) -> Path:

@@ -50,7 +50,10 @@ def robot_check(
     check = {"franka": fci_arm, "ur": ur_arm}.get(loaded.robot.driver)
     if check is None:
         driver = loaded.robot.driver
-        fail(f"profile {loaded.name} has robot.driver: {driver}; this checks franka and ur")
+        fail(
+            f"profile {loaded.name} has robot.driver: {driver}; this checks franka and ur; "
+            f"`vla-zenoh profile check {loaded.name}` checks the others"
+        )
     with progress("reading the robot"):
         findings = list(check(loaded))
     report(findings, as_json=as_json)
