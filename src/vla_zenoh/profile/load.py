@@ -14,6 +14,7 @@ from vla_zenoh import resources
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.profile import yaml_text
 from vla_zenoh.profile.profile import Profile
+from vla_zenoh.profile.schema import PATH_SOURCES
 from vla_zenoh.profile.section import WITH_REMOVABLE, Lines, explain, merge
 from vla_zenoh.resources import ROBOT_DATA_PREFIX, extended_profile, is_path, profile_file
 
@@ -122,11 +123,10 @@ def _bytes(path: Path) -> bytes:
         raise ProfileError(f"{path} cannot be read: {error.strerror}") from error
 
 
-FILE_SOURCE = "file:"
 PATHS: Mapping[str, Callable[[str], bool]] = {
     "robot.description": lambda text: not text.startswith(ROBOT_DATA_PREFIX),
     "parts.*.robot.description": lambda text: not text.startswith(ROBOT_DATA_PREFIX),
-    "cameras.*.source": lambda text: text.startswith(FILE_SOURCE),
+    "cameras.*.source": lambda text: text.startswith(PATH_SOURCES),
     "cameras.*.intrinsics": lambda text: True,
     "cameras.*.check.reference": lambda text: True,
     "arm.file": lambda text: True,
@@ -151,7 +151,7 @@ def paths_in(data: dict[str, Any]) -> Iterator[tuple[dict[str, Any], str, str]]:
             for name in list(section) if last == "*" else [last]:
                 text = section.get(name)
                 if isinstance(text, str) and names_file(text):
-                    yield section, name, FILE_SOURCE if last == "source" else ""
+                    yield section, name, text[: text.index(":") + 1] if last == "source" else ""
 
 
 def below(folder: Path, path: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 from pydantic import AfterValidator, Field
 
@@ -13,30 +13,46 @@ from vla_zenoh.types.records import MAX_DEPTH_UNIT_M, MIN_DEPTH_UNIT_M
 
 NodeKind = Literal["router", "sim", "ros2", "arm", "camera", "command", "worker", "primitives"]
 SIMULATED: tuple[NodeKind, ...] = ("router", "sim", "camera", "command", "worker")
-CAMERA_SOURCES = {
-    "sim": "sim:CAMERA",
-    "v4l2": "v4l2:DEVICE",
-    "realsense": "realsense:SERIAL",
-    "rtsp": "rtsp://HOST/PATH",
-    "rtsps": "rtsps://HOST/PATH",
-    "file": "file:PATH",
-    "ros2": "ros2:TOPIC",
-}
-"""Kind of a camera's source -> how it is written. `nodes.camera.node.make_source` opens them."""
-DEPTH_SOURCES = ("sim", "realsense")
-"""Kinds of source that measure depth."""
-LENS_SOURCES = ("v4l2", "realsense", "rtsp", "rtsps", "file")
-"""Kinds of source whose images a camera node may crop, flip and undistort."""
-LOCK_SOURCES = ("v4l2", "realsense")
-"""Kinds of source whose exposure and white balance can be fixed."""
 MIN_PERIODS = 3
 """A healthy link may be silent for up to this many periods."""
+
+
+class SourceKind(NamedTuple):
+    """A kind of camera source.
+
+    Args:
+        written: how a profile names one.
+        is_path: it names a file or folder, relative to the profile.
+        has_lens: a camera node may crop, flip and undistort its images.
+        has_depth: it measures depth.
+        has_locks: its exposure and white balance can be fixed.
+    """
+
+    written: str
+    is_path: bool = False
+    has_lens: bool = False
+    has_depth: bool = False
+    has_locks: bool = False
+
+
+CAMERA_SOURCES = {
+    "sim": SourceKind("sim:CAMERA", has_depth=True),
+    "v4l2": SourceKind("v4l2:DEVICE", has_lens=True, has_locks=True),
+    "realsense": SourceKind("realsense:SERIAL", has_lens=True, has_depth=True, has_locks=True),
+    "rtsp": SourceKind("rtsp://HOST/PATH", has_lens=True),
+    "rtsps": SourceKind("rtsps://HOST/PATH", has_lens=True),
+    "file": SourceKind("file:VIDEO_OR_FOLDER", is_path=True, has_lens=True),
+    "ros2": SourceKind("ros2:TOPIC"),
+}
+"""What a camera's source begins with -> its kind. `nodes.camera.node.make_source` opens them."""
+PATH_SOURCES = tuple(f"{name}:" for name, kind in CAMERA_SOURCES.items() if kind.is_path)
+"""What sources that name a file or folder begin with."""
 
 
 def _source(value: str) -> str:
     kind, colon, rest = value.partition(":")
     if not colon or not rest or kind not in CAMERA_SOURCES:
-        known = ", ".join(CAMERA_SOURCES.values())
+        known = ", ".join(one.written for one in CAMERA_SOURCES.values())
         raise ValueError(f"{value!r} is not a camera: write one of {known}")
     if kind in ("rtsp", "rtsps") and not rest.removeprefix("//"):
         raise ValueError(f"{value!r} lacks the host: write rtsp://HOST/PATH")
@@ -156,8 +172,8 @@ class CameraProfile(Section):
     Args:
         source: ``sim:<camera of the scene>``, ``v4l2:<device>`` (a serial number, a name in
             /dev/v4l/by-id, or a path; `vla-zenoh camera list`), ``realsense:<serial number>``,
-            ``rtsp://...``, ``file:<video or folder of images>`` (relative to the profile), or
-            ``ros2:<topic>``.
+            ``rtsp://...``, ``rtsps://...``, ``file:<video or folder of images>`` (relative to the
+            profile), or ``ros2:<topic>``.
         width: of published images, pixels.
         height: of published images, pixels.
         rate_hz: largest rate of images.
@@ -201,12 +217,14 @@ class CameraProfile(Section):
 
     def contradictions(self) -> Iterator[Fault]:
         kind = self.source.partition(":")[0]
-        if self.depth_unit_m is not None and kind not in DEPTH_SOURCES:
-            known = ", ".join(CAMERA_SOURCES[one] for one in DEPTH_SOURCES)
+        if self.depth_unit_m is not None and not CAMERA_SOURCES[kind].has_depth:
+            known = ", ".join(one.written for one in CAMERA_SOURCES.values() if one.has_depth)
             yield ("depth_unit_m",), f"is set, and {kind}: measures no depth; these do: {known}"
+        with_lens = [name for name, one in CAMERA_SOURCES.items() if one.has_lens]
+        with_locks = [name for name, one in CAMERA_SOURCES.items() if one.has_locks]
         for names, kinds in (
-            (("intrinsics", "undistort", "crop", "flip"), LENS_SOURCES),
-            (("exposure_us", "white_balance_k"), LOCK_SOURCES),
+            (("intrinsics", "undistort", "crop", "flip"), with_lens),
+            (("exposure_us", "white_balance_k"), with_locks),
         ):
             for name in names:
                 if getattr(self, name) not in (None, False, "none") and kind not in kinds:

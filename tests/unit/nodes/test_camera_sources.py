@@ -16,6 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vla_zenoh.errors import NodeError
+from vla_zenoh.lab.profile.check import check_profile
 from vla_zenoh.nodes.camera import v4l2
 from vla_zenoh.nodes.camera.camera_publisher import EARLY, LATE, RateLimiter, to_rgb
 from vla_zenoh.nodes.camera.file import FileSource, natural, open_frames
@@ -25,7 +26,7 @@ from vla_zenoh.nodes.camera.rtsp import RtspSource
 from vla_zenoh.nodes.camera.source import without_password
 from vla_zenoh.nodes.camera.v4l2 import V4l2Source, captured_ns
 from vla_zenoh.profile import load_profile
-from vla_zenoh.profile.schema import CameraProfile
+from vla_zenoh.profile.schema import CAMERA_SOURCES, CameraProfile
 
 SECOND_NS = 1_000_000_000
 REFUSAL_S = 0.5  # an address where nothing listens is given up at once
@@ -300,6 +301,23 @@ def test_all_cameras_but_those_of_ros2_are_served_unless_some_are_named() -> Non
 def test_an_unknown_kind_of_source_lists_the_known_ones() -> None:
     with pytest.raises(NodeError, match="there are: v4l2, realsense, rtsp, rtsps, file, sim"):
         make_source(CameraProfile(source="ros2:/image"))
+
+
+@pytest.mark.parametrize("kind", CAMERA_SOURCES)
+def test_every_kind_of_source_is_served_described_and_found_on_disk(
+    kind: str, tmp_path: Path
+) -> None:
+    written, is_path, *_ = CAMERA_SOURCES[kind]
+    assert written.startswith(f"{kind}:")
+    assert f"``{kind}:" in (CameraProfile.__doc__ or "")
+    if kind not in ("sim", "ros2"):
+        make_source(CameraProfile(source=written))
+    if is_path:
+        profile = tmp_path / "lab.yaml"
+        profile.write_text(f"extends: panda_sim\ncameras: {{front: {{source: '{kind}:absent'}}}}\n")
+        absent = tmp_path / "absent"
+        assert load_profile(str(profile)).cameras["front"].source == f"{kind}:{absent}"
+        assert f"there is no file or folder {absent}" in "".join(check_profile(str(profile)).errors)
 
 
 def test_what_opencv_says_of_broken_sources_does_not_reach_the_terminal(tmp_path: Path) -> None:

@@ -27,10 +27,9 @@ from vla_zenoh.lab.profile.robot_check import (
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.policy.loader import find_worker, make_policy
 from vla_zenoh.profile import HostProfile, Profile, load_with_lines
+from vla_zenoh.profile.schema import PATH_SOURCES
 from vla_zenoh.profile.section import located, located_fault
 from vla_zenoh.profile.session import address_of, host_of
-
-SIM, FILE, DEVICE = "sim:", "file:", "v4l2:/dev/"
 
 
 class ProfileReport(NamedTuple):
@@ -95,8 +94,8 @@ def _cameras(profile: Profile, part: HostProfile) -> Iterator[ProfileFault]:
     """Files of recorded cameras."""
     for camera in profile.cameras_of(part):
         source = profile.cameras[camera].source
-        path = Path(source.removeprefix(FILE)).expanduser()
-        if source.startswith(FILE) and not path.exists():
+        path = Path(source.partition(":")[2]).expanduser()
+        if source.startswith(PATH_SOURCES) and not path.exists():
             why = f"there is no file or folder {path}"
             yield ProfileFault(("cameras", camera, "source"), why, "camera")
 

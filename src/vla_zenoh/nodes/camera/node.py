@@ -19,7 +19,7 @@ from vla_zenoh.nodes.camera.source import LOOK_S, STALL_S, Source, prepare_openc
 from vla_zenoh.policy import CameraSpec, ModelSpec
 from vla_zenoh.policy.observation import size_variant
 from vla_zenoh.profile import Profile
-from vla_zenoh.profile.schema import CameraProfile
+from vla_zenoh.profile.schema import CAMERA_SOURCES, CameraProfile
 from vla_zenoh.types import Event, SceneState, SingleWriterFilter, Stamped
 
 SIM, ROS2 = "sim:", "ros2:"
@@ -62,8 +62,8 @@ def make_source(profile: CameraProfile) -> Source:
         from vla_zenoh.nodes.camera.realsense import RealsenseSource
 
         return RealsenseSource(rest, profile)
-    known = "v4l2, realsense, rtsp, rtsps, file, sim"
-    raise NodeError(f"no camera source called {kind!r}; there are: {known}")
+    known = ", ".join(name for name in CAMERA_SOURCES if name not in ("sim", "ros2"))
+    raise NodeError(f"no camera source called {kind!r}; there are: {known}, sim")
 
 
 class Grabber:

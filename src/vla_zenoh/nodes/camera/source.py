@@ -49,7 +49,8 @@ class Source(ABC):
         """Wait for the next image, decoding as little of it as possible.
 
         Returns its time of capture, ns of the monotonic clock; None if the source has ended or
-        `stop` was set. `NodeError`: the source is gone.
+        `stop` was set. `NodeError`: the source is gone. A source without a clock of its own waits
+        here until the image is due, as `file.py` does.
         """
 
     @abstractmethod
