@@ -376,8 +376,9 @@ def counters_page() -> str:
             sys.exit(f"scripts/reference.py: not described: {missing}; not in the code: {surplus}")
     out = ["# Counters", MADE.strip()]
     out.append(
-        "`vla-zenoh status` shows the counters of every node; record `NodeStatus`, field "
-        "`counters`. They only grow while a node lives."
+        "`vla-zenoh status --json` shows all counters of every node, the table of `vla-zenoh "
+        "status` only those of rejected messages; record `NodeStatus`, field `counters`. They only "
+        "grow while a node lives."
     )
     rows = ["| counter | counts |", "|---|---|"]
     rows += [f"| `{name}` | {text} |" for name, text in sorted(COUNTERS.items())]

@@ -30,7 +30,10 @@ def status(
     as_json: JsonOption = False,
     once: Annotated[bool, typer.Option("--once", help="Print the table once and exit.")] = False,
 ) -> None:
-    """Show every node: state, age, rates, latencies, counters, and the last events."""
+    """Show every node: state, age, rates, latencies, rejected messages, and the last events.
+
+    The table counts rejected messages only; --json has every counter.
+    """
     with target.client() as client:
         if not (as_json or once) and sys.stdout.isatty():
             from vla_zenoh.cli.status_table import show_live

@@ -57,6 +57,8 @@ class PythonDriver(RobotDriver):
         self.robot, self._called = make_arm(profile)
         self._reading = PythonReading(profile, self.kinematics)
         self._fault = Fault()
+        self._complaint = ""
+        """Why the last reading was rejected."""
         self._rate = RateMeter()
         self._asked_m = profile.robot.gripper.max_width_m
         self._width_m: float | None = None
@@ -112,8 +114,10 @@ class PythonDriver(RobotDriver):
             measured = self._reading.take(reading, stamp_ns, self._asked_m)
         except (TypeError, ValueError) as error:
             reason = getattr(error, "reason", "invalid")
-            self.report.reject(reason, f"{self._called}: read: {one_line(error, MAX_WORDS)}")
+            self._complaint = f"{self._called}: read: {one_line(error, MAX_WORDS)}"
+            self.report.reject(reason, self._complaint)
             return None
+        self._complaint = ""
         gripper = measured.gripper
         assert gripper is not None
         self.measured_ns, self._width_m = measured_ns, gripper.width_m
@@ -143,9 +147,11 @@ class PythonDriver(RobotDriver):
         self._call("close")
 
     def status(self) -> DriverStatus:
-        """Class, fault, width, and the robot's own entries."""
+        """Class, fault or else why a reading was rejected, width, and the robot's own entries."""
         width_m = self._asked_m if self._width_m is None else self._width_m
         detail = {"arm": self._called, "fault": self.fault, "width_m": width_m}
+        if self._complaint and not self.fault:
+            detail["complaint"] = self._complaint
         own = self._call("status") or {}
         return DriverStatus({**detail, **own}, rates_hz={"readings": self._rate.rate_hz})
 

@@ -116,6 +116,16 @@ def test_an_invalid_reading_is_rejected_and_its_fault_counts(rig: Rig) -> None:
     assert (rig.driver.fault, rig.driver.away) == ("", "")
 
 
+def test_the_status_has_the_reason_of_a_rejected_reading_until_one_is_taken(rig: Rig) -> None:
+    rig.read(position_rad=[0.0] * 5)
+    why = "my_arm.py: read: position_rad has shape (5,), wanted (7,)"
+    assert rig.driver.status().detail["complaint"] == why
+    rig.read(position_rad=[0.0] * 5, fault="the user stop is pressed")
+    assert "complaint" not in rig.driver.status().detail  # the fault matters more
+    rig.read()
+    assert "complaint" not in rig.driver.status().detail
+
+
 def test_the_same_measurement_twice_is_one(rig: Rig) -> None:
     assert rig.read(measured_ns=5) is not None
     assert rig.read(measured_ns=5) is None

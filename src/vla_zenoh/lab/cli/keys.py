@@ -21,18 +21,24 @@ from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.cli.options import JsonOption, options
 from vla_zenoh.cli.output import console, fail, new_table, styled
+from vla_zenoh.cli.plain import warn
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.codec import message
 from vla_zenoh.codec.image import MAX_IMAGE_BYTES
-from vla_zenoh.errors import CodecError, ProfileError
-from vla_zenoh.keys import Keys
+from vla_zenoh.errors import CodecError, ProfileError, nearest
+from vla_zenoh.keys import KEY_PATHS, PART_KEYS, Keys
 from vla_zenoh.lab.cli.output import print_json
+from vla_zenoh.profile import Profile
 from vla_zenoh.sanitize import one_line
 from vla_zenoh.types import NodeStatus
 
 MAX_NUMBER, MAX_TEXT = 40, 400
 """Characters."""
 POLL_S = 0.02
+PATIENCE_S = 3.0
+"""Without a sample for this long, `echo` says so, once."""
+LINK_S = 0.5
+"""How often `echo` looks for its link to the router, and how long it tries to get it back."""
 SETTINGS = ("prompt", "active", "worker", "rate", "speed")
 
 
@@ -177,8 +183,7 @@ def echo(
 ) -> None:
     """Print what is published on a key, decoded."""
     profile = target.load()
-    below = f"{profile.root}/{profile.robot.name}"
-    whole = key if key.startswith(f"{profile.root}/") else f"{below}/{key}"
+    whole = profile.keys.full(key)
     inbox, printed = CallbackRing(256, MAX_IMAGE_BYTES), 0
     with open_session(profile.session) as session:
         try:
@@ -187,17 +192,42 @@ def echo(
             )
         except zenoh.ZError as error:
             fail(f"{whole!r} is not a key expression: {error}", 2)
-        end = time.monotonic() + seconds if seconds is not None else None
-        while (count is None or printed < count) and (end is None or time.monotonic() < end):
+        began = now = time.monotonic()
+        look_at, hinted = began + LINK_S, False
+        while (count is None or printed < count) and (seconds is None or now < began + seconds):
             for arrival in inbox.drain():
                 _print_sample(arrival.sample, as_json)
                 printed += 1
                 if count is not None and printed >= count:
                     break
             time.sleep(POLL_S)
+            now = time.monotonic()
+            if not (printed or hinted) and now > began + PATIENCE_S:
+                warn(f"nothing on {whole} yet{meant(key, profile)}")
+                hinted = True
+            if now > look_at:
+                look_at = now + LINK_S
+                if not list(session.info.links()):
+                    open_session(profile.session, wait_s=LINK_S).close()  # or raise: no router
         subscriber.undeclare()
     if not printed:
-        fail(f"nothing was published on {whole}")
+        fail(f"nothing was published on {whole}{meant(key, profile)}")
+
+
+def meant(key: str, profile: Profile) -> str:
+    """The known key that `key` is like, else where to look; ends a sentence."""
+    whole = profile.keys.full(key)
+    robot = Keys.of(whole, profile.root) or profile.keys
+    known: list[str] = []
+    for name, path in KEY_PATHS.items():
+        for part in profile.part_names if name in PART_KEYS else ("",):
+            any_of = ["*"] * len(path.parameters)
+            known.append(robot.short(path.text(robot.of_part(part), *any_of)))
+    otherwise = "; `vla-zenoh keys` shows those that exist"
+    wanted = zenoh.KeyExpr(whole)
+    if any(wanted.intersects(zenoh.KeyExpr(robot.full(one))) for one in known):
+        return otherwise
+    return nearest(robot.short(whole), known, otherwise)
 
 
 def _print_sample(sample: zenoh.Sample, as_json: bool) -> None:
