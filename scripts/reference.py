@@ -295,6 +295,13 @@ REASONS = {
     "workspace": "chunk: no goal of it is inside the workspace box",
 }
 COUNTERS = {
+    "CAMERA.bad": "times a check began to reject its images",
+    "CAMERA.broken": "images that could not be decoded",
+    "CAMERA.depth": "depth images published",
+    "CAMERA.jpeg": "JPEG images published",
+    "CAMERA.losses": "times the camera was lost",
+    "CAMERA.raw": "raw images published",
+    "CAMERA.resized": "images resized for a model",
     "arm.commands_given": "set-points given to the Python class",
     "arm.missed_ticks": "ticks of the robot node that were skipped",
     "arm.stalls": "times the robot node stood still",
@@ -356,6 +363,8 @@ def counted_in_code() -> tuple[set[str], set[str]]:
                 if name in REJECTING and isinstance(first, ast.Constant):
                     reasons.add(str(first.value))
             if isinstance(node, ast.Subscript) and isinstance(node.value, ast.Attribute):
+                if node.value.attr == "counts" and path.name == "camera_publisher.py":
+                    counters.add(f"CAMERA.{ast.literal_eval(node.slice)}")
                 if node.value.attr.lstrip("_") != "counters":
                     continue
                 if isinstance(node.slice, ast.Constant):
@@ -363,6 +372,7 @@ def counted_in_code() -> tuple[set[str], set[str]]:
                 elif isinstance(node.slice, ast.JoinedStr):  # node.name before the last part
                     last = ast.unparse(node.slice).rpartition(".")[2].rstrip("'")
                     counters |= {name for name in COUNTERS if name.endswith(f".{last}")}
+    counters |= {f"CAMERA.{stream}" for stream in ("raw", "jpeg", "depth")}
     reasons |= {name.removeprefix("refused.") for name in counters if "refused." in name}
     return reasons, {name for name in counters if "refused." not in name}
 
