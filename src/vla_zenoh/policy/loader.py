@@ -269,18 +269,16 @@ def find_maker(file: ModelFile, named: str, method: str) -> Maker:
     module = import_model(file)
     function = getattr(module, named, None)
     if not function:
-        own = [
-            value
-            for value in vars(module).values()
-            if inspect.isclass(value)
-            and value.__module__ == module.__name__
-            and callable(getattr(value, method, None))
-        ]
+        classes = [each for each in vars(module).values() if inspect.isclass(each)]
+        classes = [each for each in classes if each.__module__ == module.__name__]
+        own = [each for each in classes if callable(getattr(each, method, None))]
         if len(own) != 1:
             found = ", ".join(each.__name__ for each in own) or "none"
+            hint = f"name the right one with {named} = ClassName"
+            if method == "infer" and any(callable(getattr(each, "move", None)) for each in classes):
+                hint = "a class with move is a robot's: `vla-zenoh profile check` its profile"
             raise WorkerError(
-                f"{file.path}: wanted one class with a method {method}, found: {found}; "
-                f"name the right one with {named} = ClassName"
+                f"{file.path}: wanted one class with a method {method}, found: {found}; {hint}"
             )
         function = own[0]
     if not callable(function):
