@@ -133,6 +133,8 @@ def robot_urdf(description: str) -> Path:
     except importlib.metadata.PackageNotFoundError as error:
         raise MissingExtraError("example-robot-data", "control") from error
     root = Path(str(package.locate_file("cmeel.prefix/share/example-robot-data/robots")))
+    if not root.is_dir():
+        raise MissingExtraError("example-robot-data", "control")
     path = root / description.removeprefix(ROBOT_DATA_PREFIX)
     if not path.is_file():
         raise ResourceError(

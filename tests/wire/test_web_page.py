@@ -403,7 +403,7 @@ def test_garbage_moves_nothing_and_ends_nothing(chain: Chain, site: Site) -> Non
         '{"do": "beat", "press": 1, "tick": 1e400, "twist": [9,0,0,0,0,0], "opening": 0}',
         '{"do": "hold", "press": -1, "tick": 0}',
         '{"do": "hold", "press": 1, "tick": 9007199254740991}',
-        '{"do": "look", "streams": ["../x"], "hz": 1}',
+        '{"do": "look", "streams": ["../x"], "hz": 1}', '{"do": "enter", "token": "x"}',
     ]  # fmt: skip
     with browsing(site) as browser:
         for number in range(GARBAGE):

@@ -166,7 +166,7 @@ def test_an_imported_class_is_not_taken_for_the_files_own(write) -> None:
     ("text", "match"),
     [
         ("x = 1\n", "wanted one class with a method infer, found: none"),
-        ("class Arm:\n    def move(self, command): ...\n", "is a robot's: `vla-zenoh profile check`"),
+        ("class Arm:\n    def move(self, command): ...\n", "a robot's: `vla-zenoh profile check`"),
         ("def broken(:\n", "cannot be imported: SyntaxError"),
         (
             "import no_such_module_at_all\n",

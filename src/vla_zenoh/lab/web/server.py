@@ -64,8 +64,8 @@ RATE_HZ, BURST = 50.0, 100.0
 PICTURE_POLL_S = 0.01
 POLICY_VIOLATION, TRY_LATER = 1008, 1013
 VIEWERS_TOO = ("runs", "make")
-PICTURES = ("look", "drawn")
-"""Requests of the socket for images."""
+NOT_HERE = ("enter", "look", "drawn")
+"""The first request of a socket, and those of the socket for images."""
 OPERATORS_ONLY = "your token is a viewer's, which may look and nothing else"
 Masked = Callable[[dict[str, Any]], dict[str, Any] | None]
 
@@ -306,12 +306,17 @@ class PageServer:
     async def _read(self, page: Page, text: str) -> None:
         try:
             request = parse(text)
-            if request.do in PICTURES:
-                raise CodecError("malformed", f"{request.do} is no request of this socket")
-            if request.values.get("tick", 0) > time.monotonic() * 1e3:
-                raise CodecError("invalid", f"{request.do}: tick is newer than the last one sent")
         except CodecError as error:
             self._complain(page, "bad_message", str(error))
+            return
+        if request.do in NOT_HERE:
+            self._complain(page, "bad_message", f"{request.do} is no request of this socket now")
+            return
+        if request.values.get("tick", 0) > time.monotonic() * 1e3:
+            why = f"{request.do}: tick is newer than the last one sent"
+            self._complain(page, "bad_message", why)
+            if "press" in request.values:
+                page.tell({"is": "hold_ended", "press": request.values["press"], "why": why})
             return
         if not page.limit.take(time.monotonic()) and request.do != "stop":
             self._complain(page, "too_fast", f"more than {RATE_HZ:g} messages per second")

@@ -353,6 +353,8 @@ def _in_time(make: Callable[[], Any], what: str) -> Any:
     try:
         return made.result(CONNECT_S)
     except TimeoutError as error:
+        if made.done():
+            raise  # its own
         why = f"{what}: no answer within {CONNECT_S:g} s; restart its control box?"
         raise NodeError(why) from error
 
