@@ -103,6 +103,7 @@ class Kinematics:
             self.lower_rad = np.maximum(self.lower_rad, self.ordered(arm_joints, lower))
             self.upper_rad = np.minimum(self.upper_rad, self.ordered(arm_joints, upper))
         moves = (self.lower_rad < self.upper_rad) & (self.velocity_rad_s > 0)
+        moves &= np.isfinite(self.velocity_rad_s)
         for index, name in enumerate(self.arm_joints):
             if not moves[index]:
                 unit = self.unit(index)

@@ -106,7 +106,9 @@ def test_when_a_stream_has_ended_at_rest_the_other_may_begin_and_back_again() ->
 def test_while_the_arm_brakes_the_other_stream_may_not_begin() -> None:
     side = Side()
     assert side.pose(v_m_s=0.02) is None
-    side.tick(SILENT_MS)
+    side.tick(SILENT_MS - 10)
+    assert not side.guard.braking
+    side.tick(10)
     assert side.guard.braking
     assert side.joint() == "other_mode"
     side.tick(1500)
