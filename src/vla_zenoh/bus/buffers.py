@@ -154,14 +154,14 @@ class CallbackRing(SampleBuffer):
 
     def pop(self) -> ReceivedSample | None:
         """The oldest sample."""
-        return self._arrivals.popleft() if self._arrivals else None
+        try:
+            return self._arrivals.popleft()
+        except IndexError:  # none, or another thread took it
+            return None
 
     def drain(self) -> list[ReceivedSample]:
         """All samples, oldest first."""
-        drained: list[ReceivedSample] = []
-        while self._arrivals:
-            drained.append(self._arrivals.popleft())
-        return drained
+        return list(iter(self.pop, None))
 
 
 class LatestSample(CallbackRing):

@@ -70,7 +70,9 @@ def lock_host(profile: Profile, host: str) -> IO[str]:
     name = "-".join((profile.root, profile.robot.name, host, router))
     readable = "".join(c if c.isalnum() or c in "-._" else "_" for c in name)
     # It is never removed: then two could hold it.
-    file = (folder / f"{readable[:200]}.lock").open("a+", encoding="utf-8", errors="replace")
+    path = folder / f"{readable[:200]}.lock"
+    path.touch(mode=0o600)  # another user who could open it could hold it
+    file = path.open("a+", encoding="utf-8", errors="replace")
     file.seek(0)
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -232,8 +232,8 @@ class Supervisor:
 
     def _mourn(self, child: Child, process: subprocess.Popen[str], now: float) -> None:
         stable = now - child.started_s > STABLE_S
-        child.deaths_in_a_row = 1 if stable else child.deaths_in_a_row + 1
-        wait_s = BACKOFF_S[min(child.deaths_in_a_row, len(BACKOFF_S)) - 1]
+        deaths = 1 if stable else child.deaths_in_a_row + 1
+        wait_s = BACKOFF_S[min(deaths, len(BACKOFF_S)) - 1]
         signal_group(process.pid, signal.SIGKILL)  # what it started
         child.process, child.start_again_s = None, now + wait_s
         if child.reader is not None:
@@ -242,12 +242,13 @@ class Supervisor:
         killer = SIGNAL_NAMES.get(-code, f"signal {-code}")  # a real-time signal has no name
         how = f"killed by {killer}" if code < 0 else f"exited with code {code}"
         sentence = how
-        if child.deaths_in_a_row < GIVE_UP_AFTER:
+        if deaths < GIVE_UP_AFTER:
             sentence += f"; starting again in {wait_s:g} s"
         if child.why:
             sentence += f": {child.why}"
         self._report(child, sentence, detail=child.why != "" and child.why == child.end)
         child.end = child.why or how
+        child.deaths_in_a_row = deaths  # last: `down` is read meanwhile
 
     def _report(self, child: Child, sentence: str, *, detail: bool) -> None:
         if detail:

@@ -82,9 +82,11 @@ def recorded_keys(keys: Keys, given: Sequence[str] = (), *, raw: bool = False) -
     if raw:
         found[keys.all_raw_images] = None
     # A key that two expressions match would be received, and recorded, twice.
-    return tuple(
-        each for each in found if not any(covers(other, each) for other in found if other != each)
-    )
+    kept: list[str] = []
+    for each in found:
+        if not any(covers(other, each) for other in kept):
+            kept = [other for other in kept if not covers(each, other)] + [each]
+    return tuple(kept)
 
 
 class Recorder:
