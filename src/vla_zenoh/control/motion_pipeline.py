@@ -26,7 +26,7 @@ from vla_zenoh.control.preflight import (
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.smoothing import FULL, Shares
 from vla_zenoh.control.states import OBEYING, State
-from vla_zenoh.control.step_timing import GoalPace, Order
+from vla_zenoh.control.step_timing import GoalPace, TimedGoal
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.kinematics.so3 import Pose, held_pose, pose_distance, pose_of
 from vla_zenoh.profile import Profile
@@ -376,8 +376,8 @@ class MotionPipeline:
                     name, value, limit = hits[0][:3]
                     events.append(make_event("warning", "limit", name, "leash", value, limit))
                 goal = self._shorten(plans, goal, short, now_ns)
-            order = Order(goal, timeline.plan, task.rate_hz, overdue_ns, now_ns)
-            events += self.pace.set_out(mover, order, slower)
+            timed = TimedGoal(goal, timeline.plan, task.rate_hz, overdue_ns, now_ns)
+            events += self.pace.set_out(mover, timed, slower)
             self.goal = goal
             self.gripper.request(goal.width_m)
         return events
@@ -400,7 +400,7 @@ class MotionPipeline:
             return False
         if mover.leash(goal, self._dt_s)[1]:
             return False
-        self.pace.plan_ahead(mover, Order(goal, plans[0], task.rate_hz, overdue_ns, next_ns))
+        self.pace.plan_ahead(mover, TimedGoal(goal, plans[0], task.rate_hz, overdue_ns, next_ns))
         return True
 
     def _shorten(self, plans: Sequence[Plan], goal: Goal, cut: Goal, now_ns: int) -> Goal:

@@ -191,7 +191,7 @@ def _stop_s(speed: float, most: float, jerk: float) -> float:
     return speed / most + most / jerk
 
 
-class Order(NamedTuple):
+class TimedGoal(NamedTuple):
     """Where to go, from when on, and when the watchdog brakes unless a chunk arrives."""
 
     goal: Goal
@@ -202,7 +202,7 @@ class Order(NamedTuple):
 
 
 class _Ahead(NamedTuple):
-    """The motion of an order, computed before the tick in which it is expected to begin.
+    """The motion of a goal, computed before the tick in which it is expected to begin.
 
     Args:
         of: what it depends on: objects that do not change,
@@ -268,53 +268,53 @@ class GoalPace:
             return True
         return (1.0 if slower is None else slower.share) != self.speed
 
-    def plan_ahead(self, mover: Mover, order: Order) -> None:
-        """Compute the motion of an order that is expected in the next tick."""
-        before, self.slower = self.slower, self.slowest(order.goal)
-        self._ahead = self._motion_to(mover, order)
+    def plan_ahead(self, mover: Mover, timed: TimedGoal) -> None:
+        """Compute the motion of a goal that is expected in the next tick."""
+        before, self.slower = self.slower, self.slowest(timed.goal)
+        self._ahead = self._motion_to(mover, timed)
         self.slower = before
 
     def forget_ahead(self) -> None:
         """Compute it again: its bounds have changed."""
         self._ahead = None
 
-    def set_out(self, mover: Mover, order: Order, slower: Slowdown | None) -> list[Event]:
-        """Carry out an order; reports each reason for being `slower` once per activation."""
+    def set_out(self, mover: Mover, timed: TimedGoal, slower: Slowdown | None) -> list[Event]:
+        """Carry out a goal; reports each reason for being `slower` once per activation."""
         self.slower, events = slower, list[Event]()
         if slower is not None and slower.name not in (APPROACH, *self._slowed_by):
             self._slowed_by.add(slower.name)
             name, _, value, limit, *_ = slower
             events.append(make_event("info", "limit", name, f"slower{slower.at}", value, limit))
         ahead, self._ahead = self._ahead, None
-        of, at = self._depends_on(mover, order)
+        of, at = self._depends_on(mover, timed)
         if ahead is None or ahead.at != at or not all(map(is_, ahead.of, of)):
-            ahead = self._motion_to(mover, order)
+            ahead = self._motion_to(mover, timed)
         self._timings[isinstance(mover, JointPath)] = ahead.timing
         mover.adopt(ahead.mover)  # pyright: ignore
         self.slowing &= not (ahead.enough and _within(mover, self.override))
         return events
 
     def _depends_on(
-        self, mover: Mover, order: Order
+        self, mover: Mover, timed: TimedGoal
     ) -> tuple[tuple[object, ...], tuple[float, ...]]:
-        """The objects and numbers that the motion of an order depends on."""
-        goal, plan, rate_hz, overdue_ns, now_ns = order
+        """The objects and numbers that the motion of a goal depends on."""
+        goal, plan, rate_hz, overdue_ns, now_ns = timed
         index, shares = plan.index_at(now_ns), (self.speed, self.override, self.slowing)
         return (goal, plan, mover, mover.state), (now_ns, overdue_ns, rate_hz, index, *shares)
 
-    def _motion_to(self, mover: Mover, order: Order) -> _Ahead:
-        """The motion of an order from the present state."""
-        (of, at), in_joints = self._depends_on(mover, order), isinstance(mover, JointPath)
+    def _motion_to(self, mover: Mover, timed: TimedGoal) -> _Ahead:
+        """The motion of a goal from the present state."""
+        (of, at), in_joints = self._depends_on(mover, timed), isinstance(mover, JointPath)
         timing, mover = self._timings.get(in_joints), mover.fork()
         timing = StepTiming(mover.box) if timing is None else timing.fork()
-        shares = self._shares(timing, mover, order)
+        shares = self._shares(timing, mover, timed)
         hard = self.slowing and (in_joints or not self._joints_follow)
-        enough = mover.target(order.goal, shares, all_to_stop=hard)
+        enough = mover.target(timed.goal, shares, all_to_stop=hard)
         return _Ahead(of, at, timing, mover, enough)
 
-    def _shares(self, timing: StepTiming, mover: Mover, order: Order) -> Shares:
+    def _shares(self, timing: StepTiming, mover: Mover, timed: TimedGoal) -> Shares:
         """Shares of the limits that the arm has on the way to a goal."""
-        goal, plan, rate_hz, overdue_ns, now_ns = order
+        goal, plan, rate_hz, overdue_ns, now_ns = timed
         override, speed = self.override, self.speed * self.override
         if not plan.soonest:
             way, (velocity, _) = mover.way_to(goal), mover.axis_rates()
