@@ -271,7 +271,7 @@ class GoalPace:
     def plan_ahead(self, mover: Mover, timed: TimedGoal) -> None:
         """Compute the motion of a goal that is expected in the next tick."""
         before, self.slower = self.slower, self.slowest(timed.goal)
-        self._ahead = self._motion_to(mover, timed)
+        self._ahead = self._motion_to(mover, timed, *self._depends_on(mover, timed))
         self.slower = before
 
     def forget_ahead(self) -> None:
@@ -288,7 +288,7 @@ class GoalPace:
         ahead, self._ahead = self._ahead, None
         of, at = self._depends_on(mover, timed)
         if ahead is None or ahead.at != at or not all(map(is_, ahead.of, of)):
-            ahead = self._motion_to(mover, timed)
+            ahead = self._motion_to(mover, timed, of, at)
         self._timings[isinstance(mover, JointPath)] = ahead.timing
         mover.adopt(ahead.mover)  # pyright: ignore
         self.slowing &= not (ahead.enough and _within(mover, self.override))
@@ -302,9 +302,11 @@ class GoalPace:
         index, shares = plan.index_at(now_ns), (self.speed, self.override, self.slowing)
         return (goal, plan, mover, mover.state), (now_ns, overdue_ns, rate_hz, index, *shares)
 
-    def _motion_to(self, mover: Mover, timed: TimedGoal) -> _Ahead:
-        """The motion of a goal from the present state."""
-        (of, at), in_joints = self._depends_on(mover, timed), isinstance(mover, JointPath)
+    def _motion_to(
+        self, mover: Mover, timed: TimedGoal, of: tuple[object, ...], at: tuple[float, ...]
+    ) -> _Ahead:
+        """The motion of a goal from the present state, which `of` and `at` describe."""
+        in_joints = isinstance(mover, JointPath)
         timing, mover = self._timings.get(in_joints), mover.fork()
         timing = StepTiming(mover.box) if timing is None else timing.fork()
         shares = self._shares(timing, mover, timed)
