@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import getpass
 import json
 import logging
 import logging.handlers
@@ -37,7 +36,6 @@ from vla_zenoh.errors import NodeError
 from vla_zenoh.keys import ROLLING
 from vla_zenoh.resources import is_path, profile_file
 from vla_zenoh.runtime.process import DETAIL, FATAL, die_with_parent, stop_on_signals
-from vla_zenoh.runtime.systemd_unit import systemd_unit
 
 if TYPE_CHECKING:
     from vla_zenoh.profile import Profile
@@ -46,8 +44,6 @@ if TYPE_CHECKING:
 LOG_BYTES = 10 * 1024 * 1024
 COLOURS = ("cyan", "magenta", "green", "yellow", "blue", "bright_cyan", "bright_magenta")
 CHECK_PATIENCE_S = 60.0
-KEPT = ("VLA_ZENOH_PATH", "XDG_CONFIG_HOME", "XDG_STATE_HOME")
-"""Variables that a systemd unit sets as they are."""
 
 
 def up(
@@ -73,30 +69,12 @@ def up(
         typer.Option("--no-record", help="Keep no rolling record of the last minutes."),
     ] = False,
     as_json: JsonOption = False,
-    print_unit: Annotated[
-        bool, typer.Option("--print-unit", help="Print a systemd unit that does this, and exit.")
-    ] = False,
 ) -> None:
     """Start and supervise all nodes of this host. Ctrl-C brakes the arm, then ends them.
 
     The profile is checked first, as `profile check` does; nothing starts if it cannot run.
     """
     endpoints = repeated({"--connect": connect, "--listen": listen})
-    if print_unit:
-        from vla_zenoh.runtime.launch import choose_host
-
-        loaded = effective_profile(profile, connect, listen)
-        name, _ = choose_host(loaded, host)
-        named = str(profile_file(profile).absolute()) if is_path(profile) else profile
-        words = [sys.executable, "-m", "vla_zenoh", "up", named, "--host", name]
-        words += [*endpoints, *repeated({"--also": also})]
-        words += ["--dry-run"] * dry_run + ["--verbose"] * verbose + ["--json"] * as_json
-        words += ["--no-record"] * no_record
-        words += ["--log-dir", str(log_dir.absolute())] if log_dir else []
-        kept = {key: os.environ[key] for key in KEPT if key in os.environ}
-        what = f"robot {loaded.robot.name}, host {name}"
-        print(systemd_unit(what, words, getpass.getuser(), kept), end="")
-        return
     hosts = [] if host is None else ["--host", host]
     with profile_check([profile, *hosts, *endpoints]) as check:
         from vla_zenoh.runtime.launch import Host, choose_host, lock_host  # meanwhile

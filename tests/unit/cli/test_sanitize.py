@@ -236,7 +236,6 @@ def fault(node: ast.AST, rich: set[str]) -> str:
 PRINTS = {
     "cli/main.py": "the version",
     "cli/plain.py": "lines made printable there",
-    "cli/up.py": "a systemd unit as a file",
     "cli/nodes.py": "the profile's name, for a program that waits for it",
     "lab/cli/profile.py": "a profile or a bridge's configuration as a file",
     "lab/web/making.py": "the share that is done, for the server that began it",
