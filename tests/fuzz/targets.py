@@ -44,7 +44,8 @@ from vla_zenoh.lab.tasks.order import parse_prompt
 from vla_zenoh.policy import ActionSpec, ModelSpec, ObservationSpec
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import load_profile
-from vla_zenoh.ros2 import attachment, readers
+from vla_zenoh.ros2 import readers
+from vla_zenoh.ros2.keys import Attachment
 from vla_zenoh.ros2.messages import Messages, parse
 from vla_zenoh.types import Depth, Event, Header, InferenceDebug, NodeStatus
 
@@ -441,7 +442,7 @@ def _targets() -> Iterator[Target]:
     )
     # -- ROS 2
     yield Target(
-        "ros2-attachment", attachment.decode, codec, lambda: [bytes(16) + b"\x10" + bytes(16)]
+        "ros2-attachment", Attachment.decode, codec, lambda: [bytes(16) + b"\x10" + bytes(16)]
     )
     for kind in readers.READERS:
         yield Target(

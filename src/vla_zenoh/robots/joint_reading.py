@@ -16,8 +16,8 @@ from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import Pose, quat_from_rotation
 from vla_zenoh.profile import Profile
 from vla_zenoh.robots.driver import Measurement
-from vla_zenoh.ros2.samples import Joints
 from vla_zenoh.types import FloatArray, GripperState, JointState, PoseState
+from vla_zenoh.types.records import Joints
 
 MOVING_M_S = 0.002
 """Fingers faster than this move."""

@@ -19,10 +19,9 @@ from vla_zenoh.profile import Profile
 from vla_zenoh.robot import Reading, numbers
 from vla_zenoh.robots.driver import DriverStatus, Measurement, RobotDriver, command_of
 from vla_zenoh.robots.joint_reading import JointReading
-from vla_zenoh.ros2.samples import Joints
 from vla_zenoh.sanitize import one_line
 from vla_zenoh.types import Event, FloatArray, GripperCommand, GripperState
-from vla_zenoh.types.records import JointReference, PoseReference
+from vla_zenoh.types.records import JointReference, Joints, PoseReference
 
 FUTURE_NS = 100_000_000
 MAX_WORDS = 300

@@ -1,4 +1,5 @@
-"""Names and key expressions of the ROS 2 side, for both transports. The only file with such text.
+"""Names, key expressions and attachments of the ROS 2 side, for both transports: the only file
+with such text.
 
 ``ros2dds``: the names zenoh-bridge-ros2dds gives to topics and services, and the liveliness tokens
 by which bridges tell each other what to route. ``rmw_zenoh``: those of robots that run rmw_zenoh.
@@ -7,17 +8,21 @@ by which bridges tell each other what to route. ``rmw_zenoh``: those of robots t
 from __future__ import annotations
 
 import re
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
+from hashlib import blake2b
 from typing import NamedTuple
 
-from vla_zenoh.errors import ProfileError
+from vla_zenoh.errors import CodecError, ProfileError
 
 _TYPE = re.compile(r"([a-z][a-z0-9_]*)/(msg|srv|action)/([A-Za-z][A-Za-z0-9_]*)")
 CANCEL_GOAL = "action_msgs/srv/CancelGoal"
 _SLASH_OF_BRIDGES = "§"
 _SLASH_OF_RMW = "%"
+GID_BYTES = 16
+_ATTACHMENT = struct.Struct(f"<qqB{GID_BYTES}s")
 
 
 def split_type(kind: str) -> tuple[str, str, str]:
@@ -189,3 +194,37 @@ class RmwZenoh:
 
 Wire = Ros2Dds | RmwZenoh
 """How the ROS side names and announces endpoints."""
+
+
+# -- attachments of rmw_zenoh ----------------------------------------------------------------------
+class Attachment(NamedTuple):
+    """Sequence number, source time and writer of a sample, request or reply.
+
+    A ROS 2 subscriber drops samples without it; a reply repeats number and gid of its request.
+    """
+
+    seq: int
+    stamp_ns: int
+    gid: bytes
+
+    def encode(self) -> bytes:
+        """33 bytes: ``int64 seq, int64 stamp_ns, uint8 16, 16 bytes gid``, little-endian."""
+        return _ATTACHMENT.pack(self.seq, self.stamp_ns, GID_BYTES, self.gid)
+
+    @classmethod
+    def decode(cls, payload: bytes | None) -> Attachment:
+        """Read the 33 bytes, or raise a `CodecError`: ``no_attachment``, or ``malformed``."""
+        if payload is None:
+            raise CodecError("no_attachment", "rmw_zenoh sends an attachment with everything")
+        if len(payload) != _ATTACHMENT.size:
+            why = f"an attachment of {len(payload)} bytes, wanted {_ATTACHMENT.size}"
+            raise CodecError("malformed", why)
+        seq, stamp_ns, length, gid = _ATTACHMENT.unpack(payload)
+        if length != GID_BYTES or seq < 0 or stamp_ns < 0:
+            raise CodecError("malformed", "an attachment of another layout")
+        return cls(seq, stamp_ns, gid)
+
+
+def gid_of(token: str) -> bytes:
+    """GID of a writer: 16 bytes derived from its liveliness token, which is unique."""
+    return blake2b(token.encode(), digest_size=GID_BYTES).digest()

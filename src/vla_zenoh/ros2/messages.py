@@ -35,6 +35,7 @@ NO_HASH = "TypeHashNotSupported"
 """In place of a hash where the distribution has none (Humble)."""
 MAX_MESSAGE_BYTES = 4 * 1024 * 1024
 MAX_PICTURE_BYTES = 128 * 1024 * 1024
+SECOND_NS = 1_000_000_000
 _EVENT_INFO = "service_msgs/msg/ServiceEventInfo"
 _SEPARATOR = "---"
 _SUFFIXES = (".msg", ".srv", ".action")

@@ -1,9 +1,12 @@
-"""Decoders of received ROS messages. A new type is a function and a row in `READERS`."""
+"""Decoders of received ROS messages. A new type is a function and a row in `READERS`.
+
+Numbers are as they came: finiteness and meaning are checked where a record is made of them.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -11,15 +14,31 @@ from numpy.typing import NDArray
 
 from vla_zenoh.codec.image import PNG_BEGINS, check_size, decode_jpeg, decode_png
 from vla_zenoh.errors import CodecError
-from vla_zenoh.ros2.messages import MAX_MESSAGE_BYTES, MAX_PICTURE_BYTES, Messages
-from vla_zenoh.ros2.samples import SECOND_NS, Joints, RosImage, Wrench
+from vla_zenoh.ros2.messages import MAX_MESSAGE_BYTES, MAX_PICTURE_BYTES, SECOND_NS, Messages
 from vla_zenoh.types import MAX_NAMES, FloatArray
+from vla_zenoh.types.records import Joints
 
 JOINT_STATE, WRENCH = "sensor_msgs/msg/JointState", "geometry_msgs/msg/WrenchStamped"
 IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 TEXT = "std_msgs/msg/String"
 CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1}
 _JPEG = b"\xff\xd8\xff"
+
+
+class RosImage(NamedTuple):
+    """Image of a camera, with stamp and frame of its header; `rgb` may be a read-only view."""
+
+    stamp_ns: int
+    frame: str
+    rgb: NDArray[np.uint8]
+
+
+class Wrench(NamedTuple):
+    """A geometry_msgs/WrenchStamped: (6,) N and Nm in the axes of `frame`."""
+
+    stamp_ns: int
+    frame: str
+    wrench: FloatArray
 
 
 def read(messages: Messages, kind: str, payload: bytes) -> Any:

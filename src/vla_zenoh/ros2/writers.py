@@ -1,4 +1,4 @@
-"""Messages that command a ROS 2 robot: poses, joint positions, gripper openings.
+"""Messages that command a ROS 2 robot (poses, joint positions, gripper openings) or show status.
 
 A pose can be sent as any message with a pose in it, your own too. Its fields are filled by their
 types: ``geometry_msgs/Pose`` (or ``PoseStamped``) gets the pose, ``std_msgs/Header`` stamp and
@@ -8,16 +8,15 @@ has joints the posture of its nullspace. The rest stays zero.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 from rosbags.interfaces import Nodetype
 
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.ros2.messages import Messages
-from vla_zenoh.ros2.samples import SECOND_NS, Stamp
-from vla_zenoh.types import FloatArray, JointCommand, PoseCommand
+from vla_zenoh.ros2.messages import SECOND_NS, Messages
+from vla_zenoh.types import FloatArray, JointCommand, NodeStatus, PoseCommand
 
 POSE, POSE_STAMPED = "geometry_msgs/msg/Pose", "geometry_msgs/msg/PoseStamped"
 TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
@@ -25,6 +24,21 @@ NUMBER, NUMBERS = "std_msgs/msg/Float64", "std_msgs/msg/Float64MultiArray"
 _HEADER, _TWIST = "std_msgs/msg/Header", "geometry_msgs/msg/Twist"
 NOW_NS = 0
 """A trajectory's stamp of zero means: from now on, whatever the robot's clock says."""
+DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
+OK, WARN, ERROR, STALE = range(4)
+BAD = frozenset(
+    {"fault", "stopped", "degraded", "braking", "waiting", "silent", "stalled", "unheeded"}
+)
+MAX_VALUE = 200
+PLAIN = (str, int, float, bool)
+
+
+class Stamp(NamedTuple):
+    """Stamp and frame for the header of a message."""
+
+    stamp_ns: int
+    frame: str
+
 
 Write = Callable[[Any, Stamp], Any]
 """Command and stamp -> message."""
@@ -148,3 +162,48 @@ def _pose(messages: Messages, command: PoseCommand) -> Any:
 def _xyz(messages: Messages, kind: str, values: FloatArray) -> Any:
     x, y, z = values.tolist()
     return messages.new(kind, x=x, y=y, z=z)
+
+
+# -- status of our nodes, for rqt_robot_monitor and the like --------------------------------------
+def diagnostics(
+    messages: Messages,
+    robot: str,
+    nodes: Mapping[str, tuple[NodeStatus, float, bool]],
+    stamp: Stamp,
+) -> Any:
+    """One entry for each node of a robot; `nodes` has their status, its age in s, and alive."""
+    return messages.new(
+        DIAGNOSTICS,
+        header=header(messages, stamp),
+        status=[_diagnostic(messages, robot, *node) for node in nodes.values()],
+    )
+
+
+def _diagnostic(
+    messages: Messages, robot: str, status: NodeStatus, age_s: float, alive: bool
+) -> Any:
+    level = STALE if not alive else WARN if status.state in BAD else OK
+    if status.state == "fault":
+        level = ERROR
+    why = str(status.detail.get("why", ""))
+    values = {
+        "age_s": f"{age_s:.2f}",
+        **{f"{name}_hz": f"{rate_hz:.1f}" for name, rate_hz in status.rates_hz.items()},
+        **{
+            f"{name}_ms": f"p50 {p50:.1f}, p95 {p95:.1f}"
+            for name, (p50, p95) in status.latency_ms.items()
+        },
+        **{name: str(value) for name, value in status.detail.items() if isinstance(value, PLAIN)},
+        **{name: str(count) for name, count in status.counters.items() if count},
+    }
+    return messages.new(
+        "diagnostic_msgs/msg/DiagnosticStatus",
+        level=level,
+        name=f"vla-zenoh/{robot}: {status.node}",
+        message=f"{status.state}: {why}" if why else status.state,
+        hardware_id=status.host,
+        values=[
+            messages.new("diagnostic_msgs/msg/KeyValue", key=key, value=value[:MAX_VALUE])
+            for key, value in values.items()
+        ],
+    )

@@ -457,3 +457,18 @@ class JointReference(NamedTuple):
         """Standing at `position_rad`, of which it keeps a copy."""
         zeros = np.zeros(len(position_rad))
         return cls(np.array(position_rad, float), zeros, zeros)
+
+
+class Joints(NamedTuple):
+    """Any n joints as a robot reports them, in rad or m, before arm and fingers are told apart.
+
+    Numbers are as they came: finiteness and meaning are checked where a record is made of them.
+    `stamp_ns` is 0 where the robot did not stamp it; velocity and effort (n,) are None where it
+    does not report them.
+    """
+
+    stamp_ns: int
+    names: tuple[str, ...]
+    position: FloatArray
+    velocity: FloatArray | None
+    effort: FloatArray | None

@@ -16,7 +16,7 @@ from vla_zenoh.kinematics.fingers import Fingers
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.profile import GripperProfile, JointEnds, Profile, load_profile
 from vla_zenoh.robots.joint_reading import MOVING_M_S, JointReading
-from vla_zenoh.ros2.samples import Joints
+from vla_zenoh.types.records import Joints
 
 EXACT_M = 1e-12
 STROKE_M, SHUT_RAD = 0.085, 0.8

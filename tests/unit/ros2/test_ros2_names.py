@@ -7,17 +7,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vla_zenoh.errors import CodecError, ProfileError
-from vla_zenoh.ros2 import attachment as attachments
-from vla_zenoh.ros2.attachment import Attachment
 from vla_zenoh.ros2.keys import (
     COMMAND,
     DEFAULT,
+    GID_BYTES,
     SENSOR,
+    Attachment,
     Endpoint,
     EntityRole,
     RmwZenoh,
     Ros2Dds,
     dds_type,
+    gid_of,
     parts_of,
 )
 
@@ -104,9 +105,9 @@ def test_what_is_the_default_is_left_out_of_rmw_zenohs_qos(qos: object, text: st
 
 @given(st.integers(0, 2**63 - 1), st.integers(0, 2**63 - 1), st.binary(min_size=16, max_size=16))
 def test_an_attachment_comes_back(seq: int, stamp_ns: int, gid: bytes) -> None:
-    payload = attachments.encode(Attachment(seq, stamp_ns, gid))
+    payload = Attachment(seq, stamp_ns, gid).encode()
     assert len(payload) == 33
-    assert attachments.decode(payload) == Attachment(seq, stamp_ns, gid)
+    assert Attachment.decode(payload) == Attachment(seq, stamp_ns, gid)
 
 
 def test_an_attachment_has_the_layout_that_zenoh_serialises() -> None:
@@ -114,13 +115,13 @@ def test_an_attachment_has_the_layout_that_zenoh_serialises() -> None:
 
     gid = bytes(range(16))
     theirs = ext.z_serialize((ext.Int64(3), ext.Int64(9), gid)).to_bytes()
-    assert attachments.encode(Attachment(3, 9, gid)) == theirs
+    assert Attachment(3, 9, gid).encode() == theirs
 
 
 @given(st.binary(max_size=40))
 def test_other_bytes_are_no_attachment(payload: bytes) -> None:
     try:
-        attachments.decode(payload)
+        Attachment.decode(payload)
     except CodecError as error:
         assert error.reason == "malformed"  # noqa: PT017
     else:
@@ -129,10 +130,10 @@ def test_other_bytes_are_no_attachment(payload: bytes) -> None:
 
 def test_a_missing_attachment_is_told() -> None:
     with pytest.raises(CodecError) as caught:
-        attachments.decode(None)
+        Attachment.decode(None)
     assert caught.value.reason == "no_attachment"
 
 
 def test_a_gid_is_made_of_the_token() -> None:
-    assert attachments.gid_of("a") == attachments.gid_of("a") != attachments.gid_of("b")
-    assert len(attachments.gid_of("a")) == attachments.GID_BYTES
+    assert gid_of("a") == gid_of("a") != gid_of("b")
+    assert len(gid_of("a")) == GID_BYTES

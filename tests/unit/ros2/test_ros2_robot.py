@@ -23,8 +23,8 @@ from vla_zenoh.robots.joint_reading import (
     StampFilter,
 )
 from vla_zenoh.ros2.gripper_actions import GoalSequencer, GoalStep
-from vla_zenoh.ros2.samples import Joints
 from vla_zenoh.types import GripperCommand
+from vla_zenoh.types.records import Joints
 
 FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
 ALL = (*ARM_JOINTS, *FINGERS)

@@ -11,7 +11,7 @@ import pytest
 from vla_zenoh.errors import CodecError, ProfileError
 from vla_zenoh.profile import GripperProfile
 from vla_zenoh.profile.robot import Ros2Gripper
-from vla_zenoh.ros2 import diagnostics, readers
+from vla_zenoh.ros2 import readers
 from vla_zenoh.ros2.gripper_actions import (
     GRASP,
     GRIPPER_COMMAND,
@@ -23,8 +23,16 @@ from vla_zenoh.ros2.gripper_actions import (
     send_goal,
 )
 from vla_zenoh.ros2.messages import Messages
-from vla_zenoh.ros2.samples import RosImage, Stamp
-from vla_zenoh.ros2.writers import Write, joint_writer, pose_writer, position_message
+from vla_zenoh.ros2.readers import RosImage
+from vla_zenoh.ros2.writers import (
+    DIAGNOSTICS,
+    Stamp,
+    Write,
+    diagnostics,
+    joint_writer,
+    pose_writer,
+    position_message,
+)
 from vla_zenoh.types import GripperCommand, JointCommand, NodeStatus, PoseCommand
 
 M = Messages(
@@ -347,8 +355,8 @@ def test_a_nodes_status_becomes_a_diagnostic(state: str, alive: bool, level: int
         counters={"refused.stale": 3, "nothing": 0},
         detail={"why": "because", "deep": {"a": 1}},
     )
-    message = diagnostics.write(M, "panda", {"command": (status, 0.1, alive)}, STAMP)
-    (entry,) = M.decode(diagnostics.TYPE, M.encode(message)).status
+    message = diagnostics(M, "panda", {"command": (status, 0.1, alive)}, STAMP)
+    (entry,) = M.decode(DIAGNOSTICS, M.encode(message)).status
     assert entry.level == level
     assert entry.name == "vla-zenoh/panda: command"
     assert entry.message == f"{state}: because"

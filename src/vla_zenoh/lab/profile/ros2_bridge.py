@@ -17,10 +17,10 @@ from vla_zenoh.profile.session import (
     host_of,
     is_loopback,
 )
-from vla_zenoh.ros2 import diagnostics
 from vla_zenoh.ros2.gripper_actions import GRASP
 from vla_zenoh.ros2.keys import PROMPT_TOPIC, SERVICES, STATUS_TOPIC, Endpoint, EntityRole
 from vla_zenoh.ros2.readers import JOINT_STATE, TEXT, WRENCH
+from vla_zenoh.ros2.writers import DIAGNOSTICS
 
 PROGRAM = "zenoh-bridge-ros2dds"
 ALLOWED_AS = {
@@ -205,4 +205,4 @@ def _services(prefix: str) -> Iterator[Endpoint]:
     for service in SERVICES:
         yield Endpoint(EntityRole.SERVER, f"{prefix}/{service.name}", service.type)
     yield Endpoint(EntityRole.SUBSCRIBER, f"{prefix}/{PROMPT_TOPIC}", TEXT)
-    yield Endpoint(EntityRole.PUBLISHER, f"{prefix}/{STATUS_TOPIC}", diagnostics.TYPE)
+    yield Endpoint(EntityRole.PUBLISHER, f"{prefix}/{STATUS_TOPIC}", DIAGNOSTICS)

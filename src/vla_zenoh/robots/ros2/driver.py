@@ -36,9 +36,8 @@ from vla_zenoh.robots.ros2.ros_graph import RosGraph
 from vla_zenoh.robots.ros2.ros_services import RosServices
 from vla_zenoh.ros2.keys import COMMAND, SENSOR
 from vla_zenoh.ros2.messages import MAX_PICTURE_BYTES, Messages
-from vla_zenoh.ros2.readers import JOINT_STATE, WRENCH, read
-from vla_zenoh.ros2.samples import RosImage, Stamp, Wrench
-from vla_zenoh.ros2.writers import Write, joint_writer, pose_writer
+from vla_zenoh.ros2.readers import JOINT_STATE, WRENCH, RosImage, Wrench, read
+from vla_zenoh.ros2.writers import Stamp, Write, joint_writer, pose_writer
 from vla_zenoh.runtime.process import ROUTER_PATIENCE_S
 from vla_zenoh.types import Event, FloatArray, GripperCommand, GripperState
 from vla_zenoh.types.records import JointReference, PoseReference

@@ -14,16 +14,16 @@ import zenoh
 from vla_zenoh.bus.buffers import CallbackRing, LatestSample, bytes_of
 from vla_zenoh.errors import CodecError
 from vla_zenoh.profile.robot import Ros2Profile
-from vla_zenoh.ros2 import attachment as attachments
-from vla_zenoh.ros2.attachment import Attachment
 from vla_zenoh.ros2.keys import (
     DEFAULT,
+    Attachment,
     Endpoint,
     EntityRole,
     Qos,
     RmwZenoh,
     Ros2Dds,
     Wire,
+    gid_of,
     parts_of,
 )
 from vla_zenoh.ros2.messages import Messages
@@ -95,7 +95,7 @@ class ServiceClient:
 def _attachment(gid: bytes | None, seq: itertools.count[int]) -> bytes | None:
     if gid is None:
         return None
-    return attachments.encode(Attachment(next(seq), time.time_ns(), gid))
+    return Attachment(next(seq), time.time_ns(), gid).encode()
 
 
 class Request:
@@ -108,13 +108,13 @@ class Request:
         if with_attachment:
             given = query.attachment
             payload = None if given is None else bytes_of(given, MAX_ATTACHMENT_BYTES)
-            self._attachment = attachments.decode(payload)
+            self._attachment = Attachment.decode(payload)
 
     def answer(self, response: bytes) -> None:
         """Reply with CDR bytes, and with number and gid of the request."""
         given, attachment = self._attachment, None
         if given is not None:
-            attachment = attachments.encode(Attachment(given.seq, time.time_ns(), given.gid))
+            attachment = given._replace(stamp_ns=time.time_ns()).encode()
         with self._query:
             self._query.reply(self._key, response, encoding=_CDR, attachment=attachment)
 
@@ -170,7 +170,7 @@ class RosGraph:
         """Declare an endpoint; its key, and its gid if the wire format has gids."""
         token = self._wire.token(endpoint, next(self._numbers))
         self._declared.append(self.session.liveliness().declare_token(token))
-        return self._wire.key(endpoint), attachments.gid_of(token) if self._rmw else None
+        return self._wire.key(endpoint), gid_of(token) if self._rmw else None
 
     def subscribe(self, name: str, kind: str, buffer: Buffer, qos: Qos = DEFAULT) -> Buffer:
         """Subscribe to a topic; its samples go to `buffer`."""

@@ -22,7 +22,6 @@ from vla_zenoh.codec import settings
 from vla_zenoh.errors import CodecError, SessionError
 from vla_zenoh.profile import Profile
 from vla_zenoh.robots.ros2.ros_graph import Request, RosGraph
-from vla_zenoh.ros2 import diagnostics
 from vla_zenoh.ros2.keys import (
     PROMPT_TOPIC,
     RESET,
@@ -36,7 +35,7 @@ from vla_zenoh.ros2.keys import (
 )
 from vla_zenoh.ros2.messages import Messages
 from vla_zenoh.ros2.readers import TEXT, read
-from vla_zenoh.ros2.samples import Stamp
+from vla_zenoh.ros2.writers import DIAGNOSTICS, Stamp, diagnostics
 
 STATUS_PERIOD_S = 1.0
 POLL_S = 0.05
@@ -118,7 +117,7 @@ class RosServices:
             graph.serve(f"{prefix}/{service.name}", service.type, partial(self._enqueue, service))
         self._prompt_topic, self._prompt = f"{prefix}/{PROMPT_TOPIC}", ""
         self._prompts = graph.subscribe(self._prompt_topic, TEXT, CallbackRing(MAX_WAITING))
-        self._status = graph.publisher(f"{prefix}/{STATUS_TOPIC}", diagnostics.TYPE)
+        self._status = graph.publisher(f"{prefix}/{STATUS_TOPIC}", DIAGNOSTICS)
 
     def _enqueue(self, service: Service, request: Request) -> None:
         if service is STOP:  # overtakes the calls in the queue
@@ -228,7 +227,7 @@ class RosServices:
         return "; ".join(done)
 
     def _publish_status(self) -> None:
-        message = diagnostics.write(
+        message = diagnostics(
             self._messages, self._robot, self._client.snapshot(), Stamp(time.time_ns(), "")
         )
         self._status.publish(self._messages.encode(message))
