@@ -7,8 +7,9 @@ dropped when its writer no longer controls the arm.
 
 from __future__ import annotations
 
-from enum import Enum
-from typing import Any, NamedTuple
+import secrets
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -23,6 +24,7 @@ GRIPPER_COMMAND = "control_msgs/action/GripperCommand"
 PARALLEL_COMMAND = "control_msgs/action/ParallelGripperCommand"
 SUCCEEDED = 4
 """action_msgs/GoalStatus.STATUS_SUCCEEDED."""
+ID_BYTES = 16
 
 
 class GripperOutcome(NamedTuple):
@@ -49,7 +51,7 @@ def send_goal(
     position: float,
     max_width_m: float,
 ) -> Any:
-    """The request that begins a goal with an id of 16 bytes.
+    """The request that begins a goal with this id.
 
     `position` is the opening as the driver takes it, see the function; `MOVE` and `GRASP` take
     widths. A grasp succeeds at whatever width up to `max_width_m`.
@@ -102,16 +104,15 @@ def outcome(action: str, response: Any) -> GripperOutcome:
 
 
 # -- order of goals -------------------------------------------------------------------------------
-class GoalStep(Enum):
-    SEND = "send"
-    CANCEL = "cancel"
+@dataclass(eq=False, slots=True)
+class ActionGoal:
+    """A goal, and when it was sent, accepted or cancelled last."""
 
-
-class ActionGoal(NamedTuple):
-    """A goal, identified by its number."""
-
-    number: int
     command: GripperCommand
+    since_ns: int
+    accepted: bool = False
+    cancelling: bool = False
+    id: bytes = field(default_factory=lambda: secrets.token_bytes(ID_BYTES))
 
 
 class GoalSequencer:
@@ -119,59 +120,47 @@ class GoalSequencer:
 
     A goal without any response is abandoned after `timeout_s`; an accepted one has in addition the
     time in which the fingers go `stroke_m`, their longest way, at its speed.
+
+    Attributes:
+        wish: the newest request, until it is sent.
+        goal: in flight.
     """
 
     def __init__(self, timeout_s: float, stroke_m: float) -> None:
-        self._timeout_ns, self._stroke_m = int(timeout_s * 1e9), stroke_m
-        self._wish: GripperCommand | None = None
-        self._accepted = self._cancelling = False
-        self._since_ns = self._number = 0
+        self._timeout_s, self._stroke_m = timeout_s, stroke_m
+        self.wish: GripperCommand | None = None
         self.goal: ActionGoal | None = None
         self.timeouts = 0
 
-    def want(self, command: GripperCommand) -> None:
-        """Request an opening; replaces a request that was not sent."""
-        self._wish = command
-
-    def forget(self) -> GripperCommand | None:
-        """Drop and return the request that was not sent."""
-        wish, self._wish = self._wish, None
-        return wish
-
-    def accepted(self, number: int, now_ns: int) -> None:
+    def accepted(self, goal: ActionGoal, now_ns: int) -> None:
         """The robot took the goal."""
-        if self.goal is not None and number == self.goal.number:
-            self._accepted, self._since_ns = True, now_ns
+        goal.accepted, goal.since_ns = True, now_ns
 
-    def ended(self, number: int) -> bool:
+    def ended(self, goal: ActionGoal) -> bool:
         """The goal was rejected or has ended; False if it is an older one."""
-        if self.goal is None or number != self.goal.number:
+        if goal is not self.goal:
             return False
         self.goal = None
         return True
 
-    def step(self, now_ns: int) -> GoalStep | None:
-        """Next action: `GoalStep.SEND` for the new `goal`, `GoalStep.CANCEL` for the old one."""
-        if self.goal is not None and now_ns - self._since_ns > self._patience_ns(self.goal):
-            self.timeouts += 1
-            self.goal = None
-        if self._wish is None:
+    def step(self, now_ns: int) -> Literal["send", "cancel"] | None:
+        """Next action: send the new `goal`, or cancel the old one."""
+        goal = self.goal
+        if goal is not None:
+            moves_s = self.travel_s(goal) if goal.accepted and not goal.cancelling else 0.0
+            if now_ns - goal.since_ns > (self._timeout_s + moves_s) * 1e9:
+                self.timeouts += 1
+                self.goal = goal = None
+        if self.wish is None:
             return None
-        if self.goal is None:
-            self._number += 1
-            self.goal, self._wish = ActionGoal(self._number, self._wish), None
-            self._accepted = self._cancelling = False
-            self._since_ns = now_ns
-            return GoalStep.SEND
-        if self._accepted and not self._cancelling:
-            self._cancelling, self._since_ns = True, now_ns
-            return GoalStep.CANCEL
+        if goal is None:
+            self.goal, self.wish = ActionGoal(self.wish, now_ns), None
+            return "send"
+        if goal.accepted and not goal.cancelling:
+            goal.cancelling, goal.since_ns = True, now_ns
+            return "cancel"
         return None
 
     def travel_s(self, goal: ActionGoal) -> float:
         """How long the fingers may need for it."""
         return self._stroke_m / goal.command.speed_m_s
-
-    def _patience_ns(self, goal: ActionGoal) -> int:
-        moves = self._accepted and not self._cancelling
-        return self._timeout_ns + (int(self.travel_s(goal) * 1e9) if moves else 0)

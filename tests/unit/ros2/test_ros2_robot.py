@@ -22,7 +22,7 @@ from vla_zenoh.robots.joint_reading import (
     RobotClock,
     StampFilter,
 )
-from vla_zenoh.ros2.gripper_actions import GoalSequencer, GoalStep
+from vla_zenoh.ros2.gripper_actions import ActionGoal, GoalSequencer
 from vla_zenoh.types import GripperCommand
 from vla_zenoh.types.records import Joints
 
@@ -226,63 +226,64 @@ def wish(width_m: float) -> GripperCommand:
 
 def test_a_newer_wish_cancels_and_is_sent_when_the_goal_has_ended() -> None:
     keeper = GoalSequencer(5.0, STROKE_M)
-    keeper.want(wish(0.0))
-    assert keeper.step(0) is GoalStep.SEND
-    keeper.want(wish(0.02))
-    keeper.want(wish(0.08))
+    keeper.wish = wish(0.0)
+    assert keeper.step(0) == "send"
+    keeper.wish = wish(0.02)
+    keeper.wish = wish(0.08)
     assert keeper.step(1) is None, "nothing is cancelled that was not accepted"
     goal = keeper.goal
     assert goal is not None
-    keeper.accepted(goal.number, 2)
-    assert keeper.step(3) is GoalStep.CANCEL
+    keeper.accepted(goal, 2)
+    assert keeper.step(3) == "cancel"
     assert keeper.step(4) is None, "and that once"
-    assert keeper.ended(goal.number)
-    assert keeper.step(5) is GoalStep.SEND
+    assert keeper.ended(goal)
+    assert keeper.step(5) == "send"
     assert keeper.goal is not None
     assert keeper.goal.command.width_m == 0.08, "the newest wins"
 
 
 def test_a_goal_of_which_nothing_is_heard_is_given_up() -> None:
     keeper = GoalSequencer(1.0, STROKE_M)
-    keeper.want(wish(0.0))
+    keeper.wish = wish(0.0)
     keeper.step(0)
-    keeper.want(wish(0.05))
+    goal = keeper.goal
+    assert goal is not None
+    keeper.wish = wish(0.05)
     assert keeper.step(900 * MS) is None
-    assert keeper.step(1001 * MS) is GoalStep.SEND
+    assert keeper.step(1001 * MS) == "send"
     assert keeper.timeouts == 1
-    assert not keeper.ended(1), "what is heard of it later is not heard"
+    assert not keeper.ended(goal), "what is heard of it later is not heard"
 
 
 def test_slow_fingers_have_the_time_they_need_and_who_is_silent_has_not() -> None:
     keeper = GoalSequencer(1.0, STROKE_M)
-    keeper.want(GripperCommand(0.0, 0.01, 10.0))
+    keeper.wish = GripperCommand(0.0, 0.01, 10.0)
     keeper.step(0)
     assert keeper.goal is not None
-    keeper.accepted(keeper.goal.number, 500 * MS)
+    keeper.accepted(keeper.goal, 500 * MS)
     keeper.step(9499 * MS)
     assert keeper.goal is not None, "8 s for the way, and one"
     keeper.step(9501 * MS)
     assert keeper.goal is None
-    keeper.want(GripperCommand(0.0, 0.01, 10.0))
+    keeper.wish = GripperCommand(0.0, 0.01, 10.0)
     keeper.step(10_000 * MS)
     assert keeper.goal is not None
-    keeper.accepted(keeper.goal.number, 10_000 * MS)
-    keeper.want(wish(0.08))
-    assert keeper.step(10_000 * MS) is GoalStep.CANCEL
-    assert keeper.step(11_001 * MS) is GoalStep.SEND, "a cancelled one ends at once"
+    keeper.accepted(keeper.goal, 10_000 * MS)
+    keeper.wish = wish(0.08)
+    assert keeper.step(10_000 * MS) == "cancel"
+    assert keeper.step(11_001 * MS) == "send", "a cancelled one ends at once"
 
 
 def test_a_wish_that_is_forgotten_is_not_sent_and_the_goal_in_flight_goes_on() -> None:
     keeper = GoalSequencer(1.0, STROKE_M)
-    keeper.want(wish(0.0))
+    keeper.wish = wish(0.0)
     keeper.step(0)
-    keeper.want(wish(0.08))
-    assert keeper.forget() == wish(0.08)
-    assert keeper.forget() is None
+    keeper.wish = wish(0.08)
+    keeper.wish = None
     goal = keeper.goal
     assert goal is not None
     assert goal.command == wish(0.0)
-    assert keeper.ended(goal.number)
+    assert keeper.ended(goal)
     assert keeper.step(1) is None
     assert keeper.goal is None
 
@@ -290,37 +291,39 @@ def test_a_wish_that_is_forgotten_is_not_sent_and_the_goal_in_flight_goes_on() -
 @given(st.lists(st.sampled_from(["want", "accept", "end", "step", "late end"]), max_size=60))
 def test_there_are_never_two_goals_and_the_last_wish_is_never_lost(steps: list[str]) -> None:
     keeper = GoalSequencer(1e6, STROKE_M)
-    running: set[int] = set()
+    goals: list[ActionGoal] = []
+    running = False
     sent: list[float] = []
     wishes: list[float] = []
     now_ns = 0
 
     def step() -> None:
-        if keeper.step(now_ns) is GoalStep.SEND:
+        nonlocal running
+        if keeper.step(now_ns) == "send":
             assert keeper.goal is not None
             assert not running
-            running.add(keeper.goal.number)
+            running = True
+            goals.append(keeper.goal)
             sent.append(keeper.goal.command.width_m)
 
     for what in steps:
         now_ns += 1
-        number = keeper.goal.number if keeper.goal else 0
         if what == "want":
             wishes.append(len(wishes) / 1000)
-            keeper.want(wish(wishes[-1]))
-        elif what == "accept":
-            keeper.accepted(number, now_ns)
+            keeper.wish = wish(wishes[-1])
+        elif what == "accept" and keeper.goal is not None:
+            keeper.accepted(keeper.goal, now_ns)
         elif what == "end" and running:
-            keeper.ended(number)
-            running.clear()
-        elif what == "late end":
-            assert not keeper.ended(number - 1)
+            assert keeper.ended(goals[-1])
+            running = False
+        elif what == "late end" and len(goals) > 1:
+            assert not keeper.ended(goals[-2])
         else:
             step()
     for _ in range(2):
         if keeper.goal is not None:
-            keeper.ended(keeper.goal.number)
-        running.clear()
+            keeper.ended(keeper.goal)
+        running = False
         step()
     assert sent[-1:] == wishes[-1:]
     assert sent == sorted(sent)

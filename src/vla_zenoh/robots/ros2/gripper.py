@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import secrets
 import time
 from collections import deque
 from collections.abc import Callable
@@ -13,7 +12,7 @@ from vla_zenoh.errors import CodecError
 from vla_zenoh.profile.robot import GRIPPER_ACTIONS, Ros2Gripper
 from vla_zenoh.robots.ros2.ros_graph import CALL_S, RosGraph, ServiceClient
 from vla_zenoh.ros2 import gripper_actions
-from vla_zenoh.ros2.gripper_actions import GRASP, ActionGoal, GoalSequencer, GoalStep
+from vla_zenoh.ros2.gripper_actions import GRASP, ActionGoal, GoalSequencer
 from vla_zenoh.ros2.keys import COMMAND
 from vla_zenoh.ros2.messages import Messages
 from vla_zenoh.ros2.writers import position_message
@@ -21,7 +20,6 @@ from vla_zenoh.types import Event, GripperCommand
 
 GOAL_TIMEOUT_S = 5.0
 """A goal is given up after this long without an answer, beyond the time that its fingers need."""
-ID_BYTES = 16
 
 
 class Gripper:
@@ -44,7 +42,7 @@ class Gripper:
         self._measured_m, self._sent_m = width, self._limits.max_width_m
         self._goals = GoalSequencer(GOAL_TIMEOUT_S, self._limits.max_width_m)
         self._answers: deque[Callable[[], None]] = deque()
-        self._goal_id, self._action, self._writer = b"", "", ""
+        self._action = self._writer = ""
         self.wanted_m: float | None = None
         self._held = False
         self._clients: dict[str, dict[str, ServiceClient]] = {}
@@ -88,18 +86,20 @@ class Gripper:
         self._advance()
 
     def _advance(self) -> None:
-        step = self._goals.step(time.monotonic_ns())
+        step, goal = self._goals.step(time.monotonic_ns()), self._goals.goal
         self._node.counters["ros2.gripper_timeouts"] = self._goals.timeouts
-        if step is GoalStep.SEND and self._goals.goal is not None:
-            self._send(self._goals.goal)
-        elif step is GoalStep.CANCEL:
+        if goal is None:
+            return
+        if step == "send":
+            self._send(goal)
+        elif step == "cancel":
             self._node.counters["ros2.gripper_cancelled"] += 1
-            request = gripper_actions.cancel(self._messages, self._goal_id)
+            request = gripper_actions.cancel(self._messages, goal.id)
             self._call("cancel_goal", request, lambda _: None)  # the goal's result follows
 
     def _drop_waiting(self) -> None:
         """Drop a command that waits for the goal in flight: the motion it belonged to is over."""
-        dropped = self._goals.forget()
+        dropped, self._goals.wish = self._goals.wish, None
         if dropped is not None:
             self.wanted_m = self._sent_m
             why = f"to {dropped.width_m:.3f} m waited when {self._writer[:60]!r} stopped"
@@ -111,7 +111,7 @@ class Gripper:
             return
         self.wanted_m = command.width_m
         if self._topic is None:
-            self._goals.want(command)
+            self._goals.wish = command
             self._advance()
             return
         position = gripper_actions.position(self._profile, self._limits, command.width_m)
@@ -127,12 +127,11 @@ class Gripper:
         use_grasp = closes and GRASP in self._clients
         self._sent_m = goal.command.width_m
         self._action = GRASP if use_grasp else self._profile.type
-        self._goal_id = secrets.token_bytes(ID_BYTES)
         self._held = False
         request = gripper_actions.send_goal(
             self._messages,
             self._action,
-            self._goal_id,
+            goal.id,
             goal.command,
             position=gripper_actions.position(self._profile, self._limits, self._sent_m),
             max_width_m=self._limits.max_width_m,
@@ -157,22 +156,20 @@ class Gripper:
     def _on_accepted(self, goal: ActionGoal, answer: bytes | None) -> None:
         response = self._decode(f"{self._action}_SendGoal_Response", answer)
         if response is None or not response.accepted:
-            if self._goals.ended(goal.number):
+            if self._goals.ended(goal):
                 self._emit_failure("does not answer" if response is None else "rejected the goal")
             return
-        self._goals.accepted(goal.number, time.monotonic_ns())
+        self._goals.accepted(goal, time.monotonic_ns())
         request = self._messages.new(
             f"{self._action}_GetResult_Request",
-            goal_id=gripper_actions.uuid(self._messages, self._goal_id),
+            goal_id=gripper_actions.uuid(self._messages, goal.id),
         )
         # As long as the goal may take, and the cancellation after it.
         timeout_s = self._goals.travel_s(goal) + 2 * GOAL_TIMEOUT_S
-        self._call(
-            "get_result", request, lambda answer: self._on_result(goal.number, answer), timeout_s
-        )
+        self._call("get_result", request, lambda answer: self._on_result(goal, answer), timeout_s)
 
-    def _on_result(self, number: int, answer: bytes | None) -> None:
-        if not self._goals.ended(number):
+    def _on_result(self, goal: ActionGoal, answer: bytes | None) -> None:
+        if not self._goals.ended(goal):
             return
         response = self._decode(f"{self._action}_GetResult_Response", answer)
         if response is None:
