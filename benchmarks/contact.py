@@ -181,7 +181,7 @@ def push(obstacle: Obstacle, mode: str, speed_m_s: float, *, told: bool = True) 
     forces_n: list[float] = []
 
     def force_n() -> float:
-        forces_n.append(norm3(world.wrench[:3]))
+        forces_n.append(norm3(world.wrench()[:3]))
         return forces_n[-1]
 
     ended = loop.run_until(

@@ -66,7 +66,7 @@ def depth(
 
 def _codec_rows(width: int, height: int) -> list[dict[str, Any]]:
     profile = load_profile("panda_sim")
-    with Renderer(profile.sim.scene, robot_model(profile.robot)) as renderer:
+    with Renderer(profile.sim.scene, [robot_model(profile.robot)]) as renderer:
         renderer.set_qpos(build_world(profile).qpos())
         drawn_m = renderer.render_depth("front", width, height)
     random = np.random.default_rng(SEED)

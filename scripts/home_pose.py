@@ -44,7 +44,7 @@ def solve_home(
     Raises:
         ResourceError: the pose is out of reach within the joint limits.
     """
-    model = build_model(scene, robot)
+    model = build_model(scene, [robot])
     data = mujoco.MjData(model)
     joints = [model.joint(PREFIX + name) for name in robot.arm_joints]
     addresses = [int(joint.qposadr[0]) for joint in joints]

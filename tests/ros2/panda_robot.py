@@ -187,8 +187,8 @@ def build_world(profile: Profile) -> World:
     """The world of a profile, whatever its driver."""
     return World(
         profile.sim.scene,
-        robot_model(profile),
-        home_rad=profile.robot.home_rad,
+        [robot_model(profile)],
+        home_rad=[profile.robot.home_rad],
         joint_friction_nm=profile.sim.joint_friction_nm,
         seed=profile.sim.seed,
     )
@@ -217,7 +217,7 @@ def serve_cameras(
         view: node.publisher(CAMERAS[view], Image, reliable=False, depth=1) for view in views
     }
     profile = load_profile("panda_sim")
-    renderer = Renderer(profile.sim.scene, robot_model(profile))
+    renderer = Renderer(profile.sim.scene, [robot_model(profile)])
     period_s = 1.0 / rate_hz
     next_s = time.monotonic()
     while True:

@@ -23,8 +23,8 @@ def make_world(
     """The table with a Panda at home."""
     return World(
         SCENE,
-        RobotModel(),
-        home_rad=HOME_RAD,
+        [RobotModel()],
+        home_rad=[HOME_RAD],
         gains=gains,
         joint_friction_nm=friction_nm,
         seed=seed,

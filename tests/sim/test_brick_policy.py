@@ -88,7 +88,7 @@ class Stage:
 @pytest.fixture(scope="module")
 def stage() -> Iterator[Stage]:
     profile = load_profile(PROFILE)
-    with Renderer(profile.sim.scene, RobotModel()) as renderer:
+    with Renderer(profile.sim.scene, [RobotModel()]) as renderer:
         yield Stage(build_world(profile), renderer)
 
 

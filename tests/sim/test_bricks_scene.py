@@ -14,7 +14,11 @@ from motions import HOME_RAD
 
 from vla_zenoh.errors import ResourceError
 from vla_zenoh.lab.tasks import COLOURS, brick
-from vla_zenoh.simulation.appearance import (
+from vla_zenoh.simulation.backend import Backend, why_no_opengl
+from vla_zenoh.simulation.render import Renderer
+from vla_zenoh.simulation.robot_model import RobotModel
+from vla_zenoh.simulation.scene import build_model
+from vla_zenoh.simulation.variation import (
     CAMERA,
     DISTRACTORS,
     LIGHTS,
@@ -25,12 +29,10 @@ from vla_zenoh.simulation.appearance import (
     AppearanceSwitcher,
     check_variations,
     draw_appearance,
+    draw_places,
+    footprint_m,
+    objects_of,
 )
-from vla_zenoh.simulation.backend import Backend, why_no_opengl
-from vla_zenoh.simulation.objects import draw_places, footprint_m, objects_of
-from vla_zenoh.simulation.render import Renderer
-from vla_zenoh.simulation.robot_model import RobotModel
-from vla_zenoh.simulation.scene import build_model
 from vla_zenoh.simulation.world import World
 
 SCENE = "bricks"
@@ -44,7 +46,7 @@ DISTRACTING = {"can", "block", "puck"}
 
 @cache
 def model() -> mujoco.MjModel:
-    return build_model(SCENE, RobotModel())
+    return build_model(SCENE, [RobotModel()])
 
 
 @given(SEEDS, st.booleans())
@@ -80,8 +82,8 @@ def test_a_camera_shifts_and_turns_within_its_bounds(seed: int) -> None:
 @settings(max_examples=20, deadline=None)
 @given(SEEDS)
 def test_each_part_of_a_look_is_the_same_whatever_else_is_varied(seed: int) -> None:
-    every, single = build_model(SCENE, RobotModel()), build_model(SCENE, RobotModel())
-    before = build_model(SCENE, RobotModel())
+    every, single = build_model(SCENE, [RobotModel()]), build_model(SCENE, [RobotModel()])
+    before = build_model(SCENE, [RobotModel()])
     AppearanceSwitcher(every).apply(seed, VARIATIONS)
     switcher = AppearanceSwitcher(single)
     changed = {LIGHTS: ("light_diffuse", "light_dir"), TABLE: ("mat_rgba",), CAMERA: ("cam_pos",)}
@@ -101,7 +103,7 @@ def test_an_unknown_variation_is_refused_by_name() -> None:
 
 
 def test_a_scene_that_cannot_be_varied_says_what_it_lacks() -> None:
-    other = build_model("table", RobotModel())
+    other = build_model("table", [RobotModel()])
     with pytest.raises(ResourceError, match="material 'table'"):
         AppearanceSwitcher(other).apply(0, [TABLE])
 
@@ -109,8 +111,8 @@ def test_a_scene_that_cannot_be_varied_says_what_it_lacks() -> None:
 def world(vary: list[str] | None = None, seed: int | None = None) -> World:
     return World(
         SCENE,
-        RobotModel(),
-        home_rad=HOME_RAD,
+        [RobotModel()],
+        home_rad=[HOME_RAD],
         seed=seed,
         vary=vary or (),
     )
@@ -141,7 +143,7 @@ def skip_without(backend: str) -> None:
 @pytest.mark.parametrize("backend", ["raycast", pytest.param("egl", marks=pytest.mark.gl)])
 def test_a_look_changes_the_picture_and_comes_off_again(backend: str) -> None:
     skip_without(backend)
-    with Renderer(SCENE, RobotModel(), Backend(backend)) as renderer:
+    with Renderer(SCENE, [RobotModel()], Backend(backend)) as renderer:
         plain = renderer.render("front", 96, 72).astype(float)
         for part in (LIGHTS, TABLE, CAMERA):
             renderer.vary(5, [part])
@@ -156,7 +158,7 @@ def test_both_ways_of_drawing_agree_on_a_varied_scene() -> None:
     skip_without("egl")
     pictures = []
     for backend in ("egl", "raycast"):
-        with Renderer(SCENE, RobotModel(), Backend(backend)) as renderer:
+        with Renderer(SCENE, [RobotModel()], Backend(backend)) as renderer:
             renderer.vary(7, VARIATIONS)
             pictures.append(renderer.render("front", 160, 120).astype(int))
     differing = (np.abs(pictures[0] - pictures[1]).max(axis=2) > 12).mean()

@@ -63,7 +63,7 @@ def test_pressing_into_the_table_is_bounded(gains: ImpedanceGains, duration_s: f
     down = list(line(start, (0.0, 0.0, -0.25), duration_s))
     for reference in down + 2000 * [still(down[-1])]:
         world.tick(reference)
-        pressed.append(float(world.wrench[2]))
+        pressed.append(float(world.wrench()[2]))
     touch = int(np.flatnonzero(pressed)[0])
     assert max(pressed[touch + round(IMPACT_S / STEP_S) :]) < bound + PRESS_MOVING_N
     assert pressed[-1] < bound + PRESS_SLACK_N

@@ -117,7 +117,7 @@ def test_the_reference_pose_is_where_the_held_joints_put_the_tcp() -> None:
     before = world.qpos()
     state = world.pose_state(path[-1])
     assert np.array_equal(before, world.qpos())
-    there = World(SCENE, RobotModel(), home_rad=path[-1].position_rad)
+    there = World(SCENE, [RobotModel()], home_rad=[path[-1].position_rad])
     assert state.reference_position_m is not None
     np.testing.assert_allclose(state.reference_position_m, there.tcp()[0], atol=SAME_POSE_M)
     assert 0.0 < np.linalg.norm(state.position_m - state.reference_position_m) < FOLLOW_LIMIT_M

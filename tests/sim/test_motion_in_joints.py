@@ -321,7 +321,7 @@ def test_an_arm_of_joints_that_is_blocked_is_led_back() -> None:
     push_n: list[float] = []
     for _ in range(350):
         loop.run(0.01)
-        push_n.append(norm3(loop.world.wrench[:3]))
+        push_n.append(norm3(loop.world.wrench()[:3]))
     assert max(push_n) > 10.0
     assert max(push_n) < PUSH_N
     assert loop.commander.state.value == "inactive"

@@ -144,7 +144,7 @@ def test_an_arm_that_is_blocked_pushes_no_harder_than_it_may_and_is_led_back() -
     push_n: list[float] = []
     for _ in range(350):
         loop.run(0.01)
-        push_n.append(norm3(loop.world.wrench[:3]))
+        push_n.append(norm3(loop.world.wrench()[:3]))
     assert max(push_n) > 10.0  # it did touch
     assert max(push_n) < PUSH_N
     assert loop.commander.state.value == "inactive"
@@ -156,7 +156,7 @@ def test_an_arm_that_is_blocked_pushes_no_harder_than_it_may_and_is_led_back() -
     activate(loop)
     loop.run(1.0)
     assert path_m(loop)[-1, 1] < blocked_m[1] - 0.02  # it comes away
-    assert push_n[-1] >= norm3(loop.world.wrench[:3])
+    assert push_n[-1] >= norm3(loop.world.wrench()[:3])
     check_motion(loop, contact=True)
 
 
@@ -167,7 +167,7 @@ def test_an_arm_pressed_on_the_table_stops() -> None:
     loop.run(2.5)
     rest_m = path_m(loop)[-1]
     assert speed_m_s(loop)[-125:].max() < STILL_M_S
-    assert norm3(loop.world.wrench[:3]) < LASTING_N
+    assert norm3(loop.world.wrench()[:3]) < LASTING_N
     assert rest_m[2] > 0.06
     check_motion(loop, contact=True)
 

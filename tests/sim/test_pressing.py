@@ -15,8 +15,7 @@ import pytest
 
 from vla_zenoh.kinematics.so3 import norm3
 from vla_zenoh.profile import load_profile
-from vla_zenoh.simulation.simulated_robot import WRENCH_FILTER_S
-from vla_zenoh.simulation.world import World, build_world
+from vla_zenoh.simulation.world import WRENCH_FILTER_S, World, build_world
 
 LASTING_N = 5.0
 HELD_N, WEIGHT_N = 5.0, 0.5
@@ -95,7 +94,7 @@ def test_what_is_told_of_a_contact_is_filtered_and_the_same_in_the_end() -> None
     world.tick(reference)
     first = world.pose_state(reference).wrench
     assert first is not None
-    at_once = world.wrench
+    at_once = world.wrench()
     assert norm3(at_once[:3]) > 0.0
     np.testing.assert_allclose(first, 1e-3 / WRENCH_FILTER_S * at_once, rtol=0.01)
     for _ in range(3000):
@@ -103,4 +102,4 @@ def test_what_is_told_of_a_contact_is_filtered_and_the_same_in_the_end() -> None
     told = world.pose_state(reference).wrench
     assert told is not None
     assert told[1] < 0.0  # it is pushed away from what stands at its side
-    np.testing.assert_allclose(told, world.wrench, atol=0.5)
+    np.testing.assert_allclose(told, world.wrench(), atol=0.5)

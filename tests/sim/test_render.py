@@ -32,7 +32,7 @@ MIN_GRAY_PX = 1500
 
 @pytest.fixture(scope="module")
 def rays():
-    with Renderer(SCENE, RobotModel(), choose_backend(RAYCAST)) as renderer:
+    with Renderer(SCENE, [RobotModel()], choose_backend(RAYCAST)) as renderer:
         yield renderer
 
 
@@ -43,7 +43,7 @@ def opengl():
         pytest.skip(reason)
     if os.environ.get("PYOPENGL_PLATFORM", EGL) != EGL:
         pytest.skip("another OpenGL platform is already in use in this process")
-    with Renderer(SCENE, RobotModel(), Backend(EGL)) as renderer:
+    with Renderer(SCENE, [RobotModel()], Backend(EGL)) as renderer:
         yield renderer
 
 
@@ -120,7 +120,7 @@ def test_ray_casting_only_what_moves_gives_the_picture_of_casting_everything(
     rays.render("front", *SIZE)
     rays.set_qpos(second)
     over_old_background = rays.render("front", *SIZE)
-    with Renderer(SCENE, RobotModel(), Backend(RAYCAST)) as fresh:
+    with Renderer(SCENE, [RobotModel()], Backend(RAYCAST)) as fresh:
         fresh.set_qpos(second)
         assert np.array_equal(over_old_background, fresh.render("front", *SIZE))
 

@@ -10,8 +10,8 @@ import pytest
 from motions import HOME_RAD, circle, line, make_world, wait
 
 from vla_zenoh.errors import NodeError, ResourceError
-from vla_zenoh.simulation.objects import draw_places, footprint_m, objects_of, regions_of
 from vla_zenoh.simulation.robot_model import RobotModel
+from vla_zenoh.simulation.variation import draw_places, footprint_m, objects_of, regions_of
 from vla_zenoh.simulation.world import World
 from vla_zenoh.types import PoseReference
 
@@ -171,7 +171,7 @@ TWO_BRICKS = """
 
 def test_another_scene_is_only_another_folder(tmp_path: Path) -> None:
     (tmp_path / "scene.xml").write_text(TWO_BRICKS)
-    world = World(str(tmp_path), RobotModel(), home_rad=HOME_RAD, seed=1)
+    world = World(str(tmp_path), [RobotModel()], home_rad=[HOME_RAD], seed=1)
     objects = world.objects()
     assert list(objects) == ["blue", "red"]
     assert np.linalg.norm(objects["blue"][0] - objects["red"][0]) > 0.04 * np.sqrt(2)
@@ -181,7 +181,7 @@ def test_another_scene_is_only_another_folder(tmp_path: Path) -> None:
 def test_a_region_for_an_unknown_object_is_refused(tmp_path: Path) -> None:
     (tmp_path / "scene.xml").write_text(TWO_BRICKS.replace("place/red", "place/green"))
     with pytest.raises(ResourceError, match="places 'green', but can only place: blue, red"):
-        World(str(tmp_path), RobotModel(), home_rad=HOME_RAD, seed=1)
+        World(str(tmp_path), [RobotModel()], home_rad=[HOME_RAD], seed=1)
 
 
 def test_regions_too_small_for_their_objects_are_refused(tmp_path: Path) -> None:
@@ -189,14 +189,14 @@ def test_regions_too_small_for_their_objects_are_refused(tmp_path: Path) -> None
         TWO_BRICKS.replace("-0.2 0.2 0 0", "0 0.01 0 0").replace("0.4 0.5", "0.4 0.41")
     )
     with pytest.raises(ResourceError, match="no room for blue, red"):
-        World(str(tmp_path), RobotModel(), home_rad=HOME_RAD, seed=1)
+        World(str(tmp_path), [RobotModel()], home_rad=[HOME_RAD], seed=1)
 
 
 def test_a_scene_that_does_not_exist_is_refused() -> None:
     with pytest.raises(ResourceError, match="no scene called 'tabel'; did you mean 'table'"):
-        World("tabel", RobotModel(), home_rad=HOME_RAD)
+        World("tabel", [RobotModel()], home_rad=[HOME_RAD])
 
 
 def test_a_robot_without_the_named_tcp_is_refused_with_the_names_that_exist() -> None:
     with pytest.raises(ResourceError, match=r"no link 'tool0'; it has: .*panda_hand_tcp"):
-        World("table", RobotModel(tcp_link="tool0"), home_rad=HOME_RAD)
+        World("table", [RobotModel(tcp_link="tool0")], home_rad=[HOME_RAD])

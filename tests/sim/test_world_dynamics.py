@@ -21,7 +21,7 @@ MASS_ATOL_KG = 1e-12
 
 @pytest.fixture(scope="module")
 def simulated() -> mujoco.MjModel:
-    return build_model("table", RobotModel(), joint_friction_nm=0.5)
+    return build_model("table", [RobotModel()], joint_friction_nm=0.5)
 
 
 @pytest.fixture(scope="module")

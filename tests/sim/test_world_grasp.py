@@ -50,7 +50,7 @@ def test_a_brick_is_grasped_lifted_and_does_not_slip(yaw_rad: float) -> None:
     assert brick[2] - resting_m == pytest.approx(LIFT_M, abs=LIFT_ATOL_M)
     assert np.linalg.norm(brick - world.tcp()[0] - held) < SLIP_LIMIT_M
     assert world.gripper_state().holding
-    assert world.wrench[2] == pytest.approx(-BRICK_WEIGHT_N, rel=FORCE_RTOL)
+    assert world.wrench()[2] == pytest.approx(-BRICK_WEIGHT_N, rel=FORCE_RTOL)
 
 
 def test_an_opened_gripper_lets_go() -> None:

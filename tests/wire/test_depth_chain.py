@@ -52,7 +52,7 @@ def assert_plane(rig: Rig, depth: Depth) -> None:
     """The table top in a depth picture, by the intrinsics that the camera tells."""
     told = [one.detail["cameras"] for one in rig.statuses if "cameras" in one.detail]
     seen = told[-1]["front"]["intrinsics"]
-    model = build_model(rig.profile.sim.scene, robot_model(rig.profile.robot))
+    model = build_model(rig.profile.sim.scene, [robot_model(rig.profile.robot)])
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     camera = data.camera("front")

@@ -45,9 +45,9 @@ from vla_zenoh.lab.tasks import (
 )
 from vla_zenoh.policy import Observation
 from vla_zenoh.profile import Profile, load_profile
-from vla_zenoh.simulation.appearance import VARIATIONS
 from vla_zenoh.simulation.render import Renderer
 from vla_zenoh.simulation.robot_model import RobotModel
+from vla_zenoh.simulation.variation import VARIATIONS
 from vla_zenoh.simulation.world import World, build_world
 from vla_zenoh.types import Image, ObjectPoses
 
@@ -103,7 +103,7 @@ class Stage:
         changed = self.profile.sim.model_copy(update={"vary": self.vary})
         self.profile = self.profile.model_copy(update={"sim": changed})
         self.world = build_world(self.profile)
-        self.renderer = Renderer(self.profile.sim.scene, RobotModel())
+        self.renderer = Renderer(self.profile.sim.scene, [RobotModel()])
 
     def picture(self, camera: str) -> Image:
         """Present image of a camera."""

@@ -27,11 +27,10 @@ from worker import FRONT, WRIST
 
 from vla_zenoh.lab.tasks import brick
 from vla_zenoh.profile import load_profile
-from vla_zenoh.simulation.appearance import VARIATIONS
-from vla_zenoh.simulation.objects import DISTRACTOR_PREFIX, regions_of
 from vla_zenoh.simulation.render import Renderer
 from vla_zenoh.simulation.robot_model import RobotModel
 from vla_zenoh.simulation.scene import PREFIX, TCP_SITE, build_model
+from vla_zenoh.simulation.variation import DISTRACTOR_PREFIX, VARIATIONS, regions_of
 
 SCENE = "bricks"
 SHARD = 500
@@ -44,9 +43,9 @@ class Studio:
 
     def __init__(self) -> None:
         robot = RobotModel()
-        self.model = build_model(SCENE, robot)
+        self.model = build_model(SCENE, [robot])
         self.data = mujoco.MjData(self.model)
-        self.renderer = Renderer(SCENE, robot)
+        self.renderer = Renderer(SCENE, [robot])
         self._arm = [int(self.model.joint(PREFIX + n).qposadr[0]) for n in robot.arm_joints]
         self._dofs = [int(self.model.joint(PREFIX + n).dofadr[0]) for n in robot.arm_joints]
         self._fingers = [int(self.model.joint(PREFIX + n).qposadr[0]) for n in robot.finger_joints]

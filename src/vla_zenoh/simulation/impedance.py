@@ -156,13 +156,6 @@ class CartesianImpedance(_Impedance):
         super().__init__(effort_nm, rate, most)
         self._task_space: _TaskSpace | None = None
 
-    def reset(self, posture_rad: FloatArray | None = None) -> None:
-        """Clear the integral; set the posture where `posture_rad` (n,) is given."""
-        self.integral = np.zeros(6)
-        self._task_space = None
-        if posture_rad is not None:
-            self._posture_rad = np.array(posture_rad, float)
-
     def take_over(self, torque_nm: FloatArray, state: ArmDynamics) -> None:
         """Take over from another law that held the arm at rest with `torque_nm` (n,).
 
@@ -243,10 +236,6 @@ class JointImpedance(_Impedance):
         self._damping_scale = gains.damping_ratio * np.sqrt(self._stiffness)
         rate = gains.integral_1_s * period_s * self._stiffness
         super().__init__(effort_nm, rate, _per_joint(gains.max_integral_nm, joints))
-
-    def reset(self) -> None:
-        """Clear the integral."""
-        self.integral = np.zeros(len(self._limit))
 
     def take_over(self, torque_nm: FloatArray, state: ArmDynamics) -> None:
         """Take over from the other law, see `CartesianImpedance.take_over`."""

@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.errors import NodeError, RecordError, ResourceError, in_words
-from vla_zenoh.simulation.appearance import AppearanceSwitcher
 from vla_zenoh.simulation.backend import RAYCAST, Backend, choose_backend
 from vla_zenoh.simulation.raycast import RaycastCanvas
 from vla_zenoh.simulation.robot_model import RobotModel
 from vla_zenoh.simulation.scene import POSES, build_model
+from vla_zenoh.simulation.variation import AppearanceSwitcher
 
 MAX_GEOMS = 1000
 PROBE_SIZE = 16
@@ -45,10 +45,10 @@ class Renderer:
     """
 
     def __init__(
-        self, scene: str, robot: RobotModel | Sequence[RobotModel], backend: Backend | None = None
+        self, scene: str, robots: Sequence[RobotModel], backend: Backend | None = None
     ) -> None:
         self.backend = choose_backend() if backend is None else backend
-        self._model = build_model(scene, robot)
+        self._model = build_model(scene, robots)
         self._data = mujoco.MjData(self._model)
         canvas = RaycastCanvas if self.backend.name == RAYCAST else OpenGlCanvas
         self._canvas = canvas(self._model)

@@ -52,21 +52,20 @@ def prefix_of(robot: RobotModel) -> str:
 
 
 def build_model(
-    scene: str, robots: RobotModel | Sequence[RobotModel], *, joint_friction_nm: float = 0.0
+    scene: str, robots: Sequence[RobotModel], *, joint_friction_nm: float = 0.0
 ) -> mujoco.MjModel:
-    """Compile `scene` with a robot in it, or the parts of one.
+    """Compile `scene` with a robot in it: its parts, or the only one.
 
     Raises:
         ResourceError: scene or robot are missing, or MuJoCo rejects them.
     """
     path = scene_file(scene)
-    parts = (robots,) if isinstance(robots, RobotModel) else tuple(robots)
     try:
         spec = mujoco.MjSpec.from_file(str(path))
-        for index, robot in enumerate(parts):
+        for index, robot in enumerate(robots):
             arm = _robot_spec(robot, joint_friction_nm)
             # A part meets the scene (1) and the other parts, but not itself.
-            masks = [2 << other for other in range(len(parts))] if len(parts) > 1 else [0]
+            masks = [2 << other for other in range(len(robots))] if len(robots) > 1 else [0]
             for geom in arm.geoms:
                 geom.contype, geom.conaffinity = 1 | masks[index], sum(masks) - masks[index]
             half_rad = robot.base_yaw_rad / 2
@@ -80,7 +79,7 @@ def build_model(
         _set_solver(spec)
         model = spec.compile()
     except (ValueError, mujoco.FatalError) as error:
-        described = " and ".join(dict.fromkeys(robot.description for robot in parts))
+        described = " and ".join(dict.fromkeys(robot.description for robot in robots))
         raise ResourceError(f"MuJoCo rejects scene {path} with {described}: {error}") from error
     _sort_groups(model)
     return model
