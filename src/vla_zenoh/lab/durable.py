@@ -1,38 +1,81 @@
-"""Files that survive a power cut, a lock of a folder, and the templates of pages."""
+"""Files that survive a power cut, a lock of a folder, and the templates of pages.
+
+A line that a power cut left incomplete is none: it is not read, and the next one takes its place.
+"""
 
 from __future__ import annotations
 
 import fcntl
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from vla_zenoh.errors import MissingExtraError
+from vla_zenoh.errors import MissingExtraError, VlaZenohError
 
 
-def write_whole(path: Path, text: str) -> None:
+@contextmanager
+def writing(path: Path, kind: type[VlaZenohError]) -> Iterator[None]:
+    """Turn an `OSError` into an error of this kind, which says that the file cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        raise kind(f"{path} cannot be written: {error.strerror}") from error
+
+
+def write_whole(path: Path, content: str | bytes) -> None:
     """Write a file; a reader sees the old one or the new one, never half of one."""
     part = path.with_name(f"{path.name}.part")
-    with part.open("w", encoding="utf-8") as file:
-        file.write(text)
+    with part.open("wb") as file:
+        file.write(content.encode() if isinstance(content, str) else content)
         file.flush()
         os.fsync(file.fileno())
     part.replace(path)
+    _sync_folder(path.parent)
 
 
-def lock_folder(folder: Path) -> int:
+def append_line(path: Path, line: str) -> None:
+    """Append a line to a file; it is on the disk when this returns."""
+    with path.open("ab+") as file:
+        file.seek(0)
+        file.truncate(file.read().rfind(b"\n") + 1)
+        file.write(line.encode() + b"\n")
+        file.flush()
+        os.fsync(file.fileno())
+    _sync_folder(path.parent)
+
+
+def whole_lines(path: Path) -> tuple[list[bytes], bool]:
+    """Lines of a file, none where there is no file; and whether another one is incomplete."""
+    try:
+        *lines, rest = path.read_bytes().split(b"\n")
+    except FileNotFoundError:
+        return [], False
+    return lines, bool(rest)
+
+
+def _sync_folder(path: Path) -> None:
+    """Have the names in a folder on the disk, too."""
+    folder = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+def lock_folder(folder: Path) -> int | None:
     """A file descriptor that keeps other processes from locking a folder until it is closed.
 
-    Raises:
-        BlockingIOError: another process has it.
+    None: another process has it.
     """
     lock = os.open(folder, os.O_RDONLY)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
+    except BlockingIOError:
         os.close(lock)
-        raise
+        return None
     return lock
 
 

@@ -7,8 +7,10 @@ lines.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -58,11 +60,8 @@ def distribution(values: ArrayLike) -> Distribution | None:
 
 def percentiles(values: ArrayLike) -> dict[str, float]:
     """p50, p95 and max, rounded to three digits; empty without values."""
-    found = np.asarray(values, np.float64)
-    if not found.size:
-        return {}
-    p50, p95, top = np.percentile(found, (50, 95, 100))
-    return {"p50": round(float(p50), 3), "p95": round(float(p95), 3), "max": round(float(top), 3)}
+    found = distribution(values)
+    return {name: round(getattr(found, name), 3) for name in ("p50", "p95", "max") if found}
 
 
 def wilson_95(successes: int, trials: int) -> tuple[float, float]:
@@ -145,13 +144,8 @@ def paired(outcomes: Iterable[tuple[bool, bool]]) -> Paired:
     Args:
         outcomes: for each setup whether the first succeeded, and whether the second did.
     """
-    both = first = second = neither = 0
-    for one, other in outcomes:
-        both += one and other
-        first += one and not other
-        second += other and not one
-        neither += not one and not other
-    return Paired(both, first, second, neither)
+    counts = Counter(outcomes)
+    return Paired(*(counts[pair] for pair in product((True, False), repeat=2)))
 
 
 def mcnemar_exact(first: int, second: int) -> float:

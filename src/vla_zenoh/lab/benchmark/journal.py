@@ -6,8 +6,8 @@ A run that was killed goes on where it was: an episode counts once its line is o
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ import numpy as np
 
 from vla_zenoh.errors import OutputError, RecordError
 from vla_zenoh.lab.benchmark.episode import EpisodeOutcome, EpisodeRequest
+from vla_zenoh.lab.durable import append_line, whole_lines
 
 PLAN, EPISODES, ACTIONS = "run.json", "episodes.jsonl", "actions"
 
@@ -54,10 +55,7 @@ class RunJournal:
             return
         with actions_file(self.folder, request).open("wb") as file:
             np.save(file, np.asarray(outcome.actions, np.float64))
-        with (self.folder / EPISODES).open("ab") as file:
-            file.write(json.dumps(outcome.to_dict()).encode() + b"\n")
-            file.flush()
-            os.fsync(file.fileno())
+        append_line(self.folder / EPISODES, json.dumps(outcome.to_dict()))
 
 
 def actions_file(folder: Path, request: EpisodeRequest) -> Path:
@@ -67,21 +65,12 @@ def actions_file(folder: Path, request: EpisodeRequest) -> Path:
 
 def read_episodes(folder: Path) -> dict[str, EpisodeOutcome]:
     """Episodes of a run that have ended; a last line that was cut off is not one."""
-    file = folder / EPISODES
     ended: dict[str, EpisodeOutcome] = {}
-    whole = b""
-    for line in file.read_bytes().splitlines(keepends=True) if file.exists() else []:
-        try:
+    for line in whole_lines(folder / EPISODES)[0]:
+        with suppress(ValueError, TypeError):
             found = EpisodeOutcome(**json.loads(line))
-        except (ValueError, TypeError):
-            break
-        if not line.endswith(b"\n"):
-            break
-        whole += line
-        found.ask_ms = (found.ask_ms[0], found.ask_ms[1])
-        ended.setdefault(f"{found.suite}/{found.task}/{found.episode}", found)
-    if file.exists() and len(whole) != file.stat().st_size:
-        os.truncate(file, len(whole))  # what follows would be glued to it
+            found.ask_ms = (found.ask_ms[0], found.ask_ms[1])
+            ended.setdefault(f"{found.suite}/{found.task}/{found.episode}", found)
     return ended
 
 

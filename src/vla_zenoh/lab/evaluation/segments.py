@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import numpy as np
 
 from vla_zenoh.errors import SpecError
-from vla_zenoh.lab.demo.scripted_motions import ScriptedPrompt, parse_scripted
+from vla_zenoh.lab.demo.scripted_motions import parse_scripted
 from vla_zenoh.lab.evaluation.result import PromptSegment
 from vla_zenoh.types import FloatArray
 
@@ -14,7 +16,8 @@ STILL_M_S, STILL_RAD_S = 0.002, 0.01
 
 
 def known(rows: FloatArray) -> FloatArray:
-    return rows[np.isfinite(rows).all(axis=1)] if len(rows) else rows
+    """The rows (n, D) without NaN."""
+    return rows[np.isfinite(rows).all(axis=1)]
 
 
 def path_m(position_m: FloatArray) -> float | None:
@@ -83,14 +86,15 @@ def segment(
         quat_xyzw: (n, 4), may hold NaN.
         width_m: (m,) gripper opening, may hold NaN.
     """
-    moved, turned = _since_first(position_m), rotvecs(quat_xyzw)
-    asked = _asked(prompt)
-    axis = None if asked is None or asked.motion is None else asked.motion.axis
-    steps = requests if asked is None or asked.steps is None else min(requests, asked.steps)
-    amount = None if asked is None else asked.offset(steps)
-    along_m, drift_m = _split(moved, axis if axis in (0, 1, 2) else None, amount)
-    about = axis - 3 if axis in (3, 4, 5) else None
-    along_rad, drift_rad = _split(turned, about, amount)
+    moved, turned = known(position_m), rotvecs(known(quat_xyzw))
+    moved = moved - moved[:1]
+    amounts: tuple[float | None, ...] = (None,) * 6
+    with suppress(SpecError):
+        asked = parse_scripted(prompt)
+        amount = asked.offset(requests if asked.steps is None else min(requests, asked.steps))
+        axis = -1 if asked.motion is None else asked.motion.axis
+        ways = _compared(moved, axis, amount), _compared(turned, axis - 3, amount)
+        amounts = tuple(value for pair in zip(*ways, strict=True) for value in pair)
     widths = width_m[np.isfinite(width_m)]
     return PromptSegment(
         prompt,
@@ -98,46 +102,21 @@ def segment(
         seconds,
         path_m(position_m),
         turned_rad(quat_xyzw),
-        _last(moved),
-        _last(turned),
-        None if asked is None or amount is None else abs(amount) if axis in (0, 1, 2) else 0.0,
-        None if asked is None or amount is None else abs(amount) if about is not None else 0.0,
-        along_m if asked is not None else None,
-        along_rad if asked is not None else None,
-        drift_m if asked is not None else None,
-        drift_rad if asked is not None else None,
+        tuple(moved[-1].tolist()) if len(moved) else (),
+        tuple(turned[-1].tolist()) if len(turned) else (),
+        *amounts,
         (float(widths[0]), float(widths[-1])) if len(widths) else None,
     )
 
 
-def _asked(prompt: str) -> ScriptedPrompt | None:
-    try:
-        return parse_scripted(prompt)
-    except SpecError:
-        return None
-
-
-def _since_first(position_m: FloatArray) -> FloatArray:
-    there = np.isfinite(position_m).all(axis=1)
-    if not there.any():
-        return np.full_like(position_m, np.nan)
-    return position_m - position_m[np.argmax(there)]
-
-
-def _last(rows: FloatArray) -> tuple[float, ...]:
-    there = rows[np.isfinite(rows).all(axis=1)]
-    return tuple(float(value) for value in there[-1]) if len(there) else ()
-
-
-def _split(
-    moved: FloatArray, axis: int | None, amount: float | None
-) -> tuple[float | None, float | None]:
-    """Final displacement along the axis, and the largest one off it."""
-    there = moved[np.isfinite(moved).all(axis=1)]
-    if not len(there):
-        return None, None
-    if axis is None:
-        return 0.0, float(np.linalg.norm(there, axis=1).max())
-    off = np.delete(there, axis, axis=1)
-    sign = -1.0 if amount is not None and amount < 0 else 1.0
-    return sign * float(there[-1, axis]), float(np.linalg.norm(off, axis=1).max())
+def _compared(
+    moved: FloatArray, axis: int, amount: float
+) -> tuple[float, float | None, float | None]:
+    """Asked along an axis, reached along it, and furthest off it; any other than x, y, z: none."""
+    on_axis = axis in (0, 1, 2)
+    asked = abs(amount) if on_axis else 0.0
+    if not len(moved):
+        return asked, None, None
+    off = np.linalg.norm(np.delete(moved, axis, axis=1) if on_axis else moved, axis=1)
+    reached = float(moved[-1, axis]) * (-1.0 if amount < 0 else 1.0) if on_axis else 0.0
+    return asked, reached, float(off.max())

@@ -156,7 +156,13 @@ class AuditLog:
         self._pending: list[str] = []
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            self._lock = _locked(folder)
+            lock = lock_folder(folder)
+            if lock is None:  # two logs in one folder would be no chain
+                raise RecordingError(
+                    f"another rolling record writes into {folder}: end it, or give this one "
+                    "another --folder (`up`: another --log-dir, or --no-record)"
+                )
+            self._lock = lock
             files = _files(folder)
             self._path = files[-1] if files else self._named()
             self._resume()
@@ -227,17 +233,6 @@ class AuditLog:
         """Close the file, and leave the folder to others."""
         os.close(self._fd)
         os.close(self._lock)
-
-
-def _locked(folder: Path) -> int:
-    """A lock of the folder: two logs in one would be no chain."""
-    try:
-        return lock_folder(folder)
-    except BlockingIOError as error:
-        raise RecordingError(
-            f"another rolling record writes into {folder}: end it, or give this one another "
-            "--folder (`up`: another --log-dir, or --no-record)"
-        ) from error
 
 
 def _files(folder: Path) -> list[Path]:

@@ -20,7 +20,7 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from vla_zenoh.errors import RecordingError
-from vla_zenoh.lab.durable import lock_folder, write_whole
+from vla_zenoh.lab.durable import append_line, lock_folder, whole_lines, write_whole, writing
 from vla_zenoh.lab.trial.plan import TrialPlan
 from vla_zenoh.lab.trial.verdict import EpisodeVerdict
 
@@ -97,16 +97,11 @@ class TrialFolder:
 
     def episodes(self) -> list[EpisodeVerdict]:
         """Verdicts in the order of the episodes. Raises RecordingError: a line cannot be read."""
+        path = self.path / TRIALS
         try:
-            whole, _, rest = (self.path / TRIALS).read_bytes().rpartition(b"\n")
-        except FileNotFoundError:
-            return []
+            lines, self.truncated = whole_lines(path)
         except OSError as error:
-            raise RecordingError(
-                f"{self.path / TRIALS} cannot be read: {error.strerror}"
-            ) from error
-        self.truncated = bool(rest)
-        lines = whole.split(b"\n") if whole else []
+            raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
         return [
             self._parse(EpisodeVerdict, line, f"{TRIALS}, line {number}")
             for number, line in enumerate(lines, 1)
@@ -141,15 +136,11 @@ class TrialFolder:
         Raises:
             RecordingError: another process holds it, or the folder cannot be created.
         """
-        try:
+        with writing(self.path, RecordingError):
             self.path.mkdir(exist_ok=True)
             folder = lock_folder(self.path)
-        except BlockingIOError as error:
-            raise RecordingError(
-                f"another `vla-zenoh lab trial` is at work in {self.path}"
-            ) from error
-        except OSError as error:
-            raise self._cannot(self.path, error) from error
+        if folder is None:
+            raise RecordingError(f"another `vla-zenoh lab trial` is at work in {self.path}")
         try:
             yield
         finally:
@@ -158,35 +149,11 @@ class TrialFolder:
     def begin(self, plan: TrialPlan) -> None:
         """Write the plan. Raises RecordingError: it cannot be written."""
         path = self.path / PLAN
-        try:
+        with writing(path, RecordingError):
             write_whole(path, json.dumps(asdict(plan), indent=2) + "\n")
-            self._sync_folder()
-        except OSError as error:
-            raise self._cannot(path, error) from error
 
     def append(self, verdict: EpisodeVerdict) -> None:
         """Append a verdict and sync it to the disk. Raises RecordingError: it cannot be written."""
         path = self.path / TRIALS
-        line = (json.dumps(asdict(verdict)) + "\n").encode()
-        try:
-            with path.open("ab+") as file:
-                file.seek(0)
-                file.truncate(file.read().rfind(b"\n") + 1)  # a truncated line
-                file.seek(0, os.SEEK_END)
-                file.write(line)
-                file.flush()
-                os.fsync(file.fileno())
-            self._sync_folder()
-        except OSError as error:
-            raise self._cannot(path, error) from error
-
-    def _sync_folder(self) -> None:
-        folder = os.open(self.path, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
-
-    @staticmethod
-    def _cannot(path: Path, error: OSError) -> RecordingError:
-        return RecordingError(f"{path} cannot be written: {error.strerror}")
+        with writing(path, RecordingError):
+            append_line(path, json.dumps(asdict(verdict)))

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-import os
 import time
+from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from vla_zenoh.errors import OutputError
-from vla_zenoh.lab.durable import page_template, write_whole
+from vla_zenoh.lab.durable import append_line, page_template, whole_lines, write_whole, writing
 from vla_zenoh.lab.trial.folder import TrialFolder
 from vla_zenoh.lab.trial.plan import TrialPlan
 from vla_zenoh.lab.trial.score import TrialScore, score
@@ -47,10 +47,8 @@ def write_page(trial: UnattendedTrial) -> None:
         journal=journal,
     )
     file = trial.path / PAGE
-    try:
+    with writing(file, OutputError):
         write_whole(file, page)
-    except OSError as error:
-        raise OutputError(f"{file} cannot be written: {error.strerror}") from error
 
 
 def _row(folder: TrialFolder, each: EpisodeVerdict) -> dict[str, Any]:
@@ -110,11 +108,9 @@ class UnattendedTrial:
             OutputError: that cannot be written.
         """
         file = self.path / PLAN
-        try:
-            if not file.exists():
+        if not file.exists():
+            with writing(file, OutputError):
                 write_whole(file, self.plan.model_dump_json(indent=2) + "\n")
-        except OSError as error:
-            raise OutputError(f"{file} cannot be written: {error.strerror}") from error
         self.note("begun")
 
     def trial(self, task: UnattendedTask) -> tuple[TrialFolder, TrialPlan]:
@@ -148,23 +144,15 @@ class UnattendedTrial:
         """
         line = {"what": what, "why": why, "time_s": time.time(), "episodes": len(self.episodes())}
         file = self.path / JOURNAL
-        try:
-            with file.open("ab") as out:
-                # The line feed at the start ends a line that a power cut truncated.
-                out.write(b"\n" + json.dumps(line).encode() + b"\n")
-                out.flush()
-                os.fsync(out.fileno())
-        except OSError as error:
-            raise OutputError(f"{file} cannot be written: {error.strerror}") from error
+        with writing(file, OutputError):
+            append_line(file, json.dumps(line))
 
     def journal(self) -> list[dict[str, Any]]:
         """Lines of the journal; one that was cut off is none."""
-        file, out = self.path / JOURNAL, []
-        for line in file.read_bytes().splitlines() if file.exists() else []:
-            try:
+        out: list[dict[str, Any]] = []
+        for line in whole_lines(self.path / JOURNAL)[0]:
+            with suppress(ValueError):
                 out.append(json.loads(line))
-            except ValueError:
-                continue
         return out
 
     def since(self) -> tuple[float, int]:

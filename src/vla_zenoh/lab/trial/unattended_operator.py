@@ -13,6 +13,7 @@ import numpy as np
 from vla_zenoh.bus.client import Client
 from vla_zenoh.codec.image import encode_jpeg
 from vla_zenoh.errors import NodeError, RecordingError
+from vla_zenoh.lab.durable import write_whole, writing
 from vla_zenoh.lab.episode import EpisodeRunner
 from vla_zenoh.lab.newest_records import NewestRecords, StreamSlot
 from vla_zenoh.lab.primitives.client import ask
@@ -250,12 +251,8 @@ class UnattendedOperator:
         if strip is None:
             return
         path = strip_path(self._folder, episode.due.setup, episode.due.worker)
-        part = path.with_suffix(".part")
-        try:
-            part.write_bytes(strip)
-            part.replace(path)
-        except OSError as error:
-            raise RecordingError(f"{path} cannot be written: {error.strerror}") from error
+        with writing(path, RecordingError):
+            write_whole(path, strip)
 
 
 def strip_path(folder: TrialFolder, setup: int, worker: str) -> Path:
