@@ -61,7 +61,11 @@ def test_the_file_holds_everything_that_was_said(run_file: Path, shared_chain: C
     streams = (run.poses, run.joints, run.grippers, run.commands, run.chunks, run.tasks)
     assert all(len(stream) > 5 for stream in (*streams, run.seen))
     assert run.picture_counts["front"] > 5
-    said = [(setting.name, setting.text) for setting in run.settings]
+    said = [
+        (run.keys.short(entry.key), entry.text)
+        for entry in run.file.entries()
+        if entry.header is None and entry.kind is None
+    ]
     assert said[0] == ("prompt", "hold"), "the setting in force before the recording began"
     for setting in (("prompt", f"HARD: go up x{STEPS}"), ("active", "true"), ("active", "false")):
         assert setting in said

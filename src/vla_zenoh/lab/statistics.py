@@ -10,7 +10,6 @@ import math
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -145,7 +144,8 @@ def paired(outcomes: Iterable[tuple[bool, bool]]) -> Paired:
         outcomes: for each setup whether the first succeeded, and whether the second did.
     """
     counts = Counter(outcomes)
-    return Paired(*(counts[pair] for pair in product((True, False), repeat=2)))
+    both, neither = counts[True, True], counts[False, False]
+    return Paired(both, counts[True, False], counts[False, True], neither)
 
 
 def mcnemar_exact(first: int, second: int) -> float:

@@ -20,14 +20,11 @@ from vla_zenoh.control.actions import as_deltas
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.dataset.corrections import commanded_motion
 from vla_zenoh.lab.dataset.label import EpisodeLabel
-from vla_zenoh.lab.evaluation.activations import activations, obeyed_chunks
-from vla_zenoh.lab.recording.run import RecordedSample, Run, newest
+from vla_zenoh.lab.recording.run import RecordedSample, Run, Span, is_within, newest
 from vla_zenoh.lab.teleop.policy import PERSON
 from vla_zenoh.policy import ROTATION_SIZE, ActionSpec, ModelSpec
 
 FPS_TOLERANCE = 0.01
-Span = tuple[int, int, str]
-"""Since and until when, wall ns, the arm obeyed which worker."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,11 +111,11 @@ def episodes_of(run: Run, worker: str | None = None) -> list[RecordedEpisode]:
     }
     carried_out = [
         chunk
-        for chunk in obeyed_chunks(run)
+        for chunk in run.obeyed_chunks()
         if (chunk.record.worker, chunk.header.seq, chunk.record.observation_stamp_ns) in done
     ]
     people = _people(run)
-    spans = [span for span in activations(run) if _within(span, carried_out)]
+    spans = [span for span in run.activations() if _within(span, carried_out)]
     alone = worker in people
     out: list[RecordedEpisode] = []
     for led in [[span] for span in spans] if alone else together(spans, people):
@@ -137,12 +134,7 @@ def _people(run: Run) -> set[str]:
 
 def _within(span: Span, chunks: list[RecordedSample]) -> list[RecordedSample]:
     """Those of the worker and the time of a span."""
-    since_ns, until_ns, worker = span
-    return [
-        chunk
-        for chunk in chunks
-        if since_ns <= chunk.header.stamp_wall_ns < until_ns and chunk.record.worker == worker
-    ]
+    return [chunk for chunk in chunks if is_within(chunk, span)]
 
 
 def together(spans: list[Span], people: set[str]) -> list[list[Span]]:

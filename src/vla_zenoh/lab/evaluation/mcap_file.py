@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vla_zenoh.errors import MissingExtraError, ProfileError
-from vla_zenoh.lab.evaluation.activations import activations, obeyed_chunks, prompt_intervals
 from vla_zenoh.lab.evaluation.filmstrip import filmstrip
 from vla_zenoh.lab.evaluation.result import TASKS, Evaluation, PlotTrace, TaskVerdict
 from vla_zenoh.lab.evaluation.segments import (
@@ -64,7 +63,7 @@ def _models(run: Run) -> str:
         profile = read_profile(run.file.profile_yaml, str(run.path))
     except ProfileError:
         profile = None
-    workers = dict.fromkeys(worker for _, _, worker in activations(run))
+    workers = dict.fromkeys(worker for _, _, worker in run.activations())
     return "; ".join(_model(worker, profile) for worker in workers)
 
 
@@ -152,7 +151,7 @@ def evaluate_loaded(run: Run, *, pictures: int = 0) -> Evaluation:
         out.problems.append("its recorder was ended before it could finish the file")
     if run.file.dropped:
         out.problems.append(f"the recorder dropped {run.file.dropped} samples")
-    obeyed = obeyed_chunks(run)
+    obeyed = run.obeyed_chunks()
     causes = run.first_commands()
     _requests(out, obeyed, causes, zero_ns)
     measured, commanded = _stream(run.poses, zero_ns), _commanded(run, zero_ns)
@@ -323,7 +322,7 @@ def _joint_jerk(out: Evaluation, commands: Sequence[RecordedSample]) -> None:
 def _idle(out: Evaluation, run: Run, measured: MeasuredMotion) -> None:
     active = [
         ((since_ns - run.began_ns) / 1e9, (end_ns - run.began_ns) / 1e9)
-        for since_ns, end_ns, _ in activations(run)
+        for since_ns, end_ns, _ in run.activations()
     ]
     if not active:
         return
@@ -359,7 +358,7 @@ def _segments(
     """A segment for each prompt in force while the arm was active."""
     zero_ns = run.began_ns
     steps = {(e.record.worker, e.header.seq): len(e.record.steps) for e in run.chunks}
-    for since_ns, end_ns, prompt in prompt_intervals(run):
+    for since_ns, end_ns, prompt in run.prompt_intervals():
         out.prompts.append(prompt)
         since_s, until_s = (since_ns - zero_ns) / 1e9, (end_ns - zero_ns) / 1e9
         out.marks.append((since_s, prompt))

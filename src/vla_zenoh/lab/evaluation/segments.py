@@ -88,13 +88,13 @@ def segment(
     """
     moved, turned = known(position_m), rotvecs(known(quat_xyzw))
     moved = moved - moved[:1]
-    amounts: tuple[float | None, ...] = (None,) * 6
+    way: tuple[float | None, float | None, float | None] = (None, None, None)
+    turn = way
     with suppress(SpecError):
         asked = parse_scripted(prompt)
         amount = asked.offset(requests if asked.steps is None else min(requests, asked.steps))
         axis = -1 if asked.motion is None else asked.motion.axis
-        ways = _compared(moved, axis, amount), _compared(turned, axis - 3, amount)
-        amounts = tuple(value for pair in zip(*ways, strict=True) for value in pair)
+        way, turn = _compared(moved, axis, amount), _compared(turned, axis - 3, amount)
     widths = width_m[np.isfinite(width_m)]
     return PromptSegment(
         prompt,
@@ -104,7 +104,7 @@ def segment(
         turned_rad(quat_xyzw),
         tuple(moved[-1].tolist()) if len(moved) else (),
         tuple(turned[-1].tolist()) if len(turned) else (),
-        *amounts,
+        *(way[0], turn[0], way[1], turn[1], way[2], turn[2]),
         (float(widths[0]), float(widths[-1])) if len(widths) else None,
     )
 

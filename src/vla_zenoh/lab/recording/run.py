@@ -49,20 +49,15 @@ class RecordedSample(NamedTuple):
 
 
 class RecordedImage(NamedTuple):
-    """A JPEG file with its times of reception and capture, and its sequence number."""
+    """A JPEG file with its time of capture and its sequence number."""
 
-    received_ns: int
     stamp_ns: int
     seq: int
     jpeg: bytes
 
 
-class RecordedSetting(NamedTuple):
-    """A published setting."""
-
-    received_ns: int
-    name: str
-    text: str
+Span = tuple[int, int, str]
+"""Since and until when, wall ns, the arm obeyed one worker, or one prompt was in force."""
 
 
 @dataclass(slots=True)
@@ -91,7 +86,6 @@ class Run:
     """The last of every node."""
     first_statuses: dict[str, NodeStatus] = field(default_factory=dict)
     """The first of every node."""
-    settings: list[RecordedSetting] = field(default_factory=list)
     picture_counts: Counter[str] = field(default_factory=Counter)
     """Pictures by camera."""
     depth_cameras: set[str] = field(default_factory=set)
@@ -147,28 +141,56 @@ class Run:
         }
         return replace(self, part=name, **own)
 
-    def prompts(self) -> list[tuple[int, str]]:
-        """(wall ns, prompt) of each published prompt."""
-        return [(put.received_ns, put.text) for put in self.settings if put.name == "prompt"]
-
     def first_commands(self) -> list[tuple[Cause, int]]:
-        """`first_commands` of the pose commands, else of the joint commands."""
-        return first_commands(self.commands or self.joint_commands)
+        """The cause of each chunk, and the stamp of its first pose command, else joint command.
+
+        The stamp, not the reception: a recorder may receive late what the robot received in time.
+        """
+        out: list[tuple[Cause, int]] = []
+        newest: tuple[str, int] | None = None
+        for entry in self.commands or self.joint_commands:
+            cause = entry.record.cause
+            if cause is not None and (cause.worker, cause.chunk_seq) != newest:
+                newest = (cause.worker, cause.chunk_seq)
+                out.append((cause, entry.header.stamp_wall_ns))
+        return out
+
+    # -- intervals, by the stamps of the writers: a replayed run is divided as the original is ----
+    def activations(self) -> list[Span]:
+        """Each interval in which the arm obeyed one worker."""
+        return self._spans("worker")
+
+    def prompt_intervals(self) -> list[Span]:
+        """Each interval with one prompt in force while the arm was active."""
+        return self._spans("prompt")
+
+    def obeyed_chunks(self) -> list[RecordedSample]:
+        """Chunks of the obeyed worker while the arm was active: the requests."""
+        spans = self.activations()
+        return [chunk for chunk in self.chunks if any(is_within(chunk, span) for span in spans)]
+
+    def _spans(self, name: str) -> list[Span]:
+        out: list[Span] = []
+        since_ns, now = 0, None
+        for entry in self.tasks:
+            value = getattr(entry.record, name) if entry.record.active else None
+            if value != now:
+                stamp_ns = entry.header.stamp_wall_ns
+                if now is not None:
+                    out.append((since_ns, stamp_ns, now))
+                since_ns, now = stamp_ns, value
+        if now is not None:
+            # Not the end of the file: a recorder may run on after robot and models.
+            streams = (self.tasks, self.chunks, self.commands, self.joint_commands, self.poses)
+            last_ns = max(stream[-1].header.stamp_wall_ns for stream in streams if stream)
+            out.append((since_ns, last_ns + 1, now))
+        return out
 
 
-def first_commands(commands: Sequence[RecordedSample]) -> list[tuple[Cause, int]]:
-    """The cause of each chunk, and the stamp of its first command in `commands`.
-
-    The stamp, not the reception: a recorder may receive late what the robot received in time.
-    """
-    out: list[tuple[Cause, int]] = []
-    newest: tuple[str, int] | None = None
-    for entry in commands:
-        cause = entry.record.cause
-        if cause is not None and (cause.worker, cause.chunk_seq) != newest:
-            newest = (cause.worker, cause.chunk_seq)
-            out.append((cause, entry.header.stamp_wall_ns))
-    return out
+def is_within(chunk: RecordedSample, span: Span) -> bool:
+    """Whether a chunk is of the worker and the time of a span."""
+    since_ns, until_ns, worker = span
+    return since_ns <= chunk.header.stamp_wall_ns < until_ns and chunk.record.worker == worker
 
 
 def newest(stream: Sequence[RecordedSample], at_ns: int) -> RecordedSample | None:
@@ -192,7 +214,7 @@ def load_run(path: Path) -> Run:
     """
     file = open_recording(path)
     run, keys, rejected = Run(file), file.keys, Counter[str]()
-    lists = {
+    lists: dict[type, list[RecordedSample]] = {
         PoseState: run.poses,
         JointState: run.joints,
         GripperState: run.grippers,
@@ -210,10 +232,8 @@ def load_run(path: Path) -> Run:
         run.ended_ns = max(run.ended_ns, entry.received_ns)
         if entry.kind is None:
             if entry.header is None and entry.attachment is None:
-                run.settings.append(
-                    RecordedSetting(entry.received_ns, keys.short(entry.key), entry.text)
-                )
-            elif entry.encoding == JPEG:
+                continue  # a setting; `tasks` has what the command node made of it
+            if entry.encoding == JPEG:
                 run.picture_counts[_camera(keys, entry.key)] += 1
             elif entry.encoding.startswith(DEPTH):
                 run.depth_cameras.add(_camera(keys, entry.key))
@@ -227,7 +247,15 @@ def load_run(path: Path) -> Run:
             continue
         if entry.header is None:
             continue
-        _keep(run, lists, RecordedSample(entry.header, record, entry.received_ns, entry.key))
+        if type(record) in lists:
+            received = RecordedSample(entry.header, record, entry.received_ns, entry.key)
+            lists[type(record)].append(received)
+        elif isinstance(record, ModelSpec):
+            run.specs[record.hash] = record
+        elif isinstance(record, NodeStatus):
+            node = last_chunk(entry.key)
+            run.first_statuses.setdefault(node, record)
+            run.statuses[node] = record
     if file.damage:
         run.problems.append(f"{path.name} is {file.damage}; evaluated up to there")
     run.problems += [f"{what} ({count})" for what, count in rejected.most_common(MAX_PROBLEMS)]
@@ -253,18 +281,6 @@ def _camera(keys: Keys, key: str) -> str:
     return keys.short(key).split("/")[1]
 
 
-def _keep(run: Run, lists: dict[type, list[RecordedSample]], received: RecordedSample) -> None:
-    kept = lists.get(type(received.record))
-    if kept is not None:
-        kept.append(received)
-    elif isinstance(received.record, ModelSpec):
-        run.specs[received.record.hash] = received.record
-    elif isinstance(received.record, NodeStatus):
-        node = last_chunk(received.key)
-        run.first_statuses.setdefault(node, received.record)
-        run.statuses[node] = received.record
-
-
 def pictures(file: Recording, camera: str) -> Iterator[RecordedImage]:
     """Every JPEG of a camera, oldest first, one in memory at a time."""
     return _jpegs(file, file.keys.camera_jpeg(camera))
@@ -287,4 +303,4 @@ def _jpegs(file: Recording, key: str) -> Iterator[RecordedImage]:
     for entry in file.entries(lambda each: each == key):
         if entry.header is not None and entry.encoding == JPEG:
             stamp_ns, seq = entry.header.stamp_wall_ns, entry.header.seq
-            yield RecordedImage(entry.received_ns, stamp_ns, seq, entry.payload)
+            yield RecordedImage(stamp_ns, seq, entry.payload)
