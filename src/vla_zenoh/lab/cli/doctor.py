@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import datetime as dt
 import functools
 import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -25,10 +23,9 @@ from vla_zenoh.cli.output import console, fail, new_table, styled
 from vla_zenoh.errors import SecurityError, SessionError
 from vla_zenoh.lab.cli.output import print_json, progress
 from vla_zenoh.lab.doctor import HostFinding, Needs, examine, needs_of
-from vla_zenoh.lab.doctor.access import AccessVerdict, access
-from vla_zenoh.lab.doctor.access_check import check_access, read_access, try_identity
+from vla_zenoh.lab.doctor.access import access
 from vla_zenoh.lab.doctor.software import robot
-from vla_zenoh.profile import Profile, SessionProfile
+from vla_zenoh.profile import SessionProfile
 
 
 def robot_check(
@@ -112,18 +109,8 @@ def doctor(
                 from vla_zenoh.lab.doctor.fci import fci_host
 
                 findings += fci_host(loaded, host)
-            findings += access(
-                loaded,
-                dt.datetime.now(dt.UTC),
-                functools.partial(_check_access, loaded, rules, also or ()),
-                functools.partial(try_identity, loaded),
-            )
+            findings += access(loaded, rules, also or ())
     report(findings, as_json=as_json)
-
-
-def _check_access(profile: Profile, rules: Path | None, also: Sequence[str]) -> list[AccessVerdict]:
-    others = [effective_profile(name) for name in also]
-    return check_access(profile, None if rules is None else read_access(rules), others)
 
 
 def report(findings: list[HostFinding], *, as_json: bool) -> None:

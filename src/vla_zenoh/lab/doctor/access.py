@@ -6,16 +6,21 @@ import datetime as dt
 import re
 import socket
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vla_zenoh.errors import MissingExtraError, SecurityError, VlaZenohError
 from vla_zenoh.lab.certificates.bridge import NODE as BRIDGE
 from vla_zenoh.lab.certificates.lab_certificates import unused_certificates
-from vla_zenoh.lab.doctor.needs import HostFinding
-from vla_zenoh.profile import Profile
+from vla_zenoh.lab.doctor.access_check import (
+    AccessVerdict,
+    check_access,
+    read_access,
+    try_identity,
+)
+from vla_zenoh.lab.doctor.needs import HostFinding, judged
+from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.profile.session import is_loopback
-from vla_zenoh.security.identity import Identity
 
 if TYPE_CHECKING:
     from vla_zenoh.security.certificates import Entry
@@ -25,35 +30,12 @@ SERVERS = ("router", BRIDGE)
 """Nodes whose certificates are not presented to the router."""
 
 
-@dataclass(frozen=True, slots=True)
-class AccessVerdict:
-    """Result of the access check for one identity.
-
-    Args:
-        must: number of acts that it must be able to do.
-        must_not: number of acts that it must not be able to do.
-        faults: each a sentence with the rule that is missing or too much.
-    """
-
-    identity: Identity
-    must: int
-    must_not: int
-    faults: tuple[str, ...]
-
-
-def access(
-    profile: Profile,
-    now: dt.datetime,
-    check_access: Callable[[], Sequence[AccessVerdict]],
-    try_identity: Callable[[str], str],
-) -> Iterator[HostFinding]:
+def access(profile: Profile, file: Path | None, also: Sequence[str]) -> Iterator[HostFinding]:
     """Certificates of this computer, rules of the profile, and the running router.
 
     Args:
-        now: UTC.
-        check_access: see `vla_zenoh.lab.doctor.access_check`.
-        try_identity: presents the certificate of a node of this computer to the running router;
-            returns what is wrong.
+        file: Zenoh's configuration with other rules; None: those of the profile.
+        also: profiles of other robots of the router.
     """
     security = profile.session.security
     if security is None:
@@ -64,7 +46,7 @@ def access(
 
         store = CheckedStore(security.folder)
         host = store.this_host(security.host)
-        entries = store.entries(now, host)
+        entries = store.entries(dt.datetime.now(dt.UTC), host)
     except (MissingExtraError, SecurityError) as error:
         yield HostFinding("certificates", "fail", str(error))
         return
@@ -72,12 +54,13 @@ def access(
     for path, why in unused_certificates(profile, entries).items():
         yield HostFinding(f"certificate {path.name}", "warn", why)
     try:
-        yield from map(rules, check_access())
+        given = None if file is None else read_access(file)
+        yield from map(rules, check_access(profile, given, [load_profile(name) for name in also]))
     except VlaZenohError as error:
         yield HostFinding("access", "fail", f"the rules could not be checked: {error}")
     for entry in entries:
         if entry.node not in SERVERS and not entry.faults:
-            yield _accepted(entry, try_identity)
+            yield _accepted(profile, entry)
 
 
 def certificates(host: str, entries: Sequence[Entry]) -> HostFinding:
@@ -115,25 +98,20 @@ def rules(verdict: AccessVerdict) -> HostFinding:
     )
 
 
-def _accepted(entry: Entry, try_identity: Callable[[str], str]) -> HostFinding:
+def _accepted(profile: Profile, entry: Entry) -> HostFinding:
     name = f"router takes {entry.node}@{entry.host}"
     try:
-        why = try_identity(entry.node)
+        why = try_identity(profile, entry.node)
     except VlaZenohError as error:
         return HostFinding(name, "warn", str(error))
-    return HostFinding(name, "fail" if why else "ok", why or "and grants it access")
+    return judged(name, not why, why or "and grants it access", level="fail")
 
 
 def _without(profile: Profile) -> HostFinding:
-    if all(map(is_loopback, profile.session.listen)):
-        found = "no certificates; the router listens on this computer only"
-        return HostFinding("access", "ok", found)
-    return HostFinding(
-        "access",
-        "warn",
-        "anyone on the network can command this robot",
-        "vla-zenoh secure init makes certificates and rules",
-    )
+    local = all(map(is_loopback, profile.session.listen))
+    here = "no certificates; the router listens on this computer only"
+    found = here if local else "anyone on the network can command this robot"
+    return judged("access", local, found, "vla-zenoh secure init makes certificates and rules")
 
 
 CONNECT_LIMIT_S = 1.0

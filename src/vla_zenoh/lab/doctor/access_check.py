@@ -19,7 +19,6 @@ import zenoh
 from vla_zenoh.bus.session import covers, open_session
 from vla_zenoh.errors import SecurityError
 from vla_zenoh.keys import Keys
-from vla_zenoh.lab.doctor.access import AccessVerdict
 from vla_zenoh.profile import Profile
 from vla_zenoh.security.identity import Identity, Role, identities
 from vla_zenoh.security.roles import (
@@ -108,6 +107,22 @@ def missing(config: Mapping[str, Any], identity: Identity, act: Act, key: str) -
 REPLY_S = 2.0
 RobotIdentity = tuple[Keys, Identity]
 """An identity at one robot."""
+
+
+@dataclass(frozen=True, slots=True)
+class AccessVerdict:
+    """Result of the access check for one identity.
+
+    Args:
+        must: number of acts that it must be able to do.
+        must_not: number of acts that it must not be able to do.
+        faults: each a sentence with the rule that is missing or too much.
+    """
+
+    identity: Identity
+    must: int
+    must_not: int
+    faults: tuple[str, ...]
 
 
 def check_access(

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from vla_zenoh.errors import NodeError
-from vla_zenoh.lab.doctor.needs import HostFinding
+from vla_zenoh.lab.doctor.needs import HostFinding, judged
 from vla_zenoh.nodes.camera.v4l2_devices import DEV, find_device
 
 PRIORITY = 50
@@ -68,29 +68,17 @@ def processors() -> HostFinding:
     """At least two processors: one for the controller, one for everything else."""
     usable = len(os.sched_getaffinity(0))
     found = f"{usable} usable of {os.cpu_count()}"
-    if usable < FEWEST_PROCESSORS:
-        return HostFinding(
-            "processors",
-            "warn",
-            found,
-            "give this host two or more; in a container: --cpus=2 or more",
-        )
-    return HostFinding("processors", "ok", found)
+    advice = "give this host two or more; in a container: --cpus=2 or more"
+    return judged("processors", usable >= FEWEST_PROCESSORS, found, advice)
 
 
 def governor(cpu: Path = CPU) -> HostFinding:
     """The frequency governor keeps processors awake between two ticks of a controller."""
     kinds = sorted({_text(path) for path in cpu.glob("cpu*/cpufreq/scaling_governor")})
-    if not kinds:
-        return HostFinding(
-            "frequency governor", "ok", "none; the clock frequency is fixed or hidden"
-        )
-    if kinds == ["performance"]:
-        return HostFinding("frequency governor", "ok", "performance")
-    return HostFinding(
+    return judged(
         "frequency governor",
-        "warn",
-        ", ".join(kinds),
+        kinds in ([], ["performance"]),
+        ", ".join(kinds) or "none; the clock frequency is fixed or hidden",
         "sudo cpupower frequency-set --governor performance (Debian: linux-cpupower, "
         "Ubuntu: linux-tools-generic)",
     )
@@ -128,9 +116,7 @@ def shared_memory(
         return HostFinding("shared memory", "warn", f"{folder} cannot be written", advice)
     free_mib = shutil.disk_usage(folder).free // MIB
     found = f"{free_mib} MiB free in {folder}"
-    if free_mib < wanted_mib:
-        return HostFinding("shared memory", "warn", found, advice)
-    return HostFinding("shared memory", "ok", found)
+    return judged("shared memory", free_mib >= wanted_mib, found, advice)
 
 
 def disk(folder: Path | None = None, wanted_mib: int = DISK_WANTED_MIB) -> HostFinding:
@@ -138,10 +124,9 @@ def disk(folder: Path | None = None, wanted_mib: int = DISK_WANTED_MIB) -> HostF
     folder = folder or Path.cwd()
     free_mib = shutil.disk_usage(folder).free // MIB
     found = f"{free_mib / 1024:.1f} GiB free in {folder}"
-    if free_mib >= wanted_mib:
-        return HostFinding("disk", "ok", found)
     level = "fail" if free_mib < min(DISK_NEEDED_MIB, wanted_mib) else "warn"
-    return HostFinding("disk", level, found, "free some space, or work in a folder on another disk")
+    advice = "free some space, or work in a folder on another disk"
+    return judged("disk", free_mib >= wanted_mib, found, advice, level)
 
 
 def video_devices(needed: Sequence[str] = (), dev: Path = DEV) -> HostFinding:
@@ -181,8 +166,6 @@ TIMEX_BYTES = 256
 """More than struct timex has on any architecture."""
 TIME_ERROR = 5
 
-_ADVICE = "sudo apt install chrony (needed when nodes run on more than one host)"
-
 
 def wall_clock() -> HostFinding:
     """The wall clock is synchronised, as the kernel reports: time stamps cross hosts."""
@@ -191,11 +174,9 @@ def wall_clock() -> HostFinding:
 
 def clock_finding(state: int | None) -> HostFinding:
     """Finding on the return value of adjtimex; None: it cannot be called."""
-    if state is None:
-        return HostFinding("wall clock", "warn", "unknown here", _ADVICE)
-    if state == TIME_ERROR:
-        return HostFinding("wall clock", "warn", "not synchronised", _ADVICE)
-    return HostFinding("wall clock", "ok", "synchronised")
+    found = {None: "unknown here", TIME_ERROR: "not synchronised"}.get(state, "synchronised")
+    advice = "sudo apt install chrony (needed when nodes run on more than one host)"
+    return judged("wall clock", state not in (None, TIME_ERROR), found, advice)
 
 
 def kernel_state() -> int | None:

@@ -19,7 +19,7 @@ from vla_zenoh.kinematics.kinematics import Kinematics, make_kinematics
 from vla_zenoh.kinematics.so3 import Pose, pose_distance
 from vla_zenoh.lab.doctor.computer import may_use_priority
 from vla_zenoh.lab.doctor.franka_limits import BY_FCI, JOINTS
-from vla_zenoh.lab.doctor.needs import HostFinding, Level
+from vla_zenoh.lab.doctor.needs import HostFinding, Level, judged
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.robot import FrankaProfile
 from vla_zenoh.robots.franka.arm import FrankaArm, error_names, flange_pose
@@ -74,24 +74,23 @@ def library(franka: FrankaProfile) -> HostFinding:
 
 def kernel(franka: FrankaProfile, flag: Path = REALTIME_KERNEL) -> HostFinding:
     """The kernel is a real-time one."""
-    release = os.uname().release
-    if flag.exists() and flag.read_text().strip() == "1":
-        return HostFinding("FCI: kernel", "ok", f"{release}, real time")
-    return HostFinding(
+    real_time = flag.exists() and flag.read_text().strip() == "1"
+    what = " is no real-time kernel; the robot ends a motion after 20 lost cycles"
+    return judged(
         "FCI: kernel",
-        _level(franka),
-        f"{release} is no real-time kernel; the robot ends a motion after 20 lost cycles",
+        real_time,
+        os.uname().release + (", real time" if real_time else what),
         "install a kernel with PREEMPT_RT",
+        _level(franka),
     )
 
 
 def priority(franka: FrankaProfile) -> HostFinding:
     """This user may use the priority that libfranka takes."""
-    if not may_use_priority(HIGHEST_PRIORITY):
-        advice = f"allow this user rtprio {HIGHEST_PRIORITY} and memlock unlimited (limits.conf)"
-        found = f"SCHED_FIFO {HIGHEST_PRIORITY} is not permitted"
-        return HostFinding("FCI: priority", _level(franka), found, advice)
-    return HostFinding("FCI: priority", "ok", f"SCHED_FIFO {HIGHEST_PRIORITY} is permitted")
+    may = may_use_priority(HIGHEST_PRIORITY)
+    found = f"SCHED_FIFO {HIGHEST_PRIORITY} is {'' if may else 'not '}permitted"
+    advice = f"allow this user rtprio {HIGHEST_PRIORITY} and memlock unlimited (limits.conf)"
+    return judged("FCI: priority", may, found, advice, _level(franka))
 
 
 def network_card(franka: FrankaProfile, folder: Path = NETWORK) -> HostFinding:
@@ -113,9 +112,8 @@ def network_card(franka: FrankaProfile, folder: Path = NETWORK) -> HostFinding:
         speed = -1
     if speed <= 0:  # Linux writes -1 where it is not known
         return HostFinding(name, "warn", f"{card}, of unknown speed", "it should be 1 Gbit/s")
-    if speed < 1000:
-        return HostFinding(name, "warn", f"{card}, {speed} Mbit/s", "use 1 Gbit/s, without a hub")
-    return HostFinding(name, "ok", f"{card}, {speed} Mbit/s")
+    advice = "use 1 Gbit/s, without a hub"
+    return judged(name, speed >= 1000, f"{card}, {speed} Mbit/s", advice)
 
 
 def round_trip(franka: FrankaProfile) -> HostFinding:
@@ -176,19 +174,16 @@ def _state(robot: Any) -> HostFinding:
     state = robot.state
     mode, errors = state.robot_mode.name, error_names(state.current_errors)
     found = f"mode {mode}" + (f", errors {', '.join(errors)}" if errors else "")
-    if mode == "Idle" and not errors:
-        return HostFinding("state", "ok", found)
     advice = "unlock the joints and activate FCI in Desk; a reflex ends with `vla-zenoh reset`"
-    return HostFinding("state", "warn", found, advice)
+    return judged("state", mode == "Idle" and not errors, found, advice)
 
 
 def _readings(robot: Any) -> HostFinding:
     times = [robot.state.time.to_msec() for _ in range(LOOKS)]
     lost = int(np.maximum(np.diff(times) - 1, 0).sum())
     found = f"{LOOKS} states in {times[-1] - times[0]} ms of the robot, {lost} lost"
-    if lost > LOOKS // 20:
-        return HostFinding("readings", "warn", found, "see `FCI: round trip` of vla-zenoh doctor")
-    return HostFinding("readings", "ok", found)
+    advice = "see `FCI: round trip` of vla-zenoh doctor"
+    return judged("readings", lost <= LOOKS // 20, found, advice)
 
 
 def _flange(robot: Any) -> HostFinding:
@@ -222,12 +217,9 @@ def _description(urdf: str, profile: Profile) -> Iterator[HostFinding]:
     beyond = np.flatnonzero(
         (ours.lower_rad < own.lower_rad - 1e-6) | (ours.upper_rad > own.upper_rad + 1e-6)
     )
-    if beyond.size:
-        names = ", ".join(ours.arm_joints[joint] for joint in beyond)
-        advice = "narrow robot.joint_range_rad"
-        yield HostFinding("joint ranges", "fail", f"beyond the robot's: {names}", advice)
-    else:
-        yield HostFinding("joint ranges", "ok", "within the robot's own")
+    names = ", ".join(ours.arm_joints[joint] for joint in beyond)
+    found = f"beyond the robot's: {names}" if names else "within the robot's own"
+    yield judged("joint ranges", not names, found, "narrow robot.joint_range_rad", "fail")
 
 
 def _limits(profile: Profile) -> HostFinding:
@@ -242,9 +234,9 @@ def _limits(profile: Profile) -> HostFinding:
         values = [value for _, value in getattr(profile.limits, section)]
         if np.any(np.array(values) > getattr(published, section)):
             above.append(f"limits.{section}")
-    if above:
-        return HostFinding("limits", "fail", f"above the published ones: {', '.join(above)}")
-    return HostFinding("limits", "ok", f"within those published for FCI {profile.franka.fci}")
+    within = f"within those published for FCI {profile.franka.fci}"
+    found = f"above the published ones: {', '.join(above)}" if above else within
+    return judged("limits", not above, found, level="fail")
 
 
 def _tool(ours: Kinematics) -> np.ndarray:
@@ -256,9 +248,8 @@ def _tool(ours: Kinematics) -> np.ndarray:
 def _apart(name: str, of: str, own: Pose, ours: Pose) -> HostFinding:
     apart_m, apart_rad = pose_distance(own, ours)
     found = f"{1e3 * apart_m:.2f} mm and {1e3 * apart_rad:.2f} mrad from {of}"
-    if apart_m > APART_M or apart_rad > APART_RAD:
-        return HostFinding(name, "fail", found, "is it another arm, or another description?")
-    return HostFinding(name, "ok", found)
+    near = apart_m <= APART_M and apart_rad <= APART_RAD
+    return judged(name, near, found, "is it another arm, or another description?", "fail")
 
 
 def _pose(matrix: np.ndarray) -> Pose:

@@ -26,6 +26,13 @@ class HostFinding:
     advice: str = ""
 
 
+def judged(
+    name: str, well: bool, found: str, advice: str = "", level: Level = "warn"
+) -> HostFinding:
+    """``ok`` where it is `well`, else `level` with the advice."""
+    return HostFinding(name, "ok", found) if well else HostFinding(name, level, found, advice)
+
+
 Role = Literal["base", "control", "sim", "ros2"]
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"

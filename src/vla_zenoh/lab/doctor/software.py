@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from importlib import metadata
 
 from vla_zenoh.errors import MissingExtraError, NodeError, VlaZenohError, how_to_install
-from vla_zenoh.lab.doctor.needs import HostFinding, Role
+from vla_zenoh.lab.doctor.needs import HostFinding, Role, judged
 from vla_zenoh.profile import Profile
 from vla_zenoh.simulation.backend import RAYCAST, VARIABLE, Backend, choose_backend
 
@@ -70,10 +70,8 @@ for name in sys.argv[1:]:
 
 
 def python_version(version: tuple[int, ...] = tuple(sys.version_info[:3])) -> HostFinding:
-    text = ".".join(map(str, version))
-    if version < OLDEST_PYTHON:
-        return HostFinding("Python", "fail", text, "install Python 3.11 or newer")
-    return HostFinding("Python", "ok", text)
+    text, advice = ".".join(map(str, version)), "install Python 3.11 or newer"
+    return judged("Python", version >= OLDEST_PYTHON, text, advice, "fail")
 
 
 def load_errors(modules: list[str]) -> dict[str, str]:
@@ -128,22 +126,19 @@ def libraries(role: Role, *, required: bool) -> HostFinding:
         if packages:
             return HostFinding(name, level, text, f"sudo apt install {' '.join(packages)}")
         return HostFinding(name, level, text, f"{install} --force-reinstall")
-    if any(wrong):
-        text = "; ".join(fault for fault in wrong if fault)
-        return HostFinding(name, level, text, f"{install} --upgrade")
-    return HostFinding(name, "ok", ", ".join(versions))
+    text = "; ".join(fault for fault in wrong if fault) or ", ".join(versions)
+    return judged(name, not any(wrong), text, f"{install} --upgrade", level)
 
 
 def msgpack_in_c() -> HostFinding:
     """msgpack is compiled; its Python fallback is some thirty times slower."""
     import msgpack
 
-    if msgpack.Packer.__module__ == "msgpack._cmsgpack":
-        return HostFinding("msgpack", "ok", "compiled")
-    return HostFinding(
+    compiled = msgpack.Packer.__module__ == "msgpack._cmsgpack"
+    return judged(
         "msgpack",
-        "warn",
-        "the slow fallback in Python",
+        compiled,
+        "compiled" if compiled else "the slow fallback in Python",
         "unset MSGPACK_PUREPYTHON, or: pip install --force-reinstall --only-binary :all: msgpack",
     )
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from vla_zenoh.errors import MissingExtraError, NodeError
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.kinematics.so3 import Pose, exp3, pose_distance
-from vla_zenoh.lab.doctor.needs import HostFinding
+from vla_zenoh.lab.doctor.needs import HostFinding, judged
 from vla_zenoh.profile import Profile
 from vla_zenoh.robots.ur_arm import WELL, UrArm
 
@@ -28,23 +28,19 @@ def ur_arm(profile: Profile) -> Iterator[HostFinding]:
         status = arm.status()
         found = f"robot mode {status['robot_mode']}, safety mode {status['safety_mode']}"
         well = status["robot_mode"] == "RUNNING" and status["safety_mode"] in WELL
-        advice = "" if well else "power it on and release its brakes at the pendant"
-        yield HostFinding("state", "ok" if well else "warn", found, advice)
+        advice = "power it on and release its brakes at the pendant"
+        yield judged("state", well, found, advice)
         slider = status["speed_slider"]
-        advice = "" if slider == 1 else "set it to 100 %: the arm takes no commands below that"
-        yield HostFinding(
-            "speed slider", "ok" if slider == 1 else "warn", f"{100 * slider:.0f} %", advice
-        )
+        advice = "set it to 100 %: the arm takes no commands below that"
+        yield judged("speed slider", slider == 1, f"{100 * slider:.0f} %", advice)
         joints_rad, position_m, rotvec = arm.measured()
         own = Pose(position_m, exp3(rotvec))
         kinematics = make_kinematics(profile)
         ordered_rad = kinematics.ordered(profile.robot.arm_joints, joints_rad)
         apart_m, apart_rad = pose_distance(own, kinematics.forward(ordered_rad))
         found = f"its TCP is {1e3 * apart_m:.1f} mm and {1e3 * apart_rad:.1f} mrad from ours"
-        if apart_m > APART_M or apart_rad > APART_RAD:
-            advice = "same TCP in its installation as robot.tcp_frame? same type of arm?"
-            yield HostFinding("kinematics", "fail", found, advice)
-        else:
-            yield HostFinding("kinematics", "ok", found)
+        near = apart_m <= APART_M and apart_rad <= APART_RAD
+        advice = "same TCP in its installation as robot.tcp_frame? same type of arm?"
+        yield judged("kinematics", near, found, advice, "fail")
     finally:
         arm.close()
