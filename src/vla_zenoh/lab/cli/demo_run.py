@@ -3,100 +3,71 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import typer
 
 from vla_zenoh.cli.output import console, new_table, styled
-from vla_zenoh.lab.cli.demo_options import DemoOptions
-from vla_zenoh.lab.cli.demo_stage import Stage, latency_line, open_stage, refusals, run_folder
+from vla_zenoh.keys import worker_node
+from vla_zenoh.lab.cli.demo import DemoOptions
+from vla_zenoh.lab.cli.demo_stage import Stage, latency_line, open_stage
 from vla_zenoh.lab.cli.output import print_json
 from vla_zenoh.lab.demo.runner import MotionRunner
 from vla_zenoh.lab.demo.segments import DemoSegment, SegmentOutcome, latencies
-from vla_zenoh.lab.episode import Interrupted
 from vla_zenoh.lab.evaluation.result import TASKS
 from vla_zenoh.lab.recording.run import Run
-from vla_zenoh.policy import ModelSpec
 from vla_zenoh.policy.loader import find_worker, make_policy
-from vla_zenoh.profile import Profile
-from vla_zenoh.types import NodeStatus
-
-
-def write_chunks(path: Path, spec: ModelSpec, chunks: Sequence[np.ndarray]) -> None:
-    """Write a chunk file for ``vla-zenoh worker replay``: spec, steps (N, H, D), length (N,)."""
-    horizon, dimension = spec.action.horizon, spec.action.dimension
-    steps = np.zeros((len(chunks), horizon, dimension), np.float32)
-    for index, chunk in enumerate(chunks):
-        steps[index, : len(chunk)] = chunk
-    length = np.array([len(chunk) for chunk in chunks], np.int32)
-    np.savez_compressed(path, spec=json.dumps(spec.to_dict()), steps=steps, length=length)
 
 
 def run_demo(segments: list[DemoSegment], profile: str, given: DemoOptions) -> None:
     """Run fixed motions and show how far each came."""
-    folder = run_folder(given.output)
     if given.seconds is not None:
         steps = max(round(given.seconds * given.rate_hz), 1)
         segments = [replace(segment, steps=steps) for segment in segments]
-    with open_stage(profile, folder, force=given.force) as stage:
+    with open_stage(profile, given) as stage:
         stage.profile.require_one_arm("fixed motions of demo")
-        outcomes, statuses = _run(stage, segments, given.rate_hz)
+        outcomes = _run(stage, segments, given.rate_hz)
         run, interrupted = stage.recorded(), len(outcomes) < len(segments)
-        summary = _summary(stage.profile, given.rate_hz, outcomes, statuses, run)
+        summary = _summary(stage, given.rate_hz, outcomes, run)
         summary["ok"] = summary["ok"] and not interrupted
         stage.write(summary)
         _write_chunks(stage, run)
         stage.draw(run)
-        stage.film(run)
     if given.as_json:
-        print_json({**summary, "folder": folder})
+        print_json({**summary, "folder": stage.path})
     else:
-        _show(summary, outcomes, folder, interrupted=interrupted)
+        _show(summary, outcomes, stage, interrupted=interrupted)
     if not summary["ok"]:
         raise typer.Exit(130 if interrupted else 1)
 
 
-def _run(
-    stage: Stage, segments: list[DemoSegment], rate_hz: float
-) -> tuple[list[SegmentOutcome], dict[str, NodeStatus]]:
-    """The segments that ended, and the last status of every node."""
+def _run(stage: Stage, segments: list[DemoSegment], rate_hz: float) -> list[SegmentOutcome]:
+    """The segments that ended."""
     outcomes: list[SegmentOutcome] = []
-    with stage.nodes(24) as (running, bars):
-        assert running.client is not None
-        client = running.client
-        try:
-            run = MotionRunner(client, stage.stop, running.poll)
-            run.begin(rate_hz)
-            for segment in segments:
-                bar = bars.add_task(segment.prompt, total=segment.steps)
-                outcome = run.run_segment(
-                    segment, rate_hz, lambda done, bar=bar: bars.update(bar, completed=done)
-                )
-                bars.update(bar, completed=segment.steps)
-                outcomes.append(outcome)
-        except Interrupted:
-            pass
-        finally:
-            statuses = {name: found[0] for name, found in client.snapshot().items()}
-            client.deactivate()
-            stage.facts[TASKS] = [_fact(outcome) for outcome in outcomes]
-    return outcomes, statuses
+    facts = stage.facts[TASKS] = list[dict[str, Any]]()
+    with stage.nodes(24) as (running, client, bars):
+        run = MotionRunner(client, stage.stop, running.poll)
+        run.begin(rate_hz)
+        for segment in segments:
+            bar = bars.add_task(segment.prompt, total=segment.steps)
+            outcome = run.run_segment(
+                segment, rate_hz, lambda done, bar=bar: bars.update(bar, completed=done)
+            )
+            bars.update(bar, completed=segment.steps)
+            outcomes.append(outcome)
+            facts.append(_fact(outcome))
+    return outcomes
 
 
 def _summary(
-    profile: Profile,
-    rate_hz: float,
-    outcomes: list[SegmentOutcome],
-    statuses: dict[str, NodeStatus],
-    run: Run,
+    stage: Stage, rate_hz: float, outcomes: list[SegmentOutcome], run: Run
 ) -> dict[str, Any]:
+    profile, statuses = stage.profile, stage.statuses
     rows = [outcome.to_dict() for outcome in outcomes]
     only = rows[0] if len(rows) == 1 else {}
-    worker, command = statuses.get(f"worker-{profile.task.worker}"), statuses.get("command")
+    worker, command = statuses.get(worker_node(profile.task.worker)), statuses.get("command")
     return {
         "ok": bool(rows) and all(row["ok"] for row in rows),
         "profile": profile.name,
@@ -111,7 +82,7 @@ def _summary(
             "chunks": worker.rates_hz.get("chunks", 0.0) if worker else 0.0,
         },
         "missed_ticks": command.counters.get("command.missed_ticks", 0) if command else 0,
-        "refusals": refusals(statuses),
+        "refusals": stage.refusals(),
         "segments": rows,
     }
 
@@ -134,6 +105,7 @@ def _rate(entries: list[Any]) -> float:
 
 
 def _write_chunks(stage: Stage, run: Run) -> None:
+    """Chunk file for ``vla-zenoh worker replay``: spec, steps (N, H, D), length (N,)."""
     profile = stage.profile
     worker = profile.task.worker
     spec = make_policy(find_worker(worker, profile.models)[1], profile.options.get(worker)).spec
@@ -143,11 +115,16 @@ def _write_chunks(stage: Stage, run: Run) -> None:
         for entry in run.chunks
         if entry.record.worker == worker and entry.header.seq in obeyed
     ]
-    write_chunks(stage.folder / "chunks.npz", spec, chunks)
+    steps = np.zeros((len(chunks), spec.action.horizon, spec.action.dimension), np.float32)
+    for index, chunk in enumerate(chunks):
+        steps[index, : len(chunk)] = chunk
+    length = np.array([len(chunk) for chunk in chunks], np.int32)
+    file = stage.folder / "chunks.npz"
+    np.savez_compressed(file, spec=json.dumps(spec.to_dict()), steps=steps, length=length)
 
 
 def _show(
-    summary: dict[str, Any], outcomes: list[SegmentOutcome], folder: Path, *, interrupted: bool
+    summary: dict[str, Any], outcomes: list[SegmentOutcome], stage: Stage, *, interrupted: bool
 ) -> None:
     columns = ("prompt", "steps", "asked", "reached", "drift", "rotation drift", "verdict")
     title = "asked and reached, measured at rest"
@@ -168,7 +145,8 @@ def _show(
     rates = ", ".join(f"{name} {value:.1f} Hz" for name, value in summary["rates_hz"].items())
     refused = ", ".join(f"{reason} {count}" for reason, count in summary["refusals"].items())
     screen.print(f"rates: {rates}; rejections: {refused or 'none'}")
-    screen.print(f"run folder: {folder} (run.mcap, summary.json, chunks.npz, plot.png, video.mp4)")
+    files = "run.mcap, summary.json, chunks.npz, plot.png, video.mp4"
+    screen.print(f"run folder: {stage.path} ({files})")
     if interrupted:
         screen.print("interrupted; the arm braked", style="yellow")
     elif summary["ok"]:

@@ -16,12 +16,15 @@ from typing import Any
 
 from rich.progress import Progress
 
+from vla_zenoh.bus.client import Client
 from vla_zenoh.cli.options import effective_profile
-from vla_zenoh.cli.output import Screen, errors
+from vla_zenoh.cli.output import errors
 from vla_zenoh.lab.cli.bench_file import running_nodes
+from vla_zenoh.lab.cli.demo import DemoOptions
 from vla_zenoh.lab.cli.loopback import own_address
 from vla_zenoh.lab.cli.output import progress_bars
 from vla_zenoh.lab.cli.output_path import RUNS, output_folder
+from vla_zenoh.lab.episode import Interrupted
 from vla_zenoh.lab.evaluation.mcap_file import evaluate_parts
 from vla_zenoh.lab.evaluation.plot_image import write_plot
 from vla_zenoh.lab.recording.film import Film, write_film
@@ -38,52 +41,76 @@ class Stage:
     """A profile at an address of its own, and the run folder. Made by `open_stage`.
 
     Args:
-        screen: for progress; stdout is for the summary.
+        folder: to fill; it becomes `path` at the end.
         facts: for the end of the recording, such as the verdicts.
+        statuses: the last one of every node, once the nodes have ended.
     """
 
     profile: Profile
     folder: Path
-    name: str
+    path: Path
     stop: threading.Event
-    screen: Screen
     facts: dict[str, Any] = field(default_factory=dict)
-
-    @property
-    def recording(self) -> Path:
-        """The recording, from which all other files are made."""
-        return self.folder / "run.mcap"
+    statuses: dict[str, NodeStatus] = field(default_factory=dict)
 
     @contextmanager
-    def nodes(self, width: int) -> Iterator[tuple[Host, Progress]]:
-        """Run and record all nodes, with progress bars; a failure shows the end of their log."""
-        with progress_bars(width, self.screen) as bars:
+    def nodes(self, width: int) -> Iterator[tuple[Host, Client, Progress]]:
+        """Run and record all nodes, with progress bars; a failure shows the end of their log.
+
+        At the end the arm brakes, also after Ctrl-C, which ends the block and nothing else.
+        """
+        with progress_bars(width) as bars:
             coming_up = bars.add_task("starting the nodes", total=None)
             with running_nodes(self.profile, self.folder / "nodes.log") as running:
-                assert running.session is not None
+                session, client = running.session, running.client
+                assert session is not None and client is not None
                 bars.update(coming_up, visible=False)
                 recorder = Recorder(
                     self.profile,
-                    running.session,
-                    self.recording,
+                    session,
+                    self.folder / "run.mcap",
                     about={"command": shlex.join(["vla-zenoh", *sys.argv[1:]])},
                 ).start()
                 try:
-                    yield running, bars
+                    yield running, client, bars
+                except Interrupted:
+                    pass
                 finally:
+                    found = client.snapshot().items()
+                    self.statuses.update({name: status for name, (status, _, _) in found})
+                    client.deactivate()
                     recorder.close(self.facts)
 
+    def refusals(self) -> dict[str, int]:
+        """Rejections of all nodes, by reason."""
+        out: Counter[str] = Counter()
+        for status in self.statuses.values():
+            for name, count in status.counters.items():
+                if name.startswith("refused."):
+                    out[name.removeprefix("refused.")] += count
+        return dict(sorted(out.items()))
+
     def recorded(self) -> Run:
-        return load_run(self.recording)
+        return load_run(self.folder / "run.mcap")
 
     def write(self, summary: Mapping[str, Any]) -> None:
         (self.folder / "profile.yaml").write_text(to_yaml(self.profile), "utf-8")
         text = json.dumps(summary, indent=2) + "\n"
         (self.folder / "summary.json").write_text(text, "utf-8")
 
-    def film(self, run: Run, verdicts: Sequence[tuple[int, str, bool]] = ()) -> None:
-        """Write video.mp4 with `verdicts` (ns, text, success) in it."""
-        with progress_bars(24, self.screen, counted=False) as bars:
+    def draw(self, run: Run, verdicts: Sequence[tuple[int, str, bool]] = ()) -> None:
+        """Write plots, of a robot of parts of each, and video.mp4 with `verdicts` in it.
+
+        Args:
+            verdicts: ns, text, success.
+        """
+        with progress_bars(24, counted=False) as bars:
+            drawing = bars.add_task("drawing plots", total=len(run.part_names))
+            for part, found in zip(run.part_names, evaluate_parts(run), strict=True):
+                found.name = f"{self.path.name}/{part}" if part else self.path.name
+                path = f"plot_{part}.png" if part else "plot.png"
+                write_plot(self.folder / path, found)
+                bars.update(drawing, advance=1)
             filming = bars.add_task("writing video.mp4", total=None)
             written = write_film(
                 self.folder / "video.mp4",
@@ -95,38 +122,24 @@ class Stage:
             if not written:
                 bars.update(filming, description="no images, no video", completed=1, total=1)
 
-    def draw(self, run: Run) -> None:
-        """Write plot.png; of a robot of parts plot_PART.png of each."""
-        with progress_bars(24, self.screen, counted=False) as bars:
-            drawing = bars.add_task("drawing plots", total=len(run.part_names))
-            for part, found in zip(run.part_names, evaluate_parts(run), strict=True):
-                found.name = f"{self.name}/{part}" if part else self.name
-                path = f"plot_{part}.png" if part else "plot.png"
-                write_plot(self.folder / path, found)
-                bars.update(drawing, advance=1)
-
 
 @contextmanager
-def open_stage(profile: str, folder: Path, *, force: bool) -> Iterator[Stage]:
-    """A stage for a profile; `folder` appears when the block has ended without an exception.
+def open_stage(profile: str, given: DemoOptions) -> Iterator[Stage]:
+    """A stage for a profile; its folder appears when the block has ended without an exception.
 
     Raises:
         OutputError: the folder cannot be had; see `output_folder`.
     """
     loaded = own_address(effective_profile(profile))
-    with output_folder(folder, force=force) as part:
+    path = given.output or RUNS / time.strftime("demo-%Y%m%d-%H%M%S")
+    with output_folder(path, force=given.force) as part:
         stop = stop_on_signals()
         die_with_parent()
         screen, here = errors(), loaded.session.connect[0]
-        screen.print(f"profile {loaded.name}, router at {here}, run folder {folder}")
+        screen.print(f"profile {loaded.name}, router at {here}, run folder {path}")
         watch = f"watch it from another terminal: vla-zenoh status --connect {here}"
         screen.print(watch, style="dim")
-        yield Stage(loaded, part, folder.name, stop, screen)
-
-
-def run_folder(given: Path | None) -> Path:
-    """`given`, else a folder named by the time."""
-    return given or RUNS / time.strftime("demo-%Y%m%d-%H%M%S")
+        yield Stage(loaded, part, path, stop)
 
 
 def latency_line(latency: Mapping[str, Any]) -> str:
@@ -142,13 +155,3 @@ def latency_line(latency: Mapping[str, Any]) -> str:
         f"latency, camera stamp to pose command: p50 {latency['p50']:.1f} ms, "
         f"p95 {latency['p95']:.1f} ms ({stages})"
     )
-
-
-def refusals(statuses: Mapping[str, NodeStatus]) -> dict[str, int]:
-    """Rejections of all nodes, by reason."""
-    out: Counter[str] = Counter()
-    for status in statuses.values():
-        for name, count in status.counters.items():
-            if name.startswith("refused."):
-                out[name.removeprefix("refused.")] += count
-    return dict(sorted(out.items()))

@@ -15,11 +15,10 @@ from vla_zenoh.lab.bench.task import SCENE, DemoPlan, TaskOutcome, is_judged, or
 from vla_zenoh.lab.bench.task_runner import TaskRunner
 from vla_zenoh.lab.bench.task_sheet import sheet
 from vla_zenoh.lab.cli.bench_file import shown_camera
-from vla_zenoh.lab.cli.demo_options import DemoOptions
-from vla_zenoh.lab.cli.demo_stage import Stage, latency_line, open_stage, refusals, run_folder
+from vla_zenoh.lab.cli.demo import DemoOptions
+from vla_zenoh.lab.cli.demo_stage import Stage, latency_line, open_stage
 from vla_zenoh.lab.cli.output import print_json
 from vla_zenoh.lab.demo.segments import latencies
-from vla_zenoh.lab.episode import Interrupted
 from vla_zenoh.lab.evaluation.result import TASKS
 from vla_zenoh.lab.tasks import COLOURS, DIRECTIONS, FAILURES, LIMIT_S, Order, phrase
 from vla_zenoh.lab.tasks.order import PUSH, PUT, STACK
@@ -38,8 +37,7 @@ def run_task_demo(prompts: list[str], seed: int, profile: str, given: DemoOption
         ResourceError: a prompt cannot be judged; the message lists what can.
     """
     orders = {prompt: _free_wording(prompt) for prompt in prompts if not is_judged(prompt)}
-    folder = run_folder(given.output)
-    with open_stage(profile, folder, force=given.force) as stage:
+    with open_stage(profile, given) as stage:
         loaded = stage.profile
         if not prompts and loaded.sim.scene != SCENE:
             prompts = [loaded.task.prompt]
@@ -52,7 +50,7 @@ def run_task_demo(prompts: list[str], seed: int, profile: str, given: DemoOption
             orders=orders,
             limit_s=given.seconds or LIMIT_S,
         )
-        ended, refused = _run(stage, plan)
+        ended = _run(stage, plan)
         run = stage.recorded()
         summary = {
             "ok": len(ended) == plan.episodes and all(each.success for each in ended),
@@ -62,46 +60,36 @@ def run_task_demo(prompts: list[str], seed: int, profile: str, given: DemoOption
             "seed": seed,
             "tasks": [each.to_dict() for each in ended],
             "latency_ms": latencies(run.first_commands()),
-            "refusals": refused,
+            "refusals": stage.refusals(),
         }
         stage.write(summary)
         picture = sheet(ended)
         if picture is not None:
             (stage.folder / "tasks.jpg").write_bytes(picture)
-        stage.draw(run)
         facts = stage.facts[TASKS]
-        stage.film(run, [(fact["ended_ns"], fact["said"], fact["success"]) for fact in facts])
+        stage.draw(run, [(fact["ended_ns"], fact["said"], fact["success"]) for fact in facts])
     if given.as_json:
-        print_json({**summary, "folder": folder})
+        print_json({**summary, "folder": stage.path})
     else:
-        _show(ended, summary, folder)
+        _show(ended, summary, stage.path)
     if stage.stop.is_set():
         raise typer.Exit(130)
     if not summary["ok"]:
         raise typer.Exit(1)
 
 
-def _run(stage: Stage, plan: DemoPlan) -> tuple[list[TaskOutcome], dict[str, int]]:
+def _run(stage: Stage, plan: DemoPlan) -> list[TaskOutcome]:
     ended: list[TaskOutcome] = []
     stage.facts.update({TASKS: [], "seed": plan.seed})
-    with stage.nodes(52) as (running, bars):
-        assert running.client is not None
-        client = running.client
+    with stage.nodes(52) as (running, _, bars):
         bar = bars.add_task("waiting for the first task", total=plan.episodes)
-        try:
-            for each in TaskRunner(
-                running, plan, stage.stop, shown_camera(stage.profile.cameras)
-            ).run():
-                ended.append(each)
-                stage.facts[TASKS].append(_fact(each))
-                said = f"{one_line(each.prompt, 40)}: {_word(each)}"
-                bars.update(bar, completed=len(ended), description=said)
-        except Interrupted:
-            pass
-        finally:
-            counted = refusals({n: found[0] for n, found in client.snapshot().items()})
-            client.deactivate()
-    return ended, counted
+        run = TaskRunner(running, plan, stage.stop, shown_camera(stage.profile.cameras))
+        for each in run.run():
+            ended.append(each)
+            stage.facts[TASKS].append(_fact(each))
+            said = f"{one_line(each.prompt, 40)}: {_word(each)}"
+            bars.update(bar, completed=len(ended), description=said)
+    return ended
 
 
 def _free_wording(prompt: str) -> Order:

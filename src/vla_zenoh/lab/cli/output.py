@@ -11,15 +11,14 @@ from pydantic_core import to_jsonable_python
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.status import Status
 
-from vla_zenoh.cli.output import Screen, errors, styled
+from vla_zenoh.cli.output import errors, styled
 
 
-def progress_bars(width: int, screen: Screen | None = None, *, counted: bool = True) -> Progress:
+def progress_bars(width: int, *, counted: bool = True) -> Progress:
     """Progress bars on stderr.
 
     Args:
         width: of the descriptions, in characters.
-        screen: another console.
         counted: show how many of how many are done.
     """
     return Progress(
@@ -27,7 +26,7 @@ def progress_bars(width: int, screen: Screen | None = None, *, counted: bool = T
         BarColumn(),
         *([MofNCompleteColumn()] if counted else []),
         TimeElapsedColumn(),
-        console=screen or errors(),
+        console=errors(),
     )
 
 
