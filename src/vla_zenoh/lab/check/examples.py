@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -117,35 +118,25 @@ class ExampleMaker:
         """
         seq = 0 if again else self.seq
         self.seq = max(self.seq, seq + 1)
-        seen = example_observation(self.spec, prompt=style.prompt)
-        made = replace(
-            seen,
+        spec = self.spec
+        seen = Observation(
             stamp_wall_ns=START_NS + seq * PERIOD_NS,
             seq=seq,
-            task=replace(seen.task, active=style.active, episode=1),
+            task=Task(1, style.active, style.prompt, spec.name, rate_hz=5.0),
             images=self._images(style),
             depth=self._depth(style),
-            joint=self._joint() if seen.joint is not None else None,
-            pose=PoseState(np.array(style.position_m), np.array(DOWN_XYZW), np.zeros(6))
-            if seen.pose is not None
-            else None,
-            gripper=GripperState(style.width_m, moving=False, holding=style.holding)
-            if seen.gripper is not None
-            else None,
-            effort_nm=self._joint().effort_nm if seen.effort_nm is not None else None,
-            history=(),
+            privileged=PrivilegedState({}) if "privileged" in spec.observation.state else None,
         )
-        parts = {
-            part: replace(made, joint=self._joint(part), gripper=own.gripper, pose=own.pose)
-            for part, own in seen.parts.items()
-        }
-        made = replace(made, parts=parts)
+        if spec.parts == ("",):
+            seen = replace(seen, **self._state(style, ""))
+        else:
+            parts = {part: replace(seen, **self._state(style, part)) for part in spec.parts}
+            seen = replace(seen, parts=parts)
         # An arm that stood still and was looked at: earlier pictures are as this one.
-        earlier = (
-            replace(made, stamp_wall_ns=made.stamp_wall_ns + each.stamp_wall_ns)
-            for each in seen.history
-        )
-        return replace(made, history=tuple(earlier))
+        before = range(spec.observation.history - 1, 0, -1)
+        spacing_ns = round((spec.observation.history_spacing_s or 0.0) * 1e9)
+        stamps_ns = (seen.stamp_wall_ns - steps * spacing_ns for steps in before)
+        return replace(seen, history=tuple(replace(seen, stamp_wall_ns=at) for at in stamps_ns))
 
     def _images(self, style: ExampleStyle) -> Mapping[str, Picture]:
         out: dict[str, Picture] = {}
@@ -181,8 +172,23 @@ class ExampleMaker:
             return camera.height, camera.width
         return DEFAULT_SIZE
 
-    def _joint(self, part: str = "") -> JointState:
-        names = _joint_names(self.spec, part)
+    def _state(self, style: ExampleStyle, part: str) -> dict[str, Any]:
+        """State of one arm, as far as the spec asks for it."""
+        joint = self._joint(part)
+        state = {
+            "joint": joint,
+            "pose": PoseState(np.array(style.position_m), np.array(DOWN_XYZW), np.zeros(6)),
+            "gripper": GripperState(style.width_m, moving=False, holding=style.holding),
+            "wrench": np.zeros(6),
+            "effort": joint.effort_nm,
+        }
+        asked = [name for name in self.spec.observation.state if name in state]
+        return {"effort_nm" if name == "effort" else name: state[name] for name in asked}
+
+    def _joint(self, part: str) -> JointState:
+        # Those that the model moves, or seven made up.
+        made_up = tuple(f"joint{number}" for number in range(1, 8))
+        names = self.spec.action.of(part).joints or made_up
         position = np.zeros(len(names))
         if self.profile is not None and part in self.profile.part_names:
             robot = self.profile.of_part(part).robot
@@ -191,54 +197,7 @@ class ExampleMaker:
         return JointState(names, position, zeros, zeros)
 
 
-def _joint_names(spec: ModelSpec, part: str) -> tuple[str, ...]:
-    """Those that the model moves, or seven made up."""
-    return spec.action.of(part).joints or tuple(f"joint{number}" for number in range(1, 8))
-
-
-def example_observation(
-    spec: ModelSpec, *, prompt: str = "put the red brick in the box"
-) -> Observation:
+def example_observation(spec: ModelSpec, *, prompt: str = PROMPTS[0]) -> Observation:
     """A valid observation of the declared form, gray images and an arm at rest: for dry runs."""
-    asked = spec.observation.state
-    images = {
-        camera.camera: np.full((camera.height or 480, camera.width or 640, 3), 128, np.uint8)
-        for camera in spec.observation.cameras
-    }
-    depth = {
-        one.camera: np.full((one.height or 480, one.width or 640), 500, np.uint16)
-        for one in spec.observation.depth
-    }
-    zeros = np.zeros(7)
-    seen = Observation(
-        stamp_wall_ns=0,
-        seq=0,
-        task=Task(episode=0, active=False, prompt=prompt, worker=spec.name, rate_hz=5.0),
-        images=images,
-        depth=depth,
-        joint=JointState(tuple(f"joint{i}" for i in range(1, 8)), zeros, zeros, zeros)
-        if "joint" in asked
-        else None,
-        pose=PoseState(np.array([0.45, 0.0, 0.3]), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(6))
-        if "pose" in asked
-        else None,
-        gripper=GripperState(width_m=0.08, moving=False, holding=False)
-        if "gripper" in asked
-        else None,
-        privileged=PrivilegedState({}) if "privileged" in asked else None,
-        wrench=np.zeros(6) if "wrench" in asked else None,
-        effort_nm=zeros if "effort" in asked else None,
-    )
-    if spec.parts != ("",):
-        parts: dict[str, Observation] = {}
-        for part in spec.parts:
-            names = _joint_names(spec, part)
-            still = np.zeros(len(names))
-            joint = JointState(names, still, still, still) if "joint" in asked else None
-            parts[part] = replace(seen, joint=joint)
-        none = replace(seen, joint=None, pose=None, gripper=None, wrench=None, effort_nm=None)
-        seen = replace(none, parts=parts)
-    before = range(spec.observation.history - 1, 0, -1)
-    spacing_ns = round((spec.observation.history_spacing_s or 0.0) * 1e9)
-    earlier = tuple(replace(seen, stamp_wall_ns=-steps * spacing_ns) for steps in before)
-    return replace(seen, history=earlier)
+    style = ExampleStyle("gray pictures", plain(128), prompt, active=False)
+    return ExampleMaker(spec).make(style)
