@@ -57,9 +57,6 @@ def issue(
     """A certificate for `common_name`, signed by `authority`.
 
     Args:
-        authority: of the lab.
-        common_name: of the holder.
-        now: UTC.
         days: validity, limited by that of the authority.
         addresses: host names and IP addresses of a server; None: it may only connect.
 

@@ -44,9 +44,6 @@ class LabCertificates(CheckedStore):
         """Make a certificate for each of `identities`; returns their files.
 
         Args:
-            identities: of nodes and operators.
-            now: UTC.
-            days: validity.
             addresses: at which clients look for routers.
             renew: replace existing ones; routers keep the addresses of those as well.
 

@@ -32,7 +32,6 @@ def moved_hosts(profile: Profile, at: Mapping[str, str]) -> dict[str, str]:
     """New addresses of routers: ``HOST:PORT`` of the profile -> the same port elsewhere.
 
     Args:
-        profile: as it is.
         at: host that runs a router -> its address on the network.
 
     Raises:

@@ -27,11 +27,7 @@ def alike(a: Steps, b: Steps) -> bool:
 
 
 def growth(kib: Sequence[float]) -> tuple[float, list[Finding]]:
-    """Growth of memory per inference in KiB, and a finding if it is a leak.
-
-    Args:
-        kib: resident memory after each.
-    """
+    """Growth of memory per inference, from that after each, and a finding if it is a leak."""
     third = len(kib) // 3
     # The first third may still fill caches.
     rest = np.array(kib[third:])
@@ -48,8 +44,6 @@ def slowness(
     """Findings on the duration of an inference.
 
     Args:
-        p50_s: median.
-        p95_s: 95th percentile.
         rate_hz: requested chunks per second; None: unknown.
     """
     found: list[Finding] = []

@@ -51,7 +51,6 @@ class Line:
 
     Args:
         node: publisher; "-" where there is none now and records were lost before.
-        rate_hz: records per second.
         bytes_s: bytes per second, counted once for all subscribers.
         lost: subscriber -> records that did not reach it.
     """

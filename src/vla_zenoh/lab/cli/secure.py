@@ -67,9 +67,6 @@ def copy_commands(
     Files beside the profile are copied with it; others that it names are listed.
 
     Args:
-        profile: the secured one.
-        file: of that profile.
-        store: of the certificates.
         hosts: get their certificates and the profile.
         more: get only the profile.
     """

@@ -17,14 +17,9 @@ class Published:
 
     Args:
         fci: version of the interface that the robot speaks.
-        lower_rad: lower ends of the joint ranges.
-        upper_rad: upper ends.
         velocity_rad_s: of the joints; the FR3's are smaller near the ends of the ranges.
-        acceleration_rad_s2: of the joints.
-        jerk_rad_s3: of the joints.
         translation: of the end effector: m/s, m/s^2, m/s^3.
         rotation: of the end effector: rad/s, rad/s^2, rad/s^3.
-        torque_nm: of the joints.
         near_end: offset (rad/s) and deceleration (rad/s^2) of each joint: a joint this far from an
             end of its range (rad) may move at ``sqrt(2 * deceleration * far) - offset``, no more;
             empty: everywhere at `velocity_rad_s`.

@@ -55,7 +55,6 @@ def ask(
     The arm moves only while this waits: if the process ends, or the block is left, it brakes.
 
     Args:
-        client: of the robot.
         primitive: one of `vla_zenoh.lab.primitives.requests.REQUESTS`.
         fields: of the request, without its holder.
         who: begins the name by which this client holds the arm.

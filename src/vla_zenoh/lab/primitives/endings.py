@@ -31,10 +31,7 @@ class Sight:
     """Observed state of the robot at one moment.
 
     Args:
-        now_s: monotonic time.
-        pose: measured.
         joints_rad: (n,) measured, in the order of the kinematics.
-        gripper: its state.
         done: the model reported that it is done.
         speed: override in force, 0 to 1.
     """
@@ -104,7 +101,6 @@ class Gripped:
     """Ends a motion of the gripper: ``reached``, or ``bound`` if it stops elsewhere.
 
     Args:
-        width_m: target.
         closing: until something is held, or the fingers meet.
     """
 
@@ -123,12 +119,7 @@ class Gripped:
 
 
 class RunEnding:
-    """Ends a run: the name of the first condition that holds.
-
-    Args:
-        until: conditions.
-        max_width_m: of the gripper.
-    """
+    """Ends a run: the name of the first condition that holds."""
 
     def __init__(self, until: Until, max_width_m: float) -> None:
         self._until, self._max_width_m = until, max_width_m

@@ -67,7 +67,6 @@ class PrimitivesNode:
     """Answers on `Keys.primitive`, see `vla_zenoh.lab.primitives.requests`.
 
     Args:
-        profile: the effective profile.
         session: with the rights of a worker and of an operator.
 
     Raises:

@@ -36,9 +36,6 @@ class TargetPolicy:
 
     Its spec changes with the kind of target: absolute poses or joints, or deltas of zero with a
     width. Without a width the gripper keeps what it holds.
-
-    Args:
-        joints: names of the arm's joints, in the order of the profile.
     """
 
     example_prompts = ("",)

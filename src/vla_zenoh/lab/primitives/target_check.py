@@ -30,7 +30,6 @@ class TargetCheck:
     """Checks targets of a motion. Independent of time.
 
     Args:
-        profile: limits and robot.
         reach: of the arm; it is moved.
     """
 

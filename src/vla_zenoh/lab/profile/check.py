@@ -56,8 +56,6 @@ def check_profile(
         name: of the profile, or its path.
         host: which of its hosts this computer is; None: the only one, or unknown. What a node needs
             is an error where it runs, and advice elsewhere.
-        connect: in place of session.connect.
-        listen: in place of session.listen.
     """
     try:
         loaded, lines = load_with_lines(name)

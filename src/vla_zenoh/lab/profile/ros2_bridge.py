@@ -49,7 +49,6 @@ def bridge_config(
     """Zenoh's configuration, with the plugin's section.
 
     Args:
-        profile: the effective profile.
         locks: sections for certificates and access, where the bridge is reached by TLS.
         beside: the bridge is a client of our router; else it listens where the node ``ros2``
             looks for it: ``ros2.connect``, or ``session.connect``.

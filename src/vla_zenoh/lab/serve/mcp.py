@@ -61,7 +61,6 @@ def tools(cameras: Sequence[str], allowed: Sequence[str]) -> list[dict[str, Any]
     """Descriptions of the tools, with the JSON schema of their arguments.
 
     Args:
-        cameras: names of the profile's.
         allowed: names of the tools that this client may call.
     """
     empty = {"type": "object", "properties": {}, "additionalProperties": False}
@@ -97,7 +96,6 @@ def read(
     Args:
         line: of at most `MAX_LINE` bytes.
         offered: by `tools`.
-        version: of this package.
     """
     try:
         message = _decoded(line)

@@ -41,7 +41,6 @@ class McpServer:
     """Reads requests from one stream and answers on the other.
 
     Args:
-        robot: connected with the rights of its tools.
         out: where answers go, nothing else may write there.
         drives: the certificate is an operator's, or there are none; a viewer may only look.
     """

@@ -36,11 +36,7 @@ LOG = logging.getLogger("vla_zenoh.serve")
 
 
 class OpenPiConversation:
-    """One connection of an openpi client.
-
-    Args:
-        policy: what is served.
-    """
+    """One connection of an openpi client."""
 
     def __init__(self, policy: ServedPolicy) -> None:
         self._policy = policy

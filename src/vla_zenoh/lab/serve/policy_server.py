@@ -43,10 +43,8 @@ class PolicyServer:
 
     Args:
         converse: begins the conversation of a new connection.
-        host: address to listen on.
         port: to listen on; 0: any.
         health: path of the health check.
-        max_bytes: of a frame.
         api_key: required of clients; empty: none.
     """
 

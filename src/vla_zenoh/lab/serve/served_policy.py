@@ -32,7 +32,6 @@ class ServedPolicy:
     """What a model can be asked, and under which names.
 
     Args:
-        policy: a loaded model.
         fields: name -> what it holds.
         joints: names of the arm's joints, in the order in which they are given.
         max_width_m: of the gripper.
@@ -131,7 +130,6 @@ class DefaultNames(NamedTuple):
     Args:
         camera: with a place for the name of the camera.
         state: with a place for joint, pose or gripper.
-        prompt: the text.
     """
 
     camera: str = "observation/{}"

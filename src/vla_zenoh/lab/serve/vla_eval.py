@@ -38,7 +38,6 @@ class VlaEvalConversation:
     """One connection of a vla-eval harness.
 
     Args:
-        policy: what is served.
         execute: steps of each chunk that are given out before the next one is inferred; 0: all.
     """
 

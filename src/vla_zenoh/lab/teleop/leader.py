@@ -116,7 +116,6 @@ class LeaderPolicy:
 
     Args:
         path: the leader's last seconds, oldest first, at least one state.
-        now_s: monotonic clock.
     """
 
     example_prompts = ("by hand",)

@@ -119,9 +119,6 @@ class TeleopPolicy:
     absolute width of the gripper. While the worker is not active the width is the measured one, or
     0 where an object is held, so that taking over drops nothing. Of a robot of parts one is moved
     at a time, and the others stand.
-
-    Args:
-        read: current input; called once per chunk.
     """
 
     example_prompts = ("by hand",)

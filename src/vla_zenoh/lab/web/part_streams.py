@@ -118,7 +118,6 @@ class PartStreams:
         What is unknown is absent.
 
         Args:
-            now_s: monotonic clock.
             holds: the box that its gripper is said to hold; empty: none.
         """
         pose, joints = self._recent(PoseState, now_s), self._recent(JointState, now_s)

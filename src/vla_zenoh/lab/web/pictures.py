@@ -17,6 +17,7 @@ from vla_zenoh.errors import CodecError, ProfileError
 from vla_zenoh.keys import Keys
 from vla_zenoh.lab.newest_records import StreamSlot
 from vla_zenoh.lab.rate_limit import RateLimit
+from vla_zenoh.lab.web.requests import parse
 from vla_zenoh.profile import CameraProfile
 from vla_zenoh.types import Image
 
@@ -166,6 +167,22 @@ class Look:
         self.sent = self.drawn = 0
         self.limit = RateLimit(4 * MAX_PICTURE_HZ, 100.0, now_s)
         self._last: dict[str, tuple[int, float]] = {}
+
+    def read(self, text: str, pictures: Pictures, now_s: float) -> str:
+        """Obey a message of the page; why it was not obeyed, empty: it was."""
+        try:
+            request = parse(text)
+            if not self.limit.take(now_s):
+                return "too_fast"
+            if request.do == "look":
+                pictures.change(self.streams, request.values["streams"])
+                self.streams = tuple(dict.fromkeys(request.values["streams"]))
+                self.period_s = 1 / min(max(request.values["hz"], 0.1), MAX_PICTURE_HZ)
+            elif request.do == "drawn":
+                self.drawn = max(self.drawn, min(request.values["frame"], self.sent))
+        except CodecError:
+            return "bad_message"
+        return ""
 
     def due(self, now_s: float, pictures: Pictures) -> list[str]:
         """Streams of which a newer picture may be sent now."""

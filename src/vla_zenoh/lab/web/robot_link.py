@@ -7,6 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -156,7 +157,7 @@ class RobotLink:
             "held_by": detail.get("held_by", ""),
             "limits": acting_limits(said),
             "done": detail.get("policy_done", False),
-            "task": None if task is None else task_fields(task),
+            "task": None if task is None else asdict(task),
             "jog": self.hand.has_arm,
             "trial": self.trial.state(),
             "primitives": worker_node(PRIMITIVES) in self.client.alive,
@@ -179,41 +180,25 @@ class RobotLink:
         """
         began_s = time.monotonic()
         self.client.stop()
+        stopped_s: float | None = None
+        stands_s: float | None = None
         with ExitStack() as stack:
             measured: list[LatestSample] = []
             for name in self.profile.part_names:
                 measured.append(LatestSample())
                 key = self.keys.of_part(name).state_pose
                 stack.callback(measured[-1].subscribe(self.session, key).undeclare)
-            return self._stopping(measured, began_s)
-
-    def _stopping(self, measured: list[LatestSample], began_s: float) -> dict[str, Any]:
-        stopped_s: float | None = None
-        moving = list(measured)
-        while (now_s := time.monotonic()) < began_s + STAND_S:
-            status = self.client.status("command")
-            if status is not None and status.state == "stopped":
-                stopped_s = stopped_s or now_s - began_s
-                if status.detail.get("at_rest") is not True:
-                    moving = list(measured)
-                moving = [each for each in moving if not self._stands(each)]
-                if status.detail.get("at_rest") is True and not moving:
-                    return self._stop_report(stopped_s, now_s - began_s)
-            time.sleep(STAND_POLL_S)
-        return self._stop_report(stopped_s, None)
-
-    @staticmethod
-    def _stands(measured: LatestSample) -> bool:
-        sample = measured.pop()
-        if sample is None:
-            return False
-        try:
-            state = records.decode(PoseState, bytes_of(sample.sample.payload))
-        except CodecError:
-            return False
-        return float(np.linalg.norm(state.twist[:3])) < STILL_M_S
-
-    def _stop_report(self, stopped_s: float | None, stands_s: float | None) -> dict[str, Any]:
+            moving = measured
+            while (now_s := time.monotonic()) < began_s + STAND_S:
+                status = self.client.status("command")
+                if status is not None and status.state == "stopped":
+                    stopped_s = stopped_s or now_s - began_s
+                    at_rest = status.detail.get("at_rest") is True
+                    moving = [each for each in (moving if at_rest else measured) if _moves(each)]
+                    if at_rest and not moving:
+                        stands_s = now_s - began_s
+                        break
+                time.sleep(STAND_POLL_S)
         return {
             "robot": self.keys.robot,
             "stopped": stopped_s is not None,
@@ -380,16 +365,16 @@ class RobotLink:
             part.close()
 
 
-def task_fields(task: Task) -> dict[str, Any]:
-    """The settings that a page shows."""
-    return {
-        "prompt": task.prompt,
-        "worker": task.worker,
-        "rate_hz": task.rate_hz,
-        "speed_percent": task.speed_percent,
-        "active": task.active,
-        "episode": task.episode,
-    }
+def _moves(measured: LatestSample) -> bool:
+    """Whether an arm moves, or did not say that it stands since this was asked last."""
+    sample = measured.pop()
+    if sample is None:
+        return True
+    try:
+        state = records.decode(PoseState, bytes_of(sample.sample.payload))
+    except CodecError:
+        return True
+    return not float(np.linalg.norm(state.twist[:3])) < STILL_M_S
 
 
 SETTINGS: dict[str, Callable[[RobotLink, Any], Any]] = {

@@ -54,7 +54,6 @@ class Ticket(NamedTuple):
 
     Args:
         path: a file, or the folder of a page with its pictures.
-        until_s: monotonic.
     """
 
     path: Path

@@ -24,7 +24,7 @@ from vla_zenoh.lab.web import metrics
 from vla_zenoh.lab.web.access import People, Person, host_is_ours, origin_is_ours, with_headers
 from vla_zenoh.lab.web.arm import surroundings
 from vla_zenoh.lab.web.making import FILM
-from vla_zenoh.lab.web.pictures import MAX_PICTURE_HZ, Look, Pictures
+from vla_zenoh.lab.web.pictures import Look, Pictures
 from vla_zenoh.lab.web.requests import PageRequest, parse
 from vla_zenoh.lab.web.robot_link import SETTINGS, RobotLink, asked_trial
 from vla_zenoh.lab.web.runs import HEADERS as RUN_HEADERS
@@ -456,25 +456,12 @@ class PageServer:
             sending = asyncio.create_task(self._send_pictures(look, socket))
             try:
                 while True:
-                    self._read_look(look, await _receive(socket))
+                    if fault := look.read(await _receive(socket), self._pictures, time.monotonic()):
+                        self.counters[fault] += 1
             finally:
                 self._looking -= 1
                 sending.cancel()
                 self._pictures.change(look.streams, ())
-
-    def _read_look(self, look: Look, text: str) -> None:
-        try:
-            request = parse(text)
-            if not look.limit.take(time.monotonic()):
-                self.counters["too_fast"] += 1
-            elif request.do == "look":
-                self._pictures.change(look.streams, request.values["streams"])
-                look.streams = tuple(dict.fromkeys(request.values["streams"]))
-                look.period_s = 1 / min(max(request.values["hz"], 0.1), MAX_PICTURE_HZ)
-            elif request.do == "drawn":
-                look.drawn = max(look.drawn, min(request.values["frame"], look.sent))
-        except CodecError:
-            self.counters["bad_message"] += 1
 
     async def _send_pictures(self, look: Look, socket: WebSocket) -> None:
         """Send the newest picture of each stream, as fast as asked and as the page draws them."""
