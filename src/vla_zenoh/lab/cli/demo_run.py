@@ -11,8 +11,8 @@ import typer
 
 from vla_zenoh.cli.output import console, new_table, styled
 from vla_zenoh.keys import worker_node
-from vla_zenoh.lab.cli.demo import DemoOptions
 from vla_zenoh.lab.cli.demo_stage import Stage, latency_line, open_stage
+from vla_zenoh.lab.cli.options import DemoOptions
 from vla_zenoh.lab.cli.output import print_json
 from vla_zenoh.lab.demo.runner import MotionRunner
 from vla_zenoh.lab.demo.segments import DemoSegment, SegmentOutcome, latencies

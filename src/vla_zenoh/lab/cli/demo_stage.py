@@ -20,8 +20,8 @@ from vla_zenoh.bus.client import Client
 from vla_zenoh.cli.options import effective_profile
 from vla_zenoh.cli.output import errors
 from vla_zenoh.lab.cli.bench_file import running_nodes
-from vla_zenoh.lab.cli.demo import DemoOptions
 from vla_zenoh.lab.cli.loopback import own_address
+from vla_zenoh.lab.cli.options import DemoOptions
 from vla_zenoh.lab.cli.output import progress_bars
 from vla_zenoh.lab.cli.output_path import RUNS, output_folder
 from vla_zenoh.lab.episode import Interrupted

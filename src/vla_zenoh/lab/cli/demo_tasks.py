@@ -15,8 +15,8 @@ from vla_zenoh.lab.bench.task import SCENE, DemoPlan, TaskOutcome, is_judged, or
 from vla_zenoh.lab.bench.task_runner import TaskRunner
 from vla_zenoh.lab.bench.task_sheet import sheet
 from vla_zenoh.lab.cli.bench_file import shown_camera
-from vla_zenoh.lab.cli.demo import DemoOptions
 from vla_zenoh.lab.cli.demo_stage import Stage, latency_line, open_stage
+from vla_zenoh.lab.cli.options import DemoOptions
 from vla_zenoh.lab.cli.output import print_json
 from vla_zenoh.lab.demo.segments import latencies
 from vla_zenoh.lab.evaluation.result import TASKS

@@ -2,13 +2,45 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from vla_zenoh.cli.options import JsonOption
+from vla_zenoh.lab.cli.output_path import ForceOption
+
 SimulatedProfileOption = Annotated[
     str, typer.Option("--profile", "-p", help="Name or path of a simulated robot's profile.")
 ]
+
+
+@dataclass(frozen=True)
+class DemoOptions:
+    """Options of both kinds of demo."""
+
+    rate_hz: Annotated[
+        float, typer.Option("--rate", help="Chunks per second.", min=0.2, max=50)
+    ] = 5.0
+    seconds: Annotated[
+        float | None,
+        typer.Option(
+            "--seconds",
+            help="Time for the steps of a fixed motion; time limit of a task.",
+            min=0.5,
+            max=3600,
+        ),
+    ] = None
+    profile: Annotated[
+        str | None, typer.Option("--profile", "-p", help="Name or path of a simulated profile.")
+    ] = None
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="New folder of the run; default: runs/demo-<time>."),
+    ] = None
+    force: ForceOption = False
+    as_json: JsonOption = False
 
 
 def number_list(option: str, text: str, low: float, high: float) -> list[float]:
