@@ -19,8 +19,8 @@ from ruckig import (
     Trajectory,
 )
 
-from vla_zenoh.control.limits import JointMotionLimits
-from vla_zenoh.control.smoothing import Motion, Smoother, motion_limits
+from vla_zenoh.control.limits import JointMotionLimits, motion_limits
+from vla_zenoh.control.smoothing import Motion, Smoother
 from vla_zenoh.guard.reference_governor import BRAKE_MARGIN
 from vla_zenoh.guard.stream_guard import (
     JointGuard,

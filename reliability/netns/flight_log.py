@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_zenoh.control.smoothing import Smoother, motion_limits
+from vla_zenoh.control.limits import motion_limits
+from vla_zenoh.control.smoothing import Smoother
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import Profile
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from vla_zenoh.control.chunk_planner import ChunkPlanner
 from vla_zenoh.control.chunk_validation import Lease
-from vla_zenoh.control.commander_io import NewStates, make_event
+from vla_zenoh.control.commander_io import MotionCommands, NewStates, State, make_event
 from vla_zenoh.control.limits import LimitHit
 from vla_zenoh.control.motion_pipeline import MotionPipeline
 from vla_zenoh.control.preflight import (
@@ -25,14 +25,17 @@ from vla_zenoh.control.watchdog import JointMonitor, Watchdog
 from vla_zenoh.errors import RecordError, SpecError
 from vla_zenoh.kinematics.so3 import Pose, held_pose, pose_of
 from vla_zenoh.policy import ModelSpec
-from vla_zenoh.profile import Profile
+from vla_zenoh.profile import GripperProfile, Profile
 from vla_zenoh.types import (
     ActionChunk,
     Event,
     FloatArray,
+    GripperCommand,
     GripperState,
     HeldBox,
+    JointCommand,
     JointState,
+    PoseCommand,
     PoseState,
     Stamped,
 )
@@ -41,6 +44,10 @@ FUTURE_NS = round(CLOCK_TOLERANCE_S * 1e9)
 """A pose that is stamped later than it arrived by more than this says nothing about the past."""
 LET_GO_M = 0.01
 """A gripper that opens by more than this lets go of what it holds."""
+SAME_WIDTH_M = 0.005
+"""A gripper this near to the width sent last has reached it."""
+SETTLE_NS = 60_000_000
+"""Time until a command shows as movement in the state."""
 
 
 class CommandedPart:
@@ -62,6 +69,7 @@ class CommandedPart:
         self._measured: Pose | None = None  # of the pose
         self.planner = ChunkPlanner(profile, reach)
         self.motion = MotionPipeline(profile, reach, self.planner)
+        self.gripper = GripperArbiter(profile.robot.gripper)
         self.contact, self.retreat = self.motion.contact, self.motion.retreat
         self.watchdog = Watchdog(profile)
         self.too_near: LimitHit | None = None
@@ -208,12 +216,22 @@ class CommandedPart:
         blocked = self.watchdog.begin(held_pose(measured), pose_of(measured))
         self.motion.anchor(
             measured,
-            self.gripper_state.record,
+            self.gripper.keep(self.gripper_state.record),
             joint,
             now_ns,
             blocked=blocked,
             in_joints=self._in_joints(lease.spec),
         )
+
+    def commands(self, state: State, now_ns: int) -> MotionCommands:
+        """The set-points of robot and gripper, while streaming."""
+        arm, motion, width = self.motion.command(state), self.motion, None
+        if arm is not None and state is State.ACTIVE and motion.pace.override > 0.0:
+            if motion.goal is not None:
+                self.gripper.request(motion.goal.width_m)
+            width = self.gripper.step(now_ns, self.gripper_state)
+        pose = arm if isinstance(arm, PoseCommand) else None
+        return MotionCommands(pose, arm if isinstance(arm, JointCommand) else None, width)
 
     # -- supervision --------------------------------------------------------------------------
     def lost(
@@ -317,3 +335,59 @@ class CommandedPart:
             "blocked arm is detected by limits.tracking_m alone"
         )
         return make_event("warning", "notice", "contact_not_told", why)
+
+
+class GripperArbiter:
+    """Decides when to send which width: absolute, the newest one wins, one command in flight.
+
+    A request within the dead band of the width sent last is ignored. While a command is in flight,
+    newer requests replace each other; the last one is sent when the gripper stands, or after
+    `command_timeout_s`.
+    """
+
+    def __init__(self, profile: GripperProfile) -> None:
+        self._profile = profile
+        self._requested_m: float | None = None
+        self.sent_m: float | None = None
+        self._sent_ns = 0
+        self.in_flight = False
+        """A command was sent and the gripper has not come to rest since."""
+        self.timeouts = 0
+
+    def keep(self, gripper: GripperState) -> float:
+        """Restart at the width sent last while the gripper follows it, else at its width.
+
+        Another width would end a grasp. Nothing is to be sent then.
+        """
+        width_m = min(max(gripper.width_m, 0.0), self._profile.max_width_m)
+        sent_m = self.sent_m
+        if sent_m is not None:
+            grasps = gripper.holding and sent_m < gripper.width_m
+            if grasps or abs(sent_m - gripper.width_m) < SAME_WIDTH_M:
+                width_m = sent_m
+        self._requested_m = self.sent_m = width_m
+        self.in_flight = False
+        return width_m
+
+    def request(self, width_m: float) -> None:
+        """Request a width; replaces an earlier one that was not sent."""
+        self._requested_m = min(max(width_m, 0.0), self._profile.max_width_m)
+
+    def step(self, now_ns: int, state: Stamped[GripperState] | None) -> GripperCommand | None:
+        """The command to send now, None without one."""
+        profile, asked_m, sent_m = self._profile, self._requested_m, self.sent_m
+        if self.in_flight:
+            settled = (
+                state is not None
+                and state.received_ns > self._sent_ns + SETTLE_NS
+                and not state.record.moving
+            )
+            late = now_ns - self._sent_ns > profile.command_timeout_s * 1e9
+            if not (settled or late):
+                return None
+            self.in_flight = False
+            self.timeouts += int(not settled)
+        if asked_m is None or (sent_m is not None and abs(asked_m - sent_m) <= profile.dead_band_m):
+            return None
+        self.sent_m, self._sent_ns, self.in_flight = asked_m, now_ns, True
+        return GripperCommand(asked_m, profile.speed_m_s, profile.force_n)

@@ -19,12 +19,22 @@ from typing import TYPE_CHECKING
 from vla_zenoh.control.chunk_planner import ChunkOutcome
 from vla_zenoh.control.chunk_validation import Lease, Rejection
 from vla_zenoh.control.commanded_part import CommandedPart
-from vla_zenoh.control.commander_io import Inputs, Outputs, Setting, limit_events, make_event
+from vla_zenoh.control.commander_io import (
+    DEACTIVATED,
+    OBEYING,
+    Inputs,
+    Outputs,
+    Setting,
+    State,
+    Trigger,
+    after,
+    limit_events,
+    make_event,
+)
 from vla_zenoh.control.limits import LimitHit
 from vla_zenoh.control.plan_timeline import EpisodeProgress
 from vla_zenoh.control.preflight import PeerSnapshot, reasons_of_worker
 from vla_zenoh.control.reachability import ReachabilityFilter
-from vla_zenoh.control.states import DEACTIVATED, OBEYING, State, Trigger, after
 from vla_zenoh.control.watchdog import Deadman
 from vla_zenoh.errors import RecordError
 from vla_zenoh.profile import Profile
@@ -185,7 +195,7 @@ class Commander:
         if self.state is State.ACTIVE and self._motion.timeline is not None:
             self.progress.update(self._motion.timeline, self.task.episode, now_ns)
         for part in parts if not self.dry_run else ():
-            commands = part.motion.commands(self.state, now_ns, part.gripper_state)
+            commands = part.commands(self.state, now_ns)
             if part.name:
                 out.parts[part.name] = commands
             else:

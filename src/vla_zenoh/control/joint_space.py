@@ -28,10 +28,11 @@ from vla_zenoh.control.limits import (
     into_workspace,
     joint_margins,
     joint_motion_limits,
+    motion_limits,
     workspace_corners,
 )
 from vla_zenoh.control.plan_timeline import Goal, joint_goal
-from vla_zenoh.control.smoothing import ROTATION_BOX, Motion, motion_limits
+from vla_zenoh.control.smoothing import Motion
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import Pose, norm3
 from vla_zenoh.policy import ActionSpec
@@ -230,10 +231,7 @@ class JointPath(AxisSmoother):
     def __init__(self, profile: Profile, bounds: JointBounds) -> None:
         self.kinematics, self._bounds = bounds.kinematics, bounds
         self._names = bounds.kinematics.arm_joints
-        tcp = motion_limits(profile.limits)
-        self._tcp_box = np.array(
-            [[move] * 3 + [turn * ROTATION_BOX] * 3 for move, turn in zip(*tcp, strict=True)]
-        )
+        self._tcp_box = motion_limits(profile.limits).box
         self._ticks = 0
         self._hits: list[LimitHit] = []
         self._asked: tuple[Goal, Shares, bool]
@@ -300,7 +298,7 @@ class JointPath(AxisSmoother):
         here_m = self.motion.pose.position_m
         return into_workspace(self._bounds.limits, goal.pose.position_m, here_m)[1]
 
-    def target(self, goal: Goal, shares: Shares = FULL, *, all_to_stop: bool = False) -> bool:
+    def go_to(self, goal: Goal, shares: Shares = FULL, *, all_to_stop: bool = False) -> bool:
         """Move to the joints of `goal`, or as near as the bounds allow; see `move_to`."""
         assert goal.joints_rad is not None
         self._asked, self._held = (goal, shares, all_to_stop), False
@@ -361,7 +359,7 @@ class JointPath(AxisSmoother):
         assert goal.joints_rad is not None
         self._held = False
         if self._bounds.ahead_hit(self.state.position, goal.joints_rad) is None:
-            self.target(goal, shares, all_to_stop=all_to_stop)
+            self.go_to(goal, shares, all_to_stop=all_to_stop)
 
     def _stop_hit(self) -> LimitHit | None:
         """The face of the box that a stop from the present state would cross.

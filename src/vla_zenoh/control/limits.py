@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vla_zenoh.control.smoothing import ROTATION_BOX
 from vla_zenoh.kinematics.so3 import Pose, exp3, log3, norm3, orthonormal, pose_distance
 from vla_zenoh.profile import REJECT_FACTOR, Limits, Profile, ReachLimits
 from vla_zenoh.types import FloatArray
@@ -21,6 +20,9 @@ from vla_zenoh.types import FloatArray
 if TYPE_CHECKING:
     from vla_zenoh.kinematics.kinematics import Kinematics
 
+ROTATION_BOX = 0.55
+"""Share of a rotation limit per axis, so that the norm over three axes (sqrt 3 of it) and the small
+terms of a moving chart (5 %) stay below the limit in any direction."""
 APPROACH = "approach"
 """Name of the slowdown towards a target that is further away than a step."""
 SLOWEST = 0.1
@@ -29,6 +31,29 @@ HELD_LEAD_M, HELD_LEAD_RAD = 0.01, 0.02
 """The goal of an arm that another part holds up leads it by this much at most."""
 LEAST = 0.02
 """Least share where the joints are too slow, or a far target is approached."""
+
+
+class MotionLimits(NamedTuple):
+    """(velocity, acceleration, jerk): translation per axis in m, s; rotation as norm in rad, s."""
+
+    translation: tuple[float, float, float]
+    rotation: tuple[float, float, float]
+
+    @property
+    def box(self) -> FloatArray:
+        """(3, 6) of every axis."""
+        return np.array(
+            [[move] * 3 + [turn * ROTATION_BOX] * 3 for move, turn in zip(*self, strict=True)]
+        )
+
+
+def motion_limits(limits: Limits) -> MotionLimits:
+    """The motion limits of a profile."""
+    translation, rotation = limits.translation, limits.rotation
+    return MotionLimits(
+        (translation.velocity_m_s, translation.acceleration_m_s2, translation.jerk_m_s3),
+        (rotation.velocity_rad_s, rotation.acceleration_rad_s2, rotation.jerk_rad_s3),
+    )
 
 
 class JointMotionLimits(NamedTuple):

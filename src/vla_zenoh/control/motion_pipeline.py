@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vla_zenoh.control.aggregate import PlanAggregator
+from vla_zenoh.control.axis_smoothing import FULL, Shares
 from vla_zenoh.control.chunk_planner import LOOK_AHEAD, ChunkPlanner
-from vla_zenoh.control.commander_io import MotionCommands, limit_events, make_event
+from vla_zenoh.control.commander_io import OBEYING, State, limit_events, make_event
 from vla_zenoh.control.contact import Contact, Retreat
-from vla_zenoh.control.gripper_arbiter import GripperArbiter
 from vla_zenoh.control.joint_space import JointPath
 from vla_zenoh.control.limits import into_workspace
 from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan, joint_goal
-from vla_zenoh.control.pose_path import Mover, PoseCommands, PosePath
 from vla_zenoh.control.preflight import (
     FOLLOWS_JOINT_RAD,
     LINGER_NS,
@@ -24,21 +23,27 @@ from vla_zenoh.control.preflight import (
     held_joints,
 )
 from vla_zenoh.control.reachability import ReachabilityFilter
-from vla_zenoh.control.smoothing import FULL, Shares
-from vla_zenoh.control.states import OBEYING, State
-from vla_zenoh.control.step_timing import GoalPace, TimedGoal
+from vla_zenoh.control.smoothing import Motion, PosePath
+from vla_zenoh.control.step_timing import GoalPace, Mover, TimedGoal
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.kinematics.so3 import Pose, held_pose, pose_distance, pose_of
+from vla_zenoh.kinematics.so3 import (
+    Pose,
+    held_pose,
+    pose_distance,
+    pose_of,
+    quat_from_rotation,
+)
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     Cause,
     Event,
     FloatArray,
-    GripperState,
+    JointCommand,
     JointState,
+    PoseCommand,
     PoseState,
-    Stamped,
     Task,
+    computed,
 )
 
 if TYPE_CHECKING:
@@ -80,7 +85,6 @@ class MotionPipeline:
         self._changing = False
         """It brakes, because the goals in force are joints and it moves in poses, or vice versa."""
         self._no_joints = ""
-        self.gripper = GripperArbiter(profile.robot.gripper)
         self.timeline: GoalTimeline | None = None
         self.goal: Goal | None = None
         self.streaming = False
@@ -97,7 +101,6 @@ class MotionPipeline:
         self._settling = Settling(commanded)
         self._cause: Cause | None = None
         self._rest_since_ns: int | None = None
-        self._pose_commands = PoseCommands()
 
     # -- state --------------------------------------------------------------------------------
     @property
@@ -135,7 +138,10 @@ class MotionPipeline:
         """(n,) each, commanded joints on the way to rest and at rest, from a brake in `ahead_s`."""
         assert self._joints is not None
         mover = self._mover
-        return [self._joints.position_rad] if mover is None else mover.stopping_rad(ahead_s)
+        if isinstance(mover, JointPath):
+            return mover.stopping_rad(ahead_s)
+        joints = self._joints
+        return [joints.position_rad] if mover is None else joints.stopping_rad(mover, ahead_s)
 
     def wanted_rad(self, now_ns: int) -> FloatArray | None:
         """(n,) joints of the goal in force, None where it has none."""
@@ -162,7 +168,7 @@ class MotionPipeline:
     def anchor(
         self,
         measured: PoseState,
-        gripper: GripperState,
+        width_m: float,
         joint: JointState | None,
         now_ns: int,
         *,
@@ -173,7 +179,7 @@ class MotionPipeline:
 
         Args:
             measured: TCP pose, with the controller's set-point if the robot reports it.
-            gripper: its width is kept.
+            width_m: of the gripper, which is kept.
             joint: newest joints.
             now_ns: time of this tick.
             blocked: the arm is far from its controller's set-point.
@@ -191,7 +197,8 @@ class MotionPipeline:
             self._enter(joints=False)
         self._no_joints, self._changing = "", False
         if self._poses is None:
-            self._poses = self._mover = PosePath(start, self._profile, self._joints)
+            followed = None if self._joints is None else self._joints.shares
+            self._poses = self._mover = PosePath(start, self._profile, followed)
         elif standing and not (
             self.streaming and follows(*pose_distance(self._poses.motion.pose, start))
         ):
@@ -204,7 +211,6 @@ class MotionPipeline:
             self._joints.keep_elbow()
         if in_joints and standing:
             self._enter(joints=True)
-        width_m = self.gripper.keep(gripper)
         # The goal of a blocked arm is where it is. Otherwise a brake continues, and the goal is
         # where it ends.
         assert self._mover is not None
@@ -295,33 +301,25 @@ class MotionPipeline:
         failures, mover = self.failures, self._mover  # which may be another by now
         # A stream that begins must begin at rest: no ticks are made up for.
         for _ in range(ticks if went_on else 1):
-            if isinstance(mover, JointPath):
+            if self._joints is None or isinstance(mover, JointPath):
                 mover.tick()
             else:
                 active = state is State.ACTIVE and self.pace.override > 0.0
                 active = active and not self._changing and not self.held
-                mover.tick(braking=not active and self._back is None, elbow=active)
+                self._joints.tick(mover, braking=not active and self._back is None, elbow=active)
         if isinstance(mover, JointPath):
             events += limit_events(mover.taken_hits())
         return self.failures == failures, events
 
-    def commands(
-        self, state: State, now_ns: int, gripper: Stamped[GripperState] | None
-    ) -> MotionCommands:
-        """The set-points of robot and gripper, while streaming."""
+    def command(self, state: State) -> PoseCommand | JointCommand | None:
+        """The set-point of the robot, while streaming."""
         mover = self._mover
         if not self.streaming or mover is None:
-            return MotionCommands()
-        pose = joint = width = None
+            return None
         if self._joints is None:
-            pose = self._pose_commands.of(mover.motion, self.goal, state.value, self._cause)
-        elif isinstance(mover, JointPath):
-            joint = mover.command(state.value, self._cause)
-        else:
-            joint = self._joints.command(state.value, self._cause)
-        if state is State.ACTIVE and self.pace.override > 0.0:
-            width = self.gripper.step(now_ns, gripper)
-        return MotionCommands(pose, joint, width)
+            return _pose_command(mover.motion, self.goal, state, self._cause)
+        joints = mover if isinstance(mover, JointPath) else self._joints
+        return joints.command(state.value, self._cause)
 
     def forget_plan(self, oldest_ns: int, now_ns: int) -> bool:
         """Stand where the arm is, if the plan's observation was taken before `oldest_ns`."""
@@ -364,7 +362,7 @@ class MotionPipeline:
             if near is not goal:
                 self._shorten(plans, goal, near, now_ns)
         if self.pace.override == 0.0 or self._changing or self.held:
-            mover.brake(FULL)  # on the path, to continue from there later
+            self._stop(mover, FULL)  # on the path, to continue from there later
             self.goal = None
             return events
         # The leash starts where the arm is in this tick: it may be moving away from the last goal.
@@ -379,7 +377,6 @@ class MotionPipeline:
             timed = TimedGoal(goal, timeline.plan, task.rate_hz, overdue_ns, now_ns)
             events += self.pace.set_out(mover, timed, slower)
             self.goal = goal
-            self.gripper.request(goal.width_m)
         return events
 
     def plan_ahead(self, task: Task, overdue_ns: int, next_ns: int) -> bool:
@@ -432,16 +429,23 @@ class MotionPipeline:
             inside_m, _ = into_workspace(self._limits, back.position_m, here_m)
             inside = Goal(Pose(inside_m, back.rotation), 0.0)
             shares = map(min, mover.shares(inside), Shares(self.retreat.speed))
-            mover.target(inside, Shares(*shares))
+            mover.go_to(inside, Shares(*shares))
         self._back = back
         return [] if event is None else [event]
 
     def _brake(self, mover: Mover, timeline: GoalTimeline, now_ns: int) -> None:
         """Stop, and move the goal to where the arm stops, so that nothing pulls it further."""
-        mover.brake()
+        self._stop(mover)
         self.goal = None
         if timeline.plan.cause is not None and mover.at_rest:
             self._hold(mover, timeline, now_ns)
+
+    def _stop(self, mover: Mover, shares: Shares | None = None) -> None:
+        """Come to rest as fast as joints that follow can; without them see `AxisSmoother.brake`."""
+        if self._joints is None or isinstance(mover, JointPath):
+            mover.brake(shares)
+        else:
+            self._joints.brake(mover)
 
     def _must_stream(self, state: State, now_ns: int) -> bool:
         if state in OBEYING or self.retreat.busy or not self.at_rest:
@@ -450,3 +454,13 @@ class MotionPipeline:
         if self._rest_since_ns is None:
             self._rest_since_ns = now_ns
         return self.streaming and now_ns - self._rest_since_ns < LINGER_NS
+
+
+def _pose_command(
+    motion: Motion, goal: Goal | None, state: State, cause: Cause | None
+) -> PoseCommand:
+    """The set-point of an arm that takes poses, on the way to `goal`."""
+    (position_m, rotation), *rates = motion
+    heads_m, heads = motion.pose if goal is None else goal.pose
+    here, there = quat_from_rotation(rotation), quat_from_rotation(heads)
+    return computed(PoseCommand, position_m, here, *rates, heads_m, there, state.value, cause)

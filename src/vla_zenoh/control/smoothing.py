@@ -1,4 +1,4 @@
-"""Jerk-limited motion to a target pose that may change at any tick: Ruckig on R^3 x SO(3).
+"""Jerk-limited motion of the TCP to a pose that may change at any tick: Ruckig on R^3 x SO(3).
 
 Translation is planned in the base frame. Rotation is planned as the rotation vector ``r`` of
 ``R_anchor^T R``; at every new target the anchor moves to the current smoothed rotation, so ``r``
@@ -9,36 +9,35 @@ that of `vla_zenoh.control.axis_smoothing`.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from vla_zenoh.control.axis_smoothing import FULL, AxisSmoother, AxisState, Shares
-from vla_zenoh.kinematics.so3 import Pose, body_rates, exp3, log3, orthonormal, spatial_rates
-from vla_zenoh.profile import Limits
+from vla_zenoh.control.limits import (
+    HELD_LEAD_M,
+    HELD_LEAD_RAD,
+    LimitHit,
+    MotionLimits,
+    leash,
+    motion_limits,
+    workspace_corners,
+)
+from vla_zenoh.control.plan_timeline import Goal
+from vla_zenoh.kinematics.so3 import (
+    Pose,
+    body_rates,
+    exp3,
+    interpolate,
+    log3,
+    orthonormal,
+    pose_distance,
+    spatial_rates,
+)
+from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray
-
-__all__ = ["FULL", "ROTATION_BOX", "Motion", "MotionLimits", "Shares", "Smoother", "motion_limits"]
-
-ROTATION_BOX = 0.55
-"""Share of a rotation limit per axis, so that the norm over three axes (sqrt 3 of it) and the small
-terms of a moving chart (5 %) stay below the limit in any direction."""
-
-
-class MotionLimits(NamedTuple):
-    """(velocity, acceleration, jerk): translation per axis in m, s; rotation as norm in rad, s."""
-
-    translation: tuple[float, float, float]
-    rotation: tuple[float, float, float]
-
-
-def motion_limits(limits: Limits) -> MotionLimits:
-    """The motion limits of a profile."""
-    translation, rotation = limits.translation, limits.rotation
-    return MotionLimits(
-        (translation.velocity_m_s, translation.acceleration_m_s2, translation.jerk_m_s3),
-        (rotation.velocity_rad_s, rotation.acceleration_rad_s2, rotation.jerk_rad_s3),
-    )
 
 
 class Motion(NamedTuple):
@@ -72,12 +71,8 @@ class Smoother(AxisSmoother):
         limits: MotionLimits,
         bounds_m: tuple[FloatArray, FloatArray] | None = None,
     ) -> None:
-        box = [
-            [translation] * 3 + [rotation * ROTATION_BOX] * 3
-            for translation, rotation in zip(*limits, strict=True)
-        ]
         self._anchor = np.eye(3)
-        super().__init__(np.zeros(6), dt_s, np.array(box), (slice(0, 3), slice(3, 6)))
+        super().__init__(np.zeros(6), dt_s, limits.box, (slice(0, 3), slice(3, 6)))
         self.bounds_m = bounds_m
         self.reset(pose)
 
@@ -110,17 +105,6 @@ class Smoother(AxisSmoother):
         if self._plan is None:
             return self.motion.pose
         return Pose(end[:3], orthonormal(self._anchor @ exp3(end[3:])))
-
-    def way_to(self, pose: Pose) -> FloatArray:
-        """(6,) from the smoothed pose to another, m and rad in its own axes."""
-        position_m, rotation = self.motion.pose
-        return np.concatenate([pose.position_m - position_m, log3(rotation.T @ pose.rotation)])
-
-    def axis_rates(self) -> tuple[FloatArray, FloatArray]:
-        """(6,) velocity and acceleration; those of rotation in axes that turn with the arm."""
-        (_, rotation), *rates = self.motion
-        velocity, change = (np.append(part[:3], rotation.T @ part[3:]) for part in rates)
-        return velocity, change
 
     def brake_from(self, motion: Motion) -> None:
         """Brake from the state of another motion."""
@@ -169,3 +153,85 @@ class Smoother(AxisSmoother):
             np.concatenate([acceleration[:3], spin_change]),
         )
         super()._settle(shares)
+
+
+class PosePath(Smoother):
+    """Motion to goals that are poses; `JointPath` is the same for joints.
+
+    Args:
+        start: pose to stand at.
+        profile: limits, rate.
+        followed: shares of the limits of a motion to a pose that joints can follow; None: poses are
+            commanded.
+    """
+
+    def __init__(
+        self,
+        start: Pose,
+        profile: Profile,
+        followed: Callable[[Motion, Pose, FloatArray], Shares] | None,
+    ) -> None:
+        limits = self._bounds = profile.limits
+        self._followed = followed
+        # Commanded joints have distance constraints of their own.
+        inside = workspace_corners(limits) if followed is None else None
+        super().__init__(start, 1.0 / profile.timing.command_hz, motion_limits(limits), inside)
+
+    def leash(self, goal: Goal, ahead_s: float) -> tuple[Goal, list[LimitHit]]:
+        """`goal`, or a nearer one on the leash, and the limits that acted."""
+        if self._well_within_leash(goal.pose, ahead_s):
+            return goal, []
+        (position_m, rotation), twist, acceleration = self.motion
+        way = ahead_s * (twist + 0.5 * ahead_s * acceleration)
+        ahead = Pose(position_m + way[:3], exp3(way[3:]).dot(rotation))
+        pose, hits = leash(self._bounds, goal.pose, ahead)
+        return replace(goal, pose=pose, joints_rad=None) if hits else goal, hits
+
+    def _well_within_leash(self, goal: Pose, ahead_s: float) -> bool:
+        """Whether the leash is long enough wherever the arm will be; cheaper than computing where.
+
+        It moves no further than at its speed plus what the acceleration adds.
+        """
+        limits, (pose, twist, acceleration) = self._bounds, self.motion
+        apart_m, apart_rad = pose_distance(goal, pose)
+        x, y, z, rx, ry, rz = map(abs, twist.tolist())
+        ax, ay, az, arx, ary, arz = map(abs, acceleration.tolist())
+        way_m = ahead_s * (x + y + z + ahead_s * (ax + ay + az))
+        turn_rad = ahead_s * (rx + ry + rz + ahead_s * (arx + ary + arz))
+        return apart_m + way_m <= limits.lead_m and apart_rad + turn_rad <= limits.lead_rad
+
+    def near(self, goal: Goal) -> Goal:
+        """`goal`, or one so near that the arm can retreat from there."""
+        here = self.motion.pose
+        apart_m, apart_rad = pose_distance(here, goal.pose)
+        share = 1 / max(apart_m / HELD_LEAD_M, apart_rad / HELD_LEAD_RAD, 1.0)
+        if share >= 1.0:
+            return goal
+        return replace(goal, pose=interpolate(here, goal.pose, share), joints_rad=None)
+
+    def resting_goal(self, actual: Pose, width_m: float) -> Goal:
+        """Brake; where that ends, no further outside the box than the `actual` arm is."""
+        rest, (low, high) = self.resting_pose(), workspace_corners(self._bounds)
+        least, most = np.minimum(low, actual.position_m), np.maximum(high, actual.position_m)
+        return Goal(Pose(np.clip(rest.position_m, least, most), rest.rotation), width_m)
+
+    def go_to(self, goal: Goal, shares: Shares = FULL, *, all_to_stop: bool = False) -> bool:
+        """Move to the pose of `goal`; see `AxisSmoother.move_to`."""
+        return self.target(goal.pose, shares, all_to_stop=all_to_stop)
+
+    def way_to(self, goal: Goal) -> FloatArray:
+        """(6,) from the smoothed pose to that of `goal`, m and rad in its own axes."""
+        (position_m, rotation), (there_m, there) = self.motion.pose, goal.pose
+        return np.concatenate([there_m - position_m, log3(rotation.T @ there)])
+
+    def axis_rates(self) -> tuple[FloatArray, FloatArray]:
+        """(6,) velocity and acceleration, in the same axes."""
+        (_, rotation), *rates = self.motion
+        velocity, change = (np.append(part[:3], rotation.T @ part[3:]) for part in rates)
+        return velocity, change
+
+    def shares(self, goal: Goal) -> Shares:
+        """Shares of the limits that the joints can follow on the way to a goal."""
+        if self._followed is None:
+            return FULL
+        return self._followed(self.motion, goal.pose, self.box)

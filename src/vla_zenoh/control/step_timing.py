@@ -29,12 +29,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vla_zenoh.control.axis_smoothing import FULL, Shares
 from vla_zenoh.control.commander_io import make_event
 from vla_zenoh.control.joint_space import JointPath
 from vla_zenoh.control.limits import APPROACH, Slowdown, slowest
 from vla_zenoh.control.plan_timeline import Goal, Plan
-from vla_zenoh.control.pose_path import Mover
-from vla_zenoh.control.smoothing import FULL, Shares
+from vla_zenoh.control.smoothing import PosePath
 from vla_zenoh.types import Event, FloatArray
 
 PHASE, PERIOD, DEVIATION = 0.3, 0.1, 0.2
@@ -53,6 +53,10 @@ SOON_NS = 1_000_000
 MARGIN_NS = 10_000_000
 EASING = 0.1
 """Part of the time by which what is kept in reserve may change; half of it how late the arm is."""
+
+
+Mover = PosePath | JointPath
+"""What moves the arm."""
 
 
 class Arrivals:
@@ -311,7 +315,7 @@ class GoalPace:
         timing = StepTiming(mover.box) if timing is None else timing.fork()
         shares = self._shares(timing, mover, timed)
         hard = self.slowing and (in_joints or not self._joints_follow)
-        enough = mover.target(timed.goal, shares, all_to_stop=hard)
+        enough = mover.go_to(timed.goal, shares, all_to_stop=hard)
         return _Ahead(of, at, timing, mover, enough)
 
     def _shares(self, timing: StepTiming, mover: Mover, timed: TimedGoal) -> Shares:

@@ -13,8 +13,8 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from vla_zenoh.control.limits import JointMotionLimits
-from vla_zenoh.control.smoothing import Motion, MotionLimits, motion_limits
+from vla_zenoh.control.limits import JointMotionLimits, MotionLimits, motion_limits
+from vla_zenoh.control.smoothing import Motion
 from vla_zenoh.guard.reference_governor import (
     AT_REST,
     BRAKE_MARGIN,

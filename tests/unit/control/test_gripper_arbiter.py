@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from vla_zenoh.control.gripper_arbiter import SETTLE_NS, GripperArbiter
+from vla_zenoh.control.commanded_part import SETTLE_NS, GripperArbiter
 from vla_zenoh.profile import GripperProfile
 from vla_zenoh.types import GripperState, Header, Stamped
 
@@ -16,10 +16,14 @@ def state(now_ns: int, *, moving: bool) -> Stamped[GripperState]:
     return Stamped(Header(now_ns, 0, "sim"), GripperState(0.05, moving, holding=False), now_ns)
 
 
+def standing(width_m: float) -> GripperState:
+    return GripperState(width_m, moving=False, holding=False)
+
+
 @pytest.fixture
 def gripper() -> GripperArbiter:
     arbiter = GripperArbiter(PROFILE)
-    arbiter.restart(0.08)
+    arbiter.keep(standing(0.08))
     return arbiter
 
 
@@ -43,7 +47,7 @@ def test_a_new_width_is_sent_once_with_the_profiles_speed_and_force(
 def test_a_width_outside_is_brought_inside(
     gripper: GripperArbiter, wanted_m: float, sent_m: float
 ) -> None:
-    gripper.restart(0.04)
+    gripper.keep(standing(0.04))
     gripper.request(wanted_m)
     command = gripper.step(0, None)
     assert command is not None
@@ -95,6 +99,6 @@ def test_a_gripper_that_never_answers_gets_the_next_command_after_a_while(
 def test_restart_takes_the_width_as_given(gripper: GripperArbiter) -> None:
     gripper.request(0.0)
     gripper.step(0, None)
-    gripper.restart(0.03)
+    gripper.keep(standing(0.03))
     assert not gripper.in_flight
     assert gripper.step(1, None) is None

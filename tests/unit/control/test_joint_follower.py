@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vla_zenoh.control.joint_follower import JointFollower
-from vla_zenoh.control.limits import into_workspace
+from vla_zenoh.control.limits import into_workspace, motion_limits
 from vla_zenoh.control.pose_to_joint import FAR, NEAR_M, NEAR_RAD, PoseToJoint
 from vla_zenoh.control.reachability import make_reachability_filter
-from vla_zenoh.control.smoothing import Smoother, motion_limits
+from vla_zenoh.control.smoothing import Smoother
 from vla_zenoh.guard.stream_guard import joint_motion_limits
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.kinematics.so3 import Pose, exp3, pose_distance

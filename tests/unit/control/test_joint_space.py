@@ -56,7 +56,7 @@ def test_commands_stay_inside_the_box_whenever_the_goal_changes() -> None:
     worst_m = 0.0
     for _ in range(400):
         asked = joint_goal(path.kinematics, HOME_RAD + rng.uniform(-1.0, 1.0, 7), 0.0)
-        path.target(path.leash(asked, 0.0)[0])
+        path.go_to(path.leash(asked, 0.0)[0])
         if rng.random() < 0.2:
             path.brake()
         for _ in range(int(rng.integers(1, 60))):
@@ -93,7 +93,7 @@ def test_joints_that_braked_before_a_bound_go_on_when_the_way_is_free() -> None:
             asked = joint_goal(path.kinematics, HOME_RAD + rng.uniform(-1.0, 1.0, 7), 0.0)
             goal = path.leash(asked, 0.0)[0]
             path.taken_hits()
-            path.target(goal)
+            path.go_to(goal)
             for _ in range(int(rng.integers(5, 60))):
                 path.tick()
         still = 0

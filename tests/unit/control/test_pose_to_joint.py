@@ -7,16 +7,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vla_zenoh.control.chunk_planner import ChunkPlanner
+from vla_zenoh.control.commander_io import State
+from vla_zenoh.control.limits import motion_limits
 from vla_zenoh.control.motion_pipeline import MotionPipeline
 from vla_zenoh.control.pose_to_joint import PoseToJoint
 from vla_zenoh.control.reachability import make_reachability_filter
-from vla_zenoh.control.smoothing import Smoother, motion_limits
-from vla_zenoh.control.states import State
+from vla_zenoh.control.smoothing import Smoother
 from vla_zenoh.guard.stream_guard import joint_motion_limits
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.kinematics.so3 import Pose, exp3, quat_from_rotation
 from vla_zenoh.profile import load_profile, override
-from vla_zenoh.types import FloatArray, GripperState, JointCommand, JointState, PoseState, Task
+from vla_zenoh.types import FloatArray, JointCommand, JointState, PoseState, Task
 
 PROFILE = override(load_profile("panda_sim"), {"robot": {"command": "joint", "posture": "home"}})
 KINEMATICS = make_kinematics(PROFILE)
@@ -60,7 +61,7 @@ class Moved:
         pose, zero = KINEMATICS.forward(joints_rad), np.zeros(len(joints_rad))
         self.mover.anchor(
             PoseState(pose.position_m, quat_from_rotation(pose.rotation), np.zeros(6)),
-            GripperState(0.08, False, False),
+            0.08,
             JointState(KINEMATICS.arm_joints, joints_rad, zero, zero, joints_rad),
             self.now_ns,
             blocked=False,
@@ -71,8 +72,8 @@ class Moved:
         task = Task(0, True, "hold", "scripted", 5.0)
         overdue_ns = self.now_ns + 10**9
         self.mover.advance(State.ACTIVE, task, overdue_ns, self.now_ns, ticks)
-        joint = self.mover.commands(State.ACTIVE, self.now_ns, None).joint
-        assert joint is not None
+        joint = self.mover.command(State.ACTIVE)
+        assert isinstance(joint, JointCommand)
         return joint
 
 

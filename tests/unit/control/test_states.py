@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 from command_rig import Rig
 
-from vla_zenoh.control.states import OBEYING, TABLE, State, Trigger, after
+from vla_zenoh.control.commander_io import OBEYING, TABLE, State, Trigger, after
 
 # Written down once more, so that an edge cannot come or go unnoticed.
 EDGES = [

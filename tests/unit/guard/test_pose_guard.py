@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vla_zenoh.control.smoothing import MotionLimits, Smoother, motion_limits
+from vla_zenoh.control.limits import MotionLimits, motion_limits
+from vla_zenoh.control.smoothing import Smoother
 from vla_zenoh.guard.stream_guard import PoseGuard, pose_brake_limits
 from vla_zenoh.kinematics.so3 import Pose, angle_between, exp3, norm3, quat_from_rotation
 from vla_zenoh.profile import load_profile

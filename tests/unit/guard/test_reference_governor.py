@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vla_zenoh.control.smoothing import Motion, MotionLimits
+from vla_zenoh.control.limits import MotionLimits
+from vla_zenoh.control.smoothing import Motion
 from vla_zenoh.guard.reference_governor import (
     BRAKE_MARGIN,
     GovernorLimits,

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from panda_arm import HOME_RAD, moved, panda, tool_down_at
 
 from vla_zenoh.control.joint_follower import JointFollower, JointMotion
-from vla_zenoh.control.smoothing import MotionLimits, Smoother
+from vla_zenoh.control.limits import MotionLimits
+from vla_zenoh.control.smoothing import Smoother
 from vla_zenoh.errors import RecordError
 from vla_zenoh.kinematics.kinematics import InverseKinematics, pose_error, smallest_singular_value
 from vla_zenoh.kinematics.so3 import Pose, angle_between

@@ -18,8 +18,8 @@ import numpy as np
 import zenoh
 
 from vla_zenoh.bus.buffers import Wake, bytes_of
+from vla_zenoh.control.commander_io import DEACTIVATED
 from vla_zenoh.control.reachability import make_reachability_filter
-from vla_zenoh.control.states import DEACTIVATED
 from vla_zenoh.errors import CodecError, SessionError
 from vla_zenoh.keys import PRIMITIVES, last_chunk, worker_node
 from vla_zenoh.kinematics.so3 import Pose, pose_of, rotation_from_quat

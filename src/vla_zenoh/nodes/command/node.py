@@ -19,8 +19,8 @@ from vla_zenoh.bus.node import Node
 from vla_zenoh.codec import records
 from vla_zenoh.control.commanded_part import CommandedPart
 from vla_zenoh.control.commander import Commander, Outputs, Setting
+from vla_zenoh.control.commander_io import State
 from vla_zenoh.control.reachability import make_reachability_filter
-from vla_zenoh.control.states import State
 from vla_zenoh.keys import Kind
 from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.nodes.command.inputs import CommandInputs
@@ -278,7 +278,7 @@ class CommandStatus:
         latency = {name: meter.summary() for name, meter in self._latency.items()}
         self._node.counters["command.smoothing_failures"] = commander.smoothing_failures
         self._node.counters["command.gripper_timeouts"] = sum(
-            part.motion.gripper.timeouts for part in commander.parts
+            part.gripper.timeouts for part in commander.parts
         )
         self._node.counters["command.chunks_dropped"] = chunks_dropped
         self._node.publish_status(
