@@ -28,8 +28,7 @@ from vla_zenoh.lab.doctor.access_check import (
 )
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.session import SecurityProfile
-from vla_zenoh.security.identity import Identity, Role
-from vla_zenoh.security.roles import EVERY_MESSAGE, Act, access_control
+from vla_zenoh.security.roles import EVERY_MESSAGE, Act, Identity, Role, access_control
 
 Done = set[tuple[str, Act, str]]
 """(common name, act, key) of what went through."""

@@ -22,7 +22,7 @@ from netns.site import HERE, Site, secured_site
 from vla_zenoh.bus.session import session_config
 from vla_zenoh.lab.certificates.lab_certificates import LabCertificates
 from vla_zenoh.profile import load_profile, override
-from vla_zenoh.security.identity import Identity, Role
+from vla_zenoh.security.roles import Identity, Role
 
 pytestmark = [pytest.mark.netns, pytest.mark.slow, needs_namespaces, pytest.mark.timeout(240)]
 

@@ -310,7 +310,7 @@ class NodeTraits(NamedTuple):
     """A kind of node; its command is ``vla-zenoh node KIND``, or ``vla-zenoh worker``.
 
     Args:
-        role: in a secured lab, a value of `vla_zenoh.security.identity.Role`.
+        role: in a secured lab, a value of `vla_zenoh.security.roles.Role`.
         stop_s: how long before its deadline `up` stops the next kinds; those with more stop first.
         only_one: why a robot has no second one; empty: it may have several.
     """

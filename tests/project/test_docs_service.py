@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from vla_zenoh.runtime.launch import STOP_BUDGET_S
-from vla_zenoh.runtime.scheduling import INNER_PRIORITY, LINK_PRIORITY, LOOP_PRIORITY
+from vla_zenoh.runtime.process import INNER_PRIORITY, LINK_PRIORITY, LOOP_PRIORITY
 
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "service.md"
 

@@ -13,7 +13,7 @@ from camera_rig import free_endpoint, until
 
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.profile import SessionProfile
-from vla_zenoh.runtime.scheduling import LINK_PRIORITY, realtime_links, realtime_thread
+from vla_zenoh.runtime.process import LINK_PRIORITY, realtime_links, realtime_thread
 
 ZENOHS = ("rx-", "net-")
 """How Zenoh names the threads that carry what arrives."""

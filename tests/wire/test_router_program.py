@@ -22,8 +22,7 @@ from vla_zenoh.lab.certificates.lab_certificates import LabCertificates
 from vla_zenoh.lab.certificates.secure_profile import profile_text, serving_addresses
 from vla_zenoh.profile import load_profile
 from vla_zenoh.runtime.router import router_config, run_router
-from vla_zenoh.security.identity import identities
-from vla_zenoh.security.roles import access_control
+from vla_zenoh.security.roles import access_control, identities
 
 LIMIT_S = 20.0
 

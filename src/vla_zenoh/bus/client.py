@@ -18,7 +18,7 @@ from vla_zenoh.bus.session import put_text
 from vla_zenoh.codec import records, settings
 from vla_zenoh.errors import CodecError, ProfileError, SessionError
 from vla_zenoh.keys import NO_DEADMAN_TOKEN, key_chunk, last_chunk
-from vla_zenoh.security.identity import expected_nodes, identities
+from vla_zenoh.security.roles import expected_nodes, identities
 from vla_zenoh.types import Event, Header, NodeStatus, Task
 
 if TYPE_CHECKING:

@@ -5,10 +5,14 @@ Typer, Rich, numpy and the profile's schema are not loaded here, see ``words.py`
 
 from __future__ import annotations
 
+import os
+import select
+import signal
+import sys
 import threading
 import time
-from collections.abc import Callable
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext, suppress
 from functools import wraps
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
@@ -30,6 +34,10 @@ DISCOVERY_S, POLL_S = 1.0, 0.05
 MODE_PATIENCE_S = 1.0
 ABSENT_PATIENCE_S = 1.5
 """A command node that is alive may take this long to appear."""
+KEY_S = 0.1
+SILENT_S = 2.0
+"""The command node publishes its status twice a second."""
+LEAVING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
 
 
 def _answered(command: Callable[..., None]) -> Callable[..., None]:
@@ -189,14 +197,12 @@ def speed(
         if lower and (why := target.not_operator(client.profile, "speed", f"{wanted:g}")):
             raise SecurityError(why)
         if wanted is None or lower:
-            _show_speed(target, client, task if wanted is None else client.slow_down(wanted))
+            task = task if wanted is None else client.slow_down(wanted)
+            _show(target, client, f"speed: {task.speed_percent:g} % of the planned speed")
             return
     with target.operator("speed", f"{wanted:g}") as client:
-        _show_speed(target, client, client.set_speed(wanted))
-
-
-def _show_speed(target: RobotTarget, client: Client, task: Task) -> None:
-    _show(target, client, f"speed: {task.speed_percent:g} % of the planned speed")
+        task = client.set_speed(wanted)
+        _show(target, client, f"speed: {task.speed_percent:g} % of the planned speed")
 
 
 @_answered
@@ -215,15 +221,13 @@ def stop(
 ) -> None:
     """Emergency stop: brake now and stay stopped until `vla-zenoh reset`."""
     if wait_key:
-        from vla_zenoh.cli.stop_key import stop_by_key
-
-        stop_by_key(target, lambda client: confirm_stop(target, client, every=every))
+        _stop_by_key(target, every=every)
         return
     with target.client(stop_now=True) as client:
-        confirm_stop(target, client, every=every)
+        _confirm_stop(target, client, every=every)
 
 
-def confirm_stop(target: RobotTarget, client: Client, *, every: bool) -> None:
+def _confirm_stop(target: RobotTarget, client: Client, *, every: bool) -> None:
     """Stop the others too if wanted, and wait for the confirmation."""
     if every:
         _stop_all(target, client)
@@ -315,3 +319,86 @@ def _show_stopped(target: RobotTarget, client: Client, own: str) -> None:
 
 def _show(target: RobotTarget, client: Client, text: str, separator: str = ", ") -> None:
     say(f"{text}{separator}{target.named(client)}")
+
+
+# -- stop --wait-key: a standby emergency stop for a person beside the arm ------------------------
+def _stop_by_key(target: RobotTarget, *, every: bool) -> None:
+    """Stop the robot at every key, and when the person leaves; the session stays open meanwhile."""
+    with target.client(stop=True) as client, _keys() as pressed:
+        try:
+            _stand_by(target, client, pressed, every=every)
+        finally:
+            client.stop()
+            with suppress(OSError):  # the terminal may be gone
+                _confirm_stop(target, client, every=every)
+
+
+def _stand_by(
+    target: RobotTarget, client: Client, pressed: Callable[[], bool | None], *, every: bool
+) -> None:
+    """Stop the robot at every key, until the input ends."""
+    name = target.named(client)
+    client.wait_for(lambda: _connected(client), ABSENT_PATIENCE_S)
+    say(f"Every key stops {name}; so does leaving: Ctrl-C, or closing this terminal.")
+    connected = True
+    while (key := pressed()) is not False:
+        if key:
+            client.stop()
+            with suppress(SystemExit):  # reported already; stay on standby
+                _confirm_stop(target, client, every=every)
+        if connected != (connected := _connected(client)):
+            if connected:
+                say(f"Connected: every key stops {name}.")
+            else:
+                silent = f": its command node is silent, no key stops {name}"
+                say_marked("NOT CONNECTED", BOLD_RED, silent)
+
+
+def _connected(client: Client) -> bool:
+    found = client.snapshot().get("command")
+    return found is not None and found[2] and found[1] < SILENT_S
+
+
+@contextmanager
+def _keys() -> Iterator[Callable[[], bool | None]]:
+    """A function that waits briefly for a key: True; None: there was none; False: input ended.
+
+    Signals that end or suspend a program raise `KeyboardInterrupt`, the first one alone.
+    """
+    number = sys.stdin.fileno()
+
+    def pressed() -> bool | None:
+        if not select.select([number], [], [], KEY_S)[0]:
+            return None
+        return bool(os.read(number, 4096))
+
+    def leave(*_: object) -> None:
+        for each in LEAVING:
+            signal.signal(each, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    before = {each: signal.signal(each, leave) for each in LEAVING}
+    restore = _single_keys(number)
+    try:
+        yield pressed
+    finally:
+        restore()
+        for each, handler in before.items():
+            signal.signal(each, handler)
+
+
+def _single_keys(number: int) -> Callable[[], None]:
+    """Let a terminal deliver every key at once, without echo; returns what undoes that."""
+    if not os.isatty(number):
+        return lambda: None
+    import termios
+    import tty
+
+    before = termios.tcgetattr(number)
+    tty.setcbreak(number)
+
+    def restore() -> None:
+        with suppress(termios.error, OSError):  # the terminal may be gone
+            termios.tcsetattr(number, termios.TCSADRAIN, before)
+
+    return restore

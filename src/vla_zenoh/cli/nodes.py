@@ -49,8 +49,8 @@ def router(
     ] = False,
 ) -> None:
     """Run the Zenoh router that connects all nodes of a lab."""
+    from vla_zenoh.runtime.process import prefer_this_process, realtime_links
     from vla_zenoh.runtime.router import router_config, run_router
-    from vla_zenoh.runtime.scheduling import prefer_this_process, realtime_links
 
     loaded = effective_profile(profile, listen=listen, host=host)
     others = [effective_profile(name) for name in also or ()]

@@ -16,7 +16,7 @@ from vla_zenoh.cli.plain import warn
 from vla_zenoh.cli.profile_cache import cached_profile
 from vla_zenoh.cli.words import DEFAULT_PROFILE, PROFILE_VARIABLE
 from vla_zenoh.errors import SecurityError, SessionError
-from vla_zenoh.security.identity import Role, operator_role
+from vla_zenoh.security.roles import Role, operator_role
 from vla_zenoh.security.store import local_role, operator_hosts
 
 if TYPE_CHECKING:  # Typer and the schema: the commands that drive do without them

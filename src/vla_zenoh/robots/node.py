@@ -24,7 +24,7 @@ from vla_zenoh.errors import NodeError
 from vla_zenoh.guard.arm_guard import max_braking_time_s
 from vla_zenoh.robots.arm import Arm
 from vla_zenoh.robots.driver import RobotDriver
-from vla_zenoh.runtime.scheduling import realtime_thread
+from vla_zenoh.runtime.process import realtime_thread
 from vla_zenoh.sanitize import one_line
 from vla_zenoh.types import Event
 

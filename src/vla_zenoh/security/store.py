@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from vla_zenoh.errors import SecurityError
-from vla_zenoh.security.identity import PEOPLE, Role, operator_role
+from vla_zenoh.security.roles import PEOPLE, Role, operator_role
 
 if TYPE_CHECKING:
     from vla_zenoh.profile import Profile

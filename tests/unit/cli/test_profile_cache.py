@@ -14,7 +14,7 @@ from vla_zenoh.cli.profile_cache import _Outline
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.profile import Profile, profile_names
-from vla_zenoh.security.identity import identities, operator_role
+from vla_zenoh.security.roles import identities, operator_role
 from vla_zenoh.security.store import operator_hosts
 
 SECURED = """\

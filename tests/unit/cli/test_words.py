@@ -125,7 +125,7 @@ def test_help_of_a_word_is_complete() -> None:
 
 def test_a_word_that_drives_loads_nothing_that_it_does_not_need() -> None:
     code = (
-        "import sys, vla_zenoh.cli.drive, vla_zenoh.cli.stop_key, vla_zenoh.bus.client\n"
+        "import sys, vla_zenoh.cli.drive, vla_zenoh.bus.client\n"
         "import vla_zenoh.codec.settings, vla_zenoh.security.store\n"
         f"print([name for name in {FORBIDDEN} if name in sys.modules])"
     )

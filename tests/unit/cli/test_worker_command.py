@@ -15,7 +15,7 @@ from vla_zenoh.lab.cli.check import check
 from vla_zenoh.lab.cli.serve import serve
 from vla_zenoh.profile import load_profile
 from vla_zenoh.runtime.launch import node_commands
-from vla_zenoh.security.identity import identities
+from vla_zenoh.security.roles import identities
 
 APP = typer.Typer()
 APP.command()(worker)

@@ -19,7 +19,7 @@ from vla_zenoh.lab.certificates.secure_profile import moved_hosts, profile_text,
 from vla_zenoh.lab.cli.secure import secure_app
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.security import certificates
-from vla_zenoh.security.identity import Identity, Role, operator_identities
+from vla_zenoh.security.roles import Identity, Role, operator_identities
 
 NOW = dt.datetime(2026, 3, 1, 12, tzinfo=dt.UTC)
 ROUTER = Identity(Role.ROUTER, "router", "robot")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from vla_zenoh.profile import load_profile, override
-from vla_zenoh.security.identity import Role, identities
+from vla_zenoh.security.roles import Role, identities
 
 
 def test_one_host_with_cameras_has_the_node_camera() -> None:

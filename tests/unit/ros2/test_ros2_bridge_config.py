@@ -22,8 +22,7 @@ from vla_zenoh.lab.profile.ros2_bridge import bridge_command, bridge_config, bri
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.ros2.keys import Ros2Dds
 from vla_zenoh.security import certificates
-from vla_zenoh.security.identity import Role
-from vla_zenoh.security.roles import Act
+from vla_zenoh.security.roles import Act, Role
 
 RUNNER = CliRunner()
 HOSTS = """\

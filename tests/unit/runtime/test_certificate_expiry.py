@@ -22,7 +22,7 @@ from vla_zenoh.runtime.certificate_expiry import (
     ExpiryOutlook,
     outlook,
 )
-from vla_zenoh.security.identity import Identity, Role
+from vla_zenoh.security.roles import Identity, Role
 from vla_zenoh.types import NodeStatus
 
 NOW = dt.datetime(2026, 3, 1, 12, tzinfo=dt.UTC)

@@ -9,7 +9,7 @@ import pytest
 
 from vla_zenoh.lab.certificates.lab_certificates import LabCertificates
 from vla_zenoh.profile import Profile, load_profile, override
-from vla_zenoh.security.identity import Identity, Role, identities_of, operator_identities
+from vla_zenoh.security.roles import Identity, Role, identities_of, operator_identities
 from vla_zenoh.security.store import local_role, operator_hosts
 
 NOW = dt.datetime(2026, 3, 1, 12, tzinfo=dt.UTC)

@@ -7,8 +7,7 @@ import pytest
 from vla_zenoh.bus.session import covers
 from vla_zenoh.keys import Keys
 from vla_zenoh.profile import load_profile
-from vla_zenoh.security.identity import Identity, identities
-from vla_zenoh.security.roles import Act, rights
+from vla_zenoh.security.roles import Act, Identity, identities, rights
 
 PAIR = load_profile("two_pandas_sim")
 

@@ -13,13 +13,19 @@ from vla_zenoh.errors import ProfileError
 from vla_zenoh.keys import KEY_PATHS, NODE_KINDS, Keys
 from vla_zenoh.lab.doctor.access_check import Passage, allows, missing, passages
 from vla_zenoh.profile import Profile, load_profile, override
-from vla_zenoh.security.identity import (
+from vla_zenoh.security.roles import (
+    TABLE,
+    Act,
     Identity,
+    Right,
     Role,
+    access_control,
+    expressions,
     identities,
     identities_of,
+    rights,
+    wide,
 )
-from vla_zenoh.security.roles import TABLE, Act, Right, access_control, expressions, rights, wide
 
 KEYS = Keys("panda")
 LAB = {

@@ -11,8 +11,7 @@ from typing import Any
 
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.session import TRUSTED_PROTOCOLS, host_of, is_loopback
-from vla_zenoh.security.identity import Identity, Role
-from vla_zenoh.security.roles import EVERY_MESSAGE, IN, OUT, rule
+from vla_zenoh.security.roles import EVERY_MESSAGE, IN, OUT, Identity, Role, rule
 from vla_zenoh.security.store import AUTHORITY
 
 NODE, USER = "bridge", "ros2"

@@ -13,7 +13,7 @@ from vla_zenoh.lab.certificates.authority import KeyPair
 from vla_zenoh.lab.certificates.bridge import bridges
 from vla_zenoh.profile import Profile
 from vla_zenoh.security.certificates import CheckedStore, Entry, read, read_file
-from vla_zenoh.security.identity import Identity, Role, identities
+from vla_zenoh.security.roles import Identity, Role, identities
 from vla_zenoh.security.store import AUTHORITY, THIS_HOST, Files, open_to_others
 
 KEY_MODE = 0o600

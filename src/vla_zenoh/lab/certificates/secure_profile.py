@@ -9,7 +9,7 @@ from typing import Any
 from vla_zenoh.errors import SecurityError
 from vla_zenoh.profile import HostProfile, Profile, yaml_text
 from vla_zenoh.profile.session import ANYWHERE, address_of, host_of, is_loopback
-from vla_zenoh.security.identity import Role
+from vla_zenoh.security.roles import Role
 
 HEAD = """\
 # {name}, secured: only clients with a certificate of this lab are let in.

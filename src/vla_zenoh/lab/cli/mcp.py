@@ -10,7 +10,7 @@ from vla_zenoh.cli.options import options
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.lab.primitives.remote_robot import RemoteRobot
 from vla_zenoh.lab.serve.mcp_server import McpServer
-from vla_zenoh.security.identity import Role
+from vla_zenoh.security.roles import Role
 from vla_zenoh.security.store import local_role
 
 

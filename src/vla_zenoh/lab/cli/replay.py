@@ -14,7 +14,7 @@ from vla_zenoh.errors import counted
 from vla_zenoh.lab.cli.output import print_json
 from vla_zenoh.profile import Profile, as_robot
 from vla_zenoh.runtime.process import run_node
-from vla_zenoh.security.identity import Role
+from vla_zenoh.security.roles import Role
 from vla_zenoh.security.store import Store
 
 

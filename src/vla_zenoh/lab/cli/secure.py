@@ -35,7 +35,7 @@ from vla_zenoh.profile.load import followed, paths_in
 from vla_zenoh.profile.session import DEFAULT_FOLDER
 from vla_zenoh.resources import is_path, shipped
 from vla_zenoh.security.certificates import Entry
-from vla_zenoh.security.identity import PEOPLE, Role, identities, identities_of, operator_identities
+from vla_zenoh.security.roles import PEOPLE, Role, identities, identities_of, operator_identities
 from vla_zenoh.security.store import Store
 
 

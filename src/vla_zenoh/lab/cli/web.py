@@ -16,7 +16,7 @@ from vla_zenoh.errors import NodeError, SecurityError
 from vla_zenoh.lab.web.access import People, Person, read_people
 from vla_zenoh.profile.session import is_loopback_address
 from vla_zenoh.runtime.process import run_node
-from vla_zenoh.security.identity import Role
+from vla_zenoh.security.roles import Role
 from vla_zenoh.security.store import local_role
 
 PORT = 8088

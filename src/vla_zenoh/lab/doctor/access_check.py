@@ -20,7 +20,6 @@ from vla_zenoh.bus.session import covers, open_session
 from vla_zenoh.errors import SecurityError
 from vla_zenoh.keys import Keys
 from vla_zenoh.profile import Profile
-from vla_zenoh.security.identity import Identity, Role, identities
 from vla_zenoh.security.roles import (
     IN,
     MESSAGES,
@@ -28,8 +27,11 @@ from vla_zenoh.security.roles import (
     OWN,
     TABLE,
     Act,
+    Identity,
+    Role,
     access_control,
     expressions,
+    identities,
     rights,
 )
 

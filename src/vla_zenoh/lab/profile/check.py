@@ -162,7 +162,7 @@ def _certificates(profile: Profile, host: str) -> Iterator[ProfileFault]:
     security = profile.session.security
     if security is None:
         return
-    from vla_zenoh.security.identity import PEOPLE, identities_of
+    from vla_zenoh.security.roles import PEOPLE, identities_of
     from vla_zenoh.security.store import Store
 
     people = {role.value for role in PEOPLE}

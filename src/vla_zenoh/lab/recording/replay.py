@@ -27,7 +27,7 @@ from vla_zenoh.lab.recording.record_types import group_of
 from vla_zenoh.lab.recording.sample import JPEG, Sample
 from vla_zenoh.lab.statistics import percentiles
 from vla_zenoh.profile import Profile
-from vla_zenoh.runtime.scheduling import realtime_thread
+from vla_zenoh.runtime.process import realtime_thread
 from vla_zenoh.types import Header
 
 STAMP = "_ns"

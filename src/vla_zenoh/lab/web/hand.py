@@ -15,7 +15,7 @@ from vla_zenoh.lab.teleop.policy import OperatorInput, TeleopPolicy, speeds_of
 from vla_zenoh.nodes.worker.node import WorkerNode
 from vla_zenoh.policy import Frame
 from vla_zenoh.profile import Profile
-from vla_zenoh.security.identity import TELEOP
+from vla_zenoh.security.roles import TELEOP
 from vla_zenoh.types import Task
 
 START_S = 5.0

@@ -20,7 +20,7 @@ from vla_zenoh.control.preflight import PeerSnapshot
 from vla_zenoh.errors import CodecError
 from vla_zenoh.keys import CRASHED, ON_BEHALF, Keys, last_chunk, worker_node
 from vla_zenoh.policy import ModelSpec
-from vla_zenoh.security.identity import expected_nodes
+from vla_zenoh.security.roles import expected_nodes
 from vla_zenoh.types import (
     ActionChunk,
     GripperState,

@@ -26,7 +26,7 @@ from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.nodes.command.inputs import CommandInputs
 from vla_zenoh.profile import Profile
 from vla_zenoh.runtime.estop_latch import EstopLatch
-from vla_zenoh.runtime.scheduling import realtime_thread
+from vla_zenoh.runtime.process import realtime_thread
 from vla_zenoh.types import LATENCY_STAGES, Cause, Event
 
 TASK_PERIOD_S = 0.2

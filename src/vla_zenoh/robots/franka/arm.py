@@ -26,7 +26,7 @@ from vla_zenoh.kinematics.so3 import exp3, log3, quat_from_rotation, rotation_fr
 from vla_zenoh.profile import Profile
 from vla_zenoh.robot import Command, Reading
 from vla_zenoh.robots.franka.hand import Hand
-from vla_zenoh.runtime.scheduling import realtime_children
+from vla_zenoh.runtime.process import realtime_children
 from vla_zenoh.types import FloatArray, JointCommand
 
 REST_S = 1.0
