@@ -23,8 +23,7 @@ from pydantic_core import PydanticUndefined
 from typer.main import get_command
 
 import vla_zenoh
-from vla_zenoh.cli.help import examples
-from vla_zenoh.cli.main import app
+from vla_zenoh.cli.main import app, examples
 from vla_zenoh.keys import KEY_PATHS
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.lab.doctor.franka_limits import BY_FCI, JOINTS

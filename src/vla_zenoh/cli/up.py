@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
@@ -36,6 +36,7 @@ from vla_zenoh.errors import NodeError
 from vla_zenoh.keys import ROLLING
 from vla_zenoh.resources import is_path, profile_file
 from vla_zenoh.runtime.process import DETAIL, FATAL, die_with_parent, stop_on_signals
+from vla_zenoh.runtime.supervisor import repeated
 
 if TYPE_CHECKING:
     from vla_zenoh.profile import Profile
@@ -74,8 +75,8 @@ def up(
 
     The profile is checked first, as `profile check` does; nothing starts if it cannot run.
     """
-    endpoints = repeated({"--connect": connect, "--listen": listen})
-    hosts = [] if host is None else ["--host", host]
+    hosts = repeated("--host", [host] if host else None)
+    endpoints = (*repeated("--connect", connect), *repeated("--listen", listen))
     with profile_check([profile, *hosts, *endpoints]) as check:
         from vla_zenoh.runtime.launch import Host, choose_host, lock_host  # meanwhile
 
@@ -195,12 +196,6 @@ def reject_wrong(profile: str, check: subprocess.Popen[str]) -> None:
     for line in lines:
         errors().print(styled(line, "red"), soft_wrap=True)
     fail(f"nothing was started: {profile} has faults; `vla-zenoh profile check` lists them too")
-
-
-def repeated(options: Mapping[str, Sequence[str] | None]) -> list[str]:
-    """Words of a command line for options that may be given several times."""
-    given = ((name, value) for name, values in options.items() for value in values or ())
-    return [word for pair in given for word in pair]
 
 
 def target_of(profile: str, running: Host) -> RobotTarget:

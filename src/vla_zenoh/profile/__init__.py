@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from vla_zenoh.profile.load import load_with_lines as load_with_lines
     from vla_zenoh.profile.load import override as override
     from vla_zenoh.profile.load import profile_file as profile_file
-    from vla_zenoh.profile.load import profile_names as profile_names
     from vla_zenoh.profile.load import read_profile as read_profile
     from vla_zenoh.profile.load import to_yaml as to_yaml
     from vla_zenoh.profile.profile import PartProfile as PartProfile

@@ -10,7 +10,6 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from vla_zenoh import resources
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.profile import yaml_text
 from vla_zenoh.profile.profile import Profile
@@ -19,11 +18,6 @@ from vla_zenoh.profile.section import WITH_REMOVABLE, Lines, explain, merge
 from vla_zenoh.resources import ROBOT_DATA_PREFIX, extended_profile, is_path, profile_file
 
 MAX_EXTENDS = 8
-
-
-def profile_names() -> list[str]:
-    """Names of all profiles on the search path."""
-    return resources.names("profiles")
 
 
 def load_profile(name: str) -> Profile:

@@ -170,10 +170,8 @@ class Profile(Section):
 
     def contradictions(self) -> Iterator[Fault]:
         """Sections that do not go together."""
-        yield from _robot(self)
-        yield from _parts(self)
-        yield from _cameras(self)
-        yield from _ros2(self)
+        for check in (_robot, _parts, _cameras, _ros2):
+            yield from check(self)
         yield from _unknown(("task", "worker"), [self.task.worker], "workers", self.workers)
         yield from _serves(self)
         yield from _unknown(("models",), self.models, "workers", self.workers)
@@ -237,7 +235,13 @@ def _robot(profile: Profile) -> Iterator[Fault]:
     if driver in TO_GIVE and getattr(profile, driver) is None:
         yield (driver,), f"is missing: robot.driver is {driver}{TO_GIVE[driver]}"
     if driver == "lerobot" and profile.lerobot is not None:
-        yield from _lerobot(profile.lerobot, profile.robot.arm_joints)
+        joints = profile.robot.arm_joints
+        for name in ("motors", "zero_deg"):
+            given = getattr(profile.lerobot, name)
+            if given and len(given) != len(joints):
+                yield ("lerobot", name), f"has {len(given)} entries for {len(joints)} arm_joints"
+        turned = profile.lerobot.reversed
+        yield from _unknown(("lerobot", "reversed"), turned, "robot.arm_joints", joints)
     if driver in ("ur", "lerobot") and profile.robot.command != "joint":
         yield ("robot", "command"), f"must be joint: robot.driver is {driver}"
     yield from _joint_limits((), profile.robot, profile.limits)
@@ -293,14 +297,6 @@ def _parts(profile: Profile) -> Iterator[Fault]:
         else:
             own = profile.of_part(name)
             yield from _joint_limits(("parts", name), own.robot, own.limits)
-
-
-def _lerobot(found: LeRobotProfile, joints: Sequence[str]) -> Iterator[Fault]:
-    for name in ("motors", "zero_deg"):
-        given = getattr(found, name)
-        if given and len(given) != len(joints):
-            yield ("lerobot", name), f"has {len(given)} entries for {len(joints)} arm_joints"
-    yield from _unknown(("lerobot", "reversed"), found.reversed, "robot.arm_joints", joints)
 
 
 def _cameras(profile: Profile) -> Iterator[Fault]:

@@ -10,7 +10,7 @@ import signal
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import IO, Any
@@ -28,7 +28,14 @@ from vla_zenoh.profile import HostProfile, Profile, override, to_yaml
 from vla_zenoh.runtime.certificate_expiry import CertificateExpiry
 from vla_zenoh.runtime.process import ROUTER_PATIENCE_S, RUN_FOLDER_VARIABLE
 from vla_zenoh.runtime.router import reject_taken
-from vla_zenoh.runtime.supervisor import Child, NodeCommand, Supervisor, hung_nodes, signal_group
+from vla_zenoh.runtime.supervisor import (
+    Child,
+    NodeCommand,
+    Supervisor,
+    hung_nodes,
+    repeated,
+    signal_group,
+)
 from vla_zenoh.security.roles import Role, operator_role
 from vla_zenoh.types import Event, NodeStatus
 
@@ -130,7 +137,7 @@ def node_commands(
         )
     common = ("--profile", str(profile_file))
     more: dict[str, Sequence[str]] = {
-        "router": ("--host", host, *_each("--also", map(str, also_files))),
+        "router": ("--host", host, *repeated("--also", map(str, also_files))),
         "camera": ("--name", profile.node_name(host, "camera"), *(part.cameras or ())),
         "command": ("--dry-run",) if dry_run else (),
     }
@@ -141,14 +148,10 @@ def node_commands(
             commands.append(NodeCommand(profile.node_name(host, kind), kind, words))
             continue
         for worker in profile.workers_of(part):
-            options = _each("--set", (worker_options or {}).get(worker, ()))
+            options = repeated("--set", (worker_options or {}).get(worker, ()))
             words = ("worker", worker, *common, "--host", host, *worker_arguments, *options)
             commands.append(NodeCommand(worker_node(worker), kind, words))
     return commands
-
-
-def _each(option: str, values: Iterable[str]) -> tuple[str, ...]:
-    return tuple(word for value in values for word in (option, value))
 
 
 class Host:

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -46,6 +46,11 @@ class NodeCommand(NamedTuple):
     name: str
     kind: str  # one of NODE_KINDS, or ROLLING
     arguments: tuple[str, ...]
+
+
+def repeated(option: str, values: Iterable[str] | None) -> tuple[str, ...]:
+    """Words of a command line for an option that may be given several times."""
+    return tuple(word for value in values or () for word in (option, value))
 
 
 @dataclass(slots=True)

@@ -12,8 +12,7 @@ import pytest
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from vla_zenoh.cli.help import COMPLETIONS, examples
-from vla_zenoh.cli.main import COMMANDS, _short_help, app
+from vla_zenoh.cli.main import COMMANDS, COMPLETIONS, _short_help, app, examples
 
 LEAST_EXAMPLES = 2
 ROOT: Any = get_command(app)

@@ -13,7 +13,8 @@ from vla_zenoh.bus.session import session_config
 from vla_zenoh.cli.profile_cache import _Outline
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.profile import Profile, profile_names
+from vla_zenoh.profile import Profile
+from vla_zenoh.resources import names
 from vla_zenoh.security.roles import identities, operator_role
 from vla_zenoh.security.store import operator_hosts
 
@@ -73,7 +74,7 @@ def assert_same(ours: Profile, full: Profile) -> None:
         assert operator_role(ours, host) is operator_role(full, host)
 
 
-@pytest.mark.parametrize("name", profile_names())
+@pytest.mark.parametrize("name", names("profiles"))
 def test_the_outline_of_a_shipped_profile_says_what_the_profile_says(name: str) -> None:
     full = RobotTarget(name)._load()
     ours = outline(RobotTarget(name))

@@ -10,8 +10,8 @@ from typer.testing import CliRunner
 
 from vla_zenoh import resources
 from vla_zenoh.lab.cli.profile import profile_app
-from vla_zenoh.profile import load_profile, profile_names
-from vla_zenoh.resources import robot_urdf
+from vla_zenoh.profile import load_profile
+from vla_zenoh.resources import names, robot_urdf
 
 RUNNER = CliRunner()
 
@@ -29,7 +29,7 @@ def test_every_profile_is_listed(own_folder: Path) -> None:
     (own_folder / "lab.yaml").write_text("extends: panda_sim\nabout: our [lab] \u202e\n")
     result = RUNNER.invoke(profile_app, ["list"])
     assert result.exit_code == 0
-    assert all(name in result.stdout for name in profile_names())
+    assert all(name in result.stdout for name in names("profiles"))
     assert "our [lab] \\u202e" in result.stdout
 
 
@@ -44,7 +44,7 @@ def test_a_profile_that_is_wrong_is_listed_with_its_fault(own_folder: Path) -> N
     }
     assert "lab.yaml:1: extends" in rows["lab"]["fault"]
     assert rows["panda_sim"]["hosts"] == ["here"]
-    assert set(rows) == set(profile_names())
+    assert set(rows) == set(names("profiles"))
 
 
 def test_what_is_shown_is_the_effective_profile_and_can_be_read_again(own_folder: Path) -> None:

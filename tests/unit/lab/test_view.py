@@ -28,10 +28,10 @@ from vla_zenoh.profile import (
     Profile,
     load_profile,
     override,
-    profile_names,
     read_profile,
     to_yaml,
 )
+from vla_zenoh.resources import names
 from vla_zenoh.types import (
     LATENCY_STAGES,
     ActionChunk,
@@ -370,7 +370,7 @@ def test_pictures_and_the_models_view_are_there(shown: Shown) -> None:
     assert '{"a": 1.5}' in answer
 
 
-@pytest.mark.parametrize("name", profile_names())
+@pytest.mark.parametrize("name", names("profiles"))
 def test_the_profile_in_a_recording_is_read_as_it_was(name: str) -> None:
     profile = load_profile(name)
     assert read_profile(to_yaml(profile), "run.mcap") == profile

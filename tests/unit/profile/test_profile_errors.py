@@ -22,9 +22,9 @@ from vla_zenoh.profile import (
     as_robot,
     load_profile,
     override,
-    profile_names,
 )
 from vla_zenoh.profile.session import SecurityProfile, is_loopback
+from vla_zenoh.resources import names
 
 Write = Callable[..., str]
 
@@ -183,7 +183,7 @@ def test_a_profile_beside_it_is_extended_first(write: Write) -> None:
 
 def test_own_names_are_listed(own_folder: Path) -> None:
     (own_folder / "lab.yaml").write_text("extends: panda_sim\n")
-    assert "lab" in profile_names()
+    assert "lab" in names("profiles")
 
 
 # -- merging ----------------------------------------------------------------------------------

@@ -20,8 +20,8 @@ from vla_zenoh.cli.output import console, errors, fail, new_table, styled
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.lab.cli.output import print_json
 from vla_zenoh.lab.profile.check import check_profile
-from vla_zenoh.profile import Profile, load_profile, profile_file, profile_names, to_yaml
-from vla_zenoh.resources import shipped
+from vla_zenoh.profile import Profile, load_profile, profile_file, to_yaml
+from vla_zenoh.resources import names, shipped
 
 FILE = "bridge.json5"
 
@@ -91,7 +91,7 @@ profile_app.command("bridge-config")(bridge_config)
 @profile_app.command("list")
 def list_profiles(as_json: JsonOption = False) -> None:
     """List your profiles on VLA_ZENOH_PATH, then the shipped ones."""
-    rows = [_row(name) for name in profile_names()]
+    rows = [_row(name) for name in names("profiles")]
     if as_json:
         print_json(rows)
         return
