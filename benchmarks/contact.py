@@ -29,7 +29,7 @@ import numpy as np
 
 from vla_zenoh import resources
 from vla_zenoh.codec import message
-from vla_zenoh.control.reachability import make_reachability_filter
+from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.kinematics.so3 import norm3
 from vla_zenoh.lab.lockstep import Lockstep, Message
 from vla_zenoh.policy import (
@@ -170,7 +170,7 @@ def push(obstacle: Obstacle, mode: str, speed_m_s: float, *, told: bool = True) 
     with tempfile.TemporaryDirectory() as folder:
         profile = pushing(mode, scene_with(obstacle, gap_m, Path(folder)))
         world = build_world(profile)
-    loop = Lockstep(profile, world, Push(step_m), reach=make_reachability_filter(profile))
+    loop = Lockstep(profile, world, Push(step_m), reach=ReachabilityFilter(profile))
     loop.tamper = None if told else untold
     loop.put("rate", 10.0)
     loop.run(1.1)

@@ -34,9 +34,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from benchmarks.lockstep_arm import LOOK_S, activated, in_processes
-from vla_zenoh.control.barriers import Barriers
 from vla_zenoh.control.limits import joint_motion_limits, workspace_corners
-from vla_zenoh.control.reachability import make_reachability_filter
+from vla_zenoh.control.reachability import Barriers, ReachabilityFilter
 from vla_zenoh.kinematics.kinematics import Kinematics, pose_error, smallest_singular_value
 from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.lab.lockstep import Delays, Lockstep
@@ -138,7 +137,7 @@ class Arm(NamedTuple):
 def arm_of(profile_name: str, command: str) -> Arm:
     """The arm of a profile, commanded by joints or poses."""
     profile = override(load_profile(profile_name), {"robot": {"command": command}})
-    reach = make_reachability_filter(profile)
+    reach = ReachabilityFilter(profile)
     home_rad = reach.kinematics.ordered(profile.robot.arm_joints, profile.robot.home_rad)
     return Arm(profile, reach.kinematics, reach.barriers, home_rad)
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from vla_zenoh.control.reachability import make_reachability_filter
+from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.kinematics.so3 import log3, quat_from_rotation
 from vla_zenoh.lab.lockstep import Delays, Lockstep
@@ -95,7 +95,7 @@ def activated(
     """
     world: Any = PerfectArm(profile) if perfect else build_world(profile)
     loop = Lockstep(
-        profile, world, policy, delays=delays, reach=make_reachability_filter(profile), seed=seed
+        profile, world, policy, delays=delays, reach=ReachabilityFilter(profile), seed=seed
     )
     loop.put("rate", rate_hz)
     loop.run(WARM_UP_S)

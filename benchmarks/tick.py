@@ -22,7 +22,7 @@ import numpy as np
 
 from vla_zenoh.control.commander import Commander, Inputs, Setting
 from vla_zenoh.control.preflight import PeerSnapshot
-from vla_zenoh.control.reachability import make_reachability_filter
+from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, ObservationSpec
@@ -84,9 +84,7 @@ class Player:
     def __init__(self, profile: Profile, scenario: Scenario) -> None:
         self.profile, self.scenario = profile, scenario
         self.kinematics = make_kinematics(profile)
-        self.commander = Commander(
-            profile, reach=make_reachability_filter(profile, self.kinematics)
-        )
+        self.commander = Commander(profile, reach=ReachabilityFilter(profile, self.kinematics))
         self.spec = ModelSpec(
             name=WORKER,
             observation=ObservationSpec(cameras=(CameraSpec(camera="front"),)),

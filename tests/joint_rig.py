@@ -10,7 +10,7 @@ from command_rig import Rig
 from vla_zenoh.control.commander import Setting
 from vla_zenoh.control.joint_space import JointBounds
 from vla_zenoh.control.limits import workspace_corners
-from vla_zenoh.control.reachability import make_reachability_filter
+from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.kinematics.kinematics import pose_error
 from vla_zenoh.kinematics.so3 import Pose, rotation_from_quat
 from vla_zenoh.profile import Profile, load_profile, override
@@ -36,7 +36,7 @@ class Joints:
         self, of: Profile | None = None, names: tuple[str, ...] = (), **action: Any
     ) -> None:
         self.profile = of or panda()
-        self.reach = make_reachability_filter(self.profile)
+        self.reach = ReachabilityFilter(self.profile)
         self.kinematics = self.reach.kinematics
         self.names = names or self.kinematics.arm_joints
         fields = {"space": "joint", "joints": self.names, "kind": "absolute", "gripper": "none"}

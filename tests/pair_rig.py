@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from vla_zenoh.control.part_spacing import PartSpacing
-from vla_zenoh.control.reachability import ReachabilityFilter, make_reachability_filter
+from vla_zenoh.control.reachability import ReachabilityFilter
+from vla_zenoh.kinematics.collision import PartDistance, PlacedArm
+from vla_zenoh.kinematics.so3 import Pose, rotation_from_rpy
 from vla_zenoh.lab.lockstep import Lockstep
 from vla_zenoh.policy import ActionSpec, ActionSteps, ModelSpec, Observation, ObservationSpec
 from vla_zenoh.profile import Profile, load_profile
@@ -19,6 +20,8 @@ from vla_zenoh.types import FloatArray
 PARTS = ("left", "right")
 HORIZON, DT_S = 8, 0.1
 TICK_S = 0.004
+FAR_M = 0.4
+"""Arms further apart count as this far."""
 STILL_M_S = 2e-3
 Motion = Callable[[int], Mapping[str, FloatArray]]
 """Number of the inference -> step of each part, (D,)."""
@@ -36,7 +39,23 @@ def world() -> World:
 
 @cache
 def reach() -> Mapping[str, ReachabilityFilter]:
-    return {part: make_reachability_filter(shipped().of_part(part)) for part in PARTS}
+    return {part: ReachabilityFilter(shipped().of_part(part)) for part in PARTS}
+
+
+@cache
+def _distance() -> PartDistance:
+    placed: list[PlacedArm] = []
+    for part in PARTS:
+        base, own = shipped().parts[part].base, reach()[part]
+        turn = rotation_from_rpy(np.array([0.0, 0.0, base.yaw_rad]))
+        stands = Pose(np.array(base.position_m), turn)
+        placed.append(PlacedArm(own.kinematics, own.barriers.collisions, stands))
+    return PartDistance(*placed)
+
+
+def apart_m(left_rad: FloatArray, right_rad: FloatArray) -> float:
+    """Distance of the arms at these joints (n,)."""
+    return _distance().nearest([left_rad], [right_rad], FAR_M).distance_m
 
 
 def joint_steps(kind: str = "delta") -> ActionSpec:
@@ -79,7 +98,6 @@ class Pair:
         self.policy = Asked(motion, action or joint_steps())
         self.loop = Lockstep(shipped(), world(), self.policy, reach=reach(), seed=seed)
         self.commander = self.loop.commander
-        self.spacing = PartSpacing(shipped(), self.commander.parts)
         self.path_m: dict[str, list[FloatArray]] = {part: [] for part in PARTS}
         self.least_m = self.least_measured_m = np.inf
         self.loop.run(0.5)
@@ -105,13 +123,14 @@ class Pair:
 
     def distance_m(self) -> float:
         """Between the arms where they are commanded."""
-        joints = {part.name: part.motion.joints_rad for part in self.commander.parts}
-        return self.spacing.measured_m(joints).distance_m  # pyright: ignore[reportArgumentType]
+        left_rad, right_rad = (part.motion.joints_rad for part in self.commander.parts)
+        assert left_rad is not None
+        assert right_rad is not None
+        return apart_m(left_rad, right_rad)
 
     def measured_m(self) -> float:
         """Between the arms in the world."""
-        joints = {name: part.joint_state().position_rad for name, part in world().parts.items()}
-        return self.spacing.measured_m(joints).distance_m
+        return apart_m(*(self.joints_rad(part) for part in PARTS))
 
     def joints_rad(self, part: str) -> FloatArray:
         return world().parts[part].joint_state().position_rad

@@ -22,7 +22,7 @@ from benchmarks.motion.protocol import (
     make_row,
     path_length,
 )
-from vla_zenoh.control.reachability import make_reachability_filter
+from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.errors import NodeError
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.lab.bench.task_lockstep import in_processes
@@ -81,7 +81,7 @@ def _row(profile: Profile, trial: MotionCase, conditions: Conditions) -> Row:
         build_world(profile),
         make_policy(find_model("scripted"), options),
         delays=Delays(conditions.delay_ms / 1e3, conditions.jitter, CAMERA_S, wire_s=WIRE_S),
-        reach=make_reachability_filter(profile),
+        reach=ReachabilityFilter(profile),
     )
     loop.put("rate", PREPARATION_HZ)
     loop.run(WARM_UP_S)

@@ -23,6 +23,7 @@ from pair_rig import (
     HORIZON,
     PARTS,
     TICK_S,
+    apart_m,
     joint_steps,
     random_motion,
     reach,
@@ -32,7 +33,6 @@ from pair_rig import (
 
 from vla_zenoh.control.commander import Commander, Inputs, Setting
 from vla_zenoh.control.commander_io import NewStates
-from vla_zenoh.control.part_spacing import PartSpacing
 from vla_zenoh.control.preflight import PeerSnapshot
 from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.policy import ActionSpec, ModelSpec, ObservationSpec
@@ -74,7 +74,6 @@ class PerfectPair:
             spec_sources={"scripted_pair": SOURCE},
             same_host=frozenset({"sim", "worker-scripted_pair"}),
         )
-        self.spacing = PartSpacing(shipped(), self.commander.parts)
 
     def tick(self) -> FloatArray:
         """One period; the joints of both arms, (2, n)."""
@@ -129,8 +128,7 @@ def least_m(kind: str, seed: int, ticks: int) -> tuple[float, int]:
     pair, least, held = PerfectPair(kind, seed), np.inf, 0
     for _ in range(ticks):
         at = pair.tick()
-        near = pair.spacing.measured_m(dict(zip(PARTS, at, strict=True)))
-        least = min(least, near.distance_m)
+        least = min(least, apart_m(*at))
         held += pair.commander.parts[0].motion.held
     return float(least), held
 

@@ -16,7 +16,7 @@ from motion_case import WORKER, Actions, Case
 
 from vla_zenoh.control.commander import Commander, Inputs, Setting
 from vla_zenoh.control.preflight import PeerSnapshot
-from vla_zenoh.control.reachability import make_reachability_filter
+from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.guard.arm_guard import ArmGuard, Measured
 from vla_zenoh.kinematics.so3 import Pose, exp3, log3, quat_from_rotation
 from vla_zenoh.types import (
@@ -107,7 +107,7 @@ class Rig:
         profile = case.profile
         self.case, self._rng = case, case.random
         self.trace = Trace()
-        reach = make_reachability_filter(profile, case.arm) if case.reach else None
+        reach = ReachabilityFilter(profile, case.arm) if case.reach else None
         self._kinematics = case.arm if case.reach else None
         self._joints = np.array(profile.robot.home_rad)
         self._measured = self._held = case.start

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from vla_zenoh.control.reachability import make_reachability_filter
+from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.lab.cli.profile import profile_app
 from vla_zenoh.policy.loader import make_robot
@@ -72,7 +72,7 @@ def test_at_home_its_arm_is_where_the_text_says_and_free_to_move(file: Path) -> 
     box, reach = profile.limits.workspace, profile.limits.reach
     for at_m, (low_m, high_m) in zip(home.position_m, (box.x_m, box.y_m, box.z_m), strict=True):
         assert low_m < at_m < high_m
-    margins = make_reachability_filter(profile, kinematics).margins
+    margins = ReachabilityFilter(profile, kinematics).margins
     assert margins.singular_value > reach.singularity_slow
     assert margins.self_m > reach.collision_slow_m
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from vla_zenoh.codec import message
-from vla_zenoh.control.reachability import ReachabilityFilter, make_reachability_filter
+from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.guard.reference_governor import BRAKE_MARGIN
 from vla_zenoh.lab.lockstep import Lockstep, Message, Tamper
 from vla_zenoh.policy import (
@@ -83,7 +83,7 @@ def _world() -> World:
 
 @cache
 def _shadow() -> ReachabilityFilter:
-    return make_reachability_filter(shipped())
+    return ReachabilityFilter(shipped())
 
 
 def begin(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from motions import make_world
 
-from vla_zenoh.control.reachability import make_reachability_filter
+from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.kinematics.so3 import log3
 from vla_zenoh.lab.lockstep import Delays, Lockstep
 from vla_zenoh.policy.loader import find_model, make_policy
@@ -52,7 +52,7 @@ def begin(
         make_world(),
         policy,
         delays=delays,
-        reach=make_reachability_filter(profile) if bounded else None,
+        reach=ReachabilityFilter(profile) if bounded else None,
     )
     loop.put("rate", rate_hz)
     loop.run(0.5 + 1 / rate_hz)

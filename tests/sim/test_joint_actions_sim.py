@@ -10,7 +10,7 @@ from arm_rig import activate
 from panda_arm import ARM_JOINTS, HOME_RAD, panda
 
 from vla_zenoh.control.limits import workspace_corners
-from vla_zenoh.control.reachability import make_reachability_filter
+from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.kinematics.kinematics import pose_error
 from vla_zenoh.lab.lockstep import Lockstep
 from vla_zenoh.policy import (
@@ -76,7 +76,7 @@ class Arm:
         self.policy = Along()
         profile = override(PROFILE, {"robot": robot}) if robot else PROFILE
         self.loop = Lockstep(
-            profile, build_world(profile), self.policy, reach=make_reachability_filter(profile)
+            profile, build_world(profile), self.policy, reach=ReachabilityFilter(profile)
         )
         self.loop.put("rate", 5.0)
         self.loop.run(1.1)

@@ -9,7 +9,7 @@ import pytest
 from arm_rig import Asked, activate, mark, speed_m_s, stop_time_s, way_m, with_fields
 
 from vla_zenoh.codec import message
-from vla_zenoh.control.reachability import make_reachability_filter
+from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.lab.lockstep import Lockstep, Message
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.simulation.world import build_world
@@ -26,7 +26,7 @@ def begin(prompt: str, posture: str = "start") -> Lockstep:
     world = build_world(of)
     # Activated in other joints than the home of the profile that the command node has.
     here = override(of, {"robot": {"home_rad": list(PROFILE.robot.home_rad)}})
-    loop = Lockstep(here, world, Asked(), reach=make_reachability_filter(here))
+    loop = Lockstep(here, world, Asked(), reach=ReachabilityFilter(here))
     loop.put("rate", 10.0)
     loop.put("prompt", prompt)
     loop.run(1.1)

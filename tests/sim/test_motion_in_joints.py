@@ -34,7 +34,7 @@ from panda_arm import ARM_JOINTS, panda
 
 from vla_zenoh.codec import message
 from vla_zenoh.control.joint_space import JointBounds
-from vla_zenoh.control.reachability import ReachabilityFilter, make_reachability_filter
+from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.kinematics.so3 import norm3
 from vla_zenoh.lab.lockstep import CAMERA, COMMAND, SIM, Lockstep, Message, Tamper
 from vla_zenoh.policy import (
@@ -101,7 +101,7 @@ def world() -> World:
 
 @cache
 def shadow() -> ReachabilityFilter:
-    return make_reachability_filter(PROFILE)
+    return ReachabilityFilter(PROFILE)
 
 
 def begin(prompt: str) -> Lockstep:

@@ -14,6 +14,7 @@ import pytest
 from pair_rig import (
     PARTS,
     Pair,
+    apart_m,
     joint_steps,
     random_motion,
     reach,
@@ -147,7 +148,7 @@ def test_measured_arms_that_come_too_near_brake() -> None:
     stop_m = shipped().limits.reach.part_stop_m
     assert pair.measured_m() < stop_m + 0.02
     here, turn = pair.joints_rad("right"), 0.0
-    while pair.spacing.measured_m({"left": near(pair, turn), "right": here}).distance_m > 0.02:
+    while apart_m(near(pair, turn), here) > 0.02:
         turn += 0.005
     pair.loop.tamper = changed(JointState, position_rad=near(pair, turn))
     pair.run(0.2)

@@ -34,10 +34,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vla_zenoh.control.barriers import DistanceConstraints
-from vla_zenoh.control.limits import LimitHit
+from vla_zenoh.control.limits import LimitHit, workspace_corners
+from vla_zenoh.control.reachability import Barriers
 from vla_zenoh.kinematics.kinematics import Kinematics, pose_error, smallest_singular_value
 from vla_zenoh.kinematics.so3 import Pose
+from vla_zenoh.profile import Limits
 from vla_zenoh.types import FloatArray
 
 IDENTITY_6 = np.eye(6)
@@ -62,6 +63,8 @@ ELBOW_COST = 1e-2
 BACK_JERK = 0.4
 """Rate of the correction in units of jerk over acceleration, at most one per tick."""
 ROUNDING_RAD_S = 1e-9
+NEAR_M = 0.08
+"""A pair further from its stop than this is no constraint until the next update."""
 PEEK_RAD = 1e-3
 """Joint displacement for the rate of the singular value."""
 
@@ -86,6 +89,55 @@ class JointMotion(NamedTuple):
         """Standing there."""
         zeros = np.zeros(len(position_rad))
         return cls(np.array(position_rad, dtype=np.float64), zeros, zeros, zeros)
+
+
+class DistanceConstraints:
+    """Linear constraints on joint velocities: the faces of the TCP's box, and distances of the arm.
+
+    Each constraint is a row ``g`` (n,) in m/rad and the distance left in m: joint velocities ``qd``
+    reduce it at the rate ``g qd``. Distances of the arm to itself, the table and keep-outs are
+    computed every few ticks and linear in between; their slope is the relative velocity of the two
+    nearest points along the line between them.
+
+    Args:
+        limits: with the box of the TCP.
+        barriers: of the arm; None: only the box.
+    """
+
+    def __init__(self, limits: Limits, barriers: Barriers | None) -> None:
+        self._low_m, self._high_m = workspace_corners(limits)
+        self._barriers = barriers
+        self._at_rad: FloatArray | None = None
+        self._near = np.zeros(0, dtype=np.intp)
+        self._rows, self._left_m = np.zeros((0, 0)), np.zeros(0)
+
+    def update(self, joints_rad: FloatArray) -> None:
+        """Compute distances and slopes at these joints (n,)."""
+        if self._barriers is None:
+            return
+        collisions, stop_m = self._barriers.collisions, self._barriers.stop[1:]
+        distances_m = collisions.distances(joints_rad)
+        self._near = near = np.flatnonzero(distances_m < stop_m + NEAR_M)
+        self._at_rad = joints_rad
+        self._rows = -collisions.gradients(joints_rad, near.tolist())
+        self._left_m = (distances_m - stop_m)[near]
+
+    def hit(self, row: int, left_m: float) -> LimitHit:
+        """The constraint of this row as a limit that acted, `left_m` from the arm."""
+        if row < 6 or self._barriers is None:
+            return LimitHit("workspace", -left_m, 0.0)
+        return self._barriers.hit(int(self._near[row - 6]) + 1, left_m)
+
+    def at(
+        self, joints_rad: FloatArray, position_m: FloatArray, jacobian: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Rows (m, n) and distances left (m,) at these joints (n,), their TCP and its Jacobian."""
+        rows = [jacobian[:3], -jacobian[:3]]
+        left_m = [self._high_m - position_m, position_m - self._low_m]
+        if self._at_rad is not None and len(self._rows):
+            rows.append(self._rows)
+            left_m.append(self._left_m - self._rows @ (joints_rad - self._at_rad))
+        return np.concatenate(rows), np.concatenate(left_m)
 
 
 class JointFollower:

@@ -1,6 +1,6 @@
 """Limits on what a model may ask for, and slowdowns.
 
-The arm moves at full speed, unless a barrier is near (`vla_zenoh.control.barriers`). A step for
+The arm moves at full speed, unless a barrier is near (`vla_zenoh.control.reachability`). A step for
 which the joints are too slow takes the time that they need, and a far target is approached at a
 speed of its own. The arm is then later than the steps ask for, and the slowdown lasts until it has
 caught up (`keep_slowdown`): until then it is still where it needs that speed.

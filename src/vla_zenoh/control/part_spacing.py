@@ -16,7 +16,7 @@ arms that are nearer than the stop by more than `PAST_M`, and come nearer, have 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -188,7 +188,3 @@ class PartSpacing:
         if near.distance_m >= within_m or self._edge_m >= before_m:
             return None
         return LimitHit(NAME, near.distance_m, self._stop_m, where=str(near))
-
-    def measured_m(self, joints_rad: Mapping[str, FloatArray]) -> Nearest:
-        """The nearest links with the parts at these joints (n,) each."""
-        return self._nearest([joints_rad[part.name] for part in self._parts])

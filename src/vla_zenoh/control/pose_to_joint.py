@@ -14,15 +14,16 @@ from copy import copy
 import numpy as np
 
 from vla_zenoh.control.axis_smoothing import Shares, between, stop_way
-from vla_zenoh.control.barriers import Barriers, DistanceConstraints
 from vla_zenoh.control.joint_follower import (
     POSTURE_1_S,
     POSTURE_RAD_S,
+    DistanceConstraints,
     JointFollower,
     JointMotion,
 )
 from vla_zenoh.control.joint_space import followed_shares
 from vla_zenoh.control.limits import into_workspace, joint_margins, joint_motion_limits
+from vla_zenoh.control.reachability import Barriers
 from vla_zenoh.control.smoothing import Motion, Smoother
 from vla_zenoh.kinematics.kinematics import Kinematics, pose_error
 from vla_zenoh.kinematics.so3 import Pose, exp3, log3, pose_distance

@@ -11,9 +11,15 @@ number ``h`` that must not become negative: singular value or distance minus its
 which is a control barrier function in discrete time (Agrawal, Sreenath, "Discrete control barrier
 functions for safety-critical control of discrete systems", RSS 2017) with a decay of one half.
 A joint outside its range may only move inwards. The elbow of a redundant arm is where pose and
-posture put it, as with a Cartesian controller, unless joints are commanded (`free_elbow`).
+posture put it, as with a Cartesian controller, unless joints are commanded.
 
-A step for which only the joints are too slow is kept with a slowdown, see
+Inside its zone ``slow - stop`` a barrier that shrinks limits the speed of the TCP to a share of the
+profile's::
+
+    share = sqrt(h / (slow - stop)), at least SLOWEST
+
+the speed that a constant deceleration can stop within the distance left, if it can stop full speed
+within the zone. A step for which only the joints are too slow is kept with a slowdown, see
 `vla_zenoh.control.limits`; it is shortened only if it would take more than ten times as long, for
 then the joints jump to another solution.
 """
@@ -26,7 +32,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vla_zenoh.control.barriers import Barriers, Margins
 from vla_zenoh.control.limits import (
     LEAST,
     SLOWEST,
@@ -38,6 +43,7 @@ from vla_zenoh.control.limits import (
     slowest,
 )
 from vla_zenoh.errors import RecordError
+from vla_zenoh.kinematics.collision import FREE_M, CollisionModel
 from vla_zenoh.kinematics.kinematics import (
     TOLERANCE_M,
     Approach,
@@ -45,11 +51,18 @@ from vla_zenoh.kinematics.kinematics import (
     Kinematics,
     make_kinematics,
     pose_error,
+    smallest_singular_value,
 )
 from vla_zenoh.kinematics.so3 import Pose, exp3, orthonormal
-from vla_zenoh.profile import Limits, Profile
+from vla_zenoh.profile import Profile, ReachLimits
 from vla_zenoh.types import FloatArray, HeldBox
 
+DECAY = 0.5
+"""Part of the distance to a stop that one step may take inside its zone."""
+NOISE = 2e-6
+"""m, and singular value: difference of distances and solver between two equal poses."""
+SHRINKING = 1e-6
+"""A barrier that changes by less counts as constant."""
 HALVINGS = 4
 REFINEMENTS = 4
 SMALLEST_FRACTION = 1 / 128
@@ -62,6 +75,102 @@ EFFORT = 5
 """Iterations of the solver per evaluation; one with more counts as several."""
 SAME_POSE = 1e-9
 NEWTON_STEPS = 8
+
+
+class Margins(NamedTuple):
+    """Distances of an arm to its bounds.
+
+    Args:
+        joint_rad: smallest distance of a joint to the end of its range.
+        joint: its name.
+        singular_value: smallest of the Jacobian.
+        self_m: smallest distance of the arm to itself, inf where nothing can touch.
+        table_m: smallest distance to the table, inf without one.
+        keep_out_m: smallest distance to a keep-out, inf without one.
+    """
+
+    joint_rad: float
+    joint: str
+    singular_value: float
+    self_m: float
+    table_m: float
+    keep_out_m: float
+
+
+class Barriers:
+    """Values that must not become negative: singular value and distances, each minus its stop.
+
+    Barrier 0 is the singular value, the others are pairs that may touch: the arm and itself, the
+    table and the keep-outs; hand and fingers to the table have a stop of their own.
+
+    Args:
+        kinematics: of the arm.
+        limits: stop and slow of each kind.
+        home_rad: (n,) joints known to be free of collisions.
+
+    Attributes:
+        names: of the barriers, as in `vla_zenoh.control.limits.LimitHit`.
+        stop: (n,) value at which each is zero.
+        slow: (n,) value at which its zone begins.
+
+    Raises:
+        ResourceError: the URDF's collision shapes cannot be loaded.
+        ProfileError: the arm at home touches a keep-out.
+    """
+
+    def __init__(self, kinematics: Kinematics, limits: ReachLimits, home_rad: FloatArray) -> None:
+        self.collisions = CollisionModel(
+            kinematics,
+            near_m=limits.collision_slow_m,
+            touching_m=limits.collision_stop_m,
+            table_z_m=limits.table_z_m,
+            known_good_rad=[home_rad],
+            keep_out=limits.keep_out,
+        )
+        pairs = self.collisions.pairs
+        hand = np.array([pair.is_hand and pair.limit == "table_distance" for pair in pairs], bool)
+        self.names = ["singularity", *(pair.limit for pair in pairs)]
+        stops_m = np.where(hand, limits.table_stop_m, limits.collision_stop_m)
+        slows_m = np.where(hand, limits.table_slow_m, limits.collision_slow_m)
+        self.stop = np.array([limits.singularity_stop, *stops_m])
+        self.slow = np.array([limits.singularity_slow, *slows_m])
+        self._zone = np.maximum(self.slow - self.stop, 1e-12)
+
+    def at(self, joints_rad: FloatArray, jacobian: FloatArray) -> FloatArray:
+        """Barriers (n,) at these joints, whose Jacobian is (6, n) m and rad."""
+        values = np.empty(len(self.stop))
+        values[0] = smallest_singular_value(jacobian)
+        values[1:] = self.collisions.distances(joints_rad)
+        return values - self.stop
+
+    def floor(self, before: FloatArray) -> FloatArray:
+        """Least values (n,) after one step from `before`."""
+        return np.where(before > 0, np.minimum(self._zone, (1 - DECAY) * before), before - NOISE)
+
+    def where(self, index: int) -> str:
+        """The part of the arm that barrier `index` is about; empty: the whole arm."""
+        if index == 0:
+            return ""
+        pair = self.collisions.pairs[index - 1]
+        return pair.first if pair.limit == "table_distance" else str(pair)
+
+    def hit(self, index: int, left: float, least: float = 0.0) -> LimitHit:
+        """Barrier `index` as a limit that acted: `left` of it, where it must be `least`."""
+        stop = float(self.stop[index])
+        where = self.where(index)
+        return LimitHit(self.names[index], float(left) + stop, float(least) + stop, where=where)
+
+    def slowdown(self, before: FloatArray, after: FloatArray) -> Slowdown | None:
+        """The slowdown of a step from barriers `before` to `after`, None for full speed."""
+        if (after >= self._zone).all():
+            return None
+        left = np.where(after < before - SHRINKING, np.clip(after / self._zone, 0.0, 1.0), 1.0)
+        index = int(left.argmin())
+        if left[index] >= 1.0:
+            return None
+        share = max(float(np.sqrt(left[index])), SLOWEST)
+        value, slow = float(after[index] + self.stop[index]), float(self.slow[index])
+        return Slowdown(self.names[index], share, value, slow, self.where(index))
 
 
 class _Configuration(NamedTuple):
@@ -83,48 +192,39 @@ class _Start(NamedTuple):
 
 
 class ReachabilityFilter:
-    """Bounds steps of the TCP by the kinematics of the arm. Independent of time.
+    """Bounds steps of the TCP by the kinematics of the arm, at first at home. Independent of time.
 
     Args:
-        kinematics: of the arm.
-        joints_rad: (n,) of the robot at present.
-        limits: stop and slow of the barriers, and the speed of the TCP at which a step is taken.
-        free_elbow: a redundant arm may leave its posture where a joint meets its range.
-        posture_rad: (n,) the posture that the robot's controller pulls a redundant arm to; None:
-            the joints at the last `reset`.
-        known_good_rad: configurations known to be free, besides `joints_rad`.
-        velocity_rad_s: (n,) limits of the joints; None: those of the URDF.
+        profile: its robot, and limits: stop and slow of the barriers, speed of the TCP.
+        kinematics: of the robot; None: they are made.
 
     Raises:
-        RecordError: joints of the wrong number.
-        ResourceError: the URDF's collision shapes cannot be loaded.
+        ResourceError: the robot's description or its collision shapes cannot be loaded.
+        ProfileError: as `make_kinematics`, or the arm at home touches a keep-out.
     """
 
-    def __init__(
-        self,
-        kinematics: Kinematics,
-        joints_rad: ArrayLike,
-        limits: Limits | None = None,
-        *,
-        free_elbow: bool = False,
-        posture_rad: ArrayLike | None = None,
-        known_good_rad: Sequence[FloatArray] = (),
-        velocity_rad_s: FloatArray | None = None,
-    ) -> None:
-        self.kinematics = kinematics
-        self._limits = limits = limits or Limits()
-        self._free_elbow = free_elbow
+    def __init__(self, profile: Profile, kinematics: Kinematics | None = None) -> None:
+        self.kinematics = kinematics = kinematics or make_kinematics(profile)
+        self._limits, robot = profile.limits, profile.robot
+        home_rad = kinematics.ordered(robot.arm_joints, robot.home_rad)
+        # Elbow and joint velocities are ours only where joints are commanded.
+        self._free_elbow = robot.command == "joint"
+        self._velocity_rad_s = kinematics.velocity_rad_s
+        if self._free_elbow:
+            own_rad_s = self._limits.joint.of("velocity_rad_s", kinematics.size)
+            self._velocity_rad_s = np.minimum(
+                kinematics.ordered(robot.arm_joints, own_rad_s), self._velocity_rad_s
+            )
         self._solver = InverseKinematics(
             kinematics,
-            posture_rad,
-            joint_margin_rad=joint_margins(limits.reach, kinematics),
+            home_rad,
+            joint_margin_rad=joint_margins(self._limits.reach, kinematics),
             max_iterations=SOLVER_ITERATIONS,
         )
-        self._follow_posture = posture_rad is None
-        most = kinematics.velocity_rad_s
-        self._velocity_rad_s = most if velocity_rad_s is None else np.minimum(velocity_rad_s, most)
-        self.barriers = Barriers(kinematics, limits.reach, known_good_rad)
-        self.reset(joints_rad)
+        self._at_start = robot.posture == "start"
+        """The controller pulls a redundant arm to its joints at the last `reset`, not to home."""
+        self.barriers = Barriers(kinematics, self._limits.reach, home_rad)
+        self.reset(home_rad)
 
     def reset(self, joints_rad: ArrayLike) -> None:
         """Move the model to the joints of the robot.
@@ -137,13 +237,11 @@ class ReachabilityFilter:
             raise RecordError(
                 f"joints_rad must be {self.kinematics.size} finite numbers, got {joints!r}"
             )
-        if self._follow_posture:
+        if self._at_start:
             self._solver.posture_rad = joints.copy()
         pose, jacobian = self.kinematics.pose_and_jacobian(joints)
         self._here = _Configuration(pose, joints, 0.0, self.barriers.at(joints, jacobian))
         self._measured_rad: FloatArray | None = None
-        self.slowdown: Slowdown | None = None
-        """Of the step bounded last."""
         self.cost = 1
         """Number of evaluations that the last one counts as."""
 
@@ -180,18 +278,18 @@ class ReachabilityFilter:
     @property
     def margins(self) -> Margins:
         """Margins of the model where it is."""
-        return self.barriers.margins(self._here.joints_rad, self._here.barriers)
-
-    def bound(
-        self, before: Pose, asked: Pose, dt_s: float = 0.1, start_rad: FloatArray | None = None
-    ) -> tuple[Pose, list[LimitHit]]:
-        """`bound_in_pieces` at once: the end of the step, and the limits that acted."""
-        pieces = self.bound_in_pieces(before, asked, dt_s, start_rad)
-        while True:
-            try:
-                next(pieces)
-            except StopIteration as end:
-                return end.value[:2]
+        kinematics, joints_rad = self.kinematics, self._here.joints_rad
+        room = np.minimum(joints_rad - kinematics.lower_rad, kinematics.upper_rad - joints_rad)
+        tightest = int(np.argmin(room))
+        values = (self._here.barriers + self.barriers.stop).tolist()
+        nearest_m: dict[str, float] = dict.fromkeys(
+            ("self_collision", "table_distance", "keep_out"), np.inf
+        )
+        for name, value in zip(self.barriers.names[1:], values[1:], strict=True):
+            if value < FREE_M:
+                nearest_m[name] = min(nearest_m[name], value)
+        joint = kinematics.arm_joints[tightest]
+        return Margins(float(room[tightest]), joint, values[0], *nearest_m.values())
 
     def bound_in_pieces(
         self, before: Pose, asked: Pose, dt_s: float, start_rad: FloatArray | None = None
@@ -253,11 +351,9 @@ class ReachabilityFilter:
         self, start: _Start, end: _Configuration, pose: Pose, hits: list[LimitHit], dt_s: float
     ) -> BoundedStep:
         self._here = end
-        self.slowdown = slowest(
-            self.barriers.slowdown(start.here.barriers, end.barriers),
-            self._late(start.here, end, dt_s),
-        )
-        return BoundedStep(pose, hits, end.joints_rad, self.slowdown)
+        slower = self.barriers.slowdown(start.here.barriers, end.barriers)
+        slower = slowest(slower, self._late(start.here, end, dt_s))
+        return BoundedStep(pose, hits, end.joints_rad, slower)
 
     def _guess(self, start: _Start, end: _Configuration, hits: Sequence[LimitHit]) -> float:
         """First guess of the feasible part, from how the whole step failed."""
@@ -347,24 +443,3 @@ def _part(before: Pose, step: FloatArray, fraction: float) -> Pose:
     """The pose after `fraction` of a step (6,) m and rad, on the line and the geodesic."""
     turned = exp3(fraction * step[3:]) @ before.rotation
     return Pose(before.position_m + fraction * step[:3], orthonormal(turned))
-
-
-def make_reachability_filter(
-    profile: Profile, kinematics: Kinematics | None = None
-) -> ReachabilityFilter:
-    """That of the profile's robot, at its home pose; it raises as `make_kinematics` does."""
-    kinematics = kinematics or make_kinematics(profile)
-    names = profile.robot.arm_joints
-    home_rad = kinematics.ordered(names, profile.robot.home_rad)
-    # Elbow and joint velocities are ours only where joints are commanded.
-    commanded = profile.robot.command == "joint"
-    most_rad_s = profile.limits.joint.of("velocity_rad_s", len(names))
-    return ReachabilityFilter(
-        kinematics,
-        home_rad,
-        profile.limits,
-        free_elbow=commanded,
-        posture_rad=home_rad if profile.robot.posture == "home" else None,
-        known_good_rad=[home_rad],
-        velocity_rad_s=kinematics.ordered(names, most_rad_s) if commanded else None,
-    )

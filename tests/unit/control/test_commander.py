@@ -22,7 +22,7 @@ from command_rig import (
 
 from vla_zenoh.control.commander import Commander, Inputs, Setting
 from vla_zenoh.control.motion_pipeline import LINGER_NS
-from vla_zenoh.control.reachability import make_reachability_filter
+from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.kinematics.so3 import norm3
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.types import GripperState, PoseState, Stamped
@@ -409,8 +409,8 @@ def test_a_robot_that_swings_past_its_last_command_is_not_activated_before_it_st
 
 def test_a_robot_whose_joints_swing_past_their_last_command_is_not_activated_then() -> None:
     of = override(load_profile("panda_sim"), {"robot": {"command": "joint"}})
-    kinematics = make_reachability_filter(of).kinematics
-    rig = Rig(of, reach=make_reachability_filter(of))
+    kinematics = ReachabilityFilter(of).kinematics
+    rig = Rig(of, reach=ReachabilityFilter(of))
     rig.stand_at(kinematics, np.array(of.robot.home_rad))
     rig.activate()
     rig.put("active", False)
@@ -644,8 +644,8 @@ def test_why_an_arm_stopped_by_itself_is_said_when_it_is_activated_again() -> No
 
 def test_an_arm_whose_joints_cannot_follow_stops_and_says_what_holds_them() -> None:
     of = override(load_profile("panda_sim"), {"robot": {"command": "joint"}})
-    kinematics, rng = make_reachability_filter(of).kinematics, np.random.default_rng(0)
-    rig = Rig(of, reach=make_reachability_filter(of))
+    kinematics, rng = ReachabilityFilter(of).kinematics, np.random.default_rng(0)
+    rig = Rig(of, reach=ReachabilityFilter(of))
     rig.stand_at(kinematics, np.array(of.robot.home_rad))
     rig.activate()
     step = rng.normal(size=6)
@@ -1083,7 +1083,7 @@ def test_a_router_whose_clock_was_set_back_does_not_keep_an_arm_stopped() -> Non
 
 def test_the_measured_joints_are_monitored_however_many_chunks_arrive() -> None:
     of = profile()
-    reach = make_reachability_filter(of)
+    reach = ReachabilityFilter(of)
     rig = Rig(of, reach=reach)
     rig.stand_at(reach.kinematics, reach.joints_rad.copy())
     for _ in range(3):
@@ -1107,7 +1107,7 @@ def test_a_chunk_planned_before_its_tick_gives_the_commands_that_the_tick_would(
     of = profile(robot={"command": command})
     moved: list[list[np.ndarray]] = []
     for early in (False, True):
-        reach = make_reachability_filter(of)
+        reach = ReachabilityFilter(of)
         rig = Rig(of, reach=reach)
         rig.stand_at(reach.kinematics, reach.joints_rad.copy())
         rig.joints_rad = None

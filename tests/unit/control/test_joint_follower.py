@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from vla_zenoh.control.joint_follower import JointFollower
 from vla_zenoh.control.limits import into_workspace, motion_limits
 from vla_zenoh.control.pose_to_joint import FAR, NEAR_M, NEAR_RAD, PoseToJoint
-from vla_zenoh.control.reachability import make_reachability_filter
+from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.smoothing import Smoother
 from vla_zenoh.guard.stream_guard import joint_motion_limits
 from vla_zenoh.kinematics.kinematics import make_kinematics
@@ -247,7 +247,7 @@ def test_commanded_joints_stop_before_the_arm_touches_itself_or_the_table(
     """Whoever bounds the goals: here nobody does."""
     low = override(BASE, {"limits": {"workspace": {"z_m": [-0.3, 0.9], "x_m": [-0.3, 0.75]}}})
     of = override(low, {"robot": {"command": "joint"}})
-    barriers = make_reachability_filter(of, KINEMATICS).barriers
+    barriers = ReachabilityFilter(of, KINEMATICS).barriers
     arm = Arm(of)
     arm.stage = PoseToJoint(of, KINEMATICS, barriers)
     arm.stage.restart(HOME_RAD)
@@ -262,7 +262,7 @@ def test_commanded_joints_stop_before_the_arm_touches_itself_or_the_table(
 
 
 def test_slopes_of_distances_are_those_of_small_steps() -> None:
-    collisions = make_reachability_filter(BASE, KINEMATICS).barriers.collisions
+    collisions = ReachabilityFilter(BASE, KINEMATICS).barriers.collisions
     random, compared = np.random.default_rng(0), 0
     for _ in range(40):
         joints_rad = np.clip(

@@ -7,7 +7,7 @@ import pytest
 from command_rig import Rig, profile
 
 from vla_zenoh.control.limits import LimitHit
-from vla_zenoh.control.reachability import make_reachability_filter
+from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.watchdog import JointMonitor
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.kinematics.so3 import Pose, pose_distance, quat_from_rotation
@@ -26,7 +26,7 @@ class Watching:
     """A watch of the shipped arm, told its joints at every tick."""
 
     def __init__(self, start_rad: FloatArray = HOME_RAD, commanded_rad: FloatArray | None = None):
-        shadow = make_reachability_filter(PROFILE, KINEMATICS)
+        shadow = ReachabilityFilter(PROFILE, KINEMATICS)
         shadow.reset(start_rad)
         self.watch, self.commanded_rad = JointMonitor(PROFILE, shadow), commanded_rad
         self.now_ns = 0
@@ -155,7 +155,7 @@ class Arm(Rig):
     """Poses are commanded; the joints are where a test says."""
 
     def __init__(self) -> None:
-        super().__init__(PROFILE, reach=make_reachability_filter(PROFILE, KINEMATICS))
+        super().__init__(PROFILE, reach=ReachabilityFilter(PROFILE, KINEMATICS))
         self.joints_rad, self.joints_of_shadow = HOME_RAD, False
         self.place(KINEMATICS.forward(HOME_RAD))
 

@@ -12,7 +12,7 @@ from panda_arm import HOME_RAD
 from vla_zenoh.control.joint_space import JointBounds, JointPath
 from vla_zenoh.control.limits import workspace_corners
 from vla_zenoh.control.plan_timeline import joint_goal
-from vla_zenoh.control.reachability import make_reachability_filter
+from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.types import FloatArray
 
 BOX = workspace_corners(panda().limits)
@@ -23,7 +23,7 @@ PASSED_RAD = 1e-6
 
 def made_path() -> JointPath:
     profile = panda()
-    reach = make_reachability_filter(profile)
+    reach = ReachabilityFilter(profile)
     path = JointPath(profile, JointBounds(profile, reach.kinematics, reach.barriers))
     path.stand(HOME_RAD)
     return path

@@ -11,7 +11,7 @@ from vla_zenoh.control.commander_io import State
 from vla_zenoh.control.limits import motion_limits
 from vla_zenoh.control.motion_pipeline import MotionPipeline
 from vla_zenoh.control.pose_to_joint import PoseToJoint
-from vla_zenoh.control.reachability import make_reachability_filter
+from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.smoothing import Smoother
 from vla_zenoh.guard.stream_guard import joint_motion_limits
 from vla_zenoh.kinematics.kinematics import make_kinematics
@@ -53,7 +53,7 @@ class Moved:
     """A mover of joints, and what the robot last said of itself."""
 
     def __init__(self) -> None:
-        self.shadow = make_reachability_filter(PROFILE)
+        self.shadow = ReachabilityFilter(PROFILE)
         self.mover = MotionPipeline(PROFILE, self.shadow, ChunkPlanner(PROFILE, self.shadow))
         self.now_ns = START_NS
 

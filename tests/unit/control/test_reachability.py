@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 from panda_arm import HOME_RAD, moved, panda, tool_down_at
 from pydantic import ValidationError
 
-from vla_zenoh.control.limits import SLOWEST, LimitHit
+from vla_zenoh.control.limits import SLOWEST, BoundedStep, LimitHit
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.errors import ProfileError, RecordError
 from vla_zenoh.kinematics.collision import HELD, TABLE, CollisionModel
 from vla_zenoh.kinematics.kinematics import smallest_singular_value
 from vla_zenoh.kinematics.so3 import Pose, angle_between, log3
-from vla_zenoh.profile import Limits, ReachLimits
+from vla_zenoh.profile import Limits, Profile, ReachLimits, load_profile, override
 from vla_zenoh.types import FloatArray, HeldBox
 
 STEP_M, STEP_RAD = 0.01, 0.05
@@ -48,12 +48,50 @@ STILL = np.zeros(3)
 
 KINEMATICS = panda()
 LIMITS = Limits().reach
-SHADOW = ReachabilityFilter(KINEMATICS, HOME_RAD, known_good_rad=[HOME_RAD])
 MIDDLE_RAD = tool_down_at(KINEMATICS, 0.45, 0.0, 0.4)
 
 
 def limits(**reach: Any) -> Limits:
     return Limits(reach=ReachLimits.model_validate(reach))
+
+
+def panda_with(own: Limits, **changes: Any) -> Profile:
+    robot = {"home_rad": HOME_RAD.tolist(), **changes}
+    return override(load_profile("panda_sim"), {"robot": robot}).model_copy(update={"limits": own})
+
+
+def shadow_at(
+    joints_rad: FloatArray, own: Limits | None = None, **robot: Any
+) -> ReachabilityFilter:
+    """The shadow of an arm with these limits, at these joints."""
+    shadow = ReachabilityFilter(panda_with(own or Limits(), **robot), KINEMATICS)
+    shadow.reset(joints_rad)
+    return shadow
+
+
+SHADOW = shadow_at(HOME_RAD)
+
+
+def bounded(
+    shadow: ReachabilityFilter,
+    before: Pose,
+    asked: Pose,
+    dt_s: float = 0.1,
+    start_rad: FloatArray | None = None,
+) -> BoundedStep:
+    """All pieces of a step at once."""
+    pieces = shadow.bound_in_pieces(before, asked, dt_s, start_rad)
+    while True:
+        try:
+            next(pieces)
+        except StopIteration as end:
+            return end.value
+
+
+def bound(
+    shadow: ReachabilityFilter, before: Pose, asked: Pose, **how: Any
+) -> tuple[Pose, list[LimitHit]]:
+    return bounded(shadow, before, asked, **how)[:2]
 
 
 class Walk(NamedTuple):
@@ -88,7 +126,7 @@ def walk(
     """`steps` equal steps from where the shadow stands, each on what became of the last."""
     poses, all_hits = [KINEMATICS.forward(shadow.joints_rad)], []
     for _ in range(steps):
-        pose, hits = shadow.bound(poses[-1], moved(poses[-1], translation_m, rotvec_rad))
+        pose, hits = bound(shadow, poses[-1], moved(poses[-1], translation_m, rotvec_rad))
         poses.append(pose)
         all_hits.append(hits)
         assert_sane(shadow, pose)
@@ -172,18 +210,18 @@ def test_the_hand_stops_just_above_the_table() -> None:
 
 
 def test_the_height_of_the_table_counts() -> None:
-    shadow = ReachabilityFilter(KINEMATICS, HOME_RAD, limits(table_z_m=0.1))
+    shadow = shadow_at(HOME_RAD, limits(table_z_m=0.1))
     pose = KINEMATICS.forward(HOME_RAD)
     for _ in range(20):
-        pose, _ = shadow.bound(pose, moved(pose, STEP_M * DOWN, STILL))
+        pose, _ = bound(shadow, pose, moved(pose, STEP_M * DOWN, STILL))
     assert pose.position_m[2] == pytest.approx(0.1105, abs=0.0003)
 
 
 def test_without_a_table_the_arm_may_go_below_it() -> None:
-    shadow = ReachabilityFilter(KINEMATICS, HOME_RAD, limits(table_z_m=None))
+    shadow = shadow_at(HOME_RAD, limits(table_z_m=None))
     pose = KINEMATICS.forward(HOME_RAD)
     for _ in range(25):
-        pose, hits = shadow.bound(pose, moved(pose, STEP_M * DOWN, STILL))
+        pose, hits = bound(shadow, pose, moved(pose, STEP_M * DOWN, STILL))
         assert hits == []
     assert pose.position_m[2] < 0
     assert shadow.margins.table_m == np.inf
@@ -202,22 +240,21 @@ HAND_M = 0.0316
 @pytest.mark.parametrize("shape", KEEP_OUTS.values(), ids=list(KEEP_OUTS))
 def test_no_link_enters_what_the_arm_keeps_out_of(shape: dict[str, Any]) -> None:
     kept_out = limits(keep_out={"post": shape})
-    shadow = ReachabilityFilter(KINEMATICS, HOME_RAD, kept_out, known_good_rad=[HOME_RAD])
+    shadow = shadow_at(HOME_RAD, kept_out)
     pose, hits = KINEMATICS.forward(HOME_RAD), []
     for _ in range(40):
-        pose, hits = shadow.bound(pose, moved(pose, STEP_M * FORWARD, STILL))
+        pose, hits = bound(shadow, pose, moved(pose, STEP_M * FORWARD, STILL))
     assert hits[0].name == "keep_out"
     assert hits[0].where.endswith(" and post")
     stop_m = kept_out.reach.collision_stop_m
     assert stop_m - DISTANCE_NOISE_M <= shadow.margins.keep_out_m < stop_m + 2e-3
-    assert "post" in shadow.margins.keep_out_pair
     assert pose.position_m[0] < 0.65 - stop_m - HAND_M + 0.01
 
 
 def test_a_keep_out_around_the_arm_at_home_is_an_error_with_its_name_and_the_link() -> None:
     inside = limits(keep_out={"post": {"centre_m": [0.45, 0, 0.3], "radius_m": 0.1}})
     with pytest.raises(ProfileError, match=r"panda_.* m from the keep-out 'post' with"):
-        ReachabilityFilter(KINEMATICS, HOME_RAD, inside, known_good_rad=[HOME_RAD])
+        shadow_at(HOME_RAD, inside)
 
 
 @pytest.mark.parametrize(
@@ -243,11 +280,11 @@ BAR = HeldBox((0.04, 0.04, 0.2))
 
 def test_what_the_gripper_holds_stops_above_the_table_as_the_fingers_would() -> None:
     def lowest_m(box: HeldBox | None) -> float:
-        model = ReachabilityFilter(KINEMATICS, MIDDLE_RAD, limits(), known_good_rad=[HOME_RAD])
+        model = shadow_at(MIDDLE_RAD, limits())
         model.hold(box)
         pose, hits = KINEMATICS.forward(MIDDLE_RAD), []
         for _ in range(60):
-            pose, hits = model.bound(pose, moved(pose, STEP_M * DOWN, STILL))
+            pose, hits = bound(model, pose, moved(pose, STEP_M * DOWN, STILL))
         assert hits[0].name in ("table_distance", "workspace")
         return float(pose.position_m[2])
 
@@ -262,20 +299,20 @@ def test_a_box_that_stands_on_the_table_is_lifted_and_not_pushed() -> None:
     assert LIMITS.table_z_m is not None
     start_m = LIMITS.table_z_m + BAR.size_m[2] / 2
     start_rad = tool_down_at(KINEMATICS, 0.45, 0.0, start_m)
-    model = ReachabilityFilter(KINEMATICS, start_rad, limits(), known_good_rad=[HOME_RAD])
+    model = shadow_at(start_rad, limits())
     model.hold(BAR)
     start = KINEMATICS.forward(start_rad)
-    down, hits = model.bound(start, moved(start, STEP_M * DOWN, STILL))
+    down, hits = bound(model, start, moved(start, STEP_M * DOWN, STILL))
     assert hits[0].name == "table_distance"
     assert HELD in hits[0].where
     assert start.position_m[2] - down.position_m[2] < 1e-4
-    up, hits = model.bound(down, moved(down, STEP_M * UP, STILL))
+    up, hits = bound(model, down, moved(down, STEP_M * UP, STILL))
     assert not hits
     assert up.position_m[2] - down.position_m[2] == pytest.approx(STEP_M)
 
 
 def test_an_arm_that_let_go_has_the_bounds_that_it_had() -> None:
-    model = ReachabilityFilter(KINEMATICS, MIDDLE_RAD, limits(), known_good_rad=[HOME_RAD])
+    model = ReachabilityFilter(panda_with(limits(), home_rad=MIDDLE_RAD.tolist()), KINEMATICS)
     before = model.margins
     model.hold(BAR)
     assert model.margins.table_m < before.table_m
@@ -345,7 +382,7 @@ def test_from_every_stop_the_way_back_is_open(
     here = out.poses[-1]
     for pose in reversed(out.poses):
         for _ in range(8):  # where it was slowed on the way out it may be slowed on the way in
-            here, _ = shadow.bound(here, pose)
+            here, _ = bound(shadow, here, pose)
     assert np.linalg.norm(here.position_m - out.poses[0].position_m) < RETURNED_M
     assert angle_between(here.rotation, out.poses[0].rotation) < RETURNED_RAD
 
@@ -365,7 +402,7 @@ def test_a_longer_wish_never_gets_the_arm_less_far(
     reached_m = []
     for wish_m in (0.002, 0.005, 0.01, 0.02, 0.04):
         shadow.reset(joints)
-        pose, _ = shadow.bound(before, moved(before, wish_m * unit, STILL), start_rad=joints)
+        pose, _ = bound(shadow, before, moved(before, wish_m * unit, STILL), start_rad=joints)
         reached_m.append(float((pose.position_m - before.position_m) @ unit))
     resolution_m = 0.04 / 16
     assert all(b >= a - resolution_m for a, b in itertools.pairwise(reached_m))
@@ -375,10 +412,10 @@ def test_what_was_cut_is_let_through_when_asked_for_itself() -> None:
     shadow = at(MIDDLE_RAD)
     steps = walk(shadow, STEP_M * FORWARD, STILL, 29)
     before, joints = steps.poses[-1], shadow.joints_rad
-    cut, hits = shadow.bound(before, moved(before, 0.04 * FORWARD, STILL))
+    cut, hits = bound(shadow, before, moved(before, 0.04 * FORWARD, STILL))
     assert hits
     assert np.linalg.norm(cut.position_m - before.position_m) > 0.001
-    again, hits_again = shadow.bound(before, cut, start_rad=joints)
+    again, hits_again = bound(shadow, before, cut, start_rad=joints)
     assert hits_again == []
     assert again is cut
 
@@ -397,10 +434,10 @@ def test_a_joint_found_outside_its_margin_may_come_in_and_not_go_out() -> None:
     joints[6] = KINEMATICS.upper_rad[6] - 0.01
     shadow = at(joints)
     pose = KINEMATICS.forward(joints)
-    outwards, hits = shadow.bound(pose, moved(pose, STILL, -0.05 * YAW))
+    outwards, hits = bound(shadow, pose, moved(pose, STILL, -0.05 * YAW))
     assert [hit.name for hit in hits] == ["joint_limit"]
     assert outwards is pose
-    inwards, hits = shadow.bound(pose, moved(pose, STILL, 0.05 * YAW))
+    inwards, hits = bound(shadow, pose, moved(pose, STILL, 0.05 * YAW))
     assert hits == []
     assert angle_between(inwards.rotation, pose.rotation) == pytest.approx(0.05, abs=1e-6)
 
@@ -408,14 +445,14 @@ def test_a_joint_found_outside_its_margin_may_come_in_and_not_go_out() -> None:
 def test_a_hand_found_too_near_the_table_may_rise_and_not_sink() -> None:
     strict = limits(table_stop_m=0.08, table_slow_m=0.10)
     low = tool_down_at(KINEMATICS, 0.45, 0.0, 0.05)
-    shadow = ReachabilityFilter(KINEMATICS, low, strict, known_good_rad=[])
+    shadow = shadow_at(low, strict)
     pose = KINEMATICS.forward(low)
     assert shadow.margins.table_m < strict.reach.table_stop_m
-    stays, hits = shadow.bound(pose, moved(pose, STEP_M * DOWN, STILL))
+    stays, hits = bound(shadow, pose, moved(pose, STEP_M * DOWN, STILL))
     assert stays is pose
     assert {hit.name for hit in hits} == {"table_distance"}
     for _ in range(10):
-        higher, hits = shadow.bound(pose, moved(pose, STEP_M * UP, STILL))
+        higher, hits = bound(shadow, pose, moved(pose, STEP_M * UP, STILL))
         assert hits == []
         assert higher.position_m[2] > pose.position_m[2]
         pose = higher
@@ -424,16 +461,16 @@ def test_a_hand_found_too_near_the_table_may_rise_and_not_sink() -> None:
 def test_an_arm_found_stretched_may_bend_and_not_stretch() -> None:
     straight = np.array([0.0, 0.6, 0.0, -0.5, 0.0, 1.8, 0.785])
     strict = limits(singularity_stop=0.08, singularity_slow=0.1)
-    shadow = ReachabilityFilter(KINEMATICS, straight, strict)
+    shadow = shadow_at(straight, strict)
     assert shadow.margins.singular_value < strict.reach.singularity_stop
     pose = KINEMATICS.forward(straight)
     outwards = pose.position_m - (0, 0, 0.333)
     outwards = outwards / np.linalg.norm(outwards)
-    stays, hits = shadow.bound(pose, moved(pose, STEP_M * outwards, STILL))
+    stays, hits = bound(shadow, pose, moved(pose, STEP_M * outwards, STILL))
     assert {hit.name for hit in hits} & {"singularity", "reach"}
     assert np.linalg.norm(stays.position_m - pose.position_m) < 1e-4
     for _ in range(5):
-        nearer, hits = shadow.bound(pose, moved(pose, -STEP_M * outwards, STILL))
+        nearer, hits = bound(shadow, pose, moved(pose, -STEP_M * outwards, STILL))
         assert hits == []
         pose = nearer
 
@@ -441,10 +478,10 @@ def test_an_arm_found_stretched_may_bend_and_not_stretch() -> None:
 def test_a_start_out_of_reach_may_only_come_nearer() -> None:
     shadow = at(MIDDLE_RAD)
     beyond = moved(KINEMATICS.forward(MIDDLE_RAD), 0.6 * FORWARD, STILL)
-    stays, hits = shadow.bound(beyond, moved(beyond, STEP_M * FORWARD, STILL))
+    stays, hits = bound(shadow, beyond, moved(beyond, STEP_M * FORWARD, STILL))
     assert stays is beyond
     assert hits[0].name in {"reach", "joint_limit"}
-    nearer, hits = shadow.bound(beyond, moved(beyond, 0.02 * BACK, STILL))
+    nearer, hits = bound(shadow, beyond, moved(beyond, 0.02 * BACK, STILL))
     assert hits == []
     assert nearer.position_m[0] < beyond.position_m[0]
 
@@ -455,13 +492,12 @@ def test_a_step_for_which_the_joints_are_too_slow_is_kept_and_taken_slower() -> 
     steps = walk(near, STEP_M * FORWARD, STILL, 28)
     before, joints = steps.poses[-1], near.joints_rad
     asked = moved(before, 0.008 * FORWARD, STILL)
-    calm, hits = near.bound(before, asked, dt_s=0.5, start_rad=joints)
+    calm, hits, _, slower = bounded(near, before, asked, dt_s=0.5, start_rad=joints)
     assert hits == []
-    assert near.slowdown is None or near.slowdown.name == "singularity"
-    fast, hits = near.bound(before, asked, dt_s=0.016, start_rad=joints)
+    assert slower is None or slower.name == "singularity"
+    fast, hits, _, slower = bounded(near, before, asked, dt_s=0.016, start_rad=joints)
     assert hits == []
     assert fast is calm is asked
-    slower = near.slowdown
     assert slower is not None
     assert (slower.name, slower.where, slower.limit) == ("joint_velocity", "panda_joint4", 2.175)
     assert slower.value > slower.limit
@@ -475,14 +511,10 @@ def test_a_step_for_which_the_joints_are_too_slow_is_kept_and_taken_slower() -> 
 def test_joints_that_would_need_ten_times_as_long_leap_and_the_step_is_shortened() -> None:
     near = at(MIDDLE_RAD)
     before = walk(near, STEP_M * FORWARD, STILL, 28).poses[-1]
-    slow = ReachabilityFilter(
-        KINEMATICS,
-        near.joints_rad,
-        known_good_rad=[HOME_RAD],
-        velocity_rad_s=np.full(KINEMATICS.size, 0.1),
-    )
+    own = Limits.model_validate({"joint": {"velocity_rad_s": 0.1}})
+    slow = shadow_at(near.joints_rad, own, command="joint")
     asked = moved(before, 0.008 * FORWARD, STILL)
-    pose, hits = slow.bound(before, asked, dt_s=0.016)
+    pose, hits = bound(slow, before, asked, dt_s=0.016)
     assert [hit.name for hit in hits] == ["joint_velocity"]
     assert np.linalg.norm(pose.position_m - before.position_m) < 0.008
 
@@ -491,7 +523,7 @@ def test_a_step_that_starts_elsewhere_is_judged_from_there() -> None:
     shadow = at(MIDDLE_RAD)
     steps = walk(shadow, STEP_M * UP, STILL, 10)
     earlier = steps.poses[3]  # goals of an older observation
-    pose, hits = shadow.bound(earlier, moved(earlier, STEP_M * LEFT, STILL))
+    pose, hits = bound(shadow, earlier, moved(earlier, STEP_M * LEFT, STILL))
     assert hits == []
     assert_sane(shadow, pose)
 
@@ -502,26 +534,24 @@ def test_after_a_reset_the_shadow_stands_where_the_robot_is() -> None:
     shadow.reset(HOME_RAD)
     assert np.array_equal(shadow.joints_rad, HOME_RAD)
     pose = KINEMATICS.forward(HOME_RAD)
-    same, hits = shadow.bound(pose, pose)
+    same, hits = bound(shadow, pose, pose)
     assert same is pose
     assert hits == []
 
 
 def test_an_elbow_that_is_free_turns_further() -> None:
-    free = ReachabilityFilter(KINEMATICS, MIDDLE_RAD, free_elbow=True)
+    free = shadow_at(MIDDLE_RAD, command="joint")
     steps = walk(free, STILL, -STEP_RAD * YAW, 50)
     assert steps.turned_rad > 2.3
     assert np.abs(steps.moved_m).max() < DRIFT_M
 
 
-def test_margins_name_what_is_nearest() -> None:
+def test_margins_are_those_of_what_is_nearest() -> None:
     margins = at(HOME_RAD).margins
     assert margins.joint == "panda_joint4"
     assert margins.joint_rad == pytest.approx(3.0718 - 2.627, abs=1e-3)
     assert margins.singular_value == pytest.approx(0.221, abs=1e-3)
-    assert " and " in margins.self_pair
     assert 0.05 < margins.self_m < 0.1
-    assert margins.table_link in {"panda_leftfinger", "panda_rightfinger"}
     assert margins.table_m == pytest.approx(0.16 - 0.0095, abs=1e-3)
 
 
@@ -568,11 +598,11 @@ def test_the_nearer_a_bound_the_slower_the_arm(
     pose, shares = KINEMATICS.forward(shadow.joints_rad), []
     for _ in range(400):
         wish = moved(pose, 0.2 * STEP_M * direction, 0.2 * STEP_RAD * rotvec)
-        pose, hits = shadow.bound(pose, wish)
+        pose, hits, _, slower = bounded(shadow, pose, wish)
         if hits:
             break
-        shares.append(1.0 if shadow.slowdown is None else shadow.slowdown.share)
-    assert hits[0].name == shadow.slowdown.name == name if shadow.slowdown else hits
+        shares.append(1.0 if slower is None else slower.share)
+    assert hits[0].name == slower.name == name if slower else hits
     assert shares[0] == 1.0
     approach = shares[len(shares) - shares[::-1].index(1.0) :]
     assert approach == sorted(approach, reverse=True)
@@ -582,7 +612,7 @@ def test_the_nearer_a_bound_the_slower_the_arm(
 def test_away_from_a_bound_the_arm_has_its_full_speed() -> None:
     shadow = at(MIDDLE_RAD)
     last = walk(shadow, STEP_M * FORWARD, STILL, 60).poses[-1]
-    assert shadow.slowdown is not None or shadow.margins.singular_value < LIMITS.singularity_slow
-    _, hits = shadow.bound(last, moved(last, STEP_M * BACK, STILL))
-    assert not hits
-    assert shadow.slowdown is None
+    assert shadow.margins.singular_value < LIMITS.singularity_slow
+    back = bounded(shadow, last, moved(last, STEP_M * BACK, STILL))
+    assert not back.hits
+    assert back.slowdown is None

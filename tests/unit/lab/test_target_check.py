@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from panda_arm import HOME_RAD
 
-from vla_zenoh.control.reachability import make_reachability_filter
+from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.kinematics.so3 import Pose, exp3
 from vla_zenoh.lab.primitives.target_check import TargetCheck
 from vla_zenoh.profile import load_profile, override
@@ -17,7 +17,7 @@ HOME = np.array(PROFILE.robot.home_rad)
 
 @pytest.fixture(scope="module")
 def check() -> TargetCheck:
-    return TargetCheck(PROFILE, make_reachability_filter(PROFILE))
+    return TargetCheck(PROFILE, ReachabilityFilter(PROFILE))
 
 
 def moved(check: TargetCheck, by_m: tuple[float, float, float]) -> Pose:
@@ -59,7 +59,7 @@ def test_a_tool_that_would_turn_into_the_table_is_not_allowed(check: TargetCheck
 def test_a_keep_out_on_the_way_is_named() -> None:
     post = {"centre_m": [0.55, 0.22, 0.3], "box_m": [0.2, 0.04, 0.6]}
     profile = override(PROFILE, {"limits": {"reach": {"keep_out": {"post": post}}}})
-    check = TargetCheck(profile, make_reachability_filter(profile))
+    check = TargetCheck(profile, ReachabilityFilter(profile))
     behind = moved(check, (0.1, 0.4, 0.0))
     assert check.pose_fault(HOME, moved(check, (0.1, -0.3, 0.0))) == ""
     assert "post" in check.pose_fault(HOME, behind)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.codec.image import encode_jpeg
-from vla_zenoh.control.reachability import make_reachability_filter
+from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.errors import NodeError, VlaZenohError, WorkerError, in_words
 from vla_zenoh.lab.bench.task import ARM_LOST, TaskOutcome, TaskPlan, TaskRequest
 from vla_zenoh.lab.bench.task_episode import SceneSnapshot, run_task
@@ -151,7 +151,7 @@ class _LockstepStage:
             delays=Delays(self.plan.delay_ms / 1e3, camera_s=CAMERA_S, wire_s=WIRE_S),
             picture=lambda camera: _LazyImage(self, camera),  # pyright: ignore
             reach={
-                part: make_reachability_filter(self.profile.of_part(part))
+                part: ReachabilityFilter(self.profile.of_part(part))
                 for part in self.profile.part_names
             },
             seed=seed,

@@ -184,9 +184,9 @@ def robot(profile: Profile, host: str | None = None) -> Iterator[HostFinding]:
     if not any("command" in part.nodes for part in hosts):
         return
     try:
-        from vla_zenoh.control.reachability import make_reachability_filter
+        from vla_zenoh.control.reachability import ReachabilityFilter
 
-        make_reachability_filter(profile)
+        ReachabilityFilter(profile)
     except (MissingExtraError, ImportError):
         return  # see `libraries`
     except (VlaZenohError, ValueError) as error:  # ValueError: Pinocchio's, of a malformed URDF

@@ -19,7 +19,7 @@ import zenoh
 
 from vla_zenoh.bus.buffers import Wake, bytes_of
 from vla_zenoh.control.commander_io import DEACTIVATED
-from vla_zenoh.control.reachability import make_reachability_filter
+from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.errors import CodecError, SessionError
 from vla_zenoh.keys import PRIMITIVES, last_chunk, worker_node
 from vla_zenoh.kinematics.so3 import Pose, pose_of, rotation_from_quat
@@ -79,7 +79,7 @@ class PrimitivesNode:
         profile.require_one_arm("primitives")
         self._profile = profile
         self._policy = TargetPolicy(profile.robot.arm_joints)
-        self._check = TargetCheck(profile, make_reachability_filter(profile))
+        self._check = TargetCheck(profile, ReachabilityFilter(profile))
         self._worker = RobotSession(
             *(profile, session, self._policy, PRIMITIVES),
             images="jpeg",

@@ -53,7 +53,7 @@ class TargetCheck:
         for number in range(1, count + 1):
             aim, hits = interpolate(here, target, number / count), []
             for _ in range(TRIES):
-                at, hits = self._reach.bound(at, aim, STEP_S)
+                at, hits, *_ = _last(self._reach.bound_in_pieces(at, aim, STEP_S))
                 left_m, left_rad = pose_distance(at, aim)
                 if left_m < NEAR_M and left_rad < NEAR_RAD:
                     break

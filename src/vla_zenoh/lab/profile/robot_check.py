@@ -47,9 +47,9 @@ def arm(profile: Profile) -> Iterator[ProfileFault]:
     place = ("robot", "description")
     try:
         from vla_zenoh.control.limits import into_workspace
-        from vla_zenoh.control.reachability import make_reachability_filter
+        from vla_zenoh.control.reachability import ReachabilityFilter
 
-        reach = make_reachability_filter(profile)
+        reach = ReachabilityFilter(profile)
     except (ResourceError, MissingExtraError) as error:
         yield ProfileFault(place, str(error), "command")
         return
@@ -157,11 +157,11 @@ def simulator(profile: Profile) -> Iterator[ProfileFault]:
 
 
 def _not_simulated(profile: Profile, error: VlaZenohError) -> Iterator[ProfileFault]:
-    from vla_zenoh.control.reachability import make_reachability_filter
+    from vla_zenoh.control.reachability import ReachabilityFilter
 
     try:
         urdf = resources.robot_urdf(profile.robot.description)
-        make_reachability_filter(profile)
+        ReachabilityFilter(profile)
     except (ValueError, VlaZenohError):
         return  # `arm` says so
     yield ProfileFault(

@@ -20,7 +20,7 @@ from vla_zenoh.codec import records
 from vla_zenoh.control.commanded_part import CommandedPart
 from vla_zenoh.control.commander import Commander, Outputs, Setting
 from vla_zenoh.control.commander_io import State
-from vla_zenoh.control.reachability import make_reachability_filter
+from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.keys import Kind
 from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.nodes.command.inputs import CommandInputs
@@ -73,7 +73,7 @@ class CommandNode:
     ) -> None:
         node = self.node = Node("command", profile, session)
         parts = {name: profile.of_part(name) for name in profile.part_names}
-        reach = {name: make_reachability_filter(part) for name, part in parts.items()}
+        reach = {name: ReachabilityFilter(part) for name, part in parts.items()}
         self.commander = Commander(profile, reach=reach, dry_run=dry_run)
         self._latch = None if latch is None else EstopLatch(latch)
         before = None if self._latch is None else self._latch.read()
