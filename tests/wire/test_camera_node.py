@@ -142,23 +142,6 @@ def test_a_faster_video_is_thinned_to_the_rate_not_slowed(tmp_path: Path) -> Non
         assert min(np.diff([frame.header.stamp_wall_ns for frame in frames])) > 0.05e9
 
 
-def test_a_folder_is_shown_once_in_natural_order_and_ends_when_it_shall_not_loop(
-    tmp_path: Path,
-) -> None:
-    for i in range(12):
-        assert cv2.imwrite(str(tmp_path / f"{i}.png"), grey(20 * i))
-    profile = CameraProfile(source=f"file:{tmp_path}", width=64, height=48, rate_hz=10, loop=False)
-    with camera_rig({"front": profile}) as rig:
-        frames, _ = rig.listen(rig.profile.keys.camera_raw("front"))
-        rig.wait_for("front", "ended")
-        assert rig.statuses[-1].state == "ended"
-        levels = [int(frame.rgb[24, 32, 0]) // 20 for frame in frames]
-        assert levels == list(range(levels[0], 12))
-        assert len(levels) > 5
-        assert rig.happened("front:ok->ended")
-        assert rig.thread.is_alive()
-
-
 # -- several cameras, readers, the end ------------------------------------------------------------
 def test_one_node_serves_the_cameras_it_is_given_and_no_others(tmp_path: Path) -> None:
     chart = write_chart(tmp_path)

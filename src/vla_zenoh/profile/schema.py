@@ -133,10 +133,7 @@ class CameraCheck(Section):
         stamp_s: the driver's time stamp does not advance for this long.
         clipped_share: largest share of the image that may be black, or white.
         contrast_levels: between the brightest and darkest parts, of 255; less is a covered lens.
-        uniform_share: largest share of the image that may be one even area. Off by default: a
-            table top looks like a hand in front of the lens.
-        after_s: black, white, low contrast, evenness or another camera's view is a fault after this
-            long.
+        after_s: black, white, low contrast or another camera's view is a fault after this long.
         reference: file with an image of what this camera shows at its place, as `vla-zenoh camera
             list --output` writes it: cameras that have one are told from each other by it.
     """
@@ -145,7 +142,6 @@ class CameraCheck(Section):
     stamp_s: float = Field(default=0.5, ge=0, le=60)
     clipped_share: float = Field(default=0.98, gt=0, le=1)
     contrast_levels: float = Field(default=5.0, ge=0, le=100)
-    uniform_share: float = Field(default=1.0, gt=0, le=1)
     after_s: float = Field(default=0.5, ge=0, le=60)
     reference: Text | None = None
 
@@ -193,7 +189,6 @@ class CameraProfile(Section):
         white_balance_k: fixed white balance; null: automatic. Of the same.
         fit_for_workers: also publish images in the exact size of each model's spec, for workers on
             other hosts. Every source except ``ros2:`` supports it.
-        loop: a file starts again at its end.
         check: when its images show that it cannot be trusted.
     """
 
@@ -212,7 +207,6 @@ class CameraProfile(Section):
     exposure_us: float | None = Field(default=None, ge=1, le=1_000_000)
     white_balance_k: float | None = Field(default=None, ge=1000, le=20_000)
     fit_for_workers: bool = False
-    loop: bool = True
     check: CameraCheck = CameraCheck()
 
     def contradictions(self) -> Iterator[Fault]:

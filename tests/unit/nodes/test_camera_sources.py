@@ -17,14 +17,12 @@ from hypothesis import strategies as st
 
 from vla_zenoh.errors import NodeError
 from vla_zenoh.lab.profile.check import check_profile
-from vla_zenoh.nodes.camera import v4l2
 from vla_zenoh.nodes.camera.camera_publisher import EARLY, LATE, RateLimiter, to_rgb
+from vla_zenoh.nodes.camera.capture import RtspSource, V4l2Source, captured_ns, why_not
 from vla_zenoh.nodes.camera.file import FileSource, natural, open_frames
 from vla_zenoh.nodes.camera.geometry import resize
 from vla_zenoh.nodes.camera.node import choose_cameras, make_source
-from vla_zenoh.nodes.camera.rtsp import RtspSource
 from vla_zenoh.nodes.camera.source import without_password
-from vla_zenoh.nodes.camera.v4l2 import V4l2Source, captured_ns
 from vla_zenoh.profile import load_profile
 from vla_zenoh.profile.schema import CAMERA_SOURCES, CameraProfile
 
@@ -152,7 +150,7 @@ def test_a_folder_shows_its_pictures_and_skips_other_files(tmp_path: Path) -> No
 
 def test_a_single_picture_can_be_shown_for_ever(tmp_path: Path) -> None:
     write_grey(tmp_path, "0.png", "still.png")
-    source = FileSource(str(tmp_path / "still.png"), rate_hz=200.0, loop=True)
+    source = FileSource(str(tmp_path / "still.png"), rate_hz=200.0)
     source.open()
     for _ in range(5):
         assert source.grab(threading.Event()) is not None
@@ -163,7 +161,7 @@ def test_a_single_picture_can_be_shown_for_ever(tmp_path: Path) -> None:
 
 def test_pictures_are_shown_at_the_asked_rate(tmp_path: Path) -> None:
     write_grey(tmp_path, *(f"{i}.png" for i in range(4)))
-    source = FileSource(str(tmp_path), rate_hz=20.0, loop=True)
+    source = FileSource(str(tmp_path), rate_hz=20.0)
     source.open()
     stop = threading.Event()
     times = [source.grab(stop) for _ in range(11)]
@@ -173,7 +171,7 @@ def test_pictures_are_shown_at_the_asked_rate(tmp_path: Path) -> None:
 
 def test_a_stalled_reader_is_not_served_a_burst(tmp_path: Path) -> None:
     write_grey(tmp_path, *(f"{i}.png" for i in range(4)))
-    source = FileSource(str(tmp_path), rate_hz=20.0, loop=True)
+    source = FileSource(str(tmp_path), rate_hz=20.0)
     source.open()
     stop = threading.Event()
     source.grab(stop)
@@ -186,12 +184,12 @@ def test_a_stalled_reader_is_not_served_a_burst(tmp_path: Path) -> None:
 
 def test_a_file_that_is_not_there_or_no_picture_says_so(tmp_path: Path) -> None:
     with pytest.raises(NodeError, match=r"there is no file or folder .*nothing"):
-        FileSource(str(tmp_path / "nothing"), 30.0, True).open()
+        FileSource(str(tmp_path / "nothing"), 30.0).open()
     with pytest.raises(NodeError, match="no image in the folder"):
-        FileSource(str(tmp_path), 30.0, True).open()
+        FileSource(str(tmp_path), 30.0).open()
     (tmp_path / "a.mp4").write_bytes(b"not a video" * 100)
     with pytest.raises(NodeError, match=r"a\.mp4 is neither an image nor a video"):
-        FileSource(str(tmp_path / "a.mp4"), 30.0, True).open()
+        FileSource(str(tmp_path / "a.mp4"), 30.0).open()
 
 
 def grab_for(source: FileSource, duration_s: float) -> None:
@@ -202,7 +200,7 @@ def grab_for(source: FileSource, duration_s: float) -> None:
 
 def test_a_replaced_file_is_noticed(tmp_path: Path) -> None:
     write_grey(tmp_path, "a.png", "b.png")
-    source = FileSource(str(tmp_path / "a.png"), 50.0, True)
+    source = FileSource(str(tmp_path / "a.png"), 50.0)
     source.open()
     source.grab(threading.Event())
     (tmp_path / "b.png").replace(tmp_path / "a.png")
@@ -212,7 +210,7 @@ def test_a_replaced_file_is_noticed(tmp_path: Path) -> None:
 
 def test_waiting_for_the_next_picture_ends_when_told(tmp_path: Path) -> None:
     write_grey(tmp_path, "a.png")
-    source = FileSource(str(tmp_path), rate_hz=0.01, loop=True)
+    source = FileSource(str(tmp_path), rate_hz=0.01)
     source.open()
     stop = threading.Event()
     assert source.grab(stop) is not None
@@ -239,7 +237,7 @@ def test_a_file_that_is_no_camera_says_what_may_be_wrong(tmp_path: Path) -> None
 def test_a_forbidden_device_names_the_group(tmp_path: Path) -> None:
     path = tmp_path / "video0"
     path.touch(mode=0)
-    assert "--groups video" in v4l2.why_not(path)
+    assert "--groups video" in why_not(path)
 
 
 def test_grabbing_from_a_device_that_is_gone_is_a_loss() -> None:

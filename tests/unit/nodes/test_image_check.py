@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from vla_zenoh.nodes.camera.capture import V4l2Source, is_virtual
 from vla_zenoh.nodes.camera.file import FileSource
 from vla_zenoh.nodes.camera.image_check import ImageCheck, ImageFault
-from vla_zenoh.nodes.camera.v4l2 import V4l2Source, is_virtual
 from vla_zenoh.profile.schema import CameraCheck, CameraProfile
 
 RATE_HZ = 30
@@ -45,12 +45,6 @@ def noisy(picture: Picture, levels: float = NOISE_LEVELS) -> Picture:
 
 def covered() -> Picture:
     return noisy(np.full((480, 640, 3), 14.0), DARK_NOISE_LEVELS)
-
-
-def hand_before_the_lens() -> Picture:
-    picture = scene()
-    picture[:, :520] = (150, 110, 100)
-    return noisy(picture)
 
 
 def judged(
@@ -98,6 +92,12 @@ def test_pictures_of_sixteen_bits_and_with_a_fourth_channel_are_believed() -> No
     assert judged((four[nth % 4], None) for nth in count()) is None
 
 
+def test_a_table_top_that_fills_most_of_the_picture_is_believed() -> None:
+    picture = scene()
+    picture[:, :520] = (150, 110, 100)
+    assert judged(shown(lambda: noisy(picture))) is None
+
+
 def test_a_hand_that_passes_by_is_no_covered_lens() -> None:
     clear, dark = [noisy(scene()) for _ in range(2)], [covered() for _ in range(2)]
     passing = range(30, 40)
@@ -115,52 +115,41 @@ def test_a_picture_that_comes_twice_of_a_slow_camera_is_no_lie() -> None:
 
 
 # -- lies -----------------------------------------------------------------------------------------
-LIES: dict[str, tuple[Callable[[], Iterator[Shot]], float, str, dict[str, float]]] = {
-    # what it is called -> pictures, by when it is found, what is said, settings
+LIES: dict[str, tuple[Callable[[], Iterator[Shot]], float, str]] = {
+    # what it is called -> pictures, by when it is found, what is said
     "same": (
         lambda: repeated(noisy(scene())),
         1.0,
         r"shows the same image for 1\.\d s, less than 1 s is allowed "
         r"\(cameras\.wrist\.check\.same_s\)",
-        {},
     ),
     "stamps": (
         lambda: ((picture, 7) for picture, _ in shown(lambda: noisy(scene()))),
         0.5,
         r"driver time stamp does not advance for 0\.\d s, .* 0\.5 s .*check\.stamp_s",
-        {},
     ),
     "black": (
         lambda: shown(lambda: noisy(np.full((480, 640, 3), 1.0))),
         0.5,
         r"is black: 100\.0% of the image, at most 98\.0% .*check\.clipped_share",
-        {},
     ),
     "white": (
         lambda: shown(lambda: noisy(np.full((480, 640, 3), 254.0))),
         0.5,
         r"is overexposed: 100\.0% of the image is white, at most 98\.0%",
-        {},
     ),
     "flat": (
         lambda: shown(covered),
         0.5,
         r"shows no contrast: [0-4]\.\d of 255 levels, at least 5 .*check\.contrast_levels",
-        {},
-    ),
-    "even": (
-        lambda: shown(hand_before_the_lens),
-        0.5,
-        r"shows one even area: 8\d% of the image, at most 70% .*check\.uniform_share",
-        {"uniform_share": 0.7},
     ),
 }
 
 
 @pytest.mark.parametrize("what", LIES)
 def test_each_lie_is_found_out_within_its_time_and_by_its_name(what: str) -> None:
-    shots, time_s, said, limits = LIES[what]
-    found = judged(shots(), **limits)
+    shots, time_s, said = LIES[what]
+    found = judged(shots())
     assert found is not None
     when_s, finding = found
     assert finding.what == what
@@ -177,7 +166,6 @@ def test_each_lie_is_found_out_within_its_time_and_by_its_name(what: str) -> Non
         ("black", {"clipped_share": 1.0, "contrast_levels": 0.0}),
         ("white", {"clipped_share": 1.0, "contrast_levels": 0.0}),
         ("flat", {"contrast_levels": 0.0}),
-        ("even", {}),  # what cannot be told from a table top is off by default
     ],
 )
 def test_each_check_can_be_switched_off(what: str, limits: dict[str, float]) -> None:
@@ -210,7 +198,7 @@ def test_a_camera_that_is_good_again_is_said_to_be() -> None:
 
 # -- which source has noise -----------------------------------------------------------------------
 def test_a_file_may_show_one_picture_for_ever_and_a_device_may_not() -> None:
-    assert FileSource("still.png", 30.0, loop=True).same_s == 0
+    assert FileSource("still.png", 30.0).same_s == 0
     profile = CameraProfile(source="v4l2:97")
     assert V4l2Source("97", profile).same_s == 1.0
 
@@ -232,7 +220,7 @@ def test_a_virtual_device_is_known_by_what_the_kernel_says(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
-    "limits", [{"same_s": -1.0}, {"clipped_share": 0.0}, {"uniform_share": 1.5}, {"blur": 1.0}]
+    "limits", [{"same_s": -1.0}, {"clipped_share": 0.0}, {"contrast_levels": -1.0}, {"blur": 1.0}]
 )
 def test_limits_that_mean_nothing_are_refused(limits: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=next(iter(limits))):

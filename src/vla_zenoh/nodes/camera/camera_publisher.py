@@ -25,7 +25,7 @@ from vla_zenoh.policy.observation import prepare_image
 from vla_zenoh.profile.schema import CameraProfile
 from vla_zenoh.types import Depth, Event, Image
 
-WAITING, OK, LOST, ENDED = "waiting", "ok", "lost", "ended"
+WAITING, OK, LOST = "waiting", "ok", "lost"
 _SOURCE_LIMIT = 200
 _TO_RGB = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGB}
 
@@ -192,9 +192,7 @@ class CameraPublisher:
         if (state, why) == (self.state, self.why):
             return
         was, self.state, self.why = self.state, state, why
-        if state == ENDED:
-            self.fault = None
-        level = "info" if state in (OK, ENDED) else "warning"
+        level = "info" if state == OK else "warning"
         kind, change = ("fault", state) if state == was else ("transition", f"{was}->{state}")
         self._emit(Event(level, kind, f"{self.name}:{change}", why[:1000]))
 

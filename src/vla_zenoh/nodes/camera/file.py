@@ -75,12 +75,11 @@ def open_frames(path: Path) -> Frames:
 
 
 class FileSource(Source):
-    """Replays in real time a video at its own rate, or an image or a folder of images (in natural
-    order of their names) at `rate_hz`; `loop`: again from the start."""
+    """Replays in real time, again and again, a video at its own rate, or an image or a folder of
+    images (in natural order of their names) at `rate_hz`."""
 
-    def __init__(self, path: str, rate_hz: float, loop: bool) -> None:
-        self._path = Path(path).expanduser()
-        self._rate_hz, self._loop = rate_hz, loop
+    def __init__(self, path: str, rate_hz: float) -> None:
+        self._path, self._rate_hz = Path(path).expanduser(), rate_hz
         self._frames: Frames | None = None
         self._image: Callable[[], Pixels | None] | None = None
         self._identity: tuple[int, int] = (0, 0)
@@ -106,7 +105,14 @@ class FileSource(Source):
             self._look_s = now + LOOK_S
             if self._file_identity() != self._identity:
                 raise NodeError(f"{self._path} was replaced by another file")
-        return time.monotonic_ns() if self._step() else None
+        self._image = None if self._frames is None else next(self._frames.images, None)
+        if self._image is None:  # again from the start
+            self.close()
+            self._frames = open_frames(self._path)
+            self._image = next(self._frames.images, None)
+            if self._image is None:
+                raise NodeError(f"there is no image in {self._path}")
+        return time.monotonic_ns()
 
     def retrieve(self) -> Pixels | None:
         return None if self._image is None else self._image()
@@ -115,16 +121,6 @@ class FileSource(Source):
         if self._frames is not None:
             self._frames.images.close()
             self._frames = self._image = None
-
-    def _step(self) -> bool:
-        self._image = None if self._frames is None else next(self._frames.images, None)
-        if self._image is None and self._loop:
-            self.close()
-            self._frames = open_frames(self._path)
-            self._image = next(self._frames.images, None)
-            if self._image is None:
-                raise NodeError(f"there is no image in {self._path}")
-        return self._image is not None
 
     def _file_identity(self) -> tuple[int, int]:
         try:

@@ -26,8 +26,6 @@ REPEATS = 2
 CLOCK_SET_NS = 1_000_000_000
 """A time stamp that goes back further means that the driver's clock was set, not that it froze."""
 BLACK_LEVEL, WHITE_LEVEL = 8, 247
-EVEN_LEVELS = 6
-"""Blocks whose means lie within this many levels form one even area."""
 THUMB = 4
 """Samples along a side of a point of the thumbnail that is compared with references."""
 LEAST_LIKE, LEAST_MORE = 0.5, 0.2
@@ -42,7 +40,7 @@ class ImageFault(NamedTuple):
     Args:
         check: the field of `vla_zenoh.profile.schema.CameraCheck` that is violated; `value` and
             `limit` are in its unit.
-        what: ``same``, ``stamps``, ``black``, ``white``, ``flat``, ``even`` or ``swapped``.
+        what: ``same``, ``stamps``, ``black``, ``white``, ``flat`` or ``swapped``.
         why: continues a sentence that begins with ``camera NAME``.
     """
 
@@ -218,14 +216,6 @@ def _content(sample: NDArray[Any], limits: CameraCheck) -> ImageFault | None:
             "(is the lens covered?)"
         )
         return ImageFault("contrast_levels", "flat", why, contrast, least)
-    ends = np.searchsorted(levels, levels + EVEN_LEVELS, side="right")
-    share, most = float(np.max(ends - np.arange(len(levels)))) / len(levels), limits.uniform_share
-    if share > most:
-        why = (
-            f"shows one even area: {share:.0%} of the image, at most {most:.0%} "
-            "(is something in front of the lens?)"
-        )
-        return ImageFault("uniform_share", "even", why, share, most)
     return None
 
 

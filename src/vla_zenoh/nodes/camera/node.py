@@ -13,7 +13,7 @@ from vla_zenoh.bus.buffers import LatestSample, ReceivedSample, ZenohRing
 from vla_zenoh.bus.node import Node
 from vla_zenoh.errors import NodeError, in_words
 from vla_zenoh.keys import last_chunk
-from vla_zenoh.nodes.camera.camera_publisher import ENDED, OK, CameraPublisher
+from vla_zenoh.nodes.camera.camera_publisher import OK, CameraPublisher
 from vla_zenoh.nodes.camera.image_check import read_references
 from vla_zenoh.nodes.camera.source import LOOK_S, STALL_S, Source, prepare_opencv, without_password
 from vla_zenoh.policy import CameraSpec, ModelSpec
@@ -46,18 +46,14 @@ def make_source(profile: CameraProfile) -> Source:
     """The source of a camera, not open yet. Call it before threads start: it configures OpenCV."""
     prepare_opencv()
     kind, _, rest = profile.source.partition(":")
-    if kind == "v4l2":
-        from vla_zenoh.nodes.camera.v4l2 import V4l2Source
+    if kind in ("v4l2", "rtsp", "rtsps"):
+        from vla_zenoh.nodes.camera.capture import RtspSource, V4l2Source
 
-        return V4l2Source(rest, profile)
-    if kind in ("rtsp", "rtsps"):
-        from vla_zenoh.nodes.camera.rtsp import RtspSource
-
-        return RtspSource(profile.source)
+        return V4l2Source(rest, profile) if kind == "v4l2" else RtspSource(profile.source)
     if kind == "file":
         from vla_zenoh.nodes.camera.file import FileSource
 
-        return FileSource(rest, profile.rate_hz, profile.loop)
+        return FileSource(rest, profile.rate_hz)
     if kind == "realsense":
         from vla_zenoh.nodes.camera.realsense import RealsenseSource
 
@@ -74,7 +70,7 @@ class Grabber:
         self._backoff_s = BACKOFF_S
 
     def run(self, stop: threading.Event) -> None:
-        """Grab images until `stop` is set or the source ends."""
+        """Grab images until `stop` is set."""
         while not stop.is_set():
             try:
                 self._source.open()
@@ -86,10 +82,6 @@ class Grabber:
                 if stop.is_set():
                     return
                 self._publisher.lose(in_words(error))
-            else:
-                if not stop.is_set():
-                    self._publisher.set_state(ENDED, "the last image was shown, and loop is false")
-                return
             finally:
                 self._source.close()
             stop.wait(self._backoff_s)
@@ -288,11 +280,8 @@ class CameraNode:
         publishers = self._publishers
         states = tuple(one.state for one in publishers.values())
         bad = tuple(one.fault is not None for one in publishers.values())
-        if all(state == ENDED for state in states) and not any(bad):
-            state = "ended"
-        else:
-            good = all(state in (OK, ENDED) for state in states) and not any(bad)
-            state = "running" if good else "degraded"
+        good = all(state == OK for state in states) and not any(bad)
+        state = "running" if good else "degraded"
         with self._node_lock:
             changed = (states, bad) != self._reported
             if not changed and not self.node.status_due(state):

@@ -1,4 +1,4 @@
-"""Sources of images that the camera node waits for, and what those that OpenCV reads share."""
+"""Sources of images that the camera node waits for, and how OpenCV reads them."""
 
 from __future__ import annotations
 
@@ -48,9 +48,9 @@ class Source(ABC):
     def grab(self, stop: threading.Event) -> int | None:
         """Wait for the next image, decoding as little of it as possible.
 
-        Returns its time of capture, ns of the monotonic clock; None if the source has ended or
-        `stop` was set. `NodeError`: the source is gone. A source without a clock of its own waits
-        here until the image is due, as `file.py` does.
+        Returns its time of capture, ns of the monotonic clock; None if `stop` was set.
+        `NodeError`: the source is gone. A source without a clock of its own waits here until the
+        image is due, as `file.py` does.
         """
 
     @abstractmethod
@@ -64,20 +64,6 @@ class Source(ABC):
     def depth_m(self) -> Pixels | None:
         """(H, W) depth of the grabbed image in m, in its pixels; 0: not measured. None: none."""
         return None
-
-
-class CaptureSource(Source):
-    """A `Source` that OpenCV's `VideoCapture` reads."""
-
-    def __init__(self) -> None:
-        self._capture = cv2.VideoCapture()
-
-    def retrieve(self) -> Pixels | None:
-        good, image = self._capture.retrieve()
-        return image if good else None
-
-    def close(self) -> None:
-        self._capture.release()
 
 
 def prepare_opencv() -> None:

@@ -1,4 +1,5 @@
-"""Cameras of this computer by Video4Linux."""
+"""Cameras that OpenCV's `VideoCapture` reads: those of this computer by Video4Linux, and network
+cameras by RTSP over TCP."""
 
 from __future__ import annotations
 
@@ -10,10 +11,77 @@ from pathlib import Path
 import cv2
 
 from vla_zenoh.errors import NodeError
-from vla_zenoh.nodes.camera.source import STALL_S, CaptureSource
+from vla_zenoh.nodes.camera.geometry import Pixels
+from vla_zenoh.nodes.camera.source import STALL_S, Source, without_password
 from vla_zenoh.nodes.camera.v4l2_devices import DEV, SYS, find_device
 from vla_zenoh.profile.schema import CameraProfile
 
+
+class CaptureSource(Source):
+    """A `Source` that OpenCV's `VideoCapture` reads."""
+
+    def __init__(self) -> None:
+        self._capture = cv2.VideoCapture()
+
+    def retrieve(self) -> Pixels | None:
+        good, image = self._capture.retrieve()
+        return image if good else None
+
+    def close(self) -> None:
+        self._capture.release()
+
+
+# -- network cameras ------------------------------------------------------------------------------
+OPEN_S = 10.0
+"""To log in and to wait for a key frame, which some cameras send every few seconds only."""
+INSTANT_S = 0.015
+MAX_BACKLOG = 500
+RTSP_SAME_S = 5.0
+"""Compression may repeat a still scene until the next key frame, which rarely takes longer."""
+_OPTIONS = (
+    *(cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, round(OPEN_S * 1000)),
+    *(cv2.CAP_PROP_READ_TIMEOUT_MSEC, round(STALL_S * 1000)),
+    # Each additional decoding thread delays the stream by one image.
+    *(cv2.CAP_PROP_N_THREADS, 1),
+)
+
+
+class RtspSource(CaptureSource):
+    """An RTSP stream. Images are stamped on arrival: the camera's clock is not ours.
+
+    Args:
+        url: ``rtsp://[user:password@]host[:port]/path``.
+    """
+
+    same_s = RTSP_SAME_S
+
+    def __init__(self, url: str) -> None:
+        super().__init__()
+        self._url, self._shown = url, without_password(url)
+
+    def open(self) -> None:
+        if not self._capture.open(self._url, cv2.CAP_FFMPEG, _OPTIONS):
+            raise NodeError(
+                f"{self._shown} does not answer with an image within {OPEN_S:g} s; is the camera "
+                "on, and are address, user and password right?"
+            )
+        self.backend = self._capture.getBackendName()
+        # Images that queued up while OpenCV probed the stream return at once.
+        for _ in range(MAX_BACKLOG):
+            began = time.monotonic()
+            if not self._capture.grab() or time.monotonic() - began > INSTANT_S:
+                return
+
+    def grab(self, stop: threading.Event) -> int | None:
+        began = time.monotonic()
+        good = self._capture.grab()
+        # After its time-out OpenCV first returns what was left in the decoder: those are old.
+        if not good or time.monotonic() - began > 0.9 * STALL_S:
+            raise NodeError(f"{self._shown} has ended, or sent nothing for {STALL_S:g} s")
+        return time.monotonic_ns()
+
+
+# -- devices --------------------------------------------------------------------------------------
 MAX_UNCOMPRESSED_PX = 640 * 480
 """USB 2 carries at most this many uncompressed pixels at 30 Hz."""
 SANE_AGE_S = 1.0
