@@ -215,18 +215,18 @@ def trace(src: Path) -> list[str]:
                     raise SystemExit("the nodes are not ready")
                 time.sleep(0.5)
             begun = time.time() + 1.0
-            time.sleep(1.0 + MOVING_S)
-            until = time.time()
-            time.sleep(2 * KEEP_S)
+            time.sleep(1.0 + MOVING_S + 2 * KEEP_S)
+            # Before they are stopped: what stops a node does not move an arm.
+            ran = [
+                json.loads((folder / f"{program}.json").read_text("utf-8"))
+                for program in PROGRAMS[1:]
+            ]
         finally:
             for process in reversed(programs):
                 process.send_signal(signal.SIGINT)
             for process in programs:
                 process.wait(END_S)
-        called = set()
-        for program in PROGRAMS[1:]:
-            last = json.loads((folder / f"{program}.json").read_text("utf-8"))
-            called |= {file for file, at in last.items() if at >= begun and until > begun}
+        called = {file for last in ran for file, at in last.items() if at >= begun}
     inside = sorted(Path(file) for file in called if Path(file).is_relative_to(src / PACKAGE))
     names = [path.relative_to(src / PACKAGE) for path in inside]
     return [
