@@ -14,22 +14,24 @@ import pytest
 import zenoh
 from camera_rig import Rig, camera_rig, free_endpoint, grey, until
 
-from vla_zenoh.bus.buffers import Wake, header_of
+from vla_zenoh.bus.buffers import Wake
 from vla_zenoh.bus.node import Node, Publisher
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec.image import decode_jpeg, encode_jpeg
 from vla_zenoh.keys import Kind
 from vla_zenoh.nodes.camera import node as camera_node
 from vla_zenoh.nodes.camera.camera_publisher import MAX_SIZES
-from vla_zenoh.nodes.worker.streams import CameraSubscriber, subscribe_to_camera
+from vla_zenoh.nodes.worker.robot_session import CameraStream, colour_stream
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, ObservationSpec
-from vla_zenoh.policy.observation import size_variant
+from vla_zenoh.policy.observation import History, size_variant
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.profile.schema import CameraProfile
 from vla_zenoh.types import Image
 
 SILENCE_S, PATIENCE_S = 1.0, 0.3
 """Of models and of a worker, in these tests."""
+PLAIN_SEQ = 1000
+"""Number of the first plain picture."""
 TURN_S = 0.15
 """Long enough for a spec to be heard; where it is not the thief changes his mind less often."""
 
@@ -168,25 +170,25 @@ def test_plain_pictures_are_taken_while_none_come_in_the_own_size_and_no_longer(
         keys = worker.keys
         own = camera.declare_publisher(keys.camera_fitted("front", "32x32-pad"), Kind.FRAME)
         plain = camera.declare_publisher(keys.camera_jpeg("front"), Kind.FRAME)
-        changed = Wake()
-        ears = CameraSubscriber(
-            worker, "front", own.key, plain.key, patience_s=PATIENCE_S, changed=changed
+        images = History(1)
+        ears = CameraStream(
+            *(worker, "front", (own.key, plain.key), images, lambda data, _: decode_jpeg(data)),
+            patience_s=PATIENCE_S,
+            history_s=0.0,
+            changed=Wake(),
         )
 
         def comes(stream: Publisher) -> bool:
             """Whether a picture that is put there is what is taken next."""
+            images.entries.clear()
             stream.publish(jpeg, encoding=zenoh.Encoding.IMAGE_JPEG)
-            heard = ears.pop()
-            if heard is None:
-                return False
-            header = header_of(heard.arrival.sample)
-            heard.writer.check(header, heard.arrival.mono_ns)
-            heard.writer.accept(header, heard.arrival.mono_ns)
-            return str(heard.arrival.sample.key_expr) == stream.key
+            ears.poll()
+            numbers = [image.header.seq for image in images.entries]
+            return bool(numbers) and (numbers[-1] >= PLAIN_SEQ) == (stream is plain)
 
         until("a reader", lambda: own.has_subscribers)
         assert not plain.has_subscribers
-        plain.seq = 1000  # its numbers are its own, and far ahead
+        plain.seq = PLAIN_SEQ  # its numbers are its own, and far ahead
         until("a plain one", lambda: comes(plain))
         until("the next", lambda: comes(plain))
         until("its own", lambda: comes(own))
@@ -203,12 +205,14 @@ def test_a_worker_knows_where_its_pictures_are_and_where_those_of_all() -> None:
         )
         for_all = camera.declare_publisher(keys.camera_jpeg("front"), Kind.FRAME)
         wanted = CameraSpec(camera="front", width=32, height=32, resize="pad")
-        ears = subscribe_to_camera(wanted, worker, jpeg=True, changed=Wake(), history_s=0.0)
+        images = History(1)
+        ears = colour_stream(wanted, worker, images, jpeg=True, history_s=0.0, changed=Wake())
         until("its own", lambda: own.has_subscribers)
         assert not other.has_subscribers
 
         def takes_plain() -> bool:
-            assert ears.pop() is None
+            ears.poll()
+            assert not images.entries
             return for_all.has_subscribers
 
         until("plain ones", takes_plain)

@@ -76,8 +76,8 @@ def answer(worker: RobotSession) -> None:
 
 
 def has_new(worker: RobotSession, camera: str) -> bool:
-    (feed,) = (each for each in worker._feeds if each.name == camera)
-    return feed.camera.has_new
+    (stream,) = (each for each in worker._cameras if each.camera == camera)
+    return stream.has_new
 
 
 def test_a_worker_is_woken_when_every_camera_has_sent_an_image_and_not_by_the_first(

@@ -37,6 +37,7 @@ from vla_zenoh.lab.primitives.requests import (
     decode_request,
 )
 from vla_zenoh.lab.primitives.target_check import TargetCheck
+from vla_zenoh.nodes.worker.node import InferenceDebugPublisher
 from vla_zenoh.nodes.worker.robot_session import RobotSession
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray, HeldBox
@@ -87,6 +88,7 @@ class PrimitivesNode:
             changed=Wake(),
         )
         self._worker.complaint = ""
+        self._debug = InferenceDebugPublisher(self._worker.node, PRIMITIVES, self._worker.spec)
         self._node, self._robot = self._worker.node, RemoteRobot(profile, session)
         self._robot.subscribe()
         self._stop, self._published = threading.Event(), threading.Event()
@@ -125,12 +127,14 @@ class PrimitivesNode:
                 return
             worker.due_s = max(worker.due_s + 1 / CHUNK_HZ, now_s)
             times_ns = observed_ns, observed_ns, clock.wall_ns()
-            worker.publish(observation, steps, times_ns, 1)
+            chunk = worker.publish(observation, steps, times_ns, 1)
             with self._lock:
                 # An arm activated by a chunk to the previous target would keep the spec of that
                 # chunk.
                 if target is self._policy.target:
                     self._published.set()
+            if chunk is not None:
+                self._debug.publish(observation, steps, *chunk)
         worker.report()
 
     def _aim(self, target: Target) -> None:

@@ -14,18 +14,25 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import Any, Literal
 
+import numpy as np
 import zenoh
 
 from vla_zenoh.bus.buffers import Wake
-from vla_zenoh.errors import SpecError, WorkerError
+from vla_zenoh.bus.node import Node
+from vla_zenoh.codec.image import depth_schema, encode_depth, encode_jpeg
+from vla_zenoh.errors import CodecError, RecordError, SpecError, WorkerError
+from vla_zenoh.keys import Kind
 from vla_zenoh.nodes.worker.robot_session import RobotSession
-from vla_zenoh.policy import ActionSteps, Observation, Policy, reset_of, takes_robot
+from vla_zenoh.policy import ActionSteps, ModelSpec, Observation, Policy, reset_of, takes_robot
 from vla_zenoh.profile import Profile, as_robot
-from vla_zenoh.types import Event
+from vla_zenoh.types import ActionChunk, Depth, Event, Header, Image, InferenceDebug
+from vla_zenoh.types.records import plain_values
 
 POLL_PERIOD_S = 0.25
 NAP_S, NAPS = 0.004, 5
 BLIND_NAP_S, IDLE_NAP_S, SILENT_NAP_S = 0.002, 0.02, 0.1
+SEEN_QUALITY = 95
+"""Of the JPEG images a model was given."""
 
 Ready = tuple[RobotSession, Observation, int]
 """A robot, its observation, and when that was complete (wall ns)."""
@@ -85,6 +92,9 @@ class WorkerNode:
                 self.sessions.append(robot)
             opened.pop_all()
         self.node = self.sessions[0].node
+        self._debug = {
+            one.robot: InferenceDebugPublisher(one.node, name, one.spec) for one in self.sessions
+        }
 
     def _one_for_each(
         self, policy: Policy, count: int, another: Callable[[], Policy] | None
@@ -179,13 +189,18 @@ class WorkerNode:
         answers = self._answers(ready)
         if self._delay_s:
             time.sleep(self._delay_s)
+        published: list[Any] = []
         for (robot, observation, observed_ns), answer in zip(ready, answers, strict=True):
             robot.due_s = max(robot.due_s + 1.0 / observation.task.requested_hz, began_s)
             if isinstance(answer, Exception):
                 robot.failed(answer)
                 continue
             times_ns = (observed_ns, start_ns[robot.robot], robot.node.clock.wall_ns())
-            robot.publish(observation, answer, times_ns, len(ready))
+            chunk = robot.publish(observation, answer, times_ns, len(ready))
+            if chunk is not None:
+                published.append((robot, observation, answer, *chunk))
+        for robot, *inference in published:
+            self._debug[robot.robot].publish(*inference)
 
     def _answers(self, ready: Sequence[Ready]) -> list[ActionSteps | Exception]:
         try:
@@ -208,3 +223,61 @@ class WorkerNode:
         if len(found) != len(ready):
             raise SpecError(f"infer_batch gave {len(found)} answers to {len(ready)} observations")
         return [one if isinstance(one, ActionSteps) else ActionSteps(one) for one in found]
+
+
+class InferenceDebugPublisher:
+    """Publishes observation and answer of each inference, while there are subscribers; after the
+    chunks of that inference, so it never delays one."""
+
+    def __init__(self, node: Node, worker: str, spec: ModelSpec) -> None:
+        self._node = node
+        keys, observed = node.keys, spec.observation
+        # One priority for all: the images arrive before the record.
+        self._record = node.declare_publisher(keys.seen_record(worker), Kind.FRAME)
+        self._images = [
+            (encode, one, node.declare_publisher(key(worker, one.camera), Kind.FRAME))
+            for cameras, key, encode in (
+                (observed.cameras, keys.seen, _seen_image),
+                (observed.depth, keys.seen_depth, _seen_depth),
+            )
+            for one in cameras
+        ]
+
+    def publish(
+        self, observation: Observation, answer: ActionSteps, header: Header, chunk: ActionChunk
+    ) -> None:
+        """Publish one inference, whose chunk was published with `header`."""
+        stamp_ns, seq = observation.stamp_wall_ns, header.seq
+        inference_ms = (chunk.inference_end_ns - chunk.inference_start_ns) / 1e6
+        try:
+            for encode, camera, stream in self._images:
+                if stream.has_subscribers:
+                    payload, encoding = encode(camera, observation, answer)
+                    stream.publish(payload, stamp_wall_ns=stamp_ns, seq=seq, encoding=encoding)
+            if self._record.has_subscribers:
+                seen = InferenceDebug(
+                    *(chunk.worker, seq, chunk.spec_hash, chunk.episode, stamp_ns),
+                    *(observation.prompt, chunk.steps, inference_ms),
+                    *(plain_values(answer.raw), chunk.done),
+                )
+                self._record.publish(seen, stamp_wall_ns=stamp_ns, seq=seq)
+        except (RecordError, CodecError) as error:
+            self._node.reject("seen", f"the inference cannot be published: {error}")
+
+
+def _seen_image(
+    camera: Any, observation: Observation, answer: ActionSteps
+) -> tuple[bytes, zenoh.Encoding]:
+    rgb = (answer.pictures or {}).get(camera.camera)
+    if rgb is None:
+        rgb = observation.images[camera.camera]
+        rgb = np.ascontiguousarray(rgb[..., ::-1]) if camera.colour == "bgr" else rgb
+    return encode_jpeg(Image(np.asarray(rgb)), SEEN_QUALITY), zenoh.Encoding.IMAGE_JPEG
+
+
+def _seen_depth(
+    camera: Any, observation: Observation, _: ActionSteps
+) -> tuple[bytes, zenoh.Encoding]:
+    depth = Depth(observation.depth[camera.camera], camera.unit_m)
+    encoding = zenoh.Encoding.IMAGE_PNG.with_schema(depth_schema(depth))
+    return encode_depth(depth), encoding

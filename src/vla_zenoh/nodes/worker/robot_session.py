@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import math
 import time
-from typing import Any, Literal
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple
 
-import numpy as np
 import zenoh
-from numpy.typing import NDArray
 
-from vla_zenoh.bus.buffers import LatestSample, Wake, bytes_of, header_of
+from vla_zenoh.bus.buffers import (
+    CallbackRing,
+    LatestSample,
+    ReceivedSample,
+    Wake,
+    ZenohRing,
+    bytes_of,
+    header_of,
+)
 from vla_zenoh.bus.metrics import Percentiles, RateMeter
 from vla_zenoh.bus.node import Node
 from vla_zenoh.codec import records
@@ -18,33 +26,39 @@ from vla_zenoh.codec.image import (
     decode_depth,
     decode_jpeg,
     decode_raw,
-    depth_schema,
-    encode_depth,
-    encode_jpeg,
 )
 from vla_zenoh.codec.records import SMALL_BYTES
-from vla_zenoh.errors import CodecError, PeerError, RecordError, SpecError, in_words
+from vla_zenoh.errors import CodecError, PeerError, SpecError, in_words
 from vla_zenoh.keys import Kind, worker_node
-from vla_zenoh.nodes.worker.streams import (
-    CameraSubscriber,
-    Feed,
-    ReceivedImage,
-    StateStream,
-    subscribe_to_camera,
+from vla_zenoh.policy import (
+    ActionSteps,
+    CameraSpec,
+    Observation,
+    Policy,
+    check_steps,
+    reset_of,
 )
-from vla_zenoh.policy import ActionSteps, ModelSpec, Observation, Policy, check_steps, reset_of
 from vla_zenoh.policy.inference import ChunkPrefix, make_chunk
 from vla_zenoh.policy.observation import (
     MAX_STATES,
     STATE_KINDS,
+    History,
     NotReady,
     Streams,
     assemble,
+    size_variant,
     state_names,
 )
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import Depth, Header, Image, InferenceDebug, SingleWriterFilter, Stamped, Task
-from vla_zenoh.types.records import plain_values
+from vla_zenoh.types import (
+    ActionChunk,
+    Event,
+    Header,
+    Image,
+    SingleWriterFilter,
+    Stamped,
+    Task,
+)
 
 SPEC_PERIOD_S = 1.0
 TASK_PATIENCE_S = 1.5
@@ -52,9 +66,13 @@ AFTER_A_FAILURE_S = 0.5
 FRESH_PATIENCE_S = 0.05
 SILENT_S = 0.5
 FRESH_TOLERANCE_S = 0.005
+STREAM_PATIENCE_S = 0.5
+"""After this silence of a stream's writer another one is accepted."""
+MAX_QUEUE = 96
+PATIENCE_S, PERIODS = 1.0, 3
+"""Without images on the preferred stream for this long, and for this many periods of a slow camera,
+a worker subscribes to the common one as well."""
 MAX_COMPLAINT = 500
-SEEN_QUALITY = 95
-"""Of the JPEG images a model was given."""
 
 
 class RobotSession:
@@ -82,51 +100,42 @@ class RobotSession:
         keys = node.keys
         self._chunks = node.declare_publisher(keys.delta(name), Kind.ORDER)
         self._specs = node.declare_publisher(keys.spec(name), Kind.TELEMETRY)
-        self._debug = InferenceDebugPublisher(node, name, self.spec)
         node.serve(
             keys.spec(name), lambda query: query.reply(keys.spec(name), records.encode(self.spec))
         )
         self._tasks = node.subscribe(keys.task, LatestSample(SMALL_BYTES))
-        history_s = self._history_s = self.spec.observation.history_span_s
-        jpeg = images == "jpeg"
-        self._streams = Streams.of(self.spec.observation, self.spec.parts)
-        cameras = {
-            one.camera: subscribe_to_camera(
-                one, node, jpeg=jpeg, changed=changed, history_s=history_s
+        streams = self._streams = Streams.of(self.spec.observation, self.spec.parts)
+        history_s = self.spec.observation.history_span_s
+        self._cameras = [
+            colour_stream(
+                *(one, node, streams.images[one.camera]),
+                jpeg=images == "jpeg",
+                history_s=history_s,
+                changed=changed,
             )
             for one in self.spec.observation.cameras
-        }
-        depths = {
-            one.camera: CameraSubscriber(
-                *(node, one.camera, keys.camera_depth(one.camera)),
-                changed=changed,
-                history_s=history_s,
-            )
-            for one in self.spec.observation.depth
-        }
-        decode_image = (lambda data, _: decode_jpeg(data)) if jpeg else decode_raw
-        self._feeds = [
-            Feed(name, camera, streams[name], decode)
-            for subscribers, streams, decode in (
-                (cameras, self._streams.images, decode_image),
-                (depths, self._streams.depth, decode_depth),
-            )
-            for name, camera in subscribers.items()
         ]
-        self._every_state = bool(history_s) or not self._feeds
+        self._cameras += [
+            CameraStream(
+                *(node, name, [keys.camera_depth(name)], kept, decode_depth),
+                history_s=history_s,
+                changed=changed,
+            )
+            for name, kept in streams.depth.items()
+        ]
+        self._every_state = bool(history_s) or not self._cameras
         self._states = [
             StateStream(
                 node,
                 getattr(keys.of_part(part), f"state_{what}"),
                 STATE_KINDS[what],
-                self._streams.states[name],
+                streams.states[name],
                 MAX_STATES if history_s else 256,
                 every=self._every_state,
             )
             for name, (part, what) in state_names(self.spec.observation, self.spec.parts).items()
         ]
         self._task_writer = SingleWriterFilter(TASK_PATIENCE_S)
-        self._received_s: dict[CameraSubscriber, float] = {}
         self.task: Task | None = None
         self._task_received_s = -1e9
         self._episode = -1
@@ -143,22 +152,23 @@ class RobotSession:
     def has_images(self) -> bool:
         """Whether an image was not polled yet, and every camera has one since the last chunk."""
         new = False
-        for feed in self._feeds:
-            if feed.camera.has_new:
+        for camera in self._cameras:
+            if camera.has_new:
                 new = True
-            elif not feed.images.entries or feed.images.newest_ns < self._not_before_ns:
+            elif not camera.images.entries or camera.images.newest_ns < self._not_before_ns:
                 return False
         return new
 
     @property
     def needs_images(self) -> bool:
         """Whether the model observes any camera."""
-        return bool(self._feeds)
+        return bool(self._cameras)
 
     @property
     def cameras_silent(self) -> bool:
         """Whether no image came lately: none is expected in the next moment."""
-        return time.monotonic() - max(self._received_s.values(), default=0.0) > SILENT_S
+        newest_s = max((camera.received_s for camera in self._cameras), default=0.0)
+        return time.monotonic() - newest_s > SILENT_S
 
     def poll(self) -> None:
         """Decode what was received since the last call."""
@@ -167,20 +177,16 @@ class RobotSession:
             task = self.node.decode(Task, arrival, self._task_writer)
             if task is not None:
                 self._set_task(task)
-        for feed in self._feeds:
-            # Without a history there is one, the newest.
-            while (received := feed.camera.pop()) is not None:
-                self._receive(feed, received)
-                if not self._history_s:
-                    break
+        for camera in self._cameras:
+            camera.poll()
         self.poll_states()
 
     def poll_states(self) -> None:
         """Decode the states received since the last call, unless the cameras fell silent."""
         known = all(states.entries for states in self._streams.states.values())
-        if known and not self._every_state and self._received_s and self.cameras_silent:
+        if known and not self._every_state and self.cameras_silent:
             return  # those near the next image are in their rings when it comes
-        since_ns = min((feed.images.newest_ns for feed in self._feeds), default=0)
+        since_ns = min((camera.images.newest_ns for camera in self._cameras), default=0)
         for stream in self._states:
             stream.poll(since_ns)
 
@@ -199,23 +205,6 @@ class RobotSession:
                 reset()
             except Exception as error:
                 self.failed(error, "reset_failed")
-
-    def _receive(self, feed: Feed, received: ReceivedImage) -> None:
-        (arrival, writer, key), node = received, self.node
-        sample, mono_ns = arrival.sample, arrival.mono_ns
-        try:
-            header = header_of(sample)
-            writer.check(header, mono_ns)
-            payload = bytes_of(sample.payload, MAX_IMAGE_BYTES)
-            image = feed.decode(payload, str(sample.encoding).partition(";")[2])
-        except CodecError as error:
-            node.reject(error.reason, f"camera {feed.name}: {error}")
-            return
-        writer.accept(header, mono_ns)
-        node.traffic.received(key, header, arrival.nth)
-        header, image = node.clocks.to_local_clock(header, image)
-        feed.images.add(Stamped(header, image, node.clock.wall_at(arrival.mono_ns)))
-        self._received_s[feed.camera] = mono_ns / 1e9
 
     def observe(self) -> Observation | None:
         """Poll and assemble an observation; None if there is none yet.
@@ -248,9 +237,9 @@ class RobotSession:
                 self.complaint = observation.why
             return None
         self.complaint = ""
-        if self._received_s and time.monotonic() - self.due_s < FRESH_PATIENCE_S:
+        if self._cameras and time.monotonic() - self.due_s < FRESH_PATIENCE_S:
             tolerance_s = min(FRESH_TOLERANCE_S, 0.25 / observation.rate_hz)
-            if min(self._received_s.values()) < self.due_s - tolerance_s:
+            if min(camera.received_s for camera in self._cameras) < self.due_s - tolerance_s:
                 return None
         return observation
 
@@ -260,8 +249,8 @@ class RobotSession:
         answer: ActionSteps,
         times_ns: tuple[int, int, int],
         batch: int,
-    ) -> None:
-        """Validate an answer and publish it as a chunk, or report why it was rejected.
+    ) -> tuple[Header, ActionChunk] | None:
+        """Validate an answer and publish it as a chunk; None: it was rejected and reported.
 
         `times_ns` (wall clock): observation complete, inference started, inference ended; `batch`:
         robots in this inference.
@@ -270,7 +259,7 @@ class RobotSession:
             steps, done = check_steps(self.spec.action, answer.steps), bool(answer.done)
         except Exception as error:
             self.failed(error)
-            return
+            return None
         _, start_ns, end_ns = times_ns
         patience_s = self.node.profile.timing.max_observation_age_s
         chunk = make_chunk(
@@ -285,7 +274,7 @@ class RobotSession:
         self._rate.tick()
         obeyed = observation.task.active and observation.task.worker == self.name
         self.prefix.published(observation, steps, header.stamp_wall_ns, obeyed=obeyed)
-        self._debug.publish(observation, answer, steps, header, (end_ns - start_ns) / 1e6)
+        return header, chunk
 
     def adopt_spec(self) -> None:
         """Publish the policy's spec after it changed the meaning of its actions.
@@ -337,66 +326,162 @@ class RobotSession:
         self.node.close()
 
 
-class InferenceDebugPublisher:
-    """Publishes observation and answer of each inference, while there are subscribers.
+class _Source(NamedTuple):
+    """A subscription to images, and the filter of their writer."""
 
-    It runs after the chunk was published, so it never delays one.
+    buffer: CallbackRing
+    writer: SingleWriterFilter
+
+
+class CameraStream:
+    """One camera's colour or depth images, from its subscriber to the `images` that are kept.
+
+    It subscribes to the first of `keys`, the preferred one, and after a silence of `patience_s` to
+    the second, the common one, too. The newest image waits for `poll`; where those `history_s`
+    older are needed as well, all of one inference do. Each sets `changed`.
+
+    Raises:
+        SessionError: the router does not answer at the port for images.
     """
 
-    def __init__(self, node: Node, worker: str, spec: ModelSpec) -> None:
-        self._node, self._worker, self._spec = node, worker, spec
-        keys, observed = node.keys, spec.observation
-        # One priority for all: the images arrive before the record.
-        self._record = node.declare_publisher(keys.seen_record(worker), Kind.FRAME)
-        self._images = [
-            (encode, one, node.declare_publisher(key(worker, one.camera), Kind.FRAME))
-            for cameras, key, encode in (
-                (observed.cameras, keys.seen, _seen_image),
-                (observed.depth, keys.seen_depth, _seen_depth),
-            )
-            for one in cameras
-        ]
-
-    def publish(
+    def __init__(
         self,
-        observation: Observation,
-        answer: ActionSteps,
-        steps: NDArray[np.float32],
-        chunk: Header,
-        inference_ms: float,
+        node: Node,
+        camera: str,
+        keys: Sequence[str],
+        images: History,
+        decode: Callable[[bytes, str], Any],
+        *,
+        patience_s: float = PATIENCE_S,
+        history_s: float,
+        changed: Wake,
     ) -> None:
-        """Publish one inference: its validated steps (H, D), and the header of its chunk."""
-        stamp_ns, seq = observation.stamp_wall_ns, chunk.seq
+        self._node, self.camera, self._keys, self._changed = node, camera, keys, changed
+        self.images, self._decode, self._patience_s = images, decode, patience_s
+        settings = node.profile.cameras.get(camera)
+        self._queue = 1
+        if history_s and settings is not None:
+            count = 1 + math.ceil((history_s + PATIENCE_S) * settings.rate_hz)
+            self._queue = min(MAX_QUEUE, count)
+        self.received_s = 0.0
+        """When the newest of `images` arrived, monotonic clock; 0: there is none."""
+        self._preferred = self._subscribe(keys[0])
+        self._fallback: _Source | None = None
+        self._preferred_s = time.monotonic()
+
+    @property
+    def has_new(self) -> bool:
+        """Whether there is an image that was not polled yet."""
+        return self._preferred.buffer.has_new or (
+            self._fallback is not None and self._fallback.buffer.has_new
+        )
+
+    def poll(self) -> None:
+        """Decode the newest image; with a history all that are queued."""
+        while (received := self._pop()) is not None:
+            self._receive(*received)
+            if self._queue == 1:
+                break
+
+    def _pop(self) -> tuple[ReceivedSample, _Source] | None:
+        source = self._preferred
+        arrival = source.buffer.pop()
+        if arrival is not None:
+            self._preferred_s = time.monotonic()
+            if self._fallback is not None:
+                self._node.unsubscribe(self._fallback.buffer)
+                self._fallback = None
+                why = f"there are images on {self._node.keys.short(self._keys[0])} again"
+                self._node.emit(Event("info", "notice", f"{self.camera}:own_pictures", why))
+        elif self._fallback is not None:
+            source = self._fallback
+            arrival = source.buffer.pop()
+        elif len(self._keys) > 1 and time.monotonic() - self._preferred_s >= self._patience_s:
+            self._fallback = self._subscribe(self._keys[1])
+            preferred, common = map(self._node.keys.short, self._keys)
+            why = f"no image on {preferred} for {self._patience_s:g} s; subscribing to {common}"
+            self._node.emit(
+                Event("warning", "notice", f"{self.camera}:plain_pictures", f"{why} as well")
+            )
+        return None if arrival is None else (arrival, source)
+
+    def _subscribe(self, key: str) -> _Source:
+        ring = CallbackRing(self._queue, MAX_IMAGE_BYTES, self._changed)
+        self._node.subscribe(key, ring, Kind.FRAME)
+        return _Source(ring, SingleWriterFilter(STREAM_PATIENCE_S))
+
+    def _receive(self, arrival: ReceivedSample, source: _Source) -> None:
+        node, sample, mono_ns = self._node, arrival.sample, arrival.mono_ns
         try:
-            for encode, camera, stream in self._images:
-                if stream.has_subscribers:
-                    payload, encoding = encode(camera, observation, answer)
-                    stream.publish(payload, stamp_wall_ns=stamp_ns, seq=seq, encoding=encoding)
-            if self._record.has_subscribers:
-                seen = InferenceDebug(
-                    *(self._worker, seq, self._spec.hash, observation.task.episode, stamp_ns),
-                    *(observation.prompt, steps, inference_ms),
-                    plain_values(answer.raw),
-                    bool(answer.done),
-                )
-                self._record.publish(seen, stamp_wall_ns=stamp_ns, seq=seq)
-        except (RecordError, CodecError) as error:
-            self._node.reject("seen", f"the inference cannot be published: {error}")
+            header = header_of(sample)
+            source.writer.check(header, mono_ns)
+            payload = bytes_of(sample.payload, MAX_IMAGE_BYTES)
+            image = self._decode(payload, str(sample.encoding).partition(";")[2])
+        except CodecError as error:
+            node.reject(error.reason, f"camera {self.camera}: {error}")
+            return
+        source.writer.accept(header, mono_ns)
+        node.traffic.received(str(sample.key_expr), header, arrival.nth)
+        header, image = node.clocks.to_local_clock(header, image)
+        self.images.add(Stamped(header, image, node.clock.wall_at(mono_ns)))
+        self.received_s = mono_ns / 1e9
 
 
-def _seen_image(
-    camera: Any, observation: Observation, answer: ActionSteps
-) -> tuple[bytes, zenoh.Encoding]:
-    rgb = (answer.pictures or {}).get(camera.camera)
-    if rgb is None:
-        rgb = observation.images[camera.camera]
-        rgb = np.ascontiguousarray(rgb[..., ::-1]) if camera.colour == "bgr" else rgb
-    return encode_jpeg(Image(np.asarray(rgb)), SEEN_QUALITY), zenoh.Encoding.IMAGE_JPEG
+def colour_stream(
+    spec: CameraSpec, node: Node, images: History, *, jpeg: bool, history_s: float, changed: Wake
+) -> CameraStream:
+    """The stream that suits a model: raw, JPEG, or JPEG in its input size."""
+    keys, name = node.keys, spec.camera
+    settings = node.profile.cameras.get(name)
+    wanted = [keys.camera_jpeg(name) if jpeg else keys.camera_raw(name)]
+    if jpeg and settings is not None and settings.fit_for_workers:
+        size = size_variant(spec)
+        if size is not None:
+            wanted.insert(0, keys.camera_fitted(name, size))
+    rates_hz = (settings.rate_hz, settings.jpeg_rate_hz if jpeg else None) if settings else ()
+    return CameraStream(
+        *(node, name, wanted, images, _decode_jpeg if jpeg else decode_raw),
+        patience_s=max([PATIENCE_S, *(PERIODS / rate for rate in rates_hz if rate)]),
+        history_s=history_s,
+        changed=changed,
+    )
 
 
-def _seen_depth(
-    camera: Any, observation: Observation, _: ActionSteps
-) -> tuple[bytes, zenoh.Encoding]:
-    depth = Depth(observation.depth[camera.camera], camera.unit_m)
-    encoding = zenoh.Encoding.IMAGE_PNG.with_schema(depth_schema(depth))
-    return encode_depth(depth), encoding
+def _decode_jpeg(payload: bytes, _: str) -> Image:
+    return decode_jpeg(payload)
+
+
+class StateStream:
+    """One stream of states, of at most `size` samples between two calls of `poll`, from these to
+    `states`. Unless `every` one is needed, those that no image needs are not decoded."""
+
+    def __init__(
+        self, node: Node, key: str, kind: type[Any], states: History, size: int, *, every: bool
+    ) -> None:
+        self._node, self._kind, self._states, self._every = node, kind, states, every
+        self._writer = SingleWriterFilter(STREAM_PATIENCE_S)
+        ring = CallbackRing if every else ZenohRing
+        self._ring: CallbackRing | ZenohRing = node.subscribe(key, ring(size, SMALL_BYTES))
+
+    def poll(self, since_ns: int) -> None:
+        """Decode what was received since the last call: the last before `since_ns`, and later."""
+        arrivals = self._ring.drain()
+        for arrival in arrivals if self._every else arrivals[self._first(arrivals, since_ns) :]:
+            state = self._node.decode(self._kind, arrival, self._writer)
+            if state is not None:
+                self._states.add(state)
+
+    def _first(self, arrivals: Sequence[ReceivedSample], since_ns: int) -> int:
+        """The last that the writer measured before `since_ns`, or its first; not a repetition."""
+        first = 0
+        for number in reversed(range(len(arrivals))):
+            try:
+                header = header_of(arrivals[number].sample)
+            except CodecError:
+                continue
+            if self._writer.is_next(header):
+                first = number
+                header, _ = self._node.clocks.to_local_clock(header, None)
+                if header.stamp_wall_ns <= since_ns:
+                    break
+        return first
