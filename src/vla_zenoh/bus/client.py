@@ -41,7 +41,91 @@ DROPPED_HINT = (
 )
 
 
-class Client:
+class NodeRegistry:
+    """Live nodes and their last status, of any name; safe to use from several threads.
+
+    Any client that may publish a status may do so under any name. So there is always a place for
+    the `expected` nodes of the profile, and a quota for all others; `up` runs for weeks. `dropped`
+    counts statuses and tokens that were not kept, or made room for others.
+    """
+
+    def __init__(
+        self, expected: Iterable[str] = (), clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._expected = frozenset(expected)
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._alive: set[str] = set()
+        self._statuses: dict[str, tuple[NodeStatus, float]] = {}  # the newest comes last
+        self.dropped = 0
+
+    @property
+    def alive(self) -> frozenset[str]:
+        """Names of live nodes."""
+        with self._lock:
+            return frozenset(self._alive)
+
+    def token_appeared(self, name: str) -> None:
+        """A liveliness token appeared."""
+        with self._lock:
+            full = len(self._alive - self._expected) >= MAX_OTHERS
+            if self._fit(name) and (name in self._expected or not full):
+                self._alive.add(name)
+            else:
+                self.dropped += 1
+
+    def token_gone(self, name: str) -> None:
+        """A liveliness token is gone."""
+        with self._lock:
+            self._alive.discard(name)
+
+    def status_received(self, name: str, status: NodeStatus, size: int) -> None:
+        """Keep the status of the node that its key names; `size`: in bytes."""
+        with self._lock:
+            fits = self._fit(name) and size <= MAX_STATUS_BYTES
+            if fits:
+                self._statuses.pop(name, None)
+            if fits and (name in self._expected or self._make_room()):
+                self._statuses[name] = (status, self._clock())
+            else:
+                self.dropped += 1
+
+    def status(self, name: str) -> NodeStatus | None:
+        """The last status of a node, None before the first."""
+        with self._lock:
+            found = self._statuses.get(name)
+        return found[0] if found else None
+
+    def snapshot(self) -> dict[str, tuple[NodeStatus, float, bool]]:
+        """Node -> (status, age in s, alive), by name."""
+        now_s = self._clock()
+        with self._lock:
+            return {
+                name: (status, now_s - received_s, name in self._alive)
+                for name, (status, received_s) in sorted(self._statuses.items())
+            }
+
+    @staticmethod
+    def _fit(name: str) -> bool:
+        try:
+            return bool(key_chunk(name, "node"))
+        except ProfileError:
+            return False
+
+    def _make_room(self) -> bool:
+        """Whether one more status fits, after dropping the oldest of a node that is gone."""
+        others = [name for name in self._statuses if name not in self._expected]
+        if len(others) < MAX_OTHERS:
+            return True
+        oldest = next((name for name in others if name not in self._alive), None)
+        if oldest is None:
+            return False
+        del self._statuses[oldest]
+        self.dropped += 1
+        return True
+
+
+class Client(NodeRegistry):
     """Client of one robot: settings, activation, and the last status of every node.
 
     ::
@@ -55,9 +139,8 @@ class Client:
     """
 
     def __init__(self, profile: Profile, session: zenoh.Session) -> None:
+        super().__init__(one.node for one in identities(profile))
         self.profile, self.session, self.keys = profile, session, profile.keys
-        self._lock = threading.Lock()
-        self._nodes = NodeRegistry(one.node for one in identities(profile))
         self.expected = expected_nodes(profile)
         self.events: deque[tuple[str, Header, Event]] = deque(maxlen=MAX_EVENTS)
         self.task: Task | None = None
@@ -97,7 +180,7 @@ class Client:
         found = self._decode(NodeStatus, sample, MAX_STATUS_BYTES)
         if found is not None:
             name = last_chunk(str(sample.key_expr))
-            self._nodes.status_received(name, found[1], len(sample.payload))
+            self.status_received(name, found[1], len(sample.payload))
 
     def _on_event(self, sample: zenoh.Sample) -> None:
         found = self._decode(Event, sample, MAX_EVENT_BYTES)
@@ -118,31 +201,12 @@ class Client:
     def _on_alive(self, sample: zenoh.Sample) -> None:
         name = last_chunk(str(sample.key_expr))
         if sample.kind == zenoh.SampleKind.PUT:
-            self._nodes.token_appeared(name)
+            self.token_appeared(name)
             return
-        self._nodes.token_gone(name)
+        self.token_gone(name)
         if name == "command":  # the task is no longer in force
             with self._lock:
                 self.task = None
-
-    @property
-    def alive(self) -> frozenset[str]:
-        """Names of live nodes."""
-        return self._nodes.alive
-
-    @property
-    def dropped(self) -> int:
-        """Number of statuses and tokens dropped because of their number or size."""
-        return self._nodes.dropped
-
-    def status(self, node: str) -> NodeStatus | None:
-        """The last status of a node, None before the first."""
-        found = self._nodes.status(node)
-        return found[0] if found else None
-
-    def snapshot(self) -> dict[str, tuple[NodeStatus, float, bool]]:
-        """Node -> (status, age in s, alive)."""
-        return self._nodes.snapshot()
 
     def pop_events(self) -> list[tuple[str, Header, Event]]:
         """Events since the last call, oldest first."""
@@ -289,7 +353,9 @@ class Client:
 
     def _stands(self, since_s: float) -> bool:
         """Whether the arm stands, by a status that is newer than the command."""
-        if (found := self._nodes.status("command")) is None:
+        with self._lock:
+            found = self._statuses.get("command")
+        if found is None:
             return False
         status, heard_s = found
         at_rest = status.detail.get("at_rest") is True
@@ -336,86 +402,3 @@ class Client:
                 for heard_s, event in self._refusals
                 if heard_s > since_s and event.what == f"{what}_refused"
             ]
-
-
-class NodeRegistry:
-    """Live nodes and their last status, of any name; safe to use from several threads.
-
-    Any client that may publish a status may do so under any name. So there is always a place for
-    the `expected` nodes of the profile, and a quota for all others; `up` runs for weeks. `dropped`
-    counts statuses and tokens that were not kept, or made room for others.
-    """
-
-    def __init__(
-        self, expected: Iterable[str] = (), clock: Callable[[], float] = time.monotonic
-    ) -> None:
-        self._expected = frozenset(expected)
-        self._clock = clock
-        self._lock = threading.Lock()
-        self._alive: set[str] = set()
-        self._statuses: dict[str, tuple[NodeStatus, float]] = {}  # the newest comes last
-        self.dropped = 0
-
-    @property
-    def alive(self) -> frozenset[str]:
-        """Names of live nodes."""
-        with self._lock:
-            return frozenset(self._alive)
-
-    def token_appeared(self, name: str) -> None:
-        """A liveliness token appeared."""
-        with self._lock:
-            full = len(self._alive - self._expected) >= MAX_OTHERS
-            if self._fit(name) and (name in self._expected or not full):
-                self._alive.add(name)
-            else:
-                self.dropped += 1
-
-    def token_gone(self, name: str) -> None:
-        """A liveliness token is gone."""
-        with self._lock:
-            self._alive.discard(name)
-
-    def status_received(self, name: str, status: NodeStatus, size: int) -> None:
-        """Keep the status of the node that its key names; `size`: in bytes."""
-        with self._lock:
-            fits = self._fit(name) and size <= MAX_STATUS_BYTES
-            if fits:
-                self._statuses.pop(name, None)
-            if fits and (name in self._expected or self._make_room()):
-                self._statuses[name] = (status, self._clock())
-            else:
-                self.dropped += 1
-
-    def status(self, name: str) -> tuple[NodeStatus, float] | None:
-        """The last status of a node and when it was received; None before the first."""
-        with self._lock:
-            return self._statuses.get(name)
-
-    def snapshot(self) -> dict[str, tuple[NodeStatus, float, bool]]:
-        """Node -> (status, age in s, alive), by name."""
-        now_s = self._clock()
-        with self._lock:
-            return {
-                name: (status, now_s - received_s, name in self._alive)
-                for name, (status, received_s) in sorted(self._statuses.items())
-            }
-
-    @staticmethod
-    def _fit(name: str) -> bool:
-        try:
-            return bool(key_chunk(name, "node"))
-        except ProfileError:
-            return False
-
-    def _make_room(self) -> bool:
-        """Whether one more status fits, after dropping the oldest of a node that is gone."""
-        others = [name for name in self._statuses if name not in self._expected]
-        if len(others) < MAX_OTHERS:
-            return True
-        oldest = next((name for name in others if name not in self._alive), None)
-        if oldest is None:
-            return False
-        del self._statuses[oldest]
-        self.dropped += 1
-        return True

@@ -207,7 +207,6 @@ class ClockOffsetFilter:
         self._window: deque[Exchange] = deque(maxlen=WINDOW)
         self._best: Exchange | None = None
         self._applied_ns = 0
-        self._applied_for: tuple[Exchange, int] | None = None
 
     def add(self, exchange: Exchange) -> bool:
         """Add an exchange; False: it is impossible, and ignored."""
@@ -241,10 +240,6 @@ class ClockOffsetFilter:
         best = self._best
         if best is None:
             return 0
-        # Only these make a difference: with its age an exchange only gets less certain.
-        if self._applied_for == (best, wall_minus_mono_ns):
-            return self._applied_ns
-        self._applied_for = best, wall_minus_mono_ns
         offset_ns = best.ahead_ns - wall_minus_mono_ns
         if abs(offset_ns / 1e9) > self._bound_s:
             self._applied_ns = 0

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 from functools import lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -89,7 +90,7 @@ def decode_jpeg(payload: bytes) -> Image:
     if payload.rstrip(b"\0")[-2:] != b"\xff\xd9":
         raise CodecError("truncated", "a JPEG file without its end")
     check_size(*_jpeg_size(payload))
-    return _decode(payload, "JPEG")
+    return _rgb(payload, "JPEG")
 
 
 def decode_png(payload: bytes) -> Image:
@@ -99,7 +100,7 @@ def decode_png(payload: bytes) -> Image:
     if len(payload) < 24 or not payload.startswith(PNG_BEGINS):
         raise CodecError("malformed", "not a PNG file")
     _checked_png_size(payload)
-    return _decode(payload, "PNG")
+    return _rgb(payload, "PNG")
 
 
 def _checked_png_size(payload: bytes) -> tuple[int, int]:
@@ -109,11 +110,15 @@ def _checked_png_size(payload: bytes) -> tuple[int, int]:
     return height, width
 
 
-def _decode(payload: bytes, kind: str) -> Image:
+def _pixels(payload: bytes, kind: str, flags: int) -> Any:
     try:
-        bgr = cv2.imdecode(np.frombuffer(payload, np.uint8), cv2.IMREAD_COLOR)
+        return cv2.imdecode(np.frombuffer(payload, np.uint8), flags)
     except cv2.error as error:
         raise CodecError("malformed", f"not a {kind} file: {error.err}") from error
+
+
+def _rgb(payload: bytes, kind: str) -> Image:
+    bgr = _pixels(payload, kind, cv2.IMREAD_COLOR)
     if bgr is None:
         raise CodecError("malformed", f"not a {kind} file that can be decoded")
     # In place: a large image is not held twice.
@@ -154,10 +159,7 @@ def decode_depth(payload: bytes, schema: str) -> Depth:
     size = _checked_png_size(payload)
     if payload[24:29] != _GREY_16:
         raise CodecError("invalid", "a depth image is a PNG file of one channel of 16 bits")
-    try:
-        counts = cv2.imdecode(np.frombuffer(payload, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
-        raise CodecError("malformed", f"not a PNG file: {error.err}") from error
+    counts = _pixels(payload, "PNG", cv2.IMREAD_UNCHANGED)
     if counts is None or counts.shape != size or counts.dtype != np.uint16:
         raise CodecError("malformed", "not a PNG file that can be decoded as depth")
     try:

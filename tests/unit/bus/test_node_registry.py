@@ -29,7 +29,7 @@ def test_a_node_is_alive_from_its_token_on_and_its_last_words_stay() -> None:
     assert here.snapshot() == {"sim": (status("sim"), 2.0, True)}
     here.token_gone("sim")
     assert here.snapshot() == {"sim": (status("sim"), 2.0, False)}
-    assert here.status("sim") == (status("sim"), 10.0)
+    assert here.status("sim") == status("sim")
     assert here.status("command") is None
     assert here.dropped == 0
 
