@@ -13,7 +13,7 @@ from camera_rig import camera_rig, until, write_video
 from rtsp_server import RtspServer
 
 from vla_zenoh.errors import NodeError
-from vla_zenoh.nodes.camera.capture import RtspSource
+from vla_zenoh.nodes.camera.opencv_sources import RtspSource
 from vla_zenoh.nodes.camera.source import STALL_S, prepare_opencv
 from vla_zenoh.profile.schema import CameraProfile
 

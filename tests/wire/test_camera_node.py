@@ -15,7 +15,7 @@ from camera_rig import Rig, await_match, camera_rig, grey, until, write_video
 from vla_zenoh.codec import message, records
 from vla_zenoh.codec.image import decode_raw
 from vla_zenoh.errors import NodeError
-from vla_zenoh.nodes.camera.sim_cameras import IDLE_PERIOD_S
+from vla_zenoh.nodes.camera.node import IDLE_PERIOD_S
 from vla_zenoh.profile import load_profile
 from vla_zenoh.profile.schema import CameraProfile
 from vla_zenoh.simulation.world import build_world

@@ -18,10 +18,17 @@ from hypothesis import strategies as st
 from vla_zenoh.errors import NodeError
 from vla_zenoh.lab.profile.check import check_profile
 from vla_zenoh.nodes.camera.camera_publisher import EARLY, LATE, RateLimiter, to_rgb
-from vla_zenoh.nodes.camera.capture import RtspSource, V4l2Source, captured_ns, why_not
-from vla_zenoh.nodes.camera.file import FileSource, natural, open_frames
 from vla_zenoh.nodes.camera.geometry import resize
 from vla_zenoh.nodes.camera.node import choose_cameras, make_source
+from vla_zenoh.nodes.camera.opencv_sources import (
+    FileSource,
+    RtspSource,
+    V4l2Source,
+    captured_ns,
+    natural,
+    open_frames,
+    why_not,
+)
 from vla_zenoh.nodes.camera.source import without_password
 from vla_zenoh.profile import load_profile
 from vla_zenoh.profile.schema import CAMERA_SOURCES, CameraProfile

@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vla_zenoh.nodes.camera.capture import V4l2Source, is_virtual
-from vla_zenoh.nodes.camera.file import FileSource
 from vla_zenoh.nodes.camera.image_check import ImageCheck, ImageFault
+from vla_zenoh.nodes.camera.opencv_sources import FileSource, V4l2Source, is_virtual
 from vla_zenoh.profile.schema import CameraCheck, CameraProfile
 
 RATE_HZ = 30

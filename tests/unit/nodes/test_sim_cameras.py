@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from vla_zenoh.nodes.camera.sim_cameras import COARSEST, RenderBudget
+from vla_zenoh.nodes.camera.node import COARSEST, RenderBudget
 
 RATE_HZ = 30.0
 
