@@ -19,8 +19,6 @@ from vla_zenoh.keys import last_chunk
 from vla_zenoh.nodes.camera.camera_publisher import OK, WAITING, CameraPublisher
 from vla_zenoh.nodes.camera.geometry import Intrinsics
 from vla_zenoh.nodes.camera.image_check import read_references
-from vla_zenoh.nodes.camera.opencv_sources import FileSource, RtspSource, V4l2Source
-from vla_zenoh.nodes.camera.realsense import RealsenseSource
 from vla_zenoh.nodes.camera.source import (
     STALL_S,
     Grabber,
@@ -59,6 +57,9 @@ def choose_cameras(profile: Profile, cameras: tuple[str, ...] | None) -> dict[st
 
 def make_source(profile: CameraProfile) -> Source:
     """The source of a camera, not open yet. Call it before threads start: it configures OpenCV."""
+    from vla_zenoh.nodes.camera.opencv_sources import FileSource, RtspSource, V4l2Source
+    from vla_zenoh.nodes.camera.realsense import RealsenseSource
+
     prepare_opencv()
     kind, _, rest = profile.source.partition(":")
     if kind == "v4l2":
