@@ -14,7 +14,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from vla_zenoh.control.limits import JointMotionLimits, MotionLimits, motion_limits
-from vla_zenoh.control.smoothing import Motion
+from vla_zenoh.control.smoothing import ROTATION_BOX, Motion
 from vla_zenoh.guard.reference_governor import (
     AT_REST,
     BRAKE_MARGIN,
@@ -55,9 +55,9 @@ BEGIN_M, BEGIN_RAD, BEGIN_JOINT_RAD = 0.002, 0.01, 0.004
 robot has braked by itself would make it jerk."""
 BEGIN_M_S, BEGIN_RAD_S = 0.03, 0.1
 """And it may move this fast, TCP or each joint: our streams begin at rest."""
-TURN_STOP, TURN_BESIDE = 0.55, 0.5
-"""Share of a rotation limit for each axis, so that the norm of three stays within it: in a stop,
-and in an offset from a motion that rotates as well."""
+TURN_BESIDE = 0.5
+"""Share of a rotation limit for each axis, so that the norm of three stays within it, in an offset
+from a motion that rotates as well; in a stop it is `ROTATION_BOX`."""
 
 Command = TypeVar("Command")
 
@@ -351,7 +351,7 @@ class PoseGuard(StreamGuard[Motion]):
     def __init__(self, pose: Pose, dt_s: float, timeout_s: float, brake: MotionLimits) -> None:
         self._limits = brake
         orders = (np.repeat(pair, 3) for pair in zip(*brake, strict=True))
-        shares = (np.repeat([1.0, share], 3) for share in (TURN_STOP, TURN_BESIDE))
+        shares = (np.repeat([1.0, share], 3) for share in (ROTATION_BOX, TURN_BESIDE))
         super().__init__(PoseSpace(), pose, dt_s, timeout_s, GovernorLimits(*orders, *shares))
 
     def _standing(self, here: Pose) -> Motion:
@@ -433,10 +433,8 @@ class JointGuard(StreamGuard[JointReference]):
 
 def pose_brake_limits(profile: Profile) -> MotionLimits:
     """`BRAKE_MARGIN` times the limits of a profile's pose stream."""
-    translation, rotation = motion_limits(profile.limits)
-    v, a, j = (BRAKE_MARGIN * limit for limit in translation)
-    spin_v, spin_a, spin_j = (BRAKE_MARGIN * limit for limit in rotation)
-    return MotionLimits((v, a, j), (spin_v, spin_a, spin_j))
+    limits = BRAKE_MARGIN * np.array(motion_limits(profile.limits))
+    return MotionLimits(*map(tuple, limits.tolist()))
 
 
 def joint_motion_limits(profile: Profile, margin: float = 1.0) -> JointMotionLimits:

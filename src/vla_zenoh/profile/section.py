@@ -79,6 +79,7 @@ WITH_REMOVABLE = {("cameras",), ("ros2", "cameras"), ("models",), ("serves",), (
 """Maps of which null removes an inherited entry; null in place of the map: all of them."""
 NOT_MADE = {"depth": "depth images are published where depth_unit_m is set."}
 """Key that looks like a slip of another one but asks for more than exists -> what there is."""
+OWN_ROBOT = "A robot of your own is driver: arm, with a Python file: arm: {file: my_arm.py}"
 _NO_VALUE_SHOWN = {"missing", "extra_forbidden", "too_long", "too_short", "value_error"}
 
 
@@ -184,6 +185,8 @@ def _why(fault: Any, place: Place, model: type[Section]) -> str:
         words = f"wants a map of: {', '.join(names)}" if names else words
         if given is None:
             words = f"is empty: {words}, or leave it out"
+    if place == ("robot", "driver") and fault["type"] == "literal_error":
+        return f"{words} (given: {shown(given)}). {OWN_ROBOT}"
     if fault["type"] == "string_type" and isinstance(given, (bool, int, float)):
         words = "wants text; put it in quotes"
     if fault["type"] in _NO_VALUE_SHOWN or isinstance(given, (dict, BaseModel)):

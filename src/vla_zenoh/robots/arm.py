@@ -203,7 +203,7 @@ class Arm:
             stamp_ns = mono_ns if driver.lockstep else self._node.clock.wall_at(mono_ns)
         else:
             stamp_ns, joints, _, pose, gripper = measurement
-            tcp, held_rad = self.held()
+            tcp, held_rad = self._held()
             if tcp is not None:
                 pose = replace(
                     pose,
@@ -285,7 +285,7 @@ class Arm:
         """The robot's controller holds the last set-point."""
         return self._hold.held or self._driver.simulated
 
-    def held(self) -> tuple[Pose | None, FloatArray | None]:
+    def _held(self) -> tuple[Pose | None, FloatArray | None]:
         """Set-point that a real robot's controller holds: TCP pose, (n,) joints in joint mode.
 
         None where it is unknown: nothing was sent, or the arm was moved by other means.

@@ -13,7 +13,7 @@ import numpy as np
 from vla_zenoh.errors import CodecError, RecordError
 from vla_zenoh.kinematics.fingers import Fingers
 from vla_zenoh.kinematics.kinematics import Kinematics
-from vla_zenoh.kinematics.so3 import Pose, quat_from_rotation
+from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.profile import Profile
 from vla_zenoh.robots.driver import Measurement
 from vla_zenoh.types import FloatArray, GripperState, JointState, PoseState
@@ -85,7 +85,7 @@ class JointReading:
 
     def __init__(self, profile: Profile, kinematics: Kinematics) -> None:
         robot = profile.robot
-        self._arm, self._finger_names = robot.arm_joints, robot.finger_joints
+        self.arm_joints, self._finger_names = robot.arm_joints, robot.finger_joints
         self._fingers = Fingers(robot.gripper, len(robot.finger_joints))
         self._max_width_m = robot.gripper.max_width_m
         self._kinematics = kinematics
@@ -111,12 +111,12 @@ class JointReading:
         """
         places = {name: index for index, name in enumerate(joints.names)}
         self._take_fingers(joints, places, stamp_ns)
-        missing = [name for name in self._arm if name not in places]
-        if len(missing) == len(self._arm):
+        missing = [name for name in self.arm_joints if name not in places]
+        if len(missing) == len(self.arm_joints):
             return None
         if missing:
             raise CodecError("partial", f"joint states of this arm without {', '.join(missing)}")
-        at = [places[name] for name in self._arm]
+        at = [places[name] for name in self.arm_joints]
         position = _finite("position", joints.position[at])
         self._check(position - self._middle_rad, self._furthest_rad, position, "rad")
         if joints.velocity is None:
@@ -126,7 +126,7 @@ class JointReading:
             self._check(velocity, self._fastest_rad_s, velocity, "rad/s")
         self._arm_newness.check(stamp_ns)
         try:
-            state = JointState(self._arm, position, velocity, self._effort(joints, at))
+            state = JointState(self.arm_joints, position, velocity, self._effort(joints, at))
         except RecordError as error:
             raise CodecError("invalid", str(error)) from error
         self.joints, self.stamp_ns = state, stamp_ns
@@ -139,7 +139,7 @@ class JointReading:
             joint = int(wrong[0])
             raise CodecError(
                 "invalid",
-                f"{self._arm[joint]} at {values[joint]:.4g} {unit}: more than "
+                f"{self.arm_joints[joint]} at {values[joint]:.4g} {unit}: more than "
                 f"{BEYOND:g} times what its description allows",
             )
 
@@ -176,21 +176,15 @@ class JointReading:
         self.width_m, self.width_stamp_ns = width_m, stamp_ns
 
     # -- state --------------------------------------------------------------------------------
-    def tcp(self) -> tuple[Pose, FloatArray]:
-        """Pose and twist (6,) of the TCP, by our kinematics; needs `joints`."""
-        assert self.joints is not None
-        ordered = self._kinematics.joints_of(self.joints)
-        pose, jacobian = self._kinematics.pose_and_jacobian(ordered)
-        velocity = self._kinematics.ordered(self.joints.names, self.joints.velocity_rad_s)
-        return pose, jacobian @ velocity
-
     def measurement(self, wrench: FloatArray | None, gripper: GripperState | None) -> Measurement:
         """The newest `joints` as records, or a `RecordError`: finite, but too large for one."""
-        assert self.joints is not None
-        tcp, twist = self.tcp()
+        joints, kinematics = self.joints, self._kinematics
+        assert joints is not None
+        tcp, jacobian = kinematics.pose_and_jacobian(kinematics.joints_of(joints))
+        twist = jacobian @ kinematics.ordered(joints.names, joints.velocity_rad_s)
         quat_xyzw = quat_from_rotation(tcp.rotation)
         pose = PoseState(tcp.position_m, quat_xyzw, twist, wrench, None, None)
-        return Measurement(self.stamp_ns, self.joints, tcp, pose, gripper)
+        return Measurement(self.stamp_ns, joints, tcp, pose, gripper)
 
     def gripper(self, *, busy: bool, wanted_m: float | None, held: bool) -> GripperState | None:
         """State of the gripper, None where it is not known.

@@ -13,7 +13,6 @@ from typing import Any
 
 from vla_zenoh.bus.metrics import RateMeter
 from vla_zenoh.errors import NodeError, ProfileError, in_words
-from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.policy.loader import make_robot
 from vla_zenoh.profile import Profile
 from vla_zenoh.robot import Reading, numbers
@@ -54,7 +53,7 @@ class PythonDriver(RobotDriver):
     def __init__(self, profile: Profile) -> None:
         super().__init__(profile)
         self.robot, self._called = make_arm(profile)
-        self._reading = PythonReading(profile, self.kinematics)
+        self._state = JointReading(profile, self.kinematics)
         self._fault = Fault()
         self._complaint = ""
         """Why the last reading was rejected."""
@@ -110,7 +109,7 @@ class PythonDriver(RobotDriver):
             if measured_ns == self.measured_ns:
                 return None  # unchanged: the robot is slower than this loop
             stamp_ns = self.report.clock.wall_at(measured_ns)
-            measured = self._reading.take(reading, stamp_ns, self._asked_m)
+            measured = measurement_of(reading, stamp_ns, self._asked_m, self._state)
         except (TypeError, ValueError) as error:
             reason = getattr(error, "reason", "invalid")
             self._complaint = f"{self._called}: read: {one_line(error, MAX_WORDS)}"
@@ -190,39 +189,34 @@ def _measured_ns(reading: Reading) -> int:
     return measured_ns
 
 
-class PythonReading:
-    """Validates the readings of one arm, and converts them to our records."""
+def measurement_of(
+    reading: Reading, stamp_ns: int, asked_m: float, arm: JointReading
+) -> Measurement:
+    """A reading that was measured at `stamp_ns` (wall clock) as the records of an arm.
 
-    def __init__(self, profile: Profile, kinematics: Kinematics) -> None:
-        self._names = profile.robot.arm_joints
-        self._state = JointReading(profile, kinematics)
+    If it has no width, that is `asked_m`, the last commanded one.
 
-    def take(self, reading: Reading, stamp_ns: int, asked_m: float) -> Measurement:
-        """Convert a reading that was measured at `stamp_ns` (wall clock).
+    Raises:
+        ValueError: a value is not a number, or impossible for this arm; it rejects all.
+    """
+    names = arm.arm_joints
 
-        If it has no width, that is `asked_m`, the last commanded one.
+    def maybe(name: str, size: int) -> FloatArray | None:
+        given = getattr(reading, name)
+        return None if given is None else numbers(name, given, size)
 
-        Raises:
-            ValueError: a value is not a number, or impossible for this arm; it rejects all.
-        """
-        count = len(self._names)
-
-        def maybe(name: str, size: int) -> FloatArray | None:
-            given = getattr(reading, name)
-            return None if given is None else numbers(name, given, size)
-
-        joints = Joints(
-            stamp_ns,
-            self._names,
-            numbers("position_rad", reading.position_rad, count),
-            maybe("velocity_rad_s", count),
-            maybe("effort_nm", count),
-        )
-        wrench = maybe("wrench", 6)
-        width_m = asked_m if reading.width_m is None else reading.width_m
-        gripper = GripperState(width_m, reading.moving, reading.holding)
-        self._state.take(joints, stamp_ns)
-        return self._state.measurement(wrench, gripper)
+    joints = Joints(
+        stamp_ns,
+        names,
+        numbers("position_rad", reading.position_rad, len(names)),
+        maybe("velocity_rad_s", len(names)),
+        maybe("effort_nm", len(names)),
+    )
+    wrench = maybe("wrench", 6)
+    width_m = asked_m if reading.width_m is None else reading.width_m
+    gripper = GripperState(width_m, reading.moving, reading.holding)
+    arm.take(joints, stamp_ns)
+    return arm.measurement(wrench, gripper)
 
 
 class Fault:

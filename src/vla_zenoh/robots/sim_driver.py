@@ -25,7 +25,7 @@ from vla_zenoh.keys import Kind
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import Profile
 from vla_zenoh.robots.arm import Arm
-from vla_zenoh.robots.driver import DriverStatus, Measurement, Report, RobotDriver
+from vla_zenoh.robots.driver import DriverStatus, Measurement, RobotDriver
 from vla_zenoh.simulation.world import STEP_NS, build_world
 from vla_zenoh.types import FloatArray, GripperCommand, ObjectPoses, SceneState
 from vla_zenoh.types.records import JointReference, PoseReference
@@ -155,8 +155,24 @@ class SimDriver(RobotDriver):
 
     # -- time ---------------------------------------------------------------------------------
     def pace(self) -> Callable[[], Tick]:
-        """Ticks of 1 ms that keep to the clock."""
-        return RealTimePace(self.report).wait
+        """Ticks of 1 ms on the monotonic clock; late ones follow each other at once."""
+        counters, next_ns = self.report.counters, time.monotonic_ns()
+        counters["sim.overruns"] = 0
+
+        def wait() -> Tick:
+            nonlocal next_ns
+            next_ns += STEP_NS
+            late_ns = time.monotonic_ns() - next_ns
+            if late_ns < 0:
+                time.sleep(-late_ns / 1e9)
+            elif late_ns > CATCH_UP_NS:
+                counters["sim.time_given_up_ms"] += late_ns // 1_000_000
+                next_ns += late_ns
+            elif late_ns > STEP_NS:
+                counters["sim.overruns"] += 1
+            return Tick(1, next_ns, 0.0, 0.0)
+
+        return wait
 
     def serve_lockstep(self, node: RobotNode, stop: threading.Event) -> None:
         """Publish the first state, and answer ``sim/step`` until `stop` is set."""
@@ -261,28 +277,3 @@ class SimPart(RobotDriver):
     @property
     def joint_range_rad(self) -> tuple[FloatArray, FloatArray]:
         return self._arm.joint_range_rad
-
-
-class RealTimePace:
-    """Ticks of 1 ms on the monotonic clock; late ones follow each other at once.
-
-    The counters of `report` get the late ticks and the time given up.
-    """
-
-    def __init__(self, report: Node | Report) -> None:
-        self._counters = report.counters
-        self._counters["sim.overruns"] = 0
-        self._next_ns = time.monotonic_ns()
-
-    def wait(self) -> Tick:
-        """Sleep until the next multiple of 1 ms, or return at once to catch up."""
-        self._next_ns += STEP_NS
-        late_ns = time.monotonic_ns() - self._next_ns
-        if late_ns < 0:
-            time.sleep(-late_ns / 1e9)
-        elif late_ns > CATCH_UP_NS:
-            self._counters["sim.time_given_up_ms"] += late_ns // 1_000_000
-            self._next_ns += late_ns
-        elif late_ns > STEP_NS:
-            self._counters["sim.overruns"] += 1
-        return Tick(1, self._next_ns, 0.0, 0.0)

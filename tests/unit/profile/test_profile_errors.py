@@ -58,6 +58,12 @@ def told(path: str) -> list[str]:
     return [line.replace(f"{Path(path).parent}/", "") for line in str(caught.value).splitlines()]
 
 
+def test_who_names_an_unknown_driver_is_told_how_to_write_one(write: Write) -> None:
+    (said,) = told(write("robot: {driver: kinova}\n"))
+    assert "'lerobot' or 'arm' (given: 'kinova')" in said
+    assert said.endswith("arm: {file: my_arm.py}")
+
+
 @pytest.mark.parametrize(("text", "said"), WRONG)
 def test_a_fault_is_told_so_that_it_can_be_mended(write: Write, text: str, said: str) -> None:
     lines = told(write(text))

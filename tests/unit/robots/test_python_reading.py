@@ -11,7 +11,8 @@ import pytest
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.profile import load_profile
 from vla_zenoh.robot import Reading
-from vla_zenoh.robots.python_driver import FAULT_NS, MAX_WORDS, Fault, PythonReading
+from vla_zenoh.robots.joint_reading import JointReading
+from vla_zenoh.robots.python_driver import FAULT_NS, MAX_WORDS, Fault, measurement_of
 
 PROFILE = load_profile("panda_sim")
 KINEMATICS = make_kinematics(PROFILE)
@@ -22,7 +23,7 @@ GOOD = Reading(HOME_RAD, width_m=0.05, moving=True, wrench=np.arange(6.0))
 
 
 def test_a_reading_that_holds_becomes_our_records() -> None:
-    taken = PythonReading(PROFILE, KINEMATICS).take(GOOD, STAMP_NS, ASKED_M)
+    taken = measurement_of(GOOD, STAMP_NS, ASKED_M, JointReading(PROFILE, KINEMATICS))
     np.testing.assert_array_equal(taken.joints.position_rad, HOME_RAD)
     np.testing.assert_array_equal(taken.pose.position_m, taken.tcp.position_m)
     np.testing.assert_array_equal(taken.pose.wrench, np.arange(6.0))
@@ -31,7 +32,8 @@ def test_a_reading_that_holds_becomes_our_records() -> None:
 
 
 def test_an_arm_that_does_not_say_its_width_is_believed_to_be_where_it_was_asked_to_be() -> None:
-    taken = PythonReading(PROFILE, KINEMATICS).take(replace(GOOD, width_m=None), STAMP_NS, ASKED_M)
+    arm = JointReading(PROFILE, KINEMATICS)
+    taken = measurement_of(replace(GOOD, width_m=None), STAMP_NS, ASKED_M, arm)
     assert taken.gripper.width_m == ASKED_M
 
 
@@ -52,10 +54,10 @@ def test_an_arm_that_does_not_say_its_width_is_believed_to_be_where_it_was_asked
     ],
 )
 def test_what_does_not_hold_is_refused_by_name(nonsense: dict[str, Any], why: str) -> None:
-    readings = PythonReading(PROFILE, KINEMATICS)
+    arm = JointReading(PROFILE, KINEMATICS)
     with pytest.raises(ValueError, match=why):
-        readings.take(replace(GOOD, **nonsense), STAMP_NS, ASKED_M)
-    readings.take(GOOD, STAMP_NS + 1, ASKED_M)
+        measurement_of(replace(GOOD, **nonsense), STAMP_NS, ASKED_M, arm)
+    measurement_of(GOOD, STAMP_NS + 1, ASKED_M, arm)
 
 
 def test_a_fault_lasts_until_the_robot_is_well_and_long_enough_to_be_heard() -> None:

@@ -65,7 +65,9 @@ def test_joints_in_any_order_become_the_arms_own(arm: JointReading) -> None:
     assert state.position_rad.tolist() == HOME_RAD.tolist()
     assert arm.width_m == pytest.approx(0.03)
     expected = panda().forward(HOME_RAD).position_m
-    assert np.abs(arm.tcp()[0].position_m - expected).max() < POSITION_TOLERANCE_M
+    assert (
+        np.abs(arm.measurement(None, None).tcp.position_m - expected).max() < POSITION_TOLERANCE_M
+    )
 
 
 def test_one_finger_stands_for_both(arm: JointReading) -> None:
@@ -168,7 +170,7 @@ def test_the_twist_of_the_tcp_follows_the_joints(arm: JointReading) -> None:
     before = kinematics.forward(HOME_RAD)
     after = kinematics.forward(HOME_RAD + velocity[:7] * step_s)
     expected = (after.position_m - before.position_m) / step_s
-    assert arm.tcp()[1][:3] == pytest.approx(expected, abs=1e-6)
+    assert arm.measurement(None, None).pose.twist[:3] == pytest.approx(expected, abs=1e-6)
 
 
 def test_a_stamp_that_stands_still_is_a_frozen_robot() -> None:

@@ -69,13 +69,9 @@ class EstopOrder:
             self._ours_ns = time.monotonic_ns()
             publish()
 
-    def overtook(self, asked_ns: int) -> bool:
-        """Whether a stop came after `asked_ns` on the monotonic clock."""
-        return max(self._ours_ns, self._others_ns) > asked_ns
-
     def check(self, asked_ns: int) -> None:
-        """Raise a `SessionError` if a stop came after `asked_ns`."""
-        if self.overtook(asked_ns):
+        """Raise a `SessionError` if a stop came after `asked_ns` on the monotonic clock."""
+        if max(self._ours_ns, self._others_ns) > asked_ns:
             raise SessionError("an emergency stop came after this request; send it again")
 
     def unless_stopped(self, asked_ns: int, publish: Callable[[], None]) -> None:
