@@ -15,7 +15,7 @@ from vla_zenoh.lab.cli.profile import profile_app
 from vla_zenoh.policy.loader import make_robot
 from vla_zenoh.profile import load_profile
 from vla_zenoh.resources import robot_urdf
-from vla_zenoh.ros2.gripper_actions import position
+from vla_zenoh.ros2.writers import position
 from vla_zenoh.types import JointCommand
 
 TEXT_FILE = Path(__file__).parents[2] / "docs" / "how-to" / "robots.md"

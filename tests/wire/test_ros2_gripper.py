@@ -24,8 +24,8 @@ from vla_zenoh.robots.arm import GripperCommands
 from vla_zenoh.robots.driver import RobotDriver
 from vla_zenoh.robots.ros2.gripper import Gripper
 from vla_zenoh.robots.ros2.ros_graph import RosGraph
-from vla_zenoh.ros2.gripper_actions import SUCCEEDED
 from vla_zenoh.ros2.messages import Messages
+from vla_zenoh.ros2.readers import SUCCEEDED
 from vla_zenoh.types import GripperCommand
 
 HOUR_NS = 3_600_000_000_000

@@ -118,7 +118,7 @@ def test_what_was_asked_before_a_stop_is_not_done_after_it_and_what_was_asked_la
 def test_a_stop_of_anybody_counts(rig: Rig) -> None:
     calls = rig.queue_behind_a_reset()
     rig.operator.put(rig.keys.stop, "stop")
-    until("it is heard here", lambda: rig.people._stops._others_ns > 0)
+    until("it is heard here", lambda: rig.people._others_stop_ns > 0)
     rig.agreed.set()
     answers = [call.result() for call in calls]
     assert [answer.success for answer in answers] == [True, False, False]

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from vla_zenoh.codec.image import PNG_BEGINS, check_size, decode_jpeg, decode_png
 from vla_zenoh.errors import CodecError
 from vla_zenoh.ros2.messages import MAX_MESSAGE_BYTES, MAX_PICTURE_BYTES, SECOND_NS, Messages
+from vla_zenoh.ros2.writers import GRASP, GRIPPER_COMMAND, PARALLEL_COMMAND
 from vla_zenoh.types import MAX_NAMES, FloatArray
 from vla_zenoh.types.records import Joints
 
@@ -23,6 +24,8 @@ IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedIm
 TEXT = "std_msgs/msg/String"
 CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1}
 _JPEG = b"\xff\xd8\xff"
+SUCCEEDED = 4
+"""action_msgs/GoalStatus.STATUS_SUCCEEDED."""
 
 
 class RosImage(NamedTuple):
@@ -39,6 +42,14 @@ class Wrench(NamedTuple):
     stamp_ns: int
     frame: str
     wrench: FloatArray
+
+
+class GripperOutcome(NamedTuple):
+    """Result of a goal, with the driver's message."""
+
+    reached: bool
+    holding: bool
+    message: str
 
 
 def read(messages: Messages, kind: str, payload: bytes) -> Any:
@@ -145,3 +156,13 @@ READERS: dict[str, Callable[[Any], Any]] = {
     TEXT: _text,
 }
 """Type -> decoder: message -> sample; raises `CodecError` or `ValueError`."""
+
+
+def outcome(action: str, response: Any) -> GripperOutcome:
+    """Outcome of a goal by the answer of get_result."""
+    result = response.result
+    reached = response.status == SUCCEEDED
+    if action in (GRIPPER_COMMAND, PARALLEL_COMMAND):
+        return GripperOutcome(reached and bool(result.reached_goal), bool(result.stalled), "")
+    success = reached and bool(result.success)
+    return GripperOutcome(success, success and action == GRASP, str(result.error)[:300])

@@ -15,13 +15,19 @@ import numpy as np
 from rosbags.interfaces import Nodetype
 
 from vla_zenoh.errors import ProfileError
+from vla_zenoh.kinematics.fingers import Fingers
+from vla_zenoh.profile import GripperProfile
+from vla_zenoh.profile.robot import Ros2Gripper
 from vla_zenoh.ros2.messages import SECOND_NS, Messages
-from vla_zenoh.types import FloatArray, JointCommand, NodeStatus, PoseCommand
+from vla_zenoh.types import FloatArray, GripperCommand, JointCommand, NodeStatus, PoseCommand
 
 POSE, POSE_STAMPED = "geometry_msgs/msg/Pose", "geometry_msgs/msg/PoseStamped"
 TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 NUMBER, NUMBERS = "std_msgs/msg/Float64", "std_msgs/msg/Float64MultiArray"
 _HEADER, _TWIST = "std_msgs/msg/Header", "geometry_msgs/msg/Twist"
+MOVE, GRASP = "franka_msgs/action/Move", "franka_msgs/action/Grasp"
+GRIPPER_COMMAND = "control_msgs/action/GripperCommand"
+PARALLEL_COMMAND = "control_msgs/action/ParallelGripperCommand"
 NOW_NS = 0
 """A trajectory's stamp of zero means: from now on, whatever the robot's clock says."""
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
@@ -56,7 +62,7 @@ def _time_fields(time_ns: int) -> dict[str, int]:
     return {"sec": sec, "nanosec": nanosec}
 
 
-# -- joints and gripper ---------------------------------------------------------------------------
+# -- joints ---------------------------------------------------------------------------------------
 def joint_writer(messages: Messages, kind: str, lead_ns: int) -> Write:
     """How joint positions are written as `kind`.
 
@@ -90,11 +96,6 @@ def joint_writer(messages: Messages, kind: str, lead_ns: int) -> Write:
     if found is None:
         raise ProfileError(f"joint positions cannot be sent as {kind}")
     return found
-
-
-def position_message(messages: Messages, kind: str, position: float) -> Any:
-    """The opening of a gripper as its driver takes it, as `NUMBER` or `NUMBERS`."""
-    return messages.new(kind, data=np.array([position]) if kind == NUMBERS else position)
 
 
 # -- poses ----------------------------------------------------------------------------------------
@@ -162,6 +163,70 @@ def _pose(messages: Messages, command: PoseCommand) -> Any:
 def _xyz(messages: Messages, kind: str, values: FloatArray) -> Any:
     x, y, z = values.tolist()
     return messages.new(kind, x=x, y=y, z=z)
+
+
+# -- gripper --------------------------------------------------------------------------------------
+def position(ros2: Ros2Gripper, gripper: GripperProfile, width_m: float) -> float:
+    """The number that the gripper's driver takes for an opening: m, or rad of its joint."""
+    if ros2.position == "joint" or (ros2.position is None and gripper.joint_ends is not None):
+        return Fingers(gripper, 0).position(width_m)
+    return width_m / 2 if ros2.position == "finger" else width_m
+
+
+def send_goal(
+    messages: Messages,
+    action: str,
+    goal_id: bytes,
+    command: GripperCommand,
+    *,
+    position: float,
+    max_width_m: float,
+) -> Any:
+    """The request that begins a goal with this id.
+
+    `position` is the opening as the driver takes it, see `position`; `MOVE` and `GRASP` take
+    widths. A grasp succeeds at whatever width up to `max_width_m`.
+    """
+    goal: dict[str, Any] = {"width": command.width_m, "speed": command.speed_m_s}
+    if action == GRASP:
+        epsilon = messages.new("franka_msgs/msg/GraspEpsilon", inner=max_width_m, outer=max_width_m)
+        goal |= {"epsilon": epsilon, "force": command.force_n}
+    elif action == PARALLEL_COMMAND:
+        # It has one joint, which needs no name; its speed, in the joint's unit, is the driver's.
+        order = messages.new(
+            "sensor_msgs/msg/JointState",
+            position=np.array([position]),
+            effort=np.array([command.force_n]),
+        )
+        goal = {"command": order}
+    elif action == GRIPPER_COMMAND:
+        order = messages.new(
+            "control_msgs/msg/GripperCommand", position=position, max_effort=command.force_n
+        )
+        goal = {"command": order}
+    return messages.new(
+        f"{action}_SendGoal_Request",
+        goal_id=uuid(messages, goal_id),
+        goal=messages.new(f"{action}_Goal", **goal),
+    )
+
+
+def uuid(messages: Messages, goal_id: bytes) -> Any:
+    """A unique_identifier_msgs/UUID of 16 bytes."""
+    return messages.new(
+        "unique_identifier_msgs/msg/UUID", uuid=np.frombuffer(goal_id, np.uint8).copy()
+    )
+
+
+def cancel(messages: Messages, goal_id: bytes) -> Any:
+    """The request that ends this goal alone."""
+    info = messages.new("action_msgs/msg/GoalInfo", goal_id=uuid(messages, goal_id))
+    return messages.new("action_msgs/srv/CancelGoal_Request", goal_info=info)
+
+
+def position_message(messages: Messages, kind: str, position: float) -> Any:
+    """The opening of a gripper as its driver takes it, as `NUMBER` or `NUMBERS`."""
+    return messages.new(kind, data=np.array([position]) if kind == NUMBERS else position)
 
 
 # -- status of our nodes, for rqt_robot_monitor and the like --------------------------------------

@@ -22,7 +22,7 @@ from vla_zenoh.robots.joint_reading import (
     RobotClock,
     StampFilter,
 )
-from vla_zenoh.ros2.gripper_actions import ActionGoal, GoalSequencer
+from vla_zenoh.robots.ros2.gripper import ActionGoal, GoalSequencer
 from vla_zenoh.types import GripperCommand
 from vla_zenoh.types.records import Joints
 

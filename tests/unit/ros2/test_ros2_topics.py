@@ -12,26 +12,22 @@ from vla_zenoh.errors import CodecError, ProfileError
 from vla_zenoh.profile import GripperProfile
 from vla_zenoh.profile.robot import Ros2Gripper
 from vla_zenoh.ros2 import readers
-from vla_zenoh.ros2.gripper_actions import (
+from vla_zenoh.ros2.messages import Messages
+from vla_zenoh.ros2.readers import GripperOutcome, RosImage, outcome
+from vla_zenoh.ros2.writers import (
+    DIAGNOSTICS,
     GRASP,
     GRIPPER_COMMAND,
     MOVE,
     PARALLEL_COMMAND,
-    GripperOutcome,
-    outcome,
-    position,
-    send_goal,
-)
-from vla_zenoh.ros2.messages import Messages
-from vla_zenoh.ros2.readers import RosImage
-from vla_zenoh.ros2.writers import (
-    DIAGNOSTICS,
     Stamp,
     Write,
     diagnostics,
     joint_writer,
     pose_writer,
+    position,
     position_message,
+    send_goal,
 )
 from vla_zenoh.types import GripperCommand, JointCommand, NodeStatus, PoseCommand
 

@@ -17,10 +17,9 @@ from vla_zenoh.profile.session import (
     host_of,
     is_loopback,
 )
-from vla_zenoh.ros2.gripper_actions import GRASP
 from vla_zenoh.ros2.keys import PROMPT_TOPIC, SERVICES, STATUS_TOPIC, Endpoint, EntityRole
 from vla_zenoh.ros2.readers import JOINT_STATE, TEXT, WRENCH
-from vla_zenoh.ros2.writers import DIAGNOSTICS
+from vla_zenoh.ros2.writers import DIAGNOSTICS, GRASP
 
 PROGRAM = "zenoh-bridge-ros2dds"
 ALLOWED_AS = {

@@ -1,25 +1,95 @@
-"""The gripper of a ROS 2 robot: by an action, one goal at a time, or by a topic of numbers."""
+"""The gripper of a ROS 2 robot: by a topic of numbers, or by an action, one goal at a time.
+
+The newest request wins. One that comes during a goal cancels it, and is sent once the robot has
+ended it: never two goals at once, never a stop that overtakes its move. A waiting request is
+dropped when its writer no longer controls the arm.
+"""
 
 from __future__ import annotations
 
+import secrets
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 from vla_zenoh.bus.node import Node
 from vla_zenoh.errors import CodecError
 from vla_zenoh.profile.robot import GRIPPER_ACTIONS, Ros2Gripper
 from vla_zenoh.robots.ros2.ros_graph import CALL_S, RosGraph, ServiceClient
-from vla_zenoh.ros2 import gripper_actions
-from vla_zenoh.ros2.gripper_actions import GRASP, ActionGoal, GoalSequencer
+from vla_zenoh.ros2 import writers
 from vla_zenoh.ros2.keys import COMMAND
 from vla_zenoh.ros2.messages import Messages
-from vla_zenoh.ros2.writers import position_message
+from vla_zenoh.ros2.readers import outcome
+from vla_zenoh.ros2.writers import GRASP
 from vla_zenoh.types import Event, GripperCommand
 
 GOAL_TIMEOUT_S = 5.0
 """A goal is given up after this long without an answer, beyond the time that its fingers need."""
+ID_BYTES = 16
+
+
+@dataclass(eq=False, slots=True)
+class ActionGoal:
+    """A goal, and when it was sent, accepted or cancelled last."""
+
+    command: GripperCommand
+    since_ns: int
+    accepted: bool = False
+    cancelling: bool = False
+    id: bytes = field(default_factory=lambda: secrets.token_bytes(ID_BYTES))
+
+
+class GoalSequencer:
+    """Decides when a goal is sent or cancelled. Time is given in ns of any clock.
+
+    A goal without any response is abandoned after `timeout_s`; an accepted one has in addition the
+    time in which the fingers go `stroke_m`, their longest way, at its speed.
+
+    Attributes:
+        wish: the newest request, until it is sent.
+        goal: in flight.
+    """
+
+    def __init__(self, timeout_s: float, stroke_m: float) -> None:
+        self._timeout_s, self._stroke_m = timeout_s, stroke_m
+        self.wish: GripperCommand | None = None
+        self.goal: ActionGoal | None = None
+        self.timeouts = 0
+
+    def accepted(self, goal: ActionGoal, now_ns: int) -> None:
+        """The robot took the goal."""
+        goal.accepted, goal.since_ns = True, now_ns
+
+    def ended(self, goal: ActionGoal) -> bool:
+        """The goal was rejected or has ended; False if it is an older one."""
+        if goal is not self.goal:
+            return False
+        self.goal = None
+        return True
+
+    def step(self, now_ns: int) -> Literal["send", "cancel"] | None:
+        """Next action: send the new `goal`, or cancel the old one."""
+        goal = self.goal
+        if goal is not None:
+            moves_s = self.travel_s(goal) if goal.accepted and not goal.cancelling else 0.0
+            if now_ns - goal.since_ns > (self._timeout_s + moves_s) * 1e9:
+                self.timeouts += 1
+                self.goal = goal = None
+        if self.wish is None:
+            return None
+        if goal is None:
+            self.goal, self.wish = ActionGoal(self.wish, now_ns), None
+            return "send"
+        if goal.accepted and not goal.cancelling:
+            goal.cancelling, goal.since_ns = True, now_ns
+            return "cancel"
+        return None
+
+    def travel_s(self, goal: ActionGoal) -> float:
+        """How long the fingers may need for it."""
+        return self._stroke_m / goal.command.speed_m_s
 
 
 class Gripper:
@@ -94,7 +164,7 @@ class Gripper:
             self._send(goal)
         elif step == "cancel":
             self._node.counters["ros2.gripper_cancelled"] += 1
-            request = gripper_actions.cancel(self._messages, goal.id)
+            request = writers.cancel(self._messages, goal.id)
             self._call("cancel_goal", request, lambda _: None)  # the goal's result follows
 
     def _drop_waiting(self) -> None:
@@ -114,8 +184,8 @@ class Gripper:
             self._goals.wish = command
             self._advance()
             return
-        position = gripper_actions.position(self._profile, self._limits, command.width_m)
-        message = position_message(self._messages, self._profile.type, position)
+        position = writers.position(self._profile, self._limits, command.width_m)
+        message = writers.position_message(self._messages, self._profile.type, position)
         self._topic.publish(self._messages.encode(message))
 
     # -- the action ---------------------------------------------------------------------------
@@ -128,12 +198,12 @@ class Gripper:
         self._sent_m = goal.command.width_m
         self._action = GRASP if use_grasp else self._profile.type
         self._held = False
-        request = gripper_actions.send_goal(
+        request = writers.send_goal(
             self._messages,
             self._action,
             goal.id,
             goal.command,
-            position=gripper_actions.position(self._profile, self._limits, self._sent_m),
+            position=writers.position(self._profile, self._limits, self._sent_m),
             max_width_m=self._limits.max_width_m,
         )
         self._node.counters["ros2.gripper_goals"] += 1
@@ -162,7 +232,7 @@ class Gripper:
         self._goals.accepted(goal, time.monotonic_ns())
         request = self._messages.new(
             f"{self._action}_GetResult_Request",
-            goal_id=gripper_actions.uuid(self._messages, goal.id),
+            goal_id=writers.uuid(self._messages, goal.id),
         )
         # As long as the goal may take, and the cancellation after it.
         timeout_s = self._goals.travel_s(goal) + 2 * GOAL_TIMEOUT_S
@@ -175,10 +245,10 @@ class Gripper:
         if response is None:
             self._emit_failure("does not report the result of the goal")
             return
-        outcome = gripper_actions.outcome(self._action, response)
-        self._held = outcome.holding
-        if not (outcome.reached or outcome.holding):
-            self._emit_failure(f"did not get there (status {response.status}) {outcome.message}")
+        result = outcome(self._action, response)
+        self._held = result.holding
+        if not (result.reached or result.holding):
+            self._emit_failure(f"did not get there (status {response.status}) {result.message}")
 
     def _decode(self, kind: str, answer: bytes | None) -> Any:
         if answer is None:

@@ -45,42 +45,6 @@ STATE_TIMEOUT_S = 2.0
 Reject = Callable[[str, str, str], None]
 
 
-class EstopOrder:
-    """Times of the last emergency stops, of this process and of others.
-
-    A reset or an activation that waits, while another call is answered or this process does not
-    run, must not undo a stop that came later and was sent at once. Those of others come on `key`.
-    """
-
-    def __init__(self, session: zenoh.Session, key: str) -> None:
-        self._lock = threading.Lock()
-        self._ours_ns = self._others_ns = -1
-        handler = zenoh.handlers.Callback(self._on_stop, indirect=False)
-        self._subscriber = session.declare_subscriber(
-            key, handler, allowed_origin=zenoh.Locality.REMOTE
-        )
-
-    def _on_stop(self, sample: zenoh.Sample) -> None:
-        if sample.kind == zenoh.SampleKind.PUT:
-            self._others_ns = time.monotonic_ns()
-
-    def stop(self, publish: Callable[[], None]) -> None:
-        with self._lock:
-            self._ours_ns = time.monotonic_ns()
-            publish()
-
-    def check(self, asked_ns: int) -> None:
-        """Raise a `SessionError` if a stop came after `asked_ns` on the monotonic clock."""
-        if max(self._ours_ns, self._others_ns) > asked_ns:
-            raise SessionError("an emergency stop came after this request; send it again")
-
-    def unless_stopped(self, asked_ns: int, publish: Callable[[], None]) -> None:
-        """Call `publish` after a `check`, with no stop of this process between the two."""
-        with self._lock:
-            self.check(asked_ns)
-            publish()
-
-
 class RosServices:
     """Serves the control services, applies the prompt topic, and publishes the status topic.
 
@@ -99,7 +63,15 @@ class RosServices:
     ) -> None:
         self._robot, self._messages, self._reject = profile.robot.name, messages, reject
         self._client = Client(profile, session).subscribe()
-        self._stops = EstopOrder(session, profile.keys.stop)
+        # A reset or an activation that waits, while another call is answered or this process does
+        # not run, must not undo a stop that came later and was sent at once.
+        self._stop_lock = threading.Lock()
+        self._our_stop_ns = self._others_stop_ns = -1
+        self._others_stops = session.declare_subscriber(
+            profile.keys.stop,
+            zenoh.handlers.Callback(self._on_stop, indirect=False),
+            allowed_origin=zenoh.Locality.REMOTE,
+        )
         self._calls: queue.Queue[tuple[Service, Request, int]] = queue.Queue(MAX_WAITING)
         self._called_ns = 0
         self._handlers: dict[str, Callable[[Any], str]] = {
@@ -117,7 +89,9 @@ class RosServices:
 
     def _enqueue(self, service: Service, request: Request) -> None:
         if service is STOP:  # overtakes the calls in the queue
-            self._stops.stop(lambda: self._client.publish(self._client.keys.stop, ""))
+            with self._stop_lock:
+                self._our_stop_ns = time.monotonic_ns()
+                self._client.publish(self._client.keys.stop, "")
         try:
             self._calls.put_nowait((service, request, time.monotonic_ns()))
         except queue.Full:
@@ -149,6 +123,16 @@ class RosServices:
             if changed or task is None or task.prompt != prompt:
                 self._client.publish(self._client.keys.prompt, prompt)
 
+    # -- stops --------------------------------------------------------------------------------
+    def _on_stop(self, sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.PUT:
+            self._others_stop_ns = time.monotonic_ns()
+
+    def _check_stops(self, asked_ns: int) -> None:
+        """Raise a `SessionError` if a stop came after `asked_ns` on the monotonic clock."""
+        if max(self._our_stop_ns, self._others_stop_ns) > asked_ns:
+            raise SessionError("an emergency stop came after this request; send it again")
+
     # -- services -----------------------------------------------------------------------------
     def _answer(self, service: Service, request: Request, called_ns: int) -> None:
         try:
@@ -161,7 +145,7 @@ class RosServices:
         self._called_ns = called_ns
         try:
             if service is not STOP:
-                self._stops.check(called_ns)
+                self._check_stops(called_ns)
             text, success = self._handlers[service.name](asked), True
         except CodecError as error:
             self._reject(error.reason, f"{service.name}: {error}", service.name)
@@ -173,7 +157,7 @@ class RosServices:
 
     def _activate(self, wanted: bool) -> str:
         if wanted:
-            self._stops.check(self._called_ns)  # earlier parts of a request may take seconds
+            self._check_stops(self._called_ns)  # earlier parts of a request may take seconds
             task = self._client.activate()
             return f"active: worker {task.worker}, {task.prompt!r}"
         if not self._client.deactivate():
@@ -185,9 +169,9 @@ class RosServices:
         return "stopped; call reset, then activate"
 
     def _reset(self, asked: Any) -> str:
-        self._stops.unless_stopped(
-            self._called_ns, lambda: self._client.publish(self._client.keys.reset, "")
-        )
+        with self._stop_lock:  # no stop of this process comes between the two
+            self._check_stops(self._called_ns)
+            self._client.publish(self._client.keys.reset, "")
         self._await_state("inactive")
         return "inactive"
 
