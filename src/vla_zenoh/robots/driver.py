@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import threading
 from abc import ABC, abstractmethod
-from collections import Counter
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from vla_zenoh.bus.clock import Clock, FixedRate, Tick
+from vla_zenoh.bus.clock import FixedRate, Tick
 from vla_zenoh.errors import NodeError
 from vla_zenoh.guard.arm_guard import Measured
 from vla_zenoh.kinematics.so3 import Pose, quat_from_rotation
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
-    Event,
     FloatArray,
     GripperCommand,
     GripperState,
@@ -53,22 +51,6 @@ class DriverStatus(NamedTuple):
     latency_ms: Mapping[str, tuple[float, float]] = {}
 
 
-class Report:
-    """What a driver without a bus reports to, in place of a node: keeps what is reported."""
-
-    def __init__(self) -> None:
-        self.clock = Clock()
-        self.counters: Counter[str] = Counter()
-        self.events: list[Event] = []
-
-    def emit(self, event: Event) -> None:
-        self.events.append(event)
-
-    def reject(self, reason: str, why: str, about: str = "") -> None:
-        self.counters[f"refused.{reason}"] += 1
-        self.emit(Event("warning", "refusal", reason, why))
-
-
 class RobotDriver(ABC):
     """One kind of robot as `RobotNode` drives it; a subclass needs `read` and `move`.
 
@@ -95,7 +77,7 @@ class RobotDriver(ABC):
         idle: no controller of the robot holds the last set-point any more.
         recovers: `recover` does something.
         silent_why, stalled_hint: sentences for the events of these states.
-        report: gets counters, events and rejections; the node, once there is one.
+        report: the node, once it is on the bus: gets counters, events and rejections.
     """
 
     name = ""
@@ -115,7 +97,7 @@ class RobotDriver(ABC):
         self.profile = profile
         self.period_s = 1.0 / profile.timing.command_hz
         self.modes: tuple[str, ...] = (profile.robot.command,)
-        self.report: Node | Report = Report()
+        self.report: Node
 
     # -- required -----------------------------------------------------------------------------
     @abstractmethod

@@ -11,13 +11,13 @@ from unittest.mock import MagicMock, patch
 
 import numpy as np
 import pytest
+from driver_report import Report
 
 pytest.importorskip("lerobot", reason="needs LeRobot's environment: make test-models")
 from lerobot.robots.so_follower import so_follower
 
 from vla_zenoh.errors import NodeError
 from vla_zenoh.profile import load_profile
-from vla_zenoh.robots.driver import Report
 from vla_zenoh.robots.python_driver import PythonDriver
 from vla_zenoh.types import GripperCommand, JointReference
 
@@ -78,7 +78,9 @@ def make_driver(folder: Path, more: str = "", *, calibrated: bool = True) -> Pyt
     path.write_text(
         f"extends: so101_lerobot\nlerobot: {{calibration_dir: {folder}{more and ', ' + more}}}\n"
     )
-    return PythonDriver(load_profile(str(path)))
+    driver = PythonDriver(load_profile(str(path)))
+    Report(driver)
+    return driver
 
 
 def connected(folder: Path, more: str = "") -> PythonDriver:
@@ -138,6 +140,7 @@ def test_the_gripper_has_its_width(motors: Motors, tmp_path: Path) -> None:
 
 def test_a_gripper_that_is_kept_open_holds_something(motors: Motors, tmp_path: Path) -> None:
     driver = connected(tmp_path)
+    report = Report(driver)
     driver.grip(COMMAND, 0)
     assert read(driver).gripper.moving
     time.sleep(0.4)
@@ -146,8 +149,7 @@ def test_a_gripper_that_is_kept_open_holds_something(motors: Motors, tmp_path: P
     read(driver)
     time.sleep(0.4)
     assert not read(driver).gripper.holding
-    assert isinstance(driver.report, Report)
-    assert [event.what for event in driver.report.events] == ["grasped", "object_lost"]
+    assert [event.what for event in report.events] == ["grasped", "object_lost"]
 
 
 def test_an_arm_without_gripper_rejects_its_commands(motors: Motors, tmp_path: Path) -> None:

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from driver_report import Report
 
 from vla_zenoh.errors import NodeError
 from vla_zenoh.profile import load_profile
-from vla_zenoh.robots.driver import Report
 from vla_zenoh.robots.python_driver import FAULT_NS, PythonDriver
 from vla_zenoh.types import Event, GripperCommand, JointCommand, JointReference
 
@@ -63,8 +63,7 @@ class Rig:
         (folder / "my_arm.py").write_text(arm)
         (folder / "lab.yaml").write_text(PROFILE)
         self.driver = PythonDriver(load_profile(str(folder / "lab.yaml")))
-        assert isinstance(self.driver.report, Report)
-        self.report = self.driver.report
+        self.report = Report(self.driver)
         self.now_ns = 10**12
 
     @property

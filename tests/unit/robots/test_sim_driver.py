@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from driver_report import Report
 
 from vla_zenoh.profile import load_profile
-from vla_zenoh.robots.driver import Report
 from vla_zenoh.robots.sim_driver import SimDriver
 from vla_zenoh.simulation.world import STEP_NS
 from vla_zenoh.types import GripperCommand, JointReference, PoseReference
@@ -17,7 +17,9 @@ STILL = np.zeros(6)
 
 @pytest.fixture(scope="module")
 def driver() -> SimDriver:
-    return SimDriver(load_profile("panda_sim"))
+    driver = SimDriver(load_profile("panda_sim"))
+    Report(driver)
+    return driver
 
 
 def run(driver: SimDriver, reference: PoseReference | JointReference, steps: int = 1500) -> None:
@@ -64,9 +66,8 @@ def test_the_gripper_closes(driver: SimDriver) -> None:
 
 
 def test_a_reset_puts_the_arm_home_and_is_counted(driver: SimDriver) -> None:
+    report = Report(driver)
     driver.reset(None)
-    report = driver.report
-    assert isinstance(report, Report)
     before = report.counters["sim.resets"]
     driver.status_changed()
     driver.reset(5)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from driver_report import Report
 
 pytest.importorskip("rtde_control", reason="needs the extra ur")
 
@@ -29,7 +30,6 @@ from vla_zenoh.errors import NodeError, ProfileError
 from vla_zenoh.kinematics.so3 import log3
 from vla_zenoh.lab.doctor.ur import ur_arm
 from vla_zenoh.profile import Profile, load_profile
-from vla_zenoh.robots.driver import Report
 from vla_zenoh.robots.python_driver import PythonDriver
 from vla_zenoh.types import JointReference
 
@@ -61,8 +61,7 @@ class Rig:
         path.write_text(PROFILE.format(address=peer.where()))
         self.profile: Profile = load_profile(str(path))
         self.driver = PythonDriver(self.profile)
-        assert isinstance(self.driver.report, Report)
-        self.report = self.driver.report
+        self.report = Report(self.driver)
 
     def read(self) -> Any:
         time.sleep(0.004)
