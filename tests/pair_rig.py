@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from vla_zenoh.control.reachability import ReachabilityFilter
-from vla_zenoh.kinematics.collision import PartDistance, PlacedArm
-from vla_zenoh.kinematics.so3 import Pose, rotation_from_rpy
+from vla_zenoh.kinematics.collision import PlacedArm
 from vla_zenoh.lab.lockstep import Lockstep
 from vla_zenoh.policy import ActionSpec, ActionSteps, ModelSpec, Observation, ObservationSpec
 from vla_zenoh.profile import Profile, load_profile
@@ -43,19 +42,16 @@ def reach() -> Mapping[str, ReachabilityFilter]:
 
 
 @cache
-def _distance() -> PartDistance:
-    placed: list[PlacedArm] = []
-    for part in PARTS:
-        base, own = shipped().parts[part].base, reach()[part]
-        turn = rotation_from_rpy(np.array([0.0, 0.0, base.yaw_rad]))
-        stands = Pose(np.array(base.position_m), turn)
-        placed.append(PlacedArm(own.kinematics, own.barriers.collisions, stands))
-    return PartDistance(*placed)
+def placed(part: str) -> PlacedArm:
+    own = reach()[part]
+    base = shipped().parts[part].base
+    return PlacedArm(own.kinematics, own.barriers.collisions, base)
 
 
-def apart_m(left_rad: FloatArray, right_rad: FloatArray) -> float:
-    """Distance of the arms at these joints (n,)."""
-    return _distance().nearest([left_rad], [right_rad], FAR_M).distance_m
+def apart_m(left_rad: FloatArray, right_rad: FloatArray, within_m: float = FAR_M) -> float:
+    """Distance of the arms at these joints (n,), if it is less than `within_m`."""
+    left, right = map(placed, PARTS)
+    return left.nearest([left_rad], right, [right_rad], within_m).distance_m
 
 
 def joint_steps(kind: str = "delta") -> ActionSpec:

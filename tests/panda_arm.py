@@ -27,9 +27,9 @@ def tool_down_at(kinematics: Kinematics, *position_m: float) -> FloatArray:
     home, joints = kinematics.forward(HOME_RAD), HOME_RAD
     for share in np.linspace(0, 1, 21):
         place = home.position_m + share * (np.array(position_m) - home.position_m)
-        solved = solver.solve(Pose(place, home.rotation), joints)
-        assert solved is not None
-        joints = solved
+        found = solver.approach(Pose(place, home.rotation), joints)
+        assert found.solved
+        joints = found.joints_rad
     return joints
 
 

@@ -174,9 +174,9 @@ class KinematicPanda:
             np.array([at.x, at.y, at.z]),
             rotation_from_quat(np.array([turn.x, turn.y, turn.z, turn.w])),
         )
-        solved = self._solver.solve(goal, self.joints_rad)
-        if solved is not None:
-            self.joints_rad = solved
+        found = self._solver.approach(goal, self.joints_rad)
+        if found.solved:
+            self.joints_rad = found.joints_rad
 
     def _run(self) -> None:
         stamp_ns = time.time_ns()

@@ -12,7 +12,6 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 
 import netns.flight_log
@@ -21,10 +20,8 @@ import pytest
 from camera_rig import free_endpoint
 from chain import CHAIN_PATIENCE_S, READY_PATIENCE_S, Chain, running_chain
 from netns.flight_log import STILL_M_S, Flight
-from pair_rig import DT_S, HORIZON, PARTS, reach, shipped
+from pair_rig import DT_S, HORIZON, PARTS, apart_m, reach, shipped
 
-from vla_zenoh.kinematics.collision import PartDistance, PlacedArm
-from vla_zenoh.kinematics.so3 import Pose, rotation_from_rpy
 from vla_zenoh.types import FloatArray
 
 WORKER = "worker-scripted_pair"
@@ -212,23 +209,12 @@ FAULTS = {
 QUICK = ("worker-killed", "command-killed", "router-killed", "states", "commands")
 
 
-@cache
-def apart() -> PartDistance:
-    placed: list[PlacedArm] = []
-    for part in PARTS:
-        base, own = shipped().parts[part].base, reach()[part]
-        turn = rotation_from_rpy(np.array([0.0, 0.0, base.yaw_rad]))
-        stands = Pose(np.array(base.position_m), turn)
-        placed.append(PlacedArm(own.kinematics, own.barriers.collisions, stands))
-    return PartDistance(*placed)
-
-
 def least_m(rows: dict[str, FloatArray]) -> float:
     """Smallest distance between the arms at the times of the first one's rows."""
     left, right = (rows[part] for part in PARTS)
     nearest = np.searchsorted(right[:, 0], left[:, 0]).clip(max=len(right) - 1)
     return min(
-        apart().nearest([one[1 : 1 + JOINTS]], [other[1 : 1 + JOINTS]], 1.0).distance_m
+        apart_m(one[1 : 1 + JOINTS], other[1 : 1 + JOINTS], 1.0)
         for one, other in zip(left[::2], right[nearest][::2], strict=True)
     )
 

@@ -1,10 +1,9 @@
 """From action chunks to a smooth, bounded command stream. Pure: no Zenoh, no clock, no threads.
 
 commander          state machine and settings, one `step` per tick
-chunk_validation   every reason to reject a chunk
+policy_check       every reason against a model's spec or a chunk
 chunk_planner      validate, plan, bound and enqueue chunks
-plan_timeline      plans on a time axis: which goal was in force when
-aggregate          the goal where plans overlap
+plan_timeline      plans on a time axis: which goal was in force when, and where plans overlap
 step_timing        how fast to go to a goal
 motion_pipeline    goals to commands: leash, smoothing, joints, braking
 watchdog           reasons to brake

@@ -1,6 +1,6 @@
 """From an action chunk to the goals that the arm follows: validate, plan, bound, enqueue.
 
-`ChunkPlanner.submit` validates a chunk (`vla_zenoh.control.chunk_validation`) and queues it. `plan`
+`ChunkPlanner.submit` validates a chunk (`vla_zenoh.control.policy_check`) and queues it. `plan`
 puts its steps on top of what was asked for when its observation was taken, `bound` shortens each to
 its limits and to what the arm can do. `advance` does both with the newest chunk of the queue, and
 adds the plan to the `GoalTimeline`; `bound_due` bounds the steps that follow, in time for them.
@@ -23,13 +23,6 @@ from typing import NamedTuple
 import numpy as np
 
 from vla_zenoh.control.actions import covered_step, step_joints, step_width
-from vla_zenoh.control.chunk_validation import (
-    ROUNDING,
-    Lease,
-    Rejection,
-    validate_chunk,
-    validate_steps,
-)
 from vla_zenoh.control.commander_io import StateHistory
 from vla_zenoh.control.joint_space import JointBounds
 from vla_zenoh.control.limits import (
@@ -50,6 +43,13 @@ from vla_zenoh.control.plan_timeline import (
     Plan,
     StepBounding,
     joint_goal,
+)
+from vla_zenoh.control.policy_check import (
+    ROUNDING,
+    Lease,
+    Rejection,
+    validate_chunk,
+    validate_steps,
 )
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.errors import RecordError

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from vla_zenoh.control.chunk_planner import ChunkPlanner
-from vla_zenoh.control.chunk_validation import Lease
 from vla_zenoh.control.commander_io import MotionCommands, NewStates, State, make_event
 from vla_zenoh.control.limits import LimitHit
 from vla_zenoh.control.motion_pipeline import MotionPipeline
+from vla_zenoh.control.policy_check import Lease
 from vla_zenoh.control.preflight import (
     CLOCK_TOLERANCE_S,
     JOINT_PATIENCE_S,

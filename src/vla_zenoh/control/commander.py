@@ -17,7 +17,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from vla_zenoh.control.chunk_planner import ChunkOutcome
-from vla_zenoh.control.chunk_validation import Lease, Rejection
 from vla_zenoh.control.commanded_part import CommandedPart
 from vla_zenoh.control.commander_io import (
     DEACTIVATED,
@@ -33,6 +32,7 @@ from vla_zenoh.control.commander_io import (
 )
 from vla_zenoh.control.limits import LimitHit
 from vla_zenoh.control.plan_timeline import EpisodeProgress
+from vla_zenoh.control.policy_check import Lease, Rejection
 from vla_zenoh.control.preflight import PeerSnapshot, reasons_of_worker
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.watchdog import Deadman

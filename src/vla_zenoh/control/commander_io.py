@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Generic, NamedTuple, TypeVar
 
-from vla_zenoh.control.chunk_validation import Rejection
 from vla_zenoh.control.limits import APPROACH, LimitHit
+from vla_zenoh.control.policy_check import Rejection
 from vla_zenoh.control.preflight import PeerSnapshot
 from vla_zenoh.types import (
     MAX_TEXT,

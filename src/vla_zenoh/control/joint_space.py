@@ -19,7 +19,6 @@ import numpy as np
 
 from vla_zenoh.control.actions import step_joints
 from vla_zenoh.control.axis_smoothing import FULL, AxisSmoother, Shares, line_of, stop_way
-from vla_zenoh.control.chunk_validation import Rejection
 from vla_zenoh.control.limits import (
     HELD_LEAD_RAD,
     BoundedStep,
@@ -31,6 +30,7 @@ from vla_zenoh.control.limits import (
     workspace_corners,
 )
 from vla_zenoh.control.plan_timeline import Goal, joint_goal
+from vla_zenoh.control.policy_check import Rejection
 from vla_zenoh.control.reachability import Barriers
 from vla_zenoh.control.smoothing import Motion
 from vla_zenoh.kinematics.kinematics import Kinematics

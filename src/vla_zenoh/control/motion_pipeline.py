@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vla_zenoh.control.aggregate import PlanAggregator
 from vla_zenoh.control.axis_smoothing import FULL, Shares
 from vla_zenoh.control.chunk_planner import LOOK_AHEAD, ChunkPlanner
 from vla_zenoh.control.commander_io import OBEYING, State, limit_events, make_event
 from vla_zenoh.control.contact import Contact, Retreat
 from vla_zenoh.control.joint_space import JointPath
 from vla_zenoh.control.limits import into_workspace
-from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan, joint_goal
+from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan, PlanAggregator, joint_goal
 from vla_zenoh.control.preflight import (
     FOLLOWS_JOINT_RAD,
     LINGER_NS,

@@ -24,8 +24,7 @@ from vla_zenoh.control.axis_smoothing import between
 from vla_zenoh.control.commanded_part import CommandedPart
 from vla_zenoh.control.limits import LimitHit, Slowdown
 from vla_zenoh.control.watchdog import BAND_M, PAST_M, PERIOD_NS
-from vla_zenoh.kinematics.collision import Nearest, PartDistance, PlacedArm
-from vla_zenoh.kinematics.so3 import Pose, rotation_from_rpy
+from vla_zenoh.kinematics.collision import Nearest, PlacedArm
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray
 
@@ -69,17 +68,12 @@ class PartSpacing:
 
     def place(self) -> None:
         """Take the shapes of all parts, with what their grippers hold."""
-        placed: list[PlacedArm] = []
+        self._placed: list[PlacedArm] = []
         for part in self._parts:
             base, reach = self._profile.parts[part.name].base, part.reach
             assert reach is not None
-            turn = rotation_from_rpy(np.array([0.0, 0.0, base.yaw_rad]))
-            stands = Pose(np.array(base.position_m), turn)
-            placed.append(PlacedArm(reach.kinematics, reach.barriers.collisions, stands))
-        self._pairs = [
-            (i, j, PartDistance(placed[i], placed[j]))
-            for i, j in itertools.combinations(range(len(placed)), 2)
-        ]
+            placed = PlacedArm(reach.kinematics, reach.barriers.collisions, base)
+            self._placed.append(placed)
 
     def look(
         self, now_ns: int, ahead_s: float, *, moves: bool
@@ -163,8 +157,8 @@ class PartSpacing:
         places = [
             [here_rad, *stop] for here_rad, stop in itertools.zip_longest(at, stops, fillvalue=())
         ]
-        for i, j, pair in self._pairs:
-            near = pair.nearest(places[i], places[j], found.distance_m)
+        for i, j in itertools.combinations(range(len(places)), 2):
+            near = self._placed[i].nearest(places[i], self._placed[j], places[j], found.distance_m)
             if near.distance_m < found.distance_m:
                 names = self._parts[i].name, self._parts[j].name
                 found = Nearest(

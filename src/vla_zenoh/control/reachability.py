@@ -258,7 +258,8 @@ class ReachabilityFilter:
 
     def solve(self, pose: Pose, joints_rad: FloatArray) -> FloatArray | None:
         """Joints (n,) for `pose`, solved from `joints_rad` (n,); None without a solution."""
-        return self._solver.solve(pose, joints_rad, bounded=False)
+        found = self._solver.approach(pose, joints_rad, bounded=False)
+        return found.joints_rad if found.solved else None
 
     def joints_at(self, pose: Pose) -> FloatArray:
         """Joints (n,) of `pose`, or as near to it as they get, with the robot's elbow."""

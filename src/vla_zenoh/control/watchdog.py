@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from vla_zenoh.control.chunk_validation import Lease
 from vla_zenoh.control.limits import SLOWEST, LimitHit, Slowdown, joint_margins, slowest
+from vla_zenoh.control.policy_check import Lease
 from vla_zenoh.control.preflight import CLOCK_TOLERANCE_S, PeerSnapshot
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.keys import NO_DEADMAN_TOKEN, worker_node

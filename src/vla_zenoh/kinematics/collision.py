@@ -18,8 +18,8 @@ import pinocchio as pin
 
 from vla_zenoh.errors import ProfileError, ResourceError
 from vla_zenoh.kinematics.kinematics import Kinematics
-from vla_zenoh.kinematics.so3 import Pose, rotation_from_rpy
-from vla_zenoh.profile import KeepOut
+from vla_zenoh.kinematics.so3 import rotation_from_rpy
+from vla_zenoh.profile import KeepOut, PartBase
 from vla_zenoh.types import FloatArray, HeldBox
 
 SAMPLES = 1000
@@ -331,9 +331,10 @@ class PlacedArm:
         base: where its base frame stands.
     """
 
-    def __init__(self, kinematics: Kinematics, collisions: CollisionModel, base: Pose) -> None:
+    def __init__(self, kinematics: Kinematics, collisions: CollisionModel, base: PartBase) -> None:
         self._model = kinematics.model.copy()
-        stands = pin.SE3(base.rotation, base.position_m) * kinematics.base_placement.inverse()
+        turn = rotation_from_rpy(np.array([0.0, 0.0, base.yaw_rad]))
+        stands = pin.SE3(turn, np.array(base.position_m)) * kinematics.base_placement.inverse()
         self._geometry: Any = collisions.links()
         for joint, parent in enumerate(self._model.parents):
             if joint > 0 and parent == 0:
@@ -343,16 +344,16 @@ class PlacedArm:
                 shape.placement = stands * shape.placement
         self._data, self._placed = self._model.createData(), self._geometry.createData()
         shapes = list(self._geometry.geometryObjects)
-        self.names = [shape.name for shape in shapes]
-        self.hulls: list[Any] = [shape.geometry for shape in shapes]
-        for hull in self.hulls:
+        self._names = [shape.name for shape in shapes]
+        self._hulls: list[Any] = [shape.geometry for shape in shapes]
+        for hull in self._hulls:
             hull.computeLocalAABB()
-        centres = np.array([hull.aabb_center for hull in self.hulls])
+        centres = np.array([hull.aabb_center for hull in self._hulls])
         self._centres_m = np.hstack([centres, np.ones((len(centres), 1))])[:, :, None]
-        self.radii_m = np.array([hull.aabb_radius for hull in self.hulls])
+        self._radii_m = np.array([hull.aabb_radius for hull in self._hulls])
         self._kept: dict[bytes, Placement] = {}
 
-    def place(self, joints_rad: FloatArray) -> Placement:
+    def _place(self, joints_rad: FloatArray) -> Placement:
         """Where the hulls are at these joints (n,)."""
         key = joints_rad.tobytes()
         if key not in self._kept:
@@ -367,29 +368,26 @@ class PlacedArm:
             self._kept[key] = Placement(transforms, (matrices @ self._centres_m)[:, :3, 0])
         return self._kept[key]
 
-
-class PartDistance:
-    """Distances between two arms."""
-
-    def __init__(self, first: PlacedArm, second: PlacedArm) -> None:
-        self._first, self._second = first, second
-        self._spheres_m = first.radii_m[:, None] + second.radii_m[None, :]
-        self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
-
     def nearest(
-        self, first_rad: Sequence[FloatArray], second_rad: Sequence[FloatArray], within_m: float
+        self,
+        own_rad: Sequence[FloatArray],
+        other: PlacedArm,
+        other_rad: Sequence[FloatArray],
+        within_m: float,
     ) -> Nearest:
-        """The nearest links with the arms at any two of these configurations (n,).
+        """The nearest links with this arm and another at any two of these configurations (n,).
 
         Links further apart than `within_m` are not looked for.
         """
-        ones = [self._first.place(joints_rad) for joints_rad in first_rad]
-        others = [self._second.place(joints_rad) for joints_rad in second_rad]
+        ones = [self._place(joints_rad) for joints_rad in own_rad]
+        others = [other._place(joints_rad) for joints_rad in other_rad]
         one_m = np.array([placed.centres_m for placed in ones])
         other_m = np.array([placed.centres_m for placed in others])
         between_m = one_m[:, None, :, None] - other_m[None, :, None, :]
-        apart_m = np.sqrt((between_m * between_m).sum(axis=-1)) - self._spheres_m
+        spheres_m = self._radii_m[:, None] + other._radii_m[None, :]
+        apart_m = np.sqrt((between_m * between_m).sum(axis=-1)) - spheres_m
         found = Nearest(within_m)
+        request, result = coal.DistanceRequest(), coal.DistanceResult()
         places = np.argwhere(apart_m < within_m)
         bounds_m = apart_m[apart_m < within_m]
         order = np.argsort(bounds_m)
@@ -398,15 +396,15 @@ class PartDistance:
         ):
             if bound_m >= found.distance_m:
                 break
-            self._result.clear()
+            result.clear()
             distance_m = coal.distance(
-                self._first.hulls[i],
+                self._hulls[i],
                 ones[a].transforms[i],
-                self._second.hulls[j],
+                other._hulls[j],
                 others[b].transforms[j],
-                self._request,
-                self._result,
+                request,
+                result,
             )
             if distance_m < found.distance_m:
-                found = Nearest(distance_m, self._first.names[i], self._second.names[j])
+                found = Nearest(distance_m, self._names[i], other._names[j])
         return found

@@ -248,18 +248,18 @@ class InverseKinematics:
 
     Args:
         kinematics: of the arm.
-        posture_rad: (n,) where a redundant arm prefers to be; None: the middle of its ranges.
+        posture_rad: (n,) where a redundant arm prefers to be.
         joint_margin_rad: kept from both ends of every joint's range, one number or (n,).
         max_iterations: after which there is no solution.
 
     Raises:
-        RecordError: the margin leaves a joint no range, or the posture has the wrong size.
+        RecordError: the margin leaves a joint no range.
     """
 
     def __init__(
         self,
         kinematics: Kinematics,
-        posture_rad: ArrayLike | None = None,
+        posture_rad: FloatArray,
         *,
         joint_margin_rad: float | FloatArray = 0.05,
         max_iterations: int = 40,
@@ -270,26 +270,13 @@ class InverseKinematics:
         if np.any(self.lower_rad >= self.upper_rad):
             name = kinematics.arm_joints[int(np.argmin(self.upper_rad - self.lower_rad))]
             raise RecordError(f"joint_margin_rad {joint_margin_rad} leaves {name!r} no range")
-        middle = 0.5 * (self.lower_rad + self.upper_rad)
-        self.posture_rad = middle if posture_rad is None else np.array(posture_rad, dtype=float)
-        if self.posture_rad.shape != (kinematics.size,):
-            raise RecordError(
-                f"posture_rad has shape {self.posture_rad.shape}, wanted ({kinematics.size},)"
-            )
-
-    def solve(
-        self, pose: Pose, start_rad: FloatArray, *, bounded: bool = True
-    ) -> FloatArray | None:
-        """Joints (n,) that put the TCP there, near `start_rad`; None where there are none.
-
-        The search is local: a pose that needs several joints on the very ends of their ranges, or
-        the arm in another branch than at the start, may be missed. `bounded`: see `approach`.
-        """
-        found = self.approach(pose, start_rad, bounded=bounded)
-        return found.joints_rad if found.solved else None
+        self.posture_rad = posture_rad
 
     def approach(self, pose: Pose, start_rad: FloatArray, *, bounded: bool = True) -> Approach:
-        """Like `solve`, and how near it came where there is no solution.
+        """Joints (n,) that put the TCP there, near `start_rad`, or how near it comes.
+
+        The search is local: a pose that needs several joints on the very ends of their ranges, or
+        the arm in another branch than at the start, may be missed.
 
         `bounded` keeps every joint within its bounds, the other joints taking over; else pose and
         posture alone decide where the joints go.

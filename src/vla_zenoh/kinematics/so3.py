@@ -12,6 +12,10 @@ import numpy as np
 from vla_zenoh.errors import MissingExtraError
 from vla_zenoh.types import FloatArray, PoseState
 
+MEAN_ITERATIONS = 10
+MEAN_RAD = 1e-10
+"""The mean of rotations has converged when it moves by less."""
+
 
 class _Pinocchio:
     """Pinocchio, imported at first use: the command line must load also where a model runs, which
@@ -138,6 +142,26 @@ def interpolate(start: Pose, end: Pose, share: float) -> Pose:
         start.position_m + share * (end.position_m - start.position_m),
         orthonormal(exp3(share * turn) @ start.rotation),
     )
+
+
+def mean_pose(poses: Sequence[Pose], weights: FloatArray) -> Pose:
+    """Weighted mean of poses: in R^3, and on SO(3), where ``sum_i w_i log(R_i R^T) = 0``.
+
+    Iterated from the last rotation (Karcher).
+
+    Args:
+        poses: rotations less than half a turn apart.
+        weights: (n,) not negative, not all zero.
+    """
+    shares = weights / weights.sum()
+    position_m = shares @ np.array([pose.position_m for pose in poses])
+    rotation = poses[-1].rotation
+    for _ in range(MEAN_ITERATIONS):
+        turn = shares @ np.array([log3(pose.rotation @ rotation.T) for pose in poses])
+        rotation = exp3(turn) @ rotation
+        if norm3(turn) < MEAN_RAD:
+            break
+    return Pose(position_m, orthonormal(rotation))
 
 
 def _coefficients(squared: float) -> tuple[float, float, float, float]:

@@ -102,7 +102,7 @@ class Timing(Section):
 
 
 class Composition(Section):
-    """How overlapping chunks are combined; see `vla_zenoh.control.aggregate`.
+    """How overlapping chunks are combined; see `vla_zenoh.control.plan_timeline`.
 
     Args:
         mode: ``replace``: only the newest chunk; ``blend``: it takes over from the previous one

@@ -9,9 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vla_zenoh.control.aggregate import PlanAggregator, mean_pose
-from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan
-from vla_zenoh.kinematics.so3 import Pose, angle_between, exp3, interpolate
+from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan, PlanAggregator
+from vla_zenoh.kinematics.so3 import Pose, angle_between, exp3, interpolate, mean_pose
 from vla_zenoh.profile import Composition
 from vla_zenoh.types import Cause
 

@@ -10,7 +10,7 @@ import pytest
 from command_rig import DOWN, START_M, START_NS, Rig, lone_chunk, model_spec, profile, quat_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from panda_arm import HOME_RAD, panda, tool_down_at
+from panda_arm import panda, tool_down_at
 
 from vla_zenoh.control.chunk_planner import PATIENCE, ChunkPlan, ChunkPlanner
 from vla_zenoh.control.limits import Slowdown, keep_slowdown
@@ -44,9 +44,10 @@ class CountingShadow(ReachabilityFilter):
 
 def shadow(**limits: Any) -> CountingShadow:
     reach = ReachLimits(table_z_m=TABLE_Z_M)
-    return CountingShadow(
-        KINEMATICS, START_RAD, Limits(reach=reach, **limits), known_good_rad=[HOME_RAD]
-    )
+    own = profile().model_copy(update={"limits": Limits(reach=reach, **limits)})
+    counting = CountingShadow(own, KINEMATICS)
+    counting.reset(START_RAD)
+    return counting
 
 
 # Both are asked the same questions in the same order, so that what their distances begin from is

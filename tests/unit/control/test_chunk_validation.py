@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from command_rig import MS, SOURCE, START_NS, WORKER, model_spec
 
-from vla_zenoh.control.chunk_validation import (
+from vla_zenoh.control.policy_check import (
     FUTURE_TOLERANCE_NS,
     Lease,
     Rejection,
