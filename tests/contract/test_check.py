@@ -15,10 +15,9 @@ from peer_rig import ADAPTERS, KINDS, free_port, of, reachable
 
 from vla_zenoh import resources
 from vla_zenoh.lab.check import fit
-from vla_zenoh.lab.check.examination import Examination
+from vla_zenoh.lab.check.examination import CheckReport, Examination
 from vla_zenoh.lab.check.examples import chart, example_styles
 from vla_zenoh.lab.check.model_runner import ModelRunner
-from vla_zenoh.lab.check.report import CheckReport
 from vla_zenoh.policy import (
     ActionSpec,
     CameraSpec,

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ValidationError
 
 from vla_zenoh import resources
 from vla_zenoh.bus.session import session_config
-from vla_zenoh.lab.profile.advice import advice
+from vla_zenoh.lab.profile.check import advice
 from vla_zenoh.profile import Profile, load_profile, to_yaml
 
 SHIPPED = sorted(path.stem for path in resources.shipped("profiles").glob("*.y*ml"))

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from vla_zenoh.lab.profile.advice import advice
+from vla_zenoh.lab.profile.check import advice
 from vla_zenoh.profile import load_profile, override
 
 SIM = load_profile("panda_sim")

@@ -21,9 +21,8 @@ from vla_zenoh.cli.options import (
 from vla_zenoh.cli.output import console, new_table, styled
 from vla_zenoh.control.policy_check import Finding, error
 from vla_zenoh.errors import WorkerError, counted
-from vla_zenoh.lab.check.examination import DEFAULT_RUNS, Examination
+from vla_zenoh.lab.check.examination import DEFAULT_RUNS, CheckReport, Examination
 from vla_zenoh.lab.check.model_runner import ModelRunner
-from vla_zenoh.lab.check.report import CheckReport
 from vla_zenoh.lab.cli.output import print_json, progress
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.policy.loader import make_policy

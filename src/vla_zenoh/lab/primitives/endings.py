@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -49,14 +48,6 @@ class Sight:
         twist = self.pose.twist
         linear, angular = np.linalg.norm(twist[:3]), np.linalg.norm(twist[3:])
         return bool(linear < SLOW_M_S and angular < SLOW_RAD_S)
-
-
-class Ending(Protocol):
-    """Judges each `Sight` in turn."""
-
-    def check(self, sight: Sight) -> str:
-        """Reason why it is over; empty while it is not."""
-        ...
 
 
 class Arrival:
@@ -155,3 +146,7 @@ class RunEnding:
 
     def _done(self, sight: Sight) -> bool:
         return sight.done
+
+
+Ending = Arrival | Gripped | RunEnding
+"""Its `check` judges each `Sight` in turn: the reason why it is over, empty while it is not."""

@@ -10,9 +10,10 @@ import logging
 import threading
 from collections.abc import Callable
 from http import HTTPStatus
-from typing import Protocol
 
 from vla_zenoh.errors import MissingExtraError
+from vla_zenoh.lab.serve.openpi_server import OpenPiConversation
+from vla_zenoh.lab.serve.vla_eval import VlaEvalConversation
 
 try:
     from websockets.datastructures import Headers
@@ -24,18 +25,9 @@ except ImportError as error:
 
 INTERNAL_ERROR, TRY_AGAIN_LATER = 1011, 1013
 LOG = logging.getLogger("vla_zenoh.serve")
-
-
-class Conversation(Protocol):
-    """What is said on one connection."""
-
-    def greeting(self) -> bytes | None:
-        """The first frame, where the server begins."""
-        ...
-
-    def reply(self, frame: bytes | str) -> bytes | str | None:
-        """The answer to a frame; None: none. Text is the reason why the connection is closed."""
-        ...
+Conversation = OpenPiConversation | VlaEvalConversation
+"""What is said on one connection: `greeting` is the first frame, where the server begins, `reply`
+the answer to a frame. None: none; text is the reason why the connection is closed."""
 
 
 class PolicyServer:

@@ -29,7 +29,8 @@ from vla_zenoh.lab.teleop.keyboard import (
     KeystrokeParser,
 )
 from vla_zenoh.lab.teleop.leader import LeaderArm, LeaderPolicy
-from vla_zenoh.lab.teleop.policy import InputDevice, OperatorInput, TeleopPolicy, combined
+from vla_zenoh.lab.teleop.policy import OperatorInput, TeleopPolicy, combined
+from vla_zenoh.lab.teleop.sticks import Gamepad, SpaceMouse
 from vla_zenoh.nodes.worker.node import WorkerNode
 from vla_zenoh.policy import Frame
 from vla_zenoh.profile import Profile
@@ -59,7 +60,7 @@ class Teleop:
         operator: zenoh.Session | None,
         name: str = "teleop",
         *,
-        device: InputDevice | None = None,
+        device: Gamepad | SpaceMouse | None = None,
         frame: Frame = "base",
         level: int = 2,
         leader: LeaderArm | None = None,
@@ -125,7 +126,7 @@ class Teleop:
             raise PeerError("device_lost", lost)
         return combined(typed, stick)
 
-    def _read_device(self, device: InputDevice) -> None:
+    def _read_device(self, device: Gamepad | SpaceMouse) -> None:
         """Read it more often than chunks are asked for: a short press counts."""
         while not self._stop.wait(DEVICE_S):
             before = self._stick.takeovers

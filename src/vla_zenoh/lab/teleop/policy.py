@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -48,24 +48,6 @@ class OperatorInput(NamedTuple):
     toggles: int = 0
     takeovers: int = 0
     part: int = 0
-
-
-class InputDevice(Protocol):
-    """A device beside the keyboard.
-
-    Attributes:
-        name: as the device reports it.
-    """
-
-    name: str
-
-    def read(self) -> OperatorInput:
-        """Current input. Raises PeerError: the device is gone."""
-        ...
-
-    def close(self) -> None:
-        """Release the device."""
-        ...
 
 
 def combined(one: OperatorInput, other: OperatorInput) -> OperatorInput:
