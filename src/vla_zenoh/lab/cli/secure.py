@@ -8,9 +8,10 @@ import os
 import shlex
 import socket
 from collections.abc import Collection, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import typer
 from rich.text import Text
@@ -32,7 +33,7 @@ from vla_zenoh.lab.cli.output import print_json
 from vla_zenoh.lab.cli.output_path import ForceOption, output_file
 from vla_zenoh.profile import Profile, load_profile, profile_file
 from vla_zenoh.profile.load import followed, paths_in
-from vla_zenoh.profile.session import DEFAULT_FOLDER
+from vla_zenoh.profile.session import DEFAULT_FOLDER, SecurityProfile
 from vla_zenoh.resources import is_path, shipped
 from vla_zenoh.security.certificates import Entry
 from vla_zenoh.security.roles import PEOPLE, Role, identities, identities_of, operator_identities
@@ -41,22 +42,14 @@ from vla_zenoh.security.store import Store
 
 def is_own(address: str) -> bool:
     """Whether `address`, or the host name it is, belongs to this computer."""
-    try:
-        found = socket.getaddrinfo(address, 0, type=socket.SOCK_DGRAM)
-    except OSError:
-        return False
-    return any(_can_bind(family, place) for family, _, _, _, place in found)
-
-
-def _can_bind(family: int, place: tuple[Any, ...]) -> bool:
-    if ipaddress.ip_address(str(place[0]).partition("%")[0]).is_unspecified:
-        return False  # any computer can bind 0.0.0.0
-    with socket.socket(family, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.bind(place)
-        except OSError:
-            return False
-    return True
+    with suppress(OSError):
+        for family, _, _, _, place in socket.getaddrinfo(address, 0, type=socket.SOCK_DGRAM):
+            if ipaddress.ip_address(str(place[0]).partition("%")[0]).is_unspecified:
+                continue  # any computer can bind 0.0.0.0
+            with socket.socket(family, socket.SOCK_DGRAM) as probe, suppress(OSError):
+                probe.bind(place)
+                return True
+    return False
 
 
 def copy_commands(
@@ -72,14 +65,18 @@ def copy_commands(
     """
     if not (hosts or more):
         return
-    beside, elsewhere = _files(profile, file)
+    assert profile.session.security is not None
+    # ssh and scp start in the home folder.
+    target = shlex.quote(profile.session.security.folder.removeprefix("~/"))
+    here, files = Path.cwd(), _files(profile, file)
+    beside = [path for path in files if path.parent == file.absolute().parent]
+    shown = [path.relative_to(here) if path.is_relative_to(here) else path for path in beside]
     for host in (*hosts, *more):
         if host in hosts:
-            yield from _certificates(profile, store, host)
-        here = Path.cwd()
-        shown = (path.relative_to(here) if path.is_relative_to(here) else path for path in beside)
+            yield f"  ssh {host} mkdir -p {target}"
+            yield f"  scp -rp {shlex.quote(str(store.folder / host))} {host}:{target}/"
         yield f"  scp {' '.join(shlex.quote(str(path)) for path in shown)} {host}:"
-    for path in elsewhere:
+    for path in (path for path in files if path not in beside):
         yield f"Copy this file as well, to the same place: {path}"
     there = shlex.quote(f"./{file.name}")
     if any(host in profile.hosts for host in hosts):
@@ -87,24 +84,14 @@ def copy_commands(
     yield f"To watch, there: vla-zenoh status --profile {there}"
 
 
-def _certificates(profile: Profile, store: Store, host: str) -> Iterator[str]:
-    assert profile.session.security is not None
-    # ssh and scp start in the home folder.
-    target = shlex.quote(profile.session.security.folder.removeprefix("~/"))
-    yield f"  ssh {host} mkdir -p {target}"
-    yield f"  scp -rp {shlex.quote(str(store.folder / host))} {host}:{target}/"
-
-
-def _files(profile: Profile, file: Path) -> tuple[list[Path], list[Path]]:
-    """Files that the profile consists of or names: those beside it, and the others."""
+def _files(profile: Profile, file: Path) -> list[Path]:
+    """Files that the profile consists of or names."""
     chain = [path for path, _ in followed(str(file)) if path.parent != shipped("profiles")]
     texts = [
         section[key].removeprefix(prefix) for section, key, prefix in paths_in(profile.model_dump())
     ]
     found = [path.absolute() for path in (*chain, *(Path(text).expanduser() for text in texts))]
-    here = file.absolute().parent
-    unique = list(dict.fromkeys(found))
-    return [p for p in unique if p.parent == here], [p for p in unique if p.parent != here]
+    return list(dict.fromkeys(found))
 
 
 def print_certificates(entries: list[Entry], now: dt.datetime) -> None:
@@ -213,37 +200,29 @@ def init(
             part.unlink()
             raise
     written = load_profile(str(file))
+    others = [name for name in written.hosts if name != here]
+    copy = list(copy_commands(written, file, store, others))
     if as_json:
-        others = [name for name in written.hosts if name != here]
-        print_json(
-            {
-                "profile": file,
-                "certificates": made,
-                "host": here,
-                "copy": [line.strip() for line in copy_commands(written, file, store, others)],
-            }
-        )
+        lines = [line.strip() for line in copy]
+        print_json({"profile": file, "certificates": made, "host": here, "copy": lines})
         return
-    _print_next(written, file, store, made, here)
-
-
-def _print_next(
-    written: Profile, file: Path, store: LabCertificates, made: Sequence[Path], here: str | None
-) -> None:
-    """Print the files that `init` made, and what to do with them."""
     out = console()
     for path in (*made, file):
         out.print(f"made {path}", highlight=False, soft_wrap=True)
-    others = [name for name in written.hosts if name != here]
     if others:
         which = "each of the others" if here is not None else "each host but this one"
         out.print(f"\nCopy to {which} its own folder, and to all of them the profile:")
-    for line in copy_commands(written, file, store, others):
+    for line in copy:
         out.print(line, soft_wrap=True)
     _print_here(here, RobotTarget(str(file) if "/" in str(file) else f"./{file}"))
     key = store.folder / "ca.key"
     out.print(f"Keep {key} here: anyone with it can make certificates.", soft_wrap=True)
-    _warn_of_loopback(written)
+    if len(written.hosts) > 1 and all("127.0.0.1" in each for each in written.session.listen):
+        errors().print(
+            "the router listens on its own computer only; for a network give its address: "
+            "--at HOST=ADDRESS",
+            style="yellow",
+        )
 
 
 @secure_app.command("add")
@@ -292,19 +271,11 @@ def add(
     here, file = store.known_host(), profile_file(profile)
     routers = [name for name, part in loaded.hosts.items() if "router" in part.nodes]
     changed = [name for name in routers if new and name not in (host, here)]
-    copy = list(
-        copy_commands(loaded, file, store, [name for name in (host,) if name != here], changed)
-    )
+    copy = list(copy_commands(loaded, file, store, [] if host == here else [host], changed))
     if as_json:
-        restart = routers if new else []
-        print_json(
-            {
-                "profile": file,
-                "certificates": made,
-                "copy": [line.strip() for line in copy],
-                "restart_router": restart,
-            }
-        )
+        lines, restart = [line.strip() for line in copy], routers if new else []
+        answer = {"profile": file, "certificates": made, "copy": lines, "restart_router": restart}
+        print_json(answer)
         return
     out = console()
     for path in made:
@@ -326,7 +297,7 @@ def here(
 ) -> None:
     """Note which host this computer is, where it has certificates of several."""
     security = load_profile(profile).session.security
-    store = LabCertificates(folder or (security.folder if security is not None else DEFAULT_FOLDER))
+    store = _store(folder, security)
     if host not in store.hosts():
         known = ", ".join(store.hosts()) or "none"
         fail(f"{store.folder} has no certificates of {host!r}; it has those of: {known}")
@@ -344,8 +315,7 @@ def show(
     """Show every certificate here: owner, validity, faults. Exits with 1 on a fault."""
     loaded = load_profile(profile)
     security = loaded.session.security
-    store = LabCertificates(folder or (security.folder if security is not None else DEFAULT_FOLDER))
-    now = _now()
+    store, now = _store(folder, security), _now()
     entries = store.entries(now)
     if security is not None and folder is None:
         why = unused_certificates(loaded, entries)
@@ -363,6 +333,10 @@ def show(
         fail(f"{store.folder} has no certificates; `vla-zenoh secure init` makes them")
     if any(entry.faults for entry in entries):
         raise typer.Exit(1)
+
+
+def _store(folder: str | None, security: SecurityProfile | None) -> LabCertificates:
+    return LabCertificates(folder or (security.folder if security is not None else DEFAULT_FOLDER))
 
 
 def _router_addresses(given: Sequence[str]) -> dict[str, str]:
@@ -408,15 +382,3 @@ def _extends(name: str, output: Path) -> str:
         return name
     path = os.path.relpath(profile_file(name), output.resolve().parent)
     return Path(path).stem if "/" not in path else path
-
-
-def _warn_of_loopback(profile: Profile) -> None:
-    """A router for several hosts has to listen on the network."""
-    if len(profile.hosts) > 1 and all(
-        "127.0.0.1" in endpoint for endpoint in profile.session.listen
-    ):
-        errors().print(
-            "the router listens on its own computer only; for a network give its address: "
-            "--at HOST=ADDRESS",
-            style="yellow",
-        )

@@ -184,11 +184,8 @@ def advice(profile: Profile) -> list[str]:
 def _network(profile: Profile) -> Iterator[str]:
     session = profile.session
     if session.insecure:
-        where = (
-            "any network"
-            if any(address_of(each).startswith(ANYWHERE) for each in session.listen)
-            else "the network"
-        )
+        anywhere = any(address_of(each).startswith(ANYWHERE) for each in session.listen)
+        where = "any network" if anywhere else "the network"
         yield (
             f"session.insecure: anyone on {where} of the router's computer can command this "
             "robot; make certificates with `vla-zenoh secure init`"
