@@ -14,7 +14,7 @@ from vla_zenoh.cli.options import JsonOption, options
 from vla_zenoh.cli.output import console, new_table
 from vla_zenoh.errors import MissingExtraError, VlaZenohError, in_words
 from vla_zenoh.lab.cli.output import print_json, progress
-from vla_zenoh.lab.cli.output_path import ForceOption, output_folder
+from vla_zenoh.lab.cli.output_path import ForceOption, if_wanted, output_folder
 from vla_zenoh.nodes.camera.node import make_source
 from vla_zenoh.nodes.camera.realsense import connected, sdk
 from vla_zenoh.nodes.camera.v4l2_devices import list_devices
@@ -38,11 +38,9 @@ def camera_list(
     A serial number, or a name in /dev/v4l/by-id, stays with a camera; /dev/videoN may be another
     one after a restart. With --output each is opened: stop the nodes that use them first.
     """
-    if output is None:
-        found = _realsense() + _v4l2()
-    else:
-        with output_folder(output, force=force) as folder:
-            found = _realsense() + _v4l2()
+    with if_wanted(output_folder, output, force=force) as folder:
+        found = _cameras()
+        if folder is not None:
             for row in found:
                 with progress(f"a picture of {row['source']}"):
                     row |= _picture(row["source"], folder)
@@ -59,27 +57,22 @@ def camera_list(
     console().print(table)
 
 
+def _cameras() -> list[dict[str, Any]]:
+    """RealSense cameras are listed by their own library, which gives them depth, if it is here."""
+    try:
+        found = _realsense()
+    except MissingExtraError:
+        return _v4l2()
+    return found + [row for row in _v4l2() if MAKER not in row["name"]]
+
+
 def _v4l2() -> list[dict[str, Any]]:
-    # A RealSense camera is listed by its own library, which gives it depth.
-    skipped = MAKER if _has_library() else None
     return [
-        {"source": one.source, "name": one.name, "device": str(one.path)}
-        for one in list_devices()
-        if skipped is None or skipped not in one.name
+        {"source": one.source, "name": one.name, "device": str(one.path)} for one in list_devices()
     ]
 
 
-def _has_library() -> bool:
-    try:
-        sdk()
-    except MissingExtraError:
-        return False
-    return True
-
-
 def _realsense() -> list[dict[str, Any]]:
-    if not _has_library():
-        return []
     info = sdk().camera_info
     return [
         {

@@ -19,12 +19,12 @@ from vla_zenoh.cli.options import (
     options,
 )
 from vla_zenoh.cli.output import console, new_table, styled
-from vla_zenoh.control.policy_check import Finding, error
+from vla_zenoh.control.policy_check import error
 from vla_zenoh.errors import WorkerError, counted
 from vla_zenoh.lab.check.examination import DEFAULT_RUNS, CheckReport, Examination
 from vla_zenoh.lab.check.model_runner import ModelRunner
 from vla_zenoh.lab.cli.output import print_json, progress
-from vla_zenoh.policy import ActionSpec
+from vla_zenoh.policy import ActionSpec, CameraSpec, DepthSpec
 from vla_zenoh.policy.loader import make_policy
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.runtime.environments import run_in_own_environment
@@ -110,13 +110,13 @@ def check(
         print_json(report.to_dict())
     else:
         _print(report)
-    failed = not report.ok or (strict and _of(report, "warning"))
+    failed = not report.ok or (strict and _count(report, "warning"))
     sys.stdout.flush()
     os._exit(1 if failed else 0)  # threads of a model's library may keep the process alive
 
 
-def _of(report: CheckReport, level: str) -> list[Finding]:
-    return [finding for finding in report.findings if finding.level == level]
+def _count(report: CheckReport, level: str) -> int:
+    return sum(finding.level == level for finding in report.findings)
 
 
 def _print(report: CheckReport) -> None:
@@ -130,12 +130,11 @@ def _print(report: CheckReport) -> None:
         level = styled(f"{finding.level:<7}", STYLES[finding.level])
         out.print(level, styled(finding.name, "bold"), end=": ")
         out.print(finding.why, soft_wrap=True)
-    errors, warnings = len(_of(report, "error")), len(_of(report, "warning"))
+    warnings = counted(_count(report, "warning"), "warning")
     if report.ok:
-        counts = f", {counted(warnings, 'warning')}"
-        out.print(Text.assemble(("keeps its contract", "green"), counts))
+        out.print(Text.assemble(("keeps its contract", "green"), f", {warnings}"))
     else:
-        counts = f": {counted(errors, 'error')}, {counted(warnings, 'warning')}"
+        counts = f": {counted(_count(report, 'error'), 'error')}, {warnings}"
         out.print(Text.assemble(("breaks its contract", "bold red"), counts))
 
 
@@ -214,16 +213,9 @@ def _columns(action: ActionSpec) -> list[str]:
 def _inputs(report: CheckReport) -> str:
     assert report.spec is not None
     observation = report.spec.observation
-    cameras = [
-        f"{c.camera} {f'{c.width}x{c.height} {c.resize}' if c.width else 'in its own size'} "
-        f"{c.colour}"
-        for c in observation.cameras
-    ]
+    cameras = [f"{c.camera} {_size(c)} {c.colour}" for c in observation.cameras]
     depths = [
-        f"depth of {d.camera} "
-        f"{f'{d.width}x{d.height} {d.resize}' if d.width else 'in its own size'} "
-        f"{d.unit_m * 1e3:g} mm a count"
-        for d in observation.depth
+        f"depth of {d.camera} {_size(d)} {d.unit_m * 1e3:g} mm a count" for d in observation.depth
     ]
     parts = ", ".join([*cameras, *depths, *(f"state/{part}" for part in observation.state)])
     if observation.history > 1:
@@ -232,3 +224,7 @@ def _inputs(report: CheckReport) -> str:
             f"the start of an episode: {observation.history_start}"
         )
     return parts or "none"
+
+
+def _size(of: CameraSpec | DepthSpec) -> str:
+    return f"{of.width}x{of.height} {of.resize}" if of.width else "in its own size"

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 import zenoh
+from rich.table import Table
 
 from vla_zenoh.bus.host import HOST_VARIABLE
 from vla_zenoh.bus.session import open_session
@@ -119,23 +120,21 @@ def report(findings: list[HostFinding], *, as_json: bool) -> None:
     Raises:
         typer.Exit: something will not work.
     """
+    fails, warns = (sum(each.level == level for each in findings) for level in ("fail", "warn"))
     if as_json:
         print_json(findings)
     else:
-        _show(findings)
-    if any(finding.level == "fail" for finding in findings):
+        console().print(_table(findings))
+        console().print(f"{fails} will not work, {warns} could work better")
+    if fails:
         raise typer.Exit(1)
 
 
-def _show(findings: list[HostFinding]) -> None:
+def _table(findings: list[HostFinding]) -> Table:
     table = new_table("what", "", "found and what to do")
     for column in table.columns[:2]:
         column.no_wrap = True
     for finding in findings:
         text = finding.found if not finding.advice else f"{finding.found}\n-> {finding.advice}"
         table.add_row(finding.name, styled(finding.level, COLOURS[finding.level]), text)
-    out = console()
-    out.print(table)
-    fails = sum(finding.level == "fail" for finding in findings)
-    warns = sum(finding.level == "warn" for finding in findings)
-    out.print(f"{fails} will not work, {warns} could work better")
+    return table

@@ -69,8 +69,7 @@ def keys(
 ) -> None:
     """Show which keys exist, who publishes them, their type and rate."""
     with target.client() as client:
-        found = _listen(client, seconds, images)
-        found += _settings(client)
+        found = _listen(client, seconds, images) + _settings(client)
         if not images:
             found += image_keys(client.keys, client.snapshot())
         why = "" if found else target.no_node(client, "keys")

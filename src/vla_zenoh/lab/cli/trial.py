@@ -103,7 +103,11 @@ def trial(
         if plan is None:
             fail(f"{output} holds no trial")
         found = folder.episodes()
-        _warn_of_peeking(plan, found)
+        if (done := score(plan, found).done) < plan.episodes:
+            _warn(
+                f"{done} of {plan.episodes} episodes done: p and intervals hold where the number "
+                "of episodes was fixed beforehand, not where the results so far decide when to stop"
+            )
     else:
         asked = plan_options.asked(target.load().robot.name)
         check_folder(output, begun=folder.begun())
@@ -111,8 +115,7 @@ def trial(
             plan = _plan(folder, asked)
             found = folder.episodes()
             if folder.truncated:
-                text = "the last line of trials.jsonl was cut off; its episode is repeated"
-                errors().print(text, style="yellow", markup=False)
+                _warn("the last line of trials.jsonl was cut off; its episode is repeated")
             if plan.next_due(found) is not None:
                 found = _run(folder, plan, found, target, yes_setup)
     result = score(plan, found)
@@ -167,7 +170,7 @@ def _unattended(
                 lambda: target.operator("lab", "trial", "--output", str(output)),
                 plan_file.parent,
                 stop,
-                lambda text: errors().print(text, style="yellow", markup=False),
+                _warn,
             )
         except Interrupted:
             errors().print("interrupted; the same command continues", markup=False)
@@ -184,7 +187,7 @@ def _unattended(
             _show(trial.trial(each)[1], result)
         console().print(f"page: {output / PAGE}", markup=False)
     if why:
-        errors().print(f"stopped by a rule or a person: {why}", style="yellow", markup=False)
+        _warn(f"stopped by a rule or a person: {why}")
         raise typer.Exit(STOPPED)
 
 
@@ -218,15 +221,8 @@ def _run(
         raise typer.Exit(130) from None
 
 
-def _warn_of_peeking(plan: TrialPlan, found: list[EpisodeVerdict]) -> None:
-    done = score(plan, found).done
-    if done < plan.episodes:
-        errors().print(
-            f"{done} of {plan.episodes} episodes done: p and intervals hold where the number of "
-            "episodes was fixed beforehand, not where the results so far decide when to stop",
-            style="yellow",
-            markup=False,
-        )
+def _warn(text: str) -> None:
+    errors().print(text, style="yellow", markup=False)
 
 
 def _mapping(plan: TrialPlan, result: TrialScore, found: list[EpisodeVerdict]) -> dict[str, Any]:

@@ -197,27 +197,26 @@ class PrimitivesNode:
                 self._activate(run.worker if run else PRIMITIVES, run and run.prompt, request)
                 reason, why = self._watch(ending, asked.since_s + request.timeout_s)
             if isinstance(request, Grip) and reason == "reached":
-                self._tell_held(request)
+                box = None if request.holds_m is None else HeldBox(request.holds_m)
+                self._check.hold(box)
+                self._robot.publish(self._robot.keys.held, "" if box is None else str(box))
             if isinstance(ending, Arrival):
                 off = ending.off(self._sight())
                 why = why or self._elbow(target)
         except (Rejected, SessionError, CodecError) as error:
             reason, why = "rejected", str(error)
-        ok = reason in ("reached", *_conditions(request))
+        ends_well = ["reached"]
+        if isinstance(request, RunModel):
+            ends_well += request.until.names or ["timeout"]
         return replace(
             self._standing(),
-            ok=ok,
+            ok=reason in ends_well,
             reason=reason,
             why=why,
             took_s=round(time.monotonic() - asked.since_s, 3),
             off_m=None if off is None else round(off[0], 6),
             off_rad=None if off is None else round(off[1], 6),
         )
-
-    def _tell_held(self, request: Grip) -> None:
-        box = None if request.holds_m is None else HeldBox(request.holds_m)
-        self._check.hold(box)
-        self._robot.publish(self._robot.keys.held, "" if box is None else str(box))
 
     def _prepare(self, request: PrimitiveRequest) -> tuple[Ending, Target]:
         """Ending and target of a request.
@@ -358,8 +357,14 @@ class PrimitivesNode:
                 return self._why_inactive()
             if self._stop.is_set():
                 return "ended", "the node primitives was stopped"
-            if reason := ending.check(self._sight()):
-                return reason, self._acting() if reason == "bound" else ""
+            reason = ending.check(self._sight())
+            if reason == "bound":
+                status = robot.status("command")
+                limits = status.detail.get("limits") if status is not None else None
+                acting = ", ".join(map(str, limits)) if isinstance(limits, (list, tuple)) else ""
+                return reason, f"no more progress; active limits: {acting or 'none'}"
+            if reason:
+                return reason, ""
             if time.monotonic() > until_s:
                 return "timeout", ""
             time.sleep(POLL_S)
@@ -374,12 +379,6 @@ class PrimitivesNode:
         if status.state in ("stopped", "fault"):
             return status.state, why
         return ("deactivated", "") if why == DEACTIVATED else ("ended", why)
-
-    def _acting(self) -> str:
-        status = self._robot.status("command")
-        limits = status.detail.get("limits") if status is not None else None
-        acting = ", ".join(map(str, limits)) if isinstance(limits, (list, tuple)) else ""
-        return f"no more progress; active limits: {acting or 'none'}"
 
     def _state(self) -> str:
         status = self._robot.status("command")
@@ -417,10 +416,3 @@ class PrimitivesNode:
             width_m=gripper.width_m,
             holding=gripper.holding,
         )
-
-
-def _conditions(request: PrimitiveRequest) -> list[str]:
-    """Reasons by which a run ends well."""
-    if not isinstance(request, RunModel):
-        return []
-    return request.until.names or ["timeout"]

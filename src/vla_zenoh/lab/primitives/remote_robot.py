@@ -163,11 +163,12 @@ class RemoteRobot(Client):
             SessionError: the command node did not confirm it within `timeout_s`.
         """
         self.publish(self.keys.stop, "stop")
-        self._confirm("stop", self._stopped, timeout_s)
 
-    def _stopped(self) -> bool:
-        status = self.status("command")
-        return status is not None and status.state == "stopped"
+        def stopped() -> bool:
+            status = self.status("command")
+            return status is not None and status.state == "stopped"
+
+        self._confirm("stop", stopped, timeout_s)
 
     def reset(self, timeout_s: float = TIMEOUT_S) -> None:
         """Clear an emergency stop or a fault. The arm stays inactive.
