@@ -211,7 +211,8 @@ class Examination:
 
     def _compare_batch(self) -> None:
         """Compare ``infer_batch`` on two observations with ``infer`` on each."""
-        if not judge.takes_batches(self._policy) or not self.report.deterministic:
+        takes_batches = callable(getattr(self._policy, "infer_batch", None))
+        if not takes_batches or not self.report.deterministic:
             return
         chart = self._styles[0]
         pair = (chart, replace(chart, picture=noise, prompt=self._another_prompt()))

@@ -117,11 +117,6 @@ NEAR = 1e-3
 """Tolerance as a share of the largest number: a batch is summed in another order."""
 
 
-def takes_batches(policy: Policy) -> bool:
-    """Whether the model takes several observations at once."""
-    return callable(getattr(policy, "infer_batch", None))
-
-
 def ask_batch(policy: Policy, observations: Sequence[Observation]) -> list[Any]:
     """Answers of ``infer_batch``, without committed steps."""
     infer_batch: Any = getattr(policy, "infer_batch", None)

@@ -70,13 +70,11 @@ def certificates(host: str, entries: Sequence[Entry]) -> HostFinding:
         return HostFinding(name, "fail", "none", f"vla-zenoh secure add {host}")
     faults = [f"{entry.path.name} {fault}" for entry in entries for fault in entry.faults]
     soon = [f"{entry.path.name} {entry.warning}" for entry in entries if entry.warning]
+    found, advice = "; ".join((*faults, *soon)), f"vla-zenoh secure add {host} --renew"
     if faults:
-        found = "; ".join((*faults, *soon))
-        return HostFinding(
-            name, "fail", found, f"vla-zenoh secure add {host} --renew, and copy them"
-        )
+        return HostFinding(name, "fail", found, f"{advice}, and copy them")
     if soon:
-        return HostFinding(name, "warn", "; ".join(soon), f"vla-zenoh secure add {host} --renew")
+        return HostFinding(name, "warn", found, advice)
     end = min(entry.certificate.not_after for entry in entries if entry.certificate)
     return HostFinding(name, "ok", f"{len(entries)}, all valid until {end:%Y-%m-%d}")
 
@@ -143,23 +141,17 @@ def router(endpoint: str, *, is_router: bool, try_zenoh: Callable[[str], str]) -
     if endpoint.startswith("tls/"):
         return HostFinding(name, "ok", "a server listens; nodes check its certificate")
     error = try_zenoh(endpoint)
-    if not error:
-        return HostFinding(name, "ok", "answers")
-    return HostFinding(
+    return judged(
         name,
-        "fail",
-        f"the port is in use by another program than Zenoh ({error})",
+        not error,
+        f"the port is in use by another program than Zenoh ({error})" if error else "answers",
         f"find it: sudo ss -ltnp 'sport = :{port}'; stop it, or set another port in "
         "session.listen and session.connect of the profile",
+        "fail",
     )
 
 
 def _silent(name: str, reason: str, is_router: bool) -> HostFinding:
-    if is_router:
-        return HostFinding(name, "ok", f"none yet ({reason}); vla-zenoh up starts it")
-    return HostFinding(
-        name,
-        "warn",
-        f"no answer ({reason})",
-        "start vla-zenoh up on the router's host, and open the port in its firewall",
-    )
+    found = f"none yet ({reason}); vla-zenoh up starts it" if is_router else f"no answer ({reason})"
+    advice = "start vla-zenoh up on the router's host, and open the port in its firewall"
+    return judged(name, is_router, found, advice)

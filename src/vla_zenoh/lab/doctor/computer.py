@@ -35,16 +35,10 @@ def may_use_priority(priority: int) -> bool:
 
 def real_time_priority() -> HostFinding:
     """This user may use the priority of nodes that move an arm."""
-    if not may_use_priority(PRIORITY):
-        allowed = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
-        return HostFinding(
-            "real-time priority",
-            "warn",
-            f"not permitted (RLIMIT_RTPRIO is {allowed}); pose commands may come late under load",
-            f"add the line '{_user()} - rtprio {PRIORITY}' to {LIMITS_FILE} and log in again; "
-            "in a container: --cap-add=SYS_NICE",
-        )
-    return HostFinding("real-time priority", "ok", f"SCHED_FIFO {PRIORITY} is permitted")
+    may, limit = may_use_priority(PRIORITY), resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
+    found = f"not permitted (RLIMIT_RTPRIO is {limit}); pose commands may come late under load"
+    found = f"SCHED_FIFO {PRIORITY} is permitted" if may else found
+    return judged("real-time priority", may, found, _limit_advice(f"rtprio {PRIORITY}"))
 
 
 def niceness() -> HostFinding:
@@ -53,13 +47,8 @@ def niceness() -> HostFinding:
     try:
         os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
     except OSError:
-        return HostFinding(
-            "niceness",
-            "warn",
-            f"{NICENESS} is not permitted; other programs may delay nodes that move an arm",
-            f"add the line '{_user()} - nice {NICENESS}' to {LIMITS_FILE} and log in again; "
-            "in a container: --cap-add=SYS_NICE",
-        )
+        found = f"{NICENESS} is not permitted; other programs may delay nodes that move an arm"
+        return HostFinding("niceness", "warn", found, _limit_advice(f"nice {NICENESS}"))
     os.setpriority(os.PRIO_PROCESS, 0, before)
     return HostFinding("niceness", "ok", f"{NICENESS} is permitted")
 
@@ -91,8 +80,12 @@ def _text(path: Path) -> str:
         return "unreadable"
 
 
-def _user() -> str:
-    return os.environ.get("USER") or str(os.getuid())
+def _limit_advice(limit: str) -> str:
+    user = os.environ.get("USER") or str(os.getuid())
+    return (
+        f"add the line '{user} - {limit}' to {LIMITS_FILE} and log in again; in a container: "
+        "--cap-add=SYS_NICE"
+    )
 
 
 MIB = 1024 * 1024
@@ -152,14 +145,14 @@ def video_devices(needed: Sequence[str] = (), dev: Path = DEV) -> HostFinding:
             f"--device={missing[0]}",
         )
     closed = [str(path) for path in {*present, *wanted} if not os.access(path, os.R_OK | os.W_OK)]
-    if closed:
-        return HostFinding(
-            "video devices",
-            "fail" if wanted else "warn",
-            f"no permission: {', '.join(sorted(closed))}",
-            "sudo usermod --append --groups video $USER, then log in again",
-        )
-    return HostFinding("video devices", "ok", ", ".join(map(str, present)) or "none")
+    found = f"no permission: {', '.join(sorted(closed))}"
+    return judged(
+        "video devices",
+        not closed,
+        found if closed else ", ".join(map(str, present)) or "none",
+        "sudo usermod --append --groups video $USER, then log in again",
+        "fail" if wanted else "warn",
+    )
 
 
 TIMEX_BYTES = 256

@@ -127,10 +127,9 @@ def round_trip(franka: FrankaProfile) -> HostFinding:
         return HostFinding(name, "fail", f"{address} does not answer", "is the control box on?")
     mean_ms, most_ms = float(match[1]), float(match[2])
     found = f"mean {mean_ms:.2f} ms, largest {most_ms:.2f} ms of {PINGS}"
-    if most_ms >= MOST_MS:
-        advice = "a card of its own, no switch, no power saving (ethtool --set-eee), a quiet host"
-        return HostFinding(name, "warn", f"{found}; a cycle is {MOST_MS:g} ms", advice)
-    return HostFinding(name, "ok", found)
+    found += f"; a cycle is {MOST_MS:g} ms" if most_ms >= MOST_MS else ""
+    advice = "a card of its own, no switch, no power saving (ethtool --set-eee), a quiet host"
+    return judged(name, most_ms < MOST_MS, found, advice)
 
 
 def _level(franka: FrankaProfile) -> Level:

@@ -22,19 +22,12 @@ CTRL = 4
 HOLD_S = 0.15
 """Without reports of releases a key counts as held for this long; repeats come at 20 to 30 Hz."""
 
-MOVES: dict[str, tuple[int, float]] = {
-    "w": (0, 1.0),
-    "s": (0, -1.0),
-    "a": (1, 1.0),
-    "d": (1, -1.0),
-    "r": (2, 1.0),
-    "f": (2, -1.0),
-    "l": (3, 1.0),
-    "j": (3, -1.0),
-    "i": (4, 1.0),
-    "k": (4, -1.0),
-    "u": (5, 1.0),
-    "o": (5, -1.0),
+PAIRS = ("ws", "ad", "rf", "lj", "ik", "uo")
+"""Keys of each axis of the twist, forward and back."""
+MOVES = {
+    key: (axis, sign)
+    for axis, pair in enumerate(PAIRS)
+    for key, sign in zip(pair, (1.0, -1.0), strict=True)
 }
 """Key -> axis of the twist and direction."""
 OPENINGS = {".": 1.0, ",": -1.0}
