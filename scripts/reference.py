@@ -26,7 +26,7 @@ import vla_zenoh
 from vla_zenoh.cli.main import app, examples
 from vla_zenoh.keys import KEY_PATHS
 from vla_zenoh.kinematics.kinematics import make_kinematics
-from vla_zenoh.lab.doctor.franka_limits import BY_FCI, JOINTS
+from vla_zenoh.lab.doctor.fci import BY_FCI, JOINTS
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.security.roles import OWN, TABLE
 

@@ -78,7 +78,7 @@ COMMANDS: Mapping[str, Mapping[str, str | Group]] = {
             },
         ),
         "web": "lab.cli.web:web",
-        "serve": Group("Let agents drive the robot.", {"mcp": "lab.cli.mcp:mcp"}),
+        "serve": Group("Let agents drive the robot.", {"mcp": "lab.cli.serve:mcp"}),
     },
     "Watch and record": {
         "status": "cli.status:status",

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vla_zenoh.kinematics.kinematics import make_kinematics
-from vla_zenoh.lab.doctor.franka_limits import BY_FCI, Published
+from vla_zenoh.lab.doctor.fci import BY_FCI, Published
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.robots.franka.arm import flange_pose
 

@@ -1,9 +1,10 @@
-"""vla-zenoh lab serve: a model of ours for clients of openpi, or for the benchmarks of vla-eval."""
+"""vla-zenoh lab serve, serve mcp: a model for foreign clients, the robot for agents."""
 
 from __future__ import annotations
 
 import logging
 import os
+import sys
 import threading
 from typing import Annotated, Literal
 
@@ -17,12 +18,14 @@ from vla_zenoh.cli.options import (
     options,
 )
 from vla_zenoh.cli.output import console
+from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.lab.cli.loopback import require_loopback
 from vla_zenoh.lab.serve import openpi_server
 from vla_zenoh.lab.serve.served_policy import DefaultNames, make_served_policy
 from vla_zenoh.policy.loader import make_policy
 from vla_zenoh.runtime.environments import run_in_own_environment
 from vla_zenoh.runtime.process import stop_on_signals
+from vla_zenoh.security.roles import Role
 
 
 @options
@@ -104,3 +107,25 @@ def serve(
     stop.wait()
     server.stop()
     os._exit(0)  # threads of a model's library may keep the process alive
+
+
+@options
+def mcp(target: RobotTarget) -> None:
+    """Serve the primitives, state and cameras to an agent: an MCP server on stdin and stdout.
+
+    With the rights of this computer's certificate. It ends with its stdin; then the arm brakes.
+    """
+    from vla_zenoh.bus.session import open_session
+    from vla_zenoh.lab.primitives.remote_robot import RemoteRobot
+    from vla_zenoh.lab.serve.mcp_server import McpServer
+    from vla_zenoh.security.store import local_role
+
+    profile = target.load()
+    drives = local_role(profile) in (None, Role.OPERATOR)
+    # What any library prints must not get between the answers.
+    out = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    with open_session(profile.session) as session:
+        robot = RemoteRobot(profile, session)
+        robot.subscribe()
+        McpServer(robot, out, drives=drives).serve(sys.stdin.buffer)
