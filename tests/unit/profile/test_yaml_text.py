@@ -10,13 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.profile import yaml_text
+from vla_zenoh.profile.load import read_yaml, write_yaml
 
 FILE = "lab.yaml"
 
 
 def read(text: str) -> dict[str, Any]:
-    return yaml_text.read(text.encode(), FILE)[0]
+    return read_yaml(text.encode(), FILE)[0]
 
 
 @pytest.mark.parametrize(
@@ -63,7 +63,7 @@ def test_a_key_is_a_word_whatever_it_looks_like() -> None:
 
 
 def test_everything_has_its_line() -> None:
-    _, lines = yaml_text.read(b"# first\na:\n  b: [1,\n      2]\n", FILE)
+    _, lines = read_yaml(b"# first\na:\n  b: [1,\n      2]\n", FILE)
     assert lines == {
         (): "lab.yaml:2",
         ("a",): "lab.yaml:2",
@@ -75,7 +75,7 @@ def test_everything_has_its_line() -> None:
 
 def test_an_empty_file_is_an_empty_map() -> None:
     for raw in (b"", b"# nothing\n", b"---\n", "\ufeff".encode()):
-        assert yaml_text.read(raw, FILE)[0] == {}
+        assert read_yaml(raw, FILE)[0] == {}
 
 
 def bomb() -> str:
@@ -122,7 +122,7 @@ def bomb() -> str:
 )
 def test_what_cannot_be_read_is_refused_with_its_line(raw: bytes, said: str) -> None:
     with pytest.raises(ProfileError, match=said):
-        yaml_text.read(raw, FILE)
+        read_yaml(raw, FILE)
 
 
 def test_an_alias_stands_for_what_it_names() -> None:
@@ -131,7 +131,7 @@ def test_an_alias_stands_for_what_it_names() -> None:
 
 def refused_or_read(raw: bytes) -> bool:
     try:
-        return isinstance(yaml_text.read(raw, FILE)[0], dict)
+        return isinstance(read_yaml(raw, FILE)[0], dict)
     except ProfileError as error:
         return str(error).startswith(FILE)
 
@@ -164,6 +164,6 @@ PLAIN = st.recursive(
 
 @given(st.dictionaries(st.text(max_size=6), PLAIN, max_size=4))
 def test_what_is_written_is_read_back_here_and_by_yaml_1_1(data: dict[str, Any]) -> None:
-    text = yaml_text.write(data)
+    text = write_yaml(data)
     assert read(text) == data
     assert yaml.safe_load(text) == data

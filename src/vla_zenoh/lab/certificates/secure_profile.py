@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from vla_zenoh.errors import SecurityError
-from vla_zenoh.profile import HostProfile, Profile, yaml_text
+from vla_zenoh.profile import HostProfile, Profile
+from vla_zenoh.profile.load import write_yaml
 from vla_zenoh.profile.session import ANYWHERE, address_of, host_of, is_loopback
 from vla_zenoh.security.roles import Role
 
@@ -94,7 +95,7 @@ def profile_text(
     if any(host.connect or host.listen or host.link for host in profile.hosts.values()):
         # A profile's hosts are replaced whole, so all of them are written.
         body["hosts"] = {name: _host(host, secure) for name, host in profile.hosts.items()}
-    return HEAD.format(name=profile.name, folder=shown) + yaml_text.write(body)
+    return HEAD.format(name=profile.name, folder=shown) + write_yaml(body)
 
 
 def with_operator(text: str, host: str, role: Role) -> str:

@@ -13,7 +13,7 @@ from vla_zenoh.errors import ProfileError, RecordError
 from vla_zenoh.lab.tasks import Order
 from vla_zenoh.lab.trial.plan import TrialPlan
 from vla_zenoh.lab.trial.verdict import EpisodeVerdict
-from vla_zenoh.profile import yaml_text
+from vla_zenoh.profile.load import read_yaml
 
 CONTACT_WORDS = ("contact", "does not follow", "too near to a bound")
 """In the reason of an end that the policy caused; all other losses are of the nodes, and void."""
@@ -183,7 +183,7 @@ def read_plan(path: Path) -> UnattendedPlan:
         RecordError: it cannot be read, or a value is not allowed; names it.
     """
     try:
-        data, _ = yaml_text.read(path.read_bytes(), str(path))
+        data, _ = read_yaml(path.read_bytes(), str(path))
     except (OSError, ProfileError) as error:
         raise RecordError(f"{path}: {error}") from error
     return checked_plan(data, str(path))

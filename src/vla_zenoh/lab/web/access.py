@@ -11,7 +11,7 @@ from typing import Any, Literal, NamedTuple
 
 from vla_zenoh.errors import ProfileError, SecurityError
 from vla_zenoh.keys import key_chunk
-from vla_zenoh.profile import yaml_text
+from vla_zenoh.profile.load import read_yaml
 from vla_zenoh.security.store import open_to_others
 
 PageRole = Literal["operator", "viewer"]
@@ -71,7 +71,7 @@ def read_people(path: Path) -> list[Person]:
     try:
         if fault := open_to_others(path):
             raise SecurityError(fault)
-        data, _ = yaml_text.read(path.read_bytes(), str(path))
+        data, _ = read_yaml(path.read_bytes(), str(path))
     except (OSError, ProfileError) as error:
         raise SecurityError(f"--people {path}: {error}") from error
     people: list[Person] = []
