@@ -27,7 +27,7 @@ from vla_zenoh.lab.doctor.access_check import (
     token_selectors,
 )
 from vla_zenoh.profile import Profile
-from vla_zenoh.profile.session import SecurityProfile
+from vla_zenoh.profile.schema import SecurityProfile
 from vla_zenoh.security.roles import EVERY_MESSAGE, Act, Identity, Role, access_control
 
 Done = set[tuple[str, Act, str]]

@@ -20,7 +20,7 @@ from vla_zenoh.keys import Keys, Kind, last_chunk
 
 if TYPE_CHECKING:
     from vla_zenoh.profile import SessionProfile
-    from vla_zenoh.profile.session import SecurityProfile
+    from vla_zenoh.profile.schema import SecurityProfile
 
 Mode = Literal["client", "router"]
 """No peers: a router does not forward between them."""

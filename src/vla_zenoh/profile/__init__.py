@@ -10,6 +10,5 @@ if TYPE_CHECKING:
     from vla_zenoh.profile.profile import *
     from vla_zenoh.profile.robot import *
     from vla_zenoh.profile.schema import *
-    from vla_zenoh.profile.session import *
 
-__getattr__ = lazy_names(__name__, "load", "profile", "session", "schema", "robot", "limits")
+__getattr__ = lazy_names(__name__, "load", "profile", "schema", "robot", "limits")

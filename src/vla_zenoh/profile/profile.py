@@ -28,12 +28,16 @@ from vla_zenoh.profile.robot import (
 )
 from vla_zenoh.profile.schema import (
     SIMULATED,
+    TRUSTED_PROTOCOLS,
     CameraProfile,
     Composition,
     HostProfile,
+    SessionProfile,
     SimProfile,
     TaskProfile,
     Timing,
+    endpoint_faults,
+    is_loopback,
 )
 from vla_zenoh.profile.section import (
     Fault,
@@ -45,12 +49,6 @@ from vla_zenoh.profile.section import (
     Word,
     merge,
     unknown_name,
-)
-from vla_zenoh.profile.session import (
-    TRUSTED_PROTOCOLS,
-    SessionProfile,
-    endpoint_faults,
-    is_loopback,
 )
 from vla_zenoh.resources import is_path
 

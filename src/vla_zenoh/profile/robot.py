@@ -9,8 +9,8 @@ from typing import Annotated, Literal, NamedTuple, get_args
 
 from pydantic import AfterValidator, Field
 
-from vla_zenoh.profile.section import Fault, Name, Pair, Section, Text, Vector3, Word, Words
-from vla_zenoh.profile.session import Endpoints
+from vla_zenoh.profile.schema import Endpoints
+from vla_zenoh.profile.section import Fault, Name, Range, Section, Text, Vector3, Word, Words
 
 MAX_JOINTS = 16
 """Joints that an arm has at most."""
@@ -111,7 +111,7 @@ class RobotProfile(Section):
     base_frame: Word
     tcp_frame: Word
     arm_joints: Words = Field(min_length=1)
-    joint_range_rad: Annotated[tuple[Pair, ...], Field(strict=False)] = ()
+    joint_range_rad: Annotated[tuple[Range, ...], Field(strict=False)] = ()
     finger_joints: Words = ()
     home_rad: tuple[float, ...] = Field(strict=False)
     posture: Literal["start", "home"] = "start"
@@ -130,10 +130,6 @@ class RobotProfile(Section):
             yield ("home_rad",), f"has {home} angles for {joints} arm_joints"
         if ranges not in (0, joints):
             yield ("joint_range_rad",), f"has {ranges} pairs for {joints} arm_joints"
-        for index, (low, high) in enumerate(self.joint_range_rad):
-            if low >= high:
-                given = f"[{low:g}, {high:g}]"
-                yield ("joint_range_rad", str(index)), f"is {given}: give the lower end first"
         for index, angle in enumerate(self.home_rad):
             if abs(angle) > 2 * math.pi:
                 yield ("home_rad", str(index)), f"is {angle:g}: more than a turn; give radians"

@@ -69,8 +69,7 @@ Text = Annotated[str, Field(max_length=MAX_TEXT)]
 Word = Annotated[str, Field(min_length=1, max_length=512)]
 Names = Annotated[tuple[Name, ...], Field(strict=False, max_length=64), AfterValidator(_differ)]
 Words = Annotated[tuple[Word, ...], Field(strict=False, max_length=64), AfterValidator(_differ)]
-Pair = Annotated[tuple[float, float], Field(strict=False)]
-Range = Annotated[Pair, AfterValidator(_ordered)]
+Range = Annotated[tuple[float, float], Field(strict=False), AfterValidator(_ordered)]
 Vector3 = Annotated[tuple[float, float, float], Field(strict=False)]
 Distinct = AfterValidator(_differ)
 

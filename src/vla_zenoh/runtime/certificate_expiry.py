@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from vla_zenoh.errors import MissingExtraError, SecurityError
-from vla_zenoh.profile.session import SecurityProfile
+from vla_zenoh.profile.schema import SecurityProfile
 
 LOOK_PERIOD_S = 3600.0
 TELL_PERIOD_S = 24 * 3600.0

@@ -15,7 +15,7 @@ from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import TcpUserTimeout, open_session, session_config
 from vla_zenoh.errors import NodeError
 from vla_zenoh.profile import Profile
-from vla_zenoh.profile.session import address_of, is_loopback
+from vla_zenoh.profile.schema import address_of, is_loopback
 from vla_zenoh.runtime.certificate_expiry import CertificateExpiry
 from vla_zenoh.security.roles import access_control
 

@@ -9,7 +9,7 @@ import pytest
 from vla_zenoh.bus.host import HOST_VARIABLE, HostId, own_boot_id, own_host_id
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.profile import SessionProfile
-from vla_zenoh.profile.session import SecurityProfile
+from vla_zenoh.profile.schema import SecurityProfile
 from vla_zenoh.security.store import THIS_HOST
 
 PLAIN = SessionProfile()

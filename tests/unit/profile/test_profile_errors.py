@@ -23,7 +23,7 @@ from vla_zenoh.profile import (
     load_profile,
     override,
 )
-from vla_zenoh.profile.session import SecurityProfile, is_loopback
+from vla_zenoh.profile.schema import SecurityProfile, is_loopback
 from vla_zenoh.resources import names
 
 Write = Callable[..., str]

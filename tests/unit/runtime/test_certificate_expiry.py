@@ -13,7 +13,7 @@ from vla_zenoh.cli import status_table
 from vla_zenoh.cli.output import Screen
 from vla_zenoh.lab.certificates.lab_certificates import LabCertificates
 from vla_zenoh.profile import Profile, load_profile, override
-from vla_zenoh.profile.session import SecurityProfile
+from vla_zenoh.profile.schema import SecurityProfile
 from vla_zenoh.runtime import launch
 from vla_zenoh.runtime.certificate_expiry import (
     LOOK_PERIOD_S,

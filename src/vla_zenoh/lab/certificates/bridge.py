@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from vla_zenoh.profile import Profile
-from vla_zenoh.profile.session import TRUSTED_PROTOCOLS, host_of, is_loopback
+from vla_zenoh.profile.schema import TRUSTED_PROTOCOLS, host_of, is_loopback
 from vla_zenoh.security.roles import EVERY_MESSAGE, IN, OUT, Identity, Role, rule
 from vla_zenoh.security.store import AUTHORITY
 

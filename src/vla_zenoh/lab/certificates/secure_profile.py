@@ -9,7 +9,7 @@ from typing import Any
 from vla_zenoh.errors import SecurityError
 from vla_zenoh.profile import HostProfile, Profile
 from vla_zenoh.profile.load import write_yaml
-from vla_zenoh.profile.session import ANYWHERE, address_of, host_of, is_loopback
+from vla_zenoh.profile.schema import ANYWHERE, address_of, host_of, is_loopback
 from vla_zenoh.security.roles import Role
 
 HEAD = """\

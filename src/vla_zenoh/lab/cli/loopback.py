@@ -10,7 +10,7 @@ from vla_zenoh.bus.session import open_session
 from vla_zenoh.cli.output import errors
 from vla_zenoh.errors import SecurityError, SessionError
 from vla_zenoh.profile import Profile, SessionProfile, override
-from vla_zenoh.profile.session import is_loopback_address
+from vla_zenoh.profile.schema import is_loopback_address
 
 
 def own_address(profile: Profile) -> Profile:

@@ -33,7 +33,7 @@ from vla_zenoh.lab.cli.output import print_json
 from vla_zenoh.lab.cli.output_path import ForceOption, output_file
 from vla_zenoh.profile import Profile, load_profile, profile_file
 from vla_zenoh.profile.load import followed, paths_in
-from vla_zenoh.profile.session import DEFAULT_FOLDER, SecurityProfile
+from vla_zenoh.profile.schema import DEFAULT_FOLDER, SecurityProfile
 from vla_zenoh.resources import is_path, shipped
 from vla_zenoh.security.certificates import Entry
 from vla_zenoh.security.roles import PEOPLE, Role, identities, identities_of, operator_identities

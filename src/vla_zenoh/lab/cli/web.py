@@ -14,7 +14,7 @@ from vla_zenoh.cli.output import errors
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import NodeError, SecurityError
 from vla_zenoh.lab.web.access import People, Person, read_people
-from vla_zenoh.profile.session import is_loopback_address
+from vla_zenoh.profile.schema import is_loopback_address
 from vla_zenoh.runtime.process import run_node
 from vla_zenoh.security.roles import Role
 from vla_zenoh.security.store import local_role

@@ -20,7 +20,7 @@ from vla_zenoh.lab.doctor.access_check import (
 )
 from vla_zenoh.lab.doctor.needs import HostFinding, judged
 from vla_zenoh.profile import Profile, load_profile
-from vla_zenoh.profile.session import is_loopback
+from vla_zenoh.profile.schema import is_loopback
 
 if TYPE_CHECKING:
     from vla_zenoh.security.certificates import Entry

@@ -26,9 +26,8 @@ from vla_zenoh.lab.profile.robot_check import (
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.policy.loader import find_worker, make_policy
 from vla_zenoh.profile import HostProfile, Profile, load_with_lines
-from vla_zenoh.profile.schema import PATH_SOURCES
+from vla_zenoh.profile.schema import ANYWHERE, PATH_SOURCES, address_of, host_of, is_loopback
 from vla_zenoh.profile.section import located, located_fault
-from vla_zenoh.profile.session import ANYWHERE, address_of, host_of, is_loopback
 
 
 class ProfileReport(NamedTuple):

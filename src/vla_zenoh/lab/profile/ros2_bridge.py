@@ -11,7 +11,7 @@ from typing import Any
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.robot import GRIPPER_ACTIONS, Ros2Gripper, Ros2Profile
-from vla_zenoh.profile.session import (
+from vla_zenoh.profile.schema import (
     TRUSTED_PROTOCOLS,
     endpoint_faults,
     host_of,

@@ -27,7 +27,7 @@ from vla_zenoh.nodes.camera.geometry import resize
 from vla_zenoh.nodes.camera.source import LOOK_S, STALL_S
 from vla_zenoh.profile import Profile, SessionProfile
 from vla_zenoh.profile.robot import Ros2Camera, Ros2Output, Ros2Profile
-from vla_zenoh.profile.session import TRUSTED_PROTOCOLS
+from vla_zenoh.profile.schema import TRUSTED_PROTOCOLS
 from vla_zenoh.robots.arm import Arm
 from vla_zenoh.robots.driver import DriverStatus, Measurement, RobotDriver, command_of
 from vla_zenoh.robots.joint_reading import JointReading, RobotClock, StampFilter
