@@ -325,33 +325,25 @@ def _show(target: RobotTarget, client: Client, text: str, separator: str = ", ")
 def _stop_by_key(target: RobotTarget, *, every: bool) -> None:
     """Stop the robot at every key, and when the person leaves; the session stays open meanwhile."""
     with target.client(stop=True) as client, _keys() as pressed:
+        name, connected = target.named(client), True
         try:
-            _stand_by(target, client, pressed, every=every)
+            client.wait_for(lambda: _connected(client), ABSENT_PATIENCE_S)
+            say(f"Every key stops {name}; so does leaving: Ctrl-C, or closing this terminal.")
+            while (key := pressed()) is not False:
+                if key:
+                    client.stop()
+                    with suppress(SystemExit):  # reported already; stay on standby
+                        _confirm_stop(target, client, every=every)
+                if connected != (connected := _connected(client)):
+                    if connected:
+                        say(f"Connected: every key stops {name}.")
+                    else:
+                        silent = f": its command node is silent, no key stops {name}"
+                        say_marked("NOT CONNECTED", BOLD_RED, silent)
         finally:
             client.stop()
             with suppress(OSError):  # the terminal may be gone
                 _confirm_stop(target, client, every=every)
-
-
-def _stand_by(
-    target: RobotTarget, client: Client, pressed: Callable[[], bool | None], *, every: bool
-) -> None:
-    """Stop the robot at every key, until the input ends."""
-    name = target.named(client)
-    client.wait_for(lambda: _connected(client), ABSENT_PATIENCE_S)
-    say(f"Every key stops {name}; so does leaving: Ctrl-C, or closing this terminal.")
-    connected = True
-    while (key := pressed()) is not False:
-        if key:
-            client.stop()
-            with suppress(SystemExit):  # reported already; stay on standby
-                _confirm_stop(target, client, every=every)
-        if connected != (connected := _connected(client)):
-            if connected:
-                say(f"Connected: every key stops {name}.")
-            else:
-                silent = f": its command node is silent, no key stops {name}"
-                say_marked("NOT CONNECTED", BOLD_RED, silent)
 
 
 def _connected(client: Client) -> bool:

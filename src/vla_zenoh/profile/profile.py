@@ -434,10 +434,7 @@ def _hosts(profile: Profile) -> Iterator[Fault]:
 def _endpoints(profile: Profile, name: str, host: HostProfile) -> Iterator[Fault]:
     for what in ("connect", "listen", "link"):
         endpoints = getattr(host, what)
-        for index, why in endpoint_faults(
-            endpoints or (), profile.session, listen=what == "listen"
-        ):
-            yield ("hosts", name, what, str(index)), why
+        yield from endpoint_faults(endpoints or (), profile.session, "hosts", name, what)
         if endpoints is not None and what != "connect" and "router" not in host.nodes:
             yield ("hosts", name, what), "is for a router, and this host runs none"
 

@@ -10,7 +10,7 @@ from typing import Annotated, Literal, NamedTuple
 from pydantic import AfterValidator, Field
 
 from vla_zenoh.errors import nearest
-from vla_zenoh.profile.section import Distinct, Fault, Name, Names, Section, Text, Word
+from vla_zenoh.profile.section import Distinct, Fault, Name, Names, Place, Section, Text, Word
 from vla_zenoh.types.records import MAX_DEPTH_UNIT_M, MIN_DEPTH_UNIT_M
 
 IP_PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws")
@@ -78,30 +78,32 @@ def host_of(endpoint: str) -> str:
 
 
 def endpoint_faults(
-    endpoints: Sequence[str], session: SessionProfile, *, listen: bool
-) -> Iterator[tuple[int, str]]:
-    """(index, sentence) for endpoints that contradict the session's security or links.
+    endpoints: Sequence[str], session: SessionProfile, *above: str
+) -> Iterator[tuple[Place, str]]:
+    """Faults of endpoints that contradict the session's security or links.
 
-    If `listen`, a router listens on them; otherwise nodes connect to them.
+    At a place `above` that ends in ``listen`` a router listens on them; at others nodes connect.
     """
-    for index, endpoint in enumerate(endpoints):
+    listen = above[-1] == "listen"
+    for number, endpoint in enumerate(endpoints):
+        place = (*above, str(number))
         protocol = endpoint.partition("/")[0]
         trusted = protocol in TRUSTED_PROTOCOLS
         if session.security is not None and not trusted:
             why = f"{protocol} verifies no certificate, but there is a section security: write tls/"
-            yield index, why
+            yield place, why
         elif session.security is None and trusted:
-            yield index, f"{protocol} needs certificates: make them with `vla-zenoh secure init`"
+            yield place, f"{protocol} needs certificates: make them with `vla-zenoh secure init`"
         elif listen and not (trusted or session.insecure or is_loopback(endpoint)):
             yield (
-                index,
+                place,
                 "lets anyone on that network command the robot. Make certificates with "
                 "`vla-zenoh secure init`, or listen on 127.0.0.1, or set insecure: true",
             )
         match = _HOST_AND_PORT.fullmatch(endpoint.partition("/")[2])
         has_a_second = match is not None and 0 < int(match["port"]) < 65535
         if session.separate_links and not has_a_second:
-            yield index, "separate_links needs PROTOCOL/HOST:PORT, and the next port too"
+            yield place, "separate_links needs PROTOCOL/HOST:PORT, and the next port too"
 
 
 class SecurityProfile(Section):
@@ -154,8 +156,7 @@ class SessionProfile(Section):
             if address_of(endpoint).endswith(":0"):
                 yield ("connect", str(index)), "port 0 leads nowhere"
         for name, endpoints in (("connect", self.connect), ("listen", self.listen)):
-            for index, why in endpoint_faults(endpoints, self, listen=name == "listen"):
-                yield (name, str(index)), why
+            yield from endpoint_faults(endpoints, self, name)
         if self.security is not None and self.insecure:
             yield ("insecure",), "is true, beside a section security: leave one out"
 
@@ -364,12 +365,11 @@ class CameraProfile(Section):
         if self.depth_unit_m is not None and not CAMERA_SOURCES[kind].has_depth:
             known = ", ".join(one.written for one in CAMERA_SOURCES.values() if one.has_depth)
             yield ("depth_unit_m",), f"is set, and {kind}: measures no depth; these do: {known}"
-        with_lens = [name for name, one in CAMERA_SOURCES.items() if one.has_lens]
-        with_locks = [name for name, one in CAMERA_SOURCES.items() if one.has_locks]
-        for names, kinds in (
-            (("intrinsics", "undistort", "crop", "flip"), with_lens),
-            (("exposure_us", "white_balance_k"), with_locks),
+        for names, trait in (
+            (("intrinsics", "undistort", "crop", "flip"), "has_lens"),
+            (("exposure_us", "white_balance_k"), "has_locks"),
         ):
+            kinds = [name for name, one in CAMERA_SOURCES.items() if getattr(one, trait)]
             for name in names:
                 if getattr(self, name) not in (None, False, "none") and kind not in kinds:
                     known = ", ".join(f"{one}:" for one in kinds)

@@ -258,21 +258,19 @@ class Host:
                 ]
             else:
                 reject_taken(self._part.listen or self.profile.session.listen)
-                self._start_router()
+                own, *substitutes = self.profile.session.connect
+                # All others wait for it while they import. With substitutes it starts first: nodes
+                # would connect to one of those, and stay there.
+                self.supervisor.start("router" if substitutes else "")
+                if substitutes:
+                    first = open_session(
+                        self.profile.session, connect=(own,), wait_s=ROUTER_PATIENCE_S
+                    )
+                    first.close()
         self.session = open_session(self.profile.session, wait_s=ROUTER_PATIENCE_S)
         self.client = Client(self.profile, self.session).subscribe()
         self.supervisor.start()
         self._down = DownNodes(self.profile, self.session, self.host, self._nodes_down)
-
-    def _start_router(self) -> None:
-        """Start the router, and all others, which wait for it while they import.
-
-        With substitutes it starts first: nodes would connect to one of those, and stay there.
-        """
-        own, *substitutes = self.profile.session.connect
-        self.supervisor.start("router" if substitutes else "")
-        if substitutes:
-            open_session(self.profile.session, connect=(own,), wait_s=ROUTER_PATIENCE_S).close()
 
     def _nodes_down(self) -> list[Child]:
         client = self.client

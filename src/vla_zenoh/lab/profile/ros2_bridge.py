@@ -123,7 +123,7 @@ def _section(profile: Profile) -> Ros2Profile:
 def _listening(profile: Profile, endpoint: str) -> str:
     if not (_is_trusted(endpoint) or is_loopback(endpoint) or profile.session.insecure):
         plain = profile.session.model_copy(update={"security": None})
-        (_, why), *_ = endpoint_faults([endpoint], plain, listen=True)
+        (_, why), *_ = endpoint_faults([endpoint], plain, "listen")
         raise ProfileError(f"profile {profile.name}: a bridge that listens at {endpoint} {why}")
     try:
         ipaddress.ip_address(host_of(endpoint))
