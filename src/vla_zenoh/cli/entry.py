@@ -15,15 +15,9 @@ from importlib import import_module
 from vla_zenoh.cli.words import WORDS, parse
 
 EXTRA_OF = {
-    "pinocchio": "control",
-    "ruckig": "control",
-    "mujoco": "sim",
-    "matplotlib": "sim",
-    "av": "sim",
-    "mcap": "record",
-    "plotly": "record",
-    "jinja2": "record",
-    "rosbags": "record",
+    **dict.fromkeys(("pinocchio", "ruckig"), "control"),
+    **dict.fromkeys(("mujoco", "matplotlib", "av"), "sim"),
+    **dict.fromkeys(("mcap", "plotly", "jinja2", "rosbags"), "record"),
     "rerun": "view",
 }
 """Module -> extra that brings it, for the error of a missing import."""

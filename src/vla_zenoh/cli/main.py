@@ -94,13 +94,9 @@ COMMANDS: Mapping[str, Mapping[str, str | Group]] = {
         "doctor": "lab.cli.doctor:doctor",
         "profile": "lab.cli.profile:profile_app",
         "robot": Group(
-            "Compare a robot with its profile.",
-            {"check": "lab.cli.doctor:robot_check"},
+            "Compare a robot with its profile.", {"check": "lab.cli.doctor:robot_check"}
         ),
-        "camera": Group(
-            "Cameras of this computer.",
-            {"list": "lab.cli.camera:camera_list"},
-        ),
+        "camera": Group("Cameras of this computer.", {"list": "lab.cli.camera:camera_list"}),
         "secure": "lab.cli.secure:secure_app",
         "dataset": "lab.cli.dataset:dataset_app",
         "bench": Group(

@@ -23,25 +23,15 @@ MISSING, DEAD = "missing", "dead"
 
 
 class NodeRow(NamedTuple):
-    """A node.
+    """A node."""
 
-    Args:
-        name: on the bus.
-        host: where it runs, or should run.
-        state: by its status, or ``missing``, ``starting``, ``crashed``, ``dead``.
-        why: reason of the last three, with what to do; else empty.
-        status: the last one.
-        age_s: of the status.
-        alive: it has a liveliness token.
-    """
-
-    name: str
-    host: str
-    state: str
-    why: str
-    status: NodeStatus | None
-    age_s: float | None
-    alive: bool
+    name: str  # on the bus
+    host: str  # where it runs, or should run
+    state: str  # by its status, or missing, starting, crashed, dead
+    why: str  # reason of such a state, with what to do; else empty
+    status: NodeStatus | None  # the last one
+    age_s: float | None  # of the status
+    alive: bool  # it has a liveliness token
 
 
 def node_rows(

@@ -140,10 +140,7 @@ def camera(
 
 
 @options
-def command(
-    node: NodeOptions,
-    dry_run: DryRunOption = False,
-) -> None:
+def command(node: NodeOptions, dry_run: DryRunOption = False) -> None:
     """Run the command node: turns action chunks into a bounded, smooth command stream."""
     from vla_zenoh.nodes.command.node import CommandNode
 

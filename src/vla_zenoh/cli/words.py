@@ -41,11 +41,7 @@ OPTIONS = {
     "--robot": "robot",
 }
 """Of every word: fields of `vla_zenoh.cli.target.RobotTarget`."""
-VARIABLES = {
-    PROFILE_VARIABLE: "profile",
-    "VLA_ZENOH_CONNECT": "connect",
-    "VLA_ZENOH_HOST": "host",
-}
+VARIABLES = {PROFILE_VARIABLE: "profile", "VLA_ZENOH_CONNECT": "connect", "VLA_ZENOH_HOST": "host"}
 REPEATABLE = frozenset({"connect"})
 NUMBERS = frozenset({"rate_hz"})
 

@@ -169,21 +169,13 @@ MIN_PERIODS = 3
 
 
 class SourceKind(NamedTuple):
-    """A kind of camera source.
+    """A kind of camera source."""
 
-    Args:
-        written: how a profile names one.
-        is_path: it names a file or folder, relative to the profile.
-        has_lens: a camera node may crop, flip and undistort its images.
-        has_depth: it measures depth.
-        has_locks: its exposure and white balance can be fixed.
-    """
-
-    written: str
-    is_path: bool = False
-    has_lens: bool = False
-    has_depth: bool = False
-    has_locks: bool = False
+    written: str  # how a profile names one
+    is_path: bool = False  # it names a file or folder, relative to the profile
+    has_lens: bool = False  # a camera node may crop, flip and undistort its images
+    has_depth: bool = False  # it measures depth
+    has_locks: bool = False  # its exposure and white balance can be fixed
 
 
 CAMERA_SOURCES = {

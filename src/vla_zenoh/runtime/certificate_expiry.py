@@ -20,12 +20,9 @@ TELL_PERIOD_S = 24 * 3600.0
 class ExpiryOutlook(NamedTuple):
     """Result of checking the certificates."""
 
-    days: int | None = None
-    """Until the first expires, negative if it has; None: unknown."""
-    wrong: tuple[str, ...] = ()
-    """Files that are invalid, or soon will be, and why."""
-    unknown: str = ""
-    """Why they could not be checked; empty: they were."""
+    days: int | None = None  # until the first expires, negative if it has; None: unknown
+    wrong: tuple[str, ...] = ()  # files that are invalid, or soon will be, and why
+    unknown: str = ""  # why they could not be checked; empty: they were
 
 
 def outlook(security: SecurityProfile, now: dt.datetime) -> ExpiryOutlook:

@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from vla_zenoh.bus.session import session_config
-from vla_zenoh.cli.profile_cache import _Outline
-from vla_zenoh.cli.target import RobotTarget
+from vla_zenoh.cli.target import RobotTarget, _Outline
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.profile import Profile
 from vla_zenoh.resources import names
