@@ -76,8 +76,23 @@ class RobotTarget:
         the same: the same code, options and ``extends``, and every file with the same content. Its
         sections are read; it is no `Profile` of pydantic.
         """
-        options = (list(self.connect or ()), self.host, self.robot)
-        return _cached_profile(self.profile, options, self._load)
+        try:
+            file = profile_file(self.profile)
+            key = [str(file), list(self.connect or ()), self.host, self.robot, _code()]
+            root = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
+            name = f"{zlib.crc32(json.dumps(key).encode()):08x}.json"
+            cache = root / "vla-zenoh" / "outlines" / name
+            known = _read(cache)
+            if known is not None and known["key"] == key and _unchanged(file, known["files"]):
+                return cast("Profile", _Outline(known["outline"], self._load))
+            before = _files(self.profile)
+        except (VlaZenohError, OSError, ValueError, KeyError, TypeError):
+            return self._load()  # reports what is wrong
+        profile = self._load()
+        with suppress(OSError, ValueError):
+            if before == _files(self.profile):  # none was saved meanwhile
+                _write(cache, {"key": key, "files": before, "outline": _outline_of(profile)})
+        return profile
 
     @contextmanager
     def client(self, *, stop: bool = False, stop_now: bool = False) -> Iterator[Client]:
@@ -250,29 +265,6 @@ def _outline_of(profile: Profile) -> dict[str, Any]:
         "cameras": {name: {"from_ros2": one.from_ros2} for name, one in profile.cameras.items()},
         "ros2": None if ros2 is None else {"services": True if ros2.services else None},
     }
-
-
-def _cached_profile(name: str, options: Sequence[Any], load: Callable[[], Profile]) -> Profile:
-    """An outline of the profile that `load` would return, or that profile.
-
-    `options` are all that `load` depends on beside the files. Its `ProfileError` passes through.
-    """
-    try:
-        file = profile_file(name)
-        key = [str(file), list(options), _code()]
-        root = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
-        cache = root / "vla-zenoh" / "outlines" / f"{zlib.crc32(json.dumps(key).encode()):08x}.json"
-        known = _read(cache)
-        if known is not None and known["key"] == key and _unchanged(file, known["files"]):
-            return cast("Profile", _Outline(known["outline"], load))
-        before = _files(name)
-    except (VlaZenohError, OSError, ValueError, KeyError, TypeError):
-        return load()  # reports what is wrong
-    profile = load()
-    with suppress(OSError, ValueError):
-        if before == _files(name):  # none was saved meanwhile
-            _write(cache, {"key": key, "files": before, "outline": _outline_of(profile)})
-    return profile
 
 
 def _files(name: str) -> list[tuple[str, str]]:
