@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -48,7 +48,7 @@ from vla_zenoh.profile.section import (
     Text,
     Word,
     merge,
-    unknown_name,
+    unlisted,
 )
 from vla_zenoh.resources import is_path
 
@@ -170,10 +170,10 @@ class Profile(Section):
         """Sections that do not go together."""
         for check in (_robot, _parts, _cameras, _ros2):
             yield from check(self)
-        yield from _unknown(("task", "worker"), [self.task.worker], "workers", self.workers)
+        yield from unlisted(("task", "worker"), [self.task.worker], "workers", self.workers)
         yield from _serves(self)
-        yield from _unknown(("models",), self.models, "workers", self.workers)
-        yield from _unknown(("options",), self.options, "workers", self.workers)
+        yield from unlisted(("models",), self.models, "workers", self.workers)
+        yield from unlisted(("options",), self.options, "workers", self.workers)
         yield from _hosts(self)
 
     # -- which node runs where ----------------------------------------------------------------
@@ -239,7 +239,7 @@ def _robot(profile: Profile) -> Iterator[Fault]:
             if given and len(given) != len(joints):
                 yield ("lerobot", name), f"has {len(given)} entries for {len(joints)} arm_joints"
         turned = profile.lerobot.reversed
-        yield from _unknown(("lerobot", "reversed"), turned, "robot.arm_joints", joints)
+        yield from unlisted(("lerobot", "reversed"), turned, "robot.arm_joints", joints)
     if driver in ("ur", "lerobot") and profile.robot.command != "joint":
         yield ("robot", "command"), f"must be joint: robot.driver is {driver}"
     yield from _joint_limits((), profile.robot, profile.limits)
@@ -316,7 +316,7 @@ def _ros2(profile: Profile) -> Iterator[Fault]:
     ros2, robot = profile.ros2, profile.robot
     if ros2 is None:
         return
-    yield from _unknown(("ros2", "cameras"), ros2.cameras, "cameras", profile.cameras)
+    yield from unlisted(("ros2", "cameras"), ros2.cameras, "cameras", profile.cameras)
     wanted = f"{robot.command}_command"
     if robot.driver == "ros2" and getattr(ros2, wanted) is None:
         yield ("ros2",), f"lacks {wanted}: robot.command is {robot.command}"
@@ -374,7 +374,7 @@ def _way_to_ros2(profile: Profile, places: Sequence[str] | None) -> Iterator[Fau
 
 
 def _serves(profile: Profile) -> Iterator[Fault]:
-    yield from _unknown(("serves",), profile.serves, "workers", profile.workers)
+    yield from unlisted(("serves",), profile.serves, "workers", profile.workers)
     for worker, robots in profile.serves.items():
         if profile.robot.name not in robots:
             yield (
@@ -398,8 +398,8 @@ def _hosts(profile: Profile) -> Iterator[Fault]:
                 f"watches is not a host: `vla-zenoh secure add {name} --role operator` (or viewer) "
                 "gives it a certificate",
             )
-        yield from _unknown((*place, "cameras"), host.cameras or (), "cameras", profile.cameras)
-        yield from _unknown((*place, "workers"), host.workers or (), "workers", profile.workers)
+        yield from unlisted((*place, "cameras"), host.cameras or (), "cameras", profile.cameras)
+        yield from unlisted((*place, "workers"), host.workers or (), "workers", profile.workers)
         for kind in ("sim", "arm"):
             if kind in host.nodes and profile.robot.node != kind:
                 yield (*place, "nodes"), f"has {kind}, and robot.driver is {profile.robot.driver}"
@@ -448,12 +448,3 @@ def _routers(profile: Profile) -> Iterator[Fault]:
             f"is missing: routers do not discover each other, and {alone[0]} runs one as well. "
             "Give its address, as link: [tcp/10.0.0.2:7447]",
         )
-
-
-def _unknown(
-    place: Place, named: Iterable[str], what: str, known: Iterable[str]
-) -> Iterator[Fault]:
-    entries = isinstance(named, Mapping)
-    for name in named:
-        if name not in known:
-            yield unknown_name((*place, name) if entries else place, name, what, known)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import types
 import typing
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Annotated, Any, Self
 
@@ -150,23 +150,27 @@ def _file(where: str) -> str:
     return where.rpartition(":")[0]
 
 
-def unknown_name(place: Place, name: str, section: str, known: Iterable[str]) -> Fault:
-    """Fault of a `name` at `place` that `section` does not list."""
-    near, listed = nearest(name, known, ""), ", ".join(known) or "none"
-    why = f"{name!r} is not among {section}{near or '.'} Known: {listed}"
-    # Of a map the entry goes, of any other value only its content can change.
-    entry = place[-1] == name
-    to_do = ": {".join(place) + ": null" + "}" * (len(place) - 1) if entry else ""
-    remedy = f"remove that too: {to_do}" if to_do else "name another one there"
-    slip = f"; is {near.split(chr(39))[1]!r} a slip for it?" if near else "."
-    return (
-        place,
-        why,
-        (
-            ((section, name), f"is removed, but {{}} names it: {remedy}"),
-            ((section,), f"lacks {name!r}, but {{}} names it{slip} List it, or {remedy}"),
-        ),
-    )
+def unlisted(
+    place: Place, named: Iterable[str], section: str, known: Collection[str]
+) -> Iterator[Fault]:
+    """Faults of names at `place` that `section` does not list; of a map each entry's."""
+    of_map = isinstance(named, Mapping)
+    for name in named:
+        if name in known:
+            continue
+        at, near, listed = (*place, name), nearest(name, known, ""), ", ".join(known) or "none"
+        # Of a map the entry goes, of any other value only its content can change.
+        to_do = ": {".join(at) + ": null" + "}" * (len(at) - 1)
+        remedy = f"remove that too: {to_do}" if of_map else "name another one there"
+        slip = f"; is {near.split(chr(39))[1]!r} a slip for it?" if near else "."
+        yield (
+            at if of_map else place,
+            f"{name!r} is not among {section}{near or '.'} Known: {listed}",
+            (
+                ((section, name), f"is removed, but {{}} names it: {remedy}"),
+                ((section,), f"lacks {name!r}, but {{}} names it{slip} List it, or {remedy}"),
+            ),
+        )
 
 
 def _why(fault: Any, place: Place, model: type[Section]) -> str:

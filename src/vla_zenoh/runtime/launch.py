@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fcntl
-import json
 import os
 import secrets
 import signal
@@ -89,24 +88,16 @@ def lock_host(profile: Profile, host: str) -> IO[str]:
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        holder = _described(file.read(4096))
+        holder = file.read(4096)
         file.close()
         raise NodeError(
             f"host {host} of robot {profile.robot.name} is already running{holder}"
         ) from None
     file.truncate()
-    file.write(json.dumps({"pid": os.getpid(), "since_s": time.time()}))
+    pid, since = os.getpid(), time.strftime("%Y-%m-%d %H:%M:%S")
+    file.write(f": pid {pid}, since {since}. End it there with Ctrl-C, or `kill {pid}`")
     file.flush()
     return file
-
-
-def _described(holder: str) -> str:
-    with suppress(ValueError, KeyError, TypeError):
-        found = json.loads(holder)
-        pid, since_s = int(found["pid"]), float(found["since_s"])
-        since = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(since_s))
-        return f": pid {pid}, since {since}. End it there with Ctrl-C, or `kill {pid}`"
-    return ""
 
 
 def node_commands(
@@ -303,7 +294,12 @@ class Host:
         )
         client = self.client
         if may and client is not None and "command" in client.alive and self._takes_part(client):
-            self._brake(client)
+            try:
+                if not client.deactivate(BRAKE_PATIENCE_S):
+                    self._tell("command", "does not confirm that the arm stands")
+            except zenoh.ZError as error:
+                why = f"cannot be asked to brake ({error}); stopping it brakes too"
+                self._tell("command", why)
         if self._down is not None:
             self._down.close()
         if self.session is not None:
@@ -325,13 +321,6 @@ class Host:
                 if os.getpgid(status.pid) == pid:
                     return True
         return False
-
-    def _brake(self, client: Client) -> None:
-        try:
-            if not client.deactivate(BRAKE_PATIENCE_S):
-                self._tell("command", "does not confirm that the arm stands")
-        except zenoh.ZError as error:
-            self._tell("command", f"cannot be asked to brake ({error}); stopping it brakes too")
 
     def serve(self, stop: threading.Event) -> None:
         """Run the nodes until `stop` is set; nodes that crash or hang are restarted.
