@@ -34,7 +34,6 @@ DISCOVERY_S, POLL_S = 1.0, 0.05
 MODE_PATIENCE_S = 1.0
 ABSENT_PATIENCE_S = 1.5
 """A command node that is alive may take this long to appear."""
-KEY_S = 0.1
 SILENT_S = 2.0
 """The command node publishes its status twice a second."""
 LEAVING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
@@ -71,8 +70,7 @@ def prompt(
 def activate(
     target: RobotTarget,
     held: Annotated[
-        bool,
-        typer.Option("--hold", help="Stay: the arm is active only while this runs (deadman)."),
+        bool, typer.Option("--hold", help="Stay: the arm is active only while this runs (deadman).")
     ] = False,
     as_json: AnswerOption = False,
 ) -> None:
@@ -360,7 +358,7 @@ def _keys() -> Iterator[Callable[[], bool | None]]:
     number = sys.stdin.fileno()
 
     def pressed() -> bool | None:
-        if not select.select([number], [], [], KEY_S)[0]:
+        if not select.select([number], [], [], POLL_S)[0]:
             return None
         return bool(os.read(number, 4096))
 

@@ -20,8 +20,7 @@ if TYPE_CHECKING:  # Pydantic and the schema: `up` has more to do while it loads
     from vla_zenoh.profile import Profile
 
 ProfileOption = Annotated[
-    str,
-    typer.Option("--profile", "-p", envvar=PROFILE_VARIABLE, help="Name or path of a profile."),
+    str, typer.Option("--profile", "-p", envvar=PROFILE_VARIABLE, help="Name or path of a profile.")
 ]
 ConnectOption = Annotated[
     list[str] | None,

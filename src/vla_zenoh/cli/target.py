@@ -43,8 +43,7 @@ class RobotTarget:
     connect: ConnectOption = None
     host: HostOption = None
     robot: Annotated[
-        str | None,
-        typer.Option("--robot", help="Another robot on this router than the profile's."),
+        str | None, typer.Option("--robot", help="Another robot on this router than the profile's.")
     ] = None
 
     def typed(self, *command: str, host: str | None = None, robot: str | None = None) -> str:

@@ -66,8 +66,7 @@ def up(
         ),
     ] = None,
     no_record: Annotated[
-        bool,
-        typer.Option("--no-record", help="Keep no rolling record of the last minutes."),
+        bool, typer.Option("--no-record", help="Keep no rolling record of the last minutes.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:

@@ -95,7 +95,8 @@ class CheckedStore(Store):
                 faults.append(f"is about {found.common_name!r}")
             if key.exists():
                 faults.append(open_to_others(key))
-                if not key_fits(pem, read_file(key)):
+                own, private = load_pair(pem, read_file(key))
+                if own.public_key() != private.public_key():
                     faults.append(f"{key.name} belongs to another certificate")
             elif host:
                 faults.append(f"{key.name} is not there")
@@ -137,12 +138,6 @@ def _parsed(pem: bytes) -> x509.Certificate:
     except ValueError as error:
         raise SecurityError(f"is not a certificate: {error}") from error
     return found
-
-
-def key_fits(certificate: bytes, key: bytes) -> bool:
-    """Whether the private key belongs to the certificate; see `load_pair`."""
-    found, private = load_pair(certificate, key)
-    return found.public_key() == private.public_key()
 
 
 def load_pair(

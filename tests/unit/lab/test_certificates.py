@@ -49,8 +49,10 @@ def test_a_certificate_says_whose_it_is_and_who_signed_it(authority: ca.KeyPair)
     assert not raw.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
     assert found.days_left(NOW) == ca.CERTIFICATE_DAYS
     assert certificates.signed_by(made.certificate, authority.certificate)
-    assert certificates.key_fits(*made)
-    assert not certificates.key_fits(made.certificate, authority.key)
+    own, key = certificates.load_pair(*made)
+    assert own.public_key() == key.public_key()
+    _, key = certificates.load_pair(made.certificate, authority.key)
+    assert own.public_key() != key.public_key()
 
 
 def test_another_authority_of_the_same_name_signed_something_else(authority: ca.KeyPair) -> None:
