@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.lockstep_arm import activated, in_processes
-from vla_zenoh.lab.lockstep import Delays
+from vla_zenoh.lab.lockstep.worker import Delays
 from vla_zenoh.policy import ActionSpec, ActionSteps, ModelSpec, Observation, ObservationSpec
 from vla_zenoh.profile import load_profile, override
 

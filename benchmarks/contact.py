@@ -31,7 +31,8 @@ from vla_zenoh import resources
 from vla_zenoh.codec import message
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.kinematics.so3 import norm3
-from vla_zenoh.lab.lockstep import Lockstep, Message
+from vla_zenoh.lab.lockstep.loop import Lockstep
+from vla_zenoh.lab.lockstep.worker import Message
 from vla_zenoh.policy import (
     ActionSpec,
     ActionSteps,

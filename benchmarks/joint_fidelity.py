@@ -38,7 +38,8 @@ from vla_zenoh.control.limits import joint_motion_limits, workspace_corners
 from vla_zenoh.control.reachability import Barriers, ReachabilityFilter
 from vla_zenoh.kinematics.kinematics import Kinematics, pose_error, smallest_singular_value
 from vla_zenoh.kinematics.so3 import quat_from_rotation
-from vla_zenoh.lab.lockstep import Delays, Lockstep
+from vla_zenoh.lab.lockstep.loop import Lockstep
+from vla_zenoh.lab.lockstep.worker import Delays
 from vla_zenoh.policy import ActionSpec, ActionSteps, ModelSpec, Observation, ObservationSpec
 from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh.types import FloatArray

@@ -28,7 +28,7 @@ from uv import find_uv_bin
 
 from benchmarks.lockstep_arm import activated, in_processes
 from vla_zenoh.kinematics.so3 import log3
-from vla_zenoh.lab.lockstep import Delays
+from vla_zenoh.lab.lockstep.worker import Delays
 from vla_zenoh.policy import (
     ActionSpec,
     ActionSteps,

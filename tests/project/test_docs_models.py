@@ -22,7 +22,7 @@ from model_wires import groot, openpi, openvla_rest, origami
 
 from vla_zenoh.errors import PeerError
 from vla_zenoh.lab.check.examples import example_observation
-from vla_zenoh.lab.lockstep import Lockstep
+from vla_zenoh.lab.lockstep.loop import Lockstep
 from vla_zenoh.lab.policy_servers.action_semantics import ACTION_OPTIONS, read_action_semantics
 from vla_zenoh.lab.policy_servers.field_mapping import DEFAULTS, read_map
 from vla_zenoh.lab.policy_servers.state_vector import COORDINATES, PARTS, read_parts

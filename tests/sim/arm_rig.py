@@ -16,7 +16,8 @@ import numpy as np
 from vla_zenoh.codec import message
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.guard.reference_governor import BRAKE_MARGIN
-from vla_zenoh.lab.lockstep import Lockstep, Message, Tamper
+from vla_zenoh.lab.lockstep.loop import Lockstep
+from vla_zenoh.lab.lockstep.worker import Message, Tamper
 from vla_zenoh.policy import (
     ActionSpec,
     ActionSteps,

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from motions import HOME_RAD
 
 from vla_zenoh.errors import ResourceError
-from vla_zenoh.lab.tasks import COLOURS, brick
+from vla_zenoh.lab.tasks.order import COLOURS, brick
 from vla_zenoh.simulation.backend import Backend, why_no_opengl
 from vla_zenoh.simulation.render import Renderer
 from vla_zenoh.simulation.robot_model import RobotModel

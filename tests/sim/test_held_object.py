@@ -11,7 +11,7 @@ from pair_rig import PARTS, Pair, tcp_steps
 from pair_rig import shipped as shipped_pair
 
 from vla_zenoh.kinematics.collision import HELD
-from vla_zenoh.lab.lockstep import Lockstep
+from vla_zenoh.lab.lockstep.loop import Lockstep
 from vla_zenoh.types import HeldBox
 
 BAR = HeldBox((0.04, 0.04, 0.2))

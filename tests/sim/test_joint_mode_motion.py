@@ -10,7 +10,8 @@ from arm_rig import Asked, activate, mark, speed_m_s, stop_time_s, way_m, with_f
 
 from vla_zenoh.codec import message
 from vla_zenoh.control.reachability import ReachabilityFilter
-from vla_zenoh.lab.lockstep import Lockstep, Message
+from vla_zenoh.lab.lockstep.loop import Lockstep
+from vla_zenoh.lab.lockstep.worker import Message
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.simulation.world import build_world
 from vla_zenoh.types import JointState

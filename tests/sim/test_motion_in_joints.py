@@ -36,7 +36,8 @@ from vla_zenoh.codec import message
 from vla_zenoh.control.joint_space import JointBounds
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.kinematics.so3 import norm3
-from vla_zenoh.lab.lockstep import CAMERA, COMMAND, SIM, Lockstep, Message, Tamper
+from vla_zenoh.lab.lockstep.loop import CAMERA, COMMAND, SIM, Lockstep
+from vla_zenoh.lab.lockstep.worker import Message, Tamper
 from vla_zenoh.policy import (
     ActionSpec,
     ActionSteps,

@@ -39,7 +39,8 @@ from arm_rig import (
 
 from vla_zenoh.codec import message, records
 from vla_zenoh.errors import CodecError
-from vla_zenoh.lab.lockstep import CAMERA, COMMAND, SIM, Lockstep, Message
+from vla_zenoh.lab.lockstep.loop import CAMERA, COMMAND, SIM, Lockstep
+from vla_zenoh.lab.lockstep.worker import Message
 from vla_zenoh.types import (
     ActionChunk,
     FloatArray,

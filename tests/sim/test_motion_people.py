@@ -28,7 +28,8 @@ from arm_rig import (
     way_m,
 )
 
-from vla_zenoh.lab.lockstep import Lockstep, Message
+from vla_zenoh.lab.lockstep.loop import Lockstep
+from vla_zenoh.lab.lockstep.worker import Message
 from vla_zenoh.types import FloatArray, GripperCommand, PoseCommand, PoseReference, PoseState
 
 EXACT_M = 1e-3

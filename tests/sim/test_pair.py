@@ -25,7 +25,8 @@ from pair_rig import (
 )
 
 from vla_zenoh.codec import records
-from vla_zenoh.lab.lockstep import Lockstep, Message
+from vla_zenoh.lab.lockstep.loop import Lockstep
+from vla_zenoh.lab.lockstep.worker import Message
 from vla_zenoh.lab.teleop.policy import OperatorInput, TeleopPolicy
 from vla_zenoh.types import GripperState, JointCommand, JointState, PoseState
 

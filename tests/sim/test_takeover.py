@@ -21,7 +21,8 @@ from arm_rig import (
     speed_m_s,
 )
 
-from vla_zenoh.lab.lockstep import Lockstep, Message
+from vla_zenoh.lab.lockstep.loop import Lockstep
+from vla_zenoh.lab.lockstep.worker import Message
 from vla_zenoh.lab.teleop.leader import LeaderPolicy, LeaderState
 from vla_zenoh.lab.teleop.policy import AXES, OperatorInput, TeleopPolicy
 from vla_zenoh.policy import Policy

@@ -14,7 +14,7 @@ import pytest
 from chain import Chain, command_line
 
 import vla_zenoh
-from vla_zenoh.lab.lockstep import Lockstep
+from vla_zenoh.lab.lockstep.loop import Lockstep
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import load_profile
 from vla_zenoh.simulation.world import build_world

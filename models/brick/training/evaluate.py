@@ -29,20 +29,12 @@ from generate import labelled
 from states import Situation
 from worker import HORIZON, Brick, Hand, Waypoints
 
-from vla_zenoh.lab.lockstep import Delays, Lockstep
+from vla_zenoh.lab.lockstep.loop import Lockstep
+from vla_zenoh.lab.lockstep.worker import Delays
 from vla_zenoh.lab.statistics import wilson_95
-from vla_zenoh.lab.tasks import (
-    COLOURS,
-    FAMILIES,
-    LIMIT_S,
-    Order,
-    TaskEpisode,
-    TaskJudge,
-    Verdict,
-    brick,
-    draw_episode,
-    draw_stay,
-)
+from vla_zenoh.lab.tasks.episode import TaskEpisode, draw_episode, draw_stay
+from vla_zenoh.lab.tasks.judge import LIMIT_S, TaskJudge, Verdict
+from vla_zenoh.lab.tasks.order import COLOURS, FAMILIES, Order, brick
 from vla_zenoh.policy import Observation
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.simulation.render import Renderer

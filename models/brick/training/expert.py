@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from vla_zenoh.lab.tasks import DIRECTIONS
+from vla_zenoh.lab.tasks.order import DIRECTIONS
 
 HORIZON = 8
 DT_S = 0.1

@@ -25,7 +25,7 @@ from rich.progress import track
 from states import Situation, draw
 from worker import FRONT, WRIST
 
-from vla_zenoh.lab.tasks import brick
+from vla_zenoh.lab.tasks.order import brick
 from vla_zenoh.profile import load_profile
 from vla_zenoh.simulation.render import Renderer
 from vla_zenoh.simulation.robot_model import RobotModel

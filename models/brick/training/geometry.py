@@ -12,7 +12,7 @@ from expert import HORIZON, STEP_M, STEP_RAD, Row, foretell, wish
 from states import Situation, draw, draw_order
 from worker import Hand as Memory
 
-from vla_zenoh.lab.tasks import COLOURS, DIRECTIONS, FAMILIES, Order
+from vla_zenoh.lab.tasks.order import COLOURS, DIRECTIONS, FAMILIES, Order
 
 ORDERS = 4
 """Orders per situation, each with the teacher's waypoints."""

@@ -9,8 +9,15 @@ import numpy as np
 from states import draw_order
 from worker import MAX_PIECES, tokens_of
 
-from vla_zenoh.lab.tasks import COLOURS, DIRECTIONS, HELD_OUT, NONSENSE, Order, phrase
-from vla_zenoh.lab.tasks.order import DIRECTION_PHRASES
+from vla_zenoh.lab.tasks.order import (
+    COLOURS,
+    DIRECTION_PHRASES,
+    DIRECTIONS,
+    HELD_OUT,
+    NONSENSE,
+    Order,
+    phrase,
+)
 
 KINDS = ("put", "stack", *DIRECTIONS)
 NO_TASK = len(KINDS)

@@ -29,7 +29,7 @@ from expert import (
     quarter,
 )
 
-from vla_zenoh.lab.tasks import COLOURS, DIRECTIONS, Order
+from vla_zenoh.lab.tasks.order import COLOURS, DIRECTIONS, Order
 
 REST_M = 0.0096
 BRICK_X, BRICK_Y = (0.33, 0.68), (-0.33, 0.33)

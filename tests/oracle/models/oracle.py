@@ -19,7 +19,7 @@ import zenoh
 from vla_zenoh.bus.buffers import LatestSample
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import records
-from vla_zenoh.lab.tasks import COLOURS, brick
+from vla_zenoh.lab.tasks.order import COLOURS, brick
 from vla_zenoh.policy import (
     ActionSpec,
     ActionSteps,

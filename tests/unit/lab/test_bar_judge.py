@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from vla_zenoh.errors import RecordError
-from vla_zenoh.lab.tasks import BarJudge, Order, TaskJudge, judge_of
-from vla_zenoh.lab.tasks.order import parse_prompt
+from vla_zenoh.lab.tasks.judge import BarJudge, TaskJudge, judge_of
+from vla_zenoh.lab.tasks.order import Order, parse_prompt
 from vla_zenoh.types import ObjectPoses
 
 LIFT = Order("lift")

@@ -31,7 +31,9 @@ from vla_zenoh.lab.bench.task_sheet import (
 from vla_zenoh.lab.cli.bench_file import LAST_LINES, up_with_last_lines
 from vla_zenoh.lab.cli.bench_task import _named, _varied, _with_bricks, task
 from vla_zenoh.lab.statistics import wilson_95
-from vla_zenoh.lab.tasks import COLOURS, FAMILIES, Order, TaskEpisode, Verdict, brick
+from vla_zenoh.lab.tasks.episode import TaskEpisode
+from vla_zenoh.lab.tasks.judge import Verdict
+from vla_zenoh.lab.tasks.order import COLOURS, FAMILIES, Order, brick
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import Image, ObjectPoses
 

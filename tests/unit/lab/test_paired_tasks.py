@@ -18,7 +18,8 @@ from vla_zenoh.lab.bench.paired_tasks import CONDITIONS, TaskResultFile, compare
 from vla_zenoh.lab.bench.task import TaskOutcome, TaskPlan, TaskScore
 from vla_zenoh.lab.cli.bench_compare import B_IS_WORSE
 from vla_zenoh.lab.cli.bench_compare import compare as command
-from vla_zenoh.lab.tasks import Order, TaskEpisode
+from vla_zenoh.lab.tasks.episode import TaskEpisode
+from vla_zenoh.lab.tasks.order import Order
 
 SEED = 1_000_000
 FAMILIES = ("put", "stack", "push")

@@ -8,19 +8,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vla_zenoh.errors import RecordError, ResourceError
-from vla_zenoh.lab.tasks import (
+from vla_zenoh.lab.tasks.episode import draw_episode, draw_stay
+from vla_zenoh.lab.tasks.judge import LIMIT_S, TaskJudge
+from vla_zenoh.lab.tasks.order import (
     COLOURS,
     DIRECTIONS,
     FAMILIES,
     HELD_OUT,
-    LIMIT_S,
     NONSENSE,
     TRAINING,
     Order,
-    TaskJudge,
     brick,
-    draw_episode,
-    draw_stay,
     phrase,
 )
 from vla_zenoh.types import ObjectPoses

@@ -4,8 +4,18 @@ from __future__ import annotations
 
 import pytest
 
-from vla_zenoh.lab.tasks import COLOURS, DIRECTIONS, NONSENSE, Order, phrase
-from vla_zenoh.lab.tasks.order import PUSH, PUT, STACK, is_nonsense, parse_prompt
+from vla_zenoh.lab.tasks.order import (
+    COLOURS,
+    DIRECTIONS,
+    NONSENSE,
+    PUSH,
+    PUT,
+    STACK,
+    Order,
+    is_nonsense,
+    parse_prompt,
+    phrase,
+)
 
 ORDERS = [
     *(Order(PUT, x) for x in COLOURS),

@@ -12,19 +12,19 @@ import numpy as np
 from vla_zenoh.errors import ResourceError
 from vla_zenoh.lab.policy_servers.model_options import shown
 from vla_zenoh.lab.statistics import wilson_95
-from vla_zenoh.lab.tasks import (
+from vla_zenoh.lab.tasks.episode import TaskEpisode, draw_episode, draw_stay
+from vla_zenoh.lab.tasks.judge import LIMIT_S
+from vla_zenoh.lab.tasks.order import (
     COLOURS,
     DIRECTIONS,
     FAMILIES,
     LIFT,
     LIFT_PROMPT,
-    LIMIT_S,
+    PUSH,
     Order,
-    TaskEpisode,
-    draw_episode,
-    draw_stay,
+    is_nonsense,
+    parse_prompt,
 )
-from vla_zenoh.lab.tasks.order import PUSH, is_nonsense, parse_prompt
 from vla_zenoh.types import ObjectPoses
 
 SCENE = "bricks"
@@ -37,7 +37,7 @@ CHAIN_FAILURES: Mapping[str, str] = {
     ARM_LOST: "the arm was deactivated during the episode",
     NO_STATE: "the simulator's objects were silent",
 }
-"""Kinds of failure of the chain, beside those of the task (`vla_zenoh.lab.tasks.FAILURES`)."""
+"""Kinds of failure of the chain, beside those of the task (`FAILURES` of its judge)."""
 
 BASELINES: Mapping[str, tuple[str, str]] = {
     "hold": ("scripted", "hold"),

@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol
 from vla_zenoh.errors import SpecError, WorkerError
 from vla_zenoh.lab.bench.task import NOT_OBEYED, TaskOutcome, TaskPlan, TaskRequest
 from vla_zenoh.lab.episode import EpisodeLimit
-from vla_zenoh.lab.tasks import judge_of
+from vla_zenoh.lab.tasks.judge import judge_of
 from vla_zenoh.types import FloatArray, ObjectPoses
 
 DONE_S = 1.5

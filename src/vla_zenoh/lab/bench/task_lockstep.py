@@ -22,7 +22,8 @@ from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.errors import NodeError, VlaZenohError, WorkerError, in_words
 from vla_zenoh.lab.bench.task import ARM_LOST, TaskOutcome, TaskPlan, TaskRequest
 from vla_zenoh.lab.bench.task_episode import SceneSnapshot, run_task
-from vla_zenoh.lab.lockstep import Delays, Lockstep
+from vla_zenoh.lab.lockstep.loop import Lockstep
+from vla_zenoh.lab.lockstep.worker import Delays
 from vla_zenoh.policy import ActionSteps, ModelSpec, Observation, Policy, reset_of
 from vla_zenoh.policy.loader import find_worker, make_policy
 from vla_zenoh.profile import Profile

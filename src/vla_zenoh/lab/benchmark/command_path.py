@@ -13,7 +13,8 @@ import numpy as np
 from vla_zenoh.errors import NodeError
 from vla_zenoh.kinematics.so3 import held_pose
 from vla_zenoh.lab.benchmark.episode import EpisodeClock, EpisodeConditions
-from vla_zenoh.lab.lockstep import Delays, Lockstep
+from vla_zenoh.lab.lockstep.loop import Lockstep
+from vla_zenoh.lab.lockstep.worker import Delays
 from vla_zenoh.policy import ActionSteps, ModelSpec, Observation, ObservationSpec
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.types import FloatArray, GripperState, JointState, PoseState

@@ -25,7 +25,8 @@ from vla_zenoh.lab.cli.bench_file import counts, rate_cells, running_nodes, show
 from vla_zenoh.lab.cli.options import SimulatedProfileOption
 from vla_zenoh.lab.cli.output import print_json, progress_bars
 from vla_zenoh.lab.cli.output_path import ForceOption, if_wanted, output_folder, require_free_folder
-from vla_zenoh.lab.tasks import FAMILIES, LIFT, LIMIT_S
+from vla_zenoh.lab.tasks.judge import LIMIT_S
+from vla_zenoh.lab.tasks.order import FAMILIES, LIFT
 from vla_zenoh.policy.loader import find_model
 from vla_zenoh.profile import Profile, override
 from vla_zenoh.resources import is_path

@@ -20,8 +20,8 @@ from vla_zenoh.lab.cli.options import DemoOptions
 from vla_zenoh.lab.cli.output import print_json
 from vla_zenoh.lab.demo.segments import latencies
 from vla_zenoh.lab.evaluation.result import TASKS
-from vla_zenoh.lab.tasks import COLOURS, DIRECTIONS, FAILURES, LIMIT_S, Order, phrase
-from vla_zenoh.lab.tasks.order import PUSH, PUT, STACK
+from vla_zenoh.lab.tasks.judge import FAILURES, LIMIT_S
+from vla_zenoh.lab.tasks.order import COLOURS, DIRECTIONS, PUSH, PUT, STACK, Order, phrase
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.sanitize import one_line, printable
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from vla_zenoh.errors import RecordError
 from vla_zenoh.lab.dataset.episodes import RecordedEpisode
 from vla_zenoh.lab.recording.run import newest
-from vla_zenoh.lab.tasks import judge_of
-from vla_zenoh.lab.tasks.judge import SETTLED_S
+from vla_zenoh.lab.tasks.judge import SETTLED_S, judge_of
 from vla_zenoh.lab.tasks.order import parse_prompt
 from vla_zenoh.lab.trial.verdict import Verdict, verdict_in
 

@@ -7,21 +7,3 @@ time: for tests, data generation and latency studies.
 Fault injection: `Lockstep.tamper` may drop, delay, repeat or change every message;
 `Lockstep.set_clock` sets the wall clock of one node; `Lockstep.alive` holds the live nodes.
 """
-
-from __future__ import annotations
-
-from vla_zenoh.lab.lockstep.loop import CAMERA, COMMAND, SIM, START_NS, TICK_NS, Lockstep
-from vla_zenoh.lab.lockstep.worker import Delays, LockstepTrace, Message, Tamper
-
-__all__ = [
-    "CAMERA",
-    "COMMAND",
-    "SIM",
-    "START_NS",
-    "TICK_NS",
-    "Delays",
-    "Lockstep",
-    "LockstepTrace",
-    "Message",
-    "Tamper",
-]

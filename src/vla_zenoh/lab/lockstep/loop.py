@@ -251,12 +251,12 @@ class Lockstep:
         header = Header(self.wall_ns(CAMERA), self._seq[CAMERA], CAMERA)
         arrival_ns = self.now_ns + round(self.delays.camera_s * 1e9)
         wanted = [worker.spec.observation for worker in self.workers.values()]
-        for camera in sorted({one.camera for each in wanted for one in each.cameras}):
-            picture = Stamped(header, self._picture(camera), arrival_ns)
+        cameras = sorted({one.camera for each in wanted for one in each.cameras})
+        with_depth = sorted({one.camera for each in wanted for one in each.depth})
+        shown = [(camera, self._picture(camera)) for camera in cameras]
+        for camera, record in [*shown, *((camera, self._depth(camera)) for camera in with_depth)]:
+            picture = Stamped(header, record, arrival_ns)
             self._deliver(arrival_ns, partial(self._take_picture, camera, picture))
-        for camera in sorted({one.camera for each in wanted for one in each.depth}):
-            depth = Stamped(header, self._depth(camera), arrival_ns)
-            self._deliver(arrival_ns, partial(self._take_depth, camera, depth))
 
     # -- the wire -----------------------------------------------------------------------------
     def _send(
@@ -311,13 +311,9 @@ class Lockstep:
         for worker in self.workers.values():
             worker.take_state(self._at(worker.source, state), part)
 
-    def _take_picture(self, camera: str, picture: Stamped[Image]) -> None:
+    def _take_picture(self, camera: str, picture: Stamped[Image] | Stamped[Depth]) -> None:
         for worker in self.workers.values():
             worker.take_picture(camera, self._at(worker.source, picture))
-
-    def _take_depth(self, camera: str, picture: Stamped[Depth]) -> None:
-        for worker in self.workers.values():
-            worker.take_depth(camera, self._at(worker.source, picture))
 
     def _take_task(self, task: Stamped[Task]) -> None:
         for worker in self.workers.values():

@@ -24,7 +24,6 @@ from vla_zenoh.types import (
     Depth,
     FloatArray,
     Header,
-    Image,
     JointCommand,
     PoseCommand,
     Stamped,
@@ -134,15 +133,12 @@ class LockstepWorker:
             if of_part == part and isinstance(state.record, STATE_KINDS[what]):
                 self._streams.states[name].add(state)
 
-    def take_picture(self, camera: str, picture: Stamped[Image]) -> None:
-        """Receive an image; kept if the model's spec lists it."""
-        if camera in self._streams.images:
-            self._streams.images[camera].add(picture)
-
-    def take_depth(self, camera: str, picture: Stamped[Depth]) -> None:
-        """Receive a depth picture; kept if the model's spec lists it."""
-        if camera in self._streams.depth:
-            self._streams.depth[camera].add(picture)
+    def take_picture(self, camera: str, picture: Stamped[Any]) -> None:
+        """Receive an image or a depth picture; kept if the model's spec lists it."""
+        depth = isinstance(picture.record, Depth)
+        streams: Any = self._streams.depth if depth else self._streams.images
+        if camera in streams:
+            streams[camera].add(picture)
 
     def step(self, now_ns: int, wall_ns: int) -> ActionChunk | None:
         """Infer if a request is due and an observation is complete.

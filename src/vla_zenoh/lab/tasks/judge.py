@@ -9,7 +9,18 @@ import numpy as np
 
 from vla_zenoh.errors import RecordError
 from vla_zenoh.kinematics.so3 import rotation_from_quat
-from vla_zenoh.lab.tasks.order import BOX, COLOURS, DIRECTIONS, PUSH, PUT, STACK, STAY, Order, brick
+from vla_zenoh.lab.tasks.order import (
+    BOX,
+    COLOURS,
+    DIRECTIONS,
+    LIFT,
+    PUSH,
+    PUT,
+    STACK,
+    STAY,
+    Order,
+    brick,
+)
 from vla_zenoh.types import FloatArray, ObjectPoses
 
 LIMIT_S = 30.0
@@ -198,7 +209,7 @@ TOUCHED_M = 0.01
 
 
 class BarJudge:
-    """Judges ``lift the bar``; used as a `vla_zenoh.lab.tasks.TaskJudge`.
+    """Judges ``lift the bar``; used as a `TaskJudge`.
 
     Raises:
         RecordError: there is no bar.
@@ -247,3 +258,10 @@ class BarJudge:
     def _pose(objects: ObjectPoses) -> tuple[FloatArray, FloatArray]:
         index = objects.names.index(BAR)
         return np.array(objects.position_m[index]), rotation_from_quat(objects.quat_xyzw[index])
+
+
+def judge_of(
+    order: Order, before: ObjectPoses, tcp_m: FloatArray | None = None
+) -> TaskJudge | BarJudge:
+    """The judge of a goal; see `TaskJudge` for the arguments and errors."""
+    return BarJudge(order, before) if order.family == LIFT else TaskJudge(order, before, tcp_m)

@@ -17,7 +17,7 @@ from vla_zenoh.lab.durable import write_whole, writing
 from vla_zenoh.lab.episode import EpisodeRunner
 from vla_zenoh.lab.newest_records import NewestRecords, StreamSlot
 from vla_zenoh.lab.primitives.client import ask
-from vla_zenoh.lab.tasks import TaskJudge
+from vla_zenoh.lab.tasks.judge import TaskJudge
 from vla_zenoh.lab.trial.automatic_judge import Frame, Judge, JudgedEpisode, StateSample
 from vla_zenoh.lab.trial.episode_fsm import EpisodeFsm, Phase
 from vla_zenoh.lab.trial.folder import TrialFolder

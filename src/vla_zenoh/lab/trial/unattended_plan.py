@@ -10,7 +10,7 @@ from typing import Annotated, Any, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from vla_zenoh.errors import ProfileError, RecordError
-from vla_zenoh.lab.tasks import Order
+from vla_zenoh.lab.tasks.order import Order
 from vla_zenoh.lab.trial.plan import TrialPlan
 from vla_zenoh.lab.trial.verdict import EpisodeVerdict
 from vla_zenoh.profile.load import read_yaml
@@ -31,7 +31,7 @@ class UnattendedTask(_Part):
     """A task that every worker does `episodes` times.
 
     Args:
-        order: goal for the simulator's judge, as `vla_zenoh.lab.tasks.Order`.
+        order: goal for the simulator's judge, as `vla_zenoh.lab.tasks.order.Order`.
     """
 
     name: Name

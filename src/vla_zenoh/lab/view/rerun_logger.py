@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict, deque
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -42,6 +41,7 @@ from vla_zenoh.types import (
 
 DRAW_NS = 33_000_000
 """Shortest interval between two drawings of a state or command; every cause is logged."""
+OFTEN = (PoseState, JointState, GripperState, ObjectPoses)
 APART_NS = 10_000_000_000
 """A stamp that far from the reception is of another clock: the reception counts."""
 NO_SPEC, UNFIT = "no_spec", "does not fit its spec"
@@ -116,22 +116,6 @@ class RerunLogger:
         """Samples that cannot be shown, by key and reason."""
         self.dropped = 0
         """Samples that the source of the samples had to drop."""
-        self._log_record: dict[type, Callable[[Sample, int, Any], None]] = {
-            PoseState: self._pose_state,
-            JointState: self._joint_state,
-            GripperState: self._gripper_state,
-            PoseCommand: self._pose_command,
-            JointCommand: self._joint_command,
-            GripperCommand: self._gripper_command,
-            ObjectPoses: self._objects,
-            ActionChunk: self._chunk,
-            ModelSpec: self._spec,
-            Task: self._on_task,
-            NodeStatus: self._status,
-            Event: self._event,
-            InferenceDebug: self._on_seen,
-        }
-        self._often = (PoseState, JointState, GripperState, ObjectPoses)
 
     def _layout(self) -> None:
         self._stream.send_blueprint(
@@ -189,9 +173,49 @@ class RerunLogger:
     def _record(self, kind: type, sample: Sample, stamp_ns: int) -> None:
         if sample.header is None and kind is not ModelSpec:  # the reply to a query has none
             raise CodecError("no_header", f"{sample.key} has no header")
-        if kind in self._often and not self._due(sample.key, stamp_ns):
+        if kind in OFTEN and not self._due(sample.key, stamp_ns):
             return
-        self._log_record[kind](sample, stamp_ns, records.decode(kind, sample.payload))
+        match records.decode(kind, sample.payload):
+            case PoseState() as state:
+                self._pose_state(self._arm(sample), stamp_ns, state)
+            case JointState() as state:
+                arm = self._arm(sample)
+                arm.scene.joints(state.names, state.position_rad)
+                arm.charts.joints(state.names, state.position_rad)
+            case GripperState() as state:
+                arm = self._arm(sample)
+                arm.scene.gripper(max(state.width_m, 0.0))
+                arm.charts.gripper(paths.MEASURED, state.width_m)
+            case ObjectPoses() as objects:
+                self._first.scene.objects(objects)
+            case PoseCommand() as command:
+                self._pose_command(sample, stamp_ns, command)
+            case JointCommand() as command:
+                self._joint_command(sample, stamp_ns, command)
+            case GripperCommand() as command:
+                self._arm(sample).charts.gripper(paths.COMMANDED, command.width_m)
+            case ModelSpec() as spec:
+                self._spec(stamp_ns, spec)
+            case ActionChunk() as chunk:
+                self._chunk(sample.key, stamp_ns, chunk)
+            case InferenceDebug() as seen:
+                if seen.worker not in self._seen:
+                    self._seen[seen.worker] = set()
+                    self._layout()
+                self._texts.answer(seen, self._specs.get(seen.spec_hash))
+            case Task() as task:
+                self._obeyed = task.worker
+                self._texts.task(task)
+                self._texts.now(stamp_ns, self.rejected, self.dropped)
+            case NodeStatus() as status:
+                if sample.key == self._command_status:
+                    self._first.charts.status(status)
+                    self._texts.status(status)
+                self._texts.now(stamp_ns, self.rejected, self.dropped)
+            case Event() as event:
+                self._texts.event(last_chunk(sample.key), stamp_ns, event)
+            case _:
+                raise CodecError("invalid", f"{kind.__name__} is not shown")
 
     # -- pictures and settings ----------------------------------------------------------------
     def _picture(self, sample: Sample, group: str) -> None:
@@ -225,8 +249,7 @@ class RerunLogger:
         self._texts.setting(self.keys.short(sample.key), settings.decode_text(sample.payload))
 
     # -- the robot ----------------------------------------------------------------------------
-    def _pose_state(self, sample: Sample, stamp_ns: int, state: PoseState) -> None:
-        arm = self._arm(sample)
+    def _pose_state(self, arm: _Arm, stamp_ns: int, state: PoseState) -> None:
         arm.scene.pose(paths.MEASURED, stamp_ns, pose_of(state.position_m, state.quat_xyzw))
         arm.charts.speed(paths.MEASURED, state.twist)
         commanded_m = state.reference_position_m
@@ -234,19 +257,6 @@ class RerunLogger:
             commanded_m = arm.commanded.position_m
         if commanded_m is not None:
             arm.charts.tracking(float(np.linalg.norm(commanded_m - state.position_m)))
-
-    def _joint_state(self, sample: Sample, stamp_ns: int, state: JointState) -> None:
-        arm = self._arm(sample)
-        arm.scene.joints(state.names, state.position_rad)
-        arm.charts.joints(state.names, state.position_rad)
-
-    def _gripper_state(self, sample: Sample, stamp_ns: int, state: GripperState) -> None:
-        arm = self._arm(sample)
-        arm.scene.gripper(max(state.width_m, 0.0))
-        arm.charts.gripper(paths.MEASURED, state.width_m)
-
-    def _objects(self, _: Sample, stamp_ns: int, objects: ObjectPoses) -> None:
-        self._first.scene.objects(objects)
 
     # -- commands -----------------------------------------------------------------------------
     def _pose_command(self, sample: Sample, stamp_ns: int, command: PoseCommand) -> None:
@@ -273,11 +283,8 @@ class RerunLogger:
         arm.scene.pose(paths.COMMANDED, stamp_ns, pose)
         arm.charts.speed(paths.COMMANDED, jacobian @ velocity)
 
-    def _gripper_command(self, sample: Sample, stamp_ns: int, command: GripperCommand) -> None:
-        self._arm(sample).charts.gripper(paths.COMMANDED, command.width_m)
-
     # -- models -------------------------------------------------------------------------------
-    def _spec(self, _: Sample, stamp_ns: int, spec: ModelSpec) -> None:
+    def _spec(self, stamp_ns: int, spec: ModelSpec) -> None:
         self._specs[spec.hash] = spec
         waiting, self._waiting = self._waiting, deque()
         for key, chunk_ns, chunk in waiting:
@@ -291,12 +298,12 @@ class RerunLogger:
                 self._reject(key, UNFIT)
         self._at(stamp_ns)
 
-    def _chunk(self, sample: Sample, stamp_ns: int, chunk: ActionChunk) -> None:
+    def _chunk(self, key: str, stamp_ns: int, chunk: ActionChunk) -> None:
         spec = self._specs.get(chunk.spec_hash)
         if spec is not None:
             self._draw_chunk(stamp_ns, chunk, spec)
             return
-        self._waiting.append((sample.key, stamp_ns, chunk))
+        self._waiting.append((key, stamp_ns, chunk))
         if len(self._waiting) > MAX_WAITING:
             self._reject(self._waiting.popleft()[0], NO_SPEC)
 
@@ -317,24 +324,3 @@ class RerunLogger:
         """Count the chunks whose spec was never received."""
         while self._waiting:
             self._reject(self._waiting.popleft()[0], NO_SPEC)
-
-    def _on_seen(self, _: Sample, stamp_ns: int, seen: InferenceDebug) -> None:
-        if seen.worker not in self._seen:
-            self._seen[seen.worker] = set()
-            self._layout()
-        self._texts.answer(seen, self._specs.get(seen.spec_hash))
-
-    # -- texts --------------------------------------------------------------------------------
-    def _on_task(self, _: Sample, stamp_ns: int, task: Task) -> None:
-        self._obeyed = task.worker
-        self._texts.task(task)
-        self._texts.now(stamp_ns, self.rejected, self.dropped)
-
-    def _status(self, sample: Sample, stamp_ns: int, status: NodeStatus) -> None:
-        if sample.key == self._command_status:
-            self._first.charts.status(status)
-            self._texts.status(status)
-        self._texts.now(stamp_ns, self.rejected, self.dropped)
-
-    def _event(self, sample: Sample, stamp_ns: int, event: Event) -> None:
-        self._texts.event(last_chunk(sample.key), stamp_ns, event)
