@@ -34,11 +34,12 @@ from vla_zenoh.lab.cli import net as cli_net
 from vla_zenoh.lab.cli.options import number_list
 from vla_zenoh.lab.cli.output import plain_types
 from vla_zenoh.lab.demo.scripted_motions import parse_scripted
-from vla_zenoh.lab.evaluation.mcap_file import evaluate_run
+from vla_zenoh.lab.evaluation.mcap_file import evaluate_loaded
 from vla_zenoh.lab.inference_views import InferenceView
 from vla_zenoh.lab.primitives import answer
 from vla_zenoh.lab.primitives.requests import decode_request
 from vla_zenoh.lab.recording.record_types import RECORDS, record_from_json, record_to_json
+from vla_zenoh.lab.recording.run import load_run
 from vla_zenoh.lab.serve import mcp, openpi_server
 from vla_zenoh.lab.tasks.order import parse_prompt
 from vla_zenoh.policy import ActionSpec, ModelSpec, ObservationSpec
@@ -466,7 +467,12 @@ def _targets() -> Iterator[Target]:
             lambda kind=kind: _recorded_seed(kind),
         )
     own = (VlaZenohError,)
-    yield Target("recording", partial(_in_file, ".mcap", evaluate_run), own, _recording)
+    yield Target(
+        "recording",
+        partial(_in_file, ".mcap", lambda path: evaluate_loaded(load_run(path))),
+        own,
+        _recording,
+    )
     yield Target(
         "profile",
         partial(_in_file, ".yaml", lambda path: load_profile(str(path))),

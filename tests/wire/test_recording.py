@@ -26,7 +26,7 @@ from vla_zenoh.bus.node import Publisher
 from vla_zenoh.codec import records
 from vla_zenoh.errors import NodeError
 from vla_zenoh.keys import Keys, Kind
-from vla_zenoh.lab.evaluation.mcap_file import evaluate_run
+from vla_zenoh.lab.evaluation.mcap_file import evaluate_loaded
 from vla_zenoh.lab.recording.reader import open_recording
 from vla_zenoh.lab.recording.recorder import Recorder
 from vla_zenoh.lab.recording.replay import CAMERAS, Replay
@@ -105,7 +105,7 @@ def test_rosbags_finds_the_standard_messages(run_file: Path) -> None:
 
 
 def test_its_evaluation_tells_what_the_arm_did(run_file: Path) -> None:
-    found = evaluate_run(run_file, pictures=3)
+    found = evaluate_loaded(load_run(run_file), pictures=3)
     segment = next(s for s in found.segments if s.prompt == f"HARD: go up x{STEPS}")
     assert segment.asked_m == pytest.approx(STEPS * STEP_M)
     assert segment.along_m == pytest.approx(STEPS * STEP_M, abs=REACHED_M)
@@ -156,7 +156,7 @@ def test_a_replayed_run_evaluates_as_the_original(
         moved_equally(one, other, kind)
     jpegs = [[p.jpeg for p in pictures(run.file, "front")] for run in (one, other)]
     assert jpegs[0] == jpegs[1]
-    assert_same(evaluate_run(run_file), evaluate_run(again))
+    assert_same(evaluate_loaded(load_run(run_file)), evaluate_loaded(load_run(again)))
 
 
 def test_a_worker_infers_on_a_replayed_run(run_file: Path, chain: Chain, tmp_path: Path) -> None:
@@ -251,7 +251,10 @@ def test_what_the_queue_cannot_take_is_counted_and_said(chain: Chain, tmp_path: 
     run = load_run(path)
     assert run.file.ended == {"dropped": dict(recorded.dropped)}
     assert [len(heard.record.why) for heard in run.events if "camera" in heard.key] == [0, 0]
-    assert f"the recorder dropped {recorded.dropped.total()} samples" in evaluate_run(path).problems
+    assert (
+        f"the recorder dropped {recorded.dropped.total()} samples"
+        in evaluate_loaded(load_run(path)).problems
+    )
 
 
 @pytest.mark.slow
@@ -271,7 +274,9 @@ def test_a_recorder_that_is_killed_leaves_a_readable_file(chain: Chain, tmp_path
     assert len(run.poses) > 10
     with Reader(path) as bag:
         assert sum(1 for _ in bag.messages()) > len(run.poses)
-    assert evaluate_run(path).problems == ["its recorder was ended before it could finish the file"]
+    assert evaluate_loaded(load_run(path)).problems == [
+        "its recorder was ended before it could finish the file"
+    ]
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from camera_rig import free_endpoint
 from chain import command_line, running_chain
 from recording_rig import assert_same, ghost_of, recording
 
-from vla_zenoh.lab.evaluation.mcap_file import evaluate_run
+from vla_zenoh.lab.evaluation.mcap_file import evaluate_loaded
 from vla_zenoh.lab.recording.run import load_run, pictures
 
 LAB = """\
@@ -62,4 +62,4 @@ def test_a_minute_of_two_cameras_is_recorded_whole_and_replayed(tmp_path: Path) 
     for camera in ("front", "wrist"):
         taken = [picture.seq for picture in pictures(run.file, camera)]
         assert taken == list(range(taken[0], taken[0] + len(taken))), "a picture is missing"
-    assert_same(evaluate_run(first), evaluate_run(again))
+    assert_same(evaluate_loaded(load_run(first)), evaluate_loaded(load_run(again)))

@@ -19,7 +19,7 @@ from vla_zenoh.codec import records
 from vla_zenoh.codec.image import encode_jpeg
 from vla_zenoh.keys import Keys
 from vla_zenoh.lab.evaluation.evaluate import evaluate
-from vla_zenoh.lab.evaluation.mcap_file import evaluate_run
+from vla_zenoh.lab.evaluation.mcap_file import evaluate_loaded
 from vla_zenoh.lab.evaluation.plot_image import write_plot
 from vla_zenoh.lab.evaluation.report import page
 from vla_zenoh.lab.evaluation.result import TASKS, Evaluation, PlotTrace
@@ -155,7 +155,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_stages_are_measured_and_add_up(recording: Path) -> None:
-    latency = evaluate_run(recording).latency()
+    latency = evaluate_loaded(load_run(recording)).latency()
     assert latency["outbound"].mean == CAMERA_MS
     assert latency["inference"].max == INFERENCE_MS
     assert latency["worker_to_command"].min == RECEIVED_MS
@@ -166,7 +166,7 @@ def test_stages_are_measured_and_add_up(recording: Path) -> None:
 
 
 def test_ways_tracking_jerk_and_rest_are_those_that_were_put_in(recording: Path) -> None:
-    run = evaluate_run(recording)
+    run = evaluate_loaded(load_run(recording))
     way_m = SPEED_M_S * SECONDS / 2
     assert run.name == "lab"
     assert run.path_m == pytest.approx(way_m)
@@ -180,14 +180,14 @@ def test_ways_tracking_jerk_and_rest_are_those_that_were_put_in(recording: Path)
 def test_requests_are_those_of_the_obeyed_worker_and_their_success_is_counted(
     recording: Path,
 ) -> None:
-    run = evaluate_run(recording)
+    run = evaluate_loaded(load_run(recording))
     asked = SECONDS * 1_000_000_000 // CHUNK_NS
     assert run.requests == asked
     assert run.succeeded == asked - 1, "the last chunk came too late for any command"
 
 
 def test_seams_tell_how_far_the_goal_went(recording: Path) -> None:
-    run = evaluate_run(recording)
+    run = evaluate_loaded(load_run(recording))
     assert len(run.seam_goal_mm) == SECONDS * 5 - 2
     assert run.seam_goal_mm.max() == pytest.approx(10.0 - SPEED_M_S * TICK_NS / 1e6, abs=0.01)
     assert run.seam_velocity_mm_s.max() == pytest.approx(50.0, abs=0.01), "it stops at once"
@@ -217,7 +217,7 @@ def test_commands_that_are_rarer_at_rest_change_neither_jerk_nor_seams(tmp_path:
         for sample in sorted(samples, key=lambda each: each.received_ns):
             out.write(sample)
         out.finish({"dropped": {}})
-        runs.append(evaluate_run(path))
+        runs.append(evaluate_loaded(load_run(path)))
     often, rarely = runs
     assert rarely.seam_velocity_mm_s == pytest.approx(often.seam_velocity_mm_s, abs=1e-6)
     assert often.seam_velocity_mm_s.max() < 0.01
@@ -226,20 +226,20 @@ def test_commands_that_are_rarer_at_rest_change_neither_jerk_nor_seams(tmp_path:
 
 
 def test_refusals_are_those_of_the_recorded_time(recording: Path) -> None:
-    run = evaluate_run(recording)
+    run = evaluate_loaded(load_run(recording))
     assert (run.refusals, run.skipped) == ({"stale": SECONDS}, {"superseded": SECONDS})
 
 
 def test_the_drift_off_the_asked_axis_and_the_gripper_are_told(recording: Path) -> None:
-    (segment,) = evaluate_run(recording).segments
+    (segment,) = evaluate_loaded(load_run(recording)).segments
     assert segment.along_m == pytest.approx(SPEED_M_S * SECONDS / 2)
     assert segment.drift_m == pytest.approx(0.0, abs=1e-12)
     assert segment.width_m == (0.08, 0.03)
-    assert evaluate_run(recording).row()["gripper_travel_m"] == pytest.approx(0.05)
+    assert evaluate_loaded(load_run(recording)).row()["gripper_travel_m"] == pytest.approx(0.05)
 
 
 def test_the_strip_shows_the_pictures_that_chunks_were_made_of(recording: Path) -> None:
-    views = evaluate_run(recording, pictures=4).views
+    views = evaluate_loaded(load_run(recording), pictures=4).views
     assert [view.model for view in views] == [False, True] * 4
     np.testing.assert_allclose([v.t_s for v in views[::2]], [0.0, 1.2, 2.4, 3.8], atol=0.05)
 
@@ -250,9 +250,9 @@ def test_a_recording_that_was_cut_off_is_evaluated_up_to_there(
     cut = tmp_path / "cut.mcap"
     whole = recording.read_bytes()
     cut.write_bytes(whole[: len(whole) // 2])
-    run = evaluate_run(cut)
+    run = evaluate_loaded(load_run(cut))
     assert any("cut off or damaged after" in problem for problem in run.problems)
-    assert 0 < run.requests <= evaluate_run(recording).requests
+    assert 0 < run.requests <= evaluate_loaded(load_run(recording)).requests
 
 
 def test_a_run_that_moves_to_another_time_and_robot_keeps_its_latencies(recording: Path) -> None:
@@ -309,7 +309,7 @@ def judged(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_run_says_where_it_comes_from(judged: Path) -> None:
-    about = evaluate_run(judged).about
+    about = evaluate_loaded(load_run(judged)).about
     assert about.items() >= PROVENANCE.items()
     assert about["seed"] == "7"
     assert about["model"] == "scripted"
@@ -317,13 +317,13 @@ def test_a_run_says_where_it_comes_from(judged: Path) -> None:
 
 
 def test_the_verdicts_on_its_tasks_are_those_of_the_judge(judged: Path, recording: Path) -> None:
-    (verdict,) = evaluate_run(judged).verdicts
+    (verdict,) = evaluate_loaded(load_run(judged)).verdicts
     assert (verdict.prompt, verdict.success, verdict.said) == tuple(TASK.values())
-    assert evaluate_run(recording).verdicts == []
+    assert evaluate_loaded(load_run(recording)).verdicts == []
 
 
 def test_a_page_of_one_run_shows_provenance_verdict_curves_and_video(judged: Path) -> None:
-    run = evaluate_run(judged, pictures=2)
+    run = evaluate_loaded(load_run(judged), pictures=2)
     text = page([run], {})
     body = text[text.index("<body>") :]
     assert f"<h1>Evaluation of {run.name}</h1>" in body
@@ -336,7 +336,7 @@ def test_a_page_of_one_run_shows_provenance_verdict_curves_and_video(judged: Pat
 
 
 def test_a_page_counts_only_runs(judged: Path, recording: Path) -> None:
-    runs = [evaluate_run(judged), evaluate_run(recording)]
+    runs = [evaluate_loaded(load_run(judged)), evaluate_loaded(load_run(recording))]
     text = page(runs, {})
     assert "<h1>Evaluation of 2 runs</h1>" in text
     assert text.count("<section id=") == len(runs)
@@ -353,7 +353,7 @@ def test_the_film_is_as_long_as_the_run_and_shows_every_camera(
 
 
 def test_the_curves_are_drawn_into_a_picture(judged: Path, tmp_path: Path) -> None:
-    assert write_plot(tmp_path / "plot.png", evaluate_run(judged))
+    assert write_plot(tmp_path / "plot.png", evaluate_loaded(load_run(judged)))
     assert cv2.imread(str(tmp_path / "plot.png")).shape[1] > 1000
     assert not write_plot(tmp_path / "none.png", Evaluation("empty"))
     assert not (tmp_path / "none.png").exists()
@@ -404,7 +404,7 @@ def test_other_files_in_a_folder_are_passed_over(recording: Path) -> None:
 
 
 def test_the_page_needs_no_network_and_no_prompt_breaks_it(recording: Path) -> None:
-    run = evaluate_run(recording)
+    run = evaluate_loaded(load_run(recording))
     run.marks = [(0.0, "</script><script>alert(1)</script><b>")]
     run.segments = [replace(run.segments[0], prompt=run.marks[0][1])]
     text = page([run], {})

@@ -288,7 +288,7 @@ class _Dataset:
             name: of_numbers(np.concatenate([each[name] for each in rows])) for name in rows[0]
         }
         for camera, of_episodes in videos.items():
-            stats[PICTURE + camera] = joined(video.histogram for video in of_episodes)
+            stats[PICTURE + camera] = joined([video.histogram for video in of_episodes])
         for depth in self._depths:
             stats[depth.name] = joined(depth.histograms)
         info = {

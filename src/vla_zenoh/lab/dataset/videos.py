@@ -5,7 +5,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -57,21 +57,11 @@ def chosen(
     return out
 
 
-class EpisodeVideo:
+class EpisodeVideo(NamedTuple):
     """The MP4 of one episode and camera, and the histogram of its images."""
 
-    def __init__(self, path: Path, fps: int) -> None:
-        self.video = VideoWriter(path, fps, extra="dataset", **OPTIONS)
-        self.histogram = Histogram()
-
-    def add(self, jpeg: bytes, count: int) -> None:
-        """Append an image as `count` frames.
-
-        Raises:
-            RecordingError: its size differs from that of the images before.
-            CodecError: it is no JPEG file.
-        """
-        self.histogram.add(self.video.add(image_codec.decode_jpeg(jpeg).rgb, count))
+    video: VideoWriter
+    histogram: Histogram
 
 
 def write_videos(
@@ -81,9 +71,15 @@ def write_videos(
 
     Args:
         wanted: file and image numbers of each episode; numbers never decrease.
-        fps: frames per second.
+
+    Raises:
+        RecordingError: images of one episode differ in size.
+        CodecError: one is no JPEG file.
     """
-    videos = [EpisodeVideo(path, fps) for path, _ in wanted]
+    videos = [
+        EpisodeVideo(VideoWriter(path, fps, extra="dataset", **OPTIONS), Histogram())
+        for path, _ in wanted
+    ]
     users: dict[int, list[tuple[int, int]]] = {}
     for which, (_, numbers) in enumerate(wanted):
         for number in sorted(set(numbers)):
@@ -91,10 +87,11 @@ def write_videos(
     try:
         for number, picture in enumerate(pictures(run.file, camera)):
             for which, times in users.get(number, ()):
-                videos[which].add(picture.jpeg, times)
+                video, histogram = videos[which]
+                histogram.add(video.add(image_codec.decode_jpeg(picture.jpeg).rgb, times))
     finally:
-        for video in videos:
-            video.video.close()
+        for video, _ in videos:
+            video.close()
     return videos
 
 

@@ -25,7 +25,7 @@ from vla_zenoh.lab.evaluation.segments import (
 )
 from vla_zenoh.lab.policy_servers.model_options import shown
 from vla_zenoh.lab.recording.film import Film, write_film
-from vla_zenoh.lab.recording.run import RecordedSample, Run, load_run
+from vla_zenoh.lab.recording.run import RecordedSample, Run
 from vla_zenoh.lab.trial.verdict import FACT
 from vla_zenoh.profile import Profile, read_profile
 from vla_zenoh.types import (
@@ -121,15 +121,6 @@ class MeasuredMotion(NamedTuple):
         return MeasuredMotion(*(column[first:last] for column in self))
 
 
-def evaluate_run(path: Path, *, pictures: int = 0) -> Evaluation:
-    """Evaluate a recording of one arm; `Evaluation.problems` lists what cannot be read.
-
-    Raises:
-        RecordingError: the file cannot be opened, or is of another program.
-    """
-    return evaluate_loaded(load_run(path), pictures=pictures)
-
-
 def evaluate_parts(run: Run, *, pictures: int = 0) -> list[Evaluation]:
     """One evaluation of each part, named ``RUN/PART``; of one arm just that.
 
@@ -142,7 +133,7 @@ def evaluate_parts(run: Run, *, pictures: int = 0) -> list[Evaluation]:
 
 
 def evaluate_loaded(run: Run, *, pictures: int = 0) -> Evaluation:
-    """`evaluate_run` of a run in memory, of one arm or part."""
+    """Evaluate a run of one arm or part; `Evaluation.problems` lists what cannot be read."""
     zero_ns = run.began_ns
     name = run.path.parent.name if run.path.stem == "run" else run.path.stem
     name += f"/{run.part}" if run.part else ""

@@ -62,7 +62,6 @@ def write_film(
     newest: dict[str, bytes] = {}
     shown: dict[str, tuple[bytes, Picture]] = {}
     writer = VideoWriter(path, look.rate_hz, extra="sim", crf=str(look.quality))
-    captions = _Captions(run, verdicts)
 
     def draw(until_ns: int) -> None:
         nonlocal done
@@ -71,7 +70,8 @@ def write_film(
                 if camera not in shown or shown[camera][0] is not jpeg:
                     shown[camera] = (jpeg, decoded_at_height(jpeg, look.height_px))
             pictures = [shown[camera][1] for camera in cameras if camera in shown]
-            writer.add(captions.write(_beside(pictures, len(cameras), look.height_px), now_ns))
+            frame = _beside(pictures, len(cameras), look.height_px)
+            writer.add(_write_caption(frame, run, verdicts, now_ns))
             done += 1
             progress(done, total)
 
@@ -94,31 +94,26 @@ def _beside(pictures: Sequence[Picture], count: int, height_px: int) -> Picture:
     return np.vstack([np.hstack([*pictures, *missing]), strip.astype(np.uint8)])
 
 
-class _Captions:
-    """Text of the strip at a time. `verdicts`: as of `write_film`."""
-
-    def __init__(self, run: Run, verdicts: Sequence[tuple[int, str, bool]]) -> None:
-        self._began_ns, self._tasks, self._verdicts = run.began_ns, run.tasks, verdicts
-        self._stamps = [entry.received_ns for entry in run.tasks]
-
-    def write(self, picture: Picture, now_ns: int) -> Picture:
-        """Draw into a picture; returns it."""
-        at = bisect_right(self._stamps, now_ns) - 1
-        task = self._tasks[at].record if at >= 0 else None
-        left = f"{(now_ns - self._began_ns) / 1e9:5.1f} s   {task.prompt if task else ''}"
-        right, colour = "", WHITE
-        if task is not None:
-            right = f"{task.worker} {task.rate_hz:g} Hz, {'active' if task.active else 'inactive'}"
-        for stamp_ns, text, success in self._verdicts:
-            if stamp_ns <= now_ns < stamp_ns + VERDICT_NS:
-                right, colour = text, GREEN if success else RED
-        # OpenCV draws only ASCII.
-        left, right = (text.encode("ascii", "replace").decode() for text in (left, right))
-        scale = TEXT * picture.shape[0] / cv2.getTextSize("X", FONT, 1.0, 1)[0][1]
-        width = cv2.getTextSize(right, FONT, scale, 1)[0][0]
-        margin = round(TEXT * picture.shape[0])
-        below = picture.shape[0] - margin
-        end = picture.shape[1] - width - margin
-        for text, x, ink in ((left, margin, WHITE), (right, end, colour)):
-            cv2.putText(picture, text, (x, below), FONT, scale, ink, 1, cv2.LINE_AA)
-        return picture
+def _write_caption(
+    picture: Picture, run: Run, verdicts: Sequence[tuple[int, str, bool]], now_ns: int
+) -> Picture:
+    """Draw the text of the strip at a time into a picture; returns it."""
+    at = bisect_right(run.tasks, now_ns, key=lambda entry: entry.received_ns) - 1
+    task = run.tasks[at].record if at >= 0 else None
+    left = f"{(now_ns - run.began_ns) / 1e9:5.1f} s   {task.prompt if task else ''}"
+    right, colour = "", WHITE
+    if task is not None:
+        right = f"{task.worker} {task.rate_hz:g} Hz, {'active' if task.active else 'inactive'}"
+    for stamp_ns, text, success in verdicts:
+        if stamp_ns <= now_ns < stamp_ns + VERDICT_NS:
+            right, colour = text, GREEN if success else RED
+    # OpenCV draws only ASCII.
+    left, right = (text.encode("ascii", "replace").decode() for text in (left, right))
+    scale = TEXT * picture.shape[0] / cv2.getTextSize("X", FONT, 1.0, 1)[0][1]
+    width = cv2.getTextSize(right, FONT, scale, 1)[0][0]
+    margin = round(TEXT * picture.shape[0])
+    below = picture.shape[0] - margin
+    end = picture.shape[1] - width - margin
+    for text, x, ink in ((left, margin, WHITE), (right, end, colour)):
+        cv2.putText(picture, text, (x, below), FONT, scale, ink, 1, cv2.LINE_AA)
+    return picture

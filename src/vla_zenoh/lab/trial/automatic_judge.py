@@ -34,12 +34,7 @@ class Frame(NamedTuple):
 
 
 class StateSample(NamedTuple):
-    """Measured state at one time of an episode.
-
-    Args:
-        pose: of the TCP, base frame.
-        gripper: None: none was received.
-    """
+    """Measured state at one time of an episode, poses of the TCP. `gripper`: None: unknown."""
 
     time_s: float
     pose: PoseState
@@ -122,7 +117,11 @@ def _model_judge(choice: JudgeChoice) -> Judge:
             "temperature": 0,
             "messages": [{"role": "user", "content": content}],
         }
-        answer = _answer(choice.url, body)
+        try:
+            found = json.loads(post_json(choice.url, body, MODEL_PATIENCE_S, MAX_ANSWER_BYTES))
+            answer = str(found["choices"][0]["message"]["content"])
+        except (OSError, ValueError, LookupError, TypeError) as error:
+            raise NodeError(f"judge {choice.url}: {in_words(error)}") from error
         word = answer.strip().lower()
         if not word.startswith(("yes", "no")):
             raise NodeError(f"judge {choice.url}: the answer begins with neither yes nor no")
@@ -131,18 +130,16 @@ def _model_judge(choice: JudgeChoice) -> Judge:
     return judge
 
 
-def _answer(url: str, body: Mapping[str, Any]) -> str:
-    request = urllib.request.Request(
-        url, json.dumps(body).encode(), {"content-type": "application/json"}
-    )
+def post_json(url: str, body: Mapping[str, Any], timeout_s: float, most: int = 0) -> bytes:
+    """Post an object; the first `most` bytes of the answer. Raises OSError, ValueError."""
+    content = json.dumps(body).encode()
+    request = urllib.request.Request(url, content, {"content-type": "application/json"})
     try:
-        with urllib.request.urlopen(request, timeout=MODEL_PATIENCE_S) as response:
-            found = json.loads(response.read(MAX_ANSWER_BYTES))
-        return str(found["choices"][0]["message"]["content"])
-    except (OSError, ValueError, LookupError, TypeError) as error:
-        if isinstance(error, urllib.error.HTTPError):
-            error.close()
-        raise NodeError(f"judge {url}: {in_words(error)}") from error
+        with urllib.request.urlopen(request, timeout=timeout_s) as response:
+            return response.read(most)
+    except urllib.error.HTTPError as error:
+        error.close()
+        raise
 
 
 def _line(text: str) -> str:

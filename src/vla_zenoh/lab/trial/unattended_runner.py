@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import queue
 import threading
 import time
-import urllib.error
-import urllib.request
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import asdict
@@ -17,7 +14,7 @@ from typing import Any
 from vla_zenoh.bus.client import Client
 from vla_zenoh.errors import NodeError, OutputError, RecordingError, SessionError
 from vla_zenoh.lab.episode import Interrupted
-from vla_zenoh.lab.trial.automatic_judge import make_judge
+from vla_zenoh.lab.trial.automatic_judge import Judge, make_judge, post_json
 from vla_zenoh.lab.trial.runner import TrialRunner
 from vla_zenoh.lab.trial.unattended import UnattendedTrial, write_page
 from vla_zenoh.lab.trial.unattended_operator import TrialStopped, UnattendedOperator
@@ -61,17 +58,11 @@ class Webhook:
 
     def _send(self) -> None:
         while (message := self._waiting.get()) is not None:
-            body = json.dumps(message).encode()
             for attempt in range(ATTEMPTS):
-                request = urllib.request.Request(
-                    self._url, body, {"content-type": "application/json"}
-                )
                 try:
-                    with urllib.request.urlopen(request, timeout=PATIENCE_S):
-                        break
+                    post_json(self._url, message, PATIENCE_S)
+                    break
                 except (OSError, ValueError) as error:
-                    if isinstance(error, urllib.error.HTTPError):
-                        error.close()
                     if attempt == ATTEMPTS - 1:
                         self._warn(f"webhook: {message['what']!r} was not delivered: {error}")
                     time.sleep(BACK_OFF_S)
@@ -121,7 +112,7 @@ def run_unattended(
 def _run(
     trial: UnattendedTrial,
     open_client: Callable[[], AbstractContextManager[Client]],
-    judge: Any,
+    judge: Judge | None,
     stop: threading.Event,
     warn: Callable[[str], None],
     hook: Webhook,
