@@ -21,11 +21,6 @@ class Distribution:
 
     Args:
         std: of a sample (divisor n - 1), 0 for a single value.
-        min: smallest.
-        p50: median.
-        p95: 95th percentile.
-        p99: 99th percentile.
-        max: largest.
     """
 
     count: int

@@ -35,7 +35,6 @@ class VideoWriter:
 
     Args:
         path: of the file; its folder is made.
-        rate_hz: frames per second.
         extra: optional dependencies to name where PyAV is missing.
         options: of the encoder, such as ``crf``, the constant rate factor.
     """

@@ -46,7 +46,6 @@ def measure_command(
     """Measure ticks at one rate while the arm moves up and down.
 
     Args:
-        command_hz: ticks per second.
         log: called with (node, line) of the nodes' output.
 
     Raises:

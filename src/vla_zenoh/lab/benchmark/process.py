@@ -137,7 +137,6 @@ class BenchmarkProcess:
         """Carry out recorded steps, and draw the pictures of a video into `folder`.
 
         Args:
-            request: whose steps they are.
             actions: (n, D), every step.
             camera: empty: nothing is drawn.
 
@@ -233,7 +232,6 @@ def replay_episode(
     """Execute recorded steps from the same initial state, without a model.
 
     Args:
-        request: whose steps they are.
         look: called with the number of steps so far, 0 first.
     """
     began_s = time.perf_counter()

@@ -23,12 +23,7 @@ VIDEOS = "failures"
 
 
 def summary(plan: Mapping[str, Any], ended: Collection[EpisodeOutcome]) -> dict[str, Any]:
-    """The result file's content.
-
-    Args:
-        plan: of the run.
-        ended: its episodes.
-    """
+    """The result file's content."""
     tasks = list(dict.fromkeys(each.task for each in ended))
     return {
         **plan,
@@ -81,10 +76,8 @@ def write_videos(
     """Videos of failures, drawn from their recorded steps.
 
     Args:
-        folder: of the run.
         place: where the steps are executed again.
         failed: requests and outcomes of failed episodes.
-        camera: of the benchmark.
         most: largest number; the first failure of every task comes first.
     """
     first: dict[str, int] = Counter()

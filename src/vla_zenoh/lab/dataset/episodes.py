@@ -38,12 +38,7 @@ class EpisodeLabel(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EpisodeFrame:
-    """One time step.
-
-    Args:
-        stamp_ns: wall clock.
-        action: (D,) float32, with the meaning of the spec.
-    """
+    """One time step. `action`: (D,) float32, with the meaning of the spec."""
 
     stamp_ns: int
     action: NDArray[np.float32]

@@ -47,12 +47,7 @@ COUNTERS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 
 
 class Written(NamedTuple):
-    """Result of an export.
-
-    Args:
-        fps: frames per second.
-        successes: number of successful episodes; None if unknown for all.
-    """
+    """Result of an export. `successes`: number of successful episodes; None if unknown for all."""
 
     folder: Path
     episodes: int
@@ -78,7 +73,6 @@ def export(
 
     Args:
         folder: must not exist, or be empty.
-        cameras: whose images to export.
         parts: of the state, see `vla_zenoh.lab.policy_servers.state_vector`.
         progress: called with what is being written.
         depth: cameras whose depth images to export.

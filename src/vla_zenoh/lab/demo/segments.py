@@ -37,7 +37,6 @@ class DemoSegment:
 
     Args:
         prompt: without the count.
-        steps: number of steps.
         motion: of one step; None: hold.
         within: turn back before this distance (m or rad) from the start; None: never.
     """
@@ -109,13 +108,11 @@ class SegmentOutcome:
     """Measured motion of a segment, from rest to rest. Drift is motion that was not asked for.
 
     Args:
-        segment: prompt and steps.
         reached_m: translation along the asked direction; 0 where none was asked.
         reached_rad: rotation about the asked axis; 0 where none was asked.
         drift_mm: translation off the asked direction.
         drift_rad: rotation off the asked axis.
         asked_width_m: gripper width that the prompt asks for.
-        reached_width_m: measured gripper width.
         steps_done: steps the command node accepted.
         duration_s: from the prompt until rest.
     """

@@ -33,10 +33,7 @@ class PromptSegment:
     """Motion of the arm during one prompt.
 
     Args:
-        prompt: as published.
         requests: executed.
-        seconds: duration.
-        path_m: length of the path.
         path_rad: length of the path in rotation.
         moved_m: (3,) displacement from the first pose to the last.
         turned_rad: (3,) rotation vector from the first pose to the last, base axes.
@@ -84,13 +81,7 @@ class PlotTrace:
 
 @dataclass(frozen=True, slots=True)
 class TaskVerdict:
-    """Verdict on a task, of a demo's judge or of a person.
-
-    Args:
-        prompt: of the task.
-        success: None: not judged.
-        said: in words.
-    """
+    """Verdict on a task, of a demo's judge or of a person. `success`: None: not judged."""
 
     prompt: str
     success: bool | None
@@ -103,7 +94,6 @@ class CameraView:
 
     Args:
         t_s: since the run began.
-        camera: its name.
         jpeg: a small JPEG file.
         model: input of the model, not the image of the camera.
     """
@@ -124,7 +114,6 @@ class Evaluation:
         requests: chunks of the worker in control.
         succeeded: number of those that succeeded; None where unknown.
         seconds: from the first request to the last.
-        prompts: in their order.
         stages_ms: stage -> one value per request.
         request_t_s: time of each request, (n,).
         path_m: length of the path of the TCP; of the measured one where known.
@@ -134,7 +123,6 @@ class Evaluation:
         tracking_mm: distance between commanded and measured position at the same time.
         tracking_mrad: angle between commanded and measured orientation.
         jerk: (n,) norm of the commanded jerk in m/s^3 (rad/s^3 for joint commands).
-        jerk_unit: of `jerk`.
         active_s: time in which the arm was active.
         idle_s: part of that time in which it stood still.
         seam_goal_mm: step of the goal where a new chunk replaced another.

@@ -80,8 +80,6 @@ def segment(
 
     Args:
         prompt: as published; the motion that HARD ones request is known.
-        requests: steps executed.
-        seconds: duration.
         position_m: (n, 3), may hold NaN.
         quat_xyzw: (n, 4), may hold NaN.
         width_m: (m,) gripper opening, may hold NaN.

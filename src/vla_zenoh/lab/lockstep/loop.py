@@ -43,6 +43,8 @@ TICK_NS = 1_000_000
 START_NS = 1_700_000_000_000_000_000
 """Start of the virtual wall clock."""
 SIM, CAMERA, COMMAND = "sim", "camera", "command"
+HALF_A_METRE = Depth(np.full((48, 64), 500, np.uint16), 0.001)
+"""What all cameras with depth measure."""
 
 
 class Lockstep:
@@ -50,11 +52,8 @@ class Lockstep:
 
     Args:
         policy: the model; its ``load`` is called here if it has one.
-        delays: see `Delays`.
         picture: image of a camera, by name; None: small gray images.
-        depth: depth picture of a camera, by name; None: half a metre everywhere.
         reach: see `Commander`.
-        dry_run: see `Commander`.
         others: more workers, by name; they run without effect until selected.
     """
 
@@ -66,16 +65,14 @@ class Lockstep:
         *,
         delays: Delays | None = None,
         picture: Callable[[str], Image] | None = None,
-        depth: Callable[[str], Depth] | None = None,
         reach: ReachabilityFilter | Mapping[str, ReachabilityFilter] | None = None,
-        dry_run: bool = False,
         seed: int = 0,
         others: Mapping[str, Policy] | None = None,
     ) -> None:
         self.profile, self.world = profile, world
         self.delays = delays or Delays()
         self.now_ns = START_NS
-        self.commander = Commander(profile, reach=reach, dry_run=dry_run)
+        self.commander = Commander(profile, reach=reach)
         self.guards = {
             name: ArmGuard(
                 profile.of_part(name),
@@ -102,7 +99,7 @@ class Lockstep:
         self.alive = {SIM, CAMERA, COMMAND, *(w.source for w in self.workers.values())}
         self.camera_faults: dict[str, str] = {}
         self._clock_ns: Counter[str] = Counter()
-        self._picture, self._depth = picture or _gray, depth or _half_a_metre
+        self._picture = picture or _gray
         self._arrivals: list[tuple[int, int, Callable[[], None]]] = []
         self._sent = 0
         self._seq: Counter[str] = Counter()
@@ -254,7 +251,7 @@ class Lockstep:
         cameras = sorted({one.camera for each in wanted for one in each.cameras})
         with_depth = sorted({one.camera for each in wanted for one in each.depth})
         shown = [(camera, self._picture(camera)) for camera in cameras]
-        for camera, record in [*shown, *((camera, self._depth(camera)) for camera in with_depth)]:
+        for camera, record in [*shown, *((camera, HALF_A_METRE) for camera in with_depth)]:
             picture = Stamped(header, record, arrival_ns)
             self._deliver(arrival_ns, partial(self._take_picture, camera, picture))
 
@@ -350,7 +347,3 @@ class Lockstep:
 
 def _gray(camera: str) -> Image:
     return Image(np.full((48, 64, 3), 128, np.uint8))
-
-
-def _half_a_metre(camera: str) -> Depth:
-    return Depth(np.full((48, 64), 500, np.uint16), 0.001)

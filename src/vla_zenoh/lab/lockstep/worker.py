@@ -39,7 +39,6 @@ class Delays:
         inference_s: from observation to chunk.
         jitter: share by which an inference varies.
         camera_s: from capture to the worker.
-        camera_hz: images per second.
         wire_s: of every other message.
     """
 
@@ -55,9 +54,7 @@ class Message:
     """One message on the wire.
 
     Args:
-        kind: class of the record.
         header: of the writer.
-        payload: encoded record.
         arrival_ns: virtual time of arrival.
         part: whose state or command it is, of a robot of several parts.
     """

@@ -50,7 +50,6 @@ class FieldSource:
     Args:
         camera: image of this camera, or empty.
         parts: of the robot state, see `vla_zenoh.lab.policy_servers.state_vector`.
-        prompt: the prompt.
         blank: height and width of a black image.
     """
 
@@ -69,8 +68,6 @@ class FieldMapping:
         spec: of the model, on our side.
         keys: names in the answer.
         columns: of the answer; None: all.
-        semantics: of its numbers.
-        max_width_m: of our gripper.
     """
 
     fields: Mapping[str, FieldSource]
@@ -204,10 +201,7 @@ def read_field_mapping(
     Args:
         name: of the model, for its spec.
         presets: name -> options.
-        preset: name of the preset.
         options: of the user; they override the preset.
-        max_width_m: of our gripper.
-        joints: names of our arm's.
         normalisation: for the spec.
 
     Raises:

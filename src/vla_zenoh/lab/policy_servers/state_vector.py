@@ -81,7 +81,6 @@ def read_state(text: str, size: int, joints: int, *more: int) -> tuple[str, ...]
     Args:
         text: see `read_parts`; of a robot of several arms that of each, one after the other.
         size: how many numbers the model wants.
-        joints: how many the arm has.
         more: how many each further arm has.
 
     Raises:
@@ -159,8 +158,6 @@ def state_of(
 
     Args:
         names: of `read_parts`; single coordinates (``x``, ``roll``) are not read back.
-        numbers: (n,).
-        joints: how many the arm has.
         max_width_m: of the open gripper.
 
     Returns:

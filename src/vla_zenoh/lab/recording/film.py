@@ -28,12 +28,7 @@ Picture = NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True)
 class Film:
-    """How a film looks.
-
-    Args:
-        rate_hz: frames per second.
-        quality: x264's constant rate factor; lower is better.
-    """
+    """How a film looks. `quality`: x264's constant rate factor; lower is better."""
 
     height_px: int = 480
     rate_hz: int = 15

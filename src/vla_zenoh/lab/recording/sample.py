@@ -24,7 +24,6 @@ class Sample:
     """Payload, encoding and header of one sample of a key.
 
     Args:
-        payload: bytes.
         encoding: as Zenoh writes it, for example ``image/jpeg``.
         header: its header, None for settings.
         received_ns: time of reception, wall clock of the receiver.

@@ -20,7 +20,6 @@ class SampleQueue:
     Args:
         session: an open session; the caller closes it.
         max_bytes: payloads and attachments kept at most, the samples last taken included.
-        max_samples: samples kept at most.
     """
 
     def __init__(

@@ -46,7 +46,6 @@ class UnattendedOperator:
         task: whose episodes are run.
         judge: of finished episodes; None: the simulator's.
         due_to_stop: called before each episode: why the trial has to stop, empty: go on.
-        warn: called with warnings.
     """
 
     def __init__(

@@ -85,7 +85,6 @@ def run_unattended(
         trial: its folder is locked by this process.
         open_client: a client of the running robot; opened again after trouble.
         plan_folder: where a Python judge is looked for.
-        warn: called with warnings.
 
     Raises:
         NodeError, SessionError: trouble that does not end.

@@ -37,13 +37,8 @@ class EpisodeVerdict:
         number: of the attempt, from 1; it names the recording.
         setup: number of its setup, from 1.
         turn: which of that setup's episodes, from 1.
-        worker: that was active.
-        verdict: the operator's.
-        note: the operator's.
-        end: what ended it.
         why: the reason, as a sentence.
         time_s: from activation to the end.
-        chunks: accepted.
         brakes: times the command node braked: for want of a chunk, or to end it.
         began_ns: activation, wall clock of the operator's computer; 0: none.
         start_m: (3,) TCP at activation, base frame; None: no pose was received.
@@ -80,7 +75,6 @@ def verdict_in(metadata: Mapping[str, Any] | None, worker: str) -> Verdict | Non
 
     Args:
         metadata: None: the recording was cut off.
-        worker: name of a worker.
     """
     fact = (metadata or {}).get(FACT)
     if not isinstance(fact, Mapping) or fact.get("worker") != worker:
