@@ -59,8 +59,8 @@ def test_what_is_saved_outlives_the_ring_and_is_there_whole_or_not_at_all(tmp_pa
     log.write_text("a line\n")
     folder = tmp_path / "saved" / "stop"
     assert kept.save(folder, [log], {"asked": False}) == 3
-    while kept.drop_oldest():
-        pass
+    while kept.segments:
+        kept.drop_oldest()
     assert [path.name for path in sorted(folder.iterdir())][1:] == [
         FACTS,
         *(f"segment-{number:08d}.mcap" for number in (1, 2, 3)),

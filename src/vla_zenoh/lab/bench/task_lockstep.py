@@ -20,8 +20,14 @@ from numpy.typing import NDArray
 from vla_zenoh.codec.image import encode_jpeg
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.errors import NodeError, VlaZenohError, WorkerError, in_words
-from vla_zenoh.lab.bench.task import ARM_LOST, TaskOutcome, TaskPlan, TaskRequest
-from vla_zenoh.lab.bench.task_episode import SceneSnapshot, run_task
+from vla_zenoh.lab.bench.task import (
+    ARM_LOST,
+    SceneSnapshot,
+    TaskOutcome,
+    TaskPlan,
+    TaskRequest,
+    run_task,
+)
 from vla_zenoh.lab.lockstep.loop import Lockstep
 from vla_zenoh.lab.lockstep.worker import Delays
 from vla_zenoh.policy import ActionSteps, ModelSpec, Observation, Policy, reset_of
@@ -162,14 +168,12 @@ class _LockstepStage:
         return self._objects()
 
     def start(self, prompt: str) -> str:
-        """Activate; the last rejection, where it is rejected to the end."""
         loop = self._running
         loop.put("prompt", prompt)
         loop.run(WARM_UP_S)
         return loop.activate(ACTIVATE_PATIENCE_S, POLL_S)
 
     def step(self) -> None:
-        """Run until the next state of the objects."""
         self._running.run(STEP_S)
 
     def time_s(self) -> float:
@@ -188,7 +192,6 @@ class _LockstepStage:
         return commander.progress.done and commander.at_rest
 
     def picture(self) -> bytes | None:
-        """A picture of the camera, as JPEG."""
         if self.camera is None:
             return None
         return encode_jpeg(Image(self.draw(self.camera, self.world.qpos())))

@@ -9,8 +9,14 @@ from collections.abc import Iterator
 from vla_zenoh.control.commander_io import DEACTIVATED
 from vla_zenoh.errors import NodeError, SessionError
 from vla_zenoh.keys import worker_node
-from vla_zenoh.lab.bench.task import ARM_LOST, NO_STATE, TaskOutcome, TaskPlan
-from vla_zenoh.lab.bench.task_episode import SceneSnapshot, run_task
+from vla_zenoh.lab.bench.task import (
+    ARM_LOST,
+    NO_STATE,
+    SceneSnapshot,
+    TaskOutcome,
+    TaskPlan,
+    run_task,
+)
 from vla_zenoh.lab.episode import COMMAND, EpisodeRunner
 from vla_zenoh.lab.newest_records import NewestRecords, StreamSlot
 from vla_zenoh.runtime.launch import Host
@@ -85,7 +91,6 @@ class TaskRunner:
         return self._states.read(ObjectPoses)[1]
 
     def start(self, prompt: str) -> str:
-        """Activate; the last rejection, where it is rejected to the end."""
         try:
             self._runner.start(prompt)
         except SessionError as error:
@@ -97,7 +102,6 @@ class TaskRunner:
         self._runner.pause(STEP_S)
 
     def time_s(self) -> float:
-        """Monotonic clock."""
         return time.monotonic()
 
     def scene(self) -> SceneSnapshot:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.errors import RecordingError
-from vla_zenoh.kinematics.so3 import Pose, log3, quat_from_rotation, rotation_from_quat
+from vla_zenoh.kinematics.so3 import Pose, log3, pose_of, quat_from_rotation, rotation_from_quat
 from vla_zenoh.lab.policy_servers.state_vector import rpy
 from vla_zenoh.lab.recording.run import Run, newest
 from vla_zenoh.policy import ActionSpec
@@ -117,7 +117,7 @@ class CommandedMotion:
         state = newest(self._run.poses, at_ns)
         if state is None:
             raise self._missing("neither command/pose nor state/pose", at_ns)
-        return Pose(state.record.position_m, rotation_from_quat(state.record.quat_xyzw))
+        return pose_of(state.record)
 
     def _joints(self, at_ns: int) -> FloatArray:
         found = newest(self._run.joint_commands, at_ns) or newest(self._run.joints, at_ns)

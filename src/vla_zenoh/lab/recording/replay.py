@@ -195,7 +195,13 @@ class Replay:
         began_s = time.monotonic()
         try:
             with realtime_thread():
-                self._all_passes(stop)
+                while not stop.is_set():
+                    if not self._one_pass(stop):
+                        self.replayed.failure = self.replayed.failure or "nothing to publish"
+                        break
+                    self.replayed.passes += 1
+                    if not self._loop:
+                        break
         except NodeError as error:
             self.replayed.failure = str(error)
         self.replayed.seconds = time.monotonic() - began_s
@@ -205,15 +211,6 @@ class Replay:
         self.node.publish_status("stopped", now=True)
         self.node.close()
         return self.replayed
-
-    def _all_passes(self, stop: threading.Event) -> None:
-        while not stop.is_set():
-            if not self._one_pass(stop):
-                self.replayed.failure = self.replayed.failure or "nothing to publish"
-                return
-            self.replayed.passes += 1
-            if not self._loop:
-                return
 
     def _one_pass(self, stop: threading.Event) -> bool:
         ready: queue.Queue[tuple[int, Sample] | None] = queue.Queue(AHEAD)

@@ -164,13 +164,13 @@ class AuditLog:
                 )
             self._lock = lock
             files = _files(folder)
-            self._path = files[-1] if files else self._named()
+            self._path = files[-1] if files else self._named(0)
             self._resume()
         except OSError as error:
             raise RecordingError(f"{folder} cannot be used: {error.strerror}") from error
 
-    def _named(self) -> Path:
-        return self._folder / f"audit-{self.link.number:012d}.jsonl"
+    def _named(self, first: int) -> Path:
+        return self._folder / f"audit-{first:012d}.jsonl"
 
     def _resume(self) -> None:
         self._fd = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
@@ -221,8 +221,7 @@ class AuditLog:
         self._pending.clear()
 
     def _turn_over(self) -> None:
-        first = self.link.number - len(self._pending)
-        path = self._folder / f"audit-{first:012d}.jsonl"
+        path = self._named(self.link.number - len(self._pending))
         fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
         os.close(self._fd)
         self._fd, self._path, self._size = fd, path, 0

@@ -85,12 +85,10 @@ class Ring:
         ):
             self.drop_oldest()
 
-    def drop_oldest(self) -> bool:
-        """Delete the oldest file; False: there is none."""
-        if not self.segments:
-            return False
-        self.segments.pop(0).path.unlink(missing_ok=True)
-        return True
+    def drop_oldest(self) -> None:
+        """Delete the oldest file, if there is one."""
+        if self.segments:
+            self.segments.pop(0).path.unlink(missing_ok=True)
 
     def save(self, folder: Path, extra: list[Path], facts: Mapping[str, Any]) -> int:
         """Keep the finished files in a new folder, which is there as a whole or not at all.

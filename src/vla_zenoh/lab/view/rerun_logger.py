@@ -13,13 +13,14 @@ from vla_zenoh.codec import records, settings
 from vla_zenoh.errors import CodecError, RecordError, SpecError
 from vla_zenoh.keys import Keys, last_chunk
 from vla_zenoh.kinematics.kinematics import Kinematics
+from vla_zenoh.kinematics.so3 import Pose, pose_of, rotation_from_quat
 from vla_zenoh.lab.recording.record_types import RecordTypes, group_of, part_of
 from vla_zenoh.lab.recording.sample import DEPTH, JPEG, Sample
 from vla_zenoh.lab.view import paths
 from vla_zenoh.lab.view.charts import Charts
 from vla_zenoh.lab.view.layout import blueprint
 from vla_zenoh.lab.view.robot_model import load_robot_model
-from vla_zenoh.lab.view.scene import Scene, pose_of
+from vla_zenoh.lab.view.scene import Scene
 from vla_zenoh.lab.view.texts import TextPanels
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.profile import Profile, to_yaml
@@ -250,7 +251,7 @@ class RerunLogger:
 
     # -- the robot ----------------------------------------------------------------------------
     def _pose_state(self, arm: _Arm, stamp_ns: int, state: PoseState) -> None:
-        arm.scene.pose(paths.MEASURED, stamp_ns, pose_of(state.position_m, state.quat_xyzw))
+        arm.scene.pose(paths.MEASURED, stamp_ns, pose_of(state))
         arm.charts.speed(paths.MEASURED, state.twist)
         commanded_m = state.reference_position_m
         if commanded_m is None and arm.commanded is not None:
@@ -261,12 +262,12 @@ class RerunLogger:
     # -- commands -----------------------------------------------------------------------------
     def _pose_command(self, sample: Sample, stamp_ns: int, command: PoseCommand) -> None:
         arm = self._arm(sample)
-        goal = pose_of(command.goal_position_m, command.goal_quat_xyzw)
+        goal = Pose(command.goal_position_m, rotation_from_quat(command.goal_quat_xyzw))
         arm.scene.goal(stamp_ns, goal)
         self._first.charts.command(stamp_ns, command.cause)
         arm.commanded = command
         if self._due(sample.key, stamp_ns):
-            pose = pose_of(command.position_m, command.quat_xyzw)
+            pose = Pose(command.position_m, rotation_from_quat(command.quat_xyzw))
             arm.scene.pose(paths.COMMANDED, stamp_ns, pose)
             arm.scene.pose(paths.GOAL, stamp_ns, goal)
             arm.charts.speed(paths.COMMANDED, command.twist)

@@ -11,7 +11,7 @@ import rerun as rr
 
 from vla_zenoh.control.actions import Steps, chunk_poses
 from vla_zenoh.control.plan_timeline import Goal, Plan
-from vla_zenoh.kinematics.so3 import Pose, rotation_from_quat
+from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.lab.view import paths
 from vla_zenoh.lab.view.robot_model import RobotMeshes
 from vla_zenoh.policy import ActionSpec
@@ -213,7 +213,3 @@ class Scene:
             colors=colours,
         )
         self._stream.log(paths.OBJECTS, points)
-
-
-def pose_of(position_m: FloatArray, quat_xyzw: FloatArray) -> Pose:
-    return Pose(position_m, rotation_from_quat(quat_xyzw))
