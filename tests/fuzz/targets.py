@@ -36,8 +36,8 @@ from vla_zenoh.lab.cli.output import plain_types
 from vla_zenoh.lab.demo.scripted_motions import parse_scripted
 from vla_zenoh.lab.evaluation.mcap_file import evaluate_loaded
 from vla_zenoh.lab.inference_views import InferenceView
-from vla_zenoh.lab.primitives import answer
-from vla_zenoh.lab.primitives.requests import decode_request
+from vla_zenoh.lab.primitives import messages
+from vla_zenoh.lab.primitives.messages import decode_request
 from vla_zenoh.lab.recording.record_types import RECORDS, record_from_json, record_to_json
 from vla_zenoh.lab.recording.run import load_run
 from vla_zenoh.lab.serve import mcp, openpi_server
@@ -367,9 +367,9 @@ def _targets() -> Iterator[Target]:
         )
     yield Target(
         "primitive-answer",
-        answer.decode_answer,
+        messages.decode_answer,
         codec,
-        lambda: [answer.Answer(True, "reached", position_m=(0.1, 0.2, 0.3)).encode()],
+        lambda: [messages.Answer(True, "reached", position_m=(0.1, 0.2, 0.3)).encode()],
     )
     yield Target("prompt", _prompt, codec, lambda: [b"HARD: go up x3", b"put the red brick down"])
     yield Target("depth", _depth, codec, _depths)

@@ -17,8 +17,8 @@ from chain import Chain, command_line, running_chain
 
 from vla_zenoh.keys import PRIMITIVES, worker_node
 from vla_zenoh.kinematics.so3 import Pose, pose_distance, pose_of, rotation_from_quat
-from vla_zenoh.lab.primitives.answer import Answer, decode_answer
 from vla_zenoh.lab.primitives.client import PrimitiveError, ask
+from vla_zenoh.lab.primitives.messages import Answer, decode_answer
 from vla_zenoh.lab.primitives.remote_robot import RemoteRobot, connect
 
 NEAR_M, NEAR_RAD = 1e-3, 2e-3

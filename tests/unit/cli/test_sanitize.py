@@ -238,7 +238,7 @@ PRINTS = {
     "cli/plain.py": "lines made printable there",
     "cli/nodes.py": "the profile's name, for a program that waits for it",
     "lab/cli/profile.py": "a profile or a bridge's configuration as a file",
-    "lab/web/making.py": "the share that is done, for the server that began it",
+    "lab/web/runs.py": "the share that is done, for the server that began it",
     "runtime/environments.py": "the packages of a model that is about to run here",
 }
 """Where `print` gets something else than JSON, and what."""

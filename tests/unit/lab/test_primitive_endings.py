@@ -19,7 +19,7 @@ from vla_zenoh.lab.primitives.endings import (
     RunEnding,
     Sight,
 )
-from vla_zenoh.lab.primitives.requests import Until
+from vla_zenoh.lab.primitives.messages import Until
 from vla_zenoh.types import GripperState, PoseState
 
 PERIOD_S = 0.01

@@ -15,9 +15,8 @@ from vla_zenoh.codec.settings import MAX_HELD_M, MIN_HELD_M
 from vla_zenoh.errors import SessionError
 from vla_zenoh.keys import PRIMITIVES, worker_node
 from vla_zenoh.lab.cli.options import number_list
-from vla_zenoh.lab.primitives.answer import DEFAULT_TIMEOUT_S, Answer
 from vla_zenoh.lab.primitives.client import ask
-from vla_zenoh.lab.primitives.requests import FURTHEST_M, FURTHEST_RAD
+from vla_zenoh.lab.primitives.messages import DEFAULT_TIMEOUT_S, FURTHEST_M, FURTHEST_RAD, Answer
 from vla_zenoh.runtime.process import run_node
 
 TimeoutOption = Annotated[

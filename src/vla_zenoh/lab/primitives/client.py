@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import secrets
 import threading
 from collections.abc import Callable, Mapping
@@ -13,12 +14,11 @@ import zenoh
 from vla_zenoh.bus.buffers import bytes_of
 from vla_zenoh.bus.client import Client
 from vla_zenoh.errors import SessionError
-from vla_zenoh.lab.primitives.answer import (
+from vla_zenoh.lab.primitives.messages import (
     DEFAULT_TIMEOUT_S,
     MAX_ANSWER_BYTES,
     Answer,
     decode_answer,
-    encode_request,
 )
 
 MARGIN_S = 20.0
@@ -55,7 +55,7 @@ def ask(
     The arm moves only while this waits: if the process ends, or the block is left, it brakes.
 
     Args:
-        primitive: one of `vla_zenoh.lab.primitives.requests.REQUESTS`.
+        primitive: one of `vla_zenoh.lab.primitives.messages.REQUESTS`.
         fields: of the request, without its holder.
         who: begins the name by which this client holds the arm.
         cancelled: polled; once it returns true, the deadman is released and the arm brakes.
@@ -66,6 +66,7 @@ def ask(
     holder = f"{who}-{secrets.token_hex(4)}"
     key, replies, over = client.keys.primitive(primitive), list[zenoh.Reply](), threading.Event()
     timeout_s = fields.get("timeout_s", DEFAULT_TIMEOUT_S)
+    given = {name: value for name, value in fields.items() if value is not None}
     known = isinstance(timeout_s, (int, float)) and 0 < timeout_s <= 3600  # else it is rejected
     token: Any = client.session.liveliness().declare_token(client.keys.holding(holder))
     with ExitStack() as held:
@@ -73,7 +74,7 @@ def ask(
         client.session.get(
             key,
             handler=zenoh.handlers.Callback(replies.append, over.set, indirect=False),
-            payload=encode_request({**fields, "holder": holder}),
+            payload=json.dumps({**given, "holder": holder}),
             timeout=(timeout_s if known else 0.0) + MARGIN_S,
         )
         while not over.wait(POLL_S):

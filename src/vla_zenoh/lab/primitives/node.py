@@ -23,12 +23,10 @@ from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.errors import CodecError, SessionError
 from vla_zenoh.keys import PRIMITIVES, last_chunk, worker_node
 from vla_zenoh.kinematics.so3 import Pose, pose_of, rotation_from_quat
-from vla_zenoh.lab.primitives.answer import Answer
 from vla_zenoh.lab.primitives.endings import NEAR_RAD, Arrival, Ending, Gripped, RunEnding, Sight
-from vla_zenoh.lab.primitives.policy import CHUNK_HZ, Target, TargetPolicy
-from vla_zenoh.lab.primitives.remote_robot import RemoteRobot
-from vla_zenoh.lab.primitives.requests import (
+from vla_zenoh.lab.primitives.messages import (
     MAX_REQUEST_BYTES,
+    Answer,
     Grip,
     Home,
     MoveTo,
@@ -36,6 +34,8 @@ from vla_zenoh.lab.primitives.requests import (
     RunModel,
     decode_request,
 )
+from vla_zenoh.lab.primitives.policy import CHUNK_HZ, Target, TargetPolicy
+from vla_zenoh.lab.primitives.remote_robot import RemoteRobot
 from vla_zenoh.lab.primitives.target_check import TargetCheck
 from vla_zenoh.nodes.worker.node import InferenceDebugPublisher
 from vla_zenoh.nodes.worker.robot_session import RobotSession
@@ -65,7 +65,7 @@ class _Asked(NamedTuple):
 
 
 class PrimitivesNode:
-    """Answers on `Keys.primitive`, see `vla_zenoh.lab.primitives.requests`.
+    """Answers on `Keys.primitive`, see `vla_zenoh.lab.primitives.messages`.
 
     Args:
         session: with the rights of a worker and of an operator.

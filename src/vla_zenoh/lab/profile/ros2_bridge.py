@@ -33,6 +33,7 @@ ALLOWED_AS = {
 KINDS = (*ALLOWED_AS.values(), "action_clients")
 """All kinds in that list. One that is empty lets nothing through."""
 
+WIDTH = 80
 HEAD = """\
 // {program} for the profile {name}. Written by `vla-zenoh profile bridge-config`.
 // What the profile uses of the robot's ROS graph is let through, by its whole name, and nothing
@@ -92,7 +93,21 @@ def bridge_config(
 def bridge_text(profile: Profile, config: Mapping[str, Any]) -> str:
     """That configuration as the text of a JSON5 file."""
     head = HEAD.format(program=PROGRAM, name=profile.name)
-    return f"{head}{json.dumps(config, indent=2, ensure_ascii=False)}\n"
+    return f"{head}{_json(dict(config))}\n"
+
+
+def _json(value: Any, margin: str = "") -> str:
+    """JSON with short values on one line, so that the list stays readable."""
+    flat = json.dumps(value, ensure_ascii=False)
+    if len(margin) + len(flat) <= WIDTH or not isinstance(value, (dict, list)):
+        return flat
+    inner = f"{margin}  "
+    if isinstance(value, list):
+        parts, ends = [_json(each, inner) for each in value], "[]"
+    else:
+        parts = [f"{json.dumps(key)}: {_json(each, inner)}" for key, each in value.items()]
+        ends = "{}"
+    return f",\n{inner}".join(parts).join((f"{ends[0]}\n{inner}", f"\n{margin}{ends[1]}"))
 
 
 def bridge_command(profile: Profile, file: str = "bridge.json5") -> str:

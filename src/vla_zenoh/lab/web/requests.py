@@ -7,12 +7,12 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from vla_zenoh.errors import CodecError
-from vla_zenoh.lab.web.making import FILM, REPORT
 from vla_zenoh.types import MAX_TEXT, shown
 
 MAX_BYTES = 8192
 """Of one message; the longest is a prompt."""
 MAX_STREAMS = 16
+REPORT, FILM = "report", "film"
 MAX_NUMBER = 1e9
 AXES = 6
 

@@ -3,12 +3,15 @@
 Browsers name a run as the list does, so no path of theirs is ever opened. What was made is opened
 by a ticket: an address that cannot be guessed, good for this one result and for a while. A
 link cannot carry the token of a person, and the address of a page is no place for it.
+
+As a program, ``python -m vla_zenoh.lab.web.runs KIND RUN OUT``, it makes one of them.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import os
 import secrets
 import subprocess
 import sys
@@ -18,12 +21,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from vla_zenoh.errors import RecordingError
+from vla_zenoh.errors import RecordingError, VlaZenohError
 from vla_zenoh.lab.cli.output_path import RUNS
 from vla_zenoh.lab.evaluation.evaluate import recordings
 from vla_zenoh.lab.trial.folder import PLAN, TrialFolder
 from vla_zenoh.lab.trial.unattended import PAGE
-from vla_zenoh.lab.web.making import FILM, REPORT
+from vla_zenoh.lab.web.requests import FILM, REPORT
 
 MADE = ".web"
 """Folder of what was made, in that of the runs."""
@@ -32,6 +35,7 @@ MAX_RUNS = 100
 TICKET_S = 900.0
 MAX_TICKETS = 64
 MAX_FAULT = 500
+NICENESS, PICTURES, EVERY = 10, 8, 15
 KINDS = {
     ".html": "text/html; charset=utf-8",
     ".mp4": "video/mp4",
@@ -163,7 +167,7 @@ class Runs:
         part = out.with_name(f"{out.stem}{PART}{out.suffix}")
         words = [kind, str(path), str(part), *(["--pictures"] if pictures else [])]
         with subprocess.Popen(
-            [sys.executable, "-m", "vla_zenoh.lab.web.making", *words],
+            [sys.executable, "-m", "vla_zenoh.lab.web.runs", *words],
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
@@ -232,3 +236,38 @@ class _Trial(NamedTuple):
         said = {each.recording: f"{each.verdict} {each.note}".strip() for each in episodes}
         blind = plan is not None and plan.blind and plan.next_due(episodes) is not None
         return _Trial("its trial is blind and not finished" if blind else "", said)
+
+
+def make_file(kind: str, run: Path, out: Path, *, pictures: bool) -> None:
+    """Make it, and print the share that is done.
+
+    Raises:
+        RecordingError: the run cannot be read, or has no pictures.
+    """
+    if kind == FILM:
+        from vla_zenoh.lab.recording.film import Film, write_film
+        from vla_zenoh.lab.recording.run import load_run
+
+        def told(done: int, total: int) -> None:
+            if done % EVERY == 0:
+                print(f"{done / total:.2f}", flush=True)
+
+        if not write_film(out, load_run(run), Film(), progress=told):
+            raise RecordingError(f"{run.name} has no pictures of cameras")
+        return
+    from vla_zenoh.lab.evaluation.evaluate import evaluate
+    from vla_zenoh.lab.evaluation.report import page
+
+    runs, faults = evaluate([run], pictures=PICTURES if pictures else 0)
+    if not runs:
+        raise RecordingError("; ".join(faults.values()))
+    out.write_text(page(runs, faults), "utf-8")
+
+
+if __name__ == "__main__":
+    os.nice(NICENESS)
+    kind, run, out = sys.argv[1:4]
+    try:
+        make_file(kind, Path(run), Path(out), pictures="--pictures" in sys.argv)
+    except VlaZenohError as error:
+        sys.exit(str(error))

@@ -23,9 +23,8 @@ from vla_zenoh.lab.teleop.policy import OperatorInput
 from vla_zenoh.lab.web import metrics
 from vla_zenoh.lab.web.access import People, Person, host_is_ours, origin_is_ours, with_headers
 from vla_zenoh.lab.web.arm import surroundings
-from vla_zenoh.lab.web.making import FILM
 from vla_zenoh.lab.web.pictures import Look, Pictures
-from vla_zenoh.lab.web.requests import PageRequest, parse
+from vla_zenoh.lab.web.requests import FILM, PageRequest, parse
 from vla_zenoh.lab.web.robot_link import SETTINGS, RobotLink, asked_trial
 from vla_zenoh.lab.web.runs import HEADERS as RUN_HEADERS
 from vla_zenoh.lab.web.runs import KINDS, Runs
