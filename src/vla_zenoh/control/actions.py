@@ -107,15 +107,25 @@ def covered_step(
 ) -> tuple[Pose, Response | None]:
     """Where a step (D,) ends, of which `ActionSpec.controller` may cover only a part.
 
-    With the controller's response there, as `state` is that at `before`; None: at rest.
+    With the controller's response there, as `state` is that at `before`; None: at rest. The
+    orientation goal stays where the step does not turn.
     """
     asked = step_pose(spec, step, before, start)
     if spec.controller is None:
         return asked, None
-    turns = np.any(step[3:6])  # of a quaternion x, y, z
-    turn = asked.rotation @ before.rotation.T if turns else None
-    way_m = asked.position_m - before.position_m
-    return respond(spec.controller, way_m, turn, spec.dt_s, before, state)
+    rate = np.zeros(6) if state is None else state.rate
+    if np.any(step[3:6]):  # of a quaternion x, y, z
+        turn = asked.rotation @ before.rotation.T
+        held = orthonormal(turn @ before.rotation)
+    else:
+        held = before.rotation if state is None else state.held
+    error = log3(held @ before.rotation.T)
+    angle = norm3(error)
+    if angle > 0.0:
+        error = math.sin(angle) / angle * error
+    way = np.concatenate([asked.position_m - before.position_m, error])
+    moved, reached = _motion(spec.controller, rate, way, spec.dt_s)
+    return _after(before, moved), Response(spec.controller, reached, held, rate, way)
 
 
 def chunk_poses(spec: ActionSpec, steps: Steps, start: Pose) -> list[Pose]:
@@ -224,33 +234,6 @@ class Response:
             if length > NO_CUT:
                 part -= max(float(part @ cut), 0.0) / length**2 * cut
         return replace(self, rate=rate)
-
-
-def respond(
-    controller: ControllerSpec,
-    way_m: FloatArray,
-    turn: FloatArray | None,
-    dt_s: float,
-    before: Pose,
-    state: Response | None,
-) -> tuple[Pose, Response]:
-    """Where the arm is at the end of a step from `before`, and how it moves there.
-
-    The step is the delta `way_m` (3,) and `turn` (3, 3), in base axes; without a turn the
-    orientation goal stays. Without a `state` at the end of the step before, the arm was at rest.
-    """
-    rate = np.zeros(6) if state is None else state.rate
-    if turn is not None:
-        held = orthonormal(turn @ before.rotation)
-    else:
-        held = before.rotation if state is None else state.held
-    error = log3(held @ before.rotation.T)
-    angle = norm3(error)
-    if angle > 0.0:
-        error = math.sin(angle) / angle * error
-    way = np.concatenate([way_m, error])
-    moved, reached = _motion(controller, rate, way, dt_s)
-    return _after(before, moved), Response(controller, reached, held, rate, way)
 
 
 def between(

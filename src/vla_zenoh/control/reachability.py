@@ -53,7 +53,7 @@ from vla_zenoh.kinematics.kinematics import (
     pose_error,
     smallest_singular_value,
 )
-from vla_zenoh.kinematics.so3 import Pose, exp3, orthonormal
+from vla_zenoh.kinematics.so3 import Pose, interpolate
 from vla_zenoh.profile import Profile, ReachLimits
 from vla_zenoh.types import FloatArray, HeldBox
 
@@ -325,14 +325,13 @@ class ReachabilityFilter:
         end, hits = self._try(start, asked, dt_s)
         if not hits:
             return self._settle(start, end, asked, hits, dt_s)
-        step = pose_error(asked, before)
         best, low, high = here, 0.0, 1.0
         fraction = self._guess(start, end, hits)
         for _ in range(HALVINGS):
             if fraction < SMALLEST_FRACTION:
                 break
             yield
-            end, found = self._try(start, _part(before, step, fraction), dt_s)
+            end, found = self._try(start, interpolate(before, asked, fraction), dt_s)
             if not found:
                 best, low = end, fraction
                 break
@@ -341,7 +340,7 @@ class ReachabilityFilter:
             for _ in range(REFINEMENTS):
                 fraction = 0.5 * (low + high)
                 yield
-                end, found = self._try(start, _part(before, step, fraction), dt_s)
+                end, found = self._try(start, interpolate(before, asked, fraction), dt_s)
                 if found:
                     high, hits = fraction, found
                 else:
@@ -438,9 +437,3 @@ def _same(a: Pose, b: Pose) -> bool:
         float(np.abs(a.position_m - b.position_m).max()) < SAME_POSE
         and float(np.abs(a.rotation - b.rotation).max()) < SAME_POSE
     )
-
-
-def _part(before: Pose, step: FloatArray, fraction: float) -> Pose:
-    """The pose after `fraction` of a step (6,) m and rad, on the line and the geodesic."""
-    turned = exp3(fraction * step[3:]) @ before.rotation
-    return Pose(before.position_m + fraction * step[:3], orthonormal(turned))

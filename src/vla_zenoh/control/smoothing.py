@@ -28,7 +28,6 @@ from vla_zenoh.control.limits import (
 from vla_zenoh.control.plan_timeline import Goal
 from vla_zenoh.kinematics.so3 import (
     Pose,
-    body_rates,
     exp3,
     interpolate,
     log3,
@@ -145,7 +144,8 @@ class Smoother(AxisSmoother):
     def _settle(self, shares: Shares) -> None:
         """Move the anchor to the present rotation, and set noise to zero."""
         position, velocity, acceleration = self.state
-        spin, spin_change = body_rates(position[3:], velocity[3:], acceleration[3:])
+        turning = position[3:], velocity[3:], acceleration[3:]
+        spin, spin_change = spatial_rates(*turning, side=-1.0)
         self._anchor = orthonormal(self._anchor @ exp3(position[3:]))
         self.state = AxisState(
             np.concatenate([position[:3], np.zeros(3)]),

@@ -213,13 +213,6 @@ def spatial_rates(
     return np.array(velocity), np.array(acceleration)
 
 
-def body_rates(
-    rotvec: FloatArray, rate: FloatArray, rate_change: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Angular velocity and acceleration of ``exp3(r(t))`` in its own axes: see `spatial_rates`."""
-    return spatial_rates(rotvec, rate, rate_change, side=-1.0)
-
-
 def rates_of(
     rotvec: FloatArray, velocity: FloatArray, acceleration: FloatArray
 ) -> tuple[FloatArray, FloatArray]:

@@ -12,7 +12,7 @@ from command_rig import DOWN, MS, START_M, START_NS, Rig, lone_chunk, profile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vla_zenoh.control.actions import as_deltas, chunk_poses, respond
+from vla_zenoh.control.actions import as_deltas, chunk_poses, covered_step
 from vla_zenoh.control.chunk_planner import ChunkPlan, ChunkPlanner
 from vla_zenoh.control.commander import Setting
 from vla_zenoh.control.commander_io import StateHistory
@@ -398,8 +398,12 @@ def test_every_controller_that_can_be_declared_has_a_finite_response_that_ends_a
     kp: float, ratio: float, dt_s: float
 ) -> None:
     controller = ControllerSpec(kp=kp, damping_ratio=ratio)
-    way_m = np.array([0.05, 0.0, 0.0])
-    pose, state = respond(controller, way_m, None, dt_s, START, None)
+    spec = ActionSpec(
+        horizon=1, dt_s=0.1, rotation="rotvec", gripper="none", controller=controller
+    ).model_copy(update={"dt_s": dt_s})
+    step = np.array([0.05, 0.0, 0.0, 0.0, 0.0, 0.0])
+    pose, state = covered_step(spec, step, START, START, None)
+    assert state is not None
     assert np.isfinite(pose.position_m).all()
     assert np.isfinite(state.rate).all()
     gone_m = (pose.position_m - START.position_m)[0]
