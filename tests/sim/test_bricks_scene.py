@@ -17,8 +17,7 @@ from vla_zenoh.lab.tasks.order import COLOURS, brick
 from vla_zenoh.simulation.backend import Backend, why_no_opengl
 from vla_zenoh.simulation.render import Renderer
 from vla_zenoh.simulation.robot_model import RobotModel
-from vla_zenoh.simulation.scene import build_model
-from vla_zenoh.simulation.variation import (
+from vla_zenoh.simulation.scene import (
     CAMERA,
     DISTRACTORS,
     LIGHTS,
@@ -27,6 +26,7 @@ from vla_zenoh.simulation.variation import (
     TABLE,
     VARIATIONS,
     AppearanceSwitcher,
+    build_model,
     check_variations,
     draw_appearance,
     draw_places,

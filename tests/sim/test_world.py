@@ -11,7 +11,7 @@ from motions import HOME_RAD, circle, line, make_world, wait
 
 from vla_zenoh.errors import NodeError, ResourceError
 from vla_zenoh.simulation.robot_model import RobotModel
-from vla_zenoh.simulation.variation import draw_places, footprint_m, objects_of, regions_of
+from vla_zenoh.simulation.scene import draw_places, footprint_m, objects_of, regions_of
 from vla_zenoh.simulation.world import World
 from vla_zenoh.types import PoseReference
 

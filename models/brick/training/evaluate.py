@@ -39,7 +39,7 @@ from vla_zenoh.policy import Observation
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.simulation.render import Renderer
 from vla_zenoh.simulation.robot_model import RobotModel
-from vla_zenoh.simulation.variation import VARIATIONS
+from vla_zenoh.simulation.scene import VARIATIONS
 from vla_zenoh.simulation.world import World, build_world
 from vla_zenoh.types import Image, ObjectPoses
 

@@ -29,8 +29,14 @@ from vla_zenoh.lab.tasks.order import brick
 from vla_zenoh.profile import load_profile
 from vla_zenoh.simulation.render import Renderer
 from vla_zenoh.simulation.robot_model import RobotModel
-from vla_zenoh.simulation.scene import PREFIX, TCP_SITE, build_model
-from vla_zenoh.simulation.variation import DISTRACTOR_PREFIX, VARIATIONS, regions_of
+from vla_zenoh.simulation.scene import (
+    DISTRACTOR_PREFIX,
+    PREFIX,
+    TCP_SITE,
+    VARIATIONS,
+    build_model,
+    regions_of,
+)
 
 SCENE = "bricks"
 SHARD = 500

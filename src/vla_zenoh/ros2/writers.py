@@ -184,8 +184,8 @@ def send_goal(
 ) -> Any:
     """The request that begins a goal with this id.
 
-    `position` is the opening as the driver takes it, see `position`; `MOVE` and `GRASP` take
-    widths. A grasp succeeds at whatever width up to `max_width_m`.
+    `position` is the opening as the driver takes it; `MOVE` and `GRASP` take widths. A grasp
+    succeeds at whatever width up to `max_width_m`.
     """
     goal: dict[str, Any] = {"width": command.width_m, "speed": command.speed_m_s}
     if action == GRASP:

@@ -20,8 +20,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_zenoh.simulation.scene import MOVING_GROUP, STATIC_GROUP
-from vla_zenoh.simulation.variation import box_corners
+from vla_zenoh.simulation.scene import MOVING_GROUP, STATIC_GROUP, box_corners
 from vla_zenoh.types import FloatArray
 
 Pixels = NDArray[np.uint8]

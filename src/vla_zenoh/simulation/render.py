@@ -20,8 +20,7 @@ from vla_zenoh.errors import NodeError, RecordError, ResourceError, in_words
 from vla_zenoh.simulation.backend import RAYCAST, Backend, choose_backend
 from vla_zenoh.simulation.raycast import RaycastCanvas
 from vla_zenoh.simulation.robot_model import RobotModel
-from vla_zenoh.simulation.scene import POSES, build_model
-from vla_zenoh.simulation.variation import AppearanceSwitcher
+from vla_zenoh.simulation.scene import POSES, AppearanceSwitcher, build_model
 
 MAX_GEOMS = 1000
 PROBE_SIZE = 16

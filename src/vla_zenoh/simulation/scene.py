@@ -1,15 +1,27 @@
-"""Builds the MuJoCo model of a scene in ``sim/`` with the robot in it.
+"""A scene in ``sim/``: its MuJoCo model with the robot in it, and what a seed changes in it.
 
 The process that steps the world and those that render it build their models with `build_model` from
 the same arguments, so that a pose vector of one fits the other.
+
+A seed changes the places of the objects, and the appearance. A scene declares in its MJCF where an
+object may stand::
+
+    <custom>
+      <numeric name="place/brick" data="x_min x_max y_min y_max yaw_min yaw_max"/>
+      <numeric name="place_gap_m" data="0.05"/>
+    </custom>
+
+``distract/NAME`` is the same for a distractor, which is placed only on request. Appearance (lights,
+colour of the table, pose of the front camera) changes images alone, so only a renderer uses it.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -35,6 +47,24 @@ STIFF_SOLREF = (0.004, 1.0)
 PAD_FRICTION = (1.5, 0.02, 0.001)  # sliding, torsional, rolling
 PAD_CONDIM = 4
 PAD_SOLIMP = (0.99, 0.999, 0.001, 0.5, 2.0)  # the fingers are light, hence soft otherwise
+
+REGION_PREFIX = "place/"
+DISTRACTOR_PREFIX = "distract/"
+GAP = "place_gap_m"
+MAX_DRAWS = 1000
+
+LIGHTS, TABLE, CAMERA, DISTRACTORS = "lights", "table", "camera", "distractors"
+VARIATIONS = (LIGHTS, TABLE, CAMERA, DISTRACTORS)
+
+KEY_LIGHT, TABLE_MATERIAL, FRONT_CAMERA = "key", "table", "front"
+MAX_SHIFT_M = 0.03
+MAX_TURN_RAD = math.radians(5.0)
+AMBIENT, HEAD, KEY = (0.24, 0.44), (0.15, 0.38), (0.25, 0.65)
+MAX_TINT = 0.12
+MAX_LIGHT_TURN_RAD = 0.8
+TABLE_BRIGHTNESS, TABLE_SATURATION = (0.35, 0.95), 0.35
+_STREAM = 0x100C
+"""Second seed of the random generator: appearance and places of objects are independent."""
 
 
 def scene_file(scene: str) -> Path:
@@ -193,3 +223,205 @@ def _sort_groups(model: mujoco.MjModel) -> None:
     visible = model.geom_group < HIDDEN_GROUP
     model.geom_group[visible & moving] = MOVING_GROUP
     model.geom_group[visible & ~moving] = STATIC_GROUP
+
+
+# -- places of objects ----------------------------------------------------------------------------
+class Place(NamedTuple):
+    """Where an object stands, in the base frame, and its turn about the vertical."""
+
+    x_m: float
+    y_m: float
+    yaw_rad: float
+
+
+class Region(NamedTuple):
+    """Bounds of the places of an object."""
+
+    low: Place
+    high: Place
+
+
+def objects_of(model: mujoco.MjModel) -> dict[str, int]:
+    """Name -> body id of every object that can be placed: free bodies and mocap bodies."""
+    free = model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE].tolist()
+    placed = np.flatnonzero(model.body_mocapid >= 0).tolist()
+    return {model.body(i).name: i for i in sorted(free + placed)}
+
+
+def regions_of(model: mujoco.MjModel, prefix: str = REGION_PREFIX) -> dict[str, Region]:
+    """Regions by name of the object, from the entries that begin with `prefix`.
+
+    Raises:
+        ResourceError: a region is malformed, or of an object the scene does not have.
+    """
+    known = objects_of(model)
+    regions: dict[str, Region] = {}
+    entries = [model.numeric(index) for index in range(model.nnumeric)]
+    for entry in (entry for entry in entries if entry.name.startswith(prefix)):
+        name = entry.name.removeprefix(prefix)
+        if name not in known:
+            can = ", ".join(known) or "nothing"
+            raise ResourceError(f"the scene places {name!r}, but can only place: {can}")
+        data = entry.data.tolist()
+        if len(data) != 6 or not all(data[i] <= data[i + 1] for i in (0, 2, 4)):
+            wanted = "x_min x_max y_min y_max yaw_min yaw_max"
+            raise ResourceError(f"{entry.name} is {data}, wanted {wanted}")
+        regions[name] = Region(Place(*data[0::2]), Place(*data[1::2]))
+    return regions
+
+
+def footprint_m(model: mujoco.MjModel, body: int) -> float:
+    """Radius of the upright cylinder about the body's origin that holds all its geoms."""
+    radius = 0.0
+    for geom in np.flatnonzero(model.geom_bodyid == body):
+        rotation = np.empty(9)
+        mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
+        corners = box_corners(model, int(geom)) @ rotation.reshape(3, 3).T + model.geom_pos[geom]
+        radius = max(radius, float(np.hypot(corners[:, 0], corners[:, 1]).max()))
+    return radius
+
+
+def box_corners(model: mujoco.MjModel, geom: int) -> FloatArray:
+    """(8, 3) corners of a geom's bounding box, in the geom's frame."""
+    centre, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+    signs = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, -1).T
+    return centre + signs * half
+
+
+def draw_places(model: mujoco.MjModel, seed: int, *, distractors: bool = False) -> dict[str, Place]:
+    """Draw a place without overlaps for every object that has a region.
+
+    Objects without a region stay where the scene file has them, and the drawn ones keep clear of
+    them. Distractors do not change the places of the other objects.
+
+    Raises:
+        ResourceError: the regions are too small for the objects.
+    """
+    random = np.random.default_rng(seed)
+    regions, bodies = regions_of(model), objects_of(model)
+    radii = {name: footprint_m(model, body) for name, body in bodies.items()}
+    has_gap = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, GAP) >= 0
+    gap_m = float(model.numeric(GAP).data[0]) if has_gap else 0.0
+    fixed = {
+        name: Place(float(model.body_pos[body, 0]), float(model.body_pos[body, 1]), 0.0)
+        for name, body in bodies.items()
+        if name not in regions
+    }
+
+    def draw(wanted: dict[str, Region], beside: dict[str, Place]) -> dict[str, Place]:
+        for _ in range(MAX_DRAWS):
+            drawn = {
+                name: Place(*random.uniform(region.low, region.high).tolist())
+                for name, region in wanted.items()
+            }
+            if all(
+                math.hypot(a.x_m - b.x_m, a.y_m - b.y_m) >= radii[one] + radii[other] + gap_m
+                for (one, a), (other, b) in combinations((beside | drawn).items(), 2)
+            ):
+                return drawn
+        raise ResourceError(
+            f"no room for {', '.join(wanted)} in their regions with {gap_m:g} m between them; "
+            f"make the regions of the scene larger or {GAP} smaller"
+        )
+
+    places = draw(regions, fixed)
+    if distractors:
+        for name, region in regions_of(model, DISTRACTOR_PREFIX).items():
+            del fixed[name]
+            places |= draw({name: region}, fixed | places)
+    return places
+
+
+# -- appearance -----------------------------------------------------------------------------------
+class Appearance(NamedTuple):
+    """Differences from the scene file, (3,) each; a reset applies those that are varied.
+
+    Offset and rotation vectors are in the world frame.
+    """
+
+    ambient: FloatArray  # colour of the head light
+    head: FloatArray  # its diffuse colour
+    key: FloatArray  # diffuse colour of the scene's light
+    key_turn_rad: FloatArray  # of the direction of that light
+    table: FloatArray  # colour
+    shift_m: FloatArray  # of the front camera
+    turn_rad: FloatArray  # of the front camera
+
+
+def draw_appearance(seed: int) -> Appearance:
+    """The appearance of a reset with `seed`; offsets and rotations are uniform in a ball."""
+    random = np.random.default_rng((_STREAM, seed))
+    ambient, head, key = (_tinted(random, *bounds) for bounds in (AMBIENT, HEAD, KEY))
+    key_turn_rad = _in_ball(random, MAX_LIGHT_TURN_RAD)
+    table = random.uniform(*TABLE_BRIGHTNESS) * (1.0 - TABLE_SATURATION * random.uniform(size=3))
+    shift_m, turn_rad = _in_ball(random, MAX_SHIFT_M), _in_ball(random, MAX_TURN_RAD)
+    return Appearance(ambient, head, key, key_turn_rad, table, shift_m, turn_rad)
+
+
+def check_variations(vary: Collection[str]) -> None:
+    """Raise a `ResourceError` unless everything in `vary` is one of `VARIATIONS`."""
+    unknown = sorted(set(vary) - set(VARIATIONS))
+    if unknown:
+        raise ResourceError(f"nothing called {unknown[0]!r} to vary; {', '.join(VARIATIONS)}")
+
+
+class AppearanceSwitcher:
+    """Applies appearances to a compiled scene, which it modifies, each in place of the last."""
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self._model = model
+        head = model.vis.headlight
+        self._changed = (
+            *(head.ambient, head.diffuse, model.light_diffuse, model.light_dir),
+            *(model.mat_rgba, model.cam_pos, model.cam_quat),
+        )
+        self._original = tuple(np.array(values) for values in self._changed)
+
+    def apply(self, seed: int | None, vary: Collection[str]) -> None:
+        """Apply what `vary` names of the appearance of `seed`; None: that of the scene file.
+
+        Raises:
+            ResourceError: an unknown name in `vary`, or the scene lacks what it varies.
+        """
+        check_variations(vary)
+        for values, original in zip(self._changed, self._original, strict=True):
+            values[:] = original
+        if seed is None:
+            return
+        model, look = self._model, draw_appearance(seed)
+        if LIGHTS in vary:
+            light = self._index("light", KEY_LIGHT)
+            model.vis.headlight.ambient[:] = look.ambient
+            model.vis.headlight.diffuse[:] = look.head
+            model.light_diffuse[light] = look.key
+            direction = model.light_dir[light].copy()
+            mujoco.mju_rotVecQuat(model.light_dir[light], direction, _quat_wxyz(look.key_turn_rad))
+        if TABLE in vary:
+            model.mat_rgba[self._index("material", TABLE_MATERIAL), :3] = look.table
+        if CAMERA in vary:
+            camera = self._index("camera", FRONT_CAMERA)
+            model.cam_pos[camera] += look.shift_m
+            quat = model.cam_quat[camera].copy()
+            mujoco.mju_mulQuat(model.cam_quat[camera], _quat_wxyz(look.turn_rad), quat)
+
+    def _index(self, kind: str, name: str) -> int:
+        try:
+            return int(getattr(self._model, kind)(name).id)
+        except KeyError as error:
+            why = f"the scene has no {kind} {name!r} that could be varied"
+            raise ResourceError(f"{why}; see sim/bricks/README.md") from error
+
+
+def _tinted(random: np.random.Generator, low: float, high: float) -> FloatArray:
+    return random.uniform(low, high) * (1.0 + MAX_TINT * random.uniform(-1.0, 1.0, 3))
+
+
+def _in_ball(random: np.random.Generator, radius: float) -> FloatArray:
+    direction = random.normal(size=3)
+    return direction * radius * random.uniform() ** (1 / 3) / np.linalg.norm(direction)
+
+
+def _quat_wxyz(rotvec: FloatArray) -> FloatArray:
+    quat = np.array([1.0, 0.0, 0.0, 0.0])
+    mujoco.mju_quatIntegrate(quat, rotvec, 1.0)
+    return quat

@@ -19,8 +19,18 @@ from vla_zenoh.simulation.impedance import (
     JointImpedance,
 )
 from vla_zenoh.simulation.robot_model import RobotModel, robot_models
-from vla_zenoh.simulation.scene import GRIPPER, POSES, STEP_S, TCP_SITE, build_model, prefix_of
-from vla_zenoh.simulation.variation import DISTRACTORS, check_variations, draw_places, objects_of
+from vla_zenoh.simulation.scene import (
+    DISTRACTORS,
+    GRIPPER,
+    POSES,
+    STEP_S,
+    TCP_SITE,
+    build_model,
+    check_variations,
+    draw_places,
+    objects_of,
+    prefix_of,
+)
 from vla_zenoh.types import (
     FloatArray,
     GripperState,
@@ -55,7 +65,7 @@ class World:
         gains: of the Cartesian impedance controller; None: the default ones.
         joint_friction_nm: dry friction in every arm joint, which the controller does not model.
         seed: see `reset`.
-        vary: what else a seeded reset changes, names of `variation.VARIATIONS`.
+        vary: what else a seeded reset changes, names of `scene.VARIATIONS`.
 
     Raises:
         ResourceError: scene or robot are missing or do not fit.
@@ -91,7 +101,7 @@ class World:
             for model, home in zip(robots, home_rad, strict=True)
         }
         arm = next(iter(self.parts.values()))
-        self.robot, self.joint_range_rad, self.tcp = arm.robot, arm.joint_range_rad, arm.tcp
+        self.joint_range_rad, self.tcp = arm.joint_range_rad, arm.tcp
         self.hold_reference, self.set_gripper = arm.hold_reference, arm.set_gripper
         self.joint_state, self.pose_state = arm.joint_state, arm.pose_state
         self.gripper_state, self.wrench = arm.gripper_state, arm.wrench

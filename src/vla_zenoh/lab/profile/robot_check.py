@@ -116,8 +116,7 @@ def simulator(profile: Profile) -> Iterator[ProfileFault]:
     if profile.robot.driver != "sim" or not running & ({"sim", "camera"} if simulated else {"sim"}):
         return
     try:
-        from vla_zenoh.simulation.scene import scene_file
-        from vla_zenoh.simulation.variation import AppearanceSwitcher
+        from vla_zenoh.simulation.scene import AppearanceSwitcher, scene_file
         from vla_zenoh.simulation.world import build_world
     except ImportError as error:
         yield ProfileFault(
