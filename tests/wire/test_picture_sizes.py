@@ -21,15 +21,15 @@ from vla_zenoh.codec.image import decode_jpeg, encode_jpeg
 from vla_zenoh.keys import Kind
 from vla_zenoh.nodes.camera import node as camera_node
 from vla_zenoh.nodes.camera.camera_publisher import MAX_SIZES
-from vla_zenoh.nodes.worker.robot_session import CameraStream, colour_stream
+from vla_zenoh.nodes.worker.robot_session import CameraStream, colour_keys
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, ObservationSpec
 from vla_zenoh.policy.observation import History, size_variant
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.profile.schema import CameraProfile
 from vla_zenoh.types import Image
 
-SILENCE_S, PATIENCE_S = 1.0, 0.3
-"""Of models and of a worker, in these tests."""
+SILENCE_S = 1.0
+"""Of models, in these tests."""
 PLAIN_SEQ = 1000
 """Number of the first plain picture."""
 TURN_S = 0.15
@@ -173,7 +173,6 @@ def test_plain_pictures_are_taken_while_none_come_in_the_own_size_and_no_longer(
         images = History(1)
         ears = CameraStream(
             *(worker, "front", (own.key, plain.key), images, lambda data, _: decode_jpeg(data)),
-            patience_s=PATIENCE_S,
             history_s=0.0,
             changed=Wake(),
         )
@@ -206,7 +205,12 @@ def test_a_worker_knows_where_its_pictures_are_and_where_those_of_all() -> None:
         for_all = camera.declare_publisher(keys.camera_jpeg("front"), Kind.FRAME)
         wanted = CameraSpec(camera="front", width=32, height=32, resize="pad")
         images = History(1)
-        ears = colour_stream(wanted, worker, images, jpeg=True, history_s=0.0, changed=Wake())
+        keys_of_it = colour_keys(wanted, worker, jpeg=True)
+        ears = CameraStream(
+            *(worker, "front", keys_of_it, images, lambda data, _: decode_jpeg(data)),
+            history_s=0.0,
+            changed=Wake(),
+        )
         until("its own", lambda: own.has_subscribers)
         assert not other.has_subscribers
 

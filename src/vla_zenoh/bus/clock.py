@@ -47,13 +47,6 @@ DRIFT = 50e-6
 """Two clocks of ordinary computers run apart by this much, s per s."""
 LAST_NS = 2**63 - 1
 """The greatest stamp that a record takes."""
-_STAMPS_OF_A_CHUNK = (
-    "observation_stamp_ns",
-    "valid_until_ns",
-    "observed_ns",
-    "inference_start_ns",
-    "inference_end_ns",
-)
 
 Record = TypeVar("Record")
 
@@ -262,7 +255,8 @@ def shift_stamps(header: Header, record: Record, ahead_ns: int) -> tuple[Header,
 
     header = replace(header, stamp_wall_ns=here(header.stamp_wall_ns))
     if isinstance(record, ActionChunk):
-        stamps = {name: here(getattr(record, name)) for name in _STAMPS_OF_A_CHUNK}
+        names = [name for name in ActionChunk.__match_args__ if name.endswith("_ns")]
+        stamps = {name: here(getattr(record, name)) for name in names}
         record = replace(record, **stamps)
     return header, record
 

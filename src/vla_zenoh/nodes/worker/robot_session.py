@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import zenoh
@@ -105,22 +106,17 @@ class RobotSession:
         )
         self._tasks = node.subscribe(keys.task, LatestSample(SMALL_BYTES))
         streams = self._streams = Streams.of(self.spec.observation, self.spec.parts)
-        history_s = self.spec.observation.history_span_s
+        history_s, jpeg = self.spec.observation.history_span_s, images == "jpeg"
+        camera_stream = partial(CameraStream, node, history_s=history_s, changed=changed)
+        decode_image = _decode_jpeg if jpeg else decode_raw
         self._cameras = [
-            colour_stream(
-                *(one, node, streams.images[one.camera]),
-                jpeg=images == "jpeg",
-                history_s=history_s,
-                changed=changed,
+            camera_stream(name, colour_keys(one, node, jpeg=jpeg), kept, decode_image)
+            for one, (name, kept) in zip(
+                self.spec.observation.cameras, streams.images.items(), strict=True
             )
-            for one in self.spec.observation.cameras
         ]
         self._cameras += [
-            CameraStream(
-                *(node, name, [keys.camera_depth(name)], kept, decode_depth),
-                history_s=history_s,
-                changed=changed,
-            )
+            camera_stream(name, [keys.camera_depth(name)], kept, decode_depth)
             for name, kept in streams.depth.items()
         ]
         self._every_state = bool(history_s) or not self._cameras
@@ -336,9 +332,9 @@ class _Source(NamedTuple):
 class CameraStream:
     """One camera's colour or depth images, from its subscriber to the `images` that are kept.
 
-    It subscribes to the first of `keys`, the preferred one, and after a silence of `patience_s` to
-    the second, the common one, too. The newest image waits for `poll`; where those `history_s`
-    older are needed as well, all of one inference do. Each sets `changed`.
+    It subscribes to the first of `keys`, the preferred one, and while that is silent to the second,
+    the common one, as well. The newest image waits for `poll`; where those `history_s` older are
+    needed, all of one inference do. Each sets `changed`.
 
     Raises:
         SessionError: the router does not answer at the port for images.
@@ -352,17 +348,19 @@ class CameraStream:
         images: History,
         decode: Callable[[bytes, str], Any],
         *,
-        patience_s: float = PATIENCE_S,
         history_s: float,
         changed: Wake,
     ) -> None:
         self._node, self.camera, self._keys, self._changed = node, camera, keys, changed
-        self.images, self._decode, self._patience_s = images, decode, patience_s
+        self.images, self._decode = images, decode
+        self._queue, self._patience_s = 1, PATIENCE_S
         settings = node.profile.cameras.get(camera)
-        self._queue = 1
-        if history_s and settings is not None:
-            count = 1 + math.ceil((history_s + PATIENCE_S) * settings.rate_hz)
-            self._queue = min(MAX_QUEUE, count)
+        if settings is not None:
+            slowest_hz = min(settings.rate_hz, settings.jpeg_rate_hz or settings.rate_hz)
+            self._patience_s = max(PATIENCE_S, PERIODS / slowest_hz)
+            if history_s:
+                count = 1 + math.ceil((history_s + PATIENCE_S) * settings.rate_hz)
+                self._queue = min(MAX_QUEUE, count)
         self.received_s = 0.0
         """When the newest of `images` arrived, monotonic clock; 0: there is none."""
         self._preferred = self._subscribe(keys[0])
@@ -427,24 +425,15 @@ class CameraStream:
         self.received_s = mono_ns / 1e9
 
 
-def colour_stream(
-    spec: CameraSpec, node: Node, images: History, *, jpeg: bool, history_s: float, changed: Wake
-) -> CameraStream:
-    """The stream that suits a model: raw, JPEG, or JPEG in its input size."""
+def colour_keys(spec: CameraSpec, node: Node, *, jpeg: bool) -> list[str]:
+    """The key that suits a model: raw, JPEG, or JPEG in its input size and then the common one."""
     keys, name = node.keys, spec.camera
-    settings = node.profile.cameras.get(name)
-    wanted = [keys.camera_jpeg(name) if jpeg else keys.camera_raw(name)]
-    if jpeg and settings is not None and settings.fit_for_workers:
-        size = size_variant(spec)
-        if size is not None:
-            wanted.insert(0, keys.camera_fitted(name, size))
-    rates_hz = (settings.rate_hz, settings.jpeg_rate_hz if jpeg else None) if settings else ()
-    return CameraStream(
-        *(node, name, wanted, images, _decode_jpeg if jpeg else decode_raw),
-        patience_s=max([PATIENCE_S, *(PERIODS / rate for rate in rates_hz if rate)]),
-        history_s=history_s,
-        changed=changed,
-    )
+    settings, size = node.profile.cameras.get(name), size_variant(spec)
+    if not jpeg:
+        return [keys.camera_raw(name)]
+    if settings is None or not settings.fit_for_workers or size is None:
+        return [keys.camera_jpeg(name)]
+    return [keys.camera_fitted(name, size), keys.camera_jpeg(name)]
 
 
 def _decode_jpeg(payload: bytes, _: str) -> Image:
