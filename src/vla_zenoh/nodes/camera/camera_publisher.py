@@ -18,7 +18,7 @@ from vla_zenoh.bus.node import Node, Publisher
 from vla_zenoh.codec.image import depth_schema, encode_depth, encode_jpeg, encode_raw, raw_schema
 from vla_zenoh.errors import NodeError
 from vla_zenoh.keys import Kind
-from vla_zenoh.nodes.camera.geometry import Geometry, Intrinsics, Pixels
+from vla_zenoh.nodes.camera.geometry import Geometry, Intrinsics, Pixels, resize
 from vla_zenoh.nodes.camera.image_check import ImageCheck, ImageFault
 from vla_zenoh.policy import CameraSpec
 from vla_zenoh.policy.observation import prepare_image
@@ -370,9 +370,7 @@ def _shrink(image: Image, max_width: int | None) -> Image:
     height, width = image.rgb.shape[:2]
     if max_width is None or width <= max_width:
         return image
-    height = max(8, round(height * max_width / width))
-    smaller = CameraSpec(camera="any", width=max_width, height=height, resize="stretch")
-    return Image(prepare_image(image, smaller))
+    return Image(resize(image.rgb, max_width, max(8, round(height * max_width / width))))
 
 
 def to_rgb(image: Pixels) -> NDArray[np.uint8]:
