@@ -156,8 +156,8 @@ class SimDriver(RobotDriver):
     # -- time ---------------------------------------------------------------------------------
     def pace(self) -> Callable[[], Tick]:
         """Ticks of 1 ms on the monotonic clock; late ones follow each other at once."""
-        counters, next_ns = self.report.counters, time.monotonic_ns()
-        counters["sim.overruns"] = 0
+        report, next_ns = self.report, time.monotonic_ns()
+        report.counters["sim.overruns"] = 0
 
         def wait() -> Tick:
             nonlocal next_ns
@@ -166,10 +166,10 @@ class SimDriver(RobotDriver):
             if late_ns < 0:
                 time.sleep(-late_ns / 1e9)
             elif late_ns > CATCH_UP_NS:
-                counters["sim.time_given_up_ms"] += late_ns // 1_000_000
+                report.counters["sim.time_given_up_ms"] += late_ns // 1_000_000
                 next_ns += late_ns
             elif late_ns > STEP_NS:
-                counters["sim.overruns"] += 1
+                report.counters["sim.overruns"] += 1
             return Tick(1, next_ns, 0.0, 0.0)
 
         return wait
