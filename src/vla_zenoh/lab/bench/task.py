@@ -96,11 +96,15 @@ class TaskRequest:
 
     Args:
         target: colour of the brick, None: any.
+        prompt: of the user, in place of a task that is drawn; judged as ``stay`` if it is unknown.
+        order: what the prompt is taken for; None: what its wording says.
     """
 
     seed: int
     family: str
     target: str | None = None
+    prompt: str | None = None
+    order: Order | None = None
 
     def draw(self, objects: ObjectPoses, *, held_out: bool) -> TaskEpisode:
         """Draw the task in this layout.
@@ -108,6 +112,9 @@ class TaskRequest:
         Where the target cannot be pushed, another brick is; where none can, another family is drawn
         instead of skipping the layout.
         """
+        if self.prompt is not None:
+            order = self.order or parse_prompt(self.prompt) or Order(STAY)
+            return TaskEpisode(self.seed, order, self.prompt)
         if self.family == LIFT:
             return TaskEpisode(self.seed, Order(LIFT), LIFT_PROMPT)
         if self.family == STAY:
@@ -223,23 +230,6 @@ FIRST_SEED = 1
 
 
 @dataclass(frozen=True, slots=True)
-class PromptedTask(TaskRequest):
-    """An episode with a prompt of the user.
-
-    Args:
-        order: what it is taken for; None: what its wording says.
-    """
-
-    prompt: str = ""
-    order: Order | None = None
-
-    def draw(self, objects: ObjectPoses, *, held_out: bool) -> TaskEpisode:
-        """The task of the prompt; an unknown prompt is judged as ``stay``."""
-        order = self.order or parse_prompt(self.prompt) or Order(STAY)
-        return TaskEpisode(self.seed, order, self.prompt)
-
-
-@dataclass(frozen=True, slots=True)
 class DemoPlan(TaskPlan):
     """Prompts of the user, or one task of every family, all in the same layout.
 
@@ -253,7 +243,7 @@ class DemoPlan(TaskPlan):
 
     def requests(self) -> Iterator[TaskRequest]:
         for prompt in self.prompts:
-            yield PromptedTask(self.seed, STAY, None, prompt, self.orders.get(prompt))
+            yield TaskRequest(self.seed, STAY, None, prompt, self.orders.get(prompt))
         if not self.prompts:
             for family in FAMILIES:
                 yield TaskRequest(self.seed, family)

@@ -46,10 +46,8 @@ class AskedWorker:
         keys = node.keys
         self._task = node.declare_publisher(keys.task, Kind.CONTROL)
         self._states = {
-            "joint": node.declare_publisher(keys.state_joint, Kind.STATE),
-            "pose": node.declare_publisher(keys.state_pose, Kind.STATE),
-            "gripper": node.declare_publisher(keys.state_gripper, Kind.STATE),
-            "privileged": node.declare_publisher(keys.state_privileged, Kind.STATE),
+            part: node.declare_publisher(getattr(keys, f"state_{part}"), Kind.STATE)
+            for part in ("joint", "pose", "gripper", "privileged")
         }
         self._cameras: dict[str, Publisher] = {}
         self._chunks = node.subscribe(keys.delta(worker), CallbackRing(8))

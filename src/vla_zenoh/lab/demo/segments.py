@@ -53,30 +53,24 @@ class DemoSegment:
         return f"{self.prompt} x{self.steps}{within}"
 
     @property
-    def translation_m(self) -> FloatArray:
-        """(3,) translation that the prompt asks for, base frame."""
-        return self._asked()[:3]
-
-    @property
-    def rotation_rad(self) -> FloatArray:
-        """(3,) rotation vector that the prompt asks for, base frame."""
-        return self._asked()[3:6]
+    def asked(self) -> FloatArray:
+        """(6,) translation in m and rotation vector that the prompt asks for, base frame."""
+        asked = np.zeros(6)
+        if self.motion is not None and self.motion.axis < 6:
+            asked[self.motion.axis] = self._parsed.offset(self.steps)
+        return asked
 
     def width_after_m(self, before_m: float, max_width_m: float) -> float:
         """Gripper width that the prompt asks for, from `before_m`."""
         width_m = before_m
         if self.motion is not None and self.motion.axis == 6:
-            prompt = ScriptedPrompt(self.motion, self.steps, self.within)
             for index in range(self.steps):
-                width_m = min(max(width_m + prompt.step(index), 0.0), max_width_m)
+                width_m = min(max(width_m + self._parsed.step(index), 0.0), max_width_m)
         return width_m
 
-    def _asked(self) -> FloatArray:
-        asked = np.zeros(7)
-        if self.motion is not None:
-            prompt = ScriptedPrompt(self.motion, self.steps, self.within)
-            asked[self.motion.axis] = prompt.offset(self.steps)
-        return asked
+    @property
+    def _parsed(self) -> ScriptedPrompt:
+        return ScriptedPrompt(self.motion, self.steps, self.within)
 
 
 def make_segment(prompt: str, steps: int) -> DemoSegment:
@@ -129,11 +123,11 @@ class SegmentOutcome:
 
     @property
     def asked_m(self) -> float:
-        return float(np.linalg.norm(self.segment.translation_m))
+        return float(np.linalg.norm(self.segment.asked[:3]))
 
     @property
     def asked_rad(self) -> float:
-        return float(np.linalg.norm(self.segment.rotation_rad))
+        return float(np.linalg.norm(self.segment.asked[3:]))
 
     def faults(self) -> list[str]:
         """Deviations beyond the tolerances; empty: the arm did what was asked."""
@@ -191,8 +185,8 @@ def judge_segment(
     """Split the motion between two rest poses into what `segment` asks for and drift."""
     translation = after.pose.position_m - before.pose.position_m
     rotation = log3(after.pose.rotation @ before.pose.rotation.T)
-    along_m, off_m = _split(translation, segment.translation_m)
-    about_rad, off_rad = _split(rotation, segment.rotation_rad)
+    along_m, off_m = _split(translation, segment.asked[:3])
+    about_rad, off_rad = _split(rotation, segment.asked[3:])
     return SegmentOutcome(
         segment,
         along_m,

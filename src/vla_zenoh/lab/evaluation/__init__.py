@@ -1,3 +1,1 @@
 """Evaluation of recorded runs."""
-
-from __future__ import annotations

@@ -1,3 +1,1 @@
 """Recordings: MCAP files that Foxglove, Rerun and ``ros2 bag`` open, without loss."""
-
-from __future__ import annotations

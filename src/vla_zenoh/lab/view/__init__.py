@@ -1,3 +1,1 @@
 """Live and recorded runs in Rerun."""
-
-from __future__ import annotations
