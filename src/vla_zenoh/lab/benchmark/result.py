@@ -69,7 +69,7 @@ def write_page(folder: Path, result: Mapping[str, Any]) -> None:
 def write_videos(
     folder: Path,
     place: BenchmarkProcess,
-    failed: Sequence[tuple[EpisodeRequest, EpisodeOutcome]],
+    failed: Sequence[EpisodeRequest],
     camera: str,
     most: int,
 ) -> Iterable[Path]:
@@ -77,15 +77,14 @@ def write_videos(
 
     Args:
         place: where the steps are executed again.
-        failed: requests and outcomes of failed episodes.
         most: largest number; the first failure of every task comes first.
     """
-    first: dict[str, int] = Counter()
-    order = []
-    for request, outcome in failed:
-        order.append((first[request.task.name], request, outcome))
-        first[request.task.name] += 1
-    for _, request, _ in sorted(order, key=lambda each: each[0])[:most]:
+    seen: Counter[str] = Counter()
+    order: list[tuple[int, EpisodeRequest]] = []
+    for request in failed:
+        order.append((seen[request.task.name], request))
+        seen[request.task.name] += 1
+    for _, request in sorted(order, key=lambda each: each[0])[:most]:
         file = folder / VIDEOS / f"{request.key.replace('/', '.')}.mp4"
         if file.exists():
             continue

@@ -306,7 +306,7 @@ def _videos(
     about: dict[str, Any],
 ) -> None:
     failed = [
-        (each, journal.ended[each.key])
+        each
         for each in requests
         if each.key in journal.ended and not journal.ended[each.key].success
     ]

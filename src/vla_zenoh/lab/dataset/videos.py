@@ -146,10 +146,8 @@ class DepthColumn:
         """A sample by its number; the file is read once if these grow."""
         if self._at < 0 or number < self._at:
             self._entries, self._at = depths(run.file, self.camera), -1
-        if number > self._at:
-            for _ in range(number - self._at):
-                self._newest = next(self._entries)
-            self._at = number
+        while self._at < number:
+            self._newest, self._at = next(self._entries), self._at + 1
         return self._newest
 
     def _check(self, episode: RecordedEpisode, depth: Depth) -> None:
