@@ -221,6 +221,7 @@ class PeerMonitor:
         self._expected = frozenset(expected_nodes(node.profile))
         self._down: dict[str, str] = {}
         self._hosts: dict[str, HostId] = {}
+        self._same_host: set[str] = set()
         self._next_clocks_s = 0.0
         self._statuses = node.subscribe(node.keys.all_status, ZenohRing(STATUSES_AT_ONCE))
         self._new_specs = node.subscribe(node.keys.all_specs, ZenohRing(SPECS_AT_ONCE))
@@ -237,6 +238,7 @@ class PeerMonitor:
                 return
             for known in (self._status_sources, self._hosts):
                 known.pop(name, None)
+            self._same_host.discard(name)
             if name.startswith("worker-"):
                 for known in (self._specs, self._spec_sources, self._complaints):
                     known.pop(name.removeprefix("worker-"), None)
@@ -262,7 +264,7 @@ class PeerMonitor:
         with self._lock:
             if not self._changed:
                 return None
-            self._changed, here = False, self._node.host_id
+            self._changed = False
             return PeerSnapshot(
                 frozenset(self._alive),
                 self._robot_node,
@@ -275,7 +277,7 @@ class PeerMonitor:
                 },
                 {camera: self._servers[camera] for camera in self._cameras},
                 {name: place.host for name, place in self._hosts.items()},
-                frozenset(name for name, place in self._hosts.items() if place.shares_clock(here)),
+                frozenset(self._same_host),
                 {node: at[:2] for node, at in self._node.clocks.offsets().items()},
                 frozenset(self._holders),
                 dict(self._camera_faults),
@@ -374,7 +376,11 @@ class PeerMonitor:
             return last_chunk(key), None
 
     def _update_from_status(self, status: NodeStatus) -> None:
-        self._hosts[status.node] = HostId(status.host, status.boot)
+        place = HostId(status.host, status.boot)
+        if self._hosts.get(status.node) != place:
+            self._hosts[status.node] = place
+            same = place.shares_clock(self._node.host_id)
+            (self._same_host.add if same else self._same_host.discard)(status.node)
         if status.node.startswith("worker-"):
             complaint = status.detail.get("complaint", "")
             worker = status.node.removeprefix("worker-")
