@@ -17,12 +17,29 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from vla_zenoh.errors import *
-    from vla_zenoh.lab.primitives.remote_robot import *
-    from vla_zenoh.policy import *
-    from vla_zenoh.profile import *
-    from vla_zenoh.robot import *
-    from vla_zenoh.types import *
+    from vla_zenoh.errors import (
+        CodecError,
+        ProfileError,
+        RecordError,
+        SecurityError,
+        SessionError,
+        SpecError,
+        VlaZenohError,
+    )
+    from vla_zenoh.lab.primitives.client import PrimitiveError
+    from vla_zenoh.lab.primitives.remote_robot import RemoteRobot, connect
+    from vla_zenoh.policy import (
+        ActionSpec,
+        ActionSteps,
+        CameraSpec,
+        ModelSpec,
+        Observation,
+        ObservationSpec,
+        Policy,
+    )
+    from vla_zenoh.profile import Profile, load_profile
+    from vla_zenoh.robot import Command, Reading, Robot
+    from vla_zenoh.types import ActionChunk, GripperState, Image, JointState, PoseState, Stamped
 
 __all__ = [
     "ActionChunk",
