@@ -67,30 +67,24 @@ class Arrivals:
         self._period_ns = self._deviation_ns = 0.0
         self._intervals = 0
 
-    def arrived(self, now_ns: int, asked_period_ns: float) -> None:
-        """A chunk arrived, of a worker that is asked for one in every `asked_period_ns`."""
+    def arrived(self, now_ns: int, asked_period_ns: float) -> tuple[float, float]:
+        """When the next chunk is expected after one that arrived, and how much later it may be.
+
+        The worker is asked for one in every `asked_period_ns`.
+        """
         if self._last_ns is None:
             self._last_ns, self._period_ns = now_ns, asked_period_ns
             self._deviation_ns = FIRST_DEVIATION * asked_period_ns
-            return
-        self._intervals += 1
-        expected_ns = self._last_ns + self._period_ns
-        late_ns, half_ns = now_ns - expected_ns, 0.5 * self._period_ns
-        # The first intervals weigh most: a slow model is asked less often than requested.
-        phase, period = max(PHASE, 1 / self._intervals), max(PERIOD, 1 / self._intervals)
-        self._last_ns = min(max(expected_ns + phase * late_ns, now_ns - half_ns), now_ns + half_ns)
-        self._period_ns = max(self._period_ns + period * late_ns, 0.5 * asked_period_ns)
-        self._deviation_ns += DEVIATION * (abs(late_ns) - self._deviation_ns)
-
-    @property
-    def next_ns(self) -> float:
-        """When the next chunk is expected; the beginning of time before the first one."""
-        return -math.inf if self._last_ns is None else self._last_ns + self._period_ns
-
-    @property
-    def spare_ns(self) -> float:
-        """How much later than that it may well be."""
-        return SPARE * self._deviation_ns
+        else:
+            self._intervals += 1
+            next_ns = self._last_ns + self._period_ns
+            late_ns, half_ns = now_ns - next_ns, 0.5 * self._period_ns
+            # The first intervals weigh most: a slow model is asked less often than requested.
+            phase, period = max(PHASE, 1 / self._intervals), max(PERIOD, 1 / self._intervals)
+            self._last_ns = min(max(next_ns + phase * late_ns, now_ns - half_ns), now_ns + half_ns)
+            self._period_ns = max(self._period_ns + period * late_ns, 0.5 * asked_period_ns)
+            self._deviation_ns += DEVIATION * (abs(late_ns) - self._deviation_ns)
+        return self._last_ns + self._period_ns, SPARE * self._deviation_ns
 
 
 class StepTiming:
@@ -164,7 +158,7 @@ class StepTiming:
         return min(max(share, SLOWEST), 1.0)
 
     def _take(self, plan: Plan, plan_ns: int, asked_period_s: float) -> None:
-        self._arrivals.arrived(plan_ns, asked_period_s * 1e9)
+        next_ns, late_by_ns = self._arrivals.arrived(plan_ns, asked_period_s * 1e9)
         steps, before = len(plan.goals), self._plan
         self._gone = 0.0
         if before is not None:
@@ -172,10 +166,10 @@ class StepTiming:
             asked = before.steps_until(now_ns) - before.steps_until(plan.start_ns)
             self._gone = min(max(asked * before.dt_ns / plan.dt_ns, 0.0), steps - 1.0)
         lasts_ns = (steps - self._gone) * plan.dt_ns
-        wait_ns = max(self._arrivals.next_ns - plan_ns, 0.0)
+        wait_ns = max(next_ns - plan_ns, 0.0)
         self._stretch = max(1.0, wait_ns / lasts_ns)
         covered_ns = lasts_ns * self._stretch - wait_ns
-        spare_ns = MARGIN_NS + max(0.0, self._arrivals.spare_ns - covered_ns)
+        spare_ns = MARGIN_NS + max(0.0, late_by_ns - covered_ns)
         most_ns = EASING * (plan_ns - self._took_ns) if before is not None else math.inf
         self._spare_ns += min(max(spare_ns - self._spare_ns, -most_ns), most_ns)
         # An arm that began late, by what the first inference took, does not make up for it at once.
@@ -313,13 +307,6 @@ class GoalPace:
         in_joints = isinstance(mover, JointPath)
         timing, mover = self._timings.get(in_joints), mover.fork()
         timing = StepTiming(mover.box) if timing is None else timing.fork()
-        shares = self._shares(timing, mover, timed)
-        hard = self.slowing and (in_joints or not self._joints_follow)
-        enough = mover.go_to(timed.goal, shares, all_to_stop=hard)
-        return _Ahead(of, at, timing, mover, enough)
-
-    def _shares(self, timing: StepTiming, mover: Mover, timed: TimedGoal) -> Shares:
-        """Shares of the limits that the arm has on the way to a goal."""
         goal, plan, rate_hz, overdue_ns, now_ns = timed
         override, speed = self.override, self.speed * self.override
         if not plan.soonest:
@@ -329,11 +316,11 @@ class GoalPace:
             speed = min(speed, share)
         # The same motion in more time: acceleration scales with the square of the override, jerk
         # with the cube. Until a faster arm has slowed down it brakes as hard as it may.
-        most = FULL
-        if _within(mover, override):
-            most = Shares(1.0, override**2, override**3)
-        wanted = Shares(speed, most.acceleration, most.jerk)
-        return Shares(*map(min, mover.shares(goal), wanted))
+        change, jerk = (override**2, override**3) if _within(mover, override) else FULL[1:]
+        shares = Shares(*map(min, mover.shares(goal), Shares(speed, change, jerk)))
+        hard = self.slowing and (in_joints or not self._joints_follow)
+        enough = mover.go_to(goal, shares, all_to_stop=hard)
+        return _Ahead(of, at, timing, mover, enough)
 
 
 def _within(mover: Mover, override: float) -> bool:

@@ -191,7 +191,8 @@ class CollisionModel:
 
         Those of the last two joints may touch what the gripper holds.
         """
-        joint, self._tcp = kinematics.tcp_placement
+        frame = kinematics.model.frames[kinematics.tcp]
+        joint, self._tcp = frame.parentJoint, frame.placement
         wrist = (joint, self._model.parents[joint] or joint)
         shapes = self._geometry.geometryObjects
         others = [index for index in range(len(shapes)) if shapes[index].parentJoint not in wrist]

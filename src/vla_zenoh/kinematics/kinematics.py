@@ -90,7 +90,7 @@ class Kinematics:
         self.arm_joints: tuple[str, ...] = tuple(self.model.names)[1:]
         self.slides = np.array([_slides(joint) for joint in list(self.model.joints)[1:]], bool)
         """(n,) joints that slide: their positions are m."""
-        self._tcp = _frame(self.model, urdf, tcp_frame)
+        self.tcp = _frame(self.model, urdf, tcp_frame)
         self.base_placement = _base_placement(self.model, self.data, urdf, base_frame)
         self._base_turn: FloatArray | None = None
         if not np.allclose(self.base_placement.rotation, np.eye(3), atol=1e-12):
@@ -120,12 +120,6 @@ class Kinematics:
     def unit(self, index: int) -> str:
         """Of the positions of joint `index`: rad, or m where it slides."""
         return "m" if self.slides[index] else "rad"
-
-    @property
-    def tcp_placement(self) -> tuple[int, Any]:
-        """The joint that moves the TCP, and the TCP's placement in its frame."""
-        frame = self.model.frames[self._tcp]
-        return frame.parentJoint, frame.placement
 
     # -- joints -------------------------------------------------------------------------------
     def ordered(self, names: Sequence[str], values: ArrayLike) -> FloatArray:
@@ -163,7 +157,7 @@ class Kinematics:
     def jacobian(self, joints_rad: FloatArray) -> FloatArray:
         """(6, n): twist of the TCP (linear first, base axes) per joint velocity."""
         jacobian = pin.computeFrameJacobian(
-            self.model, self.data, joints_rad, self._tcp, pin.LOCAL_WORLD_ALIGNED
+            self.model, self.data, joints_rad, self.tcp, pin.LOCAL_WORLD_ALIGNED
         )
         jacobian = jacobian.reshape(6, -1)  # Pinocchio gives that of one joint as (6,)
         return jacobian if self._base_turn is None else self._base_turn @ jacobian
@@ -173,7 +167,7 @@ class Kinematics:
         return self._tcp_pose(), jacobian
 
     def _tcp_pose(self) -> Pose:
-        placement = pin.updateFramePlacement(self.model, self.data, self._tcp)
+        placement = pin.updateFramePlacement(self.model, self.data, self.tcp)
         if self._base_turn is not None:
             placement = self.base_placement.actInv(placement)
         # Copies: the placement is a view into the work space.
