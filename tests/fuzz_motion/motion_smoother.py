@@ -24,8 +24,8 @@ from motion_judge import (
     unreversed,
 )
 
-from vla_zenoh.control.limits import ROTATION_BOX, MotionLimits
-from vla_zenoh.control.smoothing import Motion, Shares, Smoother
+from vla_zenoh.control.limits import ROTATION_BOX, MotionLimits, Shares
+from vla_zenoh.control.smoothing import Motion, Smoother
 from vla_zenoh.kinematics.so3 import Pose, exp3
 
 SHIPPED = MotionLimits((0.5, 2.0, 20.0), (1.5, 6.0, 60.0))

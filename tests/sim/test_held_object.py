@@ -80,8 +80,8 @@ def test_an_arm_keeps_away_from_what_the_other_holds() -> None:
     try:
         pair.loop.put("held", HeldBox((0.2, 0.2, 0.05)), part="left")
         pair.run(6.0)
-        nearest = pair.commander.part_distance
-        assert nearest is not None
+        assert pair.commander.spacing is not None
+        nearest = pair.commander.spacing.nearest
         assert HELD in nearest.first
         stop_m = shipped_pair().limits.reach.part_stop_m
         assert stop_m - 1e-3 <= nearest.distance_m < stop_m + 0.02

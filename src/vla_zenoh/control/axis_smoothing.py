@@ -32,6 +32,7 @@ from ruckig import (
     Trajectory,
 )
 
+from vla_zenoh.control.limits import FULL, Shares
 from vla_zenoh.kinematics.so3 import cross3, norm3
 from vla_zenoh.types import FloatArray
 
@@ -54,23 +55,13 @@ BESIDE = 0.01
 """Part of the limits for motion beside the line."""
 _ASIDE = np.array([[ASIDE], *([quiet] for quiet in QUIET[1:])])
 TINY, MOST = 1e-12, 1e9
+DONE = (Result.Working, Result.Finished)
 _WAYS = (
     (Synchronization.Time, False),
     (Synchronization.No, False),
     (Synchronization.No, True),
 )
 """Attempts at planning a motion, in order: how axes are synchronised, `slowly` of `_input`."""
-
-
-class Shares(NamedTuple):
-    """Shares of the limits of velocity, acceleration and jerk, each above 0 and at most 1."""
-
-    velocity: float = 1.0
-    acceleration: float = 1.0
-    jerk: float = 1.0
-
-
-FULL = Shares()
 
 
 class AxisState(NamedTuple):
@@ -81,7 +72,7 @@ class AxisState(NamedTuple):
     acceleration: FloatArray
 
 
-class _Plan:
+class Plan:
     """A planned motion: a path in k coordinates along the columns of a basis.
 
     Args:
@@ -91,20 +82,18 @@ class _Plan:
         pace: time of the path per second.
     """
 
-    def __init__(
-        self, start: FloatArray, basis: FloatArray, path: Trajectory, pace: float = 1.0
-    ) -> None:
+    def __init__(self, start: FloatArray, basis: FloatArray, path: Trajectory, pace: float) -> None:
         self._start, self._basis, self._path, self._pace = start, basis, path, pace
         self._paced, self._paced_twice = pace * basis, pace * pace * basis
         self.duration_s: float = path.duration / pace
         self.end = start + basis @ path.at_time(path.duration)[0]
         """(n,) its end."""
 
-    def range_m(self) -> tuple[FloatArray, FloatArray]:
-        """Bounds (3,) below and above the translation along each axis."""
-        start, basis = self._start[:3], self._basis[:3]
-        reached = np.stack([basis * extreme for extreme in _extrema(self._path)])
-        return start + reached.min(axis=0).sum(axis=1), start + reached.max(axis=0).sum(axis=1)
+    def extrema(self) -> tuple[FloatArray, FloatArray]:
+        """(n,) bounds below and above the positions on the way."""
+        reached = np.stack([self._basis * extreme for extreme in _extrema(self._path)])
+        least, most = reached.min(axis=0), reached.max(axis=0)
+        return self._start + least.sum(axis=1), self._start + most.sum(axis=1)
 
     def at(self, time_s: float) -> AxisState:
         """State `time_s` after the start."""
@@ -129,8 +118,6 @@ class AxisSmoother:
         groups: axes that have a straight line of their own; by default all together.
     """
 
-    bounds_m: tuple[FloatArray, FloatArray] | None = None
-
     def __init__(
         self,
         position: FloatArray,
@@ -139,7 +126,6 @@ class AxisSmoother:
         groups: tuple[slice, ...] = (slice(None),),
     ) -> None:
         self._dt_s, self.box, self._groups = dt_s, box, groups
-        self._ruckigs: dict[int, Ruckig] = {}
         self.failures = 0
         self.stand(position)
 
@@ -149,7 +135,7 @@ class AxisSmoother:
         self.state = AxisState(np.array(position, dtype=np.float64), zeros, zeros)
         """The present state."""
         self._target = self.state.position
-        self._plan: _Plan | None = None
+        self._plan: Plan | None = None
         self._elapsed_s = 0.0
         self._jerk, self._sign = zeros, zeros
         self._pace = 1.0
@@ -211,7 +197,7 @@ class AxisSmoother:
         self._begin(self._stop(limits, together=shares is not None))
 
     # -- planning -----------------------------------------------------------------------------
-    def _begin(self, plan: _Plan | None) -> None:
+    def _begin(self, plan: Plan | None) -> None:
         """Execute `plan`; without one brake, and if that cannot be planned, stand."""
         self._elapsed_s = 0.0
         if plan is None:
@@ -225,7 +211,7 @@ class AxisSmoother:
 
     def _towards(
         self, way: FloatArray, limits: FloatArray, unreversed: FloatArray, all_to_stop: bool
-    ) -> tuple[_Plan | None, bool]:
+    ) -> tuple[Plan | None, bool]:
         """The plan of a motion by `way` (n,) without detours, and whether `limits` suffice.
 
         To `unreversed` (3, n) it keeps where an axis would else reverse for nothing.
@@ -233,7 +219,7 @@ class AxisSmoother:
         if not np.isfinite(way).all():
             return None, False
         basis, parts = self._coordinates(way, limits)
-        plan: _Plan | None = None
+        plan: Plan | None = None
         hardest = np.concatenate([limits[:1], self.box[1:]])
         attempts = [limits]
         attempts += [unreversed] * bool((limits < unreversed).any())
@@ -251,7 +237,7 @@ class AxisSmoother:
                 path = self._calculated(ask)
                 if path is None:
                     continue
-                found = _Plan(self.state.position, basis, path, self._pace_of(most))
+                found = Plan(self.state.position, basis, path, self._pace_of(most))
                 stop = basis, may_take, parts
                 if not (self._overshoots(path, along, stop) or self._leaves(found)):
                     if most is not limits:
@@ -260,17 +246,9 @@ class AxisSmoother:
                 plan = plan if slowly and plan is not None else found
         return plan, False
 
-    def _leaves(self, plan: _Plan) -> bool:
-        """Whether a planned motion leaves the box; from outside it may enter."""
-        if self.bounds_m is None:
-            return False
-        low, high = self.bounds_m
-        low, high = low - OVERSHOOT, high + OVERSHOOT
-        start, end = self.state.position[:3], plan.end[:3]
-        least, most = plan.range_m()
-        below = (np.minimum(start, end) >= low) & (least < low)
-        above = (np.maximum(start, end) <= high) & (most > high)
-        return bool(below.any() or above.any())
+    def _leaves(self, plan: Plan) -> bool:
+        """Whether a planned motion leaves where it has to stay."""
+        return False
 
     def _coordinates(self, way: FloatArray, limits: FloatArray) -> tuple[FloatArray, list[float]]:
         """Basis (n, k) with the fewest directions for a motion by `way`, and their limit shares."""
@@ -342,7 +320,7 @@ class AxisSmoother:
             or (high > np.maximum(most, stop_high + OVERSHOOT)).any()
         )
 
-    def _stop(self, limits: FloatArray, *, together: bool) -> _Plan | None:
+    def _stop(self, limits: FloatArray, *, together: bool) -> Plan | None:
         size = limits.shape[1]
         basis = np.eye(size)
         ask = self._input(basis, limits, [1.0] * size)
@@ -351,7 +329,7 @@ class AxisSmoother:
             ask.synchronization = synchronization
             path = self._calculated(ask)
             if path is not None:
-                return _Plan(self.state.position, basis, path, self._pace_of(limits))
+                return Plan(self.state.position, basis, path, self._pace_of(limits))
         return None
 
     def _input(
@@ -391,11 +369,9 @@ class AxisSmoother:
 
     def _calculated(self, ask: InputParameter) -> Trajectory | None:
         """The trajectory for `ask`, None if Ruckig finds none."""
-        size = ask.degrees_of_freedom
-        path = Trajectory(size)
-        ruckig = self._ruckigs.setdefault(size, Ruckig(size))
+        path = Trajectory(ask.degrees_of_freedom)
         try:
-            done = ruckig.calculate(ask, path) in (Result.Working, Result.Finished)
+            done = Ruckig(ask.degrees_of_freedom).calculate(ask, path) in DONE
         except (RuckigError, ValueError):
             return None
         return path if done else None
@@ -486,23 +462,6 @@ class AxisSmoother:
         velocity[np.abs(velocity) < QUIET[1] * self._pace] = 0.0
         acceleration[np.abs(acceleration) < QUIET[2] * self._pace**2] = 0.0
         self.state = AxisState(position, velocity, acceleration)
-
-
-def stop_way(
-    velocity: FloatArray, acceleration: FloatArray, box: FloatArray, ahead_s: float
-) -> FloatArray:
-    """Longest distance (n,) of a stop of all axes together, within `box`, begun in `ahead_s`."""
-    _, most, jerk = box
-    ramp_s = np.abs(acceleration) / jerk
-    later = velocity + 0.5 * acceleration * ramp_s
-    fast = np.where(np.abs(later) > np.abs(velocity), later, velocity)
-    stop_s = float(np.max(0.5 * (np.abs(later) / most + most / jerk) + ramp_s))
-    return (ahead_s + stop_s) * fast
-
-
-def between(start: FloatArray, end: FloatArray) -> list[FloatArray]:
-    """Two places (n,) of a short motion: half of it, and its end."""
-    return [0.5 * (start + end), end]
 
 
 def _across(along: FloatArray) -> FloatArray:

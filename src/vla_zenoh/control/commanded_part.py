@@ -18,7 +18,7 @@ from vla_zenoh.control.preflight import (
     PeerSnapshot,
     joint_state_faults,
     reasons_by_joints,
-    reasons_of_part,
+    why_not_ready,
 )
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.watchdog import JointMonitor, Watchdog
@@ -154,9 +154,10 @@ class CommandedPart:
             self._joint_monitor.reset()  # what is too near now may only move apart
 
     def measure(self) -> str:
-        """Track whether the arm stands; returns why these joints are not this arm's, or empty."""
-        if self.pose is None:
+        """Track whether the arm follows, or stands; why its joints are another arm's, or empty."""
+        if self.pose is None or self._measured is None:
             return ""
+        self.watchdog.measure(self.motion.commanded, self._measured)
         joint = self.joint.record if self.joint else None
         try:
             self.motion.measure(self.pose.record, joint, self.pose.received_ns)
@@ -164,16 +165,7 @@ class CommandedPart:
             return str(error)
         return ""
 
-    def track(self) -> None:
-        """Compare the measured pose with the commanded one."""
-        if self._measured is not None:
-            self.watchdog.measure(self.motion.commanded, self._measured)
-
     # -- activation ---------------------------------------------------------------------------
-    def reasons_not_to_activate(self, peers: PeerSnapshot, now_ns: int) -> list[str]:
-        """Reasons of the arm itself, whatever the worker."""
-        return reasons_of_part(self.profile, peers, self.pose, self.gripper_state, now_ns)
-
     def reasons_against(
         self, worker: str, spec: ModelSpec | None, chunk: Stamped[ActionChunk] | None, now_ns: int
     ) -> list[str]:
@@ -276,18 +268,20 @@ class CommandedPart:
         commanded_rad = motion.joints_rad
         reach.set_elbow(measured_rad if commanded_rad is None else commanded_rad)
 
-    def monitor_due(self, now_ns: int) -> bool:
-        """The next check of the measured joints is due."""
-        return self._joint_monitor is not None and now_ns >= self._joint_monitor.next_ns
-
     def monitor_late(self, now_ns: int) -> bool:
-        """It is long overdue."""
+        """The next check of the measured joints is long overdue."""
         return self._joint_monitor is not None and self._joint_monitor.late(now_ns)
 
-    def monitor_joints(self, now_ns: int) -> None:
-        """Slow a moving arm down if its measured joints come near a bound, see `too_near`."""
-        monitor, motion, measured_rad = self._joint_monitor, self.motion, self.measured_rad
-        if monitor is None or measured_rad is None or not motion.streaming:
+    def monitor_joints(self, now_ns: int, *, if_late: bool) -> None:
+        """Slow a moving arm down if its measured joints come near a bound, see `too_near`.
+
+        `if_late`: only if that is long overdue.
+        """
+        monitor, motion = self._joint_monitor, self.motion
+        if monitor is None or not (monitor.late(now_ns) if if_late else monitor.due(now_ns)):
+            return
+        measured_rad = self.measured_rad
+        if measured_rad is None or not motion.streaming:
             return
         commanded_rad, in_joints = motion.joints_rad, motion.in_joints
         found = monitor.update(measured_rad, commanded_rad, now_ns, in_joints=in_joints)
@@ -304,7 +298,7 @@ class CommandedPart:
             # An arm without contact is not blocked: its state is stuck, or it was slowed down.
             retreats = not (self.contact.known and self.contact.quiet)
         else:
-            name, value, limit, unit = overload
+            name, value, limit, unit = overload.name, overload.value, overload.stop, overload.unit
             events.append(make_event("warning", "limit", name, "stopped", value, limit))
             why = (
                 f"something presses against the arm: {name} {value:.1f} {unit}, "
@@ -321,8 +315,7 @@ class CommandedPart:
         pose, gripper = self.pose, self.gripper_state
         if pose is None or gripper is None or self.watchdog.state_lost(pose, gripper, now_ns):
             return False
-        alive = peers.robot_node in peers.alive
-        return alive and gripper.record.mode == "ready" and not gripper.record.faults
+        return peers.robot_node in peers.alive and not why_not_ready(gripper.record)
 
     def _load_sensing(self) -> Event:
         """Event when the robot begins or ceases to measure external loads."""

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from vla_zenoh.control.chunk_planner import ChunkOutcome
 from vla_zenoh.control.commanded_part import CommandedPart
@@ -26,23 +25,24 @@ from vla_zenoh.control.commander_io import (
     Setting,
     State,
     Trigger,
-    after,
     limit_events,
     make_event,
 )
 from vla_zenoh.control.limits import LimitHit
+from vla_zenoh.control.part_spacing import PartSpacing
 from vla_zenoh.control.plan_timeline import EpisodeProgress
 from vla_zenoh.control.policy_check import Lease, Rejection
-from vla_zenoh.control.preflight import PeerSnapshot, reasons_of_worker
+from vla_zenoh.control.preflight import (
+    PeerSnapshot,
+    reasons_of_part,
+    reasons_of_worker,
+    why_not_ready,
+)
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.watchdog import Deadman
 from vla_zenoh.errors import RecordError
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import MAX_TEXT, ActionChunk, HeldBox, Stamped, Task
-
-if TYPE_CHECKING:
-    from vla_zenoh.control.part_spacing import PartSpacing
-    from vla_zenoh.kinematics.collision import Nearest
 
 LATE_NS = 10_000_000_000
 """A setting that was put before a stop arrives at most this long after it. Stamps that say so later
@@ -50,8 +50,6 @@ are those of a clock that was set."""
 PLANNING_NS = 2_000_000
 """A chunk and the motion to its first goal are planned within this. In less time only the chunk is,
 so that the next tick is not missed."""
-
-__all__ = ["Commander", "Inputs", "Outputs", "Setting"]
 
 
 class Commander:
@@ -91,11 +89,8 @@ class Commander:
         self._resumed_ns = 0
         self._peers = PeerSnapshot()
         self._latest: dict[str, Stamped[ActionChunk]] = {}
-        self._spacing: PartSpacing | None = None
-        if profile.parts and all(part.reach for part in self.parts):
-            from vla_zenoh.control.part_spacing import PartSpacing  # of robots of parts alone
-
-            self._spacing = PartSpacing(profile, self.parts)
+        several = profile.parts and all(part.reach for part in self.parts)
+        self.spacing = PartSpacing(profile, self.parts) if several else None
         first = self.parts[0]
         # All parts have the same chunks at the same time: one queue, one deadline.
         self._planner, self._motion, self._watchdog = first.planner, first.motion, first.watchdog
@@ -128,31 +123,17 @@ class Commander:
         it is due, or overdue. Its events are among the next outputs.
         """
         for part in self.parts if self.state is State.ACTIVE else ():
-            events = part.motion.look_ahead(now_ns)
-            if events:
-                self._out.events += part.tagged(events)
+            self._out.events += part.tagged(part.motion.look_ahead(now_ns))
         planned = self._plan_ahead(now_ns + self._period_ns)
         for part in self.parts if self.state in OBEYING else ():
             # One of them is work enough for one tick.
-            busy = planned or part.planner.spent
-            if part.monitor_late(now_ns) if busy else part.monitor_due(now_ns):
-                part.monitor_joints(now_ns)
+            part.monitor_joints(now_ns, if_late=planned or part.planner.spent)
 
     def _plan_ahead(self, next_ns: int) -> bool:
         """Plan the motion to the goals of the next tick; returns whether they are new."""
-        new = False
-        for part in self.parts if self.state is State.ACTIVE else ():
-            new |= part.motion.plan_ahead(self.task, self._watchdog.deadline_ns, next_ns)
-        return new
-
-    def _take_chunks(self, chunks: Sequence[Stamped[ActionChunk]], now_ns: int) -> None:
-        """Plan what is new; the planning budget begins with the first call for a tick."""
-        if not self._prepared:
-            for part in self.parts:
-                part.planner.begin_tick()
-        for chunk in chunks:
-            self._submit_chunk(chunk, now_ns)
-        self._plan_chunks(now_ns)
+        parts = self.parts if self.state is State.ACTIVE else ()
+        overdue_ns = self._watchdog.deadline_ns
+        return any([part.motion.plan_ahead(self.task, overdue_ns, next_ns) for part in parts])
 
     def step(self, inputs: Inputs, now_ns: int, ticks: int = 1) -> Outputs:
         """Process the inputs of one tick.
@@ -165,8 +146,7 @@ class Commander:
         """
         task_before, out, parts = self.task, self._out, self.parts
         self._update_states(inputs)
-        if inputs.settings:
-            self._apply_settings(inputs.settings, now_ns)
+        self._apply_settings(inputs.settings, now_ns)
         planned = self._prepared or bool(inputs.chunks)
         self._take_chunks(inputs.chunks, now_ns)
         self._prepared = False
@@ -178,17 +158,15 @@ class Commander:
                 except RecordError as error:
                     self._change(Trigger.LOSE, part.says(str(error)))
             if self.state in OBEYING:
-                if part.monitor_late(now_ns):  # `look_ahead` is not called in time
-                    part.monitor_joints(now_ns)
+                part.monitor_joints(now_ns, if_late=True)  # `look_ahead` is not called in time
                 if part.too_near is not None:
                     self._brake_at(part.too_near, part)
-        if self._spacing is not None:
-            self._keep_apart(self._spacing, now_ns, ticks)
+        if self.spacing is not None:
+            self._keep_apart(self.spacing, now_ns, ticks)
         overdue_ns, all_planned = self._watchdog.deadline_ns, True
         for part in parts:
             planned, events = part.motion.advance(self.state, self.task, overdue_ns, now_ns, ticks)
-            if events:
-                out.events += part.tagged(events)
+            out.events += part.tagged(events)
             all_planned = all_planned and planned
         if not all_planned:
             self._change(Trigger.FAULT, "no trajectory could be computed; braked")
@@ -222,16 +200,6 @@ class Commander:
         """An arm retreats from what blocked it."""
         return any(part.retreat.busy for part in self.parts)
 
-    @property
-    def part_distance(self) -> Nearest | None:
-        """The nearest links of two parts where they are commanded; None: there is one part."""
-        return None if self._spacing is None else self._spacing.nearest
-
-    @property
-    def smoothing_failures(self) -> int:
-        """Times Ruckig found no trajectory and the arm braked instead."""
-        return sum(part.motion.failures for part in self.parts)
-
     # -- states and settings ------------------------------------------------------------------
     def _update_states(self, inputs: Inputs) -> None:
         if inputs.peers is not None:
@@ -241,15 +209,10 @@ class Commander:
             part.update(states)
             if part.held is not None and part.let_go:
                 self._hold(part, None)
-            if states.gripper is None:
-                continue
-            gripper = states.gripper.record
-            if gripper.faults:
-                why = f"the robot reports: {'; '.join(gripper.faults)}"
-                self._change(Trigger.FAULT, part.says(why))
-            elif gripper.mode != "ready":
-                why = f"the robot is not ready but {gripper.mode!r}"
-                self._change(Trigger.LOSE, part.says(why))
+            why = why_not_ready(states.gripper.record) if states.gripper else ""
+            if states.gripper and why:
+                faulty = states.gripper.record.faults
+                self._change(Trigger.FAULT if faulty else Trigger.LOSE, part.says(why))
 
     def _apply_settings(self, settings: Sequence[Setting], now_ns: int) -> None:
         stops = [setting for setting in settings if setting.name == "stop"]
@@ -257,30 +220,20 @@ class Commander:
             self._change(Trigger.STOP, "emergency stop")
             self._stop_put_ns, self._stop_came_ns = max(stop.put_ns or 0 for stop in stops), now_ns
         for setting in settings:
-            self._apply_setting(setting, now_ns, bool(stops))
+            try:
+                self._set(setting, now_ns, stopped=bool(stops))
+            except RecordError as error:
+                self._reject_setting(setting.name, [str(error)])
 
-    def _apply_setting(self, setting: Setting, now_ns: int, stopped: bool) -> None:
-        name, value = setting.name, setting.value
+    def _set(self, setting: Setting, now_ns: int, *, stopped: bool) -> None:
+        name, value, put_ns, of_part = setting
         if name == "reset" or (name == "active" and value is not False):
-            if stopped:
-                # Their order within a tick is not known: the stop wins.
-                self._reject_setting(name, ["an emergency stop came at the same time"])
-                return
-            overtaken = setting.put_ns is not None and setting.put_ns <= self._stop_put_ns
+            if stopped:  # their order within a tick is not known: the stop wins
+                raise RecordError("an emergency stop came at the same time")
+            overtaken = put_ns is not None and put_ns <= self._stop_put_ns
             if overtaken and 0 <= now_ns - self._stop_came_ns < LATE_NS:
                 late = "it was put before the last emergency stop and arrived after it"
-                self._reject_setting(name, [f"{late}; put it again"])
-                return
-        try:
-            if name == "held":
-                box = value if isinstance(value, HeldBox) else None
-                self._hold(next(part for part in self.parts if part.name == setting.part), box)
-            else:
-                self._set(name, value, now_ns)
-        except RecordError as error:
-            self._reject_setting(name, [str(error)])
-
-    def _set(self, name: str, value: object, now_ns: int) -> None:
+                raise RecordError(f"{late}; put it again")
         if name == "prompt" and isinstance(value, str):
             if value != self.task.prompt:
                 self._new_episode(now_ns, prompt=value)
@@ -303,8 +256,15 @@ class Commander:
             for part in self.parts:
                 part.retreat.end()
             self._change(Trigger.DEACTIVATE, DEACTIVATED)
+        elif name == "held":
+            box = value if isinstance(value, HeldBox) else None
+            self._hold(next(part for part in self.parts if part.name == of_part), box)
         elif name == "reset":
-            self._reset()
+            grippers = [part.gripper_state.record for part in self.parts if part.gripper_state]
+            faults = [fault for gripper in grippers for fault in gripper.faults]
+            if self.state is State.FAULT and faults:
+                raise RecordError(f"the robot still reports: {'; '.join(faults)}")
+            self._change(Trigger.RESET, "reset")
         elif name == "lose":
             self._change(Trigger.LOSE, str(value))
         elif name != "stop":
@@ -314,8 +274,8 @@ class Commander:
         if box == part.held:
             return
         part.hold(box)
-        if self._spacing is not None:
-            self._spacing.place()
+        if self.spacing is not None:
+            self.spacing.place()
         holds = "nothing" if box is None else f"a box of {box} m"
         self._emit("info", "notice", "gripper_holds", part.says(f"the gripper holds {holds}"))
 
@@ -327,7 +287,7 @@ class Commander:
         if changes:
             self._ended = ""
         if self.state in OBEYING:
-            self._watchdog.expect_first(now_ns, self.task.rate_hz, self.task.speed)
+            self._watchdog.expect(None, now_ns, self.task)
 
     def _change_speed(self, percent: float, now_ns: int) -> None:
         before = self.task.speed
@@ -339,7 +299,7 @@ class Commander:
         forgotten = [part.motion.forget_plan(oldest_ns, now_ns) for part in self.parts if paused]
         if any(forgotten):
             self._resumed_ns = now_ns
-            self._watchdog.expect_first(now_ns, self.task.rate_hz, self.task.speed)
+            self._watchdog.expect(None, now_ns, self.task)
             self._emit("info", "notice", "paused", "waits for a chunk that is newer than the pause")
 
     def _change_worker(self, worker: str, now_ns: int) -> None:
@@ -398,7 +358,8 @@ class Commander:
         peers, task, chunk = self._peers, self.task, self._latest.get(worker)
         spec, reasons = peers.specs.get(worker), list[str]()
         for part in self.parts:
-            reasons += map(part.says, part.reasons_not_to_activate(peers, now_ns))
+            pose, gripper = part.pose, part.gripper_state
+            reasons += map(part.says, reasons_of_part(part.profile, peers, pose, gripper, now_ns))
         reasons += reasons_of_worker(
             self.profile, worker, task.prompt, peers, chunk, now_ns, task.rate_hz
         )
@@ -420,19 +381,11 @@ class Commander:
         """Start in STOPPED: an emergency stop outlives the process that received it."""
         self.state, self.why = State.STOPPED, why[:MAX_TEXT]
 
-    def _reset(self) -> None:
-        states = [part.gripper_state for part in self.parts if part.gripper_state]
-        faults = [fault for state in states for fault in state.record.faults]
-        if self.state is State.FAULT and faults:
-            self._reject_setting("reset", [f"the robot still reports: {'; '.join(faults)}"])
-            return
-        self._change(Trigger.RESET, "reset")
-
     def _change(self, trigger: Trigger, why: str) -> None:
-        new = after(self.state, trigger)
-        if new is self.state:
+        old, new = self.state, self.state.after(trigger)
+        if new is old:
             return
-        old, self.state, self.why = self.state, new, why
+        self.state, self.why = new, why
         if new not in OBEYING:
             for part in self.parts:
                 part.contact.end()
@@ -441,45 +394,38 @@ class Commander:
         asked = new in OBEYING or trigger in (Trigger.DEACTIVATE, Trigger.RESET)
         self._emit("info" if asked else "warning", "transition", f"{old.value}->{new.value}", why)
 
-    def _emit(
-        self,
-        level: str,
-        kind: str,
-        what: str,
-        why: str,
-        value: float | None = None,
-        limit: float | None = None,
-    ) -> None:
-        self._out.events.append(make_event(level, kind, what, why, value, limit))
+    def _emit(self, level: str, kind: str, what: str, why: str) -> None:
+        self._out.events.append(make_event(level, kind, what, why))
 
     # -- chunks -------------------------------------------------------------------------------
-    def _submit_chunk(self, chunk: Stamped[ActionChunk], now_ns: int) -> None:
-        worker = chunk.record.worker
-        leased = self.state in OBEYING and worker == self.task.worker
-        lease = self.lease if leased else None
-        owner = self._peers.spec_sources.get(worker)
-        outcome = self._planner.submit(chunk, owner, lease, self.task, now_ns)
-        if outcome is not None:
-            self._report_outcome(outcome)
-        elif lease is None:
-            self._latest[worker] = chunk
-
-    def _plan_chunks(self, now_ns: int) -> None:
+    def _take_chunks(self, chunks: Sequence[Stamped[ActionChunk]], now_ns: int) -> None:
+        """Plan what is new; the planning budget begins with the first call for a tick."""
+        if not self._prepared:
+            for part in self.parts:
+                part.planner.begin_tick()
+        for chunk in chunks:
+            worker = chunk.record.worker
+            leased = self.state in OBEYING and worker == self.task.worker
+            lease = self.lease if leased else None
+            owner = self._peers.spec_sources.get(worker)
+            outcome = self._planner.submit(chunk, owner, lease, self.task, now_ns)
+            if outcome is not None:
+                self._report_outcome(outcome)
+            elif lease is None:
+                self._latest[worker] = chunk
         timeline, lease = self._motion.timeline, self.lease
         if timeline is None or lease is None or not self._planner.waiting:
             return
         episode = self.task.episode if self.state in OBEYING else None
         resumed_ns = now_ns if self.state is State.HOLDING else self._resumed_ns
-        action = lease.spec.action
-        others = self.parts[1:]
+        action, others = lease.spec.action, self.parts[1:]
         beside = [(part.planner, part.motion.timeline) for part in others if part.motion.timeline]
         for outcome in self._planner.advance(timeline, action, episode, resumed_ns, now_ns, beside):
             self._report_outcome(outcome)
             if outcome.plan is not None:
                 self._resumed_ns = resumed_ns
                 self._latest[outcome.chunk.record.worker] = outcome.chunk
-                rate_hz, speed = self.task.rate_hz, self.task.speed
-                self._watchdog.expect_next(outcome.plan.left_ns(now_ns), now_ns, rate_hz, speed)
+                self._watchdog.expect(outcome.plan.left_ns(now_ns), now_ns, self.task)
                 self.progress.chunks += 1
                 self._change(Trigger.FRESH, "fresh chunk")
 
@@ -493,7 +439,8 @@ class Commander:
         if not rejection.quiet:
             reason, why, value, limit, _ = rejection
             why = f"{outcome.chunk.record.worker}: {why}"
-            self._emit("warning", "refusal", reason, why, value, limit)
+            event = make_event("warning", "refusal", reason, why, value, limit)
+            self._out.events.append(event)
 
     # -- supervision --------------------------------------------------------------------------
     def _measure(self) -> None:
@@ -503,8 +450,6 @@ class Commander:
                 self._change(Trigger.LOSE, part.says(why))
 
     def _supervise(self, now_ns: int) -> None:
-        for part in self.parts:
-            part.track()
         self._measure()
         unheld = self.deadman.lost(self._peers.holders)
         for part in self.parts:
@@ -517,8 +462,7 @@ class Commander:
         worker, moves = self.task.worker, not self.dry_run
         for part in self.parts:
             why, events = part.lost(self._peers, worker, self.lease, now_ns, moves=moves)
-            if events:
-                self._out.events += part.tagged(events)
+            self._out.events += part.tagged(events)
             if why:
                 lost[part.says(why)] = why
         # What all parts have lost is said once.
@@ -542,9 +486,8 @@ class Commander:
         ahead_s = ticks / self.profile.timing.command_hz
         slowdown, hit = spacing.look(now_ns, ahead_s, moves=moves)
         if hit is not None and not self._motion.held:
-            why = f"stand{hit.at}"
-            event = make_event("warning", "limit", hit.name, why, hit.value, hit.limit)
-            self._out.events.append(event)
+            what, why = hit.name, f"stand{hit.at}"
+            self._out.events.append(make_event("warning", "limit", what, why, hit.value, hit.limit))
         for part in self.parts:
             part.motion.pace.part_slowdown, part.motion.held = slowdown, hit is not None
 

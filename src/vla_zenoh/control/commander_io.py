@@ -45,6 +45,10 @@ class State(StrEnum):
     STOPPED = "stopped"  # emergency stop, latched until reset
     FAULT = "fault"  # of the robot or the command node, latched until reset
 
+    def after(self, trigger: Trigger) -> State:
+        """The state after `trigger`; unchanged if `TABLE` has no such transition."""
+        return TABLE.get((self, trigger), self)
+
 
 class Trigger(StrEnum):
     """Events that may change the state."""
@@ -83,11 +87,6 @@ OBEYING = frozenset({State.ACTIVE, State.HOLDING})
 """States in which chunks of the leased worker are executed."""
 DEACTIVATED = "deactivated"
 """The reason of an INACTIVE state that a client requested."""
-
-
-def after(state: State, trigger: Trigger) -> State:
-    """The state after `trigger`; unchanged if the table has no such transition."""
-    return TABLE.get((state, trigger), state)
 
 
 class Setting(NamedTuple):

@@ -26,12 +26,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
 from vla_zenoh.control.commander_io import make_event
-from vla_zenoh.control.limits import SLOWEST, Slowdown
+from vla_zenoh.control.limits import SLOWEST, Slowdown, slowest
 from vla_zenoh.kinematics.so3 import Pose, norm3, pose_distance
 from vla_zenoh.profile import ContactLimits, Limits
 from vla_zenoh.types import Event, JointState, PoseState, Stamped
@@ -60,17 +59,8 @@ STRAY_M, STRAY_RAD = 0.01, 0.05
 """An arm further away than when it was blocked, plus the brake and this, does not retreat."""
 
 
-class ExternalLoad(NamedTuple):
-    """``contact_force``, ``contact_torque`` or ``contact_effort`` above its limit, in N or Nm."""
-
-    name: str
-    value: float
-    limit: float
-    unit: str
-
-
-class _LoadFilter:
-    """One kind of load, filtered and without its bias."""
+class Load:
+    """One kind of load, filtered and without its bias: a value in N or Nm, and its limits."""
 
     def __init__(
         self,
@@ -80,19 +70,24 @@ class _LoadFilter:
         stop: float | None,
         apart: Callable[[Sequence[float], Sequence[float]], float],
     ) -> None:
-        self.name, self.unit = name, unit
+        self.name, self.unit = name, unit  # of the limit
         self.stop = math.inf if stop is None else stop
         self.slow = self.stop if slow is None else slow
         self._apart = apart
-        self.known = False
+        self.known, self._stamp_ns = False, 0
         self._filtered: list[float] = []
         self._bias: list[float] = []
         self._start_bias: list[float] = []
         self.value = 0.0
         """The size of the load, in N or Nm."""
 
-    def update(self, measured: Sequence[float], dt_s: float, *, drifts: bool) -> None:
-        """Add a measurement, `dt_s` after the last one; `drifts`: let the bias follow."""
+    def update(self, measured: Sequence[float] | None, stamp_ns: int, *, drifts: bool) -> None:
+        """Add what was measured at `stamp_ns`, None: nothing; `drifts`: let the bias follow."""
+        if measured is None:
+            self.known = False
+            return
+        dt_s = min(max((stamp_ns - self._stamp_ns) / 1e9, 0.0), LONGEST_S)
+        self._stamp_ns = stamp_ns
         if not self.known or len(measured) != len(self._filtered):
             self._filtered, self.known = list(measured), True
             self._bias, self._start_bias = [0.0] * len(measured), [0.0] * len(measured)
@@ -134,64 +129,46 @@ class Contact:
     """
 
     def __init__(self, limits: ContactLimits) -> None:
-        self._force = _LoadFilter(
+        self._force = Load(
             "contact_force", "N", limits.force_slow_n, limits.force_stop_n, math.dist
         )
-        self._torque = _LoadFilter(
+        self._torque = Load(
             "contact_torque", "Nm", limits.torque_slow_nm, limits.torque_stop_nm, math.dist
         )
-        self._effort = _LoadFilter(
+        self._effort = Load(
             "contact_effort", "Nm", limits.effort_slow_nm, limits.effort_stop_nm, _greatest
         )
         self._all = (self._force, self._torque, self._effort)
         self._wants_effort = limits.effort_stop_nm is not None
         self._active = False
-        self._kinds: list[_LoadFilter] = []
-        """Those that the robot measures."""
-        self._begun: list[_LoadFilter] = []
-        self._pose_ns = self._joint_ns = 0
+        self._begun: list[Load] = []
+
+    @property
+    def _measured(self) -> list[Load]:
+        """The loads that the robot measures."""
+        return [load for load in self._all if load.known]
 
     # -- measurements -------------------------------------------------------------------------
     def update_pose(self, state: Stamped[PoseState]) -> None:
         """Add the newest pose, with the wrench if the robot measures one."""
-        wrench = state.record.wrench
-        if wrench is None:
-            self._forget(self._force, self._torque)
-            return
-        load = wrench.tolist()
-        dt_s = _passed_s(self._pose_ns, state.header.stamp_wall_ns)
-        self._pose_ns = state.header.stamp_wall_ns
-        self._force.update(load[:3], dt_s, drifts=self._active)
-        self._torque.update(load[3:], dt_s, drifts=self._active)
-        if self._force not in self._kinds:
-            self._measures()
+        wrench, stamp_ns = state.record.wrench, state.header.stamp_wall_ns
+        force, torque = (None, None) if wrench is None else (wrench[:3], wrench[3:])
+        for load, measured in ((self._force, force), (self._torque, torque)):
+            values = None if measured is None else measured.tolist()
+            load.update(values, stamp_ns, drifts=self._active)
 
     def update_joints(self, state: Stamped[JointState]) -> None:
         """Add the newest joints; used if a limit of the profile says that efforts are external."""
-        effort_nm = state.record.effort_nm
-        if effort_nm is None:
-            self._forget(self._effort)
-        elif self._wants_effort:
-            dt_s = _passed_s(self._joint_ns, state.header.stamp_wall_ns)
-            self._joint_ns = state.header.stamp_wall_ns
-            self._effort.update(effort_nm.tolist(), dt_s, drifts=self._active)
-            if self._effort not in self._kinds:
-                self._measures()
-
-    def _forget(self, *kinds: _LoadFilter) -> None:
-        if any(kind.known for kind in kinds):
-            for kind in kinds:
-                kind.known = False
-            self._measures()
-
-    def _measures(self) -> None:
-        self._kinds = [kind for kind in self._all if kind.known]
+        if self._wants_effort:
+            effort_nm = state.record.effort_nm
+            values = None if effort_nm is None else effort_nm.tolist()
+            self._effort.update(values, state.header.stamp_wall_ns, drifts=self._active)
 
     def begin(self) -> None:
         """Start an activation: the present load is not a contact."""
-        self._active, self._begun = True, self._kinds
-        for kind in self._kinds:
-            kind.zero()
+        self._active, self._begun = True, self._measured
+        for load in self._begun:
+            load.zero()
 
     def end(self) -> None:
         """End the activation: the bias follows the load no longer."""
@@ -201,14 +178,14 @@ class Contact:
     @property
     def known(self) -> bool:
         """The robot measures external loads."""
-        return bool(self._kinds)
+        return any(load.known for load in self._all)
 
     @property
     def lost(self) -> str:
         """Which load the robot measured when the activation began and does not now."""
-        for kind in self._begun:
-            if not kind.known:
-                return f"the robot no longer measures {kind.name}, which limits.contact needs"
+        for load in self._begun:
+            if not load.known:
+                return f"the robot no longer measures {load.name}, which limits.contact needs"
         return ""
 
     @property
@@ -234,32 +211,23 @@ class Contact:
     @property
     def quiet(self) -> bool:
         """No contact, as far as the robot measures it."""
-        return all(kind.value <= QUIET * kind.slow for kind in self._kinds)
+        return all(load.value <= QUIET * load.slow for load in self._measured)
 
-    def overload(self) -> ExternalLoad | None:
+    def overload(self) -> Load | None:
         """The load above its stop limit, None without one."""
-        for kind in self._kinds:
-            value = kind.value
-            if value > kind.stop:
-                return ExternalLoad(kind.name, value, kind.stop, kind.unit)
-        return None
+        return next((load for load in self._measured if load.value > load.stop), None)
 
     def slowdown(self) -> Slowdown | None:
         """The slowdown of the greatest load, None without one."""
-        slowest: Slowdown | None = None
-        for kind in self._kinds:
-            value = kind.value
-            if value <= kind.slow:
+        slower: Slowdown | None = None
+        for load in self._measured:
+            if load.value <= load.slow:
                 continue
-            left = max((kind.stop - value) / max(kind.stop - kind.slow, 1e-9), 0.0)
+            left = max((load.stop - load.value) / max(load.stop - load.slow, 1e-9), 0.0)
             share = max(math.ceil(left * STEPS) / STEPS, SLOWEST)
-            if share < (slowest.share if slowest else 1.0):
-                slowest = Slowdown(kind.name, share, value, kind.slow, "")
-        return slowest
-
-
-def _passed_s(before_ns: int, now_ns: int) -> float:
-    return min(max((now_ns - before_ns) / 1e9, 0.0), LONGEST_S)
+            if share < 1.0:
+                slower = slowest(slower, Slowdown(load.name, share, load.value, load.slow, ""))
+        return slower
 
 
 # -- retreat ------------------------------------------------------------------------------------
@@ -317,13 +285,6 @@ def _place(pose: Pose) -> list[float]:
     return pose.position_m.tolist() + turned.tolist()
 
 
-class _Begun(NamedTuple):
-    """Poses at which the retreat was requested."""
-
-    commanded: Pose
-    measured: Pose
-
-
 class Retreat:
     """Where a blocked arm moves to, from `begin` until it is free.
 
@@ -338,7 +299,8 @@ class Retreat:
         """Its share of the speed limits."""
         self._trail = CommandTrail()
         self._measured: Pose | None = None
-        self._begun: _Begun | None = None
+        self._begun: tuple[Pose, Pose] | None = None
+        """Poses at which it was requested, commanded and measured."""
         self._target: Pose | None = None
         self._ahead: list[Pose] = []
         self._until_ns = self._rest_ns = 0
@@ -357,7 +319,7 @@ class Retreat:
     def begin(self, commanded: Pose) -> None:
         """Retreat from `commanded` after the brake: the arm is blocked or in contact."""
         if self._measured is not None:
-            self._begun = _Begun(commanded, self._measured)
+            self._begun = commanded, self._measured
             self._target = None
 
     def end(self) -> None:
@@ -398,12 +360,12 @@ class Retreat:
         return target, None
 
     def _set_out(
-        self, begun: _Begun, commanded: Pose, measured: Pose, now_ns: int
+        self, begun: tuple[Pose, Pose], commanded: Pose, measured: Pose, now_ns: int
     ) -> tuple[Pose | None, Event | None]:
         if self._contact.known and self._contact.quiet:
             return self._finish("no further than the brake, nothing presses any more")
         apart_m, apart_rad = pose_distance(commanded, measured)
-        braked_m, braked_rad = pose_distance(begun.commanded, commanded)
+        braked_m, braked_rad = pose_distance(begun[0], commanded)
         most_m = self._limits.tracking_m + braked_m + STRAY_M
         most_rad = self._limits.tracking_rad + braked_rad + STRAY_RAD
         if apart_m > most_m or apart_rad > most_rad:
@@ -411,13 +373,13 @@ class Retreat:
             where = f"{apart_m:.3f} m and {apart_rad:.2f} rad from its command"
             why = f"the arm does not retreat: it is {where}"
             return None, make_event("warning", "notice", "retreat", why)
-        on_m = norm3(measured.position_m - begun.measured.position_m)
+        on_m = norm3(measured.position_m - begun[1].position_m)
         # It does not return to a pose from which a person has pushed it away since.
         here = np.array(_place(measured))
         into = _place(commanded) - here
         self._ahead = [
             pose
-            for pose in (begun.measured, *self._trail.back(RELIEF_M))
+            for pose in (begun[1], *self._trail.back(RELIEF_M))
             if (_place(pose) - here) @ into <= 0
         ]
         speed_m_s = self.speed * self._limits.translation.velocity_m_s

@@ -18,15 +18,18 @@ from typing import Self
 import numpy as np
 
 from vla_zenoh.control.actions import step_joints
-from vla_zenoh.control.axis_smoothing import FULL, AxisSmoother, Shares, line_of, stop_way
+from vla_zenoh.control.axis_smoothing import AxisSmoother, line_of
 from vla_zenoh.control.limits import (
+    FULL,
     HELD_LEAD_RAD,
     BoundedStep,
     LimitHit,
+    Shares,
     into_workspace,
     joint_margins,
     joint_motion_limits,
     motion_limits,
+    stop_way,
     workspace_corners,
 )
 from vla_zenoh.control.plan_timeline import Goal, joint_goal

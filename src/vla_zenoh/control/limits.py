@@ -56,6 +56,17 @@ def motion_limits(limits: Limits) -> MotionLimits:
     )
 
 
+class Shares(NamedTuple):
+    """Shares of the limits of velocity, acceleration and jerk, each above 0 and at most 1."""
+
+    velocity: float = 1.0
+    acceleration: float = 1.0
+    jerk: float = 1.0
+
+
+FULL = Shares()
+
+
 class JointMotionLimits(NamedTuple):
     """Limits of joint motion, (n,) each: rad/s, rad/s^2, rad/s^3."""
 
@@ -76,6 +87,23 @@ def joint_motion_limits(profile: Profile, kinematics: Kinematics) -> JointMotion
     return JointMotionLimits(
         np.minimum(velocity, share * kinematics.velocity_rad_s), acceleration, jerk
     )
+
+
+def stop_way(
+    velocity: FloatArray, acceleration: FloatArray, box: FloatArray, ahead_s: float
+) -> FloatArray:
+    """Longest distance (n,) of a stop of all axes together, within `box`, begun in `ahead_s`."""
+    _, most, jerk = box
+    ramp_s = np.abs(acceleration) / jerk
+    later = velocity + 0.5 * acceleration * ramp_s
+    fast = np.where(np.abs(later) > np.abs(velocity), later, velocity)
+    stop_s = float(np.max(0.5 * (np.abs(later) / most + most / jerk) + ramp_s))
+    return (ahead_s + stop_s) * fast
+
+
+def between(start: FloatArray, end: FloatArray) -> list[FloatArray]:
+    """Two places (n,) of a short motion: half of it, and its end."""
+    return [0.5 * (start + end), end]
 
 
 def joint_margins(limits: ReachLimits, kinematics: Kinematics) -> FloatArray:

@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vla_zenoh.control.axis_smoothing import FULL, Shares
 from vla_zenoh.control.chunk_planner import LOOK_AHEAD, ChunkPlanner
 from vla_zenoh.control.commander_io import OBEYING, State, limit_events, make_event
 from vla_zenoh.control.contact import Contact, Retreat
 from vla_zenoh.control.joint_space import JointPath
-from vla_zenoh.control.limits import into_workspace
+from vla_zenoh.control.limits import FULL, Shares, into_workspace
 from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan, PlanAggregator, joint_goal
 from vla_zenoh.control.preflight import (
     FOLLOWS_JOINT_RAD,
@@ -106,11 +105,6 @@ class MotionPipeline:
     def in_joints(self) -> bool:
         """The arm moves in joints."""
         return isinstance(self._mover, JointPath)
-
-    @property
-    def speed(self) -> float:
-        """Share of the speed limits on the way to the goal, without the speed override."""
-        return self.pace.speed
 
     @property
     def at_rest(self) -> bool:
@@ -287,7 +281,11 @@ class MotionPipeline:
         """
         if self._mover is None or self.timeline is None:
             return True, []
-        self._set_override(task.speed, self.timeline, now_ns)
+        if task.speed != self.pace.override or task.speed != self.timeline.clock.override:
+            # Plan time passes at the override, and the motion to the goal is planned again.
+            self.pace.override, self.pace.slowing = task.speed, task.speed > 0.0
+            self.timeline.clock.set(task.speed, now_ns)
+            self.goal = None
         if state is State.ACTIVE:
             self._cause = self.timeline.plan.cause
             events = self._follow(self.timeline, task, overdue_ns, now_ns, ticks)
@@ -335,13 +333,6 @@ class MotionPipeline:
         width_m = timeline.at(now_ns).width_m
         timeline.hold(mover.resting_goal(mover.motion.pose, width_m), now_ns)
         self.pace.stand()
-
-    def _set_override(self, override: float, timeline: GoalTimeline, now_ns: int) -> None:
-        """Let plan time pass at the speed override, and replan the motion to the goal."""
-        if override != self.pace.override or override != timeline.clock.override:
-            self.pace.override, self.pace.slowing = override, override > 0.0
-            timeline.clock.set(override, now_ns)
-            self.goal = None
 
     def _follow(
         self, timeline: GoalTimeline, task: Task, overdue_ns: int, now_ns: int, ticks: int
@@ -421,7 +412,10 @@ class MotionPipeline:
             self._enter(joints=False)
             mover = self._poses
         if back is None:
-            self._brake(mover, timeline, now_ns)
+            self._stop(mover)
+            self.goal = None
+            if timeline.plan.cause is not None and mover.at_rest:
+                self._hold(mover, timeline, now_ns)  # so that nothing pulls the arm further
         elif back is not self._back:
             # Whatever the speed override: an arm in contact has to come free.
             here_m = mover.motion.pose.position_m
@@ -431,13 +425,6 @@ class MotionPipeline:
             mover.go_to(inside, Shares(*shares))
         self._back = back
         return [] if event is None else [event]
-
-    def _brake(self, mover: Mover, timeline: GoalTimeline, now_ns: int) -> None:
-        """Stop, and move the goal to where the arm stops, so that nothing pulls it further."""
-        self._stop(mover)
-        self.goal = None
-        if timeline.plan.cause is not None and mover.at_rest:
-            self._hold(mover, timeline, now_ns)
 
     def _stop(self, mover: Mover, shares: Shares | None = None) -> None:
         """Come to rest as fast as joints that follow can; without them see `AxisSmoother.brake`."""

@@ -20,9 +20,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vla_zenoh.control.axis_smoothing import between
 from vla_zenoh.control.commanded_part import CommandedPart
-from vla_zenoh.control.limits import LimitHit, Slowdown
+from vla_zenoh.control.limits import LimitHit, Slowdown, between
 from vla_zenoh.control.watchdog import BAND_M, PAST_M, PERIOD_NS
 from vla_zenoh.kinematics.collision import Nearest, PlacedArm
 from vla_zenoh.profile import Profile

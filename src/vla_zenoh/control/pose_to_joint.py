@@ -13,7 +13,6 @@ from copy import copy
 
 import numpy as np
 
-from vla_zenoh.control.axis_smoothing import Shares, between, stop_way
 from vla_zenoh.control.joint_follower import (
     POSTURE_1_S,
     POSTURE_RAD_S,
@@ -22,7 +21,14 @@ from vla_zenoh.control.joint_follower import (
     JointMotion,
 )
 from vla_zenoh.control.joint_space import followed_shares
-from vla_zenoh.control.limits import into_workspace, joint_margins, joint_motion_limits
+from vla_zenoh.control.limits import (
+    Shares,
+    between,
+    into_workspace,
+    joint_margins,
+    joint_motion_limits,
+    stop_way,
+)
 from vla_zenoh.control.reachability import Barriers
 from vla_zenoh.control.smoothing import Motion, Smoother
 from vla_zenoh.kinematics.kinematics import Kinematics, pose_error

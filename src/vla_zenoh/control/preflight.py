@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from operator import is_
 from typing import Any
 
 import numpy as np
@@ -94,7 +93,12 @@ def reasons_of_part(
 
     `now_ns`, here and below, is on the clock of the records' ``received_ns``.
     """
-    return [*_robot(profile, peers, pose, now_ns), *_gripper(profile, gripper, now_ns)]
+    reasons = _robot(profile, peers, pose, now_ns)
+    if gripper is None:
+        return [*reasons, "the gripper is not known: nothing received on state/gripper"]
+    reasons += _too_old("gripper's state", gripper, profile, now_ns)
+    why = why_not_ready(gripper.record)
+    return [*reasons, why] if why else reasons
 
 
 def reasons_of_worker(
@@ -240,15 +244,11 @@ def _robot(
     return reasons
 
 
-def _gripper(profile: Profile, gripper: Stamped[GripperState] | None, now_ns: int) -> list[str]:
-    if gripper is None:
-        return ["the gripper is not known: nothing received on state/gripper"]
-    reasons = _too_old("gripper's state", gripper, profile, now_ns)
-    if gripper.record.faults:
-        reasons.append(f"the robot reports: {'; '.join(gripper.record.faults)}")
-    elif gripper.record.mode != "ready":
-        reasons.append(f"the robot is not ready but {gripper.record.mode!r}")
-    return reasons
+def why_not_ready(gripper: GripperState) -> str:
+    """Faults that the robot reports, or the mode in which it takes no commands; empty if none."""
+    if gripper.faults:
+        return f"the robot reports: {'; '.join(gripper.faults)}"
+    return "" if gripper.mode == "ready" else f"the robot is not ready but {gripper.mode!r}"
 
 
 def _too_old(what: str, state: Stamped[Any], profile: Profile, now_ns: int) -> list[str]:
@@ -401,7 +401,6 @@ class Settling:
     def __init__(self, kinematics: Kinematics | None) -> None:
         self._kinematics = kinematics
         self._standing: tuple[Pose, FloatArray | None, int] | None = None
-        self._measured: tuple[PoseState | None, JointState | None] = None, None
         self._measured_ns = 0
 
     def restart(self) -> None:
@@ -410,13 +409,11 @@ class Settling:
 
     def measure(self, measured: PoseState, joint: JointState | None, received_ns: int) -> None:
         """Track whether the robot moves; a record that is repeated does not show that it stands."""
-        before, self._measured = self._measured, (measured, joint)
-        if self._standing is None or not all(map(is_, before, self._measured)):
-            held, held_rad = held_pose(measured), None
-            if self._kinematics is not None and joint is not None:
-                held_rad = held_joints(self._kinematics, joint)
-            if self._standing is None or max(_apart(held, held_rad, *self._standing[:2])) > SETTLED:
-                self._standing = held, held_rad, received_ns
+        held, held_rad = held_pose(measured), None
+        if self._kinematics is not None and joint is not None:
+            held_rad = held_joints(self._kinematics, joint)
+        if self._standing is None or max(_apart(held, held_rad, *self._standing[:2])) > SETTLED:
+            self._standing = held, held_rad, received_ns
         self._measured_ns = received_ns
 
     def unsettled(self, commanded: Pose, commanded_rad: FloatArray | None) -> list[str]:

@@ -15,12 +15,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vla_zenoh.control.axis_smoothing import FULL, AxisSmoother, AxisState, Shares
+from vla_zenoh.control.axis_smoothing import OVERSHOOT, AxisSmoother, AxisState, Plan
 from vla_zenoh.control.limits import (
+    FULL,
     HELD_LEAD_M,
     HELD_LEAD_RAD,
     LimitHit,
     MotionLimits,
+    Shares,
     leash,
     motion_limits,
     workspace_corners,
@@ -52,6 +54,12 @@ class Motion(NamedTuple):
     twist: FloatArray
     acceleration: FloatArray
 
+    def axis_rates(self) -> tuple[FloatArray, FloatArray]:
+        """(6,) twist and acceleration; those of rotation in axes that turn with the arm."""
+        body = self.pose.rotation.T
+        twist, change = (np.append(rates[:3], body @ rates[3:]) for rates in self[1:])
+        return twist, change
+
 
 class Smoother(AxisSmoother):
     """Trajectory generator: moves to targets within motion limits, or brakes.
@@ -71,8 +79,8 @@ class Smoother(AxisSmoother):
         bounds_m: tuple[FloatArray, FloatArray] | None = None,
     ) -> None:
         self._anchor = np.eye(3)
+        self._bounds_m = bounds_m
         super().__init__(np.zeros(6), dt_s, limits.box, (slice(0, 3), slice(3, 6)))
-        self.bounds_m = bounds_m
         self.reset(pose)
 
     def reset(self, pose: Pose) -> None:
@@ -108,14 +116,7 @@ class Smoother(AxisSmoother):
     def brake_from(self, motion: Motion) -> None:
         """Brake from the state of another motion."""
         self.reset(motion.pose)
-        body = motion.pose.rotation.T
-        (velocity, spin), (change, spin_change) = (
-            (values[:3], body @ values[3:]) for values in (motion.twist, motion.acceleration)
-        )
-        self.state = self.state._replace(
-            velocity=np.concatenate([velocity, spin]),
-            acceleration=np.concatenate([change, spin_change]),
-        )
+        self.state = AxisState(self.state.position, *motion.axis_rates())
         self.motion = motion
         self.brake()
 
@@ -136,6 +137,18 @@ class Smoother(AxisSmoother):
         twist[3:], change[3:] = self._anchor @ spin, self._anchor @ spin_change
         self.motion = Motion(Pose(position[:3].copy(), rotation), twist, change)
         return self.motion
+
+    def _leaves(self, plan: Plan) -> bool:
+        """Whether a planned motion leaves the box; from outside it may enter."""
+        if self._bounds_m is None:
+            return False
+        low, high = self._bounds_m
+        low, high = low - OVERSHOOT, high + OVERSHOOT
+        start, end = self.state.position[:3], plan.end[:3]
+        least, most = (reached[:3] for reached in plan.extrema())
+        below = (np.minimum(start, end) >= low) & (least < low)
+        above = (np.maximum(start, end) <= high) & (most > high)
+        return bool(below.any() or above.any())
 
     @property
     def _rates(self) -> tuple[FloatArray, FloatArray]:
@@ -226,9 +239,7 @@ class PosePath(Smoother):
 
     def axis_rates(self) -> tuple[FloatArray, FloatArray]:
         """(6,) velocity and acceleration, in the same axes."""
-        (_, rotation), *rates = self.motion
-        velocity, change = (np.append(part[:3], rotation.T @ part[3:]) for part in rates)
-        return velocity, change
+        return self.motion.axis_rates()
 
     def shares(self, goal: Goal) -> Shares:
         """Shares of the limits that the joints can follow on the way to a goal."""

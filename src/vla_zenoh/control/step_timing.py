@@ -29,10 +29,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vla_zenoh.control.axis_smoothing import FULL, Shares
 from vla_zenoh.control.commander_io import make_event
 from vla_zenoh.control.joint_space import JointPath
-from vla_zenoh.control.limits import APPROACH, Slowdown, slowest
+from vla_zenoh.control.limits import APPROACH, FULL, Shares, Slowdown, slowest
 from vla_zenoh.control.plan_timeline import Goal, Plan
 from vla_zenoh.control.smoothing import PosePath
 from vla_zenoh.types import Event, FloatArray

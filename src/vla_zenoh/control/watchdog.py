@@ -15,7 +15,7 @@ from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.keys import NO_DEADMAN_TOKEN, worker_node
 from vla_zenoh.kinematics.so3 import Pose, pose_distance
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import FloatArray, GripperState, PoseState, Stamped
+from vla_zenoh.types import FloatArray, GripperState, PoseState, Stamped, Task
 
 NEVER_NS = 1 << 62
 FIRST_CHUNK_PATIENCE_S = 1.0
@@ -43,30 +43,22 @@ class Watchdog:
         self._limits, self._timing = profile.limits, profile.timing
         self.tracking_m = self.tracking_rad = 0.0
         self._excused = (0.0, 0.0)
-        self._compared: tuple[Pose | None, Pose | None] = None, None
         self.deadline_ns = 0
         """When the next chunk is overdue."""
         self._left_ns, self._patience_ns = 0.0, 0
-        self._present: tuple[PeerSnapshot, str, Lease] | None = None
-        """The nodes, worker and lease that nothing was missing of."""
 
     # -- chunks -------------------------------------------------------------------------------
-    def expect_first(self, now_ns: int, rate_hz: float, speed: float) -> None:
-        """Set the deadline of the first chunk of an episode that begins at `now_ns`."""
-        self._expect(0, now_ns, rate_hz, speed, FIRST_CHUNK_PATIENCE_S)
+    def expect(self, left_ns: int | None, now_ns: int, task: Task) -> None:
+        """Set the deadline of the next chunk; never at override 0.
 
-    def expect_next(self, left_ns: int, now_ns: int, rate_hz: float, speed: float) -> None:
-        """Set the deadline after a chunk with `left_ns` of plan time, or ``max_open_loop_s``."""
-        left_ns = min(left_ns, int(self._timing.max_open_loop_s * 1e9))
-        self._expect(left_ns, now_ns, rate_hz, speed)
-
-    def _expect(
-        self, left_ns: int, now_ns: int, rate_hz: float, speed: float, extra_s: float = 0.0
-    ) -> None:
-        """One period at the requested rate later, plus the watchdog; never at override 0."""
-        self._left_ns = left_ns + 1e9 / rate_hz
+        One period at the requested rate, and the watchdog, after `left_ns` of plan time, of which
+        ``max_open_loop_s`` count at most; None: of the first chunk of an episode.
+        """
+        extra_s = FIRST_CHUNK_PATIENCE_S if left_ns is None else 0.0
+        plan_ns = min(left_ns or 0, int(self._timing.max_open_loop_s * 1e9))
+        self._left_ns = plan_ns + 1e9 / task.rate_hz
         self._patience_ns = int((self._timing.watchdog_s + extra_s) * 1e9)
-        self._set_deadline(now_ns, speed)
+        self._set_deadline(now_ns, task.speed)
 
     def override_changed(self, now_ns: int, before: float, speed: float) -> None:
         """Keep the plan time that is left until the deadline, of an override that was `before`."""
@@ -102,9 +94,6 @@ class Watchdog:
 
     def measure(self, commanded: Pose | None, actual: Pose) -> None:
         """Update the tracking error; `commanded` is None while nothing is streamed."""
-        before, self._compared = self._compared, (commanded, actual)
-        if commanded is before[0] and actual is before[1]:
-            return
         self.tracking_m, self.tracking_rad = (
             (0.0, 0.0) if commanded is None else pose_distance(commanded, actual)
         )
@@ -112,12 +101,6 @@ class Watchdog:
     def blocked(self) -> str:
         """Why the arm counts as blocked, empty while it follows."""
         limits = self._limits
-        if (
-            self._excused == (0.0, 0.0)
-            and self.tracking_m <= limits.tracking_m
-            and self.tracking_rad <= limits.tracking_rad
-        ):
-            return ""
         for apart, limit, excused, back_off, unit in (
             (self.tracking_m, limits.tracking_m, self._excused[0], BACK_OFF_M, "m"),
             (self.tracking_rad, limits.tracking_rad, self._excused[1], BACK_OFF_RAD, "rad"),
@@ -163,9 +146,6 @@ class Watchdog:
         lost = self.state_lost(pose, gripper, now_ns)
         if lost:
             return lost
-        seen = peers, worker, lease
-        if self._present is not None and all(map(is_, seen, self._present)):
-            return ""
         needed = [peers.robot_node, worker_node(worker)]
         cameras = lease.spec.observation.camera_names
         needed += [peers.camera_nodes.get(camera, "camera") for camera in cameras]
@@ -177,7 +157,6 @@ class Watchdog:
                 return f"camera {camera!r} {peers.camera_faults[camera]}"
         if peers.spec_sources.get(worker) != lease.source:
             return f"worker {worker!r} was restarted"
-        self._present = seen
         return ""
 
 
@@ -219,8 +198,7 @@ class JointMonitor:
         """Forget the last values: the arm is not being moved."""
         self._edge: FloatArray | None = None
         self._expected_rad: FloatArray | None = None
-        self.next_ns = 0
-        """When the next check is due."""
+        self._next_ns = 0
         self._elbow_next = False
         self.elbow_rad = 0.0
         """Greatest distance of a joint from where it is expected."""
@@ -234,9 +212,13 @@ class JointMonitor:
         """The slowdown of the arm, None for full speed."""
         return slowest(self._bound_slowdown, self._elbow_slowdown)
 
+    def due(self, now_ns: int) -> bool:
+        """The next check is due."""
+        return now_ns >= self._next_ns
+
     def late(self, now_ns: int) -> bool:
         """A check is overdue by a whole period."""
-        return now_ns >= self.next_ns + PERIOD_NS // 2
+        return now_ns >= self._next_ns + PERIOD_NS // 2
 
     def update(
         self,
@@ -257,9 +239,9 @@ class JointMonitor:
         Returns:
             the bound for which the arm has to brake, None without one.
         """
-        if now_ns < self.next_ns:
+        if now_ns < self._next_ns:
             return None
-        self.next_ns = now_ns + PERIOD_NS // 2
+        self._next_ns = now_ns + PERIOD_NS // 2
         self._elbow_next = not self._elbow_next
         seen = measured_rad, commanded_rad, in_joints
         if self.slowdown is None and all(map(is_, seen, self._passed[self._elbow_next])):

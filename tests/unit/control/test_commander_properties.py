@@ -134,7 +134,7 @@ def check_goal(rig: Rig) -> None:
 def check(rig: Rig) -> None:
     rig.put("active", False)
     rig.run(1.0)
-    assert rig.commander.smoothing_failures == 0
+    assert rig.commander.parts[0].motion.failures == 0
     if rig.commands:
         rig.assert_smooth()
 

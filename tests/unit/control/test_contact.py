@@ -65,7 +65,7 @@ def test_a_force_above_its_limit_is_named_with_value_and_limit(
     arm.feels(*(1.3 * LIMITS.force_stop_n * np.array(direction)), s=0.2)
     pressed = arm.contact.overload()
     assert pressed is not None
-    assert (pressed.name, pressed.limit, pressed.unit) == (
+    assert (pressed.name, pressed.stop, pressed.unit) == (
         "contact_force",
         LIMITS.force_stop_n,
         "N",

@@ -178,7 +178,7 @@ def test_the_measured_arm_ends_the_activation_with_an_event_that_names_joint_val
     for _ in range(400):
         arm.joints_rad = joints_rad = joints_rad - 0.002 * JOINT["panda_joint4"]
         arm.tick()
-        slowest = min(slowest, arm.commander.parts[0].motion.speed)
+        slowest = min(slowest, arm.commander.parts[0].motion.pace.speed)
         if arm.state != "active":
             break
     assert arm.state == "inactive"

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from vla_zenoh.control.limits import MotionLimits
-from vla_zenoh.control.smoothing import Motion, Shares, Smoother
+from vla_zenoh.control.limits import MotionLimits, Shares
+from vla_zenoh.control.smoothing import Motion, Smoother
 from vla_zenoh.kinematics.so3 import Pose, angle_between, exp3, log3, norm3
 
 DT_S = 0.004

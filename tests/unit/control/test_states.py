@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 from command_rig import Rig
 
-from vla_zenoh.control.commander_io import OBEYING, TABLE, State, Trigger, after
+from vla_zenoh.control.commander_io import OBEYING, TABLE, State, Trigger
 
 # Written down once more, so that an edge cannot come or go unnoticed.
 EDGES = [
@@ -40,19 +40,19 @@ def test_the_table_has_these_edges_and_no_others() -> None:
 @pytest.mark.parametrize("trigger", Trigger)
 def test_where_the_table_has_no_edge_nothing_changes(state: State, trigger: Trigger) -> None:
     expected = TABLE.get((state, trigger), state)
-    assert after(state, trigger) is expected
+    assert state.after(trigger) is expected
 
 
 @pytest.mark.parametrize("state", State)
 def test_a_stop_is_obeyed_from_every_state(state: State) -> None:
-    assert after(state, Trigger.STOP) is State.STOPPED
+    assert state.after(Trigger.STOP) is State.STOPPED
 
 
 @pytest.mark.parametrize("state", [state for state in State if state not in OBEYING])
 def test_chunks_are_obeyed_after_an_activation_only(state: State) -> None:
     leading_in = {s for (s, t), new in TABLE.items() if new in OBEYING and s not in OBEYING}
     assert leading_in == {State.INACTIVE}
-    assert after(state, Trigger.FRESH) is state
+    assert state.after(Trigger.FRESH) is state
 
 
 def set_faults(rig: Rig, faults: tuple[str, ...]) -> None:

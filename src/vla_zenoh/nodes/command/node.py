@@ -272,11 +272,13 @@ class CommandStatus:
         }
         of_parts = {part.name: _part_detail(part) for part in commander.parts}
         several = of_parts.get("", {"parts": of_parts})
-        near = commander.part_distance
-        if near is not None:
+        if commander.spacing is not None:
+            near = commander.spacing.nearest
             several["part_distance_m"] = round(near.distance_m, 4) if near.first else None
         latency = {name: meter.summary() for name, meter in self._latency.items()}
-        self._node.counters["command.smoothing_failures"] = commander.smoothing_failures
+        self._node.counters["command.smoothing_failures"] = sum(
+            part.motion.failures for part in commander.parts
+        )
         self._node.counters["command.gripper_timeouts"] = sum(
             part.gripper.timeouts for part in commander.parts
         )
@@ -296,7 +298,7 @@ class CommandStatus:
                 "held_by": commander.deadman.name if task.active else "",
                 "at_rest": commander.at_rest,
                 "streaming": commander.streaming,
-                "speed_share": round(min(part.motion.speed for part in commander.parts), 3),
+                "speed_share": round(min(part.motion.pace.speed for part in commander.parts), 3),
                 "tracking_mm": _most(part.watchdog.tracking_m for part in commander.parts),
                 "tracking_mrad": _most(part.watchdog.tracking_rad for part in commander.parts),
                 "elbow_mrad": _most(part.elbow_rad for part in commander.parts),
