@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
+from operator import itemgetter
 from typing import Generic, NamedTuple, TypeVar
 
 from vla_zenoh.control.limits import APPROACH, LimitHit
@@ -118,16 +119,13 @@ class StateHistory(Generic[Measured]):
     """States of the last seconds, by the time they were measured: where the arm was then."""
 
     def __init__(self) -> None:
-        self._stamps: deque[int] = deque(maxlen=MOST_STATES)
-        self._states: deque[Measured] = deque(maxlen=MOST_STATES)
+        self._states: deque[tuple[int, Measured]] = deque(maxlen=MOST_STATES)
 
     def restart(self, measured: Stamped[Measured] | None) -> None:
         """Drop all states but this one."""
-        self._stamps.clear()
         self._states.clear()
         if measured is not None:
-            self._stamps.append(measured.header.stamp_wall_ns)
-            self._states.append(measured.record)
+            self._states.append((measured.header.stamp_wall_ns, measured.record))
 
     def add(self, measured: Stamped[Measured], tolerance_ns: int) -> None:
         """Add a state; if time goes back, a clock was set, and only this state is kept.
@@ -139,15 +137,13 @@ class StateHistory(Generic[Measured]):
         stamp_ns = measured.header.stamp_wall_ns
         if stamp_ns > measured.received_ns + tolerance_ns:
             return
-        if self._stamps and stamp_ns <= self._stamps[-1]:
-            if stamp_ns < self._stamps[-1]:
-                self.restart(measured)
-            return
-        self._stamps.append(stamp_ns)
-        self._states.append(measured.record)
-        while self._stamps[0] < stamp_ns - KEPT_NS:
-            self._stamps.popleft()
-            self._states.popleft()
+        last_ns = self._states[-1][0] if self._states else -1
+        if stamp_ns < last_ns:
+            self.restart(measured)
+        elif stamp_ns > last_ns:
+            self._states.append((stamp_ns, measured.record))
+            while self._states[0][0] < stamp_ns - KEPT_NS:
+                self._states.popleft()
 
     def around(self, t_ns: int, gap_ns: int) -> tuple[Measured, Measured, float] | None:
         """The states measured next before and after `t_ns`, and the share of time between them.
@@ -160,14 +156,14 @@ class StateHistory(Generic[Measured]):
             None where no state was measured within `gap_ns` before; the last one before it twice,
             with a share of 0, where none was measured after it.
         """
-        index = bisect_right(self._stamps, t_ns)
-        if index == 0 or t_ns - self._stamps[index - 1] > gap_ns:
+        index = bisect_right(self._states, t_ns, key=itemgetter(0))
+        if index == 0 or t_ns - self._states[index - 1][0] > gap_ns:
             return None
-        before = self._states[index - 1]
-        if index == len(self._stamps) or self._stamps[index - 1] == t_ns:
+        since_ns, before = self._states[index - 1]
+        if index == len(self._states) or since_ns == t_ns:
             return before, before, 0.0
-        since_ns, until_ns = self._stamps[index - 1], self._stamps[index]
-        return before, self._states[index], (t_ns - since_ns) / (until_ns - since_ns)
+        until_ns, after = self._states[index]
+        return before, after, (t_ns - since_ns) / (until_ns - since_ns)
 
 
 class MotionCommands(NamedTuple):
