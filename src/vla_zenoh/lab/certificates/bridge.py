@@ -27,7 +27,8 @@ def bridges(profile: Profile, host: str | None = None) -> list[Identity]:
     None where only that host reaches it.
     """
     places = profile.ros2.connect if profile.ros2 is not None else None
-    if all(_is_open_here(endpoint) for endpoint in places or ()):
+    trusted = [each.partition("/")[0] in TRUSTED_PROTOCOLS for each in places or ()]
+    if not any(trusted) and all(map(is_loopback, places or ())):
         return []
     addresses = tuple(dict.fromkeys(map(host_of, places or ())))
     return [
@@ -67,7 +68,3 @@ def bridge_locks(profile: Profile, folder: Path) -> dict[str, Any]:
 
 def _users(profile: Profile) -> list[str]:
     return [name for name, part in profile.hosts.items() if USER in part.nodes]
-
-
-def _is_open_here(endpoint: str) -> bool:
-    return is_loopback(endpoint) and endpoint.partition("/")[0] not in TRUSTED_PROTOCOLS

@@ -218,8 +218,12 @@ def sim(
                 write_page(output.output, result)
         if stop.is_set():
             raise typer.Exit(130)
-        if output.output is not None and replay is None:
-            _videos(output, teller, requests, journal, about)
+        if output.output is not None and replay is None and about["cameras"]:
+            ended = [(each, journal.ended.get(each.key)) for each in requests]
+            failed = [each for each, end in ended if end is not None and not end.success]
+            camera = shown_camera(about["cameras"]) or ""
+            for file in write_videos(output.output, teller, failed, camera, output.videos):
+                errors().print(f"{file}", soft_wrap=True)
             write_page(output.output, result)
     finally:
         teller.close()
@@ -296,25 +300,6 @@ def _result(
         result["same_end"] = sum(bool(a and a.end and a.end == b.end) for a, b in pairs)
         result["replayed"] = read_json(replay / PLAN)["worker"]
     return result
-
-
-def _videos(
-    output: BenchmarkOutput,
-    teller: BenchmarkProcess,
-    requests: Sequence[EpisodeRequest],
-    journal: RunJournal,
-    about: dict[str, Any],
-) -> None:
-    failed = [
-        each
-        for each in requests
-        if each.key in journal.ended and not journal.ended[each.key].success
-    ]
-    if output.output is None or not about["cameras"]:
-        return
-    camera = shown_camera(about["cameras"]) or ""
-    for file in write_videos(output.output, teller, failed, camera, output.videos):
-        errors().print(f"{file}", soft_wrap=True)
 
 
 def _chosen(text: str, known: Sequence[BenchmarkTask]) -> list[BenchmarkTask]:

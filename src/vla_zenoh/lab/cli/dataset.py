@@ -69,7 +69,9 @@ def export(
     from vla_zenoh.lab.policy_servers.state_vector import read_parts
     from vla_zenoh.lab.recording.run import load_run
 
-    parts, files = read_parts(state) if state else None, _files(runs)
+    parts, files = read_parts(state) if state else None, list(recordings(runs))
+    if not files:
+        raise RecordingError(f"no {MCAP} file in {', '.join(map(str, runs))}")
     wanted = labels or [each for each in EpisodeLabel if each is not EpisodeLabel.DISCARDED]
     episodes, seen, deep, workers, left_out = [], None, None, set[str](), Counter[str]()
     with (
@@ -152,10 +154,3 @@ def stats(
         print_json(content)
     else:
         console().print(f"{path}: key {next(iter(content))!r}")
-
-
-def _files(given: list[Path]) -> list[Path]:
-    out = list(recordings(given))
-    if not out:
-        raise RecordingError(f"no {MCAP} file in {', '.join(map(str, given))}")
-    return out

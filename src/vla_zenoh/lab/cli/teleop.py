@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
-import zenoh
 
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.cli.options import model_options, options
@@ -15,7 +14,6 @@ from vla_zenoh.cli.output import errors
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import SecurityError
 from vla_zenoh.keys import worker_node
-from vla_zenoh.profile import Profile
 from vla_zenoh.runtime.process import run_node
 
 
@@ -69,7 +67,11 @@ def teleop(
             errors().print(f"following {arm.name}")
 
         def run(session, stop) -> None:  # pyright: ignore  # as run_node gives them
-            settings = _settings_session(loaded, stack)
+            settings = None  # with the operator's certificate: a worker may not publish them
+            try:
+                settings = stack.enter_context(open_session(loaded.session))
+            except SecurityError as error:
+                errors().print(f"enter, tab and x will do nothing: {error}", style="yellow")
             node = Teleop(
                 loaded,
                 session,
@@ -83,12 +85,3 @@ def teleop(
             node.run(stop)
 
         run_node(loaded, run, identity=worker_node(name))
-
-
-def _settings_session(profile: Profile, stack: ExitStack) -> zenoh.Session | None:
-    """A session with the operator's certificate: a worker may not publish settings."""
-    try:
-        return stack.enter_context(open_session(profile.session))
-    except SecurityError as error:
-        errors().print(f"enter, tab and x will do nothing: {error}", style="yellow")
-        return None

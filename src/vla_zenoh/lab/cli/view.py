@@ -24,7 +24,6 @@ from vla_zenoh.profile import Profile, read_profile
 from vla_zenoh.runtime.process import run_node, stop_on_signals
 
 if TYPE_CHECKING:
-    from vla_zenoh.lab.recording.reader import Recording
     from vla_zenoh.lab.view.rerun_logger import RerunLogger
 
 POLL_S = 0.03
@@ -185,7 +184,11 @@ def _recorded(path: Path, profile_name: str, output: ViewOutput, part: Path | No
 
     stop = stop_on_signals()
     file = open_recording(path)
-    profile = _profile_of(file, profile_name)
+    try:
+        profile = read_profile(file.profile_yaml, f"profile in {file.path}")
+    except ProfileError as error:
+        errors().print(f"{error}; showing the robot of --profile {profile_name}", style="yellow")
+        profile = RobotTarget(profile_name).load()
     output.check(profile)
     with output.open(path.stem, part) as (stream, viewer):
         logger = RerunLogger(profile, stream, keys=file.keys)
@@ -201,14 +204,6 @@ def _recorded(path: Path, profile_name: str, output: ViewOutput, part: Path | No
             stop.wait(POLL_S)
     if not logger.shown and not stop.is_set():
         fail(f"{path} holds nothing that can be shown")
-
-
-def _profile_of(file: Recording, name: str) -> Profile:
-    try:
-        return read_profile(file.profile_yaml, f"profile in {file.path}")
-    except ProfileError as error:
-        errors().print(f"{error}; showing the robot of --profile {name}", style="yellow")
-        return RobotTarget(name).load()
 
 
 def _summarise(logger: RerunLogger) -> None:

@@ -19,7 +19,7 @@ from vla_zenoh.errors import MissingExtraError, NodeError, how_to_install
 from vla_zenoh.kinematics.kinematics import Kinematics, make_kinematics
 from vla_zenoh.kinematics.so3 import Pose, pose_distance
 from vla_zenoh.lab.doctor.computer import may_use_priority
-from vla_zenoh.lab.doctor.needs import HostFinding, Level, judged
+from vla_zenoh.lab.doctor.needs import HostFinding, Level, judged, nodes_on
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.robot import FrankaProfile
 from vla_zenoh.robots.franka.arm import FrankaArm, error_names, flange_pose
@@ -101,10 +101,9 @@ BY_FCI: Mapping[int, Published] = {limits.fci: limits for limits in (PANDA, FR3)
 # -- the host ---------------------------------------------------------------------------------
 def fci_host(profile: Profile, host: str | None = None) -> Iterator[HostFinding]:
     """What the 1 kHz loop of a Franka arm needs of this computer; nothing for other robots."""
-    hosts = [profile.hosts[host]] if host is not None else list(profile.hosts.values())
     if profile.franka is None or profile.robot.driver != "franka":
         return
-    if any("arm" in part.nodes for part in hosts):
+    if "arm" in nodes_on(profile, host):
         yield library(profile.franka)
         yield kernel(profile.franka)
         yield priority(profile.franka)
@@ -266,7 +265,9 @@ def _description(urdf: str, profile: Profile) -> Iterator[HostFinding]:
         file.flush()
         own = Kinematics(Path(file.name), links[0], joints)
     ours, random = make_kinematics(profile), np.random.default_rng(0)
-    tool = _tool(ours)
+    middle_rad = (ours.lower_rad + ours.upper_rad) / 2
+    # (4, 4): our TCP in the frame of the flange.
+    tool = np.linalg.inv(flange_pose(middle_rad)) @ _matrix(ours.forward(middle_rad))
     worst = Pose(np.zeros(3), np.eye(3)), Pose(np.zeros(3), np.eye(3))
     for _ in range(LOOKS):
         joints_rad = random.uniform(ours.lower_rad, ours.upper_rad)
@@ -297,12 +298,6 @@ def _limits(profile: Profile) -> HostFinding:
     within = f"within those published for FCI {profile.franka.fci}"
     found = f"above the published ones: {', '.join(above)}" if above else within
     return judged("limits", not above, found, level="fail")
-
-
-def _tool(ours: Kinematics) -> np.ndarray:
-    """(4, 4): our TCP in the frame of the flange."""
-    middle_rad = (ours.lower_rad + ours.upper_rad) / 2
-    return np.linalg.inv(flange_pose(middle_rad)) @ _matrix(ours.forward(middle_rad))
 
 
 def _apart(name: str, of: str, own: Pose, ours: Pose) -> HostFinding:

@@ -53,6 +53,12 @@ class Needs:
     devices: tuple[str, ...] = ()
 
 
+def nodes_on(profile: Profile, host: str | None) -> set[str]:
+    """Kinds of nodes of a host, or of all together when `host` is None."""
+    hosts = [profile.hosts[host]] if host is not None else profile.hosts.values()
+    return {node for part in hosts for node in part.nodes}
+
+
 def needs_of(profile: Profile, host: str | None = None) -> Needs:
     """Requirements of `profile` on one of its hosts, or on all together when `host` is None.
 
@@ -64,7 +70,7 @@ def needs_of(profile: Profile, host: str | None = None) -> Needs:
             f"profile {profile.name!r} has no host {host!r}; it has: {', '.join(profile.hosts)}"
         )
     hosts = [profile.hosts[host]] if host is not None else list(profile.hosts.values())
-    nodes = {node for part in hosts for node in part.nodes}
+    nodes = nodes_on(profile, host)
     roles: set[Role] = {"base"}
     if nodes & {"command", "arm"}:
         roles.add("control")

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from importlib import metadata
 
 from vla_zenoh.errors import MissingExtraError, NodeError, VlaZenohError, how_to_install
-from vla_zenoh.lab.doctor.needs import HostFinding, Role, judged
+from vla_zenoh.lab.doctor.needs import HostFinding, Role, judged, nodes_on
 from vla_zenoh.profile import Profile
 from vla_zenoh.simulation.backend import RAYCAST, VARIABLE, Backend, choose_backend
 
@@ -180,8 +180,7 @@ def robot(profile: Profile, host: str | None = None) -> Iterator[HostFinding]:
         host: which of its hosts this computer is; None: all of them. Hosts without the command
             node have no finding.
     """
-    hosts = [profile.hosts[host]] if host is not None else list(profile.hosts.values())
-    if not any("command" in part.nodes for part in hosts):
+    if "command" not in nodes_on(profile, host):
         return
     try:
         from vla_zenoh.control.reachability import ReachabilityFilter

@@ -23,7 +23,6 @@ from vla_zenoh.lab.profile.robot_check import (
     ros2,
     simulator,
 )
-from vla_zenoh.policy import ModelSpec
 from vla_zenoh.policy.loader import find_worker, make_policy
 from vla_zenoh.profile import HostProfile, Profile, load_with_lines
 from vla_zenoh.profile.schema import ANYWHERE, PATH_SOURCES, address_of, host_of, is_loopback
@@ -100,7 +99,7 @@ def _cameras(profile: Profile, part: HostProfile) -> Iterator[ProfileFault]:
 def _workers(profile: Profile, name: str) -> Iterator[ProfileFault]:
     """Models, made as a worker makes them, and what they need of the profile."""
     for worker in profile.workers:
-        place = ("models", worker) if worker in profile.models else ("workers",)
+        place = own = ("models", worker) if worker in profile.models else ("workers",)
         options = profile.options.get(worker, {})
         try:
             _, model = find_worker(worker, profile.models)
@@ -118,15 +117,10 @@ def _workers(profile: Profile, name: str) -> Iterator[ProfileFault]:
         except VlaZenohError as error:
             yield ProfileFault(place, str(error), worker)
             continue
-        yield from _spec_faults(profile, worker, policy.spec)
+        from vla_zenoh.control.policy_check import spec_errors
 
-
-def _spec_faults(profile: Profile, worker: str, spec: ModelSpec) -> Iterator[ProfileFault]:
-    from vla_zenoh.control.policy_check import spec_errors
-
-    place = ("models", worker) if worker in profile.models else ("workers",)
-    for _, _, why in spec_errors(profile, spec):
-        yield ProfileFault(place, f"worker {worker!r}: {why}")
+        for _, _, why in spec_errors(profile, policy.spec):
+            yield ProfileFault(own, f"worker {worker!r}: {why}")
 
 
 # -- network ----------------------------------------------------------------------------------

@@ -16,7 +16,6 @@ from vla_zenoh.lab.serve.openpi_server import OpenPiConversation
 from vla_zenoh.lab.serve.vla_eval import VlaEvalConversation
 
 try:
-    from websockets.datastructures import Headers
     from websockets.exceptions import ConnectionClosed
     from websockets.http11 import Request, Response
     from websockets.sync.server import Server, ServerConnection, serve
@@ -74,7 +73,8 @@ class PolicyServer:
     def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
         if request.path == self._health:
             return connection.respond(HTTPStatus.OK, "OK\n")
-        if self._key and not _has_key(request.headers, self._key):
+        given = request.headers.get("Authorization", "").encode()
+        if self._key and not hmac.compare_digest(given, f"Api-Key {self._key}".encode()):
             return connection.respond(HTTPStatus.UNAUTHORIZED, "wrong or no API key\n")
         if self._busy.locked():
             return connection.respond(
@@ -105,8 +105,3 @@ class PolicyServer:
             if isinstance(reply, str):
                 connection.close(INTERNAL_ERROR, "the reason is in the frame before")
                 return
-
-
-def _has_key(headers: Headers, key: str) -> bool:
-    given = headers.get("Authorization", "")
-    return hmac.compare_digest(given.encode(), f"Api-Key {key}".encode())

@@ -25,7 +25,7 @@ from vla_zenoh.lab.teleop.policy import COVER_S, DT_S, HORIZON, PERSON, kept_wid
 from vla_zenoh.policy import ActionSpec, ActionSteps, ModelSpec, Observation, ObservationSpec
 from vla_zenoh.policy.loader import make_robot
 from vla_zenoh.profile import Profile
-from vla_zenoh.robot import Reading, numbers
+from vla_zenoh.robot import numbers
 from vla_zenoh.types import FloatArray
 
 READ_S = 0.01
@@ -62,17 +62,16 @@ class LeaderArm:
         while not self._end.wait(READ_S):
             try:
                 reading = self._robot.read()
-                if reading is not None:
-                    self._take(reading)
+                if reading is None:
+                    continue
+                position_rad = numbers("position_rad", reading.position_rad, self._joints)
+                if np.isfinite(position_rad).all():
+                    now = LeaderState(time.monotonic(), position_rad, reading.width_m)
+                    with self._lock:
+                        self._path.append(now)
             except Exception as error:
                 self._why = in_words(error)
                 return
-
-    def _take(self, reading: Reading) -> None:
-        position_rad = numbers("position_rad", reading.position_rad, self._joints)
-        if np.isfinite(position_rad).all():
-            with self._lock:
-                self._path.append(LeaderState(time.monotonic(), position_rad, reading.width_m))
 
     def path(self) -> list[LeaderState]:
         """Its last seconds, oldest first. Raises PeerError: it is gone."""

@@ -104,15 +104,12 @@ class Pictures:
                 if name not in self._streams:
                     self._streams[name] = _Stream(self._session, key)
                 self._streams[name].users += 1
-            gone = [self._dropped(name) for name in before - wanted]
+            for name in before - wanted:
+                self._streams[name].users -= 1
+            unused = [name for name, stream in self._streams.items() if not stream.users]
+            gone = [self._streams.pop(name) for name in unused]
         for stream in gone:
-            if stream is not None:
-                stream.subscriber.undeclare()
-
-    def _dropped(self, name: str) -> _Stream | None:
-        stream = self._streams[name]
-        stream.users -= 1
-        return self._streams.pop(name) if stream.users == 0 else None
+            stream.subscriber.undeclare()
 
     def count(self, name: str) -> int:
         stream = self._streams.get(name)

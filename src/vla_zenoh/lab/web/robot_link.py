@@ -308,8 +308,9 @@ class RobotLink:
             with self._hold_lock:
                 before = self._hold.held
                 self._hold.expire(time.monotonic())
-                if self._over():  # stopped, or ended by itself: a new press starts again
-                    self._hold.held = None
+                task = self.client.task
+                if self._confirmed and (task is None or not task.active):
+                    self._hold.held = None  # stopped, or ended by itself: a new press starts again
                 held = self._hold.held is not None
                 let_go, self._let_go = self._let_go, False
                 self.counters["hold_lost"] += before is not None and not held
@@ -318,11 +319,6 @@ class RobotLink:
                 self.client.publish(self.keys.active, "false")
             if not held:  # also one that was declared after the hold had ended
                 self.client.release_deadman()
-
-    def _over(self) -> bool:
-        """The arm was active with the hold in force, and is not any more."""
-        task = self.client.task
-        return self._confirmed and (task is None or not task.active)
 
     def deactivate(self) -> str:
         """Brake the arm, and wait until it stands. Raises SessionError: it does not in time."""
