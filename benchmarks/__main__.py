@@ -11,6 +11,7 @@ from benchmarks.codec.cli import codec
 from benchmarks.delay import delay
 from benchmarks.deployment import deployment
 from benchmarks.depth import depth
+from benchmarks.footprint import footprint
 from benchmarks.load.cli import load
 from benchmarks.motion.cli import motion
 from benchmarks.openvla import openvla
@@ -33,6 +34,7 @@ COMMANDS = (
     delay,
     deployment,
     depth,
+    footprint,
     load,
     motion,
     openvla,
