@@ -182,13 +182,23 @@ def traced_program(out: Path, arguments: list[str]) -> None:
     main()
 
 
+def answers(address: tuple[str, int]) -> bool:
+    """Whether a server listens there."""
+    try:
+        socket.create_connection(address).close()
+    except OSError:
+        return False
+    return True
+
+
 def trace(src: Path) -> list[str]:
     """Files of the package that run while images become motions, command line and lab aside."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
-            endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+            address = probe.getsockname()
+        endpoint = f"tcp/127.0.0.1:{address[1]}"
         (folder / "look.py").write_text(MODEL, "utf-8")
         profile = folder / "traced.yaml"
         session = f"session: {{listen: [{endpoint}], connect: [{endpoint}]}}\n"
@@ -208,6 +218,8 @@ def trace(src: Path) -> list[str]:
             words = [*word, "--profile", str(profile)]
             whole = [sys.executable, __file__, "--as", str(folder / f"{program}.json"), *words]
             programs.append(subprocess.Popen(whole, env=environment, cwd=folder))
+            while program == "router" and not answers(address):
+                time.sleep(0.1)  # the others do not wait for it
         try:
             give_up = time.monotonic() + START_S
             while subprocess.run(command("activate"), env=environment, check=False).returncode:

@@ -72,7 +72,7 @@ class AxisState(NamedTuple):
     acceleration: FloatArray
 
 
-class Plan:
+class AxisPlan:
     """A planned motion: a path in k coordinates along the columns of a basis.
 
     Args:
@@ -135,7 +135,7 @@ class AxisSmoother:
         self.state = AxisState(np.array(position, dtype=np.float64), zeros, zeros)
         """The present state."""
         self._target = self.state.position
-        self._plan: Plan | None = None
+        self._plan: AxisPlan | None = None
         self._elapsed_s = 0.0
         self._jerk, self._sign = zeros, zeros
         self._pace = 1.0
@@ -197,7 +197,7 @@ class AxisSmoother:
         self._begin(self._stop(limits, together=shares is not None))
 
     # -- planning -----------------------------------------------------------------------------
-    def _begin(self, plan: Plan | None) -> None:
+    def _begin(self, plan: AxisPlan | None) -> None:
         """Execute `plan`; without one brake, and if that cannot be planned, stand."""
         self._elapsed_s = 0.0
         if plan is None:
@@ -211,7 +211,7 @@ class AxisSmoother:
 
     def _towards(
         self, way: FloatArray, limits: FloatArray, unreversed: FloatArray, all_to_stop: bool
-    ) -> tuple[Plan | None, bool]:
+    ) -> tuple[AxisPlan | None, bool]:
         """The plan of a motion by `way` (n,) without detours, and whether `limits` suffice.
 
         To `unreversed` (3, n) it keeps where an axis would else reverse for nothing.
@@ -219,7 +219,7 @@ class AxisSmoother:
         if not np.isfinite(way).all():
             return None, False
         basis, parts = self._coordinates(way, limits)
-        plan: Plan | None = None
+        plan: AxisPlan | None = None
         hardest = np.concatenate([limits[:1], self.box[1:]])
         attempts = [limits]
         attempts += [unreversed] * bool((limits < unreversed).any())
@@ -237,7 +237,7 @@ class AxisSmoother:
                 path = self._calculated(ask)
                 if path is None:
                     continue
-                found = Plan(self.state.position, basis, path, self._pace_of(most))
+                found = AxisPlan(self.state.position, basis, path, self._pace_of(most))
                 stop = basis, may_take, parts
                 if not (self._overshoots(path, along, stop) or self._leaves(found)):
                     if most is not limits:
@@ -246,7 +246,7 @@ class AxisSmoother:
                 plan = plan if slowly and plan is not None else found
         return plan, False
 
-    def _leaves(self, plan: Plan) -> bool:
+    def _leaves(self, plan: AxisPlan) -> bool:
         """Whether a planned motion leaves where it has to stay."""
         return False
 
@@ -320,7 +320,7 @@ class AxisSmoother:
             or (high > np.maximum(most, stop_high + OVERSHOOT)).any()
         )
 
-    def _stop(self, limits: FloatArray, *, together: bool) -> Plan | None:
+    def _stop(self, limits: FloatArray, *, together: bool) -> AxisPlan | None:
         size = limits.shape[1]
         basis = np.eye(size)
         ask = self._input(basis, limits, [1.0] * size)
@@ -329,7 +329,7 @@ class AxisSmoother:
             ask.synchronization = synchronization
             path = self._calculated(ask)
             if path is not None:
-                return Plan(self.state.position, basis, path, self._pace_of(limits))
+                return AxisPlan(self.state.position, basis, path, self._pace_of(limits))
         return None
 
     def _input(

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vla_zenoh.control.axis_smoothing import OVERSHOOT, AxisSmoother, AxisState, Plan
+from vla_zenoh.control.axis_smoothing import OVERSHOOT, AxisPlan, AxisSmoother, AxisState
 from vla_zenoh.control.limits import (
     FULL,
     HELD_LEAD_M,
@@ -138,7 +138,7 @@ class Smoother(AxisSmoother):
         self.motion = Motion(Pose(position[:3].copy(), rotation), twist, change)
         return self.motion
 
-    def _leaves(self, plan: Plan) -> bool:
+    def _leaves(self, plan: AxisPlan) -> bool:
         """Whether a planned motion leaves the box; from outside it may enter."""
         if self._bounds_m is None:
             return False
