@@ -323,8 +323,9 @@ def _show(target: RobotTarget, client: Client, text: str, separator: str = ", ")
 def _stop_by_key(target: RobotTarget, *, every: bool) -> None:
     """Stop the robot at every key, and when the person leaves; the session stays open meanwhile."""
     with target.client(stop=True) as client, _keys() as pressed:
-        name, connected = target.named(client), True
+        connected = True
         try:
+            name = target.named(client)
             client.wait_for(lambda: _connected(client), ABSENT_PATIENCE_S)
             say(f"Every key stops {name}; so does leaving: Ctrl-C, or closing this terminal.")
             while (key := pressed()) is not False:

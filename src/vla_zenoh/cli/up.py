@@ -74,7 +74,7 @@ def up(
 
     The profile is checked first, as `profile check` does; nothing starts if it cannot run.
     """
-    hosts = repeated("--host", [host] if host else None)
+    hosts = repeated("--host", None if host is None else [host])
     endpoints = (*repeated("--connect", connect), *repeated("--listen", listen))
     with profile_check([profile, *hosts, *endpoints]) as check:
         from vla_zenoh.runtime.launch import Host, choose_host, lock_host  # meanwhile

@@ -67,12 +67,12 @@ class PartSpacing:
 
     def place(self) -> None:
         """Take the shapes of all parts, with what their grippers hold."""
-        self._placed: list[PlacedArm] = []
+        placed: list[PlacedArm] = []
         for part in self._parts:
             base, reach = self._profile.parts[part.name].base, part.reach
             assert reach is not None
-            placed = PlacedArm(reach.kinematics, reach.barriers.collisions, base)
-            self._placed.append(placed)
+            placed.append(PlacedArm(reach.kinematics, reach.barriers.collisions, base))
+        self._placed = placed
 
     def look(
         self, now_ns: int, ahead_s: float, *, moves: bool

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from vla_zenoh import resources
 from vla_zenoh.errors import ProfileError, RecordError, nearest
 from vla_zenoh.kinematics.so3 import Pose, log3
-from vla_zenoh.profile import GripperProfile, JointEnds, Profile
+from vla_zenoh.profile import JointEnds, Profile
 from vla_zenoh.types import FloatArray, JointState
 
 BEYOND_LIMITS = 0.1
@@ -193,40 +193,6 @@ def make_kinematics(profile: Profile) -> Kinematics:
     )
 
 
-class Fingers:
-    """Converts between the opening of a gripper and the positions of its finger joints.
-
-    Sliding fingers add up to the opening, unless the profile gives their positions when open and
-    shut; revolute fingers need these. Several joints move alike, as those of one motor do.
-
-    Args:
-        gripper: its section of the profile.
-        count: number of finger joints; 0: one that is commanded and not measured.
-    """
-
-    def __init__(self, gripper: GripperProfile, count: int) -> None:
-        self._count = max(count, 1)
-        ends = gripper.joint_ends
-        # width = slope * mean position + offset
-        if ends is None:
-            self._slope, self._offset_m = float(self._count), 0.0
-        else:
-            self._slope = gripper.max_width_m / (ends.open - ends.shut)
-            self._offset_m = -self._slope * ends.shut
-
-    def width_m(self, positions: ArrayLike) -> float:
-        """Opening at the measured positions (k,), m or rad."""
-        return self._slope * float(np.asarray(positions, np.float64).mean()) + self._offset_m
-
-    def speed_m_s(self, velocities: ArrayLike) -> float:
-        """Speed of the opening at joint velocities (k,), m/s or rad/s."""
-        return abs(self._slope * float(np.asarray(velocities, np.float64).mean()))
-
-    def position(self, width_m: float) -> float:
-        """Position of each joint at an opening, m or rad."""
-        return (width_m - self._offset_m) / self._slope
-
-
 def smallest_singular_value(jacobian: FloatArray) -> float:
     """How slow the TCP's slowest direction is (m and rad alike) per rad/s; 0 when singular."""
     wide = jacobian if jacobian.shape[0] <= jacobian.shape[1] else jacobian.T
@@ -298,7 +264,7 @@ class InverseKinematics:
         if np.any(self.lower_rad >= self.upper_rad):
             name = kinematics.arm_joints[int(np.argmin(self.upper_rad - self.lower_rad))]
             raise RecordError(f"joint_margin_rad {joint_margin_rad} leaves {name!r} no range")
-        self.posture_rad = posture_rad
+        self.posture_rad = posture_rad.copy()
 
     def approach(self, pose: Pose, start_rad: FloatArray, *, bounded: bool = True) -> Approach:
         """Joints (n,) that put the TCP there, near `start_rad`, or how near it comes.

@@ -11,7 +11,8 @@ from collections import deque
 import numpy as np
 
 from vla_zenoh.errors import CodecError, RecordError
-from vla_zenoh.kinematics.kinematics import Fingers, Kinematics
+from vla_zenoh.kinematics.fingers import Fingers
+from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.profile import Profile
 from vla_zenoh.robots.driver import Measurement

@@ -15,7 +15,7 @@ import numpy as np
 from rosbags.interfaces import Nodetype
 
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.kinematics.kinematics import Fingers
+from vla_zenoh.kinematics.fingers import Fingers
 from vla_zenoh.profile import GripperProfile
 from vla_zenoh.profile.robot import Ros2Gripper
 from vla_zenoh.ros2.messages import SECOND_NS, Messages

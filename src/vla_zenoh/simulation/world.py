@@ -65,7 +65,7 @@ class World:
         gains: of the Cartesian impedance controller; None: the default ones.
         joint_friction_nm: dry friction in every arm joint, which the controller does not model.
         seed: see `reset`.
-        vary: what else a seeded reset changes, names of `scene.VARIATIONS`.
+        vary: what else a seeded reset changes, names of `VARIATIONS`.
 
     Raises:
         ResourceError: scene or robot are missing or do not fit.

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from panda_arm import ARM_JOINTS, TCP_FRAME, URDF
 
 from vla_zenoh.errors import CodecError, ProfileError
-from vla_zenoh.kinematics.kinematics import Fingers, Kinematics
+from vla_zenoh.kinematics.fingers import Fingers
+from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.profile import GripperProfile, JointEnds, Profile, load_profile
 from vla_zenoh.robots.joint_reading import MOVING_M_S, JointReading
 from vla_zenoh.types.records import Joints

@@ -198,6 +198,6 @@ class ExampleMaker:
 
 
 def example_observation(spec: ModelSpec, *, prompt: str = PROMPTS[0]) -> Observation:
-    """A valid observation of the declared form, gray images and an arm at rest: for dry runs."""
+    """A valid observation of the declared form: gray images, depth 0.8 m, an arm at rest."""
     style = ExampleStyle("gray pictures", plain(128), prompt, active=False)
     return ExampleMaker(spec).make(style)

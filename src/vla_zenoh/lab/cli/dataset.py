@@ -14,7 +14,7 @@ from vla_zenoh.cli.output import console, errors, fail
 from vla_zenoh.errors import RecordingError, counted, nearest
 from vla_zenoh.lab.cli.output import print_json, progress
 from vla_zenoh.lab.cli.output_path import ForceOption, output_file, output_folder
-from vla_zenoh.lab.dataset.episodes import EpisodeLabel
+from vla_zenoh.lab.dataset.label import EpisodeLabel
 from vla_zenoh.lab.evaluation.evaluate import MCAP, recordings
 
 dataset_app = typer.Typer(

@@ -78,8 +78,10 @@ class Stage:
                 finally:
                     found = client.snapshot().items()
                     self.statuses.update({name: status for name, (status, _, _) in found})
-                    client.deactivate()
-                    recorder.close(self.facts)
+                    try:
+                        client.deactivate()
+                    finally:
+                        recorder.close(self.facts)
 
     def refusals(self) -> dict[str, int]:
         """Rejections of all nodes, by reason."""

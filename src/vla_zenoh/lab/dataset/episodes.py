@@ -12,7 +12,6 @@ in the numbers of the model's spec (`vla_zenoh.lab.dataset.corrections`).
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,20 +19,12 @@ from numpy.typing import NDArray
 from vla_zenoh.control.actions import as_deltas
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.dataset.corrections import commanded_motion
+from vla_zenoh.lab.dataset.label import EpisodeLabel
 from vla_zenoh.lab.recording.run import RecordedSample, Run, Span, is_within, newest
 from vla_zenoh.lab.teleop.policy import PERSON
 from vla_zenoh.policy import ROTATION_SIZE, ActionSpec, ModelSpec
 
 FPS_TOLERANCE = 0.01
-
-
-class EpisodeLabel(StrEnum):
-    """The word in a dataset for what came of an episode; a person called a discarded one void."""
-
-    SUCCESS = "success"
-    FAILURE = "failure"
-    UNKNOWN = "unknown"
-    DISCARDED = "discarded"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

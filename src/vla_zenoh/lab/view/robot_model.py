@@ -17,7 +17,8 @@ import pinocchio as pin
 import rerun as rr
 
 from vla_zenoh.errors import ResourceError, VlaZenohError
-from vla_zenoh.kinematics.kinematics import Fingers, make_kinematics
+from vla_zenoh.kinematics.fingers import Fingers
+from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.lab.view import paths
 from vla_zenoh.profile import Profile

@@ -90,11 +90,12 @@ class WorkerNode:
                 )
                 opened.callback(robot.close)
                 self.sessions.append(robot)
+            self._debug = {
+                one.robot: InferenceDebugPublisher(one.node, name, one.spec)
+                for one in self.sessions
+            }
             opened.pop_all()
         self.node = self.sessions[0].node
-        self._debug = {
-            one.robot: InferenceDebugPublisher(one.node, name, one.spec) for one in self.sessions
-        }
 
     def _one_for_each(
         self, policy: Policy, count: int, another: Callable[[], Policy] | None

@@ -180,7 +180,8 @@ class RobotSession:
     def poll_states(self) -> None:
         """Decode the states received since the last call, unless the cameras fell silent."""
         known = all(states.entries for states in self._streams.states.values())
-        if known and not self._every_state and self.cameras_silent:
+        seen = any(camera.received_s for camera in self._cameras)
+        if seen and known and not self._every_state and self.cameras_silent:
             return  # those near the next image are in their rings when it comes
         since_ns = min((camera.images.newest_ns for camera in self._cameras), default=0)
         for stream in self._states:
