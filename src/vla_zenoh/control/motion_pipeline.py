@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from operator import is_
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -99,6 +100,7 @@ class MotionPipeline:
         self._settling = Settling(commanded)
         self._cause: Cause | None = None
         self._rest_since_ns: int | None = None
+        self._pose_commands = _PoseCommands()
 
     # -- state --------------------------------------------------------------------------------
     @property
@@ -314,7 +316,7 @@ class MotionPipeline:
         if not self.streaming or mover is None:
             return None
         if self._joints is None:
-            return _pose_command(mover.motion, self.goal, state, self._cause)
+            return self._pose_commands.of(mover.motion, self.goal, state, self._cause)
         joints = mover if isinstance(mover, JointPath) else self._joints
         return joints.command(state.value, self._cause)
 
@@ -442,11 +444,29 @@ class MotionPipeline:
         return self.streaming and now_ns - self._rest_since_ns < LINGER_NS
 
 
-def _pose_command(
-    motion: Motion, goal: Goal | None, state: State, cause: Cause | None
-) -> PoseCommand:
-    """The set-point of an arm that takes poses, on the way to `goal`."""
-    (position_m, rotation), *rates = motion
-    heads_m, heads = motion.pose if goal is None else goal.pose
-    here, there = quat_from_rotation(rotation), quat_from_rotation(heads)
-    return computed(PoseCommand, position_m, here, *rates, heads_m, there, state.value, cause)
+class _PoseCommands:
+    """The set-points of an arm that takes poses; what stays the same is computed once."""
+
+    def __init__(self) -> None:
+        self._sent: PoseCommand | None = None
+        self._made_of: tuple[Motion, Goal | None, State, Cause | None] | None = None
+
+    def of(
+        self, motion: Motion, goal: Goal | None, state: State, cause: Cause | None
+    ) -> PoseCommand:
+        """The set-point of this tick, on the way to `goal`."""
+        made_of, before, sent = (motion, goal, state, cause), self._made_of, self._sent
+        if before and sent and all(map(is_, made_of, before)):
+            return sent  # the arm is at rest
+        (position_m, rotation), *rates = motion
+        here = quat_from_rotation(rotation)
+        if goal is None:
+            heads_m, heads = position_m, here
+        elif before and sent and goal is before[1]:
+            heads_m, heads = sent.goal_position_m, sent.goal_quat_xyzw
+        else:
+            heads_m, heads = goal.pose.position_m, quat_from_rotation(goal.pose.rotation)
+        where = position_m, here, *rates, heads_m, heads
+        self._made_of = made_of
+        self._sent = computed(PoseCommand, *where, state.value, cause)
+        return self._sent

@@ -192,11 +192,26 @@ class PosePath(Smoother):
 
     def leash(self, goal: Goal, ahead_s: float) -> tuple[Goal, list[LimitHit]]:
         """`goal`, or a nearer one on the leash, and the limits that acted."""
+        if self._well_within_leash(goal.pose, ahead_s):
+            return goal, []
         (position_m, rotation), twist, acceleration = self.motion
         way = ahead_s * (twist + 0.5 * ahead_s * acceleration)
         ahead = Pose(position_m + way[:3], exp3(way[3:]).dot(rotation))
         pose, hits = leash(self._bounds, goal.pose, ahead)
         return replace(goal, pose=pose, joints_rad=None) if hits else goal, hits
+
+    def _well_within_leash(self, goal: Pose, ahead_s: float) -> bool:
+        """Whether the leash is long enough wherever the arm will be; cheaper than computing where.
+
+        It moves no further than at its speed plus what the acceleration adds.
+        """
+        limits, (pose, twist, acceleration) = self._bounds, self.motion
+        apart_m, apart_rad = pose_distance(goal, pose)
+        x, y, z, rx, ry, rz = map(abs, twist.tolist())
+        ax, ay, az, arx, ary, arz = map(abs, acceleration.tolist())
+        way_m = ahead_s * (x + y + z + ahead_s * (ax + ay + az))
+        turn_rad = ahead_s * (rx + ry + rz + ahead_s * (arx + ary + arz))
+        return apart_m + way_m <= limits.lead_m and apart_rad + turn_rad <= limits.lead_rad
 
     def near(self, goal: Goal) -> Goal:
         """`goal`, or one so near that the arm can retreat from there."""

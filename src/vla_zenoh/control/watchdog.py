@@ -43,6 +43,9 @@ class Watchdog:
         self._limits, self._timing = profile.limits, profile.timing
         self.tracking_m = self.tracking_rad = 0.0
         self._excused = (0.0, 0.0)
+        self._compared: tuple[Pose | None, Pose | None] = None, None
+        self._present: tuple[PeerSnapshot, str, Lease] | None = None
+        """The nodes, worker and lease that nothing was missing of."""
         self.deadline_ns = 0
         """When the next chunk is overdue."""
         self._left_ns, self._patience_ns = 0.0, 0
@@ -94,6 +97,9 @@ class Watchdog:
 
     def measure(self, commanded: Pose | None, actual: Pose) -> None:
         """Update the tracking error; `commanded` is None while nothing is streamed."""
+        before, self._compared = self._compared, (commanded, actual)
+        if commanded is before[0] and actual is before[1]:
+            return
         self.tracking_m, self.tracking_rad = (
             (0.0, 0.0) if commanded is None else pose_distance(commanded, actual)
         )
@@ -101,6 +107,12 @@ class Watchdog:
     def blocked(self) -> str:
         """Why the arm counts as blocked, empty while it follows."""
         limits = self._limits
+        if (
+            self._excused == (0.0, 0.0)
+            and self.tracking_m <= limits.tracking_m
+            and self.tracking_rad <= limits.tracking_rad
+        ):
+            return ""
         for apart, limit, excused, back_off, unit in (
             (self.tracking_m, limits.tracking_m, self._excused[0], BACK_OFF_M, "m"),
             (self.tracking_rad, limits.tracking_rad, self._excused[1], BACK_OFF_RAD, "rad"),
@@ -146,6 +158,9 @@ class Watchdog:
         lost = self.state_lost(pose, gripper, now_ns)
         if lost:
             return lost
+        seen = peers, worker, lease
+        if self._present is not None and all(map(is_, seen, self._present)):
+            return ""
         needed = [peers.robot_node, worker_node(worker)]
         cameras = lease.spec.observation.camera_names
         needed += [peers.camera_nodes.get(camera, "camera") for camera in cameras]
@@ -157,6 +172,7 @@ class Watchdog:
                 return f"camera {camera!r} {peers.camera_faults[camera]}"
         if peers.spec_sources.get(worker) != lease.source:
             return f"worker {worker!r} was restarted"
+        self._present = seen
         return ""
 
 
