@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import zenoh
 
 from vla_zenoh.types import Event, Header
@@ -46,11 +47,13 @@ class Percentiles:
     """Percentiles of the last values."""
 
     def __init__(self, size: int) -> None:
-        self._values: deque[float] = deque(maxlen=size)
+        self._values = np.empty(size)
+        self._count = 0
 
     def add(self, value: float) -> None:
         """Add a value."""
-        self._values.append(value)
+        self._values[self._count % len(self._values)] = value
+        self._count += 1
 
     def summary(self) -> tuple[float, float] | None:
         """(p50, p95), None without values."""
@@ -62,8 +65,9 @@ class Percentiles:
         return {name: round(value, 1) for name, value in self._shares().items()}
 
     def _shares(self) -> dict[str, float]:
-        ordered = sorted(self._values)
-        return {name: ordered[round(at * (len(ordered) - 1))] for name, at in SHARES if ordered}
+        ordered = np.sort(self._values[: self._count])
+        last = len(ordered) - 1
+        return {name: float(ordered[round(at * last)]) for name, at in SHARES if last >= 0}
 
 
 LINKS_PERIOD_S = 5.0

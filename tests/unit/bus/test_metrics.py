@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import cast
 
+import pytest
 import zenoh
 
-from vla_zenoh.bus.metrics import MAX_SENDERS, OTHERS, Traffic
+from vla_zenoh.bus.metrics import MAX_SENDERS, OTHERS, Percentiles, Traffic
 from vla_zenoh.types import Header
 
 POSE, DELTA = "vla/panda/state/pose", "vla/panda/delta/scripted"
@@ -79,3 +80,27 @@ def test_a_stream_that_was_ended_begins_anew() -> None:
     again = Written(POSE)
     again.seq, again.sent_bytes = 2, 200
     assert set(found.sent([again])) == {POSE}
+
+
+# -- percentiles ----------------------------------------------------------------------------------
+def test_percentiles_without_values_are_none() -> None:
+    found = Percentiles(8)
+    assert found.summary() is None
+    assert found.spread() == {}
+
+
+@pytest.mark.parametrize("before", [[], [1e9] * 100, [-5.0] * 101])
+def test_percentiles_are_those_of_the_last_values(before: list[float]) -> None:
+    found = Percentiles(101)
+    for value in (*before, *(float(value) for value in range(100, -1, -1))):
+        found.add(value)
+    assert found.summary() == (50.0, 95.0)
+    assert found.spread() == {"p50": 50.0, "p95": 95.0, "p99": 99.0, "max": 100.0}
+
+
+def test_percentiles_of_few_values_are_some_of_them() -> None:
+    found = Percentiles(100)
+    found.add(3.0)
+    assert found.summary() == (3.0, 3.0)
+    found.add(1.0)
+    assert found.spread()["max"] == 3.0

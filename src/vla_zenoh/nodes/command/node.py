@@ -37,7 +37,8 @@ CHORES_S = 0.05
 """Period of tasks that no motion depends on: status, clock queries, reading other nodes' status."""
 PLANNING_NS = 1_500_000
 """A chunk is planned this long before the next tick, or at once if it arrives later. Its other
-readers get it first: planning at a real-time priority keeps a processor from them."""
+readers get it first: planning at a real-time priority keeps a processor from them. Where the period
+is shorter, so that a tick would be missed, it is planned after the next tick."""
 REST_S, REST_TIMEOUTS = 0.02, 5
 """Period of the ticks while the arm rests, and how many of them a command timeout has at least."""
 REST_AFTER_NS = 100_000_000
@@ -128,12 +129,15 @@ class CommandNode:
         rest_s = min(REST_S, timing.command_timeout_s / REST_TIMEOUTS)
         rest_periods = max(int(rest_s * timing.command_hz), 1)
         give_up = 0.0
+        tick_first = PLANNING_NS * timing.command_hz > 1e9
         while True:
-            if loop.wait_for(arrival):
+            arrived = loop.wait_for(arrival)
+            if arrived:
                 loop.resume()
-                loop.wait_until(PLANNING_NS)
-                arrival.clear()
-                self._prepare(loop.next_ns)
+                if not tick_first:
+                    loop.wait_until(PLANNING_NS)
+                    arrival.clear()
+                    self._prepare(loop.next_ns)
             tick = loop.wait()
             if tick.periods > 1:
                 self.node.counters["command.missed_ticks"] += tick.periods - 1
@@ -146,8 +150,12 @@ class CommandNode:
                 extra.append(Setting("active", False))
                 if not self.commander.streaming or time.monotonic() > give_up:
                     break
-            if self._on_tick(extra, tick):
+            plans = arrived and tick_first
+            if self._on_tick(extra, tick, take_chunks=not plans):
                 loop.skip(rest_periods)
+            if plans:
+                loop.resume()
+                self._prepare(loop.next_ns)
 
     def _prepare(self, next_mono_ns: int) -> None:
         """Plan chunks that arrived, so that the next tick need not."""
@@ -158,14 +166,14 @@ class CommandNode:
         self.commander.prepare(inputs, self.node.clock.wall_at(next_mono_ns))
         self._status.chunk_us.add((time.perf_counter() - began) * 1e6)
 
-    def _on_tick(self, extra: list[Setting], tick: Tick) -> bool:
+    def _on_tick(self, extra: list[Setting], tick: Tick, *, take_chunks: bool) -> bool:
         """Returns whether the arm rests."""
         began = time.perf_counter()
         now_ns = self.node.clock.wall_at(tick.nominal_ns)
         chores = tick.nominal_ns >= self._next_chores_ns
         if chores:
             self._next_chores_ns = tick.nominal_ns + round(CHORES_S * 1e9)
-        inputs = self._inputs.poll(now_ns, news=chores)
+        inputs = self._inputs.poll(now_ns, news=chores, take_chunks=take_chunks)
         inputs.settings = [*inputs.settings, *extra]
         timing = self.node.profile.timing
         limit = max(1, int(timing.command_timeout_s * timing.command_hz))
