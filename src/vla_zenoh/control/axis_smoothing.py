@@ -56,11 +56,7 @@ BESIDE = 0.01
 _ASIDE = np.array([[ASIDE], *([quiet] for quiet in QUIET[1:])])
 TINY, MOST = 1e-12, 1e9
 DONE = (Result.Working, Result.Finished)
-_WAYS = (
-    (Synchronization.Time, False),
-    (Synchronization.No, False),
-    (Synchronization.No, True),
-)
+_WAYS = ((Synchronization.Time, False), (Synchronization.No, False), (Synchronization.No, True))
 """Attempts at planning a motion, in order: how axes are synchronised, `slowly` of `_input`."""
 
 
@@ -295,10 +291,7 @@ class AxisSmoother:
         return each
 
     def _overshoots(
-        self,
-        path: Trajectory,
-        target: FloatArray,
-        stop: tuple[FloatArray, FloatArray, list[float]],
+        self, path: Trajectory, target: FloatArray, stop: tuple[FloatArray, FloatArray, list[float]]
     ) -> bool:
         """Whether a coordinate leaves the range between its start, its target (k,) and its stop.
 

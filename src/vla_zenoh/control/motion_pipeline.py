@@ -14,24 +14,12 @@ from vla_zenoh.control.contact import Contact, Retreat
 from vla_zenoh.control.joint_space import JointPath
 from vla_zenoh.control.limits import FULL, Shares, into_workspace
 from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan, PlanAggregator, joint_goal
-from vla_zenoh.control.preflight import (
-    FOLLOWS_JOINT_RAD,
-    LINGER_NS,
-    Settling,
-    follows,
-    held_joints,
-)
+from vla_zenoh.control.preflight import FOLLOWS_JOINT_RAD, LINGER_NS, Settling, follows, held_joints
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.smoothing import Motion, PosePath
 from vla_zenoh.control.step_timing import GoalPace, Mover, TimedGoal
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.kinematics.so3 import (
-    Pose,
-    held_pose,
-    pose_distance,
-    pose_of,
-    quat_from_rotation,
-)
+from vla_zenoh.kinematics.so3 import Pose, held_pose, pose_distance, pose_of, quat_from_rotation
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     Cause,

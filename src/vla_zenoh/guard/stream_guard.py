@@ -13,12 +13,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from vla_zenoh.control.limits import (
-    ROTATION_BOX,
-    JointMotionLimits,
-    MotionLimits,
-    motion_limits,
-)
+from vla_zenoh.control.limits import ROTATION_BOX, JointMotionLimits, MotionLimits, motion_limits
 from vla_zenoh.control.smoothing import Motion
 from vla_zenoh.guard.reference_governor import (
     AT_REST,

@@ -93,8 +93,7 @@ SO101 = RobotModel(
     armature_kg_m2=0.028,
     effort_nm=2.9,
     gains=JointGains(
-        stiffness_nm_rad=(60.0, 60.0, 60.0, 40.0, 40.0),
-        max_integral_nm=(1.5, 1.5, 1.5, 1.0, 1.0),
+        stiffness_nm_rad=(60.0, 60.0, 60.0, 40.0, 40.0), max_integral_nm=(1.5, 1.5, 1.5, 1.0, 1.0)
     ),
     finger_joints=("gripper",),
     finger_links=("gripper_link", "moving_jaw_so101_v1_link"),
@@ -119,10 +118,7 @@ def robot_model(robot: RobotProfile) -> RobotModel:
     found = SO101 if robot.description == SO101.description else RobotModel()
     ends = robot.gripper.joint_ends
     found = replace(
-        found,
-        description=robot.description,
-        arm_joints=robot.arm_joints,
-        tcp_link=robot.tcp_frame,
+        found, description=robot.description, arm_joints=robot.arm_joints, tcp_link=robot.tcp_frame
     )
     if ends is None:
         return found

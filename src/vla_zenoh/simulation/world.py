@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vla_zenoh.errors import NodeError, RecordError, ResourceError
-from vla_zenoh.kinematics.so3 import rotation_from_rpy
+from vla_zenoh.kinematics.so3 import quat_from_rotation, rotation_from_rpy
 from vla_zenoh.profile import Profile
 from vla_zenoh.simulation.impedance import (
     ArmDynamics,
@@ -420,18 +420,12 @@ class SimulatedPart:
             held = reference.position_m, reference.rotation
         return PoseState(
             position_m=position,
-            quat_xyzw=_quat_xyzw(rotation),
+            quat_xyzw=quat_from_rotation(rotation),
             twist=self._tcp_jacobian() @ self._velocity_rad_s,
             wrench=self._filtered_wrench.copy(),
             reference_position_m=held[0],
-            reference_quat_xyzw=_quat_xyzw(held[1]),
+            reference_quat_xyzw=quat_from_rotation(held[1]),
         )
-
-
-def _quat_xyzw(rotation: FloatArray) -> FloatArray:
-    quat_wxyz = np.empty(4)
-    mujoco.mju_mat2Quat(quat_wxyz, np.ascontiguousarray(rotation).ravel())
-    return quat_wxyz[[1, 2, 3, 0]]
 
 
 class SimulatedGripper:
@@ -466,8 +460,7 @@ class SimulatedGripper:
         # reversal starts at the fingers, else it would lag by the whole squeeze.
         if (target - self._measured_m) * (self._set_m - self._measured_m) <= 0.0:
             self._set_m = self._measured_m
-        self._target_m = target
-        self._step_m = speed_m_s * STEP_S
+        self._target_m, self._step_m = target, speed_m_s * STEP_S
         if abs(target - self._measured_m) > HELD_MARGIN_M and not self._holding:
             self._rest_ticks = 0
         self._bound_force(force_n)

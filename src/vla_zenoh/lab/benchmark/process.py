@@ -26,12 +26,7 @@ from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec.image import encode_jpeg
 from vla_zenoh.errors import NodeError, VlaZenohError, WorkerError, in_words
 from vla_zenoh.lab.benchmark.asked_worker import AskedWorker
-from vla_zenoh.lab.benchmark.contract import (
-    Benchmark,
-    BenchmarkTask,
-    make_benchmark,
-    raw_steps,
-)
+from vla_zenoh.lab.benchmark.contract import Benchmark, BenchmarkTask, make_benchmark, raw_steps
 from vla_zenoh.lab.benchmark.episode import (
     Asked,
     EpisodeClock,

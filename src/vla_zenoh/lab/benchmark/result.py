@@ -67,11 +67,7 @@ def write_page(folder: Path, result: Mapping[str, Any]) -> None:
 
 
 def write_videos(
-    folder: Path,
-    place: BenchmarkProcess,
-    failed: Sequence[EpisodeRequest],
-    camera: str,
-    most: int,
+    folder: Path, place: BenchmarkProcess, failed: Sequence[EpisodeRequest], camera: str, most: int
 ) -> Iterable[Path]:
     """Videos of failures, drawn from their recorded steps.
 

@@ -11,13 +11,7 @@ from typing import Annotated
 import typer
 from rich.text import Text
 
-from vla_zenoh.cli.options import (
-    PROFILE_VARIABLE,
-    JsonOption,
-    ModelOptions,
-    WorkerChoice,
-    options,
-)
+from vla_zenoh.cli.options import PROFILE_VARIABLE, JsonOption, ModelOptions, WorkerChoice, options
 from vla_zenoh.cli.output import console, new_table, styled
 from vla_zenoh.control.policy_check import error
 from vla_zenoh.errors import WorkerError, counted

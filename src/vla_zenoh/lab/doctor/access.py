@@ -12,12 +12,7 @@ from typing import TYPE_CHECKING
 from vla_zenoh.errors import MissingExtraError, SecurityError, VlaZenohError
 from vla_zenoh.lab.certificates.bridge import NODE as BRIDGE
 from vla_zenoh.lab.certificates.lab_certificates import unused_certificates
-from vla_zenoh.lab.doctor.access_check import (
-    AccessVerdict,
-    check_access,
-    read_access,
-    try_identity,
-)
+from vla_zenoh.lab.doctor.access_check import AccessVerdict, check_access, read_access, try_identity
 from vla_zenoh.lab.doctor.needs import HostFinding, judged
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.profile.schema import is_loopback

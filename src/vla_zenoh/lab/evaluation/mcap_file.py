@@ -28,14 +28,7 @@ from vla_zenoh.lab.recording.film import Film, write_film
 from vla_zenoh.lab.recording.run import RecordedSample, Run
 from vla_zenoh.lab.trial.verdict import FACT
 from vla_zenoh.profile import Profile, read_profile
-from vla_zenoh.types import (
-    LATENCY_STAGES,
-    Cause,
-    FloatArray,
-    JointCommand,
-    NodeStatus,
-    PoseCommand,
-)
+from vla_zenoh.types import LATENCY_STAGES, Cause, FloatArray, JointCommand, NodeStatus, PoseCommand
 
 
 def provenance(run: Run) -> dict[str, str]:

@@ -11,13 +11,7 @@ from vla_zenoh.control.commander_io import MotionCommands
 from vla_zenoh.keys import worker_node
 from vla_zenoh.policy import Policy, check_steps, reset_of
 from vla_zenoh.policy.inference import ChunkPrefix, make_chunk
-from vla_zenoh.policy.observation import (
-    STATE_KINDS,
-    NotReady,
-    Streams,
-    assemble,
-    state_names,
-)
+from vla_zenoh.policy.observation import STATE_KINDS, NotReady, Streams, assemble, state_names
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     ActionChunk,

@@ -38,14 +38,7 @@ from pydantic import ValidationError
 
 from vla_zenoh.errors import SpecError, describe_faults
 from vla_zenoh.lab.policy_servers.model_options import number, one_of, whole_number
-from vla_zenoh.policy import (
-    ActionSpec,
-    Anchor,
-    ControllerSpec,
-    Frame,
-    GripperSemantics,
-    RelativeTo,
-)
+from vla_zenoh.policy import ActionSpec, Anchor, ControllerSpec, Frame, GripperSemantics, RelativeTo
 
 Action = Literal["delta", "absolute", "velocity", "joint_delta", "joint_position", "joint_velocity"]
 _JOINT_KINDS: Mapping[str, str] = {

@@ -82,10 +82,7 @@ class PrimitivesNode:
         self._policy = TargetPolicy(profile.robot.arm_joints)
         self._check = TargetCheck(profile, ReachabilityFilter(profile))
         self._worker = RobotSession(
-            *(profile, session, self._policy, PRIMITIVES),
-            images="jpeg",
-            host=None,
-            changed=Wake(),
+            *(profile, session, self._policy, PRIMITIVES), images="jpeg", host=None, changed=Wake()
         )
         self._worker.complaint = ""
         self._debug = InferenceDebugPublisher(self._worker.node, PRIMITIVES, self._worker.spec)

@@ -11,12 +11,7 @@ from typing import Any
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.robot import GRIPPER_ACTIONS, Ros2Gripper, Ros2Profile
-from vla_zenoh.profile.schema import (
-    TRUSTED_PROTOCOLS,
-    endpoint_faults,
-    host_of,
-    is_loopback,
-)
+from vla_zenoh.profile.schema import TRUSTED_PROTOCOLS, endpoint_faults, host_of, is_loopback
 from vla_zenoh.ros2.keys import PROMPT_TOPIC, SERVICES, STATUS_TOPIC, Endpoint, EntityRole
 from vla_zenoh.ros2.readers import JOINT_STATE, TEXT, WRENCH
 from vla_zenoh.ros2.writers import DIAGNOSTICS, GRASP

@@ -12,14 +12,7 @@ from numpy.typing import NDArray
 from vla_zenoh.errors import PeerError, RecordError, SpecError
 from vla_zenoh.lab.policy_servers.field_mapping import FieldSource, read_map
 from vla_zenoh.lab.policy_servers.state_vector import ROTATIONS, parts_of, read_parts, state_of
-from vla_zenoh.policy import (
-    ActionSteps,
-    ModelSpec,
-    Observation,
-    Policy,
-    check_steps,
-    reset_of,
-)
+from vla_zenoh.policy import ActionSteps, ModelSpec, Observation, Policy, check_steps, reset_of
 from vla_zenoh.policy.inference import Committed
 from vla_zenoh.policy.observation import prepare_image
 from vla_zenoh.types import GripperState, Image, JointState, PoseState, Task, shown

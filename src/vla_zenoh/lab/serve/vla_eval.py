@@ -117,12 +117,7 @@ def _plain(value: Any) -> Any:
     if not isinstance(value, np.ndarray):
         return value
     shape = list(value.shape)
-    return {
-        "__ndarray__": True,
-        "data": value.tobytes(),
-        "dtype": value.dtype.str,
-        "shape": shape,
-    }
+    return {"__ndarray__": True, "data": value.tobytes(), "dtype": value.dtype.str, "shape": shape}
 
 
 def read_message(frame: bytes | str) -> tuple[str, dict[str, Any], int]:

@@ -19,13 +19,7 @@ from vla_zenoh.keys import last_chunk
 from vla_zenoh.nodes.camera.camera_publisher import OK, WAITING, CameraPublisher
 from vla_zenoh.nodes.camera.geometry import Intrinsics
 from vla_zenoh.nodes.camera.image_check import read_references
-from vla_zenoh.nodes.camera.source import (
-    STALL_S,
-    Grabber,
-    Source,
-    prepare_opencv,
-    without_password,
-)
+from vla_zenoh.nodes.camera.source import STALL_S, Grabber, Source, prepare_opencv, without_password
 from vla_zenoh.policy import CameraSpec, ModelSpec
 from vla_zenoh.policy.observation import size_variant
 from vla_zenoh.profile import Profile

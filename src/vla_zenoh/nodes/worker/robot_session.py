@@ -22,23 +22,11 @@ from vla_zenoh.bus.buffers import (
 from vla_zenoh.bus.metrics import Percentiles, RateMeter
 from vla_zenoh.bus.node import Node
 from vla_zenoh.codec import records
-from vla_zenoh.codec.image import (
-    MAX_IMAGE_BYTES,
-    decode_depth,
-    decode_jpeg,
-    decode_raw,
-)
+from vla_zenoh.codec.image import MAX_IMAGE_BYTES, decode_depth, decode_jpeg, decode_raw
 from vla_zenoh.codec.records import SMALL_BYTES
 from vla_zenoh.errors import CodecError, PeerError, SpecError, in_words
 from vla_zenoh.keys import Kind, worker_node
-from vla_zenoh.policy import (
-    ActionSteps,
-    CameraSpec,
-    Observation,
-    Policy,
-    check_steps,
-    reset_of,
-)
+from vla_zenoh.policy import ActionSteps, CameraSpec, Observation, Policy, check_steps, reset_of
 from vla_zenoh.policy.inference import ChunkPrefix, make_chunk
 from vla_zenoh.policy.observation import (
     MAX_STATES,
@@ -51,15 +39,7 @@ from vla_zenoh.policy.observation import (
     state_names,
 )
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import (
-    ActionChunk,
-    Event,
-    Header,
-    Image,
-    SingleWriterFilter,
-    Stamped,
-    Task,
-)
+from vla_zenoh.types import ActionChunk, Event, Header, Image, SingleWriterFilter, Stamped, Task
 
 SPEC_PERIOD_S = 1.0
 TASK_PATIENCE_S = 1.5

@@ -231,8 +231,7 @@ class Gripper:
             return
         self._goals.accepted(goal, time.monotonic_ns())
         request = self._messages.new(
-            f"{self._action}_GetResult_Request",
-            goal_id=writers.uuid(self._messages, goal.id),
+            f"{self._action}_GetResult_Request", goal_id=writers.uuid(self._messages, goal.id)
         )
         # As long as the goal may take, and the cancellation after it.
         timeout_s = self._goals.travel_s(goal) + 2 * GOAL_TIMEOUT_S
