@@ -11,6 +11,7 @@ BIN := .venv/bin
 COMMA := ,
 READY := .venv/.ready-$(subst $(COMMA),-,$(EXTRAS))
 SUITE := not slow and not models and not ros2 and not franka
+WHICH := not long
 # Real arms brake when their computer stands still for a tenth of a second, and so do those of the tests: one that
 # fails in real time is tried once more, and told in the summary.
 AGAIN := --reruns 1 -r fEsR
@@ -18,7 +19,7 @@ AGAIN := --reruns 1 -r fEsR
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test slow fuzz fuzz-motion soak test-ros2 test-franka test-realsense test-models check format bench bench-faults bench-ros2 build docs ros2-bridge clean
+.PHONY: help setup demo test test-long slow fuzz fuzz-motion soak test-ros2 test-franka test-realsense test-models check format bench bench-faults bench-ros2 build docs ros2-bridge clean
 
 help: ## Show this list
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z0-9-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
@@ -32,12 +33,16 @@ $(READY): pyproject.toml constraints.txt scripts/bootstrap.py
 demo: $(READY) ## Simulator, model and command node at work, no GPU needed
 	$(BIN)/vla-zenoh demo $(ARGS)
 
-# What depends on time runs alone, the rest on every core, in order of the folders: the long files of tests/sim are not
-# the last ones. A process of theirs that dies ends the run: whoever is to take its place waits for its files for ever.
-# 5 is pytest's word for "none of these".
-test: $(READY) ## Run the tests
-	$(BIN)/python -m pytest -n auto --max-worker-restart 0 --dist loadfile --no-loadscope-reorder -m "$(SUITE) and not realtime" $(ARGS) || [ $$? = 5 ]
-	$(BIN)/python -m pytest $(AGAIN) -m "$(SUITE) and realtime" $(ARGS) || [ $$? = 5 ]
+# Two files that depend on time run at once, of the rest as many as there are cores, in order of the folders: the long
+# files of tests/sim are not the last ones. A process of theirs that dies ends the run: whoever is to take its place waits
+# for its files for ever. 5 is pytest's word for "none of these".
+FILES := --max-worker-restart 0 --dist loadfile --no-loadscope-reorder
+test: $(READY) ## Run the tests that take up to six seconds each
+	$(BIN)/python -m pytest -n auto $(FILES) -m "$(SUITE) and $(WHICH) and not realtime" $(ARGS) || [ $$? = 5 ]
+	$(BIN)/python -m pytest -n 2 $(FILES) $(AGAIN) -m "$(SUITE) and $(WHICH) and realtime" $(ARGS) || [ $$? = 5 ]
+
+test-long: WHICH := long
+test-long: test ## Run those that take longer, as CI does, too
 
 slow: $(READY) ## Run the tests that take long, too, and search for new examples
 	HYPOTHESIS_PROFILE=searching $(BIN)/python -m pytest -m "not models and not franka" $(ARGS)

@@ -101,6 +101,7 @@ def assert_nothing_stale(chain: Chain, since_ns: int) -> None:
     assert moved > 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", of(*ADAPTERS, quick=["openpi"]))
 def test_a_killed_policy_server_brakes_the_arm_which_goes_on_when_it_is_there_again(
     name: str, tmp_path: Path

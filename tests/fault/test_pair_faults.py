@@ -238,6 +238,7 @@ def brake_s(part: str, speed_rad_s: FloatArray) -> float:
     return float((speed_rad_s / hardest + 2 * ends_s).max())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in FAULTS]
 )

@@ -142,6 +142,7 @@ def be_a_nuisance(chain: Chain, seconds: float) -> None:
     assert chain.go(direction, 3) == pytest.approx(sign * 0.03, abs=0.001), chain.height_m()
 
 
+@pytest.mark.long
 def test_junk_on_every_key_moves_nothing_and_is_counted(chain: Chain) -> None:
     be_a_nuisance(chain, SHORT_S)
 
@@ -197,6 +198,7 @@ def test_a_forged_chunk_is_refused_by_its_reason_and_moves_nothing(
     chain.until("it goes on", lambda: chain.state() == "active")
 
 
+@pytest.mark.long
 def test_a_flood_does_not_slow_the_command_loop(chain: Chain) -> None:
     chain.activate_when_ready()
     chain.go("up", 10)

@@ -118,6 +118,7 @@ def drawn(stage: Stage, seed: int, family: str, target: str | None = None) -> Ta
     return draw_episode(seed, stage.objects(), family=family, target=target)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("family", ["put", pytest.param("stack", marks=pytest.mark.slow), "push"])
 def test_each_family_of_tasks_is_done(stage: Stage, family: str) -> None:
     verdict = carry_out(stage, drawn(stage, SEED, family))

@@ -178,6 +178,7 @@ def test_chunks_of_many_steps_that_overlap_end_where_they_were_to() -> None:
     check_stream(run.loop)
 
 
+@pytest.mark.long
 def test_friction_in_every_joint_costs_no_more_than_two_millimetres() -> None:
     run = carry_out(begin(5.0, make_world(friction_nm=FRICTION_NM)), "go up", 50)
     check_translation(run, 2, 0.5, WITH_FRICTION_M)

@@ -74,6 +74,7 @@ def towards_each_other(_: int) -> dict[str, np.ndarray]:
     return dict.fromkeys(PARTS, np.array([0.02, 0.0, 0.0, 0.0, 0.0, 0.0, 0.04]))
 
 
+@pytest.mark.long
 def test_an_arm_keeps_away_from_what_the_other_holds() -> None:
     pair = Pair(towards_each_other, tcp_steps())
     left = pair.commander.parts[0]

@@ -18,6 +18,9 @@ PERIOD_MS = 4.0
 WAIT_TOLERANCE_MS = 0.1
 
 
+pytestmark = pytest.mark.long
+
+
 @pytest.fixture(scope="module")
 def told(tmp_path_factory: pytest.TempPathFactory) -> dict:
     file = tmp_path_factory.mktemp("bench") / "result.json"

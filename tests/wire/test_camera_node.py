@@ -281,6 +281,7 @@ def test_a_simulated_camera_is_fresh_while_scenes_come_and_lost_when_they_stop()
         rig.wait_for("front", "ok")
 
 
+@pytest.mark.long
 def test_a_scene_that_stands_still_is_no_frozen_camera() -> None:
     with camera_rig(SMALL) as rig:
         stage = Stage(rig)

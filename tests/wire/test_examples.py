@@ -86,6 +86,7 @@ def test_the_arm_is_driven_by_the_zenoh_package_alone(chain: Chain, tmp_path: Pa
     assert chain.height_m() - before_m > MOVED_M
 
 
+@pytest.mark.long
 def test_a_recording_is_evaluated_and_plotted(chain: Chain, tmp_path: Path) -> None:
     file = tmp_path / "run.mcap"
     words = ("record", "--profile", profile_file(chain), "--output", str(file), "--seconds", "10")

@@ -78,6 +78,7 @@ def query(robot: RemoteRobot, primitive: str, payload: bytes) -> Answer:
     return decode_answer(replies[0].ok.payload.to_bytes())
 
 
+@pytest.mark.long
 def test_move_to_goes_to_a_pose_and_tells_where_the_arm_stands(robot: RemoteRobot) -> None:
     for position_m in ((0.5, 0.1, 0.3), (0.4, -0.15, 0.25)):
         answer = robot.move_to(position_m, DOWN)
@@ -107,6 +108,7 @@ def test_an_arm_that_takes_poses_goes_to_the_pose_of_its_joints(robot: RemoteRob
     assert answer.position_m == pytest.approx(HOME_M, abs=2 * NEAR_M)
 
 
+@pytest.mark.long
 def test_an_arm_that_takes_joints_goes_to_them(tmp_path: Path) -> None:
     with running_chain(tmp_path, more=f"robot: {{command: joint}}\n{HOSTS}") as found:
         found.until("the node answers", lambda: worker_node(PRIMITIVES) in found.client.alive, 40)
@@ -131,6 +133,7 @@ def test_the_gripper_opens_and_closes_while_the_arm_stands(robot: RemoteRobot) -
     assert here(robot) == pytest.approx(before_m, abs=NEAR_M)
 
 
+@pytest.mark.long
 def test_what_a_grip_holds_bounds_the_arm_until_it_opens(robot: RemoteRobot) -> None:
     def holds() -> object:
         status = robot.status("command")
@@ -300,6 +303,7 @@ def test_a_model_runs_until_a_condition_holds(robot: RemoteRobot) -> None:
     until("the prompt is back", lambda: robot.task is not None and robot.task.prompt == "hold")
 
 
+@pytest.mark.long
 def test_the_example_moves_the_arm(chain: Chain, robot: RemoteRobot) -> None:
     example = Path(__file__).parents[2] / "examples" / "move_by_script.py"
     said = subprocess.run(
@@ -314,6 +318,7 @@ def test_the_example_moves_the_arm(chain: Chain, robot: RemoteRobot) -> None:
     assert "the model was stopped: inside" in said
 
 
+@pytest.mark.long
 def test_the_command_line_moves_the_arm(chain: Chain, robot: RemoteRobot) -> None:
     def do(*words: str) -> tuple[int, str]:
         done = command_line("do", *words, profile=chain.profile_file)

@@ -49,6 +49,7 @@ def hold_still(chain: Chain) -> None:
     assert chain.detail("streaming")
 
 
+@pytest.mark.long
 def test_an_arm_that_rests_gets_fewer_commands_until_a_chunk_moves_it(chain: Chain) -> None:
     hold_still(chain)
     missed = chain.counter("command.missed_ticks")

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from chain import write_profile
 
 PATIENCE_S = 60.0
@@ -26,6 +27,7 @@ def test_up_takes_the_profile_that_the_environment_names_as_every_command_does()
     assert "'no_such_profile'" in done.stderr
 
 
+@pytest.mark.long
 def test_up_on_a_port_of_another_program_names_port_and_way_out_and_starts_nothing(
     tmp_path: Path,
 ) -> None:

@@ -95,6 +95,7 @@ def test_an_elbow_swivels_as_asked_with_the_tcp_at_rest() -> None:
     arm.assert_within_limits()
 
 
+@pytest.mark.long
 def test_fifty_random_smooth_motions_end_where_they_were_asked_to() -> None:
     rng, arm = np.random.default_rng(1), Joints()
     arm.activate()
@@ -190,6 +191,7 @@ def test_an_arm_that_begins_within_the_margin_of_a_range_only_leaves_it() -> Non
     assert arm.joints_rad == pytest.approx(away_rad, abs=EXACT_RAD)
 
 
+@pytest.mark.long
 def test_joints_slide_along_the_workspace_box_and_are_told() -> None:
     arm = Joints()
     arm.activate()
@@ -234,6 +236,7 @@ def test_joints_slow_down_and_end_before_a_link_enters_what_it_keeps_out_of() ->
 
 
 # -- five joints ----------------------------------------------------------------------------------
+@pytest.mark.long
 def test_an_arm_of_five_joints_follows_twenty_five_motions_of_its_joints() -> None:
     rng, arm = np.random.default_rng(2), Joints(so101())
     arm.activate()

@@ -83,6 +83,7 @@ def test_a_stop_passes_no_joint_s_targets() -> None:
     assert worst_rad < PASSED_RAD
 
 
+@pytest.mark.long
 def test_joints_that_braked_before_a_bound_go_on_when_the_way_is_free() -> None:
     """A new goal makes the way bend towards a bound; at rest the straight way may be free."""
     rng, path = np.random.default_rng(1), made_path()
