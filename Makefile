@@ -41,8 +41,8 @@ test: $(READY) ## Run the tests that take up to six seconds each
 	$(BIN)/python -m pytest -n auto $(FILES) -m "$(SUITE) and $(WHICH) and not realtime" $(ARGS) || [ $$? = 5 ]
 	$(BIN)/python -m pytest -n 2 $(FILES) $(AGAIN) -m "$(SUITE) and $(WHICH) and realtime" $(ARGS) || [ $$? = 5 ]
 
-test-long: WHICH := long
-test-long: test ## Run those that take longer, as CI does, too
+test-long: $(READY) ## Run those that take longer, too, as CI does
+	@$(MAKE) --no-print-directory test WHICH=long
 
 slow: $(READY) ## Run the tests that take long, too, and search for new examples
 	HYPOTHESIS_PROFILE=searching $(BIN)/python -m pytest -m "not models and not franka" $(ARGS)

@@ -32,8 +32,8 @@ from vla_zenoh.types import (
     Stamped,
 )
 
-STATES, SLOW_STATES = 32, 64
-"""States buffered until they are read: the robot's, and room for those of another source."""
+STATES = 32
+"""States buffered between two ticks: the robot's, and room for those of another source."""
 CHUNKS = 64
 WORDS = settings.MAX_SETTING_BYTES
 SETTINGS: tuple[tuple[str, int, int, Callable[[bytes], Any]], ...] = (
@@ -49,8 +49,7 @@ SETTINGS: tuple[tuple[str, int, int, Callable[[bytes], Any]], ...] = (
 """Name of each key, samples buffered between two ticks, largest payload, and decoder: a stop has
 any payload."""
 CLOCK_PERIOD_S = 0.1
-SLOW_PERIOD_S = 0.025
-"""Period of reading the states that take long to decode, or that no motion depends on at once."""
+JOINT_PERIOD_S = 0.025
 
 MAX_WORKERS, MAX_HOLDERS = 32, 32
 MAX_WHY = 300
@@ -168,31 +167,28 @@ class _PartInputs:
 
     def __init__(self, node: Node, keys: Keys) -> None:
         self._node = node
-        self._rings: dict[type[Any], CallbackRing | ZenohRing] = {
-            PoseState: node.subscribe(keys.state_pose, CallbackRing(STATES, SMALL_BYTES)),
-            JointState: node.subscribe(keys.state_joint, ZenohRing(SLOW_STATES, SMALL_BYTES)),
-            GripperState: node.subscribe(keys.state_gripper, ZenohRing(SLOW_STATES, SMALL_BYTES)),
+        self._rings: dict[type[Any], CallbackRing] = {
+            kind: node.subscribe(key, CallbackRing(STATES, SMALL_BYTES))
+            for kind, key in (
+                (PoseState, keys.state_pose),
+                (JointState, keys.state_joint),
+                (GripperState, keys.state_gripper),
+            )
         }
         silence_s = node.profile.timing.state_timeout_s
         self._writers = {kind: SingleWriterFilter(silence_s) for kind in self._rings}
         self.held = node.subscribe(keys.held, ZenohRing(16, WORDS))
-        self._read_s = {JointState: 0.0, GripperState: 0.0}
+        self._last_joint = 0.0
 
     def poll(self, requested: bool) -> NewStates:
-        """The newest states; joints and gripper every `SLOW_PERIOD_S`, in turn, and both when an
-        activation is `requested`."""
-        joint = self._slow_state(JointState, requested)
-        gripper = self._slow_state(GripperState, requested) if requested or joint is None else None
-        return NewStates(self._state(PoseState), joint=joint, gripper=gripper)
-
-    def _slow_state(self, kind: type[Any], requested: bool) -> Stamped[Any] | None:
-        now_s = time.monotonic()
-        if not requested and now_s - self._read_s[kind] < SLOW_PERIOD_S:
-            return None
-        found = self._state(kind)
-        if found is not None:
-            self._read_s[kind] = now_s
-        return found
+        """The newest states; joints, which are expensive to decode, every `JOINT_PERIOD_S` and when
+        an activation is `requested`."""
+        joint, now_s = None, time.monotonic()
+        if requested or now_s - self._last_joint >= JOINT_PERIOD_S:
+            joint = self._state(JointState)
+            if joint is not None:
+                self._last_joint = now_s
+        return NewStates(self._state(PoseState), joint=joint, gripper=self._state(GripperState))
 
     def _state(self, kind: type[Any]) -> Stamped[Any] | None:
         """The newest state from the robot's source, whatever other sources publish."""

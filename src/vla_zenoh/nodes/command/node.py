@@ -136,7 +136,6 @@ class CommandNode:
                 loop.resume()
                 if not tick_first:
                     loop.wait_until(PLANNING_NS)
-                    arrival.clear()
                     self._prepare(loop.next_ns)
             tick = loop.wait()
             if tick.periods > 1:
@@ -160,6 +159,7 @@ class CommandNode:
     def _prepare(self, next_mono_ns: int) -> None:
         """Plan chunks that arrived, so that the next tick need not."""
         began = time.perf_counter()
+        self._inputs.chunk_arrival.clear()
         inputs = self._inputs.poll_streams()
         if inputs.chunks:
             self._busy_ns = next_mono_ns
