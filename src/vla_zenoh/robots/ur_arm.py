@@ -273,7 +273,9 @@ class UrArm:
 
     def recover(self) -> None:
         """Release a protective stop and start the control program, in a thread."""
-        if not self._busy and not self._started:
+        works = self._started and self._program_runs and self.safety_mode in WELL
+        if not self._busy and not works:
+            self._started = False  # `read` may not have noticed yet that the program has ended
             self._starting = threading.Thread(target=self._recover, name="recovery", daemon=True)
             self._starting.start()
 
