@@ -370,7 +370,10 @@ def counted_in_code() -> tuple[set[str], set[str]]:
                     counters.add(str(node.slice.value))
                 elif isinstance(node.slice, ast.JoinedStr):  # node.name before the last part
                     last = ast.unparse(node.slice).rpartition(".")[2].rstrip("'")
-                    counters |= {name for name in COUNTERS if name.endswith(f".{last}")}
+                    described = {name for name in COUNTERS if name.endswith(f".{last}")}
+                    if not described and "reason" not in last:
+                        sys.exit(f"scripts/reference.py: not described: {ast.unparse(node.slice)}")
+                    counters |= described
     counters |= {f"CAMERA.{stream}" for stream in ("raw", "jpeg", "depth")}
     reasons |= {name.removeprefix("refused.") for name in counters if "refused." in name}
     return reasons, {name for name in counters if "refused." not in name}

@@ -359,6 +359,7 @@ FILES = {
     "arm.py": "class Arm:\n    def __init__(self, port: str = 'x'): ...\n"
     "    def read(self): ...\n    def move(self, command): ...\n",
     "blind_arm.py": "class Arm:\n    def move(self, command): ...\n",
+    "stiff_arm.py": "class Arm:\n    def read(self): ...\n    def move(self): ...\n",
     "Bad.msg": "this is no definition\n",
 }
 """Beside the profile."""
@@ -494,6 +495,7 @@ CHECKED: list[tuple[str, str]] = [
         "arm: {here}/arm.py: Arm has no option 'prot'; did you mean 'port'? Its options: port",
     ),
     (ARM + "arm: {file: blind_arm.py}", "blind_arm.py: Arm needs methods `read()` and `move(comm"),
+    (ARM + "arm: {file: stiff_arm.py}", "stiff_arm.py: Arm needs methods `read()` and `move(comm"),
     (
         ROS2 + "ros2: {pose_command: {topic: /goal, type: geometry_msgs/msg/PoseStmped}}",
         "ros2: geometry_msgs/msg/PoseStmped is not a type of ROS 2 jazzy; did you mean 'geometry_m",

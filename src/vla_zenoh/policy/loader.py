@@ -167,7 +167,7 @@ def import_model(model: ModelFile) -> ModuleType:
     except (Exception, SystemExit) as error:
         del sys.modules[name]
         hint = (
-            "; name what brings it in the header of a model's file (PEP 723), or install it here"
+            "; name what brings it in the header of the file (PEP 723), or install it here"
             if isinstance(error, ModuleNotFoundError)
             else ""
         )
@@ -217,7 +217,7 @@ def make_robot(path: Path, options: Mapping[str, str] | None = None) -> Robot:
     """
     maker = find_robot_maker(path)
     robot = maker.make(options or {})
-    if not isinstance(robot, Robot):
+    if not isinstance(robot, Robot) or not is_robot(robot):
         raise WorkerError(f"{maker.where} {IS_ROBOT}")
     return robot
 
@@ -234,6 +234,23 @@ def find_robot_maker(path: Path) -> Maker:
 
 
 IS_ROBOT = "needs methods `read()` and `move(command)`"
+
+
+def is_robot(owner: Any) -> bool:
+    """Whether a robot, or a class of robots, has methods that can be called like that."""
+    for name, given in (("read", 0), ("move", 1)):
+        method = getattr(owner, name, None)
+        if not callable(method):
+            return False
+        if inspect.isclass(owner) and inspect.isfunction(inspect.getattr_static(owner, name)):
+            given += 1  # self
+        try:
+            inspect.signature(method).bind(*[None] * given)
+        except TypeError:
+            return False
+        except ValueError:  # written in C, without a signature
+            continue
+    return True
 
 
 class Maker(NamedTuple):
@@ -313,7 +330,7 @@ class _Options(NamedTuple):
         if missing:
             raise WorkerError(
                 f"{what} needs the option {missing[0]!r}: give {missing[0]}=VALUE, with --set or "
-                f"in the profile's options. Its options: {self.listed}"
+                f"in the profile's options (of an arm: arm.options). Its options: {self.listed}"
             )
 
 

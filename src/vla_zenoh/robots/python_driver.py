@@ -134,7 +134,12 @@ class PythonDriver(RobotDriver):
             self.report.emit(Event("warning", "notice", "object_lost", why))
 
     def move(self, reference: PoseReference | JointReference, now_ns: int) -> None:
-        self._call("move", command_of(reference, self.profile.robot.arm_joints))
+        try:
+            self._call("move", command_of(reference, self.profile.robot.arm_joints))
+        except NodeError as error:
+            if not isinstance(error.__cause__, AttributeError):
+                raise
+            raise NodeError(f"{error}; robot.command is {self.profile.robot.command}") from error
         self.report.counters["arm.commands_given"] += 1
 
     def grip(self, command: GripperCommand, now_ns: int) -> None:

@@ -135,6 +135,16 @@ def test_what_the_class_raises_names_file_and_method(rig: Rig) -> None:
         rig.read(raises=True)
 
 
+def test_a_class_that_wants_the_other_kind_of_command_is_told_which_the_profile_has(
+    tmp_path: Path,
+) -> None:
+    poses = ARM.replace("self.calls.append(command)", "self.calls.append(command.position_m)")
+    rig, there = Rig(tmp_path, poses), JointReference.at_rest(np.zeros(7))
+    wanted = r"my_arm.py: move: .*'JointCommand'.* no attribute.*; robot.command is joint"
+    with pytest.raises(NodeError, match=wanted):
+        rig.driver.move(there, rig.now_ns)
+
+
 def test_a_robot_in_another_mode_takes_no_commands_and_says_so(rig: Rig) -> None:
     rig.read()
     rig.read(mode="Guiding")

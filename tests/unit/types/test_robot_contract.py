@@ -56,6 +56,8 @@ def test_the_class_that_moves_is_made_with_the_options_of_the_profile(tmp_path: 
         ("x = 1", "wanted one class with a method move, found: none"),
         (ARM + ARM.replace("class Arm", "class Other"), "found: Arm, Other.*ROBOT = ClassName"),
         (ARM.replace("def read", "def look"), "needs methods `read\\(\\)`"),
+        (ARM.replace("def read(self", "def read(self, more"), "needs methods `read\\(\\)`"),
+        (ARM.replace("def move(self, command", "def move(self"), "needs methods `read\\(\\)`"),
         (
             ARM.replace("address: str", "port: str"),
             "Arm has no option 'address'. Its options: port",

@@ -15,7 +15,7 @@ from vla_zenoh.errors import (
     VlaZenohError,
     nearest,
 )
-from vla_zenoh.policy.loader import IS_ROBOT, find_model, find_robot_maker
+from vla_zenoh.policy.loader import IS_ROBOT, find_model, find_robot_maker, is_robot
 from vla_zenoh.profile import POSE_JOINTS, Profile
 from vla_zenoh.profile.section import Place
 
@@ -184,7 +184,7 @@ def robot_file(profile: Profile) -> Iterator[ProfileFault]:
             return  # its header asks for an environment of its own, in which the node looks
         maker = find_robot_maker(path)
         maker.options.check(profile.arm.options, maker.where)
-        if not all(callable(getattr(maker.function, name, None)) for name in ("read", "move")):
+        if not is_robot(maker.function):
             yield ProfileFault(("arm",), f"{maker.where} {IS_ROBOT}", "arm")
     except VlaZenohError as error:
         yield ProfileFault(("arm",), str(error), "arm")

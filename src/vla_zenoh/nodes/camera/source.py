@@ -33,6 +33,9 @@ _ENVIRONMENT = {
 class Source(ABC):
     """A device, stream or file. Used by one thread; may be opened again after `close`.
 
+    A constructor that raises ends the whole node: `CameraProfile` checks what is written, `open`
+    what is there.
+
     Attributes:
         backend: name of the library or driver that reads it; known once it is open.
         same_s: how long a working source may repeat an identical image, s; 0: indefinitely.
@@ -60,7 +63,7 @@ class Source(ABC):
 
     @abstractmethod
     def retrieve(self) -> Pixels | None:
-        """Decode the grabbed image; None if it is corrupt."""
+        """Decode the grabbed image, see `Pixels`: BGR where it has colour; None if corrupt."""
 
     @abstractmethod
     def close(self) -> None:
