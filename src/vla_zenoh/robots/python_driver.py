@@ -77,6 +77,8 @@ class PythonDriver(RobotDriver):
             return method(*given)
         except Exception as error:
             words = one_line(in_words(error), MAX_WORDS)
+            if name == "move" and isinstance(error, AttributeError):
+                words += f"; robot.command is {self.profile.robot.command}"
             raise NodeError(f"{self._called}: {name}: {words}") from error
 
     def connect(self) -> None:
@@ -134,12 +136,7 @@ class PythonDriver(RobotDriver):
             self.report.emit(Event("warning", "notice", "object_lost", why))
 
     def move(self, reference: PoseReference | JointReference, now_ns: int) -> None:
-        try:
-            self._call("move", command_of(reference, self.profile.robot.arm_joints))
-        except NodeError as error:
-            if not isinstance(error.__cause__, AttributeError):
-                raise
-            raise NodeError(f"{error}; robot.command is {self.profile.robot.command}") from error
+        self._call("move", command_of(reference, self.profile.robot.arm_joints))
         self.report.counters["arm.commands_given"] += 1
 
     def grip(self, command: GripperCommand, now_ns: int) -> None:
