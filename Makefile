@@ -13,8 +13,8 @@ READY := .venv/.ready-$(subst $(COMMA),-,$(EXTRAS))
 SUITE := not slow and not models and not ros2 and not franka
 WHICH := not long
 # Real arms brake when their computer stands still for a tenth of a second, and so do those of the tests: one that
-# fails in real time is tried once more, and told in the summary.
-AGAIN := --reruns 1 -r fEsR
+# fails in real time is tried twice more, and told in the summary.
+AGAIN := --reruns 2 -r fEsR
 # Where a container forbids Python to keep what it has compiled, every process of every test would compile it anew.
 export PYTHONDONTWRITEBYTECODE :=
 
