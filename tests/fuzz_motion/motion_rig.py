@@ -193,6 +193,9 @@ class Rig:
         if inputs.chunks and at % 2:  # as the command node does with one that comes between ticks
             self.commander.prepare(Inputs(chunks=inputs.chunks), self._now_ns)
             inputs.chunks = ()
+        if at % 3 == 0:  # and with states
+            early, inputs = inputs, Inputs(inputs.settings, inputs.chunks, peers=inputs.peers)
+            self.commander.update(Inputs(pose=early.pose, joint=early.joint, gripper=early.gripper))
         out = self.commander.step(inputs, self._now_ns, periods)
         self.commander.look_ahead(self._now_ns)
         state = self.commander.state.value

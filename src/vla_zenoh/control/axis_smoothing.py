@@ -139,6 +139,11 @@ class AxisSmoother:
         self._too_fast = zeros > 0.0
         self.braking = False
 
+    @property
+    def moment(self) -> tuple[object, ...]:
+        """What the next tick depends on: the same objects, the same motion."""
+        return self._plan, self.state
+
     def fork(self) -> Self:
         """A copy that moves by itself."""
         return copy(self)

@@ -110,7 +110,7 @@ class Commander:
             inputs: chunks and states; settings and peers are left to `step`.
             next_ns: `now_ns` of the next call of `step`.
         """
-        self._update_states(inputs)
+        self.update(inputs)
         self._take_chunks(inputs.chunks, next_ns)
         self._prepared = True
         if self._period_ns >= PLANNING_NS:
@@ -130,10 +130,9 @@ class Commander:
             part.monitor_joints(now_ns, if_late=planned or part.planner.spent)
 
     def _plan_ahead(self, next_ns: int) -> bool:
-        """Plan the motion to the goals of the next tick; returns whether they are new."""
-        parts = self.parts if self.state is State.ACTIVE else ()
-        overdue_ns = self._watchdog.deadline_ns
-        return any([part.motion.plan_ahead(self.task, overdue_ns, next_ns) for part in parts])
+        """Compute the motion of the next tick; returns whether its goals are new."""
+        at = self.state, self.task, self._watchdog.deadline_ns, next_ns
+        return any([part.motion.plan_ahead(*at) for part in self.parts])
 
     def step(self, inputs: Inputs, now_ns: int, ticks: int = 1) -> Outputs:
         """Process the inputs of one tick.
@@ -145,7 +144,7 @@ class Commander:
                 function of time, so the same trajectory is sampled later, no faster.
         """
         task_before, out, parts = self.task, self._out, self.parts
-        self._update_states(inputs)
+        self.update(inputs)
         self._apply_settings(inputs.settings, now_ns)
         planned = self._prepared or bool(inputs.chunks)
         self._take_chunks(inputs.chunks, now_ns)
@@ -201,7 +200,8 @@ class Commander:
         return any(part.retreat.busy for part in self.parts)
 
     # -- states and settings ------------------------------------------------------------------
-    def _update_states(self, inputs: Inputs) -> None:
+    def update(self, inputs: Inputs) -> None:
+        """Take states; called before `step`, they count for its tick, which has less to do then."""
         if inputs.peers is not None:
             self._peers = inputs.peers
         for part in self.parts:

@@ -13,7 +13,8 @@ from __future__ import annotations
 import math
 from collections.abc import Generator, Iterable
 from copy import copy
-from typing import Self
+from operator import is_
+from typing import Any, Self
 
 import numpy as np
 
@@ -238,6 +239,7 @@ class JointPath(AxisSmoother):
         self._ticks = 0
         self._hits: list[LimitHit] = []
         self._asked: tuple[Goal, Shares, bool]
+        self._sent: tuple[tuple[Any, ...], JointCommand | None] = (), None
         self._held = False
         """It braked before a bound, on the way to what was asked for last."""
         home_rad = self.kinematics.ordered(profile.robot.arm_joints, profile.robot.home_rad)
@@ -438,8 +440,12 @@ class JointPath(AxisSmoother):
         )
 
     def command(self, state: str, cause: Cause | None) -> JointCommand:
-        """The joint command of this tick."""
-        return computed(JointCommand, self._names, *self.state, state, cause)
+        """The joint command of this tick; the same one where nothing changed."""
+        made_of, (before, sent) = (self.state, state, cause), self._sent
+        if sent is None or not all(map(is_, made_of, before)):
+            sent = computed(JointCommand, self._names, *self.state, state, cause)
+            self._sent = made_of, sent
+        return sent
 
 
 def followed_shares(

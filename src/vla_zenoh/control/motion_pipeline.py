@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from operator import is_
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -16,13 +16,12 @@ from vla_zenoh.control.limits import FULL, Shares, into_workspace
 from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan, PlanAggregator, joint_goal
 from vla_zenoh.control.preflight import FOLLOWS_JOINT_RAD, LINGER_NS, Settling, follows, held_joints
 from vla_zenoh.control.reachability import ReachabilityFilter
-from vla_zenoh.control.smoothing import Motion, PosePath
+from vla_zenoh.control.smoothing import PoseCommands, PosePath
 from vla_zenoh.control.step_timing import GoalPace, Mover, TimedGoal
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.kinematics.so3 import Pose, held_pose, pose_distance, pose_of, quat_from_rotation
+from vla_zenoh.kinematics.so3 import Pose, held_pose, pose_distance, pose_of
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
-    Cause,
     Event,
     FloatArray,
     JointCommand,
@@ -30,7 +29,6 @@ from vla_zenoh.types import (
     PoseCommand,
     PoseState,
     Task,
-    computed,
 )
 
 if TYPE_CHECKING:
@@ -86,9 +84,11 @@ class MotionPipeline:
         """What moves the arm: `_poses` or `_path`; None before any activation."""
         commanded = None if self._joints is None or reach is None else reach.kinematics
         self._settling = Settling(commanded)
-        self._cause: Cause | None = None
         self._rest_since_ns: int | None = None
-        self._pose_commands = _PoseCommands()
+        self._pose_commands = PoseCommands()
+        self._ahead: _Ahead | None = None
+        self.expected: PoseCommand | JointCommand | None = None
+        """The command of the next tick, None: not known."""
 
     # -- state --------------------------------------------------------------------------------
     @property
@@ -277,10 +277,8 @@ class MotionPipeline:
             self.timeline.clock.set(task.speed, now_ns)
             self.goal = None
         if state is State.ACTIVE:
-            self._cause = self.timeline.plan.cause
             events = self._follow(self.timeline, task, overdue_ns, now_ns, ticks)
         else:
-            self._cause = None
             events = self._retreat_or_brake(self._mover, self.timeline, state, now_ns)
         went_on, self.streaming = self.streaming, self._must_stream(state, now_ns)
         if not self.streaming:
@@ -288,12 +286,13 @@ class MotionPipeline:
         failures, mover = self.failures, self._mover  # which may be another by now
         # A stream that begins must begin at rest: no ticks are made up for.
         for _ in range(ticks if went_on else 1):
-            if self._joints is None or isinstance(mover, JointPath):
-                mover.tick()
-            else:
-                active = state is State.ACTIVE and self.pace.override > 0.0
-                active = active and not self._changing and not self.held
-                self._joints.tick(mover, braking=not active and self._back is None, elbow=active)
+            ahead, self._ahead = self._ahead, None
+            if ahead is None or not all(map(is_, ahead.of, self._depends_on(mover, state))):
+                self._tick(mover, self._joints, state)
+                continue
+            mover.adopt(ahead.mover)  # pyright: ignore
+            if self._joints is not None and ahead.joints is not None:
+                self._joints.adopt(ahead.joints)
         if isinstance(mover, JointPath):
             events += limit_events(mover.taken_hits())
         return self.failures == failures, events
@@ -303,10 +302,34 @@ class MotionPipeline:
         mover = self._mover
         if not self.streaming or mover is None:
             return None
-        if self._joints is None:
-            return self._pose_commands.of(mover.motion, self.goal, state, self._cause)
-        joints = mover if isinstance(mover, JointPath) else self._joints
-        return joints.command(state.value, self._cause)
+        return self._command_of(mover, self._joints, self.goal, state)
+
+    def _command_of(
+        self, mover: Mover, joints: PoseToJoint | None, goal: Goal | None, state: State
+    ) -> PoseCommand | JointCommand:
+        plan = None if self.timeline is None else self.timeline.plan
+        cause = plan.cause if plan is not None and state is State.ACTIVE else None
+        if joints is None:
+            return self._pose_commands.of(mover.motion, goal, state.value, cause)
+        arm = mover if isinstance(mover, JointPath) else joints
+        return arm.command(state.value, cause)
+
+    def _tick(self, mover: Mover, joints: PoseToJoint | None, state: State) -> None:
+        if joints is None or isinstance(mover, JointPath):
+            mover.tick()
+        else:
+            active = self._follows(state)
+            joints.tick(mover, braking=not active and self._back is None, elbow=active)
+
+    def _follows(self, state: State) -> bool:
+        """Whether the arm follows a goal, and does not brake."""
+        active = state is State.ACTIVE and self.pace.override > 0.0
+        return active and not self._changing and not self.held
+
+    def _depends_on(self, mover: Mover, state: State) -> tuple[object, ...]:
+        """What a tick depends on."""
+        joints = () if self._joints is None else self._joints.moment
+        return *mover.moment, *joints, self._follows(state), self._back
 
     def forget_plan(self, oldest_ns: int, now_ns: int) -> bool:
         """Stand where the arm is, if the plan's observation was taken before `oldest_ns`."""
@@ -359,14 +382,33 @@ class MotionPipeline:
             self.goal = goal
         return events
 
-    def plan_ahead(self, task: Task, overdue_ns: int, next_ns: int) -> bool:
-        """Compute the motion to the goal that comes into force at the next tick, if one does.
+    def plan_ahead(self, state: State, task: Task, overdue_ns: int, next_ns: int) -> bool:
+        """Compute the motion of the next tick, `expected`; returns whether its goal is new.
 
-        That tick takes it over if nothing that the motion depends on has changed by then; the
-        arguments are those of `advance`.
+        That tick takes it over if nothing that it depends on has changed by then. The arguments are
+        those of `advance`.
         """
-        timeline, mover = self.timeline, self._mover
         self.pace.forget_ahead()
+        new = state is State.ACTIVE and self._plan_to_next(task, overdue_ns, next_ns)
+        self._tick_ahead(state)
+        return new
+
+    def _tick_ahead(self, state: State) -> None:
+        self._ahead = self.expected = None
+        if self._mover is None or not self.streaming:
+            return
+        if self.goal is not None and isinstance(self._mover, PosePath):
+            self._mover.leash(self.goal, self._dt_s)  # remembers that it does not act
+        goal, mover = self.pace.ahead or (self.goal, self._mover)
+        of, mover = self._depends_on(mover, state), mover.fork()
+        joints = None if self._joints is None else self._joints.fork()
+        self._tick(mover, joints, state)
+        self._ahead = _Ahead(of, mover, joints)
+        self.expected = self._command_of(mover, joints, goal, state)
+
+    def _plan_to_next(self, task: Task, overdue_ns: int, next_ns: int) -> bool:
+        """Plan the motion to the goal that comes into force at the next tick, if one does."""
+        timeline, mover = self.timeline, self._mover
         if timeline is None or mover is None or self.held or self.pace.override == 0.0:
             return False
         plans = self._aggregator.plans(timeline, next_ns)
@@ -432,29 +474,15 @@ class MotionPipeline:
         return self.streaming and now_ns - self._rest_since_ns < LINGER_NS
 
 
-class _PoseCommands:
-    """The set-points of an arm that takes poses; what stays the same is computed once."""
+class _Ahead(NamedTuple):
+    """The motion of a tick, computed before it.
 
-    def __init__(self) -> None:
-        self._sent: PoseCommand | None = None
-        self._made_of: tuple[Motion, Goal | None, State, Cause | None] | None = None
+    Args:
+        of: what it depends on, see `MotionPipeline._depends_on`.
+        mover: after that tick.
+        joints: likewise, where they follow the pose.
+    """
 
-    def of(
-        self, motion: Motion, goal: Goal | None, state: State, cause: Cause | None
-    ) -> PoseCommand:
-        """The set-point of this tick, on the way to `goal`."""
-        made_of, before, sent = (motion, goal, state, cause), self._made_of, self._sent
-        if before and sent and all(map(is_, made_of, before)):
-            return sent  # the arm is at rest
-        (position_m, rotation), *rates = motion
-        here = quat_from_rotation(rotation)
-        if goal is None:
-            heads_m, heads = position_m, here
-        elif before and sent and goal is before[1]:
-            heads_m, heads = sent.goal_position_m, sent.goal_quat_xyzw
-        else:
-            heads_m, heads = goal.pose.position_m, quat_from_rotation(goal.pose.rotation)
-        where = position_m, here, *rates, heads_m, heads
-        self._made_of = made_of
-        self._sent = computed(PoseCommand, *where, state.value, cause)
-        return self._sent
+    of: tuple[object, ...]
+    mover: Mover
+    joints: PoseToJoint | None

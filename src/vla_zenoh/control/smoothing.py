@@ -11,7 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from operator import is_
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -35,10 +36,11 @@ from vla_zenoh.kinematics.so3 import (
     log3,
     orthonormal,
     pose_distance,
+    quat_from_rotation,
     spatial_rates,
 )
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import FloatArray
+from vla_zenoh.types import Cause, FloatArray, PoseCommand, computed
 
 
 class Motion(NamedTuple):
@@ -188,11 +190,16 @@ class PosePath(Smoother):
         self._followed = followed
         # Commanded joints have distance constraints of their own.
         inside = workspace_corners(limits) if followed is None else None
+        self._on_leash: tuple[Goal, Motion, float] | None = None
         super().__init__(start, 1.0 / profile.timing.command_hz, motion_limits(limits), inside)
 
     def leash(self, goal: Goal, ahead_s: float) -> tuple[Goal, list[LimitHit]]:
         """`goal`, or a nearer one on the leash, and the limits that acted."""
+        known = self._on_leash
+        if known and goal is known[0] and self.motion is known[1] and ahead_s == known[2]:
+            return goal, []
         if self._well_within_leash(goal.pose, ahead_s):
+            self._on_leash = goal, self.motion, ahead_s
             return goal, []
         (position_m, rotation), twist, acceleration = self.motion
         way = ahead_s * (twist + 0.5 * ahead_s * acceleration)
@@ -246,3 +253,28 @@ class PosePath(Smoother):
         if self._followed is None:
             return FULL
         return self._followed(self.motion, goal.pose, self.box)
+
+
+class PoseCommands:
+    """The pose commands of an arm; what does not change is computed once."""
+
+    def __init__(self) -> None:
+        self._sent: tuple[tuple[Any, ...], PoseCommand | None] = (), None
+
+    def of(self, motion: Motion, goal: Goal | None, state: str, cause: Cause | None) -> PoseCommand:
+        """The command of a tick, on the way to `goal`; the same one where nothing changed."""
+        made_of, (before, sent) = (motion, goal, state, cause), self._sent
+        if sent is not None and all(map(is_, made_of, before)):
+            return sent
+        (position_m, rotation), *rates = motion
+        here = quat_from_rotation(rotation)
+        if goal is None:
+            heads_m, heads = position_m, here
+        elif sent is not None and goal is before[1]:
+            heads_m, heads = sent.goal_position_m, sent.goal_quat_xyzw
+        else:
+            heads_m, heads = goal.pose.position_m, quat_from_rotation(goal.pose.rotation)
+        where = position_m, here, *rates, heads_m, heads
+        sent = computed(PoseCommand, *where, state, cause)
+        self._sent = made_of, sent
+        return sent

@@ -202,6 +202,7 @@ class _Ahead(NamedTuple):
     """The motion of a goal, computed before the tick in which it is expected to begin.
 
     Args:
+        goal: of the motion.
         of: what it depends on: objects that do not change,
         at: and numbers.
         timing: with the goal taken.
@@ -209,6 +210,7 @@ class _Ahead(NamedTuple):
         enough: the shares suffice.
     """
 
+    goal: Goal
     of: tuple[object, ...]
     at: tuple[float, ...]
     timing: StepTiming
@@ -271,6 +273,11 @@ class GoalPace:
         self._ahead = self._motion_to(mover, timed, *self._depends_on(mover, timed))
         self.slower = before
 
+    @property
+    def ahead(self) -> tuple[Goal, Mover] | None:
+        """The goal that is expected in the next tick, and what is on its way to it."""
+        return None if self._ahead is None else (self._ahead.goal, self._ahead.mover)
+
     def forget_ahead(self) -> None:
         """Compute it again: its bounds have changed."""
         self._ahead = None
@@ -319,7 +326,7 @@ class GoalPace:
         shares = Shares(*map(min, mover.shares(goal), Shares(speed, change, jerk)))
         hard = self.slowing and (in_joints or not self._joints_follow)
         enough = mover.go_to(goal, shares, all_to_stop=hard)
-        return _Ahead(of, at, timing, mover, enough)
+        return _Ahead(goal, of, at, timing, mover, enough)
 
 
 def _within(mover: Mover, override: float) -> bool:

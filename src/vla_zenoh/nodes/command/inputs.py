@@ -76,14 +76,22 @@ class CommandInputs:
         ]
         self._last_clock = 0.0
 
-    def poll(self, now_ns: int, *, news: bool = True, take_chunks: bool = True) -> Inputs:
-        """Everything received since the last call, for the tick at `now_ns`, wall clock.
+    @property
+    def has_states(self) -> bool:
+        """Whether there are states for `poll_streams`."""
+        return any(part.has_new for part in self._parts.values())
 
-        `news`: read what other nodes publish; their liveliness is always up to date.
+    def read_news(self, now_ns: int) -> None:
+        """Read status and specs of the other nodes, for the next `poll`."""
+        self._peer_monitor.read_news(now_ns)
+
+    def poll(self, now_ns: int, *, take_chunks: bool = True) -> Inputs:
+        """What was received since the last call, for the tick at `now_ns`, wall clock.
+
         `take_chunks`: else they are left to `poll_streams`.
         """
         settings_put = self._poll_settings()
-        peers = self._peer_monitor.update(now_ns, news=news)
+        peers = self._peer_monitor.snapshot(now_ns)
         inputs = self.poll_streams(settings_put, take_chunks=take_chunks)
         inputs.settings, inputs.peers = [*settings_put, *self._check_clock()], peers
         return inputs
@@ -92,6 +100,8 @@ class CommandInputs:
         self, settings_put: Sequence[Setting] = (), *, take_chunks: bool = True
     ) -> Inputs:
         """The chunks and states among them."""
+        if take_chunks:
+            self.chunk_arrival.clear()
         arrived = self.chunks.drain() if take_chunks else ()
         chunks = [self._chunk(arrival) for arrival in arrived]
         inputs = Inputs(chunks=[chunk for chunk in chunks if chunk is not None])
@@ -180,6 +190,11 @@ class _PartInputs:
         self.held = node.subscribe(keys.held, ZenohRing(16, WORDS))
         self._last_joint = 0.0
 
+    @property
+    def has_new(self) -> bool:
+        """Whether a state came since the last `poll`; joints never come alone."""
+        return self._rings[PoseState].has_new or self._rings[GripperState].has_new
+
     def poll(self, requested: bool) -> NewStates:
         """The newest states; joints, which are expensive to decode, every `JOINT_PERIOD_S` and when
         an activation is `requested`."""
@@ -257,14 +272,16 @@ class PeerMonitor:
             else:
                 self._node.counters["refused.holder"] += 1
 
-    def update(self, now_ns: int, *, news: bool = True) -> PeerSnapshot | None:
-        """A new snapshot, or None if nothing changed; `news`: read status and specs first."""
-        if news:
-            for arrival in self._statuses.drain():
-                self._receive_status(arrival, now_ns)
-            for arrival in self._new_specs.drain():
-                self._receive_spec(arrival)
-            self._track_clocks()
+    def read_news(self, now_ns: int) -> None:
+        """Read status and specs, and measure clocks."""
+        for arrival in self._statuses.drain():
+            self._receive_status(arrival, now_ns)
+        for arrival in self._new_specs.drain():
+            self._receive_spec(arrival)
+        self._track_clocks()
+
+    def snapshot(self, now_ns: int) -> PeerSnapshot | None:
+        """What is known, None if nothing changed since the last call."""
         with self._lock:
             if not self._changed:
                 return None

@@ -27,7 +27,7 @@ from vla_zenoh.nodes.command.inputs import CommandInputs
 from vla_zenoh.profile import Profile
 from vla_zenoh.runtime.estop_latch import EstopLatch
 from vla_zenoh.runtime.process import realtime_thread
-from vla_zenoh.types import LATENCY_STAGES, Cause, Event
+from vla_zenoh.types import LATENCY_STAGES, Cause, Event, JointCommand
 
 TASK_PERIOD_S = 0.2
 BRAKE_BEFORE_EXIT_S = 1.0
@@ -39,6 +39,9 @@ PLANNING_NS = 1_500_000
 """A chunk is planned this long before the next tick, or at once if it arrives later. Its other
 readers get it first: planning at a real-time priority keeps a processor from them. Where the period
 is shorter, so that a tick would be missed, it is planned after the next tick."""
+READING_NS = 400_000
+"""States are read and checked this long before each tick, so that it only has to read the others.
+Not where the period is too short to plan a chunk in, and most ticks have no new ones."""
 REST_S, REST_TIMEOUTS = 0.02, 5
 """Period of the ticks while the arm rests, and how many of them a command timeout has at least."""
 REST_AFTER_NS = 100_000_000
@@ -130,13 +133,18 @@ class CommandNode:
         rest_periods = max(int(rest_s * timing.command_hz), 1)
         give_up = 0.0
         tick_first = PLANNING_NS * timing.command_hz > 1e9
+        reading_ns = 0 if tick_first else READING_NS
         while True:
-            arrived = loop.wait_for(arrival)
+            arrived = loop.wait_for(arrival, reading_ns)
             if arrived:
                 loop.resume()
                 if not tick_first:
                     loop.wait_until(PLANNING_NS)
                     self._prepare(loop.next_ns)
+            if reading_ns:
+                loop.wait_until(reading_ns)
+                if self._inputs.has_states:
+                    self.commander.update(self._inputs.poll_streams(take_chunks=False))
             tick = loop.wait()
             if tick.periods > 1:
                 self.node.counters["command.missed_ticks"] += tick.periods - 1
@@ -159,7 +167,6 @@ class CommandNode:
     def _prepare(self, next_mono_ns: int) -> None:
         """Plan chunks that arrived, so that the next tick need not."""
         began = time.perf_counter()
-        self._inputs.chunk_arrival.clear()
         inputs = self._inputs.poll_streams()
         if inputs.chunks:
             self._busy_ns = next_mono_ns
@@ -173,17 +180,24 @@ class CommandNode:
         chores = tick.nominal_ns >= self._next_chores_ns
         if chores:
             self._next_chores_ns = tick.nominal_ns + round(CHORES_S * 1e9)
-        inputs = self._inputs.poll(now_ns, news=chores, take_chunks=take_chunks)
+        inputs = self._inputs.poll(now_ns, take_chunks=take_chunks)
         inputs.settings = [*inputs.settings, *extra]
         timing = self.node.profile.timing
         limit = max(1, int(timing.command_timeout_s * timing.command_hz))
         out = self.commander.step(inputs, now_ns, min(tick.periods, limit))
-        self._publish(out, now_ns)
+        self._command(out, now_ns)
+        self._status.add_tick(now_ns, tick.stall_s, time.perf_counter() - began)
+        self._report(out)
         if self._latch is not None and any(event.kind == "transition" for event in out.events):
             latched = self.commander.state in (State.STOPPED, State.FAULT)
             self._latch.set(self.commander.why if latched else None)
-        self._status.add_tick(now_ns, tick.stall_s, time.perf_counter() - began)
         self.commander.look_ahead(now_ns)
+        for part in self.commander.parts:
+            command = part.motion.expected
+            if command is not None:  # its bytes are kept for the next tick
+                self._outs[part.name][isinstance(command, JointCommand)].encoded(command)
+        if chores:
+            self._inputs.read_news(now_ns)
         if chores or out.events or out.task_changed:
             why = None if self._latch is None else self._latch.failure()
             if why is not None:
@@ -204,7 +218,7 @@ class CommandNode:
             return False
         return 0 < timeline.plan.end_ns - now_ns < LONGEST_PLAN_NS
 
-    def _publish(self, out: Outputs, now_ns: int) -> None:
+    def _command(self, out: Outputs, now_ns: int) -> None:
         for name, (pose, joint, gripper) in self._outs.items():
             commands = out.of(name)
             if commands.pose is not None:
@@ -213,6 +227,8 @@ class CommandNode:
                 joint.publish(commands.joint, stamp_wall_ns=now_ns)
             if commands.gripper is not None:
                 gripper.publish(commands.gripper)
+
+    def _report(self, out: Outputs) -> None:
         for rejection in out.rejections:
             kind = "skipped" if rejection.quiet else "refused"
             self.node.counters[f"{kind}.{rejection.reason}"] += 1
