@@ -7,6 +7,23 @@ part of what is said. `WRONG` are wrong by themselves, `CHECKED` on a computer o
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from typing import get_args
+
+from vla_zenoh.profile.robot import RobotProfile
+from vla_zenoh.profile.schema import CAMERA_SOURCES, NodeKind
+
+
+def any_of(names: Iterable[str]) -> str:
+    """The names as a sentence lists what may be written."""
+    *others, last = (repr(name) for name in names)
+    return f"{', '.join(others)} or {last}"
+
+
+DRIVERS: tuple[str, ...] = get_args(RobotProfile.model_fields["driver"].annotation)
+"""What `robot.driver` may be."""
+CAMERAS = ", ".join(kind.written for kind in CAMERA_SOURCES.values())
+
 WRONG: list[tuple[str, str]] = [
     # (text behind "extends: panda_sim", part of one line of what is said)
     (
@@ -173,8 +190,7 @@ WRONG: list[tuple[str, str]] = [
     ),
     (
         "robot: {driver: ros}",
-        "wants 'sim', 'ros2', 'franka', 'ur', 'lerobot' or 'arm'; did you mean 'ros2'? "
-        "(given: 'ros')",
+        f"wants {any_of(DRIVERS)}; did you mean 'ros2'? (given: 'ros')",
     ),
     ("robot: {tcp_frame: ''}", "robot.tcp_frame: must not be empty"),
     (
@@ -184,9 +200,12 @@ WRONG: list[tuple[str, str]] = [
     ("task: {prompt: true}", "task.prompt: wants text; put it in quotes (given: True)"),
     (
         "cameras: {front: {source: webcam}}",
-        "'webcam' is not a camera: write one of sim:CAMERA, v4l2",
+        f"'webcam' is not a camera: write one of {CAMERAS}",
     ),
-    ("cameras: {front: {source: 'sim:'}}", "'sim:' is not a camera: write one of sim:CAMERA"),
+    (
+        "cameras: {front: {source: 'sim:'}}",
+        f"'sim:' is not a camera: write one of {CAMERAS}",
+    ),
     (
         "cameras: {front: {source: 'rtsp://'}}",
         "'rtsp://' lacks the host: write rtsp://HOST/PATH",
@@ -201,8 +220,7 @@ WRONG: list[tuple[str, str]] = [
     ("hosts: {a: {}}", "lab.yaml:2: hosts.a.nodes: is missing"),
     (
         "hosts:\n  a:\n    nodes: [router, camer]",
-        "lab.yaml:4: hosts.a.nodes.1: wants 'router', 'sim', 'ros2', 'arm', 'camera', "
-        "'command', 'worker' or 'primitives'; did you mean 'camera'?",
+        f"lab.yaml:4: hosts.a.nodes.1: wants {any_of(get_args(NodeKind))}; did you mean 'camera'?",
     ),
     ("hosts: {a: {nodes: [sim, sim]}}", "hosts.a.nodes: sim: given more than once"),
     (

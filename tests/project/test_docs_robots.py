@@ -8,18 +8,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 from typer.testing import CliRunner
+from wrong_profiles import DRIVERS
 
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.lab.cli.profile import profile_app
 from vla_zenoh.policy.loader import make_robot
 from vla_zenoh.profile import load_profile
+from vla_zenoh.profile.schema import CAMERA_SOURCES
 from vla_zenoh.resources import robot_urdf
 from vla_zenoh.ros2.writers import position
 from vla_zenoh.types import JointCommand
 
 TEXT_FILE = Path(__file__).parents[2] / "docs" / "how-to" / "robots.md"
 TEXT = TEXT_FILE.read_text("utf-8")
+REFERENCE = (TEXT_FILE.parents[1] / "reference" / "profile.md").read_text("utf-8")
 UR5 = "example-robot-data:ur_description/urdf/ur5_robot.urdf"
 HOME_M = (0.49, 0.11, 0.43)
 TEXT_M = 0.005
@@ -54,6 +57,21 @@ def folder(tmp_path: Path) -> Path:
 @pytest.fixture
 def file(folder: Path) -> Path:
     return folder / "ur5.yaml"
+
+
+@pytest.mark.parametrize("kind", CAMERA_SOURCES)
+def test_every_camera_source_is_on_this_page_and_in_the_reference(kind: str) -> None:
+    (paragraph,) = re.findall(r"^- \*\*Cameras\.\*\* .*?(?=^- )", TEXT, re.DOTALL | re.MULTILINE)
+    assert f"`{kind}:" in paragraph
+    (row,) = re.findall(r"^\| `source` .*$", REFERENCE, re.MULTILINE)
+    assert f"``{kind}:" in row
+
+
+@pytest.mark.parametrize("driver", DRIVERS)
+def test_every_robot_driver_is_on_this_page_and_in_the_reference(driver: str) -> None:
+    assert re.search(rf"driver: {driver}\b", TEXT)
+    (row,) = re.findall(r"^\| `driver` .*$", REFERENCE, re.MULTILINE)
+    assert f"``{driver}``: " in row
 
 
 def test_its_robot_is_right_and_needs_no_second_look(file: Path) -> None:

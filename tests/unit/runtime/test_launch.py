@@ -18,6 +18,7 @@ from vla_zenoh.keys import NODE_KINDS
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.profile.robot import RobotProfile
 from vla_zenoh.profile.schema import NodeKind
+from vla_zenoh.robots.python_driver import BUILT_IN
 from vla_zenoh.runtime.launch import Host, node_commands
 from vla_zenoh.runtime.supervisor import STOP_ORDER
 from vla_zenoh.types import NodeStatus
@@ -52,6 +53,7 @@ def test_every_kind_of_node_may_stand_in_a_profile_and_every_robot_driver_is_one
     robots = {kind for kind, traits in NODE_KINDS.items() if traits.role == "robot"}
     drivers = get_args(RobotProfile.model_fields["driver"].annotation)
     assert robots == {RobotProfile.model_construct(driver=name).node for name in drivers}
+    assert set(drivers) == {*robots, *BUILT_IN}
 
 
 def test_every_kind_of_node_has_a_command() -> None:
