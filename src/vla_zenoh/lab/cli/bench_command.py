@@ -38,10 +38,12 @@ def command(
     from vla_zenoh.runtime.process import die_with_parent, stop_on_signals
 
     rates_hz = number_list("--rates", rates, 50, 1000)
+    chosen = effective_profile(profile)
+    chosen.require_one_arm("the motion of bench command")
     with kept_rows(result) as rows:
         stop = stop_on_signals()
         die_with_parent()
-        loaded = own_address(effective_profile(profile))
+        loaded = own_address(chosen)
         for rate_hz in track(rates_hz, "command node", console=errors()):
             rows.append(measure_command(loaded, rate_hz, seconds, stop, rows.log, busy))
     times = [f"{name} {share}" for name in ("tick us", "late us", "pose ms") for share in SHARES]

@@ -1,0 +1,25 @@
+"""``vla-zenoh bench command``: which robots it is for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from vla_zenoh.cli.main import app
+from vla_zenoh.errors import ProfileError
+from vla_zenoh.lab.bench import command_runner
+
+
+def test_a_robot_of_parts_is_rejected_before_anything_starts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(command_runner, "Host")
+    out = tmp_path / "out.json"
+    done = CliRunner().invoke(app, ["bench", "command", "-p", "two_pandas_sim", "-o", str(out)])
+    assert isinstance(done.exception, ProfileError)
+    assert str(done.exception) == (
+        "the motion of bench command: for one arm only, and robot 'pair' has the parts left, right"
+    )
+    assert not out.exists()
