@@ -210,6 +210,18 @@ def test_a_slewing_clock_is_followed_silently(monkeypatch: pytest.MonkeyPatch) -
     assert clock.wall_ns() - true() > 0.4 * ADOPT_S * 1e9
 
 
+def test_a_thread_that_is_preempted_between_two_clocks_notices_no_step(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    true: Callable[[], int] = time.monotonic_ns
+    late_ns = iter([200_000_000, 0, 0] * 2)  # the first reading of either call comes too late
+    monkeypatch.setattr(time, "monotonic_ns", lambda: true() + next(late_ns))
+    clock = Clock()
+    assert clock.adopt_system_time() == 0.0
+    monkeypatch.undo()
+    assert abs(clock.wall_ns() - time.time_ns()) / 1e9 < STEP_TOLERANCE_S
+
+
 def test_a_dead_process_is_not_running_even_before_it_is_buried() -> None:
     process = subprocess.Popen([sys.executable, "-c", ""])
     pid = process.pid

@@ -28,8 +28,9 @@ from vla_zenoh.types import Header
 
 ADOPT_S = 0.005
 """A smaller difference to the system's wall clock is slewing, and is followed silently."""
-NOISE_S = 0.001
-"""A still smaller one is mostly the time between reading two clocks; following it would jitter."""
+NOISE_S, READINGS = 0.001, 3
+"""A still smaller one is mostly the time between reading two clocks; following it would jitter. A
+thread that is preempted there finds the wall clock too early, so the latest reading counts."""
 ASK_PERIOD_S = 1.0
 FIRST_ASKS, FIRST_PERIOD_S = 8, 0.1
 """The first queries follow each other quickly: one of them will be undisturbed."""
@@ -55,7 +56,7 @@ class Clock:
     """Wall clock: the monotonic clock plus an offset that is updated now and then."""
 
     def __init__(self) -> None:
-        self.offset_ns = time.time_ns() - time.monotonic_ns()
+        self.offset_ns = max(time.time_ns() - time.monotonic_ns() for _ in range(READINGS))
         """Wall time minus monotonic time."""
 
     def wall_ns(self) -> int:
@@ -68,11 +69,10 @@ class Clock:
 
     def adopt_system_time(self) -> float:
         """Adopt the system's wall clock; returns its step in s, 0 if there was none."""
-        offset_ns = time.time_ns() - time.monotonic_ns()
+        offset_ns = max(time.time_ns() - time.monotonic_ns() for _ in range(READINGS))
         step_s = (offset_ns - self.offset_ns) / 1e9
-        if abs(step_s) < NOISE_S:
-            return 0.0
-        self.offset_ns = offset_ns
+        if abs(step_s) >= NOISE_S:
+            self.offset_ns = offset_ns
         return step_s if abs(step_s) > ADOPT_S else 0.0
 
 
