@@ -310,12 +310,16 @@ class Chain:
         self.client.set_prompt("hold")
         self.wait_still()
         start_m = self.reference_m()[2]
-        self.client.set_prompt(f"HARD: go {direction} x{count}")
-        self.until(
-            f"{count} steps carried out",
-            lambda: self.detail("policy_done") and self.detail("accepted_steps") >= count,
-            timeout_s,
-        )
+        prompt = f"HARD: go {direction} x{count}"
+        self.client.set_prompt(prompt)
+
+        def done() -> bool:
+            status = self.client.status("command")  # one, as a newer one may come in between
+            said = status.detail if status else {}
+            ours = said.get("prompt") == prompt  # and not what was done before
+            return ours and said["policy_done"] and said["accepted_steps"] >= count
+
+        self.until(f"{count} steps carried out", done, timeout_s)
         self.wait_still()
         return float(self.reference_m()[2] - start_m)
 

@@ -9,9 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from chain import MOVING_M_S, Chain
+from chain import MOVING_M_S, Chain, Track
 
 from vla_zenoh.runtime.supervisor import HANG_S
+from vla_zenoh.types import Event
 
 BRAKE_S = 0.35
 """A jerk-limited stop from 0.15 m/s takes 0.17 s, the rest is the arm's lag."""
@@ -28,6 +29,7 @@ JUMP_M = 0.003
 """Between two references, 5 ms apart: 0.5 m/s would be 0.0025."""
 RUN_S = 0.5
 STEPS_BEFORE_NS = 300_000_000
+SOME_STATES = 20
 
 
 class Death(NamedTuple):
@@ -60,16 +62,33 @@ def assert_gentle(chain: Chain, since_ns: int = 0) -> None:
     assert track.largest_step_m() <= JUMP_M
 
 
-def kill_in_motion(chain: Chain, node: str) -> tuple[int, int]:
-    """Kill it; returns its process number and the time (ns)."""
+def move_a_while(chain: Chain) -> None:
+    """Until the arm has been moving all the time that a test looks back at."""
     chain.move()
     time.sleep(RUN_S)
-    chain.until("it moves still", chain.moves)
+
+    def moved() -> bool:
+        since_ns = time.time_ns() - STEPS_BEFORE_NS
+        speed_m_s = chain.recorder.track(since_ns).between(since_ns).speed_m_s
+        return len(speed_m_s) > 0 and bool(speed_m_s.mean() > MOVING_M_S)
+
+    chain.until("it moves still", moved)
     chain.client.pop_events()
+
+
+def kill_in_motion(chain: Chain, node: str) -> tuple[int, int]:
+    """Kill it; returns its process number and the time (ns)."""
+    move_a_while(chain)
     pid = chain.pid(node)
     at_ns = time.time_ns()
     os.kill(pid, signal.SIGKILL)
     return pid, at_ns
+
+
+def time_to_stand_s(chain: Chain, since_ns: int) -> float:
+    """From `since_ns` until the arm stands: its track is complete once it has been seen to."""
+    chain.wait_still()
+    return chain.recorder.track().time_to_stand_s(since_ns)
 
 
 def assert_restarted(chain: Chain, node: str, old_pid: int) -> None:
@@ -86,6 +105,25 @@ def assert_restarted(chain: Chain, node: str, old_pid: int) -> None:
     assert any(name == node and "SIGKILL" in line for name, line in chain.told)
 
 
+def await_states(chain: Chain) -> Track:
+    """The arm's next states: a node that starts again says so before the first of them."""
+    since_ns = time.time_ns()
+
+    def states() -> Track | None:
+        track = chain.recorder.track(since_ns)
+        return track if len(track.stamp_ns) > SOME_STATES else None
+
+    return chain.until("its states come", states, RESTART_S)
+
+
+def endings(chain: Chain) -> list[Event]:
+    """Ends of the activation.
+
+    A computer that is busy may take longer to bury a node than the watchdog waits.
+    """
+    return chain.events("active->inactive") or chain.events("holding->inactive")
+
+
 def assert_waits_and_works_again(chain: Chain) -> None:
     """Nothing moves before it is activated; then it does as told, from where it stands."""
     chain.until(
@@ -93,10 +131,11 @@ def assert_waits_and_works_again(chain: Chain) -> None:
         lambda: chain.state() == "inactive" and chain.state("worker-scripted") == "inferring",
         RESTART_S,
     )
+    await_states(chain)
     began_ns = time.time_ns()
     time.sleep(0.5)
     still = chain.recorder.track(began_ns)
-    assert len(still.stamp_ns) > 20
+    assert len(still.stamp_ns) > SOME_STATES
     assert still.speed_m_s.max() < MOVING_M_S
     assert chain.state() == "inactive"
     assert chain.client.task is not None
@@ -116,10 +155,10 @@ def test_a_killed_node_brakes_the_arm_and_needs_a_new_activation(
     pid, killed_ns = kill_in_motion(chain, death.node)
     assert_restarted(chain, death.node, pid)
 
+    stood_s = time_to_stand_s(chain, killed_ns)
     track = chain.recorder.track()
     before = track.between(killed_ns - STEPS_BEFORE_NS, killed_ns)  # the speed goes with the steps
     assert before.speed_m_s.mean() > MOVING_M_S
-    stood_s = track.time_to_stand_s(killed_ns)
     watchdog_s = chain.profile.timing.watchdog_s
     print(f"{death.node}: {before.speed_m_s.mean():.3f} m/s to rest in {stood_s:.3f} s")
     assert stood_s <= watchdog_s + BRAKE_S + BUSY_S
@@ -128,16 +167,14 @@ def test_a_killed_node_brakes_the_arm_and_needs_a_new_activation(
     if death.own_brake:
         assert chain.events("running->braking")
     else:
-        # A computer that is busy may take longer to bury it than the watchdog waits.
-        (event,) = chain.events("active->inactive") or chain.events("holding->inactive")
+        (event,) = chain.until("it is noticed", lambda: endings(chain))
         assert event.why == death.why
     assert_waits_and_works_again(chain)
 
 
 def test_a_killed_simulator_is_noticed_and_starts_again_at_home(chain: Chain) -> None:
     pid, killed_ns = kill_in_motion(chain, "sim")
-    chain.until("it is noticed", lambda: chain.events("active->inactive"))
-    (event,) = chain.events("active->inactive")
+    (event,) = chain.until("it is noticed", lambda: endings(chain))
     assert event.why == "node 'sim' is gone"
     assert_restarted(chain, "sim", pid)
     # There is no arm to be measured: what would have been sent to one is.
@@ -157,19 +194,21 @@ def test_a_killed_router_stops_the_arm_and_all_find_each_other_again(chain: Chai
     nodes = ("sim", "camera", "command", "worker-scripted")
     chain.until(
         "all speak again",
-        lambda: all(age_s < 1.0 for n, (_, age_s, _) in chain.client.snapshot().items()),
+        lambda: (
+            all(age_s < 1.0 for n, (_, age_s, _) in chain.client.snapshot().items())
+            and chain.client.alive >= set(nodes)
+        ),
         RESTART_S,
     )
-    assert chain.client.alive >= set(nodes)
     # Nobody hears the arm while there is no router. Afterwards it stands, near where it was.
-    stands = chain.recorder.track(time.time_ns() - 300_000_000)
+    stands = await_states(chain)
     assert stands.speed_m_s.max() < MOVING_M_S
     speed_m_s = float(at_kill.speed_m_s[-20:].mean())
     went_m = float(np.linalg.norm(stands.position_m[-1] - at_kill.position_m[-1]))
     timeout_s = chain.profile.timing.command_timeout_s
     print(f"router: {speed_m_s:.3f} m/s, {went_m * 1e3:.1f} mm on")
     assert went_m <= speed_m_s * (timeout_s + BRAKE_S + BUSY_S)
-    assert chain.counter("sim.stream_silences", "sim") >= 1
+    chain.until("its silence counts", lambda: chain.counter("sim.stream_silences", "sim") >= 1)
     chain.until("it says why", lambda: "is gone" in str(chain.detail("why")))
     chain.recorder.forget()
     assert_waits_and_works_again(chain)
@@ -177,10 +216,7 @@ def test_a_killed_router_stops_the_arm_and_all_find_each_other_again(chain: Chai
 
 # -- hung, not dead -------------------------------------------------------------------------------
 def hang_in_motion(chain: Chain, node: str, seconds: float) -> int:
-    chain.move()
-    time.sleep(RUN_S)
-    chain.until("it moves still", chain.moves)
-    chain.client.pop_events()
+    move_a_while(chain)
     pid = chain.pid(node)
     at_ns = time.time_ns()
     os.kill(pid, signal.SIGSTOP)
@@ -195,22 +231,20 @@ def test_a_hung_worker_lets_the_arm_hold_and_then_lose_it(chain: Chain) -> None:
     lease_s = chain.profile.session.lease_ms / 1e3
     at_ns = hang_in_motion(chain, "worker-scripted", 2.5 * lease_s)
     timing = chain.profile.timing
-    track = chain.recorder.track()
-    stood_s = track.time_to_stand_s(at_ns)
+    stood_s = time_to_stand_s(chain, at_ns)
     patience_s = 1.0 / chain.profile.task.rate_hz + timing.watchdog_s
     print(f"hung worker: to rest in {stood_s:.3f} s")
     assert stood_s <= patience_s + BRAKE_S + BUSY_S
     assert_gentle(chain)
+    (event,) = chain.until("it is noticed", lambda: chain.events("holding->inactive"))
     assert chain.events("active->holding")
-    (event,) = chain.events("holding->inactive")
     assert event.why == "node 'worker-scripted' is gone"
     assert_waits_and_works_again(chain)
 
 
 def test_a_hung_command_node_is_braked_by_the_robot_and_comes_back_inactive(chain: Chain) -> None:
     at_ns = hang_in_motion(chain, "command", 2.0)
-    track = chain.recorder.track()
-    stood_s = track.time_to_stand_s(at_ns)
+    stood_s = time_to_stand_s(chain, at_ns)
     print(f"hung command node: to rest in {stood_s:.3f} s")
     assert stood_s <= chain.profile.timing.command_timeout_s + BRAKE_S + BUSY_S
     assert_gentle(chain)

@@ -51,16 +51,30 @@ def site(shared_chain: Chain, tmp_path_factory: pytest.TempPathFactory) -> Itera
 def hold_until_it_moves(chain: Chain, browser: Browser) -> None:
     chain.client.set_prompt("HARD: go up" if chain.height_m() < 0.42 else chain.down)
     browser.hold_until_active(READY_PATIENCE_S)
-    chain.until("it moves", chain.moves)
+
+    def moves() -> bool:
+        if browser.answers("hold_ended"):  # an echo that a busy computer kept back: press again
+            browser.let_go()
+            browser.hold_until_active(READY_PATIENCE_S)
+        return chain.moves()
+
+    chain.until("it moves", moves)
+
+
+def stopped_ns(chain: Chain) -> int:
+    """When the command node took a stop: a page's own word for it is under way for some time."""
+    chain.until("stopped", lambda: chain.state() == "stopped" and chain.events("active->stopped"))
+    events = [(header, event.what) for _, header, event in list(chain.client.events)]
+    return next(header.stamp_wall_ns for header, what in events if what == "active->stopped")
 
 
 def test_a_stop_of_the_page_says_which_robot_stood_when(chain: Chain, site: Site) -> None:
     with browsing(site) as browser, browsing(site, VIEWER) as other:
         hold_until_it_moves(chain, browser)
-        since_ns = time.time_ns()
+        chain.client.pop_events()
         browser.send(do="stop")
         report = browser.wait("stopped")
-        assert chain.state() == "stopped"
+        since_ns = stopped_ns(chain)
         assert report["robot"] == chain.profile.robot.name
         assert report["by"] == "anna"
         assert report["stopped"]
@@ -70,7 +84,7 @@ def test_a_stop_of_the_page_says_which_robot_stood_when(chain: Chain, site: Site
         assert chain.recorder.track(since_ns).time_to_stand_s(since_ns) <= report["stands_s"] + 0.1
         assert browser.ask(do="activate")["is"] == "failed"
         assert browser.ask(do="reset")["text"] == "cleared; inactive"
-        assert chain.state() == "inactive"
+        chain.until("inactive", lambda: chain.state() == "inactive")
 
 
 def test_a_stop_goes_by_post_where_the_socket_is_broken(chain: Chain, site: Site) -> None:
@@ -78,7 +92,7 @@ def test_a_stop_goes_by_post_where_the_socket_is_broken(chain: Chain, site: Site
     status, _, body = site.ask("POST", "/stop", ours)
     assert status == 200
     assert json.loads(body)["stopped"]
-    assert chain.state() == "stopped"
+    chain.until("stopped", lambda: chain.state() == "stopped")
 
 
 def test_nobody_else_stops_by_post(chain: Chain, site: Site) -> None:
