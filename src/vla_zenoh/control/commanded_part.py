@@ -146,7 +146,7 @@ class CommandedPart:
                 "robot.tcp_frame and robot.arm_joints in the profile"
             )
         self.reach.hold(box)
-        self.motion.pace.forget_ahead()
+        self.motion.forget_ahead()
         self.held = box
         gripper = self.gripper_state
         self._grasp_m = np.inf if gripper is None else gripper.record.width_m

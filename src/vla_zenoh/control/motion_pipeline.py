@@ -327,7 +327,7 @@ class MotionPipeline:
         return active and not self._changing and not self.held
 
     def _depends_on(self, mover: Mover, state: State) -> tuple[object, ...]:
-        """What a tick depends on."""
+        """What a tick depends on, besides bounds, see `forget_ahead`."""
         joints = () if self._joints is None else self._joints.moment
         return *mover.moment, *joints, self._follows(state), self._back
 
@@ -392,6 +392,11 @@ class MotionPipeline:
         new = state is State.ACTIVE and self._plan_to_next(task, overdue_ns, next_ns)
         self._tick_ahead(state)
         return new
+
+    def forget_ahead(self) -> None:
+        """Compute the next tick when it is due: its bounds have changed."""
+        self.pace.forget_ahead()
+        self._ahead = None
 
     def _tick_ahead(self, state: State) -> None:
         self._ahead = self.expected = None

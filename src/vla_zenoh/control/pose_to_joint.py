@@ -125,7 +125,7 @@ class PoseToJoint:
     @property
     def moment(self) -> tuple[object, ...]:
         """What the next tick depends on, besides the pose: the same objects, the same motion."""
-        return self._now, self._posture_rad
+        return self._now, self._posture_rad, self._waiting_s
 
     def fork(self) -> PoseToJoint:
         """A copy that moves by itself."""

@@ -21,15 +21,17 @@ from command_rig import (
 )
 
 from vla_zenoh.control.commander import Commander, Inputs, Setting
-from vla_zenoh.control.motion_pipeline import LINGER_NS
+from vla_zenoh.control.motion_pipeline import LINGER_NS, MotionPipeline
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.kinematics.so3 import norm3
 from vla_zenoh.profile import load_profile, override
-from vla_zenoh.types import GripperState, PoseState, Stamped
+from vla_zenoh.types import FloatArray, GripperState, HeldBox, PoseState, Stamped
 
 UP = [0.0, 0.0, 0.01, 0.0, 0.0, 0.0, 0.0]
 FORTH = [0.02, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
 STAND = [0.0] * 7
+DOWN_FAST = [0.0, 0.0, -0.03, 0.0, 0.0, 0.0, 0.0]
+BOX = HeldBox((0.1, 0.1, 0.6))
 STEP_M = 0.01
 AT_GOAL_M, AT_GOAL_RAD = 1e-6, 1e-6
 
@@ -642,16 +644,15 @@ def test_why_an_arm_stopped_by_itself_is_said_when_it_is_activated_again() -> No
     assert "ended" not in rig.commander.why
 
 
-def test_an_arm_whose_joints_cannot_follow_stops_and_says_what_holds_them() -> None:
-    of = override(load_profile("panda_sim"), {"robot": {"command": "joint"}})
+def stuck_rig(**robot: str) -> Rig:
+    """Just stopped, because the joints cannot follow."""
+    of = override(load_profile("panda_sim"), {"robot": {"command": "joint", **robot}})
     kinematics, rng = ReachabilityFilter(of).kinematics, np.random.default_rng(0)
     rig = Rig(of, reach=ReachabilityFilter(of))
     rig.stand_at(kinematics, np.array(of.robot.home_rad))
     rig.activate()
     step = rng.normal(size=6)
     for _ in range(60):
-        if rig.state != "active":
-            break
         step = step + 0.5 * rng.normal(size=6)
         way = np.clip(step, -1, 1) * [0.03, 0.03, 0.03, 0.15, 0.15, 0.15]
         rig.send([[*way, 0.0]] * 8)
@@ -659,6 +660,13 @@ def test_an_arm_whose_joints_cannot_follow_stops_and_says_what_holds_them() -> N
             out = rig.tick()
             if out.joint is not None:
                 rig.stand_at(kinematics, out.joint.position_rad)
+            if rig.state != "active":
+                return rig
+    raise AssertionError("the joints follow")
+
+
+def test_an_arm_whose_joints_cannot_follow_stops_and_says_what_holds_them() -> None:
+    rig = stuck_rig()
     why = "the joints cannot follow the pose: it has waited for them for 0.5 s; they are held by"
     assert rig.state == "inactive"
     assert f"{why} joint_limit panda_joint5" in rig.commander.why
@@ -666,6 +674,42 @@ def test_an_arm_whose_joints_cannot_follow_stops_and_says_what_holds_them() -> N
     rig.run(2.0)
     rig.activate()
     assert f"the last activation ended: {why}" in rig.commander.why
+
+
+def test_an_arm_whose_joints_could_not_follow_can_be_activated_while_it_is_paused() -> None:
+    rig = stuck_rig(posture="home")
+    rig.put("speed", 0.0)
+    while rig.state != "active":
+        assert rig.commander.streaming, rig.commander.why
+        rig.put("active", True)
+    rig.run(0.1)
+    assert rig.state == "active", rig.commander.why
+
+
+def velocities_rad_s(held_after: int) -> list[FloatArray]:
+    """Of joints on their way, whose gripper holds a box after so many ticks."""
+    of = override(load_profile("panda_sim"), {"robot": {"command": "joint"}})
+    reach = ReachabilityFilter(of)
+    rig = Rig(of, reach=reach)
+    rig.stand_at(reach.kinematics, np.array(of.robot.home_rad))
+    rig.activate()
+    rig.send([DOWN_FAST] * 8)
+    rig.run(0.1)
+    for _ in range(held_after):
+        rig.tick()
+    outs = [rig.put("held", BOX), *(rig.tick() for _ in range(4))]
+    return [out.joint.velocity_rad_s for out in outs if out.joint is not None]
+
+
+@pytest.mark.parametrize("held_after", range(4))  # distances are computed in every fourth tick
+def test_a_box_is_kept_clear_from_the_tick_on_in_which_the_gripper_holds_it(
+    held_after: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ahead = velocities_rad_s(held_after)
+    monkeypatch.setattr(MotionPipeline, "_tick_ahead", lambda *_: None)
+    then = velocities_rad_s(held_after)
+    assert len(ahead) == len(then) == 5
+    np.testing.assert_allclose(ahead, then, atol=1e-4)
 
 
 @pytest.mark.parametrize(("name", "value"), [("prompt", "go down"), ("worker", OTHER)])

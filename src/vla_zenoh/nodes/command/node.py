@@ -36,12 +36,14 @@ MAX_WHY, MAX_LIMIT = 2000, 200
 CHORES_S = 0.05
 """Period of tasks that no motion depends on: status, clock queries, reading other nodes' status."""
 PLANNING_NS = 1_500_000
-"""A chunk is planned this long before the next tick, or at once if it arrives later. Its other
-readers get it first: planning at a real-time priority keeps a processor from them. Where the period
-is shorter, so that a tick would be missed, it is planned after the next tick."""
+"""A chunk is planned this long before the next tick, or at once if it arrives later, or in the tick
+if less than `READING_NS` before. Its other readers get it first: planning at a real-time priority
+keeps a processor from them. Where the period is shorter, so that a tick would be missed, it is
+planned after the next tick."""
 READING_NS = 400_000
-"""States are read and checked this long before each tick, so that it only has to read the others.
-Not where the period is too short to plan a chunk in, and most ticks have no new ones."""
+"""States are read this long before each tick, which then only has to read those that came since.
+Where the period is too short to plan a chunk in, they are read in the tick alone: there most ticks
+have no new ones."""
 REST_S, REST_TIMEOUTS = 0.02, 5
 """Period of the ticks while the arm rests, and how many of them a command timeout has at least."""
 REST_AFTER_NS = 100_000_000
