@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import re
 import shlex
+from collections import UserDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from importlib import import_module
 from importlib.resources import files
@@ -125,26 +126,20 @@ COMMANDS: Mapping[str, Mapping[str, str | Group]] = {
 }
 
 
-class _LazyCommands(Mapping[str, Any]):
+class _LazyCommands(UserDict[str, Any]):
     """Name -> command, imported when it is first looked up."""
 
     def __init__(
         self, panels: Mapping[str, Mapping[str, str | Group]], path: Sequence[str]
     ) -> None:
-        self._entries = {name: entry for group in panels.values() for name, entry in group.items()}
+        super().__init__({name: one for group in panels.values() for name, one in group.items()})
         self._path = path
-        self._loaded: dict[str, Any] = {}
 
     def __getitem__(self, name: str) -> Any:
-        if name not in self._loaded:
-            self._loaded[name] = _load((*self._path, name), self._entries[name])
-        return self._loaded[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._entries)
-
-    def __len__(self) -> int:
-        return len(self._entries)
+        found = self.data[name]
+        if isinstance(found, (str, Group)):
+            found = self.data[name] = _load((*self._path, name), found)
+        return found
 
 
 def _load(path: Sequence[str], entry: str | Group) -> Any:
@@ -265,21 +260,6 @@ def _profile(context: Any) -> Any:
         return load_profile(DEFAULT_PROFILE)
 
 
-def profiles(context: Any) -> Iterable[str]:
-    """Names of profiles."""
-    return resources.names("profiles")
-
-
-def models(context: Any) -> Iterable[str]:
-    """Workers of the profile, and names of models."""
-    return [*_profile(context).workers, *resources.names("models")]
-
-
-def of_profile(section: str) -> Callable[[Any], Iterable[str]]:
-    """What the profile has in a section: workers, hosts or cameras."""
-    return lambda context: getattr(_profile(context), section)
-
-
 def prompts(context: Any) -> Iterable[str]:
     """The profile's prompt, one task of every kind, and some motions of the scripted worker."""
     tasks = ("put the red brick in the box", "stack the red brick on the green brick")
@@ -307,11 +287,17 @@ class Candidate(NamedTuple):
 
 
 COMPLETIONS: Mapping[str, Callable[[Any], Iterable[str]]] = {
-    **dict.fromkeys(("profile", "also", "profile show.name", "profile check.names"), profiles),
-    "model": models,
-    **dict.fromkeys(("worker", "workers", "lab compare.a", "lab compare.b"), of_profile("workers")),
-    "host": of_profile("hosts"),
-    "cameras": of_profile("cameras"),
+    **dict.fromkeys(
+        ("profile", "also", "profile show.name", "profile check.names"),
+        lambda _: resources.names("profiles"),
+    ),
+    "model": lambda context: [*_profile(context).workers, *resources.names("models")],
+    **dict.fromkeys(
+        ("worker", "workers", "lab compare.a", "lab compare.b"),
+        lambda context: _profile(context).workers,
+    ),
+    "host": lambda context: _profile(context).hosts,
+    "cameras": lambda context: _profile(context).cameras,
     **dict.fromkeys(("prompt", "prompts", "prompt.text"), prompts),
     **dict.fromkeys(("key", "keys"), keys),
 }
