@@ -21,15 +21,16 @@ class RecordError(VlaZenohError, ValueError):
     """A value cannot be a valid record: its shape, range, or NaN."""
 
 
-class CodecError(VlaZenohError, ValueError):
-    """Bytes from the wire are not what their key promises.
-
-    `reason` is the stable name of its counter in status, for example ``truncated``.
-    """
+class CountedError(VlaZenohError):
+    """An error whose `reason` is the stable name of its counter in status, as ``truncated``."""
 
     def __init__(self, reason: str, message: str) -> None:
         super().__init__(message)
         self.reason = reason
+
+
+class CodecError(CountedError, ValueError):
+    """Bytes from the wire are not what their key promises."""
 
 
 class ProfileError(VlaZenohError, ValueError):
@@ -96,15 +97,8 @@ class OutputError(VlaZenohError):
     """An output file or folder cannot be written, or would overwrite something."""
 
 
-class PeerError(VlaZenohError):
-    """A policy server gave no usable answer.
-
-    `reason` is the stable name of its counter in status, for example ``peer_timeout``.
-    """
-
-    def __init__(self, reason: str, message: str) -> None:
-        super().__init__(message)
-        self.reason = reason
+class PeerError(CountedError):
+    """A policy server gave no usable answer."""
 
 
 class NodeError(VlaZenohError):

@@ -303,7 +303,7 @@ class Client(NodeRegistry):
         Raises:
             SessionError: rejected, with every reason.
         """
-        text = settings.encode_deadman_activation(holder).decode() if holder else "true"
+        text = f"true {settings.WHILE} {holder}" if holder else "true"
         return self._set("activate", text, lambda task: task.active, timeout_s)
 
     def activate_with_deadman(self, what: str, timeout_s: float = 3.0) -> Task:

@@ -88,7 +88,8 @@ class Traffic:
         self._sent: dict[str, tuple[int, int]] = {}
         # (key, source) -> its first seq, our count then, losses since; the newest comes last
         self._received: dict[tuple[str, str], tuple[int, int, int]] = {}
-        self._lost: Counter[str] = Counter()
+        self.lost: Counter[str] = Counter()
+        """Key -> records that never arrived here."""
         self._links: list[str] = []
         self._links_s = -1e9
 
@@ -106,8 +107,8 @@ class Traffic:
         lost = max((header.seq - seq) - (arrivals - count), before)
         self._received[who] = (seq, count, lost)
         if lost > before:
-            full = key not in self._lost and len(self._lost) >= MAX_SENDERS
-            self._lost[OTHERS if full else key] += lost - before
+            full = key not in self.lost and len(self.lost) >= MAX_SENDERS
+            self.lost[OTHERS if full else key] += lost - before
         if len(self._received) > MAX_SENDERS:
             del self._received[next(iter(self._received))]
 
@@ -125,10 +126,6 @@ class Traffic:
                 rates = ((stream.seq - count) / took_s, (stream.sent_bytes - size) / took_s)
                 out[stream.key] = [round(rate, 2) for rate in rates]
         return out
-
-    def lost(self) -> dict[str, int]:
-        """Key -> records that never arrived here."""
-        return dict(self._lost)
 
     def links(self) -> list[str]:
         """Endpoints this node is connected to, as Zenoh writes them."""

@@ -208,7 +208,7 @@ class Node:
         short, traffic = self.keys.short, self.traffic
         net = {
             "sent": {short(key): rates for key, rates in traffic.sent(self._publishers).items()},
-            "lost": {short(key): count for key, count in traffic.lost().items()},
+            "lost": {short(key): count for key, count in traffic.lost.items()},
             "links": traffic.links(),
         }
         clocks = {

@@ -9,7 +9,6 @@ the metres of a count (``image/png;depth16;0.001``: 1 mm).
 from __future__ import annotations
 
 import re
-from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -53,20 +52,14 @@ def encode_raw(image: Image) -> bytes:
 
 def decode_raw(payload: bytes, schema: str) -> Image:
     """An image from its pixels, without copying; `CodecError`: schema or length do not fit."""
-    height, width = _raw_size(schema)
-    if len(payload) != height * width * 3:
-        raise CodecError("truncated", f"{len(payload)} bytes for an rgb8 image of {height}x{width}")
-    return Image(np.frombuffer(payload, np.uint8).reshape(height, width, 3))
-
-
-@lru_cache(maxsize=16)
-def _raw_size(schema: str) -> tuple[int, int]:
     match = _RAW_SCHEMA.fullmatch(schema)
     if match is None:
         raise CodecError("malformed", f"raw image schema {shown(schema)}, wanted rgb8;HEIGHTxWIDTH")
     height, width = int(match[1]), int(match[2])
     check_size(height, width)
-    return height, width
+    if len(payload) != height * width * 3:
+        raise CodecError("truncated", f"{len(payload)} bytes for an rgb8 image of {height}x{width}")
+    return Image(np.frombuffer(payload, np.uint8).reshape(height, width, 3))
 
 
 def encode_jpeg(image: Image, quality: int = DEFAULT_JPEG_QUALITY) -> bytes:

@@ -132,8 +132,3 @@ def decode_seed(payload: bytes) -> int | None:
     if not (word.isascii() and word.isdigit() and len(word) <= MAX_SEED_DIGITS):
         raise CodecError("invalid", f"{word[:40]!r} is not a seed: give nothing or a whole number")
     return int(word)
-
-
-def encode_deadman_activation(holder: str) -> bytes:
-    """An activation that lasts as long as the token `vla_zenoh.keys.Keys.holding` of `holder`."""
-    return f"true {WHILE} {holder}".encode()

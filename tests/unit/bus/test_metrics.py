@@ -34,7 +34,7 @@ def test_gaps_are_lost_and_what_the_slot_dropped_is_not() -> None:
     hear(found, POSE, "sim#1", 3, 4, 9)
     found.received(DELTA, Header(0, 0, "worker-scripted#1"), 1)
     found.received(DELTA, Header(0, 5, "worker-scripted#1"), 6)
-    assert found.lost() == {POSE: 4}
+    assert found.lost == {POSE: 4}
 
 
 def test_who_comes_after_many_others_is_watched_too() -> None:
@@ -42,7 +42,7 @@ def test_who_comes_after_many_others_is_watched_too() -> None:
     for start in range(2 * MAX_SENDERS):
         hear(found, POSE, f"sim#{start}", 0, 1)
     hear(found, DELTA, "worker-scripted#1", 0, 9)
-    assert found.lost() == {DELTA: 8}
+    assert found.lost == {DELTA: 8}
 
 
 def test_losses_of_who_was_forgotten_stay_with_their_key() -> None:
@@ -50,7 +50,7 @@ def test_losses_of_who_was_forgotten_stay_with_their_key() -> None:
     hear(found, POSE, "sim#before", 0, 5)
     for start in range(2 * MAX_SENDERS):
         hear(found, POSE, f"sim#{start}", 0, 2)
-    assert found.lost() == {POSE: 4 + 2 * MAX_SENDERS}
+    assert found.lost == {POSE: 4 + 2 * MAX_SENDERS}
 
 
 def test_who_speaks_all_the_time_is_not_forgotten_for_those_who_spoke_once() -> None:
@@ -59,14 +59,14 @@ def test_who_speaks_all_the_time_is_not_forgotten_for_those_who_spoke_once() -> 
         found.received(POSE, Header(0, turn, "sim#1"), turn + 1)
         hear(found, DELTA, f"worker-scripted#{turn}", 0)
     found.received(POSE, Header(0, 2 * MAX_SENDERS + 7, "sim#1"), 2 * MAX_SENDERS + 1)
-    assert found.lost() == {POSE: 7}
+    assert found.lost == {POSE: 7}
 
 
 def test_made_up_keys_take_a_bounded_place() -> None:
     found = traffic()
     for number in range(4 * MAX_SENDERS):
         hear(found, f"vla/panda/delta/ghost{number}", f"ghost{number}#1", 0, 2)
-    lost = found.lost()
+    lost = found.lost
     assert len(lost) <= 2 * MAX_SENDERS + 1
     assert sum(lost.values()) == 4 * MAX_SENDERS
     assert lost[OTHERS] > 0

@@ -169,7 +169,7 @@ class WorkerNode:
         others_s = [robot.due_s - now_s for robot in self.sessions if robot not in due]
         if not due:
             stop.wait(max(0.0, min(*others_s, POLL_PERIOD_S)))
-        elif all(robot.needs_images for robot in due):
+        elif self.spec.observation.camera_names:
             silent = all(robot.cameras_silent for robot in self.sessions)
             for nap_s in (SILENT_NAP_S,) if silent else (NAP_S,) * NAPS:
                 if self._changed.wait(nap_s) and any(robot.has_images for robot in due):

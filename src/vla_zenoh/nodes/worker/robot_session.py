@@ -39,7 +39,7 @@ from vla_zenoh.policy.observation import (
     state_names,
 )
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import ActionChunk, Event, Header, Image, SingleWriterFilter, Stamped, Task
+from vla_zenoh.types import ActionChunk, Event, Header, SingleWriterFilter, Stamped, Task
 
 SPEC_PERIOD_S = 1.0
 TASK_PATIENCE_S = 1.5
@@ -88,7 +88,7 @@ class RobotSession:
         streams = self._streams = Streams.of(self.spec.observation, self.spec.parts)
         history_s, jpeg = self.spec.observation.history_span_s, images == "jpeg"
         camera_stream = partial(CameraStream, node, history_s=history_s, changed=changed)
-        decode_image = _decode_jpeg if jpeg else decode_raw
+        decode_image = (lambda payload, _: decode_jpeg(payload)) if jpeg else decode_raw
         self._cameras = [
             camera_stream(name, colour_keys(one, node, jpeg=jpeg), kept, decode_image)
             for one, (name, kept) in zip(
@@ -134,11 +134,6 @@ class RobotSession:
             elif not camera.images.entries or camera.images.newest_ns < self._not_before_ns:
                 return False
         return new
-
-    @property
-    def needs_images(self) -> bool:
-        """Whether the model observes any camera."""
-        return bool(self._cameras)
 
     @property
     def cameras_silent(self) -> bool:
@@ -415,10 +410,6 @@ def colour_keys(spec: CameraSpec, node: Node, *, jpeg: bool) -> list[str]:
     if settings is None or not settings.fit_for_workers or size is None:
         return [keys.camera_jpeg(name)]
     return [keys.camera_fitted(name, size), keys.camera_jpeg(name)]
-
-
-def _decode_jpeg(payload: bytes, _: str) -> Image:
-    return decode_jpeg(payload)
 
 
 class StateStream:
