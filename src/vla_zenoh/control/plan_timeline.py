@@ -429,10 +429,16 @@ class PlanAggregator:
         """The plans that F(now) depends on, the newest last."""
         if self._mode == "replace":
             return [timeline.plan]
+        episode_plans = timeline.episode_plans()
+        newest = next(episode_plans)
         if self._mode == "blend":
-            return self._blended(timeline, now_ns)
-        newest, *older = timeline.episode_plans()
-        alive = [plan for plan in older if now_ns < plan.end_ns]
+            plans = [newest]
+            for older in episode_plans:
+                if self._weight(older, plans[-1], now_ns) >= 1.0:
+                    break
+                plans.append(older)
+            return plans[::-1]
+        alive = [plan for plan in episode_plans if now_ns < plan.end_ns]
         return [newest, *alive[: self._max_plans - 1]][::-1]
 
     def goal(self, plans: Sequence[Plan], now_ns: int) -> Goal:
@@ -450,15 +456,6 @@ class PlanAggregator:
             mean = _with_rest(_mean_goal(waypoints, self._weights), waypoints)
             known = self._mean = waypoints, mean
         return known[1]
-
-    def _blended(self, timeline: GoalTimeline, now_ns: int) -> list[Plan]:
-        episode_plans = timeline.episode_plans()
-        plans = [next(episode_plans)]
-        for older in episode_plans:
-            if self._weight(older, plans[-1], now_ns) >= 1.0:
-                break
-            plans.append(older)
-        return plans[::-1]
 
     def _weight(self, older: Plan, plan: Plan, now_ns: int) -> float:
         """Share of `plan` against `older`: 0 when it arrives, 1 at the end of its window."""

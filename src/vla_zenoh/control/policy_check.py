@@ -403,20 +403,6 @@ def validate_chunk(
             task.episode,
             quiet=record.episode < task.episode,
         )
-    rejection = _validate_times(record, lease, max_age_s, now_ns)
-    if rejection is not None:
-        return rejection
-    try:
-        check_steps(lease.spec.action, record.steps)
-    except SpecError as error:
-        return Rejection("shape", str(error))
-    lease.last_observation_ns = record.observation_stamp_ns
-    return None
-
-
-def _validate_times(
-    record: ActionChunk, lease: Lease, max_age_s: float, now_ns: int
-) -> Rejection | None:
     age_s = (now_ns - record.observation_stamp_ns) / 1e9
     if age_s < -FUTURE_TOLERANCE_NS / 1e9:
         return Rejection("future", f"its observation is {-age_s:.3f} s in the future", age_s, 0.0)
@@ -431,6 +417,11 @@ def _validate_times(
         return Rejection("expired", f"it was valid until {late_s:.3f} s ago", late_s, 0.0)
     if record.observation_stamp_ns <= lease.last_observation_ns:
         return Rejection("out_of_order", "its observation is not newer than the last one used")
+    try:
+        check_steps(lease.spec.action, record.steps)
+    except SpecError as error:
+        return Rejection("shape", str(error))
+    lease.last_observation_ns = record.observation_stamp_ns
     return None
 
 

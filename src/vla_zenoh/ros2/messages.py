@@ -70,10 +70,7 @@ class Messages:
         for kind, text in (shipped_too | dict(extra or {})).items():
             definitions |= parse(kind, text)
         self._register(definitions)
-        self._hash_chars_as_ros_does()
-
-    def _hash_chars_as_ros_does(self) -> None:
-        """ROS 2 makes a ``char`` of message text a ``uint8``; rosbags hashes it as a character."""
+        # ROS 2 makes a ``char`` of message text a ``uint8``; rosbags hashes it as a character.
         for kind, (constants, fields) in self._store.fielddefs.items():
             changed = [(name, _as_uint8(described)) for name, described in fields]
             self._store.fielddefs[kind] = (constants, changed)

@@ -144,16 +144,12 @@ def _compressed_image(message: Any) -> RosImage:
     return RosImage(_stamp_ns(message.header), message.header.frame_id, decode(payload).rgb)
 
 
-def _text(message: Any) -> str:
-    return message.data
-
-
 READERS: dict[str, Callable[[Any], Any]] = {
     JOINT_STATE: _joints,
     WRENCH: _wrench,
     IMAGE: _image,
     COMPRESSED_IMAGE: _compressed_image,
-    TEXT: _text,
+    TEXT: lambda message: message.data,
 }
 """Type -> decoder: message -> sample; raises `CodecError` or `ValueError`."""
 

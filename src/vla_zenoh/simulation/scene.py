@@ -111,7 +111,11 @@ def build_model(
     except (ValueError, mujoco.FatalError) as error:
         described = " and ".join(dict.fromkeys(robot.description for robot in robots))
         raise ResourceError(f"MuJoCo rejects scene {path} with {described}: {error}") from error
-    _sort_groups(model)
+    # Two groups for ray casting.
+    moving = model.body_weldid[model.geom_bodyid] != 0
+    visible = model.geom_group < HIDDEN_GROUP
+    model.geom_group[visible & moving] = MOVING_GROUP
+    model.geom_group[visible & ~moving] = STATIC_GROUP
     return model
 
 
@@ -215,14 +219,6 @@ def _set_solver(spec: mujoco.MjSpec) -> None:
     # Multisampling costs ten times the rest of a software-rendered frame.
     spec.visual.quality.offsamples = 0
     spec.visual.quality.shadowsize = 0
-
-
-def _sort_groups(model: mujoco.MjModel) -> None:
-    """Sort visible geoms into two groups, moving and static, for ray casting."""
-    moving = model.body_weldid[model.geom_bodyid] != 0
-    visible = model.geom_group < HIDDEN_GROUP
-    model.geom_group[visible & moving] = MOVING_GROUP
-    model.geom_group[visible & ~moving] = STATIC_GROUP
 
 
 # -- places of objects ----------------------------------------------------------------------------
@@ -351,7 +347,10 @@ class Appearance(NamedTuple):
 def draw_appearance(seed: int) -> Appearance:
     """The appearance of a reset with `seed`; offsets and rotations are uniform in a ball."""
     random = np.random.default_rng((_STREAM, seed))
-    ambient, head, key = (_tinted(random, *bounds) for bounds in (AMBIENT, HEAD, KEY))
+    ambient, head, key = (
+        random.uniform(low, high) * (1.0 + MAX_TINT * random.uniform(-1.0, 1.0, 3))
+        for low, high in (AMBIENT, HEAD, KEY)
+    )
     key_turn_rad = _in_ball(random, MAX_LIGHT_TURN_RAD)
     table = random.uniform(*TABLE_BRIGHTNESS) * (1.0 - TABLE_SATURATION * random.uniform(size=3))
     shift_m, turn_rad = _in_ball(random, MAX_SHIFT_M), _in_ball(random, MAX_TURN_RAD)
@@ -410,10 +409,6 @@ class AppearanceSwitcher:
         except KeyError as error:
             why = f"the scene has no {kind} {name!r} that could be varied"
             raise ResourceError(f"{why}; see sim/bricks/README.md") from error
-
-
-def _tinted(random: np.random.Generator, low: float, high: float) -> FloatArray:
-    return random.uniform(low, high) * (1.0 + MAX_TINT * random.uniform(-1.0, 1.0, 3))
 
 
 def _in_ball(random: np.random.Generator, radius: float) -> FloatArray:

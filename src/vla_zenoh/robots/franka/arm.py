@@ -165,7 +165,11 @@ class FrankaArm:
                 "active? The node restarts and reconnects; then activate the arm again"
             ) from error
         if self._was_in_control and not in_control:
-            self._ended = self._why_ended()
+            self._motion, self._ended = None, ""  # it was released, or ended by itself
+            try:
+                robot.poll_motion()
+            except self._franky.Exception as error:
+                self._ended = in_words(error)
         self._was_in_control = in_control
         still_ns = time.monotonic_ns() - self._moved_ns
         if in_control and still_ns > REST_S * 1e9 and self._motion is not None:
@@ -202,15 +206,6 @@ class FrankaArm:
         if self._hand is not None and self._hand.fault:
             return f"hand: {self._hand.fault}"
         return self._ended
-
-    def _why_ended(self) -> str:
-        """Why the loop ended by itself; empty: it was released."""
-        self._motion = None
-        try:
-            self.robot.poll_motion()
-        except self._franky.Exception as error:
-            return in_words(error)
-        return ""
 
     def status(self) -> Mapping[str, Any]:
         """Robot mode, errors and quality of the connection."""

@@ -149,7 +149,12 @@ class Gripper:
     def poll(self, writer: str, *, writer_active: bool) -> None:
         """Handle answers, and send or cancel the goal that is due; see `ArmGuard.writer`."""
         if self._writer and not writer_active:
-            self._drop_waiting()
+            # The motion is over that the command belonged to, which waits for the goal in flight.
+            dropped, self._goals.wish = self._goals.wish, None
+            if dropped is not None:
+                self.wanted_m = self._sent_m
+                why = f"to {dropped.width_m:.3f} m waited when {self._writer[:60]!r} stopped"
+                self._node.reject("outlived", f"command/gripper {why}")
         self._writer = writer if writer_active else ""
         while self._answers:
             self._answers.popleft()()
@@ -166,14 +171,6 @@ class Gripper:
             self._node.counters["ros2.gripper_cancelled"] += 1
             request = writers.cancel(self._messages, goal.id)
             self._call("cancel_goal", request, lambda _: None)  # the goal's result follows
-
-    def _drop_waiting(self) -> None:
-        """Drop a command that waits for the goal in flight: the motion it belonged to is over."""
-        dropped, self._goals.wish = self._goals.wish, None
-        if dropped is not None:
-            self.wanted_m = self._sent_m
-            why = f"to {dropped.width_m:.3f} m waited when {self._writer[:60]!r} stopped"
-            self._node.reject("outlived", f"command/gripper {why}")
 
     def move(self, command: GripperCommand, now_ns: int) -> None:
         """Send a command, after the goal in flight ended; `now_ns` (wall clock) stamps it."""

@@ -106,7 +106,10 @@ class RosServices:
             self._poll_prompts()
             if time.monotonic() >= next_status_s:
                 next_status_s = time.monotonic() + STATUS_PERIOD_S
-                self._publish_status()
+                stamp = Stamp(time.time_ns(), "")
+                nodes = self._client.snapshot()
+                message = diagnostics(self._messages, self._robot, nodes, stamp)
+                self._status.publish(self._messages.encode(message))
 
     def _poll_prompts(self) -> None:
         """Apply the prompts of the topic; a repeated one only if the task has another one now."""
@@ -205,12 +208,6 @@ class RosServices:
         if asked.active:
             done.append(self._activate(True))
         return "; ".join(done)
-
-    def _publish_status(self) -> None:
-        message = diagnostics(
-            self._messages, self._robot, self._client.snapshot(), Stamp(time.time_ns(), "")
-        )
-        self._status.publish(self._messages.encode(message))
 
 
 def prompt_text(value: str) -> str:
