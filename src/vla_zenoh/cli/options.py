@@ -8,7 +8,7 @@ import inspect
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_type_hints
 
 import typer
 
@@ -126,8 +126,7 @@ class NodeOptions:
         return effective_profile(self.profile, self.connect)
 
 
-@dataclass(frozen=True)
-class WorkerChoice:
+class WorkerChoice(NamedTuple):
     """The worker to run: its name in keys, its model file, and the options of the model."""
 
     name: str

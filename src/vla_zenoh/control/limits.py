@@ -243,11 +243,8 @@ class Slowdown(NamedTuple):
 
 def slowest(*reasons: Slowdown | None) -> Slowdown | None:
     """The slowdown with the least share, None without any."""
-    least: Slowdown | None = None
-    for reason in reasons:
-        if reason is not None and (least is None or reason.share < least.share):
-            least = reason
-    return least
+    given = [reason for reason in reasons if reason is not None]
+    return min(given, key=lambda reason: reason.share, default=None)
 
 
 def full_speed_s(limits: Limits, before: Pose, after: Pose) -> float:

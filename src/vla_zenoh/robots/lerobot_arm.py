@@ -40,7 +40,7 @@ class LeRobotArm:
     def __init__(self, profile: Profile) -> None:
         assert profile.lerobot is not None
         settings = self._settings = profile.lerobot
-        self._profile, names = profile, profile.robot.arm_joints
+        names = profile.robot.arm_joints
         self._keys = [f"{name}.pos" for name in settings.motors or names]
         self._gripper = f"{settings.gripper}.pos" if settings.gripper else ""
         self._width_m = profile.robot.gripper.max_width_m
@@ -65,8 +65,20 @@ class LeRobotArm:
     # -- connection ---------------------------------------------------------------------------
     def connect(self) -> None:
         """Connect to the motors, or raise a `NodeError`; they go limp for a moment."""
-        settings = self._settings
-        robot = self._robot = make_lerobot(self._profile)
+        settings, lerobot = self._settings, import_module("lerobot.robots")
+        folder = Path(settings.calibration_dir).expanduser() if settings.calibration_dir else None
+        try:
+            kind = lerobot.RobotConfig.get_choice_class(settings.robot)
+            config = kind(
+                port=settings.port,
+                id=settings.id,
+                calibration_dir=folder,
+                use_degrees=settings.units == "degrees",
+                disable_torque_on_disconnect=settings.limp_at_end,
+            )
+            robot = self._robot = lerobot.make_robot_from_config(config)
+        except Exception as error:
+            raise NodeError(f"LeRobot's {settings.robot}: {in_words(error)}") from error
         missing = {*self._keys, *filter(None, [self._gripper])} - set(robot.action_features)
         if missing:
             raise NodeError(
@@ -140,23 +152,3 @@ class LeRobotArm:
         self._asked = OPEN * min(max(width_m / self._width_m, 0.0), 1.0)
         self._grip_moved_s, self._gripping = time.monotonic(), True
         self._robot.send_action({self._gripper: self._asked})
-
-
-def make_lerobot(profile: Profile) -> Any:
-    """LeRobot's robot of a profile, not connected; a `NodeError` if it has none of this name."""
-    lerobot = import_module("lerobot.robots")
-    settings = profile.lerobot
-    assert settings is not None
-    folder = Path(settings.calibration_dir).expanduser() if settings.calibration_dir else None
-    try:
-        kind = lerobot.RobotConfig.get_choice_class(settings.robot)
-        config = kind(
-            port=settings.port,
-            id=settings.id,
-            calibration_dir=folder,
-            use_degrees=settings.units == "degrees",
-            disable_torque_on_disconnect=settings.limp_at_end,
-        )
-        return lerobot.make_robot_from_config(config)
-    except Exception as error:
-        raise NodeError(f"LeRobot's {settings.robot}: {in_words(error)}") from error

@@ -223,10 +223,6 @@ class Depth:
             counts = np.where((counts >= 1) & (counts <= MAX_COUNT), counts, 0)
         return Depth(counts.astype(np.uint16), unit_m)
 
-    def metres(self) -> NDArray[np.float32]:
-        """(H, W) distance in m; 0: not measured."""
-        return (self.counts * self.unit_m).astype(np.float32)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ActionChunk:

@@ -30,7 +30,7 @@ def test_a_distance_that_no_count_can_say_is_not_measured() -> None:
     metres = np.array([[np.nan, np.inf, -1.0, 0.0], [0.0004, 0.0006, 65.535, 65.54]])
     depth = Depth.of_metres(metres, 0.001)
     np.testing.assert_array_equal(depth.counts, [[0, 0, 0, 0], [0, 1, 65535, 0]])
-    np.testing.assert_allclose(depth.metres()[1], [0, 0.001, 65.535, 0], rtol=1e-6)
+    np.testing.assert_allclose((depth.counts * depth.unit_m)[1], [0, 0.001, 65.535, 0], rtol=1e-6)
 
 
 @pytest.mark.parametrize("schema", ["", "depth16", "rgb8;48x64", "depth16;", "depth16;nan"])

@@ -99,7 +99,10 @@ class Ros2Driver(RobotDriver):
         profile, ros2 = self.profile, self._ros2
         self._node, self._arm, session = node, arm, node.session
         if ros2.connect is not None:
-            settings = _session_settings(profile, ros2.connect)
+            more: dict[str, Any] = {"connect": ros2.connect}
+            if all(each.partition("/")[0] in TRUSTED_PROTOCOLS for each in ros2.connect):
+                more |= {"listen": ros2.connect, "security": profile.session.security}
+            settings = SessionProfile(lease_ms=profile.session.lease_ms, **more)
             self._own_session = open_session(settings, identity=NAME, wait_s=ROUTER_PATIENCE_S)
         name = "".join(each if each.isalnum() else "_" for each in profile.robot.name)
         graph = self.graph = RosGraph(
@@ -443,11 +446,3 @@ def read_messages(ros2: Ros2Profile) -> Messages:
         except (OSError, ValueError, RuntimeError) as error:
             raise ProfileError(f"ros2.messages.{kind}: {path} cannot be read: {error}") from error
     return Messages(ros2.distribution, texts)
-
-
-def _session_settings(profile: Profile, endpoints: tuple[str, ...]) -> SessionProfile:
-    """Settings of the session to the robot's own bridge or router."""
-    more: dict[str, Any] = {}
-    if all(endpoint.partition("/")[0] in TRUSTED_PROTOCOLS for endpoint in endpoints):
-        more = {"listen": endpoints, "security": profile.session.security}
-    return SessionProfile(connect=endpoints, lease_ms=profile.session.lease_ms, **more)

@@ -42,8 +42,6 @@ POLL_S = 0.05
 MAX_WAITING = 32
 STATE_TIMEOUT_S = 2.0
 
-Reject = Callable[[str, str, str], None]
-
 
 class RosServices:
     """Serves the control services, applies the prompt topic, and publishes the status topic.
@@ -59,7 +57,7 @@ class RosServices:
         graph: RosGraph,
         messages: Messages,
         prefix: str,
-        reject: Reject,
+        reject: Callable[[str, str, str], None],
     ) -> None:
         self._robot, self._messages, self._reject = profile.robot.name, messages, reject
         self._client = Client(profile, session).subscribe()
