@@ -276,6 +276,7 @@ class MotionPipeline:
             self.pace.override, self.pace.slowing = task.speed, task.speed > 0.0
             self.timeline.clock.set(task.speed, now_ns)
             self.goal = None
+        failures = self.failures
         if state is State.ACTIVE:
             events = self._follow(self.timeline, task, overdue_ns, now_ns, ticks)
         else:
@@ -283,7 +284,7 @@ class MotionPipeline:
         went_on, self.streaming = self.streaming, self._must_stream(state, now_ns)
         if not self.streaming:
             return True, events
-        failures, mover = self.failures, self._mover  # which may be another by now
+        mover = self._mover  # which may be another by now
         # A stream that begins must begin at rest: no ticks are made up for.
         for _ in range(ticks if went_on else 1):
             ahead, self._ahead = self._ahead, None

@@ -20,6 +20,7 @@ from command_rig import (
     quat_of,
 )
 
+from vla_zenoh.control.axis_smoothing import AxisSmoother
 from vla_zenoh.control.commander import Commander, Inputs, Setting
 from vla_zenoh.control.motion_pipeline import LINGER_NS, MotionPipeline
 from vla_zenoh.control.reachability import ReachabilityFilter
@@ -1192,3 +1193,24 @@ def test_a_robot_that_leaves_its_ready_mode_between_two_ticks_is_inactive_in_the
     assert rig.state == "inactive"
     assert not rig.commander.task.active
     assert out.task_changed
+
+
+@pytest.mark.parametrize("command", ["pose", "joint"])
+def test_a_goal_without_a_trajectory_is_a_fault_and_the_arm_brakes(
+    command: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    of = profile(robot={"command": command})
+    reach = ReachabilityFilter(of)
+    rig = Rig(of, reach=reach)
+    rig.stand_at(reach.kinematics, reach.joints_rad.copy())
+    rig.joints_rad = None
+    rig.activate()
+    rig.tick(chunks=[rig.chunk([UP] * 8)])
+    rig.run(0.2)
+    assert rig.state == "active"
+    monkeypatch.setattr(AxisSmoother, "_towards", lambda *_: (None, False))
+    rig.tick(chunks=[rig.chunk([UP] * 8)])
+    rig.run(1.0)
+    assert rig.state == "fault"
+    assert rig.commander.why == "no trajectory could be computed; braked"
+    assert rig.commander.at_rest
