@@ -478,6 +478,11 @@ class SimulatedGripper:
         return GripperState(self._opening()[0], moving=self._moving, holding=self._holding)
 
     @property
+    def force_n(self) -> float:
+        """Force of either finger, inwards positive."""
+        return -float(self._data.actuator_force[self._actuator])
+
+    @property
     def _moving(self) -> bool:
         return self._rest_ticks < AT_REST_TICKS
 
