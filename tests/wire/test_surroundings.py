@@ -41,7 +41,9 @@ class Scene:
 
     def look(self) -> PeerSnapshot:
         self.command.clocks.poll()
-        self.peers = self.ears.update(self.command.clock.wall_ns()) or self.peers
+        now_ns = self.command.clock.wall_ns()
+        self.ears.read_news(now_ns)
+        self.peers = self.ears.snapshot(now_ns) or self.peers
         return self.peers
 
     def says(self, node: Node, age_s: Any) -> None:

@@ -105,6 +105,7 @@ def node_commands(
     host: str,
     profile_file: Path,
     worker_options: Mapping[str, Sequence[str]] | None = None,
+    worker_arguments: Sequence[str] = (),
     also_files: Sequence[Path] = (),
     *,
     dry_run: bool = False,
@@ -139,7 +140,7 @@ def node_commands(
             continue
         for worker in profile.workers_of(part):
             options = repeated("--set", (worker_options or {}).get(worker, ()))
-            words = ("worker", worker, *common, "--host", host, *options)
+            words = ("worker", worker, *common, "--host", host, *worker_arguments, *options)
             commands.append(NodeCommand(worker_node(worker), kind, words))
     return commands
 
@@ -152,6 +153,7 @@ class Host:
         log, tell: called with (node, line) that it writes, and (node, sentence) about it.
         own_router: fail if a router already answers.
         worker_options: worker -> ``name=value`` options.
+        worker_arguments: further arguments for the command line of every worker.
         also: other robots' profiles that the router of this host serves.
         dry_run: the command node computes and checks everything but commands nothing.
         rolling: folder of the rolling record, which runs beside a command node; None: no record.
@@ -171,6 +173,7 @@ class Host:
         tell: Callable[[str, str], None],
         own_router: bool = False,
         worker_options: Mapping[str, Sequence[str]] | None = None,
+        worker_arguments: Sequence[str] = (),
         also: Sequence[Profile] = (),
         dry_run: bool = False,
         rolling: Path | None = None,
@@ -192,7 +195,7 @@ class Host:
         # Children read the profile that is in force here, with all options applied.
         self.profile_file = self._write(profile)
         self._also = [self._write(other) for other in also]
-        files = (self.profile_file, worker_options, self._also)
+        files = (self.profile_file, worker_options, worker_arguments, self._also)
         commands = node_commands(profile, self.host, *files, dry_run=dry_run)
         if rolling is not None and "command" in part.nodes:
             words = ("lab", ROLLING, "--folder", str(rolling), "--profile", str(self.profile_file))
