@@ -16,8 +16,9 @@ from camera_rig import await_match, free_endpoint, until
 from vla_zenoh.bus.buffers import CallbackRing, LatestSample, ReceivedSample, ZenohRing
 from vla_zenoh.bus.clock import ADOPT_S, Clock
 from vla_zenoh.bus.node import Node
-from vla_zenoh.bus.session import MAX_MESSAGE_BYTES, open_session
-from vla_zenoh.errors import CodecError
+from vla_zenoh.bus.session import MAX_MESSAGE_BYTES, alive_nodes, open_session
+from vla_zenoh.errors import CodecError, NodeError
+from vla_zenoh.keys import Keys
 from vla_zenoh.profile import SessionProfile, load_profile, override
 from vla_zenoh.runtime.process import is_running
 from vla_zenoh.types import Header, SingleWriterFilter
@@ -92,6 +93,22 @@ def test_a_mailbox_keeps_the_newest_in_order_and_no_more_than_it_holds() -> None
         taken = [arrival.sample.payload.to_string() for arrival in box.drain()]
         assert taken == ["7", "8", "9"]
         assert box.drain() == []
+
+
+def test_no_node_counts_as_dead_while_the_router_is_away() -> None:
+    endpoint = free_endpoint()
+    profile = SessionProfile(listen=(endpoint,), connect=(endpoint,))
+    keys = Keys("panda")
+    router = open_session(profile, mode="router")
+    with open_session(profile) as asking, open_session(profile) as answering:
+        _token = answering.liveliness().declare_token(keys.alive("command"))
+        until("the node is found", lambda: alive_nodes(asking, keys) == {"command"})
+        router.close()
+        until("the link is lost", lambda: not asking.info.routers_zid())
+        with pytest.raises(NodeError, match="the router does not report within 1 s which nodes"):
+            alive_nodes(asking, keys)
+        with open_session(profile, mode="router"):
+            until("the node is found again", lambda: alive_nodes(asking, keys) == {"command"})
 
 
 @pytest.mark.parametrize("make", [LatestSample, partial(CallbackRing, 4), partial(ZenohRing, 4)])

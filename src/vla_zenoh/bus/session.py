@@ -219,9 +219,14 @@ def alive_nodes(session: zenoh.Session, keys: Keys, name: str | None = None) -> 
         replies = list(session.liveliness().get(expression, timeout=PATIENCE_S))
         found |= {last_chunk(str(r.ok.key_expr)) for r in replies if r.ok is not None}
         # A query that timed out ends like one that was answered completely.
-        answers += time.monotonic() - began_s < PATIENCE_S and all(r.ok for r in replies)
+        in_time = time.monotonic() - began_s < PATIENCE_S and all(r.ok for r in replies)
+        # And one of a session that lost its router ends at once, without a reply.
+        linked = bool(session.info.routers_zid())
+        answers += in_time and linked
         if answers == ANSWERS:
             return found
+        if not linked:
+            time.sleep(max(0.0, began_s + PATIENCE_S - time.monotonic()))
     raise NodeError(
         f"the router does not report within {PATIENCE_S:g} s which nodes of {keys.robot!r} are "
         "alive; it may be overloaded, or its access control may not know us. Try again"
