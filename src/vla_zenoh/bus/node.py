@@ -99,13 +99,20 @@ class Node:
         profile: the effective profile.
         session: open session, which the caller closes.
         host: name of this host in the profile, if known.
+        routes: the session is a router's.
 
     Raises:
         NodeError: a node of this name is already running, or the router does not answer.
     """
 
     def __init__(
-        self, name: str, profile: Profile, session: zenoh.Session, *, host: str | None = None
+        self,
+        name: str,
+        profile: Profile,
+        session: zenoh.Session,
+        *,
+        host: str | None = None,
+        routes: bool = False,
     ) -> None:
         self.name, self.profile, self.session = name, profile, session
         self.host_id = own_host_id(profile.session, host)
@@ -120,7 +127,7 @@ class Node:
         self._image_session: zenoh.Session | None = None
         self.traffic = Traffic(session)
         self._status_s, self._last_state = 0.0, ""
-        if alive_nodes(session, self.keys, name):
+        if alive_nodes(session, self.keys, name, routes=routes):
             raise NodeError(
                 f"node {name!r} of robot {profile.robot.name!r} is already running. Stop it, or "
                 "start this one with a different --name, if the command has that option"

@@ -205,8 +205,12 @@ ANSWERS = 2
 """A single answer in time may lack a node that is alive; this has been observed."""
 
 
-def alive_nodes(session: zenoh.Session, keys: Keys, name: str | None = None) -> set[str]:
+def alive_nodes(
+    session: zenoh.Session, keys: Keys, name: str | None = None, *, routes: bool = False
+) -> set[str]:
     """Names of a robot's nodes that are alive; with `name`, of this one only.
+
+    `routes` means a router's session, which asks itself.
 
     Raises:
         NodeError: the router does not answer in time, so more nodes may be alive.
@@ -221,7 +225,7 @@ def alive_nodes(session: zenoh.Session, keys: Keys, name: str | None = None) -> 
         # A query that timed out ends like one that was answered completely.
         in_time = time.monotonic() - began_s < PATIENCE_S and all(r.ok for r in replies)
         # And one of a session that lost its router ends at once, without a reply.
-        linked = bool(session.info.routers_zid())
+        linked = routes or bool(session.info.routers_zid())
         answers += in_time and linked
         if answers == ANSWERS:
             return found

@@ -44,7 +44,7 @@ def run_router(
     profile, options = _session_of(profile, host, also)
     os.environ.setdefault(RUNTIME_VARIABLE, RUNTIME)
     with open_session(profile.session, **options) as session:
-        node = Node(options["identity"], profile, session, host=host)
+        node = Node(options["identity"], profile, session, host=host, routes=True)
         impatience = TcpUserTimeout(profile.session.lease_ms / 1e3)
         expiry = CertificateExpiry(profile.session.security)
         clients = Clients(session)
