@@ -20,6 +20,7 @@ from vla_zenoh.lab.teleop.keyboard import (
     HOLD_S,
     MOVES,
     QUIT,
+    SILENT_S,
     STOP,
     TAKE_OVER,
     Keyboard,
@@ -119,9 +120,26 @@ def test_a_tap_between_two_looks_counts_once() -> None:
 def test_a_released_key_stops_at_once() -> None:
     keyboard = Keyboard()
     typed(keyboard, "a", 0.0, KeyEvent.PRESSED)
-    assert keyboard.read(60.0).twist == (0, 1, 0, 0, 0, 0)
-    typed(keyboard, "a", 60.0, KeyEvent.RELEASED)
-    assert keyboard.read(60.0).twist == STILL
+    for now_s in (0.1, 0.5):  # before it repeats
+        assert keyboard.read(now_s).twist == (0, 1, 0, 0, 0, 0)
+    typed(keyboard, "a", 0.5, KeyEvent.RELEASED)
+    assert keyboard.read(0.5).twist == STILL
+
+
+def test_a_key_whose_release_never_comes_is_let_go() -> None:
+    keyboard = Keyboard()
+    keyboard.update(Keystroke("releases", KeyEvent.TYPED), 0.0)
+    typed(keyboard, "rw", 0.0, KeyEvent.PRESSED)
+    for now_s in np.arange(0.5, 5.0, 0.04):
+        typed(keyboard, "w", now_s, KeyEvent.HELD)
+        assert keyboard.read(now_s + 0.02).twist == (1, 0, 1, 0, 0, 0)
+    assert keyboard.read(5.0 + SILENT_S).twist == STILL
+    # What the network held back, all at once.
+    typed(keyboard, "www", 7.0, KeyEvent.HELD)
+    typed(keyboard, "w", 7.0, KeyEvent.RELEASED)
+    assert keyboard.read(7.0).twist == STILL
+    typed(keyboard, "w", 8.0, KeyEvent.HELD)
+    assert keyboard.read(8.0).twist == (1, 0, 0, 0, 0, 0), "it is held again"
 
 
 def test_keys_are_let_go_with_the_window() -> None:

@@ -21,6 +21,10 @@ MAX_SEQUENCE = 32
 CTRL = 4
 HOLD_S = 0.15
 """Without reports of releases a key counts as held for this long; repeats come at 20 to 30 Hz."""
+SILENT_S = 1.0
+"""With them, keys without any keystroke for this long are let go: the release may be stuck in a
+stalled network, and a held key repeats, after 0.7 s at most by default. Only the last of several
+held keys does."""
 
 PAIRS = ("ws", "ad", "rf", "lj", "ik", "uo")
 """Keys of each axis of the twist, forward and back."""
@@ -133,12 +137,14 @@ class Keyboard:
         self.level = level
         self.reports_releases = False
         self._until_s: dict[str, float] = {}
+        self._stroke_s = 0.0
         self._new: set[str] = set()
         self._toggles = self._part = 0
 
     def update(self, stroke: Keystroke, now_s: float) -> str | None:
         """Process one keystroke; the command it gives, one of `KEY_COMMANDS`, if any."""
         key, event = stroke
+        self._stroke_s = now_s
         if key == "releases":
             self.reports_releases = True
         elif key == "unfocused":  # no releases will be reported
@@ -159,7 +165,7 @@ class Keyboard:
         if event is KeyEvent.RELEASED:
             self._until_s.pop(key, None)
             return
-        if key not in self._until_s:
+        if key not in self._until_s and event is not KeyEvent.HELD:
             self._new.add(key)
         self._until_s[key] = now_s + HOLD_S if event is KeyEvent.TYPED else float("inf")
 
@@ -169,6 +175,8 @@ class Keyboard:
 
     def read(self, now_s: float) -> OperatorInput:
         """Input since the last call: a key that was only tapped counts once."""
+        if now_s - self._stroke_s > SILENT_S:
+            self._until_s.clear()
         self._until_s = {key: until for key, until in self._until_s.items() if until > now_s}
         down = self._new | set(self._until_s)
         self._new = set()
