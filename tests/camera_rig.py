@@ -33,6 +33,15 @@ def free_endpoint() -> str:
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
+@contextmanager
+def routed_session() -> Iterator[zenoh.Session]:
+    """A client's session with a router of its own."""
+    endpoint = free_endpoint()
+    profile = SessionProfile(listen=(endpoint,), connect=(endpoint,))
+    with open_session(profile, mode="router"), open_session(profile) as session:
+        yield session
+
+
 def until(what: str, ask: Callable[[], Value | None], timeout_s: float = PATIENCE_S) -> Value:
     """The first true answer; fails, naming `what`, when none comes."""
     give_up = time.monotonic() + timeout_s

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import zenoh
+from camera_rig import routed_session
 from panda_arm import ARM_JOINTS, HOME_RAD, panda
 from ros2_peer import FINGERS, GOAL, Ros2Peer
 from ros2_rig import write_profile
@@ -39,9 +40,6 @@ TICK_S, RAMP_S = 0.004, 0.24
 TICK_NS = 4_000_000
 SPEED_M_S = 0.2
 TOPIC = "/panda/panda_cartesian_impedance_controller/desired_pose"
-ALONE = """{
-  mode: "peer", scouting: {multicast: {enabled: false}}, listen: {endpoints: []}
-}"""
 
 
 @dataclass
@@ -138,7 +136,7 @@ def ros2_turns(folder: Path, monkeypatch: pytest.MonkeyPatch, more: str = "") ->
     """`more` is YAML that goes on in the profile's section ros2."""
     profile = load_profile(str(write_profile(folder, more=more)))
     assert profile.ros2 is not None
-    with zenoh.open(zenoh.Config.from_json5(ALONE)) as session:
+    with routed_session() as session:
         goals: list[Any] = []
         peer = Ros2Peer(session)
         peer.on(TOPIC, GOAL, goals.append)

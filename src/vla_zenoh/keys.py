@@ -199,7 +199,7 @@ class Keys:
     alive = _KeyOf("alive/{node}", "Liveliness token.")
     clock = _KeyOf(
         "clock/{node}",
-        "Query for the four stamps of NTP: the reply has its times of arrival and reply.",
+        "Query for the four stamps of NTP: the reply has its times of arrival, reply and start.",
     )
 
     # -- the simulator's own ------------------------------------------------------------------

@@ -376,7 +376,10 @@ def _targets() -> Iterator[Target]:
     yield Target("jpeg", image.decode_jpeg, codec, lambda: [image.encode_jpeg(_gray())])
     yield Target("raw", _raw, codec, lambda: [b"rgb8;2x2\n" + bytes(12)])
     yield Target(
-        "stamps", decode_stamps, codec, lambda: [message.pack({"heard_ns": 1, "said_ns": 2})]
+        "stamps",
+        decode_stamps,
+        codec,
+        lambda: [message.pack({"heard_ns": 1, "said_ns": 2, "since_ns": 0})],
     )
     # -- other systems
     yield Target(

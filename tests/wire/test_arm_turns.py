@@ -13,6 +13,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import zenoh
+from camera_rig import routed_session
 from guard_rig import JointWriter
 
 from vla_zenoh.bus import buffers as slots
@@ -47,9 +48,6 @@ HEARD = 15
 JERKED_RAD = 2.5e-4
 """Two steps differ by less: a tick of twice the acceleration of `limits.joint`."""
 FAULT = "protective stop"
-ALONE = """{
-  mode: "peer", scouting: {multicast: {enabled: false}}, listen: {endpoints: []}
-}"""
 ARM = """
 from vla_zenoh.robot import Reading
 
@@ -177,7 +175,7 @@ def turns(
     (tmp_path / "my_arm.py").write_text(ARM)
     (tmp_path / "lab.yaml").write_text(PROFILE + getattr(request, "param", ""))
     profile = load_profile(str(tmp_path / "lab.yaml"))
-    with zenoh.open(zenoh.Config.from_json5(ALONE)) as session:
+    with routed_session() as session:
         node = RobotNode(PythonDriver(profile), session)
         home_rad = np.array(profile.robot.home_rad)
         heard: dict[type, list[Any]] = {}

@@ -111,6 +111,37 @@ def test_no_node_counts_as_dead_while_the_router_is_away() -> None:
             until("the node is found again", lambda: alive_nodes(asking, keys) == {"command"})
 
 
+def test_a_second_node_of_a_name_that_a_new_router_did_not_know_of_ends(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    endpoint = free_endpoint()
+    profile = override(
+        load_profile("panda_sim"), {"session": {"listen": [endpoint], "connect": [endpoint]}}
+    )
+    with (
+        open_session(profile.session, mode="router"),
+        open_session(profile.session) as one,
+        open_session(profile.session) as other,
+    ):
+        first = Node("command", profile, one)
+        monkeypatch.setattr("vla_zenoh.bus.node.alive_nodes", lambda *_, **__: set())
+        second = Node("command", profile, other)
+
+        def told() -> str:
+            first.publish_status("inactive")
+            second.publish_status("stopped", now=True)
+            try:
+                second.publish_status("inactive")
+            except NodeError as error:
+                return str(error)
+            return ""
+
+        assert "node 'command' of robot 'panda' is already running" in until("it ends", told)
+        second.close()
+        first.publish_status("inactive")
+        first.close()
+
+
 @pytest.mark.parametrize("make", [LatestSample, partial(CallbackRing, 4), partial(ZenohRing, 4)])
 def test_a_sample_larger_than_its_slot_takes_is_dropped_counted_and_told(
     make: Callable[[int], LatestSample | CallbackRing | ZenohRing],

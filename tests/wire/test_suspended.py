@@ -7,16 +7,12 @@ import threading
 from typing import Any
 
 import pytest
-import zenoh
-from camera_rig import until
+from camera_rig import routed_session, until
 
 from vla_zenoh.bus import clock
 from vla_zenoh.nodes.command.node import CommandNode
 from vla_zenoh.profile import load_profile
 
-ALONE = """{
-  mode: "peer", scouting: {multicast: {enabled: false}}, listen: {endpoints: []}
-}"""
 ASLEEP_NS = 3_600_000_000_000
 
 
@@ -25,7 +21,7 @@ def test_after_the_computer_was_suspended_the_activation_ends(
 ) -> None:
     asleep_ns = [0]
     monkeypatch.setattr(clock, "suspended_ns", lambda: asleep_ns[0])
-    with zenoh.open(zenoh.Config.from_json5(ALONE)) as session:
+    with routed_session() as session:
         node = CommandNode(load_profile("panda_sim"), session)
         step, lost = node.commander.step, list[str]()
 

@@ -283,16 +283,23 @@ class _Peer:
 
 class ClockSync:
     """Clock offsets of the nodes other than `name`, and stamps converted with them, see
-    `ClockOffsetFilter`."""
+    `ClockOffsetFilter`.
+
+    `duplicate`: another node of this `name`, started before this one, replied as well.
+    """
 
     def __init__(
         self, session: zenoh.Session, keys: Keys, clock: Clock, name: str, bound_s: float
     ) -> None:
         self._session, self._keys, self._clock, self._name = session, keys, clock, name
         self._bound_s = bound_s
+        self._since_ns = time.time_ns()
         self._lock = threading.Lock()
         self._peers: dict[str, _Peer] = {}
         self._next_look_s = 0.0
+        own = ClockOffsetFilter(bound_s)
+        self._own = _Peer(keys.clock(name), own, time.monotonic(), alive=True)
+        self.duplicate = False
 
     def track(self, node: str, *, alive: bool = True) -> None:
         """Measure the clock of `node` from now on; invalid names are ignored."""
@@ -319,28 +326,34 @@ class ClockSync:
         if now_s < self._next_look_s:
             return
         self._next_look_s = now_s + FIRST_PERIOD_S / 2
-        for node, peer in list(self._peers.items()):
+        for node, peer in [*self._peers.items(), (self._name, self._own)]:
             if now_s >= peer.next_ask_s:
                 peer.asks += 1
                 peer.next_ask_s = now_s + (
                     FIRST_PERIOD_S if peer.asks <= FIRST_ASKS else ASK_PERIOD_S
                 )
                 self._ask(peer)
-            if peer.forgotten(now_s):
+            if peer is not self._own and peer.forgotten(now_s):
                 with self._lock:  # room for others; it comes back with its next sample
                     del self._peers[node]
 
     def _ask(self, peer: _Peer) -> None:
         asked_ns = time.monotonic_ns()
+        own = peer is self._own
 
         def on_reply(reply: zenoh.Reply) -> None:
             got_ns = time.monotonic_ns()
             if reply.ok is None:
                 return
             try:
-                heard_ns, said_ns = decode_stamps(bytes_of(reply.ok.payload, MAX_STAMPS_BYTES))
+                heard_ns, said_ns, since_ns = decode_stamps(
+                    bytes_of(reply.ok.payload, MAX_STAMPS_BYTES)
+                )
             except CodecError:
                 return  # not one of our nodes' clocks
+            if own:
+                self.duplicate |= since_ns < self._since_ns
+                return
             with self._lock:
                 if peer.filter.add(Exchange(asked_ns, heard_ns, said_ns, got_ns)):
                     peer.answered_s = time.monotonic()
@@ -349,8 +362,14 @@ class ClockSync:
             peer.key,
             zenoh.handlers.Callback(on_reply, indirect=False),
             timeout=PATIENCE_S,
+            allowed_destination=zenoh.Locality.REMOTE if own else None,
             **QOS[Kind.CONTROL],
         )
+
+    def reply(self, query: zenoh.Query) -> None:
+        """Reply to a query of this node's clock with the times of its arrival and of this reply."""
+        reply = {"heard_ns": self._clock.wall_ns(), "said_ns": self._clock.wall_ns()}
+        query.reply(self._own.key, message.pack(reply | {"since_ns": self._since_ns}))
 
     def offsets(self) -> dict[str, ClockOffset]:
         """Node -> its clock minus ours, of those that replied lately."""
@@ -375,17 +394,12 @@ class ClockSync:
         return shift_stamps(header, record, ahead_ns) if ahead_ns else (header, record)
 
 
-def reply_with_stamps(clock: Clock, key: str, query: zenoh.Query) -> None:
-    """Reply to a clock query with the times of its arrival and of this reply."""
-    reply = {"heard_ns": clock.wall_ns(), "said_ns": clock.wall_ns()}
-    query.reply(key, message.pack(reply))
-
-
-def decode_stamps(payload: bytes) -> tuple[int, int]:
-    """Times (ns) of arrival and reply of a query, on the peer's wall clock, or a `CodecError`."""
+def decode_stamps(payload: bytes) -> tuple[int, int, int]:
+    """Times (ns) of arrival and reply of a query and of the peer's start, on the peer's wall clock,
+    or a `CodecError`."""
     found = message.unpack(payload)
     found = found if isinstance(found, dict) else {}
-    heard, said = found.get("heard_ns"), found.get("said_ns")
-    if type(heard) is not int or type(said) is not int:
-        raise CodecError("shape", "a clock replies with heard_ns and said_ns")
-    return heard, said
+    heard, said, since = (found.get(name) for name in ("heard_ns", "said_ns", "since_ns"))
+    if type(heard) is not int or type(said) is not int or type(since) is not int:
+        raise CodecError("shape", "a clock replies with heard_ns, said_ns and since_ns")
+    return heard, said, since

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import zenoh
 
 from vla_zenoh.bus.buffers import ReceivedSample, SampleBuffer, bytes_of, header_of
-from vla_zenoh.bus.clock import Clock, ClockSync, reply_with_stamps
+from vla_zenoh.bus.clock import Clock, ClockSync
 from vla_zenoh.bus.host import own_host_id
 from vla_zenoh.bus.metrics import EventThrottle, Traffic
 from vla_zenoh.bus.session import QOS, alive_nodes, open_session
@@ -128,19 +128,21 @@ class Node:
         self.traffic = Traffic(session)
         self._status_s, self._last_state = 0.0, ""
         if alive_nodes(session, self.keys, name, routes=routes):
-            raise NodeError(
-                f"node {name!r} of robot {profile.robot.name!r} is already running. Stop it, or "
-                "start this one with a different --name, if the command has that option"
-            )
+            raise self._duplicate()
         self.clocks = ClockSync(
             session, self.keys, self.clock, name, profile.timing.max_clock_offset_s
         )
-        own_clock = self.keys.clock(name)
-        self.serve(own_clock, lambda query: reply_with_stamps(self.clock, own_clock, query))
+        self.serve(self.keys.clock(name), self.clocks.reply)
         self._token = session.liveliness().declare_token(self.keys.alive(name))
         self._status = self.declare_publisher(self.keys.status(name), Kind.TELEMETRY)
         events = self.declare_publisher(self.keys.event(name), Kind.TELEMETRY)
         self._events = EventThrottle(events.publish)
+
+    def _duplicate(self) -> NodeError:
+        return NodeError(
+            f"node {self.name!r} of robot {self.profile.robot.name!r} is already running. Stop it, "
+            "or start this one with a different --name, if the command has that option"
+        )
 
     def declare_publisher(self, key: str, kind: Kind) -> Publisher:
         """A publisher on `key`.
@@ -187,8 +189,14 @@ class Node:
         latency_ms: Mapping[str, tuple[float, float]] | None = None,
         now: bool = False,
     ) -> None:
-        """Publish the status if it is due: periodically, when `state` changes, or `now`."""
-        if not self.status_due(state) and not now:
+        """Publish the status if it is due: periodically, when `state` changes, or `now`.
+
+        Raises:
+            NodeError: see `status_due`; not with `now`, by which a node says that it ends.
+        """
+        if now:
+            self._poll()
+        elif not self.status_due(state):
             return
         self._status_s, self._last_state = time.monotonic(), state
         self._status.publish(
@@ -204,12 +212,22 @@ class Node:
         )
 
     def status_due(self, state: str) -> bool:
-        """Whether `publish_status` would publish now; lets a fast loop skip collecting details."""
+        """Whether `publish_status` would publish now; lets a fast loop skip collecting details.
+
+        Raises:
+            NodeError: a node of this name was started before, which a router that had just been
+                restarted did not know of yet.
+        """
+        self._poll()
+        if self.clocks.duplicate:
+            raise self._duplicate()
+        due = time.monotonic() - self._status_s >= STATUS_PERIOD_S
+        return due or state != self._last_state
+
+    def _poll(self) -> None:
         self.clocks.poll()
         self._report_rejected()
         self._events.poll()
-        due = time.monotonic() - self._status_s >= STATUS_PERIOD_S
-        return due or state != self._last_state
 
     def _bus_detail(self) -> dict[str, Any]:
         short, traffic = self.keys.short, self.traffic

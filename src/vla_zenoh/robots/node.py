@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 
 import zenoh
 
@@ -87,7 +88,8 @@ class RobotNode:
 
         def report() -> None:
             while not done.wait(CONNECTING_S):
-                self.node.publish_status("connecting")
+                with suppress(NodeError):  # the loop ends by it
+                    self.node.publish_status("connecting")
 
         reporter = threading.Thread(target=report, name="connecting", daemon=True)
         reporter.start()

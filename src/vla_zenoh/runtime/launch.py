@@ -28,6 +28,7 @@ from vla_zenoh.runtime.certificate_expiry import CertificateExpiry
 from vla_zenoh.runtime.process import ROUTER_PATIENCE_S, RUN_FOLDER_VARIABLE
 from vla_zenoh.runtime.router import reject_taken
 from vla_zenoh.runtime.supervisor import (
+    HEARD_S,
     Child,
     NodeCommand,
     Supervisor,
@@ -209,6 +210,7 @@ class Host:
         self._own_router = own_router
         self._down: DownNodes | None = None
         self._ready, self._dry_run = False, dry_run
+        self._deaf_s = time.monotonic()  # when no node was heard
         self._expiry = CertificateExpiry(profile.session.security)
         self.session: zenoh.Session | None = None
         self.client: Client | None = None
@@ -349,7 +351,10 @@ class Host:
         """Kill those that hang; report once that all are ready."""
         heard, running = client.snapshot(), self.supervisor.running()
         said = {name: (status.pid, age_s) for name, (status, age_s, _) in heard.items()}
-        for name in hung_nodes(running, said):
+        now_s = time.monotonic()
+        if min((age_s for _, age_s in said.values()), default=HEARD_S) >= HEARD_S:
+            self._deaf_s = now_s
+        for name in hung_nodes(running, said, now_s - self._deaf_s):
             self._tell(name, f"silent for {said[name][1]:.0f} s; it hangs; killing it")
             signal_group(running[name][1], signal.SIGKILL)
         names = client.expected.keys() & {each.command.name for each in self.supervisor.children}

@@ -71,21 +71,25 @@ class Child:
 
 
 def hung_nodes(
-    running: Mapping[str, tuple[str, int]], said: Mapping[str, tuple[int, float]]
+    running: Mapping[str, tuple[str, int]],
+    said: Mapping[str, tuple[int, float]],
+    hearing_s: float,
 ) -> list[str]:
     """Nodes to kill: they run, but their heartbeat (the status) has stopped.
 
     A hung node does no harm, since the arm brakes without it, but a new one cannot start beside it.
     Workers are exempt: a large model may take long to load or to infer. `running` nodes of this
-    host have kind and pid; `said` has pid and age (s) of the last status of nodes of all hosts.
+    host have kind and pid; `said` has pid and age (s) of the last status of nodes of all hosts;
+    `hearing_s` is how long any of them has been heard: when the router comes back, the first status
+    makes no other node a silent one.
     """
     silent = [
         name
         for name, (kind, pid) in running.items()
         if kind != "worker" and name in said and said[name][0] == pid and said[name][1] > HANG_S
     ]
-    if any(age_s < HEARD_S for _, age_s in said.values()):
-        return sorted(silent)
+    if hearing_s > 0.0:
+        return sorted(silent) if hearing_s > HANG_S else []
     # No status at all: the fault is the router's, or the network's, which no restart repairs.
     return sorted(name for name in silent if running[name][0] == "router")
 

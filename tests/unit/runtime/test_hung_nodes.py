@@ -21,35 +21,42 @@ def said(**ages_s: float) -> dict[str, tuple[int, float]]:
 
 
 def test_nobody_hangs_while_all_speak() -> None:
-    assert hung_nodes(RUNNING, said()) == []
+    assert hung_nodes(RUNNING, said(), LONG_S) == []
 
 
 def test_a_node_that_is_silent_while_others_speak_hangs() -> None:
-    assert hung_nodes(RUNNING, said(sim=LONG_S)) == ["sim"]
-    assert hung_nodes(RUNNING, said(sim=HANG_S - 1.0)) == []
+    assert hung_nodes(RUNNING, said(sim=LONG_S), LONG_S) == ["sim"]
+    assert hung_nodes(RUNNING, said(sim=HANG_S - 1.0), LONG_S) == []
 
 
 def test_a_worker_may_think_as_long_as_it_likes() -> None:
-    assert hung_nodes(RUNNING, said(worker_big=600.0)) == []
+    assert hung_nodes(RUNNING, said(worker_big=600.0), LONG_S) == []
 
 
 def test_a_node_that_was_started_anew_is_not_blamed_for_what_ran_before() -> None:
     before = {**said(), "sim": (17, LONG_S)}
-    assert hung_nodes(RUNNING, before) == []
+    assert hung_nodes(RUNNING, before, LONG_S) == []
 
 
 def test_a_node_that_has_said_nothing_yet_is_starting() -> None:
     heard = said()
     del heard["command"]
-    assert hung_nodes(RUNNING, heard) == []
+    assert hung_nodes(RUNNING, heard, LONG_S) == []
 
 
 def test_when_nobody_is_heard_the_router_is_ended_alone() -> None:
     silence = said(router=LONG_S, sim=LONG_S, command=LONG_S, worker_big=LONG_S)
-    assert hung_nodes(RUNNING, silence) == ["router"]
+    assert hung_nodes(RUNNING, silence, 0.0) == ["router"]
 
 
 def test_when_nobody_is_heard_and_the_router_is_elsewhere_nothing_is_ended() -> None:
     silence = said(router=LONG_S, sim=LONG_S, command=LONG_S, worker_big=LONG_S)
     here = {name: RUNNING[name] for name in ("sim", "command")}
-    assert hung_nodes(here, silence) == []
+    assert hung_nodes(here, silence, 0.0) == []
+
+
+def test_when_the_router_comes_back_the_first_that_speaks_makes_nobody_hang() -> None:
+    back = said(sim=LONG_S, command=LONG_S)
+    assert hung_nodes(RUNNING, back, FRESH_S) == []
+    assert hung_nodes(RUNNING, back, HANG_S) == []
+    assert hung_nodes(RUNNING, back, LONG_S) == ["command", "sim"]

@@ -19,7 +19,7 @@ from vla_zenoh import __version__
 from vla_zenoh.bus.buffers import bytes_of
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import covers
-from vla_zenoh.errors import RecordingError
+from vla_zenoh.errors import NodeError, RecordingError
 from vla_zenoh.keys import Keys
 from vla_zenoh.lab.recording.sample import TEXT
 from vla_zenoh.lab.recording.sample_queue import SampleQueue
@@ -190,7 +190,7 @@ class Recorder:
         try:
             self._write_until_closed()
             self._writer.finish({"dropped": dict(self.recorded.dropped), **self._ended})
-        except RecordingError as error:
+        except (RecordingError, NodeError) as error:
             self._fail(str(error))
         self._measure()
         self.recorded.size_bytes = self.recorded.path.stat().st_size
