@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator
 
 import pytest
-from chain import Chain, running_chain
+from chain import CHAIN_PATIENCE_S, Chain, running_chain
 from hypothesis import settings
 
 # Machines that run tests are slow now and then: time per example says nothing about the code. The
@@ -29,9 +29,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture(scope="module")
-def shared_chain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chain]:
+def shared_chain(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Chain]:
     """One robot for all tests of a file; take `chain` instead, which begins in order."""
-    with running_chain(tmp_path_factory.mktemp("chain")) as chain:
+    patience_s = getattr(request.module, "ROBOT_PATIENCE_S", CHAIN_PATIENCE_S)
+    with running_chain(tmp_path_factory.mktemp("chain"), patience_s=patience_s) as chain:
         chain.activate_when_ready()
         yield chain
 

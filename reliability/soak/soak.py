@@ -71,6 +71,8 @@ CALM_SHARE, CALM_WARM_S = 0.2, 30.0
 looked whether anything grows."""
 QUIET_S = (1.0, 5.0)
 FREEZE_S = (0.05, 3.0)
+LEASE_MS = 1000
+"""The default, not that of the tests: the longest freezes cost a node its link."""
 LIFE_S = 65.0
 """A node is killed again only after it lived for so long: else its supervisor gives it up."""
 JUNK = 400
@@ -399,7 +401,7 @@ def main() -> int:
         shutil.copy(find_model("scripted").path, folder / "models" / "twin.py")
         os.environ["VLA_ZENOH_PATH"] = str(folder)
         more = f"workers: [{', '.join(WORKERS)}]\n"
-        with running_chain(folder, more=more) as chain:
+        with running_chain(folder, more=more, lease_ms=LEASE_MS) as chain:
             soak = Soak(chain, seed, say)
             found = soak.run(asked.minutes)
             story = chain.story() if found.failure else ""

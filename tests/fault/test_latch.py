@@ -7,11 +7,9 @@ import os
 import signal
 
 import pytest
-from chain import Chain
+from chain import READY_PATIENCE_S, Chain
 
 from vla_zenoh.errors import SessionError
-
-RESTART_S = 12.0
 
 
 def test_a_command_node_that_is_started_again_is_still_stopped(chain: Chain) -> None:
@@ -26,7 +24,7 @@ def test_a_command_node_that_is_started_again_is_still_stopped(chain: Chain) -> 
             and status.pid != old_pid
             and status.state == "stopped"
         ),
-        RESTART_S,
+        READY_PATIENCE_S,
     )
     with pytest.raises(SessionError, match="stopped before this node was started"):
         chain.client.activate()

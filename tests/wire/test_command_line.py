@@ -8,11 +8,12 @@ import sys
 from typing import Any
 
 from camera_rig import free_endpoint
-from chain import Chain, command_line
+from chain import LONG_PATIENCE_S, Chain, command_line
 
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.profile import load_profile, override
 
+ROBOT_PATIENCE_S = LONG_PATIENCE_S
 REFUSED = 1
 RATE_TOLERANCE = 0.25
 

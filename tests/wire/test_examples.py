@@ -11,7 +11,7 @@ from pathlib import Path
 
 import cv2
 import pytest
-from chain import Chain, command_line
+from chain import LONG_PATIENCE_S, Chain, command_line
 
 import vla_zenoh
 from vla_zenoh.lab.lockstep.loop import Lockstep
@@ -21,6 +21,7 @@ from vla_zenoh.simulation.world import build_world
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 MOVED_M = 0.04
+ROBOT_PATIENCE_S = LONG_PATIENCE_S
 
 
 def run(name: str, *arguments: str, folder: Path, timeout_s: float = 60) -> str:

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 from camera_rig import until
-from chain import Chain, running_chain
+from chain import LONG_PATIENCE_S, Chain, running_chain
 
 from vla_zenoh.keys import PRIMITIVES, worker_node
 
@@ -27,7 +27,8 @@ END_S = 20.0
 
 @pytest.fixture(scope="module")
 def chain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chain]:
-    with running_chain(tmp_path_factory.mktemp("mcp"), more=HOSTS) as found:
+    folder = tmp_path_factory.mktemp("mcp")
+    with running_chain(folder, more=HOSTS, patience_s=LONG_PATIENCE_S) as found:
         found.until("the node answers", lambda: worker_node(PRIMITIVES) in found.client.alive, 40)
         yield found
 

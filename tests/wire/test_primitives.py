@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from camera_rig import until
-from chain import Chain, command_line, running_chain
+from chain import LONG_PATIENCE_S, Chain, command_line, running_chain
 
 from vla_zenoh.keys import PRIMITIVES, worker_node
 from vla_zenoh.kinematics.so3 import Pose, pose_distance, pose_of, rotation_from_quat
@@ -32,7 +32,8 @@ GARBAGE = 200
 
 @pytest.fixture(scope="module")
 def chain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chain]:
-    with running_chain(tmp_path_factory.mktemp("primitives"), more=HOSTS) as found:
+    folder = tmp_path_factory.mktemp("primitives")
+    with running_chain(folder, more=HOSTS, patience_s=LONG_PATIENCE_S) as found:
         found.until("the node answers", lambda: worker_node(PRIMITIVES) in found.client.alive, 40)
         yield found
 

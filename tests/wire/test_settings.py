@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import zenoh
 from camera_rig import until
-from chain import READY_PATIENCE_S, Chain, command_line, running_chain
+from chain import LONG_PATIENCE_S, READY_PATIENCE_S, Chain, command_line, running_chain
 
 from vla_zenoh.bus.buffers import LatestSample
 from vla_zenoh.bus.client import Client
@@ -22,6 +22,7 @@ from vla_zenoh.codec import records
 from vla_zenoh.errors import SessionError
 from vla_zenoh.types import ActionChunk, ObjectPoses
 
+ROBOT_PATIENCE_S = LONG_PATIENCE_S
 SAME_M = 1e-3
 """Two placements of an object by one seed, once it has come to rest."""
 APART_M = 0.01

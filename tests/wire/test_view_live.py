@@ -15,13 +15,14 @@ from pathlib import Path
 
 import pytest
 from camera_rig import until
-from chain import READY_PATIENCE_S, Chain, command_line
+from chain import LONG_PATIENCE_S, READY_PATIENCE_S, Chain, command_line
 from view_rig import Shown
 
 from vla_zenoh.errors import NodeError
 from vla_zenoh.lab.view.listener import ViewListener
 from vla_zenoh.lab.view.viewer import open_window
 
+ROBOT_PATIENCE_S = LONG_PATIENCE_S
 END_PATIENCE_S = 30.0
 STEPS, STEP_M = 5, 0.01
 REACHED_M = 0.002
