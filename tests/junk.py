@@ -97,8 +97,13 @@ def all_keys(keys: Keys) -> dict[str, str]:
     return out
 
 
-def samples_of(chain: Chain, seconds: float = 1.2) -> dict[str, tuple[bytes, bytes | None]]:
-    """The newest true sample on each stream, to make false ones of."""
+def samples_of(
+    chain: Chain, seconds: float = 1.2, *wanted: str
+) -> dict[str, tuple[bytes, bytes | None]]:
+    """The newest true sample on each stream, to make false ones of.
+
+    Waits for those `wanted`, by default for all that are written all the time.
+    """
     found: dict[str, tuple[bytes, bytes | None]] = {}
 
     def keep(sample: zenoh.Sample) -> None:
@@ -112,8 +117,10 @@ def samples_of(chain: Chain, seconds: float = 1.2) -> dict[str, tuple[bytes, byt
         chain.profile.keys.all_keys, zenoh.handlers.Callback(keep, indirect=False)
     )
     time.sleep(seconds)
-    subscriber.undeclare()
     keys = all_keys(chain.profile.keys)
+    wanted = wanted or tuple(keys[name] for name in STREAMS if name not in SELDOM)
+    chain.until(f"samples on {wanted}", lambda: found.keys() >= set(wanted))
+    subscriber.undeclare()
     for name, record in SELDOM.items():
         header = records.encode_header(Header(time.time_ns(), 0, STRANGER))
         found.setdefault(keys[name], (records.encode(record), header))

@@ -33,8 +33,10 @@ def assert_same(one: Evaluation, other: Evaluation) -> None:
 
 
 @contextmanager
-def recording(chain: Chain, path: Path, profile: Profile | None = None) -> Iterator[Recorder]:
-    recorder = Recorder(profile or chain.profile, chain.session, path).start()
+def recording(
+    chain: Chain, path: Path, profile: Profile | None = None, name: str = "recorder"
+) -> Iterator[Recorder]:
+    recorder = Recorder(profile or chain.profile, chain.session, path, name=name).start()
     try:
         yield recorder
     finally:

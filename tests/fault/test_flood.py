@@ -84,7 +84,7 @@ def test_a_flood_does_not_delay_the_command_loop_beyond_its_watchdog(
         key, payload, head = keys.prompt, b"\xffflood", None
     else:
         key = keys.delta("scripted")
-        payload, _ = samples_of(chain, 0.6)[key]
+        payload, _ = samples_of(chain, 0.6, key)[key]
         head = records.encode_header(Header(time.time_ns(), 1, STRANGER))
     chain.client.set_prompt("HARD: go up within 0.1")
     chain.until("it moves", chain.moves)

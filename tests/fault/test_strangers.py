@@ -5,17 +5,19 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 import pytest
 import zenoh
-from chain import Chain, Recorder
+from chain import LONG_PATIENCE_S, Chain, Recorder
 from junk import OBEYED, OTHERS, SETTINGS, STRANGER, STREAMS, all_junk, all_keys, samples_of
 
 from vla_zenoh.codec import message, records
 from vla_zenoh.types import GripperState, Header
 
+ROBOT_PATIENCE_S = LONG_PATIENCE_S
 SHORT_S, LONG_S = 8.0, 30.0
 PAUSE_S = 0.001
 """Between two puts: a thousand a second, were they for nothing."""
@@ -24,6 +26,9 @@ FLOOD_SHARE = 0.6
 """Of those puts a busy machine must manage, or the flood is none."""
 LOOP_SHARE = 0.9
 """Of the ticks of the command loop that must still take place."""
+WINDOW_S = 0.5
+"""The rate is the median of such windows: a stall of the computer falls into one or two of them, a
+flood that slows the loop into all."""
 COMMAND_TOLERANCE = 1.1
 ARM_TOLERANCE = 2.7
 """As in test_dead_nodes."""
@@ -32,6 +37,34 @@ BOX_TOLERANCE_M = 0.003
 BRAKE_S = 0.5
 OPEN_M = 0.075
 """Nobody asked the gripper to close, but strangers."""
+SOME_STATES = 20
+AHEAD = 30
+"""Of the true worker, which goes on meanwhile: what comes after its own is not looked at."""
+COUNTED = {
+    "command.malformed",
+    "command.invalid",
+    "command.no_header",
+    "command.schema",
+    "command.oversize",
+    "command.foreign",
+    "command.replayed",
+    "sim.malformed",
+    "sim.invalid",
+    "sim.no_header",
+    "sim.schema",
+    "sim.pose_foreign",
+    "sim.pose_replayed",
+    "sim.foreign",
+    "sim.reset_refused",
+    "worker-scripted.malformed",
+    "worker-scripted.no_header",
+    "worker-scripted.schema",
+    "worker-scripted.foreign",
+    "worker-scripted.replayed",
+    "camera.malformed",
+    "camera.no_header",
+}
+"""What junk on every key is refused for, by node."""
 
 
 def test_every_key_of_the_table_is_tried(shared_chain: Chain) -> None:
@@ -94,38 +127,19 @@ def be_a_nuisance(chain: Chain, seconds: float) -> None:
             time.sleep(PAUSE_S)
 
     share = keep_moving(chain, seconds, put_some)
-    time.sleep(1.2)  # two reports
+
+    def grown() -> set[str]:
+        return {name for name, count in chain.refused().items() if count > refused.get(name, 0)}
+
+    with suppress(AssertionError):  # what is missing is told below
+        chain.until("all is counted", lambda: grown() >= COUNTED)
     print(f"active {share:.0%} of the time; {len(kinds)} kinds of junk; {chain.refused()}")
     assert chain.host.supervisor.pids() == pids, chain.story()
     assert share > 0.9, chain.story()
     assert_within_limits(chain, chain.recorder)
-    gripper, _ = samples_of(chain, 0.3)[keys["state_gripper"]]
+    gripper, _ = samples_of(chain, 0.3, keys["state_gripper"])[keys["state_gripper"]]
     assert records.decode(GripperState, gripper).width_m > OPEN_M
-    grown = {name for name, count in chain.refused().items() if count > refused.get(name, 0)}
-    assert grown >= {
-        "command.malformed",
-        "command.invalid",
-        "command.no_header",
-        "command.schema",
-        "command.oversize",
-        "command.foreign",
-        "command.replayed",
-        "sim.malformed",
-        "sim.invalid",
-        "sim.no_header",
-        "sim.schema",
-        "sim.pose_foreign",
-        "sim.pose_replayed",
-        "sim.foreign",
-        "sim.reset_refused",
-        "worker-scripted.malformed",
-        "worker-scripted.no_header",
-        "worker-scripted.schema",
-        "worker-scripted.foreign",
-        "worker-scripted.replayed",
-        "camera.malformed",
-        "camera.no_header",
-    }, sorted(grown)
+    assert grown() >= COUNTED, sorted(COUNTED - grown())
 
     # And it still does as told.
     chain.client.set_prompt("HARD: go up" if chain.height_m() < 0.4 else "HARD: go down")
@@ -154,12 +168,13 @@ def test_junk_on_every_key_for_long_moves_nothing_and_is_counted(chain: Chain) -
 
 def forged(chain: Chain, **changes: Any) -> tuple[bytes, bytes]:
     """A chunk in the name of the true worker, newer than its newest, with some fields changed."""
-    payload, attachment = samples_of(chain, 0.5)[chain.profile.keys.delta("scripted")]
+    key = chain.profile.keys.delta("scripted")
+    payload, attachment = samples_of(chain, 0.5, key)[key]
     assert attachment is not None
     true, fields = records.decode_header(attachment), message.unpack(payload)
     now_ns = time.time_ns()
     fresh = {"observation_stamp_ns": now_ns, "valid_until_ns": now_ns + 10**9}
-    header = Header(now_ns, true.seq + 3, true.source)
+    header = Header(now_ns, true.seq + AHEAD, true.source)
     return message.pack(fields | fresh | changes), records.encode_header(header)
 
 
@@ -193,6 +208,7 @@ def test_a_forged_chunk_is_refused_by_its_reason_and_moves_nothing(
         lambda: chain.counter(f"refused.{reason}") == began + 1,
     )
     time.sleep(0.3)
+    chain.until("states", lambda: len(chain.recorder.track().stamp_ns) >= SOME_STATES)
     track = chain.recorder.track()
     assert np.ptp(track.reference_m, axis=0).max() < 1e-4
     chain.until("it goes on", lambda: chain.state() == "active")
@@ -203,7 +219,7 @@ def test_a_flood_does_not_slow_the_command_loop(chain: Chain) -> None:
     chain.activate_when_ready()
     chain.go("up", 10)
     keys = chain.profile.keys
-    payload, attachment = samples_of(chain, 0.6)[keys.delta("scripted")]
+    payload, attachment = samples_of(chain, 0.6, keys.delta("scripted"))[keys.delta("scripted")]
     stranger = records.encode_header(Header(time.time_ns(), 1, STRANGER))
     assert attachment is not None
     pid = chain.pid("command")
@@ -230,10 +246,12 @@ def test_a_flood_does_not_slow_the_command_loop(chain: Chain) -> None:
         for header, _ in chain.recorder.commands()
         if began_ns < header.stamp_wall_ns < ended_ns
     ]
-    rate_hz = len(commands) / took_s
+    counts, _ = np.histogram(commands, max(1, int(took_s / WINDOW_S)), range=(began_ns, ended_ns))
+    rate_hz = float(np.median(counts)) * len(counts) / took_s
     missed = chain.counter("command.missed_ticks") - missed
     dropped = chain.counter("command.chunks_dropped")
     print(f"{sent / took_s:.0f} puts/s, loop {rate_hz:.1f} Hz, {missed} missed, {dropped} dropped")
+    assert counts.min() > 0, f"the loop stood still: {counts}"
     assert rate_hz > LOOP_SHARE * chain.profile.timing.command_hz, chain.story()
     assert chain.pid("command") == pid
     assert_within_limits(chain, chain.recorder)

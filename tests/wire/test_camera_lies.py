@@ -14,9 +14,10 @@ from camera_rig import free_endpoint
 from chain import Chain, command_line, running_chain
 
 from vla_zenoh.errors import SessionError
+from vla_zenoh.types import Event
 
 SAME_S = 0.6
-FOUND_S = 5.0
+FOUND_S = 15.0
 """Until it is found, told and obeyed, on a busy computer; itself it takes `SAME_S` and 0.2 s."""
 PICTURES = 40
 PROFILE = """\
@@ -77,6 +78,11 @@ def shared_chain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chain]:
         yield chain
 
 
+def endings(chain: Chain) -> list[Event]:
+    """Ends of the activation, also one that held because a busy computer made the worker late."""
+    return chain.events("active->inactive") or chain.events("holding->inactive")
+
+
 LIES = {
     "frozen": (
         lambda: [noisy(scene())],
@@ -96,13 +102,13 @@ LIES = {
 def test_a_camera_that_lies_ends_the_activation_by_name(chain: Chain, what: str) -> None:
     lie, said, check = LIES[what]
     folder = chain.profile_file.with_name("show")
+    show(folder, true_pictures())
     chain.move()
     chain.client.pop_events()
-    show(folder, lie())
-    chain.until("it ends", lambda: chain.events("active->inactive"), FOUND_S)
-    (ended,) = chain.events("active->inactive")
-    chain.wait_still()
     try:
+        show(folder, lie())
+        (ended,) = chain.until("it ends", lambda: endings(chain), FOUND_S)
+        chain.wait_still()
         with pytest.raises(SessionError, match=said):
             chain.client.activate()
         (told,) = (event for event in chain.events("front:same") + chain.events("front:flat"))

@@ -7,16 +7,17 @@ from pathlib import Path
 
 import numpy as np
 from camera_rig import until
-from chain import READY_PATIENCE_S, Chain, command_line
+from chain import LONG_PATIENCE_S, READY_PATIENCE_S, Chain, command_line
+from recording_rig import recording
 from teleop_rig import Screen, teleop
 
 from vla_zenoh.codec import records
 from vla_zenoh.lab.dataset.episodes import episodes_of
-from vla_zenoh.lab.recording.recorder import Recorder
 from vla_zenoh.lab.recording.run import load_run
 from vla_zenoh.lab.teleop.keyboard import END
 from vla_zenoh.types import GripperState
 
+ROBOT_PATIENCE_S = LONG_PATIENCE_S
 MOVED_M = 0.03
 OFF_AXIS_M = 0.005
 SPEED_M_S = 0.06
@@ -89,9 +90,8 @@ def test_it_takes_the_arm_from_a_model_in_motion_and_gives_it_back(chain: Chain)
 def test_a_recording_of_a_takeover_has_the_chunks_of_both_and_says_who_led(
     chain: Chain, tmp_path: Path
 ) -> None:
-    recorder = Recorder(chain.profile, chain.session, tmp_path / "run.mcap", name="of-takeover")
-    recorder.start()
-    with teleop(chain) as screen:
+    path = tmp_path / "run.mcap"
+    with recording(chain, path, name="of-takeover") as recorder, teleop(chain) as screen:
         chain.client.set_worker("scripted")
         chain.move()
         screen.type(b"\t")
@@ -103,8 +103,8 @@ def test_a_recording_of_a_takeover_has_the_chunks_of_both_and_says_who_led(
         chain.until("the model has it back", lambda: chain.client.task.worker == "scripted")
         chain.until("it moves on", chain.moves)
         assert chain.client.deactivate()
-    assert not recorder.close().failure
-    run = load_run(tmp_path / "run.mcap")
+    assert not recorder.recorded.failure
+    run = load_run(path)
     (episode,) = [each for each in episodes_of(run) if "teleop" in each.workers]
     assert (episode.worker, episode.workers) == ("scripted", ["scripted", "teleop"])
     ((since_ns, until_ns),) = [(a, b) for a, b, worker in episode.led if worker == "teleop"]

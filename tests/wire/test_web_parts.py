@@ -58,6 +58,16 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Host, Site]
             thread.join()
 
 
+@pytest.fixture(autouse=True)
+def _no_latch(pair: tuple[Host, Site]) -> None:
+    """A stop that a test has left latched would be in the way when it is tried again."""
+    client = pair[0].client
+    assert client is not None
+    if client.latch_reason():
+        client.reset()
+        until("it is reset", client.cleared, READY_S)
+
+
 def moves(page: Browser) -> bool:
     arms = page.state.get("arms", {})
     return all(arms[part].get("speed_m_s", 0) > 0.01 for part in ("left", "right"))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterator
+from shutil import rmtree
 from typing import Any
 
 import pytest
@@ -22,12 +23,12 @@ pytest.importorskip("uvicorn", reason="needs the extra web")
 PLAN: dict[str, Any] = {
     "do": "trial",
     "workers": "scripted",
-    "prompt": "HARD: go up",
     "episodes": 2,
     "seconds": 30,
     "blind": True,
 }
 PATIENCE_S = 20.0
+MIDDLE_M = 0.42
 
 
 @pytest.fixture(scope="module")
@@ -35,6 +36,22 @@ def site(shared_chain: Chain, tmp_path_factory: pytest.TempPathFactory) -> Itera
     people = write_people(tmp_path_factory.mktemp("people"))
     with serving(shared_chain.profile_file, people) as site:
         yield site
+
+
+def plan(chain: Chain, name: str) -> dict[str, Any]:
+    """A trial that has room to move."""
+    prompt = "HARD: go up" if chain.height_m() < MIDDLE_M else chain.down
+    return {**PLAN, "prompt": prompt, "name": name}
+
+
+@pytest.fixture(autouse=True)
+def _no_trial(chain: Chain, site: Site) -> None:
+    """What a test that failed has left would be in the way when it is tried again."""
+    with browsing(site) as page:
+        if (page.state.get("trial") or {}).get("on"):
+            assert page.ask(do="end_trial")["is"] == "done"
+            until("it ended", lambda: not page.state["trial"]["on"], PATIENCE_S)
+    rmtree(chain.profile_file.parent / "runs", ignore_errors=True)
 
 
 def phase(page: Browser, *wanted: str) -> dict[str, Any]:
@@ -70,7 +87,7 @@ def test_a_person_judges_a_blind_trial_and_the_folder_is_as_the_terminal_writes_
     chain: Chain, site: Site
 ) -> None:
     with browsing(site) as page:
-        assert page.ask(**PLAN, name="blind")["is"] == "done"
+        assert page.ask(**plan(chain, "blind"))["is"] == "done"
         until("masked states", lambda: page.state["trial"].get("phase") == "setup")
         page.heard.clear()
         seen = runs(page)
@@ -115,7 +132,7 @@ def test_an_episode_that_nobody_watches_is_braked_and_waits_for_its_verdict(
     chain: Chain, site: Site
 ) -> None:
     with browsing(site) as page:
-        assert page.ask(**PLAN, name="left")["is"] == "done"
+        assert page.ask(**plan(chain, "left"))["is"] == "done"
         runs(page)
         chain.until("it moves", chain.moves)
         page.watches = False  # a hidden tab, a sleeping tablet
@@ -137,7 +154,7 @@ def test_an_episode_that_nobody_watches_is_braked_and_waits_for_its_verdict(
 
 def test_a_stop_ends_an_episode_and_an_old_answer_is_none(chain: Chain, site: Site) -> None:
     with browsing(site) as page:
-        assert page.ask(**PLAN, name="stopped")["is"] == "done"
+        assert page.ask(**plan(chain, "stopped"))["is"] == "done"
         old = phase(page, "setup")["number"]
         runs(page)
         chain.until("it moves", chain.moves)
@@ -156,14 +173,18 @@ def test_a_stop_ends_an_episode_and_an_old_answer_is_none(chain: Chain, site: Si
 
 
 def test_a_trial_that_cannot_be_is_named(chain: Chain, site: Site) -> None:
+    blind = plan(chain, "blind")
     with browsing(site) as page:
+        assert page.ask(**blind)["is"] == "done"
+        assert page.ask(do="end_trial")["is"] == "done"
+        until("it ended", lambda: not page.state["trial"]["on"], PATIENCE_S)
         for change, why in (
             ({"name": "../away"}, "cannot be part of a key"),
             ({"name": "new", "workers": ""}, "say models and prompt"),
             ({"name": "new", "workers": "a, a"}, "twice"),
             ({"name": "blind", "prompt": "another"}, "has another plan"),
         ):
-            found = page.ask(**{**PLAN, **change})
+            found = page.ask(**{**blind, **change})
             assert found["is"] == "failed", change
             assert why in found["why"]
         assert not page.state["trial"].get("on")
