@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
 import zenoh
-from camera_rig import free_endpoint, until
+from camera_rig import PATIENCE_S, free_endpoint, until
 
 from vla_zenoh.bus.client import MAX_OTHERS, MAX_WHY, Client
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import open_session
+from vla_zenoh.cli.drive import _reaches
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import MAX_JPEG_BYTES
+from vla_zenoh.errors import SessionError
 from vla_zenoh.lab.inference_views import MAX_SAMPLES, InferenceDebugSubscriber
+from vla_zenoh.lab.primitives.remote_robot import RemoteRobot
+from vla_zenoh.lab.web.robot_link import RobotLink
 from vla_zenoh.policy import MAX_CAMERAS
 from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh.types import Event, Header, InferenceDebug, NodeStatus
@@ -25,12 +31,15 @@ MAX_SEEN = 5
 SURELY = zenoh.CongestionControl.BLOCK
 
 
+def own_profile() -> Profile:
+    endpoint = free_endpoint()
+    where = {"listen": [endpoint], "connect": [endpoint]}
+    return override(load_profile("panda_sim"), {"session": where})
+
+
 @pytest.fixture
 def profile() -> Iterator[Profile]:
-    endpoint = free_endpoint()
-    made = override(
-        load_profile("panda_sim"), {"session": {"listen": [endpoint], "connect": [endpoint]}}
-    )
+    made = own_profile()
     with open_session(made.session, mode="router"):
         yield made
 
@@ -125,3 +134,94 @@ def test_what_is_no_picture_does_not_wait_for_who_looks(profile: Profile) -> Non
         assert listener.poll() == []
         assert listener.left_out["cameras"] == MAX_SAMPLES - MAX_CAMERAS
         listener.close()
+
+
+def say(node: Node, state: str, client: Client) -> None:
+    def heard() -> bool:
+        node.publish_status(state)  # again only after a while
+        status = client.status("command")
+        return "command" in client.alive and status is not None and status.state == state
+
+    until(f"it is heard that the command node is {state}", heard)
+
+
+def unconfirmed(robot: RemoteRobot) -> None:
+    """A stop and a reset raise, and say that nothing was heard since."""
+    for request in (robot.stop, robot.reset):
+        with pytest.raises(SessionError, match="did not confirm it: it is silent"):
+            request(0.2)
+
+
+@pytest.mark.parametrize("state", ["stopped", "inactive"])
+def test_what_is_lost_with_the_router_is_not_confirmed_by_an_older_status(state: str) -> None:
+    profile = own_profile()
+    router = open_session(profile.session, mode="router")
+    with open_session(profile.session) as here, open_session(profile.session) as there:
+        node, robot, link = Node("command", profile, there), RemoteRobot(profile, here), None
+        try:
+            say(node, state, robot.subscribe())
+            link = RobotLink(profile, here)
+            say(node, state, link.client)
+            unconfirmed(robot)  # the command node has not repeated it
+            router.close()
+            until("the router is lost", lambda: "command" not in robot.alive)
+            unconfirmed(robot)
+            robot.publish(robot.keys.stop, "stop")
+            assert not _reaches(robot, robot.stopped)
+            assert not link.stop()["stopped"]
+            with pytest.raises(SessionError, match="not accepted"):
+                link.hold_box("", "")
+        finally:
+            if link is not None:
+                link.close()
+            node.close()
+
+
+def test_a_stop_and_a_reset_are_confirmed_by_the_next_status(profile: Profile) -> None:
+    with open_session(profile.session) as here, open_session(profile.session) as there:
+        node, robot = Node("command", profile, there), RemoteRobot(profile, here)
+        say(node, "stopped", robot.subscribe())
+        for request, state in ((robot.stop, "stopped"), (robot.reset, "inactive")):
+            timer = threading.Timer(0.2, node.publish_status, (state,), {"now": True})
+            timer.start()
+            request(PATIENCE_S)
+            timer.join()
+        node.close()
+
+
+def test_a_fault_that_stays_ends_the_wait_for_a_reset(profile: Profile) -> None:
+    with open_session(profile.session) as here, open_session(profile.session) as there:
+        node, robot = Node("command", profile, there), RemoteRobot(profile, here)
+        say(node, "fault", robot.subscribe())
+        with pytest.raises(SessionError, match="fault"), repeated(node, "fault"):
+            robot.reset(1.0)
+        node.close()
+
+
+def test_a_command_node_that_crashed_clears_nothing(profile: Profile) -> None:
+    with open_session(profile.session) as here, open_session(profile.session) as there:
+        node, robot = Node("command", profile, there), RemoteRobot(profile, here)
+        robot.subscribe()
+        for state in ("crashed", "starting"):  # by `up`, in its name
+            say(node, state, robot)
+            with pytest.raises(SessionError, match="reset"), repeated(node, state):
+                robot.reset(0.5)
+        node.close()
+
+
+@contextmanager
+def repeated(node: Node, state: str) -> Iterator[None]:
+    """The node says its state again and again."""
+    over = threading.Event()
+
+    def say_it() -> None:
+        while not over.wait(0.05):
+            node.publish_status(state, now=True)
+
+    thread = threading.Thread(target=say_it)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()

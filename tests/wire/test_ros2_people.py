@@ -17,6 +17,7 @@ from ros2_peer import Ros2Peer
 from ros2_rig import write_profile
 
 from vla_zenoh.bus.client import Client
+from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import records
 from vla_zenoh.keys import Keys
@@ -138,3 +139,21 @@ def test_what_comes_last_in_a_request_is_not_done_after_a_stop_in_between(rig: R
     assert stop.result().success
     assert TOO_LATE in call.result().message
     assert len(rig.heard) == 2
+
+
+def test_a_stop_is_not_confirmed_by_an_older_status(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.undo()
+    client = rig.people._client
+    node = Node("command", client.profile, rig.operator)
+
+    def heard() -> bool:
+        node.publish_status("stopped")  # again only after a while
+        return client.status("command") is not None and "command" in client.alive
+
+    until("it is heard", heard)
+    response = rig.ask("stop").result()
+    assert not response.success
+    assert response.message == "the command node is silent, not stopped"
+    node.close()

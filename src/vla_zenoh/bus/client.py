@@ -96,6 +96,15 @@ class NodeRegistry:
             found = self._statuses.get(name)
         return found[0] if found else None
 
+    def status_since(self, name: str, since_s: float) -> NodeStatus | None:
+        """The last status of a live node, None unless it came after `since_s` of the clock.
+
+        A request that was lost with the router would else be confirmed by an old status.
+        """
+        with self._lock:
+            status, heard_s = self._statuses.get(name, (None, since_s))
+            return status if heard_s > since_s and name in self._alive else None
+
     def snapshot(self) -> dict[str, tuple[NodeStatus, float, bool]]:
         """Node -> (status, age in s, alive), by name."""
         now_s = self._clock()
@@ -148,7 +157,7 @@ class Client(NodeRegistry):
         self._refusals: deque[tuple[float, Event]] = deque(maxlen=MAX_REFUSALS)
         self._subscriptions: list[Any] = []
         self._token: Any = None
-        self._reset_s = 0.0
+        self._stop_s = self._reset_s = 0.0
 
     def subscribe(self) -> Client:
         """Subscribe to status, events, liveliness and the task; returns the client."""
@@ -226,7 +235,13 @@ class Client(NodeRegistry):
 
     def stop(self) -> None:
         """Trigger the emergency stop; it latches until `reset`."""
+        self._stop_s = time.monotonic()
         self.publish(self.keys.stop, "stop")
+
+    def stopped(self) -> bool:
+        """Whether the command node has said since the last `stop` that it is stopped."""
+        status = self.status_since("command", self._stop_s)
+        return status is not None and status.state == "stopped"
 
     def reset(self) -> None:
         """Clear a latched emergency stop or fault; the arm stays inactive."""
@@ -234,20 +249,20 @@ class Client(NodeRegistry):
         self.publish(self.keys.reset, "reset")
 
     def cleared(self) -> bool:
-        """Whether no stop and no fault is latched any more; to be polled after `reset`.
+        """Whether the command node has said since `reset` that no stop and no fault is latched.
 
         A robot that recovers on a reset still reports its fault when the command node gets that
         reset and rejects it: it is put again as soon as no node reports a fault.
         """
-        status = self.status("command")
-        if status is None or status.state not in ("", "stopped", "fault"):
+        status = self.status_since("command", self._reset_s)
+        if status is None or status.state in ("inactive", "active", "holding"):
             return status is not None
         if status.state == "fault" and time.monotonic() - self._reset_s > RESET_AGAIN_S:
             faults = {
                 name for name, (node, _, _) in self.snapshot().items() if node.state == "fault"
             }
             if faults <= {"command"}:
-                self.reset()
+                Client.reset(self)  # a subclass's may wait for this
         return False
 
     def publish(self, key: str, text: str) -> None:
@@ -353,13 +368,10 @@ class Client(NodeRegistry):
 
     def _stands(self, since_s: float) -> bool:
         """Whether the arm stands, by a status that is newer than the command."""
-        with self._lock:
-            found = self._statuses.get("command")
-        if found is None:
+        status = self.status_since("command", since_s)
+        if status is None or status.state in ("active", "holding"):
             return False
-        status, heard_s = found
-        at_rest = status.detail.get("at_rest") is True
-        return heard_s > since_s and at_rest and status.state not in ("active", "holding")
+        return status.detail.get("at_rest") is True
 
     def _set(self, what: str, text: str, taken: Callable[[Task], bool], timeout_s: float) -> Task:
         """Put a setting, and wait for a newer task that has it, or a newer rejection.

@@ -230,7 +230,7 @@ def _confirm_stop(target: RobotTarget, client: Client, *, every: bool) -> None:
     if every:
         _stop_all(target, client)
         return
-    if not _stops(client):
+    if not _reaches(client, client.stopped):
         _fail(target, client, "stop", "confirm that it stopped")
     _show_stopped(target, client, client.profile.robot.name)
     if others := target.others(client):
@@ -244,18 +244,10 @@ def reset(target: RobotTarget, as_json: AnswerOption = False) -> None:
         client.reset()
         if not _reaches(client, client.cleared):
             status = client.status("command")
-            if status is None or "command" not in client.alive:
+            if status is None or not client.latch_reason() or "command" not in client.alive:
                 _fail(target, client, "reset", "answer")
             fail(f"not cleared: {status.detail.get('why', '')}: {target.named(client)}")
         _show(target, client, "reset; inactive", ": ")
-
-
-def _stops(client: Client) -> bool:
-    def stopped() -> bool:
-        status = client.status("command")
-        return status is not None and status.state == "stopped"
-
-    return _reaches(client, stopped)
 
 
 def _reaches(client: Client, done: Callable[[], bool]) -> bool:
@@ -299,7 +291,7 @@ def _stop_all(target: RobotTarget, own: Client) -> None:
         named = own.profile.robot.model_copy(update={"name": robot})
         other = own.profile.model_copy(update={"robot": named})
         clients.append(Client(other, own.session).subscribe())
-    done = [_stops(client) for client in clients]
+    done = [_reaches(client, client.stopped) for client in clients]
     for client, stopped in zip(clients, done, strict=True):
         if stopped:
             _show_stopped(target, client, own.keys.robot)

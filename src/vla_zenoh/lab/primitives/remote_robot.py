@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, Literal, TypeVar
@@ -162,13 +163,8 @@ class RemoteRobot(Client):
         Raises:
             SessionError: the command node did not confirm it within `timeout_s`.
         """
-        self.publish(self.keys.stop, "stop")
-
-        def stopped() -> bool:
-            status = self.status("command")
-            return status is not None and status.state == "stopped"
-
-        self._confirm("stop", stopped, timeout_s)
+        super().stop()
+        self._confirm("stop", self.stopped, timeout_s)
 
     def reset(self, timeout_s: float = TIMEOUT_S) -> None:
         """Clear an emergency stop or a fault. The arm stays inactive.
@@ -180,9 +176,11 @@ class RemoteRobot(Client):
         self._confirm("reset", self.cleared, timeout_s)
 
     def _confirm(self, what: str, done: Callable[[], bool], timeout_s: float) -> None:
+        began_s = time.monotonic()
         if not self.wait_for(done, timeout_s):
-            why = f": {self.latch_reason()}" if self.latch_reason() else ""
-            raise SessionError(f"{what}: the command node did not confirm it{why}")
+            heard = self.status_since("command", began_s) is not None
+            why = self.latch_reason() if heard else "it is silent, or the router is lost"
+            raise SessionError(f"{what}: the command node did not confirm it{why and f': {why}'}")
 
     def _record(self, kind: type[Record], key: str, timeout_s: float) -> Stamped[Record]:
         buffer = self._buffer(key, MAX_RECORD_BYTES)

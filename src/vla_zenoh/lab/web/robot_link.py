@@ -30,7 +30,7 @@ from vla_zenoh.lab.web.recordings import Recordings
 from vla_zenoh.lab.web.trial import PageTrial
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import ActionChunk, PoseState, Task
+from vla_zenoh.types import ActionChunk, NodeStatus, PoseState, Task
 
 STILL_M_S = 0.005
 """A measured arm that is slower stands: an impedance controller still settles."""
@@ -112,13 +112,15 @@ class RobotLink:
     def arms(self) -> dict[str, dict[str, Any]]:
         """What is drawn of each part; of a robot that is one arm, of one without a name."""
         now_s = time.monotonic()
+        status = self.client.status("command")
         return {
-            name: part.described(now_s, self._box_of(name)) for name, part in self._parts.items()
+            name: part.described(now_s, self._box_of(name, status))
+            for name, part in self._parts.items()
         }
 
-    def _box_of(self, part: str) -> str:
+    @staticmethod
+    def _box_of(part: str, status: NodeStatus | None) -> str:
         """The box that a gripper holds, as the command node reports it."""
-        status = self.client.status("command")
         detail: Mapping[str, Any] = {} if status is None else status.detail
         return str(detail.get("parts", {"": detail}).get(part, {}).get("gripper_holds", ""))
 
@@ -132,8 +134,14 @@ class RobotLink:
         if part not in self._parts:
             raise SessionError(f"the robot has no part {part!r}")
         box = decode_held(text.encode())
+        began_s = time.monotonic()
         self.client.publish(self.keys.of_part(part).held if part else self.keys.held, str(box))
-        if not self.client.wait_for(lambda: self._box_of(part) == str(box), STAND_S):
+
+        def counts() -> bool:
+            status = self.client.status_since("command", began_s)
+            return status is not None and self._box_of(part, status) == str(box)
+
+        if not self.client.wait_for(counts, STAND_S):
             raise SessionError("not accepted: the log says why")
         return f"counted as held: {box} m" if box else "nothing is held"
 
@@ -190,7 +198,7 @@ class RobotLink:
                 stack.callback(measured[-1].subscribe(self.session, key).undeclare)
             moving = measured
             while (now_s := time.monotonic()) < began_s + STAND_S:
-                status = self.client.status("command")
+                status = self.client.status_since("command", began_s)
                 if status is not None and status.state == "stopped":
                     stopped_s = stopped_s or now_s - began_s
                     at_rest = status.detail.get("at_rest") is True

@@ -166,19 +166,20 @@ class RosServices:
         return "inactive, the arm stands"
 
     def _stop(self, asked: Any) -> str:
-        self._await_state("stopped")
+        self._await_state("stopped", self._called_ns)
         return "stopped; call reset, then activate"
 
     def _reset(self, asked: Any) -> str:
         with self._stop_lock:  # no stop of this process comes between the two
             self._check_stops(self._called_ns)
+            asked_ns = time.monotonic_ns()
             self._client.publish(self._client.keys.reset, "")
-        self._await_state("inactive")
+        self._await_state("inactive", asked_ns)
         return "inactive"
 
-    def _await_state(self, wanted: str) -> None:
+    def _await_state(self, wanted: str, since_ns: int) -> None:
         def state() -> str:
-            status = self._client.status("command")
+            status = self._client.status_since("command", since_ns / 1e9)
             return "silent" if status is None else status.state
 
         if not self._client.wait_for(lambda: state() == wanted, STATE_TIMEOUT_S):
