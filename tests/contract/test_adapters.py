@@ -37,6 +37,7 @@ from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import JointState
 
+pytestmark = pytest.mark.realtime
 STEP_M, ATOL_M = 0.01, 1e-6
 FK_ATOL_M = 1e-3
 TIMEOUT_S = 1.0

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import pytest
 from camera_rig import until
 from chain import READY_PATIENCE_S, command_line, write_profile
-from test_supervisor import Up, client_of
+from test_supervisor import Up, client_of, up
 
 from vla_zenoh.bus.client import Client
 from vla_zenoh.runtime.supervisor import GIVE_UP_AFTER
@@ -55,14 +55,19 @@ class Lab(NamedTuple):
         return json.loads(self.run("status", "--json").stdout)
 
 
-@pytest.fixture(scope="module")
-def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
-    folder = tmp_path_factory.mktemp("lab")
+def lab_profile(folder: Path) -> Path:
     (folder / "bad.py").write_text(MODEL)
     more = "workers: [scripted, bad]\nmodels: {bad: ./bad.py}\n"
     more += "options: {scripted: {camera: wrist}}\n"
     path = write_profile(folder, more=more)
     path.write_text(path.read_text().replace("wrist: null", f"wrist: {{source: 'v4l2:{DEVICE}'}}"))
+    return path
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
+    folder = tmp_path_factory.mktemp("lab")
+    path = lab_profile(folder)
     running = Up(str(path), "--log-dir", str(folder / "log"))
     try:
         with client_of(path) as (client, _):
@@ -99,7 +104,7 @@ def test_a_worker_whose_load_raises_is_one_line_and_its_reason_is_everywhere(lab
     assert "Traceback" in log
     assert 'raise FileNotFoundError("weights.pt not found")' in log
 
-    events = [event for node, _, event in lab.client.pop_events() if node == "worker-bad"]
+    events = [event for node, _, event in list(lab.client.events) if node == "worker-bad"]
     assert any(event.what == "crashed" and REASON in event.why for event in events)
 
     told = lab.status()
@@ -118,6 +123,7 @@ def test_a_worker_whose_load_raises_is_one_line_and_its_reason_is_everywhere(lab
 
 
 def test_status_has_a_row_for_a_node_that_is_not_there(lab: Lab) -> None:
+    until("the camera node", lambda: "camera" in lab.client.alive, READY_PATIENCE_S)
     os.kill(lab.running.process.pid, signal.SIGSTOP)  # so that it starts nothing again
     try:
         pid = lab.status()["nodes"]["camera"]["pid"]
@@ -153,9 +159,12 @@ def test_sim_stands_in_front_of_what_moves(lab: Lab) -> None:
     assert "SIM inactive" in shown
 
 
-def test_a_clean_end_is_silent(lab: Lab) -> None:
-    """Last of all: it ends the lab."""
-    lab.running.end(signal.SIGTERM)
-    lab.running.thread.join(5.0)
-    assert "all nodes have stopped" in lab.running.text
-    assert [line for line in lab.running.lines if any(word in line for word in NOISE)] == []
+def test_a_clean_end_is_silent(tmp_path: Path) -> None:
+    path = lab_profile(tmp_path)
+    with up(str(path)) as running:
+        with client_of(path) as (client, _):
+            until("the robot", lambda: {"sim", "command"} <= client.alive, READY_PATIENCE_S)
+        running.end(signal.SIGTERM)
+        running.thread.join(5.0)
+        assert "all nodes have stopped" in running.text
+        assert [line for line in running.lines if any(word in line for word in NOISE)] == []

@@ -101,6 +101,7 @@ def arms(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Arms]:
 def move(arms: Arms) -> None:
     """From rest: activate, and wait until both arms are fast."""
     chain = arms.chain
+    arms.unblock()  # what a test that failed has left
     if chain.state() in ("stopped", "fault"):
         chain.client.publish(chain.client.keys.reset, "")
     chain.client.publish(chain.client.keys.active, "false")
@@ -116,7 +117,7 @@ def move(arms: Arms) -> None:
         return False
 
     chain.until("the arms stand", rests, READY_PATIENCE_S)
-    chain.until("both are home, from where the way is long", at_home)
+    chain.until("both are home, from where the way is long", at_home, READY_PATIENCE_S)
     chain.activate_when_ready()
     chain.client.set_prompt("lift the bar")
     chain.until("both arms move", arms.fast)
@@ -245,9 +246,6 @@ def brake_s(part: str, speed_rad_s: FloatArray) -> float:
 def test_both_arms_stand_in_time_and_apart(arms: Arms, name: str) -> None:
     fault, chain = FAULTS[name], arms.chain
     move(arms)
-    began_s = time.monotonic()
-    fault.begin(arms)
-    time.sleep(fault.patience_s + SEEN_S)
 
     def tracks(since_s: float) -> dict[str, FloatArray]:
         every = {part: arms.rows(part, fault.measured_by) for part in PARTS}
@@ -257,9 +255,14 @@ def test_both_arms_stand_in_time_and_apart(arms: Arms, name: str) -> None:
         moved = tracks(time.monotonic() - SEEN_S)
         return all((np.abs(rows[:, 1 + JOINTS :]) < 0.01).all() for rows in moved.values())
 
-    chain.until("both stand", stand, STANDS_S)
-    ended_s = time.monotonic()
-    fault.end(arms)
+    began_s = time.monotonic()
+    try:
+        fault.begin(arms)
+        time.sleep(fault.patience_s + SEEN_S)
+        chain.until("both stand", stand, STANDS_S)
+        ended_s = time.monotonic()
+    finally:
+        fault.end(arms)
     chain.until("it is not active", lambda: chain.state() != "active", STANDS_S)
 
     least, cells, late = np.inf, [], []

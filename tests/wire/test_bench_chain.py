@@ -22,9 +22,19 @@ pytestmark = pytest.mark.long
 
 
 @pytest.fixture(scope="module")
-def told(tmp_path_factory: pytest.TempPathFactory) -> dict:
-    file = tmp_path_factory.mktemp("bench") / "result.json"
-    return run_bench(file, "chain-250", "zenoh-router", "zenoh-direct", "zmq")
+def results() -> dict[int, dict]:
+    """By attempt: what a busy computer has spoiled is not asked again."""
+    return {}
+
+
+@pytest.fixture
+def told(request: pytest.FixtureRequest, results: dict[int, dict], tmp_path: Path) -> dict:
+    attempt = getattr(request.node, "execution_count", 1)
+    if attempt not in results:
+        results[attempt] = run_bench(
+            tmp_path / "result.json", "chain-250", "zenoh-router", "zenoh-direct", "zmq"
+        )
+    return results[attempt]
 
 
 def run_bench(file: Path, *ways: str) -> dict:
