@@ -169,12 +169,17 @@ class Browser:
     def answers(self, what: str) -> list[dict[str, Any]]:
         return [message for message in list(self.heard) if message["is"] == what]
 
-    def wait(self, what: str, fits: Callable[[dict[str, Any]], bool] = lambda _: True) -> Any:
+    def wait(
+        self,
+        what: str,
+        fits: Callable[[dict[str, Any]], bool] = lambda _: True,
+        timeout_s: float = PATIENCE_S,
+    ) -> Any:
         """The first message of this kind that fits."""
         return until(
             f"a message {what}, of {[m for m in self.heard if m['is'] not in ('nodes', 'event')]}",
             lambda: next((message for message in self.answers(what) if fits(message)), None),
-            PATIENCE_S,
+            timeout_s,
         )
 
     def ask(self, **message: Any) -> dict[str, Any]:

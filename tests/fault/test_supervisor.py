@@ -319,12 +319,14 @@ def test_what_a_node_has_started_ends_with_it(tmp_path: Path) -> None:
         tell=lambda *_: None,
     )
     supervisor.start()
-    until("a process that the model has started", lambda: "inner" in lines)
-    (group,) = supervisor.pids().values()
-    assert os.getpgid(group) == group
-    supervisor.stop(time.monotonic() + END_S)
+    try:
+        until("a process that the model has started", lambda: "inner" in lines, READY_PATIENCE_S)
+        (group,) = supervisor.pids().values()
+        assert os.getpgid(group) == group
+    finally:
+        supervisor.stop(time.monotonic() + END_S)
 
-    until("nothing is left of it", lambda: not group_runs(group), BUSY_S)
+    until("nothing is left of it", lambda: not group_runs(group))
 
 
 def begin(*commands: NodeCommand) -> tuple[Supervisor, list[str]]:

@@ -16,7 +16,7 @@ from camera_rig import until
 from chain import command_line
 
 TIMEOUT_S = 110.0
-EPISODES = 8
+EPISODES = 40
 
 
 @pytest.fixture
@@ -84,7 +84,7 @@ def test_a_benchmark_whose_process_is_killed_begins_that_episode_again(
     asked = words(model, "-n", str(EPISODES), "-o", str(out), "--processes", "2")
     with subprocess.Popen([sys.executable, "-m", "vla_zenoh", *asked]) as begun:
         until("an episode", lambda: lines(out), TIMEOUT_S)
-        os.kill(until("a process", lambda: environments(begun.pid))[-1], signal.SIGKILL)
+        os.kill(until("a process", lambda: environments(begun.pid), TIMEOUT_S)[-1], signal.SIGKILL)
         assert begun.wait(TIMEOUT_S) == 0
     found = result(out)
     assert (found["successes"], found["episodes"]) == (3 * EPISODES, 3 * EPISODES)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import cv2
 import pytest
-from chain import LONG_PATIENCE_S, Chain, command_line
+from chain import LONG_PATIENCE_S, READY_PATIENCE_S, Chain, command_line
 
 import vla_zenoh
 from vla_zenoh.lab.lockstep.loop import Lockstep
@@ -54,11 +54,11 @@ def test_a_program_stops_the_arm_and_resets_it(chain: Chain) -> None:
     chain.move()
     with vla_zenoh.connect(chain.profile) as robot:
         robot.stop()
-        assert chain.state() == "stopped"
+        chain.until("it is stopped", lambda: chain.state() == "stopped")
         with pytest.raises(vla_zenoh.SessionError, match="emergency stop"):
             robot.activate()
         robot.reset()
-        assert chain.state() == "inactive"
+        chain.until("it is reset", lambda: chain.state() == "inactive")
         assert robot.chunk("scripted").record.worker == "scripted"
 
 
@@ -90,13 +90,17 @@ def test_the_arm_is_driven_by_the_zenoh_package_alone(chain: Chain, tmp_path: Pa
 @pytest.mark.long
 def test_a_recording_is_evaluated_and_plotted(chain: Chain, tmp_path: Path) -> None:
     file = tmp_path / "run.mcap"
-    words = ("record", "--profile", profile_file(chain), "--output", str(file), "--seconds", "10")
+    words = ("record", "--profile", profile_file(chain), "--output", str(file), "--seconds", "20")
     recording = threading.Thread(target=command_line, args=words)
     recording.start()
-    chain.until("the recorder is alive", lambda: "recorder" in chain.client.alive)
-    chain.activate_when_ready()
-    chain.go("up", 10)
-    recording.join()
+    try:
+        chain.until(
+            "the recorder is alive", lambda: "recorder" in chain.client.alive, READY_PATIENCE_S
+        )
+        chain.activate_when_ready()
+        chain.go("up", 10)
+    finally:
+        recording.join()
     text = run("evaluate_and_plot.py", str(file), folder=tmp_path)
     assert float(re.findall(r"path of the TCP: ([\d.]+) m", text)[0]) > MOVED_M
     assert "p95" in text

@@ -43,7 +43,7 @@ HANDED_OVER_M = 2e-4
 PROFILE = """\
 extends: panda_sim
 robot: {{command: joint}}
-timing: {{command_timeout_s: 0.3}}  # the writer is a test on a busy machine
+timing: {{command_timeout_s: 1.0}}  # the writer is a test on a busy machine
 session:
   listen: [{endpoint}]
   connect: [{endpoint}]

@@ -31,8 +31,6 @@ ARM_TOLERANCE = 2.7
 """As in tests/fault/test_dead_nodes.py: the arm brakes by itself when nobody commands."""
 AGAIN_S = 20.0
 
-pytestmark = pytest.mark.timeout(120)
-
 
 @dataclass
 class Lab:
@@ -146,7 +144,8 @@ def test_a_fault_of_the_robot_stops_it_until_it_is_gone_and_reset(lab: Lab, what
     lab.trouble("")
     chain.until("the robot is well", lambda: chain.state("arm") == "running")
     assert chain.state() == "fault"
-    chain.client.publish(chain.client.keys.reset, "")
+    chain.client.reset()
+    chain.until("it is reset", chain.client.cleared)
     chain.activate_when_ready()
 
 

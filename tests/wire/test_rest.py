@@ -42,6 +42,7 @@ def loop_hz(chain: Chain) -> float:
 
 def hold_still(chain: Chain) -> None:
     """Activate, and let the model fall silent, until the command node ticks slowly."""
+    chain.settle()
     chain.activate_when_ready()
     chain.client.set_prompt(UNKNOWN)
     chain.until("holding", lambda: chain.state() == "holding")
@@ -65,10 +66,15 @@ def test_a_motion_out_of_rest_begins_without_a_step(chain: Chain) -> None:
     hold_still(chain)
     since_ns = time.time_ns()
     chain.move()
-    positions_m = np.array([pose.position_m for _, pose in chain.recorder.commands(since_ns)])
+    commands = chain.recorder.commands(since_ns)
+    positions_m = np.array([pose.position_m for _, pose in commands])
     steps_m = np.linalg.norm(np.diff(positions_m, axis=0), axis=1)
     began = int(np.argmax(steps_m > 0))
-    assert steps_m[began] < SAME_M
+    # A busy computer may be late for the first tick: then it is as far as the jerk allows.
+    headers = [header for header, _ in commands]
+    apart_s = (headers[began + 1].stamp_wall_ns - headers[began].stamp_wall_ns) / 1e9
+    jerk_m_s3 = chain.profile.limits.translation.jerk_m_s3
+    assert steps_m[began] < max(SAME_M, jerk_m_s3 * apart_s**3 / 6)
     chain.settle()
 
 

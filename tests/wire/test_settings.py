@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zenoh
-from camera_rig import until
+from camera_rig import PATIENCE_S, until
 from chain import LONG_PATIENCE_S, READY_PATIENCE_S, Chain, command_line, running_chain
 
 from vla_zenoh.bus.buffers import LatestSample
@@ -59,7 +59,7 @@ def foreign_program(chain: Chain, **settings: str) -> None:
 
 
 def value_of(chain: Chain, name: str) -> str:
-    (reply,) = chain.session.get(f"vla/panda/{name}", timeout=2.0)
+    (reply,) = chain.session.get(f"vla/panda/{name}", timeout=PATIENCE_S)
     assert reply.ok is not None
     return reply.ok.payload.to_string()
 
@@ -237,14 +237,14 @@ def test_a_slow_reader_has_the_newest_and_holds_nobody_up(chain: Chain) -> None:
         for _ in range(8):
             time.sleep(SLOW_READER_S)
             for slot in slots.values():
-                assert slot.wait(1.0)
+                assert slot.wait(PATIENCE_S)
                 arrival = slot.pop()
                 assert arrival is not None
                 ages_s.append((time.monotonic_ns() - arrival.mono_ns) / 1e9)
         assert max(ages_s) < FRESH_S, ages_s
         put_ns = time.monotonic_ns()
         chain.session.put(keys.stop, b"")
-        assert stop.wait(1.0)
+        assert stop.wait(PATIENCE_S)
         arrival = stop.pop()
         assert arrival is not None
         assert (arrival.mono_ns - put_ns) / 1e9 < FRESH_S

@@ -19,7 +19,7 @@ from vla_zenoh.errors import SessionError
 from vla_zenoh.profile import load_profile
 
 STEPS, STEP_M, TOLERANCE_M = 5, 0.01, 0.001
-END_S = 5.0
+END_S = 20.0
 HOSTS = """\
 hosts:
   robot: {{nodes: [router, sim, camera, command]}}
@@ -85,7 +85,7 @@ def test_models_on_another_host_get_jpeg_and_move_the_arm(tmp_path: Path) -> Non
                 way_m = now.reference_position_m[2] - start_m
                 return abs(way_m - STEPS * STEP_M) < TOLERANCE_M and np.abs(now.twist).max() < 0.01
 
-            until(f"{STEPS} steps", arrived, 15.0)
+            until(f"{STEPS} steps", arrived, READY_PATIENCE_S)
             camera = client.status("camera")
             assert camera is not None
             assert camera.counters["front.jpeg"] > 0
