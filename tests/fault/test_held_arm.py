@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pytest
-from chain import MOVING_M_S, Chain
+from chain import MOVING_M_S, Chain, FloatArray
 
 BRAKE_S = 0.35
 """A jerk-limited stop from 0.15 m/s takes 0.17 s, the rest is the arm's lag."""
@@ -21,6 +21,7 @@ BUSY_S = 0.3
 FROZEN_EXTRA_S = 3.0
 """A program that stands still is given up by the router, see session.lease_ms."""
 ENDS_S = 15.0
+SOME_STATES = 20
 
 
 @contextmanager
@@ -61,7 +62,13 @@ def test_killed_it_takes_the_arm_with_it_and_the_arm_waits(ready: Chain) -> None
     assert re.fullmatch(r"deadman 'person-[^']+' is gone", str(ready.detail("why")))
     time.sleep(0.5)
     assert ready.state() == "inactive"
-    assert ready.recorder.track(time.time_ns() - 300_000_000).speed_m_s.max() < MOVING_M_S
+    since_ns = time.time_ns() - 300_000_000
+
+    def speeds_m_s() -> FloatArray:
+        return ready.recorder.track(since_ns).speed_m_s
+
+    ready.until("its states come", lambda: len(speeds_m_s()) > SOME_STATES)
+    assert speeds_m_s().max() < MOVING_M_S
 
 
 def test_frozen_it_takes_the_arm_with_it_too(ready: Chain) -> None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import mujoco
 import numpy as np
-from camera_rig import PATIENCE_S, Rig, await_match, camera_rig, until
+from camera_rig import Rig, await_match, camera_rig, until
+from chain import READY_PATIENCE_S
 from depth_rig import Looker, looking
 
 from vla_zenoh.bus.session import open_session
@@ -46,6 +48,14 @@ class Stage:
         self._publisher.put(payload, attachment=header)
         self._seq += 1
         time.sleep(1 / 30)
+
+    def show_until(self, what: str, enough: Callable[[], bool]) -> None:
+        def shown() -> bool:
+            if not enough():
+                self.show()
+            return enough()
+
+        until(what, shown, READY_PATIENCE_S)
 
 
 def assert_plane(rig: Rig, depth: Depth) -> None:
@@ -86,8 +96,7 @@ def test_a_plane_is_within_a_millimetre_after_wire_and_recording(tmp_path: Path)
         with open_session(rig.profile.session) as session:
             recorder = Recorder(rig.profile, session, tmp_path / "run.mcap").start()
             await_match(rig.session, key)
-            while len(heard) < 10:
-                stage.show()
+            stage.show_until("pictures of depth", lambda: len(heard) >= 10)
             recorder.close()
         subscriber.undeclare()
         kind, _, schema = heard[-1].encoding.partition(";")
@@ -110,8 +119,7 @@ def test_nobody_who_asks_for_depth_costs_no_depth() -> None:
     with camera_rig(CAMERAS) as rig:
         stage = Stage(rig)
         colour, _one = rig.listen(rig.profile.keys.camera_raw("front"))
-        while len(colour) < 5:
-            stage.show()
+        stage.show_until("pictures", lambda: len(colour) >= 5)
         time.sleep(0.6)
         assert rig.counter("front.raw") >= 5
         assert rig.counter("front.depth") == 0
@@ -123,9 +131,7 @@ def test_a_model_gets_the_depth_of_its_picture_and_shows_it_as_it_got_it() -> No
         shown, _one = rig.listen(rig.profile.keys.seen_depth("looker", "front"))
         stage = Stage(rig)
         with looking(rig, model) as tell:
-            while len(shown) < 3:
-                stage.show()
-                tell()
+            stage.show_until("what it saw", lambda: tell() or len(shown) >= 3)
         by_stamp = {seen.stamp_wall_ns: seen for seen in model.seen}
         for frame in shown:
             depth = decode_depth(frame.payload, frame.encoding.partition(";")[2])
@@ -141,10 +147,7 @@ def test_a_model_gets_the_depth_of_its_picture_and_shows_it_as_it_got_it() -> No
 def test_a_slow_model_gets_a_history_of_what_came_while_it_was_thinking() -> None:
     model = Looker(0.4, history=3, history_spacing_s=0.2, max_skew_s=0.1)
     with camera_rig(CAMERAS) as rig, looking(rig, model) as tell:
-        stage, give_up = Stage(rig), time.monotonic() + PATIENCE_S
-        while len(model.seen) < 6 and time.monotonic() < give_up:
-            stage.show()
-            tell()
+        Stage(rig).show_until("it saw enough", lambda: tell() or len(model.seen) >= 6)
     assert len(model.seen) == 6
     first = model.seen[0]
     assert [each.stamp_wall_ns for each in first.history] == [first.stamp_wall_ns] * 2

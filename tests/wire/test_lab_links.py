@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from access_rehearsal import surprises
-from camera_rig import camera_rig, free_endpoint, grey, until
+from camera_rig import PATIENCE_S, camera_rig, free_endpoint, grey, until
 
 from vla_zenoh.bus.buffers import LatestSample
 from vla_zenoh.bus.clock import MAX_HEARD
@@ -87,7 +87,7 @@ def test_stamps_of_another_host_are_read_on_the_own_clock() -> None:
 
         def exchange() -> Stamped[Task] | None:
             out.publish(Task(0, False, "hold", "scripted", 5.0))
-            assert slot.wait(1.0)
+            assert slot.wait(PATIENCE_S)
             arrival = slot.pop()
             assert arrival is not None
             near.clocks.poll()
@@ -143,7 +143,7 @@ def test_commands_and_pictures_travel_on_links_of_their_own() -> None:
         until("a reader of both", lambda: pictures.has_subscribers and news.has_subscribers)
         for stream, slot in ((pictures, seen), (news, heard)):
             stream.publish(b"something")
-            assert slot.wait(2.0)
+            assert slot.wait(PATIENCE_S)
         port, own = endpoint.removeprefix("tcp/"), second_link(endpoint).removeprefix("tcp/")
         for node in (camera, worker):
             assert node.traffic.links() == sorted([f"tcp/{port}", f"tcp/{own}"])

@@ -69,6 +69,7 @@ def kept(chain: Chain, folder: Path, limits: RingLimits = SHORT) -> Iterator[Kep
 def test_a_stop_is_saved_with_what_came_before_and_after_it_and_evaluates(
     chain: Chain, tmp_path: Path
 ) -> None:
+    chain.activate_when_ready()  # a rejected activation would be saved, too
     with kept(chain, tmp_path) as record:
         chain.move()
         chain.client.stop()

@@ -211,7 +211,10 @@ def process(*words: str, profile: Path, **more: Any) -> Iterator[subprocess.Pope
         yield child
     finally:
         child.terminate()
-        child.communicate(timeout=15)
+        try:
+            child.communicate(timeout=15)
+        finally:
+            child.kill()
 
 
 def test_a_replay_onto_a_live_robot_is_refused(run_file: Path, chain: Chain) -> None:

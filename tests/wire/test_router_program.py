@@ -113,11 +113,13 @@ def test_status_says_in_red_that_strangers_may_command(
     session = f"{{listen: [{endpoint}], connect: [{endpoint}], insecure: true}}"
     file.write_text(f"extends: panda_sim\nsession: {session}\n")
     stop = threading.Event()
-    thread = threading.Thread(target=run_router, args=(load_profile(str(file)), stop))
+    profile = load_profile(str(file))
+    thread = threading.Thread(target=run_router, args=(profile, stop))
     thread.start()
     monkeypatch.setenv("FORCE_COLOR", "1")
     monkeypatch.setenv("COLUMNS", "200")
     try:
+        open_session(profile.session, wait_s=LIMIT_S).close()  # it listens
         shown = CliRunner().invoke(app, ["status", "--once", "--profile", str(file)])
     finally:
         stop.set()

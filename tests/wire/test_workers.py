@@ -88,7 +88,10 @@ def worker(chain: Chain, model: str, *arguments: str) -> Iterator[subprocess.Pop
         yield process
     finally:
         process.terminate()
-        process.communicate(timeout=10)
+        try:
+            process.communicate(timeout=10)
+        finally:
+            process.kill()
 
 
 def test_a_shadow_is_not_obeyed_and_takes_over_in_motion(chain: Chain, tmp_path: Path) -> None:
