@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
 import pytest
 import zenoh
-from camera_rig import PATIENCE_S, free_endpoint, until
+from camera_rig import PATIENCE_S, await_match, free_endpoint, until
 
 from vla_zenoh.bus.client import MAX_OTHERS, MAX_WHY, Client
 from vla_zenoh.bus.node import Node
@@ -18,12 +19,13 @@ from vla_zenoh.cli.drive import _reaches
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import MAX_JPEG_BYTES
 from vla_zenoh.errors import SessionError
+from vla_zenoh.keys import Kind
 from vla_zenoh.lab.inference_views import MAX_SAMPLES, InferenceDebugSubscriber
 from vla_zenoh.lab.primitives.remote_robot import RemoteRobot
 from vla_zenoh.lab.web.robot_link import RobotLink
 from vla_zenoh.policy import MAX_CAMERAS
 from vla_zenoh.profile import Profile, load_profile, override
-from vla_zenoh.types import Event, Header, InferenceDebug, NodeStatus
+from vla_zenoh.types import Event, Header, InferenceDebug, NodeStatus, PoseState
 
 STRANGERS = 2000
 TOKENS = 300
@@ -225,3 +227,24 @@ def repeated(node: Node, state: str) -> Iterator[None]:
     finally:
         over.set()
         thread.join()
+
+
+def test_a_state_of_a_robot_that_is_gone_is_not_returned_as_where_it_is(profile: Profile) -> None:
+    profile = override(profile, {"timing": {"state_timeout_s": 0.5}})
+    pose = PoseState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(6))
+    with open_session(profile.session) as here, open_session(profile.session) as there:
+        node, robot = Node("sim", profile, there), RemoteRobot(profile, here)
+        publisher = node.declare_publisher(profile.keys.state_pose, Kind.STATE)
+        with pytest.raises(SessionError):
+            robot.pose_state(0.0)  # from now on it listens
+        await_match(there, profile.keys.state_pose)
+        for _ in range(2):
+            publisher.publish(pose)
+            assert np.array_equal(robot.pose_state().record.position_m, pose.position_m)
+            assert robot.pose_state(0.0) is robot.pose_state(0.0)
+        publisher.publish(pose)  # arrives, but is read too late
+        node.close()
+        time.sleep(2 * profile.timing.state_timeout_s)
+        for _ in range(2):
+            with pytest.raises(SessionError, match="nothing was published on vla/panda/state/pose"):
+                robot.pose_state(0.2)

@@ -20,7 +20,7 @@ import zenoh
 from vla_zenoh.bus.buffers import Wake, bytes_of
 from vla_zenoh.control.commander_io import DEACTIVATED
 from vla_zenoh.control.reachability import ReachabilityFilter
-from vla_zenoh.errors import CodecError, SessionError
+from vla_zenoh.errors import CodecError, NodeError, SessionError, VlaZenohError
 from vla_zenoh.keys import PRIMITIVES, last_chunk, worker_node
 from vla_zenoh.kinematics.so3 import Pose, pose_of, rotation_from_quat
 from vla_zenoh.lab.primitives.endings import NEAR_RAD, Arrival, Ending, Gripped, RunEnding, Sight
@@ -35,7 +35,7 @@ from vla_zenoh.lab.primitives.messages import (
     decode_request,
 )
 from vla_zenoh.lab.primitives.policy import CHUNK_HZ, Target, TargetPolicy
-from vla_zenoh.lab.primitives.remote_robot import RemoteRobot
+from vla_zenoh.lab.primitives.remote_robot import TIMEOUT_S, RemoteRobot
 from vla_zenoh.lab.primitives.target_check import TargetCheck
 from vla_zenoh.nodes.worker.node import InferenceDebugPublisher
 from vla_zenoh.nodes.worker.robot_session import RobotSession
@@ -98,7 +98,11 @@ class PrimitivesNode:
         )
 
     def run(self, stop: threading.Event) -> None:
-        """Serve until `stop` is set; an arm that moves is braked first."""
+        """Serve until `stop` is set; an arm that moves is braked first.
+
+        Raises:
+            NodeError: an unexpected exception ended it before.
+        """
         self._stop = stop
         thread = threading.Thread(target=self._serve, name="primitive")
         self._worker.report(now=True)
@@ -108,6 +112,8 @@ class PrimitivesNode:
             time.sleep(POLL_S)
         self._queryable.undeclare()
         self._worker.close()
+        if not stop.is_set():
+            raise NodeError("the thread that carries out primitives failed; its traceback says why")
 
     # -- chunks -------------------------------------------------------------------------------
     def _publish_chunk(self) -> None:
@@ -177,21 +183,26 @@ class PrimitivesNode:
                 asked = self._asked.get(timeout=AGAIN_S)
             except queue.Empty:
                 continue
-            answer = self._carry_out(asked)
-            with self._lock:
-                self._current = None
-            self._reply(asked.query, answer)
+            answer = Answer(False, "ended", "the node primitives failed: its output says why")
+            try:
+                answer = self._carry_out(asked)
+            finally:
+                with self._lock:
+                    self._current = None
+                self._reply(asked.query, answer)
 
     # -- one primitive ------------------------------------------------------------------------
     def _carry_out(self, asked: _Asked) -> Answer:
         request = asked.request
         off: tuple[float, float] | None = None
+        failed = "rejected"
         try:
             ending, target = self._prepare(request)
             with self._settings_kept(), self._stands_after():
                 self._aim(target)
                 run = request if isinstance(request, RunModel) else None
                 self._activate(run.worker if run else PRIMITIVES, run and run.prompt, request)
+                failed = "ended"
                 reason, why = self._watch(ending, asked.since_s + request.timeout_s)
             if isinstance(request, Grip) and reason == "reached":
                 box = None if request.holds_m is None else HeldBox(request.holds_m)
@@ -200,8 +211,8 @@ class PrimitivesNode:
             if isinstance(ending, Arrival):
                 off = ending.off(self._sight())
                 why = why or self._elbow(target)
-        except (Rejected, SessionError, CodecError) as error:
-            reason, why = "rejected", str(error)
+        except (Rejected, VlaZenohError, zenoh.ZError) as error:
+            reason, why = failed, str(error)
         ends_well = ["reached"]
         if isinstance(request, RunModel):
             ends_well += request.until.names or ["timeout"]
@@ -354,7 +365,10 @@ class PrimitivesNode:
                 return self._why_inactive()
             if self._stop.is_set():
                 return "ended", "the node primitives was stopped"
-            reason = ending.check(self._sight())
+            try:
+                reason = ending.check(self._sight(POLL_S))
+            except SessionError:  # no state comes: the command node ends it and says why
+                reason = ""
             if reason == "bound":
                 status = robot.status("command")
                 limits = status.detail.get("limits") if status is not None else None
@@ -381,7 +395,7 @@ class PrimitivesNode:
         status = self._robot.status("command")
         return status.state if status is not None else ""
 
-    def _sight(self) -> Sight:
+    def _sight(self, timeout_s: float = TIMEOUT_S) -> Sight:
         robot = self._robot
         task, status = robot.task, robot.status("command")
         done = status is not None and status.detail.get("policy_done") is True
@@ -390,9 +404,9 @@ class PrimitivesNode:
             done = done and status.detail.get("episode") == task.episode
         return Sight(
             time.monotonic(),
-            robot.pose_state().record,
-            self._check.kinematics.joints_of(robot.joint_state().record),
-            robot.gripper_state().record,
+            robot.pose_state(timeout_s).record,
+            self._check.kinematics.joints_of(robot.joint_state(timeout_s).record),
+            robot.gripper_state(timeout_s).record,
             done,
             task.speed if task is not None else 1.0,
         )
@@ -402,7 +416,7 @@ class PrimitivesNode:
         try:
             pose, joint = self._robot.pose_state().record, self._robot.joint_state().record
             gripper = self._robot.gripper_state().record
-        except (SessionError, CodecError):
+        except VlaZenohError:
             return Answer(False, "")
         return Answer(
             False,

@@ -43,15 +43,15 @@ class RemoteRobot(Client):
         self._newest: dict[str, Stamped[Any]] = {}
 
     def joint_state(self, timeout_s: float = TIMEOUT_S) -> Stamped[JointState]:
-        """Newest joint state; waits for the first."""
+        """Newest joint state; waits for one no older than ``timing.state_timeout_s``."""
         return self._record(JointState, self.keys.state_joint, timeout_s)
 
     def pose_state(self, timeout_s: float = TIMEOUT_S) -> Stamped[PoseState]:
-        """Newest measured pose of the TCP in the base frame; waits for the first."""
+        """Newest measured pose of the TCP in the base frame; waits as `joint_state`."""
         return self._record(PoseState, self.keys.state_pose, timeout_s)
 
     def gripper_state(self, timeout_s: float = TIMEOUT_S) -> Stamped[GripperState]:
-        """Newest gripper state; waits for the first."""
+        """Newest gripper state; waits as `joint_state`."""
         return self._record(GripperState, self.keys.state_gripper, timeout_s)
 
     def chunk(self, worker: str, timeout_s: float = TIMEOUT_S) -> Stamped[ActionChunk]:
@@ -183,11 +183,14 @@ class RemoteRobot(Client):
             raise SessionError(f"{what}: the command node did not confirm it{why and f': {why}'}")
 
     def _record(self, kind: type[Record], key: str, timeout_s: float) -> Stamped[Record]:
-        buffer = self._buffer(key, MAX_RECORD_BYTES)
-        sample = buffer.pop() if key in self._newest else self._next(key, 0, timeout_s)
+        oldest_ns = time.monotonic_ns() - int(self.profile.timing.state_timeout_s * 1e9)
+        sample = self._buffer(key, MAX_RECORD_BYTES).pop()
         if sample is not None:
             self._newest[key] = self._decoded(kind, sample)
-        return self._newest[key]
+        newest = self._newest.get(key)
+        if newest is None or newest.received_ns < oldest_ns:
+            newest = self._newest[key] = self._decoded(kind, self._next(key, 0, timeout_s))
+        return newest
 
     @staticmethod
     def _decoded(kind: type[Record], sample: ReceivedSample) -> Stamped[Record]:

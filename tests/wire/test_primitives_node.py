@@ -1,0 +1,96 @@
+"""The node primitives alone: whatever goes wrong, who asked is answered."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+from camera_rig import free_endpoint, until
+
+from vla_zenoh.bus.client import Client
+from vla_zenoh.bus.node import Node
+from vla_zenoh.bus.session import open_session
+from vla_zenoh.errors import NodeError
+from vla_zenoh.keys import PRIMITIVES, Kind, worker_node
+from vla_zenoh.lab.primitives.client import ask
+from vla_zenoh.lab.primitives.messages import Answer
+from vla_zenoh.lab.primitives.node import PrimitivesNode
+from vla_zenoh.profile import load_profile, override
+from vla_zenoh.types import GripperState, JointState, PoseState, Task
+
+DOWN = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+@contextmanager
+def running(joints: tuple[str, ...]) -> Iterator[tuple[PrimitivesNode, Client, Future[None]]]:
+    """The node, who asks it, and the node's end; a robot whose states have these joints."""
+    where = [free_endpoint()]
+    profile = override(load_profile("panda_sim"), {"session": {"listen": where, "connect": where}})
+    keys, over = profile.keys, threading.Event()
+    with (
+        open_session(profile.session, mode="router"),
+        open_session(profile.session) as bus,
+        open_session(profile.session) as ours,
+        open_session(profile.session) as theirs,
+        ThreadPoolExecutor(2) as threads,
+    ):
+        command = Node("command", profile, bus)
+        zeros = np.zeros(len(joints))
+        said = [
+            (command.declare_publisher(key, Kind.STATE), record)
+            for key, record in (
+                (keys.task, Task(1, False, "", "scripted", 5.0)),
+                (keys.state_joint, JointState(joints, zeros, zeros, None)),
+                (keys.state_pose, PoseState(np.array([0.4, 0.0, 0.3]), DOWN, np.zeros(6))),
+                (keys.state_gripper, GripperState(0.04, moving=False, holding=False)),
+            )
+        ]
+
+        def say() -> None:
+            while not over.wait(0.02):
+                for publisher, record in said:
+                    publisher.publish(record)
+
+        saying, client = threads.submit(say), Client(profile, theirs).subscribe()
+        node = PrimitivesNode(profile, ours)
+        ended = threads.submit(node.run, over)
+        try:
+            until(
+                "the node and the task are known",
+                lambda: worker_node(PRIMITIVES) in client.alive and node._robot.task,
+            )
+            yield node, client, ended
+        finally:
+            over.set()
+            saying.result()
+            command.close()
+
+
+def test_a_foreign_joint_state_is_a_reason_to_reject_and_the_node_still_answers() -> None:
+    with running(("elbow",)) as (_, client, ended):
+        for _ in range(2):
+            answer = ask(client, "home", {"timeout_s": 1.0})
+            assert (answer.ok, answer.reason) == (False, "rejected")
+            assert "panda_joint1" in answer.why
+        assert not ended.done()
+    ended.result()
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_an_unexpected_exception_is_answered_and_ends_the_node_with_an_error(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def fail(*_: Any) -> Answer:
+        raise RuntimeError("unexpected")
+
+    monkeypatch.setattr(PrimitivesNode, "_carry_out", fail)
+    with running(("elbow",)) as (_, client, ended):
+        answer = ask(client, "home", {"timeout_s": 1.0})
+        assert (answer.ok, answer.reason) == (False, "ended")
+        with pytest.raises(NodeError, match="primitives failed"):
+            ended.result()
