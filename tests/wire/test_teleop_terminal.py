@@ -6,15 +6,18 @@ import time
 from pathlib import Path
 
 import numpy as np
+import zenoh
 from camera_rig import until
-from chain import LONG_PATIENCE_S, READY_PATIENCE_S, Chain, command_line
+from chain import LONG_PATIENCE_S, READY_PATIENCE_S, Chain, command_line, write_profile
 from recording_rig import recording
 from teleop_rig import Screen, teleop
 
+from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import records
 from vla_zenoh.lab.dataset.episodes import episodes_of
 from vla_zenoh.lab.recording.run import load_run
 from vla_zenoh.lab.teleop.keyboard import END
+from vla_zenoh.profile import load_profile
 from vla_zenoh.types import GripperState
 
 ROBOT_PATIENCE_S = LONG_PATIENCE_S
@@ -158,6 +161,27 @@ def test_ctrl_c_in_motion_ends_it_stops_the_arm_and_restores_the_terminal(chain:
         chain.until("nobody is obeyed", lambda: chain.state() == "inactive")
         chain.wait_still()
         assert b"Traceback" not in screen.shown
+
+
+def test_enter_never_activates_an_arm_whose_state_is_unknown(tmp_path: Path) -> None:
+    file = write_profile(tmp_path)
+    profile = load_profile(str(file))
+    heard: list[str] = []
+    with open_session(profile.session, mode="router"), open_session(profile.session) as session:
+        handler = zenoh.handlers.Callback(
+            lambda sample: heard.append(sample.payload.to_string()), indirect=False
+        )
+        listening = session.declare_subscriber(profile.keys.active, handler)
+        screen = Screen(file)
+        try:
+            until("it is there", lambda: b"follows ?" in screen.shown, READY_PATIENCE_S)
+            screen.type(b"\r")
+            until("it is told", lambda: b"state unknown: Enter deactivates" in screen.shown)
+            until("the brake", lambda: heard)
+        finally:
+            screen.close()
+        listening.undeclare()
+    assert heard == ["false"]
 
 
 def test_without_a_terminal_it_says_so(chain: Chain) -> None:

@@ -38,6 +38,8 @@ from vla_zenoh.sanitize import one_line
 
 SHOW_PERIOD_S = 0.2
 DEVICE_S = 0.02
+UNKNOWN = "state unknown"
+"""Before the first task, and after the link of the operator was lost."""
 
 
 class Teleop:
@@ -143,6 +145,7 @@ class Teleop:
 
     def _execute(self, command: str) -> None:
         client = self._client
+        task = client.task if client is not None else None
         if command == QUIT:
             self._stop.set()
         elif client is None:
@@ -150,19 +153,25 @@ class Teleop:
         elif command == STOP:
             client.stop()
         elif command == ACTIVATE:
-            active = client.task is not None and client.task.active
-            client.publish(client.keys.active, "false" if active else "true")
+            # Of an arm that may be active the key is the brake.
+            activates = task is not None and not task.active
+            client.publish(client.keys.active, "true" if activates else "false")
+            if task is None:
+                self._lines.append(
+                    f"{UNKNOWN}: Enter deactivates. Press it again to activate once it is known"
+                )
         elif command == TAKE_OVER:
             self._note_who_leads(client)
-            current = client.task.worker if client.task is not None else ""
+            current = task.worker if task is not None else ""
             client.publish(
                 client.keys.worker, self._other_worker if current == self._name else self._name
             )
 
     def _note_who_leads(self, client: Client) -> None:
         """To give the arm back to, also where it was taken by ``vla-zenoh use``."""
-        if client.task is not None and client.task.worker != self._name:
-            self._other_worker = client.task.worker
+        task = client.task
+        if task is not None and task.worker != self._name:
+            self._other_worker = task.worker
 
     # -- out ----------------------------------------------------------------------------------
     def _show_status(self, terminal: Terminal) -> None:
@@ -180,6 +189,8 @@ class Teleop:
         task = self._client.task if self._client else None
         status = self._client.status("command") if self._client else None
         state = status.state if status else "no command node"
+        if status is not None and task is None:
+            state = UNKNOWN
         whose = "?" if task is None else "you" if task.worker == self._name else task.worker
         return one_line(f"{state}, follows {whose} | {self.policy.describe()}")[:118]
 
