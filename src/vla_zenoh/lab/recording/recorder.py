@@ -9,6 +9,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -124,20 +125,23 @@ class Recorder:
         self._ended: Mapping[str, Any] = {}
         self.recorded = RecordingResult(path, dropped=self._queue.dropped)
         self._began_s = time.monotonic()
-        self._writer = RecordingWriter(
-            path,
-            self.node.keys,
-            profile_yaml=to_yaml(profile),
-            base_frame=profile.robot.base_frame,
-            began_ns=self.node.clock.wall_ns(),
-            about={
-                "profile": profile.name,
-                "keys": " ".join(self._expressions),
-                "host": socket.gethostname(),
-                "code": code_version(),
-                **(about or {}),
-            },
-        )
+        with ExitStack() as undo:
+            undo.callback(self.node.close)
+            self._writer = RecordingWriter(
+                path,
+                self.node.keys,
+                profile_yaml=to_yaml(profile),
+                base_frame=profile.robot.base_frame,
+                began_ns=self.node.clock.wall_ns(),
+                about={
+                    "profile": profile.name,
+                    "keys": " ".join(self._expressions),
+                    "host": socket.gethostname(),
+                    "code": code_version(),
+                    **(about or {}),
+                },
+            )
+            undo.pop_all()
         self._thread = threading.Thread(target=self._write_all, name=name, daemon=True)
 
     # -- life ---------------------------------------------------------------------------------
@@ -145,9 +149,12 @@ class Recorder:
         """Subscribe and begin to record. Raises RecordingError: not a key expression."""
         # With Python's default of 5 ms, Zenoh's thread may wait that long for the writing thread.
         sys.setswitchinterval(SWITCH_INTERVAL_S)
-        self._queue.subscribe(self._expressions)
         self._thread.start()
-        self._ask_settings()
+        with ExitStack() as undo:
+            undo.callback(self.close)
+            self._queue.subscribe(self._expressions)
+            self._ask_settings()
+            undo.pop_all()
         return self
 
     def _ask_settings(self) -> None:

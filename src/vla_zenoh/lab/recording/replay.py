@@ -20,7 +20,7 @@ from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import alive_nodes
 from vla_zenoh.codec import image as image_codec
 from vla_zenoh.codec import message
-from vla_zenoh.errors import CodecError, NodeError, RecordingError
+from vla_zenoh.errors import CodecError, NodeError, RecordingError, in_words
 from vla_zenoh.keys import Keys
 from vla_zenoh.lab.recording.reader import Recording
 from vla_zenoh.lab.recording.record_types import group_of
@@ -163,6 +163,7 @@ class Replay:
         self._file, self._groups = file, frozenset(groups)
         self._speed, self._loop = speed, loop
         self._here, self._there = file.keys, profile.keys
+        self._link_lost = False
         self._alive = alive_nodes(session, profile.keys)
         self._reject_live_robot()
         self.node = Node(NAME, profile, session)
@@ -177,6 +178,8 @@ class Replay:
     # -- liveliness ---------------------------------------------------------------------------
     def _on_alive(self, name: str, alive: bool) -> None:
         (self._alive.add if alive else self._alive.discard)(name)
+        if name == NAME and not alive:  # ours: the link is lost, and with it every token
+            self._link_lost = True
 
     def _reject_live_robot(self) -> None:
         live = sorted(name for name in list(self._alive) if not name.startswith(_BYSTANDERS))
@@ -213,7 +216,7 @@ class Replay:
         return self.replayed
 
     def _one_pass(self, stop: threading.Event) -> bool:
-        ready: queue.Queue[tuple[int, Sample] | None] = queue.Queue(AHEAD)
+        ready: queue.Queue[tuple[int, Sample] | Exception | None] = queue.Queue(AHEAD)
         ending = threading.Event()
         self._last.clear()
         # Both clocks are read once: setting the wall clock does not disturb the pass.
@@ -232,6 +235,9 @@ class Replay:
                     continue
                 if found is None:
                     break
+                if isinstance(found, Exception):
+                    path = self._file.path
+                    raise NodeError(f"{path} cannot be replayed: {in_words(found)}") from found
                 anything = True
                 self._put(*found, to_mono_ns, stop)
         finally:
@@ -241,6 +247,14 @@ class Replay:
 
     # -- reading ahead ------------------------------------------------------------------------
     def _prepare(self, ready: queue.Queue[Any], ending: threading.Event, starts_ns: int) -> None:
+        end: Exception | None = None
+        try:
+            self._read_ahead(ready, ending, starts_ns)
+        except Exception as error:  # the other thread waits for the end
+            end = error
+        _hand_over(ready, end, ending)
+
+    def _read_ahead(self, ready: queue.Queue[Any], ending: threading.Event, starts_ns: int) -> None:
         restamper: Restamper | None = None
         suffix = secrets.token_hex(4)
         for entry in self._chosen():
@@ -252,7 +266,6 @@ class Replay:
             self._publisher(sample.key)
             if not _hand_over(ready, (entry.received_ns, sample), ending):
                 return
-        _hand_over(ready, None, ending)
 
     def _chosen(self) -> Iterator[Sample]:
         for entry in self._file.entries(lambda key: group_of(self._here, key) in self._groups):
@@ -309,11 +322,17 @@ class Replay:
             )
 
     def _check_robot(self) -> None:
-        """Publish status, and end at once when a robot comes alive.
+        """Publish status, and end at once when a robot comes alive, or may do so unnoticed.
 
         Raises:
-            NodeError: a robot is alive.
+            NodeError: a robot is alive, or the link to the router is or was lost.
         """
+        # Zenoh links again by itself, and samples may arrive there before a robot's token here.
+        if self._link_lost or not self.node.session.info.routers_zid():
+            raise NodeError(
+                "the link to the router was lost, and a robot may have come alive meanwhile: the "
+                "replay ended. Start it again"
+            )
         self._reject_live_robot()
         if self.node.status_due("replaying"):
             self.node.counters["samples"] = self.replayed.samples.total()
