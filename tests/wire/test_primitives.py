@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import subprocess
 import sys
 import threading
@@ -220,6 +222,22 @@ def test_time_over_brakes_short_of_the_target(robot: RemoteRobot) -> None:
     assert error.value.answer.off_m is not None
     assert error.value.answer.off_m > 0.05
     assert speed_m_s(robot) < 0.01
+
+
+def test_a_robot_that_falls_silent_in_motion_ends_it_with_the_command_node_s_reason(
+    robot: RemoteRobot,
+) -> None:
+    thread, found = in_background(lambda: robot.move_to(FAR_M))
+    until("it moves", lambda: speed_m_s(robot) > 0.05)
+    simulator = robot.status("sim")
+    assert simulator is not None
+    os.kill(simulator.pid, signal.SIGSTOP)
+    try:
+        thread.join(20)
+    finally:
+        os.kill(simulator.pid, signal.SIGCONT)
+    assert found[0].reason == "ended"
+    assert "nothing was published" not in found[0].why
 
 
 CLIENT = """

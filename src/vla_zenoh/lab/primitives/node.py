@@ -209,8 +209,9 @@ class PrimitivesNode:
                 self._check.hold(box)
                 self._robot.publish(self._robot.keys.held, "" if box is None else str(box))
             if isinstance(ending, Arrival):
-                off = ending.off(self._sight())
-                why = why or self._elbow(target)
+                with suppress(SessionError):  # a robot that is gone: the reason is known
+                    off = ending.off(self._sight())
+                    why = why or self._elbow(target)
         except (Rejected, VlaZenohError, zenoh.ZError) as error:
             reason, why = failed, str(error)
         ends_well = ["reached"]
