@@ -8,14 +8,13 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 import zenoh
-from camera_rig import free_endpoint, until
+from camera_rig import routed_session, until
 
 from vla_zenoh.bus.buffers import Wake
-from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import records
 from vla_zenoh.nodes.worker.robot_session import RobotSession
 from vla_zenoh.policy import ActionSpec, ActionSteps, CameraSpec, ModelSpec, ObservationSpec
-from vla_zenoh.profile import SessionProfile, load_profile
+from vla_zenoh.profile import load_profile
 from vla_zenoh.types import Header, Task
 
 CAMERAS = ("front", "wrist")
@@ -61,7 +60,7 @@ class Cameras:
 
 @pytest.fixture
 def cameras() -> Iterator[Cameras]:
-    with open_session(SessionProfile(listen=(free_endpoint(),)), mode="router") as session:
+    with routed_session() as session:
         found = Cameras(session)
         yield found
         found.worker.close()
