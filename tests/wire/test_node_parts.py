@@ -6,7 +6,8 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 
 import pytest
@@ -19,7 +20,7 @@ from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import MAX_MESSAGE_BYTES, alive_nodes, open_session
 from vla_zenoh.errors import CodecError, NodeError
 from vla_zenoh.keys import Keys
-from vla_zenoh.profile import SessionProfile, load_profile, override
+from vla_zenoh.profile import Profile, SessionProfile, load_profile, override
 from vla_zenoh.runtime.process import is_running
 from vla_zenoh.types import Header, SingleWriterFilter
 
@@ -33,6 +34,21 @@ def refused(speaker: SingleWriterFilter, header: Header, mono_ns: int) -> str | 
     except CodecError as error:
         return error.reason
     return None
+
+
+@contextmanager
+def two_sessions() -> Iterator[tuple[Profile, zenoh.Session, zenoh.Session]]:
+    """A profile with a router of its own, and two clients of that."""
+    endpoint = free_endpoint()
+    profile = override(
+        load_profile("panda_sim"), {"session": {"listen": [endpoint], "connect": [endpoint]}}
+    )
+    with (
+        open_session(profile.session, mode="router"),
+        open_session(profile.session) as one,
+        open_session(profile.session) as other,
+    ):
+        yield profile, one, other
 
 
 @pytest.fixture
@@ -114,15 +130,7 @@ def test_no_node_counts_as_dead_while_the_router_is_away() -> None:
 def test_a_second_node_of_a_name_that_a_new_router_did_not_know_of_ends(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    endpoint = free_endpoint()
-    profile = override(
-        load_profile("panda_sim"), {"session": {"listen": [endpoint], "connect": [endpoint]}}
-    )
-    with (
-        open_session(profile.session, mode="router"),
-        open_session(profile.session) as one,
-        open_session(profile.session) as other,
-    ):
+    with two_sessions() as (profile, one, other):
         first = Node("command", profile, one)
         monkeypatch.setattr("vla_zenoh.bus.node.alive_nodes", lambda *_, **__: set())
         second = Node("command", profile, other)
@@ -146,16 +154,8 @@ def test_a_second_node_of_a_name_that_a_new_router_did_not_know_of_ends(
 def test_a_sample_larger_than_its_slot_takes_is_dropped_counted_and_told(
     make: Callable[[int], LatestSample | CallbackRing | ZenohRing],
 ) -> None:
-    endpoint = free_endpoint()
-    profile = override(
-        load_profile("panda_sim"), {"session": {"listen": [endpoint], "connect": [endpoint]}}
-    )
     limit = 1000
-    with (
-        open_session(profile.session, mode="router"),
-        open_session(profile.session) as reader,
-        open_session(profile.session) as writer,
-    ):
+    with two_sessions() as (profile, reader, writer):
         node = Node("reader", profile, reader)
         key = node.keys.prompt
         slot = node.subscribe(key, make(limit))
@@ -189,15 +189,7 @@ def test_a_sample_larger_than_its_slot_takes_is_dropped_counted_and_told(
 def test_what_deletes_is_not_taken_for_what_is_put(
     make: Callable[[], LatestSample | CallbackRing | ZenohRing],
 ) -> None:
-    endpoint = free_endpoint()
-    profile = override(
-        load_profile("panda_sim"), {"session": {"listen": [endpoint], "connect": [endpoint]}}
-    )
-    with (
-        open_session(profile.session, mode="router"),
-        open_session(profile.session) as reader,
-        open_session(profile.session) as writer,
-    ):
+    with two_sessions() as (profile, reader, writer):
         node = Node("reader", profile, reader)
         key = node.keys.reset
         slot = node.subscribe(key, make())  # pyright: ignore[reportArgumentType]
