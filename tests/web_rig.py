@@ -158,6 +158,18 @@ class Browser:
             assert time.monotonic() < give_up_s, ended
             self.let_go()
 
+    def hold_until(self, what: str, moved: Callable[[], Any], patience_s: float) -> None:
+        """Hold until the arm has moved; press again where a busy computer ends the hold."""
+        self.hold_until_active(patience_s)
+
+        def held_and_moved() -> Any:
+            if self.answers("hold_ended"):
+                self.let_go()
+                self.hold_until_active(patience_s)
+            return moved()
+
+        until(what, held_and_moved, patience_s)
+
     def let_go(self) -> None:
         self._holding.clear()
         self.send(do="release")

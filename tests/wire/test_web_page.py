@@ -51,15 +51,7 @@ def site(shared_chain: Chain, tmp_path_factory: pytest.TempPathFactory) -> Itera
 
 def hold_until_it_moves(chain: Chain, browser: Browser) -> None:
     chain.client.set_prompt("HARD: go up" if chain.height_m() < 0.42 else chain.down)
-    browser.hold_until_active(READY_PATIENCE_S)
-
-    def moves() -> bool:
-        if browser.answers("hold_ended"):  # an echo that a busy computer kept back: press again
-            browser.let_go()
-            browser.hold_until_active(READY_PATIENCE_S)
-        return chain.moves()
-
-    chain.until("it moves", moves)
+    browser.hold_until("it moves", chain.moves, READY_PATIENCE_S)
 
 
 def stopped_ns(chain: Chain) -> int:

@@ -19,6 +19,8 @@ pytest.importorskip("uvicorn", reason="needs the extra web")
 
 READY_S, PATIENCE_S = 90.0, 20.0
 POLL_S = 0.05
+HIGH_M = 0.5
+"""The height from which an arm goes down."""
 PROFILE = """\
 extends: two_pandas_sim
 cameras:
@@ -129,9 +131,14 @@ def test_the_chosen_arm_is_moved_by_hand_and_the_other_stands(pair: tuple[Host, 
             until("the page has the arm", lambda: page.state["jog"], PATIENCE_S)
             until("both stand", lambda: all_slower(page), PATIENCE_S)
             began = {name: arm["measured_m"] for name, arm in page.state["arms"].items()}
-            page.twist = [0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
-            page.hold_until_active(READY_S)
-            until("it rises", lambda p=part, b=began: height(page, p) > b[p][2] + 0.03, PATIENCE_S)
+            # A high arm goes down: it would soon be straight.
+            up = 1.0 if began[part][2] < HIGH_M else -1.0
+            page.twist = [0.0, 0.0, up, 0.0, 0.0, 0.0]
+            page.hold_until(
+                "it goes up or down",
+                lambda p=part, b=began, way=up: way * (height(page, p) - b[p][2]) > 0.03,
+                READY_S,
+            )
             page.let_go()
             until("both stand", lambda: all_slower(page), PATIENCE_S)
             assert page.state["arms"][other]["measured_m"] == pytest.approx(began[other], abs=3e-3)
