@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 from chain import CHAIN_PATIENCE_S, Chain, running_chain
@@ -26,6 +27,18 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.path.parent.name in IN_REAL_TIME:
             item.add_marker(pytest.mark.realtime)
+
+
+@pytest.hookimpl(tryfirst=True)  # before the fixtures are made
+def pytest_runtest_setup(item: pytest.Function) -> None:
+    """A test that is tried again begins with new processes, whatever the failed try left behind."""
+    if getattr(item, "execution_count", 1) == 1:
+        return
+    request: Any = item._request
+    for fixtures in item._fixtureinfo.name2fixturedefs.values():
+        for fixture in fixtures:
+            if fixture.scope == "module":
+                fixture.finish(request)
 
 
 @pytest.fixture(scope="module")

@@ -94,3 +94,17 @@ def test_an_unexpected_exception_is_answered_and_ends_the_node_with_an_error(
         assert (answer.ok, answer.reason) == (False, "ended")
         with pytest.raises(NodeError, match="primitives failed"):
             ended.result()
+
+
+def test_a_chunk_that_cannot_be_published_ends_the_node_and_its_thread(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with running(("elbow",)) as (_, _client, ended):
+
+        def fail(_: PrimitivesNode) -> None:
+            raise RuntimeError("unexpected")
+
+        monkeypatch.setattr(PrimitivesNode, "_publish_chunk", fail)
+        with pytest.raises(RuntimeError, match="unexpected"):
+            ended.result(10.0)
+        assert "primitive" not in [thread.name for thread in threading.enumerate()]

@@ -107,9 +107,14 @@ class PrimitivesNode:
         thread = threading.Thread(target=self._serve, name="primitive")
         self._worker.report(now=True)
         thread.start()
-        while thread.is_alive():
-            self._publish_chunk()
-            time.sleep(POLL_S)
+        try:
+            while thread.is_alive():
+                self._publish_chunk()
+                time.sleep(POLL_S)
+        except BaseException:
+            stop.set()  # the thread brakes the arm, and answers
+            thread.join()
+            raise
         self._queryable.undeclare()
         self._worker.close()
         if not stop.is_set():
