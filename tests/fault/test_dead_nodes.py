@@ -9,8 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+import zenoh
 from chain import MOVING_M_S, READY_PATIENCE_S, Chain, Track
 
+from vla_zenoh.codec import message
 from vla_zenoh.runtime.supervisor import HANG_S
 from vla_zenoh.types import Event
 
@@ -210,6 +212,37 @@ def test_a_killed_router_stops_the_arm_and_all_find_each_other_again(chain: Chai
     chain.until("its silence counts", lambda: chain.counter("sim.stream_silences", "sim") >= 1)
     chain.until("it says why", lambda: "is gone" in str(chain.detail("why")))
     chain.recorder.forget()
+    assert_waits_and_works_again(chain)
+
+
+def test_a_command_node_whose_name_another_one_has_brakes_the_arm_before_it_ends(
+    chain: Chain,
+) -> None:
+    key, there = (
+        chain.profile.keys.clock("command"),
+        {"heard_ns": 0, "said_ns": 0, "age_ns": 1 << 62},
+    )
+
+    def reply(query: zenoh.Query) -> None:
+        query.reply(key, message.pack(there))
+
+    move_a_while(chain)
+    pid, at_ns = chain.pid("command"), time.time_ns()
+    handler = zenoh.handlers.Callback(reply, indirect=False)
+    another = chain.session.declare_queryable(key, handler)
+    (event,) = chain.until("it ends the activation", lambda: endings(chain))
+    another.undeclare()
+    assert event.why == "deactivated"
+    chain.until(
+        "it runs again",
+        lambda: chain.host.supervisor.pids().get("command", pid) != pid,
+        READY_PATIENCE_S,
+    )
+    assert any(name == "command" and "is already running" in line for name, line in chain.lines)
+    chain.wait_still()
+    assert chain.recorder.hardest_command(at_ns) > 0.0
+    assert_gentle(chain)
+    assert not chain.events("running->braking"), "the robot braked it"
     assert_waits_and_works_again(chain)
 
 

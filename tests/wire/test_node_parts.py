@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -15,7 +16,7 @@ import zenoh
 from camera_rig import await_match, free_endpoint, until
 
 from vla_zenoh.bus.buffers import CallbackRing, LatestSample, ReceivedSample, ZenohRing
-from vla_zenoh.bus.clock import ADOPT_S, Clock
+from vla_zenoh.bus.clock import ADOPT_S, Clock, decode_stamps
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import MAX_MESSAGE_BYTES, alive_nodes, open_session
 from vla_zenoh.errors import CodecError, NodeError
@@ -26,6 +27,8 @@ from vla_zenoh.types import Header, SingleWriterFilter
 
 SILENCE_NS = 500_000_000
 STEP_TOLERANCE_S = 0.002
+AWAY_NS = 300_000_000
+"""An absence of a node, in this test, after which it may have been replaced."""
 
 
 def refused(speaker: SingleWriterFilter, header: Header, mono_ns: int) -> str | None:
@@ -148,6 +151,86 @@ def test_a_second_node_of_a_name_that_a_new_router_did_not_know_of_ends(
         second.close()
         first.publish_status("inactive")
         first.close()
+
+
+STOPPED_NODE = f"""
+import sys, time
+from vla_zenoh.bus import clock
+from vla_zenoh.bus.node import Node
+from vla_zenoh.bus.session import open_session
+from vla_zenoh.profile import load_profile, override
+
+clock.AWAY_NS = {AWAY_NS}
+where = {{"listen": [sys.argv[1]], "connect": [sys.argv[1]]}}
+profile = override(load_profile("panda_sim"), {{"session": where}})
+with open_session(profile.session) as session:
+    node = Node("command", profile, session)
+    print("ready", flush=True)
+    while True:
+        node.publish_status("inactive")
+        time.sleep(0.02)
+"""
+
+
+def test_a_stopped_node_that_was_replaced_ends_when_it_goes_on_and_not_the_new_one() -> None:
+    with two_sessions() as (profile, one, other):
+        words = [sys.executable, "-c", STOPPED_NODE, *profile.session.connect]
+        with subprocess.Popen(
+            words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        ) as process:
+            try:
+                assert process.stdout is not None
+                assert process.stderr is not None
+                assert process.stdout.readline() == "ready\n"
+                until("its token is there", lambda: alive_nodes(one, profile.keys))
+                process.send_signal(signal.SIGSTOP)
+                until("its token is gone", lambda: not alive_nodes(one, profile.keys), 30.0)
+                replacement = Node("command", profile, other)
+                process.send_signal(signal.SIGCONT)
+
+                def ends() -> bool:
+                    replacement.publish_status("inactive")
+                    return process.poll() is not None
+
+                until("it ends", ends, 30.0)
+                assert "is already running" in process.stderr.read()
+                replacement.publish_status("inactive")
+                replacement.close()
+            finally:
+                process.kill()
+
+
+@pytest.mark.parametrize("replaced", [True, False])
+def test_the_age_of_a_node_begins_again_after_a_long_absence_and_not_after_a_short_one(
+    monkeypatch: pytest.MonkeyPatch, replaced: bool
+) -> None:
+    endpoint = free_endpoint()
+    where = {"session": {"listen": [endpoint], "connect": [endpoint]}}
+    profile = override(load_profile("panda_sim"), where)
+    router = open_session(profile.session, mode="router")
+    with open_session(profile.session) as session:
+        node = Node("command", profile, session)
+        began_ns = time.monotonic_ns()
+        if replaced:
+            monkeypatch.setattr("vla_zenoh.bus.clock.AWAY_NS", AWAY_NS)
+        router.close()
+        until("the link is lost", lambda: not session.info.routers_zid())
+        time.sleep(2 * AWAY_NS / 1e9)
+        node.publish_status("inactive")
+        with (
+            open_session(profile.session, mode="router"),
+            open_session(profile.session) as asking,
+        ):
+            came_ns = time.monotonic_ns()
+            until("it answers", lambda: list(asking.get(profile.keys.clock("command"))), 30.0)
+            answer = next(iter(asking.get(profile.keys.clock("command"))))
+            age_ns = decode_stamps(answer.ok.payload.to_bytes())[2]
+            now_ns = time.monotonic_ns()
+            if replaced:
+                assert age_ns < now_ns - came_ns
+            else:
+                assert age_ns > came_ns - began_ns
+        node.close()
 
 
 @pytest.mark.parametrize("make", [LatestSample, partial(CallbackRing, 4), partial(ZenohRing, 4)])

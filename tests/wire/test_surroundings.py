@@ -16,7 +16,8 @@ from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import records
 from vla_zenoh.control.preflight import PeerSnapshot
-from vla_zenoh.keys import ON_BEHALF, STARTING
+from vla_zenoh.keys import ON_BEHALF, STARTING, Kind
+from vla_zenoh.nodes.command import inputs
 from vla_zenoh.nodes.command.inputs import MAX_WORKERS, PeerMonitor
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.types import Header, NodeStatus
@@ -163,6 +164,26 @@ def test_up_that_still_takes_a_living_node_for_a_starting_one_is_not_heard_in_it
     scene.says(scene.camera, 3.0)
     until("the camera's own word", lambda: scene.look().camera_nodes == {"front": "camera"})
     assert scene.refused("foreign_status") == 0
+
+
+def test_of_two_nodes_of_one_name_the_other_is_heard_when_one_has_fallen_silent(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(inputs, "SILENT_S", ROOM_S)
+    camera = scene.camera
+    says = {"cameras": {"front": {"age_s": 3.0}}}
+    source, camera.source = camera.source, "camera#another"
+    other = camera.declare_publisher(camera.keys.status("camera"), Kind.TELEMETRY)
+    camera.source = source
+    status = NodeStatus("camera", "running", "there", 1, 1, detail=says, boot="boot")
+    scene.says(camera, 1.0)
+    until("the camera is heard", lambda: scene.look().camera_nodes)
+    other.publish(status)
+    until("the other is rejected", lambda: scene.look() and scene.refused("foreign_status"))
+    assert scene.look().hosts["camera"] != "there"
+    time.sleep(ROOM_S)
+    other.publish(status)
+    until("the other is heard", lambda: scene.look().hosts["camera"] == "there")
 
 
 def test_no_picture_is_younger_than_now(scene: Scene) -> None:

@@ -35,6 +35,8 @@ ASK_PERIOD_S = 1.0
 FIRST_ASKS, FIRST_PERIOD_S = 8, 0.1
 """The first queries follow each other quickly: one of them will be undisturbed."""
 PATIENCE_S = 2.0
+AWAY_NS = 10_000_000_000
+"""A node that was away for longer may have been replaced."""
 FORGET_S = 30.0
 """An offset is discarded after this time without a reply."""
 HEARD_PATIENCE_S = 2.0
@@ -285,15 +287,24 @@ class ClockSync:
     """Clock offsets of the nodes other than `name`, and stamps converted with them, see
     `ClockOffsetFilter`.
 
-    `duplicate`: another node of this `name`, started before this one, replied as well.
+    `duplicate`: another node of this `name`, which has been there for longer, replied as well.
+    `routes` means a router's session.
     """
 
     def __init__(
-        self, session: zenoh.Session, keys: Keys, clock: Clock, name: str, bound_s: float
+        self,
+        session: zenoh.Session,
+        keys: Keys,
+        clock: Clock,
+        name: str,
+        bound_s: float,
+        *,
+        routes: bool = False,
     ) -> None:
         self._session, self._keys, self._clock, self._name = session, keys, clock, name
         self._bound_s = bound_s
-        self._since_ns = time.time_ns()
+        self._routes = routes
+        self._since_ns = self._linked_ns = time.monotonic_ns() + suspended_ns()
         self._lock = threading.Lock()
         self._peers: dict[str, _Peer] = {}
         self._next_look_s = 0.0
@@ -332,6 +343,8 @@ class ClockSync:
                 peer.next_ask_s = now_s + (
                     FIRST_PERIOD_S if peer.asks <= FIRST_ASKS else ASK_PERIOD_S
                 )
+                if peer is self._own and (self._routes or self._session.info.routers_zid()):
+                    self._age_ns()
                 self._ask(peer)
             if peer is not self._own and peer.forgotten(now_s):
                 with self._lock:  # room for others; it comes back with its next sample
@@ -346,13 +359,13 @@ class ClockSync:
             if reply.ok is None:
                 return
             try:
-                heard_ns, said_ns, since_ns = decode_stamps(
+                heard_ns, said_ns, age_ns = decode_stamps(
                     bytes_of(reply.ok.payload, MAX_STAMPS_BYTES)
                 )
             except CodecError:
                 return  # not one of our nodes' clocks
             if own:
-                self.duplicate |= since_ns < self._since_ns
+                self.duplicate |= age_ns > self._age_ns()
                 return
             with self._lock:
                 if peer.filter.add(Exchange(asked_ns, heard_ns, said_ns, got_ns)):
@@ -366,10 +379,22 @@ class ClockSync:
             **QOS[Kind.CONTROL],
         )
 
+    def _age_ns(self) -> int:
+        """For how long this node has been there; called while it has a link.
+
+        It begins again after a long absence (lost link, stopped process, sleep of the computer):
+        who was started meanwhile in its place stays.
+        """
+        now_ns = time.monotonic_ns() + suspended_ns()
+        if now_ns - self._linked_ns > AWAY_NS:
+            self._since_ns = now_ns
+        self._linked_ns = now_ns
+        return now_ns - self._since_ns
+
     def reply(self, query: zenoh.Query) -> None:
         """Reply to a query of this node's clock with the times of its arrival and of this reply."""
         reply = {"heard_ns": self._clock.wall_ns(), "said_ns": self._clock.wall_ns()}
-        query.reply(self._own.key, message.pack(reply | {"since_ns": self._since_ns}))
+        query.reply(self._own.key, message.pack(reply | {"age_ns": self._age_ns()}))
 
     def offsets(self) -> dict[str, ClockOffset]:
         """Node -> its clock minus ours, of those that replied lately."""
@@ -395,11 +420,11 @@ class ClockSync:
 
 
 def decode_stamps(payload: bytes) -> tuple[int, int, int]:
-    """Times (ns) of arrival and reply of a query and of the peer's start, on the peer's wall clock,
-    or a `CodecError`."""
+    """Times (ns) of arrival and reply of a query on the peer's wall clock, and for how long (ns)
+    the peer has been there, or a `CodecError`."""
     found = message.unpack(payload)
     found = found if isinstance(found, dict) else {}
-    heard, said, since = (found.get(name) for name in ("heard_ns", "said_ns", "since_ns"))
-    if type(heard) is not int or type(said) is not int or type(since) is not int:
-        raise CodecError("shape", "a clock replies with heard_ns, said_ns and since_ns")
-    return heard, said, since
+    heard, said, age = (found.get(name) for name in ("heard_ns", "said_ns", "age_ns"))
+    if type(heard) is not int or type(said) is not int or type(age) is not int:
+        raise CodecError("shape", "a clock replies with heard_ns, said_ns and age_ns")
+    return heard, said, age

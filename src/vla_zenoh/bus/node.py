@@ -129,9 +129,8 @@ class Node:
         self._status_s, self._last_state = 0.0, ""
         if alive_nodes(session, self.keys, name, routes=routes):
             raise self._duplicate()
-        self.clocks = ClockSync(
-            session, self.keys, self.clock, name, profile.timing.max_clock_offset_s
-        )
+        bound_s = profile.timing.max_clock_offset_s
+        self.clocks = ClockSync(session, self.keys, self.clock, name, bound_s, routes=routes)
         self.serve(self.keys.clock(name), self.clocks.reply)
         self._token = session.liveliness().declare_token(self.keys.alive(name))
         self._status = self.declare_publisher(self.keys.status(name), Kind.TELEMETRY)
@@ -140,8 +139,9 @@ class Node:
 
     def _duplicate(self) -> NodeError:
         return NodeError(
-            f"node {self.name!r} of robot {self.profile.robot.name!r} is already running. Stop it, "
-            "or start this one with a different --name, if the command has that option"
+            f"node {self.name!r} of robot {self.profile.robot.name!r} is already running: "
+            "`vla-zenoh status` says where. Stop it, or start this one with a different --name, "
+            "if the command has that option"
         )
 
     def declare_publisher(self, key: str, kind: Kind) -> Publisher:
@@ -215,8 +215,8 @@ class Node:
         """Whether `publish_status` would publish now; lets a fast loop skip collecting details.
 
         Raises:
-            NodeError: a node of this name was started before, which a router that had just been
-                restarted did not know of yet.
+            NodeError: a node of this name has been there for longer, which a router that had just
+                been restarted did not know of yet; or which took the place of this one.
         """
         self._poll()
         if self.clocks.duplicate:

@@ -35,6 +35,8 @@ LEAST_S, SLACK_S = 1.0, 0.2
 """The last brake may take this long at least, and this much longer than the limits allow."""
 MAX_REASON = 300
 CONNECTING_S = 0.2
+REPLIES, REPLY_S = 4, 0.05
+"""Another node of this name is asked for so often, and has so much time to reply."""
 WATCH_S = 0.05
 
 
@@ -84,6 +86,10 @@ class RobotNode:
     def _connect(self) -> None:
         """Connect the driver, publishing the status meanwhile: else the node counts as hung."""
         self.node.publish_status("connecting", now=True)
+        if not self.driver.simulated:  # another node may move the arm, which has one client
+            for _ in range(REPLIES):
+                time.sleep(REPLY_S)
+                self.node.publish_status("connecting")
         done = threading.Event()
 
         def report() -> None:

@@ -28,11 +28,11 @@ from vla_zenoh.runtime.certificate_expiry import CertificateExpiry
 from vla_zenoh.runtime.process import ROUTER_PATIENCE_S, RUN_FOLDER_VARIABLE
 from vla_zenoh.runtime.router import reject_taken
 from vla_zenoh.runtime.supervisor import (
-    HEARD_S,
     Child,
     NodeCommand,
     Supervisor,
     hung_nodes,
+    is_hearing,
     repeated,
     signal_group,
 )
@@ -352,7 +352,7 @@ class Host:
         heard, running = client.snapshot(), self.supervisor.running()
         said = {name: (status.pid, age_s) for name, (status, age_s, _) in heard.items()}
         now_s = time.monotonic()
-        if min((age_s for _, age_s in said.values()), default=HEARD_S) >= HEARD_S:
+        if not is_hearing(heard):
             self._deaf_s = now_s
         for name in hung_nodes(running, said, now_s - self._deaf_s):
             self._tell(name, f"silent for {said[name][1]:.0f} s; it hangs; killing it")

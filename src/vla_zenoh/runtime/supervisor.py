@@ -70,6 +70,16 @@ class Child:
     end: str = ""  # of the process before: why, or how
 
 
+def is_hearing(heard: Mapping[str, tuple[object, float, bool]]) -> bool:
+    """Whether a status of a live node came lately: `up` itself publishes that of one that is down,
+    and hears it without any router.
+
+    Args:
+        heard: node -> (status, its age in s, whether the node is alive).
+    """
+    return any(alive and age_s < HEARD_S for _, age_s, alive in heard.values())
+
+
 def hung_nodes(
     running: Mapping[str, tuple[str, int]],
     said: Mapping[str, tuple[int, float]],

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from vla_zenoh.runtime.supervisor import HANG_S, hung_nodes
+from vla_zenoh.runtime.supervisor import HANG_S, HEARD_S, hung_nodes, is_hearing
 
 RUNNING = {
     "router": ("router", 1),
@@ -60,3 +60,11 @@ def test_when_the_router_comes_back_the_first_that_speaks_makes_nobody_hang() ->
     assert hung_nodes(RUNNING, back, FRESH_S) == []
     assert hung_nodes(RUNNING, back, HANG_S) == []
     assert hung_nodes(RUNNING, back, LONG_S) == ["command", "sim"]
+
+
+def test_only_a_live_node_that_spoke_lately_shows_that_the_router_is_there() -> None:
+    lost = {"command": (None, LONG_S, False), "sim": (None, HEARD_S, True)}
+    assert not is_hearing({})
+    assert not is_hearing(lost)
+    assert not is_hearing({**lost, "camera": (None, FRESH_S, False)}), "`up` speaks for it"
+    assert is_hearing({**lost, "camera": (None, FRESH_S, True)})

@@ -180,7 +180,11 @@ class RemoteRobot(Client):
         if not self.wait_for(done, timeout_s):
             heard = self.status_since("command", began_s) is not None
             why = self.latch_reason() if heard else "it is silent, or the router is lost"
-            raise SessionError(f"{what}: the command node did not confirm it{why and f': {why}'}")
+            then = "; use the emergency stop of the arm itself" if what == "stop" else ""
+            raise SessionError(
+                f"{what}: the command node of robot {self.profile.robot.name!r} did not confirm it"
+                f"{why and f': {why}'}{then}"
+            )
 
     def _record(self, kind: type[Record], key: str, timeout_s: float) -> Stamped[Record]:
         oldest_ns = time.monotonic_ns() - int(self.profile.timing.state_timeout_s * 1e9)

@@ -54,6 +54,9 @@ JOINT_PERIOD_S = 0.025
 MAX_WORKERS, MAX_HOLDERS = 32, 32
 MAX_WHY = 300
 CLOCKS_PERIOD_S = 0.25
+SILENT_S = 2.0
+"""After this time another source of a node's status is accepted: of two nodes of one name one ends,
+and their token stays."""
 STATUSES_AT_ONCE, SPECS_AT_ONCE = 32, 16
 """More than our nodes publish between two updates: each does so twice a second."""
 
@@ -231,7 +234,7 @@ class PeerMonitor:
         self._changed = True
         self._specs: dict[str, ModelSpec] = {}
         self._spec_sources: dict[str, str] = {}
-        self._status_sources: dict[str, str] = {}
+        self._status_sources: dict[str, tuple[str, float]] = {}  # with the time of the last one
         self._complaints: dict[str, str] = {}
         self._servers = node.profile.camera_servers()
         self._cameras: dict[str, tuple[float, int]] = {}
@@ -255,12 +258,15 @@ class PeerMonitor:
             if alive:
                 self._down.pop(name, None)
                 return
-            for known in (self._status_sources, self._hosts):
-                known.pop(name, None)
-            self._same_host.discard(name)
-            if name.startswith("worker-"):
-                for known in (self._specs, self._spec_sources, self._complaints):
-                    known.pop(name.removeprefix("worker-"), None)
+            self._forget(name)
+
+    def _forget(self, name: str) -> None:
+        for known in (self._status_sources, self._hosts):
+            known.pop(name, None)
+        self._same_host.discard(name)
+        if name.startswith("worker-"):
+            for known in (self._specs, self._spec_sources, self._complaints):
+                known.pop(name.removeprefix("worker-"), None)
 
     def _on_holding(self, name: str, present: bool) -> None:
         with self._lock:
@@ -324,14 +330,15 @@ class PeerMonitor:
     # The source is checked before the payload: messages of other sources are not decoded, and no
     # clock is measured for a made-up name.
     def _receive_status(self, arrival: ReceivedSample, now_ns: int) -> None:
-        """Accept a node's status on its own key, while it is alive, from the first source of it."""
+        """Accept a live node's status on its own key, from one source until that is silent."""
         name, header = self._name_and_header(arrival)
         if header is None:
             return
-        source = header.source
+        source, now_s = header.source, time.monotonic()
         with self._lock:
             alive = name in self._alive
-            ours = alive and self._status_sources.get(name, source) == source
+            known, heard_s = self._status_sources.get(name, (source, now_s))
+            ours = alive and (known == source or now_s - heard_s > SILENT_S)
         # `up` may see a node start later than we do.
         if source.startswith(ON_BEHALF) if alive else name in self._expected:
             self._receive_on_behalf(name, arrival, header)
@@ -343,7 +350,9 @@ class PeerMonitor:
         with self._lock:
             # A node that is gone must not block a restarted one of the same name.
             if status is not None and name in self._alive:
-                self._status_sources[name], self._changed = source, True
+                if known != source:
+                    self._forget(name)
+                self._status_sources[name], self._changed = (source, now_s), True
                 self._update_from_status(status)
             else:
                 self._node.counters["refused.foreign_status"] += 1

@@ -21,6 +21,7 @@ from vla_zenoh.control.commanded_part import CommandedPart
 from vla_zenoh.control.commander import Commander, Outputs, Setting
 from vla_zenoh.control.commander_io import State
 from vla_zenoh.control.reachability import ReachabilityFilter
+from vla_zenoh.errors import NodeError
 from vla_zenoh.keys import Kind
 from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.nodes.command.inputs import CommandInputs
@@ -99,6 +100,7 @@ class CommandNode:
         self._task_out = node.declare_publisher(keys.task, Kind.CONTROL)
         self._last_task = 0.0
         self._next_chores_ns = self._busy_ns = 0
+        self._replaced: NodeError | None = None
         self._serve_settings()
 
     def _serve_settings(self) -> None:
@@ -116,7 +118,11 @@ class CommandNode:
         )
 
     def run(self, stop: threading.Event) -> None:
-        """Run until `stop` is set, then brake and exit."""
+        """Run until `stop` is set, then brake and exit.
+
+        Raises:
+            NodeError: another node of this name runs; the arm was braked first.
+        """
         sys.setswitchinterval(SWITCH_INTERVAL_S)
         gc.collect()
         gc.freeze()
@@ -124,9 +130,12 @@ class CommandNode:
             self._loop(stop)
         if self._latch is not None:
             self._latch.close()
-        self.node.publish_status("stopped", now=True)
+        if self._replaced is None:
+            self.node.publish_status("stopped", now=True)
         self.node.close()
         gc.unfreeze()  # so that the interpreter frees everything at exit
+        if self._replaced is not None:
+            raise self._replaced
 
     def _loop(self, stop: threading.Event) -> None:
         timing, arrival = self.node.profile.timing, self._inputs.chunk_arrival
@@ -154,7 +163,7 @@ class CommandNode:
             if tick.stall_s > timing.command_timeout_s:
                 why = f"the command loop stood still for {tick.stall_s:.3f} s"
                 extra = [Setting("lose", f"{why}, {tick.computed_s:.3f} s of it computing")]
-            if stop.is_set():
+            if stop.is_set() or self._replaced is not None:
                 give_up = give_up or time.monotonic() + BRAKE_BEFORE_EXIT_S
                 extra.append(Setting("active", False))
                 if not self.commander.streaming or time.monotonic() > give_up:
@@ -205,7 +214,10 @@ class CommandNode:
             if why is not None:
                 self.node.counters["command.latch_failed"] += 1
                 self.node.emit(Event("error", "fault", "latch", why))
-            self._status.publish(out, self._inputs.chunks.dropped)
+            try:
+                self._status.publish(out, self._inputs.chunks.dropped)
+            except NodeError as error:
+                self._replaced = error
         busy = inputs.chunks or inputs.settings or not self.commander.at_rest
         if busy or any(self._awaits(part, now_ns) for part in self.commander.parts):
             self._busy_ns = tick.nominal_ns

@@ -183,7 +183,8 @@ class RosServices:
             return "silent" if status is None else status.state
 
         if not self._client.wait_for(lambda: state() == wanted, STATE_TIMEOUT_S):
-            raise SessionError(f"the command node is {state()}, not {wanted}")
+            then = "; use the emergency stop of the arm itself" if wanted == "stopped" else ""
+            raise SessionError(f"the command node is {state()}, not {wanted}{then}")
 
     def _set_prompt(self, asked: Any) -> str:
         return f"prompt {self._client.set_prompt(prompt_text(asked.prompt)).prompt!r}"
