@@ -142,6 +142,16 @@ def test_a_key_whose_release_never_comes_is_let_go() -> None:
     assert keyboard.read(8.0).twist == (1, 0, 0, 0, 0, 0), "it is held again"
 
 
+def test_repetitions_that_come_late_move_no_longer_than_a_repetition_lasts() -> None:
+    keyboard = Keyboard()
+    keyboard.update(Keystroke("releases", KeyEvent.TYPED), 0.0)
+    typed(keyboard, "w", 0.0, KeyEvent.PRESSED)
+    assert keyboard.read(0.1).twist == (1, 0, 0, 0, 0, 0)
+    assert keyboard.read(2.0).twist == STILL
+    typed(keyboard, "www", 10.0, KeyEvent.HELD)  # and the release is still under way
+    assert keyboard.read(10.0 + HOLD_S).twist == STILL
+
+
 def test_keys_are_let_go_with_the_window() -> None:
     keyboard = Keyboard()
     typed(keyboard, "wi.", 0.0, KeyEvent.PRESSED)

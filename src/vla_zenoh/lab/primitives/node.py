@@ -49,6 +49,8 @@ READY_S = 4.0
 """Spec, first chunk and deadman have to reach the command node before it activates."""
 AGAIN_S = 0.25
 ARRIVES_S = 0.05
+BLIND_S = 1.0
+"""A command node that misses the states, too, has ended the motion by then, and says why."""
 BRAKE_S = 5.0
 POSE_JOINTS = 6
 
@@ -214,7 +216,7 @@ class PrimitivesNode:
                 self._check.hold(box)
                 self._robot.publish(self._robot.keys.held, "" if box is None else str(box))
             if isinstance(ending, Arrival):
-                with suppress(SessionError):  # a robot that is gone: the reason is known
+                with suppress(VlaZenohError):  # a robot that is gone: the reason is known
                     off = ending.off(self._sight())
                     why = why or self._elbow(target)
         except (Rejected, VlaZenohError, zenoh.ZError) as error:
@@ -351,30 +353,39 @@ class PrimitivesNode:
         if prompt is not None:
             robot.set_prompt(prompt)
         if worker == PRIMITIVES:
-            self._published.wait(READY_S)
+            until_s = time.monotonic() + READY_S
+            while not (self._published.wait(POLL_S) or self._stop.is_set()):
+                if time.monotonic() > until_s:
+                    break
             time.sleep(ARRIVES_S)
         while True:
+            if self._stop.is_set():
+                raise Rejected("the node primitives ends")
             try:
                 robot.activate(holder=request.holder)
                 return
             except SessionError:
-                if time.monotonic() > give_up_s or self._stop.is_set():
+                if time.monotonic() > give_up_s:
                     raise
             time.sleep(AGAIN_S)
 
     def _watch(self, ending: Ending, until_s: float) -> tuple[str, str]:
         """Wait until the primitive ends; returns its reason and details."""
-        robot = self._robot
+        robot, seen_s = self._robot, time.monotonic()
+        blind_s = self._profile.timing.state_timeout_s + BLIND_S
         while True:
             task = robot.task
             if task is None or not task.active:
                 return self._why_inactive()
             if self._stop.is_set():
-                return "ended", "the node primitives was stopped"
+                return "ended", "the node primitives ends"
             try:
                 reason = ending.check(self._sight(POLL_S))
-            except SessionError:  # no state comes: the command node ends it and says why
+                seen_s = time.monotonic()
+            except SessionError:
                 reason = ""
+                if time.monotonic() - seen_s > blind_s:
+                    return "ended", "no state of the robot reaches the node primitives"
             if reason == "bound":
                 status = robot.status("command")
                 limits = status.detail.get("limits") if status is not None else None

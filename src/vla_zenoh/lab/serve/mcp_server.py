@@ -132,14 +132,22 @@ class McpServer:
     def _state(self) -> dict[str, Any]:
         robot = self._robot
         robot.wait_for(lambda: robot.task and robot.status("command"), STATUS_S)
-        pose, joint = robot.pose_state().record, robot.joint_state().record
-        gripper, task, status = robot.gripper_state().record, robot.task, robot.status("command")
+        task, status = robot.task, robot.status("command")
+        state = status.state if status is not None else "unknown"
+        why = status.detail.get("why", "") if status is not None else ""
+        try:
+            pose, joint = robot.pose_state().record, robot.joint_state().record
+            gripper = robot.gripper_state().record
+        except SessionError as error:
+            raise SessionError(
+                f"{error}; the command node is {state}{why and f': {why}'}"
+            ) from None
         box = robot.profile.limits.workspace
         worker = worker_node("")
         fields = {
             "robot": robot.profile.robot.name,
-            "state": status.state if status is not None else "unknown",
-            "why": status.detail.get("why", "") if status is not None else "",
+            "state": state,
+            "why": why,
             "active": task is not None and task.active,
             "worker": task.worker if task is not None else "",
             "prompt": task.prompt if task is not None else "",

@@ -167,7 +167,9 @@ class Keyboard:
             return
         if key not in self._until_s and event is not KeyEvent.HELD:
             self._new.add(key)
-        self._until_s[key] = now_s + HOLD_S if event is KeyEvent.TYPED else float("inf")
+        # A repetition that a slow network kept back may be of a key that is up by now.
+        held = event is KeyEvent.PRESSED or self._until_s.get(key) == float("inf")
+        self._until_s[key] = float("inf") if held else now_s + HOLD_S
 
     def release_all(self) -> None:
         self._until_s.clear()

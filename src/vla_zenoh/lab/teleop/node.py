@@ -16,6 +16,7 @@ import zenoh
 
 from vla_zenoh.bus.client import Client
 from vla_zenoh.errors import NodeError, PeerError
+from vla_zenoh.keys import CRASHED, STARTING
 from vla_zenoh.lab.teleop.keyboard import (
     ACTIVATE,
     BEGIN,
@@ -38,8 +39,12 @@ from vla_zenoh.sanitize import one_line
 
 SHOW_PERIOD_S = 0.2
 DEVICE_S = 0.02
+NO_COMMAND_NODE = "no command node"
 UNKNOWN = "state unknown"
 """Before the first task, and after the link of the operator was lost."""
+LINK_LOST = (
+    "the link to the router is lost: nothing was sent. Use the emergency stop of the arm itself"
+)
 
 
 class Teleop:
@@ -150,6 +155,8 @@ class Teleop:
             self._stop.set()
         elif client is None:
             self._lines.append("this key needs the certificate of an operator on this computer")
+        elif command in (STOP, ACTIVATE) and not client.session.info.routers_zid():
+            self._lines.append(LINK_LOST)
         elif command == STOP:
             client.stop()
         elif command == ACTIVATE:
@@ -188,8 +195,8 @@ class Teleop:
     def _status_line(self) -> str:
         task = self._client.task if self._client else None
         status = self._client.status("command") if self._client else None
-        state = status.state if status else "no command node"
-        if status is not None and task is None:
+        state = status.state if status else NO_COMMAND_NODE
+        if task is None and state not in (CRASHED, STARTING, NO_COMMAND_NODE):
             state = UNKNOWN
         whose = "?" if task is None else "you" if task.worker == self._name else task.worker
         return one_line(f"{state}, follows {whose} | {self.policy.describe()}")[:118]
