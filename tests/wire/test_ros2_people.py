@@ -155,5 +155,7 @@ def test_a_stop_is_not_confirmed_by_an_older_status(
     until("it is heard", heard)
     response = rig.ask("stop").result()
     assert not response.success
-    assert response.message == "the command node is silent, not stopped"
+    assert response.message == (
+        "the command node is silent, not stopped; use the emergency stop of the arm itself"
+    )
     node.close()
