@@ -65,15 +65,15 @@ def assert_gentle(chain: Chain, since_ns: int = 0) -> None:
 
 def move_a_while(chain: Chain) -> None:
     """Until the arm has been moving all the time that a test looks back at."""
-    chain.move()
-    time.sleep(RUN_S)
 
     def moved() -> bool:
+        chain.move()  # the other way, where a busy computer let it come to the end of this one
+        time.sleep(RUN_S)
         since_ns = time.time_ns() - STEPS_BEFORE_NS
         speed_m_s = chain.recorder.track(since_ns).between(since_ns).speed_m_s
         return len(speed_m_s) > 0 and bool(speed_m_s.mean() > MOVING_M_S)
 
-    chain.until("it moves still", moved)
+    chain.until("it moves still", moved, READY_PATIENCE_S)
     chain.client.pop_events()
 
 
