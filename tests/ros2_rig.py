@@ -99,7 +99,8 @@ class Ros2Rig:
 
     def stream(self, key: str, source: str = "command#1") -> Publisher:
         """A writer of commands; waits until the node hears it."""
-        stream = Publisher(self.session, key, Kind.CONTROL, source, Clock())
+        kind = Kind.ORDER if key == self.profile.keys.command_gripper else Kind.CONTROL
+        stream = Publisher(self.session, key, kind, source, Clock())
         until(f"the node listens to {key}", lambda: stream.has_subscribers)
         return stream
 
