@@ -13,16 +13,17 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import zenoh
-from camera_rig import routed_session
+from camera_rig import free_endpoint, routed_session, until
 from guard_rig import JointWriter
 
 from vla_zenoh.bus import buffers as slots
 from vla_zenoh.bus.clock import Tick
-from vla_zenoh.codec import records
+from vla_zenoh.bus.session import open_session
+from vla_zenoh.codec import message, records
 from vla_zenoh.errors import NodeError
 from vla_zenoh.guard.reference_governor import BRAKE_MARGIN
 from vla_zenoh.guard.stream_guard import joint_motion_limits
-from vla_zenoh.profile import load_profile
+from vla_zenoh.profile import load_profile, override
 from vla_zenoh.robots import python_driver
 from vla_zenoh.robots.node import FAILURES, LEAST_S, RobotNode
 from vla_zenoh.robots.python_driver import PythonDriver
@@ -437,6 +438,31 @@ def test_a_stream_begins_where_the_arm_is_measured_once_nothing_holds_the_last_s
     given = np.array(turns.arm.moves[given_before[0] :])
     assert len(given) >= 20
     np.testing.assert_allclose(given - turns.arm.said["position_rad"], 0.0, atol=BRAKED_RAD)
+
+
+# -- another node of its name ------------------------------------------------------------------
+def test_no_arm_is_connected_by_a_node_whose_name_another_one_has(tmp_path: Path) -> None:
+    (tmp_path / "my_arm.py").write_text(ARM)
+    (tmp_path / "lab.yaml").write_text(PROFILE)
+    endpoint, connected = free_endpoint(), list[bool]()
+    where = {"session": {"listen": [endpoint], "connect": [endpoint]}}
+    profile = override(load_profile(str(tmp_path / "lab.yaml")), where)
+    key, there = profile.keys.clock("arm"), {"heard_ns": 0, "said_ns": 0, "age_ns": 1 << 62}
+    with (
+        open_session(profile.session, mode="router"),
+        open_session(profile.session) as theirs,
+        open_session(profile.session) as ours,
+    ):
+        reply = message.pack(there)
+        handler = zenoh.handlers.Callback(lambda query: query.reply(key, reply), indirect=False)
+        _another = theirs.declare_queryable(key, handler)
+        asking = ours.declare_querier(key)
+        until("the other one is there", lambda: asking.matching_status.matching)
+        driver = PythonDriver(profile)
+        driver.connect = lambda: connected.append(True)
+        with pytest.raises(NodeError, match="is already running"):
+            RobotNode(driver, ours).run(threading.Event())
+    assert not connected
 
 
 # -- the gripper ------------------------------------------------------------------------------

@@ -153,16 +153,16 @@ def test_a_second_node_of_a_name_that_a_new_router_did_not_know_of_ends(
         first.close()
 
 
-STOPPED_NODE = f"""
+STOPPED_NODE = """
 import sys, time
 from vla_zenoh.bus import clock
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.profile import load_profile, override
 
-clock.AWAY_NS = {AWAY_NS}
-where = {{"listen": [sys.argv[1]], "connect": [sys.argv[1]]}}
-profile = override(load_profile("panda_sim"), {{"session": where}})
+clock.AWAY_NS = 1_500_000_000  # it asks once a second
+where = {"listen": [sys.argv[1]], "connect": [sys.argv[1]]}
+profile = override(load_profile("panda_sim"), {"session": where})
 with open_session(profile.session) as session:
     node = Node("command", profile, session)
     print("ready", flush=True)
@@ -184,6 +184,7 @@ def test_a_stopped_node_that_was_replaced_ends_when_it_goes_on_and_not_the_new_o
                 assert process.stdout.readline() == "ready\n"
                 until("its token is there", lambda: alive_nodes(one, profile.keys))
                 process.send_signal(signal.SIGSTOP)
+                time.sleep(2.0)
                 until("its token is gone", lambda: not alive_nodes(one, profile.keys), 30.0)
                 replacement = Node("command", profile, other)
                 process.send_signal(signal.SIGCONT)

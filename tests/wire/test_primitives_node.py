@@ -43,7 +43,7 @@ def running(
     """
     where = [free_endpoint()]
     profile = override(load_profile("panda_sim"), {"session": {"listen": where, "connect": where}})
-    keys, over = profile.keys, threading.Event()
+    keys, over, stop = profile.keys, threading.Event(), threading.Event()
     silent = silent or threading.Event()
     with (
         open_session(profile.session, mode="router"),
@@ -77,7 +77,7 @@ def running(
 
         saying, client = threads.submit(say), Client(profile, theirs).subscribe()
         node = PrimitivesNode(profile, ours)
-        ended = threads.submit(node.run, over)
+        ended = threads.submit(node.run, stop)
         try:
             until(
                 "the node and the task are known",
@@ -85,6 +85,7 @@ def running(
             )
             yield node, client, ended
         finally:
+            stop.set()
             over.set()
             saying.result()
             command.close()

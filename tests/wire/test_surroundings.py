@@ -169,7 +169,6 @@ def test_up_that_still_takes_a_living_node_for_a_starting_one_is_not_heard_in_it
 def test_of_two_nodes_of_one_name_the_other_is_heard_when_one_has_fallen_silent(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(inputs, "SILENT_S", ROOM_S)
     camera = scene.camera
     says = {"cameras": {"front": {"age_s": 3.0}}}
     source, camera.source = camera.source, "camera#another"
@@ -181,6 +180,7 @@ def test_of_two_nodes_of_one_name_the_other_is_heard_when_one_has_fallen_silent(
     other.publish(status)
     until("the other is rejected", lambda: scene.look() and scene.refused("foreign_status"))
     assert scene.look().hosts["camera"] != "there"
+    monkeypatch.setattr(inputs, "SILENT_S", ROOM_S)
     time.sleep(ROOM_S)
     other.publish(status)
     until("the other is heard", lambda: scene.look().hosts["camera"] == "there")

@@ -167,7 +167,8 @@ def test_enter_never_activates_an_arm_whose_state_is_unknown(tmp_path: Path) -> 
     file = write_profile(tmp_path)
     profile = load_profile(str(file))
     heard: list[str] = []
-    with open_session(profile.session, mode="router"), open_session(profile.session) as session:
+    router = open_session(profile.session, mode="router")
+    with open_session(profile.session) as session:
         handler = zenoh.handlers.Callback(
             lambda sample: heard.append(sample.payload.to_string()), indirect=False
         )
@@ -178,8 +179,17 @@ def test_enter_never_activates_an_arm_whose_state_is_unknown(tmp_path: Path) -> 
             screen.type(b"\r")
             until("it is told", lambda: b"state unknown: Enter deactivates" in screen.shown)
             until("the brake", lambda: heard)
+            router.close()
+            lost = b"the link to the router is lost: nothing was sent"
+
+            def told() -> bool:
+                screen.type(b"x")
+                return lost in screen.shown
+
+            until("the lost link is told", told)
         finally:
             screen.close()
+            router.close()
         listening.undeclare()
     assert heard == ["false"]
 

@@ -371,7 +371,7 @@ class PrimitivesNode:
 
     def _watch(self, ending: Ending, until_s: float) -> tuple[str, str]:
         """Wait until the primitive ends; returns its reason and details."""
-        robot, seen_s = self._robot, time.monotonic()
+        robot, looked_s, blind_for_s = self._robot, time.monotonic(), 0.0
         blind_s = self._profile.timing.state_timeout_s + BLIND_S
         while True:
             task = robot.task
@@ -381,11 +381,14 @@ class PrimitivesNode:
                 return "ended", "the node primitives ends"
             try:
                 reason = ending.check(self._sight(POLL_S))
-                seen_s = time.monotonic()
+                blind_for_s = 0.0
             except SessionError:
                 reason = ""
-                if time.monotonic() - seen_s > blind_s:
+                # A look lasts a few times POLL_S: more is a stall of this computer.
+                blind_for_s += min(time.monotonic() - looked_s, 10 * POLL_S)
+                if blind_for_s > blind_s:
                     return "ended", "no state of the robot reaches the node primitives"
+            looked_s = time.monotonic()
             if reason == "bound":
                 status = robot.status("command")
                 limits = status.detail.get("limits") if status is not None else None
