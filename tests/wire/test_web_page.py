@@ -38,6 +38,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus  # noqa: E402
 
 GARBAGE = 10_000
 STILL_MM = 2.0
+STOPS = 4
 BRAKE_S = 0.5
 """A brake from the speed of these motions, on a busy computer."""
 
@@ -54,6 +55,22 @@ def hold_until_it_moves(chain: Chain, browser: Browser) -> None:
     browser.hold_until("it moves", chain.moves, READY_PATIENCE_S)
 
 
+def stop_in_motion(chain: Chain, browser: Browser) -> dict[str, Any]:
+    """The page's report of a stop; again where a busy computer had ended the hold before it."""
+    for _ in range(STOPS):
+        hold_until_it_moves(chain, browser)
+        chain.client.pop_events()
+        browser.heard.clear()
+        browser.send(do="stop")
+        report = browser.wait("stopped")
+        chain.until("stopped", lambda: chain.state() == "stopped")
+        if chain.events("active->stopped"):
+            return report
+        browser.let_go()
+        assert browser.ask(do="reset")["is"] == "done"
+    raise AssertionError("each hold ended before its stop")
+
+
 def stopped_ns(chain: Chain) -> int:
     """When the command node took a stop: a page's own word for it is under way for some time."""
     chain.until("stopped", lambda: chain.state() == "stopped" and chain.events("active->stopped"))
@@ -63,16 +80,13 @@ def stopped_ns(chain: Chain) -> int:
 
 def test_a_stop_of_the_page_says_which_robot_stood_when(chain: Chain, site: Site) -> None:
     with browsing(site) as browser, browsing(site, VIEWER) as other:
-        hold_until_it_moves(chain, browser)
-        chain.client.pop_events()
-        browser.send(do="stop")
-        report = browser.wait("stopped")
+        report = stop_in_motion(chain, browser)
         since_ns = stopped_ns(chain)
         assert report["robot"] == chain.profile.robot.name
         assert report["by"] == "anna"
         assert report["stopped"]
         assert 0 < report["stopped_s"] <= report["stands_s"]
-        assert other.wait("stopped") == report
+        assert other.wait("stopped", lambda message: message == report)
         chain.wait_still()
         assert chain.recorder.track(since_ns).time_to_stand_s(since_ns) <= report["stands_s"] + 0.1
         assert browser.ask(do="activate")["is"] == "failed"
