@@ -180,7 +180,7 @@ def test_enter_never_activates_an_arm_whose_state_is_unknown(tmp_path: Path) -> 
             until("it is told", lambda: b"state unknown: Enter deactivates" in screen.shown)
             until("the brake", lambda: heard)
             router.close()
-            lost = b"the link to the router is lost: nothing was sent"
+            lost = b"the link to the router is lost: nobody heard that"
 
             def told() -> bool:
                 screen.type(b"x")

@@ -43,7 +43,7 @@ NO_COMMAND_NODE = "no command node"
 UNKNOWN = "state unknown"
 """Before the first task, and after the link of the operator was lost."""
 LINK_LOST = (
-    "the link to the router is lost: nothing was sent. Use the emergency stop of the arm itself"
+    "the link to the router is lost: nobody heard that. Use the emergency stop of the arm itself"
 )
 
 
@@ -155,10 +155,12 @@ class Teleop:
             self._stop.set()
         elif client is None:
             self._lines.append("this key needs the certificate of an operator on this computer")
-        elif command in (STOP, ACTIVATE) and not client.session.info.routers_zid():
-            self._lines.append(LINK_LOST)
         elif command == STOP:
             client.stop()
+            if not client.session.info.routers_zid():
+                self._lines.append(LINK_LOST)
+        elif command == ACTIVATE and not client.session.info.routers_zid():
+            self._lines.append(LINK_LOST)
         elif command == ACTIVATE:
             # Of an arm that may be active the key is the brake.
             activates = task is not None and not task.active
