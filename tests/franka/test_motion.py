@@ -136,6 +136,10 @@ def test_an_arm_node_that_is_killed_in_motion_comes_back_and_moves_nothing_by_it
         ),
         AGAIN_S,
     )
+    since_ns = time.time_ns()  # it says that it runs before the first of its states
+    lab.chain.until(
+        "its states come", lambda: lab.chain.recorder.track(since_ns).stamp_ns.size > 20
+    )
     there = lab.chain.measured().position_m
     time.sleep(1.5)
     np.testing.assert_allclose(lab.chain.measured().position_m, there, atol=1e-3)
