@@ -9,10 +9,11 @@ from typing import Any
 
 import pytest
 from camera_rig import await_match, free_endpoint, until
+from command_rig import model_spec
 
 from vla_zenoh.bus import clock as offsets
 from vla_zenoh.bus.clock import MAX_HEARD, MAX_PEERS
-from vla_zenoh.bus.node import Node
+from vla_zenoh.bus.node import Node, Publisher
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import records
 from vla_zenoh.control.preflight import PeerSnapshot
@@ -184,6 +185,40 @@ def test_of_two_nodes_of_one_name_the_other_is_heard_when_one_has_fallen_silent(
     time.sleep(ROOM_S)
     other.publish(status)
     until("the other is heard", lambda: scene.look().hosts["camera"] == "there")
+
+
+def test_the_spec_of_a_worker_is_accepted_from_the_source_of_its_status(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    worker, spec = scene.thief, model_spec("scripted")
+    source, key = worker.source, worker.keys.spec("scripted")
+    worker.source = "worker-scripted#another"
+    other = worker.declare_publisher(key, Kind.TELEMETRY)
+    worker.source = source
+    own = worker.declare_publisher(key, Kind.TELEMETRY)
+
+    def seen(by: str) -> bool:
+        return scene.look().spec_sources.get("scripted") == by
+
+    def says(publisher: Publisher, wanted: str) -> bool:
+        publisher.publish(spec)
+        return seen(wanted)
+
+    await_match(worker.session, key)
+    until("the other's spec is heard", lambda: says(other, "worker-scripted#another"))
+    rejected = scene.refused("foreign_spec")
+    own.publish(spec)
+    until("it is foreign", lambda: scene.look() and scene.refused("foreign_spec") > rejected)
+    worker.publish_status("inferring", now=True)
+    until("the worker's own spec is heard", lambda: says(own, source))
+    # Its status may be silent for long, and that is no other worker.
+    monkeypatch.setattr(inputs, "SILENT_S", ROOM_S)
+    time.sleep(2 * ROOM_S)
+    worker.publish_status("inferring", now=True)
+    for _ in range(AT_ONCE):
+        scene.look()
+        time.sleep(ROOM_S / AT_ONCE)
+    assert seen(source)
 
 
 def test_no_picture_is_younger_than_now(scene: Scene) -> None:

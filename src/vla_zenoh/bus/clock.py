@@ -11,6 +11,7 @@ counts, and half its round trip is the uncertainty: a bound, not a guess.
 
 from __future__ import annotations
 
+import random
 import threading
 import time
 from collections import deque
@@ -383,11 +384,11 @@ class ClockSync:
         """For how long this node has been there; called while it has a link.
 
         It begins again after a long absence (lost link, stopped process, sleep of the computer):
-        who was started meanwhile in its place stays.
+        who was started meanwhile in its place stays. Chance decides between two that were away.
         """
         now_ns = time.monotonic_ns() + suspended_ns()
         if now_ns - self._linked_ns > AWAY_NS:
-            self._since_ns = now_ns
+            self._since_ns = now_ns + random.randrange(1_000_000_000)
         self._linked_ns = now_ns
         return now_ns - self._since_ns
 

@@ -35,8 +35,9 @@ LEAST_S, SLACK_S = 1.0, 0.2
 """The last brake may take this long at least, and this much longer than the limits allow."""
 MAX_REASON = 300
 CONNECTING_S = 0.2
-REPLIES, REPLY_S = 4, 0.05
-"""Another node of this name is asked for so often, and has so much time to reply."""
+REPLIES, REPLY_S = 20, 0.05
+"""For so long another node of this name is looked for: after a router's restart it links again
+within 0.5 s."""
 WATCH_S = 0.05
 
 

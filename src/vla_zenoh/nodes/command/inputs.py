@@ -350,7 +350,9 @@ class PeerMonitor:
         with self._lock:
             # A node that is gone must not block a restarted one of the same name.
             if status is not None and name in self._alive:
-                if known != source:
+                # A worker whose spec is known already is not a new one.
+                worker = name.removeprefix("worker-")
+                if known != source and self._spec_sources.get(worker) != source:
                     self._forget(name)
                 self._status_sources[name], self._changed = (source, now_s), True
                 self._update_from_status(status)
@@ -373,14 +375,15 @@ class PeerMonitor:
                 self._down[name], self._changed = why[:MAX_WHY], True
 
     def _receive_spec(self, arrival: ReceivedSample) -> None:
-        """Accept a worker's spec on its own key, while it is alive, from the first source of it."""
+        """Accept a live worker's spec on its own key, from one source or that of its status."""
         worker, header = self._name_and_header(arrival)
         if header is None:
             return
         source, node = header.source, worker_node(worker)
         with self._lock:
             known = self._spec_sources.get(worker)
-            ours = node in self._alive and known in (None, source)
+            speaks, _ = self._status_sources.get(node, ("", 0.0))
+            ours = node in self._alive and (known in (None, source) or speaks == source)
             if ours and known is None and len(self._specs) >= MAX_WORKERS:
                 self._node.counters["refused.more_workers"] += 1
                 return
@@ -389,7 +392,7 @@ class PeerMonitor:
             return
         with self._lock:
             if stamped is not None and node in self._alive:
-                if self._specs.get(worker) != stamped.record:
+                if self._specs.get(worker) != stamped.record or known != source:
                     self._specs[worker] = stamped.record
                     self._spec_sources[worker] = source
                     self._changed = True
