@@ -165,7 +165,10 @@ class CommandNode:
                 extra = [Setting("lose", f"{why}, {tick.computed_s:.3f} s of it computing")]
             if stop.is_set() or self._replaced is not None:
                 give_up = give_up or time.monotonic() + BRAKE_BEFORE_EXIT_S
-                extra.append(Setting("active", False))
+                if self._replaced is not None:
+                    extra.append(Setting("lose", "another command node of this robot runs"))
+                else:
+                    extra.append(Setting("active", False))
                 if not self.commander.streaming or time.monotonic() > give_up:
                     break
             plans = arrived and tick_first
