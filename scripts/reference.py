@@ -240,7 +240,7 @@ def cli_page() -> str:
 # -- counters -----------------------------------------------------------------------------------
 REASONS = {
     "before_activation": "chunk: its observation is older than the activation",
-    "busy": "primitive: another one runs",
+    "busy": "primitive: another one runs; ROS 2: too many requests at once",
     "cameras": "`seen`: more cameras than a model may have",
     "clock_step": "the wall clock was set",
     "deleted": "a Zenoh `delete` on a key that takes puts",
@@ -264,6 +264,7 @@ REASONS = {
     "no_attachment": "rmw_zenoh: no attachment",
     "no_gripper": "gripper command for an arm without a gripper",
     "no_header": "no header in the attachment",
+    "middleware": "gripper command: no bridge carries a goal to the middleware of its action",
     "not_measured": "chunk: it begins at the measured pose or joints, unknown shortly before",
     "out_of_order": "older than the one before",
     "outlived": "gripper command from before a stop",

@@ -37,6 +37,7 @@ session:
   connect: ["{endpoint}"]
 ros2:
   domain: {domain}
+  services: true
   cameras: {{wrist: null}}
 """
 APART = """\

@@ -153,7 +153,7 @@ class Sdk:
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Profile, Sdk]]:
     """A router and the SDK's node."""
-    more = f"  pose_command: {{topic: /target, type: {POSE}}}\n  gripper: null\n"
+    more = f"  pose_command: {{topic: /target, type: {POSE}}}\n  gripper: null\n  services: true\n"
     path = write_profile(tmp_path_factory.mktemp("rmw"), "rmw_zenoh", more)
     profile = load_profile(str(path))
     with open_session(profile.session, mode="router"):

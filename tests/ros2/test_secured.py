@@ -48,6 +48,7 @@ session:
   connect: ["{ours}"]
 ros2:
   domain: {domain}
+  services: true
   connect: ["{theirs}"]
   cameras: {{wrist: null}}
 hosts:

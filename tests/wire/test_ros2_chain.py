@@ -5,9 +5,11 @@ What a real bridge and DDS add is tested in tests/ros2; here are the real proces
 
 from __future__ import annotations
 
+import json
 import threading
 import time
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from ros2_rig import CAMERA, HEIGHT, WIDTH, write_profile
 
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.profile import load_profile
+from vla_zenoh.ros2.keys import BOOL, EMPTY, TEXT
 
 pytestmark = pytest.mark.slow
 
@@ -35,7 +38,7 @@ def lab(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[tuple[Chain, KinematicPanda]]:
     folder = tmp_path_factory.mktemp("ros2chain")
-    path = write_profile(folder, request.param)
+    path = write_profile(folder, request.param, "  services: true\n")
     with (
         running_chain(folder, profile_file=path) as chain,
         open_session(load_profile(str(path)).session) as session,
@@ -86,6 +89,44 @@ def test_ten_steps_asked_by_service_move_the_robot_by_ten_steps(
     time.sleep(0.2)
     way_m = robot.tcp_m - began_m
     assert way_m == pytest.approx([0, 0, STEPS * STEP_M], abs=WAY_TOLERANCE_M)
+
+
+def test_topics_do_what_services_do_and_their_answers_come_on_a_topic(
+    lab: tuple[Chain, KinematicPanda],
+) -> None:
+    chain, robot = lab
+    answers: list[dict[str, Any]] = []
+    robot.peer.on("/vla/answer", TEXT, lambda message: answers.append(json.loads(message.data)))
+
+    def ask(name: str, kind: str, **values: Any) -> dict[str, Any]:
+        count = len(answers)
+        robot.peer.put(f"/vla/{name}", robot.peer.message(kind, **values))
+        chain.until(f"{name} is answered", lambda: len(answers) > count)
+        return answers[-1]
+
+    chain.client.deactivate()
+    asked = {"id": "1", "prompt": "hold", "rate_hz": 5.0, "active": True}
+    answer = ask("request", TEXT, data=json.dumps(asked))
+    assert (answer["id"], answer["what"], answer["ok"]) == ("1", "request", True), answer
+    assert ask("stop", EMPTY)["ok"]
+    assert chain.state() == "stopped"
+    refused = ask("active", BOOL, data=True)
+    assert not refused["ok"]
+    assert "stop" in refused["reason"]
+    assert ask("reset", EMPTY)["ok"]
+    for active in (True, False):
+        answer = ask("active", BOOL, data=active)
+        assert answer["ok"], answer
+    assert ask("prompt", TEXT, data="go up")["reason"] == "prompt 'go up'"
+
+
+def test_what_works_is_told_on_rosout(lab: tuple[Chain, KinematicPanda]) -> None:
+    chain, robot = lab
+    lines: list[Any] = []
+    robot.peer.on("/rosout", "rcl_interfaces/msg/Log", lines.append)
+    chain.until("it is told", lambda: lines)
+    assert "/vla/stop" in lines[0].msg
+    assert "offers services" in lines[0].msg
 
 
 def test_stop_and_reset_by_service_are_those_of_our_keys(

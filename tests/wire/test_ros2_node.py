@@ -12,6 +12,7 @@ from typing import Any, Self
 import numpy as np
 import pytest
 import zenoh
+from camera_rig import await_match
 from panda_arm import ARM_JOINTS, HOME_RAD, panda
 from ros2_rig import CAMERA, HEIGHT, WIDTH, Ros2Rig, ros2_rig
 
@@ -44,7 +45,7 @@ BRIDGES = ("ros2dds", "rmw_zenoh")
 def shared_rig(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Ros2Rig]:
-    with ros2_rig(tmp_path_factory.mktemp("ros2"), request.param) as rig:
+    with ros2_rig(tmp_path_factory.mktemp("ros2"), request.param, "  services: true\n") as rig:
         rig.newest(JointState)
         yield rig
 
@@ -412,14 +413,7 @@ def test_a_prompt_on_a_topic_becomes_our_prompt(rig: Ros2Rig) -> None:
         zenoh.handlers.Callback(lambda s: heard.append(s.payload.to_string()), indirect=False),
     )
 
-    def say() -> bool:
-        rig.peer.put("/vla/prompt", rig.peer.message("std_msgs/msg/String", data="go up"))
-        time.sleep(0.05)
-        return bool(heard)
-
-    rig.wait("the prompt", say)
-    assert heard[0] == "go up"
-    heard.clear()
+    await_match(rig.peer.session, rig.peer.key("/vla/prompt", "std_msgs/msg/String"))
     for words in ("go down", "go up", "stay"):
         rig.peer.put("/vla/prompt", rig.peer.message("std_msgs/msg/String", data=words))
     rig.wait("the last prompt", lambda: "stay" in heard)

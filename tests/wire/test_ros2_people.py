@@ -1,7 +1,9 @@
-"""Services of ROS people: what an emergency stop that comes later does to those that wait."""
+"""ROS users' topics and services: what a stop that comes later does to requests that wait, which
+requests are answered how, and that nothing old sets an arm in motion."""
 
 from __future__ import annotations
 
+import json
 import threading
 import time
 from collections.abc import Iterator
@@ -22,8 +24,10 @@ from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import records
 from vla_zenoh.keys import Keys
 from vla_zenoh.profile import load_profile
+from vla_zenoh.robots.ros2 import operator_topics
+from vla_zenoh.robots.ros2.operator_topics import OperatorTopics
 from vla_zenoh.robots.ros2.ros_graph import RosGraph
-from vla_zenoh.robots.ros2.ros_services import RosServices
+from vla_zenoh.ros2.keys import BOOL, EMPTY, OPERATIONS, TEXT
 from vla_zenoh.ros2.messages import Messages
 from vla_zenoh.types import Header, Task
 
@@ -36,16 +40,26 @@ TOO_LATE = "an emergency stop came after this request"
 class Rig:
     """Callers, services that do not answer before `agreed`, and what is put on our keys."""
 
-    people: RosServices
+    people: OperatorTopics
     peer: Ros2Peer
     callers: ThreadPoolExecutor
     operator: zenoh.Session
     keys: Keys
     heard: list[tuple[str, str]]
     agreed: threading.Event
+    answers: list[dict[str, Any]]
 
     def ask(self, name: str, kind: str = TRIGGER, **values: Any) -> Future[Any]:
         return self.callers.submit(self.peer.call, f"/vla/{name}", kind, PATIENCE_S, **values)
+
+    def put(self, name: str, kind: str, **values: Any) -> None:
+        """Publish on a topic below /vla."""
+        self.peer.put(f"/vla/{name}", self.peer.message(kind, **values))
+
+    def answer(self, nth: int) -> dict[str, Any]:
+        """The nth answer."""
+        until(f"answer {nth}", lambda: len(self.answers) > nth)
+        return self.answers[nth]
 
     def expect(self, *wanted: tuple[str, str]) -> None:
         until(f"{wanted}", lambda: len(self.heard) >= len(wanted))
@@ -81,16 +95,22 @@ def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
         link = RosGraph(ours, profile.ros2, messages, "vla_panda")
         # No command node is here: this is when it would have agreed.
         monkeypatch.setattr(Client, "wait_for", lambda *_: agreed.wait(PATIENCE_S))
-        people = RosServices(profile, ours, link, messages, "/vla", lambda *_: None)
+        people = OperatorTopics(
+            profile, ours, link, messages, "/vla", lambda *_: None, services=True
+        )
         peer = Ros2Peer(theirs)
         for key in (keys.active, keys.stop, keys.reset, keys.rate):
             theirs.declare_subscriber(key, zenoh.handlers.Callback(keep, indirect=False))
             await_match(ours, key)
         await_match(operator, keys.stop)
         await_match(operator, keys.task)
+        answers: list[dict[str, Any]] = []
+        peer.on("/vla/answer", TEXT, lambda message: answers.append(json.loads(message.data)))
+        for one in OPERATIONS:
+            await_match(theirs, f"vla/{one.name}")
         thread = threading.Thread(target=people.run, args=(over,))
         thread.start()
-        yield Rig(people, peer, callers, operator, keys, heard, agreed)
+        yield Rig(people, peer, callers, operator, keys, heard, agreed, answers)
         agreed.set()
         over.set()
         thread.join()
@@ -159,3 +179,112 @@ def test_a_stop_is_not_confirmed_by_an_older_status(
         "the command node is silent, not stopped; use the emergency stop of the arm itself"
     )
     node.close()
+
+
+# -- by topic -----------------------------------------------------------------------------------
+def test_a_stop_by_topic_is_sent_at_once_whatever_waits_and_is_answered(rig: Rig) -> None:
+    rig.put("reset", EMPTY)
+    rig.expect(("reset", ""))
+    rig.put("active", BOOL, data=True)
+    until("it waits", lambda: rig.people._calls.qsize() == 1)
+    rig.put("stop", EMPTY)
+    rig.expect(("reset", ""), ("stop", ""))
+    rig.agreed.set()
+    assert rig.answer(0) == {"id": None, "what": "reset", "ok": True, "reason": "inactive"}
+    late = rig.answer(1)
+    assert (late["what"], late["ok"]) == ("active", False)
+    assert TOO_LATE in late["reason"]
+    assert (rig.answer(2)["what"], rig.answer(2)["ok"]) == ("stop", True)
+
+
+@pytest.mark.parametrize("payload", [b"", b"\x00", bytes(1000), b"\xff" * 20_000])
+def test_a_stop_by_topic_acts_whatever_its_bytes(rig: Rig, payload: bytes) -> None:
+    rig.peer.put_bytes("/vla/stop", EMPTY, payload)
+    rig.expect(("stop", ""))
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("go up", "no JSON"),
+        ("[1]", "no JSON object"),
+        ('{"promt": "go up"}', "'promt' is none of id, prompt, worker, rate_hz, active"),
+        ('{"active": 1}', "active is '1'"),
+        ('{"rate_hz": true}', "rate_hz is 'True'"),
+        ('{"rate_hz": NaN}', "rate 'nan'"),
+        ('{"id": "7", "rate_hz": 1e9}', "out of range"),
+    ],
+)
+def test_a_request_by_topic_that_cannot_be_meant_is_answered_with_the_reason(
+    rig: Rig, text: str, reason: str
+) -> None:
+    rig.put("request", TEXT, data=text)
+    answer = rig.answer(0)
+    assert not answer["ok"]
+    assert reason in answer["reason"]
+    assert rig.heard == []
+
+
+def test_the_answer_of_a_request_by_topic_has_its_id(rig: Rig) -> None:
+    rig.agreed.set()
+    rig.put("request", TEXT, data='{"id": "7", "rate_hz": 5}')
+    answer = rig.answer(0)
+    assert (answer["id"], answer["what"]) == ("7", "request")
+    rig.expect(("rate", "5"))
+
+
+def test_an_activation_or_reset_that_goes_on_being_published_is_executed_once(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(OperatorTopics, "_check_stops", lambda *_: None)
+    monkeypatch.setattr(operator_topics, "REPEAT_NS", 60_000_000_000)
+    rig.agreed.set()
+    for nth in range(3):
+        rig.put("reset", EMPTY)
+        rig.answer(nth)
+    assert [answer["ok"] for answer in rig.answers] == [True, False, False]
+    assert "repeated" in rig.answers[1]["reason"]
+    assert rig.heard == [("reset", "")]
+    monkeypatch.setattr(operator_topics, "REPEAT_NS", 0)
+    rig.put("reset", EMPTY)
+    assert rig.answer(3)["ok"]
+
+
+@pytest.mark.parametrize(
+    ("topic", "kind", "values"),
+    [
+        ("active", BOOL, {"data": True}),
+        ("reset", EMPTY, {}),
+        ("request", TEXT, {"data": '{"active": true}'}),
+    ],
+)
+def test_what_a_transient_local_publisher_sends_again_sets_nothing_in_motion_but_stops(
+    rig: Rig, topic: str, kind: str, values: dict[str, Any]
+) -> None:
+    durability = ["TRANSIENT_LOCAL"]
+
+    def describe(query: zenoh.Query) -> None:
+        qos = {"durability": {"kind": durability[0]}}
+        for name in (topic, "stop"):
+            key = f"@/b1/ros2/dds/010f00/writer/010f0001/rt/vla/{name}"
+            if query.key_expr.intersects(zenoh.KeyExpr(key)):
+                query.reply(key, json.dumps({"key": "010f0001", "qos": qos}))
+        query.drop()
+
+    rig.agreed.set()
+    bridge = rig.operator.declare_queryable(
+        "@/b1/ros2/**", zenoh.handlers.Callback(describe, indirect=False)
+    )
+    until("the bridge is asked", lambda: rig.people._graph.has_transient_local(f"/vla/{topic}"))
+    rig.put(topic, kind, **values)
+    answer = rig.answer(0)
+    assert not answer["ok"]
+    assert "transient_local" in answer["reason"]
+    assert rig.heard == []
+    rig.put("stop", EMPTY)
+    rig.expect(("stop", ""))
+    assert rig.answer(1)["ok"]
+    durability[0] = "VOLATILE"
+    rig.put(topic, kind, **values)
+    until("it is executed", lambda: len(rig.heard) > 1)
+    bridge.undeclare()

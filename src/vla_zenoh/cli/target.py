@@ -262,7 +262,7 @@ def _outline_of(profile: Profile) -> dict[str, Any]:
         "session": profile.session.model_dump(mode="json"),
         "hosts": hosts,
         "cameras": {name: {"from_ros2": one.from_ros2} for name, one in profile.cameras.items()},
-        "ros2": None if ros2 is None else {"services": True if ros2.services else None},
+        "ros2": None if ros2 is None else {"prefix": ros2.prefix},
     }
 
 

@@ -402,7 +402,9 @@ class Ros2Profile(Section):
         gripper: action or topic for the gripper.
         messages: type -> file with its definition, relative to the profile, for types that neither
             ROS nor this package has.
-        services: prefix of our own services and topics; null: none.
+        prefix: of our own topics and services, as ``/vla/stop``; null: none.
+        services: offer services beside these topics. They reach only callers of the robot's own
+            rmw_zenoh, or of Cyclone DDS: with ROS 2's default, Fast DDS, a call waits for ever.
     """
 
     bridge: Literal["ros2dds", "rmw_zenoh"] = "ros2dds"
@@ -417,4 +419,5 @@ class Ros2Profile(Section):
     joint_command: Ros2Output | None = None
     gripper: Ros2Gripper | None = None
     messages: dict[RosType, Word] = Field(default_factory=dict)
-    services: Topic | None = "/vla"
+    prefix: Topic | None = "/vla"
+    services: bool = False

@@ -42,21 +42,26 @@ def dds_type(kind: str) -> str:
     return f"{package}::{room}::dds_::{name}_"
 
 
-class Service(NamedTuple):
-    """A service of ours: the last part of its name, and its type."""
+class Operation(NamedTuple):
+    """A request of a ROS user: the last part and type of its topic, and those of its service."""
 
     name: str
     type: str
+    service: str
+    service_type: str
 
 
-SET_ACTIVE = Service("set_active", "std_srvs/srv/SetBool")
-STOP = Service("stop", "std_srvs/srv/Trigger")
-RESET = Service("reset", "std_srvs/srv/Trigger")
-SET_PROMPT = Service("set_prompt", "vla_msgs/srv/SetPrompt")
-SET_REQUEST = Service("set_request", "vla_msgs/srv/SetRequest")
-SERVICES = (SET_ACTIVE, STOP, RESET, SET_PROMPT, SET_REQUEST)
+TEXT, BOOL, EMPTY = "std_msgs/msg/String", "std_msgs/msg/Bool", "std_msgs/msg/Empty"
+_TRIGGER = "std_srvs/srv/Trigger"
+STOP = Operation("stop", EMPTY, "stop", _TRIGGER)
+RESET = Operation("reset", EMPTY, "reset", _TRIGGER)
+ACTIVE = Operation("active", BOOL, "set_active", "std_srvs/srv/SetBool")
+PROMPT = Operation("prompt", TEXT, "set_prompt", "vla_msgs/srv/SetPrompt")
+REQUEST = Operation("request", TEXT, "set_request", "vla_msgs/srv/SetRequest")
+OPERATIONS = (STOP, RESET, ACTIVE, PROMPT, REQUEST)
 
-PROMPT_TOPIC, STATUS_TOPIC = "prompt", "status"
+ANSWER_TOPIC, STATUS_TOPIC = "answer", "status"
+ROSOUT, LOG = "/rosout", "rcl_interfaces/msg/Log"
 
 
 # -- endpoints -----------------------------------------------------------------------------------
@@ -66,16 +71,18 @@ class Qos:
 
     depth: int = 10
     reliable: bool = True
+    transient_local: bool = False
 
     def as_ros2dds(self, type_hash: str | None) -> str:
         """As in the bridge's tokens: key-less, DDS's numbers, and the hash as user data."""
-        text = f":{int(self.reliable)}:0:0,{self.depth}"
+        text = f":{int(self.reliable)}:{int(self.transient_local)}:0,{self.depth}"
         return text if type_hash is None else f"{text}:typehash={type_hash};"
 
     def as_rmw_zenoh(self) -> str:
         """As in rmw_zenoh's tokens: what is the default (reliable, volatile) is left out."""
         reliability = "" if self.reliable else "2"
-        return f"{reliability}::,{self.depth}:,:,:,,"
+        durability = "1" if self.transient_local else ""
+        return f"{reliability}:{durability}:,{self.depth}:,:,:,,"
 
 
 DEFAULT = Qos()
@@ -83,6 +90,8 @@ SENSOR = Qos(depth=5, reliable=False)
 """rclcpp's SensorDataQoS: matches both reliable and best-effort publishers."""
 COMMAND = Qos(depth=1)
 """Setpoints: reliable, so that it matches every subscriber; the newest replaces older ones."""
+LATCHED = Qos(transient_local=True)
+"""What somebody who comes late should read as well."""
 
 
 class EntityRole(Enum):

@@ -5,6 +5,7 @@ Numbers are as they came: finiteness and meaning are checked where a record is m
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from vla_zenoh.codec.image import PNG_BEGINS, check_size, decode_jpeg, decode_png
 from vla_zenoh.errors import CodecError
+from vla_zenoh.ros2.keys import BOOL, EMPTY, TEXT
 from vla_zenoh.ros2.messages import MAX_MESSAGE_BYTES, MAX_PICTURE_BYTES, SECOND_NS, Messages
 from vla_zenoh.ros2.writers import GRASP, GRIPPER_COMMAND, PARALLEL_COMMAND
 from vla_zenoh.types import MAX_NAMES, FloatArray
@@ -21,7 +23,6 @@ from vla_zenoh.types.records import Joints
 
 JOINT_STATE, WRENCH = "sensor_msgs/msg/JointState", "geometry_msgs/msg/WrenchStamped"
 IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
-TEXT = "std_msgs/msg/String"
 CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1}
 _JPEG = b"\xff\xd8\xff"
 SUCCEEDED = 4
@@ -34,6 +35,16 @@ class RosImage(NamedTuple):
     stamp_ns: int
     frame: str
     rgb: NDArray[np.uint8]
+
+
+class Wanted(NamedTuple):
+    """What a ROS user requests at once; None: unchanged. The answer repeats the `id`."""
+
+    id: str | None = None
+    prompt: str | None = None
+    worker: str | None = None
+    rate_hz: float | None = None
+    active: bool | None = None
 
 
 class Wrench(NamedTuple):
@@ -70,6 +81,27 @@ def _stamp_ns(header: Any) -> int:
     if stamp.sec < 0 or stamp.nanosec >= SECOND_NS:
         raise CodecError("invalid", f"a stamp of {stamp.sec} s and {stamp.nanosec} ns")
     return stamp.sec * SECOND_NS + stamp.nanosec
+
+
+_WANTED = {"id": str, "prompt": str, "worker": str, "rate_hz": (int, float), "active": bool}
+_EXAMPLE = '{"id": "7", "prompt": "go up", "active": true}'
+
+
+def read_request(text: str) -> Wanted:
+    """The JSON of a request by topic, or a `CodecError` that says what is allowed."""
+    try:
+        given = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise CodecError("malformed", f"no JSON: {str(error)[:80]}; wanted: {_EXAMPLE}") from error
+    if not isinstance(given, dict):
+        raise CodecError("malformed", f"no JSON object; wanted: {_EXAMPLE}")
+    for name, value in given.items():
+        kinds = _WANTED.get(name)
+        if kinds is None:
+            raise CodecError("invalid", f"{name[:40]!r} is none of {', '.join(_WANTED)}")
+        if not isinstance(value, kinds) or (name == "rate_hz" and isinstance(value, bool)):
+            raise CodecError("invalid", f"{name} is {str(value)[:40]!r}; wanted: {_EXAMPLE}")
+    return Wanted(**given)
 
 
 # -- state ----------------------------------------------------------------------------------------
@@ -150,6 +182,8 @@ READERS: dict[str, Callable[[Any], Any]] = {
     IMAGE: _image,
     COMPRESSED_IMAGE: _compressed_image,
     TEXT: lambda message: message.data,
+    BOOL: lambda message: bool(message.data),
+    EMPTY: lambda message: None,
 }
 """Type -> decoder: message -> sample; raises `CodecError` or `ValueError`."""
 

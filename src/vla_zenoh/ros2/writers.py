@@ -18,6 +18,7 @@ from vla_zenoh.errors import ProfileError
 from vla_zenoh.kinematics.fingers import Fingers
 from vla_zenoh.profile import GripperProfile
 from vla_zenoh.profile.robot import Ros2Gripper
+from vla_zenoh.ros2.keys import LOG
 from vla_zenoh.ros2.messages import SECOND_NS, Messages
 from vla_zenoh.types import FloatArray, GripperCommand, JointCommand, NodeStatus, PoseCommand
 
@@ -32,6 +33,8 @@ NOW_NS = 0
 """A trajectory's stamp of zero means: from now on, whatever the robot's clock says."""
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 OK, WARN, ERROR, STALE = range(4)
+INFO = 20
+"""rcl_interfaces/Log.INFO."""
 BAD = frozenset(
     {"fault", "stopped", "degraded", "braking", "waiting", "silent", "stalled", "unheeded"}
 )
@@ -272,3 +275,9 @@ def _diagnostic(
             for key, value in values.items()
         ],
     )
+
+
+def log(messages: Messages, robot: str, text: str, stamp: Stamp) -> Any:
+    """A rcl_interfaces/Log of level INFO, as ROS nodes publish them on /rosout."""
+    time = messages.new("builtin_interfaces/msg/Time", **_time_fields(stamp.stamp_ns))
+    return messages.new(LOG, stamp=time, level=INFO, name=f"vla_{robot}", msg=text)

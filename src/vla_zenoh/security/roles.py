@@ -138,7 +138,7 @@ def _nodes(profile: Profile, host: str) -> list[Identity]:
             served = tuple(c for c in profile.cameras_of(part) if c not in from_ros2)
             found.append(Identity(role, name, host, cameras=served))
         elif kind == "ros2":
-            offers = profile.ros2 is not None and profile.ros2.services is not None
+            offers = profile.ros2 is not None and profile.ros2.prefix is not None
             people = (Role.OPERATOR,) if offers else ()
             found.append(Identity(role, name, host, cameras=from_ros2, speaks_for=people))
         else:

@@ -67,20 +67,20 @@ def test_the_shipped_profile_lets_through_what_it_names_and_nothing_else() -> No
             "/camera/realsense2_camera/color/image_raw",
             "/camera/wrist_camera/color/image_raw",
             "/joint_states",
+            "/vla/active",
             "/vla/prompt",
+            "/vla/request",
+            "/vla/reset",
+            "/vla/stop",
         ],
         "subscribers": [
             "/panda/panda_cartesian_impedance_controller/desired_pose",
+            "/rosout",
+            "/vla/answer",
             "/vla/status",
         ],
         "service_servers": [],
-        "service_clients": [
-            "/vla/reset",
-            "/vla/set_active",
-            "/vla/set_prompt",
-            "/vla/set_request",
-            "/vla/stop",
-        ],
+        "service_clients": [],
         "action_servers": ["/panda_gripper/move"],
         "action_clients": [],
     }
@@ -97,7 +97,7 @@ ros2:
   wrench: {topic: /wrench}
   joint_command: {topic: /joints, type: trajectory_msgs/msg/JointTrajectory}
   gripper: {grasp: /panda_gripper/grasp}
-  services: null
+  prefix: null
 """,
     )
     found = allowed(profile)
@@ -119,14 +119,14 @@ ros2:
 """,
     )
     found = allowed(profile)
-    assert found["subscribers"] == ["/joints", "/vla/status", "/width"]
+    assert found["subscribers"] == ["/joints", "/rosout", "/vla/answer", "/vla/status", "/width"]
     assert found["action_servers"] == []
 
 
 def test_cameras_alone_let_through_no_command(tmp_path: Path) -> None:
     profile = lab(
         tmp_path,
-        "robot: {driver: sim}\ncameras: {wrist: {source: 'sim:wrist'}}\nros2: {services: null}\n"
+        "robot: {driver: sim}\ncameras: {wrist: {source: 'sim:wrist'}}\nros2: {prefix: null}\n"
         "hosts: {here: {nodes: [router, sim, ros2, command, worker]}}\n",
     )
     found = allowed(profile)

@@ -189,6 +189,8 @@ def _examples() -> dict[str, bytes]:
             "data": np.frombuffer(png, np.uint8),
         },
         "std_msgs/msg/String": {"data": "hold"},
+        "std_msgs/msg/Bool": {"data": True},
+        "std_msgs/msg/Empty": {},
     }
     assert set(fields) == set(MUTATED_KINDS)
     return {kind: JAZZY.encode(JAZZY.new(kind, **values)) for kind, values in fields.items()}

@@ -317,7 +317,7 @@ def test_nobody_deletes_and_no_rule_but_the_routers_lets_a_deletion_pass(lab: Pr
     )
 
 
-def test_a_ros_node_speaks_for_ros_people_only_where_services_are_offered() -> None:
+def test_a_ros_node_speaks_for_ros_people_only_where_they_have_topics() -> None:
     security = {"listen": ["tls/10.0.0.2:7447"], "connect": ["tls/10.0.0.2:7447"], "security": {}}
     bridge = {"connect": ["tcp/127.0.0.1:7448"]}
     plain = load_profile("panda_ros2")
@@ -325,8 +325,8 @@ def test_a_ros_node_speaks_for_ros_people_only_where_services_are_offered() -> N
         ProfileError, match=r"ros2\.connect: is missing: in a secured lab the bridge"
     ):
         override(plain, {"session": security})
-    for services, drives in (("/vla", True), (None, False)):
-        ros2 = {**bridge, "services": services}
+    for prefix, drives in (("/vla", True), (None, False)):
+        ros2 = {**bridge, "prefix": prefix}
         lab = override(plain, {"session": security, "ros2": ros2})
         written = may(lab, "ros2@here", Act.PUT)
         assert {"state/pose", "camera/front/jpeg", "status/ros2"} <= written

@@ -12,8 +12,17 @@ from vla_zenoh.errors import ProfileError
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.robot import GRIPPER_ACTIONS, Ros2Gripper, Ros2Profile
 from vla_zenoh.profile.schema import TRUSTED_PROTOCOLS, endpoint_faults, host_of, is_loopback
-from vla_zenoh.ros2.keys import PROMPT_TOPIC, SERVICES, STATUS_TOPIC, Endpoint, EntityRole
-from vla_zenoh.ros2.readers import JOINT_STATE, TEXT, WRENCH
+from vla_zenoh.ros2.keys import (
+    ANSWER_TOPIC,
+    LOG,
+    OPERATIONS,
+    ROSOUT,
+    STATUS_TOPIC,
+    TEXT,
+    Endpoint,
+    EntityRole,
+)
+from vla_zenoh.ros2.readers import JOINT_STATE, WRENCH
 from vla_zenoh.ros2.writers import DIAGNOSTICS, GRASP
 
 PROGRAM = "zenoh-bridge-ros2dds"
@@ -170,8 +179,8 @@ def endpoints(profile: Profile) -> tuple[Endpoint, ...]:
     if profile.robot.driver == "ros2":
         found += _arm(ros2, profile.robot.command)
         found += [] if ros2.gripper is None else _gripper(ros2.gripper)
-    if ros2.services is not None:
-        found += _services(ros2.services)
+    if ros2.prefix is not None:
+        found += _operations(ros2.prefix, services=ros2.services)
     return tuple(dict.fromkeys(found))
 
 
@@ -194,8 +203,11 @@ def _gripper(gripper: Ros2Gripper) -> Iterator[Endpoint]:
         yield Endpoint(EntityRole.ACTION_CLIENT, gripper.grasp, GRASP)
 
 
-def _services(prefix: str) -> Iterator[Endpoint]:
-    for service in SERVICES:
-        yield Endpoint(EntityRole.SERVER, f"{prefix}/{service.name}", service.type)
-    yield Endpoint(EntityRole.SUBSCRIBER, f"{prefix}/{PROMPT_TOPIC}", TEXT)
+def _operations(prefix: str, *, services: bool) -> Iterator[Endpoint]:
+    for one in OPERATIONS:
+        yield Endpoint(EntityRole.SUBSCRIBER, f"{prefix}/{one.name}", one.type)
+        if services:
+            yield Endpoint(EntityRole.SERVER, f"{prefix}/{one.service}", one.service_type)
+    yield Endpoint(EntityRole.PUBLISHER, f"{prefix}/{ANSWER_TOPIC}", TEXT)
     yield Endpoint(EntityRole.PUBLISHER, f"{prefix}/{STATUS_TOPIC}", DIAGNOSTICS)
+    yield Endpoint(EntityRole.PUBLISHER, ROSOUT, LOG)

@@ -1,7 +1,7 @@
-"""Driver of a ROS 2 robot: joint states in, set-points out; its cameras and services beside them.
+"""Driver of a ROS 2 robot: joint states in, set-points out; cameras, operators' topics.
 
 Neither ROS nor DDS runs here: messages are CDR on keys of zenoh-bridge-ros2dds, or of a robot with
-rmw_zenoh. Cameras and services have threads of their own.
+rmw_zenoh. Cameras and operators' topics have threads of their own.
 """
 
 from __future__ import annotations
@@ -32,8 +32,9 @@ from vla_zenoh.robots.arm import Arm
 from vla_zenoh.robots.driver import DriverStatus, Measurement, RobotDriver, command_of
 from vla_zenoh.robots.joint_reading import JointReading, RobotClock, StampFilter
 from vla_zenoh.robots.ros2.gripper import Gripper
+from vla_zenoh.robots.ros2.middleware import GRIPPER, MiddlewareWatch
+from vla_zenoh.robots.ros2.operator_topics import OperatorTopics
 from vla_zenoh.robots.ros2.ros_graph import RosGraph
-from vla_zenoh.robots.ros2.ros_services import RosServices
 from vla_zenoh.ros2.keys import COMMAND, SENSOR
 from vla_zenoh.ros2.messages import MAX_PICTURE_BYTES, Messages
 from vla_zenoh.ros2.readers import JOINT_STATE, WRENCH, RosImage, Wrench, read
@@ -56,7 +57,7 @@ LEAD_PERIODS = 2
 
 
 class Ros2Driver(RobotDriver):
-    """The ROS 2 robot of a profile; with another ``robot.driver``, only its cameras and services.
+    """The ROS 2 robot of a profile; with another ``robot.driver``, only its cameras and topics.
 
     Raises:
         ProfileError: the section ros2 is missing or has an unknown name in it.
@@ -108,8 +109,16 @@ class Ros2Driver(RobotDriver):
         graph = self.graph = RosGraph(
             self._own_session or session, ros2, self._messages, f"vla_{name}"
         )
+        watch = self._middleware = MiddlewareWatch(graph, ros2, self._emit)
         if self.has_arm:
-            self.gripper = Gripper(node, graph, self._messages, ros2.gripper, self._width_m)
+            self.gripper = Gripper(
+                node,
+                graph,
+                self._messages,
+                ros2.gripper,
+                self._width_m,
+                lambda: watch.faults.get(GRIPPER, ""),
+            )
             self.states = StateSubscriber(node, graph, self._messages, ros2, self.kinematics)
             command = profile.robot.command
             output = ros2.joint_command if command == "joint" else ros2.pose_command
@@ -122,10 +131,17 @@ class Ros2Driver(RobotDriver):
             Camera(camera, topic, node, graph, read_messages(ros2), self._emit, self._reject)
             for camera, topic in profile.ros2_cameras().items()
         ]
-        self._services = None
-        if ros2.services is not None:
-            self._services = RosServices(
-                profile, session, graph, read_messages(ros2), ros2.services, self._reject
+        self._operators = None
+        if ros2.prefix is not None:
+            self._operators = OperatorTopics(
+                profile,
+                session,
+                graph,
+                read_messages(ros2),
+                ros2.prefix,
+                self._reject,
+                services=ros2.services,
+                about=watch.about,
             )
         for buffer in graph.buffers:
             node.watch_buffer(buffer)
@@ -145,8 +161,9 @@ class Ros2Driver(RobotDriver):
         self._deferred.append(lambda: self._node.reject(reason, why, about))
 
     def connect(self) -> None:
-        """Start the threads of cameras and services."""
-        bodies = [each.run for each in (*self._cameras, self._services) if each is not None]
+        """Start the threads of cameras, operators' topics and what watches the middleware."""
+        threaded = (*self._cameras, self._operators, self._middleware)
+        bodies = [each.run for each in threaded if each is not None]
         self._threads = [
             threading.Thread(target=body, args=(self._halt,), name=f"ros2 {index}", daemon=True)
             for index, body in enumerate(bodies)
@@ -268,6 +285,8 @@ class Ros2Driver(RobotDriver):
             "cameras": {publisher.name: publisher.detail() for publisher in publishers},
             "bridge": self._ros2.bridge,
             "others": self.graph.others,
+            "middleware": self._middleware.view.middleware,
+            "ros2_faults": dict(self._middleware.faults),
         }
         ages_s, rates_hz = {}, {name: rate_hz for name, (rate_hz, _) in figures.items()}
         if self._arm is not None:

@@ -96,7 +96,7 @@ class Gripper:
     """Sends accepted gripper commands to the robot; without a `profile` it has no gripper.
 
     `width` measures the opening between the fingers (m), None while unknown; `wanted_m` is that of
-    the newest command, None before the first.
+    the newest command, None before the first. `blocked` says why goals do not reach the action.
     """
 
     def __init__(
@@ -106,9 +106,11 @@ class Gripper:
         messages: Messages,
         profile: Ros2Gripper | None,
         width: Callable[[], float | None],
+        blocked: Callable[[], str] = str,
     ) -> None:
         self._node, self._messages, self._profile = node, messages, profile
         self._limits = node.profile.robot.gripper
+        self._blocked = blocked
         self._measured_m, self._sent_m = width, self._limits.max_width_m
         self._goals = GoalSequencer(GOAL_TIMEOUT_S, self._limits.max_width_m)
         self._answers: deque[Callable[[], None]] = deque()
@@ -175,6 +177,9 @@ class Gripper:
     def move(self, command: GripperCommand, now_ns: int) -> None:
         """Send a command, after the goal in flight ended; `now_ns` (wall clock) stamps it."""
         if self._profile is None:
+            return
+        if self._topic is None and (why := self._blocked()):
+            self._node.reject("middleware", why, "command/gripper")
             return
         self.wanted_m = command.width_m
         if self._topic is None:
