@@ -289,13 +289,13 @@ def test_the_node_drives_a_robot_of_the_other_side(lab: tuple[Profile, Sdk]) -> 
     profile, sdk = lab
     sdk.forget()
     poses: list[PoseState] = []
+
+    def keep(sample: zenoh.Sample) -> None:
+        poses.append(records.decode(PoseState, sample.payload.to_bytes()))
+
     with open_session(profile.session) as ours, open_session(profile.session) as watcher:
         subscriber = watcher.declare_subscriber(
-            profile.keys.state_pose,
-            zenoh.handlers.Callback(
-                lambda s: poses.append(records.decode(PoseState, s.payload.to_bytes())),
-                indirect=False,
-            ),
+            profile.keys.state_pose, zenoh.handlers.Callback(keep, indirect=False)
         )
         node, stop = RobotNode(Ros2Driver(profile), ours), threading.Event()
         thread = threading.Thread(target=node.run, args=(stop,))

@@ -408,9 +408,12 @@ def test_a_service_without_a_command_node_says_what_is_missing(rig: Ros2Rig) -> 
 
 def test_a_prompt_on_a_topic_becomes_our_prompt(rig: Ros2Rig) -> None:
     heard: list[str] = []
+
+    def keep(sample: zenoh.Sample) -> None:
+        heard.append(sample.payload.to_string())
+
     subscriber = rig.session.declare_subscriber(
-        rig.profile.keys.prompt,
-        zenoh.handlers.Callback(lambda s: heard.append(s.payload.to_string()), indirect=False),
+        rig.profile.keys.prompt, zenoh.handlers.Callback(keep, indirect=False)
     )
 
     await_match(rig.peer.session, rig.peer.key("/vla/prompt", "std_msgs/msg/String"))
