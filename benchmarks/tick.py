@@ -139,8 +139,8 @@ class Player:
         header = Header(now_ns - round(ago_s * 1e9), self.seq, SOURCE)
         return Stamped(header, record, now_ns)
 
-    def tick(self, chunks: list[Stamped[ActionChunk]], *settings: Setting) -> tuple[int, int, int]:
-        """One tick; nanoseconds of planning before it, of itself, and of looking ahead after it."""
+    def tick(self, chunks: list[Stamped[ActionChunk]], *settings: Setting) -> tuple[int, int]:
+        """One tick; nanoseconds of planning before it, and of itself."""
         self.now_ns += self.period_ns
         header = Header(self.now_ns, self.now_ns // self.period_ns, ARM)
         held = (self.position_m, self.quat_xyzw)
@@ -162,19 +162,17 @@ class Player:
         planned_ns = time.perf_counter_ns()
         out = self.commander.step(inputs, self.now_ns)
         stepped_ns = time.perf_counter_ns()
-        self.commander.look_ahead(self.now_ns)
-        after_ns = time.perf_counter_ns() - stepped_ns
         if out.pose is not None:
             self.position_m, self.quat_xyzw = out.pose.position_m, out.pose.quat_xyzw
         if out.joint is not None:
             self.joints_rad = out.joint.position_rad
             at = self.kinematics.forward(self.joints_rad)
             self.position_m, self.quat_xyzw = at.position_m, quat_from_rotation(at.rotation)
-        return planned_ns - began_ns, stepped_ns - planned_ns, after_ns
+        return planned_ns - began_ns, stepped_ns - planned_ns
 
-    def play(self, duration_s: float) -> tuple[list[tuple[int, int, int]], list[bool]]:
+    def play(self, duration_s: float) -> tuple[list[tuple[int, int]], list[bool]]:
         """The times of every tick, and whether a chunk came before it."""
-        spent_ns: list[tuple[int, int, int]] = []
+        spent_ns: list[tuple[int, int]] = []
         with_chunk: list[bool] = []
         period_s = HEAP_S if self.scenario.heap else PERIOD_S
         every = round(period_s * 1e9 / self.period_ns)
@@ -211,7 +209,7 @@ def main() -> None:
             reach = base.limits.reach.model_copy(update={"table_z_m": scenario.table_z_m})
             limits = base.limits.model_copy(update={"reach": reach})
             profile = base.model_copy(update={"robot": robot, "limits": limits})
-            runs: list[list[tuple[int, int, int]]] = []
+            runs: list[list[tuple[int, int]]] = []
             with_chunk: list[bool] = []
             for _ in range(given.runs):
                 player = Player(profile, scenario)
@@ -223,11 +221,10 @@ def main() -> None:
             least_us = np.min(runs, axis=0) / 1e3
             chunky = np.array(with_chunk)
             print(f"{command}, {scenario.name}:  p50, p95, max us; ticks")
-            planned_us, tick_us, after_us = least_us.T
+            planned_us, tick_us = least_us.T
             print(_row("chunk planned", planned_us[chunky]))
             print(_row("tick after it", tick_us[chunky]))
             print(_row("any other tick", tick_us[~chunky]))
-            print(_row("steps after a tick", after_us))
 
 
 if __name__ == "__main__":

@@ -111,7 +111,6 @@ class Rig:
             inputs.pose, inputs.gripper = self.pose_state(), self.gripper_state()
             inputs.joint = self.joint_state()
         out = self.commander.step(inputs, self.now_ns, ticks)
-        self.commander.look_ahead(self.now_ns)
         self.events += out.events
         self.refused.update(refusal.reason for refusal in out.rejections)
         if out.pose is not None:

@@ -86,7 +86,6 @@ class PerfectPair:
         if self.commander.state.value == "inactive" and self._ticks % 100 == 50:
             inputs.settings = [Setting("active", True)]
         out = self.commander.step(inputs, self.now_ns)
-        self.commander.look_ahead(self.now_ns)
         for part, commands in out.parts.items():
             if commands.joint is not None:
                 self.joints_rad[part] = np.array(commands.joint.position_rad)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import heapq
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -191,13 +191,9 @@ class Rig:
             self._tell(at, inputs)
         followed, before = self.guard.following, self.commander.state.value
         if inputs.chunks and at % 2:  # as the command node does with one that comes between ticks
-            self.commander.prepare(Inputs(chunks=inputs.chunks), self._now_ns)
-            inputs.chunks = ()
-        if at % 3 == 0:  # and with states
-            early, inputs = inputs, Inputs(inputs.settings, inputs.chunks, peers=inputs.peers)
-            self.commander.update(Inputs(pose=early.pose, joint=early.joint, gripper=early.gripper))
+            early, inputs = inputs, Inputs(inputs.settings, peers=inputs.peers)
+            self.commander.prepare(replace(early, settings=(), peers=None), self._now_ns)
         out = self.commander.step(inputs, self._now_ns, periods)
-        self.commander.look_ahead(self._now_ns)
         state = self.commander.state.value
         for event in out.events:
             if event.what.endswith("->fault") and not event.why.startswith("the robot reports"):

@@ -125,12 +125,12 @@ class FixedRate:
         early = (self.next_ns - time.monotonic_ns()) // self._period_ns
         self.next_ns -= max(early, 0) * self._period_ns
 
-    def wait_for(self, arrival: threading.Event, before_ns: int = 0) -> bool:
-        """Wait for `arrival`, at most until `before_ns` before the next cycle; whether it came.
+    def wait_for(self, arrival: threading.Event) -> bool:
+        """Wait for `arrival`, at most until the next cycle; whether it came.
 
         It is cleared then.
         """
-        left_ns = self.next_ns - before_ns - time.monotonic_ns()
+        left_ns = self.next_ns - time.monotonic_ns()
         if left_ns <= 0 or not arrival.wait(left_ns / 1e9):
             return False
         arrival.clear()

@@ -42,7 +42,6 @@ class Publisher:
         self.key = key
         self.seq = 0
         self.sent_bytes = 0
-        self._encoded: tuple[Any, bytes] = None, b""
 
     @property
     def has_subscribers(self) -> bool:
@@ -64,17 +63,11 @@ class Publisher:
             self.seq if seq is None else seq,
             self._source,
         )
-        payload = record if isinstance(record, bytes) else self.encoded(record)
+        payload = record if isinstance(record, bytes) else records.encode(record)
         self._publisher.put(payload, attachment=records.encode_header(header), encoding=encoding)
         self.seq += 1
         self.sent_bytes += len(payload)
         return header
-
-    def encoded(self, record: Any) -> bytes:
-        """Bytes of a record; those of the last one are kept, since an arm at rest repeats it."""
-        if record is not self._encoded[0]:
-            self._encoded = record, records.encode(record)
-        return self._encoded[1]
 
     def undeclare(self) -> None:
         """Close it."""
@@ -86,7 +79,7 @@ def publish_together(stamp_wall_ns: int, seq: int, *states: tuple[Publisher, Any
 
     What is put at once travels in one packet, and wakes every thread on its way once.
     """
-    payloads = [publisher.encoded(record) for publisher, record in states]
+    payloads = [records.encode(record) for _, record in states]
     for (publisher, _), payload in zip(states, payloads, strict=True):
         publisher.publish(payload, stamp_wall_ns=stamp_wall_ns, seq=seq)
 

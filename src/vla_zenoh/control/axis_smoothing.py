@@ -17,8 +17,7 @@ states", RSS 2021.
 
 from __future__ import annotations
 
-from copy import copy
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -138,19 +137,6 @@ class AxisSmoother:
         self._again: tuple[Shares, bool] | None = None
         self._too_fast = zeros > 0.0
         self.braking = False
-
-    @property
-    def moment(self) -> tuple[object, ...]:
-        """What the next tick depends on: the same objects, the same motion."""
-        return self._plan, self.state
-
-    def fork(self) -> Self:
-        """A copy that moves by itself."""
-        return copy(self)
-
-    def adopt(self, fork: Self) -> None:
-        """Take over the motion of a `fork` that was made of the present state."""
-        vars(self).update(vars(fork))
 
     def move_to(
         self, target: FloatArray, shares: Shares = FULL, *, all_to_stop: bool = False

@@ -126,11 +126,6 @@ class ChunkPlanner:
         """Chunks are queued, or one is being planned."""
         return self._pending is not None or bool(self._queue)
 
-    @property
-    def spent(self) -> bool:
-        """Evaluations were made in this tick."""
-        return self._left < self.budget
-
     def begin_tick(self) -> None:
         """Renew the budget of evaluations."""
         self._left = self.budget

@@ -146,7 +146,6 @@ class CommandedPart:
                 "robot.tcp_frame and robot.arm_joints in the profile"
             )
         self.reach.hold(box)
-        self.motion.forget_ahead()
         self.held = box
         gripper = self.gripper_state
         self._grasp_m = np.inf if gripper is None else gripper.record.width_m
@@ -268,17 +267,10 @@ class CommandedPart:
         commanded_rad = motion.joints_rad
         reach.set_elbow(measured_rad if commanded_rad is None else commanded_rad)
 
-    def monitor_late(self, now_ns: int) -> bool:
-        """The next check of the measured joints is long overdue."""
-        return self._joint_monitor is not None and self._joint_monitor.late(now_ns)
-
-    def monitor_joints(self, now_ns: int, *, if_late: bool) -> None:
-        """Slow a moving arm down if its measured joints come near a bound, see `too_near`.
-
-        `if_late`: only if that is long overdue.
-        """
+    def monitor_joints(self, now_ns: int) -> None:
+        """Slow a moving arm down if its measured joints come near a bound, see `too_near`."""
         monitor, motion = self._joint_monitor, self.motion
-        if monitor is None or not (monitor.late(now_ns) if if_late else monitor.due(now_ns)):
+        if monitor is None or not monitor.due(now_ns):
             return
         measured_rad = self.measured_rad
         if measured_rad is None or not motion.streaming:

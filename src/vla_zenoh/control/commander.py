@@ -47,9 +47,6 @@ from vla_zenoh.types import MAX_TEXT, ActionChunk, HeldBox, Stamped, Task
 LATE_NS = 10_000_000_000
 """A setting that was put before a stop arrives at most this long after it. Stamps that say so later
 are those of a clock that was set."""
-PLANNING_NS = 2_000_000
-"""A chunk and the motion to its first goal are planned within this. In less time only the chunk is,
-so that the next tick is not missed."""
 
 
 class Commander:
@@ -78,7 +75,6 @@ class Commander:
             CommandedPart(profile.of_part(name), reaches.get(name)) for name in profile.part_names
         )
         self.dry_run = dry_run
-        self._period_ns = round(1e9 / profile.timing.command_hz)
         self.state = State.INACTIVE
         self.why = "not activated yet"
         self._ended = ""  # why the last activation did, if not on request
@@ -110,29 +106,9 @@ class Commander:
             inputs: chunks and states; settings and peers are left to `step`.
             next_ns: `now_ns` of the next call of `step`.
         """
-        self.update(inputs)
+        self._update(inputs)
         self._take_chunks(inputs.chunks, next_ns)
         self._prepared = True
-        if self._period_ns >= PLANNING_NS:
-            self._plan_ahead(next_ns)
-
-    def look_ahead(self, now_ns: int) -> None:
-        """Bound steps that are due later, plan the motion to the next, monitor the measured joints.
-
-        To be called when the commands of a tick are published. Without it all of that is done when
-        it is due, or overdue. Its events are among the next outputs.
-        """
-        for part in self.parts if self.state is State.ACTIVE else ():
-            self._out.events += part.tagged(part.motion.look_ahead(now_ns))
-        planned = self._plan_ahead(now_ns + self._period_ns)
-        for part in self.parts if self.state in OBEYING else ():
-            # One of them is work enough for one tick.
-            part.monitor_joints(now_ns, if_late=planned or part.planner.spent)
-
-    def _plan_ahead(self, next_ns: int) -> bool:
-        """Compute the motion of the next tick; returns whether its goals are new."""
-        at = self.state, self.task, self._watchdog.deadline_ns, next_ns
-        return any([part.motion.plan_ahead(*at) for part in self.parts])
 
     def step(self, inputs: Inputs, now_ns: int, ticks: int = 1) -> Outputs:
         """Process the inputs of one tick.
@@ -144,20 +120,18 @@ class Commander:
                 function of time, so the same trajectory is sampled later, no faster.
         """
         task_before, out, parts = self.task, self._out, self.parts
-        self.update(inputs)
+        self._update(inputs)
         self._apply_settings(inputs.settings, now_ns)
-        planned = self._prepared or bool(inputs.chunks)
         self._take_chunks(inputs.chunks, now_ns)
         self._prepared = False
         self._supervise(now_ns)
         for part in parts:
-            if not planned or self.state not in OBEYING or part.monitor_late(now_ns):
-                try:
-                    part.follow_elbow(obeying=self.state in OBEYING)
-                except RecordError as error:
-                    self._change(Trigger.LOSE, part.says(str(error)))
+            try:
+                part.follow_elbow(obeying=self.state in OBEYING)
+            except RecordError as error:
+                self._change(Trigger.LOSE, part.says(str(error)))
             if self.state in OBEYING:
-                part.monitor_joints(now_ns, if_late=True)  # `look_ahead` is not called in time
+                part.monitor_joints(now_ns)
                 if part.too_near is not None:
                     self._brake_at(part.too_near, part)
         if self.spacing is not None:
@@ -200,8 +174,7 @@ class Commander:
         return any(part.retreat.busy for part in self.parts)
 
     # -- states and settings ------------------------------------------------------------------
-    def update(self, inputs: Inputs) -> None:
-        """Take states; called before `step`, they count for its tick, which has less to do then."""
+    def _update(self, inputs: Inputs) -> None:
         if inputs.peers is not None:
             self._peers = inputs.peers
         for part in self.parts:

@@ -13,8 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Generator, Iterable
 from copy import copy
-from operator import is_
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -245,11 +244,6 @@ class JointPath(AxisSmoother):
         home_rad = self.kinematics.ordered(profile.robot.arm_joints, profile.robot.home_rad)
         super().__init__(home_rad, 1.0 / profile.timing.command_hz, np.array(bounds.motion))
 
-    def fork(self) -> Self:
-        fork = super().fork()
-        fork._hits = self._hits.copy()
-        return fork
-
     def stand(self, position: FloatArray) -> None:
         super().stand(position)
         self._held = False
@@ -440,12 +434,8 @@ class JointPath(AxisSmoother):
         )
 
     def command(self, state: str, cause: Cause | None) -> JointCommand:
-        """The joint command of this tick; the same one where nothing changed."""
-        made_of, (before, sent) = (self.state, state, cause), self._sent
-        if sent is None or not all(map(is_, made_of, before)):
-            sent = computed(JointCommand, self._names, *self.state, state, cause)
-            self._sent = made_of, sent
-        return sent
+        """The joint command of this tick."""
+        return computed(JointCommand, self._names, *self.state, state, cause)
 
 
 def followed_shares(

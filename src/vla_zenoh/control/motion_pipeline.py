@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from operator import is_
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from vla_zenoh.control.limits import FULL, Shares, into_workspace
 from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan, PlanAggregator, joint_goal
 from vla_zenoh.control.preflight import FOLLOWS_JOINT_RAD, LINGER_NS, Settling, follows, held_joints
 from vla_zenoh.control.reachability import ReachabilityFilter
-from vla_zenoh.control.smoothing import PoseCommands, PosePath
+from vla_zenoh.control.smoothing import PosePath, pose_command
 from vla_zenoh.control.step_timing import GoalPace, Mover, TimedGoal
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.kinematics.so3 import Pose, held_pose, pose_distance, pose_of
@@ -85,10 +84,6 @@ class MotionPipeline:
         commanded = None if self._joints is None or reach is None else reach.kinematics
         self._settling = Settling(commanded)
         self._rest_since_ns: int | None = None
-        self._pose_commands = PoseCommands()
-        self._ahead: _Ahead | None = None
-        self.expected: PoseCommand | JointCommand | None = None
-        """The command of the next tick, None: not known."""
 
     # -- state --------------------------------------------------------------------------------
     @property
@@ -247,13 +242,6 @@ class MotionPipeline:
         return [] if mover is None else self._settling.unsettled(mover.motion.pose, self.joints_rad)
 
     # -- one tick -----------------------------------------------------------------------------
-    def look_ahead(self, now_ns: int) -> list[Event]:
-        """Bound the steps after the one that is due, as far as the budget goes."""
-        if self.timeline is None:
-            return []
-        plans = self._aggregator.plans(self.timeline, now_ns)
-        return limit_events(self._planner.bound_due(plans, now_ns, LOOK_AHEAD))
-
     def advance(
         self, state: State, task: Task, overdue_ns: int, now_ns: int, ticks: int
     ) -> tuple[bool, list[Event]]:
@@ -287,13 +275,12 @@ class MotionPipeline:
         mover = self._mover  # which may be another by now
         # A stream that begins must begin at rest: no ticks are made up for.
         for _ in range(ticks if went_on else 1):
-            ahead, self._ahead = self._ahead, None
-            if ahead is None or not all(map(is_, ahead.of, self._depends_on(mover, state))):
-                self._tick(mover, self._joints, state)
-                continue
-            mover.adopt(ahead.mover)  # pyright: ignore
-            if self._joints is not None and ahead.joints is not None:
-                self._joints.adopt(ahead.joints)
+            if self._joints is None or isinstance(mover, JointPath):
+                mover.tick()
+            else:
+                active = self._follows(state)
+                braking = not active and self._back is None
+                self._joints.tick(mover, braking=braking, elbow=active)
         if isinstance(mover, JointPath):
             events += limit_events(mover.taken_hits())
         return self.failures == failures, events
@@ -303,34 +290,17 @@ class MotionPipeline:
         mover = self._mover
         if not self.streaming or mover is None:
             return None
-        return self._command_of(mover, self._joints, self.goal, state)
-
-    def _command_of(
-        self, mover: Mover, joints: PoseToJoint | None, goal: Goal | None, state: State
-    ) -> PoseCommand | JointCommand:
         plan = None if self.timeline is None else self.timeline.plan
         cause = plan.cause if plan is not None and state is State.ACTIVE else None
-        if joints is None:
-            return self._pose_commands.of(mover.motion, goal, state.value, cause)
-        arm = mover if isinstance(mover, JointPath) else joints
+        if self._joints is None:
+            return pose_command(mover.motion, self.goal, state.value, cause)
+        arm = mover if isinstance(mover, JointPath) else self._joints
         return arm.command(state.value, cause)
-
-    def _tick(self, mover: Mover, joints: PoseToJoint | None, state: State) -> None:
-        if joints is None or isinstance(mover, JointPath):
-            mover.tick()
-        else:
-            active = self._follows(state)
-            joints.tick(mover, braking=not active and self._back is None, elbow=active)
 
     def _follows(self, state: State) -> bool:
         """Whether the arm follows a goal, and does not brake."""
         active = state is State.ACTIVE and self.pace.override > 0.0
         return active and not self._changing and not self.held
-
-    def _depends_on(self, mover: Mover, state: State) -> tuple[object, ...]:
-        """What a tick depends on, besides bounds, see `forget_ahead`."""
-        joints = () if self._joints is None else self._joints.moment
-        return *mover.moment, *joints, self._follows(state), self._back
 
     def forget_plan(self, oldest_ns: int, now_ns: int) -> bool:
         """Stand where the arm is, if the plan's observation was taken before `oldest_ns`."""
@@ -381,52 +351,8 @@ class MotionPipeline:
             timed = TimedGoal(goal, timeline.plan, task.rate_hz, overdue_ns, now_ns)
             events += self.pace.set_out(mover, timed, slower)
             self.goal = goal
+        events += limit_events(self._planner.bound_due(plans, now_ns, LOOK_AHEAD))
         return events
-
-    def plan_ahead(self, state: State, task: Task, overdue_ns: int, next_ns: int) -> bool:
-        """Compute the motion of the next tick, `expected`; returns whether its goal is new.
-
-        That tick takes it over if nothing that it depends on has changed by then. The arguments are
-        those of `advance`.
-        """
-        self.pace.forget_ahead()
-        new = state is State.ACTIVE and self._plan_to_next(task, overdue_ns, next_ns)
-        self._tick_ahead(state)
-        return new
-
-    def forget_ahead(self) -> None:
-        """Compute the next tick when it is due: its bounds have changed."""
-        self.pace.forget_ahead()
-        self._ahead = None
-
-    def _tick_ahead(self, state: State) -> None:
-        self._ahead = self.expected = None
-        if self._mover is None or not self.streaming:
-            return
-        if self.goal is not None and isinstance(self._mover, PosePath):
-            self._mover.leash(self.goal, self._dt_s)  # remembers that it does not act
-        goal, mover = self.pace.ahead or (self.goal, self._mover)
-        of, mover = self._depends_on(mover, state), mover.fork()
-        joints = None if self._joints is None else self._joints.fork()
-        self._tick(mover, joints, state)
-        self._ahead = _Ahead(of, mover, joints)
-        self.expected = self._command_of(mover, joints, goal, state)
-
-    def _plan_to_next(self, task: Task, overdue_ns: int, next_ns: int) -> bool:
-        """Plan the motion to the goal that comes into force at the next tick, if one does."""
-        timeline, mover = self.timeline, self._mover
-        if timeline is None or mover is None or self.held or self.pace.override == 0.0:
-            return False
-        plans = self._aggregator.plans(timeline, next_ns)
-        if len(plans) > 1:  # their mix is another goal in every tick
-            return False
-        goal = self._aggregator.goal(plans, next_ns)
-        if goal is self.goal or (goal.arm is not None) is not self.in_joints:
-            return False
-        if mover.leash(goal, self._dt_s)[1]:
-            return False
-        self.pace.plan_ahead(mover, TimedGoal(goal, plans[0], task.rate_hz, overdue_ns, next_ns))
-        return True
 
     def _shorten(self, plans: Sequence[Plan], goal: Goal, cut: Goal, now_ns: int) -> Goal:
         """Shift all later goals by what the leash cut off, or the cut part would come back.
@@ -478,17 +404,3 @@ class MotionPipeline:
         if self._rest_since_ns is None:
             self._rest_since_ns = now_ns
         return self.streaming and now_ns - self._rest_since_ns < LINGER_NS
-
-
-class _Ahead(NamedTuple):
-    """The motion of a tick, computed before it.
-
-    Args:
-        of: what it depends on, see `MotionPipeline._depends_on`.
-        mover: after that tick.
-        joints: likewise, where they follow the pose.
-    """
-
-    of: tuple[object, ...]
-    mover: Mover
-    joints: PoseToJoint | None

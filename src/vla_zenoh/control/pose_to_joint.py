@@ -10,7 +10,6 @@ follows them. An arm that stops does not make up for its lag.
 from __future__ import annotations
 
 from copy import copy
-from operator import is_
 from typing import Any
 
 import numpy as np
@@ -121,19 +120,6 @@ class PoseToJoint:
         self.keep_elbow()
         self.pace = 1.0
         """Rate of the pose's time, 0 to 1."""
-
-    @property
-    def moment(self) -> tuple[object, ...]:
-        """What the next tick depends on, besides the pose: the same objects, the same motion."""
-        return self._now, self._posture_rad, self._waiting_s
-
-    def fork(self) -> PoseToJoint:
-        """A copy that moves by itself."""
-        return copy(self)
-
-    def adopt(self, fork: PoseToJoint) -> None:
-        """Take over the motion of a `fork` that was made of the present one."""
-        vars(self).update(vars(fork))
 
     def keep_elbow(self) -> None:
         """Start an activation: the posture is that of the present joints, or home."""
@@ -281,12 +267,8 @@ class PoseToJoint:
         return float(np.abs(self._now.velocity_rad_s).max()) < REST_RAD_S
 
     def command(self, state: str, cause: Cause | None) -> JointCommand:
-        """The joint command of this tick; the same one where nothing changed."""
-        made_of, (before, sent) = (self._now, state, cause), self._sent
-        if sent is None or not all(map(is_, made_of, before)):
-            sent = computed(JointCommand, self._names, *self._now[:3], state, cause)
-            self._sent = made_of, sent
-        return sent
+        """The joint command of this tick."""
+        return computed(JointCommand, self._names, *self._now[:3], state, cause)
 
 
 def _joint_way(jacobian: FloatArray, way: FloatArray) -> FloatArray:

@@ -11,8 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from operator import is_
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -190,35 +189,15 @@ class PosePath(Smoother):
         self._followed = followed
         # Commanded joints have distance constraints of their own.
         inside = workspace_corners(limits) if followed is None else None
-        self._on_leash: tuple[Goal, Motion, float] | None = None
         super().__init__(start, 1.0 / profile.timing.command_hz, motion_limits(limits), inside)
 
     def leash(self, goal: Goal, ahead_s: float) -> tuple[Goal, list[LimitHit]]:
         """`goal`, or a nearer one on the leash, and the limits that acted."""
-        known = self._on_leash
-        if known and goal is known[0] and self.motion is known[1] and ahead_s == known[2]:
-            return goal, []
-        if self._well_within_leash(goal.pose, ahead_s):
-            self._on_leash = goal, self.motion, ahead_s
-            return goal, []
         (position_m, rotation), twist, acceleration = self.motion
         way = ahead_s * (twist + 0.5 * ahead_s * acceleration)
         ahead = Pose(position_m + way[:3], exp3(way[3:]).dot(rotation))
         pose, hits = leash(self._bounds, goal.pose, ahead)
         return replace(goal, pose=pose, joints_rad=None) if hits else goal, hits
-
-    def _well_within_leash(self, goal: Pose, ahead_s: float) -> bool:
-        """Whether the leash is long enough wherever the arm will be; cheaper than computing where.
-
-        It moves no further than at its speed plus what the acceleration adds.
-        """
-        limits, (pose, twist, acceleration) = self._bounds, self.motion
-        apart_m, apart_rad = pose_distance(goal, pose)
-        x, y, z, rx, ry, rz = map(abs, twist.tolist())
-        ax, ay, az, arx, ary, arz = map(abs, acceleration.tolist())
-        way_m = ahead_s * (x + y + z + ahead_s * (ax + ay + az))
-        turn_rad = ahead_s * (rx + ry + rz + ahead_s * (arx + ary + arz))
-        return apart_m + way_m <= limits.lead_m and apart_rad + turn_rad <= limits.lead_rad
 
     def near(self, goal: Goal) -> Goal:
         """`goal`, or one so near that the arm can retreat from there."""
@@ -255,26 +234,18 @@ class PosePath(Smoother):
         return self._followed(self.motion, goal.pose, self.box)
 
 
-class PoseCommands:
-    """The pose commands of an arm; what does not change is computed once."""
-
-    def __init__(self) -> None:
-        self._sent: tuple[tuple[Any, ...], PoseCommand | None] = (), None
-
-    def of(self, motion: Motion, goal: Goal | None, state: str, cause: Cause | None) -> PoseCommand:
-        """The command of a tick, on the way to `goal`; the same one where nothing changed."""
-        made_of, (before, sent) = (motion, goal, state, cause), self._sent
-        if sent is not None and all(map(is_, made_of, before)):
-            return sent
-        (position_m, rotation), *rates = motion
-        here = quat_from_rotation(rotation)
-        if goal is None:
-            heads_m, heads = position_m, here
-        elif sent is not None and goal is before[1]:
-            heads_m, heads = sent.goal_position_m, sent.goal_quat_xyzw
-        else:
-            heads_m, heads = goal.pose.position_m, quat_from_rotation(goal.pose.rotation)
-        where = position_m, here, *rates, heads_m, heads
-        sent = computed(PoseCommand, *where, state, cause)
-        self._sent = made_of, sent
-        return sent
+def pose_command(motion: Motion, goal: Goal | None, state: str, cause: Cause | None) -> PoseCommand:
+    """The command of a tick on the way to `goal`; None: where the arm is."""
+    (position_m, rotation), twist, acceleration = motion
+    heads_m, heads = (position_m, rotation) if goal is None else goal.pose
+    return computed(
+        PoseCommand,
+        position_m,
+        quat_from_rotation(rotation),
+        twist,
+        acceleration,
+        heads_m,
+        quat_from_rotation(heads),
+        state,
+        cause,
+    )

@@ -23,8 +23,6 @@ Only the speed is bounded by this. Which goal is in force when, and where the ar
 from __future__ import annotations
 
 import math
-from copy import copy
-from operator import is_
 from typing import NamedTuple
 
 import numpy as np
@@ -100,12 +98,6 @@ class StepTiming:
         self._took_ns = 0
         self._begun_ns = self._late_ns = 0.0
         self._gone = self._stretch = self._spare_ns = 0.0
-
-    def fork(self) -> StepTiming:
-        """A copy that goes on by itself."""
-        fork = copy(self)
-        fork._arrivals = copy(self._arrivals)
-        return fork
 
     def share(
         self,
@@ -198,26 +190,6 @@ class TimedGoal(NamedTuple):
     now_ns: int
 
 
-class _Ahead(NamedTuple):
-    """The motion of a goal, computed before the tick in which it is expected to begin.
-
-    Args:
-        goal: of the motion.
-        of: what it depends on: objects that do not change,
-        at: and numbers.
-        timing: with the goal taken.
-        mover: on its way to it.
-        enough: the shares suffice.
-    """
-
-    goal: Goal
-    of: tuple[object, ...]
-    at: tuple[float, ...]
-    timing: StepTiming
-    mover: Mover
-    enough: bool
-
-
 class GoalPace:
     """The motion to each goal, as fast as steps, slowdowns and the speed override allow.
 
@@ -240,7 +212,6 @@ class GoalPace:
         self._slowed_by: set[str] = set()
         self._timings: dict[bool, StepTiming] = {}
         """Of joints, and of poses, since the arm stood."""
-        self._ahead: _Ahead | None = None
 
     def begin(self) -> None:
         """Start an activation."""
@@ -267,21 +238,6 @@ class GoalPace:
             return True
         return (1.0 if slower is None else slower.share) != self.speed
 
-    def plan_ahead(self, mover: Mover, timed: TimedGoal) -> None:
-        """Compute the motion of a goal that is expected in the next tick."""
-        before, self.slower = self.slower, self.slowest(timed.goal)
-        self._ahead = self._motion_to(mover, timed, *self._depends_on(mover, timed))
-        self.slower = before
-
-    @property
-    def ahead(self) -> tuple[Goal, Mover] | None:
-        """The goal that is expected in the next tick, and what is on its way to it."""
-        return None if self._ahead is None else (self._ahead.goal, self._ahead.mover)
-
-    def forget_ahead(self) -> None:
-        """Compute it again: its bounds have changed."""
-        self._ahead = None
-
     def set_out(self, mover: Mover, timed: TimedGoal, slower: Slowdown | None) -> list[Event]:
         """Carry out a goal; reports each reason for being `slower` once per activation."""
         self.slower, events = slower, list[Event]()
@@ -289,33 +245,11 @@ class GoalPace:
             self._slowed_by.add(slower.name)
             name, _, value, limit, *_ = slower
             events.append(make_event("info", "limit", name, f"slower{slower.at}", value, limit))
-        ahead, self._ahead = self._ahead, None
-        of, at = self._depends_on(mover, timed)
-        if ahead is None or ahead.at != at or not all(map(is_, ahead.of, of)):
-            ahead = self._motion_to(mover, timed, of, at)
-        self._timings[isinstance(mover, JointPath)] = ahead.timing
-        mover.adopt(ahead.mover)  # pyright: ignore
-        self.slowing &= not (ahead.enough and _within(mover, self.override))
-        return events
-
-    def _depends_on(
-        self, mover: Mover, timed: TimedGoal
-    ) -> tuple[tuple[object, ...], tuple[float, ...]]:
-        """The objects and numbers that the motion of a goal depends on."""
         goal, plan, rate_hz, overdue_ns, now_ns = timed
-        index, shares = plan.index_at(now_ns), (self.speed, self.override, self.slowing)
-        return (goal, plan, mover, mover.state), (now_ns, overdue_ns, rate_hz, index, *shares)
-
-    def _motion_to(
-        self, mover: Mover, timed: TimedGoal, of: tuple[object, ...], at: tuple[float, ...]
-    ) -> _Ahead:
-        """The motion of a goal from the present state, which `of` and `at` describe."""
         in_joints = isinstance(mover, JointPath)
-        timing, mover = self._timings.get(in_joints), mover.fork()
-        timing = StepTiming(mover.box) if timing is None else timing.fork()
-        goal, plan, rate_hz, overdue_ns, now_ns = timed
         override, speed = self.override, self.speed * self.override
         if not plan.soonest:
+            timing = self._timings.setdefault(in_joints, StepTiming(mover.box))
             way, (velocity, _) = mover.way_to(goal), mover.axis_rates()
             index, left_s = plan.index_at(now_ns), (overdue_ns - now_ns) / 1e9
             share = timing.share(plan, index, now_ns, 1.0 / rate_hz, left_s, way, velocity)
@@ -326,7 +260,8 @@ class GoalPace:
         shares = Shares(*map(min, mover.shares(goal), Shares(speed, change, jerk)))
         hard = self.slowing and (in_joints or not self._joints_follow)
         enough = mover.go_to(goal, shares, all_to_stop=hard)
-        return _Ahead(goal, of, at, timing, mover, enough)
+        self.slowing &= not (enough and _within(mover, override))
+        return events
 
 
 def _within(mover: Mover, override: float) -> bool:

@@ -232,10 +232,6 @@ class JointMonitor:
         """The next check is due."""
         return now_ns >= self._next_ns
 
-    def late(self, now_ns: int) -> bool:
-        """A check is overdue by a whole period."""
-        return now_ns >= self._next_ns + PERIOD_NS // 2
-
     def update(
         self,
         measured_rad: FloatArray,

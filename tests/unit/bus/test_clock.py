@@ -76,13 +76,6 @@ def test_an_arrival_ends_the_wait_once_and_the_turn_is_at_its_time_all_the_same(
     assert loop.wait().nominal_ns == due_ns
 
 
-def test_the_wait_for_an_arrival_can_end_before_the_next_cycle() -> None:
-    loop, arrival = FixedRate(1.0), threading.Event()
-    before_ns = round(0.95e9)
-    assert not loop.wait_for(arrival, before_ns)
-    assert 0 < loop.next_ns - time.monotonic_ns() <= before_ns
-
-
 def test_cycles_that_are_skipped_are_not_missed() -> None:
     loop = FixedRate(RATE_HZ)
     loop.wait()

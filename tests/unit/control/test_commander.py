@@ -22,11 +22,11 @@ from command_rig import (
 
 from vla_zenoh.control.axis_smoothing import AxisSmoother
 from vla_zenoh.control.commander import Commander, Inputs, Setting
-from vla_zenoh.control.motion_pipeline import LINGER_NS, MotionPipeline
+from vla_zenoh.control.motion_pipeline import LINGER_NS
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.kinematics.so3 import norm3
 from vla_zenoh.profile import load_profile, override
-from vla_zenoh.types import FloatArray, GripperState, HeldBox, PoseState, Stamped
+from vla_zenoh.types import GripperState, HeldBox, PoseState, Stamped
 
 UP = [0.0, 0.0, 0.01, 0.0, 0.0, 0.0, 0.0]
 FORTH = [0.02, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
@@ -685,32 +685,6 @@ def test_an_arm_whose_joints_could_not_follow_can_be_activated_while_it_is_pause
         rig.put("active", True)
     rig.run(0.1)
     assert rig.state == "active", rig.commander.why
-
-
-def velocities_rad_s(held_after: int) -> list[FloatArray]:
-    """Of joints on their way, whose gripper holds a box after so many ticks."""
-    of = override(load_profile("panda_sim"), {"robot": {"command": "joint"}})
-    reach = ReachabilityFilter(of)
-    rig = Rig(of, reach=reach)
-    rig.stand_at(reach.kinematics, np.array(of.robot.home_rad))
-    rig.activate()
-    rig.send([DOWN_FAST] * 8)
-    rig.run(0.1)
-    for _ in range(held_after):
-        rig.tick()
-    outs = [rig.put("held", BOX), *(rig.tick() for _ in range(4))]
-    return [out.joint.velocity_rad_s for out in outs if out.joint is not None]
-
-
-@pytest.mark.parametrize("held_after", range(4))  # distances are computed in every fourth tick
-def test_a_box_is_kept_clear_from_the_tick_on_in_which_the_gripper_holds_it(
-    held_after: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    ahead = velocities_rad_s(held_after)
-    monkeypatch.setattr(MotionPipeline, "_tick_ahead", lambda *_: None)
-    then = velocities_rad_s(held_after)
-    assert len(ahead) == len(then) == 5
-    np.testing.assert_allclose(ahead, then, atol=1e-4)
 
 
 @pytest.mark.parametrize(("name", "value"), [("prompt", "go down"), ("worker", OTHER)])

@@ -203,7 +203,6 @@ class Lockstep:
         inputs, self._inbox = self._inbox, Inputs([], [])
         out = self.commander.step(inputs, self.wall_ns(COMMAND))
         self._prepared = False
-        self.commander.look_ahead(self.wall_ns(COMMAND))
         self._publish(out)
         position_m, rotation = self.world.tcp()
         self.trace.time_ns.append(self.now_ns)

@@ -79,11 +79,6 @@ class CommandInputs:
         ]
         self._last_clock = 0.0
 
-    @property
-    def has_states(self) -> bool:
-        """Whether there are states for `poll_streams`."""
-        return any(part.has_new for part in self._parts.values())
-
     def read_news(self, now_ns: int) -> None:
         """Read status and specs of the other nodes, for the next `poll`."""
         self._peer_monitor.read_news(now_ns)
@@ -192,11 +187,6 @@ class _PartInputs:
         self._writers = {kind: SingleWriterFilter(silence_s) for kind in self._rings}
         self.held = node.subscribe(keys.held, ZenohRing(16, WORDS))
         self._last_joint = 0.0
-
-    @property
-    def has_new(self) -> bool:
-        """Whether a state came since the last `poll`; joints never come alone."""
-        return self._rings[PoseState].has_new or self._rings[GripperState].has_new
 
     def poll(self, requested: bool) -> NewStates:
         """The newest states; joints, which are expensive to decode, every `JOINT_PERIOD_S` and when

@@ -28,7 +28,7 @@ from vla_zenoh.nodes.command.inputs import CommandInputs
 from vla_zenoh.profile import Profile
 from vla_zenoh.runtime.estop_latch import EstopLatch
 from vla_zenoh.runtime.process import realtime_thread
-from vla_zenoh.types import LATENCY_STAGES, Cause, Event, JointCommand
+from vla_zenoh.types import LATENCY_STAGES, Cause, Event
 
 TASK_PERIOD_S = 0.2
 BRAKE_BEFORE_EXIT_S = 1.0
@@ -37,14 +37,9 @@ MAX_WHY, MAX_LIMIT = 2000, 200
 CHORES_S = 0.05
 """Period of tasks that no motion depends on: status, clock queries, reading other nodes' status."""
 PLANNING_NS = 1_500_000
-"""A chunk is planned this long before the next tick, or at once if it arrives later, or in the tick
-if less than `READING_NS` before. Its other readers get it first: planning at a real-time priority
-keeps a processor from them. Where the period is shorter, so that a tick would be missed, it is
-planned after the next tick."""
-READING_NS = 400_000
-"""States are read this long before each tick, which then only has to read those that came since.
-Where the period is too short to plan a chunk in, they are read in the tick alone: there most ticks
-have no new ones."""
+"""A chunk is planned this long before the next tick, or at once if it arrives later. Its other
+readers get it first: planning at a real-time priority keeps a processor from them. Where the period
+is shorter, so that a tick would be missed, it is planned after the next tick."""
 REST_S, REST_TIMEOUTS = 0.02, 5
 """Period of the ticks while the arm rests, and how many of them a command timeout has at least."""
 REST_AFTER_NS = 100_000_000
@@ -144,18 +139,13 @@ class CommandNode:
         rest_periods = max(int(rest_s * timing.command_hz), 1)
         give_up = 0.0
         tick_first = PLANNING_NS * timing.command_hz > 1e9
-        reading_ns = 0 if tick_first else READING_NS
         while True:
-            arrived = loop.wait_for(arrival, reading_ns)
+            arrived = loop.wait_for(arrival)
             if arrived:
                 loop.resume()
                 if not tick_first:
                     loop.wait_until(PLANNING_NS)
                     self._prepare(loop.next_ns)
-            if reading_ns:
-                loop.wait_until(reading_ns)
-                if self._inputs.has_states:
-                    self.commander.update(self._inputs.poll_streams(take_chunks=False))
             tick = loop.wait()
             if tick.periods > 1:
                 self.node.counters["command.missed_ticks"] += tick.periods - 1
@@ -205,11 +195,6 @@ class CommandNode:
         if self._latch is not None and any(event.kind == "transition" for event in out.events):
             latched = self.commander.state in (State.STOPPED, State.FAULT)
             self._latch.set(self.commander.why if latched else None)
-        self.commander.look_ahead(now_ns)
-        for part in self.commander.parts:
-            command = part.motion.expected
-            if command is not None:  # its bytes are kept for the next tick
-                self._outs[part.name][isinstance(command, JointCommand)].encoded(command)
         if chores:
             self._inputs.read_news(now_ns)
         if chores or out.events or out.task_changed:
