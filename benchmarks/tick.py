@@ -193,7 +193,7 @@ def _row(name: str, spent_us: np.ndarray) -> str:
 
 
 def main() -> None:
-    arguments = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    arguments = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     arguments.add_argument("--duration-s", type=float, default=5.0, help="of every scenario")
     arguments.add_argument("--runs", type=int, default=5, help="of which the least counts")
     arguments.add_argument("--command", choices=("pose", "joint", "both"), default="both")

@@ -67,7 +67,7 @@ class PerfectPair:
         self.spec, self.now_ns, self._ticks, self._chunks = spec, START_NS, 0, 0
         self.commander = Commander(shipped(), reach=reach())
         home_rad = np.array(shipped().robot.home_rad)
-        self.joints_rad = dict.fromkeys(PARTS, home_rad)
+        self.joints_rad: dict[str, np.ndarray] = dict.fromkeys(PARTS, home_rad)
         self._peers = PeerSnapshot(
             alive=frozenset({"sim", "worker-scripted_pair"}),
             specs={"scripted_pair": spec},
@@ -97,12 +97,13 @@ class PerfectPair:
         arm, joints_rad = reach()[part].kinematics, self.joints_rad[part]
         pose = arm.forward(joints_rad)
         still = np.zeros(len(joints_rad))
-        states = (
-            PoseState(pose.position_m, quat_from_rotation(pose.rotation), np.zeros(6)),
-            GripperState(0.04, False, False),
-            JointState(arm.arm_joints, joints_rad, still, None),
+        told = PoseState(pose.position_m, quat_from_rotation(pose.rotation), np.zeros(6))
+        joints = JointState(arm.arm_joints, joints_rad, still, None)
+        return NewStates(
+            Stamped(header, told, self.now_ns),
+            Stamped(header, GripperState(0.04, False, False), self.now_ns),
+            Stamped(header, joints, self.now_ns),
         )
-        return NewStates(*(Stamped(header, state, self.now_ns) for state in states))
 
     def _chunk(self) -> Stamped[ActionChunk]:
         self._chunks += 1

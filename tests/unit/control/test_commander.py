@@ -1140,11 +1140,13 @@ def test_a_chunk_planned_before_its_tick_gives_the_commands_that_the_tick_would(
                 rig.commander.prepare(Inputs(chunks=chunks), rig.now_ns + rig.period_ns)
                 chunks = []
             out = rig.tick(chunks=chunks)
-            record = out.pose or out.joint
-            assert record is not None
-            moved[-1].append(record.position_m if out.pose else record.position_rad)
+            if out.pose is not None:
+                moved[-1].append(out.pose.position_m)
+            else:
+                assert out.joint is not None
+                moved[-1].append(out.joint.position_rad)
         assert rig.commander.progress.chunks == 8
-    np.testing.assert_array_equal(*moved)
+    np.testing.assert_array_equal(moved[0], moved[1])
     assert np.linalg.norm(moved[0][-1] - moved[0][0]) > 0.01
 
 
