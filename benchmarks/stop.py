@@ -91,8 +91,6 @@ class _Lab:
         self._folder = tempfile.TemporaryDirectory()
         self._file = Path(self._folder.name) / "robot.yaml"
         self._file.write_text(to_yaml(profile), "utf-8")
-        # So that the outline of the profile is known, as where `activate` was typed before.
-        subprocess.run(self._typed("status", "--json"), stdout=subprocess.DEVNULL, check=False)
 
     def _typed(self, *words: str) -> list[str]:
         return [sys.executable, "-m", "vla_zenoh", *words, "--profile", str(self._file)]

@@ -251,6 +251,6 @@ def test_the_command_line_knows_every_command_without_any_optional_library() -> 
 def test_a_command_that_is_not_called_is_not_imported() -> None:
     """Every node and every word of a person waits for the import of the command line."""
     loaded = loaded_after("vla_zenoh.cli.main")
-    light = {"vla_zenoh.cli.main", "vla_zenoh.cli.words"}
+    light = {"vla_zenoh.cli.main", "vla_zenoh.cli.options"}
     assert {name for name in loaded if name.startswith("vla_zenoh.cli.")} == light
     assert loaded.isdisjoint({"numpy", "pydantic", "vla_zenoh.nodes"})

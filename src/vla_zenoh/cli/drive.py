@@ -1,7 +1,4 @@
-"""vla-zenoh prompt, activate, deactivate, use, rate, speed, stop, reset: one setting each.
-
-Typer, Rich, numpy and the profile's schema are not loaded here, see ``words.py``.
-"""
+"""vla-zenoh prompt, activate, deactivate, use, rate, speed, stop, reset: one setting each."""
 
 from __future__ import annotations
 
@@ -16,16 +13,16 @@ from contextlib import contextmanager, nullcontext, suppress
 from functools import wraps
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
+import typer
+
+from vla_zenoh.cli.options import AnswerOption, options
 from vla_zenoh.cli.plain import BOLD_RED, complain, fail, json_answer, say, say_marked, warn
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import SecurityError, nearest
 from vla_zenoh.keys import CRASHED, Keys, worker_node
 
 if TYPE_CHECKING:
-    import typer
-
     from vla_zenoh.bus.client import Client
-    from vla_zenoh.cli.options import AnswerOption
     from vla_zenoh.types import Task
 
 PATIENCE_S = 3.0
@@ -50,6 +47,7 @@ def _answered(command: Callable[..., None]) -> Callable[..., None]:
     return run
 
 
+@options
 @_answered
 def prompt(
     text: Annotated[str, typer.Argument(help="Instruction for the model.")],
@@ -66,6 +64,7 @@ def prompt(
         _show(target, client, said)
 
 
+@options
 @_answered
 def activate(
     target: RobotTarget,
@@ -119,6 +118,7 @@ def _inactive(client: Client, activated: Task) -> str:
     return str(status.detail.get("why", "")) or status.state
 
 
+@options
 @_answered
 def deactivate(target: RobotTarget, as_json: AnswerOption = False) -> None:
     """Brake the arm; then no worker moves it."""
@@ -132,6 +132,7 @@ def _deactivate(target: RobotTarget, client: Client) -> None:
     _show(target, client, "inactive, the arm stands", ": ")
 
 
+@options
 @_answered
 def use(
     worker: Annotated[str, typer.Argument(help="Worker whose chunks move the arm.")],
@@ -160,6 +161,7 @@ def _require_worker(client: Client, worker: str) -> None:
         fail(f"worker {worker!r} is not alive{why} Alive are: {', '.join(alive) or 'none'}")
 
 
+@options
 @_answered
 def rate(
     rate_hz: Annotated[float, typer.Argument(help="Chunks per second.")],
@@ -174,6 +176,7 @@ def rate(
         _show(target, client, f"rate: {client.set_rate(rate_hz).rate_hz:g} Hz")
 
 
+@options
 @_answered
 def speed(
     target: RobotTarget,
@@ -203,6 +206,7 @@ def speed(
         _show(target, client, f"speed: {task.speed_percent:g} % of the planned speed")
 
 
+@options
 @_answered
 def stop(
     target: RobotTarget,
@@ -237,6 +241,7 @@ def _confirm_stop(target: RobotTarget, client: Client, *, every: bool) -> None:
         warn(f"not stopped: {', '.join(others)}; `{target.typed('stop', '--all')}` stops all")
 
 
+@options
 @_answered
 def reset(target: RobotTarget, as_json: AnswerOption = False) -> None:
     """Clear an emergency stop or a fault. The arm stays inactive."""

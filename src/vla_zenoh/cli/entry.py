@@ -1,18 +1,10 @@
-"""Entry of ``vla-zenoh``. The commands that drive a robot start at once; all others use Typer.
-
-Typer, Rich and the profile's schema take half a second to load, during which an arm that should
-stop keeps moving.
-"""
+"""Entry of ``vla-zenoh``: the priority of a stop, and errors as one line."""
 
 from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Sequence
 from contextlib import suppress
-from importlib import import_module
-
-from vla_zenoh.cli.words import WORDS, parse
 
 EXTRA_OF = {
     **dict.fromkeys(("pinocchio", "ruckig"), "control"),
@@ -34,7 +26,9 @@ def main() -> None:
         with suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, 0, HASTE)
     try:
-        _chosen(sys.argv[1:])()
+        from vla_zenoh.cli.main import app
+
+        app()
     except KeyboardInterrupt:
         sys.exit(130)
     except Exception as error:
@@ -75,19 +69,3 @@ def _tell_supervisor(error: Exception, sentence: str | None) -> None:
         say(f"{DETAIL}{line}")
     what = sentence or f"{type(error).__name__}: {error}"
     say(f"{FATAL}{'; '.join(what.splitlines())}")
-
-
-def _chosen(words: Sequence[str]) -> Callable[[], None]:
-    parsed = parse(words)
-    if parsed is None:
-        from vla_zenoh.cli.main import app
-
-        return app
-    import zenoh
-
-    from vla_zenoh.cli.target import RobotTarget
-
-    zenoh.init_log_from_env_or("off")  # as main.py does
-    name, arguments, target = parsed
-    function = getattr(import_module(WORDS[name].module), name)
-    return lambda: function(target=RobotTarget(**target), **arguments)

@@ -7,22 +7,20 @@ command that runs completes nothing.
 from __future__ import annotations
 
 import os
-import re
 import shlex
 from collections import UserDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from importlib import import_module
 from importlib.resources import files
-from pathlib import Path
 from textwrap import indent
 from typing import Any, NamedTuple
 
 import typer
 import zenoh
-from typer.core import TyperCommand, TyperGroup
+from typer.core import TyperGroup
 
 from vla_zenoh import __version__, resources
-from vla_zenoh.cli.words import DEFAULT_PROFILE, PROFILE_VARIABLE, WORDS
+from vla_zenoh.cli.options import DEFAULT_PROFILE, PROFILE_VARIABLE
 from vla_zenoh.errors import VlaZenohError, describe_fault
 from vla_zenoh.keys import KEY_PATHS
 
@@ -150,10 +148,6 @@ def _load(path: Sequence[str], entry: str | Group) -> Any:
     else:
         module, _, attribute = entry.partition(":")
         found = getattr(import_module(f"vla_zenoh.{module}"), attribute)
-        if name in WORDS:  # their modules do not load Typer
-            from vla_zenoh.cli.options import options
-
-            found = options(found)
     around = typer.Typer(rich_markup_mode=None, add_completion=False)
     around.callback()(lambda: None)  # makes it a group even with a single command
     if isinstance(found, typer.Typer):
@@ -170,18 +164,6 @@ def _load(path: Sequence[str], entry: str | Group) -> Any:
     return command
 
 
-def _short_help(entry: str) -> str | None:
-    """Line of a command in the help of its group, from its source: importing all takes 0.5 s.
-
-    None: it is not found there.
-    """
-    module, _, name = entry.partition(":")
-    file = Path(__file__).parents[1].joinpath(*module.split(".")).with_suffix(".py")
-    says = rf'(?:def {name}\(.*?^    """|{name} = typer\.Typer\([^)]*?help="\s*)(.*?)"'
-    found = re.search(f"^{says}", file.read_text("utf-8"), re.DOTALL | re.MULTILINE)
-    return TyperCommand(None, help=found[1]).get_short_help_str(MAX_SHORT) if found else None
-
-
 def _lazy_group(
     panels: Mapping[str, Mapping[str, str | Group]], path: Sequence[str] = ()
 ) -> type[TyperGroup]:
@@ -195,13 +177,8 @@ def _lazy_group(
             for title, names in panels.items():
                 with formatter.section(title):
                     formatter.write_dl(
-                        (f"{name:<{width}}", self._line(name, entry))
-                        for name, entry in names.items()
+                        (f"{name:<{width}}", self.commands[name].short_help) for name in names
                     )
-
-        def _line(self, name: str, entry: str | Group) -> str:
-            line = entry.help if isinstance(entry, Group) else _short_help(entry)
-            return line or self.commands[name].short_help
 
         def invoke(self, ctx: Any) -> Any:
             try:

@@ -13,11 +13,13 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_type_hints
 import typer
 
 from vla_zenoh.bus.host import HOST_VARIABLE
-from vla_zenoh.cli.words import DEFAULT_PROFILE, PROFILE_VARIABLE
 
 if TYPE_CHECKING:  # Pydantic and the schema: `up` has more to do while it loads them
     from vla_zenoh.policy.loader import ModelFile
     from vla_zenoh.profile import Profile
+
+DEFAULT_PROFILE = "panda_sim"
+PROFILE_VARIABLE = "VLA_ZENOH_PROFILE"
 
 ProfileOption = Annotated[
     str, typer.Option("--profile", "-p", envvar=PROFILE_VARIABLE, help="Name or path of a profile.")

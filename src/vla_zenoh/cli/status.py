@@ -11,20 +11,21 @@ import json
 import sys
 from typing import TYPE_CHECKING, Annotated
 
+import typer
+
 from vla_zenoh.cli.node_rows import acting_limits, hosts_down, mode_of, node_rows
+from vla_zenoh.cli.options import JsonOption, options
 from vla_zenoh.cli.plain import fail
 from vla_zenoh.cli.target import RobotTarget
 
 if TYPE_CHECKING:
-    import typer
-
     from vla_zenoh.bus.client import Client
-    from vla_zenoh.cli.options import JsonOption
 
 LISTEN_S = 1.2
 """A node publishes its status twice a second."""
 
 
+@options
 def status(
     target: RobotTarget,
     as_json: JsonOption = False,

@@ -25,7 +25,7 @@ from pydantic import (
 )
 
 from vla_zenoh.errors import SpecError, describe_faults
-from vla_zenoh.types.records import MAX_DEPTH_UNIT_M, MIN_DEPTH_UNIT_M
+from vla_zenoh.types import MAX_DEPTH_UNIT_M, MIN_DEPTH_UNIT_M
 
 StatePart = Literal["joint", "pose", "gripper", "privileged", "wrench", "effort"]
 Resize = Literal["none", "stretch", "pad", "crop"]

@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field
 
 from vla_zenoh.errors import nearest
 from vla_zenoh.profile.section import Distinct, Fault, Name, Names, Place, Section, Text, Word
-from vla_zenoh.types.records import MAX_DEPTH_UNIT_M, MIN_DEPTH_UNIT_M
+from vla_zenoh.types import MAX_DEPTH_UNIT_M, MIN_DEPTH_UNIT_M
 
 IP_PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws")
 FILE_PROTOCOLS = ("unixsock-stream",)

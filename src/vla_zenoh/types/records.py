@@ -13,8 +13,10 @@ from numpy.typing import ArrayLike, NDArray
 from vla_zenoh.errors import RecordError
 from vla_zenoh.types.arrays import FloatArray, float32_table, numbers, unit_quaternion, vector
 from vla_zenoh.types.stream import (
+    MAX_DEPTH_UNIT_M,
     MAX_ENTRIES,
     MAX_TEXT,
+    MIN_DEPTH_UNIT_M,
     boolean,
     details,
     entries,
@@ -29,7 +31,6 @@ from vla_zenoh.types.stream import (
     texts,
 )
 
-MIN_DEPTH_UNIT_M, MAX_DEPTH_UNIT_M = 1e-5, 0.1
 """Metres of one count of a depth image: from 0.65 m to 6.5 km in all."""
 MAX_COUNT = 2**16 - 1
 MAX_RAW_NUMBERS = 4096

@@ -27,6 +27,7 @@ MAX_NAMES = 1024
 MAX_ENTRIES = 1024
 MAX_DETAIL_TEXT = 65_536
 MAX_DETAIL_DEPTH = 3
+MIN_DEPTH_UNIT_M, MAX_DEPTH_UNIT_M = 1e-5, 0.1
 
 set_field = object.__setattr__
 """Puts the final form of a field into a frozen record."""

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import subprocess
-import sys
 from collections.abc import Iterator
 from typing import Any
 
@@ -12,7 +10,7 @@ import pytest
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from vla_zenoh.cli.main import COMMANDS, COMPLETIONS, _short_help, app, examples
+from vla_zenoh.cli.main import COMPLETIONS, app, examples
 
 LEAST_EXAMPLES = 2
 ROOT: Any = get_command(app)
@@ -102,25 +100,3 @@ def test_every_profile_option_and_key_is_completed() -> None:
     named = {parameter.name for path in ALL for parameter in found(path).params}
     of_one = {name.rpartition(".")[2] for name in COMPLETIONS}
     assert of_one <= named
-
-
-def test_the_line_of_a_command_is_the_same_without_importing_it() -> None:
-    for names in COMMANDS.values():
-        for name, entry in names.items():
-            assert (
-                not isinstance(entry, str) or _short_help(entry) == ROOT.commands[name].short_help
-            )
-
-
-def test_help_imports_no_command() -> None:
-    code = (
-        "import sys, vla_zenoh.cli.main as main\n"
-        "try: main.app(['--help'])\n"
-        "except SystemExit: pass\n"
-        "print([name for name in ('numpy', 'pydantic', 'rich', 'yaml') if name in sys.modules])"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
-    )
-    assert "Drive the robot" in done.stdout
-    assert done.stdout.splitlines()[-1] == "[]"

@@ -1,0 +1,93 @@
+"""The commands that drive a robot: what they load, how a stop starts, their answers as JSON."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import subprocess
+import sys
+
+import pytest
+from typed import typed
+from typer.testing import CliRunner
+
+from vla_zenoh.cli.main import app
+from vla_zenoh.cli.plain import json_answer, say, warn
+from vla_zenoh.errors import SessionError
+
+NOWHERE = ("--connect", "tcp/127.0.0.1:9")
+
+
+def test_help_of_a_stop_is_complete() -> None:
+    done = CliRunner().invoke(app, ["stop", "--help"], env={"COLUMNS": "120"})
+    for words in ("--all", "--wait-key", "--profile", "--connect", "--host", "--robot"):
+        assert words in done.output
+
+
+def after_typing(*words: str, printed: str) -> str:
+    """What a process prints after the command line has run in it."""
+    code = (
+        f"import os, sys\nsys.argv = {['vla-zenoh', *words]!r}\n"
+        "from vla_zenoh.cli.entry import main\n"
+        "try: main()\nexcept SystemExit: pass\n"
+        f"print({printed})"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
+    )
+    return done.stdout.strip()
+
+
+@pytest.mark.parametrize("line", ["stop", "prompt go"])
+def test_a_command_that_drives_does_not_load_numpy(line: str) -> None:
+    """It takes longer to load than all that the command needs."""
+    assert after_typing(*line.split(), *NOWHERE, printed="'numpy' in sys.modules") == "False"
+
+
+def test_a_stop_starts_with_raised_priority_where_permitted() -> None:
+    most, _ = resource.getrlimit(resource.RLIMIT_NICE)
+    permitted = os.geteuid() == 0 or 20 - most <= -20
+    here = str(os.getpriority(os.PRIO_PROCESS, 0))
+    niceness = "os.getpriority(os.PRIO_PROCESS, 0)"
+    assert after_typing("reset", *NOWHERE, printed=niceness) == here
+    assert after_typing("stop", *NOWHERE, printed=niceness) == ("-20" if permitted else here)
+
+
+@pytest.mark.parametrize("line", ["prompt go", "activate", "stop", "reset", "use brick", "rate 5"])
+def test_with_json_a_failure_is_one_object_and_nothing_else(
+    capsys: pytest.CaptureFixture[str], line: str
+) -> None:
+    done = typed(capsys, *line.split(), "--json", *NOWHERE)
+    assert done.code == 1
+    assert done.stderr == ""
+    answer = json.loads(done.stdout)
+    assert answer["ok"] is False
+    assert "no Zenoh router answers" in answer["errors"][0]
+
+
+def test_with_json_every_reason_of_a_rejection_is_an_entry(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(SystemExit) as ended, json_answer():
+        raise SessionError("activate rejected:\n  - no prompt is set\n  - the router is gone")
+    assert ended.value.code == 1
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["reasons"] == ["no prompt is set", "the router is gone"]
+
+
+def test_with_json_the_lines_of_a_command_are_its_messages(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with json_answer():
+        say("rate: 5 Hz")
+        warn("not stopped: b")
+    captured = capsys.readouterr()
+    assert captured.err == ""
+    assert json.loads(captured.out) == {
+        "ok": True,
+        "messages": ["rate: 5 Hz"],
+        "warnings": ["not stopped: b"],
+        "errors": [],
+        "reasons": [],
+    }
