@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +32,7 @@ HOME_M = (0.49, 0.11, 0.43)
 TEXT_M = 0.005
 """The text rounds to centimetres."""
 DOWN = -0.999
+SHIPPED = "example-robot-data/robots/ur_description/"
 MESHES = "package://ur_description/"
 """How drivers of ROS name the folder of a robot's shapes."""
 
@@ -151,12 +156,31 @@ def test_its_own_arm_is_right_and_goes_where_it_is_told_to(folder: Path) -> None
     np.testing.assert_array_equal(reading.position_rad, target_rad)
 
 
-def test_the_profile_and_the_arm_of_the_page_on_a_ur5e_are_right(tmp_path: Path) -> None:
+def _like_the_makers(package: Path) -> None:
+    """A package as the maker's: a xacro with an argument, and meshes by the package's name."""
+    urdf = robot_urdf(UR5)
+    (package / "urdf").mkdir(parents=True)
+    (package / "package.xml").write_text("<package><name>ur_description</name></package>")
+    text = urdf.read_text().replace(f"package://{SHIPPED}", MESHES)
+    head = '<robot xmlns:xacro="http://ros.org/wiki/xacro" name="$(arg name)">'
+    arguments = '<xacro:arg name="name" default="ur"/><xacro:arg name="ur_type" default="ur5"/>'
+    text = re.sub(r"<robot[^>]*>", head + arguments, text, count=1)
+    (package / "urdf" / "ur.urdf.xacro").write_text(text)
+    shutil.copytree(urdf.parents[1] / "meshes", package / "meshes")
+
+
+def test_the_steps_of_the_page_on_a_ur5e_are_right(tmp_path: Path) -> None:
+    """From the maker's xacro on; for it stands one made of the UR5's URDF, which has its joints."""
     page = TEXT_FILE.with_name("ur5e-without-ros.md").read_text("utf-8")
     for name, text in re.findall(r"```\w+\n# (\w+\.\w+)\n(.*?)```", page, re.DOTALL):
-        # The maker's description is not in any package; the UR5's has the same joints.
-        text = text.replace("description: ur5e.urdf", f"description: {UR5}")
         (tmp_path / name).write_text(text, "utf-8")
+    _like_the_makers(tmp_path / "ur_description")
+    lines = re.search(r"^    (xacrodoc .*\\\n.*)$", page, re.MULTILINE)
+    assert lines is not None
+    programs = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    subprocess.run(
+        lines[1], shell=True, check=True, cwd=tmp_path, env={**os.environ, "PATH": programs}
+    )
     file = tmp_path / "ur5e.yaml"
     result = CliRunner().invoke(profile_app, ["check", str(file)])
     assert result.exit_code == 0, result.output

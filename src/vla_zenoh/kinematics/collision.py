@@ -243,7 +243,7 @@ def _one_hull_a_link(kinematics: Kinematics) -> Any:
         points = coal.StdVec_Vec3s()
         points.extend([corner.copy() for corner in np.concatenate(found)])
         hull = coal.Convex.convexHull(points, True, "Qt")
-        frame = full.getFrameId(link)
+        frame = full.getFrameId(link, pin.FrameType.BODY)
         parent = full.frames[frame].parentJoint
         hulls.addGeometryObject(pin.GeometryObject(link, parent, frame, pin.SE3.Identity(), hull))
     _, reduced = pin.buildReducedModel(

@@ -1,7 +1,8 @@
 """Positions of finger joints and the opening of a gripper.
 
 Sliding fingers add up to the opening, unless the profile gives their positions when open and shut;
-revolute fingers need these. Several joints move alike, as those of one motor do.
+revolute fingers need these. Several joints move alike, as those of one motor do, or as mirror
+images: then `Kinematics.finger_signs` has -1 for those that go the other way.
 """
 
 from __future__ import annotations
@@ -31,13 +32,13 @@ class Fingers:
             self._offset_m = -self._slope * ends.shut
 
     def width_m(self, positions: ArrayLike) -> float:
-        """Opening at the measured positions (k,), m or rad."""
+        """Opening at the measured positions (k,), m or rad, each with its finger's sign."""
         return self._slope * float(np.asarray(positions, np.float64).mean()) + self._offset_m
 
     def speed_m_s(self, velocities: ArrayLike) -> float:
-        """Speed of the opening at joint velocities (k,), m/s or rad/s."""
+        """Speed of the opening at joint velocities (k,), m/s or rad/s, with their signs."""
         return abs(self._slope * float(np.asarray(velocities, np.float64).mean()))
 
     def position(self, width_m: float) -> float:
-        """Position of each joint at an opening, m or rad."""
+        """Position of each joint at an opening, m or rad, to be multiplied by its sign."""
         return (width_m - self._offset_m) / self._slope

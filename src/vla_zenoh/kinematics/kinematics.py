@@ -9,7 +9,7 @@ whatever order a profile or a `JointState` lists them in.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 
 from vla_zenoh import resources
 from vla_zenoh.errors import ProfileError, RecordError, nearest
+from vla_zenoh.kinematics.description import MOVING, DescribedJoint, Description, Mimic
 from vla_zenoh.kinematics.so3 import Pose, log3
 from vla_zenoh.profile import JointEnds, Profile
 from vla_zenoh.types import FloatArray, JointState
@@ -54,6 +55,7 @@ class Kinematics:
         finger_joints: locked where the hand is widest.
         base_frame: poses are given in this link, which must not move; None: the URDF's root.
         joint_range_rad: narrows the range of each of `arm_joints`; empty: as the URDF has it.
+        locked_rad: where joints between base and TCP stand that are not commanded.
         finger_ends: positions of the open and shut hand; None: open at their upper limit, which
             needs joints that slide.
 
@@ -72,32 +74,45 @@ class Kinematics:
         base_frame: str | None = None,
         finger_ends: JointEnds | None = None,
         joint_range_rad: Sequence[tuple[float, float]] = (),
+        locked_rad: Mapping[str, float] | None = None,
     ) -> None:
         self.urdf = urdf
-        self.full_model: Any = pin.buildModelFromUrdf(str(urdf))
-        self.locked_position = _locked(
-            self.full_model, urdf, arm_joints, finger_joints, finger_ends
+        self.described = described = Description(urdf)
+        self.followers: Mapping[str, Mimic] = _followers(described, arm_joints)
+        """Joints that move with one of the arm's."""
+        followers = self.followers
+        passive = _not_commanded(
+            described, base_frame or described.root, tcp_frame, arm_joints, locked_rad or {}
         )
+        self.locked_rad: Mapping[str, float] = passive
+        """Joints between base and TCP that are not commanded, and where they are assumed to be."""
+        ends = [_finger_ends(described, name, finger_joints, finger_ends) for name in finger_joints]
+        self.finger_signs: FloatArray = np.array([end.sign for end in ends], np.float64)
+        """(k,) 1 for a finger joint whose position grows as the hand opens, else -1; as the first
+        where the profile says where they are open and shut."""
+        opened = {name: end.open for name, end in zip(finger_joints, ends, strict=True)}
+        self.full_model: Any = pin.buildModelFromXML(described.text(followers), mimic=True)
         self.locked_joints: list[int] = [
-            index
-            for index, name in enumerate(self.full_model.names)
-            if index > 0 and name not in arm_joints
+            self.joint_id(name)
+            for name, joint in described.joints.items()
+            if joint.moves and name not in arm_joints and name not in followers
         ]
+        self.locked_position = _locked(self.full_model, described, {**opened, **passive})
         self.model: Any = pin.buildReducedModel(
             self.full_model, self.locked_joints, self.locked_position
         )
         self.data: Any = self.model.createData()
-        self.arm_joints: tuple[str, ...] = tuple(self.model.names)[1:]
-        self.slides = np.array([_slides(joint) for joint in list(self.model.joints)[1:]], bool)
+        self.arm_joints: tuple[str, ...] = tuple(sorted(arm_joints, key=self.joint_id))
+        joints = [described.joints[name] for name in self.arm_joints]
+        self.slides = np.array([joint.kind == "prismatic" for joint in joints], bool)
         """(n,) joints that slide: their positions are m."""
-        self.tcp = _frame(self.model, urdf, tcp_frame)
-        self.base_placement = _base_placement(self.model, self.data, urdf, base_frame)
+        self.tcp = _frame(self.model, tcp_frame)
+        self.base_placement = _base_placement(self.model, self.data, base_frame)
         self._base_turn: FloatArray | None = None
         if not np.allclose(self.base_placement.rotation, np.eye(3), atol=1e-12):
             self._base_turn = np.kron(np.eye(2), self.base_placement.rotation.T)
-        self.lower_rad: FloatArray = np.array(self.model.lowerPositionLimit)
-        self.upper_rad: FloatArray = np.array(self.model.upperPositionLimit)
-        self.velocity_rad_s: FloatArray = np.array(self.model.upperVelocityLimit)
+        limits = [_limits(described, joint, followers) for joint in joints]
+        self.lower_rad, self.upper_rad, self.velocity_rad_s = np.array(limits).T
         if joint_range_rad:
             lower, upper = zip(*joint_range_rad, strict=True)
             self.lower_rad = np.maximum(self.lower_rad, self.ordered(arm_joints, lower))
@@ -116,6 +131,10 @@ class Kinematics:
     def size(self) -> int:
         """Number of arm joints, n."""
         return len(self.arm_joints)
+
+    def joint_id(self, name: str) -> int:
+        """Index of a joint in `full_model`."""
+        return self.full_model.getJointId(self.described.model_name(name))
 
     def unit(self, index: int) -> str:
         """Of the positions of joint `index`: rad, or m where it slides."""
@@ -168,8 +187,7 @@ class Kinematics:
 
     def _tcp_pose(self) -> Pose:
         placement = pin.updateFramePlacement(self.model, self.data, self.tcp)
-        if self._base_turn is not None:
-            placement = self.base_placement.actInv(placement)
+        placement = self.base_placement.actInv(placement)
         # Copies: the placement is a view into the work space.
         return Pose(placement.translation.copy(), placement.rotation.copy())
 
@@ -190,6 +208,7 @@ def make_kinematics(profile: Profile) -> Kinematics:
         base_frame=robot.base_frame,
         finger_ends=robot.gripper.joint_ends,
         joint_range_rad=robot.joint_range_rad,
+        locked_rad=robot.locked_rad,
     )
 
 
@@ -353,82 +372,207 @@ def _inside(
         step = onto + _damped_step(error - jacobian @ onto, free, aside, damping + 1e-6)
 
 
-def _locked(
-    model: Any,
-    urdf: Path,
-    arm_joints: Sequence[str],
-    finger_joints: Sequence[str],
-    finger_ends: JointEnds | None,
-) -> FloatArray:
-    """Configuration of the whole robot at which all but the arm is locked."""
-    known = list(model.names)[1:]
-    for name in (*arm_joints, *finger_joints):
-        if name not in known:
-            raise ProfileError(
-                f"{urdf.name} has no joint {name!r}{nearest(name, known, '')}; "
-                f"it has: {', '.join(known)}"
-            )
+class FingerEnds(NamedTuple):
+    """Where a finger joint is with the hand open, m or rad, and the way it goes to open it."""
+
+    open: float
+    sign: float
+
+
+def _joint(described: Description, name: str) -> DescribedJoint:
+    if name not in described.joints:
+        raise ProfileError(
+            f"{described.name} has no joint {name!r}{nearest(name, described.joints, '')}; "
+            f"it has: {', '.join(each.name for each in described.joints.values() if each.moves)}"
+        )
+    return described.joints[name]
+
+
+def _followers(described: Description, arm_joints: Sequence[str]) -> dict[str, Mimic]:
+    """Joints that move with one of the arm's."""
     for name in arm_joints:
-        joint = model.joints[model.getJointId(name)]
-        if joint.nq != 1:
+        joint = _joint(described, name)
+        if not joint.moves:
+            raise ProfileError(f"joint {name!r} of {described.name} is fixed: it cannot be moved")
+        if joint.mimic is not None:
             raise ProfileError(
-                f"joint {name!r} of {urdf.name} is continuous; only joints with limits are "
+                f"joint {name!r} of {described.name} follows joint {joint.mimic.joint!r} (mimic) "
+                "and is not commanded: leave it out of arm_joints"
+            )
+        if joint.kind not in ("revolute", "prismatic"):
+            raise ProfileError(
+                f"joint {name!r} of {described.name} is {joint.kind}; only joints with limits are "
                 "supported: make it revolute and give it limits"
             )
+    followers: dict[str, Mimic] = {}
+    for name, joint in described.joints.items():
+        if joint.mimic is not None and joint.mimic.joint in described.joints:
+            follows = described.follows(name)
+            if follows.joint in arm_joints:
+                followers[name] = follows
+    return followers
+
+
+def _not_commanded(
+    described: Description,
+    base_frame: str,
+    tcp_frame: str,
+    arm_joints: Sequence[str],
+    locked_rad: Mapping[str, float],
+) -> dict[str, float]:
+    """Joint between base and TCP -> where it stands, for those that no arm joint moves."""
+    for link in (base_frame, tcp_frame):
+        if link not in described.links:
+            raise ProfileError(
+                f"{described.name} has no link {link!r}{nearest(link, described.links, '')}; "
+                f"it has: {', '.join(described.links)}"
+            )
+    below = [described.follows(joint.name) for joint in described.chain(described.root, base_frame)]
+    if any(follows.joint in arm_joints for follows in below):
+        raise ProfileError(
+            f"base_frame {base_frame!r} of {described.name} moves with the arm's joints"
+        )
+    chain = [joint for joint in described.chain(base_frame, tcp_frame) if joint.moves]
+    leaders = {joint.name: described.follows(joint.name).joint for joint in chain}
+    for name in arm_joints:
+        if name not in leaders.values():
+            raise ProfileError(
+                f"arm joint {name!r} of {described.name} does not move tcp_frame {tcp_frame!r} "
+                f"against base_frame {base_frame!r}: leave it out of arm_joints, or give other "
+                "frames"
+            )
+    passive = {name: leader for name, leader in leaders.items() if leader not in arm_joints}
+    for name in locked_rad:
+        _joint(described, name)
+    missing = sorted(set(passive.values()) - locked_rad.keys())
+    if missing:
+        raise ProfileError(
+            f"{described.name} has {_listed(missing)} between base_frame {base_frame!r} and "
+            f"tcp_frame {tcp_frame!r}, which arm_joints does not name. Where does it stand? Add it "
+            "to arm_joints, or write where it is fixed, as robot: {locked_rad: {"
+            + ", ".join(f"{name}: 0.0" for name in missing)
+            + "}}"
+        )
+    for name, value in locked_rad.items():
+        joint = _joint(described, name)
+        if name not in passive.values():
+            raise ProfileError(
+                f"locked_rad has joint {name!r}, which is not between base_frame {base_frame!r} "
+                f"and tcp_frame {tcp_frame!r} of {described.name}, or is commanded: leave it out"
+            )
+        if not joint.lower <= value <= joint.upper:
+            raise ProfileError(
+                f"locked_rad puts joint {name!r} of {described.name} at {value:g} {joint.unit}: "
+                f"it goes from {joint.lower:g} to {joint.upper:g}"
+            )
+    return dict(locked_rad)
+
+
+def _listed(names: Sequence[str]) -> str:
+    return f"joint{'s' if len(names) > 1 else ''} {', '.join(map(repr, names))}"
+
+
+def _locked(model: Any, described: Description, known: Mapping[str, float]) -> FloatArray:
+    """Configuration of the whole robot in which all but the arm is locked.
+
+    Joints of which nothing is known stand at 0, or at the end of their range next to it.
+    """
     position = pin.neutral(model)
-    for name in finger_joints:
-        joint = model.joints[model.getJointId(name)]
-        position[joint.idx_q] = _wide_open(model, joint, f"{name!r} of {urdf.name}", finger_ends)
+    for name in (each.name for each in described.joints.values() if each.moves):
+        joint = model.joints[model.getJointId(described.model_name(name))]
+        index = joint.idx_q
+        value = _position(described, name, known)
+        if joint.nq == 1:
+            position[index] = value
+        elif joint.nq == 2:  # continuous
+            position[index : index + 2] = math.cos(value), math.sin(value)
     return position
 
 
-def _slides(joint: Any) -> bool:
-    return joint.shortname().startswith("JointModelP")
+def _position(described: Description, name: str, known: Mapping[str, float]) -> float:
+    if name in known:
+        return known[name]
+    joint = described.joints.get(name)
+    if joint is None or joint.kind not in MOVING:
+        return 0.0
+    if joint.mimic is not None and joint.mimic.joint in described.joints:
+        follows = described.follows(name)
+        leader = _position(described, follows.joint, known)
+        return follows.multiplier * leader + follows.offset
+    return min(max(0.0, joint.lower), joint.upper)
 
 
-def _wide_open(model: Any, joint: Any, called: str, ends: JointEnds | None) -> float:
-    """Position of a finger joint at which the hand is widest, m or rad."""
-    lower = float(model.lowerPositionLimit[joint.idx_q])
-    upper = float(model.upperPositionLimit[joint.idx_q])
-    if joint.nq != 1 or not (math.isfinite(lower) and math.isfinite(upper)):
+def _limits(
+    described: Description, joint: DescribedJoint, followers: Mapping[str, Mimic]
+) -> tuple[float, float, float]:
+    """Range and velocity of an arm joint, in which the joints that follow it keep theirs."""
+    lower, upper, velocity = joint.lower, joint.upper, joint.velocity
+    for name, follows in followers.items():
+        if follows.joint == joint.name and follows.multiplier != 0:
+            other = described.joints[name]
+            ends = [
+                (end - follows.offset) / follows.multiplier for end in (other.lower, other.upper)
+            ]
+            lower, upper = max(lower, min(ends)), min(upper, max(ends))
+            velocity = min(velocity, other.velocity / abs(follows.multiplier))
+    return lower, upper, velocity
+
+
+def _finger_ends(
+    described: Description, name: str, fingers: Sequence[str], ends: JointEnds | None
+) -> FingerEnds:
+    """Where a finger joint is at which the hand is widest, m or rad, and its direction.
+
+    The ends in the profile are those of the first finger; another one may be its mirror image.
+    """
+    joint = _joint(described, name)
+    called = f"{name!r} of {described.name}"
+    if joint.kind not in ("revolute", "prismatic"):
         raise ProfileError(f"finger joint {called} has no limits to open and to shut at")
-    unit = "m" if _slides(joint) else "rad"
-    if ends is None and unit == "m":
-        return upper
+    lower, upper, unit = joint.lower, joint.upper, joint.unit
+    margin = BEYOND_LIMITS * (upper - lower)
     way = f"it goes from {lower:g} to {upper:g} {unit}"
     wanted = f"gripper: {{joint_open_{unit}: ..., joint_shut_{unit}: ...}}"
-    if ends is None:
+    if ends is None and unit == "rad":
         raise ProfileError(
             f"finger joint {called} turns, and its angle is no width: say at which angle the "
             f"gripper is open by max_width_m and at which it is shut, as {wanted}; {way}"
         )
+    if ends is None:
+        for end, far, sign in ((lower, upper, 1.0), (upper, lower, -1.0)):
+            if abs(end) <= margin < abs(far):
+                return FingerEnds(far, sign)
+        raise ProfileError(
+            f"finger joint {called} is not shut at 0: {way}. Say where the gripper is open by "
+            f"max_width_m and where it is shut, as {wanted}"
+        )
     if ends.unit != unit:
         does = "slides" if unit == "m" else "turns"
         raise ProfileError(f"finger joint {called} {does}: write {wanted}; {way}")
-    margin = BEYOND_LIMITS * (upper - lower)
+    signs = [1.0] if name == fingers[0] else [1.0, -1.0]
+    if (follows := described.follows(name)).joint == fingers[0]:
+        signs = [math.copysign(1.0, follows.multiplier)]
+    for sign in signs:
+        if all(lower - margin <= sign * end <= upper + margin for end in (ends.open, ends.shut)):
+            return FingerEnds(sign * ends.open, sign)
     for what, value in (("open", ends.open), ("shut", ends.shut)):
         if not lower - margin <= value <= upper + margin:
             raise ProfileError(
                 f"finger joint {called} cannot be at gripper.joint_{what}_{unit} ({value:g}): {way}"
             )
-    return ends.open
+    raise ProfileError(
+        f"finger joint {called} goes the other way than {fingers[0]!r}, and cannot be at "
+        f"{-ends.open:g} and {-ends.shut:g} {unit}: {way}"
+    )
 
 
-def _frame(model: Any, urdf: Path, name: str) -> int:
-    if not model.existFrame(name):
-        known = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
-        raise ProfileError(
-            f"{urdf.name} has no link {name!r}{nearest(name, known, '')}; "
-            f"it has: {', '.join(known)}"
-        )
-    return model.getFrameId(name)
+def _frame(model: Any, name: str) -> int:
+    """Index of a link's frame: a joint may have the same name."""
+    return model.getFrameId(name, pin.FrameType.BODY)
 
 
-def _base_placement(model: Any, data: Any, urdf: Path, name: str | None) -> Any:
+def _base_placement(model: Any, data: Any, name: str | None) -> Any:
     if name is None:
         return pin.SE3.Identity()
-    index = _frame(model, urdf, name)
-    if model.frames[index].parentJoint != 0:
-        raise ProfileError(f"base_frame {name!r} of {urdf.name} moves with the arm's joints")
     pin.framesForwardKinematics(model, data, pin.neutral(model))
-    return data.oMf[index].copy()
+    return data.oMf[_frame(model, name)].copy()

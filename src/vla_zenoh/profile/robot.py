@@ -96,6 +96,8 @@ class RobotProfile(Section):
         arm_joints: in the order of every list of joint values in the profile.
         joint_range_rad: lower and upper end for each of arm_joints, within those of the
             description; empty: those. m for a joint that slides, here and in home_rad.
+        locked_rad: where joints stand that lie between base_frame and tcp_frame and are not
+            commanded, as a torso: name -> rad, or m where it slides.
         finger_joints: of the gripper; their states give its width. Prismatic ones add up to it; for
             revolute ones `gripper` defines where they are open and shut.
         home_rad: joint positions of the simulated arm after a reset.
@@ -112,6 +114,7 @@ class RobotProfile(Section):
     tcp_frame: Word
     arm_joints: Words = Field(min_length=1)
     joint_range_rad: Annotated[tuple[Range, ...], Field(strict=False)] = ()
+    locked_rad: dict[Word, float] = Field(default_factory=dict)
     finger_joints: Words = ()
     home_rad: tuple[float, ...] = Field(strict=False)
     posture: Literal["start", "home"] = "start"
@@ -133,6 +136,8 @@ class RobotProfile(Section):
         for index, angle in enumerate(self.home_rad):
             if abs(angle) > 2 * math.pi:
                 yield ("home_rad", str(index)), f"is {angle:g}: more than a turn; give radians"
+        for name in sorted(set(self.arm_joints) & self.locked_rad.keys()):
+            yield ("locked_rad", name), "is in arm_joints, too: it cannot stand still and move"
         if shared := sorted(set(self.arm_joints) & set(self.finger_joints)):
             yield ("finger_joints",), f"repeats arm_joints: {', '.join(shared)}"
         if self.gripper.dead_band_m >= self.gripper.max_width_m:

@@ -80,6 +80,10 @@ class RobotClock:
         return offset_s is not None and abs(offset_s) * 1e9 > TOLERATED_NS
 
 
+LOCKED_TOLERANCE = 0.01
+"""A joint that is not commanded may be off by this, rad or m: 1 cm at the TCP, 1 m away."""
+
+
 class JointReading:
     """Newest state of one arm and its gripper, from its joint states; None before the first."""
 
@@ -87,6 +91,7 @@ class JointReading:
         robot = profile.robot
         self.arm_joints, self._finger_names = robot.arm_joints, robot.finger_joints
         self._fingers = Fingers(robot.gripper, len(robot.finger_joints))
+        self._finger_signs = dict(zip(robot.finger_joints, kinematics.finger_signs, strict=True))
         self._max_width_m = robot.gripper.max_width_m
         self._kinematics = kinematics
         at = [kinematics.arm_joints.index(name) for name in robot.arm_joints]
@@ -116,6 +121,7 @@ class JointReading:
             return None
         if missing:
             raise CodecError("partial", f"joint states of this arm without {', '.join(missing)}")
+        self._check_locked(joints, places)
         at = [places[name] for name in self.arm_joints]
         position = _finite("position", joints.position[at])
         self._check(position - self._middle_rad, self._furthest_rad, position, "rad")
@@ -131,6 +137,19 @@ class JointReading:
             raise CodecError("invalid", str(error)) from error
         self.joints, self.stamp_ns = state, stamp_ns
         return state
+
+    def _check_locked(self, joints: Joints, places: dict[str, int]) -> None:
+        """Reject states in which a joint that is not commanded is not where poses assume it."""
+        for name, assumed in self._kinematics.locked_rad.items():
+            if name not in places:
+                continue
+            value = float(joints.position[places[name]])
+            if not abs(value - assumed) <= LOCKED_TOLERANCE:
+                raise CodecError(
+                    "invalid",
+                    f"{name} is at {value:.4g}, and robot.locked_rad has it at {assumed:g}: every "
+                    "pose would be wrong. Put it there, or change the profile",
+                )
 
     def _check(self, off: FloatArray, most: FloatArray, values: FloatArray, unit: str) -> None:
         """Reject `values` whose `off` exceeds `most`, all (n,)."""
@@ -159,10 +178,12 @@ class JointReading:
         return None
 
     def _take_fingers(self, joints: Joints, places: dict[str, int], stamp_ns: int) -> None:
-        at = [places[name] for name in self._finger_names if name in places]
-        if not at:
+        fingers = [name for name in self._finger_names if name in places]
+        if not fingers:
             return
-        positions = _finite("position", joints.position[at])
+        at = [places[name] for name in fingers]
+        signs = np.array([self._finger_signs[name] for name in fingers])
+        positions = signs * _finite("position", joints.position[at])
         if float(np.abs(positions).max()) > FURTHEST:
             raise CodecError("invalid", f"a finger joint beyond {FURTHEST:g} m or rad")
         self._finger_newness.check(stamp_ns)
@@ -170,7 +191,7 @@ class JointReading:
         elapsed_s = (stamp_ns - self.width_stamp_ns) / 1e9
         velocity = None if joints.velocity is None else joints.velocity[at]
         if velocity is not None and bool((np.abs(velocity) <= FURTHEST).all()):
-            self._finger_speed_m_s = self._fingers.speed_m_s(velocity)
+            self._finger_speed_m_s = self._fingers.speed_m_s(signs * velocity)
         elif self.width_m is not None and 0 < elapsed_s < 1:
             self._finger_speed_m_s = abs(width_m - self.width_m) / elapsed_s
         self.width_m, self.width_stamp_ns = width_m, stamp_ns

@@ -133,7 +133,11 @@ def test_a_turned_base_turns_pose_and_jacobian(tmp_path: Path) -> None:
     ("tcp_frame", "joints", "message"),
     [
         ("panda_hand_tpc", ARM_JOINTS, "did you mean 'panda_hand_tcp'"),
-        (TCP_FRAME, ("panda_joint8", *ARM_JOINTS[1:]), "no joint 'panda_joint8'"),
+        (
+            TCP_FRAME,
+            ("panda_joint8", *ARM_JOINTS[1:]),
+            "joint 'panda_joint8' of panda.urdf is fixed",
+        ),
         (TCP_FRAME, ("panda_jiont1", *ARM_JOINTS[1:]), "did you mean 'panda_joint1'"),
     ],
 )

@@ -48,6 +48,7 @@ def arm(profile: Profile) -> Iterator[ProfileFault]:
     try:
         from vla_zenoh.control.limits import into_workspace
         from vla_zenoh.control.reachability import ReachabilityFilter
+        from vla_zenoh.kinematics.plausibility import implausible
 
         reach = ReachabilityFilter(profile)
     except (ResourceError, MissingExtraError) as error:
@@ -63,6 +64,8 @@ def arm(profile: Profile) -> Iterator[ProfileFault]:
         yield ProfileFault(place, f"{profile.robot.description!r} cannot be read: {error}")
         return
     kinematics = reach.kinematics
+    for why in implausible(kinematics, profile.limits):
+        yield ProfileFault(place, why)
     home_rad = kinematics.ordered(profile.robot.arm_joints, profile.robot.home_rad)
     for index, joint in enumerate(kinematics.arm_joints):
         low, high = float(kinematics.lower_rad[index]), float(kinematics.upper_rad[index])
@@ -87,18 +90,39 @@ def arm(profile: Profile) -> Iterator[ProfileFault]:
 
 
 def joints_advice(profile: Profile) -> Iterator[str]:
-    """Advice for an arm with too few joints for any pose."""
-    joints = len(profile.robot.arm_joints)
-    if joints >= POSE_JOINTS:
-        return
+    """What the check assumes of joints that are not commanded, of home, and of too few joints."""
     try:
+        from vla_zenoh.control.limits import into_workspace
         from vla_zenoh.control.policy_check import immovable_axes
         from vla_zenoh.kinematics.kinematics import make_kinematics
 
         kinematics = make_kinematics(profile)
     except (ImportError, ValueError, VlaZenohError):
         return  # `arm` says so
+    for name, (joint, multiplier, offset) in kinematics.followers.items():
+        yield (
+            f"robot.arm_joints: {name} is not commanded; poses assume that it follows {joint}, at "
+            f"{multiplier:g} times its position plus {offset:g}"
+        )
+    for name, value in kinematics.locked_rad.items():
+        yield (
+            f"robot.locked_rad: {name} is not commanded, and every pose assumes it at {value:g}. "
+            "States that have it elsewhere are rejected; a robot that does not publish it is "
+            "believed"
+        )
     home_rad = kinematics.ordered(profile.robot.arm_joints, profile.robot.home_rad)
+    at_m = kinematics.forward(home_rad).position_m
+    _, outside_m = into_workspace(profile.limits, at_m)
+    if outside_m > 0 and profile.robot.driver != "sim":
+        where = ", ".join(f"{value:.3f}" for value in at_m)
+        yield (
+            f"robot.home_rad: the TCP is then at ({where}) m, {outside_m:.3f} m outside "
+            "limits.workspace: the arm cannot be moved home. Are base_frame, tcp_frame and the "
+            "units of the description right?"
+        )
+    joints = len(profile.robot.arm_joints)
+    if joints >= POSE_JOINTS:
+        return
     axes = ", ".join(immovable_axes(kinematics.jacobian(home_rad))) or "none"
     yield (
         f"robot.arm_joints: {joints} joints cannot reach every pose, as six can. At home the TCP "

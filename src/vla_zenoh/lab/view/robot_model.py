@@ -52,14 +52,15 @@ class RobotMeshes:
         self._joints = {
             name: self._index(name) for name in (*robot.arm_joints, *robot.finger_joints)
         }
-        self._finger_names = robot.finger_joints
+        signs = self.kinematics.finger_signs.tolist()
+        self._finger_signs = dict(zip(robot.finger_joints, signs, strict=True))
         self._fingers = Fingers(robot.gripper, len(robot.finger_joints))
         self._shapes = _load_shapes(self.kinematics.urdf)
         links = dict.fromkeys(link for link, _, _ in self._shapes)
-        self._frames = {link: self._model.getFrameId(link) for link in links}
+        self._frames = {link: self._model.getFrameId(link, pin.FrameType.BODY) for link in links}
 
     def _index(self, joint: str) -> int:
-        return self._model.joints[self._model.getJointId(joint)].idx_q
+        return self._model.joints[self.kinematics.joint_id(joint)].idx_q
 
     def log_shapes(self, stream: rr.RecordingStream, root: str) -> None:
         """Log every shape, static below the entity of its link below `root`.
@@ -81,7 +82,8 @@ class RobotMeshes:
 
     def open(self, width_m: float) -> None:
         """Open all fingers equally to a width."""
-        self.move(dict.fromkeys(self._finger_names, self._fingers.position(width_m)))
+        position = self._fingers.position(width_m)
+        self.move({name: sign * position for name, sign in self._finger_signs.items()})
 
     def placements(self) -> Iterator[tuple[str, Pose]]:
         """Every link with a shape, and its pose in the base frame."""

@@ -1,0 +1,77 @@
+"""Numbers of a robot description that no arm has: degrees for radians, millimetres for metres."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from vla_zenoh.kinematics.kinematics import Kinematics
+from vla_zenoh.profile import Limits
+
+MAX_TURN_RAD = 4 * math.pi + 0.1
+"""Wrists turn by at most two turns to each side; a range in degrees is beyond this."""
+MAX_SPEED_RAD_S = 50.0
+"""The quickest joints of arms make 10 rad/s; a velocity in degrees is beyond this."""
+MAX_LENGTH_M = 10.0
+"""Between two joints, or from the root of the description to the base."""
+
+
+def implausible(kinematics: Kinematics, limits: Limits) -> Iterator[str]:
+    """What cannot be right about an arm, each with the unit that it is probably in."""
+    name = kinematics.urdf.name
+    for index, joint in enumerate(kinematics.arm_joints):
+        low, high = float(kinematics.lower_rad[index]), float(kinematics.upper_rad[index])
+        velocity = float(kinematics.velocity_rad_s[index])
+        slides = bool(kinematics.slides[index])
+        furthest = MAX_LENGTH_M if slides else MAX_TURN_RAD
+        fastest = MAX_LENGTH_M if slides else MAX_SPEED_RAD_S
+        unit, wrong = ("m", "millimetres") if slides else ("rad", "degrees")
+        if max(abs(low), abs(high)) > furthest:
+            yield (
+                f"joint {joint!r} of {name} goes from {low:g} to {high:g} {unit}: are these "
+                f"{wrong}? Correct the description, or give robot.joint_range_rad"
+            )
+        if velocity > fastest:
+            yield (
+                f"joint {joint!r} of {name} has a velocity of {velocity:g} {unit}/s: are these "
+                f"{wrong}? Correct the description"
+            )
+    base_m = float(np.linalg.norm(kinematics.base_placement.translation))
+    if base_m > MAX_LENGTH_M:
+        yield (
+            f"base_frame is {base_m:g} m from the root of {name}: is this in millimetres, or a "
+            "place on a map? Give a base_frame at the arm's foot, or correct the description"
+        )
+    lengths_m = [
+        (float(np.linalg.norm(kinematics.model.jointPlacements[index].translation)), joint)
+        for index, joint in enumerate(kinematics.model.names)
+        if index > 1
+    ]
+    tcp = kinematics.model.frames[kinematics.tcp]
+    lengths_m.append((float(np.linalg.norm(tcp.placement.translation)), tcp.name))
+    for length_m, what in lengths_m:
+        if length_m > MAX_LENGTH_M:
+            yield (
+                f"{name} has {what!r} {length_m:g} m from the joint before it: are these "
+                "millimetres? A URDF is in metres"
+            )
+    yield from _out_of_reach(kinematics, limits, sum(length for length, _ in lengths_m))
+
+
+def _out_of_reach(kinematics: Kinematics, limits: Limits, length_m: float) -> Iterator[str]:
+    """Whether the workspace lies where no joint position takes the TCP."""
+    slides_m = float(np.sum(np.abs(kinematics.upper_rad)[kinematics.slides]))
+    first = kinematics.model.jointPlacements[1]
+    foot_m = kinematics.base_placement.actInv(first).translation
+    box = limits.workspace
+    ends = np.array([box.x_m, box.y_m, box.z_m])
+    nearest_m = np.clip(foot_m, ends[:, 0], ends[:, 1])
+    away_m, reach_m = float(np.linalg.norm(nearest_m - foot_m)), length_m + slides_m
+    if away_m > reach_m:
+        yield (
+            f"limits.workspace is {away_m:.3g} m from the first joint, and the arm of "
+            f"{kinematics.urdf.name} is {reach_m:.3g} m long: nothing in it can be reached. Are "
+            "its numbers in the frame of base_frame, and in metres?"
+        )
