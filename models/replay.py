@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from vla_zenoh.errors import SpecError, in_words
-from vla_zenoh.policy import ActionSteps, ModelSpec, Observation, check_steps
+from vla_zenoh.policy import ActionSteps, ModelSpec, Observation, check_steps, standing_step
 
 
 class Replay:
@@ -58,20 +58,9 @@ class Replay:
     def infer(self, observation: Observation) -> ActionSteps:
         """The next recorded chunk; after the last one, stand still."""
         if self._next >= len(self._chunks):
-            return ActionSteps(self._stand(), done=True)
+            last = self._chunks[-1][-1]
+            return ActionSteps(standing_step(self.spec.action, last)[None], done=True)
         chunk = self._chunks[self._next]
         if observation.task.active:
             self._next += 1
         return ActionSteps(chunk, self._next >= len(self._chunks))
-
-    def _stand(self) -> np.ndarray:
-        last = self._chunks[-1][-1:].copy()
-        if self.spec.action.kind != "absolute":
-            rotation_is_quaternion = self.spec.action.rotation == "quaternion"
-            gripper = last[0, -1] if self.spec.action.gripper not in ("none", "delta_m") else 0.0
-            last[:] = 0.0
-            if rotation_is_quaternion:
-                last[0, 6] = 1.0
-            if self.spec.action.gripper != "none":
-                last[0, -1] = gripper
-        return last

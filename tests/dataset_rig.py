@@ -15,6 +15,8 @@ from vla_zenoh.keys import Keys
 from vla_zenoh.lab.recording.sample import JPEG, MSGPACK, Sample
 from vla_zenoh.lab.recording.writer import RecordingWriter
 from vla_zenoh.policy import ActionSpec, ModelSpec, ObservationSpec
+from vla_zenoh.profile import load_profile
+from vla_zenoh.profile.load import to_yaml
 from vla_zenoh.types import (
     ActionChunk,
     Cause,
@@ -29,6 +31,7 @@ from vla_zenoh.types import (
 )
 
 KEYS = Keys("panda")
+PROFILE = to_yaml(load_profile("panda_sim"))
 ZERO_NS = 1_700_000_000_000_000_000
 MS = 1_000_000
 HEIGHT, WIDTH = 48, 64
@@ -133,7 +136,7 @@ def write_run(
             encoding = f"image/png;{depth_schema(depth)}"
             key = KEYS.camera_depth("front")
             samples.append(Sample(key, encode_depth(depth), encoding, header, at_ns + MS))
-    out = RecordingWriter(path, KEYS, profile_yaml="", base_frame="base", began_ns=ZERO_NS)
+    out = RecordingWriter(path, KEYS, profile_yaml=PROFILE, base_frame="base", began_ns=ZERO_NS)
     for sample in sorted(samples, key=lambda each: each.received_ns):
         out.write(sample)
     out.finish({"dropped": {}, **(ended or {})})
@@ -201,7 +204,7 @@ def write_mixed_run(
         header = Header(at_ns, number, "camera#1")
         key = KEYS.camera_jpeg("front")
         samples.append(Sample(key, picture(number), JPEG, header, at_ns + MS))
-    out = RecordingWriter(path, KEYS, profile_yaml="", base_frame="base", began_ns=ZERO_NS)
+    out = RecordingWriter(path, KEYS, profile_yaml=PROFILE, base_frame="base", began_ns=ZERO_NS)
     for sample in sorted(samples, key=lambda each: each.received_ns):
         out.write(sample)
     out.finish({"dropped": {}, **(ended or {})})

@@ -12,6 +12,8 @@ from vla_zenoh.keys import Keys
 from vla_zenoh.lab.recording.sample import JPEG, Sample
 from vla_zenoh.lab.recording.writer import RecordingWriter
 from vla_zenoh.policy import ActionSpec, ModelSpec, ObservationSpec
+from vla_zenoh.profile import load_profile
+from vla_zenoh.profile.load import to_yaml
 from vla_zenoh.types import (
     ActionChunk,
     Cause,
@@ -24,6 +26,7 @@ from vla_zenoh.types import (
 )
 
 KEYS = Keys("pair")
+PROFILE = to_yaml(load_profile("two_pandas_sim"))
 JOINTS = ("joint1", "joint2")
 BEGIN_MS, END_MS = 500, 500 + CHUNK_MS * CHUNKS
 SPEED_M_S = {"left": 0.1, "right": 0.2}
@@ -89,7 +92,7 @@ def write_pair_run(path: Path, *, of: ModelSpec | None = None, silent: Sequence[
         at_ns = ZERO_NS + 50 * number * MS
         header = Header(at_ns, number, "camera#1")
         samples.append(Sample(KEYS.camera_jpeg("front"), picture(number), JPEG, header, at_ns + MS))
-    out = RecordingWriter(path, KEYS, profile_yaml="", base_frame="base", began_ns=ZERO_NS)
+    out = RecordingWriter(path, KEYS, profile_yaml=PROFILE, base_frame="base", began_ns=ZERO_NS)
     for sample in sorted(samples, key=lambda each: each.received_ns):
         out.write(sample)
     out.finish({"dropped": {}})

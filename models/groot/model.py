@@ -1,6 +1,6 @@
 # /// script
 # requires-python = ">=3.11"
-# dependencies = ["numpy", "pyzmq>=26"]
+# dependencies = ["example-robot-data>=6", "numpy", "pin>=4", "pyzmq>=26"]
 # ///
 """Queries a GR00T policy server (N1.5, N1.6 and later) over ZeroMQ.
 

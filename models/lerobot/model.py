@@ -47,7 +47,7 @@ from vla_zenoh_model_lerobot.mapping import (
 from vla_zenoh.errors import SpecError, WorkerError, in_words
 from vla_zenoh.lab.policy_servers.action_semantics import ActionSemantics, read_action_semantics
 from vla_zenoh.lab.policy_servers.model_options import checkpoint_folder, one_of
-from vla_zenoh.lab.policy_servers.state_vector import parts_of, state_vector
+from vla_zenoh.lab.policy_servers.state_vector import StateNumbers, parts_of, state_numbers
 from vla_zenoh.policy import (
     ActionSpec,
     ActionSteps,
@@ -66,7 +66,8 @@ class LeRobot:
 
     Args:
         checkpoint: directory with ``config.json``, ``model.safetensors`` and the two pipelines.
-        state: what the numbers of ``observation.state`` are, in order, see `state_vector`.
+        state: what the numbers of ``observation.state`` are, in order, see
+            lab/policy_servers/state_vector.py.
         map: ``feature=camera:NAME`` if the names differ, separated by commas; ``feature=`` leaves
             an image out. Others are from the camera named like their last part.
         size: of the images, WIDTHxHEIGHT; empty: as the camera gives them; ``auto``: that of the
@@ -103,16 +104,21 @@ class LeRobot:
         steps = 1 if self._one_by_one else horizon(config, meaning.get("horizon", ""))
         one_of("resize", resize, get_args(Resize))
         robot = load_profile(profile)
-        arms = {name: robot.of_part(name).robot for name in arm_names(parts, tuple(robot.parts))}
-        self._max_width_m = {name: arm.gripper.max_width_m for name, arm in arms.items()}
+        arms = {name: robot.of_part(name) for name in arm_names(parts, tuple(robot.parts))}
+        told = {**meaning, "horizon": str(steps)}
         self._meaning: dict[str, ActionSemantics] = {
-            name: read_action_semantics({**meaning, "horizon": str(steps)}, joints=arm.arm_joints)
+            name: read_action_semantics(told, joints=arm.robot.arm_joints)
             for name, arm in arms.items()
         }
         inputs = features(self._folder, config, "input_features")
         self._pictures = pictures(inputs, map, kind)
-        joints = [len(arm.arm_joints) for arm in arms.values()]
-        self._state = state_parts(self._folder, kind, inputs, state, joints)
+        joints = [len(arm.robot.arm_joints) for arm in arms.values()]
+        names = state_parts(self._folder, kind, inputs, state, joints)
+        self._state: dict[str, StateNumbers] = {
+            name: state_numbers(names, arm, self._meaning[name].state_units)
+            for name, arm in arms.items()
+            if names
+        }
         self._check_action(config)
         self._device = device
         cameras: list[CameraSpec] = []
@@ -125,7 +131,7 @@ class LeRobot:
             name="lerobot",
             observation=ObservationSpec(
                 cameras=tuple(cameras),
-                state=tuple(dict.fromkeys(parts_of(self._state))),
+                state=parts_of(names),
                 prompt=kind not in WITHOUT_WORDS,
             ),
             action=self._meaning[""].spec
@@ -219,8 +225,8 @@ class LeRobot:
         }
         if self._state:
             each = [
-                state_vector(self._state, observation.parts.get(part, observation), most_m)
-                for part, most_m in self._max_width_m.items()
+                numbers.encode(observation.parts.get(part, observation))
+                for part, numbers in self._state.items()
             ]
             given[STATE] = np.concatenate(each)
         if committed is not None:

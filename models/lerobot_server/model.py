@@ -1,6 +1,6 @@
 # /// script
 # requires-python = ">=3.11"
-# dependencies = ["numpy", "grpcio>=1.70"]
+# dependencies = ["example-robot-data>=6", "grpcio>=1.70", "numpy", "pin>=4"]
 # ///
 """Queries lerobot's policy server (``lerobot.async_inference.policy_server``) over gRPC.
 

@@ -1,6 +1,6 @@
 # /// script
 # requires-python = ">=3.11"
-# dependencies = ["numpy", "websockets>=15"]
+# dependencies = ["example-robot-data>=6", "numpy", "pin>=4", "websockets>=15"]
 # ///
 """Queries a policy server with openpi's protocol.
 

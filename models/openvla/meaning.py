@@ -56,7 +56,7 @@ def data_meaning(told: Mapping[str, str], key: str, trained: Range, chunk: int) 
     if found.spec.horizon > chunk:
         raise WorkerError(f"horizon is {found.spec.horizon}; the model's chunks have {chunk}")
     longest = float(np.abs([trained.low[:3], trained.high[:3]]).max())
-    if found.action == "delta" and longest * found.scales[0] > LONGEST_STEP_M:
+    if found.action == "delta" and longest * found.units.position_scale_m > LONGEST_STEP_M:
         raise WorkerError(
             f"data set {key!r} has steps of {longest:.3g}, which are no metres. Say what one unit "
             "is with --set position_scale_m= and --set rotation_scale_rad= (robosuite's and "

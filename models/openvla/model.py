@@ -2,9 +2,11 @@
 # requires-python = ">=3.11,<3.14"
 # dependencies = [
 #     "bitsandbytes==0.50.2",
+#     "example-robot-data>=6",
 #     "numpy>=1.26",
 #     "opencv-python-headless>=4.9",
 #     "pillow>=11",
+#     "pin>=4",
 #     "safetensors==0.8.0",
 #     "timm==1.0.31",
 #     "tokenizers>=0.22",
@@ -37,7 +39,12 @@ from vla_zenoh_model_openvla.tokens import PROMPTS, ActionBins, prompt_text, pro
 
 from vla_zenoh.errors import SpecError, WorkerError, in_words
 from vla_zenoh.lab.policy_servers.model_options import checkpoint_folder, one_of
-from vla_zenoh.lab.policy_servers.state_vector import parts_of, read_state, state_vector
+from vla_zenoh.lab.policy_servers.state_vector import (
+    StateNumbers,
+    parts_of,
+    read_state,
+    state_numbers,
+)
 from vla_zenoh.policy import ActionSteps, CameraSpec, ModelSpec, Observation, ObservationSpec
 from vla_zenoh.profile import load_profile
 
@@ -108,21 +115,21 @@ class OpenVLA:
         self._chunk = 1 if self._files is None else chunk_steps(chunk, self._key)
         self._meaning = data_meaning(meaning, self._key, self._range, self._chunk)
         self._state_range: Range | None = None
-        self._state: tuple[str, ...] = ()
-        robot = load_profile(profile).robot
-        self._max_width_m = robot.gripper.max_width_m
+        self._state: StateNumbers | None = None
+        robot = load_profile(profile)
         if self._files is None and (len(self._cameras) > 1 or state):
             raise WorkerError("plain OpenVLA sees one camera and no state; cameras= names one")
         if self._files is not None and self._files.state is not None:
             trained_on = read_range(found.statistics, self._key, "proprio", size=None)
             self._state_range = trained_on
-            self._state = read_state(state, len(trained_on.low), len(robot.arm_joints))
+            names = read_state(state, len(trained_on.low), len(robot.robot.arm_joints))
+            self._state = state_numbers(names, robot, self._meaning.state_units)
         self.spec = ModelSpec(
             name="openvla",
             observation=ObservationSpec(
                 # The image in full size: shrinking it is part of the training data's preparation.
                 cameras=tuple(CameraSpec(camera=name) for name in self._cameras),
-                state=parts_of(self._state),
+                state=parts_of(self._state.names if self._state else ()),
                 prompt=True,
             ),
             action=self._meaning.spec,
@@ -225,8 +232,8 @@ class OpenVLA:
             "prompt_tokens": ids,
         }
         state = None
-        if self._state_range is not None:
-            measured = state_vector(self._state, observation, self._max_width_m)
+        if self._state_range is not None and self._state is not None:
+            measured = self._state.encode(observation)
             state = raw["state"] = self._state_range.shrink(measured).tolist()
         answer = self._answer(ids, [self._pixels(picture) for picture in seen.values()], state)
         if self._head is None:

@@ -1,6 +1,6 @@
 # /// script
 # requires-python = ">=3.11"
-# dependencies = ["numpy", "eclipse-zenoh>=1.9,<2"]
+# dependencies = ["eclipse-zenoh>=1.9,<2", "example-robot-data>=6", "numpy", "pin>=4"]
 # ///
 """Queries a policy by origami-zenoh-v1: Zenoh queries through the router of the policy.
 

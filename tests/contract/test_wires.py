@@ -30,6 +30,7 @@ from vla_zenoh.errors import PeerError
 from vla_zenoh.lab.policy_servers.field_mapping import read_field_mapping
 from vla_zenoh.lab.serve import openpi_server
 from vla_zenoh.policy import ActionSpec
+from vla_zenoh.profile import load_profile
 
 EXAMPLES, MUTATIONS = 20, 60
 DTYPES = ("|b1", "|u1", "<i4", "<i8", "<f4", "<f8", ">f4", "<f2")
@@ -192,8 +193,9 @@ READ: dict[str, Any] = {
 }
 
 
-LAYOUT = read_field_mapping("x", openpi.PRESETS, "libero", {"keys": "actions"}, max_width_m=0.08)
-NAMED = read_field_mapping("x", groot.PRESETS, "libero", {"keys": "x"}, max_width_m=0.08)
+PANDA = load_profile("panda_sim")
+LAYOUT = read_field_mapping("x", openpi.PRESETS, "libero", {"keys": "actions"}, profile=PANDA)
+NAMED = read_field_mapping("x", groot.PRESETS, "libero", {"keys": "x"}, profile=PANDA)
 MAX_MESSAGE = 1500
 
 

@@ -29,17 +29,19 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_zenoh.errors import RecordError
+from vla_zenoh.errors import RecordError, SpecError
 from vla_zenoh.kinematics.so3 import (
     Pose,
     exp3,
     log3,
     norm3,
     orthonormal,
+    quat_from_rotation,
     rotation_from_quat,
     rotation_from_rpy,
 )
-from vla_zenoh.policy import ROTATION_SIZE, ActionSpec, ControllerSpec
+from vla_zenoh.policy import ActionSpec, ControllerSpec
+from vla_zenoh.policy.meaning import unturned
 from vla_zenoh.types import FloatArray, unit_quaternion
 
 Steps = NDArray[np.float32] | NDArray[np.float64]
@@ -57,13 +59,26 @@ def rotation_of(spec: ActionSpec, numbers: FloatArray) -> FloatArray:
     """Rotation matrix (3, 3) of the rotation numbers of a step.
 
     Raises:
-        RecordError: a quaternion that is not a unit quaternion.
+        RecordError: a quaternion that is not a unit quaternion, or a 6D rotation without two
+            directions.
     """
+    if spec.rotation == "rotation_6d":
+        try:
+            return rotation_from_quat(np.array(spec.rotation_form.decode(numbers)))
+        except SpecError as error:
+            raise RecordError(str(error)) from error
     if spec.rotation == "rpy":
         return rotation_from_rpy(numbers)
     if spec.rotation == "rotvec":
         return exp3(numbers)
     return rotation_from_quat(unit_quaternion("rotation of the action", numbers))
+
+
+def turns(spec: ActionSpec, step: FloatArray) -> bool:
+    """Whether the rotation numbers of a step are others than those of no rotation."""
+    if spec.rotation == "rotation_6d":
+        return bool(np.any(step[spec.rotation_columns] != unturned(spec.rotation)))
+    return bool(np.any(step[3:6]))  # of a quaternion x, y, z
 
 
 def step_pose(spec: ActionSpec, step: FloatArray, before: Pose, start: Pose | None = None) -> Pose:
@@ -74,7 +89,7 @@ def step_pose(spec: ActionSpec, step: FloatArray, before: Pose, start: Pose | No
     ``v dt, exp(w dt)``. An absolute step is the pose itself.
     """
     translation = np.asarray(step[:3], np.float64) * spec.position_scale_m
-    turn = np.asarray(step[3 : 3 + ROTATION_SIZE[spec.rotation]], np.float64)
+    turn = np.asarray(step[spec.rotation_columns], np.float64)
     if spec.kind == "velocity":
         translation, turn = translation * spec.dt_s, turn * spec.dt_s
     rotation = rotation_of(spec, turn)
@@ -114,7 +129,7 @@ def covered_step(
     if spec.controller is None:
         return asked, None
     rate = np.zeros(6) if state is None else state.rate
-    if np.any(step[3:6]):  # of a quaternion x, y, z
+    if turns(spec, step):
         turn = asked.rotation @ before.rotation.T
         held = orthonormal(turn @ before.rotation)
     else:
@@ -141,9 +156,10 @@ def chunk_poses(spec: ActionSpec, steps: Steps, start: Pose) -> list[Pose]:
 def as_deltas(spec: ActionSpec, steps: Steps) -> tuple[ActionSpec, FloatArray]:
     """The same chunk of one arm as deltas, each added to the step before, with the spec of them.
 
-    A chunk of deltas on the previous step, or of absolute poses, is returned as it is.
+    A chunk of deltas on the previous step, or of absolute poses, is returned as it is, but with
+    quaternions in place of 6D rotations.
     """
-    steps = np.asarray(steps, np.float64)
+    spec, steps = with_quaternions(spec, np.asarray(steps, np.float64))
     size = spec.arm_size
     if spec.kind == "velocity":
         scaled = np.concatenate([steps[:, :size] * spec.dt_s, steps[:, size:]], axis=1)
@@ -165,6 +181,21 @@ def as_deltas(spec: ActionSpec, steps: Steps) -> tuple[ActionSpec, FloatArray]:
         rows.append(np.concatenate([way_m, turn]))
     changed = {"relative_to": "previous", "rotation": "rotvec", "position_scale_m": 1.0}
     return spec.model_copy(update=changed), np.concatenate([rows, steps[:, size:]], axis=1)
+
+
+def with_quaternions(spec: ActionSpec, steps: FloatArray) -> tuple[ActionSpec, FloatArray]:
+    """The same steps (H, D) with quaternions in place of 6D rotations, with the spec of them.
+
+    Raises:
+        RecordError: a 6D rotation without two directions.
+    """
+    if spec.space == "joint" or spec.rotation != "rotation_6d":
+        return spec, steps
+    quats = [quat_from_rotation(rotation_of(spec, row)) for row in steps[:, spec.rotation_columns]]
+    rows = np.concatenate(
+        [steps[:, :3], np.array(quats), steps[:, spec.rotation_columns.stop :]], axis=1
+    )
+    return spec.model_copy(update={"rotation": "quaternion"}), rows
 
 
 def gripper_range(spec: ActionSpec, max_width_m: float) -> tuple[float, float]:
@@ -196,12 +227,10 @@ def step_width(
         raise RecordError(f"gripper {spec.gripper} of {value:g}{wanted}")
     if spec.gripper == "delta_m":
         wanted_m = before_m + value
-    elif spec.gripper == "absolute_m":
-        wanted_m = value
+    elif spec.gripper == "binary":
+        wanted_m = max_width_m * ((value > spec.gripper_threshold) == spec.gripper_open_is_high)
     else:
-        binary = spec.gripper == "binary"
-        fraction = float(value > spec.gripper_threshold) if binary else value
-        wanted_m = (fraction if spec.gripper_open_is_high else 1.0 - fraction) * max_width_m
+        wanted_m = max_width_m * spec.gripper_scale(max_width_m).decode(value)
     return min(max(wanted_m, 0.0), max_width_m)
 
 

@@ -23,11 +23,12 @@ from vla_zenoh.control.actions import (
     rotation_of,
     step_pose,
     step_width,
+    with_quaternions,
 )
 from vla_zenoh.control.limits import bound_step, workspace_corners
 from vla_zenoh.control.plan_timeline import Goal
 from vla_zenoh.errors import RecordError, SpecError
-from vla_zenoh.policy import ROTATION_SIZE, ActionSpec, ModelSpec, check_steps
+from vla_zenoh.policy import ActionSpec, ModelSpec, check_steps
 from vla_zenoh.profile import POSE_JOINTS, REACH_M, REJECT_FACTOR, Limits, Profile
 from vla_zenoh.types import QUATERNION_NORM_TOLERANCE, ActionChunk, FloatArray, Stamped, Task
 
@@ -153,7 +154,13 @@ def chunk_errors(
         if beyond is not None:
             yield error("joint_units", beyond[0])
         return
-    rotation = steps[:, 3 : 3 + ROTATION_SIZE[spec.rotation]]
+    wrote_6d = spec.rotation == "rotation_6d"
+    try:
+        spec, steps = with_quaternions(spec, steps)
+    except RecordError as fault:
+        yield error("rotation_6d", str(fault))
+        return
+    rotation = steps[:, spec.rotation_columns]
     if spec.rotation == "quaternion":
         worst = max(np.linalg.norm(rotation, axis=1).tolist(), key=lambda norm: abs(norm - 1.0))
         if abs(worst - 1.0) > QUATERNION_NORM_TOLERANCE:
@@ -174,7 +181,7 @@ def chunk_errors(
             f"position_scale_m is {spec.position_scale_m:g}",
         )
     too_far_rad = REJECT_FACTOR * limits.step_rad
-    if spec.rotation == "quaternion" and not spec.targets:
+    if spec.rotation == "quaternion" and not spec.targets and not wrote_6d:
         most_rad, swapped_rad = (
             2 * math.acos(min(float(np.abs(rotation[:, index]).min()), 1.0)) for index in (3, 0)
         )
@@ -199,7 +206,7 @@ def largest_step(spec: ActionSpec, steps: Steps) -> tuple[float, float]:
     """Largest length (m) and angle (rad) from one step to the next; of absolute poses their own."""
     spec, steps = as_deltas(spec, steps)
     position_m = steps[:, :3] * spec.position_scale_m
-    rotation = steps[:, 3 : 3 + ROTATION_SIZE[spec.rotation]]
+    rotation = steps[:, spec.rotation_columns]
     angles = np.linalg.norm(rotation, axis=1)
     if spec.rotation == "quaternion":
         angles = 2 * np.arccos(np.clip(np.abs(rotation[:, 3]), 0.0, 1.0))
@@ -432,13 +439,14 @@ def validate_steps(
 
     All steps are checked before the arm follows the first one, which starts from `start`.
     """
-    rotations = steps[:, 3 : 3 + ROTATION_SIZE[action.rotation]]
     try:
         for step in steps if action.gripper != "none" else ():
             step_width(action, step, start.width_m, max_width_m)
         if action.space == "joint":
             beyond = beyond_radians(action, steps, limits)
             return None if beyond is None else Rejection("step_rad", *beyond)
+        action, steps = with_quaternions(action, steps)
+        rotations = steps[:, action.rotation_columns]
         if action.rotation == "quaternion":
             off = np.abs(np.linalg.norm(rotations, axis=1) - 1.0)
             for index in (off > 0.9 * QUATERNION_NORM_TOLERANCE).nonzero()[0]:
@@ -448,7 +456,7 @@ def validate_steps(
     if action.kind == "absolute":
         return _validate_targets(steps[:, :3] * action.position_scale_m, limits)
     action, steps = as_deltas(action, steps)
-    rotations = steps[:, 3 : 3 + ROTATION_SIZE[action.rotation]]
+    rotations = steps[:, action.rotation_columns]
     lengths_m = steps[:, :3] * action.position_scale_m
     if action.rotation == "quaternion":
         most_rad = 2.0 * np.arccos(np.clip(np.abs(rotations[:, 3]) - ROUNDING, 0.0, 1.0))

@@ -20,7 +20,8 @@ from numpy.typing import ArrayLike
 from vla_zenoh import resources
 from vla_zenoh.errors import ProfileError, RecordError, nearest
 from vla_zenoh.kinematics.description import MOVING, DescribedJoint, Description, Mimic
-from vla_zenoh.kinematics.so3 import Pose, log3
+from vla_zenoh.kinematics.so3 import Pose, log3, quat_from_rotation
+from vla_zenoh.policy.meaning import reference
 from vla_zenoh.profile import JointEnds, Profile
 from vla_zenoh.types import FloatArray, JointState
 
@@ -210,6 +211,19 @@ def make_kinematics(profile: Profile) -> Kinematics:
         joint_range_rad=robot.joint_range_rad,
         locked_rad=robot.locked_rad,
     )
+
+
+def home_orientation(profile: Profile) -> tuple[float, float, float, float]:
+    """Orientation of the TCP at `robot.home_rad`, x, y, z, w, with a sign free of rounding.
+
+    It is the default reference of the numbers that a rotation has (`vla_zenoh.policy.meaning`).
+
+    Raises:
+        ResourceError, ProfileError: as `make_kinematics`.
+    """
+    arm, robot = make_kinematics(profile), profile.robot
+    home_rad = arm.ordered(robot.arm_joints, robot.home_rad)
+    return reference(quat_from_rotation(arm.forward(home_rad).rotation))
 
 
 def smallest_singular_value(jacobian: FloatArray) -> float:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vla_zenoh.errors import MissingExtraError
+from vla_zenoh.policy.meaning import quat_of_matrix
 from vla_zenoh.types import FloatArray, PoseState
 
 MEAN_ITERATIONS = 10
@@ -75,21 +76,8 @@ def rotation_from_quat(quat_xyzw: FloatArray) -> FloatArray:
 
 
 def quat_from_rotation(rotation: FloatArray) -> FloatArray:
-    """Unit quaternion x, y, z, w with w >= 0.
-
-    Its greatest component is computed first, of the diagonal, and divides the others.
-    """
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation.tolist()
-    if xx + yy + zz > 0.0:
-        q = (zy - yz, xz - zx, yx - xy, 1.0 + xx + yy + zz)
-    elif xx >= yy and xx >= zz:
-        q = (1.0 + xx - yy - zz, xy + yx, xz + zx, zy - yz)
-    elif yy >= zz:
-        q = (xy + yx, 1.0 - xx + yy - zz, yz + zy, xz - zx)
-    else:
-        q = (xz + zx, yz + zy, 1.0 - xx - yy + zz, yx - xy)
-    norm = math.copysign(math.hypot(*q), q[3])
-    return np.array([value / norm for value in q])
+    """Unit quaternion x, y, z, w with w >= 0."""
+    return np.array(quat_of_matrix(rotation.tolist()))
 
 
 def orthonormal(rotation: FloatArray) -> FloatArray:

@@ -25,7 +25,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vla_zenoh.errors import SpecError
-from vla_zenoh.policy.spec import ROTATION_SIZE, ActionSpec, ModelSpec
+from vla_zenoh.policy.meaning import RotationForm, toward, unturned
+from vla_zenoh.policy.spec import ActionSpec, ModelSpec
 from vla_zenoh.types import (
     ActionChunk,
     FloatArray,
@@ -38,6 +39,8 @@ from vla_zenoh.types import (
 from vla_zenoh.types.arrays import is_finite, to_float32
 
 REMEMBERED_LATENCIES = 10
+SAME_RAD = 1e-6
+"""Rotations this near to each other are interpolated as numbers."""
 ALIGNED = 1e-3
 """An observation this close to a step's end (in steps) counts as at its end."""
 
@@ -174,6 +177,21 @@ def check_steps(spec: ActionSpec, steps: ArrayLike) -> NDArray[np.float32]:
     return array
 
 
+def standing_step(spec: ActionSpec, last: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(D,) the step without motion after `last`, which keeps the gripper as it is."""
+    if spec.parts:
+        own = [standing_step(each.action, last[spec.columns(each.part)]) for each in spec.parts]
+        return np.concatenate(own)
+    out = last.copy()
+    if spec.kind != "absolute":
+        out[: spec.arm_size] = 0.0
+        if spec.space == "tcp":
+            out[spec.rotation_columns] = unturned(spec.rotation)
+    if spec.gripper == "delta_m":
+        out[-1] = 0.0
+    return out
+
+
 def make_chunk(
     worker: str,
     spec: ModelSpec,
@@ -286,7 +304,10 @@ class ChunkPrefix:
         # The command node starts the first step at once; see control/plan_timeline.py.
         passed_s = observation.task.speed * (observation.stamp_wall_ns - stamp_ns) / 1e9
         had = max(passed_s / self._action.dt_s, 1.0)
-        left = rest_of(self._action, steps, had)
+        try:
+            left = rest_of(self._action, steps, had)
+        except SpecError:  # numbers that are no rotation, which no arm follows
+            return None
         if not len(left):
             return None
         late = observation.task.speed * max(self._latencies_s) / self._action.dt_s
@@ -297,25 +318,32 @@ def rest_of(spec: ActionSpec, steps: NDArray[np.float32], had: float) -> NDArray
     """The steps of a chunk that remain after `had` of them, which may be fractional.
 
     They follow the same path, resampled from the observation on: deltas are weighted sums of two
-    neighbours, absolute poses interpolate between two. Rotations are interpolated as numbers, which
-    is accurate for close neighbours. Absolute gripper numbers keep their current value.
+    neighbours, absolute poses interpolate between two, on the shortest turn. Absolute gripper
+    numbers keep their current value.
     """
     whole = math.floor(had + ALIGNED)
     share = max(had - whole, 0.0)
     if share < ALIGNED:
         return steps[whole:].copy()
     first, second = steps[whole:-1].astype(np.float64), steps[whole + 1 :].astype(np.float64)
-    turn = slice(3, 3 + ROTATION_SIZE[spec.rotation])
-    turns = spec.space == "tcp"
-    if turns and spec.rotation == "quaternion":
-        near = np.sign(np.sum(first[:, turn] * second[:, turn], axis=1, keepdims=True))
-        second[:, turn] *= np.where(near < 0, -1.0, 1.0)
-    elif turns and spec.kind == "absolute":
-        away = second[:, turn] - first[:, turn]
-        second[:, turn] = first[:, turn] + (away + math.pi) % (2 * math.pi) - math.pi
     mixed = (1.0 - share) * first + share * second
-    if turns and spec.rotation == "quaternion":
-        mixed[:, turn] /= np.linalg.norm(mixed[:, turn], axis=1, keepdims=True)
+    if spec.space == "tcp" and (spec.kind == "absolute" or spec.rotation_form.size > 3):
+        turns = spec.rotation_columns
+        each = zip(first[:, turns], second[:, turns], strict=True)
+        mixed[:, turns] = [_between(spec.rotation_form, a, b, share) for a, b in each]
     if spec.gripper not in ("none", "delta_m"):
         mixed[:, -1] = first[:, -1]
     return mixed.astype(np.float32)
+
+
+def _between(form: RotationForm, first: Any, second: Any, share: float) -> list[float]:
+    """Numbers of the rotation at `share` of the way, nearest to those it begins with."""
+    begin = form.decode(first)
+    end = toward(form.decode(second), begin)
+    angle = math.acos(min(sum(a * b for a, b in zip(begin, end, strict=True)), 1.0))
+    weights = 1.0 - share, share
+    if angle > SAME_RAD:
+        weights = (math.sin(weight * angle) / math.sin(angle) for weight in weights)
+    of_begin, of_end = weights
+    mixed = [of_begin * a + of_end * b for a, b in zip(begin, end, strict=True)]
+    return form.follow(first, mixed)

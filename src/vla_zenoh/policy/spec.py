@@ -10,7 +10,7 @@ import hashlib
 import json
 from collections.abc import Iterator, Mapping
 from functools import lru_cache
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self, get_args
 
 from pydantic import (
     AfterValidator,
@@ -25,25 +25,31 @@ from pydantic import (
 )
 
 from vla_zenoh.errors import SpecError, describe_faults
+from vla_zenoh.policy.meaning import ROTATION_FORMS, GripperScale, RotationForm
 from vla_zenoh.types import MAX_DEPTH_UNIT_M, MIN_DEPTH_UNIT_M
 
 StatePart = Literal["joint", "pose", "gripper", "privileged", "wrench", "effort"]
 Resize = Literal["none", "stretch", "pad", "crop"]
 Frame = Literal["base", "tcp"]
-Rotation = Literal["rpy", "rotvec", "quaternion"]
+Rotation = Literal["rpy", "rotvec", "quaternion", "rotation_6d"]
 MotionKind = Literal["delta", "absolute", "velocity"]
 ActionSpace = Literal["tcp", "joint"]
 Anchor = Literal["goal", "measured"]
 RelativeTo = Literal["previous", "start"]
 GripperSemantics = Literal["none", "delta_m", "absolute_m", "open_fraction", "binary"]
 
-ROTATION_SIZE: Mapping[Rotation, int] = {"rpy": 3, "rotvec": 3, "quaternion": 4}
+ROTATION_SIZE: Mapping[Rotation, int] = {
+    name: ROTATION_FORMS[name].size for name in get_args(Rotation)
+}
 
 MAX_CAMERAS = MAX_JOINTS = 16
 MAX_PARTS = 4
 
 MAX_HISTORY, MAX_HISTORY_S = 16, 2.0
 """Observations in one inference, and the time from the first to the last of them."""
+
+BINARY_AWAY = 0.5
+"""How far from its threshold a binary gripper's number is."""
 
 STREAM_OF: Mapping[StatePart, StatePart] = {"wrench": "pose", "effort": "joint"}
 """Parts of the state that travel in the records of another one."""
@@ -246,7 +252,8 @@ class ActionSpec(_Spec):
         controller: of the data, where that covers only a part of each delta; None: steps are
             covered whole.
         rotation: ``rpy`` extrinsic x, y, z in rad; ``rotvec`` axis times angle in rad;
-            ``quaternion`` x, y, z, w.
+            ``quaternion`` x, y, z, w; ``rotation_6d`` the first two columns of the matrix, one
+            after the other (Zhou et al. 2019).
         position_scale_m: metres (m/s of a velocity) of one unit of x, y, z.
         gripper: ``none`` no such number; ``delta_m`` added to the width; ``absolute_m`` the width;
             ``open_fraction`` 0 shut to 1 open; ``binary`` above or below `gripper_threshold`.
@@ -321,6 +328,29 @@ class ActionSpec(_Spec):
     def arm_size(self) -> int:
         """Numbers of the arm in one step; that of the gripper follows."""
         return len(self.joints) if self.joints else 3 + ROTATION_SIZE[self.rotation]
+
+    @property
+    def rotation_form(self) -> RotationForm:
+        """The form of the rotation numbers of a step."""
+        return ROTATION_FORMS[self.rotation]
+
+    @property
+    def rotation_columns(self) -> slice:
+        """The columns of the rotation numbers in one step."""
+        return slice(3, 3 + self.rotation_form.size)
+
+    def gripper_scale(self, max_width_m: float) -> GripperScale:
+        """What the gripper's number says of the opening, where it is one.
+
+        A ``binary`` number is told as the two that its threshold lies between.
+        """
+        if self.gripper == "absolute_m":
+            return GripperScale(0.0, max_width_m)
+        low, high = 0.0, 1.0
+        if self.gripper == "binary":  # -1 and 1 where it switches at 0
+            away = BINARY_AWAY if self.gripper_threshold else 1.0
+            low, high = self.gripper_threshold - away, self.gripper_threshold + away
+        return GripperScale(low, high) if self.gripper_open_is_high else GripperScale(high, low)
 
     @property
     def dimension(self) -> int:

@@ -27,12 +27,13 @@ from dataset_rig import (
 from dataset_rig import write_run as make_run
 
 from vla_zenoh.errors import RecordingError
-from vla_zenoh.lab.dataset.episodes import episodes_of, fps_of, hold
+from vla_zenoh.lab.dataset.episodes import episodes_of, fps_of
 from vla_zenoh.lab.dataset.features import Histogram, action_names, of_numbers, usual_state
 from vla_zenoh.lab.dataset.lerobot import export
 from vla_zenoh.lab.dataset.openvla import openvla_statistics
 from vla_zenoh.lab.policy_servers.state_vector import read_parts
 from vla_zenoh.lab.recording.run import Run, load_run
+from vla_zenoh.policy import standing_step
 from vla_zenoh.types import JointState
 
 FPS, USED = 10, 2
@@ -87,13 +88,13 @@ def test_a_chunk_that_ran_out_is_followed_by_frames_that_stand_still(tmp_path: P
 def test_standing_still_is_said_in_the_words_of_the_spec() -> None:
     step = np.arange(1, 9, dtype=np.float32)
     quaternion = spec(rotation="quaternion").action
-    np.testing.assert_array_equal(hold(quaternion, step), [0, 0, 0, 0, 0, 0, 1, 8])
+    np.testing.assert_array_equal(standing_step(quaternion, step), [0, 0, 0, 0, 0, 0, 1, 8])
     absolute = spec(rotation="quaternion", kind="absolute").action
-    np.testing.assert_array_equal(hold(absolute, step), step)
+    np.testing.assert_array_equal(standing_step(absolute, step), step)
     delta = spec(gripper="delta_m").action
-    np.testing.assert_array_equal(hold(delta, step[:7]), np.zeros(7))
+    np.testing.assert_array_equal(standing_step(delta, step[:7]), np.zeros(7))
     without = spec(gripper="none").action
-    np.testing.assert_array_equal(hold(without, step[:6]), np.zeros(6))
+    np.testing.assert_array_equal(standing_step(without, step[:6]), np.zeros(6))
 
 
 def test_the_actions_in_the_file_are_those_of_the_chunks_to_the_bit(dataset: Path) -> None:

@@ -75,8 +75,9 @@ def test_the_persons_frames_are_what_the_arm_was_asked_for_in_the_models_numbers
     np.testing.assert_allclose(actions[:, 1], WAY_M, atol=PERIOD_M)
     np.testing.assert_allclose(actions[:, [0, 2, 3, 4, 5]], 0.0, atol=ATOL)
     shares = actions[:, 6]
-    assert shares[0] == pytest.approx(0.05), "nothing was commanded: the measured width"
-    assert shares[-1] == pytest.approx(PERSON_WIDTH_M)
+    most_m = load_profile("panda_sim").robot.gripper.max_width_m
+    assert shares[0] == pytest.approx(0.05 / most_m), "nothing was commanded: the measured width"
+    assert shares[-1] == pytest.approx(PERSON_WIDTH_M / most_m)
 
 
 @pytest.mark.parametrize(

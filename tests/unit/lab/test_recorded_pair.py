@@ -19,13 +19,14 @@ from pair_recording_rig import (
     write_pair_run,
 )
 
-from vla_zenoh.lab.dataset.episodes import episodes_of, hold
+from vla_zenoh.lab.dataset.episodes import episodes_of
 from vla_zenoh.lab.dataset.features import action_names, names_of_state, usual_state
 from vla_zenoh.lab.dataset.lerobot import export
 from vla_zenoh.lab.dataset.openvla import openvla_statistics
 from vla_zenoh.lab.evaluation.evaluate import combined, evaluate
 from vla_zenoh.lab.policy_servers.state_vector import read_parts
 from vla_zenoh.lab.recording.run import load_run
+from vla_zenoh.policy import standing_step
 
 USED, COLUMNS = 2, 6
 NAMES = [
@@ -128,7 +129,7 @@ def test_a_chunk_that_ran_out_leaves_both_arms_where_they_are(tmp_path: Path) ->
     last = steps_of(0, 2, COLUMNS)[-1]
     after = [frame.action for frame in episode.frames[2 * USED + HORIZON : 5 * USED]]
     np.testing.assert_array_equal(after, [last] * 2)
-    deltas = hold(pair_spec(kind="delta").action, last)
+    deltas = standing_step(pair_spec(kind="delta").action, last)
     np.testing.assert_array_equal(deltas, [0, 0, last[2], 0, 0, last[5]])
 
 

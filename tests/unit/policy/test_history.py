@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from vla_zenoh.lab.policy_servers.state_vector import read_parts, state_vector
+from vla_zenoh.lab.policy_servers.state_vector import StateNumbers, read_parts
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, Observation, ObservationSpec
 from vla_zenoh.policy.observation import MAX_PICTURES, NotReady, Streams, assemble
 from vla_zenoh.types import Header, Image, JointState, PoseState, Stamped, Task
@@ -173,7 +173,7 @@ def test_a_wrench_is_an_input_of_its_own_and_needs_no_pose() -> None:
     assert seen.wrench is not None
     np.testing.assert_array_equal(seen.wrench, np.arange(6.0))
     assert all(each.wrench is not None for each in seen.history)
-    vector = state_vector(read_parts("wrench+zero"), seen, 0.08)
+    vector = StateNumbers(read_parts("wrench+zero"), (), 0.08).encode(seen)
     np.testing.assert_array_equal(vector, [0, 1, 2, 3, 4, 5, 0])
 
 
@@ -192,5 +192,6 @@ def test_what_the_robot_does_not_measure_is_named() -> None:
             assert isinstance(seen, Observation)
             assert seen.joint is None
             np.testing.assert_array_equal(
-                state_vector(read_parts("effort"), seen, 0.08), np.array([1.5, -2.0], np.float32)
+                StateNumbers(read_parts("effort"), (), 0.08).encode(seen),
+                np.array([1.5, -2.0], np.float32),
             )

@@ -68,13 +68,14 @@ def _compare(path: Path, a: str, b: str, tolerance_s: float) -> Disagreement:
         if worker not in specs:
             there = sorted({entry.record.worker for entry in run.chunks})
             fail(f"{path} has no chunks of {worker!r}; it has: {', '.join(there) or 'none'}")
+    grips = any(spec.action.gripper != "none" for spec in specs.values())
     return disagreement(
         chunks[a],
         chunks[b],
         specs[a].action,
         specs[b].action,
         lambda stamp_ns: arm_state(run, stamp_ns),
-        max_width_m=run.max_width_m,
+        max_width_m=run.profile.robot.gripper.max_width_m if grips else 0.0,
         tolerance_s=tolerance_s,
     )
 

@@ -20,9 +20,11 @@ from vla_zenoh.cli.options import (
 from vla_zenoh.cli.output import console
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.lab.cli.loopback import require_loopback
+from vla_zenoh.lab.policy_servers.state_vector import home_reference
 from vla_zenoh.lab.serve import openpi_server
 from vla_zenoh.lab.serve.served_policy import DefaultNames, make_served_policy
 from vla_zenoh.policy.loader import make_policy
+from vla_zenoh.policy.meaning import IDENTITY
 from vla_zenoh.runtime.environments import run_in_own_environment
 from vla_zenoh.runtime.process import stop_on_signals
 from vla_zenoh.security.roles import Role
@@ -82,6 +84,7 @@ def serve(
         robot.arm_joints,
         robot.gripper.max_width_m,
         DefaultNames() if openpi else vla_eval.NAMES,
+        home_reference(loaded) if "pose" in policy.spec.observation.state else IDENTITY,
     )
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     getattr(policy, "load", lambda: None)()

@@ -13,14 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.errors import RecordingError
-from vla_zenoh.kinematics.so3 import Pose, log3, pose_of, quat_from_rotation, rotation_from_quat
-from vla_zenoh.lab.policy_servers.state_vector import rpy
+from vla_zenoh.kinematics.so3 import Pose, pose_of, quat_from_rotation, rotation_from_quat
+from vla_zenoh.lab.policy_servers.state_vector import home_reference
 from vla_zenoh.lab.recording.run import Run, newest
 from vla_zenoh.policy import ActionSpec
+from vla_zenoh.policy.meaning import IDENTITY
 from vla_zenoh.types import FloatArray
-
-BINARY = 0.5
-"""How far from its threshold a binary gripper is told to be open or shut."""
 
 
 def commanded_motion(run: Run, spec: ActionSpec) -> Callable[[int, int], NDArray[np.float32]]:
@@ -53,8 +51,11 @@ class CommandedMotion:
                 "step, so a person's motion cannot be told in its numbers; export what each of "
                 "them led with --worker"
             )
-        self._run, self._spec, self._max_width_m = run, spec, run.max_width_m
-        self._last_quat: FloatArray | None = None
+        self._run, self._spec = run, spec
+        self._max_width_m = run.profile.robot.gripper.max_width_m
+        # Absolute poses lie around the home orientation, deltas around no motion.
+        absolute = spec.space == "tcp" and spec.kind == "absolute"
+        self._reference = home_reference(run.profile) if absolute else IDENTITY
 
     def action(self, since_ns: int, until_ns: int) -> NDArray[np.float32]:
         """(D,) the step from one time to another, wall ns.
@@ -82,31 +83,17 @@ class CommandedMotion:
         else:
             moved = after.position_m - before.position_m
             turn = after.rotation @ before.rotation.T
-        return [*(moved / spec.position_scale_m), *self._numbers(turn)]
-
-    def _numbers(self, turn: FloatArray) -> FloatArray | list[float]:
-        if self._spec.rotation == "rotvec":
-            return log3(turn)
-        quat = quat_from_rotation(turn)
-        if self._spec.rotation == "rpy":
-            return rpy(quat)
-        if self._last_quat is not None and quat @ self._last_quat < 0:
-            quat = -quat  # the same rotation
-        self._last_quat = quat
-        return quat
+        turned = spec.rotation_form.encode(quat_from_rotation(turn), self._reference)
+        return [*(moved / spec.position_scale_m), *turned]
 
     def _gripper(self, since_ns: int, until_ns: int) -> float:
         spec, width_m = self._spec, self._width_m(until_ns)
         if spec.gripper == "delta_m":
             return width_m - self._width_m(since_ns)
-        if spec.gripper == "absolute_m":
-            return width_m
-        share = width_m / self._max_width_m
-        if not spec.gripper_open_is_high:
-            share = 1.0 - share
-        if spec.gripper == "open_fraction":
-            return share
-        return spec.gripper_threshold + (BINARY if share > 0.5 else -BINARY)
+        share = min(width_m / self._max_width_m, 1.0)
+        if spec.gripper == "binary":
+            share = float(share > 0.5)
+        return spec.gripper_scale(self._max_width_m).encode(share)
 
     # -- what was recorded --------------------------------------------------------------------
     def _pose(self, at_ns: int) -> Pose:

@@ -22,7 +22,7 @@ from vla_zenoh.lab.dataset.corrections import commanded_motion
 from vla_zenoh.lab.dataset.label import EpisodeLabel
 from vla_zenoh.lab.recording.run import RecordedSample, Run, Span, is_within, newest
 from vla_zenoh.lab.teleop.policy import PERSON
-from vla_zenoh.policy import ROTATION_SIZE, ActionSpec, ModelSpec
+from vla_zenoh.policy import ActionSpec, ModelSpec, standing_step
 
 FPS_TOLERANCE = 0.01
 
@@ -239,7 +239,7 @@ def _frames(
         count = max(round((end_ns - begin_ns) / dt_ns), 1)
         if chunk is chunks[-1] and not to_the_end:
             count = min(count, len(steps))
-        rest = hold(spec, steps[-1])
+        rest = standing_step(spec, steps[-1])
         for index in range(count):
             at_ns = begin_ns + index * dt_ns
             # A chunk's observation may be from just before the activation.
@@ -253,21 +253,3 @@ def _prompt(run: Run, at_ns: int) -> str:
     """In force at a time; before the first task, its own."""
     task = newest(run.tasks, at_ns) or run.tasks[0]
     return task.record.prompt
-
-
-def hold(spec: ActionSpec, last: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(D,) the step without motion after `last`."""
-    if spec.parts:
-        own = [hold(each.action, last[spec.columns(each.part)]) for each in spec.parts]
-        return np.concatenate(own)
-    if spec.kind == "absolute":
-        out = last.copy()
-    else:
-        out = np.zeros_like(last)
-        if spec.space == "tcp" and spec.rotation == "quaternion":
-            out[2 + ROTATION_SIZE["quaternion"]] = 1.0
-    if spec.gripper == "delta_m":
-        out[-1] = 0.0
-    elif spec.gripper != "none":
-        out[-1] = last[-1]
-    return out

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.dataset.episodes import RecordedEpisode
-from vla_zenoh.lab.policy_servers.state_vector import parts_of, state_vector
+from vla_zenoh.lab.policy_servers.state_vector import StateNumbers, parts_of, state_numbers
 from vla_zenoh.lab.recording.run import Run, nearest
 from vla_zenoh.policy import ActionSpec, Observation
+from vla_zenoh.policy.meaning import ROTATION_FORMS
 from vla_zenoh.policy.spec import STREAM_OF
 from vla_zenoh.types import Task
 
@@ -89,11 +91,7 @@ INTERVENTION = "intervention"
 """A person led the arm; the name that LeRobot's rollouts with corrections have."""
 NAMES = {
     "position": ["x", "y", "z"],
-    "rpy": ["roll", "pitch", "yaw"],
-    "rotvec": ["rx", "ry", "rz"],
-    "quaternion": ["qx", "qy", "qz", "qw"],
-    "quat_xyzw": ["qx", "qy", "qz", "qw"],
-    "quat_wxyz": ["qw", "qx", "qy", "qz"],
+    **{name: [*form.names] for name, form in ROTATION_FORMS.items()},
     "wrench": [*(f"force_{axis}" for axis in "xyz"), *(f"torque_{axis}" for axis in "xyz")],
     "fingers_m": ["left_finger", "right_finger"],
 }
@@ -168,10 +166,20 @@ def states_of(episode: RecordedEpisode, parts: Sequence[str]) -> NDArray[np.floa
     return np.concatenate(each, axis=1)
 
 
+def numbers_of(run: Run, parts: Sequence[str]) -> StateNumbers:
+    """The numbers of a state of the run's robot, whose joints come as they were recorded.
+
+    Raises:
+        RecordingError: the recording holds no profile.
+    """
+    found = state_numbers(parts, run.profile)
+    return replace(found, joints=run.joints[0].record.names) if run.joints else found
+
+
 def _states(episode: RecordedEpisode, run: Run, parts: Sequence[str]) -> NDArray[np.float32]:
     streams: dict[str, Any] = {"joint": run.joints, "pose": run.poses, "gripper": run.grippers}
     wanted = {part: streams[STREAM_OF.get(part, part)] for part in parts_of(parts)}
-    most_m, place = run.max_width_m, f"{run.part}/" if run.part else ""
+    numbers, place = numbers_of(run, parts), f"{run.part}/" if run.part else ""
     task = Task(0, True, "", episode.worker, 1.0)
     rows = []
     for frame in episode.frames:
@@ -187,5 +195,5 @@ def _states(episode: RecordedEpisode, run: Run, parts: Sequence[str]) -> NDArray
             if found[name] is None:
                 raise RecordingError(f"{run.path}: its robot did not measure {part}")
         observation = Observation(frame.stamp_ns, 0, task, **found)
-        rows.append(state_vector(parts, observation, most_m))
+        rows.append(numbers.encode(observation))
     return np.array(rows, np.float32)

@@ -1,6 +1,8 @@
-"""Meaning of an external policy's output, by options of the user.
+"""Meaning of an external policy's numbers, by options of the user.
 
-The same options serve policy servers, LeRobot checkpoints and OpenVLA checkpoints::
+The same options serve policy servers, LeRobot checkpoints and OpenVLA checkpoints, in both
+directions: they say what its answers mean, how the steps in execution are told to it, and in which
+units it wants the state (`vla_zenoh.lab.policy_servers.state_vector`)::
 
     action     delta, absolute, velocity (of the TCP); joint_delta, joint_position, joint_velocity
     frame      base, tcp: axes of a delta or velocity
@@ -8,15 +10,23 @@ The same options serve policy servers, LeRobot checkpoints and OpenVLA checkpoin
     relative_to  previous, start: what each delta of a chunk is added to
     controller none, or KP:DAMPING_RATIO of the data's controller, where that covers only a part of
                each delta (robosuite's and LIBERO's: 150:1)
-    rotation   rpy, rotvec, quat_xyzw, quat_wxyz
+    rotation   rpy, rotvec, quat_xyzw, quat_wxyz, rotation_6d (first two columns of the matrix),
+               rotation_6d_rows (first two rows)
+    rotation_reference  home, or x,y,z,w: of the numbers that one rotation has (both signs of a
+               quaternion, angles that differ by a turn), the state has those nearest to this one;
+               0,0,0,1: w >= 0 and angles within [-pi, pi]
     clip       numbers of the arm are clipped to [-clip, clip] first; empty: never
-    position_scale_m, rotation_scale_rad   one unit of the numbers of a pose, default 1
-    joint_scale_rad    one unit of the numbers of joints: 1 for radians, 0.0174533 for degrees; or
-               one for each joint, with commas, m for a joint that slides
+    position_scale_m, rotation_scale_rad   one unit of the numbers of a pose, default 1; of
+               absolute poses also that of the state
+    joint_scale_rad    one unit of the numbers of joints: 1 for radians, 0.0174533 for degrees,
+               negative for a joint that turns the other way; or one for each joint, with commas, m
+               for a joint that slides; of joint_position also that of `joint` in the state
+    joint_zero its number where a joint of the profile is at 0, default 0; or one for each
     gripper    none, delta_m, absolute_m, open_fraction, binary
     gripper_open       high, low: which end of binary and open_fraction is open
     gripper_range      SHUT:OPEN, the numbers of open_fraction where it is shut and open, in place
-               of gripper_open: 0:100 of LeRobot's SO-101, whose gripper is one of the joints
+               of gripper_open: 0:100 of LeRobot's SO-101, whose gripper is one of the joints; also
+               those of `gripper_open` in the state
     gripper_threshold  of binary
     dt_s       duration of a step
     horizon    largest number of steps used from an answer
@@ -29,7 +39,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, cast, get_args
 
 import numpy as np
@@ -39,6 +49,7 @@ from pydantic import ValidationError
 from vla_zenoh.errors import SpecError, describe_faults
 from vla_zenoh.lab.policy_servers.model_options import number, one_of, whole_number
 from vla_zenoh.policy import ActionSpec, Anchor, ControllerSpec, Frame, GripperSemantics, RelativeTo
+from vla_zenoh.policy.meaning import ROTATION_FORMS, SHARE, GripperScale
 
 Action = Literal["delta", "absolute", "velocity", "joint_delta", "joint_position", "joint_velocity"]
 _JOINT_KINDS: Mapping[str, str] = {
@@ -46,7 +57,17 @@ _JOINT_KINDS: Mapping[str, str] = {
     "joint_position": "absolute",
     "joint_velocity": "velocity",
 }
-ForeignRotation = Literal["rpy", "rotvec", "quat_xyzw", "quat_wxyz"]
+ForeignRotation = Literal[
+    "rpy", "rotvec", "quat_xyzw", "quat_wxyz", "rotation_6d", "rotation_6d_rows"
+]
+_SPEC_ROTATIONS: Mapping[str, str] = {
+    "quat_xyzw": "quaternion",
+    "quat_wxyz": "quaternion",
+    "rotation_6d_rows": "rotation_6d",
+}
+"""Forms that are another one in a spec."""
+SCALED = ("rpy", "rotvec")
+"""Forms whose numbers have a unit."""
 
 ACTION_OPTIONS: Mapping[str, str] = {
     "action": "",
@@ -55,10 +76,12 @@ ACTION_OPTIONS: Mapping[str, str] = {
     "relative_to": "",
     "controller": "",
     "rotation": "",
+    "rotation_reference": "home",
     "clip": "",
     "position_scale_m": "1",
     "rotation_scale_rad": "1",
     "joint_scale_rad": "",
+    "joint_zero": "0",
     "gripper": "",
     "gripper_open": "",
     "gripper_range": "",
@@ -70,8 +93,8 @@ ACTION_OPTIONS: Mapping[str, str] = {
 ADDED_TO = ("anchor", "relative_to", "controller")
 """What deltas are added to, and how much of them is covered."""
 NO_CONTROLLER = "none"
-QUATERNION_SLACK = 0.1
-"""A quaternion this far from unit length is normalised; further off it is rejected."""
+HOME = "home"
+"""Reference of rotations: the TCP's at `robot.home_rad`."""
 _ALLOWED: Mapping[str, tuple[str, ...]] = {
     "action": get_args(Action),
     "rotation": get_args(ForeignRotation),
@@ -98,36 +121,71 @@ _ASKED: Mapping[str, str] = {
 
 
 @dataclass(frozen=True, slots=True)
+class StateUnits:
+    """Units of a policy's state, as far as its options say them.
+
+    Args:
+        joint_scales: one unit of `joint`, of all or of each, in rad, of one that slides in m.
+        joint_zeros: its number where the joint is at 0, of all or of each.
+        position_scale_m: one unit of a position.
+        rotation_scale_rad: one unit of angles.
+        gripper: the numbers of `gripper_open`.
+        rotation_reference: home, or a quaternion x,y,z,w.
+    """
+
+    joint_scales: tuple[float, ...] = (1.0,)
+    joint_zeros: tuple[float, ...] = (0.0,)
+    position_scale_m: float = 1.0
+    rotation_scale_rad: float = 1.0
+    gripper: GripperScale = SHARE
+    rotation_reference: str = HOME
+
+
+METRIC = StateUnits()
+"""Metres, radians, and a gripper from 0 to 1."""
+
+
+@dataclass(frozen=True, slots=True)
 class ActionSemantics:
-    """Converts an external policy's output to action steps; made by `read_action_semantics`.
+    """Converts an external policy's numbers to action steps, and steps to its numbers.
+
+    Made by `read_action_semantics`.
 
     Args:
         spec: of the converted steps, in metres and radians.
         action: kind of the arm's numbers.
         rotation: their representation of rotations, if they are poses.
         clip: bound of the arm's raw numbers; 0: none.
-        scales: (position, rotation) one unit in m, rad.
-        gripper_range: the gripper's number where it is shut, and open, which are 0 and 1 then.
-        joint_scales: one unit of all joints, or of each, in rad, of a joint that slides in m.
+        units: of the numbers.
     """
 
     spec: ActionSpec
     action: Action
     rotation: ForeignRotation
     clip: float
-    scales: tuple[float, float]
-    joint_scales: tuple[float, ...] = (1.0,)
-    gripper_range: tuple[float, float] = (0.0, 1.0)
+    units: StateUnits
 
     @property
     def needs_joints(self) -> bool:
         """Whether its numbers are joints."""
         return self.spec.space == "joint"
 
+    @property
+    def state_units(self) -> StateUnits:
+        """Units of the state: those of the actions, where both are of one kind.
+
+        A unit of a delta or a velocity says nothing of the state, which is in m and rad then.
+        """
+        units = self.units
+        if self.action != "joint_position":
+            units = replace(units, joint_scales=(1.0,), joint_zeros=(0.0,))
+        if self.action != "absolute":
+            units = replace(units, position_scale_m=1.0, rotation_scale_rad=1.0)
+        return units
+
     def parts(self) -> dict[str, int]:
         """Parts of a row in order, with their sizes."""
-        turns = 4 if self.rotation.startswith("quat") else 3
-        arm = {"position": 3, self.rotation: turns}
+        arm = {"position": 3, self.rotation: ROTATION_FORMS[self.rotation].size}
         if self.needs_joints:
             arm = {"joints": len(self.spec.joints)}
         return arm if self.spec.gripper == "none" else {**arm, "gripper": 1}
@@ -139,7 +197,7 @@ class ActionSemantics:
             rows: (H, C), laid out as in `parts`.
 
         Raises:
-            SpecError: wrong number of columns, or a quaternion without unit length.
+            SpecError: wrong number of columns, or numbers that are no rotation.
         """
         parts = self.parts()
         if rows.shape[1] != sum(parts.values()):
@@ -149,35 +207,45 @@ class ActionSemantics:
                 "shape",
             )
         arm, gripper = np.split(rows, [rows.shape[1] - ("gripper" in parts)], axis=1)
-        shut, opened = self.gripper_range
-        gripper = (gripper - shut) / (opened - shut)
+        gripper = np.vectorize(self.units.gripper.decode, otypes=[np.float64])(gripper)
         if self.clip:
             arm = arm.clip(-self.clip, self.clip)
         if self.needs_joints:
-            return np.concatenate([arm * np.array(self.joint_scales), gripper], axis=1)
-        return np.concatenate([arm[:, :3] * self.scales[0], self._turns(arm), gripper], axis=1)
+            arm = (arm - self._zeros) * np.array(self.units.joint_scales)
+            return np.concatenate([arm, gripper], axis=1)
+        position_m, turns = arm[:, :3] * self.units.position_scale_m, arm[:, 3:]
+        if self.rotation in SCALED:
+            turns = turns * self.units.rotation_scale_rad
+        turns = _rewritten(turns, self.rotation, self.spec.rotation)
+        return np.concatenate([position_m, turns, gripper], axis=1)
 
     def rows(self, steps: NDArray[Any]) -> NDArray[np.float64]:
         """The inverse of `steps`: action steps (K, D) as the policy's own numbers (K, C)."""
         split = steps.shape[1] - (self.spec.gripper != "none")
         arm, gripper = np.split(steps.astype(np.float64), [split], axis=1)
+        gripper = np.vectorize(self.units.gripper.encode, otypes=[np.float64])(gripper)
         if self.needs_joints:
-            return np.concatenate([arm / np.array(self.joint_scales), gripper], axis=1)
-        turns = arm[:, 3:]
-        if self.rotation.startswith("quat"):
-            turns = np.roll(turns, 0 if self.rotation == "quat_xyzw" else 1, axis=1)
-        else:
-            turns = turns / self.scales[1]
-        return np.concatenate([arm[:, :3] / self.scales[0], turns, gripper], axis=1)
+            arm = arm / np.array(self.units.joint_scales) + self._zeros
+            return np.concatenate([arm, gripper], axis=1)
+        position, turns = arm[:, :3] / self.units.position_scale_m, arm[:, 3:]
+        turns = _rewritten(turns, self.spec.rotation, self.rotation)
+        if self.rotation in SCALED:
+            turns = turns / self.units.rotation_scale_rad
+        return np.concatenate([position, turns, gripper], axis=1)
 
-    def _turns(self, arm: NDArray[np.float64]) -> NDArray[np.float64]:
-        rotation = arm[:, 3:]
-        if not self.rotation.startswith("quat"):
-            return rotation * self.scales[1]
-        norm = np.linalg.norm(rotation, axis=1, keepdims=True)
-        if (abs(norm - 1.0) > QUATERNION_SLACK).any():
-            raise SpecError(f"a quaternion of norm {norm.min():.3g}; wanted 1", "quaternion")
-        return np.roll(rotation / norm, 0 if self.rotation == "quat_xyzw" else -1, axis=1)
+    @property
+    def _zeros(self) -> NDArray[np.float64]:
+        """Only positions have a zero; a change of them has none."""
+        return np.array(self.units.joint_zeros if self.action == "joint_position" else (0.0,))
+
+
+def _rewritten(numbers: NDArray[np.float64], before: str, after: str) -> NDArray[np.float64]:
+    """Rotations (n, ...) in another form, with the sign that they have."""
+    if before == after:
+        return numbers
+    quats = [ROTATION_FORMS[before].decode(row) for row in numbers]
+    rows = [ROTATION_FORMS[after].encode(quat, quat) for quat in quats]
+    return np.array(rows).reshape(len(rows), ROTATION_FORMS[after].size)
 
 
 def read_action_semantics(
@@ -218,25 +286,42 @@ def read_action_semantics(
     _ask_for_missing(chosen, f"action={action} is not that of {whose}, so " if other else "")
     if action in _JOINT_KINDS:
         chosen |= {"rotation": "rotvec", "frame": "base"}
-    position, rotation = (
-        number(name, chosen[name]) for name in ("position_scale_m", "rotation_scale_rad")
+    units = StateUnits(
+        joint_scales=_of_joints("joint_scale_rad", chosen["joint_scale_rad"] or "1", joints),
+        joint_zeros=_of_joints("joint_zero", chosen["joint_zero"], joints),
+        position_scale_m=number("position_scale_m", chosen["position_scale_m"]),
+        rotation_scale_rad=number("rotation_scale_rad", chosen["rotation_scale_rad"]),
+        gripper=_gripper_range(chosen),
+        rotation_reference=chosen["rotation_reference"],
     )
-    given_scales = (chosen["joint_scale_rad"] or "1").split(",")
-    joint_scales = tuple(number("joint_scale_rad", text.strip()) for text in given_scales)
-    if len(joint_scales) not in (1, len(joints)):
-        raise SpecError(
-            f"joint_scale_rad has {len(joint_scales)} numbers for {len(joints)} joints: give one "
-            "for all of them, or one each"
-        )
+    scales = {
+        "joint_scale_rad": units.joint_scales,
+        "position_scale_m": (units.position_scale_m,),
+        "rotation_scale_rad": (units.rotation_scale_rad,),
+    }
+    for name, values in scales.items():
+        if 0.0 in values:
+            raise SpecError(f"{name} is 0: every number would mean the same; give one unit's size")
+    if any(units.joint_zeros) and action != "joint_position":
+        raise SpecError("joint_zero goes with action=joint_position: a change has no zero")
     return ActionSemantics(
         spec=_spec(chosen, joints, normalisation),
         action=cast(Action, action),
         rotation=cast(ForeignRotation, chosen["rotation"]),
         clip=number("clip", chosen["clip"] or "0"),
-        scales=(position, rotation),
-        joint_scales=joint_scales,
-        gripper_range=_gripper_range(chosen),
+        units=units,
     )
+
+
+def _of_joints(name: str, text: str, joints: Sequence[str]) -> tuple[float, ...]:
+    """One number for all joints, or one for each."""
+    found = tuple(number(name, each.strip(), least=-math.inf) for each in text.split(","))
+    if len(found) not in (1, len(joints)):
+        raise SpecError(
+            f"{name} has {len(found)} numbers for {len(joints)} joints: give one for all of them, "
+            "or one each"
+        )
+    return found
 
 
 def _ask_for_missing(chosen: Mapping[str, str], why: str) -> None:
@@ -255,11 +340,11 @@ def _ask_for_missing(chosen: Mapping[str, str], why: str) -> None:
         )
 
 
-def _gripper_range(chosen: Mapping[str, str]) -> tuple[float, float]:
+def _gripper_range(chosen: Mapping[str, str]) -> GripperScale:
     """The gripper's number where it is shut, and where it is open."""
     text = chosen["gripper_range"]
     if not text:
-        return 0.0, 1.0
+        return SHARE
     if chosen["gripper"] != "open_fraction" or chosen["gripper_open"]:
         raise SpecError(
             "gripper_range goes with gripper=open_fraction, in place of gripper_open: leave out "
@@ -271,7 +356,7 @@ def _gripper_range(chosen: Mapping[str, str]) -> tuple[float, float]:
     )
     if len(ends) != 2 or ends[0] == ends[1]:
         raise SpecError(f"gripper_range is {text!r}; wanted SHUT:OPEN, two numbers as 0:100")
-    return ends[0], ends[1]
+    return GripperScale(*ends)
 
 
 def _not_asked(chosen: Mapping[str, str]) -> set[str]:
@@ -322,7 +407,7 @@ def _spec(
                 "anchor": chosen["anchor"] or "goal",
                 "relative_to": chosen["relative_to"] or "previous",
                 "controller": read_controller(chosen["controller"]),
-                "rotation": "quaternion" if rotation.startswith("quat") else rotation,
+                "rotation": _SPEC_ROTATIONS.get(rotation, rotation),
                 "gripper": chosen["gripper"],
                 "gripper_open_is_high": chosen["gripper_open"] != "low",
                 "gripper_threshold": number("gripper_threshold", threshold, least=-math.inf),

@@ -93,14 +93,12 @@ class Adapter(ABC):
                 f"timeout_s is {timeout_s!r}, wanted {MIN_TIMEOUT_S:g} to {MAX_TIMEOUT_S:g}: "
                 "a late answer is useless"
             )
-        robot = load_profile(profile).robot
         self.mapping = read_field_mapping(
             self.name,
             self.presets,
             preset,
             mapping,
-            max_width_m=robot.gripper.max_width_m,
-            joints=robot.arm_joints,
+            profile=load_profile(profile),
             normalisation=normalisation,
         )
         if self.mapping.semantics.needs_joints and not self.joints:

@@ -17,7 +17,7 @@ For the meaning of the numbers see `vla_zenoh.lab.policy_servers.action_semantic
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, get_args
 
@@ -31,7 +31,12 @@ from vla_zenoh.lab.policy_servers.action_semantics import (
     as_spec_error,
     read_action_semantics,
 )
-from vla_zenoh.lab.policy_servers.state_vector import parts_of, read_parts, state_vector
+from vla_zenoh.lab.policy_servers.state_vector import (
+    StateNumbers,
+    parts_of,
+    read_parts,
+    state_numbers,
+)
 from vla_zenoh.policy import (
     ActionSteps,
     CameraSpec,
@@ -40,6 +45,7 @@ from vla_zenoh.policy import (
     ObservationSpec,
     StatePart,
 )
+from vla_zenoh.profile import Profile
 from vla_zenoh.types import shown
 
 
@@ -68,14 +74,15 @@ class FieldMapping:
         spec: of the model, on our side.
         keys: names in the answer.
         columns: of the answer; None: all.
+        states: field of the request -> the numbers of its state.
     """
 
     fields: Mapping[str, FieldSource]
+    states: Mapping[str, StateNumbers]
     spec: ModelSpec
     keys: tuple[str, ...]
     columns: tuple[int, ...] | None
     semantics: ActionSemantics
-    max_width_m: float
 
     def wrong_columns(self, given: Any) -> list[str]:
         """Why an answer of `given` columns does not fit, if it is a number at all."""
@@ -101,7 +108,7 @@ class FieldMapping:
             elif source.prompt:
                 out[theirs] = observation.prompt
             else:
-                out[theirs] = state_vector(source.parts, observation, self.max_width_m)
+                out[theirs] = self.states[theirs].encode(observation)
         return out
 
     # -- in -----------------------------------------------------------------------------------
@@ -192,8 +199,7 @@ def read_field_mapping(
     preset: str,
     options: Mapping[str, str],
     *,
-    max_width_m: float,
-    joints: Sequence[str] = (),
+    profile: Profile,
     normalisation: str | None = None,
 ) -> FieldMapping:
     """The mapping that a preset and options define.
@@ -202,6 +208,7 @@ def read_field_mapping(
         name: of the model, for its spec.
         presets: name -> options.
         options: of the user; they override the preset.
+        profile: of the robot, one arm.
         normalisation: for the spec.
 
     Raises:
@@ -224,17 +231,25 @@ def read_field_mapping(
     given = {name: value for name, value in options.items() if name in ACTION_OPTIONS}
     whose = f"preset {preset}"
     semantics = read_action_semantics(
-        given, presets[preset], whose, joints=joints, normalisation=normalisation
+        given,
+        presets[preset],
+        whose,
+        joints=profile.robot.arm_joints,
+        normalisation=normalisation,
     )
     with as_spec_error():
         observation = _observation(fields, chosen)
     return FieldMapping(
         fields=fields,
+        states={
+            theirs: state_numbers(source.parts, profile, semantics.state_units)
+            for theirs, source in fields.items()
+            if source.parts
+        },
         spec=ModelSpec(name=name, observation=observation, action=semantics.spec),
         keys=_keys(chosen["keys"]),
         columns=read_columns(chosen["columns"]),
         semantics=semantics,
-        max_width_m=max_width_m,
     )
 
 

@@ -21,6 +21,7 @@ STATE8 = "position+rotvec+fingers_m"
 OSC = {
     "action": "delta",
     "rotation": "rotvec",
+    "rotation_reference": "1,0,0,0",
     "clip": "1",
     "position_scale_m": "0.05",
     "rotation_scale_rad": "0.5",
@@ -29,7 +30,7 @@ OSC = {
     "controller": "150:1",
     "dt_s": "0.05",
 }
-"""LIBERO's controller."""
+"""LIBERO's controller. Its states turn about +x by about half a turn where the tool points down."""
 OPENS_AT_1 = {"gripper": "binary", "gripper_open": "high"}
 """As data for OpenVLA and GR00T was converted to; LIBERO's environment takes -1 for open."""
 ADDED = {"anchor": "goal", "relative_to": "previous", "controller": "none"}

@@ -6,31 +6,50 @@ For model environments: numpy alone. Parts are joined by ``+``, as in ``position
     position, x y z                 TCP in the base frame, m
     rpy, roll pitch yaw             its rotation: extrinsic x, y, z, rad
     rotvec, rx ry rz                its rotation: axis times angle, rad
-    quat_xyzw, quat_wxyz            its rotation: unit quaternion with w >= 0
+    quat_xyzw, quat_wxyz            its rotation: unit quaternion
+    rotation_6d, rotation_6d_rows   its rotation: first two columns, or rows, of the matrix
     wrench                          external, at the TCP: force N, torque Nm, base axes
     effort                          of the arm's joints, Nm
     gripper_m, fingers_m            opening, m; both fingers, +half and -half of it, m
     gripper_open, gripper_closed    0 shut to 1 open, and 0 open to 1 shut
     zero, zero*N                    N zeros, for what this robot does not have
+
+`StateUnits` says in which units, where a policy has others.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_zenoh.errors import SpecError
+from vla_zenoh.errors import MissingExtraError, SpecError
+from vla_zenoh.lab.policy_servers.action_semantics import HOME, METRIC, SCALED, StateUnits
+from vla_zenoh.lab.policy_servers.model_options import number
 from vla_zenoh.policy import Observation, StatePart
+from vla_zenoh.policy.meaning import (
+    CLEAR,
+    IDENTITY,
+    QUATERNION_SLACK,
+    ROTATION_FORMS,
+    SHARE,
+    GripperScale,
+)
+from vla_zenoh.profile import Profile
+from vla_zenoh.types import FloatArray, JointState
 
+ROTATIONS = tuple(name for name in ROTATION_FORMS if name != "quaternion")
+CUT = ("rpy", "rotvec", "quat_xyzw", "quat_wxyz")
+"""Forms in which a rotation has several numbers, so that a reference chooses."""
+JOINTS = ("joint", "joint_deg")
 COORDINATES: Mapping[str, tuple[str, ...]] = {
     "position": ("x", "y", "z"),
-    "rpy": ("roll", "pitch", "yaw"),
-    "rotvec": ("rx", "ry", "rz"),
+    **{name: ROTATION_FORMS[name].names for name in SCALED},
 }
 """Parts whose numbers have names of their own."""
 PARTS: Mapping[str, tuple[StatePart | None, int | None]] = {
@@ -38,8 +57,7 @@ PARTS: Mapping[str, tuple[StatePart | None, int | None]] = {
     "joint_deg": ("joint", None),
     **{whole: ("pose", 3) for whole in COORDINATES},
     **{name: ("pose", 1) for names in COORDINATES.values() for name in names},
-    "quat_xyzw": ("pose", 4),
-    "quat_wxyz": ("pose", 4),
+    **{name: ("pose", ROTATION_FORMS[name].size) for name in ROTATIONS if name not in SCALED},
     "gripper_m": ("gripper", 1),
     "fingers_m": ("gripper", 2),
     "gripper_open": ("gripper", 1),
@@ -50,13 +68,10 @@ PARTS: Mapping[str, tuple[StatePart | None, int | None]] = {
 }
 """Name -> which part of the robot's state it is taken from, and how many numbers it has; None: as
 many as the arm has joints."""
-UPRIGHT = 1e-7
-"""Cosine of a pitch so near to 90 degrees that roll and yaw turn about the same axis."""
 
 _ZEROS = re.compile(r"zero\*([1-9][0-9]{0,3})")
 _WHOLE = {name: (whole, i) for whole, names in COORDINATES.items() for i, name in enumerate(names)}
-
-Numbers = Sequence[float] | NDArray[np.float64]
+GRIPPERS = ("gripper_m", "fingers_m", "gripper_open", "gripper_closed")
 
 
 # -- names ----------------------------------------------------------------------------------------
@@ -118,151 +133,192 @@ def parts_of(names: Sequence[str]) -> tuple[StatePart, ...]:
 
 
 # -- a state as numbers ---------------------------------------------------------------------------
-def state_vector(
-    names: Sequence[str], observation: Observation, max_width_m: float
-) -> NDArray[np.float32]:
-    """(n,) the numbers.
+@dataclass(frozen=True, slots=True)
+class StateNumbers:
+    """A state in the numbers of a policy, in both directions; made by `state_numbers`.
 
     Args:
         names: of `read_parts`.
-        observation: has the state of `parts_of`.
+        joints: names of the arm's, in the order in which they are told.
         max_width_m: of the open gripper.
+        units: of the numbers.
+        reference: quaternion x, y, z, w; of the numbers of a rotation those nearest to it are told.
     """
-    joint, pose, gripper = observation.joint, observation.pose, observation.gripper
-    out: list[float] = []
-    for name in names:
-        whole, index = _WHOLE.get(name, (name, None))
-        if joint is not None and name in JOINTS:
-            in_degrees = name == "joint_deg"
-            numbers = (np.rad2deg if in_degrees else np.asarray)(joint.position_rad).tolist()
-        elif pose is not None and whole == "position":
-            numbers = pose.position_m.tolist()
-        elif pose is not None and whole in ROTATIONS:
-            numbers = ROTATIONS[whole][0](pose.quat_xyzw)
-        elif name == "wrench" and observation.wrench is not None:
-            numbers = observation.wrench.tolist()
-        elif name == "effort" and observation.effort_nm is not None:
-            numbers = observation.effort_nm.tolist()
-        elif gripper is not None and name in GRIPPERS:
-            numbers = GRIPPERS[name][0](gripper.width_m, max_width_m)
+
+    names: tuple[str, ...]
+    joints: tuple[str, ...]
+    max_width_m: float
+    units: StateUnits = METRIC
+    reference: tuple[float, ...] = IDENTITY
+
+    @property
+    def size(self) -> int:
+        """How many numbers there are."""
+        return sum(size_of(name, len(self.joints)) for name in self.names)
+
+    def encode(self, observation: Observation) -> NDArray[np.float32]:
+        """(n,) the numbers of an observation that has the state of `parts_of`.
+
+        Raises:
+            SpecError: it lacks a part.
+        """
+        out: list[float] = []
+        for name in self.names:
+            whole, index = _WHOLE.get(name, (name, None))
+            part = PARTS[name][0]
+            measured = None if part is None else getattr(observation, _FIELDS.get(part, part))
+            if part is not None and measured is None:
+                raise SpecError(f"the observation has no {part}, of which {name!r} is a part")
+            if name in JOINTS or name == "effort":
+                measured = self._ordered(observation, measured)
+            values = self._encoded(whole, measured)
+            out += values if index is None else [values[index]]
+        return np.array(out, np.float32)
+
+    def _encoded(self, name: str, measured: Any) -> list[float]:
+        units = self.units
+        if name == "joint_deg":
+            return np.rad2deg(measured).tolist()
+        if name == "joint":
+            unit = np.array(units.joint_scales)
+            return (measured / unit + units.joint_zeros).tolist()
+        if name == "position":
+            return (measured.position_m / units.position_scale_m).tolist()
+        if name in ROTATIONS:
+            values = ROTATION_FORMS[name].encode(measured.quat_xyzw, self.reference)
+            return [value / self._unit_of(name) for value in values]
+        if name in GRIPPERS:
+            share = measured.width_m / self.max_width_m
+            if name == "fingers_m":
+                return [measured.width_m / 2, -measured.width_m / 2]
+            if name != "gripper_m":
+                share = min(max(share, 0.0), 1.0)
+            return [self._scale_of(name).encode(share)]
+        return [0.0] if name == "zero" else measured.tolist()
+
+    def _ordered(self, observation: Observation, measured: Any) -> FloatArray:
+        """What was measured of each joint, in the order of `joints`."""
+        if isinstance(measured, JointState):
+            names, measured = measured.names, measured.position_rad
+        elif observation.joint is not None:
+            names = observation.joint.names
         else:
-            numbers = [0.0]
-        out += numbers if index is None else [numbers[index]]
-    return np.array(out, np.float32)
+            return measured
+        if names == self.joints:
+            return measured
+        place = {name: index for index, name in enumerate(names)}
+        missing = [name for name in self.joints if name not in place]
+        if missing:
+            raise SpecError(
+                f"the state has no joint {', '.join(missing)}; it has {', '.join(names)}"
+            )
+        return measured[[place[name] for name in self.joints]]
+
+    def decode(self, numbers: NDArray[np.float64]) -> dict[str, Any]:
+        """The inverse of `encode`: what the numbers say of the robot.
+
+        Single coordinates (``x``, ``roll``) are not read back.
+
+        Returns:
+            any of ``joint`` (n,) rad, ``position_m`` (3,), ``quat_xyzw`` (4,), ``width_m``.
+
+        Raises:
+            SpecError: another count of numbers, or a part that cannot be read back.
+        """
+        if numbers.shape != (self.size,):
+            raise SpecError(
+                f"{'+'.join(self.names)} has shape {numbers.shape}, wanted ({self.size},)", "shape"
+            )
+        units, out = self.units, dict[str, Any]()
+        at = 0
+        for name in self.names:
+            size = size_of(name, len(self.joints))
+            values, at = numbers[at : at + size], at + size
+            if name == "joint_deg":
+                out["joint"] = np.deg2rad(values)
+            elif name == "joint":
+                out["joint"] = (values - units.joint_zeros) * np.array(units.joint_scales)
+            elif name == "position":
+                out["position_m"] = values * units.position_scale_m
+            elif name in ROTATIONS:
+                given = (values * self._unit_of(name)).tolist()
+                out["quat_xyzw"] = self._near(ROTATION_FORMS[name].decode(given))
+            elif name == "fingers_m":
+                out["width_m"] = float(values[0] - values[1])
+            elif name in GRIPPERS:
+                out["width_m"] = self.max_width_m * self._scale_of(name).decode(float(values[0]))
+            elif name != "zero":
+                raise SpecError(f"{name} alone says too little; give position and rpy or quat_xyzw")
+        return out
+
+    def _near(self, quat_xyzw: list[float]) -> FloatArray:
+        return np.array(ROTATION_FORMS["quat_xyzw"].encode(quat_xyzw, self.reference))
+
+    def _unit_of(self, rotation: str) -> float:
+        return self.units.rotation_scale_rad if rotation in SCALED else 1.0
+
+    def _scale_of(self, gripper: str) -> GripperScale:
+        if gripper == "gripper_m":
+            return GripperScale(0.0, self.max_width_m)
+        return GripperScale(1.0, 0.0) if gripper == "gripper_closed" else self.units.gripper
 
 
-def state_of(
-    names: Sequence[str], numbers: NDArray[np.float64], joints: int, max_width_m: float
-) -> dict[str, Any]:
-    """The inverse of `state_vector`: what the numbers say of the robot.
+_FIELDS = {"effort": "effort_nm"}
+"""Fields of an observation that are not called as their part."""
+
+
+def state_numbers(
+    names: Sequence[str], profile: Profile, units: StateUnits = METRIC
+) -> StateNumbers:
+    """The numbers of a state of the profile's robot.
 
     Args:
-        names: of `read_parts`; single coordinates (``x``, ``roll``) are not read back.
-        max_width_m: of the open gripper.
-
-    Returns:
-        any of ``joint`` (n,) rad, ``position_m`` (3,), ``quat_xyzw`` (4,), ``width_m``.
+        names: of `read_parts`.
+        profile: of one arm, see `Profile.of_part`.
+        units: of the numbers.
 
     Raises:
-        SpecError: another count of numbers, or a part that cannot be read back.
+        SpecError: a part and a unit that contradict each other, or an invalid reference.
+        ProfileError, ResourceError: rotations need the home orientation, and the robot's
+            description does not give it.
     """
-    sizes = [size_of(name, joints) for name in names]
-    if numbers.shape != (sum(sizes),):
+    if "gripper_closed" in names and units.gripper != SHARE:
         raise SpecError(
-            f"{'+'.join(names)} has shape {numbers.shape}, wanted ({sum(sizes)},)", "shape"
+            "the state has gripper_closed, which is 0 open to 1 shut, and gripper_range says other "
+            "numbers: name gripper_open, which has them"
         )
-    out: dict[str, Any] = {}
-    at = 0
-    for name, size in zip(names, sizes, strict=True):
-        values, at = numbers[at : at + size], at + size
-        if name in JOINTS:
-            out["joint"] = np.deg2rad(values) if name == "joint_deg" else values
-        elif name == "position":
-            out["position_m"] = values
-        elif name in ROTATIONS:
-            out["quat_xyzw"] = np.array(ROTATIONS[name][1](values.tolist()))
-        elif name in GRIPPERS:
-            out["width_m"] = GRIPPERS[name][1](float(values[0]), max_width_m)
-        elif name != "zero":
-            raise SpecError(f"{name} alone says too little; give position and rpy or quat_xyzw")
-    return out
+    robot = profile.robot
+    cut = any(_WHOLE.get(name, (name,))[0] in CUT for name in names)
+    given = units.rotation_reference
+    near = read_reference(given) if given != HOME else home_reference(profile) if cut else IDENTITY
+    width_m = robot.gripper.max_width_m
+    return StateNumbers(tuple(names), robot.arm_joints, width_m, units, near)
 
 
-# -- forms ----------------------------------------------------------------------------------------
-def quat_xyzw(quaternion: Numbers) -> list[float]:
-    """The same rotation, x, y, z, w with w >= 0."""
-    sign = -1.0 if quaternion[3] < 0 else 1.0
-    return [sign * float(value) for value in quaternion]
+def home_reference(profile: Profile) -> tuple[float, ...]:
+    """The TCP's orientation at `robot.home_rad` of one arm, as a reference.
+
+    Raises:
+        ProfileError, ResourceError, MissingExtraError: the robot's kinematics cannot be made.
+    """
+    try:
+        from vla_zenoh.kinematics.kinematics import home_orientation
+    except ImportError as error:
+        raise MissingExtraError("pinocchio", "control") from error
+    return home_orientation(profile)
 
 
-def quat_wxyz(quaternion: Numbers) -> list[float]:
-    """The same rotation, w, x, y, z with w >= 0."""
-    *axis, w = quat_xyzw(quaternion)
-    return [w, *axis]
+def read_reference(text: str) -> tuple[float, ...]:
+    """The quaternion of the option ``rotation_reference``.
 
-
-def rotvec(quaternion: Numbers) -> list[float]:
-    """Axis times angle in rad, angle within [0, pi]."""
-    x, y, z, w = quat_xyzw(quaternion)
-    sine = math.sqrt(x * x + y * y + z * z)
-    factor = 2 * math.atan2(sine, w) / sine if sine > 0 else 2.0
-    return [factor * x, factor * y, factor * z]
-
-
-def rpy(quaternion: Numbers) -> list[float]:
-    """Roll, pitch, yaw in rad: turns about the fixed x, y, z, one after the other."""
-    x, y, z, w = quat_xyzw(quaternion)
-    ahead, aside = 1 - 2 * (y * y + z * z), 2 * (w * z + x * y)
-    sine, cosine = 2 * (w * y - z * x), math.hypot(ahead, aside)
-    pitch = math.atan2(sine, cosine)
-    if cosine < UPRIGHT:  # only the sum, or difference, of the other two is known
-        return [0.0, pitch, math.copysign(2.0, -sine) * math.atan2(x, w)]
-    roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    return [roll, pitch, math.atan2(aside, ahead)]
-
-
-def _of_rotvec(turn_rad: Numbers) -> list[float]:
-    angle_rad = math.hypot(*turn_rad)
-    factor = math.sin(angle_rad / 2) / angle_rad if angle_rad > 0 else 0.5
-    return [*(factor * value for value in turn_rad), math.cos(angle_rad / 2)]
-
-
-def _of_rpy(turns_rad: Numbers) -> list[float]:
-    (sr, cr), (sp, cp), (sy, cy) = ((math.sin(a / 2), math.cos(a / 2)) for a in turns_rad)
-    return [
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-        cr * cp * cy + sr * sp * sy,
-    ]
-
-
-def _open(width_m: float, max_width_m: float) -> float:
-    return min(max(width_m / max_width_m, 0.0), 1.0)
-
-
-JOINTS = ("joint", "joint_deg")
-ROTATIONS: Mapping[
-    str, tuple[Callable[[Numbers], list[float]], Callable[[list[float]], list[float]]]
-] = {
-    "rpy": (rpy, _of_rpy),
-    "rotvec": (rotvec, _of_rotvec),
-    "quat_xyzw": (quat_xyzw, list),
-    "quat_wxyz": (quat_wxyz, lambda values: [*values[1:], values[0]]),
-}
-"""Name -> numbers of a quaternion x, y, z, w, and the other way round."""
-GRIPPERS: Mapping[
-    str, tuple[Callable[[float, float], list[float]], Callable[[float, float], float]]
-] = {
-    "gripper_m": (lambda width_m, _: [width_m], lambda value, _: value),
-    "fingers_m": (lambda width_m, _: [width_m / 2, -width_m / 2], lambda value, _: 2.0 * value),
-    "gripper_open": (
-        lambda width_m, most_m: [_open(width_m, most_m)],
-        lambda value, most_m: value * most_m,
-    ),
-    "gripper_closed": (
-        lambda width_m, most_m: [1 - _open(width_m, most_m)],
-        lambda value, most_m: (1.0 - value) * most_m,
-    ),
-}
-"""Name -> numbers of an opening, and the opening by their first, both with that of the open one."""
+    Raises:
+        SpecError: neither home nor a unit quaternion x,y,z,w with w >= 0.
+    """
+    entries = text.split(",")
+    found = tuple(number("rotation_reference", entry.strip(), least=-math.inf) for entry in entries)
+    length = math.hypot(*found)
+    if len(found) != 4 or abs(length - 1.0) > QUATERNION_SLACK or found[3] < -CLEAR:
+        raise SpecError(
+            f"rotation_reference is {text!r}; wanted home, or a unit quaternion x,y,z,w with w >= 0"
+        )
+    return tuple(value / length for value in found)

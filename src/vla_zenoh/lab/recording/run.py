@@ -6,17 +6,17 @@ from bisect import bisect_left, bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import yaml
-
-from vla_zenoh.errors import CodecError
+from vla_zenoh.errors import CodecError, ProfileError, RecordingError
 from vla_zenoh.keys import Keys, last_chunk
 from vla_zenoh.lab.recording.reader import Recording, open_recording
 from vla_zenoh.lab.recording.record_types import group_of, part_of
 from vla_zenoh.lab.recording.sample import DEPTH, JPEG, Sample
 from vla_zenoh.policy import ModelSpec
+from vla_zenoh.profile import Profile, read_profile
 from vla_zenoh.types import (
     ActionChunk,
     Cause,
@@ -35,6 +35,7 @@ from vla_zenoh.types import (
 )
 
 MAX_PROBLEMS = 20
+_read_profile = lru_cache(maxsize=4)(partial(read_profile, where="the recorded profile"))
 PART_STREAMS = ("poses", "joints", "grippers", "commands", "joint_commands", "gripper_commands")
 """Fields of a `Run` that each part of a robot has of its own."""
 
@@ -113,14 +114,19 @@ class Run:
         return (self.ended_ns - self.began_ns) / 1e9
 
     @property
-    def max_width_m(self) -> float:
-        """Of the gripper, from the profile in force; 1 without one, so that shares equal widths."""
+    def profile(self) -> Profile:
+        """The profile that was in force, of this part.
+
+        Raises:
+            RecordingError: the recording holds none that can be read.
+        """
         try:
-            profile = yaml.safe_load(self.file.profile_yaml)
-            own = profile.get("parts", {}).get(self.part, {}).get("robot", {}).get("gripper", {})
-            return float({**profile["robot"]["gripper"], **own}["max_width_m"])
-        except (AttributeError, TypeError, KeyError, ValueError, yaml.YAMLError):
-            return 1.0
+            return _read_profile(self.file.profile_yaml).of_part(self.part)
+        except (ProfileError, KeyError) as error:
+            raise RecordingError(
+                f"{self.path} holds no profile of this robot that can be read, which says how far "
+                f"its gripper opens and where its home is: {error}"
+            ) from error
 
     @property
     def part_names(self) -> tuple[str, ...]:

@@ -11,9 +11,15 @@ from numpy.typing import NDArray
 
 from vla_zenoh.errors import PeerError, RecordError, SpecError
 from vla_zenoh.lab.policy_servers.field_mapping import FieldSource, read_map
-from vla_zenoh.lab.policy_servers.state_vector import ROTATIONS, parts_of, read_parts, state_of
+from vla_zenoh.lab.policy_servers.state_vector import (
+    ROTATIONS,
+    StateNumbers,
+    parts_of,
+    read_parts,
+)
 from vla_zenoh.policy import ActionSteps, ModelSpec, Observation, Policy, check_steps, reset_of
 from vla_zenoh.policy.inference import Committed
+from vla_zenoh.policy.meaning import IDENTITY
 from vla_zenoh.policy.observation import prepare_image
 from vla_zenoh.types import GripperState, Image, JointState, PoseState, Task, shown
 
@@ -27,13 +33,13 @@ class ServedPolicy:
     Args:
         fields: name -> what it holds.
         joints: names of the arm's joints, in the order in which they are given.
-        max_width_m: of the gripper.
+        states: name -> the numbers of its state.
     """
 
     policy: Policy
     fields: Mapping[str, FieldSource]
     joints: tuple[str, ...]
-    max_width_m: float
+    states: Mapping[str, StateNumbers]
 
     @property
     def spec(self) -> ModelSpec:
@@ -61,7 +67,10 @@ class ServedPolicy:
         out: dict[str, str] = {}
         for name, source in self.fields.items():
             if source.camera:
-                out[name] = f"image of camera {source.camera}, (H, W, 3) RGB uint8"
+                out[name] = (
+                    f"image of camera {source.camera}, RGB, (H, W, 3) or (3, H, W), uint8, or "
+                    "floats from 0 to 1"
+                )
             else:
                 out[name] = "text" if source.prompt else "+".join(source.parts)
         return out
@@ -88,12 +97,12 @@ class ServedPolicy:
                         raise PeerError("peer_request", f"{name} is not text: {shown(value)}")
                     prompt = value
                 elif source.camera:
-                    if not isinstance(value, np.ndarray):
-                        raise PeerError("peer_request", f"{name} is no array: {shown(value)}")
-                    images[source.camera] = prepare_image(Image(value), cameras[source.camera])
+                    image = Image(_pixels(name, value))
+                    images[source.camera] = prepare_image(image, cameras[source.camera])
                 else:
-                    numbers = np.asarray(value, np.float64)
-                    state |= state_of(source.parts, numbers, len(self.joints), self.max_width_m)
+                    # One number comes without a shape, too: a gripper's.
+                    numbers = np.atleast_1d(np.asarray(value, np.float64))
+                    state |= self.states[name].decode(numbers)
             return Observation(
                 stamp_wall_ns=stamp_wall_ns,
                 seq=0,
@@ -117,6 +126,31 @@ class ServedPolicy:
         return out
 
 
+def _pixels(name: str, value: Any) -> NDArray[np.uint8]:
+    """(H, W, 3) of what a client sends, as openpi's own policies read it.
+
+    Source: openpi, ``_parse_image`` of its policies: floats are from 0 to 1, and channels may come
+    first.
+    """
+    given = np.asarray(value)
+    if given.ndim != 3 or given.dtype.kind not in "uif":
+        raise PeerError("peer_request", f"{name} is no image: {shown(value)}")
+    if given.shape[0] == 3 != given.shape[2]:
+        given = np.moveaxis(given, 0, -1)
+    if given.dtype.kind != "f":
+        beyond = given.size and (given.min() < 0 or given.max() > 255)
+        wanted, scale = "0 to 255", 1
+    else:
+        beyond = not (given.size and given.min() >= 0.0 and given.max() <= 1.0)
+        wanted, scale = "0 to 1, as it holds floats", 255
+    if beyond:
+        raise PeerError(
+            "peer_request",
+            f"{name} holds numbers from {given.min():.4g} to {given.max():.4g}; wanted {wanted}",
+        )
+    return np.ascontiguousarray(scale * given).astype(np.uint8)
+
+
 class DefaultNames(NamedTuple):
     """Default names of the clients' fields.
 
@@ -136,8 +170,12 @@ def make_served_policy(
     joints: tuple[str, ...],
     max_width_m: float,
     names: DefaultNames = DefaultNames(),  # noqa: B008  # cannot be changed
+    reference: tuple[float, ...] = IDENTITY,
 ) -> ServedPolicy:
     """The offer of a model; `map_option` names things otherwise than `names`.
+
+    The model is given the quaternion, of the two, that is nearer to the `reference` x, y, z, w,
+    whatever the client sends.
 
     Raises:
         SpecError: what the model needs is not named, or named twice.
@@ -172,4 +210,9 @@ def make_served_policy(
     parts = {part for source in fields.values() for part in source.parts}
     if "pose" in spec.observation.state and not ("position" in parts and parts & set(ROTATIONS)):
         raise SpecError(f"map must give the whole pose: position and one of {', '.join(ROTATIONS)}")
-    return ServedPolicy(policy, fields, joints, max_width_m)
+    states = {
+        name: StateNumbers(source.parts, joints, max_width_m, reference=reference)
+        for name, source in fields.items()
+        if source.parts
+    }
+    return ServedPolicy(policy, fields, joints, states)

@@ -29,7 +29,7 @@ PORT = 8000
 HEALTH_PATH = "/health"
 PROTOCOL_VERSION = 1
 NAMES = DefaultNames(camera="images/{}", state="states/{}", prompt="task_description")
-_ROTATIONS = {"rpy": "euler_xyz", "rotvec": "axis_angle", "quat_xyzw": "quaternion_xyzw"}
+_ROTATIONS = {"rpy": "euler_xyz", "rotvec": "axis_angle", "quaternion": "quaternion_xyzw"}
 MAX_ERROR = 1000
 LOG = logging.getLogger("vla_zenoh.serve")
 
@@ -102,8 +102,11 @@ def action_spec(action: ActionSpec) -> dict[str, Any]:
         out["position"] = {"name": "position", "dims": 3, "format": position}
     rotation = _ROTATIONS.get(action.rotation)
     if rotation is not None:
-        dims = 4 if action.rotation == "quat_xyzw" else 3
-        out["rotation"] = {"name": "rotation", "dims": dims, "format": rotation}
+        out["rotation"] = {
+            "name": "rotation",
+            "dims": action.rotation_form.size,
+            "format": rotation,
+        }
     return out
 
 

@@ -45,8 +45,8 @@ ALL: dict[str, tuple[Presets, str]] = {
 def layout(
     presets: Presets = openpi.PRESETS, /, preset: str = "libero", **options: str
 ) -> FieldMapping:
-    joints = load_profile("panda_sim").robot.arm_joints
-    return read_field_mapping("x", presets, preset, options, max_width_m=WIDTH_M, joints=joints)
+    profile = load_profile("panda_sim")
+    return read_field_mapping("x", presets, preset, options, profile=profile)
 
 
 def steps_of(of: FieldMapping, answer: Any) -> np.ndarray[Any, Any]:
