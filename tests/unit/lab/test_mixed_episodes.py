@@ -31,6 +31,7 @@ from vla_zenoh.lab.policy_servers.state_vector import read_parts
 from vla_zenoh.lab.recording.run import load_run
 from vla_zenoh.lab.trial.verdict import FACT
 from vla_zenoh.policy import ControllerSpec
+from vla_zenoh.profile import load_profile
 
 PARTS = read_parts("position+rpy+gripper_m")
 EACH = 10
