@@ -61,7 +61,7 @@ def test_the_forms_are_those_of_kinematics(quat: list[float]) -> None:
 
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("yaw_deg", [0, 45, 90, 135, 180, -90])
-def test_no_number_jumps_with_the_tool_straight_down(form: str, yaw_deg: float) -> None:
+def test_no_number_jumps_with_the_tool_straight_down(form: str, yaw_deg: int) -> None:
     """The commonest pose there is: half a turn, where the usual forms have their cut."""
     random = np.random.default_rng(yaw_deg % 360)
     home = rotation_from_rpy(np.array([math.pi, 0.0, math.radians(yaw_deg)]))

@@ -116,7 +116,9 @@ def seen(profile: Any = SO101, **state: Any) -> Observation:
     zeros = np.zeros(len(names))
     known = {
         "joint": JointState(names, home_rad, zeros, zeros),
-        "pose": PoseState(np.array([0.3, 0.1, 0.2]), home_orientation(profile), np.zeros(6)),
+        "pose": PoseState(
+            np.array([0.3, 0.1, 0.2]), np.array(home_orientation(profile)), np.zeros(6)
+        ),
         "gripper": GripperState(0.03, moving=False, holding=False),
     }
     return replace(example_observation(spec), **{**known, **state})
