@@ -18,7 +18,7 @@ import typer
 from vla_zenoh.cli.options import AnswerOption, options
 from vla_zenoh.cli.plain import BOLD_RED, complain, fail, json_answer, say, say_marked, warn
 from vla_zenoh.cli.target import RobotTarget
-from vla_zenoh.errors import SecurityError, nearest
+from vla_zenoh.errors import CodecError, SecurityError, nearest
 from vla_zenoh.keys import CRASHED, Keys, worker_node
 
 if TYPE_CHECKING:
@@ -50,14 +50,20 @@ def _answered(command: Callable[..., None]) -> Callable[..., None]:
 @options
 @_answered
 def prompt(
-    text: Annotated[str, typer.Argument(help="Instruction for the model.")],
+    text: Annotated[str, typer.Argument(help="Instruction for the model, in words.")],
     target: RobotTarget,
     as_json: AnswerOption = False,
 ) -> None:
     """Set the prompt. Any Zenoh client can: put the text on <root>/<robot>/prompt."""
     from vla_zenoh.codec.settings import decode_text
 
-    decode_text(text.encode())  # rejects it before a router is asked
+    if not decode_text(text.encode()):  # rejects it before a router is asked
+        raise CodecError(
+            "invalid",
+            "the prompt is empty: give the task in words, as in "
+            f"`{target.typed('prompt', 'HARD: go up')}`; `{target.typed('deactivate')}` brakes "
+            "the arm",
+        )
     with target.operator("prompt", text) as client:
         task = client.set_prompt(text)
         said = f"prompt: {task.prompt!r} (worker {task.worker}, {task.rate_hz:g} Hz)"

@@ -28,9 +28,15 @@ def main() -> None:
     try:
         from vla_zenoh.cli.main import app
 
-        app()
+        try:
+            app()
+        finally:
+            sys.stdout.flush()
     except KeyboardInterrupt:
         sys.exit(130)
+    except BrokenPipeError:  # whatever reads the output has ended, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
     except Exception as error:
         from vla_zenoh.runtime.process import PARENT_VARIABLE
 

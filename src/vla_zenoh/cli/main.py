@@ -7,6 +7,7 @@ command that runs completes nothing.
 from __future__ import annotations
 
 import os
+import re
 import shlex
 from collections import UserDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -17,7 +18,7 @@ from typing import Any, NamedTuple
 
 import typer
 import zenoh
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 from vla_zenoh import __version__, resources
 from vla_zenoh.cli.options import DEFAULT_PROFILE, PROFILE_VARIABLE
@@ -124,6 +125,17 @@ COMMANDS: Mapping[str, Mapping[str, str | Group]] = {
 }
 
 
+NEGATIVE = re.compile(r"-\.?[0-9].*")
+
+
+class _Command(TyperCommand):
+    """Takes a negative number for an argument, whose range is then the error, and no option."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        ctx.ignore_unknown_options = any(map(NEGATIVE.fullmatch, args))
+        return super().parse_args(ctx, args)
+
+
 class _LazyCommands(UserDict[str, Any]):
     """Name -> command, imported when it is first looked up."""
 
@@ -153,7 +165,7 @@ def _load(path: Sequence[str], entry: str | Group) -> Any:
     if isinstance(found, typer.Typer):
         around.add_typer(found, name=name)
     else:
-        around.command(name)(found)
+        around.command(name, cls=_Command)(found)
     group = typer.main.get_command(around)
     assert isinstance(group, TyperGroup)
     command = group.commands[name]

@@ -21,6 +21,7 @@ from vla_zenoh.cli.options import (
     NodeOptions,
     ProfileOption,
     effective_profile,
+    node_name,
     options,
 )
 from vla_zenoh.cli.plain import say
@@ -123,7 +124,10 @@ def camera(
         list[str] | None, typer.Argument(help="Cameras of the profile; default: all.")
     ] = None,
     name: Annotated[
-        str, typer.Option("--name", help="Node name; a second camera host needs another one.")
+        str,
+        typer.Option(
+            "--name", parser=node_name, help="Node name; a second camera host needs another one."
+        ),
     ] = "camera",
 ) -> None:
     """Publish images of cameras: V4L2 devices, RTSP streams, files and the simulator's."""
@@ -163,10 +167,14 @@ def worker(
     node: NodeOptions,
     model_options: ModelOptions,
     name: Annotated[
-        str | None, typer.Option("--name", help="Name in its keys; default: the model's name.")
+        str | None,
+        typer.Option(
+            "--name", parser=node_name, help="Name in its keys; default: the model's name."
+        ),
     ] = None,
     delay_ms: Annotated[
-        float, typer.Option("--delay", min=0, help="Milliseconds added to every inference.")
+        float,
+        typer.Option("--delay", min=0, max=60_000, help="Milliseconds added to every inference."),
     ] = 0.0,
     host: HostOption = None,
 ) -> None:

@@ -11,13 +11,20 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_type_hints
 
 import typer
+import zenoh
 
 from vla_zenoh.bus.host import HOST_VARIABLE
+from vla_zenoh.errors import ProfileError, nearest
+from vla_zenoh.keys import key_chunk
 
 if TYPE_CHECKING:  # Pydantic and the schema: `up` has more to do while it loads them
     from vla_zenoh.policy.loader import ModelFile
     from vla_zenoh.profile import Profile
 
+MAX_SECONDS = 7 * 24 * 3600
+"""Longest time that an option of a command takes: a week."""
+MAX_INDEX = 2**31 - 1
+"""Largest seed, and largest number of an episode."""
 DEFAULT_PROFILE = "panda_sim"
 PROFILE_VARIABLE = "VLA_ZENOH_PROFILE"
 
@@ -57,6 +64,39 @@ DryRunOption = Annotated[
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 AnswerOption = Annotated[bool, typer.Option("--json", help="Print the answer as JSON on stdout.")]
+
+
+def node_name(text: str) -> str:
+    """Parse a name that is part of a key; a `ProfileError` says what is allowed."""
+    return key_chunk(text, "name")
+
+
+def network_address(text: str) -> str:
+    """Parse the IP address or host name of one computer, or raise a `ValueError`."""
+    from vla_zenoh.profile.schema import network_address
+
+    return network_address(text)
+
+
+def bind_address(text: str) -> str:
+    """Parse an address to listen at: as `network_address`, or all addresses of this computer."""
+    return text if text in ("0.0.0.0", "::") else network_address(text)
+
+
+def key_expression(text: str) -> str:
+    """Parse a key with wildcards, or raise a `ValueError`."""
+    try:
+        zenoh.KeyExpr(text)
+    except zenoh.ZError as error:
+        raise ValueError(f"{text!r} is no key: write it as in `vla-zenoh keys`") from error
+    return text
+
+
+def not_empty(text: str) -> str:
+    """Parse a text that must say something."""
+    if not text.strip():
+        raise ValueError("is empty: leave the option out or give a text")
+    return text
 
 
 def options(command: Callable[..., None]) -> Callable[..., None]:
@@ -110,11 +150,24 @@ def effective_profile(
     from vla_zenoh.profile import load_profile, override
 
     loaded = load_profile(profile) if isinstance(profile, str) else profile
+    if host is not None:
+        _check_host(loaded, host)
     changes: dict[str, Any] = {"connect": connect} if connect else {}
     changes |= {"listen": listen} if listen else {}
     if host is not None and loaded.session.security is not None:
         changes["security"] = {"host": host}
     return override(loaded, {"session": changes}) if changes else loaded
+
+
+def _check_host(profile: Profile, host: str) -> None:
+    security = profile.session.security
+    people = () if security is None else tuple(security.people)
+    known = (*profile.hosts, *people)
+    if host not in known:
+        named = ", ".join(known) or "none"
+        raise ProfileError(
+            f"profile {profile.name} has no host {host!r}{nearest(host, known)} It has: {named}"
+        )
 
 
 @dataclass(frozen=True)

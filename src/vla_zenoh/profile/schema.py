@@ -25,6 +25,9 @@ _HOST_AND_PORT = re.compile(
     r":(?P<port>[0-9]{1,5})"
 )
 
+_LABEL = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9-]{0,61}[A-Za-z0-9])?")
+"""Part of a host name between dots (RFC 1123)."""
+
 
 def _endpoint(value: str) -> str:
     protocol, slash, _ = value.partition("/")
@@ -43,9 +46,41 @@ def _endpoint(value: str) -> str:
     match = _HOST_AND_PORT.fullmatch(address)
     if match is None:
         raise ValueError(f"{value!r}: write {protocol}/HOST:PORT, as {protocol}/10.0.0.2:7447")
+    host = match["host"]
+    if host.rpartition(".")[2].isdigit() and not _is_ipv4(host):
+        raise ValueError(f"{value!r}: {host} is no IPv4 address: it has four numbers up to 255")
     if int(match["port"]) > 65535:
         raise ValueError(f"{value!r}: a port is at most 65535")
     return value
+
+
+def _is_ipv4(host: str) -> bool:
+    try:
+        ipaddress.IPv4Address(host)
+    except ValueError:
+        return False
+    return True
+
+
+def network_address(text: str) -> str:
+    """`text` if it is the IP address or host name of one computer, without protocol and port.
+
+    Raises:
+        ValueError: it is not.
+    """
+    try:
+        found = ipaddress.ip_address(text)
+    except ValueError:
+        labels = text.split(".")
+        if not all(map(_LABEL.fullmatch, labels)) or labels[-1].isdigit():
+            raise ValueError(
+                f"{text!r} is no address: write an IP address or a host name, without protocol "
+                "and port, such as 10.0.0.2, fd00::2 or lab-pc.local"
+            ) from None
+        return text
+    if found.is_unspecified:
+        raise ValueError(f"{text!r} stands for all addresses of a computer: give one of them")
+    return text
 
 
 Endpoint = Annotated[str, Field(max_length=512), AfterValidator(_endpoint)]

@@ -91,3 +91,22 @@ def test_with_json_the_lines_of_a_command_are_its_messages(
         "errors": [],
         "reasons": [],
     }
+
+
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize("line", ["profile show panda_sim --json", "profile list", "--help"])
+def test_output_that_is_read_no_further_is_no_traceback(line: str, unbuffered: str) -> None:
+    """As by `| head`."""
+    read, write = os.pipe()
+    os.close(read)
+    done = subprocess.run(
+        [sys.executable, "-m", "vla_zenoh", *line.split()],
+        stdout=write,
+        stderr=subprocess.PIPE,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONUNBUFFERED": unbuffered},
+        timeout=60,
+    )
+    os.close(write)
+    assert (done.returncode, done.stderr) == (1, "")

@@ -14,7 +14,7 @@ import typer
 from rich.progress import TimeRemainingColumn
 
 from vla_zenoh import __version__
-from vla_zenoh.cli.options import JsonOption, ModelOptions, model_options, options
+from vla_zenoh.cli.options import MAX_INDEX, JsonOption, ModelOptions, model_options, options
 from vla_zenoh.cli.output import console, errors, new_table
 from vla_zenoh.errors import ResourceError
 from vla_zenoh.lab.benchmark.contract import BenchmarkTask
@@ -44,7 +44,10 @@ class BenchmarkEpisodes:
         int, typer.Option("--episodes", "-n", min=1, max=100_000, help="Of every task.")
     ] = 10
     first: Annotated[
-        int, typer.Option("--first", min=0, help="Index of the first initial state, or seed.")
+        int,
+        typer.Option(
+            "--first", min=0, max=MAX_INDEX, help="Index of the first initial state, or seed."
+        ),
     ] = 0
     mode: Annotated[
         Mode,
@@ -64,7 +67,10 @@ class BenchmarkEpisodes:
         ),
     ] = None
     replan: Annotated[
-        int, typer.Option("--replan", min=0, help="Steps to carry out of each chunk; 0: all.")
+        int,
+        typer.Option(
+            "--replan", min=0, max=100_000, help="Steps to carry out of each chunk; 0: all."
+        ),
     ] = 0
 
     @property
@@ -126,7 +132,8 @@ class BenchmarkOutput:
         ),
     ] = None
     videos: Annotated[
-        int, typer.Option("--videos", min=0, help="Of failures, at most, with --output.")
+        int,
+        typer.Option("--videos", min=0, max=100_000, help="Of failures, at most, with --output."),
     ] = 5
     as_json: JsonOption = False
 

@@ -14,6 +14,7 @@ import typer
 
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
+    MAX_INDEX,
     JsonOption,
     ModelOptions,
     effective_profile,
@@ -43,7 +44,10 @@ class EpisodeOptions:
 
     episodes: Annotated[int, typer.Option("--episodes", "-n", min=1, max=100_000)] = 30
     seed: Annotated[
-        int, typer.Option("--seed", "-s", min=0, help="Of the first layout; the next ones follow.")
+        int,
+        typer.Option(
+            "--seed", "-s", min=0, max=MAX_INDEX, help="Of the first layout; the next ones follow."
+        ),
     ] = UNSEEN_SEED
     family: Annotated[
         str | None,
@@ -120,7 +124,7 @@ def task(
     processes: Annotated[
         int | None,
         typer.Option(
-            "--processes", min=1, help="Processes with --lockstep; default: one per core."
+            "--processes", min=1, max=256, help="Processes with --lockstep; default: one per core."
         ),
     ] = None,
     profile: SimulatedProfileOption = DEFAULT_PROFILE,

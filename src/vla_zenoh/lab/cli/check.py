@@ -11,7 +11,15 @@ from typing import Annotated
 import typer
 from rich.text import Text
 
-from vla_zenoh.cli.options import PROFILE_VARIABLE, JsonOption, ModelOptions, WorkerChoice, options
+from vla_zenoh.cli.options import (
+    MAX_SECONDS,
+    PROFILE_VARIABLE,
+    JsonOption,
+    ModelOptions,
+    WorkerChoice,
+    node_name,
+    options,
+)
 from vla_zenoh.cli.output import console, new_table, styled
 from vla_zenoh.control.policy_check import error
 from vla_zenoh.errors import WorkerError, counted
@@ -34,17 +42,22 @@ class CheckPlan:
         list[str] | None, typer.Option("--prompt", help="Prompt to try; repeatable.")
     ] = None
     rate_hz: Annotated[
-        float | None, typer.Option("--rate", help="Required chunks per second.", min=0.01)
+        float | None, typer.Option("--rate", help="Required chunks per second.", min=0.01, max=1000)
     ] = None
-    runs: Annotated[int, typer.Option("--runs", help="Timed inferences.", min=1)] = DEFAULT_RUNS
+    runs: Annotated[int, typer.Option("--runs", help="Timed inferences.", min=1, max=1_000_000)] = (
+        DEFAULT_RUNS
+    )
     budget_s: Annotated[
         float,
         typer.Option(
-            "--budget", help="Seconds after loading at which no further test is started.", min=1
+            "--budget",
+            help="Seconds after loading at which no further test is started.",
+            min=1,
+            max=MAX_SECONDS,
         ),
     ] = 30.0
     patience_s: Annotated[
-        float, typer.Option("--patience", help="Seconds for one call of the model.", min=0.1)
+        float, typer.Option("--patience", help="Seconds for one call.", min=0.1, max=MAX_SECONDS)
     ] = 300.0
 
     def examine(
@@ -85,7 +98,8 @@ def check(
         ),
     ] = None,
     name: Annotated[
-        str | None, typer.Option("--name", help="Worker name; default: the model's name.")
+        str | None,
+        typer.Option("--name", parser=node_name, help="Worker name; default: the model's name."),
     ] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Fail on warnings too.")] = False,
     as_json: JsonOption = False,

@@ -28,7 +28,9 @@ def compare(
     file: Annotated[Path, typer.Argument(help="A recording of both.")],
     tolerance_s: Annotated[
         float,
-        typer.Option("--tolerance", help="Seconds between two observations of a pair.", min=0),
+        typer.Option(
+            "--tolerance", help="Seconds between two observations of a pair.", min=0, max=3600
+        ),
     ] = DEFAULT_TOLERANCE_S,
     as_json: JsonOption = False,
 ) -> None:

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from vla_zenoh.cli.options import JsonOption
+from vla_zenoh.cli.options import JsonOption, not_empty
 from vla_zenoh.cli.output import console, errors, fail
 from vla_zenoh.errors import RecordingError, counted, nearest
 from vla_zenoh.lab.cli.output import print_json, progress
@@ -133,7 +133,9 @@ def stats(
     folder: Annotated[Path, typer.Argument(help="A LeRobot dataset v3.0.")],
     name: Annotated[
         str | None,
-        typer.Option("--name", help="Key of the statistics; default: the folder's name."),
+        typer.Option(
+            "--name", parser=not_empty, help="Key of the statistics; default: the folder's name."
+        ),
     ] = None,
     output: Annotated[
         Path | None,

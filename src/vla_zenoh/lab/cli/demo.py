@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from vla_zenoh.cli.options import DEFAULT_PROFILE, options
+from vla_zenoh.cli.options import DEFAULT_PROFILE, MAX_INDEX, not_empty, options
 from vla_zenoh.lab.cli.options import DemoOptions
 
 DEFAULT_STEPS = 50
@@ -20,6 +20,7 @@ def demo(
         str | None,
         typer.Option(
             "--prompt",
+            parser=not_empty,
             help="A task such as 'put the red brick in the box', or a fixed motion such as "
             "'HARD: go up'. Default: one task of every kind.",
         ),
@@ -31,7 +32,7 @@ def demo(
         int, typer.Option("--steps", help="Steps of a fixed motion.", min=1, max=10_000)
     ] = DEFAULT_STEPS,
     seed: Annotated[
-        int | None, typer.Option("--seed", help="Of the layout of the tasks.", min=0)
+        int | None, typer.Option("--seed", help="Of the layout of the tasks.", min=0, max=MAX_INDEX)
     ] = None,
 ) -> None:
     """Start a simulated robot, let prompts move it, and show what it did.

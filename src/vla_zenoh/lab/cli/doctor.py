@@ -84,7 +84,12 @@ def doctor(
     as_json: JsonOption = False,
     rules: Annotated[
         Path | None,
-        typer.Option("--rules", help="Check the access rules in this Zenoh configuration instead."),
+        typer.Option(
+            "--rules",
+            exists=True,
+            dir_okay=False,
+            help="Check the access rules in this Zenoh configuration instead.",
+        ),
     ] = None,
     also: AlsoOption = None,
 ) -> None:
@@ -96,6 +101,8 @@ def doctor(
         raise typer.BadParameter("--host names a host of a profile: give --profile too")
     if also and profile is None:
         raise typer.BadParameter("--also names robots beside that of a profile: give --profile too")
+    if rules is not None and profile is None:
+        raise typer.BadParameter("--rules are of a secured profile: give --profile too")
     zenoh.init_log_from_env_or("off")
     needs, session, loaded = Needs(), SessionProfile(), None
     if profile is not None:

@@ -14,7 +14,7 @@ from rich.live import Live
 from rich.table import Table
 
 from vla_zenoh.bus.client import Client
-from vla_zenoh.cli.options import options
+from vla_zenoh.cli.options import MAX_SECONDS, node_name, options
 from vla_zenoh.cli.output import console, errors, fail, new_table
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.codec.image import decode_jpeg
@@ -35,7 +35,9 @@ MAX_NUMBERS = 32
 @options
 def inspect(
     target: RobotTarget,
-    worker: Annotated[str | None, typer.Argument(help="Default: all workers.")] = None,
+    worker: Annotated[
+        str | None, typer.Argument(parser=node_name, help="Default: all workers.")
+    ] = None,
     output: Annotated[
         Path | None,
         typer.Option(
@@ -44,10 +46,12 @@ def inspect(
     ] = None,
     force: ForceOption = False,
     seconds: Annotated[
-        float | None, typer.Option("--seconds", "-s", help="End after this time.")
+        float | None,
+        typer.Option("--seconds", "-s", min=0.1, max=MAX_SECONDS, help="End after this time."),
     ] = None,
     count: Annotated[
-        int | None, typer.Option("--count", "-n", help="End after this many inferences.", min=1)
+        int | None,
+        typer.Option("--count", "-n", min=1, max=10**9, help="End after this many inferences."),
     ] = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print one line of JSON per inference.")

@@ -19,7 +19,7 @@ from rich.table import Table
 from vla_zenoh.bus.buffers import CallbackRing, bytes_of, header_of
 from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.session import open_session
-from vla_zenoh.cli.options import JsonOption, options
+from vla_zenoh.cli.options import MAX_SECONDS, JsonOption, key_expression, options
 from vla_zenoh.cli.output import console, fail, new_table, styled
 from vla_zenoh.cli.plain import warn
 from vla_zenoh.cli.target import RobotTarget
@@ -58,7 +58,9 @@ class KeyTraffic:
 @options
 def keys(
     target: RobotTarget,
-    seconds: Annotated[float, typer.Option("--seconds", "-s", help="How long to listen.")] = 2.0,
+    seconds: Annotated[
+        float, typer.Option("--seconds", "-s", min=0.1, max=MAX_SECONDS, help="How long to listen.")
+    ] = 2.0,
     images: Annotated[
         bool,
         typer.Option(
@@ -169,14 +171,19 @@ def image_keys(of: Keys, nodes: Mapping[str, tuple[NodeStatus, float, bool]]) ->
 def echo(
     key: Annotated[
         str,
-        typer.Argument(help="Below <root>/<robot>/, such as state/pose or 'event/*'; or whole."),
+        typer.Argument(
+            parser=key_expression,
+            help="Below <root>/<robot>/, such as state/pose or 'event/*'; or whole.",
+        ),
     ],
     target: RobotTarget,
     count: Annotated[
-        int | None, typer.Option("--count", "-n", help="End after this many samples.")
+        int | None,
+        typer.Option("--count", "-n", min=1, max=10**9, help="End after this many samples."),
     ] = None,
     seconds: Annotated[
-        float | None, typer.Option("--seconds", "-s", help="End after this time.")
+        float | None,
+        typer.Option("--seconds", "-s", min=0.1, max=MAX_SECONDS, help="End after this time."),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:

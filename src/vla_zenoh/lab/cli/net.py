@@ -11,7 +11,7 @@ import typer
 from rich.table import Table
 
 from vla_zenoh.bus.clock import Clock, ClockSync
-from vla_zenoh.cli.options import JsonOption, options
+from vla_zenoh.cli.options import MAX_SECONDS, JsonOption, options
 from vla_zenoh.cli.output import console, fail, new_table, styled
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.lab.cli.output import print_json, progress
@@ -67,7 +67,7 @@ class Line:
 def net(
     target: RobotTarget,
     seconds: Annotated[
-        float, typer.Option("--seconds", "-s", min=1.0, help="How long to listen.")
+        float, typer.Option("--seconds", "-s", min=1.0, max=MAX_SECONDS, help="How long to listen.")
     ] = 3.0,
     as_json: JsonOption = False,
 ) -> None:

@@ -43,16 +43,21 @@ class DemoOptions:
     as_json: JsonOption = False
 
 
-def number_list(option: str, text: str, low: float, high: float) -> list[float]:
-    """Parse numbers separated by commas.
+def number_list(
+    option: str, text: str, low: float, high: float, count: int | None = None
+) -> list[float]:
+    """Parse numbers separated by commas; of another `count` than is given they are rejected.
 
     Raises:
-        typer.BadParameter: not numbers, or out of [low, high]; names the option.
+        typer.BadParameter: not numbers, too many, too few, or out of [low, high]; names the option.
     """
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError as error:
         raise typer.BadParameter(f"{option} wants numbers separated by commas: {error}") from error
+    if count is not None and len(numbers) != count:
+        plural = "s separated by commas" if count > 1 else ""
+        raise typer.BadParameter(f"{option} wants {count} number{plural}, not {text!r}")
     if not all(low <= number <= high for number in numbers):
         raise typer.BadParameter(f"{option} wants numbers from {low:g} to {high:g}")
     return numbers

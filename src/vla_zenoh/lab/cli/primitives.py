@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from vla_zenoh.cli.options import AnswerOption, NodeOptions, options
+from vla_zenoh.cli.options import AnswerOption, NodeOptions, node_name, not_empty, options
 from vla_zenoh.cli.plain import fail, say
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.codec.settings import MAX_HELD_M, MIN_HELD_M
@@ -57,9 +57,9 @@ def move_to(
     """Go straight to a pose, or to joints; rejected before it moves where that cannot be."""
     fields: dict[str, Any] = {}
     if at is not None:
-        fields["position_m"] = number_list("--at", at, -FURTHEST_M, FURTHEST_M)
+        fields["position_m"] = number_list("--at", at, -FURTHEST_M, FURTHEST_M, 3)
     if quat is not None:
-        fields["quat_xyzw"] = number_list("--quat", quat, -1.0, 1.0)
+        fields["quat_xyzw"] = number_list("--quat", quat, -1.0, 1.0, 4)
     if joints is not None:
         fields["joints_rad"] = _joints(joints)
     if not fields:
@@ -91,21 +91,24 @@ def grip(
     """Open or close the gripper while the arm stands."""
     word = {"close": "closed"}.get(width, width)
     wanted = word if word in ("open", "closed") else _number("WIDTH (open, closed, m)", word, 1.0)
-    holds_m = None if holds is None else number_list("--holds", holds, MIN_HELD_M, MAX_HELD_M)
+    holds_m = None if holds is None else number_list("--holds", holds, MIN_HELD_M, MAX_HELD_M, 3)
     fields = {"width_m": wanted, "holds_m": holds_m}
     _carry_out(target, "grip", fields, timeout_s, as_json=as_json)
 
 
 @options
 def run(
-    worker: Annotated[str, typer.Argument(help="Worker that moves the arm.")],
+    worker: Annotated[str, typer.Argument(parser=node_name, help="Worker that moves the arm.")],
     target: RobotTarget,
     until: Annotated[
         list[str] | None,
         typer.Option("--until", help=f"Condition that ends it, repeatable: {CONDITIONS}."),
     ] = None,
     prompt: Annotated[
-        str | None, typer.Option("--prompt", help="For the worker; default: the present one.")
+        str | None,
+        typer.Option(
+            "--prompt", parser=not_empty, help="For the worker; default: the present one."
+        ),
     ] = None,
     timeout_s: TimeoutOption = DEFAULT_TIMEOUT_S,
     as_json: AnswerOption = False,
@@ -144,10 +147,7 @@ def _stands(answer: Answer) -> str:
 
 
 def _number(option: str, text: str, most: float) -> float:
-    numbers = number_list(option, text, 0.0, most)
-    if len(numbers) > 1:
-        raise typer.BadParameter(f"{option} wants one number, not {text!r}")
-    return numbers[0]
+    return number_list(option, text, 0.0, most, 1)[0]
 
 
 def _joints(text: str) -> list[float] | dict[str, float]:
@@ -156,7 +156,7 @@ def _joints(text: str) -> list[float] | dict[str, float]:
     found: dict[str, float] = {}
     for part in text.split(","):
         name, _, value = part.partition("=")
-        (found[name.strip()],) = number_list("--joints", value, -FURTHEST_RAD, FURTHEST_RAD)
+        (found[name.strip()],) = number_list("--joints", value, -FURTHEST_RAD, FURTHEST_RAD, 1)
     return found
 
 
@@ -173,7 +173,7 @@ def _until(given: list[str]) -> dict[str, Any]:
             found[named] = _number(f"--until {name}", value, 1000.0)
         elif name == "inside" and ":" in value:
             low, high = (
-                number_list("--until inside", part, -FURTHEST_M, FURTHEST_M)
+                number_list("--until inside", part, -FURTHEST_M, FURTHEST_M, 3)
                 for part in value.split(":", 1)
             )
             found["inside"] = {"low_m": low, "high_m": high}

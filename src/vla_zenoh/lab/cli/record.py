@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vla_zenoh.cli.options import JsonOption, options
+from vla_zenoh.cli.options import MAX_SECONDS, JsonOption, key_expression, node_name, options
 from vla_zenoh.cli.output import console, errors, fail
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import counted
@@ -32,16 +32,21 @@ def record(
         typer.Option(
             "--keys",
             "-k",
+            parser=key_expression,
             help="Only these: a key expression below <root>/<robot>/, or whole; repeatable. "
             "Default: everything but raw images.",
         ),
     ] = None,
     raw: Annotated[bool, typer.Option("--raw", help="Raw images too; they are 1 MB each.")] = False,
     seconds: Annotated[
-        float | None, typer.Option("--seconds", "-s", help="End after this time.", min=0.1)
+        float | None,
+        typer.Option("--seconds", "-s", min=0.1, max=MAX_SECONDS, help="End after this time."),
     ] = None,
     name: Annotated[
-        str, typer.Option("--name", help="Node name; a second recorder needs another one.")
+        str,
+        typer.Option(
+            "--name", parser=node_name, help="Node name; a second recorder needs another one."
+        ),
     ] = "recorder",
     as_json: JsonOption = False,
 ) -> None:

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from vla_zenoh.cli.options import JsonOption, options
+from vla_zenoh.cli.options import JsonOption, not_empty, options
 from vla_zenoh.cli.output import console, errors, fail
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.cli.up import default_log_folder, rolling_folder
@@ -36,7 +36,7 @@ def rolling(
         float, typer.Option("--minutes", help="How much is kept.", min=0.1, max=1440)
     ] = 10.0,
     megabytes: Annotated[
-        int, typer.Option("--megabytes", help="Room on the disk at most.", min=20)
+        int, typer.Option("--megabytes", help="Room on the disk at most.", min=20, max=10**9)
     ] = 2048,
 ) -> None:
     """Keep the last minutes and the audit log, as `up` does beside the command node.
@@ -61,7 +61,9 @@ def rolling(
 @options
 def save(
     target: RobotTarget,
-    why: Annotated[str, typer.Argument(help="Why; it is kept with the record.")] = "by hand",
+    why: Annotated[
+        str, typer.Argument(parser=not_empty, help="Why; it is kept with the record.")
+    ] = "by hand",
 ) -> None:
     """Keep the last minutes of the rolling record, which `up` keeps, in a folder of their own."""
     with target.operator("lab", "save", why) as client:

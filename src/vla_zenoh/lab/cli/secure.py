@@ -16,7 +16,14 @@ from typing import Annotated, Literal
 import typer
 from rich.text import Text
 
-from vla_zenoh.cli.options import DEFAULT_PROFILE, HostOption, JsonOption, ProfileOption
+from vla_zenoh.cli.options import (
+    DEFAULT_PROFILE,
+    HostOption,
+    JsonOption,
+    ProfileOption,
+    network_address,
+    node_name,
+)
 from vla_zenoh.cli.output import console, errors, fail, new_table, styled
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import SecurityError, VlaZenohError
@@ -145,7 +152,11 @@ FolderOption = Annotated[
 ]
 AddressOption = Annotated[
     list[str] | None,
-    typer.Option("--address", help="Another name or address of the router; repeatable."),
+    typer.Option(
+        "--address",
+        parser=network_address,
+        help="Another name or address of the router; repeatable.",
+    ),
 ]
 DaysOption = Annotated[int, typer.Option("--days", min=1, max=AUTHORITY_DAYS, help="Validity.")]
 
@@ -227,7 +238,9 @@ def init(
 
 @secure_app.command("add")
 def add(
-    host: Annotated[str, typer.Argument(help="Host of the profile, or another computer.")],
+    host: Annotated[
+        str, typer.Argument(parser=node_name, help="Host of the profile, or another computer.")
+    ],
     profile: ProfileOption = DEFAULT_PROFILE,
     role: Annotated[
         Literal["operator", "viewer", "replay"] | None,
@@ -345,7 +358,12 @@ def _router_addresses(given: Sequence[str]) -> dict[str, str]:
         host, equals, address = text.partition("=")
         if not equals or not host or not address:
             raise typer.BadParameter(f"--at wants HOST=ADDRESS, not {text!r}")
-        out[host] = address
+        if host in out:
+            raise typer.BadParameter(f"--at gives host {host!r} two addresses")
+        try:
+            out[host] = network_address(address)
+        except ValueError as error:
+            raise typer.BadParameter(f"--at {text}: {error}") from error
     return out
 
 

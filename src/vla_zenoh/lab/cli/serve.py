@@ -14,7 +14,9 @@ from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
     ModelOptions,
     ProfileOption,
+    bind_address,
     effective_profile,
+    not_empty,
     options,
 )
 from vla_zenoh.cli.output import console
@@ -47,22 +49,32 @@ def serve(
         str, typer.Option("--map", help="Other names, as observation/image=camera:front,...")
     ] = "",
     host: Annotated[
-        str, typer.Option(help="Address to listen on; a network's only with --api-key.")
+        str,
+        typer.Option(
+            parser=bind_address, help="Address to listen on; a network's only with --api-key."
+        ),
     ] = "127.0.0.1",
     port: Annotated[
         int, typer.Option(min=0, max=65535, help="0: any free one.")
     ] = openpi_server.PORT,
     api_key: Annotated[
-        str, typer.Option(envvar="VLA_ZENOH_API_KEY", help="Key that clients must send.")
-    ] = "",
+        str | None,
+        typer.Option(
+            envvar="VLA_ZENOH_API_KEY", parser=not_empty, help="Key that clients must send."
+        ),
+    ] = None,
     execute: Annotated[
         int,
-        typer.Option(min=0, help="vla-eval: steps of a chunk before the next one; 0: all of them."),
+        typer.Option(
+            min=0,
+            max=100_000,
+            help="vla-eval: steps of a chunk before the next one; 0: all of them.",
+        ),
     ] = 0,
 ) -> None:
     """Serve a model of ours to clients of openpi, or to the benchmarks of vla-eval."""
     loaded = effective_profile(profile)
-    if not api_key:
+    if api_key is None:
         require_loopback(
             loaded,
             "--host",
@@ -101,7 +113,7 @@ def serve(
         port,
         health=openpi_server.HEALTH_PATH if openpi else vla_eval.HEALTH_PATH,
         max_bytes=openpi_server.MAX_BYTES,
-        api_key=api_key,
+        api_key=api_key or "",
     )
     threading.Thread(target=server.serve_forever, daemon=True).start()
     console().print(f"{chosen.name} for {wire}'s clients at ws://{host}:{server.port}")

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import typer
 
 from vla_zenoh.bus.session import open_session
-from vla_zenoh.cli.options import model_options, options
+from vla_zenoh.cli.options import model_options, node_name, options
 from vla_zenoh.cli.output import errors
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import SecurityError
@@ -40,7 +40,9 @@ def teleop(
         Literal["base", "tcp"], typer.Option(help="Axes of the motion: robot base or TCP.")
     ] = "base",
     speed: Annotated[int, typer.Option("--speed", min=1, max=5, help="Initial speed level.")] = 3,
-    name: Annotated[str, typer.Option("--name", help="Name of the worker.")] = "teleop",
+    name: Annotated[
+        str, typer.Option("--name", parser=node_name, help="Name of the worker.")
+    ] = "teleop",
 ) -> None:
     """Drive the arm by hand, as a worker whose model is you.
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from vla_zenoh.cli.options import JsonOption, options
+from vla_zenoh.cli.options import MAX_INDEX, MAX_SECONDS, JsonOption, options
 from vla_zenoh.cli.output import console, errors, fail, new_table
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import RecordingError
@@ -33,18 +33,22 @@ class PlanOptions:
         str | None, typer.Option("--workers", "-w", help="One or more, separated by commas.")
     ] = None
     prompt: Annotated[str | None, typer.Option("--prompt", help="The task.")] = None
-    episodes: Annotated[int | None, typer.Option("--episodes", "-n", min=1, help="Per worker.")] = (
-        None
-    )
+    episodes: Annotated[
+        int | None, typer.Option("--episodes", "-n", min=1, max=100_000, help="Per worker.")
+    ] = None
     setups: Annotated[
         Path | None,
         typer.Option("--setups", help="Text file with a setup per line; every worker does each."),
     ] = None
     seconds: Annotated[
-        float | None, typer.Option("--seconds", "-s", min=0.1, help="Time limit of an episode.")
+        float | None,
+        typer.Option("--seconds", "-s", min=0.1, max=MAX_SECONDS, help="Time limit of an episode."),
     ] = None
     seed: Annotated[
-        int | None, typer.Option("--seed", help="Of the order of workers; default: random.")
+        int | None,
+        typer.Option(
+            "--seed", min=0, max=MAX_INDEX, help="Of the order of workers; default: random."
+        ),
     ] = None
     is_open: Annotated[
         bool, typer.Option("--open", help="Show which worker runs; default: blind.")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vla_zenoh.cli.options import options
+from vla_zenoh.cli.options import MAX_SECONDS, bind_address, options
 from vla_zenoh.cli.output import errors, fail
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import MissingExtraError, OutputError, ProfileError, counted
@@ -50,6 +50,7 @@ class ViewOutput:
         str,
         typer.Option(
             "--bind",
+            parser=bind_address,
             help="With --serve: address to listen at; a network's only with an insecure profile.",
         ),
     ] = "127.0.0.1"
@@ -125,7 +126,8 @@ def view(
         typer.Argument(help="A file of `vla-zenoh record`; default: the running robot."),
     ] = None,
     seconds: Annotated[
-        float | None, typer.Option("--seconds", "-s", help="End after this time.", min=0.1)
+        float | None,
+        typer.Option("--seconds", "-s", min=0.1, max=MAX_SECONDS, help="End after this time."),
     ] = None,
 ) -> None:
     """View a robot and its model in Rerun, live or from a recording.

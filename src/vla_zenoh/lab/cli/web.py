@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import secrets
 import socket
+import ssl
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from vla_zenoh.cli.options import options
+from vla_zenoh.cli.options import bind_address, network_address, options
 from vla_zenoh.cli.output import errors
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import NodeError, SecurityError
@@ -26,7 +27,10 @@ PORT = 8088
 def web(
     target: RobotTarget,
     bind: Annotated[
-        str, typer.Option("--bind", help="Address to listen at; a network's only with TLS.")
+        str,
+        typer.Option(
+            "--bind", parser=bind_address, help="Address to listen at; a network's only with TLS."
+        ),
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: any free one.")] = PORT,
     people: Annotated[
@@ -45,7 +49,11 @@ def web(
     ] = None,
     name: Annotated[
         list[str] | None,
-        typer.Option("--name", help="Host name by which browsers reach this server; repeatable."),
+        typer.Option(
+            "--name",
+            parser=network_address,
+            help="Host name by which browsers reach this server; repeatable.",
+        ),
     ] = None,
 ) -> None:
     """Serve a page that watches and drives the robot, for computer, tablet and phone.
@@ -95,6 +103,14 @@ def _require_tls(bind: str, certificate: Path | None, key: Path | None) -> None:
     for file in (certificate, key):
         if file is not None and not file.is_file():
             raise SecurityError(f"{file} is not there")
+    if certificate is not None and key is not None:
+        try:
+            ssl.create_default_context(ssl.Purpose.CLIENT_AUTH).load_cert_chain(certificate, key)
+        except OSError as error:
+            raise SecurityError(
+                f"--certificate {certificate} and --key {key} are no certificate and its key, "
+                f"each as PEM: {error}"
+            ) from error
     if certificate is None and not is_loopback_address(bind):
         raise SecurityError(
             f"--bind {bind or '(all interfaces)'}: without TLS anyone on that network could read "

@@ -1,0 +1,150 @@
+"""Values of options are checked where they are given: numbers, addresses, names, files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typed import typed
+from typer.main import get_command
+
+from vla_zenoh.cli.main import app
+from vla_zenoh.profile.schema import network_address
+
+USAGE, FAILED = 2, 1
+SERVING = "secure init --folder keys -o lab.yaml --profile panda_sim_two_hosts"
+TALKING = "--connect tcp/127.0.0.1:9"
+
+
+def parameters(command: Any, path: tuple[str, ...] = ()) -> Iterator[Any]:
+    """Every option and argument of every command, with the words of its command."""
+    for name, below in getattr(command, "commands", {}).items():
+        yield from parameters(below, (*path, name))
+    for parameter in command.params:
+        if hasattr(parameter, "type_descriptor"):
+            yield pytest.param(parameter, id=" ".join((*path, *parameter.opts)))
+
+
+ALL = [*parameters(get_command(app))]
+NUMBERS = [each for each in ALL if each.values[0].type_descriptor.annotation in (int, float)]
+TEXTS = {"rate rate_hz"}
+"""Numbers that travel as text: the codec of the setting names their range."""
+
+
+@pytest.mark.parametrize("parameter", [each for each in NUMBERS if each.id not in TEXTS])
+def test_every_number_has_a_smallest_and_a_largest_value(parameter: Any) -> None:
+    """So neither nan nor inf is one."""
+    information = parameter.type_descriptor.parameter_info
+    assert information.min is not None
+    assert information.max is not None
+
+
+def test_names_and_addresses_have_parsers() -> None:
+    """Options by whose name one sees that they are names in keys, or addresses."""
+    for each in ALL:
+        parameter, information = each.values[0], each.values[0].type_descriptor.parameter_info
+        if {"--name", "--bind", "--address"} & set(parameter.opts):
+            assert information.parser is not None, each.id
+
+
+ADDRESSES = ["127.0.0.1:7552", "10.0.0.300", "lab_pc", "tcp/10.0.0.3", "a b", "", "0.0.0.0", "::"]
+ADDRESSES += ["[::1]", "-a", "a..b", "10.0.0", "x" * 64, "tls/a:1", "10.0.0.2/24"]
+
+
+@pytest.mark.parametrize("text", ADDRESSES)
+def test_what_is_no_address_of_a_computer_is_rejected(text: str) -> None:
+    with pytest.raises(ValueError, match="address"):
+        network_address(text)
+
+
+@pytest.mark.parametrize(
+    "text", ["10.0.0.2", "fd00::2", "fe80::1%eth0", "lab-pc", "lab-pc.local", "localhost", "A1"]
+)
+def test_addresses_and_host_names_are_taken(text: str) -> None:
+    assert network_address(text) == text
+
+
+@pytest.mark.parametrize("address", ADDRESSES)
+@pytest.mark.parametrize("option", ["--at robot={}", "--address {}"])
+def test_no_certificate_is_made_for_what_is_no_address(
+    capsys: pytest.CaptureFixture[str], monkeypatch: Any, tmp_path: Path, option: str, address: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = typed(capsys, *SERVING.split(), *(word.format(address) for word in option.split()))
+    assert done.code == USAGE, done.stderr
+    assert option.split()[0] in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+LINES = [
+    (f"{SERVING} --at robot=10.0.0.2 --at robot=10.0.0.3", USAGE, "two addresses"),
+    (f"{SERVING} --address 10.0.0.2:7447", USAGE, "is no address"),
+    ("web --bind 10.0.0.300", USAGE, "'10.0.0.300' is no address"),
+    ("web --name lab:80", USAGE, "'lab:80' is no address"),
+    ("view --serve --bind nosuch:5", USAGE, "'nosuch:5' is no address"),
+    ("lab serve --worker scripted --host 10.0.0.300", USAGE, "is no address"),
+    ("up panda_sim --listen tcp/10.0.0.300:7447", FAILED, "10.0.0.300 is no IPv4 address"),
+    (f"status --host nosuch {TALKING}", FAILED, "has no host 'nosuch'"),
+    (f"stop --host a/b {TALKING}", FAILED, "has no host 'a/b'"),
+    (f"worker scripted --name a/b {TALKING}", USAGE, "cannot be part of a key"),
+    (f"teleop --name a/b {TALKING}", USAGE, "cannot be part of a key"),
+    (f"node camera --name a/b {TALKING}", USAGE, "cannot be part of a key"),
+    (f"record --name a/b {TALKING}", USAGE, "cannot be part of a key"),
+    ("check scripted --name a/b", USAGE, "cannot be part of a key"),
+    (f"do run a/b {TALKING}", USAGE, "cannot be part of a key"),
+    (f"lab inspect a/b {TALKING}", USAGE, "cannot be part of a key"),
+    ("secure add a/b --role operator", USAGE, "cannot be part of a key"),
+    (f"echo a//b {TALKING}", USAGE, "is no key"),
+    (f"record --keys a//b {TALKING}", USAGE, "is no key"),
+    ("do move-to --at 1,2", USAGE, "--at wants 3 numbers"),
+    ("do move-to --at 0,0,1 --quat 0,0,1", USAGE, "--quat wants 4 numbers"),
+    ("do grip 0.05 --holds 0.1,0.2", USAGE, "--holds wants 3 numbers"),
+    ("do grip -0.05", USAGE, "wants numbers from 0 to 1"),
+    ("rate -5", FAILED, "rate '-5' Hz is out of range: give 0.05 to 100"),
+    ("rate -.5", FAILED, "is out of range: give 0.05 to 100"),
+    ("speed -5", FAILED, "speed '-5' percent is out of range: give 0 to 100 percent"),
+    ("rate --nosuch", USAGE, "No such option: --nosuch"),
+    ("doctor --rules absent.json5 --profile panda_sim", USAGE, "absent.json5"),
+    ("doctor --rules .", USAGE, "--rules"),
+    ("web --certificate junk --key junk", FAILED, "are no certificate and its key"),
+]
+
+
+@pytest.mark.parametrize(("line", "code", "said"), LINES, ids=[line for line, *_ in LINES])
+def test_a_bad_value_is_named_with_what_is_allowed(
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: Any,
+    tmp_path: Path,
+    line: str,
+    code: int,
+    said: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "300")
+    (tmp_path / "junk").write_text("junk")
+    done = typed(capsys, *line.split())
+    assert said in done.said
+    assert done.code == code
+    assert done.stdout == ""
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("prompt", ""),
+        ("prompt", "  "),
+        ("demo", "--prompt", ""),
+        ("do", "run", "scripted", "--prompt", ""),
+        ("lab", "save", ""),
+        ("lab", "serve", "--worker", "scripted", "--api-key", ""),
+    ],
+)
+def test_an_empty_text_is_rejected_with_what_to_give(
+    capsys: pytest.CaptureFixture[str], words: tuple[str, ...]
+) -> None:
+    done = typed(capsys, *words)
+    assert done.code in (FAILED, USAGE)
+    assert "empty" in done.said
+    assert "give" in done.said
