@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Mapping
+from copy import copy
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,9 @@ NO_HASH = "TypeHashNotSupported"
 MAX_MESSAGE_BYTES = 4 * 1024 * 1024
 MAX_PICTURE_BYTES = 128 * 1024 * 1024
 SECOND_NS = 1_000_000_000
+HEADER_BYTES = 4
+"""In front of CDR: two for its representation, two of options, which nobody uses."""
+_BIG_ENDIAN, _LITTLE_ENDIAN = b"\0\0", b"\0\1"
 _EVENT_INFO = "service_msgs/msg/ServiceEventInfo"
 _SEPARATOR = "---"
 _SUFFIXES = (".msg", ".srv", ".action")
@@ -70,16 +74,19 @@ class Messages:
         for kind, text in (shipped_too | dict(extra or {})).items():
             definitions |= parse(kind, text)
         self._register(definitions)
-        # ROS 2 makes a ``char`` of message text a ``uint8``; rosbags hashes it as a character.
-        for kind, (constants, fields) in self._store.fielddefs.items():
-            changed = [(name, _as_uint8(described)) for name, described in fields]
-            self._store.fielddefs[kind] = (constants, changed)
+        # ROS 2 makes a ``char`` of message text a ``uint8``; rosbags hashes it as a character. A
+        # ``byte`` has a hash of its own, but rosbags reads it as signed.
+        self._hashed = copy(self._store)
+        self._hashed.fielddefs = _with_uint8(self._store.fielddefs, "char")
+        self._store.fielddefs |= _with_uint8(self._hashed.fielddefs, "byte")
 
     def _register(self, definitions: Mapping[str, Any]) -> None:
         known = {*self._store.fielddefs, *definitions}
         for kind, (_, fields) in definitions.items():
             for name, described in fields:
                 wanted = _named(described)
+                if wanted is not None and wanted.endswith("/wstring"):
+                    raise ProfileError(f"{kind}.{name} is a wstring, which is not supported")
                 if wanted is not None and wanted not in known:
                     raise ProfileError(
                         f"{kind}.{name} is a {wanted}, which is not known: give its text as well"
@@ -118,7 +125,7 @@ class Messages:
 
     def definition(self, kind: str) -> str:
         """Text of a message and of all that it is made of, as bags and MCAP files keep it."""
-        return self._store.generate_msgdef(kind, ros_version=2)[0]
+        return self._hashed.generate_msgdef(kind, ros_version=2)[0]
 
     def new(self, kind: str, **values: Any) -> Any:
         """A message with these fields; the others are zero, empty or false."""
@@ -141,7 +148,7 @@ class Messages:
         (inner, of), size = what
         count = size if node == Nodetype.ARRAY else 0
         if inner == Nodetype.BASE and of[0] != "string":
-            return np.zeros(count, np.uint8 if of[0] == "byte" else np.dtype(of[0]))
+            return np.zeros(count, np.dtype(of[0]))
         return [self._zero((inner, of)) for _ in range(count)]
 
     # -- CDR ----------------------------------------------------------------------------------
@@ -156,24 +163,37 @@ class Messages:
     def decode(self, kind: str, payload: bytes, limit: int = MAX_MESSAGE_BYTES) -> Any:
         """A message of `kind`; its arrays are views into `payload` and read-only.
 
+        As ROS subscribers do, it leaves out what stands behind the message: padding, or the rest
+        of a buffer that was larger.
+
         Raises:
             CodecError: ``oversize`` (more than `limit` bytes) or ``malformed``.
         """
         if len(payload) > limit:
             raise CodecError("oversize", f"{kind} of {len(payload)} bytes, at most {limit}")
         try:
-            return self._store.deserialize_cdr(payload, kind)
+            return self._deserialize(kind, payload)
         except (SerdeError, struct.error, ValueError, IndexError, OverflowError) as error:
             raise CodecError("malformed", f"{kind}: {str(error)[:200]}") from error
+
+    def _deserialize(self, kind: str, payload: bytes) -> Any:
+        representation = payload[:2]
+        if representation not in (_BIG_ENDIAN, _LITTLE_ENDIAN) or len(payload) < HEADER_BYTES:
+            raise CodecError(
+                "malformed", f"{kind}: no plain CDR, but representation {representation.hex()!r}"
+            )
+        of = self._store.get_msgdef(kind)
+        read = of.deserialize_cdr_le if representation == _LITTLE_ENDIAN else of.deserialize_cdr_be
+        return read(memoryview(payload)[HEADER_BYTES:], 0, of.cls, self._store)[0]
 
     # -- hashes -------------------------------------------------------------------------------
     def hash(self, kind: str) -> str:
         """Type hash of a message or service (REP-2016), as ROS 2 of this distribution has it."""
         if self.distribution == "humble":
             return NO_HASH
-        if f"{kind}_Request" in self._store.fielddefs and kind not in self._store.fielddefs:
+        if f"{kind}_Request" in self._hashed.fielddefs and kind not in self._hashed.fielddefs:
             self._define_service(kind)
-        return self._store.hash_rihs01(kind)
+        return self._hashed.hash_rihs01(kind)
 
     def _define_service(self, service: str) -> None:
         """The types that exist for the sake of the hash: the service itself, and its event."""
@@ -190,15 +210,22 @@ class Messages:
             ("response_message", response),
             ("event_message", (Nodetype.NAME, event)),
         ]
-        self._store.fielddefs |= {event: ([], of_event), service: ([], of_service)}
+        self._hashed.fielddefs |= {event: ([], of_event), service: ([], of_service)}
 
 
-def _as_uint8(described: Any) -> Any:
-    """A field with any ``char`` in it as one of ``uint8``."""
+def _with_uint8(definitions: Definitions, instead: str) -> Definitions:
+    """The definitions with ``uint8`` in place of another type of one byte."""
+    return {
+        kind: (constants, [(name, _as_uint8(described, instead)) for name, described in fields])
+        for kind, (constants, fields) in definitions.items()
+    }
+
+
+def _as_uint8(described: Any, instead: str) -> Any:
     node, what = described
     if node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
-        return (node, (_as_uint8(what[0]), what[1]))
-    return (node, ("uint8", 0)) if node == Nodetype.BASE and what[0] == "char" else described
+        return (node, (_as_uint8(what[0], instead), what[1]))
+    return (node, ("uint8", 0)) if node == Nodetype.BASE and what[0] == instead else described
 
 
 def _named(described: Any) -> str | None:

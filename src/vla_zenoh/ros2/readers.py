@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from vla_zenoh.codec.image import PNG_BEGINS, check_size, decode_jpeg, decode_png
 from vla_zenoh.errors import CodecError
-from vla_zenoh.ros2.keys import BOOL, EMPTY, TEXT
+from vla_zenoh.ros2.keys import BOOL, TEXT
 from vla_zenoh.ros2.messages import MAX_MESSAGE_BYTES, MAX_PICTURE_BYTES, SECOND_NS, Messages
 from vla_zenoh.ros2.writers import GRASP, GRIPPER_COMMAND, PARALLEL_COMMAND
 from vla_zenoh.types import MAX_NAMES, FloatArray
@@ -183,7 +183,6 @@ READERS: dict[str, Callable[[Any], Any]] = {
     COMPRESSED_IMAGE: _compressed_image,
     TEXT: lambda message: message.data,
     BOOL: lambda message: bool(message.data),
-    EMPTY: lambda message: None,
 }
 """Type -> decoder: message -> sample; raises `CodecError` or `ValueError`."""
 

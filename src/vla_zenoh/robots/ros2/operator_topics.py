@@ -206,7 +206,7 @@ class OperatorTopics:
 
     def _wanted(self, call: Call) -> Wanted:
         operation, by_topic = call.operation, call.service is None
-        if operation is STOP:
+        if operation is STOP or (operation is RESET and by_topic):
             return Wanted()
         if not by_topic:
             asked = self._messages.decode(f"{operation.service_type}_Request", call.payload)
@@ -221,9 +221,7 @@ class OperatorTopics:
         value = read(self._messages, operation.type, call.payload)
         if operation is ACTIVE:
             return Wanted(active=value)
-        if operation is PROMPT:
-            return Wanted(prompt=value)
-        return read_request(value) if operation is REQUEST else Wanted()
+        return Wanted(prompt=value) if operation is PROMPT else read_request(value)
 
     def _execute(self, call: Call, wanted: Wanted) -> str:
         """Answer of a request that was executed, or a `SessionError` or `CodecError`."""
