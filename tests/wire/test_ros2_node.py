@@ -438,6 +438,61 @@ def test_a_robots_clock_that_differs_is_measured_and_told(tmp_path: Path) -> Non
         assert time.time_ns() - header.stamp_wall_ns > 2.4e9, "stamps are kept"
 
 
+SIMULATED = """\
+  use_sim_time: true
+  pose_command: {topic: /target, type: geometry_msgs/msg/PoseStamped}
+"""
+POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
+
+
+# -- simulated time -------------------------------------------------------------------------------
+class SimulatedTime:
+    """Stamps of a simulation that began now."""
+
+    def __init__(self, rig: Ros2Rig, rate: float = 1.0) -> None:
+        self._peer, self._rate, self._began_s = rig.peer, rate, time.monotonic()
+        rig.robot.alter = self._stamp
+
+    def _stamp(self, fields: dict[str, Any]) -> None:
+        elapsed_s = (time.monotonic() - self._began_s) * self._rate
+        fields["header"] = self._peer.header(int(elapsed_s * 1e9) + 1)
+
+
+def test_stamps_that_look_like_simulated_time_have_that_remedy(tmp_path: Path) -> None:
+    with ros2_rig(tmp_path) as rig:
+        SimulatedTime(rig)
+        event = rig.wait("it is told", lambda: rig.happened("robot_clock"))[-1]
+        assert "simulated time" in event.why
+        assert "ros2.use_sim_time: true" in event.why
+
+
+def test_simulated_time_becomes_ours_at_any_rate_and_when_it_is_set_back(tmp_path: Path) -> None:
+    with ros2_rig(tmp_path, more=SIMULATED) as rig:
+
+        def ages_s() -> list[float]:
+            since = len(rig.states[JointState])
+            rig.wait("states", lambda: len(rig.states[JointState]) > since + 50)
+            now_ns = time.time_ns()
+            return [(now_ns - h.stamp_wall_ns) / 1e9 for h, _ in rig.states[JointState][since:]]
+
+        for rate in (1.0, 0.3, 3.0):
+            SimulatedTime(rig, rate)  # each begins at 0 again
+            assert max(map(abs, ages_s())) < 5.0
+            rig.wait(
+                "its rate", lambda r=rate: rig.detail("sim_time_rate") == pytest.approx(r, 0.1)
+            )
+        assert rig.statuses[-1].state == "running"
+        assert not rig.happened("robot_clock")
+        stamps: list[Any] = []
+        rig.peer.on("/target", POSE_STAMPED, lambda goal: stamps.append(goal.header.stamp))
+        with Commander(rig):
+            rig.wait("goals", lambda: len(stamps) > 20)
+        assert stamps[-1].sec < 1000, "in the time of the robot"
+        rig.robot.frozen = True
+        rig.robot.alter = lambda fields: fields.update(header=rig.peer.header(10**9))
+        rig.wait("a paused one is silent", lambda: rig.statuses[-1].state == "silent")
+
+
 WIDTHS = """\
   wrench: {topic: /wrench}
   gripper: {topic: /width, type: std_msgs/msg/Float64, position: finger}

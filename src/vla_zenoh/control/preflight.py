@@ -25,6 +25,8 @@ CHUNK_PATIENCE_S = 2.0
 CLOCK_TOLERANCE_S = 0.02
 """A state may be stamped this far in the future before clocks count as different."""
 CAMERA_PATIENCE_S = 1.0
+FIRST_REAL_NS = 10**18
+"""Stamps before this (2001) are no time of day."""
 JOINT_PATIENCE_S = 0.1
 SAME_TCP_M, SAME_TCP_RAD = 0.005, 0.02
 """Largest difference of the TCP by kinematics from the TCP that the robot reports."""
@@ -216,6 +218,16 @@ def _elbow_is_not_held(profile: Profile, joint: JointState, pose: PoseState) -> 
     ]
 
 
+def clock_remedy(stamp_ns: int, profile: Profile) -> str:
+    """What to do about a robot's stamps that are not of this clock."""
+    if stamp_ns < FIRST_REAL_NS and profile.ros2 is not None:
+        return (
+            f"they look like simulated time ({stamp_ns / 1e9:.1f} s after its beginning): set "
+            "ros2.use_sim_time: true"
+        )
+    return "synchronise the clocks of both hosts (chrony or ptp)"
+
+
 def _robot(
     profile: Profile, peers: PeerSnapshot, pose: Stamped[PoseState] | None, now_ns: int
 ) -> list[str]:
@@ -231,7 +243,7 @@ def _robot(
     if not -CLOCK_TOLERANCE_S <= delay_s <= CLOCK_TOLERANCE_S + profile.timing.state_timeout_s:
         reasons.append(
             f"the robot's clock and this one differ: its newest state arrived {delay_s:+.3f} s "
-            "after its stamp; synchronise the clocks of both hosts (chrony or ptp)"
+            f"after its stamp; {clock_remedy(pose.header.stamp_wall_ns, profile)}"
         )
     _, outside_m = into_workspace(profile.limits, pose.record.position_m)
     if outside_m > profile.limits.step_m:

@@ -398,6 +398,8 @@ class Ros2Profile(Section):
         connect: endpoints of bridge or router; None: those of session.connect.
         distribution: of the robot; type hashes are part of names.
         domain: ROS domain id.
+        use_sim_time: the robot's stamps are simulated time (Gazebo, Isaac Sim), at any rate; it is
+            translated by the arrivals of joint states.
         joint_states: topic of sensor_msgs/JointState with the arm's joints.
         finger_states: topic with the finger joints, if they are on another one.
         wrench: external wrench at the TCP; ``limits.contact`` has no effect without it.
@@ -416,6 +418,7 @@ class Ros2Profile(Section):
     connect: Endpoints | None = None
     distribution: Literal["humble", "iron", "jazzy", "kilted", "lyrical"] = "jazzy"
     domain: int = Field(default=0, ge=0, le=232)
+    use_sim_time: bool = False
     joint_states: Topic = "/joint_states"
     finger_states: Topic | None = None
     wrench: Ros2Wrench | None = None

@@ -6,6 +6,8 @@ missing efforts are None.
 
 from __future__ import annotations
 
+import bisect
+import threading
 from collections import deque
 
 import numpy as np
@@ -31,6 +33,12 @@ RESTARTED_NS = 1_000_000_000
 smaller step back is a message that was overtaken."""
 CLOCK_WINDOW = 1000
 """Number of messages by which clocks are compared."""
+RATE_WINDOW_NS = 1_000_000_000
+"""Span by which the rate of simulated time is measured."""
+SLOWEST = 0.01
+"""Simulated time that runs more slowly counts as standing."""
+OLDEST_NS = 2_000_000_000
+"""Simulated stamps older than this are not translated."""
 TOLERATED_NS = 20_000_000
 """Clocks that differ by less count as equal, as in the command node's preflight."""
 
@@ -84,6 +92,60 @@ LOCKED_TOLERANCE = 0.01
 """A joint that is not commanded may be off by this, rad or m: 1 cm at the TCP, 1 m away."""
 
 
+class SimulatedClock:
+    """Translates a robot's simulated time to ours, by stamps and arrivals of its joint states.
+
+    Simulated time runs at any rate, stands still and is set back. Safe to use from any thread.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._pairs: deque[tuple[int, int]] = deque()  # (stamp, arrival)
+
+    def take(self, stamp_ns: int, arrived_ns: int) -> None:
+        """Note the arrival of a joint state; a stamp of 0 is none."""
+        if stamp_ns == 0:
+            return
+        with self._lock:
+            pairs = self._pairs
+            if pairs and stamp_ns < pairs[-1][0]:
+                pairs.clear()
+            pairs.append((stamp_ns, arrived_ns))
+            while arrived_ns - pairs[0][1] > RATE_WINDOW_NS:
+                pairs.popleft()
+
+    @property
+    def newest_ns(self) -> int:
+        """The newest stamp, 0 before the first."""
+        with self._lock:
+            return self._pairs[-1][0] if self._pairs else 0
+
+    @property
+    def rate(self) -> float:
+        """Simulated seconds in a second of ours; 1 while unknown."""
+        with self._lock:
+            return self._rate()
+
+    def _rate(self) -> float:
+        if not self._pairs:
+            return 1.0
+        (first_ns, since_ns), (last_ns, until_ns) = self._pairs[0], self._pairs[-1]
+        known = until_ns - since_ns > RATE_WINDOW_NS / 10
+        return (last_ns - first_ns) / (until_ns - since_ns) if known else 1.0
+
+    def wall_ns(self, stamp_ns: int, arrived_ns: int) -> int:
+        """When a message of this stamp was made, in our time; its arrival where that is unknown."""
+        with self._lock:
+            pairs, rate = list(self._pairs), self._rate()
+        if stamp_ns == 0 or not pairs:
+            return arrived_ns
+        at = bisect.bisect_right(pairs, (stamp_ns, arrived_ns))
+        near_ns, then_ns = pairs[max(at - 1, 0)]
+        made_ns = then_ns + round((stamp_ns - near_ns) / max(rate, SLOWEST))
+        # Of another clock, or from before the simulation was set back.
+        return arrived_ns if arrived_ns - made_ns > OLDEST_NS else min(made_ns, arrived_ns)
+
+
 class JointReading:
     """Newest state of one arm and its gripper, from its joint states; None before the first."""
 
@@ -107,15 +169,19 @@ class JointReading:
         self._finger_speed_m_s = 0.0
         self.efforts_missing = 0
 
-    def take(self, joints: Joints, stamp_ns: int) -> JointState | None:
+    def take(self, joints: Joints, stamp_ns: int, made_ns: int | None = None) -> JointState | None:
         """Process a message of `stamp_ns`; the arm's joints in it, None if it has none of them.
+
+        `made_ns` is the robot's own stamp, by which messages are told to be new, if `stamp_ns` is
+        not that one.
 
         Raises:
             CodecError: ``frozen``, ``out_of_order``, ``partial`` (some of the arm's joints), or
                 ``invalid`` (not finite, or nothing that this arm can do).
         """
         places = {name: index for index, name in enumerate(joints.names)}
-        self._take_fingers(joints, places, stamp_ns)
+        made_ns = stamp_ns if made_ns is None else made_ns
+        self._take_fingers(joints, places, stamp_ns, made_ns)
         missing = [name for name in self.arm_joints if name not in places]
         if len(missing) == len(self.arm_joints):
             return None
@@ -130,7 +196,7 @@ class JointReading:
         else:
             velocity = _finite("velocity", joints.velocity[at])
             self._check(velocity, self._fastest_rad_s, velocity, "rad/s")
-        self._arm_newness.check(stamp_ns)
+        self._arm_newness.check(made_ns)
         try:
             state = JointState(self.arm_joints, position, velocity, self._effort(joints, at))
         except RecordError as error:
@@ -177,7 +243,9 @@ class JointReading:
         self.efforts_missing += 1
         return None
 
-    def _take_fingers(self, joints: Joints, places: dict[str, int], stamp_ns: int) -> None:
+    def _take_fingers(
+        self, joints: Joints, places: dict[str, int], stamp_ns: int, made_ns: int
+    ) -> None:
         fingers = [name for name in self._finger_names if name in places]
         if not fingers:
             return
@@ -186,7 +254,7 @@ class JointReading:
         positions = signs * _finite("position", joints.position[at])
         if float(np.abs(positions).max()) > FURTHEST:
             raise CodecError("invalid", f"a finger joint beyond {FURTHEST:g} m or rad")
-        self._finger_newness.check(stamp_ns)
+        self._finger_newness.check(made_ns)
         width_m = self._fingers.width_m(positions)
         elapsed_s = (stamp_ns - self.width_stamp_ns) / 1e9
         velocity = None if joints.velocity is None else joints.velocity[at]

@@ -20,6 +20,7 @@ from vla_zenoh.robots.joint_reading import (
     BEYOND,
     JointReading,
     RobotClock,
+    SimulatedClock,
     StampFilter,
 )
 from vla_zenoh.robots.ros2.gripper import ActionGoal, GoalSequencer
@@ -200,6 +201,9 @@ def test_a_gripper_of_which_nothing_was_heard_has_no_state(arm: JointReading) ->
     assert arm.gripper(busy=False, wanted_m=0.01, held=False) is None
 
 
+EPOCH_NS = 1_790_000_000 * 10**9
+
+
 # -- the robot's clock ----------------------------------------------------------------------------
 @pytest.mark.parametrize(("behind_s", "differs"), [(0.0, False), (2.5, True), (-0.3, True)])
 def test_the_offset_of_the_robots_clock_is_the_least_delay(behind_s: float, differs: bool) -> None:
@@ -219,6 +223,42 @@ def test_what_has_no_stamp_says_nothing_of_the_clock() -> None:
     assert clock.unstamped == 1
     assert clock.offset_s is None
     assert not clock.differs
+
+
+# -- simulated time -------------------------------------------------------------------------------
+@pytest.mark.parametrize("rate", [0.3, 1.0, 3.0])
+def test_simulated_time_of_any_rate_is_translated_by_the_arrivals_of_joint_states(
+    rate: float,
+) -> None:
+    clock = SimulatedClock()
+    for number in range(200):
+        clock.take(7 * MS + round(number * 10 * MS * rate), EPOCH_NS + number * 10 * MS)
+    assert clock.rate == pytest.approx(rate, rel=1e-3)
+    now_ns = EPOCH_NS + 1990 * MS
+    for age_ms in (0, 40, 333, 990):
+        stamp_ns = clock.newest_ns - round(age_ms * MS * rate)
+        assert clock.wall_ns(stamp_ns, now_ns) == pytest.approx(now_ns - age_ms * MS, abs=11 * MS)
+    ahead_ns = clock.newest_ns + round(20 * MS * rate)
+    assert clock.wall_ns(ahead_ns, now_ns + 50 * MS) == pytest.approx(now_ns + 20 * MS, abs=MS)
+    assert clock.wall_ns(ahead_ns, now_ns) == now_ns, "nothing was made after it arrived"
+
+
+def test_simulated_time_that_stands_still_or_is_set_back_begins_anew() -> None:
+    clock = SimulatedClock()
+    assert clock.wall_ns(5 * MS, EPOCH_NS) == EPOCH_NS
+    for number in range(100):
+        clock.take(90_000 * MS + number * MS, EPOCH_NS + number * MS)
+    paused_ns = EPOCH_NS + 60_000 * MS
+    for number in range(300):
+        clock.take(90_100 * MS + number * MS, paused_ns + number * MS)
+    assert clock.rate == pytest.approx(1.0, rel=1e-3)
+    assert clock.wall_ns(90_390 * MS, paused_ns + 299 * MS) == paused_ns + 290 * MS
+    assert clock.wall_ns(89_000 * MS, paused_ns + 299 * MS) == paused_ns - 1100 * MS
+    clock.take(1 * MS, paused_ns + 400 * MS)
+    assert (clock.newest_ns, clock.rate) == (1 * MS, 1.0)
+    late_ns = paused_ns + 401 * MS
+    assert clock.wall_ns(90_398 * MS, late_ns) == late_ns, "of before it was set back"
+    assert clock.wall_ns(late_ns, late_ns) == late_ns, "of another clock"
 
 
 # -- gripper goals --------------------------------------------------------------------------------

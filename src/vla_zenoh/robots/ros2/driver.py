@@ -20,6 +20,7 @@ from vla_zenoh.bus.buffers import CallbackRing, LatestSample, ReceivedSample
 from vla_zenoh.bus.metrics import RateMeter
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import open_session
+from vla_zenoh.control.preflight import clock_remedy
 from vla_zenoh.errors import CodecError, ProfileError, RecordError
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.nodes.camera.camera_publisher import OK, CameraPublisher
@@ -30,7 +31,7 @@ from vla_zenoh.profile.robot import Ros2Camera, Ros2Output, Ros2Profile
 from vla_zenoh.profile.schema import TRUSTED_PROTOCOLS
 from vla_zenoh.robots.arm import Arm
 from vla_zenoh.robots.driver import DriverStatus, Measurement, RobotDriver, command_of
-from vla_zenoh.robots.joint_reading import JointReading, RobotClock, StampFilter
+from vla_zenoh.robots.joint_reading import JointReading, RobotClock, SimulatedClock, StampFilter
 from vla_zenoh.robots.ros2.gripper import Gripper
 from vla_zenoh.robots.ros2.middleware import GRIPPER, MiddlewareWatch
 from vla_zenoh.robots.ros2.operator_topics import OperatorTopics
@@ -40,8 +41,8 @@ from vla_zenoh.ros2.messages import MAX_PICTURE_BYTES, Messages
 from vla_zenoh.ros2.readers import JOINT_STATE, WRENCH, RosImage, Wrench, read
 from vla_zenoh.ros2.writers import Stamp, Write, joint_writer, pose_writer
 from vla_zenoh.runtime.process import ROUTER_PATIENCE_S
-from vla_zenoh.types import Event, FloatArray, GripperCommand, GripperState
-from vla_zenoh.types.records import JointReference, PoseReference
+from vla_zenoh.types import Event, FloatArray, GripperCommand, GripperState, JointState
+from vla_zenoh.types.records import JointReference, Joints, PoseReference
 
 NAME = "ros2"
 JOIN_S = 0.3
@@ -109,6 +110,7 @@ class Ros2Driver(RobotDriver):
         graph = self.graph = RosGraph(
             self._own_session or session, ros2, self._messages, f"vla_{name}"
         )
+        simulated = self._simulated = SimulatedClock() if ros2.use_sim_time else None
         watch = self._middleware = MiddlewareWatch(graph, ros2, self._emit)
         if self.has_arm:
             self.gripper = Gripper(
@@ -119,7 +121,9 @@ class Ros2Driver(RobotDriver):
                 self._width_m,
                 lambda: watch.faults.get(GRIPPER, ""),
             )
-            self.states = StateSubscriber(node, graph, self._messages, ros2, self.kinematics)
+            self.states = StateSubscriber(
+                node, graph, self._messages, ros2, self.kinematics, simulated
+            )
             command = profile.robot.command
             output = ros2.joint_command if command == "joint" else ros2.pose_command
             if output is None:
@@ -128,7 +132,16 @@ class Ros2Driver(RobotDriver):
             self._write = self.writing(output)
             self._writer = graph.publisher(output.topic, output.type, COMMAND)
         self._cameras = [
-            Camera(camera, topic, node, graph, read_messages(ros2), self._emit, self._reject)
+            Camera(
+                camera,
+                topic,
+                node,
+                graph,
+                read_messages(ros2),
+                self._emit,
+                self._reject,
+                simulated,
+            )
             for camera, topic in profile.ros2_cameras().items()
         ]
         self._operators = None
@@ -216,7 +229,8 @@ class Ros2Driver(RobotDriver):
     def move(self, reference: PoseReference | JointReference, now_ns: int) -> None:
         """Publish a set-point."""
         command = command_of(reference, self.profile.robot.arm_joints)
-        message = self._write(command, Stamp(now_ns, self._frame))
+        stamp_ns = now_ns if self._simulated is None else self._simulated.newest_ns
+        message = self._write(command, Stamp(stamp_ns, self._frame))
         self._writer.publish(self._messages.encode(message))
         self._node.counters["ros2.commands_sent"] += 1
 
@@ -249,9 +263,10 @@ class Ros2Driver(RobotDriver):
             return
         self._clock_reported = clock.differs
         if clock.differs:
+            stamp_ns = self.states.state.stamp_ns
             why = (
                 f"the robot's stamps are {clock.offset_s:+.3f} s behind this clock; "
-                "synchronise both (chrony or ptp)"
+                f"{clock_remedy(stamp_ns, self.profile)}"
             )
             self._node.emit(Event("warning", "notice", "robot_clock", why))
 
@@ -296,6 +311,7 @@ class Ros2Driver(RobotDriver):
             detail |= {
                 "held": self._arm.holds,
                 "robot_clock_behind_s": states.clock.offset_s,
+                "sim_time_rate": None if self._simulated is None else self._simulated.rate,
                 "width_m": states.state.width_m,
             }
             rates_hz["joint_states"] = states.rate.rate_hz
@@ -320,8 +336,10 @@ class Camera:
         messages: Messages,
         emit: Callable[[Event], None],
         reject: Callable[[str, str, str], None],
+        simulated: SimulatedClock | None,
     ) -> None:
         self._topic, self._node, self._messages, self._reject = topic, node, messages, reject
+        self._simulated = simulated
         self.publisher = CameraPublisher(
             name, node.profile.cameras[name], topic.topic, node, emit, CAMERA_SAME_S
         )
@@ -371,7 +389,8 @@ class Camera:
         if wanted:
             settings = publisher.profile
             rgb = resize(image.rgb, settings.width, settings.height)
-            stamp_ns = image.stamp_ns or self._node.clock.wall_at(arrival.mono_ns)
+            arrived_ns = self._node.clock.wall_at(arrival.mono_ns)
+            stamp_ns = wall_stamp_ns(image.stamp_ns, arrived_ns, self._simulated)
             publisher.publish_rgb(rgb, arrival.mono_ns, stamp_ns)
         return True
 
@@ -389,10 +408,12 @@ class StateSubscriber:
         messages: Messages,
         ros2: Ros2Profile,
         kinematics: Kinematics,
+        simulated: SimulatedClock | None,
     ) -> None:
         self._node, self._messages, self._ros2 = node, messages, ros2
         self.state = JointReading(node.profile, kinematics)
         self.clock = RobotClock()
+        self.simulated = simulated
         self.rate = RateMeter()
         self.received_ns: int | None = None
         self._wrench: Wrench | None = None
@@ -426,16 +447,27 @@ class StateSubscriber:
                 try:
                     joints = self._decode(JOINT_STATE, arrival)
                     arrived_ns = self._node.clock.wall_at(arrival.mono_ns)
-                    if self.state.take(joints, joints.stamp_ns or arrived_ns) is None:
+                    if self._take(joints, arrived_ns) is None:
                         continue  # of the fingers alone, or of another robot
                 except CodecError as error:
                     self._reject(str(arrival.sample.key_expr), error)
                     continue
                 fresh = True
-                self.clock.take(joints.stamp_ns, arrived_ns)
+                if self.simulated is None:
+                    self.clock.take(joints.stamp_ns, arrived_ns)
+                else:
+                    self.simulated.take(joints.stamp_ns, arrived_ns)
                 self.received_ns = arrival.mono_ns
                 self.rate.tick()
         return fresh
+
+    def _take(self, joints: Joints, arrived_ns: int) -> JointState | None:
+        made_ns = joints.stamp_ns or arrived_ns
+        if self.simulated is None:
+            return self.state.take(joints, made_ns)
+        if joints.velocity is not None:  # per simulated second
+            joints = joints._replace(velocity=joints.velocity * self.simulated.rate)
+        return self.state.take(joints, arrived_ns, made_ns)
 
     def _update_wrench(self) -> None:
         if self._wrenches is None or self._ros2.wrench is None:
@@ -451,8 +483,16 @@ class StateSubscriber:
             except CodecError as error:
                 self._reject(self._ros2.wrench.topic, error)
             else:
-                stamp_ns = found.stamp_ns or self._node.clock.wall_at(arrival.mono_ns)
+                arrived_ns = self._node.clock.wall_at(arrival.mono_ns)
+                stamp_ns = wall_stamp_ns(found.stamp_ns, arrived_ns, self.simulated)
                 self._wrench = found._replace(stamp_ns=stamp_ns)
+
+
+def wall_stamp_ns(stamp_ns: int, arrived_ns: int, simulated: SimulatedClock | None) -> int:
+    """When a message was made, in our time; a stamp of 0 is none."""
+    if simulated is not None:
+        return simulated.wall_ns(stamp_ns, arrived_ns)
+    return stamp_ns or arrived_ns
 
 
 def read_messages(ros2: Ros2Profile) -> Messages:
