@@ -28,20 +28,23 @@ WIDTH, HEIGHT = 64, 48
 PROFILE = """\
 extends: panda_ros2
 cameras:
-  front: {{source: "ros2:{camera}", width: {width}, height: {height}, rate_hz: 60}}
+  front: {{source: "ros2:{camera}", width: {width}, height: {height}, rate_hz: 60{depth_unit}}}
   wrist: null
 timing: {{command_timeout_s: 0.3, state_timeout_s: 0.5}}
 session: {{listen: [{endpoint}], connect: [{endpoint}]}}
 ros2:
   bridge: {bridge}
-  cameras: {{wrist: null}}
+  cameras: {{wrist: null{depth}}}
 {more}"""
+DEPTH = "/camera/aligned_depth_to_color/image_raw"
 
 
-def write_profile(folder: Path, bridge: str = "ros2dds", more: str = "") -> Path:
+def write_profile(
+    folder: Path, bridge: str = "ros2dds", more: str = "", *, depth: bool = False
+) -> Path:
     """A profile of a ROS 2 Panda with one small camera, on an address of its own.
 
-    `more` is YAML that goes on in the section ros2.
+    `more` is YAML that goes on in the section ros2; with `depth` the camera has it, too.
     """
     path = folder / "ros2.yaml"
     path.write_text(
@@ -52,6 +55,8 @@ def write_profile(folder: Path, bridge: str = "ros2dds", more: str = "") -> Path
             width=WIDTH,
             height=HEIGHT,
             more=more,
+            depth_unit=", depth_unit_m: 0.001" if depth else "",
+            depth=f", front: {{topic: {CAMERA}, depth: {{topic: {DEPTH}}}}}" if depth else "",
         )
     )
     return path
@@ -106,9 +111,11 @@ class Ros2Rig:
 
 
 @contextmanager
-def ros2_rig(folder: Path, bridge: str = "ros2dds", more: str = "") -> Iterator[Ros2Rig]:
+def ros2_rig(
+    folder: Path, bridge: str = "ros2dds", more: str = "", *, depth: bool = False
+) -> Iterator[Ros2Rig]:
     """The node, in a thread, and a kinematic Panda on the other side."""
-    profile = load_profile(str(write_profile(folder, bridge, more)))
+    profile = load_profile(str(write_profile(folder, bridge, more, depth=depth)))
     with (
         open_session(profile.session, mode="router"),
         open_session(profile.session) as theirs,

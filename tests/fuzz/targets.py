@@ -46,8 +46,10 @@ from vla_zenoh.policy import ActionSpec, ModelSpec, ObservationSpec
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import load_profile
 from vla_zenoh.ros2 import readers
+from vla_zenoh.ros2.bridge_view import read_view
 from vla_zenoh.ros2.keys import Attachment
 from vla_zenoh.ros2.messages import Messages, parse
+from vla_zenoh.ros2.pictures import COMPRESSED_IMAGE, IMAGE
 from vla_zenoh.types import Depth, Event, Header, InferenceDebug, NodeStatus
 
 OF_TORCH = Path(__file__).parents[1] / "contract" / "lerobot_actions.pickle"
@@ -455,6 +457,25 @@ def _targets() -> Iterator[Target]:
             codec,
             lambda kind=kind: _cdr_seed(kind),
         )
+    for kind in (IMAGE, COMPRESSED_IMAGE):
+        yield Target(
+            f"ros2-depth-{kind.rsplit('/', 1)[-1]}",
+            lambda data, kind=kind: readers.read_depth(_messages(), kind, data),
+            codec,
+            lambda kind=kind: _cdr_seed(kind),
+        )
+    yield Target(
+        "ros2-request",
+        lambda data: readers.read_request(_text(data)),
+        codec,
+        lambda: [b'{"id": "7", "prompt": "go up", "rate_hz": 5, "active": true}'],
+    )
+    yield Target(
+        "ros2-bridge-view",
+        lambda data: read_view([("@/b1/ros2/config", data), (_text(data), b"{}")]),
+        codec,
+        lambda: [b'{"domain": 3}', b"@/b1/ros2/dds/010f00"],
+    )
     yield Target(
         "ros2-definition",
         lambda data: parse("a_msgs/msg/A", _text(data)),

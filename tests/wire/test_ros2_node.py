@@ -14,10 +14,10 @@ import pytest
 import zenoh
 from camera_rig import await_match
 from panda_arm import ARM_JOINTS, HOME_RAD, panda
-from ros2_rig import CAMERA, HEIGHT, WIDTH, Ros2Rig, ros2_rig
+from ros2_rig import CAMERA, DEPTH, HEIGHT, WIDTH, Ros2Rig, ros2_rig
 
 from vla_zenoh.bus.node import Publisher
-from vla_zenoh.codec.image import decode_raw
+from vla_zenoh.codec.image import decode_depth, decode_raw
 from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.types import (
     GripperCommand,
@@ -213,6 +213,34 @@ def test_pictures_come_with_their_stamp_and_depth_is_refused(rig: Ros2Rig) -> No
     rig.wait("the camera is lost", lambda: rig.detail("cameras")["front"]["state"] == "lost")
     assert "distances" in rig.detail("cameras")["front"]["why"]
     subscriber.undeclare()
+
+
+def test_depth_of_a_topic_of_its_own_goes_with_the_colours(tmp_path: Path) -> None:
+    counts = np.arange(HEIGHT * WIDTH, dtype="<u2").reshape(HEIGHT, WIDTH)
+    with ros2_rig(tmp_path, depth=True) as rig:
+        heard: list[Any] = []
+
+        def keep(sample: zenoh.Sample) -> None:
+            schema = str(sample.encoding).partition(";")[2]
+            heard.append(decode_depth(sample.payload.to_bytes(), schema))
+
+        key = rig.profile.keys.camera_depth("front")
+        handler = zenoh.handlers.Callback(keep, indirect=False)
+        subscriber = rig.session.declare_subscriber(key, handler)
+
+        def send() -> bool:
+            stamp_ns = time.time_ns()
+            message = image(rig, stamp_ns, "16UC1")
+            message.step, message.data = 2 * WIDTH, counts.view(np.uint8).ravel()
+            rig.peer.put(DEPTH, message)
+            rig.peer.put(CAMERA, image(rig, stamp_ns))
+            time.sleep(0.02)
+            return bool(heard)
+
+        rig.wait("depth", send)
+        assert (heard[0].counts == counts).all()
+        assert heard[0].unit_m == pytest.approx(0.001)
+        subscriber.undeclare()
 
 
 # -- commands -------------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from vla_zenoh.errors import CodecError, RecordError
 from vla_zenoh.types import Depth, Image, shown
@@ -143,6 +144,15 @@ def decode_depth(payload: bytes, schema: str) -> Depth:
     if match is None:
         why = f"depth schema {shown(schema)}, wanted depth16;METRES_A_COUNT"
         raise CodecError("malformed", why)
+    try:
+        return Depth(decode_png16(payload), float(match[1]))
+    except RecordError as error:
+        raise CodecError("invalid", f"depth schema: {error}") from error
+
+
+def decode_png16(payload: bytes) -> NDArray[np.uint16]:
+    """(H, W) of a PNG file of one channel of 16 bits; `CodecError`: not a whole one, or larger
+    than we read."""
     if len(payload) > MAX_PNG_BYTES:
         raise CodecError("oversize", f"a PNG of {len(payload)} bytes, at most {MAX_PNG_BYTES}")
     if payload[:8] != PNG_BEGINS or payload[12:16] != b"IHDR":
@@ -155,10 +165,7 @@ def decode_depth(payload: bytes, schema: str) -> Depth:
     counts = _pixels(payload, "PNG", cv2.IMREAD_UNCHANGED)
     if counts is None or counts.shape != size or counts.dtype != np.uint16:
         raise CodecError("malformed", "not a PNG file that can be decoded as depth")
-    try:
-        return Depth(np.asarray(counts, np.uint16), float(match[1]))
-    except RecordError as error:
-        raise CodecError("invalid", f"depth schema: {error}") from error
+    return np.asarray(counts, np.uint16)
 
 
 def check_size(height: int, width: int) -> None:

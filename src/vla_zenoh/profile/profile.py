@@ -324,6 +324,10 @@ def _ros2(profile: Profile) -> Iterator[Fault]:
         source = profile.cameras[name].source if name in profile.cameras else ""
         if source.startswith("ros2:") and source.removeprefix("ros2:") != camera.topic:
             yield ("ros2", "cameras", name, "topic"), f"is not that of cameras.{name}: {source!r}"
+    for name, camera in profile.ros2_cameras().items():
+        if (camera.depth is None) != (profile.cameras[name].depth_unit_m is None):
+            why = f"goes with cameras.{name}.depth_unit_m, and either is given without the other"
+            yield ("ros2", "cameras", name, "depth"), why
     yield from _way_to_ros2(profile, ros2.connect)
     joints = ros2.joint_command
     if joints is not None and joints.type not in JOINT_COMMANDS:

@@ -322,6 +322,21 @@ GripperAction = Literal[
 GRIPPER_ACTIONS: tuple[GripperAction, ...] = get_args(GripperAction)
 
 
+ImageType = Literal["sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"]
+
+
+class Ros2Depth(Section):
+    """A topic of depth images, of the same view as the colours (aligned, registered).
+
+    Args:
+        topic: its name.
+        type: raw, or compressed as a PNG of 16 bits.
+    """
+
+    topic: Topic
+    type: ImageType = "sensor_msgs/msg/Image"
+
+
 class Ros2Camera(Section):
     """A camera topic.
 
@@ -329,13 +344,13 @@ class Ros2Camera(Section):
         topic: its name.
         type: raw or compressed.
         frame: required frame_id of its images; None: any.
+        depth: topic of its depth; goes with ``depth_unit_m`` of the camera.
     """
 
     topic: Topic
-    type: Literal["sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"] = (
-        "sensor_msgs/msg/Image"
-    )
+    type: ImageType = "sensor_msgs/msg/Image"
     frame: Word | None = None
+    depth: Ros2Depth | None = None
 
 
 class Ros2Output(Section):

@@ -220,7 +220,7 @@ CAMERA_SOURCES = {
     "rtsp": SourceKind("rtsp://HOST/PATH", has_lens=True),
     "rtsps": SourceKind("rtsps://HOST/PATH", has_lens=True),
     "file": SourceKind("file:VIDEO_OR_FOLDER", is_path=True, has_lens=True),
-    "ros2": SourceKind("ros2:TOPIC"),
+    "ros2": SourceKind("ros2:TOPIC", has_depth=True),
 }
 """What a camera's source begins with -> its kind. `nodes.camera.node.make_source` opens them."""
 PATH_SOURCES = tuple(f"{name}:" for name, kind in CAMERA_SOURCES.items() if kind.is_path)
@@ -355,7 +355,8 @@ class CameraProfile(Section):
         jpeg_rate_hz: largest rate of the JPEG stream; null: every image.
         jpeg_width: wider images are scaled down for the JPEG stream; null: never.
         depth_unit_m: metres of one count of the depth stream, 16 bits: at 0.001 it reaches 65 m in
-            steps of 1 mm; null: no depth. ``sim:`` and ``realsense:`` have depth.
+            steps of 1 mm; null: no depth. ``sim:``, ``realsense:`` and
+            ``ros2:`` have depth.
         intrinsics: YAML file with width, height, fx_px, fy_px, cx_px, cy_px and distortion (k1, k2,
             p1, p2, k3 of OpenCV) of the camera's own images; null: those that the camera reports,
             if any.

@@ -9,22 +9,25 @@ import json
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_zenoh.codec.image import PNG_BEGINS, check_size, decode_jpeg, decode_png
 from vla_zenoh.errors import CodecError
 from vla_zenoh.ros2.keys import BOOL, TEXT
 from vla_zenoh.ros2.messages import MAX_MESSAGE_BYTES, MAX_PICTURE_BYTES, SECOND_NS, Messages
+from vla_zenoh.ros2.pictures import (
+    COMPRESSED_IMAGE,
+    IMAGE,
+    read_compressed_depth_m,
+    read_compressed_rgb,
+    read_depth_m,
+    read_rgb,
+)
 from vla_zenoh.ros2.writers import GRASP, GRIPPER_COMMAND, PARALLEL_COMMAND
 from vla_zenoh.types import MAX_NAMES, FloatArray
 from vla_zenoh.types.records import Joints
 
 JOINT_STATE, WRENCH = "sensor_msgs/msg/JointState", "geometry_msgs/msg/WrenchStamped"
-IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
-CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1}
-_JPEG = b"\xff\xd8\xff"
 SUCCEEDED = 4
 """action_msgs/GoalStatus.STATUS_SUCCEEDED."""
 
@@ -35,6 +38,14 @@ class RosImage(NamedTuple):
     stamp_ns: int
     frame: str
     rgb: NDArray[np.uint8]
+
+
+class RosDepth(NamedTuple):
+    """Depth of a camera in m, 0 or not finite where nothing was measured."""
+
+    stamp_ns: int
+    frame: str
+    depth_m: NDArray[np.float32]
 
 
 class Wanted(NamedTuple):
@@ -138,42 +149,19 @@ def _wrench(message: Any) -> Wrench:
 
 # -- images ---------------------------------------------------------------------------------------
 def _image(message: Any) -> RosImage:
-    """A raw image; of ``rgb8`` a view into the message."""
-    channels = CHANNELS.get(message.encoding)
-    if channels is None:
-        deep = message.encoding in ("16UC1", "32FC1", "mono16")
-        raise CodecError(
-            "encoding",
-            f"an image of encoding {message.encoding[:40]!r}; read are: {', '.join(CHANNELS)}"
-            + (". This one holds distances, which no model here takes" if deep else ""),
-        )
-    height, width, step = message.height, message.width, message.step
-    check_size(height, width)
-    if step < width * channels:
-        raise CodecError("invalid", f"rows of {step} bytes for {width} pixels {message.encoding}")
-    data = np.asarray(message.data, np.uint8)
-    # The last row may come without its padding.
-    if len(data) < step * (height - 1) + width * channels:
-        raise CodecError("truncated", f"{len(data)} bytes of {step * height}")
-    rows = np.lib.stride_tricks.as_strided(
-        data, (height, width, channels), (step, channels, 1), writeable=False
-    )
-    rgb: NDArray[np.uint8] = rows
-    if message.encoding != "rgb8":
-        code = cv2.COLOR_BGR2RGB if message.encoding == "bgr8" else cv2.COLOR_GRAY2RGB
-        rgb = np.asarray(cv2.cvtColor(np.ascontiguousarray(rows), code), np.uint8)
-    return RosImage(_stamp_ns(message.header), message.header.frame_id, rgb)
+    return RosImage(_stamp_ns(message.header), message.header.frame_id, read_rgb(message))
 
 
 def _compressed_image(message: Any) -> RosImage:
-    """A JPEG or PNG, told apart by its bytes: drivers write many things into ``format``."""
-    payload = np.asarray(message.data, np.uint8).tobytes()
-    if "compressedDepth" in message.format or not payload.startswith((PNG_BEGINS, _JPEG)):
-        raise CodecError(
-            "encoding", f"a compressed image {message.format[:40]!r}; read are: jpeg, png"
-        )
-    decode = decode_jpeg if payload.startswith(_JPEG) else decode_png
-    return RosImage(_stamp_ns(message.header), message.header.frame_id, decode(payload).rgb)
+    rgb = read_compressed_rgb(message)
+    return RosImage(_stamp_ns(message.header), message.header.frame_id, rgb)
+
+
+def read_depth(messages: Messages, kind: str, payload: bytes) -> RosDepth:
+    """Decode CDR bytes of `IMAGE` or `COMPRESSED_IMAGE` as depth; a `CodecError` if it is none."""
+    message = messages.decode(kind, payload, MAX_PICTURE_BYTES)
+    depth_m = read_depth_m(message) if kind == IMAGE else read_compressed_depth_m(message)
+    return RosDepth(_stamp_ns(message.header), message.header.frame_id, depth_m)
 
 
 READERS: dict[str, Callable[[Any], Any]] = {

@@ -104,7 +104,7 @@ def test_padding_may_lack_behind_the_last_row() -> None:
     ("fields", "reason"),
     [
         ({"encoding": "16UC1"}, "encoding"),
-        ({"encoding": "yuv422"}, "encoding"),
+        ({"encoding": "nv24"}, "encoding"),
         ({"height": 0}, "invalid"),
         ({"width": 2**31}, "invalid"),
         ({"step": 14}, "invalid"),
@@ -119,7 +119,7 @@ def test_an_image_that_cannot_be_shown_is_refused(fields: dict[str, Any], reason
 
 
 def test_a_depth_image_is_told_apart() -> None:
-    with pytest.raises(CodecError, match=r"rgb8, bgr8, mono8.*distances"):
+    with pytest.raises(CodecError, match="it holds distances"):
         read(image("16UC1", RGB))
 
 

@@ -173,9 +173,9 @@ def endpoints(profile: Profile) -> tuple[Endpoint, ...]:
     ros2 = profile.ros2
     if ros2 is None:
         return ()
-    found = [
-        Endpoint(EntityRole.SUBSCRIBER, c.topic, c.type) for c in profile.ros2_cameras().values()
-    ]
+    cameras = profile.ros2_cameras().values()
+    topics = [one for camera in cameras for one in (camera, camera.depth) if one is not None]
+    found = [Endpoint(EntityRole.SUBSCRIBER, one.topic, one.type) for one in topics]
     if profile.robot.driver == "ros2":
         found += _arm(ros2, profile.robot.command)
         found += [] if ros2.gripper is None else _gripper(ros2.gripper)

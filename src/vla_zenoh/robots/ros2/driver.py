@@ -24,7 +24,7 @@ from vla_zenoh.control.preflight import clock_remedy
 from vla_zenoh.errors import CodecError, ProfileError, RecordError
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.nodes.camera.camera_publisher import OK, CameraPublisher
-from vla_zenoh.nodes.camera.geometry import resize
+from vla_zenoh.nodes.camera.geometry import Pixels, resize
 from vla_zenoh.nodes.camera.source import LOOK_S, STALL_S
 from vla_zenoh.profile import Profile, SessionProfile
 from vla_zenoh.profile.robot import Ros2Camera, Ros2Output, Ros2Profile
@@ -38,7 +38,15 @@ from vla_zenoh.robots.ros2.operator_topics import OperatorTopics
 from vla_zenoh.robots.ros2.ros_graph import RosGraph
 from vla_zenoh.ros2.keys import COMMAND, SENSOR
 from vla_zenoh.ros2.messages import MAX_PICTURE_BYTES, Messages
-from vla_zenoh.ros2.readers import JOINT_STATE, WRENCH, RosImage, Wrench, read
+from vla_zenoh.ros2.readers import (
+    JOINT_STATE,
+    WRENCH,
+    RosDepth,
+    RosImage,
+    Wrench,
+    read,
+    read_depth,
+)
 from vla_zenoh.ros2.writers import Stamp, Write, joint_writer, pose_writer
 from vla_zenoh.runtime.process import ROUTER_PATIENCE_S
 from vla_zenoh.types import Event, FloatArray, GripperCommand, GripperState, JointState
@@ -53,6 +61,9 @@ BUFFER = 64
 WRENCH_TIMEOUT_NS = 200_000_000
 CAMERA_WAIT_S, CAMERA_SAME_S = 0.1, 2.0
 """A sensor has noise; a driver that repeats an image for less than the second is tolerated."""
+DEPTHS_KEPT = 4
+SAME_VIEW_PERIODS = 1.5
+"""Depth may be this many image periods older than its colours: drivers publish it after them."""
 LEAD_PERIODS = 2
 """A trajectory's point lies this many command periods ahead."""
 
@@ -349,6 +360,11 @@ class Camera:
         self._image = graph.subscribe(
             topic.topic, topic.type, LatestSample(MAX_PICTURE_BYTES), SENSOR
         )
+        self._depth = None
+        if topic.depth is not None:
+            ring = CallbackRing(DEPTHS_KEPT, MAX_PICTURE_BYTES)
+            self._depth = graph.subscribe(topic.depth.topic, topic.depth.type, ring, SENSOR)
+        self._depths: deque[RosDepth] = deque(maxlen=DEPTHS_KEPT)
 
     def run(self, stop: threading.Event) -> None:
         """Publish images until `stop` is set."""
@@ -391,8 +407,28 @@ class Camera:
             rgb = resize(image.rgb, settings.width, settings.height)
             arrived_ns = self._node.clock.wall_at(arrival.mono_ns)
             stamp_ns = wall_stamp_ns(image.stamp_ns, arrived_ns, self._simulated)
-            publisher.publish_rgb(rgb, arrival.mono_ns, stamp_ns)
+            publisher.publish_rgb(rgb, arrival.mono_ns, stamp_ns, self._depth_at(image.stamp_ns))
         return True
+
+    def _depth_at(self, stamp_ns: int) -> Pixels | None:
+        """(H, W) metres that were measured when the image was taken; None if there are none."""
+        topic, settings = self._topic.depth, self.publisher.profile
+        if self._depth is None or topic is None:
+            return None
+        for arrival in self._depth.drain():
+            if not self.publisher.wants_depth:
+                continue
+            try:
+                payload = arrival.sample.payload.to_bytes()
+                self._depths.append(read_depth(self._messages, topic.type, payload))
+            except CodecError as error:
+                self._reject(error.reason, f"{topic.topic}: {error}", self.publisher.name)
+        if not self._depths:
+            return None
+        near = min(self._depths, key=lambda depth: abs(depth.stamp_ns - stamp_ns))
+        if abs(near.stamp_ns - stamp_ns) * settings.rate_hz > SAME_VIEW_PERIODS * 1e9:
+            return None
+        return resize(near.depth_m, settings.width, settings.height, depth=True)
 
 
 class StateSubscriber:
