@@ -154,7 +154,7 @@ def _success(run: Evaluation, table: _Table) -> None:
     if not table.has("success"):
         return
     words = [word.lower() for word in table.texts("success")]
-    run.succeeded = sum(word in _TRUE for word in words)
+    run.executed = sum(word in _TRUE for word in words)
     strange = [word for word in words if word not in _TRUE | _FALSE]
     if strange:
         run.problems.append(

@@ -131,8 +131,8 @@ def test_its_evaluation_tells_what_the_arm_did(run_file: Path) -> None:
     assert found.command_path_m == pytest.approx(STEPS * STEP_M, abs=REACHED_M)
     assert found.requests >= STEPS
     # A chunk that comes just before the arm is deactivated leads to no command any more.
-    assert found.success_rate is not None
-    assert found.success_rate >= 1.0 - 1.0 / found.requests
+    assert found.executed_share is not None
+    assert found.executed_share >= 1.0 - 1.0 / found.requests
     assert set(found.latency()) == {
         "end_to_end",
         "outbound",

@@ -6,8 +6,9 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Group
+from rich.console import Group, RenderableType
 from rich.live import Live
+from rich.padding import Padding
 from rich.text import Text
 
 from vla_zenoh.bus.client import DROPPED_HINT
@@ -20,7 +21,7 @@ from vla_zenoh.cli.node_rows import (
     mode_of,
     node_rows,
 )
-from vla_zenoh.cli.output import console, new_table, styled
+from vla_zenoh.cli.output import ENDLESS, console, new_table, styled
 from vla_zenoh.sanitize import one_line, printable
 from vla_zenoh.types import Event, Header, NodeStatus
 
@@ -33,6 +34,10 @@ MAX_LINES, MAX_LINE = 12, 60
 """Lines of one cell, and characters of each."""
 MAX_WORDS = 400
 """Characters of one sentence."""
+NARROW = 100
+"""On a terminal of fewer columns a node has lines of its own in place of a row."""
+NARROW_LINES = 4
+"""Of one message there."""
 STALE_S = 1.5
 STYLES = {
     "active": "bold green",
@@ -68,6 +73,7 @@ def _now(robot: Client, events: Sequence[tuple[str, Header, Event]]) -> Group:
         left_out=robot.dropped,
         expected=robot.expected,
         alive=robot.alive,
+        width=console().width,
     )
 
 
@@ -80,18 +86,25 @@ def render(
     left_out: int = 0,
     expected: Mapping[str, str] | None = None,
     alive: frozenset[str] = frozenset(),
+    width: int = ENDLESS,
 ) -> Group:
     """The table of nodes and the events. Warnings come first: no table pushes them off the screen.
 
     `left_out` counts statuses of unknown nodes that were not kept; `expected` and `alive` are those
-    of `node_rows`.
+    of `node_rows`. On a terminal whose `width` is below `NARROW` there is no table: it would wrap
+    each message into dozens of lines.
     """
     mode, sentence, style = MODE_WORDS[mode_of(nodes)]
     title = Text.assemble((mode, style), printable(f" robot {robot}: {sentence}"))
     columns = ("node", "state", "age", "rate", "rejected", "message")
-    table = new_table(*columns, title=title, title_style="")
-    for row in node_rows(nodes, expected or {}, alive):
-        table.add_row(*_cells(row, mode))
+    rows = [_cells(row, mode) for row in node_rows(nodes, expected or {}, alive)]
+    table: RenderableType
+    if width < NARROW:
+        table = Group(title, *(part for cells in rows for part in _paragraphs(cells, width)))
+    else:
+        table = new_table(*columns, title=title, title_style="")
+        for cells in rows:
+            table.add_row(*cells)
     above = [_line(*each) for each in _warnings(nodes, insecure=insecure, left_out=left_out)]
     below = [_line(f"limit acting now: {limit}", "yellow") for limit in acting_limits(nodes)]
     for host, missing in hosts_down(nodes, expected or {}, alive).items():
@@ -104,6 +117,16 @@ def render(
         )
         below += [_line(f"{one_line(name)}, ms p50/p95: {stages}", "dim")] if stages else []
     return Group(*above, table, *below, *(_event(*each) for each in events[-MAX_EVENTS:]))
+
+
+def _paragraphs(cells: Sequence[str | Text], width: int) -> Iterator[RenderableType]:
+    """The row of a node as its name, state and age, and below them what else it has."""
+    name, state, age, *others = cells
+    yield Text.assemble(printable(str(name)), "  ", state, "  ", age)
+    for words in others:
+        if words:
+            text = one_line("; ".join(str(words).splitlines()), NARROW_LINES * (width - 4))
+            yield Padding(Text(text), (0, 0, 0, 2))
 
 
 def _line(text: str, style: str) -> Text:

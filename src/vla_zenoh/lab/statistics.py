@@ -74,6 +74,11 @@ def wilson_95(successes: int, trials: int) -> tuple[float, float]:
     )
 
 
+ALPHA = 0.05
+LEAST_DIFFERING = 6
+"""Setups that one alone succeeded on, from which on p can be below `ALPHA`: 2 / 2**6 is."""
+
+
 @dataclass(frozen=True, slots=True)
 class Paired:
     """Setups that both did once, by who succeeded. Counts are not negative."""
@@ -119,6 +124,26 @@ class Paired:
     @property
     def p(self) -> float:
         return mcnemar_exact(self.first, self.second)
+
+    @property
+    def stated_95(self) -> tuple[float, float] | None:
+        """`difference_95`, where it and `p` agree whether there is a difference; else None.
+
+        The interval is approximate, p is exact: of few setups they may contradict each other.
+        """
+        low, high = self.difference_95
+        return (low, high) if (low <= 0.0 <= high) == (self.p >= ALPHA) else None
+
+    @property
+    def too_few(self) -> str:
+        """A sentence if too few setups differ to tell anything; else empty."""
+        differing = self.first + self.second
+        if differing >= LEAST_DIFFERING:
+            return ""
+        return (
+            f"Too few of the {self.setups} pairs differ to tell: {differing}, and "
+            f"{LEAST_DIFFERING} or more are needed for p below {ALPHA:g}"
+        )
 
     def _phi(self) -> float:
         """Correlation of both outcomes, drawn towards 0 by half a setup; 0 if one is constant."""

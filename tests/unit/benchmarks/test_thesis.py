@@ -159,7 +159,7 @@ def test_failed_rows_count_by_their_reason(tmp_path: Path) -> None:
     for index in (1, 4, 5):
         table[index] |= {"success": "False", "error": "timeout" if index < 5 else ""}
     run = evaluated(tmp_path, table)
-    assert run.success_rate == 0.7
+    assert run.executed_share == 0.7
     assert run.refusals == {"timeout": 2, "no reason given": 1}
 
 
@@ -259,7 +259,7 @@ def test_a_word_that_is_neither_true_nor_false_counts_as_failed(tmp_path: Path) 
     table = rows(4)
     table[0]["success"] = "perhaps"
     run = evaluated(tmp_path, table)
-    assert run.success_rate == 0.75
+    assert run.executed_share == 0.75
     assert "1 of 4 cells are neither true nor false ('perhaps')" in run.problems[0]
 
 

@@ -183,7 +183,31 @@ def test_requests_are_those_of_the_obeyed_worker_and_their_success_is_counted(
     run = evaluate_loaded(load_run(recording))
     asked = SECONDS * 1_000_000_000 // CHUNK_NS
     assert run.requests == asked
-    assert run.succeeded == asked - 1, "the last chunk came too late for any command"
+    assert run.executed == asked - 1, "the last chunk came too late for any command"
+
+
+def test_chunks_that_were_executed_without_the_motion_asked_for_are_named(
+    recording: Path, tmp_path: Path
+) -> None:
+    """A recording that was begun when the arm stood again: everything was executed in it."""
+    path, since_ns = tmp_path / "late.mcap", ZERO_NS + SECONDS * 500_000_000
+    out = RecordingWriter(path, KEYS, profile_yaml="", base_frame="base", began_ns=since_ns)
+    samples = [*chunks(), *commands(), *states(), *others()]
+    for sample in sorted(samples, key=lambda each: each.received_ns):
+        if sample.key == KEYS.spec("scripted"):  # asked for when the recording began
+            out.write(replace(sample, received_ns=since_ns))
+        elif sample.received_ns > since_ns:
+            out.write(sample)
+    out.finish({"dropped": {}})
+    run = evaluate_loaded(load_run(path))
+    assert run.executed_share is not None
+    assert run.executed_share > 0.8
+    assert run.reached_share == pytest.approx(0.0, abs=1e-6)
+    problems = " ".join(run.problems)
+    assert "the recording began after the arm had begun to move" in problems
+    assert "reached 0.0000 m: its chunks were executed, and the arm did not do it" in problems
+    whole = evaluate_loaded(load_run(recording))
+    assert "began after" not in " ".join(whole.problems)
 
 
 def test_seams_tell_how_far_the_goal_went(recording: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vla_zenoh.lab.statistics import Paired, mcnemar_exact, paired
+from vla_zenoh.lab.statistics import ALPHA, LEAST_DIFFERING, Paired, mcnemar_exact, paired
 
 ATOL = 1e-12
 COVERED_AT_LEAST = 0.93
@@ -104,3 +104,21 @@ def test_the_interval_covers_the_truth_about_as_often_as_it_says(
                 chance**count for chance, count in zip(chances, (a, b, c, d), strict=True)
             )
     assert COVERED_AT_LEAST < covered < 1.0
+
+
+@given(TABLES)
+def test_a_stated_interval_never_contradicts_p(table: Paired) -> None:
+    if (stated := table.stated_95) is not None:
+        low, high = stated
+        assert (low <= 0.0 <= high) == (table.p >= ALPHA)
+
+
+def test_few_setups_that_differ_are_said_to_be_too_few() -> None:
+    four = Paired(0, 4, 0, 0)
+    assert four.p > ALPHA
+    assert four.stated_95 is None
+    assert four.too_few.startswith("Too few of the 4 pairs differ to tell: 4, and 6 or more")
+    six = Paired(0, LEAST_DIFFERING, 0, 0)
+    assert six.p < ALPHA
+    assert six.too_few == ""
+    assert Paired(0, LEAST_DIFFERING - 1, 0, 0).p >= ALPHA

@@ -14,9 +14,8 @@ from typing import Any
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
 
 from vla_zenoh.errors import RecordError, describe_fault
-from vla_zenoh.lab.statistics import Paired, paired
+from vla_zenoh.lab.statistics import ALPHA, Paired, paired
 
-ALPHA = 0.05
 """Significance level, as in the intervals at 95 %."""
 CONDITIONS = (
     *("mode", "replan", "profile", "vary", "held_out"),
@@ -202,7 +201,7 @@ def figures(counts: Paired) -> dict[str, Any]:
         "rate_a": (counts.both + counts.second) / n,
         "rate_b": (counts.both + counts.first) / n,
         "difference": counts.difference,
-        "difference_95": list(counts.difference_95),
+        "difference_95": counts.stated_95,
         "p": counts.p,
     }
 

@@ -11,9 +11,10 @@ from rich.table import Table
 from vla_zenoh.cli.options import JsonOption
 from vla_zenoh.cli.output import console, new_table
 from vla_zenoh.errors import ResourceError
-from vla_zenoh.lab.bench.paired_tasks import ALPHA, CONDITIONS, Comparison, figures, read_run
+from vla_zenoh.lab.bench.paired_tasks import CONDITIONS, Comparison, figures, read_run
 from vla_zenoh.lab.bench.paired_tasks import compare as compare_runs
 from vla_zenoh.lab.cli.output import print_json
+from vla_zenoh.lab.statistics import ALPHA
 
 B_IS_WORSE = 3
 """Exit code; 1 and 2 are those of every command for errors."""
@@ -91,7 +92,7 @@ def _print(found: Comparison, *, tasks: bool) -> None:
 
 
 def _row(table: Table, name: str, row: dict[str, Any]) -> None:
-    low, high = row["difference_95"]
+    interval = row["difference_95"]
     table.add_row(
         name,
         str(row["pairs"]),
@@ -99,18 +100,22 @@ def _row(table: Table, name: str, row: dict[str, Any]) -> None:
         f"{row['rate_b']:.1%}",
         *(str(row[part]) for part in ("both", "only_a", "only_b", "neither")),
         f"{row['difference']:+.1%}",
-        f"{low:+.1%}..{high:+.1%}",
+        "" if interval is None else f"{interval[0]:+.1%}..{interval[1]:+.1%}",
         f"{row['p']:.2g}",
     )
 
 
 def _verdict(found: Comparison) -> str:
     counts = found.counts
-    low, high = counts.difference_95
+    if counts.too_few:
+        return f"{counts.too_few} (p = {counts.p:.2g})."
     if counts.p >= ALPHA:
-        return (
-            f"No significant difference: p = {counts.p:.2g}, B's rate minus A's is between "
-            f"{low:+.1%} and {high:+.1%}."
+        interval = counts.stated_95
+        between = (
+            ""
+            if interval is None
+            else f", B's rate minus A's is between {interval[0]:+.1%} and {interval[1]:+.1%}"
         )
+        return f"No significant difference: p = {counts.p:.2g}{between}."
     word = "fewer" if found.b_is_worse else "more"
     return f"B does {word} of the same tasks than A: p = {counts.p:.2g}."

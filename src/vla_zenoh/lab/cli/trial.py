@@ -242,7 +242,7 @@ def _mapping(plan: TrialPlan, result: TrialScore, found: list[EpisodeVerdict]) -
             **asdict(pair),
             "setups": pair.setups,
             "difference": pair.difference,
-            "difference_95": pair.difference_95,
+            "difference_95": pair.stated_95,
             "p": pair.p,
         },
         "episodes": [asdict(each) for each in found],
@@ -272,11 +272,14 @@ def _show(plan: TrialPlan, result: TrialScore) -> None:
     pair = result.paired
     if pair is not None:
         one, other = plan.workers
-        low, high = pair.difference_95
+        interval = pair.stated_95
+        between = "" if interval is None else f" (95 %: {interval[0]:+.1%}..{interval[1]:+.1%})"
         screen.print(
-            f"{one} minus {other} over {pair.setups} setups that both did: {pair.difference:+.1%} "
-            f"(95 %: {low:+.1%}..{high:+.1%}), exact McNemar p = {pair.p:.3g}; both {pair.both}, "
+            f"{one} minus {other} over {pair.setups} setups that both did: {pair.difference:+.1%}"
+            f"{between}, exact McNemar p = {pair.p:.3g}; both {pair.both}, "
             f"{one} alone {pair.first}, {other} alone {pair.second}, neither {pair.neither}",
             markup=False,
             soft_wrap=True,
         )
+        if pair.too_few:
+            screen.print(f"{pair.too_few}.", soft_wrap=True)

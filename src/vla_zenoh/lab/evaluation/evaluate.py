@@ -24,7 +24,7 @@ _OF_ONE_RUN = (
     | _SERIES
     | {*("problems", "measured", "commanded", "marks", "views"), *("about", "film")}
 )
-_OF_A_ROBOT = {"requests", "succeeded", "seconds", "refusals", "skipped", "verdicts"}
+_OF_A_ROBOT = {"requests", "executed", "seconds", "refusals", "skipped", "verdicts"}
 
 
 def recordings(paths: Iterable[Path]) -> Iterator[Path]:
@@ -88,8 +88,8 @@ def combined(runs: Sequence[Evaluation]) -> Evaluation:
         if each.name not in _OF_ONE_RUN and each.name != "stages_ms":
             of = robots if each.name in _OF_A_ROBOT else runs
             setattr(out, each.name, _joined([getattr(run, each.name) for run in of]))
-    if any(run.succeeded is None for run in runs):
-        out.succeeded = None
+    if any(run.executed is None for run in runs):
+        out.executed = None
     out.prompts = list(dict.fromkeys(out.prompts))
     out.stages_ms = {
         stage: _joined([run.stages_ms[stage] for run in robots if stage in run.stages_ms])

@@ -149,6 +149,11 @@ def evaluate_loaded(run: Run, *, pictures: int = 0) -> Evaluation:
     out.skipped = _counted(run.first_statuses, run.statuses, "skipped.")
     out.gripper_orders = len(run.gripper_commands)
     _segments(out, run, causes, measured)
+    if causes and causes[0][0].received_ns < run.began_ns:
+        out.problems.append(
+            "the recording began after the arm had begun to move: the motion before is not in it"
+        )
+    out.problems += [found.shortfall for found in out.segments if found.shortfall]
     out.about, out.verdicts = provenance(run), verdicts(run)
     if pictures:
         out.views = filmstrip(run, [entry.record for entry in obeyed], pictures)
@@ -177,7 +182,7 @@ def _requests(
 ) -> None:
     out.requests = len(obeyed)
     carried_out = {(cause.worker, cause.chunk_seq) for cause, _ in causes}
-    out.succeeded = sum((entry.record.worker, entry.header.seq) in carried_out for entry in obeyed)
+    out.executed = sum((entry.record.worker, entry.header.seq) in carried_out for entry in obeyed)
     if obeyed:
         first, last = obeyed[0].header, obeyed[-1].header
         out.seconds = (last.stamp_wall_ns - first.stamp_wall_ns) / 1e9

@@ -22,6 +22,8 @@ STAGES = {
     "command_to_pose": "of that, until the pose command",
 }
 """Stages of a request, and their meaning."""
+SHORT_SHARE, SHORT_M, SHORT_RAD = 0.1, 0.005, 0.02
+"""An arm that misses what a prompt asks for by more than this share and length did not do it."""
 TASKS = "tasks"
 """Name of a demo's verdicts in the metadata at the end of a recording."""
 THESIS_NAMES = {"e2e": "end_to_end", "backend": "inference", "outbound": "outbound"}
@@ -60,6 +62,36 @@ class PromptSegment:
     drift_m: float | None
     drift_rad: float | None
     width_m: tuple[float, float] | None
+
+    @property
+    def asked(self) -> float | None:
+        """Requested along the axis of the prompt, or about it; None or 0: nothing is known."""
+        return self.asked_rad or self.asked_m
+
+    @property
+    def along(self) -> float:
+        """Reached of `asked`."""
+        found = self.along_rad if self.asked_rad else self.along_m
+        return found or 0.0
+
+    @property
+    def reached_share(self) -> float:
+        """`along` as a share of `asked`, which is above 0."""
+        assert self.asked
+        return self.along / self.asked
+
+    @property
+    def shortfall(self) -> str:
+        """A sentence if the arm did not go where the prompt asked; else empty."""
+        if not self.asked:
+            return ""
+        unit, least = ("rad", SHORT_RAD) if self.asked_rad else ("m", SHORT_M)
+        if abs(self.asked - self.along) <= max(least, SHORT_SHARE * self.asked):
+            return ""
+        return (
+            f"prompt {self.prompt!r}: asked {self.asked:.4f} {unit}, reached {self.along:.4f} "
+            f"{unit}: its chunks were executed, and the arm did not do it"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +144,8 @@ class Evaluation:
         name: ``record_id``.
         path: of the file; None for all runs.
         requests: chunks of the worker in control.
-        succeeded: number of those that succeeded; None where unknown.
+        executed: number of those of which a step was executed; None where unknown. That the arm did
+            what was asked is another thing: see `segments` and `verdicts`.
         seconds: from the first request to the last.
         stages_ms: stage -> one value per request.
         request_t_s: time of each request, (n,).
@@ -146,7 +179,7 @@ class Evaluation:
     name: str
     path: Path | None = None
     requests: int = 0
-    succeeded: int | None = None
+    executed: int | None = None
     seconds: float = 0.0
     prompts: list[str] = field(default_factory=list)
     stages_ms: dict[str, FloatArray] = field(default_factory=dict)
@@ -179,11 +212,16 @@ class Evaluation:
     views: list[CameraView] = field(default_factory=list)
 
     @property
-    def success_rate(self) -> float | None:
-        """Share of the requests that succeeded."""
-        if self.succeeded is None or not self.requests:
+    def executed_share(self) -> float | None:
+        """Share of the requests of which a step was executed."""
+        if self.executed is None or not self.requests:
             return None
-        return self.succeeded / self.requests
+        return self.executed / self.requests
+
+    @property
+    def reached_share(self) -> float | None:
+        """Share of the motion that its prompt asks for, of the segment that reached the least."""
+        return min((each.reached_share for each in self.segments if each.asked), default=None)
 
     def latency(self) -> dict[str, Distribution]:
         """Stage -> distribution in ms, in the order of `STAGES`."""
@@ -200,7 +238,8 @@ class Evaluation:
             for short in ("mean", "std", "p50", "p95", "p99", "min", "max"):
                 out[f"{name}_{'median' if short == 'p50' else short}_ms"] = values[short]
         out |= {
-            "success_rate": self.success_rate,
+            "success_rate": self.executed_share,
+            "reached_share": self.reached_share,
             "trans_total_m": self.path_m,
             "rot_total_rad": self.path_rad,
             "seconds": self.seconds,

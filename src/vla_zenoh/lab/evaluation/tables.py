@@ -10,11 +10,12 @@ from vla_zenoh.types import FloatArray
 
 LATENCY_COLUMNS = ("min", "mean", "p50", "p95", "max")
 SUMMARY_COLUMNS = (
-    *("run", "n", "ok", "p50 ms", "p95 ms", "path m", "turn rad"),
+    *("run", "n", "executed", "reached", "p50 ms", "p95 ms", "path m", "turn rad"),
     *("off mm", "track mm", "idle s", "refused"),
 )
-"""Requests, success rate, end-to-end latency, path of the TCP, largest distance off the requested
-axis, tracking error (p95), time standing while active, rejections."""
+"""Requests, share of them that was executed, least share of a prompt's motion that was reached,
+end-to-end latency, path of the TCP, largest distance off the requested axis, tracking error (p95),
+time standing while active, rejections."""
 NARROW = 7
 """Number of these columns that fit on a terminal of 80 characters."""
 NONE = "-"
@@ -25,6 +26,10 @@ def number(value: float | None, unit: str, digits: int = 3, scale: float = 1.0) 
     return NONE if value is None else f"{value * scale:.{digits}f} {unit}".rstrip()
 
 
+def _share(value: float | None) -> str:
+    return NONE if value is None else f"{value:.0%}"
+
+
 def summary_row(run: Evaluation) -> tuple[str, ...]:
     """One line for one run, see `SUMMARY_COLUMNS`."""
     latency = run.latency().get("end_to_end")
@@ -33,7 +38,8 @@ def summary_row(run: Evaluation) -> tuple[str, ...]:
     return (
         run.name,
         str(run.requests),
-        NONE if run.success_rate is None else f"{run.success_rate:.0%}",
+        _share(run.executed_share),
+        _share(run.reached_share),
         number(latency.p50 if latency else None, "", 1),
         number(latency.p95 if latency else None, "", 1),
         number(run.path_m, ""),
@@ -103,7 +109,8 @@ SEGMENT_COLUMNS = (
 
 HINTS = {
     "requests": "chunks of the worker in control while the arm was active",
-    "succeeded": "requests of which at least one step was executed",
+    "executed": "requests of which at least one step was executed, whether or not it did the task",
+    "reached": "share of the motion that a prompt asked for; of the prompt that reached the least",
     "path": "length of the measured way of the TCP",
     "tracking error, mean / p95 / max": "measured from commanded position at the same time",
     "idle while active": "the arm stood still though it was active",
@@ -127,7 +134,8 @@ def figures(run: Evaluation) -> list[tuple[str, str]]:
     rows = [
         ("tasks done", tasks_done(run)),
         ("requests", str(run.requests)),
-        ("succeeded", NONE if run.success_rate is None else f"{run.success_rate:.1%}"),
+        ("executed", _share(run.executed_share)),
+        ("reached", _share(run.reached_share)),
         ("time", number(run.seconds, "s", 1)),
         ("path", number(run.path_m, "m", 4)),
         ("rotation path", number(run.path_rad, "rad", 4)),
