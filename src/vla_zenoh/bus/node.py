@@ -8,14 +8,23 @@ import secrets
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any, TypeVar
 
 import zenoh
 
-from vla_zenoh.bus.buffers import ReceivedSample, SampleBuffer, bytes_of, header_of
+from vla_zenoh.bus.buffers import (
+    CallbackRing,
+    ReceivedSample,
+    SampleBuffer,
+    ZenohRing,
+    bytes_of,
+    header_of,
+)
 from vla_zenoh.bus.clock import Clock, ClockSync
 from vla_zenoh.bus.host import own_host_id
 from vla_zenoh.bus.metrics import EventThrottle, Traffic
+from vla_zenoh.bus.reception import REMEDY, SHARE, Reception, lost_in_words
 from vla_zenoh.bus.session import QOS, alive_nodes, open_session
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, NodeError
@@ -26,6 +35,10 @@ from vla_zenoh.types import Event, Header, NodeStatus, SingleWriterFilter, Stamp
 MSGPACK = zenoh.Encoding("application/msgpack")
 STATUS_PERIOD_S = 0.5
 IMAGE_LINK_TIMEOUT_S = 10.0
+STATUSES = 64
+"""Statuses of other nodes that are kept between two of our own."""
+LOSSES_PERIOD_S = 5.0
+"""Events of lost samples are published at most this often, with their sum."""
 
 Record = TypeVar("Record")
 AnyBuffer = TypeVar("AnyBuffer", bound=SampleBuffer)
@@ -119,6 +132,11 @@ class Node:
         self._buffers: dict[SampleBuffer, list[Any]] = {}  # with their subscribers
         self._image_session: zenoh.Session | None = None
         self.traffic = Traffic(session)
+        self.reception = Reception(self.keys)
+        self._statuses: ZenohRing | None = None
+        self._short: dict[str, str] = {}
+        self._losses: Counter[str] = Counter()
+        self._losses_s = 0.0
         self._status_s, self._last_state = 0.0, ""
         if alive_nodes(session, self.keys, name, routes=routes):
             raise self._duplicate()
@@ -192,6 +210,7 @@ class Node:
         elif not self.status_due(state):
             return
         self._status_s, self._last_state = time.monotonic(), state
+        self._report_losses()
         self._status.publish(
             NodeStatus(
                 *(self.name, state, self.host_id.host, os.getpid(), self.started_wall_ns),
@@ -222,12 +241,38 @@ class Node:
         self._report_rejected()
         self._events.poll()
 
+    def follow_senders(self) -> None:
+        """Compare what arrives with the statuses of all senders; images are followed anyway."""
+        if self._statuses is None:
+            self._statuses = self.subscribe(self.keys.all_status, ZenohRing(STATUSES))
+
+    def _report_losses(self) -> None:
+        for arrival in () if self._statuses is None else self._statuses.drain():
+            with suppress(CodecError):  # who reads statuses for their content counts it
+                payload = bytes_of(arrival.sample.payload)
+                self.reception.status_received(records.decode(NodeStatus, payload))
+        before, self._short = self._short, self.reception.short()
+        for name, why in self._short.items():
+            if name not in before:
+                self.counters["short_streams"] += 1
+                self.emit(Event("warning", "fault", "short_stream", why[:1000], limit=SHARE))
+        for name in before.keys() - self._short.keys():
+            self.emit(Event("info", "notice", "whole_stream", f"{name}: samples arrive again"))
+        lost = self.traffic.lost - self._losses
+        if lost and time.monotonic() - self._losses_s >= LOSSES_PERIOD_S:
+            self._losses, self._losses_s = Counter(self.traffic.lost), time.monotonic()
+            why = f"samples that never arrived: {lost_in_words(lost, self.keys)}; {REMEDY}"
+            count = float(lost.total())
+            self.emit(Event("warning", "fault", "samples_lost", why[:1000], value=count))
+
     def _bus_detail(self) -> dict[str, Any]:
         short, traffic = self.keys.short, self.traffic
         net = {
             "sent": {short(key): rates for key, rates in traffic.sent(self._publishers).items()},
             "lost": {short(key): count for key, count in traffic.lost.items()},
+            "short": self._short,
             "links": traffic.links(),
+            "shared_memory": traffic.memory(),
         }
         clocks = {
             node: {
@@ -249,12 +294,18 @@ class Node:
             SessionError: the router does not answer at the port for images.
         """
         self.watch_buffer(buffer)
+        if kind is Kind.FRAME:
+            self.follow_senders()
         self._buffers[buffer].append(buffer.subscribe(self._session_for(kind), key))
+        if isinstance(buffer, CallbackRing):  # a ring that Zenoh fills cannot count
+            self.reception.watch(key, buffer.arrived)
         return buffer
 
     def unsubscribe(self, buffer: SampleBuffer) -> None:
         """Undeclare the subscribers of `buffer`."""
+        self.reception.unwatch(buffer.arrived)
         for subscriber in self._buffers[buffer]:
+            self.traffic.forget(str(subscriber.key_expr))
             subscriber.undeclare()
         self._report_rejected()
         del self._buffers[buffer]
@@ -324,6 +375,8 @@ class Node:
         if writer_filter is not None:
             writer_filter.accept(header, arrival.mono_ns)
         self.traffic.received(key, header, arrival.nth)
+        if isinstance(record, NodeStatus):
+            self.reception.status_received(record)
         return Stamped(here, record, self.clock.wall_at(arrival.mono_ns))
 
     def decode_text(

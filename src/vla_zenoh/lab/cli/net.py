@@ -170,8 +170,8 @@ def lines_of(statuses: Mapping[str, NodeStatus]) -> list[Line]:
     out: list[Line] = []
     for name, status in statuses.items():
         for key, rates in _map(_map(status.detail.get("net")).get("sent")).items():
-            if isinstance(rates, (list, tuple)) and len(rates) == 2:
-                rate_hz, bytes_s = (_number(rate) or 0.0 for rate in rates)
+            if isinstance(rates, (list, tuple)) and len(rates) == 3:
+                rate_hz, bytes_s, _ = (_number(rate) or 0.0 for rate in rates)
                 line = Line(key, name, hosts[name], rate_hz, bytes_s, lost.get(key, {}))
                 out.append(line)
     published = {line.key for line in out}

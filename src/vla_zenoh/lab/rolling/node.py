@@ -106,7 +106,10 @@ class RollingRecord:
         self._audit.subscribe(
             (*settings, *held, *orders, keys.event("command"), f"{keys.status('router')}$*")
         )
+        self.node.follow_senders()
         self._queue.subscribe(recorded_keys(keys))
+        for expression in recorded_keys(keys):
+            self.node.reception.watch(expression, self._queue.arrived)
         while not stop.wait(WRITE_S):
             self.step()
         self.close()

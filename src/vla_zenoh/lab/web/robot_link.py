@@ -30,7 +30,7 @@ from vla_zenoh.lab.web.recordings import Recordings
 from vla_zenoh.lab.web.trial import PageTrial
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import ActionChunk, NodeStatus, PoseState, Task
+from vla_zenoh.types import ActionChunk, Event, NodeStatus, PoseState, Task
 
 STILL_M_S = 0.005
 """A measured arm that is slower stands: an impedance controller still settles."""
@@ -62,6 +62,7 @@ class RobotLink:
             self._rings[ModelSpec].subscribe(session, self.keys.all_specs),
         ]
         self._specs: dict[str, ModelSpec] = {}
+        self._short: dict[str, str] = {}
         self._seen: dict[str, list[str]] = {}
         self._hold, self._let_go, self._confirmed = Hold(), False, False
         self._hold_lock, self._activating = threading.Lock(), threading.Lock()
@@ -84,6 +85,11 @@ class RobotLink:
                 self._take(kind, sample, now_s)
             for rejected in ring.pop_rejected():
                 self.counters["bad_sample"] += rejected.times
+        before, self._short = self._short, self.client.reception.short()
+        for name, why in self._short.items():
+            if name not in before:
+                self.counters["short_streams"] += 1
+                self.client.note("web", Event("warning", "fault", "short_stream", why))
 
     def _take(self, kind: type[Any], sample: ReceivedSample, now_s: float) -> None:
         try:
