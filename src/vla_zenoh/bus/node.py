@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 import secrets
+import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -28,7 +29,7 @@ from vla_zenoh.bus.reception import REMEDY, SHARE, Reception, lost_in_words
 from vla_zenoh.bus.session import QOS, alive_nodes, open_session
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, NodeError
-from vla_zenoh.keys import Kind, last_chunk
+from vla_zenoh.keys import ENDED, Kind, last_chunk
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import Event, Header, NodeStatus, SingleWriterFilter, Stamped
 
@@ -222,6 +223,11 @@ class Node:
                 self.host_id.boot,
             )
         )
+
+    def publish_end(self, detail: Mapping[str, Any] | None = None) -> None:
+        """Publish that the node ends as it should; not while an exception ends it."""
+        if sys.exc_info()[0] is None:
+            self.publish_status(ENDED, detail=detail, now=True)
 
     def status_due(self, state: str) -> bool:
         """Whether `publish_status` would publish now; lets a fast loop skip collecting details.

@@ -22,7 +22,7 @@ from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.reception import Share
 from vla_zenoh.bus.session import covers
 from vla_zenoh.errors import NodeError, RecordingError
-from vla_zenoh.keys import Keys
+from vla_zenoh.keys import ENDED, Keys
 from vla_zenoh.lab.recording.sample import TEXT
 from vla_zenoh.lab.recording.sample_queue import SampleQueue
 from vla_zenoh.lab.recording.writer import RecordingWriter
@@ -39,7 +39,7 @@ POLL_S, WRITE_S = 0.1, 0.025
 ANSWER_S = 1.0
 GIT_S = 2.0
 SWITCH_INTERVAL_S = 5e-4
-RECORDING, FAILED, STOPPED = "recording", "failed", "stopped"
+RECORDING, FAILED = "recording", "failed"
 
 
 def code_version() -> str:
@@ -211,7 +211,7 @@ class Recorder:
             self._fail(str(error))
         self._measure()
         self.recorded.size_bytes = self.recorded.path.stat().st_size
-        self._report(FAILED if self.recorded.failure else STOPPED, now=True)
+        self._report(FAILED if self.recorded.failure else ENDED, now=True)
 
     def _write_until_closed(self) -> None:
         commit_s = time.monotonic() + COMMIT_S

@@ -140,7 +140,7 @@ class RollingRecord:
         self._add(ENDED)
         self._write_audit()
         self._log.close()
-        self.node.publish_status("stopped", detail=self._detail(), now=True)
+        self.node.publish_end(self._detail())
         self.node.close()
 
     def _note_beginning(self) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 
 from vla_zenoh.cli.node_rows import NodeRow
 from vla_zenoh.errors import MissingExtraError
+from vla_zenoh.keys import ENDED
 from vla_zenoh.sanitize import one_line
 
 try:
@@ -34,7 +35,7 @@ MAX_SERIES = 256
 MAX_LABEL = 64
 PREFIX = "vla_zenoh"
 STATES = (
-    "active", "braking", "crashed", "dead", "degraded", "fault", "holding", "inactive",
+    "active", "braking", "crashed", "dead", "degraded", "ended", "fault", "holding", "inactive",
     "inferring", "missing", "ok", "recording", "routing", "running", "silent", "stalled",
     "starting", "stopped", "unheeded", "waiting",
 )  # fmt: skip
@@ -122,7 +123,8 @@ def _of_node(out: _Families, row: NodeRow) -> None:
     gauge, counter = GaugeMetricFamily, CounterMetricFamily
     known = row.state if row.state in STATES else OTHER
     states = {state: state == known for state in (*STATES, OTHER)}
-    out.add(gauge, "node_alive", "1 while it has a liveliness token.", node, int(row.alive))
+    if row.state != ENDED:  # a recorder that has done its work is not missed
+        out.add(gauge, "node_alive", "1 while it has a liveliness token.", node, int(row.alive))
     out.add(StateSetMetricFamily, "node_state", "State of a node.", node, states)
     status = row.status
     if status is None:

@@ -19,7 +19,7 @@ from vla_zenoh.cli.node_rows import NodeRow, acting_limits, mode_of, node_rows
 from vla_zenoh.codec import records
 from vla_zenoh.codec.settings import decode_held
 from vla_zenoh.errors import CodecError, RecordError, SessionError, VlaZenohError
-from vla_zenoh.keys import PRIMITIVES, ROLLING, last_chunk, worker_node
+from vla_zenoh.keys import ENDED, PRIMITIVES, ROLLING, last_chunk, worker_node
 from vla_zenoh.lab.primitives.client import ask
 from vla_zenoh.lab.teleop.policy import OperatorInput
 from vla_zenoh.lab.trial.plan import MAX_SETUPS
@@ -161,7 +161,9 @@ class RobotLink:
         said, task = self.client.snapshot(), self.client.task
         status, age_s, alive = said.get("command", (None, 0.0, False))
         detail: Mapping[str, Any] = status.detail if status is not None and alive else {}
-        state = "" if status is None else status.state if alive else "dead"
+        state = "" if status is None else status.state
+        if not alive and state not in ("", ENDED):
+            state = "dead"
         return {
             "mode": mode_of(said),
             "state": state or "no command node",

@@ -293,8 +293,8 @@ class RobotSession:
         )
 
     def close(self) -> None:
-        """Report ``stopped`` and close the node."""
-        self.node.publish_status("stopped", now=True)
+        """Report ``ended`` and close the node."""
+        self.node.publish_end()
         self.node.close()
 
 
