@@ -18,7 +18,6 @@ from vla_zenoh.bus.buffers import (
     CallbackRing,
     ReceivedSample,
     SampleBuffer,
-    ZenohRing,
     bytes_of,
     header_of,
 )
@@ -36,8 +35,6 @@ from vla_zenoh.types import Event, Header, NodeStatus, SingleWriterFilter, Stamp
 MSGPACK = zenoh.Encoding("application/msgpack")
 STATUS_PERIOD_S = 0.5
 IMAGE_LINK_TIMEOUT_S = 10.0
-STATUSES = 64
-"""Statuses of other nodes that are kept between two of our own."""
 LOSSES_PERIOD_S = 5.0
 """Events of lost samples are published at most this often, with their sum."""
 
@@ -134,7 +131,7 @@ class Node:
         self._image_session: zenoh.Session | None = None
         self.traffic = Traffic(session)
         self.reception = Reception(self.keys)
-        self._statuses: ZenohRing | None = None
+        self._follows = False
         self._short: dict[str, str] = {}
         self._losses: Counter[str] = Counter()
         self._losses_s = 0.0
@@ -248,15 +245,20 @@ class Node:
         self._events.poll()
 
     def follow_senders(self) -> None:
-        """Compare what arrives with the statuses of all senders; images are followed anyway."""
-        if self._statuses is None:
-            self._statuses = self.subscribe(self.keys.all_status, ZenohRing(STATUSES))
+        """Compare what arrives with the statuses of all senders; of images this is done anyway."""
+        if not self._follows:
+            self._follows = True
+            # At once, on Zenoh's thread: what has arrived by then is what the status is about.
+            handler = zenoh.handlers.Callback(self._on_status, indirect=False)
+            status = self.session.declare_subscriber(self.keys.all_status, handler)
+            self._declared.append(status)
+
+    def _on_status(self, sample: zenoh.Sample) -> None:
+        with suppress(CodecError):  # who reads statuses for their content counts it
+            status = records.decode(NodeStatus, bytes_of(sample.payload))
+            self.reception.status_received(status)
 
     def _report_losses(self) -> None:
-        for arrival in () if self._statuses is None else self._statuses.drain():
-            with suppress(CodecError):  # who reads statuses for their content counts it
-                payload = bytes_of(arrival.sample.payload)
-                self.reception.status_received(records.decode(NodeStatus, payload))
         before, self._short = self._short, self.reception.short()
         for name, why in self._short.items():
             if name not in before:
@@ -381,8 +383,6 @@ class Node:
         if writer_filter is not None:
             writer_filter.accept(header, arrival.mono_ns)
         self.traffic.received(key, header, arrival.nth)
-        if isinstance(record, NodeStatus):
-            self.reception.status_received(record)
         return Stamped(here, record, self.clock.wall_at(arrival.mono_ns))
 
     def decode_text(

@@ -173,6 +173,12 @@ def test_facts_profile_and_order_are_kept(tmp_path: Path) -> None:
     assert (run.damage, run.ended) == ("", {"dropped": {}})
 
 
+def test_a_file_without_samples_is_whole(tmp_path: Path) -> None:
+    run = open_recording(written(tmp_path / "a.mcap"))
+    assert list(run.entries()) == []
+    assert (run.damage, run.ended) == ("", {"dropped": {}})
+
+
 def test_only_the_keys_that_are_wanted_are_read(tmp_path: Path) -> None:
     run = open_recording(written(tmp_path / "a.mcap", pose(), picture(), chunk()))
     assert [e.key for e in run.entries(lambda key: "state" in key)] == [KEYS.state_pose]

@@ -237,7 +237,7 @@ def _by_index(file: IO[bytes], summary: Summary, damage: Callable[[str], None]) 
     broken: list[ChunkIndex] = []
     waiting: list[tuple[int, int, Message]] = []
     order = count()
-    for index, following in zip(chunks, [*chunks[1:], None], strict=True):
+    for index, following in zip(chunks, [*chunks, None][1:], strict=True):
         try:
             if max(index.chunk_length, index.uncompressed_size) > MAX_RECORD_BYTES:
                 raise McapError("the chunk is too large")

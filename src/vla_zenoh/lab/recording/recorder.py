@@ -127,6 +127,7 @@ class Recorder:
             session, max_bytes=queue_bytes, max_samples=QUEUE_SAMPLES, clock=self.node.clock
         )
         self._closing = threading.Event()
+        self._shares: dict[str, Share] = {}
         self._ended: Mapping[str, Any] = {}
         self.recorded = RecordingResult(path, dropped=self._queue.dropped)
         self._began_s = time.monotonic()
@@ -189,6 +190,8 @@ class Recorder:
 
     def stop_listening(self) -> None:
         """Unsubscribe; the file stays open until `close`."""
+        self._shares = self._shares or self.node.reception.shares()
+        self.node.reception.unwatch(self._queue.arrived)  # what is sent from now on is not lost
         self._queue.close()
 
     def close(self, ended: Mapping[str, Any] | None = None) -> RecordingResult:
@@ -232,7 +235,7 @@ class Recorder:
 
     def _count_lost(self) -> None:
         dropped, lost = self._queue.dropped, Counter(self.node.traffic.lost)
-        for key, (sent, received) in self.node.reception.shares().items():
+        for key, (sent, received) in self._shares.items():
             self.recorded.streams[key] = Share(sent, received - dropped[key])
             lost[key] = max(lost[key], Share(sent, received).lost)
         self.recorded.lost = +lost

@@ -131,6 +131,7 @@ class RollingRecord:
     def close(self) -> None:
         """Write what there is, and leave."""
         self._audit.close()
+        self.node.reception.unwatch(self._queue.arrived)
         self._queue.close()
         self.step()
         if self._reasons:

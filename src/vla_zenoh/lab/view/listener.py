@@ -6,10 +6,10 @@ from contextlib import suppress
 
 import zenoh
 
+from vla_zenoh.bus.buffers import bytes_of
 from vla_zenoh.bus.reception import Reception
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError
-from vla_zenoh.lab.recording.sample import Sample
 from vla_zenoh.lab.recording.sample_queue import SampleQueue
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import NodeStatus
@@ -43,11 +43,10 @@ class ViewListener(SampleQueue):
             if reply.ok is not None:
                 self.receive(reply.ok)
 
-    def take(self) -> list[Sample]:
-        """As `SampleQueue.take`; statuses among them tell `reception` what was sent."""
-        taken = super().take()
-        for sample in taken:
-            if sample.key.startswith(self._statuses):
-                with suppress(CodecError):
-                    self.reception.status_received(records.decode(NodeStatus, sample.payload))
-        return taken
+    def receive(self, sample: zenoh.Sample) -> None:
+        """As `SampleQueue.receive`; a status tells `reception` at once what was sent until then."""
+        super().receive(sample)
+        if str(sample.key_expr).startswith(self._statuses):
+            with suppress(CodecError):
+                status = records.decode(NodeStatus, bytes_of(sample.payload))
+                self.reception.status_received(status)
