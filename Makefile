@@ -10,7 +10,7 @@ MINUTES ?= 60
 BIN := .venv/bin
 COMMA := ,
 READY := .venv/.ready-$(subst $(COMMA),-,$(EXTRAS))
-SUITE := not slow and not models and not ros2 and not franka
+SUITE := not slow and not models and not ros2 and not rclpy and not franka
 WHICH := not long
 # Real arms brake when their computer stands still for a tenth of a second, and so do those of the tests: one that
 # fails in real time is tried twice more, and told in the summary.
@@ -19,7 +19,7 @@ AGAIN := --reruns 2 -r fEsR
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-long slow fuzz fuzz-motion soak test-ros2 test-franka test-realsense test-models check format bench bench-faults bench-ros2 build docs ros2-bridge clean
+.PHONY: help setup demo test test-long slow fuzz fuzz-motion soak test-ros2 test-franka test-realsense test-models check format bench bench-faults bench-ros2 bench-rclpy build docs ros2-bridge ros2-environment clean
 
 help: ## Show this list
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z0-9-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
@@ -45,7 +45,7 @@ test-long: $(READY) ## Run those that take longer, too, as CI does
 	@$(MAKE) --no-print-directory test WHICH=long
 
 slow: $(READY) ## Run the tests that take long, too, and search for new examples
-	HYPOTHESIS_PROFILE=searching $(BIN)/python -m pytest -m "not models and not franka" $(ARGS)
+	HYPOTHESIS_PROFILE=searching $(BIN)/python -m pytest -m "not models and not franka and not rclpy" $(ARGS)
 
 fuzz: $(READY) ## Feed every reader of foreign bytes with nonsense; SECONDS=600 for longer
 	$(BIN)/python tests/fuzz/fuzz.py --seconds $(SECONDS) $(ARGS)
@@ -56,8 +56,11 @@ fuzz-motion: $(READY) ## Fuzz command node and guard with a perfect arm; MINUTES
 soak: $(READY) ## Run the whole chain with random faults; MINUTES=3 for a short one
 	$(BIN)/python reliability/soak/soak.py --minutes $(MINUTES) $(ARGS)
 
-test-ros2: $(READY) ros2-bridge ## Run the tests with a real ROS 2 bridge and a DDS robot
-	$(BIN)/python -m pytest $(AGAIN) -m ros2 $(ARGS)
+# Of ROS 2 itself the distribution jazzy and what is quick; everything with ALL=1.
+DISTRIBUTIONS := jazzy $(if $(ALL),kilted)
+test-ros2: $(READY) ros2-bridge ros2-environment ## Run the tests with a real ROS 2 bridge, a DDS robot and ROS 2's rclpy; ALL=1 for all
+	$(BIN)/python -m pytest $(AGAIN) -m ros2 $(ARGS) || [ $$? = 5 ]
+	ROS2_DISTRIBUTIONS="$(DISTRIBUTIONS)" $(BIN)/python -m pytest $(AGAIN) -m "rclpy$(if $(ALL),, and not slow)" $(ARGS) || [ $$? = 5 ]
 
 test-franka: $(READY) ## Run the tests of the driver franka against franka-sim, in an environment of its own
 	$(BIN)/python scripts/test_franka.py $(AGAIN) $(ARGS)
@@ -88,6 +91,9 @@ bench-faults: $(READY) ## Faults of a lab network on an arm in motion (root), ta
 bench-ros2: $(READY) ros2-bridge ## Measure a picture's way to a pose through ROS 2
 	$(BIN)/python tests/ros2/bench.py $(ARGS)
 
+bench-rclpy: $(READY) ros2-bridge ros2-environment ## Measure exactness, latency, stops and faults with an rclpy robot
+	$(BIN)/python tests/ros2/bench_rclpy.py $(ARGS)
+
 build: $(READY) ## Build wheel and sdist into dist/ and try each in an empty environment
 	$(BIN)/python scripts/check_wheel.py $(ARGS)
 
@@ -98,6 +104,9 @@ docs: $(READY) ## Make the reference pages from the code, and the site into site
 
 ros2-bridge: ## Build a zenoh-bridge-ros2dds for the tests, once, unless PATH has one
 	@$(PYTHON) scripts/ros2_bridge.py
+
+ros2-environment: $(READY) ## Make an environment with ROS 2's rclpy for the tests, once
+	@$(BIN)/python scripts/ros2_environment.py $(DISTRIBUTIONS)
 
 clean: ## Remove everything these targets made
 	rm -rf .venv .tools dist site .pytest_cache .ruff_cache .hypothesis

@@ -50,10 +50,13 @@ class Bridge:
         program: the bridge.
         folder: for its settings and what it says.
         settings: text of its configuration.
+        distribution: of ROS 2.
     """
 
-    def __init__(self, program: Path, folder: Path, settings: str) -> None:
-        self._program = program
+    def __init__(
+        self, program: Path, folder: Path, settings: str, distribution: str = "jazzy"
+    ) -> None:
+        self._program, self._distribution = program, distribution
         self._settings = folder / "bridge.json5"
         self._settings.write_text(settings)
         self.log = folder / "bridge.log"
@@ -65,7 +68,7 @@ class Bridge:
             **os.environ,
             "CYCLONEDDS_URI": LOOPBACK_XML,
             "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-            "ROS_DISTRO": "jazzy",
+            "ROS_DISTRO": self._distribution,
             "RUST_LOG": os.environ.get("RUST_LOG", "info"),
         }
         with self.log.open("ab") as log:

@@ -91,7 +91,6 @@ class AskedWorker:
         )
 
     def close(self) -> None:
-        self.node.publish_end()
         self.node.close()
 
     def _publish(self, seen: BenchmarkObservation) -> None:

@@ -1,0 +1,554 @@
+"""A lab whose robot is ROS 2 itself: rclpy programs on Fast DDS, the real bridge, and our nodes.
+
+The programs of `ros_side/` run in ROS's own Python, as scripts/ros2_environment.py makes it, and
+talk with a test by lines of JSON. Times in what they tell are of this computer's monotonic clock.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import cv2
+import numpy as np
+import panda_dh
+from bridge import ROOT, Bridge, generated
+from camera_rig import PATIENCE_S, free_endpoint, until
+from chain import CHAIN_PATIENCE_S, Chain, Track, running_chain
+from numpy.typing import NDArray
+from ros_node import free_domain
+
+SIDE = Path(__file__).with_name("ros_side")
+
+FloatArray = NDArray[np.float64]
+START_S = 30.0
+FAST_DDS = "rmw_fastrtps_cpp"
+MOVING_M_S = 0.05
+STILL_RAD, STAND_S = 1e-8, 0.2
+"""This arm is kinematics alone: it stands where no digit changes any more."""
+MIDDLE_M = 0.40
+WIDTH, HEIGHT, CAMERA_HZ, PICTURES = 160, 120, 30, 5
+FRONT, WRIST = "/front/image_raw", "/wrist/image_raw/compressed"
+
+PROFILE = """\
+extends: panda_ros2
+robot: {{name: {name}}}
+cameras:
+  front:
+    source: "ros2:{front}"
+    {size}
+  wrist:
+    source: "ros2:{wrist}"
+    {size}
+task: {{prompt: hold, rate_hz: 10, worker: scripted}}
+session: {{listen: ["{endpoint}"], connect: ["{endpoint}"], lease_ms: 4000}}
+timing: {{command_timeout_s: {patience_s[command]}, state_timeout_s: {patience_s[state]}}}
+ros2:
+  distribution: {distribution}
+  domain: {domain}
+  joint_states: {space}/joint_states
+  cameras:
+    front: {{topic: {front}, type: sensor_msgs/msg/Image}}
+    wrist: {{topic: {wrist}, type: sensor_msgs/msg/CompressedImage}}
+  pose_command: {{topic: {space}/desired_pose, type: geometry_msgs/msg/PoseStamped}}
+  gripper: {gripper}
+{more}"""
+CAMERA = """\
+width: {width}
+    height: {height}
+    rate_hz: {hz}
+    check: {{same_s: 0}}"""
+BY_TOPIC = "{{topic: {space}/gripper_width, type: std_msgs/msg/Float64, position: width}}"
+BY_ACTION = (
+    "{{topic: {space}/gripper/move, type: franka_msgs/action/Move, grasp: {space}/gripper/grasp}}"
+)
+
+
+def environment_script() -> ModuleType:
+    """scripts/ros2_environment.py, which knows where ROS's Python is."""
+    sys.path.append(str(ROOT / "scripts"))
+    spec = importlib.util.spec_from_file_location(
+        "ros2_environment", ROOT / "scripts" / "ros2_environment.py"
+    )
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def ros_python(distribution: str) -> Path:
+    """ROS's Python. It is no reason to skip a test that there is none: make test-ros2 makes it."""
+    python = environment_script().python_of(distribution)
+    assert python is not None, f"no rclpy of {distribution} here: make test-ros2"
+    return python
+
+
+class Program:
+    """One of the programs of `ros_side/`, as a process.
+
+    Args:
+        name: of its file, without ``.py``.
+        distribution: whose Python.
+        domain: ROS domain id.
+        settings: its argument.
+        environ: variables beside those of this process.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        distribution: str,
+        domain: int,
+        settings: Mapping[str, Any] | None = None,
+        environ: Mapping[str, str] | None = None,
+    ) -> None:
+        self._words = [
+            str(ros_python(distribution)),
+            str(SIDE / f"{name}.py"),
+            json.dumps(settings or {}),
+        ]
+        self._environ = {
+            **{key: value for key, value in os.environ.items() if not key.startswith("PYTHON")},
+            "PYTHONDONTWRITEBYTECODE": "1",
+            "PYTHONPATH": str(SIDE.parent),
+            "ROS_DOMAIN_ID": str(domain),
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+            "RMW_IMPLEMENTATION": FAST_DDS,
+            **(environ or {}),
+        }
+        self.told: list[dict[str, Any]] = []
+        self._process: subprocess.Popen[str] | None = None
+        self._reader: threading.Thread | None = None
+
+    def start(self, *, wait: bool = True) -> Program:
+        """Start it; with `wait`, until ROS runs in it."""
+        before = len(self.told)
+        self._process = subprocess.Popen(
+            self._words,
+            env=self._environ,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        self._reader = threading.Thread(target=self._read, args=(self._process,), daemon=True)
+        self._reader.start()
+        if wait:
+            self.wait_ready(before)
+        return self
+
+    def wait_ready(self, before: int = 0) -> None:
+        """Until ROS runs in it."""
+        until(
+            f"{self._words[1]} runs",
+            lambda: not self.alive or self.since(before, "ready"),
+            START_S,
+        )
+        assert self.since(before, "ready")[0]["ready"] == FAST_DDS
+
+    def _read(self, process: subprocess.Popen[str]) -> None:
+        assert process.stdout is not None
+        with process.stdout:
+            for line in process.stdout:
+                if line.startswith("{"):
+                    self.told.append(json.loads(line))
+
+    @property
+    def alive(self) -> bool:
+        return self._process is not None and self._process.poll() is None
+
+    def do(self, command: str, **how: Any) -> None:
+        """Let it do something; see the program."""
+        assert self._process is not None
+        assert self._process.stdin is not None
+        self._process.stdin.write(json.dumps({"do": command, **how}) + "\n")
+        self._process.stdin.flush()
+
+    def since(self, before: int, what: str) -> list[dict[str, Any]]:
+        """What it told with this key, from the line number `before` on."""
+        return [line for line in self.told[before:] if what in line]
+
+    def ask(self, command: str, answer: str, timeout_s: float = 20.0, **how: Any) -> dict[str, Any]:
+        """Let it do something and wait for a line with the key `answer`."""
+        before = len(self.told)
+        self.do(command, **how)
+        lines = until(
+            f"{command} {how} is answered",
+            lambda: self.since(before, answer) or self.since(before, "failed"),
+            timeout_s,
+        )
+        assert answer in lines[0], lines[0]
+        return lines[0]
+
+    def kill(self) -> None:
+        """End it as a crash would."""
+        if self._process is not None:
+            self._process.kill()
+            self._gone()
+
+    def end(self) -> None:
+        """Let it end by itself."""
+        if self._process is None:
+            return
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.close()
+            self._process.wait(5)
+        except (OSError, subprocess.TimeoutExpired):
+            self._process.kill()
+        self._gone()
+
+    def _gone(self) -> None:
+        assert self._process is not None
+        assert self._reader is not None
+        self._process.wait()
+        self._reader.join()
+        if self._process.stdin is not None:
+            with suppress(OSError):
+                self._process.stdin.close()
+        self._process = None
+
+
+class Arm(Program):
+    """The rclpy robot; its own log says how it moved. Settings: see `ros_side/arm.py`."""
+
+    def __init__(self, distribution: str, domain: int, **settings: Any) -> None:
+        environ = settings.pop("environ", None)
+        super().__init__("arm", distribution, domain, settings, environ)
+
+    def track(self, since_ns: int = 0) -> Track:
+        """How it moved, by the joints of its log; stamps are monotonic."""
+        return track_of([(line["t"], line["q"]) for line in self._lines("q", since_ns)])
+
+    def goals(self, since_ns: int = 0) -> tuple[NDArray[np.int64], FloatArray]:
+        """(n,) when each pose arrived, and (n, 3) the positions."""
+        found = self._lines("goal", since_ns)
+        return (
+            np.array([line["t"] for line in found], np.int64),
+            np.array([line["goal"] for line in found]).reshape(-1, 3),
+        )
+
+    def _lines(self, what: str, since_ns: int) -> list[dict[str, Any]]:
+        out = []
+        for line in reversed(self.told):
+            if line["t"] < since_ns - 1_000_000_000:  # lines of two threads may be swapped
+                break
+            if what in line and line["t"] >= since_ns:
+                out.append(line)
+        return out[::-1]
+
+    def joints_rad(self) -> FloatArray:
+        """Its joints now."""
+
+        def newest() -> FloatArray | None:
+            return next((np.array(line["q"]) for line in reversed(self.told) if "q" in line), None)
+
+        return until("joints of the robot", lambda: newest() is not None) and newest()
+
+    def tcp(self) -> FloatArray:
+        """Its TCP now, (4, 4)."""
+        return panda_dh.forward(self.joints_rad())
+
+    def width_m(self) -> float:
+        return next(line["width_m"] for line in reversed(self.told) if "width_m" in line)
+
+    def speed_m_s(self) -> float:
+        """How fast it is, over the last 60 ms."""
+        track = self.track(time.monotonic_ns() - 60_000_000)
+        if len(track.stamp_ns) < 2:
+            return 0.0
+        way_m = np.linalg.norm(track.position_m[-1] - track.position_m[0])
+        return float(way_m / (track.stamp_ns[-1] - track.stamp_ns[0]) * 1e9)
+
+    def stands(self) -> bool:
+        lines = self._lines("q", time.monotonic_ns() - int(STAND_S * 1e9))
+        if len(lines) < 5:
+            return False
+        return float(np.ptp([line["q"] for line in lines], axis=0).max()) < STILL_RAD
+
+    def wait_still(self, timeout_s: float = PATIENCE_S) -> FloatArray:
+        """Until it stands; its TCP then, (4, 4)."""
+        until("the robot stands", self.stands, timeout_s)
+        return self.tcp()
+
+
+def track_of(joints: list[tuple[int, list[float]]]) -> Track:
+    """How an arm moved of (ns, joints rad)."""
+    stamps = np.array([at_ns for at_ns, _ in joints], np.int64)
+    places = np.array([panda_dh.forward(q)[:3, 3] for _, q in joints]).reshape(-1, 3)
+    twist = np.zeros((len(joints), 6))
+    if len(joints) > 1:
+        twist[:, :3] = np.gradient(places, stamps / 1e9, axis=0)
+    nobody = np.full(len(joints), "panda", object)
+    return Track(stamps, places, twist, np.full_like(places, np.nan), nobody)
+
+
+def pictures(folder: Path, width: int, height: int) -> list[NDArray[np.uint8]]:
+    """Files of pictures for `ros_side/camera.py`, in every encoding; the pictures, RGB."""
+    folder.mkdir(exist_ok=True)
+    made = []
+    for number in range(PICTURES):
+        noise = np.random.default_rng(number).integers(0, 256, (6, 8, 3), np.uint8)
+        rgb = cv2.resize(noise, (width, height), interpolation=cv2.INTER_NEAREST)
+        bgr = np.ascontiguousarray(rgb[..., ::-1])
+        (folder / f"{number}.rgb8").write_bytes(rgb.tobytes())
+        (folder / f"{number}.bgr8").write_bytes(bgr.tobytes())
+        done, jpeg = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 95])
+        assert done
+        (folder / f"{number}.jpeg").write_bytes(jpeg.tobytes())
+        made.append(rgb)
+    return made
+
+
+@dataclass
+class RosLab:
+    """What a test holds."""
+
+    distribution: str
+    domain: int
+    bridge: Bridge
+    arm: Arm
+    cameras: Program
+    person: Program
+    chain: Chain
+    pictures: list[NDArray[np.uint8]]
+
+    def settle(self) -> None:
+        """Whatever was before: inactive, standing, prompt ``hold``."""
+        self.chain.settle()
+        self.arm.wait_still()
+        self.chain.recorder.forget()
+        self.chain.client.pop_events()
+        assert not self.chain.failure, self.chain.failure
+
+    def activate_at_rest(self) -> FloatArray:
+        """Activate with prompt ``hold``; where the TCP then stands, (4, 4)."""
+        self.chain.client.set_prompt("hold")
+        self.chain.activate_when_ready()
+        return self.arm.wait_still()
+
+    def move(self, speed_m_s: float = MOVING_M_S, rate_hz: float = 10.0) -> None:
+        """Activate with an endless motion away from the nearer end; returns when it is fast."""
+        up = self.arm.tcp()[2, 3] < MIDDLE_M
+        self.chain.client.set_rate(rate_hz)
+        self.chain.client.set_prompt("HARD: go up" if up else "HARD: go down")
+        self.chain.activate_when_ready()
+        self.chain.until("it moves", lambda: self.arm.speed_m_s() > speed_m_s)
+
+    def story(self) -> str:
+        """For the message of a test that fails."""
+        return f"{self.chain.story()}\nbridge:\n{self.bridge.tail()}"
+
+
+def write_profile(
+    folder: Path,
+    distribution: str,
+    domain: int,
+    *,
+    endpoint: str | None = None,
+    space: str = "",
+    name: str = "panda",
+    gripper: str = BY_TOPIC,
+    size: tuple[int, int] = (WIDTH, HEIGHT),
+    more: str = "",
+    patience_s: Mapping[str, float] = CHAIN_PATIENCE_S,
+) -> Path:
+    """A profile of the rclpy robot; `more` is YAML at the end of the section ros2."""
+    path = folder / f"{name}_rclpy.yaml"
+    path.write_text(
+        PROFILE.format(
+            name=name,
+            front=space + FRONT,
+            wrist=space + WRIST,
+            size=CAMERA.format(width=size[0], height=size[1], hz=CAMERA_HZ),
+            endpoint=endpoint or free_endpoint(),
+            distribution=distribution,
+            domain=domain,
+            space=space,
+            patience_s=patience_s,
+            gripper=gripper.format(space=space),
+            more=more,
+        )
+    )
+    return path
+
+
+def camera_settings(
+    folder: Path, space: str = "", size: tuple[int, int] = (WIDTH, HEIGHT)
+) -> dict[str, Any]:
+    """A raw camera, best effort, and a compressed one, reliable."""
+    return {
+        "rate_hz": CAMERA_HZ,
+        "folder": str(folder),
+        "width": size[0],
+        "height": size[1],
+        "topics": [
+            {"topic": space + FRONT, "encoding": "rgb8", "reliable": False},
+            {"topic": space + WRIST, "encoding": "jpeg", "reliable": True},
+        ],
+    }
+
+
+@contextmanager
+def running_ros_lab(
+    folder: Path,
+    program: Path,
+    distribution: str,
+    *,
+    arm: Mapping[str, Any] | None = None,
+    gripper: str = BY_TOPIC,
+    more: str = "",
+    size: tuple[int, int] = (WIDTH, HEIGHT),
+    cameras: Callable[[dict[str, Any]], None] = lambda settings: None,
+    patience_s: Mapping[str, float] = CHAIN_PATIENCE_S,
+) -> Iterator[RosLab]:
+    """Everything up while the block lasts.
+
+    Args:
+        folder: for profile, settings and logs.
+        program: the bridge.
+        distribution: of ROS 2.
+        arm: settings of the robot; `environ` among them: variables.
+        gripper: its section of the profile, `BY_TOPIC` or `BY_ACTION`.
+        more: YAML at the end of the profile's section ros2.
+        size: of the pictures, width and height.
+        cameras: changes their settings.
+        patience_s: of the profile, with commands and states that are late.
+    """
+    domain = free_domain()
+    profile = write_profile(
+        folder,
+        distribution,
+        domain,
+        gripper=gripper,
+        size=size,
+        more=more,
+        patience_s=patience_s,
+    )
+    made = pictures(folder / "pictures", *size)
+    seen = camera_settings(folder / "pictures", size=size)
+    cameras(seen)
+    with ExitStack() as stack:
+        settings = generated(profile, beside=True)
+        bridge = Bridge(program, folder, settings, distribution).start()
+        stack.callback(bridge.kill)
+        robot = Arm(distribution, domain, **(arm or {}))
+        eyes = Program("camera", distribution, domain, seen)
+        person = Program("person", distribution, domain)
+        for one in (robot, eyes, person):
+            one.start(wait=False)
+            stack.callback(one.end)
+        chain = stack.enter_context(running_chain(folder, profile_file=profile))
+        chain.recorder.only = {"state": "ros2#", "command": "command#"}
+        for one in (robot, eyes, person):
+            one.wait_ready()
+        yield RosLab(distribution, domain, bridge, robot, eyes, person, chain, made)
+
+
+# -- what tests do ---------------------------------------------------------------------------------
+STRING, BOOL, EMPTY = "std_msgs/msg/String", "std_msgs/msg/Bool", "std_msgs/msg/Empty"
+TYPES = {"stop": EMPTY, "reset": EMPTY, "active": BOOL, "prompt": STRING, "request": STRING}
+ANSWER = "/vla/answer"
+STEPS_PATIENCE_S = 30.0
+
+
+def carry_out(lab: RosLab, prompt: str, count: int) -> FloatArray:
+    """Let an active standing arm do `count` steps of a prompt; its TCP then, (4, 4)."""
+    client = lab.chain.client
+    client.set_prompt("hold")
+    lab.arm.wait_still()
+    words = f"HARD: {prompt} x{count}"
+    client.set_prompt(words)
+
+    def done() -> bool:
+        status = client.status("command")
+        said = status.detail if status else {}
+        ours = said.get("prompt") == words
+        return ours and said["policy_done"] and said["accepted_steps"] >= count
+
+    lab.chain.until(f"{count} steps carried out", done, STEPS_PATIENCE_S)
+    lab.chain.wait_still()
+    return lab.arm.wait_still()
+
+
+def heard(person: Program, topic: str, before: int = 0) -> list[dict[str, Any]]:
+    """What a person heard of a topic."""
+    return [line for line in person.told[before:] if line.get("heard") == topic]
+
+
+def received_tcp(lab: RosLab) -> FloatArray:
+    """TCP of the joints that another rclpy node received, said after this call; (4, 4)."""
+    person, since_ns, topic = lab.person, time.time_ns(), "/joint_states"
+    if not any(line.get("hears") == topic for line in person.told):
+        person.ask("hear", "hears", topic=topic, type="sensor_msgs/msg/JointState", every=10)
+    before = len(person.told)
+
+    def newer() -> dict[str, Any] | None:
+        for line in heard(person, topic, before):
+            stamp = line["value"]["header"]["stamp"]
+            if stamp["sec"] * 10**9 + stamp["nanosec"] > since_ns:
+                return line["value"]
+        return None
+
+    message = until("joints in rclpy", newer)
+    joints = dict(zip(message["name"], message["position"], strict=True))
+    return panda_dh.forward([joints[name] for name in panda_dh.JOINTS])
+
+
+def request(
+    lab: RosLab, what: str, value: Mapping[str, Any] | None = None, **how: Any
+) -> dict[str, Any]:
+    """Publish on one of our topics as a ROS user does; the answer, from its JSON."""
+    person = lab.person
+    if not any(line.get("hears") == ANSWER for line in person.told):
+        person.ask("hear", "hears", topic=ANSWER, type=STRING)
+        time.sleep(1.0)  # until the bridge has both ends of it
+    before = len(person.told)
+    person.ask("say", "said", topic=f"/vla/{what}", type=TYPES[what], value=value or {}, **how)
+
+    def answer() -> dict[str, Any] | None:
+        found = (json.loads(line["value"]["data"]) for line in heard(person, ANSWER, before))
+        return next((each for each in found if each["what"] == what), None)
+
+    return until(f"/vla/{what} is answered", answer, 15.0)
+
+
+# -- what is preloaded into a robot ----------------------------------------------------------------
+LOSSY = SIDE / "lossy.c"
+WALL_CLOCK = ROOT / "reliability" / "netns" / "wall_clock.c"
+
+
+def library(folder: Path, source: Path) -> str:
+    """A library of a C file, for LD_PRELOAD."""
+    made = folder / f"{source.stem}.so"
+    subprocess.run(["cc", "-shared", "-fPIC", "-O1", source, "-o", made, "-ldl"], check=True)
+    return str(made)
+
+
+class WallClock:
+    """A wall clock of its own for a robot, `environ` gives it one."""
+
+    def __init__(self, folder: Path, offset_s: float = 0.0) -> None:
+        self._file = folder / "wall_clock"
+        self.set(offset_s)
+        self.environ = {
+            "LD_PRELOAD": library(folder, WALL_CLOCK),
+            "WALL_CLOCK_FILE": str(self._file),
+        }
+
+    def set(self, offset_s: float) -> None:
+        """How far it is off, from now on."""
+        data = round(offset_s * 1e9).to_bytes(8, "little", signed=True)
+        with self._file.open("r+b" if self._file.exists() else "wb") as file:
+            file.write(data)  # in place: a running robot has it mapped
