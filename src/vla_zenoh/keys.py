@@ -302,6 +302,8 @@ ROLLING = "rolling"
 
 CRASHED, STARTING = "crashed", "starting"
 """States in the status that `vla-zenoh up` publishes for a node of its host that does not run."""
+ENDED = "ended"
+"""State in the last status of a node that ended as it should; one that died publishes none."""
 ON_BEHALF = "up-"
 """Prefix of the source of such a status."""
 

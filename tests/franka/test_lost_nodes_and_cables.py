@@ -52,7 +52,7 @@ def whole(lab: Lab) -> None:
     lab.chain.until(
         "every node is there",
         lambda: (
-            all(lab.chain.state(node) not in ("", "stopped", "connecting") for node in nodes)
+            all(lab.chain.state(node) not in ("", "ended", "connecting") for node in nodes)
             and set(nodes) <= lab.chain.client.alive
         ),
         BACK_S,
@@ -167,7 +167,7 @@ def test_a_robot_that_is_gone_in_motion_and_comes_back(lab: Lab, tmp_path: Path)
     lab.robot.process.wait()
     lab.chain.until(
         "the fault is told, or the node is gone",
-        lambda: lab.fault() or lab.chain.state("arm") in ("silent", "stopped", "connecting"),
+        lambda: lab.fault() or lab.chain.state("arm") in ("silent", "ended", "connecting"),
         BACK_S,
     )
     tell(lab, "SIGKILL of the simulator", since, began_ns)

@@ -46,6 +46,7 @@ from vla_zenoh.types import (
     FloatArray,
     GripperCommand,
     GripperState,
+    Image,
     JointState,
     PoseCommand,
     PoseState,
@@ -100,6 +101,31 @@ def test_chunks_that_are_too_late_are_nothing_and_the_arm_stops() -> None:
     assert loop.refused["stale"] > 5
     assert stop_time_s(loop, since) < STARVED_STOP_S
     assert way_m(loop, since) < STARVED_WAY_M
+    check_motion(loop)
+
+
+@pytest.mark.parametrize("kept", [Image, None])
+def test_a_camera_that_repeats_one_image_with_new_stamps_stops_the_arm(
+    kept: type[Any] | None,
+) -> None:
+    first: dict[str, Message] = {}
+
+    def repeated(sent: Message) -> Iterable[Message]:
+        if sent.kind is not kept:
+            return [sent]
+        shown = first.setdefault(sent.camera, sent)
+        return [replace(sent, payload=shown.payload)]
+
+    loop = moving()
+    loop.tamper = repeated
+    loop.run(3.0)
+    found = [event for event in loop.events if event.what == "same_image"]
+    if kept is None:  # images go through `tamper` and differ
+        assert not found
+        return
+    (event,) = found
+    assert "while the arm moves" in event.why
+    assert speed_m_s(loop)[-1] < STILL_M_S
     check_motion(loop)
 
 

@@ -199,7 +199,7 @@ def test_the_node_ends_in_time_and_says_goodbye(tmp_path: Path) -> None:
         assert time.monotonic() - began < STOP_S
         left = {thread.name for thread in threading.enumerate()}
         assert not left & {f"camera {name}" for name in cameras}
-        until("a last word", lambda: rig.statuses[-1].state == "stopped")
+        until("a last word", lambda: rig.statuses[-1].state == "ended")
         alive = rig.watcher.liveliness().get(rig.profile.keys.all_alive, timeout=1.0)
         assert [reply for reply in alive if reply.ok is not None] == []
 

@@ -76,7 +76,7 @@ def record_going_up(chain: Chain, path: Path) -> None:
 def test_the_file_holds_everything_that_was_said(run_file: Path, shared_chain: Chain) -> None:
     run = load_run(run_file)
     assert run.problems == []
-    assert run.file.ended == {"dropped": {}}
+    assert run.file.ended == {"dropped": {}, "lost": {}}
     streams = (run.poses, run.joints, run.grippers, run.commands, run.chunks, run.tasks)
     assert all(len(stream) > 5 for stream in (*streams, run.seen))
     assert run.picture_counts["front"] > 5
@@ -271,7 +271,7 @@ def test_what_the_queue_cannot_take_is_counted_and_said(chain: Chain, tmp_path: 
     # What it says of itself is larger than this queue, and is missing as well.
     assert recorded.dropped[key] == 1
     run = load_run(path)
-    assert run.file.ended == {"dropped": dict(recorded.dropped)}
+    assert run.file.ended == {"dropped": dict(recorded.dropped), "lost": {}}
     assert [len(heard.record.why) for heard in run.events if "camera" in heard.key] == [0, 0]
     assert (
         f"the recorder dropped {recorded.dropped.total()} samples"

@@ -133,4 +133,4 @@ def test_a_recorder_that_cannot_subscribe_leaves_the_bus_and_closes_its_file(
     await_gone(session, profile)
     file = open_recording(path)
     list(file.entries())
-    assert file.ended == {"dropped": {}}
+    assert file.ended == {"dropped": {}, "lost": {}}

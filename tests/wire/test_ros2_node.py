@@ -338,7 +338,7 @@ def test_whatever_breaks_in_the_loop_the_arm_is_braked_before_it_ends(
             rig.wait("it is told", lambda: rig.happened("broken"))
         steps_m = np.diff([goal.pose.position.z for goal in goals])
         assert steps_m[-1] < BRAKED_M < steps_m[-100:].max()
-        assert rig.statuses[-1].state in ("braking", "running", "stopped")
+        assert rig.statuses[-1].state in ("braking", "running", "ended")
 
 
 # -- gripper --------------------------------------------------------------------------------------

@@ -21,6 +21,9 @@ from vla_zenoh.codec.records import MAX_RECORD_BYTES
 from vla_zenoh.errors import CodecError
 from vla_zenoh.types import Header
 
+MAX_KEYS = 256
+"""Of one buffer that are counted."""
+
 
 def bytes_of(payload: zenoh.ZBytes | None, limit: int = MAX_RECORD_BYTES) -> bytes:
     """The bytes of a payload, empty if there is none; more than `limit` raise a `CodecError`."""
@@ -52,7 +55,8 @@ def header_of(sample: zenoh.Sample) -> Header:
 class ReceivedSample(NamedTuple):
     """A sample and its time of arrival, monotonic clock.
 
-    `nth`: samples its buffer had received by then, this one included; 0: not counted.
+    `nth`: samples of its key that its buffer had received by then, this one included; 0: not
+    counted.
     """
 
     sample: zenoh.Sample
@@ -75,6 +79,8 @@ class SampleBuffer:
     def __init__(self, limit: int) -> None:
         self._limit = limit
         self._rejected: dict[str, RejectedSample] = {}
+        self.arrived: dict[str, int] = {}
+        """Key -> samples that arrived, also those that were dropped since."""
 
     def __call__(self, sample: zenoh.Sample) -> None:
         """Keep a sample; runs on Zenoh's thread."""
@@ -93,6 +99,20 @@ class SampleBuffer:
             self._rejected[reason] = RejectedSample(reason, str(sample.key_expr), str(error), times)
             return False
         return True
+
+    @property
+    def count(self) -> int:
+        """Samples that arrived."""
+        return sum(self.arrived.values())
+
+    def _count(self, sample: zenoh.Sample) -> int:
+        """How many samples of this key arrived; 0 if there are too many keys to count."""
+        key = str(sample.key_expr)
+        count = self.arrived.get(key, 0) + 1
+        if count == 1 and len(self.arrived) >= MAX_KEYS:
+            return 0
+        self.arrived[key] = count
+        return count
 
     def pop_rejected(self) -> list[RejectedSample]:
         """Samples rejected since the last call, by reason."""
@@ -122,7 +142,7 @@ class Wake:
 class CallbackRing(SampleBuffer):
     """Keeps the newest `size` samples in order; older ones are dropped and counted.
 
-    Every sample sets `arrival`; several buffers may share one. `count` samples came in all.
+    Every sample sets `arrival`; several buffers may share one.
     """
 
     def __init__(
@@ -135,15 +155,14 @@ class CallbackRing(SampleBuffer):
         self._arrival = arrival
         self._arrivals: deque[ReceivedSample] = deque(maxlen=size)
         self._size = size
-        self.count = self.dropped = 0
+        self.dropped = 0
 
     def __call__(self, sample: zenoh.Sample) -> None:
         if not self._accepts(sample):
             return
-        self.count += 1
         if len(self._arrivals) == self._size:
             self.dropped += 1
-        self._arrivals.append(ReceivedSample(sample, time.monotonic_ns(), self.count))
+        self._arrivals.append(ReceivedSample(sample, time.monotonic_ns(), self._count(sample)))
         if self._arrival is not None:
             self._arrival.set()
 
@@ -189,7 +208,7 @@ class ZenohRing(SampleBuffer):
 
     def __init__(self, size: int, limit: int = MAX_RECORD_BYTES) -> None:
         super().__init__(limit)
-        self._size, self.count = size, 0
+        self._size = size
         self._receive: Callable[[], zenoh.Sample | None] = lambda: None
 
     def subscribe(self, session: zenoh.Session, key: str) -> zenoh.Subscriber[Any]:
@@ -205,8 +224,7 @@ class ZenohRing(SampleBuffer):
             if sample is None:
                 break
             if self._accepts(sample):
-                self.count += 1
-                drained.append(ReceivedSample(sample, time.monotonic_ns(), self.count))
+                drained.append(ReceivedSample(sample, time.monotonic_ns(), self._count(sample)))
         else:
             return [arrival._replace(nth=0) for arrival in drained]
         return drained

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import zenoh
 
-from vla_zenoh.bus.buffers import bytes_of, header_of
+from vla_zenoh.bus.buffers import SampleBuffer, bytes_of, header_of
+from vla_zenoh.bus.reception import Reception
 from vla_zenoh.bus.session import put_text
 from vla_zenoh.codec import records, settings
 from vla_zenoh.errors import CodecError, ProfileError, SessionError
@@ -144,13 +145,15 @@ class Client(NodeRegistry):
             robot.set_prompt("pick up the red brick")
             robot.activate_with_deadman("my script")
 
-    `expected` has the nodes that the profile assigns to hosts, each with its host.
+    `expected` has the nodes that the profile assigns to hosts, each with its host; `reception`
+    tells what this client does not receive, of its subscriptions by `watch`.
     """
 
     def __init__(self, profile: Profile, session: zenoh.Session) -> None:
         super().__init__(one.node for one in identities(profile))
         self.profile, self.session, self.keys = profile, session, profile.keys
         self.expected = expected_nodes(profile)
+        self.reception = Reception(profile.keys)
         self.events: deque[tuple[str, Header, Event]] = deque(maxlen=MAX_EVENTS)
         self.task: Task | None = None
         self._task_heard_s = -1e9
@@ -171,6 +174,18 @@ class Client(NodeRegistry):
         ]
         return self
 
+    def watch(self, key: str, buffer: SampleBuffer) -> Callable[[], None]:
+        """Subscribe with `buffer`, whose samples are compared with what is sent; what is returned
+        ends that."""
+        subscriber = buffer.subscribe(self.session, key)
+        self.reception.watch(key, buffer.arrived)
+
+        def end() -> None:
+            subscriber.undeclare()
+            self.reception.unwatch(buffer.arrived)
+
+        return end
+
     def _subscribe(self, key: str, callback: Callable[[zenoh.Sample], None]) -> Any:
         return self.session.declare_subscriber(
             key, zenoh.handlers.Callback(callback, indirect=False)
@@ -190,6 +205,7 @@ class Client(NodeRegistry):
         if found is not None:
             name = last_chunk(str(sample.key_expr))
             self.status_received(name, found[1], len(sample.payload))
+            self.reception.status_received(found[1])
 
     def _on_event(self, sample: zenoh.Sample) -> None:
         found = self._decode(Event, sample, MAX_EVENT_BYTES)
@@ -216,6 +232,11 @@ class Client(NodeRegistry):
         if name == "command":  # the task is no longer in force
             with self._lock:
                 self.task = None
+
+    def note(self, name: str, event: Event) -> None:
+        """Add an event of this program to those of the nodes."""
+        with self._lock:
+            self.events.append((name, Header(time.time_ns(), 0, name), event))
 
     def pop_events(self) -> list[tuple[str, Header, Event]]:
         """Events since the last call, oldest first."""

@@ -240,10 +240,11 @@ class ClockOffsetFilter:
         if best is None:
             return 0
         offset_ns = best.ahead_ns - wall_minus_mono_ns
-        if abs(offset_ns / 1e9) > self._bound_s:
+        bound_ns, doubt_ns = self._bound_s * 1e9, best.uncertainty_ns(now_mono_ns)
+        if abs(offset_ns) > max(bound_ns, doubt_ns):
             self._applied_ns = 0
-        elif abs(offset_ns - self._applied_ns) > best.uncertainty_ns(now_mono_ns):
-            self._applied_ns = offset_ns
+        elif abs(offset_ns - self._applied_ns) > doubt_ns:
+            self._applied_ns = offset_ns if abs(offset_ns) <= bound_ns else 0
         return self._applied_ns
 
 

@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 import zenoh
 
+from vla_zenoh.bus import shared_memory
+from vla_zenoh.bus.session import covers
 from vla_zenoh.types import Event, Header
 
 
@@ -91,13 +93,14 @@ class Traffic:
         self.lost: Counter[str] = Counter()
         """Key -> records that never arrived here."""
         self._links: list[str] = []
-        self._links_s = -1e9
+        self._memory: dict[str, Any] = {}
+        self._looked_s = -1e9
 
     def received(self, key: str, header: Header, arrivals: int) -> None:
-        """Count a received record, when its buffer had received `arrivals` samples; 0: unknown.
+        """Count a received record, when `arrivals` of its key had arrived; 0: unknown.
 
-        Records that a buffer dropped are not lost: they arrived. If several sources share a buffer
-        too few are counted, never too many.
+        Records that a buffer dropped are not lost: they arrived. If several sources share a key too
+        few are counted, never too many.
         """
         who = (key, header.source)
         if arrivals == 0:
@@ -112,28 +115,44 @@ class Traffic:
         if len(self._received) > MAX_SENDERS:
             del self._received[next(iter(self._received))]
 
-    def sent(self, streams: Iterable[Any]) -> dict[str, list[float]]:
-        """Key -> records and bytes per second of these `Publisher`, since the last call."""
+    def forget(self, expression: str) -> None:
+        """A subscription has ended: what is published until the next one is not lost."""
+        for who in [who for who in self._received if covers(expression, who[0])]:
+            del self._received[who]
+
+    def sent(self, streams: Iterable[Any]) -> dict[str, list[float | int]]:
+        """Key -> records and bytes per second of these `Publisher`, since the last call, and
+        records since the beginning."""
         now_s = time.monotonic()
         took_s = max(now_s - self._reported_s, 1e-3)
         self._reported_s = now_s
-        out: dict[str, list[float]] = {}
+        out: dict[str, list[float | int]] = {}
         before, self._sent = self._sent, {}
         for stream in streams:
             count, size = before.get(stream.key, (0, 0))
             self._sent[stream.key] = (stream.seq, stream.sent_bytes)
             if stream.seq > count:
                 rates = ((stream.seq - count) / took_s, (stream.sent_bytes - size) / took_s)
-                out[stream.key] = [round(rate, 2) for rate in rates]
+                out[stream.key] = [*(round(rate, 2) for rate in rates), stream.seq]
         return out
 
     def links(self) -> list[str]:
         """Endpoints this node is connected to, as Zenoh writes them."""
-        if time.monotonic() - self._links_s > LINKS_PERIOD_S:
-            self._links_s = time.monotonic()
-            found = {str(link.dst) for one in self.sessions for link in one.info.links()}
-            self._links = sorted(found)[:MAX_LINKS]
+        self._look()
         return self._links
+
+    def memory(self) -> dict[str, Any]:
+        """Its shared memory, see `shared_memory.figures`."""
+        self._look()
+        return self._memory
+
+    def _look(self) -> None:
+        if time.monotonic() - self._looked_s <= LINKS_PERIOD_S:
+            return
+        self._looked_s = time.monotonic()
+        found = {str(link.dst) for one in self.sessions for link in one.info.links()}
+        self._links = sorted(found)[:MAX_LINKS]
+        self._memory = shared_memory.figures()
 
 
 PERIOD_S = 0.25

@@ -5,27 +5,38 @@ from __future__ import annotations
 import itertools
 import os
 import secrets
+import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any, TypeVar
 
 import zenoh
 
-from vla_zenoh.bus.buffers import ReceivedSample, SampleBuffer, bytes_of, header_of
+from vla_zenoh.bus.buffers import (
+    CallbackRing,
+    ReceivedSample,
+    SampleBuffer,
+    bytes_of,
+    header_of,
+)
 from vla_zenoh.bus.clock import Clock, ClockSync
 from vla_zenoh.bus.host import own_host_id
 from vla_zenoh.bus.metrics import EventThrottle, Traffic
+from vla_zenoh.bus.reception import REMEDY, SHARE, Reception, lost_in_words
 from vla_zenoh.bus.session import QOS, alive_nodes, open_session
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, NodeError
-from vla_zenoh.keys import Kind, last_chunk
+from vla_zenoh.keys import ENDED, Kind, last_chunk
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import Event, Header, NodeStatus, SingleWriterFilter, Stamped
 
 MSGPACK = zenoh.Encoding("application/msgpack")
 STATUS_PERIOD_S = 0.5
 IMAGE_LINK_TIMEOUT_S = 10.0
+LOSSES_PERIOD_S = 5.0
+"""Events of lost samples are published at most this often, with their sum."""
 
 Record = TypeVar("Record")
 AnyBuffer = TypeVar("AnyBuffer", bound=SampleBuffer)
@@ -119,6 +130,11 @@ class Node:
         self._buffers: dict[SampleBuffer, list[Any]] = {}  # with their subscribers
         self._image_session: zenoh.Session | None = None
         self.traffic = Traffic(session)
+        self.reception = Reception(self.keys)
+        self._follows = False
+        self._short: dict[str, str] = {}
+        self._losses: Counter[str] = Counter()
+        self._losses_s = 0.0
         self._status_s, self._last_state = 0.0, ""
         if alive_nodes(session, self.keys, name, routes=routes):
             raise self._duplicate()
@@ -192,6 +208,7 @@ class Node:
         elif not self.status_due(state):
             return
         self._status_s, self._last_state = time.monotonic(), state
+        self._report_losses()
         self._status.publish(
             NodeStatus(
                 *(self.name, state, self.host_id.host, os.getpid(), self.started_wall_ns),
@@ -203,6 +220,11 @@ class Node:
                 self.host_id.boot,
             )
         )
+
+    def publish_end(self, detail: Mapping[str, Any] | None = None) -> None:
+        """Publish that the node ends as it should; not while an exception ends it."""
+        if sys.exc_info()[0] is None:
+            self.publish_status(ENDED, detail=detail, now=True)
 
     def status_due(self, state: str) -> bool:
         """Whether `publish_status` would publish now; lets a fast loop skip collecting details.
@@ -222,12 +244,43 @@ class Node:
         self._report_rejected()
         self._events.poll()
 
+    def follow_senders(self) -> None:
+        """Compare what arrives with the statuses of all senders; of images this is done anyway."""
+        if not self._follows:
+            self._follows = True
+            # At once, on Zenoh's thread: what has arrived by then is what the status is about.
+            handler = zenoh.handlers.Callback(self._on_status, indirect=False)
+            status = self.session.declare_subscriber(self.keys.all_status, handler)
+            self._declared.append(status)
+
+    def _on_status(self, sample: zenoh.Sample) -> None:
+        with suppress(CodecError):  # who reads statuses for their content counts it
+            status = records.decode(NodeStatus, bytes_of(sample.payload))
+            self.reception.status_received(status)
+
+    def _report_losses(self) -> None:
+        before, self._short = self._short, self.reception.short()
+        for name, why in self._short.items():
+            if name not in before:
+                self.counters["short_streams"] += 1
+                self.emit(Event("warning", "fault", "short_stream", why[:1000], limit=SHARE))
+        for name in before.keys() - self._short.keys():
+            self.emit(Event("info", "notice", "whole_stream", f"{name}: samples arrive again"))
+        lost = self.traffic.lost - self._losses
+        if lost and time.monotonic() - self._losses_s >= LOSSES_PERIOD_S:
+            self._losses, self._losses_s = Counter(self.traffic.lost), time.monotonic()
+            why = f"samples that never arrived: {lost_in_words(lost, self.keys)}; {REMEDY}"
+            count = float(lost.total())
+            self.emit(Event("warning", "fault", "samples_lost", why[:1000], value=count))
+
     def _bus_detail(self) -> dict[str, Any]:
         short, traffic = self.keys.short, self.traffic
         net = {
             "sent": {short(key): rates for key, rates in traffic.sent(self._publishers).items()},
             "lost": {short(key): count for key, count in traffic.lost.items()},
+            "short": self._short,
             "links": traffic.links(),
+            "shared_memory": traffic.memory(),
         }
         clocks = {
             node: {
@@ -249,12 +302,18 @@ class Node:
             SessionError: the router does not answer at the port for images.
         """
         self.watch_buffer(buffer)
+        if kind is Kind.FRAME:
+            self.follow_senders()
         self._buffers[buffer].append(buffer.subscribe(self._session_for(kind), key))
+        if isinstance(buffer, CallbackRing):  # a ring that Zenoh fills cannot count
+            self.reception.watch(key, buffer.arrived)
         return buffer
 
     def unsubscribe(self, buffer: SampleBuffer) -> None:
         """Undeclare the subscribers of `buffer`."""
+        self.reception.unwatch(buffer.arrived)
         for subscriber in self._buffers[buffer]:
+            self.traffic.forget(str(subscriber.key_expr))
             subscriber.undeclare()
         self._report_rejected()
         del self._buffers[buffer]

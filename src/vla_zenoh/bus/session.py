@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import zenoh
 
+from vla_zenoh.bus.shared_memory import LARGE_BYTES, POOL_BYTES, obstacle
 from vla_zenoh.errors import NodeError, SessionError
 from vla_zenoh.keys import Keys, Kind, last_chunk
 
@@ -86,7 +87,13 @@ def session_config(
         },
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "transport": {
-            "shared_memory": {"enabled": profile.shared_memory},
+            "shared_memory": {
+                "enabled": profile.shared_memory and not obstacle(),
+                "transport_optimization": {
+                    "pool_size": POOL_BYTES,
+                    "message_size_threshold": LARGE_BYTES,
+                },
+            },
             "link": {
                 "rx": {"max_message_size": MAX_MESSAGE_BYTES},
                 "tx": {

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from vla_zenoh.keys import CRASHED, STARTING
+from vla_zenoh.keys import CRASHED, ENDED, STARTING
 from vla_zenoh.sanitize import one_line
 from vla_zenoh.types import NodeStatus
 
@@ -27,7 +27,7 @@ class NodeRow(NamedTuple):
 
     name: str  # on the bus
     host: str  # where it runs, or should run
-    state: str  # by its status, or missing, starting, crashed, dead
+    state: str  # by its status (``ended`` if as it should), or missing, starting, crashed, dead
     why: str  # reason of such a state, with what to do; else empty
     status: NodeStatus | None  # the last one
     age_s: float | None  # of the status
@@ -57,7 +57,10 @@ def node_rows(
         state, why = status.state, ""
         if not lives and state in (CRASHED, STARTING):  # by `up`, in its name
             why = str(status.detail.get("complaint", ""))
-        elif not lives:
+        elif not lives and state == ENDED and name in expected:
+            state = MISSING
+            why = f"it was ended; `vla-zenoh up` on host {host} starts it again"
+        elif not lives and state != ENDED:
             state, why = DEAD, "it exited, or lost its connection; see the output of `up` there"
         rows.append(NodeRow(name, status.host, state, why, status, age_s, lives))
     return rows

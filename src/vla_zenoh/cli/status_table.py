@@ -157,6 +157,14 @@ def _warnings(nodes: Statuses, *, insecure: bool, left_out: int) -> Iterator[tup
         if isinstance(wrong, (list, tuple)) and wrong:
             host = nodes[name][0].host
             yield f"certificates of {name} on {host}: {'; '.join(map(str, wrong))}", "bold yellow"
+    without: dict[str, list[str]] = {}
+    for name, detail in details.items():
+        why = _fields(_fields(detail.get("net")).get("shared_memory")).get("off")
+        if isinstance(why, str):
+            without.setdefault(why, []).append(name)
+    for why, names in without.items():
+        if why:
+            yield f"no shared memory in {', '.join(names)}: {why}", "dim"
     if left_out:
         yield f"{left_out} {DROPPED_HINT}", "yellow"
 
@@ -193,6 +201,7 @@ def _cell(lines: list[str], most: int = MAX_LINE) -> str:
 
 def _message(row: NodeRow, found: NodeStatus, mode: str) -> str:
     detail = found.detail
+    short = [str(why) for why in _fields(_fields(detail.get("net")).get("short")).values()]
     if row.name == "command":
         rate_hz, speed = detail.get("rate_hz"), detail.get("speed_percent")
         rate = f"{rate_hz:g}" if isinstance(rate_hz, (int, float)) else "?"
@@ -202,7 +211,9 @@ def _message(row: NodeRow, found: NodeStatus, mode: str) -> str:
             f"{detail.get('accepted_chunks', 0)} chunks executed"
             f"{f', speed {speed:g} %' if slowed else ''}"
         )
-        return _cell([str(detail.get("why", "")), task], MAX_WORDS)
+        return _cell([*short, str(detail.get("why", "")), task], MAX_WORDS)
+    if short:
+        return _cell(short, MAX_WORDS)
     if bad := _bad_cameras(_fields(detail.get("cameras"))):
         return _cell(bad, MAX_WORDS)
     text = str(detail.get("complaint") or detail.get("fault") or detail.get("renderer") or "")

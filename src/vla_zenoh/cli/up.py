@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from vla_zenoh.bus.shared_memory import obstacle
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
     PROFILE_VARIABLE,
@@ -120,6 +121,8 @@ def up(
         place = f"profile {loaded.name}, host {running.host}, router at {where}"
         tell("up", f"{running.mode} | {place}{more}")
         tell("up", f"log: {file}")
+        if loaded.session.shared_memory and (why := obstacle()):
+            tell("up", f"no shared memory: {why}")
         if ROLLING in {child.command.kind for child in running.supervisor.children}:
             tell("up", f"rolling record: {record}")
         elif not (no_record or can_record):

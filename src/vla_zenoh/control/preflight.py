@@ -83,6 +83,10 @@ class PeerSnapshot:
         why = self.down.get(node)
         return f": {why}" if why else ""
 
+    def uncertainty_s(self, node: str) -> float:
+        """By how much stamps of a node may be wrong on our clock."""
+        return 0.0 if node in self.same_host else self.clocks.get(node, (0.0, 0.0))[1]
+
 
 def reasons_of_part(
     profile: Profile,
@@ -240,7 +244,8 @@ def _robot(
         return [*reasons, "the TCP pose is not known: nothing received on state/pose"]
     reasons += _too_old("TCP pose", pose, profile, now_ns)
     delay_s = (pose.received_ns - pose.header.stamp_wall_ns) / 1e9
-    if not -CLOCK_TOLERANCE_S <= delay_s <= CLOCK_TOLERANCE_S + profile.timing.state_timeout_s:
+    tolerance_s = CLOCK_TOLERANCE_S + peers.uncertainty_s(peers.robot_node)
+    if not -tolerance_s <= delay_s <= tolerance_s + profile.timing.state_timeout_s:
         reasons.append(
             f"the robot's clock and this one differ: its newest state arrived {delay_s:+.3f} s "
             f"after its stamp; {clock_remedy(pose.header.stamp_wall_ns, profile)}"
@@ -314,7 +319,7 @@ def _chunk(
             f"worker {worker!r} is too slow: its newest chunk came {delay_s:.2f} s after its "
             f"observation, at most {oldest_s:g} s is allowed (timing.max_observation_age_s)"
         ]
-    if delay_s < -CLOCK_TOLERANCE_S:
+    if delay_s < -CLOCK_TOLERANCE_S - peers.uncertainty_s(worker_node(worker)):
         return [
             f"the clocks of camera and command node differ: worker {worker!r} saw something "
             f"{-delay_s:.3f} s before it happened; synchronise them (chrony or ptp)"
@@ -374,9 +379,8 @@ def _clocks(
     bound_s, reasons = profile.timing.max_clock_offset_s, []
     for node in dict.fromkeys(nodes):
         offset_s, uncertainty_s = peers.clocks.get(node, (None, 0.0))
-        # By the estimate alone: however long a link is, that is near zero if the clocks agree and
-        # both directions take the same time.
-        if offset_s is not None and abs(offset_s) > bound_s:
+        # Within its uncertainty it is none: a slow link, or a busy computer, is no wrong clock.
+        if offset_s is not None and abs(offset_s) > max(bound_s, uncertainty_s):
             reasons.append(
                 f"the clock of node {node!r} is {offset_s:+.3f} s off this one's "
                 f"(+-{uncertainty_s:.4f} s), at most {bound_s:g} s is allowed "

@@ -211,16 +211,17 @@ class SourceKind(NamedTuple):
     has_lens: bool = False  # a camera node may crop, flip and undistort its images
     has_depth: bool = False  # it measures depth
     has_locks: bool = False  # its exposure and white balance can be fixed
+    same_moving_s: float = 1.0  # an image may repeat while the arm moves; 0: indefinitely
 
 
 CAMERA_SOURCES = {
     "sim": SourceKind("sim:CAMERA", has_depth=True),
     "v4l2": SourceKind("v4l2:DEVICE", has_lens=True, has_locks=True),
     "realsense": SourceKind("realsense:SERIAL", has_lens=True, has_depth=True, has_locks=True),
-    "rtsp": SourceKind("rtsp://HOST/PATH", has_lens=True),
-    "rtsps": SourceKind("rtsps://HOST/PATH", has_lens=True),
-    "file": SourceKind("file:VIDEO_OR_FOLDER", is_path=True, has_lens=True),
-    "ros2": SourceKind("ros2:TOPIC", has_depth=True),
+    "rtsp": SourceKind("rtsp://HOST/PATH", has_lens=True, same_moving_s=5.0),
+    "rtsps": SourceKind("rtsps://HOST/PATH", has_lens=True, same_moving_s=5.0),
+    "file": SourceKind("file:VIDEO_OR_FOLDER", is_path=True, has_lens=True, same_moving_s=0.0),
+    "ros2": SourceKind("ros2:TOPIC", has_depth=True, same_moving_s=2.0),
 }
 """What a camera's source begins with -> its kind. `nodes.camera.node.make_source` opens them."""
 PATH_SOURCES = tuple(f"{name}:" for name, kind in CAMERA_SOURCES.items() if kind.is_path)
@@ -307,7 +308,9 @@ class CameraCheck(Section):
     Args:
         same_s: an identical image for this long: frozen, as every sensor has noise. null: depends
             on the source: 1 for ``v4l2:``, 2 for ``ros2:``, 5 for ``rtsp:``, whose compression may
-            repeat a still scene; 0 for ``sim:``, ``file:`` and virtual devices without noise.
+            repeat a still scene; 0 for ``sim:``, ``file:`` and virtual devices without noise. A
+            worker counts as well, while the arm moves and for ``sim:`` too (1): it gives its model
+            no image that repeats.
         stamp_s: the driver's time stamp does not advance for this long.
         clipped_share: largest share of the image that may be black, or white.
         contrast_levels: between the brightest and darkest parts, of 255; less is a covered lens.
@@ -404,6 +407,13 @@ class CameraProfile(Section):
                     yield (name,), f"is set, and works with {known} only"
         if self.undistort and self.intrinsics is None and kind != "realsense":
             yield ("intrinsics",), "is missing: undistort needs the file with the lens"
+
+    @property
+    def same_moving_s(self) -> float:
+        """How long its images may stay the same while the arm moves, s; 0: indefinitely."""
+        if self.check.same_s is not None:
+            return self.check.same_s
+        return CAMERA_SOURCES[self.source.partition(":")[0]].same_moving_s
 
     @property
     def from_ros2(self) -> bool:

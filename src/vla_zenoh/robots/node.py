@@ -112,7 +112,7 @@ class RobotNode:
         except NodeError as error:  # an exception before this one matters more
             self.node.reject("robot_failed", str(error))
         finally:
-            self.node.publish_status("stopped", now=True)
+            self.node.publish_end()
             self.node.close()
 
     def _loop(self, wait: Callable[[], Tick], stop: threading.Event) -> None:

@@ -124,8 +124,18 @@ def run_node(
         if stop.is_set():
             return
         raise
+    if PARENT_VARIABLE not in os.environ and profile.session.shared_memory:
+        tell_obstacle()
     with session:
         run(session, stop)
+
+
+def tell_obstacle() -> None:
+    """Print why this process uses no shared memory, if it does not."""
+    from vla_zenoh.bus.shared_memory import obstacle
+
+    if why := obstacle():
+        print(f"no shared memory: {why}", file=sys.stderr)
 
 
 # -- priorities on a busy computer: loops that keep an arm in motion, then their links -----------

@@ -229,7 +229,8 @@ TABLE: Mapping[str, Allowed] = {
     "command_joint": _stream({COMMAND}, {ROBOT, OPERATOR, VIEWER}),
     "command_gripper": _stream({COMMAND}, {ROBOT, OPERATOR, VIEWER}),
     "primitive": {Act.ANSWER: {WORKER}, Act.ASK: {OPERATOR}},
-    "status": NEWS,
+    # A worker compares what it receives with what the senders say they sent.
+    "status": {Act.PUT: SPEAKERS, Act.SUBSCRIBE: {COMMAND, WORKER} | LOOKERS},
     "event": NEWS,
     "alive": {Act.ANNOUNCE: SPEAKERS, Act.WATCH: NODES | LOOKERS | {REPLAY}},
     "clock": {Act.ANSWER: SPEAKERS, Act.ASK: NODES | LOOKERS | {REPLAY}},

@@ -41,6 +41,23 @@ def test_the_mode_of_a_command_node_that_ended_is_unknown() -> None:
     assert mode_of(ended) == mode_of({}) == "unknown"
 
 
+@pytest.mark.parametrize("name", ["recorder", "replay", "worker-teleop", "rolling", "benchmark"])
+def test_a_node_that_ended_well_is_not_dead_and_one_that_died_is(name: str) -> None:
+    said = {name: (status(name, "ended"), 60.0, False)}
+    (row,) = (row for row in node_rows(said, {}) if row.name == name)
+    assert (row.state, row.why) == ("ended", "")
+    said = {name: (status(name, "recording"), 60.0, False)}
+    (row,) = (row for row in node_rows(said, {}) if row.name == name)
+    assert row.state == "dead"
+
+
+def test_a_node_of_the_profile_that_ended_is_missing() -> None:
+    said = {**alive(status("command")), "sim": (status("sim", "ended"), 60.0, False)}
+    rows = {row.name: row for row in node_rows(said, EXPECTED)}
+    assert rows["sim"].state == "missing"
+    assert "`vla-zenoh up` on host robot" in rows["sim"].why
+
+
 def test_a_mode_that_no_version_knows_is_unknown() -> None:
     assert mode_of(alive(status("command", mode="\x1b[31mlive"))) == "unknown"
     assert mode_of(alive(status("command", mode=["live"]))) == "unknown"

@@ -176,7 +176,7 @@ def test_when_all_is_well_there_is_no_reason() -> None:
             r"the clock of node 'camera' is \+0\.150 s off",
             clock("camera", (0.15, 0.1)),
         ),
-        (r"the clock of node 'sim' is -0\.101 s off", clock("sim", (-0.101, 0.3))),
+        (r"the clock of node 'sim' is -0\.101 s off", clock("sim", (-0.101, 0.05))),
         (
             "the clock of node 'worker-scripted' on gpu is not known",
             peers(hosts={"worker-scripted": "gpu"}, same_host=frozenset({"sim", "camera"})),
@@ -196,6 +196,28 @@ def test_each_thing_that_is_missing_is_a_reason(
 def test_a_clock_that_is_reckoned_with_is_no_reason() -> None:
     ready = Ready()
     clock("camera", (0.099, 0.3))(ready)
+    assert ready.reasons() == []
+
+
+@pytest.mark.parametrize("offset_s", [-0.5, -0.138, 0.0, 0.099, 0.101, 0.138, 0.5])
+@pytest.mark.parametrize("uncertainty_s", [0.0, 0.02, 0.1385, 1.0])
+@pytest.mark.parametrize("node", ["camera", "sim", "worker-scripted"])
+def test_an_offset_within_its_own_uncertainty_is_none(
+    node: str, offset_s: float, uncertainty_s: float
+) -> None:
+    ready = Ready()
+    clock(node, (offset_s, uncertainty_s))(ready)
+    wrong = abs(offset_s) > max(uncertainty_s, ready.profile.timing.max_clock_offset_s)
+    assert bool(ready.reasons()) is wrong, ready.reasons()
+
+
+def test_a_state_of_another_host_may_be_early_by_what_its_clock_is_uncertain() -> None:
+    ready = Ready()
+    header = replace(ready.pose.header, stamp_wall_ns=ready.pose.received_ns + 150 * MS)
+    ready.pose = replace(ready.pose, header=header)
+    assert any("clock" in reason for reason in ready.reasons())
+    others = ready.peers.same_host - {"sim"}
+    peers(same_host=others, clocks={"sim": (0.1, 0.2)})(ready)
     assert ready.reasons() == []
 
 

@@ -26,7 +26,7 @@ def test_what_was_lost_of_a_writer_that_is_silent_is_shown() -> None:
     found = by_name(
         said("worker-a", "gpu", net={"lost": {"state/pose": 7, "task": 1}}),
         said("worker-b", "gpu", net={"lost": {"state/pose": 2}}),
-        said("command", "robot", net={"sent": {"task": [5.0, 100.0]}}),
+        said("command", "robot", net={"sent": {"task": [5.0, 100.0, 10]}}),
     )
     assert lines_of(found) == [
         Line("task", "command", "robot", 5.0, 100.0, {"worker-a": 1}),
@@ -36,7 +36,7 @@ def test_what_was_lost_of_a_writer_that_is_silent_is_shown() -> None:
 
 def test_a_key_that_somebody_writes_has_his_lines_alone() -> None:
     found = by_name(
-        said("sim", "robot", net={"sent": {"state/pose": [HZ, BYTES_S]}}),
+        said("sim", "robot", net={"sent": {"state/pose": [HZ, BYTES_S, 7]}}),
         said("worker-a", "gpu", net={"lost": {"state/pose": 7}}),
     )
     assert lines_of(found) == [Line("state/pose", "sim", "robot", HZ, BYTES_S, {"worker-a": 7})]
@@ -49,7 +49,7 @@ def hosts(*statuses: NodeStatus) -> set[tuple[str, str]]:
 def test_two_computers_of_the_same_name_are_a_pair() -> None:
     sim = said("sim", "ubuntu", ONE, clocks={"worker-a": CLOCK, "command": CLOCK})
     worker = said(
-        "worker-a", "ubuntu", OTHER, clocks={"sim": CLOCK}, net={"sent": {"delta/a": [1.0, 9.0]}}
+        "worker-a", "ubuntu", OTHER, clocks={"sim": CLOCK}, net={"sent": {"delta/a": [1.0, 9.0, 3]}}
     )
     command = said("command", "ubuntu", ONE, clocks={"sim": CLOCK})
     assert hosts(sim, worker, command) == {

@@ -9,6 +9,7 @@ import resource
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
+from mcap.records import Attachment, Channel, Message, Metadata, Schema
+from mcap.stream_reader import StreamReader
+from mcap.writer import CompressionType, Writer
 from random_records import RECORDS
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -130,7 +134,7 @@ def test_every_record_comes_back_byte_for_byte(kind: type, tmp_path: Path, data:
 def test_pictures_and_settings_come_back_byte_for_byte(tmp_path: Path) -> None:
     raw = Image(np.arange(60, dtype=np.uint8).reshape(4, 5, 3))
     pixels = sample(KEYS.camera_raw("front"), encode_raw(raw), f"zenoh/bytes;{raw_schema(raw)}")
-    put = [picture(), pixels, prompt("öffne den Greifer"), prompt("")]
+    put = [prompt("öffne den Greifer"), prompt(""), picture(), pixels]  # as they were received
     assert list(open_recording(written(tmp_path / "a.mcap", *put)).entries()) == put
 
 
@@ -166,6 +170,12 @@ def test_facts_profile_and_order_are_kept(tmp_path: Path) -> None:
     assert run.profile_yaml == "about: test\n"
     assert (run.keys, run.about["schema"]) == (KEYS, "1")
     assert list(run.entries()) == put
+    assert (run.damage, run.ended) == ("", {"dropped": {}})
+
+
+def test_a_file_without_samples_is_whole(tmp_path: Path) -> None:
+    run = open_recording(written(tmp_path / "a.mcap"))
+    assert list(run.entries()) == []
     assert (run.damage, run.ended) == ("", {"dropped": {}})
 
 
@@ -277,6 +287,82 @@ def test_a_file_that_was_cut_off_gives_what_it_has_and_says_so(
     run = open_recording(cut)
     assert 28 <= len(list(run.entries())) <= 30
     assert "cut off or damaged after" in run.damage
+
+
+def rewritten(path: Path, order: Callable[[Message], Any], compression: CompressionType) -> Path:
+    """The file as another tool writes it: attachment first, metadata last, messages by `order`."""
+    with path.open("rb") as file:
+        records = list(StreamReader(file).records)
+    other = path.with_name("rewritten.mcap")
+    out = Writer(str(other), chunk_size=2000, compression=compression)
+    out.start()
+    (attachment,) = (one for one in records if isinstance(one, Attachment))
+    stamps = (attachment.create_time, attachment.log_time)
+    out.add_attachment(*stamps, attachment.name, attachment.media_type, attachment.data)
+    schemas = {one.id: one for one in records if isinstance(one, Schema)}
+    channels = {one.id: one for one in records if isinstance(one, Channel)}
+    known: dict[int, int] = {}
+    for message in sorted((one for one in records if isinstance(one, Message)), key=order):
+        channel = channels[message.channel_id]
+        if channel.id not in known:
+            schema = schemas[channel.schema_id]
+            number = out.register_schema(schema.name, schema.encoding, schema.data)
+            encoding, facts = channel.message_encoding, channel.metadata
+            known[channel.id] = out.register_channel(channel.topic, encoding, number, facts)
+        times = (message.log_time, message.data, message.publish_time, message.sequence)
+        out.add_message(known[channel.id], *times)
+    for one in {one.name: one for one in records if isinstance(one, Metadata)}.values():
+        out.add_metadata(one.name, one.metadata)
+    out.finish()
+    return other
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+@pytest.mark.parametrize(
+    "order",
+    [
+        pytest.param(lambda message: message.log_time, id="time"),
+        pytest.param(lambda message: -message.log_time, id="backwards"),
+        pytest.param(lambda message: (message.channel_id, message.log_time), id="channel"),
+    ],
+)
+def test_a_file_that_another_tool_wrote_anew_is_read_in_the_order_of_reception(
+    tmp_path: Path, order: Callable[[Message], Any], compression: CompressionType
+) -> None:
+    put = [prompt("hold"), *[each(i) for i in range(40) for each in (pose, picture, chunk)]]
+    run = open_recording(rewritten(written(tmp_path / "a.mcap", *put), order, compression))
+    assert (run.profile_yaml, run.keys) == ("about: test\n", KEYS)
+
+    def moment(entry: Sample) -> tuple[int, str]:
+        return entry.received_ns, entry.key
+
+    found = list(run.entries())
+    assert [entry.received_ns for entry in found] == [entry.received_ns for entry in put]
+    assert sorted(found, key=moment) == sorted(put, key=moment)
+    assert (run.damage, run.ended) == ("", {"dropped": {}})
+
+
+def test_one_damaged_chunk_of_a_whole_file_is_left_out_counted_and_named(tmp_path: Path) -> None:
+    put = [each(i) for i in range(40) for each in (pose, picture)]
+    path = rewritten(
+        written(tmp_path / "a.mcap", *put), lambda one: one.log_time, CompressionType.ZSTD
+    )
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    broken = summary.chunk_indexes[len(summary.chunk_indexes) // 2]
+    data = bytearray(path.read_bytes())
+    data[broken.chunk_start_offset + broken.chunk_length // 2] ^= 0xFF
+    path.write_bytes(data)
+    run = open_recording(path)
+    found = list(run.entries())
+    lost = len(put) - len(found)
+    assert 1 <= lost <= 4
+    assert [entry.received_ns for entry in found[-3:]] == [entry.received_ns for entry in put[-3:]]
+    assert f"damaged: 1 of {len(summary.chunk_indexes)} chunks cannot be read" in run.damage
+    assert "messages from 0.2 to 0.2 s" in run.damage
+    assert "/vla/panda/camera/front/jpeg" in run.damage
+    assert run.ended == {"dropped": {}}
 
 
 def test_damage_in_the_middle_is_noticed(tmp_path: Path) -> None:

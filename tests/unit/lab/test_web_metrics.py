@@ -77,6 +77,26 @@ def test_a_node_that_is_gone_says_no_more_than_that() -> None:
     assert "vla_zenoh_rate_hertz" not in found
 
 
+def test_a_node_that_ended_well_is_not_missed() -> None:
+    """The shipped alert NodeGone fires where node_alive is 0."""
+    status = NodeStatus("recorder", "ended", "h", 1, 1)
+    gone = NodeRow("recorder", "h", "ended", "", status, 5.0, False)
+    found = parsed(exposition([gone], {}, 0))
+    assert "vla_zenoh_node_alive" not in found
+    states = {
+        one.labels["vla_zenoh_node_state"]: one.value for one in found["vla_zenoh_node_state"]
+    }
+    assert [name for name, value in states.items() if value] == ["ended"]
+
+
+def test_the_shared_memory_of_a_process_is_told() -> None:
+    memory = {"off": "", "locked_bytes": 9_000_000, "host_bytes": 18_000_000}
+    status = NodeStatus("router", "routing", "h", 1, 1, detail={"net": {"shared_memory": memory}})
+    found = parsed(exposition([row(status, "router")], {}, 0))
+    assert found["vla_zenoh_shared_memory_locked_bytes"][0].value == 9e6
+    assert found["vla_zenoh_shared_memory_host_bytes"][0].value == 18e6
+
+
 def test_names_of_strangers_do_not_grow_the_metrics_without_bound() -> None:
     statuses = [
         NodeStatus(f"n{number}", f"state{number}", "h", 1, 2, {}, {}, {}, {f"refused.{number}": 1})

@@ -91,6 +91,7 @@ class AskedWorker:
         )
 
     def close(self) -> None:
+        self.node.publish_end()
         self.node.close()
 
     def _publish(self, seen: BenchmarkObservation) -> None:

@@ -170,8 +170,8 @@ def lines_of(statuses: Mapping[str, NodeStatus]) -> list[Line]:
     out: list[Line] = []
     for name, status in statuses.items():
         for key, rates in _map(_map(status.detail.get("net")).get("sent")).items():
-            if isinstance(rates, (list, tuple)) and len(rates) == 2:
-                rate_hz, bytes_s = (_number(rate) or 0.0 for rate in rates)
+            if isinstance(rates, (list, tuple)) and len(rates) == 3:
+                rate_hz, bytes_s, _ = (_number(rate) or 0.0 for rate in rates)
                 line = Line(key, name, hosts[name], rate_hz, bytes_s, lost.get(key, {}))
                 out.append(line)
     published = {line.key for line in out}
@@ -195,12 +195,12 @@ def tables(
     """A table of the pairs of hosts and one of the keys.
 
     Args:
-        bound_ms: a larger clock offset is marked.
+        bound_ms: a clock offset that is larger than this and its uncertainty is marked.
     """
     columns = ("from", "to", "round trip", "clock ahead by", "link", "measured by")
     hosts = new_table(*columns, title=f"robot {robot}")
     for pair in pairs:
-        wrong = abs(pair.offset_ms) > bound_ms
+        wrong = abs(pair.offset_ms) > max(bound_ms, pair.uncertainty_ms)
         clock = f"{pair.offset_ms:+.2f} +- {pair.uncertainty_ms:.2f} ms"
         hosts.add_row(
             one_line(pair.seen_from),

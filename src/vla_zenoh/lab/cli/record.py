@@ -19,6 +19,8 @@ from vla_zenoh.runtime.process import run_node
 if TYPE_CHECKING:
     from vla_zenoh.lab.recording.recorder import RecordingResult
 
+SHOWN = 5
+
 
 @options
 def record(
@@ -48,6 +50,16 @@ def record(
             "--name", parser=node_name, help="Node name; a second recorder needs another one."
         ),
     ] = "recorder",
+    min_share: Annotated[
+        float,
+        typer.Option(
+            "--min-share",
+            help="Exit status 1 if less of a stream is recorded than this share of what its sender "
+            "announced.",
+            min=0.0,
+            max=1.0,
+        ),
+    ] = 0.95,
     as_json: JsonOption = False,
 ) -> None:
     """Record a robot's keys into an MCAP file, until Ctrl-C.
@@ -55,6 +67,7 @@ def record(
     Foxglove, Rerun and `ros2 bag` open it. Until it is finished it is FILE.part.mcap, which is
     valid at any time, also when the recorder is killed or the disk is full.
     """
+    from vla_zenoh.bus.reception import REMEDY
     from vla_zenoh.lab.recording.recorder import Recorder, recorded_keys
 
     loaded = target.load()
@@ -78,6 +91,16 @@ def record(
     _show(done[0], path, as_json)
     if not done[0].samples:
         fail("nothing was published; is a robot up? (`vla-zenoh up`)")
+    if short := {key: one for key, one in done[0].streams.items() if one.below(min_share)}:
+        rows = [
+            f"{loaded.keys.short(key)} {share.received} of {share.sent}"
+            for key, share in sorted(short.items(), key=lambda item: -item[1].lost)
+        ]
+        more = f" and {len(rows) - SHOWN} more" if len(rows) > SHOWN else ""
+        fail(
+            f"samples are missing (--min-share {min_share:g}), recorded of those announced: "
+            f"{', '.join(rows[:SHOWN])}{more}; {REMEDY}"
+        )
 
 
 def _show(recorded: RecordingResult, path: Path, as_json: bool) -> None:
@@ -92,6 +115,11 @@ def _show(recorded: RecordingResult, path: Path, as_json: bool) -> None:
                 "cpu_share": time.process_time() / max(recorded.seconds, 1e-9),
                 "samples": recorded.samples,
                 "dropped": recorded.dropped,
+                "lost": recorded.lost,
+                "streams": {
+                    key: {"announced": one.sent, "received": one.received, "lost": one.lost}
+                    for key, one in recorded.streams.items()
+                },
                 "failure": recorded.failure,
             }
         )
@@ -99,7 +127,8 @@ def _show(recorded: RecordingResult, path: Path, as_json: bool) -> None:
         console().print(
             f"{path}: {recorded.samples.total():,} samples of "
             f"{counted(len(recorded.samples), 'key')} in {recorded.seconds:.1f} s, "
-            f"{recorded.size_bytes / 1e6:.1f} MB, {recorded.dropped.total()} dropped"
+            f"{recorded.size_bytes / 1e6:.1f} MB, {recorded.dropped.total()} dropped, "
+            f"{recorded.lost.total()} lost"
         )
     if recorded.dropped:
         worst = ", ".join(f"{key} {count}" for key, count in recorded.dropped.most_common(5))

@@ -162,12 +162,16 @@ def _live(profile: Profile, output: ViewOutput, part: Path | None, seconds: floa
             listener = ViewListener(session, profile)
             errors().print(f"viewing robot {profile.robot.name}; Ctrl-C ends it")
             end_s = None if seconds is None else time.monotonic() + seconds
+            short: dict[str, str] = {}
             while not stop.is_set() and not (viewer is not None and viewer.closed):
                 if end_s is not None and time.monotonic() >= end_s:
                     break
                 for sample in listener.take():
                     logger.log(sample)
                 logger.dropped = listener.dropped.total()
+                before, short = short, listener.reception.short()
+                for why in [why for name, why in short.items() if name not in before]:
+                    errors().print(why, style="yellow")
                 stop.wait(POLL_S)
             listener.close()
             done.append(logger)

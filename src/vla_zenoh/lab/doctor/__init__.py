@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
+from vla_zenoh.bus.shared_memory import lockable_bytes
 from vla_zenoh.lab.doctor.access import router
 from vla_zenoh.lab.doctor.computer import (
     disk,
     governor,
+    locked_memory,
     niceness,
     processors,
     real_time_priority,
@@ -41,6 +43,7 @@ def examine(needs: Needs, try_zenoh: Callable[[str], str]) -> Iterator[HostFindi
     yield real_time_priority()
     yield niceness()
     yield shared_memory()
+    yield locked_memory(lockable_bytes())
     yield disk()
     for endpoint in needs.endpoints:
         yield router(endpoint, is_router=needs.is_router, try_zenoh=try_zenoh)

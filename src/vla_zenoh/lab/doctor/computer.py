@@ -10,6 +10,14 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
+from vla_zenoh.bus.shared_memory import (
+    FREE_IT,
+    HOST_BYTES,
+    LOCK_BYTES,
+    SENDER_BYTES,
+    held_bytes,
+    in_mib,
+)
 from vla_zenoh.errors import NodeError
 from vla_zenoh.lab.doctor.needs import HostFinding, judged
 from vla_zenoh.nodes.camera.v4l2_devices import DEV, find_device
@@ -89,8 +97,7 @@ def _limit_advice(limit: str) -> str:
 
 
 MIB = 1024 * 1024
-SHARED_MEMORY_WANTED_MIB = 256
-"""Each Zenoh session that sends images takes a pool of 16 MiB; a lab has up to ten of them."""
+SHARED_MEMORY_WANTED_MIB = HOST_BYTES // MIB
 DISK_WANTED_MIB = 2048
 DISK_NEEDED_MIB = 200
 
@@ -100,16 +107,42 @@ SHARED_MEMORY = Path("/dev/shm")
 def shared_memory(
     folder: Path = SHARED_MEMORY, wanted_mib: int = SHARED_MEMORY_WANTED_MIB
 ) -> HostFinding:
-    """Room in shared memory for images; without it they go through sockets, five times slower."""
+    """Room in shared memory for images; without it they go through sockets, twice as slow."""
     advice = (
         f"sudo mount -o remount,size={wanted_mib}M {folder}; "
         f"in a container: --shm-size={wanted_mib}m"
     )
     if not os.access(folder, os.W_OK):
         return HostFinding("shared memory", "warn", f"{folder} cannot be written", advice)
-    free_mib = shutil.disk_usage(folder).free // MIB
-    found = f"{free_mib} MiB free in {folder}"
+    held = held_bytes()
+    if held + SENDER_BYTES > HOST_BYTES:
+        found = f"{in_mib(held)} of at most {in_mib(HOST_BYTES)} are held by programs of this host"
+        return HostFinding("shared memory", "warn", f"{found}; new nodes use none", FREE_IT)
+    free_mib = (shutil.disk_usage(folder).free + held) // MIB
+    found = f"{free_mib} MiB in {folder}, {in_mib(held)} of them held by programs of this host"
     return judged("shared memory", free_mib >= wanted_mib, found, advice)
+
+
+def locked_memory(may_lock: int | None) -> HostFinding:
+    """Memory that this user may lock, as `lockable_bytes` has it: Zenoh locks what it shares."""
+    enough = may_lock is None or may_lock >= LOCK_BYTES
+    if may_lock is None:
+        found = "no limit"
+    elif enough:
+        found = in_mib(may_lock)
+    else:
+        found = (
+            f"{in_mib(may_lock)} (`ulimit -l`), shared memory needs {in_mib(LOCK_BYTES)}: our "
+            "programs copy images through sockets, twice as slow; another Zenoh program that keeps "
+            "shared memory on loses them without an error"
+        )
+    user = os.environ.get("USER") or str(os.getuid())
+    advice = (
+        f"add the line '{user} - memlock unlimited' to {LIMITS_FILE} and log in again; in a "
+        "systemd unit: LimitMEMLOCK=infinity; in a container: --ulimit memlock=-1. In other Zenoh "
+        "programs: transport/shared_memory/enabled: false"
+    )
+    return judged("locked memory", enough, found, advice)
 
 
 def disk(folder: Path | None = None, wanted_mib: int = DISK_WANTED_MIB) -> HostFinding:

@@ -94,6 +94,7 @@ def verdicts(run: Run) -> list[TaskVerdict]:
 
 FILM, MAX_FILM_S = Film(height_px=270, rate_hz=10, quality=30), 180.0
 """The film of a page, and how long a run may be for one."""
+SHOWN_LOST = 5
 GAP_S = 0.05
 """A longer gap in a stream is an interruption; nothing is derived across it."""
 PERIOD_QUANTILE = 0.05
@@ -135,6 +136,10 @@ def evaluate_loaded(run: Run, *, pictures: int = 0) -> Evaluation:
         out.problems.append("its recorder was ended before it could finish the file")
     if run.file.dropped:
         out.problems.append(f"the recorder dropped {run.file.dropped} samples")
+    lost = (run.file.ended or {}).get("lost")
+    if isinstance(lost, dict) and lost:
+        worst = ", ".join(f"{key} {count}" for key, count in list(lost.items())[:SHOWN_LOST])
+        out.problems.append(f"samples never reached the recorder: {worst}")
     obeyed = run.obeyed_chunks()
     causes = run.first_commands()
     _requests(out, obeyed, causes, zero_ns)

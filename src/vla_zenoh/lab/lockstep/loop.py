@@ -13,6 +13,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vla_zenoh.codec import records
+from vla_zenoh.codec.image import (
+    decode_depth,
+    decode_raw,
+    depth_schema,
+    encode_depth,
+    encode_raw,
+    raw_schema,
+)
 from vla_zenoh.control.commander import Commander, Inputs, Outputs, Setting
 from vla_zenoh.control.commander_io import NewStates
 from vla_zenoh.control.preflight import PeerSnapshot
@@ -43,8 +51,6 @@ TICK_NS = 1_000_000
 START_NS = 1_700_000_000_000_000_000
 """Start of the virtual wall clock."""
 SIM, CAMERA, COMMAND = "sim", "camera", "command"
-HALF_A_METRE = Depth(np.full((48, 64), 500, np.uint16), 0.001)
-"""What all cameras with depth measure."""
 
 
 class Lockstep:
@@ -52,7 +58,7 @@ class Lockstep:
 
     Args:
         policy: the model; its ``load`` is called here if it has one.
-        picture: image of a camera, by name; None: small gray images.
+        picture: image of a camera, by name; None: small gray images with a little noise.
         reach: see `Commander`.
         others: more workers, by name; they run without effect until selected.
     """
@@ -99,7 +105,7 @@ class Lockstep:
         self.alive = {SIM, CAMERA, COMMAND, *(w.source for w in self.workers.values())}
         self.camera_faults: dict[str, str] = {}
         self._clock_ns: Counter[str] = Counter()
-        self._picture = picture or _gray
+        self._picture = picture or (lambda _: _gray(self._seq[CAMERA]))
         self._arrivals: list[tuple[int, int, Callable[[], None]]] = []
         self._sent = 0
         self._seq: Counter[str] = Counter()
@@ -164,7 +170,10 @@ class Lockstep:
             self._publish_pictures()
         self._receive()
         for worker in self.workers.values():
+            before = worker.complaint
             chunk = worker.step(self.now_ns, self.wall_ns(worker.source))
+            if worker.complaint and not before:
+                self.events.append(Event("warning", "fault", "same_image", worker.complaint))
             if chunk is not None:
                 # Published when the inference is over, and stamped with that time.
                 end_ns = chunk.inference_end_ns - self._clock_ns[worker.source]
@@ -250,9 +259,14 @@ class Lockstep:
         cameras = sorted({one.camera for each in wanted for one in each.cameras})
         with_depth = sorted({one.camera for each in wanted for one in each.depth})
         shown = [(camera, self._picture(camera)) for camera in cameras]
-        for camera, record in [*shown, *((camera, HALF_A_METRE) for camera in with_depth)]:
+        depth = _half_a_metre(self._seq[CAMERA])
+        for camera, record in [*shown, *((camera, depth) for camera in with_depth)]:
             picture = Stamped(header, record, arrival_ns)
-            self._deliver(arrival_ns, partial(self._take_picture, camera, picture))
+            if self.tamper is None:  # else an image would be encoded that nobody needs
+                self._deliver(arrival_ns, partial(self._take_picture, camera, picture))
+                continue
+            for arriving in self.tamper(_image_message(camera, picture)):
+                self._deliver(arriving.arrival_ns, partial(self._arrive_image, arriving))
 
     # -- the wire -----------------------------------------------------------------------------
     def _send(
@@ -286,6 +300,15 @@ class Lockstep:
             self.refused[error.reason] += 1
             return
         take(Stamped(header, record, message.arrival_ns))
+
+    def _arrive_image(self, message: Message) -> None:
+        decode = decode_depth if message.kind is Depth else decode_raw
+        try:
+            image = decode(message.payload, message.encoding)
+        except CodecError as error:
+            self.refused[error.reason] += 1
+            return
+        self._take_picture(message.camera, Stamped(message.header, image, message.arrival_ns))
 
     def _at(self, node: str, arrived: Stamped[Any]) -> Stamped[Any]:
         """With the time of arrival on the clock of `node`."""
@@ -344,5 +367,24 @@ class Lockstep:
         self._arm(part).set_gripper(order.width_m, order.speed_m_s, order.force_n)
 
 
-def _gray(camera: str) -> Image:
-    return Image(np.full((48, 64, 3), 128, np.uint8))
+def _gray(seq: int) -> Image:
+    rgb = np.full((48, 64, 3), 128, np.uint8)
+    rgb[0] += np.uint8(seq % 101)  # as a sensor's noise: no image is as the last one
+    return Image(rgb)
+
+
+def _half_a_metre(seq: int) -> Depth:
+    """What all cameras with depth measure, with a little noise."""
+    counts = np.full((48, 64), 500, np.uint16)
+    counts[0] += np.uint16(seq % 101)
+    return Depth(counts, 0.001)
+
+
+def _image_message(camera: str, picture: Stamped[Image] | Stamped[Depth]) -> Message:
+    record = picture.record
+    if isinstance(record, Depth):
+        payload, encoding = encode_depth(record), depth_schema(record)
+    else:
+        payload, encoding = encode_raw(record), raw_schema(record)
+    kind, header = type(record), picture.header
+    return Message(kind, header, payload, picture.received_ns, "", camera, encoding)

@@ -10,6 +10,7 @@ from typing import Any
 from vla_zenoh.control.commander_io import MotionCommands
 from vla_zenoh.keys import worker_node
 from vla_zenoh.policy import Policy, check_steps, reset_of
+from vla_zenoh.policy.frozen import FrozenImages
 from vla_zenoh.policy.inference import ChunkPrefix, make_chunk
 from vla_zenoh.policy.observation import STATE_KINDS, NotReady, Streams, assemble, state_names
 from vla_zenoh.profile import Profile
@@ -51,6 +52,8 @@ class Message:
         header: of the writer.
         arrival_ns: virtual time of arrival.
         part: whose state or command it is, of a robot of several parts.
+        camera: whose image it is.
+        encoding: of an image, as `codec.image` has it.
     """
 
     kind: type[Any]
@@ -58,6 +61,8 @@ class Message:
     payload: bytes
     arrival_ns: int
     part: str = ""
+    camera: str = ""
+    encoding: str = ""
 
 
 Tamper = Callable[[Message], Iterable[Message]]
@@ -101,6 +106,9 @@ class LockstepWorker:
         self._patience_s = profile.timing.max_observation_age_s
         self._delays, self._jitter = delays, jitter
         self._streams = Streams.of(self.spec.observation, self.spec.parts)
+        self._frozen = FrozenImages.of(profile.cameras)
+        self.complaint = ""
+        """Why its newest observation was not used; empty: it was."""
         names = state_names(self.spec.observation, self.spec.parts)
         self._names = {(part, what): name for name, (part, what) in names.items()}
         self._not_before_ns = self._due_ns = self._asked_ns = self._episode_ns = 0
@@ -151,6 +159,9 @@ class LockstepWorker:
             episode_ns=self._episode_ns,
         )
         if isinstance(observation, NotReady):
+            return None
+        self.complaint = self._frozen.judge(observation)
+        if self.complaint:
             return None
         answer = self._continuation.infer(observation)
         steps = check_steps(self.spec.action, answer.steps)

@@ -207,6 +207,8 @@ class RemoteRobot(Client):
             sample = buffer.pop()
             if sample is not None:
                 return sample
+        if why := self.reception.short().get(self.keys.short(key)):
+            raise SessionError(f"nothing came within {timeout_s:g} s; {why}")
         raise SessionError(
             f"nothing was published on {key} for {timeout_s:g} s; `vla-zenoh keys` shows which "
             "keys have a publisher"
@@ -215,7 +217,7 @@ class RemoteRobot(Client):
     def _buffer(self, key: str, limit: int) -> LatestSample:
         if key not in self._buffers:
             self._buffers[key] = LatestSample(limit)
-            self._subscriptions.append(self._subscribe(key, self._buffers[key]))
+            self.watch(key, self._buffers[key])
         return self._buffers[key]
 
 

@@ -1,7 +1,9 @@
 """Reads the samples of a recording in the order of reception.
 
-A file that was cut off is read as far as it goes; `Recording.damage` then holds the reason. A
-folder of a saved rolling record is read as one recording, its segments one after the other.
+A file with an index at its end is read by that: its parts may be in any order, as other tools write
+them, and a damaged chunk is left out. One that was cut off has none and is read as far as it goes.
+`Recording.damage` says what is missing. A folder of a saved rolling record is read as one
+recording, its segments one after the other.
 """
 
 from __future__ import annotations
@@ -9,19 +11,34 @@ from __future__ import annotations
 import json
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
+from heapq import heappop, heappush
+from itertools import count
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeVar
 
+from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
-from mcap.records import Attachment, Channel, Message, Metadata, Schema
+from mcap.reader import SeekingReader
+from mcap.records import (
+    Attachment,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    McapRecord,
+    Message,
+    MessageIndex,
+    Metadata,
+    Schema,
+)
 from mcap.records import Header as McapHeader
-from mcap.stream_reader import CRCValidationError, StreamReader
+from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
+from mcap.summary import Summary
 from zstandard import ZstdError
 
-from vla_zenoh.errors import CodecError, RecordError, RecordingError
+from vla_zenoh.errors import CodecError, RecordError, RecordingError, counted
 from vla_zenoh.keys import Keys
 from vla_zenoh.lab.recording import ros2_messages
 from vla_zenoh.lab.recording.record_types import RECORDS, bytes_from_json, record_from_json
@@ -37,8 +54,13 @@ _KINDS = {kind.__name__: kind for kind in RECORDS}
 _SCHEMAS = (ros2_messages.TEXT, ros2_messages.IMAGE, ros2_messages.JPEG_IMAGE)
 _BROKEN = (
     *(McapError, CRCValidationError, ZstdError, struct.error),
-    *(ValueError, EOFError, KeyError, OverflowError),
+    *(ValueError, EOFError, KeyError, OverflowError, UnicodeDecodeError, MemoryError),
+    *(RuntimeError, IndexError),
 )
+"""What MCAP, zstd and lz4 raise for bytes that are none of theirs."""
+OPCODE_AND_LENGTH = 1 + 8
+
+Read = TypeVar("Read", bound=McapRecord)
 
 
 class Recording:
@@ -54,10 +76,10 @@ class Recording:
         self.ended: dict[str, Any] | None = None
         """Metadata from its end, once `entries` has read it; None: the file was cut off."""
         self.damage = ""
-        """Why reading ended early; empty if it did not."""
+        """What could not be read, and why; empty if everything was."""
 
     def entries(self, wanted: Callable[[str], bool] = lambda key: True) -> Iterator[Sample]:
-        """Samples in the order of reception, up to the first damage (see `damage`).
+        """Samples in the order of reception; see `damage` for what is missing.
 
         Args:
             wanted: whether to read a key; other keys are skipped undecoded.
@@ -75,7 +97,7 @@ class Recording:
         schemas: dict[int, Schema] = {}
         channels: dict[int, _Source | None] = {}
         with path.open("rb") as file:
-            for record in _whole(file, partial(setattr, self, "damage")):
+            for record in _records(file, self._note_damage):
                 if isinstance(record, Message):
                     source = channels.get(record.channel_id)
                     if source is None:
@@ -83,7 +105,7 @@ class Recording:
                     try:
                         entry = source.sample(record)
                     except CodecError as error:
-                        self.damage = self.damage or f"{source.key}: {error}"
+                        self._note_damage(f"{source.key}: {error}")
                     else:
                         yield entry
                 elif isinstance(record, Schema):
@@ -96,7 +118,10 @@ class Recording:
                     try:
                         self.ended = {name: json.loads(value) for name, value in facts}
                     except (ValueError, RecursionError) as error:
-                        self.damage = self.damage or f"its last facts are not JSON: {error}"
+                        self._note_damage(f"its last facts are not JSON: {error}")
+
+    def _note_damage(self, why: str) -> None:
+        self.damage = self.damage or why
 
     @property
     def dropped(self) -> int:
@@ -154,8 +179,107 @@ def _source(channel: Channel, schemas: dict[int, Schema]) -> _Source | None:
     return _Source(facts["key"], source, encoding, schema.name, json_of)
 
 
+def _records(file: IO[bytes], damage: Callable[[str], None]) -> Iterator[Any]:
+    """MCAP records: messages in the order of reception, each after its channel and schema."""
+    summary = _summary(file)
+    if summary is None:
+        file.seek(0)
+        yield from _whole(file, damage)
+        return
+    yield from summary.schemas.values()
+    yield from summary.channels.values()
+    yield from _by_index(file, summary, damage)
+    for index in summary.metadata_indexes:
+        if index.name == ENDED:
+            with suppress(*_BROKEN):
+                yield _at(file, index.offset, Metadata)
+
+
+def _facts(file: IO[bytes], damage: Callable[[str], None]) -> Iterator[Any]:
+    """Metadata and attachments: by the index, then all records of the file, as far as needed."""
+    summary = _summary(file)
+    if summary is not None:
+        with suppress(*_BROKEN):
+            for index in summary.metadata_indexes:
+                yield _at(file, index.offset, Metadata)
+            for index in summary.attachment_indexes:
+                if index.name == PROFILE_FILE:
+                    yield _at(file, index.offset, Attachment)
+    file.seek(0)
+    yield from _whole(file, damage)
+
+
+def _summary(file: IO[bytes]) -> Summary | None:
+    """The index at the end of a file; None if there is none, or it is incomplete."""
+    file.seek(0)
+    try:
+        found = SeekingReader(file, record_size_limit=MAX_RECORD_BYTES).get_summary()
+    except _BROKEN:
+        return None
+    if found is None or found.statistics is None:
+        return None
+    in_chunks = found.chunk_indexes or not found.statistics.message_count
+    whole = len(found.chunk_indexes) == found.statistics.chunk_count
+    return found if in_chunks and whole else None
+
+
+def _at(file: IO[bytes], offset: int, kind: type[Read]) -> Read:
+    """The record of this kind at an offset; raises one of `_BROKEN`."""
+    file.seek(offset + OPCODE_AND_LENGTH)
+    return kind.read(ReadDataStream(file))  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _by_index(file: IO[bytes], summary: Summary, damage: Callable[[str], None]) -> Iterator[Any]:
+    """What the chunks hold, whatever their order in the file, without those that are damaged."""
+    chunks = sorted(
+        summary.chunk_indexes, key=lambda one: (one.message_start_time, one.chunk_start_offset)
+    )
+    broken: list[ChunkIndex] = []
+    waiting: list[tuple[int, int, Message]] = []
+    order = count()
+    for index, following in zip(chunks, [*chunks, None][1:], strict=True):
+        try:
+            if max(index.chunk_length, index.uncompressed_size) > MAX_RECORD_BYTES:
+                raise McapError("the chunk is too large")
+            records = breakup_chunk(_at(file, index.chunk_start_offset, Chunk), validate_crc=True)
+        except _BROKEN:
+            broken.append(index)
+            continue
+        for record in records:
+            if isinstance(record, Message):
+                heappush(waiting, (record.log_time, next(order), record))
+            else:
+                yield record
+        while waiting and (following is None or waiting[0][0] < following.message_start_time):
+            yield heappop(waiting)[-1]
+    while waiting:
+        yield heappop(waiting)[-1]
+    if broken:
+        damage(_missing(file, summary, broken))
+
+
+def _missing(file: IO[bytes], summary: Summary, broken: Sequence[ChunkIndex]) -> str:
+    """What the chunks held that cannot be read, by their message indexes."""
+    assert summary.statistics is not None
+    topics: Counter[str] = Counter()
+    for chunk in broken:
+        for channel, offset in chunk.message_index_offsets.items():
+            topic = summary.channels[channel].topic if channel in summary.channels else "?"
+            with suppress(*_BROKEN):
+                topics[topic] += len(_at(file, offset, MessageIndex).records)
+    began_ns = summary.statistics.message_start_time
+    first_s = (min(one.message_start_time for one in broken) - began_ns) / 1e9
+    last_s = (max(one.message_end_time for one in broken) - began_ns) / 1e9
+    worst = ", ".join(f"{topic} {lost}" for topic, lost in topics.most_common(SHOWN_TOPICS))
+    return (
+        f"damaged: {len(broken)} of {counted(len(summary.chunk_indexes), 'chunk')} cannot be read, "
+        f"with {counted(topics.total(), 'message')} from {first_s:.1f} to {last_s:.1f} s after its "
+        f"beginning ({worst or 'of unknown keys'}); the rest is read"
+    )
+
+
 def _whole(file: IO[bytes], damage: Callable[[str], None]) -> Iterator[Any]:
-    """MCAP records up to the end, or to the first that cannot be read."""
+    """MCAP records as the file has them, up to the end or the first that cannot be read."""
     reader = StreamReader(file, record_size_limit=MAX_RECORD_BYTES, validate_crcs=True)
     records = iter(reader.records)
     while True:
@@ -163,10 +287,10 @@ def _whole(file: IO[bytes], damage: Callable[[str], None]) -> Iterator[Any]:
             record = next(records)
         except StopIteration:
             return
-        except (*_BROKEN, UnicodeDecodeError, MemoryError) as error:
+        except _BROKEN as error:
             damage(
                 f"cut off or damaged after {file.tell():,} bytes "
-                f"({type(error).__name__}{f': {error}' if str(error) else ''})"
+                f"({type(error).__name__}{f': {error}' if str(error) else ''}); read up to there"
             )
             return
         yield record
@@ -189,22 +313,24 @@ def open_recording(path: Path) -> Recording:
         return Recording(path, first.about, first.profile_yaml)
     ros2_messages.messages()
     about: dict[str, str] | None = None
+    profile_yaml: str | None = None
     problems: list[str] = []
     topics: Counter[str] = Counter()
     try:
         with path.open("rb") as file:
-            records = _whole(file, problems.append)
-            if not isinstance(next(records, None), McapHeader):
+            if not isinstance(next(_whole(file, problems.append), None), McapHeader):
                 raise RecordingError(f"{path} is not an MCAP file")
-            for record in records:
+            for record in _facts(file, problems.append):
                 if isinstance(record, Metadata) and record.name == ABOUT:
                     about = record.metadata
-                elif isinstance(record, Attachment) and about and record.name == PROFILE_FILE:
-                    if not {"robot", "root"} <= about.keys():
-                        raise RecordingError(f"{path} does not say of which robot it is")
-                    return Recording(path, about, record.data.decode("utf-8", "replace"))
+                elif isinstance(record, Attachment) and record.name == PROFILE_FILE:
+                    profile_yaml = record.data.decode("utf-8", "replace")
                 elif isinstance(record, Channel):
                     topics[record.topic] += 1
+                if about is not None and profile_yaml is not None:
+                    if not {"robot", "root"} <= about.keys():
+                        raise RecordingError(f"{path} does not say of which robot it is")
+                    return Recording(path, about, profile_yaml)
     except OSError as error:
         raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
     if problems and not topics:

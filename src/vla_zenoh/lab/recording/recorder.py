@@ -19,9 +19,10 @@ import zenoh
 from vla_zenoh import __version__
 from vla_zenoh.bus.buffers import bytes_of
 from vla_zenoh.bus.node import Node
+from vla_zenoh.bus.reception import Share
 from vla_zenoh.bus.session import covers
 from vla_zenoh.errors import NodeError, RecordingError
-from vla_zenoh.keys import Keys
+from vla_zenoh.keys import ENDED, Keys
 from vla_zenoh.lab.recording.sample import TEXT
 from vla_zenoh.lab.recording.sample_queue import SampleQueue
 from vla_zenoh.lab.recording.writer import RecordingWriter
@@ -38,7 +39,7 @@ POLL_S, WRITE_S = 0.1, 0.025
 ANSWER_S = 1.0
 GIT_S = 2.0
 SWITCH_INTERVAL_S = 5e-4
-RECORDING, FAILED, STOPPED = "recording", "failed", "stopped"
+RECORDING, FAILED = "recording", "failed"
 
 
 def code_version() -> str:
@@ -60,6 +61,8 @@ class RecordingResult:
 
     Args:
         dropped: samples by key that the disk was too slow for.
+        streams: key -> samples that its sender announced in its status, and that are recorded.
+        lost: samples by key that never arrived.
         failure: why it ended early; empty if it did not.
     """
 
@@ -69,6 +72,8 @@ class RecordingResult:
     cpu_s: float = 0.0
     samples: Counter[str] = field(default_factory=Counter)
     dropped: Counter[str] = field(default_factory=Counter)
+    streams: dict[str, Share] = field(default_factory=dict)
+    lost: Counter[str] = field(default_factory=Counter)
     failure: str = ""
 
 
@@ -122,6 +127,7 @@ class Recorder:
             session, max_bytes=queue_bytes, max_samples=QUEUE_SAMPLES, clock=self.node.clock
         )
         self._closing = threading.Event()
+        self._shares: dict[str, Share] = {}
         self._ended: Mapping[str, Any] = {}
         self.recorded = RecordingResult(path, dropped=self._queue.dropped)
         self._began_s = time.monotonic()
@@ -152,7 +158,10 @@ class Recorder:
         self._thread.start()
         with ExitStack() as undo:
             undo.callback(self.close)
+            self.node.follow_senders()
             self._queue.subscribe(self._expressions)
+            for expression in self._expressions:
+                self.node.reception.watch(expression, self._queue.arrived)
             self._ask_settings()
             undo.pop_all()
         return self
@@ -181,6 +190,8 @@ class Recorder:
 
     def stop_listening(self) -> None:
         """Unsubscribe; the file stays open until `close`."""
+        self._shares = self._shares or self.node.reception.shares()
+        self.node.reception.unwatch(self._queue.arrived)  # what is sent from now on is not lost
         self._queue.close()
 
     def close(self, ended: Mapping[str, Any] | None = None) -> RecordingResult:
@@ -196,12 +207,14 @@ class Recorder:
     def _write_all(self) -> None:
         try:
             self._write_until_closed()
-            self._writer.finish({"dropped": dict(self.recorded.dropped), **self._ended})
+            self._count_lost()
+            facts = {"dropped": dict(self.recorded.dropped), "lost": dict(self.recorded.lost)}
+            self._writer.finish({**facts, **self._ended})
         except (RecordingError, NodeError) as error:
             self._fail(str(error))
         self._measure()
         self.recorded.size_bytes = self.recorded.path.stat().st_size
-        self._report(FAILED if self.recorded.failure else STOPPED, now=True)
+        self._report(FAILED if self.recorded.failure else ENDED, now=True)
 
     def _write_until_closed(self) -> None:
         commit_s = time.monotonic() + COMMIT_S
@@ -211,11 +224,21 @@ class Recorder:
             closing = self._closing.wait(WRITE_S)
             for sample in self._queue.take():
                 self._writer.write(sample)
+                if sample.header is not None:
+                    arrived = self._writer.counts[sample.key] + self._queue.dropped[sample.key]
+                    self.node.traffic.received(sample.key, sample.header, arrived)
             if time.monotonic() >= commit_s:
                 self._writer.commit()
                 commit_s = time.monotonic() + COMMIT_S
                 self._measure()
                 self._report(RECORDING)
+
+    def _count_lost(self) -> None:
+        dropped, lost = self._queue.dropped, Counter(self.node.traffic.lost)
+        for key, (sent, received) in self._shares.items():
+            self.recorded.streams[key] = Share(sent, received - dropped[key])
+            lost[key] = max(lost[key], Share(sent, received).lost)
+        self.recorded.lost = +lost
 
     def _fail(self, why: str) -> None:
         self.recorded.failure = why

@@ -211,7 +211,7 @@ class Replay:
         self.replayed.damage = self._file.damage
         self.replayed.late_ms = percentiles(np.array(self._late_ns) / 1e6)
         self.replayed.interval_error_ms = percentiles(np.array(self._errors_ns) / 1e6)
-        self.node.publish_status("stopped", now=True)
+        self.node.publish_end()
         self.node.close()
         return self.replayed
 

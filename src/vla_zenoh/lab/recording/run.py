@@ -263,7 +263,7 @@ def load_run(path: Path) -> Run:
             run.first_statuses.setdefault(node, record)
             run.statuses[node] = record
     if file.damage:
-        run.problems.append(f"{path.name} is {file.damage}; evaluated up to there")
+        run.problems.append(f"{path.name} is {file.damage}")
     run.problems += [f"{what} ({count})" for what, count in rejected.most_common(MAX_PROBLEMS)]
     return run
 

@@ -34,6 +34,8 @@ class SampleQueue:
         """Samples that did not fit, by key."""
         self.rejected: Counter[str] = Counter()
         """Deletions, which carry no sample, by reason."""
+        self.arrived: Counter[str] = Counter()
+        """Samples that arrived, those that did not fit included, by key."""
         self._session, self._clock = session, clock or Clock()
         self._max_bytes, self._max_samples = max_bytes, max_samples
         self._lock = threading.Lock()
@@ -54,6 +56,7 @@ class SampleQueue:
     def receive(self, sample: zenoh.Sample) -> None:
         """Add a sample from Zenoh, also from the reply to a query."""
         key = str(sample.key_expr)
+        self.arrived[key] += 1
         try:
             check_size(sample, self._max_bytes)
         except CodecError as error:  # copying an oversized one costs as much as keeping it

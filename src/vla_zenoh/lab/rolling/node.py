@@ -106,7 +106,10 @@ class RollingRecord:
         self._audit.subscribe(
             (*settings, *held, *orders, keys.event("command"), f"{keys.status('router')}$*")
         )
+        self.node.follow_senders()
         self._queue.subscribe(recorded_keys(keys))
+        for expression in recorded_keys(keys):
+            self.node.reception.watch(expression, self._queue.arrived)
         while not stop.wait(WRITE_S):
             self.step()
         self.close()
@@ -128,6 +131,7 @@ class RollingRecord:
     def close(self) -> None:
         """Write what there is, and leave."""
         self._audit.close()
+        self.node.reception.unwatch(self._queue.arrived)
         self._queue.close()
         self.step()
         if self._reasons:
@@ -137,7 +141,7 @@ class RollingRecord:
         self._add(ENDED)
         self._write_audit()
         self._log.close()
-        self.node.publish_status("stopped", detail=self._detail(), now=True)
+        self.node.publish_end(self._detail())
         self.node.close()
 
     def _note_beginning(self) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 
 from vla_zenoh.cli.node_rows import NodeRow
 from vla_zenoh.errors import MissingExtraError
+from vla_zenoh.keys import ENDED
 from vla_zenoh.sanitize import one_line
 
 try:
@@ -34,7 +35,7 @@ MAX_SERIES = 256
 MAX_LABEL = 64
 PREFIX = "vla_zenoh"
 STATES = (
-    "active", "braking", "crashed", "dead", "degraded", "fault", "holding", "inactive",
+    "active", "braking", "crashed", "dead", "degraded", "ended", "fault", "holding", "inactive",
     "inferring", "missing", "ok", "recording", "routing", "running", "silent", "stalled",
     "starting", "stopped", "unheeded", "waiting",
 )  # fmt: skip
@@ -122,7 +123,8 @@ def _of_node(out: _Families, row: NodeRow) -> None:
     gauge, counter = GaugeMetricFamily, CounterMetricFamily
     known = row.state if row.state in STATES else OTHER
     states = {state: state == known for state in (*STATES, OTHER)}
-    out.add(gauge, "node_alive", "1 while it has a liveliness token.", node, int(row.alive))
+    if row.state != ENDED:  # a recorder that has done its work is not missed
+        out.add(gauge, "node_alive", "1 while it has a liveliness token.", node, int(row.alive))
     out.add(StateSetMetricFamily, "node_state", "State of a node.", node, states)
     status = row.status
     if status is None:
@@ -169,10 +171,14 @@ def _of_links(out: _Families, node: dict[str, str], detail: Mapping[str, Any]) -
     net = net if isinstance(net, Mapping) else {}
     sent = net.get("sent")
     for key, pair in sent.items() if isinstance(sent, Mapping) else ():
-        if isinstance(pair, (list, tuple)) and len(pair) == 2:
+        if isinstance(pair, (list, tuple)) and len(pair) == 3:
             labels = {**node, "key": str(key)}
             out.add(gauge, "sent_hertz", "Records published.", labels, pair[0], "hertz")
             out.add(gauge, "sent_bytes", "Published per second.", labels, pair[1], "bytes")
+    for name, value in _numbers(net.get("shared_memory")):  # locked_bytes, host_bytes
+        out.add(
+            gauge, f"shared_memory_{name}", "Of the process, of the host.", node, value, "bytes"
+        )
     for key, count in _numbers(net.get("lost")):
         labels = {**node, "key": key}
         out.add(CounterMetricFamily, "lost_records", "Never arrived here.", labels, count)

@@ -5,16 +5,15 @@ from __future__ import annotations
 import threading
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
-import zenoh
 
 from vla_zenoh.bus.buffers import bytes_of, header_of
+from vla_zenoh.bus.client import Client
 from vla_zenoh.codec.image import decode_depth, encode_jpeg
 from vla_zenoh.errors import CodecError, ProfileError
-from vla_zenoh.keys import Keys
 from vla_zenoh.lab.newest_records import StreamSlot
 from vla_zenoh.lab.rate_limit import RateLimit
 from vla_zenoh.lab.web.requests import parse
@@ -46,9 +45,9 @@ class Picture(NamedTuple):
 
 
 class _Stream:
-    def __init__(self, session: zenoh.Session, key: str) -> None:
+    def __init__(self, client: Client, key: str) -> None:
         self.latest = StreamSlot(MAX_PICTURE_BYTES)
-        self.subscriber: Any = self.latest.subscribe(session, key)
+        self.end = client.watch(key, self.latest)
         self.users = 0
 
 
@@ -60,10 +59,8 @@ class Pictures:
         offered: streams of the cameras: ``camera/NAME``, and ``depth/NAME`` where it measures it.
     """
 
-    def __init__(
-        self, session: zenoh.Session, keys: Keys, cameras: Mapping[str, CameraProfile]
-    ) -> None:
-        self._session, self._keys = session, keys
+    def __init__(self, client: Client, cameras: Mapping[str, CameraProfile]) -> None:
+        self._client, self._keys = client, client.keys
         self.offered = tuple(f"camera/{name}" for name in cameras) + tuple(
             f"depth/{name}" for name, camera in cameras.items() if camera.depth_unit_m is not None
         )
@@ -102,14 +99,14 @@ class Pictures:
                 raise CodecError("malformed", f"at most {MAX_STREAMS} streams of pictures")
             for name, key in keys.items():
                 if name not in self._streams:
-                    self._streams[name] = _Stream(self._session, key)
+                    self._streams[name] = _Stream(self._client, key)
                 self._streams[name].users += 1
             for name in before - wanted:
                 self._streams[name].users -= 1
             unused = [name for name, stream in self._streams.items() if not stream.users]
             gone = [self._streams.pop(name) for name in unused]
         for stream in gone:
-            stream.subscriber.undeclare()
+            stream.end()
 
     def count(self, name: str) -> int:
         stream = self._streams.get(name)

@@ -19,7 +19,7 @@ from vla_zenoh.cli.node_rows import NodeRow, acting_limits, mode_of, node_rows
 from vla_zenoh.codec import records
 from vla_zenoh.codec.settings import decode_held
 from vla_zenoh.errors import CodecError, RecordError, SessionError, VlaZenohError
-from vla_zenoh.keys import PRIMITIVES, ROLLING, last_chunk, worker_node
+from vla_zenoh.keys import ENDED, PRIMITIVES, ROLLING, last_chunk, worker_node
 from vla_zenoh.lab.primitives.client import ask
 from vla_zenoh.lab.teleop.policy import OperatorInput
 from vla_zenoh.lab.trial.plan import MAX_SETUPS
@@ -30,7 +30,7 @@ from vla_zenoh.lab.web.recordings import Recordings
 from vla_zenoh.lab.web.trial import PageTrial
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import ActionChunk, NodeStatus, PoseState, Task
+from vla_zenoh.types import ActionChunk, Event, NodeStatus, PoseState, Task
 
 STILL_M_S = 0.005
 """A measured arm that is slower stands: an impedance controller still settles."""
@@ -62,6 +62,7 @@ class RobotLink:
             self._rings[ModelSpec].subscribe(session, self.keys.all_specs),
         ]
         self._specs: dict[str, ModelSpec] = {}
+        self._short: dict[str, str] = {}
         self._seen: dict[str, list[str]] = {}
         self._hold, self._let_go, self._confirmed = Hold(), False, False
         self._hold_lock, self._activating = threading.Lock(), threading.Lock()
@@ -84,6 +85,11 @@ class RobotLink:
                 self._take(kind, sample, now_s)
             for rejected in ring.pop_rejected():
                 self.counters["bad_sample"] += rejected.times
+        before, self._short = self._short, self.client.reception.short()
+        for name, why in self._short.items():
+            if name not in before:
+                self.counters["short_streams"] += 1
+                self.client.note("web", Event("warning", "fault", "short_stream", why))
 
     def _take(self, kind: type[Any], sample: ReceivedSample, now_s: float) -> None:
         try:
@@ -155,7 +161,9 @@ class RobotLink:
         said, task = self.client.snapshot(), self.client.task
         status, age_s, alive = said.get("command", (None, 0.0, False))
         detail: Mapping[str, Any] = status.detail if status is not None and alive else {}
-        state = "" if status is None else status.state if alive else "dead"
+        state = "" if status is None else status.state
+        if not alive and state not in ("", ENDED):
+            state = "dead"
         return {
             "mode": mode_of(said),
             "state": state or "no command node",

@@ -101,7 +101,7 @@ class PageServer:
         self._link, self._people = link, people
         self._names, self._secure = tuple(names), secure
         self._runs = Runs()
-        self._pictures = Pictures(link.session, link.keys, link.profile.cameras)
+        self._pictures = Pictures(link.client, link.profile.cameras)
         self._pages: dict[int, Page] = {}
         self._news: deque[dict[str, Any]] = deque(maxlen=MAX_NEWS)
         self._state = ""

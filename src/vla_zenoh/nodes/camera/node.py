@@ -178,7 +178,7 @@ class CameraNode:
             for thread in self._threads:
                 thread.join(max(0.0, give_up - time.monotonic()))
             with self._node_lock:
-                self.node.publish_status("stopped", now=True)
+                self.node.publish_end()
                 self.node.close()
 
     def _add_thread(self, name: str, body: Callable[[threading.Event], None]) -> None:

@@ -73,6 +73,7 @@ class CommandInputs:
         self.chunks = node.subscribe(keys.all_deltas, ring)
         names = node.profile.part_names
         self._parts = {name: _PartInputs(node, keys.of_part(name)) for name in names}
+        node.follow_senders()
         self._settings = [
             (name, node.subscribe(getattr(keys, name), ZenohRing(size, limit)), decode)
             for name, size, limit, decode in SETTINGS

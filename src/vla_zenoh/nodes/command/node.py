@@ -126,7 +126,7 @@ class CommandNode:
         if self._latch is not None:
             self._latch.close()
         if self._replaced is None:
-            self.node.publish_status("stopped", now=True)
+            self.node.publish_end()
         self.node.close()
         gc.unfreeze()  # so that the interpreter frees everything at exit
         if self._replaced is not None:

@@ -27,6 +27,7 @@ from vla_zenoh.codec.records import SMALL_BYTES
 from vla_zenoh.errors import CodecError, PeerError, SpecError, in_words
 from vla_zenoh.keys import Kind, worker_node
 from vla_zenoh.policy import ActionSteps, CameraSpec, Observation, Policy, check_steps, reset_of
+from vla_zenoh.policy.frozen import FrozenImages
 from vla_zenoh.policy.inference import ChunkPrefix, make_chunk
 from vla_zenoh.policy.observation import (
     MAX_STATES,
@@ -111,6 +112,7 @@ class RobotSession:
             )
             for name, (part, what) in state_names(self.spec.observation, self.spec.parts).items()
         ]
+        self._frozen, self._repeats = FrozenImages.of(profile.cameras), False
         self._task_writer = SingleWriterFilter(TASK_PATIENCE_S)
         self.task: Task | None = None
         self._task_received_s = -1e9
@@ -208,7 +210,12 @@ class RobotSession:
             if not observation.waiting:
                 self.complaint = observation.why
             return None
-        self.complaint = ""
+        if why := self._frozen.judge(observation):
+            if not self._repeats:
+                self.node.emit(Event("warning", "fault", "same_image", why[:1000]))
+            self._repeats, self.complaint = True, why
+            return None
+        self._repeats, self.complaint = False, ""
         if self._cameras and time.monotonic() - self.due_s < FRESH_PATIENCE_S:
             tolerance_s = min(FRESH_TOLERANCE_S, 0.25 / observation.rate_hz)
             if min(camera.received_s for camera in self._cameras) < self.due_s - tolerance_s:
@@ -293,8 +300,8 @@ class RobotSession:
         )
 
     def close(self) -> None:
-        """Report ``stopped`` and close the node."""
-        self.node.publish_status("stopped", now=True)
+        """Report ``ended`` and close the node."""
+        self.node.publish_end()
         self.node.close()
 
 
