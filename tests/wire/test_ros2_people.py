@@ -25,6 +25,7 @@ from vla_zenoh.codec import records
 from vla_zenoh.keys import Keys
 from vla_zenoh.profile import load_profile
 from vla_zenoh.robots.ros2 import operator_topics
+from vla_zenoh.robots.ros2.middleware import Bridges
 from vla_zenoh.robots.ros2.operator_topics import OperatorTopics
 from vla_zenoh.robots.ros2.ros_graph import RosGraph
 from vla_zenoh.ros2.keys import BOOL, EMPTY, OPERATIONS, TEXT
@@ -96,7 +97,14 @@ def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
         # No command node is here: this is when it would have agreed.
         monkeypatch.setattr(Client, "wait_for", lambda *_: agreed.wait(PATIENCE_S))
         people = OperatorTopics(
-            profile, ours, link, messages, "/vla", lambda *_: None, services=True
+            profile,
+            ours,
+            link,
+            Bridges(ours, profile.ros2),
+            messages,
+            "/vla",
+            lambda *_: None,
+            services=True,
         )
         peer = Ros2Peer(theirs)
         for key in (keys.active, keys.stop, keys.reset, keys.rate):
@@ -275,7 +283,7 @@ def test_what_a_transient_local_publisher_sends_again_sets_nothing_in_motion_but
     bridge = rig.operator.declare_queryable(
         "@/b1/ros2/**", zenoh.handlers.Callback(describe, indirect=False)
     )
-    until("the bridge is asked", lambda: rig.people._graph.has_transient_local(f"/vla/{topic}"))
+    until("the bridge is asked", lambda: rig.people._bridges.has_transient_local(f"/vla/{topic}"))
     rig.put(topic, kind, **values)
     answer = rig.answer(0)
     assert not answer["ok"]

@@ -139,7 +139,8 @@ def _fields(value: object) -> Mapping[str, Any]:
 
 
 def _warnings(nodes: Statuses, *, insecure: bool, left_out: int) -> Iterator[tuple[str, str]]:
-    """Sentences and their styles: open routers, bad certificates, unknown nodes."""
+    """Sentences and their styles: open routers, bad certificates, what of ROS 2 does not work,
+    unknown nodes."""
     details = {name: found.detail for name, (found, _, _) in nodes.items()}
     routers = {
         n: one.get("listen") for n, one in details.items() if one.get("security") == "insecure"
@@ -157,6 +158,8 @@ def _warnings(nodes: Statuses, *, insecure: bool, left_out: int) -> Iterator[tup
         if isinstance(wrong, (list, tuple)) and wrong:
             host = nodes[name][0].host
             yield f"certificates of {name} on {host}: {'; '.join(map(str, wrong))}", "bold yellow"
+        for why in _fields(detail.get("ros2_faults")).values():
+            yield f"{name}: {why}", "bold yellow"
     without: dict[str, list[str]] = {}
     for name, detail in details.items():
         why = _fields(_fields(detail.get("net")).get("shared_memory")).get("off")
@@ -223,6 +226,8 @@ def _message(row: NodeRow, found: NodeStatus, mode: str) -> str:
     days, unknown = certificates.get("days"), certificates.get("unknown")
     if not text and isinstance(days, (int, float)):
         text = f"certificates last {days:g} days"
+    if not text and (seen := _fields(detail.get("middleware"))):
+        text = f"robot's ROS 2: {', '.join(map(str, seen))}"
     return one_line(text or (unknown if isinstance(unknown, str) else ""), MAX_WORDS)
 
 

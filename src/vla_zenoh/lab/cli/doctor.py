@@ -25,6 +25,7 @@ from vla_zenoh.errors import SecurityError, SessionError
 from vla_zenoh.lab.cli.output import print_json, progress
 from vla_zenoh.lab.doctor import HostFinding, Needs, examine, needs_of
 from vla_zenoh.lab.doctor.access import access
+from vla_zenoh.lab.doctor.ros2 import ros2_bridge
 from vla_zenoh.lab.doctor.software import robot
 from vla_zenoh.profile import SessionProfile
 
@@ -113,6 +114,7 @@ def doctor(
         findings = list(examine(needs, functools.partial(try_zenoh, session)))
         if loaded is not None:
             findings += robot(loaded, host)
+            findings += ros2_bridge(loaded, host)
             if loaded.franka is not None:
                 from vla_zenoh.lab.doctor.fci import fci_host
 

@@ -26,14 +26,13 @@ from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.nodes.camera.camera_publisher import OK, CameraPublisher
 from vla_zenoh.nodes.camera.geometry import Pixels, resize
 from vla_zenoh.nodes.camera.source import LOOK_S, STALL_S
-from vla_zenoh.profile import Profile, SessionProfile
+from vla_zenoh.profile import Profile
 from vla_zenoh.profile.robot import Ros2Camera, Ros2Output, Ros2Profile
-from vla_zenoh.profile.schema import TRUSTED_PROTOCOLS
 from vla_zenoh.robots.arm import Arm
 from vla_zenoh.robots.driver import DriverStatus, Measurement, RobotDriver, command_of
 from vla_zenoh.robots.joint_reading import JointReading, RobotClock, SimulatedClock, StampFilter
 from vla_zenoh.robots.ros2.gripper import Gripper
-from vla_zenoh.robots.ros2.middleware import GRIPPER, MiddlewareWatch
+from vla_zenoh.robots.ros2.middleware import GRIPPER, Bridges, MiddlewareWatch, bridge_session
 from vla_zenoh.robots.ros2.operator_topics import OperatorTopics
 from vla_zenoh.robots.ros2.ros_graph import RosGraph
 from vla_zenoh.ros2.keys import COMMAND, SENSOR
@@ -112,17 +111,15 @@ class Ros2Driver(RobotDriver):
         profile, ros2 = self.profile, self._ros2
         self._node, self._arm, session = node, arm, node.session
         if ros2.connect is not None:
-            more: dict[str, Any] = {"connect": ros2.connect}
-            if all(each.partition("/")[0] in TRUSTED_PROTOCOLS for each in ros2.connect):
-                more |= {"listen": ros2.connect, "security": profile.session.security}
-            settings = SessionProfile(lease_ms=profile.session.lease_ms, **more)
+            settings = bridge_session(profile)
             self._own_session = open_session(settings, identity=NAME, wait_s=ROUTER_PATIENCE_S)
         name = "".join(each if each.isalnum() else "_" for each in profile.robot.name)
         graph = self.graph = RosGraph(
             self._own_session or session, ros2, self._messages, f"vla_{name}"
         )
         simulated = self._simulated = SimulatedClock() if ros2.use_sim_time else None
-        watch = self._middleware = MiddlewareWatch(graph, ros2, self._emit)
+        bridges = Bridges(graph.session, ros2)
+        watch = self._middleware = MiddlewareWatch(bridges, self._emit)
         if self.has_arm:
             self.gripper = Gripper(
                 node,
@@ -161,6 +158,7 @@ class Ros2Driver(RobotDriver):
                 profile,
                 session,
                 graph,
+                bridges,
                 read_messages(ros2),
                 ros2.prefix,
                 self._reject,

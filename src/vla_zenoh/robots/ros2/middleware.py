@@ -1,93 +1,151 @@
-"""Watches which middleware the robot's ROS nodes use, and says what does not work with it."""
+"""Which middleware the robot's ROS nodes use, by what the bridge says, and what does not work."""
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import zenoh
 
+from vla_zenoh.bus.buffers import bytes_of
+from vla_zenoh.errors import CodecError
+from vla_zenoh.profile import Profile, SessionProfile
 from vla_zenoh.profile.robot import GRIPPER_ACTIONS, Ros2Profile
-from vla_zenoh.robots.ros2.ros_graph import RosGraph
-from vla_zenoh.ros2.bridge_view import SERVES, BridgeView
+from vla_zenoh.profile.schema import TRUSTED_PROTOCOLS
+from vla_zenoh.ros2.bridge_view import (
+    MAX_REPLY_BYTES,
+    SERVES,
+    VIEW_KEYS,
+    BridgeView,
+    any_transient_local,
+    endpoints_key,
+    read_view,
+    vendors,
+)
 from vla_zenoh.types import Event
 
+ASK_S = 1.0
+"""Timeout of a query."""
 PERIOD_S = 5.0
 GRIPPER = "gripper_middleware"
 
 
-class MiddlewareWatch:
-    """Looks at the bridge's DDS domain now and then; `run` is the body of a thread.
+class Bridges:
+    """Queries to the bridges that a session reaches, about DDS; each waits up to `ASK_S`.
 
-    Attributes:
-        view: bridges and middleware, as they were last seen.
-        faults: name -> what does not work, and what to do.
+    With rmw_zenoh there is neither, and nothing is found.
     """
 
-    def __init__(self, graph: RosGraph, ros2: Ros2Profile, emit: Callable[[Event], None]) -> None:
-        self._graph, self._ros2, self._emit = graph, ros2, emit
-        self.view = BridgeView({}, {})
-        self.faults: dict[str, str] = {}
+    def __init__(self, session: zenoh.Session, ros2: Ros2Profile) -> None:
+        self._session, self._ros2 = session, ros2
 
-    def run(self, stop: threading.Event) -> None:
-        """Look until `stop` is set."""
-        while not stop.is_set():
-            self.look()
-            stop.wait(PERIOD_S)
+    def view(self) -> BridgeView:
+        """Bridges and the middleware that they see."""
+        return read_view(reply for key in VIEW_KEYS for reply in self._ask(key))
 
-    def look(self) -> None:
-        """Ask the bridge, and emit an event for each new fault."""
-        try:
-            self.view = self._graph.view()
-            faults = dict(self._find())
-        except zenoh.ZError:  # the session closes
-            return
-        for what, why in faults.items():
-            if what not in self.faults:
-                self._emit(Event("warning", "notice", what, why))
-        self.faults = faults
+    def has_transient_local(self, topic: str) -> bool:
+        """Whether somebody publishes a topic transient_local: it is sent again to late readers."""
+        return any_transient_local(self._ask(endpoints_key("writer", f"rt{topic}")))
 
-    def about(self) -> list[str]:
-        """Sentences for the ROS log."""
-        seen = ", ".join(self.view.middleware) or "no DDS participant"
-        return [f"the bridge sees {seen}", *self.faults.values()]
-
-    def _find(self) -> Iterator[tuple[str, str]]:
-        ros2, view = self._ros2, self.view
+    def faults(self, view: BridgeView) -> Iterator[tuple[str, str]]:
+        """What does not work, each with its name and what to do."""
+        ros2 = self._ros2
         domains = {domain for domain in view.domains.values() if domain is not None}
         if domains and ros2.domain not in domains:
             served = ", ".join(map(str, sorted(domains)))
-            why = f"the bridge serves ROS domain {served}, ros2.domain is {ros2.domain}"
-            yield "ros_domain", why
+            yield "ros_domain", f"the bridge serves domain {served}, ros2.domain is {ros2.domain}"
         if view.doubled:
-            yield (
-                "two_bridges",
+            why = (
                 f"{len(view.doubled)} bridges serve one ROS domain, so everything arrives twice: "
-                f"end all but one ({', '.join(view.doubled)})",
+                f"end all but one ({', '.join(view.doubled)})"
             )
-        if ros2.prefix is not None and ros2.services:
-            others = self._graph.callers_of(ros2.prefix) - {SERVES}
-            if others:
-                yield (
-                    "services_middleware",
-                    f"a client of {ros2.prefix}'s services uses {_and(others)}, whose calls no "
-                    f"bridge carries: it waits for ever. Use the topics, or {SERVES} there",
-                )
-        others = self._gripper_servers() - {SERVES}
-        if others and ros2.gripper is not None:
-            yield (
-                GRIPPER,
-                f"the gripper's action {ros2.gripper.topic} is served by {_and(others)}, to which "
-                f"no bridge carries a goal: command it by a topic (ros2.gripper), or start its "
-                f"node with {SERVES}",
+            yield "two_bridges", why
+        callers = self._callers() - {SERVES}
+        if callers:
+            why = (
+                f"a client of our services uses {_and(callers)}, whose calls no bridge carries: it "
+                f"waits for ever. Use the topics below {ros2.prefix}, or {SERVES} there"
             )
+            yield "services_middleware", why
+        servers = self._gripper_servers() - {SERVES}
+        if servers and ros2.gripper is not None:
+            why = (
+                f"the gripper's action {ros2.gripper.topic} is served by {_and(servers)}, to which "
+                "no bridge carries a goal: command it by a topic (ros2.gripper), or start its node "
+                f"with {SERVES}"
+            )
+            yield GRIPPER, why
+
+    def _callers(self) -> frozenset[str]:
+        if self._ros2.prefix is None or not self._ros2.services:
+            return frozenset()
+        return vendors(self._ask(endpoints_key("writer", f"rq{self._ros2.prefix}/**")))
 
     def _gripper_servers(self) -> frozenset[str]:
         gripper = self._ros2.gripper
         if gripper is None or gripper.type not in GRIPPER_ACTIONS:
             return frozenset()
         actions = [each for each in (gripper.topic, gripper.grasp) if each is not None]
-        return frozenset().union(*map(self._graph.servers_of, actions))
+        topics = [f"rq{action}/_action/send_goalRequest" for action in actions]
+        return frozenset().union(*(vendors(self._ask(endpoints_key("reader", t))) for t in topics))
+
+    def _ask(self, key: str) -> list[tuple[str, bytes]]:
+        found: list[tuple[str, bytes]] = []
+        if self._ros2.bridge != "ros2dds":
+            return found
+        for reply in self._session.get(key, timeout=ASK_S):
+            if reply.ok is not None:
+                with contextlib.suppress(CodecError):  # too large
+                    payload = bytes_of(reply.ok.payload, MAX_REPLY_BYTES)
+                    found.append((str(reply.ok.key_expr), payload))
+        return found
+
+
+def bridge_session(profile: Profile) -> SessionProfile:
+    """How the bridge is reached, or the robot's router."""
+    ros2 = profile.ros2
+    if ros2 is None or ros2.connect is None:
+        return profile.session
+    more: dict[str, Any] = {"connect": ros2.connect}
+    if all(each.partition("/")[0] in TRUSTED_PROTOCOLS for each in ros2.connect):
+        more |= {"listen": ros2.connect, "security": profile.session.security}
+    return SessionProfile(lease_ms=profile.session.lease_ms, **more)
+
+
+class MiddlewareWatch:
+    """Asks the bridges now and then; `run` is the body of a thread.
+
+    Attributes:
+        view: bridges and middleware, as they were last seen.
+        faults: name -> what does not work, and what to do.
+    """
+
+    def __init__(self, bridges: Bridges, emit: Callable[[Event], None]) -> None:
+        self._bridges, self._emit = bridges, emit
+        self.view = BridgeView({}, {})
+        self.faults: dict[str, str] = {}
+
+    def run(self, stop: threading.Event) -> None:
+        """Ask until `stop` is set."""
+        while not stop.is_set():
+            with contextlib.suppress(zenoh.ZError):  # the session closes
+                self.look()
+            stop.wait(PERIOD_S)
+
+    def look(self) -> None:
+        """Ask the bridges, and emit an event for each new fault."""
+        self.view = self._bridges.view()
+        faults = dict(self._bridges.faults(self.view))
+        for what in faults.keys() - self.faults.keys():
+            self._emit(Event("warning", "notice", what, faults[what]))
+        self.faults = faults
+
+    def about(self) -> list[str]:
+        """Sentences for the ROS log."""
+        seen = ", ".join(self.view.middleware) or "no DDS participant"
+        return [f"the bridge sees {seen}", *self.faults.values()]
 
 
 def _and(names: frozenset[str]) -> str:

@@ -23,6 +23,7 @@ from vla_zenoh.bus.client import Client
 from vla_zenoh.codec import settings
 from vla_zenoh.errors import CodecError, SessionError
 from vla_zenoh.profile import Profile
+from vla_zenoh.robots.ros2.middleware import Bridges
 from vla_zenoh.robots.ros2.ros_graph import Request, RosGraph
 from vla_zenoh.ros2.keys import (
     ACTIVE,
@@ -75,6 +76,7 @@ class OperatorTopics:
         profile: Profile,
         session: zenoh.Session,
         graph: RosGraph,
+        bridges: Bridges,
         messages: Messages,
         prefix: str,
         reject: Callable[[str, str, str], None],
@@ -83,7 +85,8 @@ class OperatorTopics:
         about: Callable[[], list[str]] = list,
     ) -> None:
         self._robot, self._messages, self._reject = profile.robot.name, messages, reject
-        self._graph, self._prefix, self._services = graph, prefix, services
+        self._prefix, self._services = prefix, services
+        self._bridges = bridges
         self._about, self._told = about, ""
         self._client = Client(profile, session).subscribe()
         # A reset or an activation that waits, while another request is answered or this process
@@ -257,7 +260,7 @@ class OperatorTopics:
                 f"once (`ros2 topic pub --once`), and again after {REPEAT_NS / 1e9:g} s of silence"
             )
         time.sleep(max(0.0, DISCOVERY_S - (time.monotonic_ns() - call.mono_ns) / 1e9))
-        if self._graph.has_transient_local(topic):
+        if self._bridges.has_transient_local(topic):
             raise SessionError(
                 f"{topic} has a publisher that is transient_local: what it once published is "
                 "received again whenever a reader comes late or a bridge restarts, so it may not "

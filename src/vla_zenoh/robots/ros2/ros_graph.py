@@ -14,15 +14,6 @@ import zenoh
 from vla_zenoh.bus.buffers import CallbackRing, LatestSample, bytes_of
 from vla_zenoh.errors import CodecError
 from vla_zenoh.profile.robot import Ros2Profile
-from vla_zenoh.ros2.bridge_view import (
-    MAX_REPLY_BYTES,
-    VIEW_KEYS,
-    BridgeView,
-    any_transient_local,
-    endpoints_key,
-    read_view,
-    vendors,
-)
 from vla_zenoh.ros2.keys import (
     DEFAULT,
     Attachment,
@@ -42,8 +33,6 @@ Buffer = TypeVar("Buffer", LatestSample, CallbackRing)
 CALL_S = 5.0
 """Timeout of a service call."""
 
-ASK_S = 1.0
-"""Timeout of a query about the DDS domain of the bridge."""
 MAX_ATTACHMENT_BYTES = 1024
 _CDR = zenoh.Encoding("application/cdr")
 _ALL_COMPLETE = zenoh.QueryTarget.ALL_COMPLETE
@@ -107,16 +96,6 @@ def _attachment(gid: bytes | None, seq: itertools.count[int]) -> bytes | None:
     if gid is None:
         return None
     return Attachment(next(seq), time.time_ns(), gid).encode()
-
-
-def ask(session: zenoh.Session, key: str) -> list[tuple[str, bytes]]:
-    """Key and payload of every reply to a query; waits up to `ASK_S`."""
-    found: list[tuple[str, bytes]] = []
-    for reply in session.get(key, timeout=ASK_S):
-        if reply.ok is not None:
-            with contextlib.suppress(CodecError):  # too large
-                found.append((str(reply.ok.key_expr), bytes_of(reply.ok.payload, MAX_REPLY_BYTES)))
-    return found
 
 
 class Request:
@@ -241,26 +220,6 @@ class RosGraph:
             part: ServiceClient(self.session, self._wire.key(end), None)
             for part, end in parts.items()
         }
-
-    # -- what the bridge says of its DDS domain, where there is one -------------------------------
-    def view(self) -> BridgeView:
-        """Bridges and the middleware that they see; waits up to `ASK_S`."""
-        return read_view(reply for key in VIEW_KEYS for reply in self._ask(key))
-
-    def has_transient_local(self, topic: str) -> bool:
-        """Whether somebody publishes a topic transient_local: it is sent again to late readers."""
-        return any_transient_local(self._ask(endpoints_key("writer", f"rt{topic}")))
-
-    def servers_of(self, action: str) -> frozenset[str]:
-        """Middleware of an action's servers."""
-        return vendors(self._ask(endpoints_key("reader", f"rq{action}/_action/send_goalRequest")))
-
-    def callers_of(self, prefix: str) -> frozenset[str]:
-        """Middleware of those that would call a service below `prefix`."""
-        return vendors(self._ask(endpoints_key("writer", f"rq{prefix}/**")))
-
-    def _ask(self, key: str) -> list[tuple[str, bytes]]:
-        return [] if self._rmw else ask(self.session, key)
 
     def close(self) -> None:
         for declared in reversed(self._declared):
