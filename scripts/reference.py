@@ -327,6 +327,7 @@ COUNTERS = {
     "ros2.stream_silences": "times the command stream fell silent",
     "ros2.unstamped": "joint states without a time stamp",
     "samples": "recorder, replay: samples written or published",
+    "unknown_fields": "fields of records that this version does not know, ignored",
     "sim.overruns": "simulation steps that took longer than they last",
     "sim.resets": "resets of the scene",
     "sim.stream_silences": "times the command stream fell silent",

@@ -17,8 +17,9 @@ from typing import NamedTuple
 from vla_zenoh.errors import ProfileError
 
 SCHEMA = 1
-"""Version of the wire. Raise it when a record of the last version cannot be decoded any more, or an
-old node would reject a new one: decoders reject unknown fields, so a new field raises it too."""
+"""Version of the wire. Raise it when a record means something else than before, or lacks a field
+that it had. Decoders ignore fields that they do not know, so a new field alone does not raise it:
+an old node must do right without what it ignores."""
 
 DEFAULT_ROOT = "vla"
 
@@ -154,8 +155,8 @@ class Keys:
     slower = _Key(
         "slower", "As `speed`, but it can only lower it: for every role that may stop the arm."
     )
-    stop = _Key("stop", "Anything: latched emergency stop.")
-    reset = _Key("reset", "Anything: clears the emergency stop.")
+    stop = _Key("stop", "Anything: latched stop, heard by the command node and the robot node.")
+    reset = _Key("reset", "Anything: clears the stop, in both.")
     save = _Key("save", "Why: the rolling record of the last minutes is saved.")
 
     # -- model workers ------------------------------------------------------------------------

@@ -27,6 +27,7 @@ from vla_zenoh.profile import load_profile, override
 from vla_zenoh.robots import python_driver
 from vla_zenoh.robots.node import FAILURES, LEAST_S, RobotNode
 from vla_zenoh.robots.python_driver import PythonDriver
+from vla_zenoh.runtime.estop_latch import EstopLatch
 from vla_zenoh.types import (
     Event,
     FloatArray,
@@ -476,3 +477,63 @@ def test_the_gripper_outlives_neither_a_stop_nor_the_age_of_its_orders(turns: Tu
     assert turns.arm.widths_m == [0.05]
     assert turns.refused("stale") == 1
     assert turns.refused("outlived") == 1
+
+
+def test_a_stop_is_heard_without_a_command_node_and_latches(turns: Turns) -> None:
+    keys, stopped_at = turns.node.node.keys, turns.last // 2
+    turns.script[stopped_at] = lambda: turns.session.put(keys.stop, "stop")
+    turns.run()
+    braked(turns)
+    moved = len(turns.arm.moves)
+    assert moved < turns.last  # the stream goes on, and the arm is sent nothing more
+    assert turns.heard[GripperState][-1].mode == "latched"
+    assert turns.node.state == "latched"
+    assert [event.what for event in turns.heard[Event]].count("running->latched") == 1
+
+
+def test_a_gripper_command_that_comes_after_a_stop_is_ignored_also_after_a_reset(
+    turns: Turns,
+) -> None:
+    keys, stopped_at = turns.node.node.keys, turns.last // 2
+    turns.script[stopped_at] = lambda: turns.session.put(keys.stop, "stop")
+    turns.script[stopped_at + 5] = lambda: turns.ask(0.01)
+    turns.script[stopped_at + 10] = lambda: turns.session.put(keys.reset, "reset")
+    turns.run()
+    assert not turns.arm.widths_m
+    assert turns.node.state != "latched"
+
+
+def test_a_stop_outlives_the_robot_node_that_heard_it(
+    turns: Turns, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    latch = tmp_path / "stopped-arm"
+    turns.node._latch = EstopLatch(latch)
+    turns.session.put(turns.node.node.keys.stop, "stop")
+    turns.node.step(turns.wait())
+    until("the latch is written", latch.exists)
+    driver = PythonDriver(turns.node.node.profile)
+    keys = turns.node.node.keys
+    turns.node._close()
+    again = RobotNode(driver, turns.session, latch=latch)
+    try:
+        assert again.state == "waiting"
+        driver.robot.position_rad = turns.home_rad
+        again.step(turns.wait())
+        assert again.state == "latched"
+        turns.session.put(keys.reset, "reset")
+        again.step(turns.wait())
+        assert again.state == "running"
+        until("the latch is removed", lambda: not latch.exists())
+    finally:
+        turns.node = again
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_a_reset_that_was_put_before_a_stop_does_not_clear_it(turns: Turns, late: bool) -> None:
+    keys = turns.node.node.keys
+    for key in (keys.stop, keys.reset) if late else (keys.reset, keys.stop):
+        turns.session.put(key, "")
+    turns.node.step(turns.wait())
+    assert turns.node.state in ("latched", "waiting")
+    assert all(arm.stop_latched for arm in turns.node.arms.values())
+    assert turns.refused("reset_refused") == 1

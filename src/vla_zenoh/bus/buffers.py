@@ -63,6 +63,12 @@ class ReceivedSample(NamedTuple):
     mono_ns: int
     nth: int = 0
 
+    @property
+    def put_ns(self) -> int | None:
+        """When the router first saw the sample, on its clock; None: it has no timestamp."""
+        stamp = self.sample.timestamp
+        return None if stamp is None else round(stamp.get_time().timestamp() * 1e9)
+
 
 class RejectedSample(NamedTuple):
     """Samples that a buffer rejected for one reason; key and sentence are of the newest."""

@@ -37,6 +37,8 @@ STATUS_PERIOD_S = 0.5
 IMAGE_LINK_TIMEOUT_S = 10.0
 LOSSES_PERIOD_S = 5.0
 """Events of lost samples are published at most this often, with their sum."""
+MAX_NEWER_SOURCES, MAX_UNKNOWN_NAMED = 256, 8
+"""Senders whose unknown fields are named, and names in each event; all are counted."""
 
 Record = TypeVar("Record")
 AnyBuffer = TypeVar("AnyBuffer", bound=SampleBuffer)
@@ -124,6 +126,7 @@ class Node:
         self.clock = Clock()
         self.source = f"{name}#{secrets.token_hex(4)}"
         self.counters: Counter[str] = Counter()
+        self._newer_sources: set[str] = set()
         self.started_wall_ns = time.time_ns()
         self._declared: list[Any] = []
         self._publishers: list[Publisher] = []
@@ -375,7 +378,10 @@ class Node:
             header = header or header_of(arrival.sample)
             if writer_filter is not None:  # first: a flood by another source must cost little
                 writer_filter.check(header, arrival.mono_ns)
-            record = records.decode(kind, bytes_of(arrival.sample.payload))
+            unknown: list[str] = []
+            record = records.decode(kind, bytes_of(arrival.sample.payload), unknown)
+            if unknown:
+                self._count_unknown(header.source, unknown)
             here, record = self.clocks.to_local_clock(header, record)
         except CodecError as error:
             self.reject_sample(key, error)
@@ -384,6 +390,16 @@ class Node:
             writer_filter.accept(header, arrival.mono_ns)
         self.traffic.received(key, header, arrival.nth)
         return Stamped(here, record, self.clock.wall_at(arrival.mono_ns))
+
+    def _count_unknown(self, source: str, fields: list[str]) -> None:
+        """Count ignored fields, and name them once for each sender."""
+        self.counters["unknown_fields"] += len(fields)
+        if source in self._newer_sources or len(self._newer_sources) >= MAX_NEWER_SOURCES:
+            return
+        self._newer_sources.add(source)
+        named = ", ".join(fields[:MAX_UNKNOWN_NAMED])
+        why = f"{source[:60]} sends {named}, which this version does not know: ignored"
+        self.emit(Event("info", "notice", "unknown_fields", why[:1000]))
 
     def decode_text(
         self, decode: Callable[[bytes], Record], arrival: ReceivedSample

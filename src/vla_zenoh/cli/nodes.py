@@ -66,15 +66,21 @@ def router(
         run_router(loaded, stop, host=host, also=others)
 
 
+def _latch_file(node: str) -> Path | None:
+    """File that exists while a stop is latched in a node; None if it is not started by `up`."""
+    folder = os.environ.get(RUN_FOLDER_VARIABLE)
+    return Path(folder) / f"stopped-{node}" if folder else None
+
+
 def _run_robot(
     node: NodeOptions, identity: str, make_driver: Callable[[Profile], RobotDriver]
 ) -> None:
     from vla_zenoh.robots.node import RobotNode
 
-    profile = node.load()
+    profile, latch = node.load(), _latch_file(identity)
     run_node(
         profile,
-        lambda session, stop: RobotNode(make_driver(profile), session).run(stop),
+        lambda session, stop: RobotNode(make_driver(profile), session, latch=latch).run(stop),
         identity=identity,
         preferred=True,
     )
@@ -149,8 +155,7 @@ def command(node: NodeOptions, dry_run: DryRunOption = False) -> None:
     from vla_zenoh.nodes.command.node import CommandNode
 
     profile = node.load()
-    folder = os.environ.get(RUN_FOLDER_VARIABLE)
-    latch = Path(folder) / "stopped" if folder else None
+    latch = _latch_file("command")
     run_node(
         profile,
         lambda session, stop: CommandNode(profile, session, dry_run=dry_run, latch=latch).run(stop),

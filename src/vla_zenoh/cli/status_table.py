@@ -45,7 +45,7 @@ STYLES = {
     **dict.fromkeys(("inferring", "running", "routing", "ok"), "green"),
     **dict.fromkeys(("holding", "waiting", "braking", "silent", "stalled", "unheeded"), "yellow"),
     **dict.fromkeys(("starting", "degraded"), "yellow"),
-    **dict.fromkeys(("stopped", "fault", "dead", "missing", "crashed"), "bold red"),
+    **dict.fromkeys(("stopped", "latched", "fault", "dead", "missing", "crashed"), "bold red"),
 }
 LEVELS = {"warning": "yellow", "error": "red"}
 

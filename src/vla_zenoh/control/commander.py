@@ -33,6 +33,7 @@ from vla_zenoh.control.part_spacing import PartSpacing
 from vla_zenoh.control.plan_timeline import EpisodeProgress
 from vla_zenoh.control.policy_check import Lease, Rejection
 from vla_zenoh.control.preflight import (
+    STOP_LATCHED,
     PeerSnapshot,
     reasons_of_part,
     reasons_of_worker,
@@ -42,7 +43,7 @@ from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.watchdog import Deadman
 from vla_zenoh.errors import RecordError
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import MAX_TEXT, ActionChunk, HeldBox, Stamped, Task
+from vla_zenoh.types import MAX_TEXT, ActionChunk, GripperState, HeldBox, Stamped, Task
 
 LATE_NS = 10_000_000_000
 """A setting that was put before a stop arrives at most this long after it. Stamps that say so later
@@ -178,8 +179,12 @@ class Commander:
         if inputs.peers is not None:
             self._peers = inputs.peers
         for part in self.parts:
-            states = inputs.of(part.name)
+            states, before = inputs.of(part.name), part.gripper_state
             part.update(states)
+            # Once, when it begins: after a reset the robot's last state may still say so.
+            latched = _latched(states.gripper) and not _latched(before)
+            if latched and self.state is not State.STOPPED:
+                self._change(Trigger.STOP, part.says("the robot node heard an emergency stop"))
             if part.held is not None and part.let_go:
                 self._hold(part, None)
             why = why_not_ready(states.gripper.record) if states.gripper else ""
@@ -471,3 +476,7 @@ class Commander:
         event = make_event("warning", "limit", hit.name, f"braked{hit.at}", hit.value, hit.limit)
         self._out.events += part.tagged([event]) if part else [event]
         self._change(Trigger.LOSE, part.says(why) if part else why)
+
+
+def _latched(gripper: Stamped[GripperState] | None) -> bool:
+    return gripper is not None and gripper.record.mode == STOP_LATCHED

@@ -261,10 +261,16 @@ def _robot(
     return reasons
 
 
+STOP_LATCHED = "latched"
+"""Mode of a robot whose node has heard a stop, until it hears a reset."""
+
+
 def why_not_ready(gripper: GripperState) -> str:
     """Faults that the robot reports, or the mode in which it takes no commands; empty if none."""
     if gripper.faults:
         return f"the robot reports: {'; '.join(gripper.faults)}"
+    if gripper.mode == STOP_LATCHED:
+        return "the robot node holds an emergency stop; `vla-zenoh reset` clears it"
     return "" if gripper.mode == "ready" else f"the robot is not ready but {gripper.mode!r}"
 
 

@@ -194,6 +194,10 @@ class ArmGuard:
         """Follow no stream and hold the reference: the arm stopped there by itself."""
         self._active.hold()
 
+    def stop(self) -> None:
+        """Follow no stream, and brake to rest."""
+        self._active.stop()
+
     def reset(self) -> None:
         """Follow no stream, forget the last, and hold the measured place: the robot was reset."""
         measured = self._measure()

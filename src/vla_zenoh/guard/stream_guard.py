@@ -294,6 +294,13 @@ class StreamGuard(ABC, Generic[Reference]):
         """
         self._rest_at(self._standing(here))
 
+    def stop(self) -> None:
+        """Follow no stream, and brake to rest as fast as the limits allow."""
+        if self.moving and not self.braking:
+            self._stream.end()
+            self._governor.stop()
+            self.braking = self._governor.moving
+
     def reset(self, here: Any) -> None:
         """Follow no stream, forget the last one, and hold this place: the robot was reset."""
         self.anchor(here)

@@ -11,6 +11,7 @@ import numpy as np
 from vla_zenoh.bus.buffers import CallbackRing, ReceivedSample
 from vla_zenoh.bus.node import Node, Publisher, publish_together
 from vla_zenoh.codec.records import SMALL_BYTES
+from vla_zenoh.control.preflight import STOP_LATCHED
 from vla_zenoh.errors import CodecError
 from vla_zenoh.guard.arm_guard import SETTLE_NS, ArmGuard, GripperGuard, HeldReference, Measured
 from vla_zenoh.keys import Kind
@@ -30,7 +31,7 @@ BUFFER = 64
 STALLED_NS = 500_000_000
 """After a stall commands are rejected and the robot is not ready for this long: what was sent
 during the stall is still arriving, and its writer has to notice and brake."""
-NOT_READY = ("braking", "stalled", "unheeded")
+NOT_READY = (STOP_LATCHED, "braking", "stalled", "unheeded")
 """States of a healthy robot that is not ready for commands; its gripper state reports them too."""
 FAULT_AGAIN_NS = 100_000_000
 """A fault without measurements is published again after this, for late subscribers."""
@@ -46,6 +47,7 @@ class Arm:
         guard: of the streams; it follows none before the first measurement.
         stall_s: duration of the last stall.
         stalls: number of stalls of the loop while it moved the arm.
+        stop_latched: an emergency stop was heard: all commands are ignored.
         accepting: False: all further commands are ignored, and the guard brakes a motion when its
             stream times out.
     """
@@ -69,7 +71,7 @@ class Arm:
         self._resting = False
         """The robot must be sent its last set-point at rest: it may have kept a velocity."""
         self.stall_s, self.stalls = 0.0, 0
-        self.accepting = True
+        self.accepting, self.stop_latched = True, False
         self._gripper_commands = GripperCommands(node, driver)
         self._joint_out = node.declare_publisher(keys.state_joint, Kind.STATE)
         self._pose_out = node.declare_publisher(keys.state_pose, Kind.STATE)
@@ -97,8 +99,15 @@ class Arm:
         if reading and not self._driver.simulated:
             self._read(mono_ns)
         self._follow(now_ns, mono_ns)
-        if self.accepting:
+        if self.stop_latched:
+            self._gripper_commands.drop()
+        elif self.accepting:
             self._gripper_commands.update(now_ns, self.guard)
+
+    def latch_stop(self) -> None:
+        """Brake, and ignore all commands until `stop_latched` is cleared."""
+        self.stop_latched = True
+        self.guard.stop()
 
     def end_step(self, mono_ns: int) -> None:
         """Read a simulated robot once all its parts have been moved: their commands act at once."""
@@ -141,7 +150,7 @@ class Arm:
         reason = away or ("stalled" if self.stalled else "")
         for mode, buffer in self._streams:
             for arrival in buffer.drain():
-                if self._measured is None or not self.accepting:
+                if self._measured is None or self.stop_latched or not self.accepting:
                     continue
                 if reason:
                     self._reject(mode, reason)
@@ -215,6 +224,7 @@ class Arm:
             states += (self._joint_out, joints), (self._pose_out, pose)
         if gripper is not None:
             mode = self.state if self.state in NOT_READY else driver.gripper_mode
+            mode = STOP_LATCHED if self.stop_latched else mode
             faults = (driver.fault,) if driver.fault else ()
             states.append((self._gripper_out, replace(gripper, mode=mode, faults=faults)))
         publish_together(stamp_ns, self._seq, *states)
@@ -239,6 +249,8 @@ class Arm:
             return "waiting"
         if self._silent:
             return "silent"
+        if self.stop_latched:
+            return STOP_LATCHED
         if self.guard.braking:
             return "braking"
         if self.stalled:
@@ -269,6 +281,7 @@ class Arm:
         timeout_s = self._driver.profile.timing.command_timeout_s
         return {
             "fault": self._driver.fault,
+            STOP_LATCHED: "emergency stop; latched until a reset",
             "silent": self._driver.silent_why,
             "braking": f"no command/{self.guard.mode} for {timeout_s:g} s while the arm moved",
             "unheeded": "command stream rejected: its first set-point does not match the arm's "
@@ -305,6 +318,10 @@ class GripperCommands:
         self._node, self._driver, key = node, driver, driver.profile.keys.command_gripper
         self._commands = node.subscribe(key, CallbackRing(16, SMALL_BYTES))
         self._guard = GripperGuard(driver.profile.robot.gripper)
+
+    def drop(self) -> None:
+        """Ignore the commands that arrived."""
+        self._commands.drain()
 
     def update(self, now_ns: int, arm: ArmGuard) -> None:
         """Accept or reject the commands that arrived; `now_ns` (wall clock) says their age.

@@ -13,18 +13,21 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
 
 import zenoh
 
-from vla_zenoh.bus.buffers import CallbackRing
+from vla_zenoh.bus.buffers import CallbackRing, ReceivedSample
 from vla_zenoh.bus.clock import Tick
 from vla_zenoh.bus.metrics import RateMeter
 from vla_zenoh.bus.node import Node
-from vla_zenoh.codec.settings import MAX_SETTING_BYTES
+from vla_zenoh.bus.session import MAX_MESSAGE_BYTES
+from vla_zenoh.control.commander import LATE_NS
 from vla_zenoh.errors import NodeError
 from vla_zenoh.guard.arm_guard import max_braking_time_s
 from vla_zenoh.robots.arm import Arm
 from vla_zenoh.robots.driver import RobotDriver
+from vla_zenoh.runtime.estop_latch import EstopLatch
 from vla_zenoh.runtime.process import realtime_thread
 from vla_zenoh.sanitize import one_line
 from vla_zenoh.types import Event
@@ -39,16 +42,23 @@ REPLIES, REPLY_S = 20, 0.05
 """For so long another node of this name is looked for: after a router's restart it links again
 within 0.5 s."""
 WATCH_S = 0.05
+HEARD = 8
+"""Stops and resets buffered between two ticks."""
 
 
 class RobotNode:
     """A robot on the bus, with name and profile of its `driver`; the owner closes the `session`.
 
+    It hears an emergency stop itself, brakes without a command node, and stays stopped until a
+    reset. `latch` is the file that exists meanwhile, so that a restarted node is stopped as well.
+
     Raises:
         NodeError: a node of this name is alive already.
     """
 
-    def __init__(self, driver: RobotDriver, session: zenoh.Session) -> None:
+    def __init__(
+        self, driver: RobotDriver, session: zenoh.Session, *, latch: Path | None = None
+    ) -> None:
         self.driver = driver
         node = self.node = Node(driver.name, driver.profile, session)
         parts = driver.parts if driver.has_arm else {}
@@ -58,9 +68,14 @@ class RobotNode:
         for name, part in parts.items():
             if part is not driver:
                 part.attach(node, self.arms[name])
-        self._resets: CallbackRing | None = None
-        if driver.recovers:
-            self._resets = node.subscribe(node.keys.reset, CallbackRing(4, MAX_SETTING_BYTES))
+        keys = node.keys
+        self._stops = node.subscribe(keys.stop, CallbackRing(HEARD, MAX_MESSAGE_BYTES))
+        self._resets = node.subscribe(keys.reset, CallbackRing(HEARD, MAX_MESSAGE_BYTES))
+        self._stopped_at: ReceivedSample | None = None
+        self._latch = None if latch is None else EstopLatch(latch)
+        if self._latch is not None and self._latch.read() is not None:
+            for arm in self.arms.values():
+                arm.latch_stop()
         self._rate = RateMeter()
         self._realtime = False
         self._watched_s = 0.0
@@ -112,6 +127,10 @@ class RobotNode:
         except NodeError as error:  # an exception before this one matters more
             self.node.reject("robot_failed", str(error))
         finally:
+            if self._latch is not None:
+                if self._stops.drain():
+                    self._latch.set("emergency stop")
+                self._latch.close()
             self.node.publish_end()
             self.node.close()
 
@@ -139,8 +158,7 @@ class RobotNode:
         if tick.periods > 1:
             self.node.counters[f"{self.node.name}.missed_ticks"] += tick.periods - 1
         mono_ns = tick.nominal_ns
-        if self._resets is not None and self._resets.drain():
-            self.driver.recover()
+        self._hear_stop()
         self.driver.poll(mono_ns)
         now_ns = mono_ns if self.driver.lockstep else self.node.clock.wall_at(mono_ns)
         for arm in self.arms.values():
@@ -149,6 +167,34 @@ class RobotNode:
             arm.end_step(mono_ns)
         self._rate.tick()
         self._watch()
+
+    def _hear_stop(self) -> None:
+        stops, resets = self._stops.drain(), self._resets.drain()
+        for stop in stops:
+            self._stopped_at = stop
+        if stops:
+            for arm in self.arms.values():
+                arm.latch_stop()
+            if self._latch is not None:
+                self._latch.set("emergency stop")
+        valid = [reset for reset in resets if not self._overtaken(reset)]
+        if resets and (stops or not valid):  # within a tick their order is not known
+            why = "a reset was put before the last emergency stop, or with it; put it again"
+            self.node.reject("reset_refused", why)
+        elif valid:
+            for arm in self.arms.values():
+                arm.stop_latched = False
+            if self._latch is not None:
+                self._latch.set(None)
+            if self.driver.recovers:
+                self.driver.recover()
+
+    def _overtaken(self, reset: ReceivedSample) -> bool:
+        """Whether a reset was put before the last stop, which arrived first."""
+        stop = self._stopped_at
+        if stop is None or stop.put_ns is None or reset.put_ns is None:
+            return False
+        return reset.put_ns <= stop.put_ns and reset.mono_ns - stop.mono_ns < LATE_NS
 
     # -- the last brake -----------------------------------------------------------------------
     def _may_end(self, mono_ns: int) -> bool:
@@ -212,11 +258,15 @@ class RobotNode:
         node.adopt_system_time()
         if not (node.status_due(self.state) or now):
             return
+        why = None if self._latch is None else self._latch.failure()
+        if why is not None:
+            node.emit(Event("error", "fault", "latch", why))
         found = driver.status()
         detail = {**found.detail, "realtime": self._realtime}
         arms = self.arms.values()
         if arms:
             guards = [arm.guard for arm in arms]
+            detail["stop_latched"] = any(arm.stop_latched for arm in arms)
             detail["following"] = all(guard.following for guard in guards)
             node.counters[f"{node.name}.stream_silences"] = sum(one.silences for one in guards)
             if not driver.simulated:

@@ -36,7 +36,17 @@ OK, WARN, ERROR, STALE = range(4)
 INFO = 20
 """rcl_interfaces/Log.INFO."""
 BAD = frozenset(
-    {"fault", "stopped", "degraded", "braking", "waiting", "silent", "stalled", "unheeded"}
+    {
+        "fault",
+        "stopped",
+        "degraded",
+        "braking",
+        "latched",
+        "waiting",
+        "silent",
+        "stalled",
+        "unheeded",
+    }
 )
 MAX_VALUE = 200
 PLAIN = (str, int, float, bool)

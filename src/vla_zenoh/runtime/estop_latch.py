@@ -60,6 +60,6 @@ class EstopLatch:
             except OSError as error:
                 done = "removed" if wanted is None else "written"
                 self._failures.put(
-                    f"{self._path} cannot be {done} ({error}): a restarted command node "
+                    f"{self._path} cannot be {done} ({error}): a restarted node "
                     "will not know whether it is stopped"
                 )

@@ -209,7 +209,7 @@ TABLE: Mapping[str, Allowed] = {
     # Every role that may stop the arm may slow it down.
     "slower": _stream({OPERATOR}, {COMMAND, OPERATOR, VIEWER}),
     "held": _stream({OPERATOR}, {COMMAND, OPERATOR, VIEWER}),
-    "stop": _stream({OPERATOR}, {COMMAND, OPERATOR, VIEWER}),
+    "stop": _stream({OPERATOR}, {COMMAND, ROBOT, OPERATOR, VIEWER}),
     "reset": _stream({OPERATOR}, {COMMAND, ROBOT, OPERATOR, VIEWER}),
     "save": _stream({OPERATOR}, {OPERATOR, VIEWER}),
     "task": {

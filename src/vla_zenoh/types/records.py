@@ -288,6 +288,7 @@ class InferenceDebug:
         keep(self, number, "inference_ms", minimum=0.0)
         keep(self, float32_table, "steps")
         keep(self, entries, "raw", of=details)
+        keep(self, boolean, "done")
 
 
 def plain_values(raw: Mapping[str, Any] | None) -> dict[str, Any]:

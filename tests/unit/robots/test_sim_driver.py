@@ -4,12 +4,25 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from camera_rig import routed_session
 from driver_report import Report
 
+from vla_zenoh.bus.clock import Tick
+from vla_zenoh.codec import records
+from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.profile import load_profile
+from vla_zenoh.robots.arm import Arm
+from vla_zenoh.robots.node import RobotNode
 from vla_zenoh.robots.sim_driver import SimDriver
 from vla_zenoh.simulation.world import STEP_NS
-from vla_zenoh.types import GripperCommand, JointReference, PoseReference
+from vla_zenoh.types import (
+    GripperCommand,
+    Header,
+    JointCommand,
+    JointReference,
+    PoseCommand,
+    PoseReference,
+)
 
 SETTLED_M, SETTLED_RAD, SHUT_M = 2e-3, 5e-3, 0.01
 STILL = np.zeros(6)
@@ -76,3 +89,60 @@ def test_a_reset_puts_the_arm_home_and_is_counted(driver: SimDriver) -> None:
     assert report.counters["sim.resets"] == before + 1
     assert driver.status_changed()
     assert not driver.status_changed()
+
+
+@pytest.mark.parametrize("name", ["panda_sim", "two_pandas_sim"])
+@pytest.mark.parametrize("mode", ["pose", "joint"])
+def test_every_arm_brakes_by_itself_when_a_stop_is_put(name: str, mode: str) -> None:
+    with routed_session() as session:
+        node = RobotNode(SimDriver(load_profile(name), lockstep=True), session)
+        writers = [StreamWriter(arm, mode) for arm in node.arms.values()]
+        fastest_rad_s = 0.0
+        for step in range(1, 1500):
+            if step % 4 == 0:
+                for writer in writers:
+                    session.put(*writer.command(step), attachment=writer.header(step))
+            if step == 500:
+                assert all(arm.guard.following for arm in node.arms.values())
+                session.put(node.node.keys.stop, "stop")
+            node.step(Tick(1, step * STEP_NS, 0.0, 0.0))
+            speeds = [
+                np.abs(arm.guard._measure().velocity_rad_s).max() for arm in node.arms.values()
+            ]
+            fastest_rad_s = max(fastest_rad_s, max(speeds))
+        assert fastest_rad_s > 0.05
+        for arm in node.arms.values():
+            assert arm.state == "latched"
+            assert not arm.guard.moving
+        assert max(speeds) < 0.02
+        node._close()
+
+
+class StreamWriter:
+    """A command node that does not hear the stop: it goes on to lead one joint, or the TCP down."""
+
+    def __init__(self, arm: Arm, mode: str) -> None:
+        self._arm, self._mode = arm, mode
+        self._keys = arm._driver.profile.keys
+        here = arm.guard._measure()
+        self._pose, self._position_rad = here.pose, here.position_rad
+
+    def header(self, step: int) -> bytes:
+        return records.encode_header(Header(step * STEP_NS, step, "command#1"))
+
+    def command(self, step: int) -> tuple[str, bytes]:
+        time_s, ramp_s = step * STEP_NS / 1e9, 0.3
+        speeding_s = min(time_s, ramp_s)
+        way = 0.1 * (speeding_s**2 / (2 * ramp_s) + time_s - speeding_s)
+        rate, change = 0.1 * speeding_s / ramp_s, 0.1 / ramp_s * (time_s < ramp_s)
+        if self._mode == "joint":
+            names = self._arm._driver.profile.robot.arm_joints
+            first = np.eye(len(names))[3]
+            record = JointCommand(
+                names, self._position_rad + way * first, rate * first, change * first, "active"
+            )
+            return self._keys.command_joint, records.encode(record)
+        down, quat_xyzw = -np.eye(6)[2], quat_from_rotation(self._pose.rotation)
+        at_m = self._pose.position_m + way * down[:3]
+        record = PoseCommand(at_m, quat_xyzw, rate * down, change * down, at_m, quat_xyzw, "active")
+        return self._keys.command_pose, records.encode(record)

@@ -36,7 +36,8 @@ MAX_LABEL = 64
 PREFIX = "vla_zenoh"
 STATES = (
     "active", "braking", "crashed", "dead", "degraded", "ended", "fault", "holding", "inactive",
-    "inferring", "missing", "ok", "recording", "routing", "running", "silent", "stalled",
+    "inferring", "latched", "missing", "ok", "recording", "routing", "running", "silent",
+    "stalled",
     "starting", "stopped", "unheeded", "waiting",
 )  # fmt: skip
 OTHER = "other"

@@ -119,12 +119,12 @@ class CommandInputs:
         Without timestamps only the order on each key is kept.
         """
         arrivals = [
-            (_put_ns(arrival), name, "", decode, arrival)
+            (arrival.put_ns, name, "", decode, arrival)
             for name, buffer, decode in self._settings
             for arrival in buffer.drain()
         ]
         arrivals += [
-            (_put_ns(arrival), "held", name, settings.decode_held, arrival)
+            (arrival.put_ns, "held", name, settings.decode_held, arrival)
             for name, part in self._parts.items()
             for arrival in part.held.drain()
         ]
@@ -206,12 +206,6 @@ class _PartInputs:
             if found is not None:
                 return found
         return None
-
-
-def _put_ns(arrival: ReceivedSample) -> int | None:
-    """When the router first saw a sample, on its clock."""
-    stamp = arrival.sample.timestamp
-    return None if stamp is None else round(stamp.get_time().timestamp() * 1e9)
 
 
 class PeerMonitor:
