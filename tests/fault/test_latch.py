@@ -55,3 +55,50 @@ def test_the_folder_of_a_lab_is_locked_against_whoever_tidies_up(chain: Chain) -
             fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
     finally:
         os.close(folder)
+
+
+def test_a_stop_in_motion_is_heard_by_the_robot_node_alone(chain: Chain) -> None:
+    chain.activate_when_ready()
+    pid = chain.pid("command")
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        chain.client.publish(chain.client.keys.stop, "stop")
+        chain.until("the robot node is latched", lambda: robot_state(chain) == "latched")
+    finally:
+        os.kill(pid, signal.SIGCONT)
+    chain.until("the command node is stopped", lambda: chain.state() == "stopped")
+    clear(chain)
+
+
+@pytest.mark.parametrize("killed", [("sim",), ("command",), ("sim", "command")])
+def test_a_stop_in_motion_outlives_whatever_is_killed(
+    chain: Chain, killed: tuple[str, ...]
+) -> None:
+    chain.activate_when_ready()
+    chain.client.publish(chain.client.keys.stop, "stop")
+    chain.until("the robot node is latched", lambda: robot_state(chain) == "latched")
+    chain.until("the command node is stopped", lambda: chain.state() == "stopped")
+    before = {name: chain.pid(name) for name in killed}
+    for pid in before.values():
+        os.kill(pid, signal.SIGKILL)
+    for name, pid in before.items():
+        chain.until(
+            f"{name} says something again",
+            lambda name=name, pid=pid: (
+                (status := chain.client.status(name)) is not None and status.pid != pid
+            ),
+            READY_PATIENCE_S,
+        )
+    chain.until("the robot is latched", lambda: robot_state(chain) == "latched", READY_PATIENCE_S)
+    chain.until("it is stopped", lambda: chain.state() == "stopped", READY_PATIENCE_S)
+    clear(chain)
+
+
+def robot_state(chain: Chain) -> str:
+    return chain.state("sim") if "sim" in chain.client.alive else ""
+
+
+def clear(chain: Chain) -> None:
+    chain.client.publish(chain.client.keys.reset, "reset")
+    chain.until("it is reset", lambda: chain.state() == "inactive")
+    chain.until("the robot runs", lambda: robot_state(chain) == "running")

@@ -200,7 +200,7 @@ def turns(
         for module in (slots, python_driver):
             monkeypatch.setattr(module, "time", clock)
         yield turns
-        node._close()
+        turns.node._close()
 
 
 def braked(turns: Turns) -> None:

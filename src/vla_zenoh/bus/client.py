@@ -264,6 +264,14 @@ class Client(NodeRegistry):
         status = self.status_since("command", self._stop_s)
         return status is not None and status.state == "stopped"
 
+    def stop_latched(self) -> list[str]:
+        """Live robot nodes that hold a stop."""
+        return [
+            name
+            for name, (status, _, alive) in self.snapshot().items()
+            if alive and status.detail.get("stop_latched")
+        ]
+
     def reset(self) -> None:
         """Clear a latched emergency stop or fault; the arm stays inactive."""
         self._reset_s = time.monotonic()
@@ -277,7 +285,7 @@ class Client(NodeRegistry):
         """
         status = self.status_since("command", self._reset_s)
         if status is None or status.state in ("inactive", "active", "holding"):
-            return status is not None
+            return status is not None and not self.stop_latched()
         if status.state == "fault" and time.monotonic() - self._reset_s > RESET_AGAIN_S:
             faults = {
                 name for name, (node, _, _) in self.snapshot().items() if node.state == "fault"
