@@ -338,6 +338,8 @@ def _ros2(profile: Profile) -> Iterator[Fault]:
         if gripper.grasp and gripper.type != "franka_msgs/action/Move":
             yield ("ros2", "gripper", "grasp"), "goes with type franka_msgs/action/Move only"
         yield from _gripper_position(gripper, robot.gripper.joint_ends is not None)
+        if gripper.type == JOINT_COMMANDS[0] and not robot.finger_joints:
+            yield ("ros2", "gripper", "type"), "is a trajectory, which needs robot.finger_joints"
 
 
 def _gripper_position(gripper: Ros2Gripper, has_ends: bool) -> Iterator[Fault]:

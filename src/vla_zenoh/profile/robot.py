@@ -319,6 +319,12 @@ GripperAction = Literal[
     "control_msgs/action/GripperCommand",
     "control_msgs/action/ParallelGripperCommand",
 ]
+GripperTopic = Literal[
+    "std_msgs/msg/Float64",
+    "std_msgs/msg/Float64MultiArray",
+    "control_msgs/msg/GripperCommand",
+    "trajectory_msgs/msg/JointTrajectory",
+]
 GRIPPER_ACTIONS: tuple[GripperAction, ...] = get_args(GripperAction)
 
 
@@ -386,7 +392,8 @@ class Ros2Gripper(Section):
 
     Args:
         topic: name of the action or topic.
-        type: one of `GRIPPER_ACTIONS`, or a topic of plain numbers.
+        type: one of `GRIPPER_ACTIONS`, which reach no gripper whose node uses Fast DDS; or of a
+            topic: a plain number, a GripperCommand, or a trajectory of robot.finger_joints.
         grasp: action of franka_msgs/action/Grasp that closes, if ``topic`` only moves.
         position: meaning of the number that is sent, if the type leaves it open: ``width``, m
             between the fingers; ``finger``, m of one finger, half of that; ``joint``, m or rad of
@@ -395,7 +402,7 @@ class Ros2Gripper(Section):
     """
 
     topic: Topic
-    type: Literal[GripperAction, "std_msgs/msg/Float64", "std_msgs/msg/Float64MultiArray"]
+    type: Literal[GripperAction, GripperTopic]
     grasp: Topic | None = None
     position: Literal["width", "finger", "joint"] | None = None
 

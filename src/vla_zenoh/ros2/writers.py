@@ -28,6 +28,7 @@ NUMBER, NUMBERS = "std_msgs/msg/Float64", "std_msgs/msg/Float64MultiArray"
 _HEADER, _TWIST = "std_msgs/msg/Header", "geometry_msgs/msg/Twist"
 MOVE, GRASP = "franka_msgs/action/Move", "franka_msgs/action/Grasp"
 GRIPPER_COMMAND = "control_msgs/action/GripperCommand"
+GRIPPER_MESSAGE = "control_msgs/msg/GripperCommand"
 PARALLEL_COMMAND = "control_msgs/action/ParallelGripperCommand"
 NOW_NS = 0
 """A trajectory's stamp of zero means: from now on, whatever the robot's clock says."""
@@ -213,9 +214,7 @@ def send_goal(
         )
         goal = {"command": order}
     elif action == GRIPPER_COMMAND:
-        order = messages.new(
-            "control_msgs/msg/GripperCommand", position=position, max_effort=command.force_n
-        )
+        order = messages.new(GRIPPER_MESSAGE, position=position, max_effort=command.force_n)
         goal = {"command": order}
     return messages.new(
         f"{action}_SendGoal_Request",
@@ -237,8 +236,30 @@ def cancel(messages: Messages, goal_id: bytes) -> Any:
     return messages.new("action_msgs/srv/CancelGoal_Request", goal_info=info)
 
 
-def position_message(messages: Messages, kind: str, position: float) -> Any:
-    """The opening of a gripper as its driver takes it, as `NUMBER` or `NUMBERS`."""
+def position_message(
+    messages: Messages,
+    kind: str,
+    command: GripperCommand,
+    joints: Mapping[str, float],
+    position: float,
+    travel_s: float,
+) -> Any:
+    """The opening of a gripper as its driver takes it: a `position`, in the type of a topic.
+
+    A trajectory brings each of the finger `joints` to its own position, after `travel_s`.
+    """
+    if kind == GRIPPER_MESSAGE:
+        return messages.new(kind, position=position, max_effort=command.force_n)
+    if kind == TRAJECTORY:
+        lead = messages.new(
+            "builtin_interfaces/msg/Duration", **_time_fields(round(travel_s * SECOND_NS))
+        )
+        point = messages.new(
+            "trajectory_msgs/msg/JointTrajectoryPoint",
+            positions=np.array(list(joints.values())),
+            time_from_start=lead,
+        )
+        return messages.new(kind, joint_names=list(joints), points=[point])
     return messages.new(kind, data=np.array([position]) if kind == NUMBERS else position)
 
 

@@ -264,8 +264,20 @@ def test_joints_are_written_as_plain_numbers() -> None:
 
 
 def test_openings_are_written_as_plain_numbers() -> None:
-    assert position_message(M, "std_msgs/msg/Float64", 0.04).data == 0.04
-    array = position_message(M, "std_msgs/msg/Float64MultiArray", 0.04)
+    command = GripperCommand(0.08, 0.1, 20.0)
+
+    def sent(kind: str) -> Any:
+        return position_message(M, kind, command, {"left": 0.04, "right": -0.04}, 0.04, 0.5)
+
+    assert sent("std_msgs/msg/Float64").data == 0.04
+    by_force = sent("control_msgs/msg/GripperCommand")
+    assert (by_force.position, by_force.max_effort) == (0.04, 20.0)
+    trajectory = sent("trajectory_msgs/msg/JointTrajectory")
+    assert trajectory.joint_names == ["left", "right"]
+    assert trajectory.points[0].positions.tolist() == [0.04, -0.04]
+    assert trajectory.points[0].time_from_start.nanosec == 500_000_000
+    assert trajectory.header.stamp.sec == 0, "from now on"
+    array = sent("std_msgs/msg/Float64MultiArray")
     assert array.data.tolist() == [0.04]
 
 

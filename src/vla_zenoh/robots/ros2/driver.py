@@ -128,6 +128,7 @@ class Ros2Driver(RobotDriver):
                 ros2.gripper,
                 self._width_m,
                 lambda: watch.faults.get(GRIPPER, ""),
+                dict(zip(profile.robot.finger_joints, self.kinematics.finger_signs, strict=True)),
             )
             self.states = StateSubscriber(
                 node, graph, self._messages, ros2, self.kinematics, simulated

@@ -10,7 +10,7 @@ from __future__ import annotations
 import secrets
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -96,7 +96,8 @@ class Gripper:
     """Sends accepted gripper commands to the robot; without a `profile` it has no gripper.
 
     `width` measures the opening between the fingers (m), None while unknown; `wanted_m` is that of
-    the newest command, None before the first. `blocked` says why goals do not reach the action.
+    the newest command, None before the first. `blocked` says why goals do not reach the action;
+    `fingers` has the sign of each finger joint.
     """
 
     def __init__(
@@ -107,10 +108,11 @@ class Gripper:
         profile: Ros2Gripper | None,
         width: Callable[[], float | None],
         blocked: Callable[[], str] = str,
+        fingers: Mapping[str, float] | None = None,
     ) -> None:
         self._node, self._messages, self._profile = node, messages, profile
         self._limits = node.profile.robot.gripper
-        self._blocked = blocked
+        self._blocked, self._fingers = blocked, fingers or {}
         self._measured_m, self._sent_m = width, self._limits.max_width_m
         self._goals = GoalSequencer(GOAL_TIMEOUT_S, self._limits.max_width_m)
         self._answers: deque[Callable[[], None]] = deque()
@@ -187,8 +189,22 @@ class Gripper:
             self._advance()
             return
         position = writers.position(self._profile, self._limits, command.width_m)
-        message = writers.position_message(self._messages, self._profile.type, position)
+        message = writers.position_message(
+            self._messages,
+            self._profile.type,
+            command,
+            {name: sign * position for name, sign in self._fingers.items()},
+            position,
+            self._travel_s(command),
+        )
         self._topic.publish(self._messages.encode(message))
+
+    def _travel_s(self, command: GripperCommand) -> float:
+        """How long the fingers take at the commanded speed."""
+        measured_m = self._measured_m()
+        at_m = self._sent_m if measured_m is None else measured_m
+        self._sent_m = command.width_m
+        return abs(command.width_m - at_m) / command.speed_m_s
 
     # -- the action ---------------------------------------------------------------------------
     def _send(self, goal: ActionGoal) -> None:
