@@ -8,10 +8,16 @@ from typing import Any
 
 from vla_zenoh.errors import SpecError, WorkerError
 from vla_zenoh.lab.policy_servers.field_mapping import FieldSource, read_map, read_size
-from vla_zenoh.lab.policy_servers.model_options import one_of, read_json, whole_number
+from vla_zenoh.lab.policy_servers.model_options import (
+    one_of,
+    read_json,
+    whole_number,
+)
 from vla_zenoh.lab.policy_servers.state_vector import read_state
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
+ADAPTER = "adapter_config.json"
+PICKLES = frozenset({".bin", ".pt", ".pth", ".ckpt", ".pkl"})
 PIPELINES = ("policy_preprocessor.json", "policy_postprocessor.json")
 STATE, ACTION, PICTURE = "observation.state", "action", "observation.image"
 EMPTY = "observation.images.empty_camera_"
@@ -39,14 +45,39 @@ def read_config(folder: Path) -> dict[str, Any]:
     config = read_json(folder / CONFIG)
     if not isinstance(config.get("type"), str):
         raise WorkerError(f"{folder / 'config.json'} has no type; it is not a LeRobot policy")
-    if config.get("use_peft"):
-        raise WorkerError(f"{folder} is an adapter; merge it with what it adapts first")
+    if (folder / ADAPTER).is_file() and not (folder / WEIGHTS).is_file():
+        raise WorkerError(f"{folder} {_how_to_merge(folder)}")
     if config["type"] in REMOTE_CODE:
         raise WorkerError(
             f"{folder} is a {config['type']!r}, for which LeRobot runs code from a model hub; "
             "such policies are not loaded"
         )
     return config
+
+
+def _how_to_merge(folder: Path) -> str:
+    """What to do with an adapter (LoRA), which `use_peft` of a config alone is not: merged weights
+    keep it."""
+    base = read_json(folder / ADAPTER).get("base_model_name_or_path") or "BASE"
+    return (
+        f"has an adapter (LoRA), and not the weights of {base}, which it changes. Merge both with "
+        "peft: PeftModel.from_pretrained(POLICY, FOLDER).merge_and_unload().save_pretrained(MERGED)"
+        f", where POLICY is {base} loaded by LeRobot; copy the files of {PIPELINES[0]} and "
+        f"{PIPELINES[1]} to MERGED and give checkpoint=MERGED"
+    )
+
+
+def check_weights(folder: Path) -> None:
+    """Raise a `WorkerError` that says what to do where a folder has no weights to load."""
+    if (folder / WEIGHTS).is_file():
+        return
+    others = sorted(path.name for path in folder.glob("*") if path.suffix in PICKLES)
+    if others:
+        raise WorkerError(
+            f"{folder} has no {WEIGHTS}, but {', '.join(others[:3])}: pickles are not loaded, as "
+            "they can run any code; save the policy with LeRobot's save_pretrained"
+        )
+    raise WorkerError(f"{folder} has no {WEIGHTS}: it is incomplete; copy or download it again")
 
 
 def features(folder: Path, config: Mapping[str, Any], name: str) -> dict[str, tuple[int, ...]]:
@@ -238,8 +269,10 @@ def device_step(pipeline: Path) -> bool:
     """
     if not pipeline.is_file():
         raise WorkerError(
-            f"{pipeline.parent} holds no {pipeline.name}; a policy from before LeRobot 0.4 is "
-            "brought up to date by lerobot's own script migrate_policy_normalization.py"
+            f"{pipeline.parent} has no {pipeline.name}: a policy from before LeRobot 0.4. In "
+            "LeRobot's environment: python -m lerobot.processor.migrate_policy_normalization "
+            f"--pretrained-path {pipeline.parent}; give what it writes, "
+            f"checkpoint={pipeline.parent}_migrated"
         )
     steps = read_json(pipeline).get("steps")
     if not isinstance(steps, list) or not all(isinstance(step, dict) for step in steps):

@@ -2,7 +2,7 @@
 # requires-python = ">=3.12,<3.14"
 # dependencies = [
 #     "example-robot-data>=6",
-#     "lerobot[pi,smolvla]==0.6.1",
+#     "lerobot==0.6.1",
 #     "numpy>=1.26",
 #     "pin>=4",
 #     "safetensors==0.8.0",
@@ -26,13 +26,14 @@ from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+from vla_zenoh_model_lerobot.environment import EXTRAS, policy_folder, requirement
 from vla_zenoh_model_lerobot.mapping import (
     ACTION,
     PIPELINES,
     STATE,
-    WEIGHTS,
     WITHOUT_WORDS,
     arm_names,
+    check_weights,
     device_step,
     features,
     horizon,
@@ -96,9 +97,9 @@ class LeRobot:
         rtc: str = "off",
         **meaning: str,
     ) -> None:
-        self._folder = checkpoint_folder(checkpoint)
+        self._folder = policy_folder(checkpoint_folder(checkpoint))
         config = read_config(self._folder)
-        kind = config["type"]
+        kind = self._kind = config["type"]
         self._one_by_one = one_by_one(config)
         self.takes_committed = takes_prefix(config, rtc)
         steps = 1 if self._one_by_one else horizon(config, meaning.get("horizon", ""))
@@ -129,6 +130,7 @@ class LeRobot:
             cameras.append(CameraSpec(camera=camera, width=wide, height=high, resize=how))
         self.spec = ModelSpec(
             name="lerobot",
+            every_step=self._one_by_one,
             observation=ObservationSpec(
                 cameras=tuple(cameras),
                 state=parts_of(names),
@@ -166,6 +168,7 @@ class LeRobot:
         import torch
         from lerobot.configs import PreTrainedConfig
         from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+        from lerobot.utils.import_utils import register_third_party_plugins
 
         device = self._device
         if device == "auto":
@@ -174,10 +177,10 @@ class LeRobot:
             name: {"device_processor": {"device": device}} if has_device else {}
             for name, has_device in ((file, device_step(self._folder / file)) for file in PIPELINES)
         }
-        if not (self._folder / WEIGHTS).is_file():
-            raise WorkerError(f"{self._folder} holds no {WEIGHTS}; other formats are pickles")
+        check_weights(self._folder)
         try:
             torch.zeros(1, device=device)
+            register_third_party_plugins()
             config = PreTrainedConfig.from_pretrained(self._folder, local_files_only=True)
             config.device = device
             # All weights are in the directory: none are fetched to be overwritten.
@@ -195,11 +198,26 @@ class LeRobot:
                 postprocessor_overrides=overrides[PIPELINES[1]],
             )
         except Exception as error:  # LeRobot raises whatever its libraries do
-            raise WorkerError(f"LeRobot cannot load {self._folder}: {in_words(error)}") from error
+            hint = self._what_to_install(error)
+            raise WorkerError(
+                f"LeRobot cannot load {self._folder}: {in_words(error)}{hint}"
+            ) from error
         bad = [n for n, w in self.policy.named_parameters() if not torch.isfinite(w).all()]
         if bad:
             raise WorkerError(f"weight {bad[0]} in {self._folder} holds NaN or infinity")
         self.reset()
+
+    def _what_to_install(self, error: Exception) -> str:
+        """What brings a missing library, or the type of a plug-in; else empty."""
+        if self._kind not in EXTRAS:
+            return (
+                f"; {self._kind!r} is no policy of LeRobot's own: install its plug-in "
+                f"(lerobot_policy_{self._kind} or alike) beside LeRobot and vla-zenoh, and name "
+                "that environment with --python"
+            )
+        if isinstance(error, ImportError):
+            return f"; a policy {self._kind!r} needs: pip install '{requirement(self._kind)}'"
+        return ""
 
     def reset(self) -> None:
         """Forget what was seen and planned in the last episode."""

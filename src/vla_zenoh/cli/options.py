@@ -221,7 +221,7 @@ class ModelOptions:
         # Before an environment is made for the model, which may take minutes and gigabytes.
         if model.missing():
             model.check_options(chosen)
-        return WorkerChoice(called, model, chosen)
+        return WorkerChoice(called, model.for_options(chosen), chosen)
 
 
 def model_options(given: list[str]) -> dict[str, str]:

@@ -54,6 +54,22 @@ def error(name: str, why: str) -> Finding:
 
 
 # -- the spec -------------------------------------------------------------------------------------
+RATE_TOLERANCE = 0.1
+"""Share by which chunks per second may differ from the steps that a model counts."""
+
+
+def pace(spec: ModelSpec, rate_hz: float) -> str:
+    """Why a model that counts inferences as steps cannot be asked at `rate_hz`; empty: it can."""
+    step_hz = 1.0 / spec.action.dt_s
+    if not spec.every_step or abs(rate_hz - step_hz) <= RATE_TOLERANCE * step_hz:
+        return ""
+    return (
+        f"it counts each inference as a step of {spec.action.dt_s:.4g} s (dt_s), as it was trained,"
+        f" and is asked every {1.0 / rate_hz:.4g} s: set {step_hz:.4g} chunks per second "
+        f"(`vla-zenoh rate {step_hz:.4g}`, task.rate_hz)"
+    )
+
+
 def spec_errors(profile: Profile, spec: ModelSpec) -> Iterator[Finding]:
     """Requirements of a spec that the profile does not meet."""
     seen = spec.observation

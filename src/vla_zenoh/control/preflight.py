@@ -134,6 +134,8 @@ def reasons_of_worker(
             f"worker {worker!r} {why}" if name == "camera" else f"worker {worker!r}: {name}: {why}"
             for _, name, why in policy_check.spec_errors(profile, spec)
         ]
+        if why := policy_check.pace(spec, rate_hz):
+            reasons.append(f"worker {worker!r}: {why}")
         reasons += _chunk(profile, worker, spec, peers, chunk, now_ns, rate_hz)
         reasons += _cameras(profile, spec, peers)
     return [*reasons, *_clocks(profile, worker, spec, peers)]

@@ -11,7 +11,7 @@ import re
 import sys
 import tomllib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -34,6 +34,7 @@ _COMPARE: Mapping[str, Callable[[Any, Any], bool]] = {
     "~=": lambda here, version: here >= version and here[:-1] == version[:-1],
 }
 ENTRY_FILE = "model.py"
+ENVIRONMENT_FILE = "environment.py"
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +65,25 @@ class ModelFile:
             except importlib.metadata.PackageNotFoundError:
                 absent.append(requirement)
         return absent
+
+    def for_options(self, options: Mapping[str, str]) -> ModelFile:
+        """With the packages that a file ``environment.py`` beside its ``model.py`` adds.
+
+        Its function ``dependencies(options)`` returns requirements; it runs before the environment
+        of the model is made, so it needs nothing but this package.
+
+        Raises:
+            WorkerError: the file cannot be imported, or fails.
+        """
+        beside = self.path.with_name(ENVIRONMENT_FILE)
+        if self.path.name != ENTRY_FILE or not beside.is_file():
+            return self
+        module = import_model(ModelFile(f"{self.name}_environment", beside))
+        try:
+            more = tuple(module.dependencies(dict(options)))
+        except Exception as error:
+            raise WorkerError(f"{beside}: dependencies failed: {in_words(error)}") from error
+        return replace(self, dependencies=(*self.dependencies, *more))
 
     def check_options(self, given: Mapping[str, str]) -> None:
         """Compare options with those of its class as far as the file shows them, not running it.

@@ -429,11 +429,19 @@ ActionSpec.model_rebuild()
 
 
 class ModelSpec(_Spec):
-    """Everything a command node must know about a model before it executes its chunks."""
+    """Everything a command node must know about a model before it executes its chunks.
+
+    Args:
+        every_step: the model counts inferences as steps of ``action.dt_s``: it keeps earlier
+            observations itself, or averages its chunks. It is asked ``1 / dt_s`` times a second.
+    """
+
+    LATER = ("every_step",)
 
     name: Text
     observation: ObservationSpec = ObservationSpec()
     action: ActionSpec
+    every_step: bool = False
 
     @property
     def parts(self) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from dataclasses import fields
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -67,15 +68,19 @@ class LeRobotArm:
         """Connect to the motors, or raise a `NodeError`; they go limp for a moment."""
         settings, lerobot = self._settings, import_module("lerobot.robots")
         folder = Path(settings.calibration_dir).expanduser() if settings.calibration_dir else None
+        given = {
+            "port": settings.port,
+            "id": settings.id,
+            "calibration_dir": folder,
+            "use_degrees": settings.units == "degrees",
+            "disable_torque_on_disconnect": settings.limp_at_end,
+        }
         try:
+            # Packages lerobot_robot_*, and lerobot_camera_* that they may use.
+            import_module("lerobot.utils.import_utils").register_third_party_plugins()
             kind = lerobot.RobotConfig.get_choice_class(settings.robot)
-            config = kind(
-                port=settings.port,
-                id=settings.id,
-                calibration_dir=folder,
-                use_degrees=settings.units == "degrees",
-                disable_torque_on_disconnect=settings.limp_at_end,
-            )
+            known = {field.name for field in fields(kind)}  # a plug-in's robot may have no port
+            config = kind(**{name: value for name, value in given.items() if name in known})
             robot = self._robot = lerobot.make_robot_from_config(config)
         except Exception as error:
             raise NodeError(f"LeRobot's {settings.robot}: {in_words(error)}") from error

@@ -198,7 +198,7 @@ def test_a_file_that_was_cut_off_is_an_error(folder: Path) -> None:
 
 def test_pickled_weights_are_not_read(folder: Path) -> None:
     (folder / "model.safetensors").rename(folder / "pytorch_model.bin")
-    with pytest.raises(WorkerError, match=r"holds no model.safetensors; other formats are pickles"):
+    with pytest.raises(WorkerError, match=r"has no model.safetensors, but .*pickles are not"):
         loaded(folder)
 
 
@@ -218,7 +218,7 @@ def test_a_pipeline_that_names_code_is_refused(folder: Path) -> None:
 
 def test_a_policy_without_pipelines_says_how_to_get_them(folder: Path) -> None:
     (folder / "policy_postprocessor.json").unlink()
-    with pytest.raises(WorkerError, match=r"holds no policy_postprocessor.json; .*migrate_policy"):
+    with pytest.raises(WorkerError, match=r"has no policy_postprocessor.json: .*migrate_policy"):
         loaded(folder)
 
 

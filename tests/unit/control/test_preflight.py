@@ -10,8 +10,11 @@ import numpy as np
 import pytest
 from command_rig import MS, START_NS, WORKER, Rig, model_spec
 
+from vla_zenoh.control.policy_check import pace
 from vla_zenoh.control.preflight import PeerSnapshot, reasons_of_part, reasons_of_worker
-from vla_zenoh.policy import CameraSpec
+from vla_zenoh.lab.check.fit import check_spec
+from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec
+from vla_zenoh.profile import load_profile
 from vla_zenoh.types import GripperState, Header, PoseState, Stamped
 
 
@@ -242,6 +245,41 @@ def test_a_slow_rate_gives_the_worker_more_time() -> None:
     ready.rate_hz = 0.05
     ready.now_ns += 20 * 10**9
     assert not any("no chunk" in reason for reason in ready.reasons())
+
+
+@pytest.mark.parametrize(
+    ("every_step", "dt_s", "rate_hz", "rejected"),
+    [
+        (True, 1 / 30, 5.0, True),
+        (True, 1 / 30, 30.0, False),
+        (True, 1 / 30, 29.0, False),
+        (True, 0.1, 30.0, True),
+        (False, 1 / 30, 5.0, False),
+    ],
+)
+def test_a_model_that_counts_its_inferences_is_asked_once_a_step(
+    every_step: bool, dt_s: float, rate_hz: float, rejected: bool
+) -> None:
+    """Else its history, or the mean of its chunks, has other times than in training."""
+    spec = ModelSpec(
+        name="act", action=ActionSpec(horizon=1, dt_s=dt_s, gripper="none"), every_step=every_step
+    )
+    profile, reason = load_profile("panda_sim"), pace(spec, rate_hz)
+    assert bool(reason) == rejected
+    found = check_spec(profile, spec, worker="scripted", rate_hz=rate_hz)
+    assert [each.why for each in found if each.name == "rate"] == ([reason] if rejected else [])
+    ready = Ready()
+    ready.rate_hz = rate_hz
+    ready.peers = replace(ready.peers, specs={WORKER: spec})
+    assert (f"worker {WORKER!r}: {reason}" in ready.reasons()) == rejected
+    if rejected:
+        assert f"asked every {1 / rate_hz:.4g} s: set {1 / dt_s:.4g} chunks per second" in reason
+
+
+def test_a_spec_without_such_a_count_has_the_form_of_before() -> None:
+    spec = ModelSpec(name="act", action=ActionSpec(horizon=1, dt_s=0.1, gripper="none"))
+    assert "every_step" not in spec.to_dict()
+    assert ModelSpec.from_dict({**spec.to_dict(), "every_step": True}).every_step
 
 
 def test_all_reasons_come_at_once() -> None:

@@ -13,9 +13,11 @@ from vla_zenoh.control.policy_check import (
     Steps,
     beyond_gripper,
     chunk_errors,
+    error,
     few_joints,
     largest_step,
     outside_workspace_m,
+    pace,
     spec_errors,
 )
 from vla_zenoh.kinematics.so3 import Pose, pose_distance
@@ -93,6 +95,8 @@ def _timing(profile: Profile, spec: ModelSpec, rate_hz: float) -> Iterator[Findi
             f"a chunk lasts {chunk_s:g} s and one is asked for every {1 / rate_hz:g} s: the arm "
             "waits in between",
         )
+    if why := pace(spec, rate_hz):
+        yield error("rate", why)
     oldest_s = profile.timing.max_observation_age_s
     if spec.observation.max_age_s > oldest_s:
         yield warning(

@@ -94,6 +94,7 @@ def checkpoint_folder(text: str) -> Path:
     if not text:
         raise WorkerError("it needs weights: --set checkpoint=DIRECTORY")
     folder = Path(text).expanduser()
+    refuse_dead_link(folder)
     if not folder.is_dir():
         what = "a file" if folder.exists() else "not there"
         raise WorkerError(
@@ -101,6 +102,16 @@ def checkpoint_folder(text: str) -> Path:
             "./PATH in a profile's options starts at the profile, with --set at this folder"
         )
     return folder
+
+
+def refuse_dead_link(path: Path) -> None:
+    """Raise a `WorkerError` if `path`, or a folder that it is in, is a link that leads nowhere."""
+    for each in (path, *path.parents):
+        if each.is_symlink() and not each.exists():
+            raise WorkerError(
+                f"{each} is a link to {each.readlink()}, which is not there: a copy of a training "
+                "needs what its links lead to; give the folder itself"
+            )
 
 
 def read_json(file: Path) -> dict[str, Any]:
