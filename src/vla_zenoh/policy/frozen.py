@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from vla_zenoh.policy.inference import Observation
 from vla_zenoh.types import FloatArray
-
-if TYPE_CHECKING:
-    from vla_zenoh.profile.schema import CameraProfile
 
 MOVED_M, MOVED_RAD = 0.02, 0.1
 """An arm that moved by less since an image appeared may look the same in it."""
@@ -43,8 +40,8 @@ class FrozenImages:
         self._shown: dict[tuple[str, str], _Shown] = {}
 
     @staticmethod
-    def of(cameras: Mapping[str, CameraProfile]) -> FrozenImages:
-        """For the cameras of a profile."""
+    def of(cameras: Mapping[str, Any]) -> FrozenImages:
+        """For the `CameraProfile` of each camera of a profile."""
         declared = [name for name, one in cameras.items() if one.check.same_s is not None]
         limits_s = {name: one.same_moving_s for name, one in cameras.items()}
         return FrozenImages(limits_s, frozenset(declared))
