@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from vla_zenoh_model_lerobot.environment import EXTRAS, policy_folder, requirement
 from vla_zenoh_model_lerobot.mapping import (
     ACTION,
+    CONFIG,
     PIPELINES,
     STATE,
     WITHOUT_WORDS,
@@ -44,6 +45,7 @@ from vla_zenoh_model_lerobot.mapping import (
     state_parts,
     takes_prefix,
 )
+from vla_zenoh_model_lerobot.normalisation import IDENTITY, Scaled, check_statistics
 
 from vla_zenoh.errors import SpecError, WorkerError, in_words
 from vla_zenoh.lab.policy_servers.action_semantics import ActionSemantics, read_action_semantics
@@ -102,6 +104,7 @@ class LeRobot:
         kind = self._kind = config["type"]
         self._one_by_one = one_by_one(config)
         self.takes_committed = takes_prefix(config, rtc)
+        self._modes: Any = config.get("normalization_mapping")
         steps = 1 if self._one_by_one else horizon(config, meaning.get("horizon", ""))
         one_of("resize", resize, get_args(Resize))
         robot = load_profile(profile)
@@ -178,6 +181,7 @@ class LeRobot:
             for name, has_device in ((file, device_step(self._folder / file)) for file in PIPELINES)
         }
         check_weights(self._folder)
+        self._check_statistics()
         try:
             torch.zeros(1, device=device)
             register_third_party_plugins()
@@ -218,6 +222,32 @@ class LeRobot:
         if isinstance(error, ImportError):
             return f"; a policy {self._kind!r} needs: pip install '{requirement(self._kind)}'"
         return ""
+
+    def _check_statistics(self) -> None:
+        """Reject pipelines that would pass on unscaled what the config says is scaled.
+
+        Raises:
+            WorkerError: names the feature, and what its statistics lack.
+        """
+        modes = self._modes
+        if not isinstance(modes, Mapping):
+            raise WorkerError(
+                f"{self._folder / CONFIG} has no normalization_mapping, which says how numbers are "
+                "scaled: save the policy again with LeRobot 0.4 or later"
+            )
+        columns = sum(sum(own.parts().values()) for own in self._meaning.values())
+        action = Scaled(ACTION, "ACTION", (columns,), modes.get("ACTION", IDENTITY))
+        state = sum(own.size for own in self._state.values())
+        before = [
+            Scaled(feature, "VISUAL", shape, modes.get("VISUAL", IDENTITY))
+            for feature, shape in self._pictures.values()
+        ]
+        if state:
+            before.append(Scaled(STATE, "STATE", (state,), modes.get("STATE", IDENTITY)))
+        if self.takes_committed:  # the steps in execution are scaled, too
+            before.append(action)
+        for file, wanted in zip(PIPELINES, (before, [action]), strict=True):
+            check_statistics(self._folder / file, wanted)
 
     def reset(self) -> None:
         """Forget what was seen and planned in the last episode."""

@@ -39,7 +39,7 @@ class Range:
     def shrink(self, numbers: ArrayLike) -> FloatArray:
         """(..., D) numbers in the units of the data to [-1, 1], cut off there."""
         given = np.asarray(numbers, dtype=np.float64)
-        span = np.where(self.high > self.low, self.high - self.low, 1.0)
+        span = np.where(self.mask, self.high - self.low, 1.0)
         return np.clip(np.where(self.mask, 2 * (given - self.low) / span - 1, given), -1.0, 1.0)
 
 
@@ -93,6 +93,12 @@ def read_range(
         )
     if (high < low).any():
         raise WorkerError(f"{name}: q99 is below q01")
+    still = np.flatnonzero((high == low) & mask.astype(bool))
+    if len(still):
+        raise WorkerError(
+            f"{name}: q01 and q99 of number {still[0]} are both {low[still[0]]:g}: it never changed in "
+            "the data, so it cannot be scaled. Set its mask to false, or give it a range"
+        )
     return Range(low, high, mask.astype(bool))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -219,6 +220,91 @@ def test_a_pipeline_that_names_code_is_refused(folder: Path) -> None:
 def test_a_policy_without_pipelines_says_how_to_get_them(folder: Path) -> None:
     (folder / "policy_postprocessor.json").unlink()
     with pytest.raises(WorkerError, match=r"has no policy_postprocessor.json: .*migrate_policy"):
+        loaded(folder)
+
+
+STATISTICS_FILES = {
+    "policy_preprocessor.json": ["observation.state", "observation.images.front"],
+    "policy_postprocessor.json": ["action"],
+}
+
+
+def change(folder: Path, pipeline: str, edit: Callable[[dict[str, Any]], None]) -> None:
+    """Edit the statistics that a pipeline of a directory scales with."""
+    steps = json.loads((folder / pipeline).read_text())["steps"]
+    (name,) = [step["state_file"] for step in steps if "state_file" in step]
+    content = load_file(folder / name)
+    edit(content)
+    save_file(content, folder / name)
+
+
+@pytest.mark.parametrize(
+    ("pipeline", "feature"), [(p, f) for p, features in STATISTICS_FILES.items() for f in features]
+)
+@pytest.mark.parametrize(
+    ("how", "why"),
+    [
+        ("missing", "there are no statistics of it; there are those of"),
+        ("prefix", r"there are those of: .*so101\.{}"),
+        ("no std", "std of it are missing; there are: .*mean"),
+        ("nan", "its mean holds NaN or infinity"),
+        ("zero", "std of its number 0 is 0: the number never changed"),
+        ("shape", "its std has the shape"),
+    ],
+)
+def test_a_policy_without_what_its_numbers_are_scaled_with_is_refused(
+    folder: Path, pipeline: str, feature: str, how: str, why: str
+) -> None:
+    """LeRobot itself passes such a feature on as it is (huggingface/lerobot#4415)."""
+
+    def edit(content: dict[str, Any]) -> None:
+        own = {key: content.pop(key) for key in [*content] if key.rpartition(".")[0] == feature}
+        mean, std = f"{feature}.mean", f"{feature}.std"
+        if how == "prefix":
+            own = {f"so101.{key}": value for key, value in own.items()}
+        elif how == "no std":
+            del own[std]
+        elif how == "nan":
+            own[mean].view(-1)[0] = float("nan")
+        elif how == "zero":
+            own[std].view(-1)[0] = 0.0
+        elif how == "shape":
+            own[std] = torch.ones(2)
+        if how != "missing":
+            content.update(own)
+
+    change(folder, pipeline, edit)
+    with pytest.raises(WorkerError, match=why.format(feature)) as refused:
+        loaded(folder)
+    assert feature in str(refused.value)
+    assert pipeline in str(refused.value)
+
+
+def test_a_policy_saved_without_statistics_is_refused(tmp_path: Path) -> None:
+    tiny_act.write(tmp_path / "act", statistics={})
+    with pytest.raises(WorkerError, match=r"images.front is scaled by MEAN_STD, and"):
+        loaded(tmp_path / "act")
+
+
+def test_a_pipeline_that_does_not_scale_is_refused(folder: Path) -> None:
+    file = folder / "policy_postprocessor.json"
+    content = json.loads(file.read_text())
+    content["steps"] = [s for s in content["steps"] if "normal" not in s["registry_name"]]
+    file.write_text(json.dumps(content))
+    with pytest.raises(WorkerError, match=r"no step that scales, .* action are scaled by MEAN_STD"):
+        loaded(folder)
+
+
+def test_a_pipeline_that_scales_otherwise_than_its_policy_was_trained_is_refused(
+    folder: Path,
+) -> None:
+    file = folder / "policy_postprocessor.json"
+    content = json.loads(file.read_text())
+    for step in content["steps"]:
+        if "normal" in step["registry_name"]:
+            step["config"]["norm_map"]["ACTION"] = "IDENTITY"
+    file.write_text(json.dumps(content))
+    with pytest.raises(WorkerError, match=r"ACTION is scaled by IDENTITY, .* config says MEAN_STD"):
         loaded(folder)
 
 

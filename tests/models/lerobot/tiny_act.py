@@ -35,6 +35,7 @@ def write(
     folder: Path,
     action: Mapping[str, torch.Tensor] = STATISTICS["action"],
     state: Mapping[str, torch.Tensor] = STATISTICS["observation.state"],
+    statistics: Mapping[str, Any] | None = None,
     **changes: Any,
 ) -> ACTPolicy:
     """Save a policy with its pipelines.
@@ -43,6 +44,7 @@ def write(
         folder: is made.
         action: statistics of its actions.
         state: statistics of the state.
+        statistics: all that are saved; None: those.
         changes: of its config.
     """
     torch.manual_seed(0)
@@ -70,10 +72,9 @@ def write(
         }
     )
     policy = ACTPolicy(config).eval()
-    before, after = make_pre_post_processors(
-        config,
-        dataset_stats={**STATISTICS, "action": dict(action), "observation.state": dict(state)},
-    )
+    own = {**STATISTICS, "action": dict(action), "observation.state": dict(state)}
+    saved = own if statistics is None else dict(statistics)
+    before, after = make_pre_post_processors(config, dataset_stats=saved)
     # As after a real training: the file names weights that would be fetched.
     config.pretrained_backbone_weights = "ResNet18_Weights.IMAGENET1K_V1"
     policy.save_pretrained(folder)
