@@ -96,8 +96,8 @@ def read_range(
     still = np.flatnonzero((high == low) & mask.astype(bool))
     if len(still):
         raise WorkerError(
-            f"{name}: q01 and q99 of number {still[0]} are both {low[still[0]]:g}: it never changed in "
-            "the data, so it cannot be scaled. Set its mask to false, or give it a range"
+            f"{name}: q01 and q99 of number {still[0]} are both {low[still[0]]:g}: it never "
+            "changed in the data, so it cannot be scaled. Set its mask to false, or give it a range"
         )
     return Range(low, high, mask.astype(bool))
 

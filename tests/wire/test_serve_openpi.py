@@ -236,6 +236,69 @@ def test_the_names_of_an_offer_can_be_those_of_liberos_clients() -> None:
     assert (seen.prompt, seen.task.active, seen.stamp_wall_ns) == ("go", True, 5)
 
 
+ASKED = {
+    "observation/front": np.full((48, 64, 3), 51, np.uint8),
+    "observation/pose": np.array([0.4, 0, 0.3, 1, 0, 0, 0]),
+    "observation/gripper": np.array([0.05]),
+    "prompt": "go",
+}
+
+
+@pytest.mark.parametrize(
+    "width", [0.05, np.float32(0.05), np.array(0.05), [0.05], np.array([0.05])]
+)
+def test_a_gripper_comes_with_or_without_a_shape(width: Any) -> None:
+    """As openpi's own DROID policies take it."""
+    seen = offer().observe({**ASKED, "observation/gripper": width}, 5)
+    assert seen.gripper.width_m == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int64, np.float32, np.float64])
+@pytest.mark.parametrize("first", [False, True])
+def test_an_image_comes_as_bytes_or_floats_and_with_its_channels_first_or_last(
+    dtype: Any, first: bool
+) -> None:
+    """As openpi's own policies take it (`_parse_image`)."""
+    image = ASKED["observation/front"].copy()
+    image[:, 32:, 1] = 255
+    given: Any = image.astype(dtype) if np.dtype(dtype).kind != "f" else (image / 255).astype(dtype)
+    given = np.moveaxis(given, -1, 0) if first else given
+    seen = offer().observe({**ASKED, "observation/front": given}, 5)
+    same = offer().observe({**ASKED, "observation/front": image}, 5)
+    off = seen.images["front"].astype(int) - same.images["front"]
+    assert np.abs(off).max() <= 1  # floats are cut off, as there
+
+
+@pytest.mark.parametrize(
+    ("image", "why"),
+    [
+        (np.full((48, 64, 3), -0.5), "numbers from -0.5 to -0.5; wanted 0 to 1"),
+        (np.full((48, 64, 3), 51.0), "wanted 0 to 1, as it holds floats"),
+        (np.full((48, 64, 3), np.nan), "wanted 0 to 1"),
+        (np.full((48, 64, 3), 300), "numbers from 300 to 300; wanted 0 to 255"),
+        (np.zeros((2, 48, 64, 3)), "is no image"),
+        (np.zeros((48, 64), np.uint8), "is no image"),
+        ("picture", "is no image"),
+    ],
+)
+def test_what_is_no_image_is_named(image: Any, why: str) -> None:
+    with pytest.raises(PeerError, match=f"observation/front .*{why}"):
+        offer().observe({**ASKED, "observation/front": image}, 5)
+
+
+def test_a_model_is_given_the_same_sign_whichever_a_client_sends() -> None:
+    robot = load_profile("panda_sim").robot
+    down = (1.0, 0.0, 0.0, 0.0)
+    served = make_served_policy(
+        model(), "", robot.arm_joints, robot.gripper.max_width_m, reference=down
+    )
+    for sign in (1.0, -1.0):
+        pose = np.array([0.4, 0, 0.3, sign, 0, 0, 1e-4])
+        seen = served.observe({**ASKED, "observation/pose": pose}, 5)
+        assert seen.pose is not None
+        assert seen.pose.quat_xyzw[0] == pytest.approx(1.0)
+
+
 @pytest.mark.parametrize(
     ("names", "why"),
     [

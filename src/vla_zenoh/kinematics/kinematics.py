@@ -213,7 +213,9 @@ def make_kinematics(profile: Profile) -> Kinematics:
     )
 
 
-def home_orientation(profile: Profile) -> tuple[float, float, float, float]:
+def home_orientation(
+    profile: Profile, kinematics: Kinematics | None = None
+) -> tuple[float, float, float, float]:
     """Orientation of the TCP at `robot.home_rad`, x, y, z, w, with a sign free of rounding.
 
     It is the default reference of the numbers that a rotation has (`vla_zenoh.policy.meaning`).
@@ -221,7 +223,7 @@ def home_orientation(profile: Profile) -> tuple[float, float, float, float]:
     Raises:
         ResourceError, ProfileError: as `make_kinematics`.
     """
-    arm, robot = make_kinematics(profile), profile.robot
+    arm, robot = kinematics or make_kinematics(profile), profile.robot
     home_rad = arm.ordered(robot.arm_joints, robot.home_rad)
     return reference(quat_from_rotation(arm.forward(home_rad).rotation))
 

@@ -14,8 +14,9 @@ import numpy as np
 
 from vla_zenoh.errors import CodecError, RecordError
 from vla_zenoh.kinematics.fingers import Fingers
-from vla_zenoh.kinematics.kinematics import Kinematics
+from vla_zenoh.kinematics.kinematics import Kinematics, home_orientation
 from vla_zenoh.kinematics.so3 import quat_from_rotation
+from vla_zenoh.policy.meaning import toward
 from vla_zenoh.profile import Profile
 from vla_zenoh.robots.driver import Measurement
 from vla_zenoh.types import FloatArray, GripperState, JointState, PoseState
@@ -156,6 +157,7 @@ class JointReading:
         self._finger_signs = dict(zip(robot.finger_joints, kinematics.finger_signs, strict=True))
         self._max_width_m = robot.gripper.max_width_m
         self._kinematics = kinematics
+        self._home_quat = home_orientation(profile, kinematics)
         at = [kinematics.arm_joints.index(name) for name in robot.arm_joints]
         lower_rad, upper_rad = kinematics.lower_rad[at], kinematics.upper_rad[at]
         self._middle_rad = (lower_rad + upper_rad) / 2
@@ -271,7 +273,7 @@ class JointReading:
         assert joints is not None
         tcp, jacobian = kinematics.pose_and_jacobian(kinematics.joints_of(joints))
         twist = jacobian @ kinematics.ordered(joints.names, joints.velocity_rad_s)
-        quat_xyzw = quat_from_rotation(tcp.rotation)
+        quat_xyzw = np.array(toward(quat_from_rotation(tcp.rotation), self._home_quat))
         pose = PoseState(tcp.position_m, quat_xyzw, twist, wrench, None, None)
         return Measurement(self.stamp_ns, joints, tcp, pose, gripper)
 

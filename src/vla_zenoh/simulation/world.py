@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import cached_property
 
 import mujoco
 import numpy as np
@@ -11,6 +12,8 @@ from numpy.typing import ArrayLike
 
 from vla_zenoh.errors import NodeError, RecordError, ResourceError
 from vla_zenoh.kinematics.so3 import quat_from_rotation, rotation_from_rpy
+from vla_zenoh.policy.meaning import reference as as_reference
+from vla_zenoh.policy.meaning import toward
 from vla_zenoh.profile import Profile
 from vla_zenoh.simulation.impedance import (
     ArmDynamics,
@@ -405,6 +408,18 @@ class SimulatedPart:
         position_m, rotation = self._in_base(self._world_m, self._world_rotation)
         return position_m.copy(), rotation.copy()
 
+    def _tcp_at(self, joints_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The TCP with the joints elsewhere."""
+        data, tcp = self._scratch, self._tcp
+        data.qpos[self._qpos] = joints_rad
+        mujoco.mj_kinematics(self._model, data)
+        return self._in_base(data.site_xpos[tcp], data.site_xmat[tcp].reshape(3, 3))
+
+    @cached_property
+    def _home_quat(self) -> tuple[float, ...]:
+        """Its sign is that of every orientation near it."""
+        return as_reference(quat_from_rotation(self._tcp_at(self._home_rad)[1]))
+
     def pose_state(self, reference: PoseReference | JointReference) -> PoseState:
         """Measured TCP pose, twist and wrench, with `reference`.
 
@@ -412,15 +427,12 @@ class SimulatedPart:
         """
         position, rotation = self.tcp()
         if isinstance(reference, JointReference):
-            data, tcp = self._scratch, self._tcp
-            data.qpos[self._qpos] = reference.position_rad
-            mujoco.mj_kinematics(self._model, data)
-            held = self._in_base(data.site_xpos[tcp], data.site_xmat[tcp].reshape(3, 3))
+            held = self._tcp_at(reference.position_rad)
         else:
             held = reference.position_m, reference.rotation
         return PoseState(
             position_m=position,
-            quat_xyzw=quat_from_rotation(rotation),
+            quat_xyzw=np.array(toward(quat_from_rotation(rotation), self._home_quat)),
             twist=self._tcp_jacobian() @ self._velocity_rad_s,
             wrench=self._filtered_wrench.copy(),
             reference_position_m=held[0],

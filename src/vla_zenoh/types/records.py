@@ -79,7 +79,7 @@ class PoseState:
 
     Args:
         position_m: (3,).
-        quat_xyzw: (4,) unit.
+        quat_xyzw: (4,) unit; of its two signs that nearer to the home orientation.
         twist: (6,) m/s and rad/s, base axes.
         wrench: (6,) N and Nm that the surroundings exert on the arm, as if they did at the TCP,
             base axes; without the weight of arm and tool. None where the robot does not know it.

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from vla_zenoh.control.actions import step_pose, step_width
+from vla_zenoh.control.plan_timeline import Goal
+from vla_zenoh.control.policy_check import chunk_errors, validate_steps
 from vla_zenoh.errors import RecordError
 from vla_zenoh.kinematics.so3 import Pose, angle_between, exp3, log3, quat_from_rotation
 from vla_zenoh.policy import ActionSpec
+from vla_zenoh.profile import Limits
 
 ATOL = 1e-9
 MAX_WIDTH_M = 0.08
@@ -135,3 +140,47 @@ def test_a_gripper_number_that_its_meaning_cannot_have_is_refused_by_name(
 ) -> None:
     with pytest.raises(RecordError, match=f"gripper {gripper}"):
         step_width(spec(gripper=gripper), np.array([0, 0, 0, 0, 0, 0, value]), 0.04, MAX_WIDTH_M)
+
+
+# -- 6D rotations ---------------------------------------------------------------------------------
+@pytest.mark.parametrize("kind", ["delta", "absolute"])
+def test_a_6d_rotation_is_the_same_step_as_a_quaternion(kind: Any) -> None:
+    turn = exp3(np.array([0.3, -0.2, 0.1]))
+    columns = [*turn.T[0], *turn.T[1]]
+    poses = [
+        step_pose(spec(kind=kind, rotation=rotation), np.array([0.4, 0, 0.3, *numbers]), BEFORE)
+        for rotation, numbers in (
+            ("quaternion", quat_from_rotation(turn)),
+            ("rotation_6d", columns),
+            ("rotation_6d", [2.0 * value for value in columns]),
+        )
+    ]
+    for pose in poses[1:]:
+        np.testing.assert_allclose(pose.position_m, poses[0].position_m, atol=1e-12)
+        np.testing.assert_allclose(pose.rotation, poses[0].rotation, atol=1e-9)
+
+
+def test_6d_rotations_are_checked_and_bounded_as_quaternions_are() -> None:
+    action = spec(rotation="rotation_6d", gripper="none")
+    limits = Limits()
+
+    def named(numbers: list[float]) -> list[str]:
+        steps = np.array([[0.0, 0, 0, *numbers]], np.float32)
+        return [found.name for found in chunk_errors(action, steps, limits, MAX_WIDTH_M)]
+
+    assert named([1, 0, 0, 0, 1, 0]) == []
+    assert named([0, 0, 0, 0, 0, 0]) == ["rotation_6d"]
+    assert named([1, 0, 0, 2, 0, 0]) == ["rotation_6d"]
+    assert named([1, 0, 0, 0, -1, 0]) == ["rotation_units"]
+    start = Goal(BEFORE, 0.04)
+    for numbers, reason in (([0.0] * 6, "meaning"), ([1, 0, 0, 0, -1, 0], "step_rad")):
+        steps = np.array([[0.0, 0, 0, *numbers]])
+        refused = validate_steps(action, steps, start, limits, MAX_WIDTH_M)
+        assert refused is not None
+        assert refused[0] == reason
+    assert (
+        validate_steps(
+            action, np.array([[0.0, 0, 0, 1, 0, 0, 0, 1, 0]]), start, limits, MAX_WIDTH_M
+        )
+        is None
+    )
