@@ -28,6 +28,7 @@ from vla_zenoh.lab.dataset.features import (
     action_names,
     joined,
     names_of_state,
+    numbers_of,
     of_numbers,
     states_of,
 )
@@ -303,6 +304,7 @@ class _Dataset:
         ours = {
             "spec": self._spec.to_dict(),
             "state": "+".join(self._parts),
+            "rotation_reference": self._references(),
             "episodes": [
                 {
                     "run": episode.run.path.name,
@@ -318,6 +320,12 @@ class _Dataset:
         }
         for path, content in ((INFO, info), (STATS, stats), (OURS, ours)):
             (self._root / path).write_text(json.dumps(content, indent=2) + "\n", "utf-8")
+
+    def _references(self) -> dict[str, list[float]]:
+        """Part of the robot -> x, y, z, w that signs and cuts of its rotations are nearest to."""
+        first = self._episodes[0]
+        each = {part: first.run.of_part(part) for part in first.spec.parts}
+        return {part: [*numbers_of(run, self._parts).reference] for part, run in each.items()}
 
     def _features(self, videos: dict[str, list[EpisodeVideo]]) -> dict[str, Any]:
         out: dict[str, Any] = {}
