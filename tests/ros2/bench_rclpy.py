@@ -127,15 +127,6 @@ def latency(lab: RosLab, seconds: float) -> None:
         subscriber.undeclare()
         lines = [line for line in lab.arm.told if "goal" in line and line["t"] > began_ns]
         hops = [(line["wall_ns"] - line["stamp_ns"]) / 1e6 for line in lines]
-        commands = {
-            tuple(command.position_m): header.stamp_wall_ns
-            for header, command in lab.chain.recorder.commands()
-        }
-        whole = [
-            (line["wall_ns"] - commands[tuple(line["goal"])]) / 1e6
-            for line in lines
-            if tuple(line["goal"]) in commands
-        ]
 
         def plain(topic: str) -> list[float]:
             out = []
@@ -146,7 +137,6 @@ def latency(lab: RosLab, seconds: float) -> None:
             return out
 
         say("\n| leg (ms) | p50 | p95 | n |\n|---|---|---|---|")
-        say(f"| pose: `command/pose` made → rclpy's callback | {p50_p95(whole)} |")
         say(f"| pose: sent by our node `ros2` → bridge → rclpy's callback | {p50_p95(hops)} |")
         say(f"| pose: rclpy → rclpy, beside it | {p50_p95(plain('/probe'))} |")
         say(f"| image {PICTURE}: rclpy → bridge → `camera/front/raw` | {p50_p95(images)} |")
