@@ -69,7 +69,9 @@ def test_a_session_from_prompt_to_reset(chain: Chain) -> None:
 
     named = f"robot panda (profile {chain.profile_file})"
     how = f"`vla-zenoh reset --profile {chain.profile_file}` clears it"
-    assert f"stopped: {named}; {how}" in ok(chain, "stop")
+    said = ok(chain, "stop")
+    assert f"CONFIRMED: {named} is stopped and stands, by " in said
+    assert how in said
     refused = run(chain, "activate")
     assert refused.returncode == REFUSED
     assert (

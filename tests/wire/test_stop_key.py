@@ -69,7 +69,7 @@ def test_leaving_by_a_signal_stops(chain: Chain, number: signal.Signals) -> None
         assert process.stdout is not None
         said = process.stdout.read()
         assert process.wait(END_S) == 130
-        assert said.startswith("stopped: robot panda")
+        assert "CONFIRMED: robot panda" in said
     os.close(write)
     chain.until("it is stopped", lambda: stopped(chain))
 

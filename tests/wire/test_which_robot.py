@@ -151,7 +151,8 @@ def test_a_stop_where_the_certificates_of_all_hosts_lie_stops_the_robot(lab: Lab
     assert done.exit_code == 0, done.stderr
     assert lab.stopped() == ["panda"]
     how = f"vla-zenoh reset --profile {lab.profile}"
-    assert f"stopped: robot panda (profile {lab.profile}); `{how}` clears it" in done.stdout
+    assert f"CONFIRMED: robot panda (profile {lab.profile}) is stopped" in done.stdout
+    assert f"`{how}` clears it" in done.stdout
     done = lab.type(*shlex.split(how)[1:])
     assert done.exit_code == 0, done.stderr
     assert "reset; inactive: robot panda" in done.stdout

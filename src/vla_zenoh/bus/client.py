@@ -9,11 +9,12 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from enum import StrEnum
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import zenoh
 
-from vla_zenoh.bus.buffers import SampleBuffer, bytes_of, header_of
+from vla_zenoh.bus.buffers import ReceivedSample, SampleBuffer, bytes_of, header_of
 from vla_zenoh.bus.reception import Reception
 from vla_zenoh.bus.session import put_text
 from vla_zenoh.codec import records, settings
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
 Value = TypeVar("Value")
 POLL_S, HOLD_PATIENCE_S = 0.02, 1.0
 RESET_AGAIN_S = 0.3
+STANDS_RAD_S, STANDS_S, STATE_AGE_S = 0.02, 0.1, 0.5
+"""An arm stands whose joints are slower than this for so long, by states that are not older."""
 MAX_EVENTS, MAX_REFUSALS = 4096, 256
 MAX_EVENT_BYTES = 64 * 1024
 MAX_WHAT, MAX_WHY = 128, 1000
@@ -135,6 +138,55 @@ class NodeRegistry:
         return True
 
 
+class StopOutcome(StrEnum):
+    """How far a stop is known to have come."""
+
+    CONFIRMED = "confirmed"  # heard, and the robot's own states show that it stands
+    HEARD = "heard"  # a node has latched it; the arm still moves, or no states come
+    NOT_CONFIRMED = "not_confirmed"  # no answer: it may have arrived all the same
+
+
+class StopProgress(NamedTuple):
+    """What is known of a stop: nodes that latched it, and speed of the fastest joint, or None."""
+
+    outcome: StopOutcome
+    heard_by: tuple[str, ...]
+    speed_rad_s: float | None
+
+
+class Standstill:
+    """Whether an arm stands, by its measured joint states."""
+
+    def __init__(self) -> None:
+        self._newest: ReceivedSample | None = None
+        self._moved_s = 0.0
+
+    def take(self, sample: zenoh.Sample) -> None:
+        """Take a joint state; runs on Zenoh's thread."""
+        self._newest = ReceivedSample(sample, time.monotonic_ns())
+        speed_rad_s = self.speed_rad_s(0.0)
+        if speed_rad_s is not None and speed_rad_s > STANDS_RAD_S:
+            self._moved_s = time.monotonic()
+
+    def speed_rad_s(self, since_s: float) -> float | None:
+        """Of the fastest joint; None: no valid state came since then, or for `STATE_AGE_S`."""
+        newest, now_s = self._newest, time.monotonic()
+        if newest is None or newest.mono_ns < max(since_s, now_s - STATE_AGE_S) * 1e9:
+            return None
+        from vla_zenoh.types import JointState  # brings numpy, when the stop is out
+
+        try:
+            state = records.decode(JointState, bytes_of(newest.sample.payload, records.SMALL_BYTES))
+        except CodecError:
+            return None
+        return float(abs(state.velocity_rad_s).max())
+
+    def stands(self, since_s: float) -> bool:
+        """No joint has moved for `STANDS_S`, and states still come."""
+        quiet_s = time.monotonic() - max(self._moved_s, since_s)
+        return quiet_s >= STANDS_S and self.speed_rad_s(since_s) is not None
+
+
 class Client(NodeRegistry):
     """Client of one robot: settings, activation, and the last status of every node.
 
@@ -161,6 +213,7 @@ class Client(NodeRegistry):
         self._subscriptions: list[Any] = []
         self._token: Any = None
         self._stop_s = self._reset_s = 0.0
+        self._standstill: list[Standstill] = []
 
     def subscribe(self) -> Client:
         """Subscribe to status, events, liveliness and the task; returns the client."""
@@ -255,14 +308,36 @@ class Client(NodeRegistry):
             time.sleep(POLL_S)
 
     def stop(self) -> None:
-        """Trigger the emergency stop; it latches until `reset`."""
+        """Trigger the emergency stop; it latches until `reset`. `stop_progress` follows it."""
         self._stop_s = time.monotonic()
         self.publish(self.keys.stop, "stop")
+        if not self._standstill:
+            for name in self.profile.part_names:
+                watch = Standstill()
+                self._standstill.append(watch)
+                key = self.keys.of_part(name).state_joint
+                self._subscriptions.append(self._subscribe(key, watch.take))
+
+    def stop_progress(self) -> StopProgress:
+        """What is known of the last `stop`; poll it."""
+        heard_by = tuple(
+            name
+            for name in self.alive
+            if (status := self.status_since(name, self._stop_s)) is not None
+            and (name == "command" and status.state == "stopped")
+            | bool(status.detail.get("stop_latched"))
+        )
+        speeds = [watch.speed_rad_s(self._stop_s) for watch in self._standstill]
+        known = [speed for speed in speeds if speed is not None]
+        stands = bool(speeds) and all(watch.stands(self._stop_s) for watch in self._standstill)
+        outcome = StopOutcome.NOT_CONFIRMED
+        if heard_by:
+            outcome = StopOutcome.CONFIRMED if stands else StopOutcome.HEARD
+        return StopProgress(outcome, heard_by, max(known, default=None))
 
     def stopped(self) -> bool:
-        """Whether the command node has said since the last `stop` that it is stopped."""
-        status = self.status_since("command", self._stop_s)
-        return status is not None and status.state == "stopped"
+        """Whether a node has said since the last `stop` that it is stopped, and the arm stands."""
+        return self.stop_progress().outcome is StopOutcome.CONFIRMED
 
     def stop_latched(self) -> list[str]:
         """Live robot nodes that hold a stop."""

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import os
-import select
 import signal
-import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from collections.abc import Callable
+from contextlib import nullcontext
 from functools import wraps
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
 from vla_zenoh.cli.options import AnswerOption, options
-from vla_zenoh.cli.plain import BOLD_RED, complain, fail, json_answer, say, say_marked, warn
-from vla_zenoh.cli.target import RobotTarget
+from vla_zenoh.cli.plain import fail, json_answer, say
+from vla_zenoh.cli.target import OWN_STOP, RobotTarget
 from vla_zenoh.errors import CodecError, SecurityError, nearest
-from vla_zenoh.keys import CRASHED, Keys, worker_node
+from vla_zenoh.keys import CRASHED, worker_node
 
 if TYPE_CHECKING:
     from vla_zenoh.bus.client import Client
@@ -213,7 +210,6 @@ def speed(
 
 
 @options
-@_answered
 def stop(
     target: RobotTarget,
     every: Annotated[
@@ -227,24 +223,18 @@ def stop(
     ] = False,
     as_json: AnswerOption = False,
 ) -> None:
-    """Emergency stop: brake now and stay stopped until `vla-zenoh reset`."""
+    """Emergency stop: brake now and stay stopped until `vla-zenoh reset`.
+
+    Exit status 0, CONFIRMED: the robot's own states show that it stands. 3, HEARD: a node has
+    latched the stop, but the arm does not stand yet. 4, NOT CONFIRMED: no answer; the stop may have
+    arrived all the same: use the robot's own emergency stop. --json prints one line for each.
+    """
+    from vla_zenoh.cli.stop import stop_and_watch, stop_by_key
+
     if wait_key:
-        _stop_by_key(target, every=every)
-        return
-    with target.client(stop_now=True) as client:
-        _confirm_stop(target, client, every=every)
-
-
-def _confirm_stop(target: RobotTarget, client: Client, *, every: bool) -> None:
-    """Stop the others too if wanted, and wait for the confirmation."""
-    if every:
-        _stop_all(target, client)
-        return
-    if not _reaches(client, client.stopped):
-        _fail(target, client, "stop", "confirm that it stopped")
-    _show_stopped(target, client, client.profile.robot.name)
-    if others := target.others(client):
-        warn(f"not stopped: {', '.join(others)}; `{target.typed('stop', '--all')}` stops all")
+        stop_by_key(target, every=every)
+    else:
+        stop_and_watch(target, every=every, as_json=as_json)
 
 
 @options
@@ -277,122 +267,12 @@ def _fail(target: RobotTarget, client: Client, command: str, what: str) -> NoRet
     if why := target.not_operator(client.profile, command):
         fail(f"{target.named(client)} does not {what}: {why}")
     if "command" not in client.alive:
-        fail(target.no_node(client, command, kind="command node"))
+        then = f". {OWN_STOP}" if command == "deactivate" else ""
+        fail(f"{target.no_node(client, command, kind='command node')}{then}")
     see = target.typed("status")
-    fail(f"the command node of {target.named(client)} does not {what}; see `{see}`")
-
-
-def _stop_all(target: RobotTarget, own: Client) -> None:
-    from vla_zenoh.bus.client import Client
-    from vla_zenoh.bus.session import alive_robots
-
-    robots: list[str] = []
-    give_up = time.monotonic() + DISCOVERY_S
-    while time.monotonic() < give_up:
-        for robot in alive_robots(own.session, own.keys):
-            if robot not in robots:
-                own.publish(Keys(robot, own.keys.root).stop, "stop")
-                robots.append(robot)
-        time.sleep(POLL_S)
-    if not robots:
-        why = target.not_operator(own.profile, "stop")
-        fail(f"no robot is visible on this router. {why}".rstrip(". "))
-    clients: list[Client] = []
-    for robot in robots:
-        named = own.profile.robot.model_copy(update={"name": robot})
-        other = own.profile.model_copy(update={"robot": named})
-        clients.append(Client(other, own.session).subscribe())
-    done = [_reaches(client, client.stopped) for client in clients]
-    for client, stopped in zip(clients, done, strict=True):
-        if stopped:
-            _show_stopped(target, client, own.keys.robot)
-        else:
-            complain(f"{target.named(client)} does not confirm that it stopped")
-    if not all(done):
-        fail(target.not_operator(own.profile, "stop", "--all") or "not every robot has stopped")
-
-
-def _show_stopped(target: RobotTarget, client: Client, own: str) -> None:
-    robot = client.keys.robot
-    how = target.typed("reset", robot=None if robot == own else robot)
-    say_marked("stopped", BOLD_RED, f": {target.named(client)}; `{how}` clears it")
+    then = f". {OWN_STOP}" if command == "deactivate" else ""
+    fail(f"the command node of {target.named(client)} does not {what}; see `{see}`{then}")
 
 
 def _show(target: RobotTarget, client: Client, text: str, separator: str = ", ") -> None:
     say(f"{text}{separator}{target.named(client)}")
-
-
-# -- stop --wait-key: a standby emergency stop for a person beside the arm ------------------------
-def _stop_by_key(target: RobotTarget, *, every: bool) -> None:
-    """Stop the robot at every key, and when the person leaves; the session stays open meanwhile."""
-    with target.client(stop=True) as client, _keys() as pressed:
-        connected = True
-        try:
-            name = target.named(client)
-            client.wait_for(lambda: _connected(client), ABSENT_PATIENCE_S)
-            say(f"Every key stops {name}; so does leaving: Ctrl-C, or closing this terminal.")
-            while (key := pressed()) is not False:
-                if key:
-                    client.stop()
-                    with suppress(SystemExit):  # reported already; stay on standby
-                        _confirm_stop(target, client, every=every)
-                if connected != (connected := _connected(client)):
-                    if connected:
-                        say(f"Connected: every key stops {name}.")
-                    else:
-                        silent = f": its command node is silent, no key stops {name}"
-                        say_marked("NOT CONNECTED", BOLD_RED, silent)
-        finally:
-            client.stop()
-            with suppress(OSError):  # the terminal may be gone
-                _confirm_stop(target, client, every=every)
-
-
-def _connected(client: Client) -> bool:
-    found = client.snapshot().get("command")
-    return found is not None and found[2] and found[1] < SILENT_S
-
-
-@contextmanager
-def _keys() -> Iterator[Callable[[], bool | None]]:
-    """A function that waits briefly for a key: True; None: there was none; False: input ended.
-
-    Signals that end or suspend a program raise `KeyboardInterrupt`, the first one alone.
-    """
-    number = sys.stdin.fileno()
-
-    def pressed() -> bool | None:
-        if not select.select([number], [], [], POLL_S)[0]:
-            return None
-        return bool(os.read(number, 4096))
-
-    def leave(*_: object) -> None:
-        for each in LEAVING:
-            signal.signal(each, signal.SIG_IGN)
-        raise KeyboardInterrupt
-
-    before = {each: signal.signal(each, leave) for each in LEAVING}
-    restore = _single_keys(number)
-    try:
-        yield pressed
-    finally:
-        restore()
-        for each, handler in before.items():
-            signal.signal(each, handler)
-
-
-def _single_keys(number: int) -> Callable[[], None]:
-    """Let a terminal deliver every key at once, without echo; returns what undoes that."""
-    if not os.isatty(number):
-        return lambda: None
-    import termios
-    import tty
-
-    before = termios.tcgetattr(number)
-    tty.setcbreak(number)
-
-    def restore() -> None:
-        with suppress(termios.error, OSError):  # the terminal may be gone
-            termios.tcsetattr(number, termios.TCSADRAIN, before)
-
-    return restore

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import time
 from contextlib import suppress
 
 EXTRA_OF = {
@@ -13,6 +14,8 @@ EXTRA_OF = {
     "rerun": "view",
 }
 """Module -> extra that brings it, for the error of a missing import."""
+BEGAN_S = time.monotonic()
+"""When this program began, before its slow imports."""
 HASTE = -20
 """Niceness of a stop."""
 

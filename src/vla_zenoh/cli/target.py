@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shlex
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 import zenoh
 
-from vla_zenoh.bus.session import open_session, put_text
+from vla_zenoh.bus.session import open_session
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
     PROFILE_VARIABLE,
@@ -29,6 +30,10 @@ from vla_zenoh.security.store import local_role, operator_hosts
 
 if TYPE_CHECKING:
     from vla_zenoh.bus.client import Client
+
+
+SILENCE_S = 0.8
+OWN_STOP = "The arm may still be moving: use the robot's own emergency stop"
 
 
 @dataclass(frozen=True)
@@ -61,25 +66,45 @@ class RobotTarget:
         profile = effective_profile(self.profile, self.connect, host=self.host)
         return profile if self.robot is None else as_robot(profile, self.robot)
 
+    def load_for_stop(self) -> Profile:
+        """Load the profile alone: no certificate is read, no router asked."""
+        return self._load()
+
+    def stop_session(self, profile: Profile) -> tuple[Profile, zenoh.Session]:
+        """A session with the best certificate that may stop the robot and that works.
+
+        Raises:
+            SecurityError: there is no certificate.
+            SessionError: no router answers.
+        """
+        return _first(_choices(profile, stop=True))
+
     @contextmanager
-    def client(self, *, stop: bool = False, stop_now: bool = False) -> Iterator[Client]:
+    def client(self, *, stop: bool = False) -> Iterator[Client]:
         """A connected client that will know the nodes in a moment.
 
         Args:
             stop: prefer a certificate that may stop the robot, and try every one.
-            stop_now: put the emergency stop before anything else; includes `stop`.
 
         Raises:
             ProfileError: the profile is invalid.
             SecurityError: there is no certificate for an operator or viewer.
             SessionError: no router answers.
         """
-        stop = stop or stop_now
-        profile, session = _first(_choices(self._load(), stop=stop)[: None if stop else 1])
+        choices = _choices(self._load(), stop=stop)[: None if stop else 1]
+        # A router that hangs keeps this waiting for 10 s, and the arm may be moving.
+        alarm = threading.Timer(SILENCE_S, warn, [f"no router answers yet. {OWN_STOP}"])
+        alarm.daemon = True
+        if stop:
+            alarm.start()
+        try:
+            profile, session = _first(choices)
+        except SessionError as error:
+            raise SessionError(f"{error}. {OWN_STOP}") if stop else error from error
+        finally:
+            alarm.cancel()
         with session:
-            if stop_now:
-                put_text(session, profile.keys.stop, "stop")
-            from vla_zenoh.bus.client import Client  # after the stop: it takes 20 ms to load
+            from vla_zenoh.bus.client import Client
 
             yield Client(profile, session).subscribe()
 

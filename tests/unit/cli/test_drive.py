@@ -7,6 +7,7 @@ import os
 import resource
 import subprocess
 import sys
+import time
 
 import pytest
 from typed import typed
@@ -16,6 +17,7 @@ from vla_zenoh.cli.main import app
 from vla_zenoh.cli.plain import json_answer, say, warn
 from vla_zenoh.errors import SessionError
 
+FIRST_LINE_S = 1.2
 NOWHERE = ("--connect", "tcp/127.0.0.1:9")
 
 
@@ -36,7 +38,7 @@ def after_typing(*words: str, printed: str) -> str:
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
     )
-    return done.stdout.strip()
+    return done.stdout.strip().splitlines()[-1]
 
 
 @pytest.mark.parametrize("line", ["stop", "prompt go"])
@@ -54,7 +56,7 @@ def test_a_stop_starts_with_raised_priority_where_permitted() -> None:
     assert after_typing("stop", *NOWHERE, printed=niceness) == ("-20" if permitted else here)
 
 
-@pytest.mark.parametrize("line", ["prompt go", "activate", "stop", "reset", "use brick", "rate 5"])
+@pytest.mark.parametrize("line", ["prompt go", "activate", "reset", "use brick", "rate 5"])
 def test_with_json_a_failure_is_one_object_and_nothing_else(
     capsys: pytest.CaptureFixture[str], line: str
 ) -> None:
@@ -110,3 +112,23 @@ def test_output_that_is_read_no_further_is_no_traceback(line: str, unbuffered: s
     )
     os.close(write)
     assert (done.returncode, done.stderr) == (1, "")
+
+
+@pytest.mark.parametrize("form", [[], ["--json"]])
+def test_a_stop_without_a_router_says_at_once_that_nobody_confirmed_it(form: list[str]) -> None:
+    words = [sys.executable, "-m", "vla_zenoh", "stop", *form, *NOWHERE]
+    began_s = time.monotonic()
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        took_s = time.monotonic() - began_s
+        assert process.wait(60) == 4
+    if form:
+        answer = json.loads(line)
+        assert (answer["ok"], answer["outcome"]) == (False, "not_confirmed")
+        line = answer["message"]
+    assert line.startswith("NOT CONFIRMED: no answer of robot panda")
+    assert "may still have arrived" in line
+    assert "EMERGENCY STOP" in line
+    print(f"first line after {took_s:.2f} s")
+    assert took_s < FIRST_LINE_S

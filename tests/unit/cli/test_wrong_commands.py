@@ -159,7 +159,6 @@ WITHOUT_A_ROUTER = (
     "status --once",
     "prompt hold",
     "activate",
-    "stop",
     "reset",
     "keys",
     "echo task",
