@@ -318,10 +318,11 @@ def with_loss(folder: Path, program: Path, distribution: str, loss: float) -> No
 
 def with_clock(folder: Path, program: Path, distribution: str) -> None:
     """The robot's clock is off, and set in motion."""
-    clock = WallClock(folder, 3.0)
+    clock = WallClock(folder)
     with running_ros_lab(folder, program, distribution, arm={"environ": clock.environ}) as lab:
-        to_and_fro(lab, "robot's clock 3 s ahead")
-        for name, offset_s in (("3 s back, in motion", 0.0), ("3 s on, in motion", 3.0)):
+        for name, offset_s in (("3 s on, in motion", 3.0), ("3 s back, in motion", -3.0)):
+            clock.set(0.0)
+            lab.chain.activate_when_ready()
             lab.settle()
             lab.move()
             time.sleep(0.3)
@@ -337,8 +338,6 @@ def with_clock(folder: Path, program: Path, distribution: str) -> None:
                 f"| robot's clock set {name} | {lab.chain.state()}, stands after {stands_s:.3f} s, "
                 f"way {way_mm:.1f} mm | | {', '.join(told)} |"
             )
-        lab.settle()
-        to_and_fro(lab, "after that")
 
 
 # -------------------------------------------------------------------------------------------------

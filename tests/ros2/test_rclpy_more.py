@@ -215,13 +215,17 @@ def test_a_robot_of_simulated_time_moves_exactly(
         up_and_down(lab)
 
 
-def test_a_robot_whose_clock_is_3_s_off_moves_exactly(
+def test_a_robot_whose_clock_is_3_s_off_is_not_activated(
     tmp_path: Path, built_bridge: Path, distribution: str
 ) -> None:
     clock = WallClock(tmp_path, 3.0)
     with running_ros_lab(
         tmp_path, built_bridge, distribution, arm={"environ": clock.environ}
     ) as lab:
+        lab.chain.until("states", lambda: lab.chain.recorder.newest_state(), 30.0)
+        with pytest.raises(SessionError, match="clock"):
+            lab.chain.client.activate()
+        clock.set(0.0)
         lab.chain.activate_when_ready()
         lab.settle()
         up_and_down(lab)
