@@ -40,6 +40,8 @@ class MadeRobot(Robot):
 
     def __init__(self, config):
         raise RuntimeError(f"a plug-in's robot at {config.address}")
+
+MadeRobot.__abstractmethods__ = frozenset()
 """
 POLICY_CONFIG = """
 from dataclasses import dataclass
