@@ -180,9 +180,7 @@ class OperatorTopics:
     def _sentence(self) -> str:
         topics = ", ".join(f"{self._prefix}/{one.name}" for one in OPERATIONS)
         offered = "offers services, too" if self._services else "no services (ros2.services)"
-        return (
-            f"vla-zenoh listens to {topics} and answers on {self._prefix}/{ANSWER_TOPIC}; {offered}"
-        )
+        return f"listens to {topics} and answers on {self._prefix}/{ANSWER_TOPIC}; {offered}"
 
     def _handle(self, call: Call) -> None:
         operation, wanted = call.operation, Wanted()
