@@ -17,6 +17,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 import typer
 from model_wires import groot, lerobot_server, npy, openpi, openvla_rest, origami, xpolicylab
@@ -259,6 +260,16 @@ def _cdr_seed(kind: str) -> list[bytes]:
     return [every.encode(every.new(kind, **fields.get(kind.rsplit("/", 1)[-1], {})))]
 
 
+def _depth_seed(kind: str) -> list[bytes]:
+    every, counts = _messages(), np.ones((2, 3), np.uint16)
+    png = np.frombuffer(cv2.imencode(".png", counts)[1].tobytes(), np.uint8)
+    fields: dict[str, Any] = {"format": "16UC1; compressedDepth png", "data": png}
+    if kind == IMAGE:
+        fields = {"height": 2, "width": 3, "step": 6, "encoding": "16UC1"}
+        fields["data"] = counts.view(np.uint8).ravel()
+    return [every.encode(every.new(kind, **fields))]
+
+
 def _recorded_seed(kind: type) -> list[bytes]:
     text, _ = record_to_json(kind, records.encode(examples()[kind]))
     return [text.encode()]
@@ -462,7 +473,7 @@ def _targets() -> Iterator[Target]:
             f"ros2-depth-{kind.rsplit('/', 1)[-1]}",
             lambda data, kind=kind: readers.read_depth(_messages(), kind, data),
             codec,
-            lambda kind=kind: _cdr_seed(kind),
+            lambda kind=kind: _depth_seed(kind),
         )
     yield Target(
         "ros2-request",
