@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
@@ -157,8 +158,6 @@ class Traffic:
 
 PERIOD_S = 0.25
 """An event of one kind is published at most this often; `count` says how many it stands for."""
-KINDS = 512
-"""Kinds that are remembered; with more the memory is cleared."""
 
 Kind = tuple[str, str, str]
 
@@ -166,8 +165,10 @@ Kind = tuple[str, str, str]
 class EventThrottle:
     """Decides when an event is published.
 
-    Transitions always are. The rejection of a setting is published late rather than never, because
-    a client waits for the answer.
+    Transitions always are. Everything else is published at once or, while one of its kind has just
+    been, late: nothing is left out, because a client may wait for the answer. A kind is remembered
+    until `PERIOD_S` after its last event, so memory is bounded by how many the node can receive in
+    that time, and no client can make it forget what it owes to another.
     """
 
     def __init__(
@@ -175,36 +176,31 @@ class EventThrottle:
     ) -> None:
         self._publish, self._clock = publish, clock
         self._published_s: dict[Kind, float] = {}
-        self._held: Counter[Kind] = Counter()
-        self._answers: dict[Kind, Event] = {}
+        self._owed: dict[Kind, Event] = {}
+        """Newest event of a kind that waits, with the count of all that do."""
 
     def emit(self, event: Event, about: str = "") -> None:
-        """Publish an event, or count it; each `about` is throttled by itself."""
-        answers = event.what.endswith("_refused")
-        if answers:  # a client gets every reason against its setting, not only the first
+        """Publish an event, or keep it for `poll`; each `about` is throttled by itself."""
+        if event.what.endswith("_refused"):  # every reason against a setting, not only the first
             about = event.why
         kind = (event.kind, event.what, about)
-        if len(self._published_s) > KINDS:
-            self._published_s.clear()
-            self._held.clear()
-            self._answers.clear()
-        if event.kind == "transition" or self._due(kind):
-            self._send(kind, event, self._held.pop(kind, 0))
-            return
-        self._held[kind] += 1
-        if answers:
-            self._answers[kind] = event
+        waiting = self._owed.get(kind)
+        if waiting is not None:
+            event = replace(event, count=event.count + waiting.count)
+        self._owed[kind] = event
+        if event.kind == "transition" or self._is_due(kind):
+            self._send(kind)
 
     def poll(self) -> None:
-        """Publish the answers that are due."""
-        for kind, event in list(self._answers.items()):
-            if self._due(kind):
-                self._send(kind, event, self._held.pop(kind, 1) - 1)
+        """Publish what is due."""
+        for kind in [kind for kind in self._owed if self._is_due(kind)]:
+            self._send(kind)
+        for kind in [kind for kind in self._published_s if self._is_due(kind)]:
+            del self._published_s[kind]
 
-    def _due(self, kind: Kind) -> bool:
-        return self._clock() - self._published_s.get(kind, -1e9) >= PERIOD_S
+    def _is_due(self, kind: Kind) -> bool:
+        return self._clock() - self._published_s.get(kind, -math.inf) >= PERIOD_S
 
-    def _send(self, kind: Kind, event: Event, others: int) -> None:
+    def _send(self, kind: Kind) -> None:
         self._published_s[kind] = self._clock()
-        self._answers.pop(kind, None)
-        self._publish(replace(event, count=event.count + others) if others else event)
+        self._publish(self._owed.pop(kind))

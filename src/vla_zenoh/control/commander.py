@@ -45,6 +45,9 @@ from vla_zenoh.errors import RecordError
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import MAX_TEXT, ActionChunk, GripperState, HeldBox, Stamped, Task
 
+ANSWER_S, MAX_ANSWER_S = 1.0, 2.0
+"""A worker answers a new prompt within this and one period of its rate; at most the latter, as
+clients wait 3 s for an activation."""
 LATE_NS = 10_000_000_000
 """A setting that was put before a stop arrives at most this long after it. Stamps that say so later
 are those of a clock that was set."""
@@ -80,6 +83,10 @@ class Commander:
         self.why = "not activated yet"
         self._ended = ""  # why the last activation did, if not on request
         asked = profile.task
+        self._awaited: str | None = None
+        """Holder of an activation that waits until the worker has heard the newest prompt."""
+        self._asked_ns = -(10**18)
+        """When prompt or worker changed last."""
         self.task = Task(0, False, asked.prompt, asked.worker, asked.rate_hz, asked.speed_percent)
         self.lease: Lease | None = None
         self.progress, self.deadman = EpisodeProgress(), Deadman()
@@ -124,6 +131,8 @@ class Commander:
         self._update(inputs)
         self._apply_settings(inputs.settings, now_ns)
         self._take_chunks(inputs.chunks, now_ns)
+        if self._awaited is not None:
+            self._activate(now_ns, self._awaited)
         self._prepared = False
         self._supervise(now_ns)
         for part in parts:
@@ -194,6 +203,8 @@ class Commander:
 
     def _apply_settings(self, settings: Sequence[Setting], now_ns: int) -> None:
         stops = [setting for setting in settings if setting.name == "stop"]
+        if any(setting.name in ("stop", "reset", "active") for setting in settings):
+            self._awaited = None
         if stops:
             self._change(Trigger.STOP, "emergency stop")
             self._stop_put_ns, self._stop_came_ns = max(stop.put_ns or 0 for stop in stops), now_ns
@@ -263,7 +274,7 @@ class Commander:
         self.task = replace(self.task, episode=episode, **changes)  # pyright: ignore
         self.progress = EpisodeProgress()
         if changes:
-            self._ended = ""
+            self._ended, self._asked_ns = "", now_ns
         if self.state in OBEYING:
             self._watchdog.expect(None, now_ns, self.task)
 
@@ -290,6 +301,7 @@ class Commander:
         self._new_episode(now_ns, worker=worker)
 
     def _activate(self, now_ns: int, holder: str) -> None:
+        self._awaited = None
         if self.state in OBEYING:
             self._hold_as_well(holder)
             return
@@ -301,6 +313,12 @@ class Commander:
             self._reject_setting("activate", [why])
             return
         lease, reasons = self._preflight(self.task.worker, now_ns)
+        if lease is None and self._is_answer_due(now_ns, reasons):
+            self._awaited = holder
+            self.why = f"activation waits for worker {self.task.worker!r}: {'; '.join(reasons)}"[
+                :MAX_TEXT
+            ]
+            return
         reasons += self.deadman.reasons_against(holder, self._peers.holders)
         self._measure()
         for part in self.parts:
@@ -318,6 +336,21 @@ class Commander:
         what = f"activated with worker {self.task.worker!r}{held}"
         self._change(Trigger.ACTIVATE, "; ".join([what, *self._ended_before()])[:MAX_TEXT])
         self._new_episode(now_ns)
+
+    def _is_answer_due(self, now_ns: int, reasons: list[str]) -> bool:
+        """Whether all reasons are the worker's, which may not have heard the newest prompt yet."""
+        worker = self.task.worker
+        asked = reasons_of_worker(
+            self.profile,
+            worker,
+            self.task.prompt,
+            self._peers,
+            self._latest.get(worker),
+            now_ns,
+            self.task.rate_hz,
+        )
+        patience_s = min(ANSWER_S + 1.0 / self.task.rate_hz, MAX_ANSWER_S)
+        return 0 <= now_ns - self._asked_ns < patience_s * 1e9 and reasons == asked
 
     def _ended_before(self) -> list[str]:
         """Why the last activation ended; nothing of it may have changed."""

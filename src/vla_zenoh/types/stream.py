@@ -58,7 +58,7 @@ Record = TypeVar("Record")
 
 @dataclass(frozen=True, slots=True)
 class Stamped(Generic[Record]):
-    """A record as received at `received_ns`, same clock as the caller's ``now_ns``."""
+    """A record as received at `received_ns`, on the wall clock of the receiver's host."""
 
     header: Header
     record: Record

@@ -21,7 +21,7 @@ from command_rig import (
 )
 
 from vla_zenoh.control.axis_smoothing import AxisSmoother
-from vla_zenoh.control.commander import Commander, Inputs, Setting
+from vla_zenoh.control.commander import MAX_ANSWER_S, Commander, Inputs, Setting
 from vla_zenoh.control.motion_pipeline import LINGER_NS
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.kinematics.so3 import norm3
@@ -1190,3 +1190,54 @@ def test_a_goal_without_a_trajectory_is_a_fault_and_the_arm_brakes(
     assert rig.state == "fault"
     assert rig.commander.why == "no trajectory could be computed; braked"
     assert rig.commander.at_rest
+
+
+# -- a prompt and an activation, put at once ------------------------------------------------------
+UNKNOWN = {WORKER: "knows no prompt 'dance'"}
+
+
+def asked_rig() -> Rig:
+    """A worker that complains about the prompt before; then a new one and an activation at once."""
+    rig = Rig()
+    rig.tick(chunks=[rig.chunk([STAND])])
+    rig.peers = replace(rig.peers, worker_complaints=UNKNOWN)
+    rig.tick()
+    rig.tick(Setting("prompt", "HARD: go down"), Setting("active", True))
+    return rig
+
+
+def test_an_activation_waits_until_the_worker_has_heard_the_prompt_before_it() -> None:
+    rig = asked_rig()
+    assert rig.refused == {}
+    assert "waits for worker" in rig.commander.why
+    rig.run(0.2)
+    rig.peers = replace(rig.peers, worker_complaints={})
+    rig.tick(chunks=[rig.chunk([STAND])])
+    assert rig.state == "active"
+    assert rig.refused == {}
+
+
+def test_a_worker_that_cannot_do_the_new_prompt_either_is_waited_for_a_bounded_time() -> None:
+    rig = asked_rig()
+    rig.run(MAX_ANSWER_S)
+    assert rig.refused["activate_refused"] == 1
+    assert "knows no prompt 'dance'" in rig.commander.why
+    rig.peers = replace(rig.peers, worker_complaints={})
+    rig.tick(chunks=[rig.chunk([STAND])])
+    assert rig.state == "inactive", "it was rejected: it does not begin later by itself"
+
+
+@pytest.mark.parametrize("ends_it", [Setting("stop"), Setting("active", False), Setting("reset")])
+def test_what_comes_after_a_waiting_activation_ends_it(ends_it: Setting) -> None:
+    rig = asked_rig()
+    rig.tick(ends_it)
+    rig.peers = replace(rig.peers, worker_complaints={})
+    rig.tick(chunks=[rig.chunk([STAND])])
+    assert rig.state != "active"
+
+
+def test_an_activation_does_not_wait_for_what_a_prompt_cannot_mend() -> None:
+    rig = Rig()
+    rig.peers = replace(rig.peers, alive=frozenset())
+    rig.tick(Setting("prompt", "HARD: go down"), Setting("active", True))
+    assert rig.refused["activate_refused"] >= 1

@@ -11,6 +11,7 @@ import zenoh
 
 from vla_zenoh.bus.buffers import LatestSample, ReceivedSample, bytes_of, header_of
 from vla_zenoh.bus.client import Client
+from vla_zenoh.bus.clock import Clock
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import MAX_IMAGE_BYTES, decode_jpeg, decode_raw
@@ -41,6 +42,7 @@ class RemoteRobot(Client):
         super().__init__(profile, session)
         self._buffers: dict[str, LatestSample] = {}
         self._newest: dict[str, Stamped[Any]] = {}
+        self._clock = Clock()
 
     def joint_state(self, timeout_s: float = TIMEOUT_S) -> Stamped[JointState]:
         """Newest joint state; waits for one no older than ``timing.state_timeout_s``."""
@@ -71,7 +73,7 @@ class RemoteRobot(Client):
         payload = bytes_of(sample.sample.payload, MAX_IMAGE_BYTES)
         schema = str(sample.sample.encoding).partition(";")[2]
         image = decode_jpeg(payload) if jpeg else decode_raw(payload, schema)
-        return Stamped(header_of(sample.sample), image, sample.mono_ns)
+        return Stamped(header_of(sample.sample), image, self._clock.wall_at(sample.mono_ns))
 
     def picture(self, camera: str, *, timeout_s: float = TIMEOUT_S) -> bytes:
         """Next image of a camera as a JPEG file, otherwise as `image`."""
@@ -187,7 +189,8 @@ class RemoteRobot(Client):
             )
 
     def _record(self, kind: type[Record], key: str, timeout_s: float) -> Stamped[Record]:
-        oldest_ns = time.monotonic_ns() - int(self.profile.timing.state_timeout_s * 1e9)
+        self._clock.adopt_system_time()
+        oldest_ns = self._clock.wall_ns() - int(self.profile.timing.state_timeout_s * 1e9)
         sample = self._buffer(key, MAX_RECORD_BYTES).pop()
         if sample is not None:
             self._newest[key] = self._decoded(kind, sample)
@@ -196,10 +199,9 @@ class RemoteRobot(Client):
             newest = self._newest[key] = self._decoded(kind, self._next(key, 0, timeout_s))
         return newest
 
-    @staticmethod
-    def _decoded(kind: type[Record], sample: ReceivedSample) -> Stamped[Record]:
+    def _decoded(self, kind: type[Record], sample: ReceivedSample) -> Stamped[Record]:
         record = records.decode(kind, bytes_of(sample.sample.payload, MAX_RECORD_BYTES))
-        return Stamped(header_of(sample.sample), record, sample.mono_ns)
+        return Stamped(header_of(sample.sample), record, self._clock.wall_at(sample.mono_ns))
 
     def _next(self, key: str, limit: int, timeout_s: float) -> ReceivedSample:
         buffer = self._buffer(key, limit)
