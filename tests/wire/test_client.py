@@ -240,7 +240,10 @@ def test_a_state_of_a_robot_that_is_gone_is_not_returned_as_where_it_is(profile:
         await_match(there, profile.keys.state_pose)
         for _ in range(2):
             publisher.publish(pose)
-            assert np.array_equal(robot.pose_state().record.position_m, pose.position_m)
+            stamped = robot.pose_state()
+            assert np.array_equal(stamped.record.position_m, pose.position_m)
+            latency_s = (stamped.received_ns - stamped.header.stamp_wall_ns) / 1e9
+            assert 0 <= latency_s < 1, "both are wall time"
             assert robot.pose_state(0.0) is robot.pose_state(0.0)
         publisher.publish(pose)  # arrives, but is read too late
         node.close()
