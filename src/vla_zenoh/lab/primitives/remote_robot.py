@@ -42,7 +42,7 @@ class RemoteRobot(Client):
         super().__init__(profile, session)
         self._buffers: dict[str, LatestSample] = {}
         self._newest: dict[str, Stamped[Any]] = {}
-        self._clock = Clock()
+        self._wall = Clock()
 
     def joint_state(self, timeout_s: float = TIMEOUT_S) -> Stamped[JointState]:
         """Newest joint state; waits for one no older than ``timing.state_timeout_s``."""
@@ -73,7 +73,7 @@ class RemoteRobot(Client):
         payload = bytes_of(sample.sample.payload, MAX_IMAGE_BYTES)
         schema = str(sample.sample.encoding).partition(";")[2]
         image = decode_jpeg(payload) if jpeg else decode_raw(payload, schema)
-        return Stamped(header_of(sample.sample), image, self._clock.wall_at(sample.mono_ns))
+        return Stamped(header_of(sample.sample), image, self._wall.wall_at(sample.mono_ns))
 
     def picture(self, camera: str, *, timeout_s: float = TIMEOUT_S) -> bytes:
         """Next image of a camera as a JPEG file, otherwise as `image`."""
@@ -189,8 +189,8 @@ class RemoteRobot(Client):
             )
 
     def _record(self, kind: type[Record], key: str, timeout_s: float) -> Stamped[Record]:
-        self._clock.adopt_system_time()
-        oldest_ns = self._clock.wall_ns() - int(self.profile.timing.state_timeout_s * 1e9)
+        self._wall.adopt_system_time()
+        oldest_ns = self._wall.wall_ns() - int(self.profile.timing.state_timeout_s * 1e9)
         sample = self._buffer(key, MAX_RECORD_BYTES).pop()
         if sample is not None:
             self._newest[key] = self._decoded(kind, sample)
@@ -201,7 +201,7 @@ class RemoteRobot(Client):
 
     def _decoded(self, kind: type[Record], sample: ReceivedSample) -> Stamped[Record]:
         record = records.decode(kind, bytes_of(sample.sample.payload, MAX_RECORD_BYTES))
-        return Stamped(header_of(sample.sample), record, self._clock.wall_at(sample.mono_ns))
+        return Stamped(header_of(sample.sample), record, self._wall.wall_at(sample.mono_ns))
 
     def _next(self, key: str, limit: int, timeout_s: float) -> ReceivedSample:
         buffer = self._buffer(key, limit)
