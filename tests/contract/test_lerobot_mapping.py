@@ -225,7 +225,6 @@ def test_joints_of_another_arm_are_refused_with_the_reason(tmp_path: Path) -> No
     ("config", "match"),
     [
         ({"model_type": "llama"}, "has no type; it is not a LeRobot policy"),
-        ({**CONFIG, "use_peft": True}, "is an adapter"),
         ({**CONFIG, "type": "groot"}, "runs code from a model hub"),
         ({**CONFIG, "input_features": ["front"]}, "not of LeRobot's form"),
         (

@@ -25,7 +25,7 @@ from vla_zenoh.lab.primitives.remote_robot import RemoteRobot
 from vla_zenoh.lab.web.robot_link import RobotLink
 from vla_zenoh.policy import MAX_CAMERAS
 from vla_zenoh.profile import Profile, load_profile, override
-from vla_zenoh.types import Event, Header, InferenceDebug, NodeStatus, PoseState
+from vla_zenoh.types import Event, Header, InferenceDebug, JointState, NodeStatus, PoseState
 
 STRANGERS = 2000
 TOKENS = 300
@@ -183,6 +183,16 @@ def test_a_stop_and_a_reset_are_confirmed_by_the_next_status(profile: Profile) -
     with open_session(profile.session) as here, open_session(profile.session) as there:
         node, robot = Node("command", profile, there), RemoteRobot(profile, here)
         say(node, "stopped", robot.subscribe())
+        with pytest.raises(SessionError, match="stop"):  # nothing shows that the arm stands
+            robot.stop(0.5)
+        node.close()
+    with (
+        open_session(profile.session) as here,
+        open_session(profile.session) as there,
+        standing(profile),
+    ):
+        node, robot = Node("command", profile, there), RemoteRobot(profile, here)
+        say(node, "stopped", robot.subscribe())
         for request, state in ((robot.stop, "stopped"), (robot.reset, "inactive")):
             timer = threading.Timer(0.2, node.publish_status, (state,), {"now": True})
             timer.start()
@@ -209,6 +219,30 @@ def test_a_command_node_that_crashed_clears_nothing(profile: Profile) -> None:
             with pytest.raises(SessionError, match="reset"), repeated(node, state):
                 robot.reset(0.5)
         node.close()
+
+
+@contextmanager
+def standing(profile: Profile) -> Iterator[None]:
+    """States of an arm that does not move."""
+    names = profile.robot.arm_joints
+    at_rest = JointState(names, np.zeros(len(names)), np.zeros(len(names)), None)
+    over = threading.Event()
+
+    def publish_states() -> None:
+        with open_session(profile.session) as session:
+            node = Node("sim", profile, session)
+            publisher = node.declare_publisher(profile.keys.state_joint, Kind.STATE)
+            while not over.wait(0.02):
+                publisher.publish(at_rest)
+            node.close()
+
+    thread = threading.Thread(target=publish_states)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
 
 
 @contextmanager
