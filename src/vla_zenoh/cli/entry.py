@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sys
+import threading
 import time
 from contextlib import suppress
 
@@ -18,6 +20,23 @@ BEGAN_S = time.monotonic()
 """When this program began, before its slow imports."""
 HASTE = -20
 """Niceness of a stop."""
+SILENCE_S = 0.9
+"""A stop that has said nothing for so long says that it is not confirmed, whatever it waits for."""
+UNHEARD = (
+    "NOT CONFIRMED: no answer yet. The stop may still arrive. USE THE ROBOT'S OWN EMERGENCY STOP"
+)
+QUIET_OPTIONS = {"--help", "--wait-key"}
+
+
+def _say_unheard() -> None:
+    unknown = {"robot": None, "heard_by": [], "speed_rad_s": None, "message": UNHEARD}
+    line = json.dumps({"ok": False, "outcome": "not_confirmed", **unknown})
+    print(line if "--json" in sys.argv else UNHEARD, flush=True)
+
+
+silence = threading.Timer(SILENCE_S, _say_unheard)
+"""Runs during the slow imports of `vla-zenoh stop`; its first line cancels it."""
+silence.daemon = True
 
 
 def main() -> None:
@@ -28,12 +47,15 @@ def main() -> None:
     if sys.argv[1:2] == ["stop"]:  # runs before other programs, where permitted
         with suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, 0, HASTE)
+        if QUIET_OPTIONS.isdisjoint(sys.argv):
+            silence.start()
     try:
         from vla_zenoh.cli.main import app
 
         try:
             app()
         finally:
+            silence.cancel()
             sys.stdout.flush()
     except KeyboardInterrupt:
         sys.exit(130)

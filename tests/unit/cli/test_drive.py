@@ -120,15 +120,19 @@ def test_a_stop_without_a_router_says_at_once_that_nobody_confirmed_it(form: lis
     began_s = time.monotonic()
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
-        line = process.stdout.readline()
+        lines = [process.stdout.readline()]
         took_s = time.monotonic() - began_s
+        lines += process.stdout.readlines()
         assert process.wait(60) == 4
+    assert len(lines) <= 2  # on a busy computer the first comes before the imports have ended
     if form:
-        answer = json.loads(line)
-        assert (answer["ok"], answer["outcome"]) == (False, "not_confirmed")
-        line = answer["message"]
-    assert line.startswith("NOT CONFIRMED: no answer of robot panda")
-    assert "may still have arrived" in line
-    assert "EMERGENCY STOP" in line
+        for answer in map(json.loads, lines):
+            assert (answer["ok"], answer["outcome"]) == (False, "not_confirmed")
+        lines = [json.loads(line)["message"] for line in lines]
+    for line in lines:
+        assert line.startswith("NOT CONFIRMED: no answer")
+        assert "The stop may still" in line
+        assert "USE THE ROBOT'S OWN EMERGENCY STOP" in line
+    assert "no answer of robot panda" in lines[-1]
     print(f"first line after {took_s:.2f} s")
     assert took_s < FIRST_LINE_S
