@@ -30,6 +30,7 @@ from vla_zenoh.runtime.router import reject_taken
 from vla_zenoh.runtime.supervisor import (
     Child,
     NodeCommand,
+    SilenceMeter,
     Supervisor,
     hung_nodes,
     is_hearing,
@@ -211,6 +212,7 @@ class Host:
         self._down: DownNodes | None = None
         self._ready, self._dry_run = False, dry_run
         self._deaf_s = time.monotonic()  # when no node was heard
+        self._silence = SilenceMeter()
         self._expiry = CertificateExpiry(profile.session.security)
         self.session: zenoh.Session | None = None
         self.client: Client | None = None
@@ -350,8 +352,15 @@ class Host:
     def _look_at_nodes(self, client: Client) -> None:
         """Kill those that hang; report once that all are ready."""
         heard, running = client.snapshot(), self.supervisor.running()
-        said = {name: (status.pid, age_s) for name, (status, age_s, _) in heard.items()}
         now_s = time.monotonic()
+        said: dict[str, tuple[int, float]] = {}
+        for name, (status, age_s, _) in heard.items():
+            if name in running:
+                starting = status.state == STARTING  # which `up` has published in its name
+                silent_s = self._silence.silent_s(
+                    name, running[name][1], age_s, now_s, starting=starting
+                )
+                said[name] = status.pid, silent_s
         if not is_hearing(heard):
             self._deaf_s = now_s
         for name in hung_nodes(running, said, now_s - self._deaf_s):

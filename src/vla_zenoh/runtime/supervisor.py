@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 from vla_zenoh.keys import NODE_KINDS, ROLLING
@@ -19,6 +20,10 @@ from vla_zenoh.runtime.process import DETAIL, FATAL, PARENT_VARIABLE
 
 HANG_S = 10.0
 """Nodes publish their status twice a second; a stall of the whole computer is not their fault."""
+START_S = 30.0
+"""A node that starts may be idle for this long, or compute for it, before its silence counts."""
+PROGRESS_S = 0.02
+"""Processor time by which a node that starts shows that it does not hang."""
 HEARD_S = 2.0
 BACKOFF_S = (0.2, 0.5, 1.0, 2.0, 5.0)
 STABLE_S = 60.0
@@ -80,6 +85,73 @@ def is_hearing(heard: Mapping[str, tuple[object, float, bool]]) -> bool:
     return any(alive and age_s < HEARD_S for _, age_s, alive in heard.values())
 
 
+class ThreadTime(NamedTuple):
+    """What the main thread of a process has done since it began."""
+
+    ran_s: float
+    waited_s: float  # for a processor, ready to run
+
+
+def thread_time(pid: int) -> ThreadTime | None:
+    """Of the main thread of a process; None where the system has no such figures."""
+    try:
+        ran_ns, waited_ns, _ = Path(f"/proc/{pid}/schedstat").read_text().split()
+    except (OSError, ValueError):
+        return None
+    return ThreadTime(int(ran_ns) / 1e9, int(waited_ns) / 1e9)
+
+
+@dataclass(slots=True)
+class _Silent:
+    pid: int
+    age_s: float
+    began: ThreadTime
+    ran_s: float  # at its last progress
+    progress_s: float  # when that was
+
+
+class SilenceMeter:
+    """How long nodes have been silent although they could have spoken.
+
+    A node is slow, and does not hang, while its main thread waits for a processor: that time does
+    not count. Neither does the start of a node, while it makes progress.
+
+    Args:
+        time_of: processor times of a process, by its id.
+    """
+
+    def __init__(self, time_of: Callable[[int], ThreadTime | None] = thread_time) -> None:
+        self._time_of = time_of
+        self._nodes: dict[str, _Silent] = {}
+
+    def silent_s(
+        self, name: str, pid: int, age_s: float, now_s: float, *, starting: bool
+    ) -> float:
+        """Silence of a node that counts.
+
+        Args:
+            name: of the node.
+            pid: of its process.
+            age_s: of its last status.
+            now_s: monotonic clock.
+            starting: it has published none itself yet.
+        """
+        time_now = self._time_of(pid)
+        if time_now is None:
+            return max(age_s - START_S, 0.0) if starting else age_s
+        node = self._nodes.get(name)
+        if node is None or node.pid != pid or age_s < node.age_s:
+            node = self._nodes[name] = _Silent(pid, age_s, time_now, time_now.ran_s, now_s)
+        node.age_s = age_s
+        if not starting:
+            return age_s - (time_now.waited_s - node.began.waited_s)
+        if time_now.ran_s - node.began.ran_s > START_S:
+            return age_s
+        if time_now.ran_s - node.ran_s > PROGRESS_S:
+            node.ran_s, node.progress_s = time_now.ran_s, now_s
+        return max(now_s - node.progress_s - START_S, 0.0)
+
+
 def hung_nodes(
     running: Mapping[str, tuple[str, int]],
     said: Mapping[str, tuple[int, float]],
@@ -89,7 +161,7 @@ def hung_nodes(
 
     A hung node does no harm, since the arm brakes without it, but a new one cannot start beside it.
     Workers are exempt: a large model may take long to load or to infer. `running` nodes of this
-    host have kind and pid; `said` has pid and age (s) of the last status of nodes of all hosts;
+    host have kind and pid; `said` has pid and silence (s, see `SilenceMeter`) of nodes of all hosts;
     `hearing_s` is how long any of them has been heard: when the router comes back, the first status
     makes no other node a silent one.
     """

@@ -73,9 +73,10 @@ class CommandNode:
         dry_run: bool = False,
         latch: Path | None = None,
     ) -> None:
-        node = self.node = Node("command", profile, session)
         parts = {name: profile.of_part(name) for name in profile.part_names}
+        # Before the node is alive: this computes for long, without letting other threads run.
         reach = {name: ReachabilityFilter(part) for name, part in parts.items()}
+        node = self.node = Node("command", profile, session)
         self.commander = Commander(profile, reach=reach, dry_run=dry_run)
         self._latch = None if latch is None else EstopLatch(latch)
         before = None if self._latch is None else self._latch.read()
