@@ -124,9 +124,7 @@ class SilenceMeter:
         self._time_of = time_of
         self._nodes: dict[str, _Silent] = {}
 
-    def silent_s(
-        self, name: str, pid: int, age_s: float, now_s: float, *, starting: bool
-    ) -> float:
+    def silent_s(self, name: str, pid: int, age_s: float, now_s: float, *, starting: bool) -> float:
         """Silence of a node that counts.
 
         Args:
@@ -161,7 +159,7 @@ def hung_nodes(
 
     A hung node does no harm, since the arm brakes without it, but a new one cannot start beside it.
     Workers are exempt: a large model may take long to load or to infer. `running` nodes of this
-    host have kind and pid; `said` has pid and silence (s, see `SilenceMeter`) of nodes of all hosts;
+    host have kind and pid; `said` has their pid by status and silence (s, see `SilenceMeter`);
     `hearing_s` is how long any of them has been heard: when the router comes back, the first status
     makes no other node a silent one.
     """
