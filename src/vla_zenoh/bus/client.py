@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 Value = TypeVar("Value")
 POLL_S, HOLD_PATIENCE_S = 0.02, 1.0
+WHY_PATIENCE_S = 1.0
+"""The command node publishes its status twice a second, and at every transition."""
 RESET_AGAIN_S = 0.3
 STANDS_RAD_S, STANDS_S, STATE_AGE_S = 0.02, 0.1, 0.5
 """An arm stands whose joints are slower than this for so long, by states that are not older."""
@@ -447,6 +449,29 @@ class Client(NodeRegistry):
                 if NO_DEADMAN_TOKEN not in str(error) or time.monotonic() > give_up_s:
                     self.release_deadman()
                     raise
+
+    def why_inactive(self, timeout_s: float = WHY_PATIENCE_S) -> str:
+        """Why the arm is not active; empty while it is.
+
+        Task and status are two messages: a status from before the end of the activation has the
+        reason of another transition, so a newer one is waited for.
+        """
+        task = self.task
+        if task is not None and task.active:
+            return ""
+        if "command" not in self.alive:
+            return "no command node is running"
+
+        def knows() -> str:
+            status = self.status("command")
+            if status is None or status.state in ("active", "holding"):
+                return ""
+            episode = status.detail.get("episode")
+            if task is not None and isinstance(episode, int) and episode < task.episode:
+                return ""
+            return str(status.detail.get("why", "")) or status.state
+
+        return self.wait_for(knows, timeout_s) or "the command node does not say why"
 
     def latch_reason(self) -> str:
         """Latched stop or fault that has to be reset before activation; empty if there is none."""

@@ -28,6 +28,7 @@ from vla_zenoh.control.commander_io import (
     limit_events,
     make_event,
 )
+from vla_zenoh.control.lateness import Lateness
 from vla_zenoh.control.limits import LimitHit
 from vla_zenoh.control.part_spacing import PartSpacing
 from vla_zenoh.control.plan_timeline import EpisodeProgress
@@ -100,6 +101,7 @@ class Commander:
         self._planner, self._motion, self._watchdog = first.planner, first.motion, first.watchdog
         self._stop_put_ns = self._stop_came_ns = 0
         """Of the last emergency stop: when it was put, by the router's clock, and its tick."""
+        self._lateness = Lateness(1.0 / profile.timing.command_hz)
         self._out = Outputs()
         self._prepared = False
 
@@ -128,6 +130,7 @@ class Commander:
                 function of time, so the same trajectory is sampled later, no faster.
         """
         task_before, out, parts = self.task, self._out, self.parts
+        self._lateness.add(ticks - 1, now_ns)
         self._update(inputs)
         self._apply_settings(inputs.settings, now_ns)
         self._take_chunks(inputs.chunks, now_ns)
@@ -481,11 +484,13 @@ class Commander:
         why = "; ".join(set(lost.values()) if same else lost)[:MAX_TEXT]
         if not why and self._watchdog.given_up(now_ns):
             why = f"held for {self.profile.timing.max_hold_s:g} s without a fresh chunk"
-        why = why or unheld
         if why:
-            self._change(Trigger.LOSE, why)
+            self._change(Trigger.LOSE, why + self._lateness.explains())
+        elif unheld:
+            self._change(Trigger.LOSE, unheld)
         elif self._watchdog.overdue(now_ns):
-            self._change(Trigger.STARVE, "no fresh chunk within the watchdog")
+            busy = self._lateness.explains()
+            self._change(Trigger.STARVE, f"no fresh chunk within the watchdog{busy}")
 
     def _keep_apart(self, spacing: PartSpacing, now_ns: int, ticks: int) -> None:
         """Slow the parts down, or let all of them stand, before they come too near; or brake."""

@@ -191,11 +191,13 @@ class EpisodeRunner:
             return EpisodeView(False, state="", why="no status of the command node received")
         detail, ours = status.detail, task.episode == started.episode
         current = detail.get("episode") == started.episode
+        why = str(detail.get("why", "")) if task.active else self.client.why_inactive()
+        inactive = not task.active and status.state in ("active", "holding")
         return EpisodeView(
             active=task.active,
             ours=ours,
-            state=status.state,
-            why=str(detail.get("why", "")) if ours else _changed(started, task),
+            state="inactive" if inactive else status.state,
+            why=why if ours else _changed(started, task),
             done=bool(current and detail.get("policy_done") and detail.get("at_rest")),
             chunks=int(detail.get("accepted_chunks", 0)) if current else 0,
             steps=int(detail.get("accepted_steps", 0)) if current else 0,

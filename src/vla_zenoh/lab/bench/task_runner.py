@@ -112,7 +112,7 @@ class TaskRunner:
 
     def failure(self) -> tuple[str, str] | None:
         """The arm is inactive, or the simulator's objects are silent."""
-        why = self._why_inactive()
+        why = self._client.why_inactive()
         if why:
             self._check_not_ended_by_others()
             return ARM_LOST, why
@@ -135,13 +135,6 @@ class TaskRunner:
         Raises:
             NodeError: there was one.
         """
-        latched, why = self._client.latch_reason(), self._why_inactive()
+        latched, why = self._client.latch_reason(), self._client.why_inactive()
         if latched or why == DEACTIVATED:
             raise NodeError(f"another client ended the episode: {latched or why}")
-
-    def _why_inactive(self) -> str:
-        task, status = self._client.task, self._client.status(COMMAND)
-        if task is not None and task.active:
-            return ""
-        why = status.detail.get("why", "") if status else "no status of the command node received"
-        return str(why) or "inactive"

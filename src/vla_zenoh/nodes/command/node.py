@@ -153,7 +153,10 @@ class CommandNode:
             extra: list[Setting] = []
             if tick.stall_s > timing.command_timeout_s:
                 why = f"the command loop stood still for {tick.stall_s:.3f} s"
-                extra = [Setting("lose", f"{why}, {tick.computed_s:.3f} s of it computing")]
+                why = f"{why}, {tick.computed_s:.3f} s of it computing"
+                if tick.computed_s < tick.stall_s / 2:
+                    why += ": this computer was too busy with something else, or suspended"
+                extra = [Setting("lose", why)]
             if stop.is_set() or self._replaced is not None:
                 give_up = give_up or time.monotonic() + BRAKE_BEFORE_EXIT_S
                 if self._replaced is not None:
