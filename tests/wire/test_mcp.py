@@ -133,7 +133,9 @@ def test_a_stop_is_obeyed_while_a_motion_runs(chain: Chain) -> None:
         chain.until("it moves", chain.moves)
         stop = found.send("tools/call", {"name": "stop", "arguments": {}})
         answers = {reply["id"]: reply["result"] for reply in (found.read(), found.read())}
-        assert answers[stop]["structuredContent"] == {"stopped": True}
+        stopped = answers[stop]["structuredContent"]
+        assert stopped["outcome"] == "confirmed"
+        assert stopped["message"].startswith(f"CONFIRMED: robot {chain.profile.robot.name} is")
         assert answers[moving]["structuredContent"]["reason"] == "stopped"
         assert found.call("home")["structuredContent"]["reason"] == "rejected"
     assert chain.state() == "stopped"

@@ -88,6 +88,7 @@ def test_it_takes_the_arm_from_a_model_in_motion_and_gives_it_back(chain: Chain)
         chain.until("it moves on", chain.moves)
         screen.type(b"x")
         chain.until("stopped", lambda: chain.state() == "stopped")
+        chain.until("the person reads it", lambda: b"CONFIRMED: robot " in screen.shown)
 
 
 def test_a_recording_of_a_takeover_has_the_chunks_of_both_and_says_who_led(

@@ -155,6 +155,20 @@ class StopProgress(NamedTuple):
     heard_by: tuple[str, ...]
     speed_rad_s: float | None
 
+    def sentence(self, robot: str, why: str = "") -> str:
+        """The outcome for a person, in the words of every way of stopping; `why` no answer came."""
+        by = ", ".join(self.heard_by)
+        if self.outcome is StopOutcome.CONFIRMED:
+            return f"CONFIRMED: {robot} is stopped and stands, by {by}"
+        if self.outcome is StopOutcome.HEARD:
+            speed = self.speed_rad_s
+            moves = "no joint states come" if speed is None else f"fastest joint {speed:.3f} rad/s"
+            return f"HEARD: by {by} of {robot}; {moves}"
+        return (
+            f"NOT CONFIRMED: no answer of {robot}{why and f': {why}'}. The stop may still have "
+            "arrived. USE THE ROBOT'S OWN EMERGENCY STOP"
+        )
+
 
 class Standstill:
     """Whether an arm stands, by its measured joint states."""
@@ -313,6 +327,11 @@ class Client(NodeRegistry):
         """Trigger the emergency stop; it latches until `reset`. `stop_progress` follows it."""
         self._stop_s = time.monotonic()
         self.publish(self.keys.stop, "stop")
+        self.follow_stop(self._stop_s)
+
+    def follow_stop(self, since_s: float) -> None:
+        """Watch what becomes of a stop put at `since_s` on the monotonic clock, by anybody."""
+        self._stop_s = since_s
         if not self._standstill:
             for name in self.profile.part_names:
                 watch = Standstill()

@@ -137,21 +137,13 @@ def _say(attempt: StopAttempt, robot: str, found: StopProgress, *, as_json: bool
     silence.cancel()
     target, own = attempt.target, attempt.profile.robot.name
     named = f"robot {robot} (profile {target.profile})"
-    by = ", ".join(found.heard_by)
+    why = target.not_operator(attempt.profile, "stop") or attempt.why
+    sentence = found.sentence(named, f"{why}; trying again for {GIVE_UP_S:g} s")
     if found.outcome is StopOutcome.CONFIRMED:
         how = target.typed("reset", robot=None if robot == own else robot)
-        word, rest = "CONFIRMED", f": {named} is stopped and stands, by {by}; `{how}` clears it"
+        sentence += f"; `{how}` clears it"
     elif found.outcome is StopOutcome.HEARD:
-        speed = found.speed_rad_s
-        moves = "no joint states come" if speed is None else f"fastest joint {speed:.3f} rad/s"
-        word, rest = "HEARD", f": by {by} of {named}; {moves}; watching it"
-    else:
-        why = target.not_operator(attempt.profile, "stop") or attempt.why
-        word = "NOT CONFIRMED"
-        rest = (
-            f": no answer of {named}: {why}. The stop may still have arrived; trying again for "
-            f"{GIVE_UP_S:g} s. USE THE ROBOT'S OWN EMERGENCY STOP"
-        )
+        sentence += "; watching it"
     if as_json:
         line = {
             "ok": found.outcome is StopOutcome.CONFIRMED,
@@ -159,11 +151,12 @@ def _say(attempt: StopAttempt, robot: str, found: StopProgress, *, as_json: bool
             "robot": robot,
             "heard_by": list(found.heard_by),
             "speed_rad_s": found.speed_rad_s,
-            "message": word + rest,
+            "message": sentence,
         }
         print(json.dumps(line), flush=True)
     else:
-        say_marked(word, BOLD_RED, rest)
+        word, colon, rest = sentence.partition(":")
+        say_marked(word, BOLD_RED, colon + rest)
 
 
 def _warn_of_others(attempt: StopAttempt) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, Literal, TypeVar
 
@@ -163,10 +163,12 @@ class RemoteRobot(Client):
         """Emergency stop: the arm brakes and stays stopped until `reset`.
 
         Raises:
-            SessionError: the command node did not confirm it within `timeout_s`.
+            SessionError: it was not confirmed within `timeout_s`; begins with HEARD or NOT
+                CONFIRMED, as `stop_progress` says.
         """
         super().stop()
-        self._confirm("stop", self.stopped, timeout_s)
+        if not self.wait_for(self.stopped, timeout_s):
+            raise SessionError(self.stop_progress().sentence(f"robot {self.profile.robot.name}"))
 
     def reset(self, timeout_s: float = TIMEOUT_S) -> None:
         """Clear an emergency stop or a fault. The arm stays inactive.
@@ -175,17 +177,13 @@ class RemoteRobot(Client):
             SessionError: it was not cleared within `timeout_s`; gives the reason.
         """
         super().reset()
-        self._confirm("reset", self.cleared, timeout_s)
-
-    def _confirm(self, what: str, done: Callable[[], bool], timeout_s: float) -> None:
         began_s = time.monotonic()
-        if not self.wait_for(done, timeout_s):
+        if not self.wait_for(self.cleared, timeout_s):
             heard = self.status_since("command", began_s) is not None
             why = self.latch_reason() if heard else "it is silent, or the router is lost"
-            then = "; use the emergency stop of the arm itself" if what == "stop" else ""
             raise SessionError(
-                f"{what}: the command node of robot {self.profile.robot.name!r} did not confirm it"
-                f"{why and f': {why}'}{then}"
+                f"reset: the command node of robot {self.profile.robot.name!r} did not confirm it"
+                f"{why and f': {why}'}"
             )
 
     def _record(self, kind: type[Record], key: str, timeout_s: float) -> Stamped[Record]:

@@ -9,10 +9,12 @@ from __future__ import annotations
 import base64
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict
 from typing import IO, Any
 
 from vla_zenoh import __version__
+from vla_zenoh.bus.client import StopOutcome
 from vla_zenoh.errors import SessionError, VlaZenohError, in_words
 from vla_zenoh.keys import worker_node
 from vla_zenoh.lab.primitives.client import ask
@@ -118,8 +120,14 @@ class McpServer:
         return said(asdict(answer), ok=answer.ok)
 
     def _stop(self, **_: Any) -> dict[str, Any]:
-        self._robot.stop()
-        return said({"stopped": True}, ok=True)
+        with suppress(SessionError):  # what it would say is said below
+            self._robot.stop()
+        found = self._robot.stop_progress()
+        text = found.sentence(f"robot {self._robot.profile.robot.name}")
+        return said(
+            {"outcome": found.outcome.value, "message": text},
+            ok=found.outcome is StopOutcome.CONFIRMED,
+        )
 
     def _picture(self, camera: Any = None) -> dict[str, Any]:
         known = self._robot.profile.cameras

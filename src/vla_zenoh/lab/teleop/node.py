@@ -14,7 +14,7 @@ from collections.abc import Callable
 
 import zenoh
 
-from vla_zenoh.bus.client import Client
+from vla_zenoh.bus.client import Client, StopOutcome
 from vla_zenoh.errors import NodeError, PeerError
 from vla_zenoh.keys import CRASHED, STARTING
 from vla_zenoh.lab.teleop.keyboard import (
@@ -39,6 +39,8 @@ from vla_zenoh.sanitize import one_line
 
 SHOW_PERIOD_S = 0.2
 DEVICE_S = 0.02
+NOT_CONFIRMED_S, FOLLOW_S = 1.0, 10.0
+"""Without an answer that is said so long after a stop, which is followed for so long."""
 NO_COMMAND_NODE = "no command node"
 UNKNOWN = "state unknown"
 """Before the first task, and after the link of the operator was lost."""
@@ -91,6 +93,8 @@ class Teleop:
         parts = PARTS_LEGEND.format(", ".join(profile.parts)) if profile.parts else ""
         self._legend = f"{LEGEND}\n{parts}"
         self._lines: deque[str] = deque(maxlen=16)
+        self._stop_told: StopOutcome | None = None
+        self._stopped_s: float | None = None
 
     def run(self, stop: threading.Event) -> None:
         """Until `stop`, Ctrl-C, q, or the end of the terminal."""
@@ -157,6 +161,7 @@ class Teleop:
             self._lines.append("this key needs the certificate of an operator on this computer")
         elif command == STOP:
             client.stop()
+            self._stop_told, self._stopped_s = None, time.monotonic()
             if not client.session.info.routers_zid():
                 self._lines.append(LINK_LOST)
         elif command == ACTIVATE and not client.session.info.routers_zid():
@@ -187,12 +192,25 @@ class Teleop:
         while not self._stop.wait(SHOW_PERIOD_S):
             if self._client is not None:
                 self._note_who_leads(self._client)
+                self._follow_stop(self._client)
             for node, _, event in self._client.pop_events() if self._client else ():
                 if event.level != "info" or event.kind == "transition":
                     self._lines.append(f"{node}: {event.what} {event.why}".rstrip())
             while self._lines:
                 terminal.print(one_line(self._lines.popleft()))
             terminal.show(self._status_line())
+
+    def _follow_stop(self, client: Client) -> None:
+        """Say each outcome of the last stop once, until the arm stands."""
+        if self._stopped_s is None:
+            return
+        found, took_s = client.stop_progress(), time.monotonic() - self._stopped_s
+        waits = found.outcome is StopOutcome.NOT_CONFIRMED and took_s < NOT_CONFIRMED_S
+        if not waits and found.outcome is not self._stop_told:
+            self._stop_told = found.outcome
+            self._lines.append(found.sentence(f"robot {client.keys.robot}"))
+        if found.outcome is StopOutcome.CONFIRMED or took_s > FOLLOW_S:
+            self._stopped_s = None
 
     def _status_line(self) -> str:
         task = self._client.task if self._client else None

@@ -6,15 +6,13 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
 from dataclasses import asdict
 from typing import Any
 
-import numpy as np
 import zenoh
 
-from vla_zenoh.bus.buffers import LatestSample, ReceivedSample, ZenohRing, bytes_of
-from vla_zenoh.bus.client import Client
+from vla_zenoh.bus.buffers import ReceivedSample, ZenohRing, bytes_of
+from vla_zenoh.bus.client import Client, StopOutcome
 from vla_zenoh.cli.node_rows import NodeRow, acting_limits, mode_of, node_rows
 from vla_zenoh.codec import records
 from vla_zenoh.codec.settings import decode_held
@@ -30,10 +28,8 @@ from vla_zenoh.lab.web.recordings import Recordings
 from vla_zenoh.lab.web.trial import PageTrial
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import ActionChunk, Event, NodeStatus, PoseState, Task
+from vla_zenoh.types import ActionChunk, Event, NodeStatus, Task
 
-STILL_M_S = 0.005
-"""A measured arm that is slower stands: an impedance controller still settles."""
 STAND_S, STAND_POLL_S = 3.0, 0.01
 WATCH_S = 0.05
 MAX_HOLDER = 48
@@ -191,35 +187,26 @@ class RobotLink:
         """Trigger the emergency stop and wait until the arm stands.
 
         Returns:
-            ``robot``, whether it is ``stopped`` (latched) and ``stands`` (measured), and seconds
-            from the call to both.
+            ``robot``, ``outcome`` and its ``message``, and seconds from the call until a node had
+            latched it and until the arm stood; None: it did not within `STAND_S`.
         """
         began_s = time.monotonic()
         self.client.stop()
-        stopped_s: float | None = None
-        stands_s: float | None = None
-        with ExitStack() as stack:
-            measured: list[LatestSample] = []
-            for name in self.profile.part_names:
-                measured.append(LatestSample())
-                key = self.keys.of_part(name).state_pose
-                stack.callback(measured[-1].subscribe(self.session, key).undeclare)
-            moving = measured
-            while (now_s := time.monotonic()) < began_s + STAND_S:
-                status = self.client.status_since("command", began_s)
-                if status is not None and status.state == "stopped":
-                    stopped_s = stopped_s or now_s - began_s
-                    at_rest = status.detail.get("at_rest") is True
-                    moving = [each for each in (moving if at_rest else measured) if _moves(each)]
-                    if at_rest and not moving:
-                        stands_s = now_s - began_s
-                        break
-                time.sleep(STAND_POLL_S)
+        heard_s: float | None = None
+        while True:
+            found, took_s = self.client.stop_progress(), time.monotonic() - began_s
+            if found.heard_by and heard_s is None:
+                heard_s = round(took_s, 3)
+            stands = found.outcome is StopOutcome.CONFIRMED
+            if stands or took_s > STAND_S:
+                break
+            time.sleep(STAND_POLL_S)
         return {
             "robot": self.keys.robot,
-            "stopped": stopped_s is not None,
-            "stopped_s": None if stopped_s is None else round(stopped_s, 3),
-            "stands_s": None if stands_s is None else round(stands_s, 3),
+            "outcome": found.outcome.value,
+            "message": found.sentence(f"robot {self.keys.robot}"),
+            "stopped_s": heard_s,
+            "stands_s": round(took_s, 3) if stands else None,
             "at_ms": time.time_ns() // 1_000_000,
         }
 
@@ -375,18 +362,6 @@ class RobotLink:
             subscriber.undeclare()
         for part in self._parts.values():
             part.close()
-
-
-def _moves(measured: LatestSample) -> bool:
-    """Whether an arm moves, or did not say that it stands since this was asked last."""
-    sample = measured.pop()
-    if sample is None:
-        return True
-    try:
-        state = records.decode(PoseState, bytes_of(sample.sample.payload))
-    except CodecError:
-        return True
-    return not float(np.linalg.norm(state.twist[:3])) < STILL_M_S
 
 
 SETTINGS: dict[str, Callable[[RobotLink, Any], Any]] = {

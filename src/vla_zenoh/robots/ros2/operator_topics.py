@@ -227,8 +227,12 @@ class OperatorTopics:
     def _execute(self, call: Call, wanted: Wanted) -> str:
         """Answer of a request that was executed, or a `SessionError` or `CodecError`."""
         if call.operation is STOP:
-            self._await_state("stopped", call.mono_ns)
-            return "stopped; call reset, then activate"
+            self._client.follow_stop(call.mono_ns / 1e9)
+            stands = self._client.wait_for(self._client.stopped, STATE_TIMEOUT_S)
+            told = self._client.stop_progress().sentence(f"robot {self._robot}")
+            if not stands:
+                raise SessionError(told)
+            return f"{told}; call reset, then activate"
         self._check_stops(call.mono_ns)
         sets_in_motion = call.operation is RESET or wanted.active is True
         if sets_in_motion and call.service is None:
@@ -280,17 +284,14 @@ class OperatorTopics:
             self._check_stops(self._called_ns)
             asked_ns = time.monotonic_ns()
             self._client.publish(self._client.keys.reset, "")
-        self._await_state("inactive", asked_ns)
-        return "inactive"
 
-    def _await_state(self, wanted: str, since_ns: int) -> None:
         def state() -> str:
-            status = self._client.status_since("command", since_ns / 1e9)
+            status = self._client.status_since("command", asked_ns / 1e9)
             return "silent" if status is None else status.state
 
-        if not self._client.wait_for(lambda: state() == wanted, STATE_TIMEOUT_S):
-            then = "; use the emergency stop of the arm itself" if wanted == "stopped" else ""
-            raise SessionError(f"the command node is {state()}, not {wanted}{then}")
+        if not self._client.wait_for(lambda: state() == "inactive", STATE_TIMEOUT_S):
+            raise SessionError(f"the command node is {state()}, not inactive")
+        return "inactive"
 
     def _apply(self, wanted: Wanted) -> str:
         """Apply what is given, one after the other: deactivation first, activation last.

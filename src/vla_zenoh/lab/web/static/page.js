@@ -217,15 +217,14 @@ function post(began) {
 }
 function unconfirmed() {
   stopping = 0;
-  setText($("stop-words"), `${welcome.robot} did NOT confirm the stop. Use the robot's own emergency stop.`);
+  setText($("stop-words"), `NOT CONFIRMED: no answer of robot ${welcome.robot}. The stop may still have arrived. USE THE ROBOT'S OWN EMERGENCY STOP`);
 }
 function showStopped(report) {
   const mine = stopping ? performance.now() - stopping : 0;
   stopping = 0;
-  if (!report.stopped) { unconfirmed(); return; }
-  const stood = report.stands_s === null ? "but it was not seen to stand" :
-    `stood at ${clock(report.at_ms)}, ${seconds(mine ? mine / 1000 : report.stands_s)} after the ${mine ? "touch" : `stop by ${report.by}`}`;
-  setText($("stop-words"), `${report.robot} stopped: ${stood}. Reset clears it.`);
+  if (report.outcome !== "confirmed") { setText($("stop-words"), report.message); return; }
+  const stood = `stood at ${clock(report.at_ms)}, ${seconds(mine ? mine / 1000 : report.stands_s)} after the ${mine ? "touch" : `stop by ${report.by}`}`;
+  setText($("stop-words"), `${report.message}; ${stood}. Reset clears it.`);
   $("stop-words").dataset.standsMs = String(mine);
 }
 $("stop").addEventListener("pointerdown", (event) => { event.preventDefault(); stop(); });
