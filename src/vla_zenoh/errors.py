@@ -85,6 +85,10 @@ class SessionError(VlaZenohError, ConnectionError):
     """No Zenoh session could be opened."""
 
 
+class StartingError(SessionError):
+    """An activation was rejected only because something is still starting."""
+
+
 class WorkerError(VlaZenohError):
     """A model worker cannot be loaded, or broke its contract."""
 

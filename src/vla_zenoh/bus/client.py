@@ -18,7 +18,7 @@ from vla_zenoh.bus.buffers import ReceivedSample, SampleBuffer, bytes_of, header
 from vla_zenoh.bus.reception import Reception
 from vla_zenoh.bus.session import put_text
 from vla_zenoh.codec import records, settings
-from vla_zenoh.errors import CodecError, ProfileError, SessionError
+from vla_zenoh.errors import CodecError, ProfileError, SessionError, StartingError
 from vla_zenoh.keys import NO_DEADMAN_TOKEN, key_chunk, last_chunk
 from vla_zenoh.security.roles import expected_nodes, identities
 from vla_zenoh.types import Event, Header, NodeStatus, Task
@@ -441,6 +441,7 @@ class Client(NodeRegistry):
         `holder`: another client, whose liveliness token on `Keys.holding` makes it the deadman.
 
         Raises:
+            StartingError: rejected only because something is still starting: try again.
             SessionError: rejected, with every reason.
         """
         text = f"true {settings.WHILE} {holder}" if holder else "true"
@@ -534,8 +535,11 @@ class Client(NodeRegistry):
         )
         if self._refused(what, began_s):
             time.sleep(0.1)  # the other reasons follow the first
-            reasons = dict.fromkeys(self._refused(what, began_s))
-            raise SessionError(f"{what} rejected:\n  - " + "\n  - ".join(reasons))
+            rejections = self._refused(what, began_s)
+            reasons = dict.fromkeys(event.why for event in rejections)
+            passes = all(event.level == "info" for event in rejections)
+            rejected = StartingError if passes else SessionError
+            raise rejected(f"{what} rejected:\n  - " + "\n  - ".join(reasons))
         if (task := self._taken(taken, began_s)) is not None:
             return task
         if activates:
@@ -555,10 +559,10 @@ class Client(NodeRegistry):
             task, heard_s = self.task, self._task_heard_s
         return task if task is not None and heard_s > since_s and taken(task) else None
 
-    def _refused(self, what: str, since_s: float) -> list[str]:
+    def _refused(self, what: str, since_s: float) -> list[Event]:
         with self._lock:
             return [
-                event.why
+                event
                 for heard_s, event in self._refusals
                 if heard_s > since_s and event.what == f"{what}_refused"
             ]

@@ -84,7 +84,7 @@ class CommandedPart:
     # -- its name in messages -----------------------------------------------------------------
     def says(self, why: str) -> str:
         """`why`, with the part that it is about."""
-        return f"{self.name}: {why}" if self.name and why else why
+        return type(why)(f"{self.name}: {why}") if self.name and why else why
 
     def tagged(self, events: Iterable[Event]) -> list[Event]:
         """Events with the part that they are about."""

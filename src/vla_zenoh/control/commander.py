@@ -35,6 +35,7 @@ from vla_zenoh.control.plan_timeline import EpisodeProgress
 from vla_zenoh.control.policy_check import Lease, Rejection
 from vla_zenoh.control.preflight import (
     STOP_LATCHED,
+    Passing,
     PeerSnapshot,
     reasons_of_part,
     reasons_of_worker,
@@ -328,7 +329,9 @@ class Commander:
             reasons += map(part.says, part.motion.unsettled() + part.contact.missing)
         known = all(part.pose and part.gripper_state for part in self.parts)
         if lease is None or not known or reasons:
-            self._reject_setting("activate", reasons + self._ended_before())
+            passing = bool(reasons) and all(isinstance(why, Passing) for why in reasons)
+            reasons += self._ended_before()
+            self._reject_setting("activate", reasons, passing=passing)
             return
         self.lease = lease
         self.deadman.name = holder
@@ -383,12 +386,14 @@ class Commander:
             return None, reasons
         return Lease(spec, chunk.header.source, now_ns, chunk.header.seq), []
 
-    def _reject_setting(self, what: str, reasons: list[str]) -> None:
+    def _reject_setting(self, what: str, reasons: list[str], *, passing: bool = False) -> None:
+        """Reject a setting; `passing`: only because something is still starting."""
         # Keep the reason for a stop: rejections that follow from it must not replace it.
         if self.state not in (State.STOPPED, State.FAULT):
             self.why = f"{what} rejected: {'; '.join(reasons)}"[:MAX_TEXT]
         for reason in reasons:
-            self._emit("warning", "refusal", f"{what}_refused", reason)
+            level = "info" if passing else "warning"
+            self._emit(level, "refusal", f"{what}_refused", reason)
             self._out.rejections.append(Rejection(f"{what}_refused", reason))
 
     def latch(self, why: str) -> None:

@@ -13,7 +13,7 @@ from vla_zenoh.control import policy_check
 from vla_zenoh.control.joint_space import JointBounds
 from vla_zenoh.control.limits import into_workspace
 from vla_zenoh.errors import RecordError, SpecError, VlaZenohError
-from vla_zenoh.keys import worker_node
+from vla_zenoh.keys import LOADING, NO_TASK, NOTHING_YET, OPENING, worker_node
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import Pose, held_pose, pose_distance, pose_of
 from vla_zenoh.policy import ModelSpec, check_steps
@@ -88,6 +88,15 @@ class PeerSnapshot:
         return 0.0 if node in self.same_host else self.clocks.get(node, (0.0, 0.0))[1]
 
 
+STARTS = (LOADING, NO_TASK, NOTHING_YET)
+
+
+class Passing(str):
+    """A reason that passes by itself: something is starting."""
+
+    __slots__ = ()
+
+
 def reasons_of_part(
     profile: Profile,
     peers: PeerSnapshot,
@@ -101,7 +110,7 @@ def reasons_of_part(
     """
     reasons = _robot(profile, peers, pose, now_ns)
     if gripper is None:
-        return [*reasons, "the gripper is not known: nothing received on state/gripper"]
+        return [*reasons, Passing("the gripper is not known: nothing received on state/gripper")]
     reasons += _too_old("gripper's state", gripper, profile, now_ns)
     why = why_not_ready(gripper.record)
     return [*reasons, why] if why else reasons
@@ -243,7 +252,7 @@ def _robot(
             f"the robot's node {peers.robot_node!r} is not alive{peers.why_down(peers.robot_node)}"
         )
     if pose is None:
-        return [*reasons, "the TCP pose is not known: nothing received on state/pose"]
+        return [*reasons, Passing("the TCP pose is not known: nothing received on state/pose")]
     reasons += _too_old("TCP pose", pose, profile, now_ns)
     delay_s = (pose.received_ns - pose.header.stamp_wall_ns) / 1e9
     tolerance_s = CLOCK_TOLERANCE_S + peers.uncertainty_s(peers.robot_node)
@@ -292,13 +301,14 @@ def _worker(worker: str, prompt: str, peers: PeerSnapshot, spec: ModelSpec | Non
         alive = ", ".join(others) or "none"
         return [f"worker {worker!r} is not alive{peers.why_down(node)}; alive are: {alive}"]
     if spec is None:
-        return [f"worker {worker!r} has not published its spec"]
+        return [Passing(f"worker {worker!r} has not published its spec")]
     reasons: list[str] = []
     if spec.observation.prompt and not prompt:
         reasons.append(f"worker {worker!r} needs a prompt and there is none")
     complaint = peers.worker_complaints.get(worker)
     if complaint:
-        reasons.append(f"worker {worker!r} reports: {complaint}")
+        why = f"worker {worker!r} reports: {complaint}"
+        reasons.append(Passing(why) if complaint.startswith(STARTS) else why)
     return reasons
 
 
@@ -318,7 +328,8 @@ def _chunk(
     # Chunks from before a restart of the worker do not count.
     ours = chunk is not None and chunk.header.source == peers.spec_sources.get(worker)
     if chunk is None or not ours or now_ns - chunk.received_ns > patience_s * 1e9:
-        return [f"worker {worker!r} has published no chunk in the last {patience_s:g} s"]
+        why = f"worker {worker!r} has published no chunk in the last {patience_s:g} s"
+        return [why if ours else Passing(why)]  # else it has published none since its start
     if chunk.record.spec_hash != spec.hash:
         return [f"worker {worker!r} publishes chunks of another spec than its own"]
     delay_s = (chunk.received_ns - chunk.record.observation_stamp_ns) / 1e9
@@ -369,9 +380,9 @@ def _cameras(profile: Profile, spec: ModelSpec, peers: PeerSnapshot) -> list[str
             )
         elif age_s > CAMERA_PATIENCE_S:
             since = "yet" if math.isinf(age_s) else f"for {age_s:.1f} s"
-            reasons.append(
-                f"camera {camera!r} has sent no image {since}: {why or 'it gives no reason'}"
-            )
+            sentence = f"camera {camera!r} has sent no image {since}: {why or 'it gives no reason'}"
+            starts = math.isinf(age_s) and (not why or why.startswith(OPENING))
+            reasons.append(Passing(sentence) if starts else sentence)
         elif camera in peers.camera_faults:
             reasons.append(f"camera {camera!r} {peers.camera_faults[camera]}")
     return reasons
@@ -396,9 +407,8 @@ def _clocks(
             )
         elif offset_s is None and node in peers.alive - peers.same_host:
             where = f" on {peers.hosts[node]}" if node in peers.hosts else ""
-            reasons.append(
-                f"the clock of node {node!r}{where} is not known: it has not answered yet"
-            )
+            why = f"the clock of node {node!r}{where} is not known: it has not answered yet"
+            reasons.append(Passing(why))
     return reasons
 
 

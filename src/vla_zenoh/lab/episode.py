@@ -10,7 +10,7 @@ from typing import Literal
 
 from vla_zenoh.bus.client import Client
 from vla_zenoh.errors import NodeError, SessionError
-from vla_zenoh.keys import worker_node
+from vla_zenoh.keys import STARTING, worker_node
 from vla_zenoh.lab.newest_records import NewestRecords
 from vla_zenoh.types import Task
 
@@ -20,7 +20,7 @@ LOAD_PATIENCE_S = 600.0
 """While the worker reports that it loads; it may be building its environment."""
 SETTLE_PATIENCE_S = 15.0
 """For cameras and worker to have data; then activation names what is missing."""
-UNSETTLED = {"waiting", "degraded"}
+UNSETTLED = {STARTING, "waiting", "degraded"}
 ACTIVATE_PATIENCE_S, ACTIVATE_PERIOD_S = 15.0, 0.2
 RESET_PATIENCE_S, RESET_PERIOD_S = 8.0, 1.0
 POLL_S, WATCH_S = 0.03, 0.1
@@ -101,7 +101,7 @@ class EpisodeRunner:
         began_s = time.monotonic()
         while True:
             status = self.client.status(worker_node(worker))
-            loading = status is None or status.detail.get("complaint") == "loading"
+            loading = status is None or status.state == STARTING
             missing = streams.missing()
             waited_s = time.monotonic() - began_s
             settled = waited_s > SETTLE_PATIENCE_S or self._settled()

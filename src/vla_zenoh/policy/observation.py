@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.errors import SpecError
+from vla_zenoh.keys import NOTHING_YET
 from vla_zenoh.policy import (
     CameraSpec,
     DepthSpec,
@@ -230,7 +231,7 @@ def assemble(
         return NotReady("there is no prompt", waiting=True)
     silent = streams.silent()
     if silent:
-        return NotReady(f"nothing received yet of {', '.join(silent)}")
+        return NotReady(f"{NOTHING_YET} of {', '.join(silent)}")
     oldest = min((one.entries[-1] for one in streams.leading()), key=_stamp_ns, default=None)
     stamp_ns = oldest.header.stamp_wall_ns if oldest else now_ns
     age_s = (now_ns - stamp_ns) / 1e9

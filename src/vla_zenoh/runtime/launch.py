@@ -22,7 +22,16 @@ from vla_zenoh.bus.host import HOST_VARIABLE, HostId, own_boot_id, own_host_id
 from vla_zenoh.bus.node import Publisher
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import NodeError, ProfileError, SessionError, VlaZenohError
-from vla_zenoh.keys import CRASHED, NODE_KINDS, ON_BEHALF, ROLLING, STARTING, Kind, worker_node
+from vla_zenoh.keys import (
+    CRASHED,
+    NODE_KINDS,
+    ON_BEHALF,
+    OPENING,
+    ROLLING,
+    STARTING,
+    Kind,
+    worker_node,
+)
 from vla_zenoh.profile import HostProfile, Profile, override, to_yaml
 from vla_zenoh.runtime.certificate_expiry import CertificateExpiry
 from vla_zenoh.runtime.process import ROUTER_PATIENCE_S, RUN_FOLDER_VARIABLE
@@ -213,6 +222,7 @@ class Host:
         self._ready, self._dry_run = False, dry_run
         self._deaf_s = time.monotonic()  # when no node was heard
         self._silence = SilenceMeter()
+        self._starting: list[str] = []
         self._expiry = CertificateExpiry(profile.session.security)
         self.session: zenoh.Session | None = None
         self.client: Client | None = None
@@ -367,9 +377,15 @@ class Host:
             self._tell(name, f"silent for {said[name][1]:.0f} s; it hangs; killing it")
             signal_group(running[name][1], signal.SIGKILL)
         names = client.expected.keys() & {each.command.name for each in self.supervisor.children}
-        if not self._ready and not self._nodes_down() and names <= heard.keys():
+        if self._ready or self._nodes_down() or not names <= heard.keys():
+            return
+        starting = sorted(why for name in names for why in still_starting(heard[name][0]))
+        if not starting:
             self._ready = True
             self._tell("up", f"{self.mode} | ready: {', '.join(sorted(names))}")
+        elif starting != self._starting:
+            self._tell("up", f"{self.mode} | starting: {'; '.join(starting)}")
+        self._starting = starting
 
     @property
     def mode(self) -> str:
@@ -377,6 +393,20 @@ class Host:
         if self._dry_run:
             return "DRY RUN"
         return "SIM" if self.profile.robot.driver == "sim" else "LIVE"
+
+
+def still_starting(status: NodeStatus) -> list[str]:
+    """What of a node is still starting, as sentences; a camera that cannot be opened is not."""
+    if status.state == STARTING:
+        return [f"{status.node}: {status.detail.get('complaint') or 'it has not reported yet'}"]
+    cameras = status.detail.get("cameras")
+    if not isinstance(cameras, Mapping):
+        return []
+    return [
+        f"camera {name!r}: {why}"
+        for name, camera in cameras.items()
+        if isinstance(camera, Mapping) and (why := str(camera.get("why"))).startswith(OPENING)
+    ]
 
 
 class DownNodes:

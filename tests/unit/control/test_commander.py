@@ -24,6 +24,7 @@ from vla_zenoh.control.axis_smoothing import AxisSmoother
 from vla_zenoh.control.commander import MAX_ANSWER_S, Commander, Inputs, Setting
 from vla_zenoh.control.motion_pipeline import LINGER_NS
 from vla_zenoh.control.reachability import ReachabilityFilter
+from vla_zenoh.keys import OPENING
 from vla_zenoh.kinematics.so3 import norm3
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.types import GripperState, HeldBox, PoseState, Stamped
@@ -68,6 +69,18 @@ def test_activation_is_refused_with_every_reason_as_an_event() -> None:
     assert len(rejections) >= 3
     assert {event.what for event in rejections} == {"activate_refused"}
     assert rig.refused["activate_refused"] == len(rejections)
+
+
+def test_an_activation_while_only_something_starts_is_rejected_as_a_notice() -> None:
+    rig = Rig()
+    rig.tick(chunks=[rig.chunk([STAND])])
+    there = rig.peers
+    rig.peers = replace(there, camera_ages_s={}, camera_reasons={"front": OPENING})
+    rig.put("active", True)
+    rig.peers = replace(there, alive=there.alive - {"camera"})
+    rig.put("active", True)
+    levels = [(event.what, event.level) for event in rig.events if event.kind == "refusal"]
+    assert levels == [("activate_refused", "info"), ("activate_refused", "warning")]
 
 
 def test_activation_begins_where_the_robot_holds_and_does_not_move_it() -> None:

@@ -11,7 +11,8 @@ import pytest
 from command_rig import MS, START_NS, WORKER, Rig, model_spec
 
 from vla_zenoh.control.policy_check import pace
-from vla_zenoh.control.preflight import PeerSnapshot, reasons_of_part, reasons_of_worker
+from vla_zenoh.control.preflight import Passing, PeerSnapshot, reasons_of_part, reasons_of_worker
+from vla_zenoh.keys import LOADING, NOTHING_YET, OPENING
 from vla_zenoh.lab.check.fit import check_spec
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec
 from vla_zenoh.profile import load_profile
@@ -312,3 +313,43 @@ def test_a_worker_that_needs_no_prompt_and_no_camera_gets_neither() -> None:
     another_chunk(spec_hash=spec.hash)(ready)
     ready.prompt = ""
     assert ready.reasons() == []
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        set_("pose", None),
+        set_("gripper", None),
+        peers(specs={}),
+        set_("chunk", None),
+        peers(worker_complaints={WORKER: LOADING}),
+        peers(worker_complaints={WORKER: f"{NOTHING_YET} of camera 'front'"}),
+        peers(camera_ages_s={}, camera_nodes={}, camera_reasons={"front": OPENING}),
+        peers(
+            camera_ages_s={}, camera_nodes={}, camera_reasons={"front": f"{OPENING}: no scene yet"}
+        ),
+    ],
+)
+def test_what_is_starting_passes_by_itself(change: Callable[[Ready], None]) -> None:
+    ready = Ready()
+    change(ready)
+    reasons = ready.reasons()
+    assert reasons
+    assert [why for why in reasons if not isinstance(why, Passing)] == []
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        gone("sim"),
+        set_("prompt", ""),
+        peers(worker_complaints={WORKER: "no sun"}),
+        later(2.3),
+        peers(camera_ages_s={"front": 1.5}, camera_reasons={"front": OPENING}),
+        peers(camera_ages_s={}, camera_nodes={}, camera_reasons={"front": "no /dev/video0"}),
+    ],
+)
+def test_what_fails_does_not_pass_by_itself(change: Callable[[Ready], None]) -> None:
+    ready = Ready()
+    change(ready)
+    assert [why for why in ready.reasons() if not isinstance(why, Passing)]

@@ -16,7 +16,7 @@ from vla_zenoh.bus.node import Node, Publisher
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import encode_raw, raw_schema
 from vla_zenoh.errors import CodecError, NodeError
-from vla_zenoh.keys import Kind, worker_node
+from vla_zenoh.keys import LOADING, Kind, worker_node
 from vla_zenoh.lab.benchmark.contract import BenchmarkObservation
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.profile import Profile
@@ -130,7 +130,7 @@ class AskedWorker:
         while time.monotonic() < give_up_s:
             spec = spec or self._asked_spec()
             self._poll_status()
-            if spec is not None and self._complaint != "loading":
+            if spec is not None and self._complaint != LOADING:
                 return spec
             self.node.publish_status("waiting")
             time.sleep(0.1)

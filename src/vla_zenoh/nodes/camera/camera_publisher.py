@@ -17,7 +17,7 @@ from vla_zenoh.bus.metrics import Percentiles, RateMeter
 from vla_zenoh.bus.node import Node, Publisher
 from vla_zenoh.codec.image import depth_schema, encode_depth, encode_jpeg, encode_raw, raw_schema
 from vla_zenoh.errors import NodeError
-from vla_zenoh.keys import Kind
+from vla_zenoh.keys import OPENING, Kind
 from vla_zenoh.nodes.camera.geometry import Geometry, Intrinsics, Pixels, resize
 from vla_zenoh.nodes.camera.image_check import ImageCheck, ImageFault
 from vla_zenoh.policy import CameraSpec
@@ -162,7 +162,7 @@ class CameraPublisher:
     ) -> None:
         self.name, self.profile, self._references = name, profile, references
         self.backend = ""
-        self.state, self.why = WAITING, "it is being opened"
+        self.state, self.why = WAITING, OPENING
         self.fault: ImageFault | None = None
         self._check = ImageCheck(name, profile.check, same_s, references)
         self.counts: Counter[str] = Counter()

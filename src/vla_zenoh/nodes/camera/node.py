@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from vla_zenoh.bus.buffers import LatestSample, ReceivedSample, ZenohRing
 from vla_zenoh.bus.node import Node
 from vla_zenoh.errors import MissingExtraError, NodeError, RecordError, VlaZenohError, in_words
-from vla_zenoh.keys import last_chunk
+from vla_zenoh.keys import OPENING, last_chunk
 from vla_zenoh.nodes.camera.camera_publisher import OK, WAITING, CameraPublisher
 from vla_zenoh.nodes.camera.geometry import Intrinsics
 from vla_zenoh.nodes.camera.image_check import read_references
@@ -369,7 +369,7 @@ class SimCameras:
                 width=width, height=height, fx_px=focal_px, fy_px=focal_px, cx_px=cx_px, cy_px=cy_px
             ).shown()
             if publisher.state == WAITING:  # without an event
-                publisher.why = f"no scene on {key} yet"
+                publisher.why = f"{OPENING}: no scene on {key} yet"
         while not stop.is_set():
             if not self._buffer.wait(WAKE_S):
                 if time.monotonic_ns() - self._received_ns > STALL_S * 1e9:

@@ -25,7 +25,7 @@ from vla_zenoh.codec import records
 from vla_zenoh.codec.image import MAX_IMAGE_BYTES, decode_depth, decode_jpeg, decode_raw
 from vla_zenoh.codec.records import SMALL_BYTES
 from vla_zenoh.errors import CodecError, PeerError, SpecError, in_words
-from vla_zenoh.keys import Kind, worker_node
+from vla_zenoh.keys import LOADING, NO_TASK, STARTING, Kind, worker_node
 from vla_zenoh.policy import ActionSteps, CameraSpec, Observation, Policy, check_steps, reset_of
 from vla_zenoh.policy.frozen import FrozenImages
 from vla_zenoh.policy.inference import ChunkPrefix, make_chunk
@@ -121,7 +121,7 @@ class RobotSession:
         self._rate = RateMeter(window_s=10.0)
         self._inference_ms = Percentiles(128)
         self._batch, self._last_spec_s = 0, -1e9
-        self.complaint = "loading"
+        self.complaint = LOADING
         """Why there is no inference; empty if there is."""
         self.due_s = 0.0
         """When the next inference is due, monotonic clock."""
@@ -191,7 +191,7 @@ class RobotSession:
         if self.task is not None and self.task.requested_hz <= 0.0:
             return None
         if self.task is None or time.monotonic() - self._task_received_s > TASK_PATIENCE_S:
-            self.complaint = "no task received: is the command node running?"
+            self.complaint = f"{NO_TASK}: is the command node running?"
             return None
         try:
             observation = assemble(
@@ -280,6 +280,8 @@ class RobotSession:
             self._last_spec_s = time.monotonic()
             self._specs.publish(self.spec)
         state = "waiting" if self.complaint else "inferring"
+        if self.complaint == LOADING:
+            state = STARTING
         if not now and not self.node.status_due(state):
             return
         task = self.task
