@@ -87,21 +87,21 @@ def activate(
     with target.operator("activate") as client:
         stop = stop_on_signals() if held else None
         hold = partial(client.activate_with_deadman, "person")
-        task = _patiently(client, client.activate if stop is None else hold)
+        task = patiently(client, client.activate if stop is None else hold)
         what = f"worker {task.worker}, prompt {task.prompt!r}, {task.rate_hz:g} Hz"
         _show(target, client, f"{_mode(client)} | active: {what}")
         if stop is not None:
             _hold(target, client, task, stop)
 
 
-def _patiently(client: Client, activate: Callable[[], Task]) -> Task:
+def patiently(client: Client, activate: Callable[[], Task]) -> Task:
     """Activate; wait while it is rejected only because something is still starting."""
     give_up_s, shown = time.monotonic() + START_PATIENCE_S, ""
     while True:
         try:
             return activate()
         except SessionError as error:
-            starts = isinstance(error, StartingError) or _are_starting(client)
+            starts = isinstance(error, StartingError) or are_starting(client)
             if not starts or time.monotonic() > give_up_s:
                 raise
             if str(error) != shown:
@@ -110,7 +110,7 @@ def _patiently(client: Client, activate: Callable[[], Task]) -> Task:
             time.sleep(START_PERIOD_S)
 
 
-def _are_starting(client: Client) -> bool:
+def are_starting(client: Client) -> bool:
     """Whether a node of the profile is starting, by its host's `up`."""
     return any(
         name in client.expected and not alive and status.state == STARTING and age_s < SILENT_S

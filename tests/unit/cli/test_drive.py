@@ -8,14 +8,20 @@ import resource
 import subprocess
 import sys
 import time
+from typing import Any, cast
 
 import pytest
 from typed import typed
 from typer.testing import CliRunner
 
+from vla_zenoh.bus.client import Client
+from vla_zenoh.cli import drive
 from vla_zenoh.cli.main import app
 from vla_zenoh.cli.plain import json_answer, say, warn
-from vla_zenoh.errors import SessionError
+from vla_zenoh.errors import SessionError, StartingError
+from vla_zenoh.keys import STARTING
+from vla_zenoh.profile import load_profile
+from vla_zenoh.types import NodeStatus, Task
 
 FIRST_LINE_S = 1.2
 NOWHERE = ("--connect", "tcp/127.0.0.1:9")
@@ -136,3 +142,38 @@ def test_a_stop_without_a_router_says_at_once_that_nobody_confirmed_it(form: lis
     assert "no answer of robot panda" in lines[-1]
     print(f"first line after {took_s:.2f} s")
     assert took_s < FIRST_LINE_S
+
+
+def test_activate_waits_while_something_starts_and_says_for_what(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(drive, "START_PERIOD_S", 0.0)
+    client = Client(load_profile("panda_sim"), cast(Any, None))
+    task = Task(1, True, "go up", "scripted", 5.0, 100.0)
+    answers: list[Any] = [StartingError("a camera is being opened")] * 2 + [task]
+
+    def activate() -> Task:
+        answer = answers.pop(0)
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    assert drive.patiently(client, activate) is task
+    assert capsys.readouterr().err.count("a camera is being opened") == 1
+    answers[:] = [SessionError("no prompt")]
+    with pytest.raises(SessionError, match="no prompt"):
+        drive.patiently(client, activate)
+    monkeypatch.setattr(drive, "START_PATIENCE_S", 0.0)
+    answers[:] = [StartingError("a camera is being opened")] * 2
+    with pytest.raises(StartingError):
+        drive.patiently(client, activate)
+
+
+def test_activate_waits_while_a_node_is_started_by_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    client = Client(load_profile("panda_sim"), cast(Any, None))
+    assert not drive.are_starting(client)
+    status = NodeStatus("command", STARTING, "here", 1, 1)
+    client.status_received("command", status, 100)
+    assert drive.are_starting(client)
+    client.token_appeared("command")
+    assert not drive.are_starting(client)
