@@ -66,10 +66,13 @@ def router(
         run_router(loaded, stop, host=host, also=others)
 
 
-def _latch_file(node: str) -> Path | None:
-    """File that exists while a stop is latched in a node; None if it is not started by `up`."""
-    folder = os.environ.get(RUN_FOLDER_VARIABLE)
-    return Path(folder) / f"stopped-{node}" if folder else None
+def latch_file(profile: Profile, node: str) -> Path:
+    """File that exists while a stop is latched in a node, kept by `up`, or beside its log."""
+    if folder := os.environ.get(RUN_FOLDER_VARIABLE):
+        return Path(folder) / f"stopped-{node}"
+    from vla_zenoh.cli.up import default_log_folder
+
+    return default_log_folder() / f"stopped-{profile.robot.name}-{node}"
 
 
 def _run_robot(
@@ -77,7 +80,8 @@ def _run_robot(
 ) -> None:
     from vla_zenoh.robots.node import RobotNode
 
-    profile, latch = node.load(), _latch_file(identity)
+    profile = node.load()
+    latch = latch_file(profile, identity)
     run_node(
         profile,
         lambda session, stop: RobotNode(make_driver(profile), session, latch=latch).run(stop),
@@ -155,7 +159,7 @@ def command(node: NodeOptions, dry_run: DryRunOption = False) -> None:
     from vla_zenoh.nodes.command.node import CommandNode
 
     profile = node.load()
-    latch = _latch_file("command")
+    latch = latch_file(profile, "command")
     run_node(
         profile,
         lambda session, stop: CommandNode(profile, session, dry_run=dry_run, latch=latch).run(stop),
