@@ -191,12 +191,14 @@ def worker(
     from vla_zenoh.nodes.worker.node import WorkerNode
     from vla_zenoh.policy.loader import make_policy
     from vla_zenoh.runtime.environments import run_in_own_environment
+    from vla_zenoh.runtime.starting import shown_as_starting
 
     profile = effective_profile(node.profile, node.connect, host=host)
     chosen = model_options.choose(profile, model, name)
     # Returns only if this environment has what the model's header asks for.
     run_in_own_environment(chosen.model, model_options.python)
-    policy = make_policy(chosen.model, chosen.options, profile=node.profile)
+    with shown_as_starting(profile, worker_node(chosen.name), host):
+        policy = make_policy(chosen.model, chosen.options, profile=node.profile)
     own = None if host is None else profile.hosts.get(host)
     if sys.stdout.isatty():
         say(f"worker {chosen.name} of robot {profile.robot.name} is running; Ctrl-C stops it")

@@ -324,6 +324,8 @@ class PeerMonitor:
             alive = name in self._alive
             known, heard_s = self._status_sources.get(name, (source, now_s))
             ours = alive and (known == source or now_s - heard_s > SILENT_S)
+        if source.startswith(ON_BEHALF) and not alive and name not in self._expected:
+            return  # a worker that was started by hand, and imports its model
         # `up` may see a node start later than we do.
         if source.startswith(ON_BEHALF) if alive else name in self._expected:
             self._receive_on_behalf(name, arrival, header)
