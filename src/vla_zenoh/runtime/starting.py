@@ -55,13 +55,15 @@ def _publish(
     source = f"{ON_BEHALF}{name}#{secrets.token_hex(4)}"
     starting = NodeStatus(name, STARTING, place.host, os.getpid(), since_ns, boot=place.boot)
     # Without a router nobody hears it, and the node itself says so later.
-    with suppress(VlaZenohError, zenoh.ZError):
-        with open_session(profile.session, identity=name) as session:
-            key = profile.keys.status(name)
-            status = Publisher(session, key, Kind.TELEMETRY, source, Clock())
+    with (
+        suppress(VlaZenohError, zenoh.ZError),
+        open_session(profile.session, identity=name) as session,
+    ):
+        key = profile.keys.status(name)
+        status = Publisher(session, key, Kind.TELEMETRY, source, Clock())
+        status.publish(starting)
+        while not ended.wait(PERIOD_S):
             status.publish(starting)
-            while not ended.wait(PERIOD_S):
-                status.publish(starting)
-            if failed.is_set():
-                why = {"complaint": "it could not be loaded; its terminal says why"}
-                status.publish(replace(starting, state=CRASHED, detail=why))
+        if failed.is_set():
+            why = {"complaint": "it could not be loaded; its terminal says why"}
+            status.publish(replace(starting, state=CRASHED, detail=why))
