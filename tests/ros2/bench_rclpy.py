@@ -38,6 +38,7 @@ from rclpy_rig import (
     RosLab,
     WallClock,
     carry_out,
+    hear_answers,
     heard,
     library,
     panda_dh,
@@ -54,6 +55,8 @@ FAST_M_S, FAST_HZ = 0.17, 20.0
 """20 steps of 1 cm a second: 0.2 m/s; reached is what is nearly that."""
 AWAY_S = 1.0
 RESTART_S = 3.0
+ANSWER_S, EVERY_S = 20.0, 0.1
+"""A stop is published at 10 Hz for so long at most."""
 PICTURE = (640, 480)
 
 
@@ -178,18 +181,21 @@ def stops(lab: RosLab, count: int) -> None:
 def stops_while_the_bridge_restarts(lab: RosLab, count: int) -> None:
     """Killed and started at once; a ROS user publishes the stop until it is answered."""
     stood_s, ways_m, latched_s, tries, moved_m = [], [], [], [], []
-    for _ in range(count):
+    hear_answers(lab)
+    for number in range(count):
         lab.move(FAST_M_S, FAST_HZ)
         killed_ns = time.monotonic_ns()
         lab.bridge.kill()
         lab.bridge.start()
         time.sleep(random.uniform(0.0, 1.5))
         before = len(lab.person.told)
-        times = 0
-        while not any(answered(lab, before)):
+        times, end_s = 0, time.monotonic() + ANSWER_S
+        while not any(answered(lab, before)) and time.monotonic() < end_s:
             lab.person.ask("say", "said", topic="/vla/stop", type=EMPTY, wait_s=0.0)
             times += 1
-            time.sleep(0.1)
+            time.sleep(EVERY_S)
+        if not answered(lab, before):
+            sys.exit(f"stop {number + 1}: no answer in {ANSWER_S:.0f} s\n{lab.story()}")
         said_ns = lab.person.since(before, "said")[0]["t"]
         latched_s.append((answered(lab, before)[0] - said_ns) / 1e9)
         tries.append(times)
@@ -202,6 +208,7 @@ def stops_while_the_bridge_restarts(lab: RosLab, count: int) -> None:
         moved_m.append(float(np.ptp(after.position_m, axis=0).max()))
         assert lab.chain.state() == "stopped", lab.chain.state()
         reset(lab)
+        say(f"{number + 1}: stands after {stands_s:.2f} s, answered after {latched_s[-1]:.2f} s")
     say(f"\nstop from rclpy while the bridge restarts, {count} times:")
     say("| | p50 | p95 | n | most |\n|---|---|---|---|---|")
     say(f"| bridge killed → the arm stands, s | {p50_p95(stood_s)} | {max(stood_s):.3f} |")

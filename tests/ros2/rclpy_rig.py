@@ -506,14 +506,20 @@ def received_tcp(lab: RosLab) -> FloatArray:
     return panda_dh.forward([joints[name] for name in panda_dh.JOINTS])
 
 
+def hear_answers(lab: RosLab) -> None:
+    """Let the person hear the answers to its requests."""
+    person = lab.person
+    if not any(line.get("hears") == ANSWER for line in person.told):
+        person.ask("hear", "hears", topic=ANSWER, type=STRING)
+        time.sleep(1.0)  # until the bridge has both ends of it
+
+
 def request(
     lab: RosLab, what: str, value: Mapping[str, Any] | None = None, **how: Any
 ) -> dict[str, Any]:
     """Publish on one of our topics as a ROS user does; the answer, from its JSON."""
     person = lab.person
-    if not any(line.get("hears") == ANSWER for line in person.told):
-        person.ask("hear", "hears", topic=ANSWER, type=STRING)
-        time.sleep(1.0)  # until the bridge has both ends of it
+    hear_answers(lab)
     before = len(person.told)
     person.ask("say", "said", topic=f"/vla/{what}", type=TYPES[what], value=value or {}, **how)
 

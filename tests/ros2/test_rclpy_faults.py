@@ -87,7 +87,9 @@ def test_the_robots_own_node_is_killed_and_comes_back_elsewhere(ros_lab: RosLab)
     """A new process, whose arm is at home.
 
     The bridge's DDS writer keeps the newest pose for the node that died, until its lease ends, and
-    Fast DDS asks for it: one old pose reaches the new node (docs/how-to/ros2.md). No other does.
+    Fast DDS asks for it where the subscription is reliable, as here: one old pose reaches the new
+    node, and that is told (docs/how-to/ros2.md). No other does, and none that was made after the
+    node was ready.
     """
     ros_lab.move()
     time.sleep(0.2)
@@ -95,7 +97,12 @@ def test_the_robots_own_node_is_killed_and_comes_back_elsewhere(ros_lab: RosLab)
     ros_lab.chain.until("inactive", lambda: ros_lab.chain.state() == "inactive")
     told = len(ros_lab.arm.told)
     ros_lab.arm.start()
+    ready_ns = time.time_ns()
     time.sleep(2.0)
     stood = ros_lab.arm.wait_still()
-    assert len(ros_lab.arm.since(told, "goal")) <= 1
+    old = ros_lab.arm.since(told, "goal")
+    assert len(old) <= 1
+    assert all(goal["stamp_ns"] < ready_ns for goal in old)
+    events = [event for _, _, event in ros_lab.chain.client.pop_events()]
+    assert any(event.what == "robot_returned" for event in events), ros_lab.story()
     obeys_again(ros_lab, stood, time.monotonic_ns())

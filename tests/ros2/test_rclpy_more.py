@@ -178,6 +178,27 @@ def test_a_controller_that_asks_for_the_last_pose_gets_no_old_one(
         assert np.linalg.norm(goals - home, axis=1).max(initial=0.0) < STANDS_M, goals
 
 
+def test_a_robot_that_subscribes_best_effort_and_is_restarted_gets_no_old_pose(
+    tmp_path: Path, built_bridge: Path, distribution: str
+) -> None:
+    """Nothing is kept for it. One that is reliable gets one, see test_rclpy_faults.py."""
+    eager = {"goals": {"reliable": False, "depth": 1}}
+    with running_ros_lab(tmp_path, built_bridge, distribution, arm=eager) as lab:
+        lab.chain.activate_when_ready()
+        lab.settle()
+        lab.move()
+        time.sleep(0.2)
+        lab.arm.kill()
+        lab.chain.until("inactive", lambda: lab.chain.state() == "inactive")
+        told = len(lab.arm.told)
+        lab.arm.start()
+        lab.arm.wait_still()
+        time.sleep(2.0)
+        assert not lab.arm.since(told, "goal")
+        lab.settle()
+        up_and_down(lab)
+
+
 # -- the gripper's actions ------------------------------------------------------------------------
 def test_a_gripper_action_on_fast_dds_is_named_and_the_arm_moves(
     tmp_path: Path, built_bridge: Path, distribution: str

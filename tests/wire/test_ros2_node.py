@@ -117,6 +117,25 @@ def test_a_robot_that_falls_silent_and_comes_back_is_told(rig: Ros2Rig) -> None:
     rig.wait("silence", lambda: rig.happened("running->silent"))
     rig.robot.silent = False
     rig.wait("voice", lambda: rig.happened("silent->running"))
+    assert not rig.happened("robot_returned"), "no set-point was sent meanwhile"
+
+
+def test_a_robot_that_returns_and_may_be_sent_an_old_set_point_is_told(
+    rig: Ros2Rig,
+) -> None:
+    before = rig.counted("ros2.commands_sent")
+    with Commander(rig):
+        rig.wait("it moves", lambda: rig.counted("ros2.commands_sent") > before)
+        rig.events.clear()
+        rig.robot.silent = True
+        rig.wait("silence", lambda: rig.happened("running->silent"))
+    assert not rig.happened("robot_returned")
+    rig.robot.silent = False
+    rig.wait("voice", lambda: rig.statuses[-1].state == "running")
+    kept = rig.profile.ros2 is not None and rig.profile.ros2.bridge == "ros2dds"
+    told = rig.happened("robot_returned")
+    assert len(told) == kept
+    assert all("best effort" in event.why for event in told)
 
 
 def test_bytes_that_are_no_message_are_counted(rig: Ros2Rig) -> None:

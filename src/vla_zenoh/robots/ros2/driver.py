@@ -97,6 +97,7 @@ class Ros2Driver(RobotDriver):
         self._others = 0
         self._bad_cameras: tuple[bool, ...] = ()
         self._clock_reported = self._fingers_lost = False
+        self._moved_ns: int | None = None
         self._own_session: zenoh.Session | None = None
 
     def attach(self, node: Node, arm: Arm | None) -> None:
@@ -225,6 +226,7 @@ class Ros2Driver(RobotDriver):
         fresh = states.update()
         self.measured_ns = states.received_ns
         self._check_clock()
+        self._check_return()
         if not fresh:
             return None
         stamp_ns = states.state.stamp_ns
@@ -242,6 +244,7 @@ class Ros2Driver(RobotDriver):
         stamp_ns = now_ns if self._simulated is None else self._simulated.newest_ns
         message = self._write(command, Stamp(stamp_ns, self._frame))
         self._writer.publish(self._messages.encode(message))
+        self._moved_ns = time.monotonic_ns()
         self._node.counters["ros2.commands_sent"] += 1
 
     def grip(self, command: GripperCommand, now_ns: int) -> None:
@@ -279,6 +282,26 @@ class Ros2Driver(RobotDriver):
                 f"{clock_remedy(stamp_ns, self.profile)}"
             )
             self._node.emit(Event("warning", "notice", "robot_clock", why))
+
+    def _check_return(self) -> None:
+        """Emit an event when a robot is heard again that a set-point was sent to meanwhile.
+
+        A bridge keeps the last one until the lease of a subscriber that died ends, and sends it to
+        a new one on Fast DDS that is reliable.
+        """
+        states, sent_ns = self.states, self._moved_ns
+        silent_s = states.silent_ns / 1e9
+        if silent_s <= self.profile.timing.state_timeout_s or self._ros2.bridge != "ros2dds":
+            return
+        if sent_ns is None or sent_ns < states.silent_from_ns:
+            return  # it was alive and acknowledged it
+        age_s = (time.monotonic_ns() - sent_ns) / 1e9
+        why = (
+            f"joint states again after {silent_s:.1f} s. A robot's node that was restarted may now "
+            f"be sent the set-point of {age_s:.1f} s ago by the bridge: "
+            f"let it subscribe to {self._output.topic[:100]} best effort, which prevents this"
+        )
+        self._node.emit(Event("warning", "notice", "robot_returned", why))
 
     def _check_peers(self) -> None:
         """Emit an event when the other side appears or disappears."""
@@ -433,7 +456,9 @@ class Camera:
 class StateSubscriber:
     """State of the arm and gripper from the robot's topics.
 
-    `received_ns` is the monotonic time of the newest joint state, None before the first.
+    `received_ns` is the monotonic time of the newest joint state, None before the first;
+    `silent_ns` is the longest time between two of those that the last update took, and
+    `silent_from_ns` when that began.
     """
 
     def __init__(
@@ -451,6 +476,7 @@ class StateSubscriber:
         self.simulated = simulated
         self.rate = RateMeter()
         self.received_ns: int | None = None
+        self.silent_from_ns = self.silent_ns = 0
         self._wrench: Wrench | None = None
         topics = dict.fromkeys((ros2.joint_states, ros2.finger_states or ros2.joint_states))
         self._joint_states = [
@@ -476,7 +502,7 @@ class StateSubscriber:
     def update(self) -> bool:
         """Process the messages that arrived; whether there is a new state of the arm's joints."""
         self._update_wrench()
-        fresh = False
+        fresh, self.silent_ns = False, 0
         for buffer in self._joint_states:
             for arrival in buffer.drain():
                 try:
@@ -492,6 +518,9 @@ class StateSubscriber:
                     self.clock.take(joints.stamp_ns, arrived_ns)
                 else:
                     self.simulated.take(joints.stamp_ns, arrived_ns)
+                since_ns = self.received_ns or arrival.mono_ns
+                if arrival.mono_ns - since_ns > self.silent_ns:
+                    self.silent_from_ns, self.silent_ns = since_ns, arrival.mono_ns - since_ns
                 self.received_ns = arrival.mono_ns
                 self.rate.tick()
         return fresh
