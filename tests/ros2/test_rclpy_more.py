@@ -195,8 +195,6 @@ def test_a_robot_that_subscribes_best_effort_and_is_restarted_gets_no_old_pose(
         lab.arm.wait_still()
         time.sleep(2.0)
         assert not lab.arm.since(told, "goal")
-        lab.settle()
-        up_and_down(lab)
 
 
 # -- the gripper's actions ------------------------------------------------------------------------
