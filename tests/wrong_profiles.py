@@ -421,7 +421,7 @@ CHECKED: list[tuple[str, str]] = [
         "robot: {description: example-robot-data:panda/panda.urdf}",
         "robot.description: robot description 'example-robot-data:panda/panda.urdf' is not in",
     ),
-    ("robot: {description: no_urdf.urdf}", "robot.description: '{here}/no_urdf.urdf' cannot be r"),
+    ("robot: {description: no_urdf.urdf}", "robot.description: no_urdf.urdf is no XML"),
     (
         UR5,
         "lab.yaml:3: robot.description: the simulator (robot.driver: sim) cannot build ur5",

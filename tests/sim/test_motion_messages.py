@@ -354,6 +354,7 @@ def test_no_record_carries_a_number_that_is_none(by: float) -> None:
     loop.tamper = keep
     loop.put("prompt", f"{HOLD} -0.03")
     loop.run(0.3)
+    del sent[Image]  # no numbers but its pixels and its time
     assert set(sent) == {
         ActionChunk, GripperCommand, GripperState, JointState, PoseCommand, PoseState, Task,
     }  # fmt: skip

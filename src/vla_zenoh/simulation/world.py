@@ -409,11 +409,11 @@ class SimulatedPart:
         return position_m.copy(), rotation.copy()
 
     def _tcp_at(self, joints_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The TCP with the joints elsewhere."""
+        """The TCP with the joints elsewhere, as copies: the scratch data is used again."""
         data, tcp = self._scratch, self._tcp
         data.qpos[self._qpos] = joints_rad
         mujoco.mj_kinematics(self._model, data)
-        return self._in_base(data.site_xpos[tcp], data.site_xmat[tcp].reshape(3, 3))
+        return self._in_base(data.site_xpos[tcp].copy(), data.site_xmat[tcp].reshape(3, 3).copy())
 
     @cached_property
     def _home_quat(self) -> tuple[float, ...]:

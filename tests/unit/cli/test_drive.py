@@ -120,6 +120,7 @@ def test_output_that_is_read_no_further_is_no_traceback(line: str, unbuffered: s
     assert (done.returncode, done.stderr) == (1, "")
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("form", [[], ["--json"]])
 def test_a_stop_without_a_router_says_at_once_that_nobody_confirmed_it(form: list[str]) -> None:
     words = [sys.executable, "-m", "vla_zenoh", "stop", *form, *NOWHERE]

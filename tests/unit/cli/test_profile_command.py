@@ -126,7 +126,7 @@ def test_a_description_that_is_none_is_a_fault_wherever_it_is(own_folder: Path) 
     (own_folder / "lab.yaml").write_text(f"extends: panda_sim\nrobot: {{description: {urdf}}}\n")
     result = RUNNER.invoke(profile_app, ["check", "lab"])
     assert result.exit_code == 1
-    assert "cannot be read" in result.stderr
+    assert "arm.urdf is no XML" in result.stderr
 
 
 TWO_HOSTS = """\

@@ -239,6 +239,7 @@ PRINTS = {
     "cli/nodes.py": "the profile's name, for a program that waits for it",
     "lab/cli/profile.py": "a profile or a bridge's configuration as a file",
     "lab/web/runs.py": "the share that is done, for the server that began it",
+    "runtime/process.py": "what this computer lacks for shared memory, in our own words",
     "runtime/environments.py": "the packages of a model that is about to run here",
 }
 """Where `print` gets something else than JSON, and what."""

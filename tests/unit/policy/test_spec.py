@@ -98,6 +98,7 @@ OTHER_VALUES: dict[tuple[str, ...], list[Any]] = {
     ("observation", "max_skew_s"): [0.05],
     ("observation", "max_age_s"): [0.4],
     ("observation", "history_start"): ["wait"],
+    ("every_step",): [True],
     ("action", "horizon"): [2, 50],
     ("action", "dt_s"): [0.1, 0.25],
     ("action", "kind"): ["absolute"],
