@@ -234,6 +234,7 @@ def fault(node: ast.AST, rich: set[str]) -> str:
 
 
 PRINTS = {
+    "cli/entry.py": "that a stop is not confirmed, in our own words, before the imports have ended",
     "cli/main.py": "the version",
     "cli/plain.py": "lines made printable there",
     "cli/nodes.py": "the profile's name, for a program that waits for it",
