@@ -330,7 +330,7 @@ class Lockstep:
         for worker in self.workers.values():
             worker.take_state(self._at(worker.source, state), part)
 
-    def _take_picture(self, camera: str, picture: Stamped[Image] | Stamped[Depth]) -> None:
+    def _take_picture(self, camera: str, picture: Stamped[Any]) -> None:
         for worker in self.workers.values():
             worker.take_picture(camera, self._at(worker.source, picture))
 
