@@ -42,7 +42,7 @@ from vla_zenoh.control.preflight import (
     why_not_ready,
 )
 from vla_zenoh.control.reachability import ReachabilityFilter
-from vla_zenoh.control.watchdog import Deadman
+from vla_zenoh.control.watchdog import IS_GONE, Deadman
 from vla_zenoh.errors import RecordError
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import MAX_TEXT, ActionChunk, GripperState, HeldBox, Stamped, Task
@@ -490,7 +490,9 @@ class Commander:
         if not why and self._watchdog.given_up(now_ns):
             why = f"held for {self.profile.timing.max_hold_s:g} s without a fresh chunk"
         if why:
-            self._change(Trigger.LOSE, why + self._lateness.explains())
+            # A busy computer explains what came late, and no process that ended.
+            busy = "" if IS_GONE in why else self._lateness.explains()
+            self._change(Trigger.LOSE, why + busy)
         elif unheld:
             self._change(Trigger.LOSE, unheld)
         elif self._watchdog.overdue(now_ns):

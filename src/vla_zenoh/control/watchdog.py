@@ -32,6 +32,10 @@ STEPS = 20
 _NOTHING = (None, None, None)
 
 
+IS_GONE = "is gone"
+"""What is said of a node that is not alive any more."""
+
+
 class Watchdog:
     """Deadline of the next chunk, tracking error, and the peers that the arm depends on.
 
@@ -166,7 +170,7 @@ class Watchdog:
         needed += [peers.camera_nodes.get(camera, "camera") for camera in cameras]
         for node in needed:
             if node not in peers.alive:
-                return f"node {node!r} is gone"
+                return f"node {node!r} {IS_GONE}"
         for camera in cameras:
             if camera in peers.camera_faults:
                 return f"camera {camera!r} {peers.camera_faults[camera]}"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from command_rig import MS, START_NS, Rig
 
@@ -22,6 +24,16 @@ def test_a_loss_after_late_ticks_says_how_late_they_were() -> None:
     assert why.startswith("robot state lost"), why
     assert "this computer is too busy" in why
     assert "0.076 s late" in why, why
+
+
+def test_a_node_that_is_gone_is_not_blamed_on_the_computer() -> None:
+    rig = Rig()
+    rig.activate()
+    rig.tick(ticks=round(0.08 * rig.profile.timing.command_hz))
+    rig.peers = replace(rig.peers, alive=rig.peers.alive - {"sim"})
+    rig.tick()
+    assert rig.state == "inactive"
+    assert rig.commander.why == "node 'sim' is gone"
 
 
 def test_a_loss_without_late_ticks_blames_nobody() -> None:
