@@ -32,7 +32,7 @@ from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.runtime.launch import Host
 from vla_zenoh.types import Event, PoseCommand, PoseState, Task
 
-READY_PATIENCE_S = 40.0
+READY_PATIENCE_S = 90.0
 """From nothing to an arm that obeys, on a busy machine: five interpreters load numpy and more."""
 END_PATIENCE_S = 10.0
 MOVING_M_S = 0.05
