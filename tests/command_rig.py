@@ -17,7 +17,7 @@ from vla_zenoh.control.commander import Commander, Inputs, Outputs, Setting
 from vla_zenoh.control.preflight import PeerSnapshot
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.kinematics.kinematics import Kinematics
-from vla_zenoh.kinematics.so3 import exp3, log3, quat_from_rotation, rotation_from_quat
+from vla_zenoh.kinematics.so3 import Pose, exp3, log3, quat_from_rotation, rotation_from_quat
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, ObservationSpec
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.types import (
@@ -72,7 +72,8 @@ class Rig:
         self.profile = of or profile()
         self.commander = Commander(self.profile, reach=reach, dry_run=dry_run)
         self.joints_rad: FloatArray | None = None
-        self.joints_of_shadow = True
+        self.joints_of_tcp = True
+        self._solved_rad: FloatArray | None = None
         self.spec = model_spec(**action)
         self.now_ns = START_NS
         self.period_ns = round(1e9 / self.profile.timing.command_hz)
@@ -161,11 +162,15 @@ class Rig:
         return Stamped(self.header("sim", "sim-1"), record, self.now_ns)
 
     def joint_state(self) -> Stamped[JointState] | None:
-        """Those of the test, wherever its TCP is said to be, else where the shadow stands."""
+        """Those of the test, wherever its TCP is said to be, else those of its TCP."""
         reach, joints_rad = self.commander.parts[0].reach, self.joints_rad
         names = self.profile.robot.arm_joints
-        if joints_rad is None and reach is not None and self.joints_of_shadow:
-            joints_rad, names = reach.joints_rad, reach.kinematics.arm_joints
+        if joints_rad is None and reach is not None and self.joints_of_tcp:
+            pose = Pose(self.position_m, rotation_from_quat(self.quat_xyzw))
+            start_rad = reach.joints_rad if self._solved_rad is None else self._solved_rad
+            solved_rad = reach.solve(pose, start_rad)
+            joints_rad = self._solved_rad = start_rad if solved_rad is None else solved_rad
+            names = reach.kinematics.arm_joints
         if joints_rad is None:
             return None
         zero = np.zeros(len(joints_rad))

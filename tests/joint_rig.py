@@ -41,7 +41,7 @@ class Joints:
         self.names = names or self.kinematics.arm_joints
         fields = {"space": "joint", "joints": self.names, "kind": "absolute", "gripper": "none"}
         self.rig = Rig(self.profile, reach=self.reach, **{**fields, **action})
-        self.rig.joints_of_shadow = False
+        self.rig.joints_of_tcp = False
         robot = self.profile.robot
         self.home_rad = self.kinematics.ordered(robot.arm_joints, robot.home_rad)
         self.at(self.home_rad)

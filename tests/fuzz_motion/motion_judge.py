@@ -96,6 +96,10 @@ class Judge:
         if trace.faults:
             at, why = trace.faults[0]
             self.found.append(Violation("FAULT", at, 1.0, "", len(trace.faults), why))
+        for name in dict.fromkeys(name for _, name, *_ in trace.broken):
+            of_name = [each for each in trace.broken if each[1] == name]
+            at, _, size, unit = max(of_name, key=lambda each: each[2])
+            self.found.append(Violation(name, at, size, unit, len(of_name)))
         if len(self._told) > 3:
             if self._case.joint:
                 self._joints()

@@ -8,17 +8,18 @@ from __future__ import annotations
 
 import heapq
 import math
+import random
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from motion_case import WORKER, Actions, Case
 
-from vla_zenoh.control.commander import Commander, Inputs, Setting
+from vla_zenoh.control.commander import Commander, Inputs, Outputs, Setting
 from vla_zenoh.control.preflight import PeerSnapshot
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.guard.arm_guard import ArmGuard, Measured
-from vla_zenoh.kinematics.so3 import Pose, exp3, log3, quat_from_rotation
+from vla_zenoh.kinematics.so3 import Pose, exp3, log3, pose_distance, quat_from_rotation
 from vla_zenoh.types import (
     ActionChunk,
     GripperState,
@@ -32,6 +33,12 @@ from vla_zenoh.types import (
 START_NS = 1_700_000_000_000_000_000
 SOURCE, ROBOT, NODE = "worker-scripted-1", "sim-1", "command-1"
 OBEYING = ("active", "holding")
+LEFT = 1e-4
+"""m and rad: less that is left of a chunk is rounding."""
+FROZEN_M = 0.02
+"""Joints that stand still while the TCP moves this far are frozen."""
+NOTICED_NS, LATE_NS = 400_000_000, 2_000_000_000
+"""Time in which a lie is noticed; how late a late state is."""
 WIRE_NS = 200_000
 """What a command needs where nothing is wrong."""
 HAPPENINGS = {
@@ -53,6 +60,9 @@ HAPPENINGS = {
     "speed": 0.15,
 }
 """How often each of them happens, per second."""
+LIES_1_S = 0.03
+LIES = ("pose late", "joints late", "gripper late", "joints frozen", "pose false")
+"""What a robot may tell that is not so, each while its other streams go on; see `Lie`."""
 HAS_SPEED = "speed_percent" in Task.__dataclass_fields__
 
 
@@ -83,6 +93,25 @@ class Tick(NamedTuple):
 
 
 @dataclass
+class Lie:
+    """A false measured state.
+
+    Args:
+        name: of `LIES`.
+        since, until: ticks.
+        shift_m: of the pose, or how far the arm has moved since its joints froze.
+        seen_ns: time for which it could have been noticed.
+    """
+
+    name: str
+    since: int
+    until: int
+    shift_m: np.ndarray
+    state: Any = None
+    seen_ns: int = 0
+
+
+@dataclass
 class Trace:
     """All that is judged: every call of the commander, and every reference of the guard."""
 
@@ -92,6 +121,8 @@ class Trace:
     """Index of the call of the commander that came before."""
     faults: list[tuple[int, str]] = field(default_factory=list)
     """(tick, why) of every fault that was not the robot's."""
+    broken: list[tuple[int, str, float, str]] = field(default_factory=list)
+    """(tick, property, size, unit) of what the rig itself sees."""
     failed: tuple[int, str] | None = None
     """(tick, exception)."""
 
@@ -153,6 +184,9 @@ class Rig:
         self._heap: list[Stamped[ActionChunk]] = []
         self._heap_until = 0
         self._person_at = 2
+        self._liar = random.Random(case.seed)
+        self._lie: Lie | None = None
+        self._chunk_ns = 0
         self._offered = False
         self._share = -math.expm1(-1.0 / (case.guard_hz * case.lag_s)) if case.lag_s else 1.0
         self._rate_hz = 5.0
@@ -189,11 +223,14 @@ class Rig:
         self._peers = None
         if at >= self._silent_until:
             self._tell(at, inputs)
+            self._tamper(at, inputs)
         followed, before = self.guard.following, self.commander.state.value
         if inputs.chunks and at % 2:  # as the command node does with one that comes between ticks
             early, inputs = inputs, Inputs(inputs.settings, peers=inputs.peers)
             self.commander.prepare(replace(early, settings=(), peers=None), self._now_ns)
+        plan_before = self._plan()
         out = self.commander.step(inputs, self._now_ns, periods)
+        self._check(at, plan_before, before, out)
         state = self.commander.state.value
         for event in out.events:
             if event.what.endswith("->fault") and not event.why.startswith("the robot reports"):
@@ -215,6 +252,71 @@ class Rig:
         )
         if record is not None:
             self._send(record)
+
+    def _plan(self) -> Any:
+        timeline = self.commander.parts[0].motion.timeline
+        return None if timeline is None else timeline.plan
+
+    def _check(self, at: int, before: Any, state: str, out: Outputs) -> None:
+        """Nothing of a chunk is lost in silence, and no lie is believed for long."""
+        motion, now = self.commander.parts[0].motion, self.commander.state.value
+        if out.accepted is not None:
+            self._chunk_ns = self._now_ns
+        plan = self._plan()
+        held = plan is not None and plan.cause is None
+        if held and before is not None and before.cause is not None:
+            left = pose_distance(before.goals[before.bounded - 1].pose, plan.goals[0].pose)
+            if max(left) > LEFT and all(event.what != "dropped" for event in out.events):
+                self.trace.broken.append((at, "part of a chunk lost in silence", max(left), "m"))
+        early_s = self.case.profile.timing.max_open_loop_s - (self._now_ns - self._chunk_ns) / 1e9
+        if (state, now) == ("active", "holding") and early_s > 0 and not motion.at_rest:
+            self.trace.broken.append((at, "holds on its way to the last step", early_s, "s"))
+        lie = self._lie
+        if lie is None or now not in OBEYING:
+            return
+        lie.seen_ns += self._period_ns if self._noticeable(lie) else 0
+        if lie.seen_ns > NOTICED_NS:
+            self.trace.broken.append((at, f"{lie.name}: not noticed", lie.seen_ns / 1e9, "s"))
+
+    def _noticeable(self, lie: Lie) -> bool:
+        """The difference is large enough for it to be a lie."""
+        if self._kinematics is None:  # its joints are not told
+            return lie.name in ("pose late", "gripper late")
+        if lie.name.endswith("late"):
+            return True
+        if lie.name == "pose false":
+            return True
+        if lie.state is None:
+            return False
+        told = self._kinematics.forward(lie.state.record.position_rad)
+        return max(pose_distance(told, self._measured)[:1]) > FROZEN_M
+
+    def _tamper(self, at: int, inputs: Inputs) -> None:
+        """What the robot tells is false now and then."""
+        lie = self._lie
+        if lie is not None and at >= lie.until:
+            lie = self._lie = None
+        if lie is None and self._liar.random() < LIES_1_S * self._period_ns / 1e9:
+            name = self._liar.choice(LIES)
+            length = round(self._liar.uniform(0.3, 1.5) * 1e9 / self._period_ns)
+            shift_m = np.array([self._liar.gauss(0.0, 1.0) for _ in range(3)])
+            shift_m *= self._liar.uniform(0.05, 0.065) / np.linalg.norm(shift_m)
+            lie = self._lie = Lie(name, at, at + length, shift_m)
+        if lie is None or inputs.pose is None:
+            return
+        if lie.name == "pose late":
+            inputs.pose = _late(inputs.pose)
+        elif lie.name == "gripper late" and inputs.gripper is not None:
+            inputs.gripper = _late(inputs.gripper)
+        elif lie.name == "joints late" and inputs.joint is not None:
+            inputs.joint = _late(inputs.joint)
+        elif lie.name == "joints frozen" and inputs.joint is not None:
+            lie.state = lie.state or inputs.joint
+            inputs.joint = replace(inputs.joint, record=lie.state.record)
+        elif lie.name == "pose false":
+            record = inputs.pose.record
+            moved = replace(record, position_m=record.position_m + lie.shift_m)
+            inputs.pose = replace(inputs.pose, record=moved)
 
     # -- the robot ----------------------------------------------------------------------------
     def _robot(self) -> None:
@@ -443,3 +545,8 @@ class Rig:
         elif what == "speed":
             settings.append(Setting("speed", rng.choice([0.0, 1.0, 10.0, 50.0, 100.0, 100.0])))
         return 1
+
+
+def _late(state: Stamped[Any]) -> Stamped[Any]:
+    header = state.header
+    return replace(state, header=replace(header, stamp_wall_ns=header.stamp_wall_ns - LATE_NS))

@@ -16,7 +16,7 @@ REASONS = {
     "control/preflight.py": {
         *("reasons_by_joints", "reasons_of_worker", "joint_state_faults", "_elbow_is_not_held"),
         *("_robot", "reasons_of_part", "_too_old", "_worker", "_chunk", "_cameras", "_clocks"),
-        *("unsettled", "why_not_ready"),
+        *("unsettled", "why_not_ready", "state_lost"),
     },
     "control/commanded_part.py": {"reasons_against"},
     "control/watchdog.py": {"reasons_against"},

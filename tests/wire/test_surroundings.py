@@ -275,3 +275,33 @@ def test_a_reader_who_is_told_of_nobody_measures_who_lives_among_made_up_names(
     for number in range(2 * MAX_HEARD):
         reader.clocks.to_local_clock(Header(0, 0, f"stranger{number}#1"), None)
     assert "camera" in reader.clocks.offsets()
+
+
+def test_a_deadman_and_a_node_that_were_gone_between_two_polls_are_gone_for_one(
+    scene: Scene,
+) -> None:
+    session, keys = scene.thief.session, scene.command.keys
+    witness = PeerMonitor(scene.command)
+
+    def seen() -> PeerSnapshot | None:
+        return witness.snapshot(scene.command.clock.wall_ns())
+
+    declared = [keys.holding("pedal"), keys.alive("extra")]
+    tokens = [session.liveliness().declare_token(key) for key in declared]
+    until(
+        "both are there", lambda: "pedal" in scene.look().holders and "extra" in scene.look().alive
+    )
+    for token in tokens:
+        token.undeclare()
+    until("both are gone", lambda: (now := seen()) and not {"pedal"} & now.holders)
+    tokens = [session.liveliness().declare_token(key) for key in declared]
+    until(
+        "both are back", lambda: (now := seen()) and "pedal" in now.holders and "extra" in now.alive
+    )
+    first, second = scene.look(), scene.look()
+    assert "pedal" not in first.holders
+    assert "extra" not in first.alive
+    assert "pedal" in second.holders
+    assert "extra" in second.alive
+    for token in tokens:
+        token.undeclare()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -18,12 +19,13 @@ from vla_zenoh.control.preflight import (
     PeerSnapshot,
     joint_state_faults,
     reasons_by_joints,
+    state_lost,
     why_not_ready,
 )
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.watchdog import JointMonitor, Watchdog
 from vla_zenoh.errors import RecordError, SpecError
-from vla_zenoh.kinematics.so3 import Pose, held_pose, pose_of
+from vla_zenoh.kinematics.so3 import Pose, held_pose, interpolate, pose_distance, pose_of
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.profile import GripperProfile, Profile
 from vla_zenoh.types import (
@@ -42,6 +44,12 @@ from vla_zenoh.types import (
 
 FUTURE_NS = round(CLOCK_TOLERANCE_S * 1e9)
 """A pose that is stamped later than it arrived by more than this says nothing about the past."""
+FALSE_M, FALSE_RAD = 0.01, 0.05
+"""Distance of two measurements of one TCP beyond which one of them is false, while it moves."""
+FASTER = 4.0
+"""A measured TCP may be this many times as fast as an axis of a command: people push arms."""
+COMPARED_NS = 50_000_000
+"""A pose is compared with joints that were measured this long after it, at most."""
 LET_GO_M = 0.01
 """A gripper that opens by more than this lets go of what it holds."""
 SAME_WIDTH_M = 0.005
@@ -67,6 +75,12 @@ class CommandedPart:
         self.joint: Stamped[JointState] | None = None
         self.gripper_state: Stamped[GripperState] | None = None
         self._measured: Pose | None = None  # of the pose
+        self._jumped = ""
+        """Why the measured pose may be false, until joints confirm it."""
+        self._contradiction = ""
+        """Why the measured pose or the joints are false."""
+        self._contradicts_ns = 0
+        """Since when, on the clock of their arrival."""
         self.planner = ChunkPlanner(profile, reach)
         self.motion = MotionPipeline(profile, reach, self.planner)
         self.gripper = GripperArbiter(profile.robot.gripper)
@@ -111,21 +125,81 @@ class CommandedPart:
     def update(self, states: NewStates) -> None:
         """Take the newest states."""
         if states.pose is not None:
-            same = self.pose is not None and states.pose.record is self.pose.record
-            self.pose = states.pose
+            before, self.pose = self.pose, states.pose
+            measured = pose_of(states.pose.record)
+            if before is not None and self._measured is not None:
+                elapsed_ns = states.pose.header.stamp_wall_ns - before.header.stamp_wall_ns
+                self._jumped = self._jump(measured, self._measured, elapsed_ns) or self._jumped
+            self._measured = measured
             self.planner.poses.add(states.pose, FUTURE_NS)
             self.contact.update_pose(states.pose)
-            if self._measured is None or not same:
-                self._measured = pose_of(states.pose.record)
-            self.retreat.measure(self._measured)
+            self.retreat.measure(measured)
         if states.joint is not None:
             self.joint = states.joint
             self.planner.joints.add(states.joint, FUTURE_NS)
             self.contact.update_joints(states.joint)
+            self._compare(states.joint)
         if states.gripper is not None:
             self.gripper_state = states.gripper
             if self.held is not None:
                 self._grasp_m = min(self._grasp_m, states.gripper.record.width_m)
+
+    def _jump(self, measured: Pose, before: Pose, elapsed_ns: int) -> str:
+        """Why a reported pose cannot follow the one `before`, empty if an arm can move so."""
+        apart_m, apart_rad = pose_distance(measured, before)
+        limits, elapsed_s = self.profile.limits, abs(elapsed_ns) / 1e9
+        most_m = FALSE_M + FASTER * elapsed_s * limits.translation.velocity_m_s
+        most_rad = FALSE_RAD + FASTER * elapsed_s * limits.rotation.velocity_rad_s
+        if apart_m <= most_m and apart_rad <= most_rad:
+            return ""
+        return (
+            f"the reported TCP pose jumped by {apart_m * 1e3:.1f} mm and {apart_rad:.3f} rad in "
+            f"{elapsed_s:.3f} s, faster than the arm can move: was its tool frame set?"
+        )
+
+    @property
+    def doubt(self) -> str:
+        """Why the measured pose must not be moved to, empty if it is trusted."""
+        return self._contradiction or self._jumped
+
+    def _compare(self, joint: Stamped[JointState]) -> None:
+        """Compare the joints with the TCP pose that the robot reported for their time."""
+        why = self._contradicted_by(joint)
+        if why is None:
+            return
+        if not why:
+            self._jumped = ""
+        elif not self._contradiction:
+            self._contradicts_ns = joint.received_ns
+        self._contradiction = why
+
+    def _contradicted_by(self, joint: Stamped[JointState]) -> str | None:
+        """Why joints and reported TCP pose of one time cannot both be right, empty if they can.
+
+        None: there is nothing to compare.
+        """
+        stamp_ns = joint.header.stamp_wall_ns
+        around = self.planner.poses.around(stamp_ns, COMPARED_NS)
+        if self.reach is None or self.pose is None or around is None:
+            return None
+        try:
+            joints_rad = self.reach.kinematics.joints_of(joint.record)
+        except RecordError:
+            return None  # reported by the monitor of its joints
+        before, after, share = around
+        reported = interpolate(pose_of(before), pose_of(after), share)
+        apart_m, apart_rad = pose_distance(self.reach.kinematics.forward(joints_rad), reported)
+        limits = self.profile.limits
+        unknown_s = max(stamp_ns - self.pose.header.stamp_wall_ns, 0) / 1e9
+        most_m = FALSE_M + FASTER * unknown_s * limits.translation.velocity_m_s
+        most_rad = FALSE_RAD + FASTER * unknown_s * limits.rotation.velocity_rad_s
+        if apart_m <= most_m and apart_rad <= most_rad:
+            return ""
+        return (
+            f"the measured joints put the TCP {apart_m * 1e3:.1f} mm and {apart_rad:.3f} rad from "
+            "where the robot reports it: one of the two is frozen or false, or the tool frame was "
+            "changed"
+        )
 
     # -- what it holds ------------------------------------------------------------------------
     @property
@@ -195,17 +269,18 @@ class CommandedPart:
         except SpecError:
             return False  # reported with the spec
 
-    def activate(self, lease: Lease, now_ns: int) -> None:
-        """Start the motion where the arm stands; its states are known."""
+    def activate(self, lease: Lease, now_ns: int) -> list[Event]:
+        """Start the motion where the arm stands; its states are known. Returns what is dropped."""
         assert self.pose is not None and self.gripper_state is not None
         self.too_near = None
+        self._jumped = ""
         if self._joint_monitor is not None:
             self._joint_monitor.reset()
         self.contact.begin()
         self.planner.restart(self.pose, self.joint)
         measured, joint = self.pose.record, self.joint.record if self.joint else None
         blocked = self.watchdog.begin(held_pose(measured), pose_of(measured))
-        self.motion.anchor(
+        return self.motion.anchor(
             measured,
             self.gripper.keep(self.gripper_state.record),
             joint,
@@ -236,20 +311,31 @@ class CommandedPart:
         contact, motion = self.contact, self.motion
         motion.pace.contact_slowdown = contact.slowdown()
         events = [] if contact.known is self._load_known else [self._load_sensing()]
-        why = self.watchdog.lost(self.pose, self.gripper_state, peers, worker, lease, now_ns)
+        why = self._state_lost(now_ns)
+        if not why and now_ns - self._contradicts_ns > self.profile.timing.state_timeout_s * 1e9:
+            why = self._contradiction
+        why = why or self.watchdog.lost(peers, worker, lease)
         if not why and motion.streaming and moves:
             why = self._obstructed(events)
-        return why or contact.lost or motion.stuck or self._joints_lost(now_ns), events
+        return why or contact.lost or motion.stuck, events
 
-    def _joints_lost(self, now_ns: int) -> str:
-        """Why the measured joints, which are monitored, count as lost; empty while they arrive."""
-        if self._joint_monitor is None or self.joint is None:
-            return ""
-        silent_s = (now_ns - self.joint.received_ns) / 1e9
-        patience_s = self.profile.timing.state_timeout_s + JOINT_PATIENCE_S
-        if silent_s <= patience_s:
-            return ""
-        return f"robot state lost: joints {silent_s:.3f} s old, at most {patience_s:g} s"
+    def _state_lost(self, now_ns: int) -> str:
+        """Which measured state is missing, late, or stamped in the future; empty if none is.
+
+        Each has its own age: that one arrives says nothing about the others.
+        """
+        joints = self._joint_monitor is not None or self.contact.wants_effort
+        patience_s = self.profile.timing.state_timeout_s
+        streams: list[tuple[str, Stamped[Any] | None, float]] = [
+            ("pose", self.pose, patience_s),
+            ("gripper", self.gripper_state, patience_s),
+            ("joints", self.joint if joints else None, patience_s + JOINT_PATIENCE_S),
+        ]
+        for name, state, most_s in streams:
+            why = "" if state is None else state_lost(name, state, most_s, now_ns)
+            if why:
+                return why
+        return ""
 
     def follow_elbow(self, *, obeying: bool) -> None:
         """Begin to bound the next step with the elbow of the commanded or measured joints.
@@ -289,8 +375,10 @@ class CommandedPart:
                 return ""
             # An arm without contact is not blocked: its state is stuck, or it was slowed down.
             retreats = not (self.contact.known and self.contact.quiet)
+            if self.doubt:
+                retreats, why = False, f"{self.doubt}; {why}"
         else:
-            name, value, limit, unit = overload.name, overload.value, overload.stop, overload.unit
+            name, value, limit, unit = overload.name, overload.most, overload.stop, overload.unit
             events.append(make_event("warning", "limit", name, "stopped", value, limit))
             why = (
                 f"something presses against the arm: {name} {value:.1f} {unit}, "
@@ -302,12 +390,14 @@ class CommandedPart:
             self.retreat.begin(commanded)
         return why
 
-    def may_retreat(self, peers: PeerSnapshot, now_ns: int) -> bool:
-        """The robot is alive and ready, without faults, and publishes its state."""
-        pose, gripper = self.pose, self.gripper_state
-        if pose is None or gripper is None or self.watchdog.state_lost(pose, gripper, now_ns):
-            return False
-        return peers.robot_node in peers.alive and not why_not_ready(gripper.record)
+    def keeps_from_retreat(self, peers: PeerSnapshot, now_ns: int) -> str:
+        """Why the arm must not retreat, empty: the robot is ready, and its state can be trusted."""
+        if self.pose is None or self.gripper_state is None:
+            return "its state is not known"
+        if peers.robot_node not in peers.alive:
+            return f"node {peers.robot_node!r} is gone"
+        why = self._state_lost(now_ns) or self.doubt
+        return why or why_not_ready(self.gripper_state.record)
 
     def _load_sensing(self) -> Event:
         """Event when the robot begins or ceases to measure external loads."""

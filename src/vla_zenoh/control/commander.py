@@ -289,8 +289,13 @@ class Commander:
         # The scene may have changed during a pause: the rest of an old chunk is not executed.
         oldest_ns = now_ns - int(self.profile.timing.max_observation_age_s * 1e9)
         paused = self.state in OBEYING and not before
-        forgotten = [part.motion.forget_plan(oldest_ns, now_ns) for part in self.parts if paused]
-        if any(forgotten):
+        forgotten = False
+        for part in self.parts if paused else ():
+            dropped = part.motion.forget_plan(oldest_ns, now_ns)
+            if dropped is not None:
+                forgotten = True
+                self._out.events += part.tagged(dropped)
+        if forgotten:
             self._resumed_ns = now_ns
             self._watchdog.expect(None, now_ns, self.task)
             self._emit("info", "notice", "paused", "waits for a chunk that is newer than the pause")
@@ -337,7 +342,7 @@ class Commander:
         self.deadman.name = holder
         self._resumed_ns = 0
         for part in self.parts:
-            part.activate(lease, now_ns)
+            self._out.events += part.tagged(part.activate(lease, now_ns))
         held = f", while {holder!r} holds it" if holder else ""
         what = f"activated with worker {self.task.worker!r}{held}"
         self._change(Trigger.ACTIVATE, "; ".join([what, *self._ended_before()])[:MAX_TEXT])
@@ -472,8 +477,12 @@ class Commander:
         self._measure()
         unheld = self.deadman.lost(self._peers.holders)
         for part in self.parts:
-            if part.retreat.busy and (unheld or not part.may_retreat(self._peers, now_ns)):
+            if not part.retreat.busy:
+                continue
+            why = unheld or part.keeps_from_retreat(self._peers, now_ns)
+            if why:
                 part.retreat.end()
+                self._emit("warning", "notice", "retreat", part.says(f"the retreat ends: {why}"))
         if self.state not in OBEYING:
             return
         assert self.lease is not None
@@ -493,11 +502,14 @@ class Commander:
             # A busy computer explains what came late, and no process that ended.
             busy = "" if IS_GONE in why else self._lateness.explains()
             self._change(Trigger.LOSE, why + busy)
-        elif unheld:
+            return
+        if unheld:
             self._change(Trigger.LOSE, unheld)
-        elif self._watchdog.overdue(now_ns):
-            busy = self._lateness.explains()
-            self._change(Trigger.STARVE, f"no fresh chunk within the watchdog{busy}")
+            return
+        arrives = any(not part.motion.at_rest for part in self.parts)
+        overdue = self._watchdog.overdue(now_ns, moves=arrives)
+        if overdue:
+            self._change(Trigger.STARVE, overdue + self._lateness.explains())
 
     def _keep_apart(self, spacing: PartSpacing, now_ns: int, ticks: int) -> None:
         """Slow the parts down, or let all of them stand, before they come too near; or brake."""

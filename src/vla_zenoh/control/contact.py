@@ -8,8 +8,11 @@ bias removed::
     b' = (f - b) / DRIFT_S,  |b - b_0| <= slow      a load that was picked up, a sensor that drifts
 
 with ``b_0`` the load at activation, at most ``slow``: a load in the gripper, a sensor that was not
-zeroed. The value that counts is the norm of ``f - b``, for joints the greatest one. Above ``slow``
-the arm has a share of its speed, ``(stop - |f - b|) / (stop - slow)``, above ``stop`` it must stop.
+zeroed. Sizes are norms, for joints the greatest one. Above ``slow`` the arm has a share of its
+speed, ``(stop - |f - b|) / (stop - slow)``. It must stop where ``max(|f|, |f - b_0|) > stop``: a
+bias that followed a slowly rising force would let the force rise by as much, so for the stop there
+is none, and what the sensor reports is the force itself. A force that rises at r N/s is larger than
+``f`` by ``r FILTER_S``, and by what it rises until the next tick: at 100 N/s by 3 N.
 
 A controller presses with the distance between command and arm, and with what its integral action
 has accumulated. So after the brake the command of a blocked arm moves
@@ -33,12 +36,14 @@ from vla_zenoh.control.commander_io import make_event
 from vla_zenoh.control.limits import SLOWEST, Slowdown, slowest
 from vla_zenoh.kinematics.so3 import Pose, norm3, pose_distance
 from vla_zenoh.profile import ContactLimits, Limits
-from vla_zenoh.types import Event, JointState, PoseState, Stamped
+from vla_zenoh.types import Event, FloatArray, JointState, PoseState, Stamped
 
 FILTER_S = 0.02
 DRIFT_S = 10.0
 LONGEST_S = 0.1
 """Longest time between two states that the filters integrate."""
+FROZEN_M = 0.05
+"""A wrench that stays the same to the last bit while the TCP moves this far is not measured."""
 QUIET = 0.2
 """Part of ``slow`` below which the arm is not in contact."""
 STEPS = 10
@@ -79,7 +84,9 @@ class Load:
         self._bias: list[float] = []
         self._start_bias: list[float] = []
         self.value = 0.0
-        """The size of the load, in N or Nm."""
+        """The size of the load without its bias, in N or Nm."""
+        self.most = 0.0
+        """The size of the load that counts for the stop, in N or Nm: no bias follows it."""
 
     def update(self, measured: Sequence[float] | None, stamp_ns: int, *, drifts: bool) -> None:
         """Add what was measured at `stamp_ns`, None: nothing; `drifts`: let the bias follow."""
@@ -102,12 +109,15 @@ class Load:
             if self._apart(bias, self._start_bias) > self.slow:
                 self._bias = bias = self._near(bias, self._start_bias)
         self.value = self._apart(filtered, bias)
+        zeros = [0.0] * len(filtered)
+        self.most = max(self._apart(filtered, self._start_bias), self._apart(filtered, zeros))
 
     def zero(self) -> None:
         """Take the present load for the bias, as far as `slow`."""
         self._start_bias = self._near(self._filtered, [0.0] * len(self._filtered))
         self._bias = self._start_bias.copy()
         self.value = self._apart(self._filtered, self._bias)
+        self.most = max(self.value, self._apart(self._filtered, [0.0] * len(self._filtered)))
 
     def _near(self, values: list[float], middle: Sequence[float]) -> list[float]:
         apart = self._apart(values, middle)
@@ -139,9 +149,12 @@ class Contact:
             "contact_effort", "Nm", limits.effort_slow_nm, limits.effort_stop_nm, _greatest
         )
         self._all = (self._force, self._torque, self._effort)
-        self._wants_effort = limits.effort_stop_nm is not None
+        self.wants_effort = limits.effort_stop_nm is not None
+        """The efforts of the joints are monitored."""
         self._active = False
         self._begun: list[Load] = []
+        self._unchanged: tuple[FloatArray, FloatArray] | None = None
+        """The newest wrench, and where the TCP was when it was first reported."""
 
     @property
     def _measured(self) -> list[Load]:
@@ -152,14 +165,24 @@ class Contact:
     def update_pose(self, state: Stamped[PoseState]) -> None:
         """Add the newest pose, with the wrench if the robot measures one."""
         wrench, stamp_ns = state.record.wrench, state.header.stamp_wall_ns
+        if wrench is not None and self._is_frozen(wrench, state.record.position_m):
+            wrench = None
         force, torque = (None, None) if wrench is None else (wrench[:3], wrench[3:])
         for load, measured in ((self._force, force), (self._torque, torque)):
             values = None if measured is None else measured.tolist()
             load.update(values, stamp_ns, drifts=self._active)
 
+    def _is_frozen(self, wrench: FloatArray, position_m: FloatArray) -> bool:
+        """The same numbers again, other than zero, however far the arm has moved meanwhile."""
+        before = self._unchanged
+        if before is None or not wrench.any() or not np.array_equal(wrench, before[0]):
+            self._unchanged = wrench, position_m
+            return False
+        return norm3(position_m - before[1]) > FROZEN_M
+
     def update_joints(self, state: Stamped[JointState]) -> None:
         """Add the newest joints; used if a limit of the profile says that efforts are external."""
-        if self._wants_effort:
+        if self.wants_effort:
             effort_nm = state.record.effort_nm
             values = None if effort_nm is None else effort_nm.tolist()
             self._effort.update(values, state.header.stamp_wall_ns, drifts=self._active)
@@ -190,13 +213,19 @@ class Contact:
 
     @property
     def missing(self) -> list[str]:
-        """Reasons against an activation: loads with a limit of the profile, not measured."""
-        if not self._wants_effort or self._effort.known:
-            return []
-        return [
-            "limits.contact.effort_stop_nm is set, and the robot reports no joint efforts; take "
-            "the limit out, or let the robot report its external joint torques"
+        """Reasons against an activation: loads above their stop, or with a limit and unknown."""
+        reasons = [
+            f"{load.name} is {load.most:.1f} {load.unit} at rest, which is more than its stop of "
+            f"{load.stop:g} {load.unit}: free the arm, or zero the robot's sensor"
+            for load in self._measured
+            if load.most > load.stop
         ]
+        if self.wants_effort and not self._effort.known:
+            reasons.append(
+                "limits.contact.effort_stop_nm is set, and the robot reports no joint efforts; "
+                "take the limit out, or let the robot report its external joint torques"
+            )
+        return reasons
 
     @property
     def force_n(self) -> float | None:
@@ -215,7 +244,7 @@ class Contact:
 
     def overload(self) -> Load | None:
         """The load above its stop limit, None without one."""
-        return next((load for load in self._measured if load.value > load.stop), None)
+        return next((load for load in self._measured if load.most > load.stop), None)
 
     def slowdown(self) -> Slowdown | None:
         """The slowdown of the greatest load, None without one."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -11,14 +12,14 @@ from vla_zenoh.control.chunk_planner import LOOK_AHEAD, ChunkPlanner
 from vla_zenoh.control.commander_io import OBEYING, State, limit_events, make_event
 from vla_zenoh.control.contact import Contact, Retreat
 from vla_zenoh.control.joint_space import JointPath
-from vla_zenoh.control.limits import FULL, Shares, into_workspace
+from vla_zenoh.control.limits import FULL, LimitHit, Shares, into_workspace
 from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan, PlanAggregator, joint_goal
 from vla_zenoh.control.preflight import FOLLOWS_JOINT_RAD, LINGER_NS, Settling, follows, held_joints
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.smoothing import PosePath, pose_command
 from vla_zenoh.control.step_timing import GoalPace, Mover, TimedGoal
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.kinematics.so3 import Pose, held_pose, pose_distance, pose_of
+from vla_zenoh.kinematics.so3 import Pose, held_pose, interpolate, pose_distance, pose_of
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     Event,
@@ -33,6 +34,10 @@ from vla_zenoh.types import (
 if TYPE_CHECKING:
     from vla_zenoh.control.pose_to_joint import PoseToJoint
 
+PIECE_M, PIECE_RAD, PIECE_S = 0.02, 0.1, 0.5
+"""A way that is no step of a plan is bounded in pieces of this length, each in this time."""
+DROPPED = 1e-5
+"""m and rad: less of a chunk that is not executed is rounding."""
 SAME_POSE = 1e-6
 """m and rad: joints whose TCP is this near to a pose reach it."""
 
@@ -152,7 +157,7 @@ class MotionPipeline:
         *,
         blocked: bool,
         in_joints: bool = False,
-    ) -> None:
+    ) -> list[Event]:
         """Start at the set-point of the robot's controller, so that nothing jumps.
 
         Args:
@@ -162,6 +167,9 @@ class MotionPipeline:
             now_ns: time of this tick.
             blocked: the arm is far from its controller's set-point.
             in_joints: the actions are joints.
+
+        Returns:
+            what is dropped of a chunk, while the brake of the last activation continues.
         """
         self.pace.begin()
         self.retreat.end()
@@ -194,15 +202,17 @@ class MotionPipeline:
         assert self._mover is not None
         goal = self._mover.resting_goal(actual, width_m)
         if blocked and goal.arm is None:
-            goal = Goal(actual, width_m)
+            goal = Goal(self._within_reach(self._mover.motion.pose, actual)[0], width_m)
         elif blocked and self._path is not None and measured_rad is not None:
             goal = joint_goal(self._path.kinematics, measured_rad, width_m)
         self.pace.stand()
+        self.goal = None if blocked else goal
         if self.timeline is None:
             self.timeline = GoalTimeline(goal, now_ns)
-        else:
-            self.timeline.restart(goal, now_ns)
-        self.goal = None if blocked else goal
+            return []
+        plan = self.timeline.plan
+        self.timeline.restart(goal, now_ns)
+        return _dropped(plan, goal)
 
     def _enter(self, *, joints: bool) -> None:
         """Act in joints or in poses from now on; only while the arm stands."""
@@ -302,21 +312,26 @@ class MotionPipeline:
         active = state is State.ACTIVE and self.pace.override > 0.0
         return active and not self._changing and not self.held
 
-    def forget_plan(self, oldest_ns: int, now_ns: int) -> bool:
-        """Stand where the arm is, if the plan's observation was taken before `oldest_ns`."""
+    def forget_plan(self, oldest_ns: int, now_ns: int) -> list[Event] | None:
+        """Stand where the arm is, if the plan's observation was taken before `oldest_ns`.
+
+        Returns what of the plan is dropped; None: it is kept.
+        """
         timeline, mover = self.timeline, self._mover
         if timeline is None or mover is None:
-            return False
+            return None
         cause = timeline.plan.cause
         if cause is None or cause.observation_stamp_ns >= oldest_ns:
-            return False
-        self._hold(mover, timeline, now_ns)
-        return True
+            return None
+        return self._hold(mover, timeline, now_ns)
 
-    def _hold(self, mover: Mover, timeline: GoalTimeline, now_ns: int) -> None:
-        width_m = timeline.at(now_ns).width_m
-        timeline.hold(mover.resting_goal(mover.motion.pose, width_m), now_ns)
+    def _hold(self, mover: Mover, timeline: GoalTimeline, now_ns: int) -> list[Event]:
+        """Stand where the motion ends, and report what is dropped of the plan in force."""
+        plan = timeline.plan
+        rest = mover.resting_goal(mover.motion.pose, timeline.at(now_ns).width_m)
+        timeline.hold(rest, now_ns)
         self.pace.stand()
+        return _dropped(plan, rest)
 
     def _follow(
         self, timeline: GoalTimeline, task: Task, overdue_ns: int, now_ns: int, ticks: int
@@ -375,20 +390,42 @@ class MotionPipeline:
         if back is not None and isinstance(mover, JointPath) and self._poses is not None:
             self._enter(joints=False)
             mover = self._poses
+        dropped: list[Event] = []
         if back is None:
             self._stop(mover)
             self.goal = None
             if timeline.plan.cause is not None and mover.at_rest:
-                self._hold(mover, timeline, now_ns)  # so that nothing pulls the arm further
+                # So that nothing pulls the arm further.
+                dropped = self._hold(mover, timeline, now_ns)
         elif back is not self._back:
             # Whatever the speed override: an arm in contact has to come free.
             here_m = mover.motion.pose.position_m
             inside_m, _ = into_workspace(self._limits, back.position_m, here_m)
-            inside = Goal(Pose(inside_m, back.rotation), 0.0)
+            inside_pose, hits = self._within_reach(mover.motion.pose, Pose(inside_m, back.rotation))
+            inside = Goal(inside_pose, 0.0)
+            dropped = limit_events(hits)
             shares = map(min, mover.shares(inside), Shares(self.retreat.speed))
             mover.go_to(inside, Shares(*shares))
         self._back = back
-        return [] if event is None else [event]
+        return dropped if event is None else [*dropped, event]
+
+    def _within_reach(self, start: Pose, end: Pose) -> tuple[Pose, list[LimitHit]]:
+        """The part of a straight way that no barrier cuts off, and the limits that cut it.
+
+        For motion that is no step of a plan; it is bounded in pieces, as steps are.
+        """
+        if self._reach is None:
+            return end, []
+        apart_m, apart_rad = pose_distance(start, end)
+        pieces = math.ceil(max(apart_m / PIECE_M, apart_rad / PIECE_RAD, 1.0))
+        here = start
+        for piece in range(1, pieces + 1):
+            there = end if piece == pieces else interpolate(start, end, piece / pieces)
+            bounded = self._reach.bound(here, there, PIECE_S)
+            here = bounded.pose
+            if bounded.hits:
+                return here, bounded.hits
+        return here, []
 
     def _stop(self, mover: Mover, shares: Shares | None = None) -> None:
         """Come to rest as fast as joints that follow can; without them see `AxisSmoother.brake`."""
@@ -404,3 +441,16 @@ class MotionPipeline:
         if self._rest_since_ns is None:
             self._rest_since_ns = now_ns
         return self.streaming and now_ns - self._rest_since_ns < LINGER_NS
+
+
+def _dropped(plan: Plan, rest: Goal) -> list[Event]:
+    """The part of a chunk's plan that is left when the arm comes to rest, as an event."""
+    if plan.cause is None:
+        return []
+    last, left = plan.goals[plan.bounded - 1], len(plan.goals) - plan.bounded
+    apart_m, apart_rad = pose_distance(last.pose, rest.pose)
+    if max(apart_m, apart_rad) <= DROPPED and not left:
+        return []
+    more = f", and {left} steps after that" if left else ""
+    why = f"{apart_m:.5f} m and {apart_rad:.5f} rad of a chunk were not executed{more}"
+    return [make_event("warning", "notice", "dropped", why, apart_m, DROPPED)]

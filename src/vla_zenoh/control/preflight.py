@@ -111,9 +111,8 @@ def reasons_of_part(
     reasons = _robot(profile, peers, pose, now_ns)
     if gripper is None:
         return [*reasons, Passing("the gripper is not known: nothing received on state/gripper")]
-    reasons += _too_old("gripper's state", gripper, profile, now_ns)
-    why = why_not_ready(gripper.record)
-    return [*reasons, why] if why else reasons
+    lost = state_lost("gripper", gripper, profile.timing.state_timeout_s, now_ns)
+    return [*reasons, *filter(None, (lost, why_not_ready(gripper.record)))]
 
 
 def reasons_of_worker(
@@ -195,9 +194,10 @@ def joint_state_faults(
     """Whether the kinematics fit this robot: joints are received, their TCP is the reported one."""
     if joint is None:
         return ["the joints are not known: nothing received on state/joint"]
-    age_s = (now_ns - joint.received_ns) / 1e9
-    if age_s > profile.timing.state_timeout_s + JOINT_PATIENCE_S:
-        return [f"the joint state is {age_s:.2f} s old"]
+    most_s = profile.timing.state_timeout_s + JOINT_PATIENCE_S
+    why = state_lost("joints", joint, most_s, now_ns)
+    if why:
+        return [why]
     try:
         joints_rad = kinematics.joints_of(joint.record)
     except VlaZenohError as error:
@@ -274,6 +274,27 @@ def _robot(
 
 STOP_LATCHED = "latched"
 """Mode of a robot whose node has heard a stop, until it hears a reset."""
+
+
+def state_lost(name: str, state: Stamped[Any], most_s: float, now_ns: int) -> str:
+    """Why a measured state is lost, empty while it arrives in time.
+
+    Args:
+        name: of the state.
+        state: the newest.
+        most_s: its greatest age, by its arrival and, with a tolerance for clocks, by its stamp.
+        now_ns: on the clock of its arrival.
+    """
+    silent_s = (now_ns - state.received_ns) / 1e9
+    if silent_s > most_s:
+        return f"robot state lost: {name} {silent_s:.3f} s old, at most {most_s:g} s"
+    late_s = (now_ns - state.header.stamp_wall_ns) / 1e9
+    if late_s > most_s + CLOCK_TOLERANCE_S:
+        late_s -= CLOCK_TOLERANCE_S
+        return f"robot state comes late: {name} by {late_s:.3f} s, at most {most_s:g} s"
+    if late_s < -most_s - CLOCK_TOLERANCE_S:
+        return f"robot state is stamped {-late_s:.3f} s in the future: {name}"
+    return ""
 
 
 def why_not_ready(gripper: GripperState) -> str:

@@ -292,6 +292,15 @@ class ReachabilityFilter:
         joint = kinematics.arm_joints[tightest]
         return Margins(float(room[tightest]), joint, values[0], *nearest_m.values())
 
+    def bound(self, before: Pose, asked: Pose, dt_s: float) -> BoundedStep:
+        """`bound_in_pieces` at once."""
+        search = self.bound_in_pieces(before, asked, dt_s)
+        while True:
+            try:
+                next(search)
+            except StopIteration as last:
+                return last.value
+
     def bound_in_pieces(
         self, before: Pose, asked: Pose, dt_s: float, start_rad: FloatArray | None = None
     ) -> Generator[None, None, BoundedStep]:

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Set as AbstractSet
-from operator import is_
-from typing import Any
 
 import numpy as np
 
 from vla_zenoh.control.limits import SLOWEST, LimitHit, Slowdown, joint_margins, slowest
 from vla_zenoh.control.policy_check import Lease
-from vla_zenoh.control.preflight import CLOCK_TOLERANCE_S, PeerSnapshot
+from vla_zenoh.control.preflight import PeerSnapshot
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.keys import NO_DEADMAN_TOKEN, worker_node
 from vla_zenoh.kinematics.so3 import Pose, pose_distance
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import FloatArray, GripperState, PoseState, Stamped, Task
+from vla_zenoh.types import FloatArray, Task
 
 NEVER_NS = 1 << 62
 FIRST_CHUNK_PATIENCE_S = 1.0
@@ -29,7 +27,29 @@ PAST_MARGIN = 0.5
 BAND_RAD, BAND_M, BAND_SINGULAR = 2e-3, 5e-4, 5e-4
 STEPS = 20
 """Number of speed shares, so that the share does not change at every update."""
-_NOTHING = (None, None, None)
+
+
+class Deadline:
+    """A time that is some plan time away, which passes at the speed override, and some seconds."""
+
+    def __init__(self) -> None:
+        self.at_ns = 0
+        self._left_ns, self._patience_ns = 0.0, 0
+
+    def set(self, left_ns: float, patience_s: float, now_ns: int, speed: float) -> None:
+        """`left_ns` of plan time from now at override `speed`, then `patience_s`; never at 0."""
+        self._left_ns, self._patience_ns = left_ns, int(patience_s * 1e9)
+        self.at_ns = NEVER_NS
+        if speed:
+            left_ns = left_ns / speed if left_ns > 0 else left_ns
+            self.at_ns = now_ns + round(left_ns) + self._patience_ns
+
+    def override_changed(self, now_ns: int, before: float, speed: float) -> None:
+        """Keep the plan time that is left, of an override that was `before`."""
+        if before:
+            left_ns = self.at_ns - self._patience_ns - now_ns
+            self._left_ns = left_ns * before if left_ns > 0 else left_ns
+        self.set(self._left_ns, self._patience_ns / 1e9, now_ns, speed)
 
 
 IS_GONE = "is gone"
@@ -47,46 +67,49 @@ class Watchdog:
         self._limits, self._timing = profile.limits, profile.timing
         self.tracking_m = self.tracking_rad = 0.0
         self._excused = (0.0, 0.0)
-        self._compared: tuple[Pose | None, Pose | None] = None, None
-        self._present: tuple[PeerSnapshot, str, Lease] | None = None
-        """The nodes, worker and lease that nothing was missing of."""
-        self.deadline_ns = 0
-        """When the next chunk is overdue."""
-        self._left_ns, self._patience_ns = 0.0, 0
+        self._chunk, self._motion = Deadline(), Deadline()
 
     # -- chunks -------------------------------------------------------------------------------
     def expect(self, left_ns: int | None, now_ns: int, task: Task) -> None:
-        """Set the deadline of the next chunk; never at override 0.
+        """Set the deadline of the next chunk, and that of the motion without one.
 
-        One period at the requested rate, and the watchdog, after `left_ns` of plan time, of which
-        ``max_open_loop_s`` count at most; None: of the first chunk of an episode.
+        The next chunk is due one period at the requested rate, and the watchdog, after `left_ns` of
+        plan time, of which ``max_open_loop_s`` count at most; None: the first chunk of an episode.
+        Whatever the rate, the arm moves for ``max_open_loop_s`` of plan time and the watchdog at
+        most. At override 0 plan time stands still.
         """
-        extra_s = FIRST_CHUNK_PATIENCE_S if left_ns is None else 0.0
-        plan_ns = min(left_ns or 0, int(self._timing.max_open_loop_s * 1e9))
-        self._left_ns = plan_ns + 1e9 / task.rate_hz
-        self._patience_ns = int((self._timing.watchdog_s + extra_s) * 1e9)
-        self._set_deadline(now_ns, task.speed)
+        patience_s = self._timing.watchdog_s
+        first_s = patience_s + FIRST_CHUNK_PATIENCE_S
+        open_loop_ns = self._timing.max_open_loop_s * 1e9
+        plan_ns = min(left_ns or 0, open_loop_ns)
+        chunk_s = first_s if left_ns is None else patience_s
+        self._chunk.set(plan_ns + 1e9 / task.rate_hz, chunk_s, now_ns, task.speed)
+        self._motion.set(open_loop_ns, patience_s, now_ns, task.speed)
 
     def override_changed(self, now_ns: int, before: float, speed: float) -> None:
-        """Keep the plan time that is left until the deadline, of an override that was `before`."""
-        if before:
-            left_ns = self.deadline_ns - self._patience_ns - now_ns
-            self._left_ns = left_ns * before if left_ns > 0 else left_ns
-        self._set_deadline(now_ns, speed)
+        """Keep the plan time that is left until the deadlines, of an override that was `before`."""
+        self._chunk.override_changed(now_ns, before, speed)
+        self._motion.override_changed(now_ns, before, speed)
 
-    def _set_deadline(self, now_ns: int, speed: float) -> None:
-        self.deadline_ns = NEVER_NS
-        if speed:
-            left_ns = self._left_ns / speed if self._left_ns > 0 else self._left_ns
-            self.deadline_ns = now_ns + round(left_ns) + self._patience_ns
+    @property
+    def deadline_ns(self) -> int:
+        """When the arm should have reached its last goal, if no chunk comes."""
+        return min(self._chunk.at_ns, self._motion.at_ns)
 
-    def overdue(self, now_ns: int) -> bool:
-        """The next chunk is overdue."""
-        return now_ns > self.deadline_ns
+    def overdue(self, now_ns: int, *, moves: bool) -> str:
+        """Why the arm holds: no chunk came; empty while one may come, or the arm is on its way.
+
+        An arm that `moves` is on its way to the last step of a chunk, which it may reach late.
+        """
+        if moves and now_ns > self._motion.at_ns:
+            return "no fresh chunk within max_open_loop_s, and the arm still moved"
+        if not moves and now_ns > self._chunk.at_ns:
+            return "no fresh chunk within the watchdog"
+        return ""
 
     def given_up(self, now_ns: int) -> bool:
         """It is overdue by ``max_hold_s``: the arm must not resume by itself any more."""
-        return now_ns > self.deadline_ns + int(self._timing.max_hold_s * 1e9)
+        return now_ns > self._chunk.at_ns + int(self._timing.max_hold_s * 1e9)
 
     # -- tracking -----------------------------------------------------------------------------
     def begin(self, held: Pose, actual: Pose) -> bool:
@@ -101,9 +124,6 @@ class Watchdog:
 
     def measure(self, commanded: Pose | None, actual: Pose) -> None:
         """Update the tracking error; `commanded` is None while nothing is streamed."""
-        before, self._compared = self._compared, (commanded, actual)
-        if commanded is before[0] and actual is before[1]:
-            return
         self.tracking_m, self.tracking_rad = (
             (0.0, 0.0) if commanded is None else pose_distance(commanded, actual)
         )
@@ -135,36 +155,8 @@ class Watchdog:
         return ""
 
     # -- peers --------------------------------------------------------------------------------
-    def state_lost(
-        self, pose: Stamped[PoseState], gripper: Stamped[GripperState], now_ns: int
-    ) -> str:
-        """Which state of the robot is missing or late, empty if none is."""
-        patience_s = self._timing.state_timeout_s
-        for what, state in (("pose", pose), ("gripper", gripper)):
-            silent_s = (now_ns - state.received_ns) / 1e9
-            if silent_s > patience_s:
-                return f"robot state lost: {what} {silent_s:.3f} s old, at most {patience_s:g} s"
-            late_s = (now_ns - state.header.stamp_wall_ns) / 1e9 - CLOCK_TOLERANCE_S
-            if late_s > patience_s:
-                return f"robot state comes late: {what} by {late_s:.3f} s, at most {patience_s:g} s"
-        return ""
-
-    def lost(
-        self,
-        pose: Stamped[PoseState],
-        gripper: Stamped[GripperState],
-        peers: PeerSnapshot,
-        worker: str,
-        lease: Lease,
-        now_ns: int,
-    ) -> str:
-        """Which state, node or camera is lost, empty if none is."""
-        lost = self.state_lost(pose, gripper, now_ns)
-        if lost:
-            return lost
-        seen = peers, worker, lease
-        if self._present is not None and all(map(is_, seen, self._present)):
-            return ""
+    def lost(self, peers: PeerSnapshot, worker: str, lease: Lease) -> str:
+        """Which node or camera is lost, empty if none is."""
         needed = [peers.robot_node, worker_node(worker)]
         cameras = lease.spec.observation.camera_names
         needed += [peers.camera_nodes.get(camera, "camera") for camera in cameras]
@@ -176,7 +168,6 @@ class Watchdog:
                 return f"camera {camera!r} {peers.camera_faults[camera]}"
         if peers.spec_sources.get(worker) != lease.source:
             return f"worker {worker!r} was restarted"
-        self._present = seen
         return ""
 
 
@@ -224,8 +215,6 @@ class JointMonitor:
         """Greatest distance of a joint from where it is expected."""
         self._bound_slowdown: Slowdown | None = None
         self._elbow_slowdown: Slowdown | None = None
-        # Joints that passed each check, so that an arm at rest is not checked again.
-        self._passed: list[tuple[Any, ...]] = [_NOTHING, _NOTHING]
 
     @property
     def slowdown(self) -> Slowdown | None:
@@ -259,15 +248,9 @@ class JointMonitor:
             return None
         self._next_ns = now_ns + PERIOD_NS // 2
         self._elbow_next = not self._elbow_next
-        seen = measured_rad, commanded_rad, in_joints
-        if self.slowdown is None and all(map(is_, seen, self._passed[self._elbow_next])):
-            return None  # nothing moved since they passed this check
         if self._elbow_next:
-            hit = self._bounds(measured_rad, in_joints=in_joints)
-        else:
-            hit = self._elbow(measured_rad, commanded_rad)
-        self._passed[self._elbow_next] = seen if hit is None else _NOTHING
-        return hit
+            return self._bounds(measured_rad, in_joints=in_joints)
+        return self._elbow(measured_rad, commanded_rad)
 
     def _bounds(self, measured_rad: FloatArray, *, in_joints: bool) -> LimitHit | None:
         kinematics, barriers = self._reach.kinematics, self._reach.barriers

@@ -27,9 +27,9 @@ _PerJoint = (
     BeforeValidator(_one_for_all),
     AfterValidator(_not_empty),
 )
-Velocity = Annotated[float, Field(gt=0, le=2.61)]
-Acceleration = Annotated[float, Field(gt=0, le=20)]
-Jerk = Annotated[float, Field(gt=0, le=10_000)]
+Velocity = Annotated[float, Field(ge=1e-3, le=2.61)]
+Acceleration = Annotated[float, Field(ge=1e-2, le=20)]
+Jerk = Annotated[float, Field(ge=0.1, le=10_000)]
 
 
 class JointLimits(Section):
@@ -90,17 +90,17 @@ class Workspace(Section):
 class TranslationLimits(Section):
     """Limits per axis of the base frame."""
 
-    velocity_m_s: float = Field(default=0.5, gt=0, le=1.7)
-    acceleration_m_s2: float = Field(default=2.0, gt=0, le=13)
-    jerk_m_s3: float = Field(default=20.0, gt=0, le=6500)
+    velocity_m_s: float = Field(default=0.5, ge=1e-3, le=1.7)
+    acceleration_m_s2: float = Field(default=2.0, ge=1e-2, le=13)
+    jerk_m_s3: float = Field(default=20.0, ge=0.1, le=6500)
 
 
 class RotationLimits(Section):
     """Limits per axis of the rotation vector."""
 
-    velocity_rad_s: float = Field(default=1.5, gt=0, le=2.5)
-    acceleration_rad_s2: float = Field(default=6.0, gt=0, le=25)
-    jerk_rad_s3: float = Field(default=60.0, gt=0, le=12500)
+    velocity_rad_s: float = Field(default=1.5, ge=1e-3, le=2.5)
+    acceleration_rad_s2: float = Field(default=6.0, ge=1e-2, le=25)
+    jerk_rad_s3: float = Field(default=60.0, ge=0.1, le=12500)
 
 
 Edge = Annotated[float, Field(gt=0, le=2 * REACH_M)]
@@ -185,7 +185,8 @@ class ReachLimits(Section):
 class ContactLimits(Section):
     """Contact forces at which the arm slows down and gives up; see `vla_zenoh.control.contact`.
 
-    Forces are measured relative to those at activation.
+    The arm slows down by forces relative to those at activation. It stops by the greater of the
+    force that the robot reports and its change since the activation.
 
     Args:
         force_slow_n: external force at the TCP above which the arm slows down.

@@ -251,6 +251,7 @@ class Timing(Section):
         command_timeout_s: the robot brakes by itself if the command stream is silent for this long.
         max_observation_age_s: a chunk inferred from an older observation is rejected.
         max_open_loop_s: longest part of a chunk that is followed; then it counts as run out.
+            Without a new chunk the arm moves for this long, at the speed override, and watchdog_s.
         max_clock_step_s: a larger jump of the wall clock brakes the arm, which then needs a new
             activation.
         max_clock_offset_s: largest offset of another host's clock that is compensated; with a

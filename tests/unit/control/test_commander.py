@@ -1117,16 +1117,17 @@ def test_the_measured_joints_are_monitored_however_many_chunks_arrive() -> None:
     of = profile()
     reach = ReachabilityFilter(of)
     rig = Rig(of, reach=reach)
-    rig.stand_at(reach.kinematics, reach.joints_rad.copy())
+    joints_rad, end_rad = reach.joints_rad.copy(), reach.kinematics.upper_rad[6] - 1e-3
+    joints_rad[6] = end_rad - 0.2
+    rig.stand_at(reach.kinematics, joints_rad)
     for _ in range(3):
         rig.tick()
     rig.activate()
     rig.run(0.2)
-    rig.joints_of_shadow = False
-    start_rad, end_rad = reach.joints_rad.copy(), reach.kinematics.upper_rad[0] - 1e-3
-    for tick in range(100):
-        rig.joints_rad = start_rad.copy()
-        rig.joints_rad[0] += (end_rad - start_rad[0]) * tick / 99
+    rig.blocked = True  # a person moves it
+    for _ in range(100):
+        joints_rad[6] += 0.2 / 99
+        rig.stand_at(reach.kinematics, joints_rad.copy())
         rig.tick(chunks=[rig.chunk([[0.0] * 7], seq=0)])
     assert rig.state == "inactive"
     assert "the measured arm is too near to a bound" in rig.commander.why

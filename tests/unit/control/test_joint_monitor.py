@@ -156,7 +156,7 @@ class Arm(Rig):
 
     def __init__(self) -> None:
         super().__init__(PROFILE, reach=ReachabilityFilter(PROFILE, KINEMATICS))
-        self.joints_rad, self.joints_of_shadow = HOME_RAD, False
+        self.joints_rad, self.joints_of_tcp = HOME_RAD, False
         self.place(KINEMATICS.forward(HOME_RAD))
 
     def place(self, pose: Pose) -> None:
@@ -171,12 +171,14 @@ def test_the_measured_arm_ends_the_activation_with_an_event_that_names_joint_val
     None
 ):
     arm = Arm()
+    joints_rad = HOME_RAD - 0.345 * JOINT["panda_joint4"]
+    arm.stand_at(KINEMATICS, joints_rad)
     arm.activate()
-    arm.send([[0, 0, 0.01, 0, 0, 0, 0]] * 16)
+    arm.blocked = True  # a person moves it
     slowest = 1.0
-    joints_rad = HOME_RAD
-    for _ in range(400):
-        arm.joints_rad = joints_rad = joints_rad - 0.002 * JOINT["panda_joint4"]
+    for _ in range(200):
+        joints_rad = joints_rad - 0.001 * JOINT["panda_joint4"]
+        arm.stand_at(KINEMATICS, joints_rad)
         arm.tick()
         slowest = min(slowest, arm.commander.parts[0].motion.pace.speed)
         if arm.state != "active":

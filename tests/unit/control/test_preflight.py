@@ -117,7 +117,7 @@ def test_when_all_is_well_there_is_no_reason() -> None:
         ("the robot's node 'sim' is not alive", gone("sim")),
         ("the TCP pose is not known", set_("pose", None)),
         (r"the TCP pose is 0\.20 s old, at most 0\.15 s", later(0.196)),
-        (r"the gripper's state is 0\.20 s old", later(0.196)),
+        (r"robot state lost: gripper 0\.\d+ s old, at most 0\.15 s", later(0.196)),
         (r"the robot's clock and this one differ: .* \+0\.900 s", clocks_apart),
         (
             r"the TCP at \(0\.100, 0\.000, 0\.300\) m is 0\.100 m outside",

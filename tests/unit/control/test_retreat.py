@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vla_zenoh.control.contact import RELIEF_M, SPACE_M, CommandTrail
-from vla_zenoh.control.watchdog import Watchdog
+from vla_zenoh.control.preflight import state_lost
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.types import PoseState, Stamped
 
@@ -309,7 +309,7 @@ def test_an_arm_that_turned_up_elsewhere_has_no_way_from_there() -> None:
 
 def test_a_watch_says_which_state_is_missing() -> None:
     rig = Rig()
-    watch = Watchdog(rig.profile)
-    pose, gripper = rig.pose_state(), rig.gripper_state()
-    assert watch.state_lost(pose, gripper, rig.now_ns) == ""
-    assert "pose" in watch.state_lost(pose, gripper, rig.now_ns + 10**9)
+    pose, most_s = rig.pose_state(), rig.profile.timing.state_timeout_s
+    assert state_lost("pose", pose, most_s, rig.now_ns) == ""
+    assert "pose" in state_lost("pose", pose, most_s, rig.now_ns + 10**9)
+    assert "future: pose" in state_lost("pose", pose, most_s, rig.now_ns - 10**9)

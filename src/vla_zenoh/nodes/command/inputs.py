@@ -216,6 +216,9 @@ class PeerMonitor:
         self._lock = threading.Lock()
         self._alive: set[str] = set()
         self._holders: set[str] = set()
+        self._nodes_gone: set[str] = set()
+        self._holders_gone: set[str] = set()
+        """Those that were gone since the last snapshot, even if they are back."""
         self._changed = True
         self._specs: dict[str, ModelSpec] = {}
         self._spec_sources: dict[str, str] = {}
@@ -243,6 +246,7 @@ class PeerMonitor:
             if alive:
                 self._down.pop(name, None)
                 return
+            self._nodes_gone.add(name)
             self._forget(name)
 
     def _forget(self, name: str) -> None:
@@ -257,6 +261,7 @@ class PeerMonitor:
         with self._lock:
             self._changed = True
             if not present:
+                self._holders_gone.add(name)
                 self._holders.discard(name)
             elif len(self._holders) < MAX_HOLDERS:
                 self._holders.add(name)
@@ -276,9 +281,14 @@ class PeerMonitor:
         with self._lock:
             if not self._changed:
                 return None
-            self._changed = False
+            # A token that was gone between two polls is gone for one: what depends on it ends.
+            alive = frozenset(self._alive - self._nodes_gone)
+            holders = frozenset(self._holders - self._holders_gone)
+            self._changed = len(alive) < len(self._alive) or len(holders) < len(self._holders)
+            self._nodes_gone.clear()
+            self._holders_gone.clear()
             return PeerSnapshot(
-                frozenset(self._alive),
+                alive,
                 self._robot_node,
                 dict(self._specs),
                 dict(self._spec_sources),
@@ -291,7 +301,7 @@ class PeerMonitor:
                 {name: place.host for name, place in self._hosts.items()},
                 frozenset(self._same_host),
                 {node: at[:2] for node, at in self._node.clocks.offsets().items()},
-                frozenset(self._holders),
+                holders,
                 dict(self._camera_faults),
                 dict(self._camera_reasons),
                 dict(self._down),

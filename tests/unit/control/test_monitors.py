@@ -1,0 +1,270 @@
+"""What is measured: each stream by itself, poses against joints, forces as they are; late arms."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from command_rig import DOWN, START_M, START_NS, Rig, profile
+
+from vla_zenoh.control.contact import Contact
+from vla_zenoh.control.reachability import ReachabilityFilter
+from vla_zenoh.errors import ProfileError
+from vla_zenoh.kinematics.so3 import Pose, quat_from_rotation, rotation_from_quat
+from vla_zenoh.profile import ContactLimits, Profile, load_profile, override
+from vla_zenoh.types import FloatArray, Header, JointState, PoseState, Stamped
+
+MS = 1_000_000
+STOP_N, MOST_N = 40.0, 44.0
+JUMPS_M = (0.05, 0.055, 0.065)
+
+
+class Arm(Rig):
+    """An arm whose joints and reported pose agree, unless a test tampers with one of them."""
+
+    def __init__(self, of: Profile | None = None, *, command: str = "pose") -> None:
+        of = of or profile(robot={"command": command})
+        reach = ReachabilityFilter(of)
+        super().__init__(of, reach=reach)
+        self.reach = reach
+        self.at_rad: FloatArray = reach.joints_rad.copy()
+        self.stand_at(reach.kinematics, self.at_rad)
+        self.jump_m = np.zeros(3)
+        self.frozen: set[str] = set()
+        self.late_ns: dict[str, int] = {}
+        self.last: dict[str, Stamped[Any]] = {}
+
+    def tick(self, *settings: Any, **more: Any) -> Any:
+        out = super().tick(*settings, **more)
+        if out.joint is not None:
+            pose = self.reach.kinematics.forward(out.joint.position_rad)
+            self.at_rad = out.joint.position_rad
+            self.position_m, self.quat_xyzw = pose.position_m, quat_from_rotation(pose.rotation)
+        return out
+
+    def _said(self, stream: str, state: Stamped[Any]) -> Stamped[Any]:
+        """As it is told: frozen values have new stamps, late ones old stamps."""
+        if stream in self.frozen and stream in self.last:
+            state = replace(state, record=self.last[stream].record)
+        self.last[stream] = state
+        header = state.header
+        late_ns = self.late_ns.get(stream, 0)
+        return replace(state, header=replace(header, stamp_wall_ns=header.stamp_wall_ns - late_ns))
+
+    def pose_state(self) -> Stamped[PoseState]:
+        state = super().pose_state()
+        moved = replace(state.record, position_m=state.record.position_m + self.jump_m)
+        return self._said("pose", replace(state, record=moved))
+
+    def gripper_state(self) -> Any:
+        return self._said("gripper", super().gripper_state())
+
+    def joint_state(self) -> Stamped[JointState]:
+        pose = Pose(self.position_m, rotation_from_quat(self.quat_xyzw))
+        found = self.reach.solve(pose, self.at_rad)
+        self.at_rad = self.at_rad if found is None else found
+        zero = np.zeros(len(self.at_rad))
+        names = self.reach.kinematics.arm_joints
+        record = JointState(names, self.at_rad, zero, zero, self.at_rad)
+        state = Stamped(self.header("joint", "sim-1"), record, self.now_ns)
+        return self._said("joints", state)
+
+    def moving(self, step_m: float = 0.01, count: int = 4) -> None:
+        """Active, and on its way down."""
+        self.activate()
+        for _ in range(count):
+            self.send([[0, 0, -step_m, 0, 0, 0, 0]] * 8)
+            self.run(0.1)
+        assert self.state == "active", self.commander.why
+
+
+# -- forces ------------------------------------------------------------------------------------
+def pressed(force_n: FloatArray, at_ns: int) -> Stamped[PoseState]:
+    wrench = np.concatenate([force_n, np.zeros(3)])
+    moved_m = START_M + 1e-12 * (at_ns - START_NS)
+    return Stamped(Header(at_ns, 0, "sim-1"), PoseState(moved_m, DOWN, np.zeros(6), wrench), at_ns)
+
+
+@pytest.mark.parametrize("rate_n_s", [0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0])
+@pytest.mark.parametrize("offset_n", [0.0, 5.0, 14.0])
+@pytest.mark.parametrize("degrees", [0, 60, 90, 180])
+def test_the_arm_brakes_at_its_force_however_slowly_it_rises_and_whatever_was_there_before(
+    rate_n_s: float, offset_n: float, degrees: float
+) -> None:
+    contact = Contact(ContactLimits(force_stop_n=STOP_N))
+    angle = np.radians(degrees)
+    offset = offset_n * np.array([np.cos(angle), np.sin(angle), 0.0])
+    step_ns = 4 * MS if rate_n_s >= 1.0 else 40 * MS
+    now_ns = START_NS
+    for _ in range(100):
+        contact.update_pose(pressed(offset, now_ns))
+        now_ns += step_ns
+    contact.begin()
+    assert contact.overload() is None
+    began_ns = now_ns
+    while contact.overload() is None:
+        rising_n = rate_n_s * (now_ns - began_ns) / 1e9
+        force_n = offset + np.array([rising_n, 0.0, 0.0])
+        assert rising_n < MOST_N, "the zero of the sensor may be false: its change counts as well"
+        assert np.linalg.norm(force_n) < MOST_N
+        contact.update_pose(pressed(force_n, now_ns))
+        now_ns += step_ns
+
+
+def test_an_arm_that_is_pressed_harder_than_the_stop_is_not_activated() -> None:
+    contact = Contact(ContactLimits(force_stop_n=STOP_N))
+    for tick in range(100):
+        contact.update_pose(pressed(np.array([0, 0, 41.0]), START_NS + 4 * MS * tick))
+    assert any("contact_force is 41.0 N at rest" in why for why in contact.missing)
+
+
+def test_a_wrench_that_stays_the_same_while_the_arm_moves_is_not_measured() -> None:
+    contact = Contact(ContactLimits())
+    contact.update_pose(pressed(np.array([1.0, 2.0, 3.0]), START_NS))
+    contact.begin()
+    for tick in range(100):
+        state = pressed(np.array([1.0, 2.0, 3.0]), START_NS + 4 * MS * tick)
+        at_m = START_M + [0.0, 0.0, 0.001 * tick]
+        contact.update_pose(replace(state, record=replace(state.record, position_m=at_m)))
+    assert "no longer measures contact_force" in contact.lost
+
+
+# -- poses against joints -----------------------------------------------------------------------
+@pytest.mark.parametrize("command", ["pose", "joint"])
+@pytest.mark.parametrize("jump_m", JUMPS_M)
+@pytest.mark.parametrize("moving", [True, False])
+def test_an_arm_does_not_move_to_a_reported_pose_that_its_joints_contradict(
+    command: str, jump_m: float, moving: bool
+) -> None:
+    rig = Arm(command=command)
+    rig.moving() if moving else rig.activate()
+    rig.jump_m = np.array([0.0, jump_m, 0.0])
+    rig.run(0.05)
+    rig.run(0.2)
+    assert rig.state == "inactive"
+    assert "TCP" in rig.commander.why, rig.commander.why
+    rig.run(0.3)
+    stood_m = rig.position_m.copy()
+    rig.run(3.0)
+    assert np.linalg.norm(rig.position_m - stood_m) < 1e-3
+
+
+def test_a_retreat_stops_before_a_bound_as_any_other_motion_does() -> None:
+    rig = Arm()
+    rig.activate()
+    motion = rig.commander.parts[0].motion
+    table_z_m = rig.profile.limits.reach.table_z_m
+    assert table_z_m is not None
+    here = Pose(rig.position_m, rotation_from_quat(rig.quat_xyzw))
+    into = Pose(np.array([*rig.position_m[:2], table_z_m - 0.05]), here.rotation)
+    bounded, hits = motion._within_reach(here, into)
+    assert {hit.name for hit in hits} == {"table_distance"}
+    assert bounded.position_m[2] > table_z_m
+
+
+# -- each stream has its own age ----------------------------------------------------------------
+@pytest.mark.parametrize("command", ["pose", "joint"])
+@pytest.mark.parametrize("stream", ["pose", "joints", "gripper"])
+def test_a_state_that_comes_late_or_is_repeated_ends_the_activation_by_name(
+    command: str, stream: str
+) -> None:
+    rig = Arm(command=command)
+    rig.moving()
+    rig.late_ns = {stream: 2000 * MS}
+    rig.run(0.02)
+    assert rig.state == "inactive"
+    assert f"late: {stream}" in rig.commander.why
+
+
+@pytest.mark.parametrize("command", ["pose", "joint"])
+@pytest.mark.parametrize("stream", ["pose", "joints"])
+def test_values_that_stand_still_while_the_arm_moves_end_the_activation(
+    command: str, stream: str
+) -> None:
+    rig = Arm(command=command)
+    rig.moving()
+    rig.frozen = {stream}
+    for _ in range(10):
+        rig.send([[0, 0, -0.02, 0, 0, 0, 0]] * 8)
+        rig.run(0.1)
+        if rig.state != "active":
+            break
+    assert rig.state == "inactive"
+    assert "the measured joints put the TCP" in rig.commander.why, rig.commander.why
+
+
+# -- late arms ----------------------------------------------------------------------------------
+@pytest.mark.parametrize("velocity_m_s", [0.5, 0.05, 0.03])
+def test_an_arm_on_its_way_to_the_last_step_of_a_chunk_arrives(velocity_m_s: float) -> None:
+    limits = profile().limits
+    slow = limits.translation.model_copy(update={"velocity_m_s": velocity_m_s})
+    rig = Rig(profile(limits={"translation": slow}), dt_s=0.05)
+    rig.activate()
+    asked_m = np.zeros(3)
+    for _ in range(3):
+        steps = [[0.005, 0, -0.005, 0, 0, 0, 0]] * 8
+        rig.send(steps)
+        asked_m += np.sum(steps, axis=0)[:3]
+        rig.run(4.0)
+    dropped = [event for event in rig.events if event.what == "dropped"]
+    cut_m = sum(event.value or 0.0 for event in dropped)
+    np.testing.assert_allclose(np.linalg.norm(rig.moved_m() - asked_m), cut_m, atol=1e-5)
+    assert not dropped
+
+
+def test_what_of_a_chunk_is_dropped_is_reported_with_its_amount() -> None:
+    limits = profile().limits
+    slow = limits.translation.model_copy(update={"velocity_m_s": 0.01})
+    rig = Rig(profile(limits={"translation": slow}), dt_s=0.05)
+    rig.activate()
+    rig.send([[0.01, 0, 0, 0, 0, 0, 0]] * 10)
+    rig.run(6.0)
+    dropped = [event for event in rig.events if event.what == "dropped"]
+    assert len(dropped) == 1
+    assert dropped[0].value == pytest.approx(0.1 - rig.moved_m()[0], abs=1e-5)
+    assert "m and 0.0" in dropped[0].why
+
+
+@pytest.mark.parametrize("rate_hz", [0.1, 0.5, 1.0, 5.0, 30.0])
+def test_without_a_model_the_arm_stands_after_max_open_loop_at_any_rate(rate_hz: float) -> None:
+    rig = Rig(dt_s=0.1)
+    rig.activate()
+    rig.put("rate", rate_hz)
+    rig.send([[0.01, 0, 0, 0, 0, 0, 0]] * 16)
+    timing = rig.profile.timing
+    rig.run(timing.max_open_loop_s + timing.watchdog_s + 0.3)
+    stood_m = rig.position_m.copy()
+    assert rig.moved_m()[0] > 0.1
+    rig.run(10.0)
+    np.testing.assert_allclose(rig.position_m, stood_m, atol=1e-6)
+
+
+# -- profiles -----------------------------------------------------------------------------------
+LEAST_LIMITS: dict[str, dict[str, float]] = {
+    "translation": {"velocity_m_s": 1e-3, "acceleration_m_s2": 1e-2, "jerk_m_s3": 0.1},
+    "rotation": {"velocity_rad_s": 1e-3, "acceleration_rad_s2": 1e-2, "jerk_rad_s3": 0.1},
+    "joint": {"velocity_rad_s": 1e-3, "acceleration_rad_s2": 1e-2, "jerk_rad_s3": 0.1},
+}
+
+
+@pytest.mark.parametrize("command", ["pose", "joint"])
+def test_an_arm_moves_within_the_least_limits_of_a_profile_without_a_fault(command: str) -> None:
+    limits = {"limits": LEAST_LIMITS, "robot": {"command": command}}
+    rig = Arm(override(load_profile("panda_sim"), limits))
+    rig.activate()
+    for _ in range(10):
+        rig.send([[0.01, 0.002, 0, 0, 0, 0.02, 0]] * 8)
+        rig.run(0.2)
+        assert rig.state == "active", rig.commander.why
+    assert rig.moved_m()[0] > 1e-5
+
+
+@pytest.mark.parametrize(
+    ("section", "name"), [(part, name) for part, of in LEAST_LIMITS.items() for name in of]
+)
+def test_smaller_limits_are_refused_by_name(section: str, name: str) -> None:
+    less = {"limits": {section: {name: 0.9 * LEAST_LIMITS[section][name]}}}
+    with pytest.raises(ProfileError, match=f"limits.{section}.{name}"):
+        override(load_profile("panda_sim"), less)
