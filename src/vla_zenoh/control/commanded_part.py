@@ -270,7 +270,11 @@ class CommandedPart:
             return False  # reported with the spec
 
     def activate(self, lease: Lease, now_ns: int) -> list[Event]:
-        """Start the motion where the arm stands; its states are known. Returns what is dropped."""
+        """Start the motion where the arm stands; its states are known.
+
+        Returns events: what is dropped of the goals before, and each distance that is too small
+        where it stands: the arm may only move away.
+        """
         assert self.pose is not None and self.gripper_state is not None
         self.too_near = None
         self._jumped = ""
@@ -280,7 +284,7 @@ class CommandedPart:
         self.planner.restart(self.pose, self.joint)
         measured, joint = self.pose.record, self.joint.record if self.joint else None
         blocked = self.watchdog.begin(held_pose(measured), pose_of(measured))
-        return self.motion.anchor(
+        events = self.motion.anchor(
             measured,
             self.gripper.keep(self.gripper_state.record),
             joint,
@@ -288,6 +292,13 @@ class CommandedPart:
             blocked=blocked,
             in_joints=self._in_joints(lease.spec),
         )
+        if self.reach is None or self.measured_rad is None:
+            return events
+        why = "begins too near, and may only move away"
+        return events + [
+            make_event("warning", "limit", hit.name, why + hit.at, hit.value, hit.limit)
+            for hit in self.reach.barriers.inside(self.measured_rad)
+        ]
 
     def commands(self, state: State, now_ns: int) -> MotionCommands:
         """The set-points of robot and gripper, while streaming."""

@@ -34,7 +34,7 @@ from vla_zenoh.control.limits import (
 )
 from vla_zenoh.control.plan_timeline import Goal, joint_goal
 from vla_zenoh.control.policy_check import Rejection
-from vla_zenoh.control.reachability import Barriers
+from vla_zenoh.control.reachability import Barriers, Floors
 from vla_zenoh.control.smoothing import Motion
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import Pose, norm3
@@ -74,6 +74,7 @@ class JointBounds:
 
     def __init__(self, profile: Profile, kinematics: Kinematics, barriers: Barriers) -> None:
         self.limits, self.kinematics, self.barriers = profile.limits, kinematics, barriers
+        self._floors = Floors(barriers)
         self.motion = joint_motion_limits(profile, kinematics)
         margin_rad = joint_margins(self.limits.reach, kinematics)
         self.lower_rad = kinematics.lower_rad + margin_rad
@@ -133,7 +134,7 @@ class JointBounds:
         target_rad, hits = self.into_ranges(start_rad, asked_rad)
         yield
         before = self._barriers_at(start_rad)
-        floor = self.barriers.floor(before)
+        floor = self._floors.after(before)
         yield
         after, found = self._try(start_rad, target_rad, floor)
         if found is not None:

@@ -6,7 +6,8 @@ number ``h`` that must not become negative: singular value or distance minus its
 ``h0`` must end with::
 
     h >= min(slow - stop, h0 / 2)     where h0 > 0: beyond `slow` it takes half of what is left,
-    h >= h0                           where h0 <= 0: a violated barrier may only be left
+    h >= h0                           where h0 <= 0: a violated barrier may only be left, and does
+                                      not fall again (`Floors`)
 
 which is a control barrier function in discrete time (Agrawal, Sreenath, "Discrete control barrier
 functions for safety-critical control of discrete systems", RSS 2017) with a decay of one half.
@@ -42,7 +43,7 @@ from vla_zenoh.control.limits import (
     joint_margins,
     slowest,
 )
-from vla_zenoh.errors import RecordError
+from vla_zenoh.errors import ProfileError, RecordError
 from vla_zenoh.kinematics.collision import FREE_M, CollisionModel
 from vla_zenoh.kinematics.kinematics import (
     TOLERANCE_M,
@@ -57,6 +58,8 @@ from vla_zenoh.kinematics.so3 import Pose, interpolate
 from vla_zenoh.profile import Profile, ReachLimits
 from vla_zenoh.types import FloatArray, HeldBox
 
+LEAVES_M = 5e-3
+"""A pair that is never far apart can get this much further apart than its stop."""
 DECAY = 0.5
 """Part of the distance to a stop that one step may take inside its zone."""
 NOISE = 2e-6
@@ -106,7 +109,7 @@ class Barriers:
     Args:
         kinematics: of the arm.
         limits: stop and slow of each kind.
-        home_rad: (n,) joints known to be free of collisions.
+        home_rad: (n,) the arm at home.
 
     Attributes:
         names: of the barriers, as in `vla_zenoh.control.limits.LimitHit`.
@@ -122,19 +125,39 @@ class Barriers:
         self.collisions = CollisionModel(
             kinematics,
             near_m=limits.collision_slow_m,
-            touching_m=limits.collision_stop_m,
             table_z_m=limits.table_z_m,
-            known_good_rad=[home_rad],
+            home_rad=home_rad,
             keep_out=limits.keep_out,
+            may_touch=limits.may_touch,
         )
         pairs = self.collisions.pairs
         hand = np.array([pair.is_hand and pair.limit == "table_distance" for pair in pairs], bool)
         self.names = ["singularity", *(pair.limit for pair in pairs)]
         stops_m = np.where(hand, limits.table_stop_m, limits.collision_stop_m)
         slows_m = np.where(hand, limits.table_slow_m, limits.collision_slow_m)
+        # A pair that is never far apart, as an upper arm whose shoulder is near the table, has a
+        # stop and a zone that it can leave.
+        farthest_m = self.collisions.farthest_m
+        stops_m = np.minimum(stops_m, farthest_m - LEAVES_M)
+        slows_m = np.maximum(np.minimum(slows_m, 0.5 * (stops_m + farthest_m)), stops_m)
         self.stop = np.array([limits.singularity_stop, *stops_m])
         self.slow = np.array([limits.singularity_slow, *slows_m])
-        self._zone = np.maximum(self.slow - self.stop, 1e-12)
+        self.zone = np.maximum(self.slow - self.stop, 1e-12)
+        if limits.keep_out:
+            self._check_keep_outs(home_rad)
+
+    def _check_keep_outs(self, home_rad: FloatArray) -> None:
+        distances_m = self.collisions.distances(home_rad)
+        for pair, distance_m, stop_m in zip(
+            self.collisions.pairs, distances_m, self.stop[1:], strict=True
+        ):
+            if pair.limit == "keep_out" and distance_m <= stop_m:
+                raise ProfileError(
+                    f"{pair.first} is {distance_m:.3f} m from the keep-out {pair.second!r} with "
+                    f"the arm at home, and must be over {stop_m:g} m (collision_stop_m) away; move "
+                    "the keep-out, make it smaller, or give another home_rad",
+                    ("limits", "reach", "keep_out", pair.second),
+                )
 
     def at(self, joints_rad: FloatArray, jacobian: FloatArray) -> FloatArray:
         """Barriers (n,) at these joints, whose Jacobian is (6, n) m and rad."""
@@ -143,9 +166,11 @@ class Barriers:
         values[1:] = self.collisions.distances(joints_rad)
         return values - self.stop
 
-    def floor(self, before: FloatArray) -> FloatArray:
-        """Least values (n,) after one step from `before`."""
-        return np.where(before > 0, np.minimum(self._zone, (1 - DECAY) * before), before - NOISE)
+    def inside(self, joints_rad: FloatArray) -> list[LimitHit]:
+        """The distances that are too small at these joints, the most violated one first."""
+        left_m = self.collisions.distances(joints_rad) - self.stop[1:]
+        order = np.argsort(left_m)
+        return [self.hit(int(i) + 1, left_m[i]) for i in order if left_m[i] <= 0]
 
     def where(self, index: int) -> str:
         """The part of the arm that barrier `index` is about; empty: the whole arm."""
@@ -162,15 +187,36 @@ class Barriers:
 
     def slowdown(self, before: FloatArray, after: FloatArray) -> Slowdown | None:
         """The slowdown of a step from barriers `before` to `after`, None for full speed."""
-        if (after >= self._zone).all():
+        if (after >= self.zone).all():
             return None
-        left = np.where(after < before - SHRINKING, np.clip(after / self._zone, 0.0, 1.0), 1.0)
+        left = np.where(after < before - SHRINKING, np.clip(after / self.zone, 0.0, 1.0), 1.0)
         index = int(left.argmin())
         if left[index] >= 1.0:
             return None
         share = max(float(np.sqrt(left[index])), SLOWEST)
         value, slow = float(after[index] + self.stop[index]), float(self.slow[index])
         return Slowdown(self.names[index], share, value, slow, self.where(index))
+
+
+class Floors:
+    """Least values of barriers after a step; a violated one does not fall, in however many steps.
+
+    Args:
+        barriers: what it is about.
+    """
+
+    def __init__(self, barriers: Barriers) -> None:
+        self._zone = barriers.zone
+        self._reached = np.full(len(barriers.zone), -np.inf)
+        """(n,) greatest values up to zero since the arm began to move by itself."""
+
+    def after(self, before: FloatArray) -> FloatArray:
+        """Least values (n,) after one step from `before`."""
+        violated = np.minimum(before, 0.0)
+        was_moved = violated < self._reached - NOISE
+        self._reached = np.where(was_moved, violated, np.maximum(violated, self._reached))
+        inside = np.minimum(self._zone, (1 - DECAY) * before)
+        return np.where(before > 0, inside, self._reached - NOISE)
 
 
 class _Configuration(NamedTuple):
@@ -224,6 +270,7 @@ class ReachabilityFilter:
         self._at_start = robot.posture == "start"
         """The controller pulls a redundant arm to its joints at the last `reset`, not to home."""
         self.barriers = Barriers(kinematics, self._limits.reach, home_rad)
+        self._floors = Floors(self.barriers)
         self.reset(home_rad)
 
     def reset(self, joints_rad: ArrayLike) -> None:
@@ -326,7 +373,7 @@ class ReachabilityFilter:
                 near_rad = here.joints_rad if start_rad is None else start_rad
                 found = self._approach(before, near_rad)
             here = self._here = self._configuration(before, found)
-        floor = self.barriers.floor(here.barriers)
+        floor = self._floors.after(here.barriers)
         if here.error > 0:  # an arm stretched towards a pose out of reach is singular
             floor[0] = -np.inf
         start = _Start(here, floor, *self._solver.bounds(here.joints_rad))

@@ -23,6 +23,7 @@ from vla_zenoh.control.limits import (
     LimitHit,
     MotionLimits,
     Shares,
+    into_workspace,
     leash,
     motion_limits,
     workspace_corners,
@@ -192,11 +193,18 @@ class PosePath(Smoother):
         super().__init__(start, 1.0 / profile.timing.command_hz, motion_limits(limits), inside)
 
     def leash(self, goal: Goal, ahead_s: float) -> tuple[Goal, list[LimitHit]]:
-        """`goal`, or a nearer one on the leash, and the limits that acted."""
+        """`goal`, or a nearer one on the leash, and the limits that acted.
+
+        It is no further outside the box than the arm is now: one that began there only comes in.
+        """
         (position_m, rotation), twist, acceleration = self.motion
         way = ahead_s * (twist + 0.5 * ahead_s * acceleration)
         ahead = Pose(position_m + way[:3], exp3(way[3:]).dot(rotation))
         pose, hits = leash(self._bounds, goal.pose, ahead)
+        inside_m, outside_m = into_workspace(self._bounds, pose.position_m, position_m)
+        if outside_m > OVERSHOOT:
+            hits.append(LimitHit("workspace", outside_m, 0.0))
+            pose = Pose(inside_m, pose.rotation)
         return replace(goal, pose=pose, joints_rad=None) if hits else goal, hits
 
     def near(self, goal: Goal) -> Goal:

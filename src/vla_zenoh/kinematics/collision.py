@@ -1,9 +1,9 @@
 """Distances of an arm to itself, to the table, to keep-outs and to another arm.
 
-Every link is the convex hull of its collision shapes. The pairs of links to check are found once,
-by sampling the joint space: pairs that are always near are neighbours by construction, pairs that
-never come near need no check, and pairs that are too near in a pose known to be good are a fault of
-the shapes: adjacent, never and default in MoveIt's setup assistant.
+Every link is the convex hull of its collision shapes. The pairs to check are found once, by
+sampling the joint space: links that are always near are neighbours by construction, pairs that
+never come near need no check, and a distance that no joint changes cannot be kept. Where the arm
+happens to stand takes no pair away.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from vla_zenoh.errors import ProfileError, ResourceError
+from vla_zenoh.errors import ProfileError, ResourceError, nearest
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import rotation_from_rpy
 from vla_zenoh.profile import KeepOut, PartBase
@@ -25,6 +25,10 @@ from vla_zenoh.types import FloatArray, HeldBox
 SAMPLES = 1000
 NEVER_SPARE_M = 0.03
 """A pair may come nearer than in any of the samples by this much."""
+NEIGHBOURS_M = 0.03
+"""Links that are never further apart are neighbours: they touch at a joint."""
+CONSTANT_M = 1e-3
+"""A distance that varies by less over the joint space depends on no joint."""
 TABLE = "table"
 HELD = "the held object"
 FREE_M = 10.0
@@ -58,15 +62,19 @@ class CollisionModel:
     Args:
         kinematics: of the arm; its other joints are locked.
         near_m: distances above this are ignored.
-        touching_m: distances below this are a collision.
         table_z_m: height of the table in the base frame; None: no table.
-        known_good_rad: configurations (n,) that are known to be free.
+        home_rad: (n,) a configuration that counts as a sample: what is near there is checked.
         keep_out: name -> shape in the base frame. Checked for every link that moves, whatever the
             samples.
+        may_touch: pairs of links, or of a link and the table, that are not checked.
+
+    Attributes:
+        pairs: those that are checked.
+        farthest_m: (len(pairs),) greatest distance of each in the samples, inf where not sampled.
 
     Raises:
         ResourceError: the URDF's collision shapes cannot be loaded, or there are none.
-        ProfileError: a known configuration touches a keep-out.
+        ProfileError: `may_touch` names a link that is not there.
     """
 
     def __init__(
@@ -74,10 +82,10 @@ class CollisionModel:
         kinematics: Kinematics,
         *,
         near_m: float,
-        touching_m: float,
         table_z_m: float | None = None,
-        known_good_rad: Sequence[FloatArray] = (),
+        home_rad: FloatArray | None = None,
         keep_out: Mapping[str, KeepOut] | None = None,
+        may_touch: Iterable[tuple[str, str]] = (),
     ) -> None:
         self._model, self._data = kinematics.model, kinematics.model.createData()
         self.held: HeldBox | None = None
@@ -97,29 +105,27 @@ class CollisionModel:
         ]
         random = np.random.default_rng(0)  # the same pairs at every start
         lower, span = kinematics.lower_rad, kinematics.upper_rad - kinematics.lower_rad
-        distances = self._at(lower + span * random.random((SAMPLES, kinematics.size)), pairs)
-        good = self._at(known_good_rad, pairs)
-        wanted = (distances.max(axis=0) > near_m) & (distances.min(axis=0) < near_m + NEVER_SPARE_M)
-        if len(good):
-            wanted &= good.min(axis=0) > touching_m
+        samples_rad = lower + span * random.random((SAMPLES, kinematics.size))
+        if home_rad is not None:
+            samples_rad = np.vstack([samples_rad, home_rad])
+        distances = self._at(samples_rad, pairs)
+        nearest_m, farthest_m = distances.min(axis=0), distances.max(axis=0)
+        to_links = np.array([second < self._links for _, second in pairs], bool)
+        neighbours = to_links & (farthest_m <= NEIGHBOURS_M)
+        constant = farthest_m - nearest_m < CONSTANT_M
+        allowed = _allowed([shape.name for shape in shapes], may_touch)
+        told = np.array([{shapes[a].name, shapes[b].name} in allowed for a, b in pairs], bool)
+        wanted = (nearest_m < near_m + NEVER_SPARE_M) & ~(neighbours | constant | told)
         used = [pair for pair, keep in zip(pairs, wanted, strict=True) if keep]
         apart: list[tuple[int, int]] = []
         for name, shape in (keep_out or {}).items():
             added = self._geometry.addGeometryObject(_keep_out(kinematics, name, shape))
             apart += [(link, added) for link in range(self._links) if shapes[link].parentJoint]
-        for distances in self._at(known_good_rad, apart) if apart else ():
-            nearest = int(np.argmin(distances))
-            if distances[nearest] <= touching_m:
-                link, kept_out = (shapes[index].name for index in apart[nearest])
-                raise ProfileError(
-                    f"{link} is {distances[nearest]:.3f} m from the keep-out {kept_out!r} with the "
-                    f"arm at home, and must be over {touching_m:g} m (collision_stop_m) away; "
-                    "move the keep-out, make it smaller, or give another home_rad",
-                    ("limits", "reach", "keep_out", kept_out),
-                )
         self._pairs, self._held_pairs = [*used, *apart], self._add_held(kinematics)
         self._use(self._pairs)
         self.pairs = tuple(self._pair(*pair) for pair in [*self._pairs, *self._held_pairs])
+        self.farthest_m = np.full(len(self.pairs), np.inf)
+        self.farthest_m[: len(used)] = farthest_m[wanted]
 
     def links(self) -> Any:
         """A geometry model of the arm's links alone, a hull each."""
@@ -215,6 +221,19 @@ class CollisionModel:
     ) -> FloatArray:
         self._use(pairs)
         return np.array([self.distances(joints_rad) for joints_rad in configurations])
+
+
+def _allowed(known: Sequence[str], may_touch: Iterable[tuple[str, str]]) -> list[set[str]]:
+    """The pairs of `may_touch`, if their names are known."""
+    for pair in may_touch:
+        for name in pair:
+            if name not in known:
+                raise ProfileError(
+                    f"there is no {name!r} with a collision shape{nearest(name, known)} "
+                    f"Known: {', '.join(known)}",
+                    ("limits", "reach", "may_touch"),
+                )
+    return [set(pair) for pair in may_touch]
 
 
 def _one_hull_a_link(kinematics: Kinematics) -> Any:

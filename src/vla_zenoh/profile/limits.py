@@ -106,6 +106,7 @@ class RotationLimits(Section):
 Edge = Annotated[float, Field(gt=0, le=2 * REACH_M)]
 Coordinate = Annotated[float, Field(ge=-REACH_M, le=REACH_M)]
 Point = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(strict=False)]
+LinkPair = Annotated[tuple[str, str], Field(strict=False)]
 Edges = Annotated[tuple[Edge, Edge, Edge], Field(strict=False)]
 
 
@@ -157,6 +158,8 @@ class ReachLimits(Section):
             work close to it.
         table_stop_m: lower bound of that distance.
         keep_out: name -> shape that the arm keeps out of: a camera's post, a wall, a person's side.
+        may_touch: pairs of links, or of a link and ``table``, whose distance is not checked: their
+            shapes, which are convex hulls, touch where the links do not.
         part_slow_m: distance of two parts of a robot below which both slow down.
         part_stop_m: lower bound of that distance.
     """
@@ -171,6 +174,7 @@ class ReachLimits(Section):
     table_slow_m: float = Field(default=0.002, ge=0, le=0.3)
     table_stop_m: float = Field(default=0.001, ge=0, le=0.3)
     keep_out: dict[Name, KeepOut] = Field(default_factory=dict, max_length=32)
+    may_touch: list[LinkPair] = Field(default_factory=list, max_length=64)
     part_slow_m: float = Field(default=0.12, ge=0, le=1)
     part_stop_m: float = Field(default=0.03, ge=0.005, le=1)
 

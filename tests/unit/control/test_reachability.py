@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from vla_zenoh.control.limits import SLOWEST, BoundedStep, LimitHit
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.errors import ProfileError, RecordError
-from vla_zenoh.kinematics.collision import HELD, TABLE, CollisionModel
+from vla_zenoh.kinematics.collision import HELD, TABLE
 from vla_zenoh.kinematics.kinematics import smallest_singular_value
 from vla_zenoh.kinematics.so3 import Pose, angle_between, log3
 from vla_zenoh.profile import Limits, Profile, ReachLimits, load_profile, override
@@ -562,23 +562,6 @@ def test_neighbours_are_no_collision_and_far_links_are_watched() -> None:
     assert {"panda_link0 and panda_hand", "panda_link5 and panda_hand"} <= pairs
     assert {"panda_link5 and table", "panda_hand and table", "panda_leftfinger and table"} <= pairs
     assert "panda_link0 and table" not in pairs
-
-
-def test_pairs_that_touch_in_a_good_pose_are_left_out() -> None:
-    watched = CollisionModel(KINEMATICS, near_m=0.05, touching_m=0.02)
-    span = KINEMATICS.upper_rad - KINEMATICS.lower_rad
-    shares = np.random.default_rng(0).random((200, 7))
-    folded = min(
-        KINEMATICS.lower_rad + span * shares, key=lambda joints: watched.distances(joints).min()
-    )
-    touching = [
-        str(pair)
-        for pair, distance_m in zip(watched.pairs, watched.distances(folded), strict=True)
-        if distance_m < 0.02
-    ]
-    assert touching
-    told = CollisionModel(KINEMATICS, near_m=0.05, touching_m=0.02, known_good_rad=[folded])
-    assert not set(touching) & {str(pair) for pair in told.pairs}
 
 
 @pytest.mark.parametrize("joints", [np.zeros(6), np.array([np.nan] * 7), np.array([np.inf] * 7)])

@@ -18,6 +18,7 @@ from vla_zenoh.lab.profile.robot_check import (
     ProfileFault,
     arm,
     braking_advice,
+    home_advice,
     joints_advice,
     robot_file,
     ros2,
@@ -80,7 +81,7 @@ def check_profile(
             errors.append(located_fault(fault, lines))
         else:
             hints.append(f"{'.'.join(place)}: on this computer: {why}")
-    hints += [*joints_advice(profile), *braking_advice(profile)]
+    hints += [*home_advice(profile), *joints_advice(profile), *braking_advice(profile)]
     return ProfileReport(list(dict.fromkeys(errors)), list(dict.fromkeys(hints)))
 
 

@@ -89,6 +89,26 @@ def arm(profile: Profile) -> Iterator[ProfileFault]:
         )
 
 
+def home_advice(profile: Profile) -> Iterator[str]:
+    """Advice for a home that is too near to something."""
+    for part in profile.parts or [""]:
+        own = profile.of_part(part)
+        try:
+            from vla_zenoh.control.reachability import ReachabilityFilter
+
+            reach = ReachabilityFilter(own)
+            home_rad = reach.kinematics.ordered(own.robot.arm_joints, own.robot.home_rad)
+        except (ImportError, ValueError, VlaZenohError):
+            return  # `arm` says so
+        for hit in reach.barriers.inside(home_rad):
+            yield (
+                f"{f'parts.{part}.' if part else ''}robot.home_rad: {hit.name}{hit.at} is "
+                f"{hit.value:.4f} m with the arm at home, and must be over {hit.limit:.4g} m: from "
+                "there the arm may only move away. Give another home_rad; or, if the convex hulls "
+                "of two links touch and the links do not, name them in limits.reach.may_touch"
+            )
+
+
 def joints_advice(profile: Profile) -> Iterator[str]:
     """What the check assumes of joints that are not commanded, of home, and of too few joints."""
     try:
