@@ -107,6 +107,7 @@ Edge = Annotated[float, Field(gt=0, le=2 * REACH_M)]
 Coordinate = Annotated[float, Field(ge=-REACH_M, le=REACH_M)]
 Point = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(strict=False)]
 LinkPair = Annotated[tuple[str, str], Field(strict=False)]
+LinkPairs = Annotated[tuple[LinkPair, ...], Field(strict=False, max_length=64)]
 Edges = Annotated[tuple[Edge, Edge, Edge], Field(strict=False)]
 
 
@@ -174,7 +175,7 @@ class ReachLimits(Section):
     table_slow_m: float = Field(default=0.002, ge=0, le=0.3)
     table_stop_m: float = Field(default=0.001, ge=0, le=0.3)
     keep_out: dict[Name, KeepOut] = Field(default_factory=dict, max_length=32)
-    may_touch: list[LinkPair] = Field(default_factory=list, max_length=64)
+    may_touch: LinkPairs = ()
     part_slow_m: float = Field(default=0.12, ge=0, le=1)
     part_stop_m: float = Field(default=0.03, ge=0.005, le=1)
 

@@ -16,7 +16,7 @@ from vla_zenoh.errors import ProfileError
 from vla_zenoh.kinematics.collision import NEIGHBOURS_M, CollisionModel
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.lab.profile.check import check_profile
-from vla_zenoh.profile import Limits, Profile, ReachLimits, load_profile, override
+from vla_zenoh.profile import Limits, Profile, load_profile, override
 from vla_zenoh.types import FloatArray
 
 KINEMATICS = panda()
@@ -98,11 +98,12 @@ def test_an_upper_arm_near_the_table_has_a_barrier_to_it() -> None:
 
 
 def test_declared_pairs_may_touch_and_unknown_ones_are_named() -> None:
-    may = LIMITS.model_copy(update={"may_touch": [("panda_link5", "panda_hand")]})
+    touching = {"limits": {"reach": {"may_touch": [["panda_link5", "panda_hand"]]}}}
+    may = override(load_profile("panda_sim"), touching).limits.reach
     pairs = {str(pair) for pair in Barriers(KINEMATICS, may, HOME_RAD).collisions.pairs}
     assert "panda_link5 and panda_hand" not in pairs
-    wrong = LIMITS.model_copy(update={"may_touch": [("panda_link5", "panda_hnd")]})
-    with pytest.raises(ProfileError, match="panda_hnd.*panda_hand"):
+    wrong = LIMITS.model_copy(update={"may_touch": (("panda_link5", "panda_hnd"),)})
+    with pytest.raises(ProfileError, match=r"panda_hnd.*panda_hand"):
         Barriers(KINEMATICS, wrong, HOME_RAD)
 
 
@@ -124,7 +125,8 @@ def low(height_m: float, command: str, **limits: Any) -> Profile:
 
 def lowest_m(rig: Rig, profile: Profile) -> float:
     reach = rig.commander.parts[0].reach
-    assert reach is not None and rig.joints_rad is not None
+    assert reach is not None
+    assert rig.joints_rad is not None
     if profile.robot.command == "pose":
         return float(rig.position_m[2])
     return float(reach.kinematics.forward(rig.joints_rad).position_m[2])

@@ -99,7 +99,7 @@ def home_advice(profile: Profile) -> Iterator[str]:
             reach = ReachabilityFilter(own)
             home_rad = reach.kinematics.ordered(own.robot.arm_joints, own.robot.home_rad)
         except (ImportError, ValueError, VlaZenohError):
-            return  # `arm` says so
+            continue  # `arm` says so
         for hit in reach.barriers.inside(home_rad):
             yield (
                 f"{f'parts.{part}.' if part else ''}robot.home_rad: {hit.name}{hit.at} is "
