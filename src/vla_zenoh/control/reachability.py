@@ -148,14 +148,14 @@ class Barriers:
 
     def _check_keep_outs(self, home_rad: FloatArray) -> None:
         distances_m = self.collisions.distances(home_rad)
-        for pair, distance_m, stop_m in zip(
-            self.collisions.pairs, distances_m, self.stop[1:], strict=True
-        ):
-            if pair.limit == "keep_out" and distance_m <= stop_m:
+        for index in np.argsort(distances_m):
+            pair, stop_m = self.collisions.pairs[index], self.stop[index + 1]
+            if pair.limit == "keep_out" and distances_m[index] <= stop_m:
                 raise ProfileError(
-                    f"{pair.first} is {distance_m:.3f} m from the keep-out {pair.second!r} with "
-                    f"the arm at home, and must be over {stop_m:g} m (collision_stop_m) away; move "
-                    "the keep-out, make it smaller, or give another home_rad",
+                    f"{pair.first} is {distances_m[index]:.3f} m from the keep-out "
+                    f"{pair.second!r} with the arm at home, and must be over {stop_m:g} m "
+                    "(collision_stop_m) away; move the keep-out, make it smaller, or give another "
+                    "home_rad",
                     ("limits", "reach", "keep_out", pair.second),
                 )
 
