@@ -170,7 +170,7 @@ class Barriers:
         """The distances that are too small at these joints, the most violated one first."""
         left_m = self.collisions.distances(joints_rad) - self.stop[1:]
         order = np.argsort(left_m)
-        return [self.hit(int(i) + 1, left_m[i]) for i in order if left_m[i] <= 0]
+        return [self.hit(int(i) + 1, float(left_m[i])) for i in order if left_m[i] <= 0]
 
     def where(self, index: int) -> str:
         """The part of the arm that barrier `index` is about; empty: the whole arm."""
