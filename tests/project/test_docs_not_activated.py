@@ -20,6 +20,7 @@ REASONS = {
     },
     "control/commanded_part.py": {"reasons_against"},
     "control/watchdog.py": {"reasons_against"},
+    "control/contact.py": {"missing"},
     "control/commander.py": {"_activate", "_preflight", "_ended_before"},
 }
 """File -> functions that give reasons against an activation."""

@@ -31,6 +31,7 @@ CONSTANT_M = 1e-3
 """A distance that varies by less over the joint space depends on no joint."""
 TABLE = "table"
 HELD = "the held object"
+POINT_M = 1e-4
 FREE_M = 10.0
 """Distance of a held object while there is none."""
 KEPT = 8
@@ -126,6 +127,15 @@ class CollisionModel:
         self.pairs = tuple(self._pair(*pair) for pair in [*self._pairs, *self._held_pairs])
         self.farthest_m = np.full(len(self.pairs), np.inf)
         self.farthest_m[: len(used)] = farthest_m[wanted]
+
+    def tcp_beyond_m(self, kinematics: Kinematics) -> float:
+        """Distance of the TCP from the shapes that move with it, inf without any."""
+        frame = self._model.frames[kinematics.tcp]
+        nearest_m = np.inf
+        for shape in list(self._geometry.geometryObjects)[: self._links]:
+            if shape.parentJoint == frame.parentJoint:
+                nearest_m = min(nearest_m, _distance_m(shape, frame.placement))
+        return float(nearest_m)
 
     def links(self) -> Any:
         """A geometry model of the arm's links alone, a hull each."""
@@ -269,6 +279,14 @@ def _one_hull_a_link(kinematics: Kinematics) -> Any:
         full, hulls, kinematics.locked_joints, kinematics.locked_position
     )
     return reduced
+
+
+def _distance_m(shape: Any, place: Any) -> float:
+    """Distance of a point from a shape, both placed in the same joint's frame."""
+    request, result = coal.DistanceRequest(), coal.DistanceResult()
+    at = coal.Transform3s(shape.placement.rotation, shape.placement.translation)
+    point = coal.Transform3s(np.eye(3), place.translation)
+    return coal.distance(shape.geometry, at, coal.Sphere(POINT_M), point, request, result) + POINT_M
 
 
 def _corners(shape: Any) -> FloatArray:

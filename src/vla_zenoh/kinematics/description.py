@@ -151,6 +151,15 @@ class Description:
         return ElementTree.tostring(root, encoding="unicode")
 
     @property
+    def shapeless(self) -> list[str]:
+        """Links that can be seen, and have no collision shape."""
+        return [
+            link.attrib["name"]
+            for link in self._root().findall("link")
+            if link.find("collision") is None and link.find("visual") is not None
+        ]
+
+    @property
     def root(self) -> str:
         """The link that no joint moves."""
         return next(link for link in self.links if link not in self._above)

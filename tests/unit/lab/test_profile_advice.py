@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from vla_zenoh import resources
 from vla_zenoh.lab.profile.check import advice
+from vla_zenoh.lab.profile.robot_check import shapes_advice
 from vla_zenoh.profile import load_profile, override
 
 SIM = load_profile("panda_sim")
@@ -71,3 +74,27 @@ def test_a_host_that_looks_elsewhere_is_not_warned_about_itself() -> None:
     elsewhere = gpu(connect=["tcp/10.0.0.2:7447"])
     found = advice(override(SIM, {"hosts": elsewhere}))
     assert not any(line.startswith("hosts.gpu") for line in found)
+
+
+TOOL = """
+  <link name="probe"><visual><geometry><sphere radius="0.01"/></geometry></visual></link>
+  <joint name="to_probe" type="fixed">
+    <parent link="panda_hand"/><child link="probe"/><origin xyz="0 0 0.4"/>
+  </joint>
+</robot>
+"""
+
+
+def test_a_link_and_a_tool_without_a_collision_shape_are_named(tmp_path: Path) -> None:
+    urdf = resources.robot_urdf(SIM.robot.description)
+    text = urdf.read_text().replace("package://", f"{urdf.resolve().parents[4]}/")
+    path = tmp_path / "probe.urdf"
+    path.write_text(text.replace("</robot>", TOOL))
+    probe = {"robot": {"description": str(path), "tcp_frame": "probe"}}
+    bare, tool = shapes_advice(override(SIM, probe))
+    assert bare.endswith(": probe")
+    assert "the TCP is 0.290 m from every collision shape" in tool
+
+
+def test_the_shipped_arms_have_shapes_up_to_their_tool() -> None:
+    assert list(shapes_advice(SIM)) == []

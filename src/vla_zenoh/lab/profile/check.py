@@ -22,6 +22,7 @@ from vla_zenoh.lab.profile.robot_check import (
     joints_advice,
     robot_file,
     ros2,
+    shapes_advice,
     simulator,
 )
 from vla_zenoh.policy.loader import find_worker, make_policy
@@ -81,7 +82,12 @@ def check_profile(
             errors.append(located_fault(fault, lines))
         else:
             hints.append(f"{'.'.join(place)}: on this computer: {why}")
-    hints += [*home_advice(profile), *joints_advice(profile), *braking_advice(profile)]
+    hints += [
+        *home_advice(profile),
+        *shapes_advice(profile),
+        *joints_advice(profile),
+        *braking_advice(profile),
+    ]
     return ProfileReport(list(dict.fromkeys(errors)), list(dict.fromkeys(hints)))
 
 

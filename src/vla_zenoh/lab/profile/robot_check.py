@@ -19,6 +19,8 @@ from vla_zenoh.policy.loader import IS_ROBOT, find_model, find_robot_maker, is_r
 from vla_zenoh.profile import POSE_JOINTS, Profile
 from vla_zenoh.profile.section import Place
 
+TOOL_M = 0.06
+"""A TCP further from all shapes has a tool without one; between open fingers it is nearer."""
 LONG_BRAKE_S = 2.5
 """`up` ends a robot's node 2.8 s after Ctrl-C, less the time until the node gets the signal.
 See `STOP_ORDER` in `vla_zenoh.runtime.supervisor`."""
@@ -106,6 +108,31 @@ def home_advice(profile: Profile) -> Iterator[str]:
                 f"{hit.value:.4f} m with the arm at home, and must be over {hit.limit:.4g} m: from "
                 "there the arm may only move away. Give another home_rad; or, if the convex hulls "
                 "of two links touch and the links do not, name them in limits.reach.may_touch"
+            )
+
+
+def shapes_advice(profile: Profile) -> Iterator[str]:
+    """Advice for what no barrier protects: links without a shape, a tool beyond all shapes."""
+    for part in profile.parts or [""]:
+        own = profile.of_part(part)
+        try:
+            from vla_zenoh.control.reachability import ReachabilityFilter
+
+            reach = ReachabilityFilter(own)
+        except (ImportError, ValueError, VlaZenohError):
+            continue  # `arm` says so
+        at = f"parts.{part}." if part else ""
+        bare = ", ".join(reach.kinematics.described.shapeless)
+        if bare:
+            yield (
+                f"{at}robot.description: links without a collision shape, which no barrier keeps "
+                f"from table, keep-outs and the arm itself: {bare}"
+            )
+        beyond_m = reach.barriers.collisions.tcp_beyond_m(reach.kinematics)
+        if beyond_m > TOOL_M:
+            yield (
+                f"{at}robot.tcp_frame: the TCP is {beyond_m:.3f} m from every collision shape of "
+                "its link: the tool between them has no barrier; add its shape to the description"
             )
 
 
