@@ -33,15 +33,17 @@ $(READY): pyproject.toml constraints.txt scripts/bootstrap.py
 demo: $(READY) ## Simulator, model and command node at work, no GPU needed
 	$(BIN)/vla-zenoh demo $(ARGS)
 
-# Two files that depend on time run at once, of the rest as many as there are cores, in order of the folders: the long
+# Files that depend on time run one at a time, two where there are four cores or more: one robot with its camera, model and
+# router keeps two cores busy. Of the rest run as many as there are cores, in order of the folders: the long
 # files of tests/sim are not the last ones. A process of theirs that dies ends the run: whoever is to take its place waits
 # for its files for ever. 5 is pytest's word for "none of these".
+AT_ONCE := $(shell $(PYTHON) -c 'import os; print(1 if os.cpu_count() < 4 else 2)')
 FILES := --max-worker-restart 0 --dist loadfile --no-loadscope-reorder
 test: $(READY) ## Run the tests that take up to six seconds each
 	$(BIN)/python -m pytest -n auto $(FILES) -m "$(SUITE) and $(WHICH) and not realtime" $(ARGS) || [ $$? = 5 ]
-	$(BIN)/python -m pytest -n 2 $(FILES) $(AGAIN) -m "$(SUITE) and $(WHICH) and realtime" $(ARGS) || [ $$? = 5 ]
+	$(BIN)/python -m pytest -n $(AT_ONCE) $(FILES) $(AGAIN) -m "$(SUITE) and $(WHICH) and realtime" $(ARGS) || [ $$? = 5 ]
 
-test-long: $(READY) ## Run those that take longer, too, as CI does
+test-long: $(READY) ## Run those that take longer, too, and the files of many whole robots
 	@$(MAKE) --no-print-directory test WHICH=long
 
 slow: $(READY) ## Run the tests that take long, too, and search for new examples

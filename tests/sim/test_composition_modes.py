@@ -14,6 +14,8 @@ from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import Composition, Profile, load_profile
 from vla_zenoh.types import FloatArray
 
+pytestmark = pytest.mark.long
+
 REACHED_M, OFF_AXIS_M, TURNED_RAD = 1e-3, 1e-3, 2e-3
 DRIFT_M, DRIFT_RAD = 1e-3, 2e-3
 LIMIT_RTOL = 1e-6

@@ -26,6 +26,8 @@ from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.simulation.world import World, build_world
 from vla_zenoh.types import JointReference
 
+pytestmark = pytest.mark.long
+
 SO101, PANDA = load_profile("so101_sim"), load_profile("panda_sim")
 JAW_M = 0.022
 """From the fixed jaw's tip of the SO-101, which is its TCP, to the middle of what it holds."""

@@ -25,6 +25,8 @@ from vla_zenoh.profile import load_profile, override
 from vla_zenoh.simulation.world import build_world
 from vla_zenoh.types import FloatArray
 
+pytestmark = pytest.mark.long
+
 PROFILE = override(load_profile("panda_sim"), {"robot": {"command": "joint"}})
 AT_REST_RAD = 1e-3
 DT_S, HORIZON = 0.1, 8

@@ -30,6 +30,8 @@ from vla_zenoh.lab.lockstep.worker import Message
 from vla_zenoh.lab.teleop.policy import OperatorInput, TeleopPolicy
 from vla_zenoh.types import GripperState, JointCommand, JointState, PoseState
 
+pytestmark = pytest.mark.long
+
 UPWARD = np.array([0.0, -0.02, 0.0, 0.02, 0.0, 0.0, 0.0, 0.04])
 """A step of joints in which either TCP moves."""
 FAST_M_S = 0.05

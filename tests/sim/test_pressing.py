@@ -17,6 +17,8 @@ from vla_zenoh.kinematics.so3 import norm3
 from vla_zenoh.profile import load_profile
 from vla_zenoh.simulation.world import WRENCH_FILTER_S, World, build_world
 
+pytestmark = pytest.mark.long
+
 LASTING_N = 5.0
 HELD_N, WEIGHT_N = 5.0, 0.5
 QUASI_STATIC_HAND_N = 140.0
