@@ -19,7 +19,7 @@ settings.register_profile("thorough", deadline=None, max_examples=2000)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))
 
 IN_REAL_TIME = {"wire", "fault", "netns", "ros2"}
-"""Folders of tests that begin processes and wait for them: one file at a time, two with four cores."""
+"""Folders of tests that begin processes and wait for them: one file at a time on two cores."""
 
 
 @pytest.hookimpl(tryfirst=True)  # before -m chooses

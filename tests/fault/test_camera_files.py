@@ -7,9 +7,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 from camera_rig import camera_rig, grey, until, write_video
 
 from vla_zenoh.profile.schema import CameraProfile
+
+pytestmark = pytest.mark.long
 
 SETTLE_S = 0.3
 RETURN_S = 3.0  # the longest pause between two attempts, and a status

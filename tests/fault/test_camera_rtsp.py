@@ -17,6 +17,8 @@ from vla_zenoh.nodes.camera.opencv_sources import RtspSource
 from vla_zenoh.nodes.camera.source import STALL_S, prepare_opencv
 from vla_zenoh.profile.schema import CameraProfile
 
+pytestmark = pytest.mark.long
+
 RATE_HZ, LENGTH_S = 25, 2.0
 COLOUR_TOLERANCE = 12  # of 255, MPEG-2
 LEFT_OUT = 0.25

@@ -17,6 +17,8 @@ from test_supervisor import Up, client_of, up
 from vla_zenoh.bus.client import Client
 from vla_zenoh.runtime.supervisor import GIVE_UP_AFTER
 
+pytestmark = pytest.mark.long
+
 GIVE_UP_S = 120.0
 REASON = "FileNotFoundError: weights.pt not found"
 DEVICE = "/dev/video97"

@@ -14,6 +14,8 @@ from contextlib import contextmanager
 import pytest
 from chain import MOVING_M_S, Chain, FloatArray
 
+pytestmark = pytest.mark.long
+
 BRAKE_S = 0.35
 """A jerk-limited stop from 0.15 m/s takes 0.17 s, the rest is the arm's lag."""
 BUSY_S = 0.3

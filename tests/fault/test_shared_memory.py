@@ -20,6 +20,7 @@ from mcap.reader import make_reader
 from vla_zenoh.bus.shared_memory import SENDER_BYTES, held_bytes, lockable_bytes
 
 pytestmark = [
+    pytest.mark.long,
     pytest.mark.realtime,
     pytest.mark.skipif(sys.platform != "linux", reason="limits of Linux"),
 ]

@@ -25,6 +25,8 @@ from vla_zenoh.profile import load_profile
 from vla_zenoh.runtime.process import PARENT_VARIABLE
 from vla_zenoh.runtime.supervisor import GIVE_UP_AFTER, NodeCommand, Supervisor, signal_group
 
+pytestmark = pytest.mark.long
+
 END_S = 3.0
 BUSY_S = 1.0
 """What a busy machine may add to it."""

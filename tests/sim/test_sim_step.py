@@ -21,7 +21,7 @@ from vla_zenoh.codec import message, records
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.types import Header, PoseCommand, PoseState
 
-pytestmark = pytest.mark.realtime
+pytestmark = [pytest.mark.realtime, pytest.mark.long]
 MS_NS = 1_000_000
 STEP_NS = 10 * MS_NS
 SPEED_M_S = 0.02

@@ -15,6 +15,8 @@ from benchmark_rig import OWN_BENCHMARK, REACHER
 from camera_rig import until
 from chain import command_line
 
+pytestmark = pytest.mark.long
+
 TIMEOUT_S = 110.0
 EPISODES = 40
 

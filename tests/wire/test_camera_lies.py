@@ -16,6 +16,8 @@ from chain import Chain, command_line, running_chain
 from vla_zenoh.errors import SessionError
 from vla_zenoh.types import Event
 
+pytestmark = pytest.mark.long
+
 SAME_S = 0.6
 FOUND_S = 15.0
 """Until it is found, told and obeyed, on a busy computer; itself it takes `SAME_S` and 0.2 s."""

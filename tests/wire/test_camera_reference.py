@@ -16,6 +16,8 @@ from vla_zenoh.simulation.render import Renderer
 from vla_zenoh.simulation.robot_model import robot_models
 from vla_zenoh.simulation.world import build_world
 
+pytestmark = pytest.mark.long
+
 NAMES = ("front", "top", "left_wrist")
 POSES, TURN_RAD = 4, 0.25
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+import pytest
 from camera_rig import Rig, await_match, camera_rig, until
 from chain import READY_PATIENCE_S
 from depth_rig import Looker, looking
@@ -23,6 +24,8 @@ from vla_zenoh.simulation.robot_model import robot_model
 from vla_zenoh.simulation.scene import build_model
 from vla_zenoh.simulation.world import build_world
 from vla_zenoh.types import Depth, Header, SceneState
+
+pytestmark = pytest.mark.long
 
 LIMIT_M = 0.001
 CAMERAS = {

@@ -30,6 +30,8 @@ from vla_zenoh.types import (
     PoseState,
 )
 
+pytestmark = pytest.mark.long
+
 START_PATIENCE_S, END_PATIENCE_S = 30.0, 10.0
 PERIOD_S = 0.004
 WAY_RAD = np.array([0.3, 0.1, -0.2, 0.2, 0.3, -0.2, 0.4])

@@ -29,6 +29,8 @@ from vla_zenoh.profile.schema import CameraProfile
 from vla_zenoh.security.roles import Act, access_control
 from vla_zenoh.types import Header, Image, Stamped, Task
 
+pytestmark = pytest.mark.long
+
 AHEAD_NS = 60_000_000
 """How far the other clock is ahead in these tests; within the bound of the profile."""
 STAMP_TOLERANCE_S = 0.02

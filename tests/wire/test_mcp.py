@@ -19,6 +19,8 @@ from chain import LONG_PATIENCE_S, Chain, running_chain
 
 from vla_zenoh.keys import PRIMITIVES, worker_node
 
+pytestmark = pytest.mark.long
+
 HOSTS = "hosts: {here: {nodes: [router, sim, camera, command, worker, primitives]}}\n"
 NEAR_M = 1e-3
 FAR_M = [0.55, 0.2, 0.35]

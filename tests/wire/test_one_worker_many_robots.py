@@ -36,6 +36,8 @@ from vla_zenoh.profile import Profile, as_robot, load_profile, override
 from vla_zenoh.runtime.launch import Host
 from vla_zenoh.types import ActionChunk, GripperState, Header, PoseState, Task
 
+pytestmark = pytest.mark.long
+
 ROBOTS = ("a", "b", "c")
 STATE_HZ = 50.0
 RATE_HZ = 10.0

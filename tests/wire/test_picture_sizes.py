@@ -28,6 +28,8 @@ from vla_zenoh.profile import load_profile, override
 from vla_zenoh.profile.schema import CameraProfile
 from vla_zenoh.types import Image
 
+pytestmark = pytest.mark.long
+
 SILENCE_S = 1.0
 """Of models, in these tests."""
 PLAIN_SEQ = 1000

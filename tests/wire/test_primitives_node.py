@@ -28,6 +28,8 @@ from vla_zenoh.lab.primitives.node import PrimitivesNode
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.types import GripperState, JointState, PoseState, Task
 
+pytestmark = pytest.mark.long
+
 DOWN = np.array([1.0, 0.0, 0.0, 0.0])
 ARM = load_profile("panda_sim").robot.arm_joints
 

@@ -15,6 +15,8 @@ from vla_zenoh.bus.session import open_session
 from vla_zenoh.profile import SessionProfile
 from vla_zenoh.runtime.process import LINK_PRIORITY, realtime_links, realtime_thread
 
+pytestmark = pytest.mark.long
+
 ZENOHS = ("rx-", "net-")
 """How Zenoh names the threads that carry what arrives."""
 

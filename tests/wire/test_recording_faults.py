@@ -22,6 +22,8 @@ from vla_zenoh.lab.web.recordings import Recordings
 from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh.types import Header
 
+pytestmark = pytest.mark.long
+
 BEGAN_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000
 PATIENCE_S = 10.0

@@ -22,6 +22,8 @@ from vla_zenoh.codec import records
 from vla_zenoh.errors import SessionError
 from vla_zenoh.types import ActionChunk, ObjectPoses
 
+pytestmark = pytest.mark.long
+
 ROBOT_PATIENCE_S = LONG_PATIENCE_S
 SAME_M = 1e-3
 """Two placements of an object by one seed, once it has come to rest."""

@@ -17,6 +17,8 @@ from vla_zenoh.bus.session import TcpUserTimeout, open_session, session_config
 from vla_zenoh.keys import Kind
 from vla_zenoh.profile import SessionProfile, load_profile, override
 
+pytestmark = pytest.mark.long
+
 LEASE_MS = 700
 ROUTER = "tcp/127.0.0.1:7447"
 PICTURE = bytes(640 * 480 * 3)

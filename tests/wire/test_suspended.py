@@ -13,6 +13,8 @@ from vla_zenoh.bus import clock
 from vla_zenoh.nodes.command.node import CommandNode
 from vla_zenoh.profile import load_profile
 
+pytestmark = pytest.mark.long
+
 ASLEEP_NS = 3_600_000_000_000
 
 

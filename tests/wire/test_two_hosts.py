@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+import pytest
 from camera_rig import free_endpoint, until
 from chain import READY_PATIENCE_S, Recorder, write_profile
 
@@ -17,6 +18,8 @@ from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import SessionError
 from vla_zenoh.profile import load_profile
+
+pytestmark = pytest.mark.long
 
 STEPS, STEP_M, TOLERANCE_M = 5, 0.01, 0.001
 END_S = 20.0

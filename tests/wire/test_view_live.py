@@ -22,6 +22,8 @@ from vla_zenoh.errors import NodeError
 from vla_zenoh.lab.view.listener import ViewListener
 from vla_zenoh.lab.view.viewer import open_window
 
+pytestmark = pytest.mark.long
+
 ROBOT_PATIENCE_S = LONG_PATIENCE_S
 END_PATIENCE_S = 30.0
 STEPS, STEP_M = 5, 0.01

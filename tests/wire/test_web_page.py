@@ -30,6 +30,8 @@ from vla_zenoh.lab.recording.reader import open_recording
 from vla_zenoh.lab.trial.verdict import verdict_in
 from vla_zenoh.lab.web.hold import HOLD_S
 
+pytestmark = pytest.mark.long
+
 pytest.importorskip("starlette", reason="needs the extra web")
 pytest.importorskip("uvicorn", reason="needs the extra web")
 parser = pytest.importorskip("prometheus_client.openmetrics.parser")

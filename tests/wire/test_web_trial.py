@@ -17,6 +17,8 @@ from vla_zenoh.lab.recording.reader import open_recording
 from vla_zenoh.lab.trial.folder import TrialFolder
 from vla_zenoh.lab.trial.verdict import EpisodeVerdict, verdict_in
 
+pytestmark = pytest.mark.long
+
 pytest.importorskip("starlette", reason="needs the extra web")
 pytest.importorskip("uvicorn", reason="needs the extra web")
 

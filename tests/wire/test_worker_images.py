@@ -17,6 +17,8 @@ from vla_zenoh.policy import ActionSpec, ActionSteps, CameraSpec, ModelSpec, Obs
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import Header, Task
 
+pytestmark = pytest.mark.long
+
 CAMERAS = ("front", "wrist")
 BLANK = np.zeros((480, 640, 3), np.uint8)
 
