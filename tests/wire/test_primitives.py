@@ -23,6 +23,8 @@ from vla_zenoh.lab.primitives.client import PrimitiveError, ask
 from vla_zenoh.lab.primitives.messages import Answer, decode_answer
 from vla_zenoh.lab.primitives.remote_robot import RemoteRobot, connect
 
+pytestmark = pytest.mark.long
+
 NEAR_M, NEAR_RAD = 1e-3, 2e-3
 HOSTS = "hosts: {here: {nodes: [router, sim, camera, command, worker, primitives]}}\n"
 DOWN = (1.0, 0.0, 0.0, 0.0)
