@@ -19,8 +19,6 @@ from chain import STILL_M_S, Chain, running_chain, write_profile
 
 from vla_zenoh.lab.demo.scripted_motions import STEP_WIDTH_M
 
-pytestmark = pytest.mark.long
-
 STEPS, STEP_M = 10, 0.01
 ON_ITS_WAY_M = 0.02
 """This arm's controller is Python in the node's own process: where a busy computer stands still, so

@@ -251,7 +251,6 @@ def _state(chain: Chain) -> str:
     return "" if status is None else status.state
 
 
-@pytest.mark.long
 def test_a_flood_on_one_key_is_counted_and_hides_nothing_on_another(
     chain: Chain, tmp_path: Path
 ) -> None:

@@ -12,8 +12,6 @@ from chain import Chain, running_chain, write_profile
 
 from vla_zenoh.nodes.command.node import REST_S
 
-pytestmark = pytest.mark.long
-
 REST_HZ = 1.0 / REST_S
 WINDOW_S = 2.0
 UNKNOWN = "a prompt that the scripted model does not know"

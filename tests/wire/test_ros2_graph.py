@@ -14,8 +14,6 @@ from vla_zenoh.profile import load_profile
 from vla_zenoh.robots.node import RobotNode
 from vla_zenoh.robots.ros2.driver import Ros2Driver
 
-pytestmark = pytest.mark.long
-
 SLASH = "§"
 PLAIN = ""
 EVERYTHING = """\

@@ -6,7 +6,6 @@ import time
 from pathlib import Path
 
 import numpy as np
-import pytest
 import zenoh
 from camera_rig import until
 from chain import LONG_PATIENCE_S, READY_PATIENCE_S, Chain, command_line, write_profile
@@ -20,8 +19,6 @@ from vla_zenoh.lab.recording.run import load_run
 from vla_zenoh.lab.teleop.keyboard import END
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import GripperState
-
-pytestmark = pytest.mark.long
 
 ROBOT_PATIENCE_S = LONG_PATIENCE_S
 MOVED_M = 0.03

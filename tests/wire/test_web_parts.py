@@ -14,8 +14,6 @@ from vla_zenoh.errors import SessionError
 from vla_zenoh.profile import load_profile
 from vla_zenoh.runtime.launch import Host
 
-pytestmark = pytest.mark.long
-
 pytest.importorskip("starlette", reason="needs the extra web")
 pytest.importorskip("uvicorn", reason="needs the extra web")
 
