@@ -91,7 +91,6 @@ def test_a_second_up_says_who_runs_and_starts_nothing(lab: Lab) -> None:
     assert lab.running.process.poll() is None
 
 
-@pytest.mark.long
 def test_a_worker_whose_load_raises_is_one_line_and_its_reason_is_everywhere(lab: Lab) -> None:
     def given_up() -> bool:
         return f"crashed {GIVE_UP_AFTER} times in a row; not restarting" in lab.running.text

@@ -142,7 +142,6 @@ def test_a_person_moves_one_arm_after_the_other() -> None:
     assert policy.describe().endswith("right still")
 
 
-@pytest.mark.long
 def test_measured_arms_that_come_too_near_brake() -> None:
     """Commanded ones stay apart; here one is pushed, or its commands are not what it follows."""
     towards = np.array([0.02, 0.0, 0.0, 0.0, 0.0, 0.0, 0.04])
@@ -295,7 +294,6 @@ def test_arms_on_their_way_to_each_other_stand_apart_when_one_of_them_fails(faul
     assert pair.state != "active"
 
 
-@pytest.mark.long
 def test_arms_that_are_sent_towards_each_other_stand_and_may_go_back() -> None:
     pair = Pair(towards_each_other, tcp_steps())
     pair.run(3.5, distances=True)
@@ -311,7 +309,6 @@ def test_arms_that_are_sent_towards_each_other_stand_and_may_go_back() -> None:
     assert pair.distance_m() > near_m + 0.1
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
     ("action", "seed"),
     [

@@ -220,7 +220,6 @@ def lab() -> Profile:
     )
 
 
-@pytest.mark.long
 def test_every_role_does_its_part_and_nothing_else_with_real_sessions(lab: Profile) -> None:
     verdicts = check_access(lab)
     assert not any(surprises(lab).values())

@@ -83,7 +83,6 @@ def query(robot: RemoteRobot, primitive: str, payload: bytes) -> Answer:
     return decode_answer(replies[0].ok.payload.to_bytes())
 
 
-@pytest.mark.long
 def test_move_to_goes_to_a_pose_and_tells_where_the_arm_stands(robot: RemoteRobot) -> None:
     for position_m in ((0.5, 0.1, 0.3), (0.4, -0.15, 0.25)):
         answer = robot.move_to(position_m, DOWN)
@@ -113,7 +112,6 @@ def test_an_arm_that_takes_poses_goes_to_the_pose_of_its_joints(robot: RemoteRob
     assert answer.position_m == pytest.approx(HOME_M, abs=2 * NEAR_M)
 
 
-@pytest.mark.long
 def test_an_arm_that_takes_joints_goes_to_them(tmp_path: Path) -> None:
     with running_chain(tmp_path, more=f"robot: {{command: joint}}\n{HOSTS}") as found:
         found.until("the node answers", lambda: worker_node(PRIMITIVES) in found.client.alive, 40)
@@ -138,7 +136,6 @@ def test_the_gripper_opens_and_closes_while_the_arm_stands(robot: RemoteRobot) -
     assert here(robot) == pytest.approx(before_m, abs=NEAR_M)
 
 
-@pytest.mark.long
 def test_what_a_grip_holds_bounds_the_arm_until_it_opens(robot: RemoteRobot) -> None:
     def holds() -> object:
         status = robot.status("command")
@@ -324,7 +321,6 @@ def test_a_model_runs_until_a_condition_holds(robot: RemoteRobot) -> None:
     until("the prompt is back", lambda: robot.task is not None and robot.task.prompt == "hold")
 
 
-@pytest.mark.long
 def test_the_example_moves_the_arm(chain: Chain, robot: RemoteRobot) -> None:
     example = Path(__file__).parents[2] / "examples" / "move_by_script.py"
     said = subprocess.run(
@@ -339,7 +335,6 @@ def test_the_example_moves_the_arm(chain: Chain, robot: RemoteRobot) -> None:
     assert "the model was stopped: inside" in said
 
 
-@pytest.mark.long
 def test_the_command_line_moves_the_arm(chain: Chain, robot: RemoteRobot) -> None:
     def do(*words: str) -> tuple[int, str]:
         done = command_line("do", *words, profile=chain.profile_file)
