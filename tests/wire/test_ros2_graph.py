@@ -23,7 +23,7 @@ EVERYTHING = """\
 """
 NO_PEOPLE = """\
   gripper: {topic: /width, type: std_msgs/msg/Float64, position: width}
-  services: null
+  services: false
 """
 
 

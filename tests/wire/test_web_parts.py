@@ -112,7 +112,7 @@ def test_a_stop_is_told_when_both_arms_stand(pair: tuple[Host, Site]) -> None:
             activate(pair[0], page)
         page.send(do="stop")
         report = page.wait("stopped")
-        assert report["stopped"]
+        assert report["outcome"] == "confirmed"
         assert report["stands_s"] is not None
         speeds = [arm["speed_m_s"] for arm in page.state["arms"].values()]
         assert len(speeds) == 2
