@@ -2,10 +2,12 @@
 
     python scripts/house.py [--src FOLDER] [--trace] [--json]
 
-For each folder of ``src/vla_zenoh``: files and lines. For the whole: modules that Python loads for
-the four nodes of a simulated robot, import cycles (imports for types count), and class names that
-occur twice. ``--trace`` adds the files that run between an image and a motion: it starts the nodes,
-lets a model that needs a camera move the arm, and records which functions are called meanwhile.
+For each folder of ``src/vla_zenoh``: files, lines and tokens (Python's, without comments,
+docstrings, indentation and line ends). For the whole: tokens of all tracked Python by top folder,
+modules that Python loads for the four nodes of a simulated robot (where the package can be
+imported), import cycles (imports for types count), and class names that occur twice. ``--trace``
+adds the files that run between an image and a motion: it starts the nodes, lets a model that needs
+a camera move the arm, and records which functions are called meanwhile.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import tokenize
 from collections import Counter, defaultdict
 from pathlib import Path
 from typing import Any
@@ -35,6 +38,15 @@ NODES = (
 )
 LAB, FRONT = "lab", ("lab", "cli")
 PROGRAMS = ("router", "sim", "camera", "worker", "command")
+NOT_COUNTED = {
+    tokenize.COMMENT,
+    tokenize.DEDENT,
+    tokenize.ENCODING,
+    tokenize.ENDMARKER,
+    tokenize.INDENT,
+    tokenize.NEWLINE,
+    tokenize.NL,
+}
 START_S, MOVING_S, END_S, KEEP_S = 60.0, 4.0, 10.0, 0.5
 MODEL = """
 # /// script
@@ -67,6 +79,34 @@ def modules_in(src: Path) -> dict[str, Path]:
     return found
 
 
+def tokens_in(path: Path) -> int:
+    """Tokens of a file, without comments, docstrings, indentation and line ends."""
+    docstrings = {
+        (node.lineno, node.col_offset)
+        for node in ast.walk(ast.parse(path.read_bytes()))
+        if isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.Constant)
+        and isinstance(node.value.value, str)
+    }
+    with path.open("rb") as file:
+        return sum(
+            token.type not in NOT_COUNTED and token.start not in docstrings
+            for token in tokenize.tokenize(file.readline)
+        )
+
+
+def tokens_by_top_folder(root: Path) -> dict[str, int]:
+    """Top folder -> tokens of the Python files that git tracks below it."""
+    listed = subprocess.run(
+        ["git", "-C", root, "ls-files", "-z", "*.py"], capture_output=True, text=True, check=True
+    )
+    tokens: Counter[str] = Counter()
+    for name in filter(None, listed.stdout.split("\0")):
+        if (root / name).is_file():
+            tokens[Path(name).parts[0]] += tokens_in(root / name)
+    return dict(tokens)
+
+
 def imports_of(modules: dict[str, Path]) -> dict[str, set[str]]:
     """Module -> the modules of the package that it imports, at whatever place."""
     out: dict[str, set[str]] = {}
@@ -83,8 +123,9 @@ def imports_of(modules: dict[str, Path]) -> dict[str, set[str]]:
     return out
 
 
-def loaded_by(src: Path, names: list[str], modules: dict[str, Path]) -> list[str]:
-    """Modules of the package that Python has loaded when it has imported `names`.
+def loaded_by(src: Path, names: list[str], modules: dict[str, Path]) -> list[str] | None:
+    """Modules of the package that Python has loaded when it has imported `names`; None if it cannot
+    import them.
 
     Packages whose file is a docstring and no more do not count.
     """
@@ -95,8 +136,16 @@ def loaded_by(src: Path, names: list[str], modules: dict[str, Path]) -> list[str
         env={**os.environ, "PYTHONPATH": str(src)},
         capture_output=True,
         text=True,
-        check=True,
+        check=False,
     )
+    if done.returncode:
+        why = done.stderr.strip().splitlines()[-1]
+        print(
+            f"modules of the nodes are not counted: {sys.executable} cannot import them ({why}); "
+            "`make setup`, then .venv/bin/python scripts/house.py",
+            file=sys.stderr,
+        )
+        return None
     loaded = [name for name in done.stdout.split() if name in modules]
     return [name for name in loaded if not says_nothing(modules[name])]
 
@@ -136,21 +185,28 @@ def measure(src: Path) -> dict[str, Any]:
     lines = {name: len(path.read_text("utf-8").splitlines()) for name, path in modules.items()}
     files: Counter[str] = Counter()
     sizes: Counter[str] = Counter()
+    tokens: Counter[str] = Counter()
     for name, path in modules.items():
         parts = path.relative_to(src / PACKAGE).parts
         room = parts[0] if len(parts) > 1 else "(beside them)"
         files[room] += 1
         sizes[room] += lines[name]
+        tokens[room] += tokens_in(path)
     roots = [f"{PACKAGE}.{name}" for names in NODES for name in names]
     present = [name for name in roots if name in modules and modules[name].name != "__init__.py"]
     loaded = loaded_by(src, present, modules)
+    tops = tokens_by_top_folder(src.parent)
     return {
-        "rooms": {room: [files[room], sizes[room]] for room in sorted(files)},
+        "rooms": {room: [files[room], sizes[room], tokens[room]] for room in sorted(files)},
         "files": len(modules),
         "lines": sum(lines.values()),
         "core_lines": sum(sizes.values()) - sizes[LAB],
-        "node_modules": len(loaded),
-        "node_lines": sum(lines[name] for name in loaded),
+        "tokens": sum(tokens.values()),
+        "core_tokens": sum(tokens.values()) - tokens[LAB],
+        "tokens_by_top_folder": tops,
+        "tokens_outside_tests": sum(tops.values()) - tops.get("tests", 0),
+        "node_modules": None if loaded is None else len(loaded),
+        "node_lines": None if loaded is None else sum(lines[name] for name in loaded),
         "cycles": in_cycles(imports),
         "class_names_twice": class_names_twice(modules),
     }
@@ -248,13 +304,18 @@ def trace(src: Path) -> list[str]:
 
 def show(found: dict[str, Any]) -> None:
     """A table of Markdown."""
-    print("| room | files | lines |\n|---|---|---|")
-    for room, (files, lines) in found["rooms"].items():
-        print(f"| {room} | {files} | {lines} |")
-    print(f"| **all** | {found['files']} | {found['lines']} |\n")
-    print(f"lines outside {LAB}/: {found['core_lines']}")
-    print(f"modules that the four nodes import: {found['node_modules']}", end="")
-    print(f" ({found['node_lines']} lines)")
+    print("| room | files | lines | tokens |\n|---|---|---|---|")
+    for room, (files, lines, tokens) in found["rooms"].items():
+        print(f"| {room} | {files} | {lines} | {tokens} |")
+    print(f"| **all** | {found['files']} | {found['lines']} | {found['tokens']} |\n")
+    print(f"outside {LAB}/: {found['core_lines']} lines, {found['core_tokens']} tokens")
+    print(f"tokens a line: {found['tokens'] / found['lines']:.1f}")
+    tops = ", ".join(f"{name} {count}" for name, count in found["tokens_by_top_folder"].items())
+    print(f"tokens of all tracked Python: {tops}")
+    print(f"tokens outside tests/: {found['tokens_outside_tests']}")
+    if found["node_modules"] is not None:
+        print(f"modules that the four nodes import: {found['node_modules']}", end="")
+        print(f" ({found['node_lines']} lines)")
     if "trace" in found:
         print(f"files that run between an image and a motion: {len(found['trace'])}")
         print("  " + " ".join(found["trace"]))

@@ -54,7 +54,7 @@ REPEAT_NS = 1_500_000_000
 """The same request again within this time, as ``ros2 topic pub`` sends it, is no new one."""
 
 
-class Call(NamedTuple):
+class OperatorCall(NamedTuple):
     """A request, and when it came; by topic if there is no `service` call to answer."""
 
     operation: Operation
@@ -98,7 +98,7 @@ class OperatorTopics:
             zenoh.handlers.Callback(self._on_stop, indirect=False),
             allowed_origin=zenoh.Locality.REMOTE,
         )
-        self._calls: queue.Queue[Call] = queue.Queue(MAX_WAITING)
+        self._calls: queue.Queue[OperatorCall] = queue.Queue(MAX_WAITING)
         self._left_out: deque[Operation] = deque(maxlen=MAX_WAITING)
         self._called_ns = 0
         self._executed: dict[Operation, tuple[Wanted, int]] = {}
@@ -122,12 +122,12 @@ class OperatorTopics:
             except CodecError as error:
                 self._reject(error.reason, f"{self._prefix}/{operation.name}: {error}", "")
                 return
-        self._enqueue(Call(operation, payload, time.monotonic_ns()))
+        self._enqueue(OperatorCall(operation, payload, time.monotonic_ns()))
 
     def _on_request(self, operation: Operation, request: Request) -> None:
-        self._enqueue(Call(operation, request.payload, time.monotonic_ns(), request))
+        self._enqueue(OperatorCall(operation, request.payload, time.monotonic_ns(), request))
 
-    def _enqueue(self, call: Call) -> None:
+    def _enqueue(self, call: OperatorCall) -> None:
         if call.operation is STOP:  # overtakes the calls in the queue
             with self._stop_lock:
                 self._our_stop_ns = time.monotonic_ns()
@@ -182,7 +182,7 @@ class OperatorTopics:
         offered = "offers services, too" if self._services else "no services (ros2.services)"
         return f"listens to {topics} and answers on {self._prefix}/{ANSWER_TOPIC}; {offered}"
 
-    def _handle(self, call: Call) -> None:
+    def _handle(self, call: OperatorCall) -> None:
         operation, wanted = call.operation, Wanted()
         self._called_ns = call.mono_ns
         # An error reply never reaches a ROS client, which would wait for ever.
@@ -205,7 +205,7 @@ class OperatorTopics:
         text = json.dumps({"id": name, "what": operation.name, "ok": ok, "reason": reason})
         self._answers.publish(self._messages.encode(self._messages.new(TEXT, data=text)))
 
-    def _wanted(self, call: Call) -> Wanted:
+    def _wanted(self, call: OperatorCall) -> Wanted:
         operation, by_topic = call.operation, call.service is None
         if operation is STOP or (operation is RESET and by_topic):
             return Wanted()
@@ -224,7 +224,7 @@ class OperatorTopics:
             return Wanted(active=value)
         return Wanted(prompt=value) if operation is PROMPT else read_request(value)
 
-    def _execute(self, call: Call, wanted: Wanted) -> str:
+    def _execute(self, call: OperatorCall, wanted: Wanted) -> str:
         """Answer of a request that was executed, or a `SessionError` or `CodecError`."""
         if call.operation is STOP:
             self._client.follow_stop(call.mono_ns / 1e9)
@@ -248,7 +248,7 @@ class OperatorTopics:
         if max(self._our_stop_ns, self._others_stop_ns) > asked_ns:
             raise SessionError("an emergency stop came after this request; send it again")
 
-    def _check_new(self, call: Call, wanted: Wanted) -> None:
+    def _check_new(self, call: OperatorCall, wanted: Wanted) -> None:
         """Raise a `SessionError` if a reset or activation may be an old one, or one sent on and on.
 
         Nothing in these messages says when they were made.
