@@ -180,7 +180,7 @@ def test_an_arm_that_raises_is_braked_and_started_again(lab: Lab, what: str) -> 
 
 
 def is_back(chain: Chain, pid: int) -> bool:
-    """Another process than `pid` runs the arm, and the newest status is its own."""
+    """Another process than `pid` runs the arm: the status is not the last one of `pid`."""
     status = chain.client.status("arm")
     return status is not None and status.state == "running" and status.pid != pid
 

@@ -28,7 +28,7 @@ SHORT = RingLimits(keep_s=4.0, max_bytes=40 * 1024**2, segment_s=1.0, after_s=0.
 LOGGED_S = 30.0
 """From a put to its line, on a busy machine: puts that were too many are counted each 5 s."""
 STEP_S = 7.0
-FLOOD = 20_000
+FLOOD = 8_000
 
 
 class Kept:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -33,16 +34,30 @@ tenth of a second for a busy computer."""
 
 def activate_by_key(chain: Chain, screen: Screen) -> None:
     """Enter, again whenever preflight finds something missing."""
+    until_accepted(chain, screen, b"\r", lambda: chain.state() == "active", "activate_refused")
+
+
+def take_by_key(chain: Chain, screen: Screen) -> None:
+    """Tab, again whenever preflight finds something missing: the model keeps the arm then."""
+
+    def taken() -> bool:
+        return chain.client.task is not None and chain.client.task.worker == "teleop"
+
+    until_accepted(chain, screen, b"\t", taken, "worker_refused")
+
+
+def until_accepted(
+    chain: Chain, screen: Screen, key: bytes, accepted: Callable[[], bool], refusal: str
+) -> None:
+    """Press `key` until it is accepted, once for each refusal."""
     give_up_s = time.monotonic() + READY_PATIENCE_S
-    while chain.state() != "active":
+    while not accepted():
         assert time.monotonic() < give_up_s, chain.story()
-        refused = chain.counter("refused.activate_refused")
-        screen.type(b"\r")
+        refused = chain.counter(f"refused.{refusal}")
+        screen.type(key)
         chain.until(
             "an answer",
-            lambda before=refused: (
-                chain.state() == "active" or chain.counter("refused.activate_refused") > before
-            ),
+            lambda before=refused: accepted() or chain.counter(f"refused.{refusal}") > before,
         )
 
 
@@ -98,8 +113,7 @@ def test_a_recording_of_a_takeover_has_the_chunks_of_both_and_says_who_led(
     with recording(chain, path, name="of-takeover") as recorder, teleop(chain) as screen:
         chain.client.set_worker("scripted")
         chain.move()
-        screen.type(b"\t")
-        chain.until("it is obeyed", lambda: chain.client.task.worker == "teleop")
+        take_by_key(chain, screen)
         height_m = chain.reference_m()[2]
         screen.hold(b"r", lambda: chain.reference_m()[2] > height_m + MOVED_M)
         chain.wait_still()
@@ -133,8 +147,7 @@ def test_a_leader_arm_takes_the_arm_from_a_model_and_gives_it_back(
     with teleop(chain, "--leader", str(leader), "--set", f"go={go}") as screen:
         chain.client.set_worker("scripted")
         chain.move()
-        screen.type(b"\t")
-        chain.until("it is obeyed", lambda: chain.client.task.worker == "teleop")
+        take_by_key(chain, screen)
         chain.wait_still()
         start_m = chain.reference_m()
         go.write_text("")
@@ -151,8 +164,7 @@ def test_a_leader_arm_takes_the_arm_from_a_model_and_gives_it_back(
 def test_ctrl_c_in_motion_ends_it_stops_the_arm_and_restores_the_terminal(chain: Chain) -> None:
     with teleop(chain) as screen:
         assert screen.settings() != screen.before
-        screen.type(b"\t")
-        chain.until("it is obeyed", lambda: chain.client.task.worker == "teleop")
+        take_by_key(chain, screen)
         activate_by_key(chain, screen)
         screen.hold(b"a", chain.moves)
         screen.type(b"\x03")
