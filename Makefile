@@ -26,7 +26,7 @@ help: ## Show this list
 
 setup: $(READY) ## Make ./.venv with everything in it
 
-$(READY): pyproject.toml constraints.txt scripts/bootstrap.py
+$(READY): pyproject.toml constraints.txt scripts/bootstrap.py $(wildcard plugins/*/pyproject.toml)
 	@$(PYTHON) scripts/bootstrap.py $(EXTRAS)
 	@touch $@
 

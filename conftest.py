@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+import tomllib
 from collections.abc import Iterator
+from importlib.metadata import entry_points
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -20,6 +23,19 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))
 
 IN_REAL_TIME = {"wire", "fault", "netns", "ros2"}
 """Folders of tests that begin processes and wait for them: one file at a time on two cores."""
+
+
+ROOT = Path(__file__).parent
+
+
+def pytest_configure() -> None:
+    """End at once where this environment lacks a plug-in of this checkout: nothing would load."""
+    for file in [ROOT / "pyproject.toml", *(ROOT / "plugins").glob("*/pyproject.toml")]:
+        project = tomllib.loads(file.read_text("utf-8"))["project"]
+        for group, wanted in project.get("entry-points", {}).items():
+            if lacking := sorted(wanted.keys() - entry_points(group=group).names):
+                names = ", ".join(lacking)
+                raise pytest.UsageError(f"{group} lacks {names} of {file}: run `make setup`")
 
 
 @pytest.hookimpl(tryfirst=True)  # before -m chooses

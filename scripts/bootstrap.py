@@ -25,6 +25,8 @@ TOOLS = ROOT / ".tools"
 UV_IN_VENV = TOOLS / "venv" / "bin" / "uv"
 UV_IN_FOLDER = TOOLS / "uv" / "bin" / "uv"
 CONSTRAINTS = ROOT / "constraints.txt"
+PLUGINS = sorted(path.parent for path in (ROOT / "plugins").glob("*/pyproject.toml"))
+"""Packages that bring robots and benchmarks; their extras are left to who needs them."""
 
 OLDEST_PYTHON = (3, 11)
 OLDEST_UV = (0, 8)
@@ -209,7 +211,9 @@ def main() -> None:
     say(f"installing the package with the extras {extras} into .venv{size}")
     quiet = [] if sys.stderr.isatty() else ["--quiet"]
     target = ["--python", VENV / "bin" / "python", "--constraint", CONSTRAINTS]
-    run(uv, *quiet, "pip", "install", *target, "--editable", f".[{extras}]")
+    packages = [f".[{extras}]", *map(str, PLUGINS)]
+    editable = [word for package in packages for word in ("--editable", package)]
+    run(uv, *quiet, "pip", "install", *target, *editable)
     bring_openmp(uv, VENV / "bin" / "python")
     say("done; the command is .venv/bin/vla-zenoh")
 

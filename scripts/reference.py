@@ -13,7 +13,7 @@ import re
 import sys
 import types
 import typing
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +21,14 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 from typer.main import get_command
+from vla_zenoh_franka.check import BY_FCI, JOINTS
 
 import vla_zenoh
 from vla_zenoh.cli.main import app, examples
 from vla_zenoh.keys import KEY_PATHS
 from vla_zenoh.kinematics.kinematics import make_kinematics
-from vla_zenoh.lab.doctor.fci import BY_FCI, JOINTS
 from vla_zenoh.profile import Profile, load_profile
+from vla_zenoh.profile.section import Section
 from vla_zenoh.security.roles import OWN, TABLE
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -100,10 +101,17 @@ def sections_of(kind: type[BaseModel]) -> dict[type[BaseModel], str]:
         if section not in paths:
             paths[section] = path
             inside: list[tuple[type[BaseModel], str]] = []
-            for name, field in section.model_fields.items():
-                inside += inner(field.annotation, f"{path}.{name}".lstrip("."))
+            for name, annotation in keys_here(section).items():
+                inside += inner(annotation, f"{path}.{name}".lstrip("."))
             waiting[:0] = inside
     return paths
+
+
+def keys_here(section: type[BaseModel]) -> Mapping[str, Any]:
+    """Keys of a section -> types; of the profile also the sections of installed robot drivers."""
+    if issubclass(section, Section):
+        return section.keys_here()
+    return {name: field.annotation for name, field in section.model_fields.items()}
 
 
 def anchor(path: str) -> str:
@@ -154,6 +162,9 @@ def profile_page() -> str:
             kind = type_text(field.annotation, paths) + (f", {bounds}" if bounds else "")
             text = texts.get(name, "").replace("|", "\\|")
             rows.append(f"| `{name}` | {kind} | {default_text(field)} | {text} |")
+        for name in sorted(keys_here(section).keys() - section.model_fields.keys()):
+            kind = type_text(keys_here(section)[name], paths)
+            rows.append(f"| `{name}` | {kind} | | options of the driver `{name}` |")
         out.append("\n".join(rows))
     return "\n\n".join(out) + "\n"
 
@@ -416,8 +427,7 @@ FRANKA = "fr3", "panda_fci"
 
 def franka_limits(profile: Profile) -> Iterator[tuple[str, str, str]]:
     """Each limit of an arm: its name, what Franka publishes, and what the profile allows."""
-    assert profile.franka is not None
-    published, ours = BY_FCI[profile.franka.fci], make_kinematics(profile)
+    published, ours = BY_FCI[profile.driver_options.fci], make_kinematics(profile)
     for index in range(JOINTS):
         yield (
             f"range of joint {index + 1}, rad",

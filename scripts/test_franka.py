@@ -4,7 +4,7 @@
     .venv/bin/python scripts/test_franka.py --benchmark [NAME ...]   # benchmarks/franka instead
 
 The simulator pins an older numpy and MuJoCo than this package uses. The driver's library, franky,
-is the extra ``franka`` of this package, and is installed into ./.venv.
+is the extra ``franky`` of plugins/vla-zenoh-franka, and is installed into ./.venv.
 """
 
 from __future__ import annotations
@@ -45,7 +45,10 @@ def main() -> int:
     uv = str(Path(sysconfig.get_path("scripts")) / "uv")
     install = [uv, "--quiet", "pip", "install", "--python", sys.executable]
     subprocess.run(
-        [*install, "-c", "constraints.txt", "-e", ".[franka]"], cwd=ROOT, env=environ, check=True
+        [*install, "-c", "constraints.txt", "-e", ".", "-e", "plugins/vla-zenoh-franka[franky]"],
+        cwd=ROOT,
+        env=environ,
+        check=True,
     )
     environ.setdefault(SIMULATOR, environment(uv, environ, *PACKAGES))
     if sys.argv[1:2] == ["--benchmark"]:

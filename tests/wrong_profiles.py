@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import get_args
 
-from vla_zenoh.profile.robot import RobotProfile
+from vla_zenoh import plugins
 from vla_zenoh.profile.schema import CAMERA_SOURCES, NodeKind
 
 
@@ -20,7 +20,7 @@ def any_of(names: Iterable[str]) -> str:
     return f"{', '.join(others)} or {last}"
 
 
-DRIVERS: tuple[str, ...] = get_args(RobotProfile.model_fields["driver"].annotation)
+DRIVERS = tuple(plugins.installed(plugins.ROBOTS))
 """What `robot.driver` may be."""
 CAMERAS = ", ".join(kind.written for kind in CAMERA_SOURCES.values())
 
@@ -190,7 +190,8 @@ WRONG: list[tuple[str, str]] = [
     ),
     (
         "robot: {driver: ros}",
-        f"wants {any_of(DRIVERS)}; did you mean 'ros2'? (given: 'ros')",
+        "lab.yaml:2: robot.driver: no robot driver 'ros' is installed; did you mean 'ros2'? "
+        f"Installed: {', '.join(DRIVERS)}. Install the package that brings it",
     ),
     ("robot: {tcp_frame: ''}", "robot.tcp_frame: must not be empty"),
     (

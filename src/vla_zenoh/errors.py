@@ -62,23 +62,28 @@ class ResourceError(VlaZenohError, FileNotFoundError):
         return str(self.args[0]) if self.args else ""
 
 
-def how_to_install(extra: str = "") -> str:
-    """Command that installs an extra of this package, or the package itself.
+def how_to_install(extra: str = "", package: str = "") -> str:
+    """Command that installs this package, with an extra; or a `package` of its ``plugins/``.
 
     Never by name alone: the package is on no index, and anyone could register the name there.
     """
-    what = f"'.[{extra}]'" if extra else "."
+    extras = f"[{extra}]" if extra else ""
+    what = f". './plugins/{package}{extras}'" if package else f"'.{extras}'" if extra else "."
     return f"pip install -c constraints.txt {what} in a checkout of vla-zenoh"
 
 
 class MissingExtraError(VlaZenohError, ImportError):
-    """A Python module is not installed; an extra of this package brings it."""
+    """A Python module is not installed; an extra of this package or of a plug-in brings it."""
 
-    def __init__(self, module: str, extra: str) -> None:
+    def __init__(self, module: str, extra: str, package: str = "") -> None:
         super().__init__(
             f"the Python module {module!r} is not installed; "
-            f"install it with: {how_to_install(extra)}"
+            f"install it with: {how_to_install(extra, package)}"
         )
+
+
+class PluginError(VlaZenohError):
+    """A plug-in is not installed, or cannot be imported; see `vla_zenoh.plugins`."""
 
 
 class SessionError(VlaZenohError, ConnectionError):

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from vla_zenoh_franka.check import fci_arm
 
 from vla_zenoh.errors import NodeError
-from vla_zenoh.lab.doctor.fci import fci_arm
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.robots.python_driver import PythonDriver
 
@@ -27,6 +27,6 @@ def test_the_node_ends_with_what_to_look_at(profile: Profile) -> None:
 
 
 def test_the_check_says_so(profile: Profile) -> None:
-    (finding,) = fci_arm(profile)
+    (finding,) = fci_arm(profile, profile.driver_options)
     assert (finding.name, finding.level) == ("connection", "fail")
     assert NOBODY in finding.found

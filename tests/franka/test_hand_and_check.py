@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 from camera_rig import until
 from franka_rig import Simulator, simulator
+from vla_zenoh_franka.check import fci_arm
+from vla_zenoh_franka.hand import Hand
 
-from vla_zenoh.lab.doctor.fci import fci_arm
 from vla_zenoh.profile import Profile, load_profile, override
-from vla_zenoh.robots.franka.hand import Hand
 
 WIDTH_M, EXACT_M = 0.03, 0.004
 CALL_S = 0.002
@@ -82,7 +82,7 @@ def profile(tmp_path: Path) -> Profile:
 
 
 def levels(profile: Profile) -> dict[str, str]:
-    return {finding.name: finding.level for finding in fci_arm(profile)}
+    return {finding.name: finding.level for finding in fci_arm(profile, profile.driver_options)}
 
 
 def test_the_arm_agrees_with_its_profile(robot: Simulator, profile: Profile) -> None:

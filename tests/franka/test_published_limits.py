@@ -9,8 +9,7 @@ import subprocess
 
 import numpy as np
 from franka_rig import VARIABLE
-
-from vla_zenoh.lab.doctor.fci import FR3, PANDA
+from vla_zenoh_franka.check import FR3, PANDA
 
 TABLES = """
 import json

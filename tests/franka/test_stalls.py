@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from camera_rig import until
 from franka_rig import Simulator, simulator
+from vla_zenoh_franka.arm import REST_S, FrankaArm
 
 from vla_zenoh.kinematics.so3 import exp3, quat_from_rotation
 from vla_zenoh.profile import load_profile
-from vla_zenoh.robots.franka.arm import REST_S, FrankaArm
 from vla_zenoh.types import FloatArray, JointCommand, PoseCommand
 
 SPEED_M_S, SPEED_RAD_S, RAMP_S, TICK_S = 0.2, 0.3, 0.4, 0.004
@@ -44,7 +44,8 @@ def robot() -> Iterator[Simulator]:
 def arm(request: pytest.FixtureRequest, robot: Simulator, tmp_path: Path) -> Iterator[FrankaArm]:
     path = tmp_path / "lab.yaml"
     path.write_text(PROFILE.format(command=request.param))
-    arm = FrankaArm(load_profile(str(path)))
+    profile = load_profile(str(path))
+    arm = FrankaArm(profile, profile.driver_options)
     arm.connect()
     until("it is configured", lambda: arm.read() and arm.status()["configured"])
     time.sleep(KNOWN_S)

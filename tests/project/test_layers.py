@@ -17,7 +17,9 @@ PACKAGE = Path(vla_zenoh.__file__).parent
 ORDER = (
     # A folder, or a module beside them, imports those of the lines above and of its own line.
     ("errors",),
-    ("keys", "resources", "robot", "sanitize", "types"),
+    ("keys", "robot", "sanitize", "types"),
+    ("plugins",),
+    ("resources",),
     ("policy",),
     ("profile",),
     ("codec",),

@@ -113,16 +113,20 @@ def ros2(node: NodeOptions) -> None:
 
 @options
 def arm(node: NodeOptions) -> None:
-    """Drive an arm with a Python class: that of `arm.file` in the profile, or a built-in one.
+    """Drive an arm with the class of an installed robot driver, or that of `arm.file`.
 
     A file with a PEP 723 header runs in an environment of its own; a robot of LeRobot does.
     """
+    from vla_zenoh import plugins
     from vla_zenoh.policy.loader import find_model
-    from vla_zenoh.robots.python_driver import PythonDriver, file_of
+    from vla_zenoh.robots.python_driver import PythonDriver, script_of
     from vla_zenoh.runtime.environments import run_in_own_environment
 
-    if (path := file_of(node.load())) is not None:
-        run_in_own_environment(find_model(str(path)), None, extra="control")
+    profile = node.load()
+    if (path := script_of(profile)) is not None:
+        packages = plugins.how_to_repeat(plugins.ROBOTS, profile.robot.driver)
+        script = find_model(str(path))
+        run_in_own_environment(script, None, extra="control", packages=packages)
 
     _run_robot(node, "arm", PythonDriver)
 

@@ -12,7 +12,8 @@ from typing import Any
 import yaml
 from pydantic import ValidationError
 
-from vla_zenoh.errors import ProfileError
+from vla_zenoh import plugins
+from vla_zenoh.errors import PluginError, ProfileError
 from vla_zenoh.profile.profile import Profile
 from vla_zenoh.profile.schema import PATH_SOURCES
 from vla_zenoh.profile.section import WITH_REMOVABLE, Lines, Place, explain, merge
@@ -134,18 +135,21 @@ def _bytes(path: Path) -> bytes:
         raise ProfileError(f"{path} cannot be read: {error.strerror}") from error
 
 
+def is_relative(text: str) -> bool:
+    """Whether an option is clearly the path of a file."""
+    return text in (".", "..") or text.startswith(("./", "../"))
+
+
 PATHS: Mapping[str, Callable[[str], bool]] = {
     "robot.description": lambda text: not text.startswith(ROBOT_DATA_PREFIX),
     "parts.*.robot.description": lambda text: not text.startswith(ROBOT_DATA_PREFIX),
     "cameras.*.source": lambda text: text.startswith(PATH_SOURCES),
     "cameras.*.intrinsics": lambda text: True,
     "cameras.*.check.reference": lambda text: True,
-    "arm.file": lambda text: True,
     "models.*": is_path,
     "ros2.messages.*": lambda text: True,
-    # Of any other text only the model, or the arm, knows whether it is a path.
-    "options.*.*": lambda text: text in (".", "..") or text.startswith(("./", "../")),
-    "arm.options.*": lambda text: text in (".", "..") or text.startswith(("./", "../")),
+    # Of any other text only the model knows whether it is a path.
+    "options.*.*": is_relative,
 }
 """Place of texts in a profile, ``*`` for any name -> whether a text there is the path of a file."""
 
@@ -163,6 +167,28 @@ def paths_in(data: dict[str, Any]) -> Iterator[tuple[dict[str, Any], str, str]]:
                 text = section.get(name)
                 if isinstance(text, str) and names_file(text):
                     yield section, name, text[: text.index(":") + 1] if last == "source" else ""
+    for name in data.keys() - Profile.model_fields.keys():
+        if isinstance(data[name], dict):
+            yield from _paths_of_driver(name, data[name])
+
+
+def _paths_of_driver(
+    driver: str, options: dict[str, Any]
+) -> Iterator[tuple[dict[str, Any], str, str]]:
+    """Paths in the section of a robot driver: declared by its plug-in, or clearly relative."""
+    try:
+        named = plugins.load(plugins.ROBOTS, driver).paths
+    except PluginError:  # reported when the whole profile is checked
+        named = ()
+    waiting = [options]
+    while waiting:
+        section = waiting.pop()
+        for name, value in section.items():
+            if isinstance(value, dict):
+                waiting.append(value)
+            declared = section is options and name in named
+            if isinstance(value, str) and (declared or is_relative(value)):
+                yield section, name, ""
 
 
 def below(folder: Path, path: str) -> str:

@@ -5,26 +5,32 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
-from pydantic import AfterValidator, BeforeValidator, Field, PrivateAttr, ValidationError
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ModelWrapValidatorHandler,
+    PrivateAttr,
+    ValidationError,
+    model_validator,
+)
+from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from vla_zenoh import keys
-from vla_zenoh.errors import ProfileError, describe_fault
+from vla_zenoh import keys, plugins
+from vla_zenoh.errors import PluginError, ProfileError, describe_fault
 from vla_zenoh.keys import NODE_KINDS, NOT_PARTS, PRIMITIVES, Keys, worker_node
 from vla_zenoh.profile.limits import Limits
 from vla_zenoh.profile.robot import (
     JOINT_COMMANDS,
-    ArmProfile,
-    FrankaProfile,
-    LeRobotProfile,
     Options,
     PartBase,
     RobotProfile,
     Ros2Camera,
     Ros2Gripper,
     Ros2Profile,
-    UrProfile,
 )
 from vla_zenoh.profile.schema import (
     SIMULATED,
@@ -96,11 +102,12 @@ class Profile(Section):
             worker that is not listed serves this robot only.
         options: worker -> options of its model as ``--set`` gives them, name -> text.
         ros2: required for a robot or camera of ROS 2.
-        arm: required for a robot that is driven by a Python file.
-        franka: required for a Franka arm over FCI.
-        ur: required for a UR arm over RTDE.
-        lerobot: required for a robot class of LeRobot.
+
+    Further sections have the name of a robot driver, and hold its options. That of a driver which
+    is not installed is a map: another computer runs it, and checks it.
     """
+
+    model_config = ConfigDict(extra="allow")
 
     name: Name
     about: Text = ""
@@ -122,11 +129,60 @@ class Profile(Section):
         default_factory=lambda: {"here": HostProfile(nodes=SIMULATED)}
     )
     ros2: Ros2Profile | None = None
-    arm: ArmProfile | None = None
-    franka: FrankaProfile | None = None
-    ur: UrProfile | None = None
-    lerobot: LeRobotProfile | None = None
     _part: str = PrivateAttr("")
+
+    @classmethod
+    def keys_here(cls) -> Mapping[str, Any]:
+        """Also the sections of installed robot drivers."""
+        robots = plugins.load_all(plugins.ROBOTS)
+        sections = {name: robot.options for name, robot in robots.items() if robot.options}
+        return {**super().keys_here(), **sections}
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _with_driver(cls, data: Any, read: ModelWrapValidatorHandler[Self]) -> Self:
+        """Validate the sections of robot drivers, each by the class that its plug-in declares."""
+        if not isinstance(data, Mapping):
+            return read(data)
+        own = {name: value for name, value in data.items() if name in cls.model_fields}
+        robot = own.get("robot")
+        driver = robot.get("driver", "sim") if isinstance(robot, Mapping) else "sim"
+        found: dict[str, Any] = {}
+        faults: list[InitErrorDetails] = []
+        for name in data.keys() - own.keys():
+            if data[name] is not None:
+                try:
+                    found[name] = _driver_section(name, data[name], name == driver)
+                except ValidationError as error:
+                    faults += [_again(fault, name) for fault in error.errors(include_url=False)]
+        if isinstance(driver, str) and driver not in data and (why := _not_installed(driver)):
+            custom = PydanticCustomError("value_error", "{why}", {"why": why})
+            faults.append({"type": custom, "loc": ("robot", "driver"), "input": driver})
+        try:
+            made = read({**own, **found})
+        except ValidationError as error:
+            # What contradicts a section that is wrong may be right: it is at no place of its own.
+            more = [
+                fault for fault in error.errors(include_url=False) if fault["loc"] or not faults
+            ]
+            faults = [*map(_again, more), *faults]
+        else:
+            if not faults:
+                return made
+        raise ValidationError.from_exception_data("Profile", faults)
+
+    @property
+    def driver_options(self) -> Any:
+        """The section of its robot driver, checked; None if the driver needs none.
+
+        Raises:
+            PluginError: the driver is not installed here.
+        """
+        robot = plugins.load(plugins.ROBOTS, self.robot.driver)
+        if robot.options is None:
+            return None
+        given = (self.__pydantic_extra__ or {}).get(self.robot.driver)
+        return robot.options() if given is None else given
 
     @property
     def keys(self) -> Keys:
@@ -218,31 +274,74 @@ class Profile(Section):
 
 
 # -- checks across sections: (place, sentence) of every fault -------------------------------------
-TO_GIVE = {
-    "ros2": "",
-    "arm": ". Name the Python file, as arm: {file: ...}",
-    "franka": ". Give franka: {address: ...}",
-    "ur": ". Give ur: {address: ...}",
-    "lerobot": ". Give lerobot: {port: .., id: ..}",
-}
-"""Driver with a section of its own -> what to write there."""
+OWN_ROBOT = "A robot of your own is driver: arm, with a Python file: arm: {file: my_arm.py}"
+
+
+def _driver_section(name: str, given: Any, is_driver: bool) -> Any:
+    """The section of a robot driver, checked; as it is, if that driver is not installed here.
+
+    Raises:
+        ValidationError: an option is wrong, or there is no such section.
+    """
+    why = ""
+    try:
+        robot = plugins.load(plugins.ROBOTS, name)
+    except PluginError as error:
+        known = name in plugins.installed(plugins.ROBOTS)
+        if (is_driver or plugins.in_own_environment()) and not known:
+            return given
+        why = str(error) if known else ""
+    else:
+        if robot.options is not None:
+            return robot.options.model_validate(given)
+    unknown = (
+        PydanticCustomError("value_error", "{why}", {"why": why}) if why else "extra_forbidden"
+    )
+    raise ValidationError.from_exception_data(name, [{"type": unknown, "loc": (), "input": given}])
+
+
+def _again(fault: Any, *above: str) -> InitErrorDetails:
+    """A fault of a section as one of what it is in."""
+    kind, context = fault["type"], fault.get("ctx", {})
+    if kind == "value_error" and "error" not in context:
+        kind = PydanticCustomError("value_error", "{why}", {"why": fault["msg"]})
+    return {"type": kind, "loc": (*above, *fault["loc"]), "input": fault["input"], "ctx": context}
+
+
+def _not_installed(driver: str) -> str:
+    """Why a driver that has no section cannot be right; empty: it may be."""
+    known = plugins.installed(plugins.ROBOTS)
+    if driver in known or plugins.in_own_environment():
+        return ""
+    try:
+        plugins.load(plugins.ROBOTS, driver)
+    except PluginError as error:
+        return f"{error}. {OWN_ROBOT}"
+    return ""
 
 
 def _robot(profile: Profile) -> Iterator[Fault]:
-    driver = profile.robot.driver
-    if driver in TO_GIVE and getattr(profile, driver) is None:
-        yield (driver,), f"is missing: robot.driver is {driver}{TO_GIVE[driver]}"
-    if driver == "lerobot" and profile.lerobot is not None:
-        joints = profile.robot.arm_joints
-        for name in ("motors", "zero_deg"):
-            given = getattr(profile.lerobot, name)
-            if given and len(given) != len(joints):
-                yield ("lerobot", name), f"has {len(given)} entries for {len(joints)} arm_joints"
-        turned = profile.lerobot.reversed
-        yield from unlisted(("lerobot", "reversed"), turned, "robot.arm_joints", joints)
-    if driver in ("ur", "lerobot") and profile.robot.command != "joint":
-        yield ("robot", "command"), f"must be joint: robot.driver is {driver}"
     yield from _joint_limits((), profile.robot, profile.limits)
+    driver = profile.robot.driver
+    if driver == "ros2" and profile.ros2 is None:
+        yield (driver,), "is missing: robot.driver is ros2"
+    if driver not in plugins.installed(plugins.ROBOTS):
+        return  # another computer runs it
+    try:
+        robot = plugins.load(plugins.ROBOTS, driver)
+    except PluginError as error:
+        yield ("robot", "driver"), str(error)
+        return
+    if profile.robot.command not in robot.commands:
+        allowed = " or ".join(robot.commands)
+        yield ("robot", "command"), f"must be {allowed}: robot.driver is {driver}"
+    fields = robot.options.model_fields if robot.options else {}
+    required = [f"{name}: ..." for name, field in fields.items() if field.is_required()]
+    if required and driver not in (profile.__pydantic_extra__ or {}):
+        give = f"Give {driver}: {{{', '.join(required)}}}"
+        yield (driver,), f"is missing: robot.driver is {driver}. {give}"
+        return
+    yield from plugins.faults_of(driver, robot.contradictions, profile, profile.driver_options)
 
 
 def _joint_limits(place: Place, robot: RobotProfile, limits: Limits) -> Iterator[Fault]:

@@ -9,6 +9,7 @@ from typing import Annotated, Literal, NamedTuple, get_args
 
 from pydantic import AfterValidator, Field
 
+from vla_zenoh.keys import NODE_KINDS
 from vla_zenoh.profile.schema import Endpoints
 from vla_zenoh.profile.section import Fault, Name, Range, Section, Text, Vector3, Word, Words
 
@@ -85,9 +86,11 @@ class RobotProfile(Section):
 
     Args:
         name: part of every key.
-        driver: ``sim``: simulator; ``ros2``: controllers of a ROS 2 robot; ``franka``: a Franka arm
-            over FCI; ``ur``: a UR arm over RTDE; ``lerobot``: a robot class of LeRobot; ``arm``:
-            Python file. The node of the last four is ``arm``.
+        driver: name of an installed plug-in: ``sim``: simulator; ``ros2``: controllers of a ROS 2
+            robot; ``arm``: a Python file; ``franka``: a Franka arm over FCI; ``ur``: a UR arm over
+            RTDE; ``lerobot``: a robot class of LeRobot; packages bring more. What it needs to know
+            is in the section of its name. The node of ``sim`` and ``ros2`` has their name, that of
+            all others is ``arm``.
         command: set-points of the arm: ``pose`` of the TCP, for a Cartesian impedance controller,
             or ``joint`` positions.
         description: path of the URDF, or ``example-robot-data:`` and a path in that package.
@@ -107,7 +110,7 @@ class RobotProfile(Section):
     """
 
     name: Name
-    driver: Literal["sim", "ros2", "franka", "ur", "lerobot", "arm"] = "sim"
+    driver: Name = "sim"
     command: Literal["pose", "joint"] = "pose"
     description: Word
     base_frame: Word
@@ -123,7 +126,8 @@ class RobotProfile(Section):
     @property
     def node(self) -> str:
         """Kind of the node that drives it."""
-        return self.driver if self.driver in ("sim", "ros2") else "arm"
+        traits = NODE_KINDS.get(self.driver)
+        return self.driver if traits is not None and traits.role == "robot" else "arm"
 
     def contradictions(self) -> Iterator[Fault]:
         joints, home, ranges = len(self.arm_joints), len(self.home_rad), len(self.joint_range_rad)
@@ -165,129 +169,6 @@ def _option(value: str) -> str:
 
 Options = dict[Annotated[str, AfterValidator(_option)], Text]
 """Keyword arguments of a class in a Python file, as text."""
-
-
-class ArmProfile(Section):
-    """A robot that is driven by a Python class, see `vla_zenoh.robot`.
-
-    Args:
-        file: the Python file.
-        options: of its constructor.
-    """
-
-    file: Word
-    options: Options = Field(default_factory=dict)
-
-
-Stiffness = Annotated[float, Field(gt=0, le=3000)]
-Threshold = Annotated[float, Field(gt=0, le=100)]
-_SEVEN = Field(strict=False, min_length=7, max_length=7)
-Stiffnesses = Annotated[tuple[Stiffness, ...], _SEVEN]
-Thresholds = Annotated[tuple[Threshold, ...], _SEVEN]
-
-
-class FrankaLoad(Section):
-    """What the flange carries beyond the end effector that is set in Desk.
-
-    Args:
-        mass_kg: its mass.
-        centre_m: its centre of mass in the flange's frame.
-        inertia_kg_m2: about that centre, in the flange's axes: xx, yy, zz, xy, xz, yz.
-    """
-
-    mass_kg: float = Field(default=0.0, ge=0, le=7)
-    centre_m: Vector3 = (0.0, 0.0, 0.0)
-    inertia_kg_m2: tuple[float, float, float, float, float, float] = Field(
-        default=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0), strict=False
-    )
-
-
-class FrankaProfile(Section):
-    """A Franka arm; all of it is set before the first motion.
-
-    The arm is a spring around its set-point, with critical damping about the commanded velocity.
-
-    Args:
-        address: of the robot's control box.
-        fci: version of the interface: 10 for an FR3, 5 for a Panda.
-        realtime: ``enforce``: its 1 kHz loop needs a real-time kernel; ``ignore``: for a simulator.
-        stiffness_n_m: of the TCP, with robot.command: pose.
-        stiffness_nm_rad: of its rotation.
-        joint_stiffness_nm_rad: of joint 1 to 7, with robot.command: joint.
-        posture_stiffness_nm_rad: with which the elbow keeps its place, with robot.command: pose.
-        collision_force_n: external force at the TCP that makes the robot end a motion (reflex);
-            above limits.contact.force_stop_n, at which the arm retreats instead.
-        collision_torque_nm: external torque about the TCP that does the same.
-        collision_joint_nm: external torque of joint 1 to 7 that does the same.
-        load: beyond the end effector of Desk.
-        hand: the robot has a Franka Hand.
-    """
-
-    address: Word
-    fci: Literal[5, 10] = 10
-    realtime: Literal["enforce", "ignore"] = "enforce"
-    stiffness_n_m: Stiffness = 2000.0
-    stiffness_nm_rad: float = Field(default=150.0, gt=0, le=300)
-    joint_stiffness_nm_rad: Stiffnesses = (600.0, 600.0, 600.0, 600.0, 250.0, 150.0, 50.0)
-    posture_stiffness_nm_rad: float = Field(default=10.0, ge=0, le=100)
-    collision_force_n: Threshold = 60.0
-    collision_torque_nm: Threshold = 30.0
-    collision_joint_nm: Thresholds = (40.0, 40.0, 36.0, 36.0, 32.0, 28.0, 24.0)
-    load: FrankaLoad = FrankaLoad()
-    hand: bool = True
-
-
-class UrProfile(Section):
-    """A UR arm over RTDE; tool, payload and watchdog are set before the first motion.
-
-    Args:
-        address: of the control box.
-        lookahead_s: of ``servoj``: the robot smooths its set-points over this time.
-        gain: of ``servoj``: how hard it follows them.
-        tcp_m: where robot.tcp_frame is in the frame of the robot's flange.
-        tcp_rotvec: its rotation there, as a rotation vector.
-        payload_kg: mass that the flange carries.
-        payload_centre_m: its centre of mass in the frame of the flange.
-        watchdog_hz: the robot stops its program if messages from this computer come less often.
-    """
-
-    address: Word
-    lookahead_s: float = Field(default=0.1, ge=0.03, le=0.2)
-    gain: float = Field(default=300.0, ge=100, le=2000)
-    tcp_m: Vector3 = (0.0, 0.0, 0.0)
-    tcp_rotvec: Vector3 = (0.0, 0.0, 0.0)
-    payload_kg: float = Field(default=0.0, ge=0, le=50)
-    payload_centre_m: Vector3 = (0.0, 0.0, 0.0)
-    watchdog_hz: float = Field(default=5.0, ge=1, le=50)
-
-
-class LeRobotProfile(Section):
-    """A robot class of LeRobot, calibrated by LeRobot's own program.
-
-    Args:
-        robot: LeRobot's name of it: ``so101_follower``, ``so100_follower``, ``koch_follower``.
-        port: serial port of its motors.
-        id: under which it was calibrated.
-        calibration_dir: folder of the calibration; empty: LeRobot's own.
-        units: of its joints: ``degrees``, or ``normalised``: -100 to 100 from one end of
-            robot.joint_range_rad (else of the description) to the other.
-        motors: of each of robot.arm_joints; empty: they have the same names.
-        zero_deg: angle by LeRobot at which each joint of the description is 0; empty: 0 for each.
-        reversed: arm_joints that turn against the description.
-        gripper: its motor, 0 to 100; empty: there is none.
-        limp_at_end: the motors are released when the node ends, and the arm falls.
-    """
-
-    robot: Name = "so101_follower"
-    port: Word
-    id: Name
-    calibration_dir: Text = ""
-    units: Literal["degrees", "normalised"] = "degrees"
-    motors: Words = ()
-    zero_deg: tuple[float, ...] = Field(default=(), strict=False)
-    reversed: Words = ()
-    gripper: Text = "gripper"
-    limp_at_end: bool = False
 
 
 # -- ROS 2: transport, topics and types -----------------------------------------------------------

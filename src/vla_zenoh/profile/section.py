@@ -32,6 +32,11 @@ class Section(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
 
+    @classmethod
+    def keys_here(cls) -> Mapping[str, Any]:
+        """Keys that a file may have here -> the types of their values."""
+        return {name: field.annotation for name, field in cls.model_fields.items()}
+
     def contradictions(self) -> Iterable[Fault]:
         """Values that are valid by themselves but contradict each other, for subclasses."""
         return ()
@@ -78,7 +83,6 @@ WITH_REMOVABLE = {("cameras",), ("ros2", "cameras"), ("models",), ("serves",), (
 """Maps of which null removes an inherited entry; null in place of the map: all of them."""
 NOT_MADE = {"depth": "depth images are published where depth_unit_m is set."}
 """Key that looks like a slip of another one but asks for more than exists -> what there is."""
-OWN_ROBOT = "A robot of your own is driver: arm, with a Python file: arm: {file: my_arm.py}"
 _NO_VALUE_SHOWN = {"missing", "extra_forbidden", "too_long", "too_short", "value_error"}
 
 
@@ -188,8 +192,6 @@ def _why(fault: Any, place: Place, model: type[Section]) -> str:
         words = f"wants a map of: {', '.join(names)}" if names else words
         if given is None:
             words = f"is empty: {words}, or leave it out"
-    if place == ("robot", "driver") and fault["type"] == "literal_error":
-        return f"{words} (given: {shown(given)}). {OWN_ROBOT}"
     if fault["type"] == "string_type" and isinstance(given, (bool, int, float)):
         words = "wants text; put it in quotes"
     if fault["type"] in _NO_VALUE_SHOWN or isinstance(given, (dict, BaseModel)):
@@ -201,15 +203,20 @@ def field_names(model: Any, place: Place) -> list[str]:
     """Fields of the section at `place`; empty if its keys are free, or it is no section."""
     for part in place:
         if _is_section(model):
-            field = model.model_fields.get(part)
-            model = field.annotation if field else None
+            model = _keys_here(model).get(part)
         elif typing.get_origin(model) is dict:
             model = typing.get_args(model)[1]
         else:
             model = None
         if typing.get_origin(model) in (typing.Union, types.UnionType):
             model = next((arg for arg in typing.get_args(model) if _is_section(arg)), None)
-    return sorted(model.model_fields) if _is_section(model) else []
+    return sorted(_keys_here(model)) if _is_section(model) else []
+
+
+def _keys_here(model: type[BaseModel]) -> Mapping[str, Any]:
+    if issubclass(model, Section):
+        return model.keys_here()
+    return {name: field.annotation for name, field in model.model_fields.items()}
 
 
 def _is_section(model: Any) -> bool:

@@ -1,21 +1,21 @@
 """Driver of a robot that is a Python class with `read` and `move`, see `vla_zenoh.robot`.
 
-The class is in a file of the profile, or one of ours: a Franka arm, a UR, a robot of LeRobot.
+A plug-in makes it, see `vla_zenoh.plugins`; that of the driver ``arm`` from a file of the profile.
 """
 
 from __future__ import annotations
 
 import operator
 import time
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from vla_zenoh import plugins
 from vla_zenoh.bus.metrics import RateMeter
-from vla_zenoh.errors import NodeError, ProfileError, in_words
-from vla_zenoh.policy.loader import make_robot
+from vla_zenoh.errors import NodeError, ProfileError, VlaZenohError, in_words
+from vla_zenoh.policy.loader import IS_ROBOT, is_robot
 from vla_zenoh.profile import Profile
-from vla_zenoh.robot import Reading, numbers
+from vla_zenoh.robot import Reading, Robot, numbers
 from vla_zenoh.robots.driver import DriverStatus, Measurement, RobotDriver, command_of
 from vla_zenoh.robots.joint_reading import JointReading
 from vla_zenoh.sanitize import one_line
@@ -27,25 +27,18 @@ MAX_WORDS = 300
 FAULT_NS = 200_000_000
 """A fault lasts at least this long: only the newest state is used, and a single one could be
 missed."""
-BUILT_IN = {
-    "franka": ("franka.arm", "FrankaArm"),
-    "ur": ("ur_arm", "UrArm"),
-    "lerobot": ("lerobot_arm", "LeRobotArm"),
-}
-"""Modules and classes, imported when used: the library of each is an extra."""
 RELEASED_M = 0.002
 """Fingers that are this much wider apart than around an object were opened."""
 
 
 class PythonDriver(RobotDriver):
-    """The robot class that the profile names: in ``arm.file``, or built in.
+    """The robot that the plug-in of ``robot.driver`` makes.
 
-    Exceptions of the class become a `NodeError` with the names of class and method.
+    Exceptions of the robot become a `NodeError` with the names of driver, or file, and method.
 
     Raises:
-        ProfileError: the section of the robot is missing.
-        WorkerError: the file is missing, or has no robot class.
-        MissingExtraError: the library of a built-in class is missing.
+        PluginError: the driver is not installed, or cannot be imported.
+        VlaZenohError: the robot cannot be made; its plug-in says why.
     """
 
     name = "arm"
@@ -156,28 +149,28 @@ class PythonDriver(RobotDriver):
         return DriverStatus({**detail, **own}, rates_hz={"readings": self._rate.rate_hz})
 
 
-def file_of(profile: Profile) -> Path | None:
-    """File whose header may ask for a separate environment."""
-    if profile.robot.driver == "lerobot":
-        return Path(__file__).with_name("lerobot_arm.py")
-    if profile.robot.driver == "arm" and profile.arm is not None:
-        path = Path(profile.arm.file).expanduser()
-        return path if path.is_file() else None  # `make_arm` reports that it is missing
-    return None
+def script_of(profile: Profile) -> Path | None:
+    """File whose header may ask for an environment of its own; None: the robot has none."""
+    return plugins.load(plugins.ROBOTS, profile.robot.driver).script(profile.driver_options)
 
 
-def make_arm(profile: Profile) -> tuple[Any, str]:
+def make_arm(profile: Profile) -> tuple[Robot, str]:
     """The robot of a profile, and its name in messages."""
-    if (driver := profile.robot.driver) in BUILT_IN:
-        module, name = BUILT_IN[driver]
-        return getattr(import_module(f"vla_zenoh.robots.{module}"), name)(profile), driver
-    if profile.arm is None:
-        raise ProfileError(
-            f"profile {profile.name!r} has no section arm, which names a Python file: "
-            "arm: {file: my_arm.py}, with robot.driver: arm"
-        )
-    path = Path(profile.arm.file).expanduser()
-    return make_robot(path, profile.arm.options), path.name
+    driver = profile.robot.driver
+    plugin = plugins.load(plugins.ROBOTS, driver)
+    if plugin.make is None:
+        raise ProfileError(f"robot.driver is {driver}: run `vla-zenoh node {driver}`")
+    options = profile.driver_options
+    script = plugin.script(options)
+    try:
+        robot = plugin.make(profile, options)
+    except VlaZenohError:
+        raise
+    except Exception as error:
+        raise NodeError(f"{driver} cannot be made: {in_words(error)}") from error
+    if not is_robot(robot):
+        raise NodeError(f"{driver}: {type(robot).__name__} {IS_ROBOT}")
+    return robot, driver if script is None else script.name
 
 
 def _measured_ns(reading: Reading) -> int:

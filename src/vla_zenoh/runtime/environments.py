@@ -17,27 +17,32 @@ from pathlib import Path
 
 from vla_zenoh import __version__
 from vla_zenoh.errors import WorkerError, how_to_install
+from vla_zenoh.plugins import OWN_ENVIRONMENT_VARIABLE, in_own_environment
 from vla_zenoh.policy.loader import ModelFile
 from vla_zenoh.runtime.process import die_with_parent
 
-INSIDE_VARIABLE = "VLA_ZENOH_WORKER_ENVIRONMENT"
-
 
 def run_in_own_environment(
-    model: ModelFile, python: str | None, *, extra: str = "", program: str = "vla_zenoh"
+    model: ModelFile,
+    python: str | None,
+    *,
+    extra: str = "",
+    packages: Sequence[str] = (),
+    program: str = "vla_zenoh",
 ) -> None:
     """Replace this process by one in the right environment; returns if this one is right.
 
     Args:
         python: interpreter of a prepared environment, which must have this package and `extra`.
         extra: of this package, which the command needs besides the model's own packages.
+        packages: more options of ``uv run`` that bring packages.
 
     Raises:
         WorkerError: another environment is needed and cannot be made.
     """
     die_with_parent()  # before the model is constructed, which may take long or hang
     missing = model.missing()
-    if INSIDE_VARIABLE in os.environ:
+    if in_own_environment():
         if missing:
             raise WorkerError(
                 f"{model.path}: its environment lacks {', '.join(missing)}; is the header right?"
@@ -49,14 +54,14 @@ def run_in_own_environment(
         _check_interpreter(python)
         command = [python]
     else:
-        command = [*environment_command(model, extra=extra), "python"]
+        command = [*environment_command(model, extra=extra), *packages, "python"]
         print(
             f"preparing an environment for {model.name}: {', '.join(model.dependencies)} "
             "(the first time takes minutes, later ones seconds)",
             file=sys.stderr,  # on stdout `vla-zenoh check --json` writes its result
             flush=True,
         )
-    os.environ[INSIDE_VARIABLE] = str(model.path)
+    os.environ[OWN_ENVIRONMENT_VARIABLE] = f"{model.name}={model.path}"
     os.execvp(command[0], [*command, "-m", program, *sys.argv[1:]])
 
 

@@ -13,12 +13,12 @@ from lerobot.cameras import CameraConfig
 from lerobot.robots import RobotConfig
 from lerobot.teleoperators import TeleoperatorConfig
 from test_lerobot import ACTION_OPTIONS
+from vla_zenoh_lerobot.arm import LeRobotArm
 
 from vla_zenoh.errors import NodeError, WorkerError
 from vla_zenoh.lab.check.examples import example_observation
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import load_profile, override
-from vla_zenoh.robots.lerobot_arm import LeRobotArm
 
 pytestmark = pytest.mark.models
 
@@ -120,7 +120,7 @@ def test_robots_cameras_and_teleoperators_of_plug_ins_are_known(
     monkeypatch.syspath_prepend(str(site))
     profile = override(load_profile("so101_lerobot"), {"lerobot": {"robot": "made_robot"}})
     with pytest.raises(NodeError, match="a plug-in's robot at x"):
-        LeRobotArm(profile).connect()
+        LeRobotArm(profile, profile.driver_options).connect()
     for kind, base in (
         ("robot", RobotConfig),
         ("camera", CameraConfig),

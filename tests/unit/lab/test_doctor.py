@@ -14,6 +14,8 @@ from pathlib import Path
 import pytest
 import typer
 from typer.testing import CliRunner
+from vla_zenoh_franka.check import network_card
+from vla_zenoh_franka.plugin import FrankaOptions
 
 from vla_zenoh.errors import ProfileError, how_to_install
 from vla_zenoh.lab.cli.doctor import doctor as doctor_command
@@ -32,7 +34,6 @@ from vla_zenoh.lab.doctor.computer import (
     shared_memory,
     video_devices,
 )
-from vla_zenoh.lab.doctor.fci import network_card
 from vla_zenoh.lab.doctor.software import (
     MODULES,
     libraries,
@@ -45,7 +46,6 @@ from vla_zenoh.lab.doctor.software import (
 )
 from vla_zenoh.lab.doctor.software import renderer_finding as judge_backend
 from vla_zenoh.profile import SessionProfile, load_profile
-from vla_zenoh.profile.robot import FrankaProfile
 from vla_zenoh.simulation.backend import Backend
 
 TIBIBYTE_MIB = 1024 * 1024
@@ -388,5 +388,5 @@ def test_a_network_card_that_reports_no_speed_is_of_unknown_speed(tmp_path: Path
         pytest.skip("no route to a network")
     (tmp_path / card[1]).mkdir()
     (tmp_path / card[1] / "speed").write_text("-1\n")
-    finding = network_card(FrankaProfile(address=address), tmp_path)
+    finding = network_card(FrankaOptions(address=address), tmp_path)
     assert (finding.level, finding.found) == ("warn", f"{card[1]}, of unknown speed")

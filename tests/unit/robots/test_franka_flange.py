@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from vla_zenoh_franka.arm import flange_pose
+from vla_zenoh_franka.check import BY_FCI, Published
 
 from vla_zenoh.kinematics.kinematics import make_kinematics
-from vla_zenoh.lab.doctor.fci import BY_FCI, Published
 from vla_zenoh.profile import Profile, load_profile
-from vla_zenoh.robots.franka.arm import flange_pose
 
 EXACT_M = EXACT_RAD = 1e-9
 FINGERS_M = 0.1034
@@ -22,8 +22,7 @@ def profile(request: pytest.FixtureRequest) -> Profile:
 
 @pytest.fixture
 def published(profile: Profile) -> Published:
-    assert profile.franka is not None
-    return BY_FCI[profile.franka.fci]
+    return BY_FCI[profile.driver_options.fci]
 
 
 def test_joint_limits_are_within_the_published_ones(profile: Profile, published: Published) -> None:
@@ -88,7 +87,7 @@ def test_the_description_has_the_published_kinematics(profile: Profile) -> None:
 
 
 def test_a_reflex_lies_above_the_contact_at_which_the_arm_retreats(profile: Profile) -> None:
-    contact, franka = profile.limits.contact, profile.franka
+    contact, franka = profile.limits.contact, profile.driver_options
     assert franka is not None
     assert contact.force_stop_n < franka.collision_force_n
     assert contact.torque_stop_nm < franka.collision_torque_nm

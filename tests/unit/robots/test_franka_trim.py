@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
-from vla_zenoh.robots.franka.arm import MOST_JOINT_RAD, MOST_M, MOST_RAD, Trim
+from vla_zenoh_franka.arm import MOST_JOINT_RAD, MOST_M, MOST_RAD, Trim
 
 DT_S, TRIM_EVERY = 1e-3, 4
 STIFFNESS, DAMPING, MASS = 2000.0, 90.0, 5.0

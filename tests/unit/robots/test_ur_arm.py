@@ -25,10 +25,10 @@ from ur_peer import (
     SET_WATCHDOG,
     PeerProcess,
 )
+from vla_zenoh_ur.check import ur_arm
 
 from vla_zenoh.errors import NodeError, ProfileError
 from vla_zenoh.kinematics.so3 import log3
-from vla_zenoh.lab.doctor.ur import ur_arm
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.robots.python_driver import PythonDriver
 from vla_zenoh.types import JointReference
@@ -265,7 +265,7 @@ def test_the_check_compares_the_robots_tcp_with_the_description(
     pose = rig.driver.kinematics.forward(AT_HOME_RAD)
     position_m = pose.position_m + [0, 0, off_m]
     rig.peer.put(tcp_pose=[*position_m.tolist(), *log3(pose.rotation).tolist()])
-    found = {each.name: each for each in ur_arm(rig.profile)}
+    found = {each.name: each for each in ur_arm(rig.profile, rig.profile.driver_options)}
     assert found["connection"].level == "ok"
     assert found["state"].found == "robot mode RUNNING, safety mode NORMAL"
     assert found["kinematics"].level == level

@@ -10,6 +10,7 @@ from typing import Any, cast, get_args
 
 import pytest
 
+from vla_zenoh import plugins
 from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.host import own_boot_id
 from vla_zenoh.cli.main import COMMANDS, Group
@@ -18,7 +19,6 @@ from vla_zenoh.keys import NODE_KINDS
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.profile.robot import RobotProfile
 from vla_zenoh.profile.schema import NodeKind
-from vla_zenoh.robots.python_driver import BUILT_IN
 from vla_zenoh.runtime.launch import Host, node_commands
 from vla_zenoh.runtime.supervisor import STOP_ORDER
 from vla_zenoh.types import NodeStatus
@@ -51,9 +51,8 @@ def test_nodes_start_from_the_router_on_and_the_robot_stops_after_what_drives_it
 def test_every_kind_of_node_may_stand_in_a_profile_and_every_robot_driver_is_one() -> None:
     assert set(get_args(NodeKind)) == set(NODE_KINDS)
     robots = {kind for kind, traits in NODE_KINDS.items() if traits.role == "robot"}
-    drivers = get_args(RobotProfile.model_fields["driver"].annotation)
+    drivers = plugins.installed(plugins.ROBOTS)
     assert robots == {RobotProfile.model_construct(driver=name).node for name in drivers}
-    assert set(drivers) == {*robots, *BUILT_IN}
 
 
 def test_every_kind_of_node_has_a_command() -> None:

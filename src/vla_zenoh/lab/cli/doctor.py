@@ -11,6 +11,7 @@ import typer
 import zenoh
 from rich.table import Table
 
+from vla_zenoh import plugins
 from vla_zenoh.bus.host import HOST_VARIABLE
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.cli.options import (
@@ -25,6 +26,7 @@ from vla_zenoh.errors import SecurityError, SessionError
 from vla_zenoh.lab.cli.output import print_json, progress
 from vla_zenoh.lab.doctor import HostFinding, Needs, examine, needs_of
 from vla_zenoh.lab.doctor.access import access
+from vla_zenoh.lab.doctor.plugins import installed_plugins, robot_driver
 from vla_zenoh.lab.doctor.ros2 import ros2_bridge
 from vla_zenoh.lab.doctor.software import robot
 from vla_zenoh.profile import SessionProfile
@@ -36,25 +38,24 @@ def robot_check(
     ] = DEFAULT_PROFILE,
     as_json: JsonOption = False,
 ) -> None:
-    """Connect to a Franka or UR arm, read it, and compare it with its profile. Moves nothing.
+    """Connect to a robot, read it, and compare it with its profile. Moves nothing.
 
-    Its kinematics against the profile's description; of a Franka also joint ranges and limits
-    against the profile's, and no other program may be connected to it. Exits with 1 if something is
-    wrong.
+    For drivers that offer it, as franka and ur do: the robot's kinematics against the profile's
+    description; of a Franka also joint ranges and limits against the profile's, and no other
+    program may be connected to it. Exits with 1 if something is wrong.
     """
-    from vla_zenoh.lab.doctor.fci import fci_arm
-    from vla_zenoh.lab.doctor.ur import ur_arm
-
     loaded = effective_profile(profile)
-    check = {"franka": fci_arm, "ur": ur_arm}.get(loaded.robot.driver)
+    driver = loaded.robot.driver
+    check = plugins.load(plugins.ROBOTS, driver).check_robot
     if check is None:
-        driver = loaded.robot.driver
+        robots = plugins.load_all(plugins.ROBOTS)
+        able = ", ".join(name for name, robot in robots.items() if robot.check_robot)
         fail(
-            f"profile {loaded.name} has robot.driver: {driver}; this checks franka and ur; "
+            f"profile {loaded.name} has robot.driver: {driver}; this checks {able or 'none'}; "
             f"`vla-zenoh profile check {loaded.name}` checks the others"
         )
     with progress("reading the robot"):
-        findings = list(check(loaded))
+        findings = list(check(loaded, loaded.driver_options))
     report(findings, as_json=as_json)
 
 
@@ -112,13 +113,11 @@ def doctor(
         needs, session = needs_of(loaded, host), loaded.session
     with progress("checking this computer"):
         findings = list(examine(needs, functools.partial(try_zenoh, session)))
+        findings += installed_plugins()
         if loaded is not None:
             findings += robot(loaded, host)
             findings += ros2_bridge(loaded, host)
-            if loaded.franka is not None:
-                from vla_zenoh.lab.doctor.fci import fci_host
-
-                findings += fci_host(loaded, host)
+            findings += robot_driver(loaded, host)
             findings += access(loaded, rules, also or ())
     report(findings, as_json=as_json)
 

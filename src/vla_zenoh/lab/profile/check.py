@@ -18,9 +18,9 @@ from vla_zenoh.lab.profile.robot_check import (
     ProfileFault,
     arm,
     braking_advice,
+    driver,
     home_advice,
     joints_advice,
-    robot_file,
     ros2,
     shapes_advice,
     simulator,
@@ -67,7 +67,7 @@ def check_profile(
         known = ", ".join(profile.hosts)
         where = located(("hosts",), f"has no {host!r}{nearest(host, profile.hosts)}", lines)
         return ProfileReport([f"{where} It has: {known}"], [])
-    found = [*arm(profile), *simulator(profile), *robot_file(profile), *ros2(profile)]
+    found = [*arm(profile), *simulator(profile), *driver(profile), *ros2(profile)]
     found += _workers(profile, name)
     here: set[str] = set()  # nodes and workers of this computer, as far as its host is known
     if host is not None:

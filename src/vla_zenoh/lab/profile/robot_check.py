@@ -6,16 +6,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from vla_zenoh import resources
+from vla_zenoh import plugins, resources
 from vla_zenoh.errors import (
     MissingExtraError,
+    PluginError,
     ProfileError,
     RecordError,
     ResourceError,
     VlaZenohError,
     nearest,
 )
-from vla_zenoh.policy.loader import IS_ROBOT, find_model, find_robot_maker, is_robot
 from vla_zenoh.profile import POSE_JOINTS, Profile
 from vla_zenoh.profile.section import Place
 
@@ -242,23 +242,16 @@ def _not_simulated(profile: Profile, error: VlaZenohError) -> Iterator[ProfileFa
     )
 
 
-def robot_file(profile: Profile) -> Iterator[ProfileFault]:
-    """The class in `arm.file`, which is not made: that may move something."""
-    if profile.arm is None or profile.robot.driver != "arm":
-        return
-    path = Path(profile.arm.file).expanduser()
-    if not path.is_file():
-        yield ProfileFault(("arm", "file"), f"there is no file {profile.arm.file}", "arm")
-        return
+def driver(profile: Profile) -> Iterator[ProfileFault]:
+    """What the plug-in of the robot driver finds."""
     try:
-        if find_model(str(path)).missing():
-            return  # its header asks for an environment of its own, in which the node looks
-        maker = find_robot_maker(path)
-        maker.options.check(profile.arm.options, maker.where)
-        if not is_robot(maker.function):
-            yield ProfileFault(("arm",), f"{maker.where} {IS_ROBOT}", "arm")
-    except VlaZenohError as error:
-        yield ProfileFault(("arm",), str(error), "arm")
+        robot = plugins.load(plugins.ROBOTS, profile.robot.driver)
+    except PluginError as error:
+        yield ProfileFault(("robot", "driver"), str(error), profile.robot.node)
+        return
+    name, options = profile.robot.driver, profile.driver_options
+    for place, why, *_ in plugins.faults_of(name, robot.check, profile, options):
+        yield ProfileFault(place, why, profile.robot.node)
 
 
 def ros2(profile: Profile) -> Iterator[ProfileFault]:

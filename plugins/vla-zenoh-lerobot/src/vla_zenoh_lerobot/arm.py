@@ -25,6 +25,7 @@ from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.profile import Profile
 from vla_zenoh.robot import Command, Reading
 from vla_zenoh.types import JointCommand
+from vla_zenoh_lerobot.plugin import LeRobotOptions
 
 LOST_S = 1.0
 """Motors that did not answer for this long count as lost."""
@@ -38,9 +39,8 @@ STILL_S = 0.3
 class LeRobotArm:
     """The arm of a profile with a section lerobot; see `vla_zenoh.robot.Robot`."""
 
-    def __init__(self, profile: Profile) -> None:
-        assert profile.lerobot is not None
-        settings = self._settings = profile.lerobot
+    def __init__(self, profile: Profile, options: LeRobotOptions) -> None:
+        settings = self._settings = options
         names = profile.robot.arm_joints
         self._keys = [f"{name}.pos" for name in settings.motors or names]
         self._gripper = f"{settings.gripper}.pos" if settings.gripper else ""

@@ -19,10 +19,10 @@ from vla_zenoh.errors import MissingExtraError, NodeError, how_to_install
 from vla_zenoh.kinematics.kinematics import Kinematics, make_kinematics
 from vla_zenoh.kinematics.so3 import Pose, pose_distance
 from vla_zenoh.lab.doctor.computer import may_use_priority
-from vla_zenoh.lab.doctor.needs import HostFinding, Level, judged, nodes_on
+from vla_zenoh.lab.doctor.needs import HostFinding, Level, judged
 from vla_zenoh.profile import Profile
-from vla_zenoh.profile.robot import FrankaProfile
-from vla_zenoh.robots.franka.arm import FrankaArm, error_names, flange_pose
+from vla_zenoh_franka.arm import FrankaArm, error_names, flange_pose
+from vla_zenoh_franka.plugin import FrankaOptions
 
 REALTIME_KERNEL = Path("/sys/kernel/realtime")
 NETWORK = Path("/sys/class/net")
@@ -99,25 +99,24 @@ BY_FCI: Mapping[int, Published] = {limits.fci: limits for limits in (PANDA, FR3)
 
 
 # -- the host ---------------------------------------------------------------------------------
-def fci_host(profile: Profile, host: str | None = None) -> Iterator[HostFinding]:
-    """What the 1 kHz loop of a Franka arm needs of this computer; nothing for other robots."""
-    if profile.franka is None or profile.robot.driver != "franka":
-        return
-    if "arm" in nodes_on(profile, host):
-        yield library(profile.franka)
-        yield kernel(profile.franka)
-        yield priority(profile.franka)
-        yield network_card(profile.franka)
-        yield round_trip(profile.franka)
+def fci_host(franka: FrankaOptions) -> Iterator[HostFinding]:
+    """What the 1 kHz loop of a Franka arm needs of this computer."""
+    yield library(franka)
+    yield kernel(franka)
+    yield priority(franka)
+    yield network_card(franka)
+    yield round_trip(franka)
 
 
-def library(franka: FrankaProfile) -> HostFinding:
+def library(franka: FrankaOptions) -> HostFinding:
     """franky is installed, on a libfranka that speaks the version of the profile."""
     name = "FCI: library"
     try:
         found = metadata.distribution(LIBRARY)
     except metadata.PackageNotFoundError:
-        return HostFinding(name, "fail", f"no {LIBRARY}", how_to_install("franka"))
+        return HostFinding(
+            name, "fail", f"no {LIBRARY}", how_to_install("franky", "vla-zenoh-franka")
+        )
     files = [Path(str(file)).name for file in found.files or ()]
     versions = [
         match[1] for file in files if (match := re.match(r"libfranka.*\.so\.([\d.]+)$", file))
@@ -132,7 +131,7 @@ def library(franka: FrankaProfile) -> HostFinding:
     return HostFinding(name, "ok", f"{text}, for FCI {franka.fci}")
 
 
-def kernel(franka: FrankaProfile, flag: Path = REALTIME_KERNEL) -> HostFinding:
+def kernel(franka: FrankaOptions, flag: Path = REALTIME_KERNEL) -> HostFinding:
     """The kernel is a real-time one."""
     real_time = flag.exists() and flag.read_text().strip() == "1"
     what = " is no real-time kernel; the robot ends a motion after 20 lost cycles"
@@ -145,7 +144,7 @@ def kernel(franka: FrankaProfile, flag: Path = REALTIME_KERNEL) -> HostFinding:
     )
 
 
-def priority(franka: FrankaProfile) -> HostFinding:
+def priority(franka: FrankaOptions) -> HostFinding:
     """This user may use the priority that libfranka takes."""
     may = may_use_priority(HIGHEST_PRIORITY)
     found = f"SCHED_FIFO {HIGHEST_PRIORITY} is {'' if may else 'not '}permitted"
@@ -153,7 +152,7 @@ def priority(franka: FrankaProfile) -> HostFinding:
     return judged("FCI: priority", may, found, advice, _level(franka))
 
 
-def network_card(franka: FrankaProfile, folder: Path = NETWORK) -> HostFinding:
+def network_card(franka: FrankaOptions, folder: Path = NETWORK) -> HostFinding:
     """The way to the robot is a cable of 1 Gbit/s."""
     name, address = "FCI: network card", franka.address
     route = _output("ip", "-o", "route", "get", address)
@@ -176,7 +175,7 @@ def network_card(franka: FrankaProfile, folder: Path = NETWORK) -> HostFinding:
     return judged(name, speed >= 1000, f"{card}, {speed} Mbit/s", advice)
 
 
-def round_trip(franka: FrankaProfile) -> HostFinding:
+def round_trip(franka: FrankaOptions) -> HostFinding:
     """Packets to the robot and back take less than one of its cycles."""
     name, address = "FCI: round trip", franka.address
     if shutil.which("ping") is None:
@@ -192,7 +191,7 @@ def round_trip(franka: FrankaProfile) -> HostFinding:
     return judged(name, most_ms < MOST_MS, found, advice)
 
 
-def _level(franka: FrankaProfile) -> Level:
+def _level(franka: FrankaOptions) -> Level:
     return "fail" if franka.realtime == "enforce" else "warn"
 
 
@@ -207,24 +206,23 @@ def _output(*command: str) -> str:
 
 
 # -- the arm ----------------------------------------------------------------------------------
-def fci_arm(profile: Profile) -> Iterator[HostFinding]:
+def fci_arm(profile: Profile, franka: FrankaOptions) -> Iterator[HostFinding]:
     """Connect to the arm, read it and compare it with the profile; moves and sets nothing."""
-    assert profile.franka is not None
     try:
-        arm = FrankaArm(profile)
+        arm = FrankaArm(profile, franka)
         arm.connect()
     except (NodeError, MissingExtraError) as error:
         yield HostFinding("connection", "fail", str(error), "see `vla-zenoh doctor --profile`")
         return
     try:
         robot = arm.robot
-        yield HostFinding("connection", "ok", f"{profile.franka.address}, FCI {profile.franka.fci}")
+        yield HostFinding("connection", "ok", f"{franka.address}, FCI {franka.fci}")
         yield _state(robot)
         yield _readings(robot)
         yield _flange(robot)
-        if profile.franka.fci >= BY_FCI[10].fci:  # an older one sends no description
+        if franka.fci >= BY_FCI[10].fci:  # an older one sends no description
             yield from _description(robot.model_urdf, profile)
-        yield _limits(profile)
+        yield _limits(profile, franka)
     finally:
         arm.close()
 
@@ -283,9 +281,8 @@ def _description(urdf: str, profile: Profile) -> Iterator[HostFinding]:
     yield judged("joint ranges", not names, found, "narrow robot.joint_range_rad", "fail")
 
 
-def _limits(profile: Profile) -> HostFinding:
-    assert profile.franka is not None
-    published = BY_FCI[profile.franka.fci]
+def _limits(profile: Profile, franka: FrankaOptions) -> HostFinding:
+    published = BY_FCI[franka.fci]
     above = [
         f"limits.joint.{name}"
         for name in ("velocity_rad_s", "acceleration_rad_s2", "jerk_rad_s3")
@@ -295,7 +292,7 @@ def _limits(profile: Profile) -> HostFinding:
         values = [value for _, value in getattr(profile.limits, section)]
         if np.any(np.array(values) > getattr(published, section)):
             above.append(f"limits.{section}")
-    within = f"within those published for FCI {profile.franka.fci}"
+    within = f"within those published for FCI {franka.fci}"
     found = f"above the published ones: {', '.join(above)}" if above else within
     return judged("limits", not above, found, level="fail")
 

@@ -22,6 +22,7 @@ from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.profile import Profile
 from vla_zenoh.robot import Command, Reading
 from vla_zenoh.types import FloatArray, JointCommand
+from vla_zenoh_ur.plugin import UrOptions
 
 PORTS = (29999, 30004)
 """Dashboard server and RTDE."""
@@ -80,14 +81,13 @@ _ABANDONED: list[Any] = []
 class UrArm:
     """The arm of a profile with a section ur; see `vla_zenoh.robot.Robot`."""
 
-    def __init__(self, profile: Profile) -> None:
-        assert profile.ur is not None
-        self._settings, self.address = profile.ur, profile.ur.address
+    def __init__(self, profile: Profile, options: UrOptions) -> None:
+        self._settings, self.address = options, options.address
         modules = "rtde_control", "rtde_receive", "dashboard_client"
         try:
             self._library: dict[str, Any] = {name: import_module(name) for name in modules}
         except ImportError as error:
-            raise MissingExtraError("ur_rtde", "ur") from error
+            raise MissingExtraError("ur_rtde", "rtde", "vla-zenoh-ur") from error
         self._rate_hz = min(profile.timing.command_hz, 500.0)
         self._period_s = 1.0 / profile.timing.command_hz
         kinematics = make_kinematics(profile)

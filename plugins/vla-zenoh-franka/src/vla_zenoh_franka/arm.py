@@ -25,9 +25,10 @@ from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.kinematics.so3 import exp3, log3, quat_from_rotation, rotation_from_quat
 from vla_zenoh.profile import Profile
 from vla_zenoh.robot import Command, Reading
-from vla_zenoh.robots.franka.hand import Hand
 from vla_zenoh.runtime.process import realtime_children
 from vla_zenoh.types import FloatArray, JointCommand
+from vla_zenoh_franka.hand import Hand
+from vla_zenoh_franka.plugin import FrankaOptions
 
 REST_S = 1.0
 """The loop ends after this long without a set-point."""
@@ -68,13 +69,12 @@ class FrankaArm:
         robot: franky's, once connected.
     """
 
-    def __init__(self, profile: Profile) -> None:
-        assert profile.franka is not None
-        self._profile, self._settings = profile, profile.franka
+    def __init__(self, profile: Profile, options: FrankaOptions) -> None:
+        self._profile, self._settings = profile, options
         try:
             self._franky: Any = import_module("franky")
         except ImportError as error:
-            raise MissingExtraError("franky", "franka") from error
+            raise MissingExtraError("franky", "franky", "vla-zenoh-franka") from error
         self._kinematics = make_kinematics(profile)
         self.robot: Any = None
         self._hand: Hand | None = None

@@ -9,16 +9,17 @@ from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.kinematics.so3 import Pose, exp3, pose_distance
 from vla_zenoh.lab.doctor.needs import HostFinding, judged
 from vla_zenoh.profile import Profile
-from vla_zenoh.robots.ur_arm import WELL, UrArm
+from vla_zenoh_ur.arm import WELL, UrArm
+from vla_zenoh_ur.plugin import UrOptions
 
 APART_M, APART_RAD = 0.01, 0.03
 """An arm's own calibration differs from that of its type by some millimetres."""
 
 
-def ur_arm(profile: Profile) -> Iterator[HostFinding]:
+def ur_arm(profile: Profile, options: UrOptions) -> Iterator[HostFinding]:
     """Connect to the arm, read it and compare it with the profile."""
     try:
-        arm = UrArm(profile)
+        arm = UrArm(profile, options)
         arm.open()
     except (NodeError, MissingExtraError) as error:
         yield HostFinding("connection", "fail", str(error), "see docs/how-to/ur-rtde.md")

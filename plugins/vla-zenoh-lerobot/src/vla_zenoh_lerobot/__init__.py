@@ -1,0 +1,1 @@
+"""Robot classes of LeRobot, run in an environment of their own."""

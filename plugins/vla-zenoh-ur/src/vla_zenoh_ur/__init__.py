@@ -1,0 +1,1 @@
+"""UR arms over RTDE, without ROS."""

@@ -1,0 +1,39 @@
+"""Checks of plug-ins: each can be imported, and what that of the robot says of this computer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from vla_zenoh import plugins
+from vla_zenoh.errors import PluginError
+from vla_zenoh.lab.doctor.needs import HostFinding, nodes_on
+from vla_zenoh.profile import Profile
+
+GROUPS = (plugins.ROBOTS,)
+
+
+def installed_plugins() -> Iterator[HostFinding]:
+    """The plug-ins of every group, and those that cannot be imported."""
+    for group in GROUPS:
+        name = f"plug-ins: {group.noun}s"
+        try:
+            known, faults = plugins.installed(group), plugins.broken(group)
+        except PluginError as error:
+            yield HostFinding(name, "fail", str(error))
+            continue
+        works = ", ".join(entry for entry in known if entry not in faults)
+        yield HostFinding(name, "ok" if works else "fail", works or "none: run make setup")
+        for why in faults.values():
+            yield HostFinding(name, "warn", why, "mend or uninstall that package")
+
+
+def robot_driver(profile: Profile, host: str | None) -> Iterator[HostFinding]:
+    """What the robot driver of a profile needs of this computer, if it runs there."""
+    if profile.robot.node not in nodes_on(profile, host):
+        return
+    try:
+        robot = plugins.load(plugins.ROBOTS, profile.robot.driver)
+    except PluginError as error:
+        yield HostFinding("robot driver", "fail", str(error))
+        return
+    yield from robot.check_host(profile, profile.driver_options)

@@ -1,0 +1,193 @@
+"""Plug-ins: robots, cameras, models and benchmarks that installed packages bring.
+
+A package declares an entry point in one of the groups below, whose value is one small declaration
+from this module. Ours are declared in the same way, in ``pyproject.toml``. Whoever reads a profile
+imports its declarations, so they import the library of a device only where it is used.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Any, Generic, NamedTuple, TypeVar
+
+from pydantic import BaseModel
+
+from vla_zenoh.errors import PluginError, in_words, nearest
+from vla_zenoh.robot import Robot
+
+OWN_ENVIRONMENT_VARIABLE = "VLA_ZENOH_WORKER_ENVIRONMENT"
+"""Set in an environment made for one model: ``NAME=PATH``. It may lack all other plug-ins."""
+Fault = tuple[Any, ...]
+"""Keys from the top of the profile down to what is wrong, and a sentence that continues them; see
+`vla_zenoh.profile.section.Fault`."""
+
+
+def _nothing(profile: Any, options: Any) -> Iterable[Any]:
+    return ()
+
+
+def _no_script(options: Any) -> Path | None:
+    return None
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotPlugin:
+    """A kind of robot: a value of ``robot.driver``. Group ``vla_zenoh.robots``.
+
+    Every function takes the `Profile` and the checked `options`, an instance of that class or None.
+
+    Args:
+        make: returns the robot, see `vla_zenoh.robot.Robot`, without connecting to it. None: the
+            driver is a node of its own, as ``sim`` and ``ros2`` are.
+        options: of the profile's section that has the name of the plug-in. A subclass of
+            `vla_zenoh.profile.section.Section` rejects unknown keys and NaN. None: no section.
+        commands: values of ``robot.command`` that it takes.
+        paths: names of options that are files, relative to the profile.
+        script: of the options: a file whose PEP 723 header asks for an environment of its own, in
+            which `make` is then called.
+        contradictions: faults of a profile, found whenever it is loaded.
+        check: further faults, found by `vla-zenoh profile check`; may read files.
+        check_host: yields `vla_zenoh.lab.doctor.HostFinding` about the computer that runs the node.
+        check_robot: yields them about the robot, for `vla-zenoh robot check`; it moves nothing.
+    """
+
+    make: Callable[[Any, Any], Robot] | None = None
+    options: type[BaseModel] | None = None
+    commands: tuple[str, ...] = ("pose", "joint")
+    paths: tuple[str, ...] = ()
+    script: Callable[[Any], Path | None] = _no_script
+    contradictions: Callable[[Any, Any], Iterable[Fault]] = _nothing
+    check: Callable[[Any, Any], Iterable[Fault]] = _nothing
+    check_host: Callable[[Any, Any], Iterable[Any]] = _nothing
+    check_robot: Callable[[Any, Any], Iterable[Any]] | None = None
+
+
+Declaration = TypeVar("Declaration")
+
+
+class Group(NamedTuple, Generic[Declaration]):
+    """Plug-ins of one kind.
+
+    Args:
+        name: of the entry point group.
+        noun: what one of them is called in messages.
+        kind: class of their declarations.
+    """
+
+    name: str
+    noun: str
+    kind: type[Declaration]
+
+
+ROBOTS = Group("vla_zenoh.robots", "robot driver", RobotPlugin)
+
+
+def installed(group: Group[Any]) -> Mapping[str, EntryPoint]:
+    """Name -> entry point of every plug-in of a group, sorted; nothing is imported.
+
+    Raises:
+        PluginError: two packages bring the same name.
+    """
+    return _found(group.name, tuple(sys.path))
+
+
+@lru_cache(maxsize=16)
+def _found(group: str, path: tuple[str, ...]) -> Mapping[str, EntryPoint]:
+    out: dict[str, EntryPoint] = {}
+    for entry in sorted(entry_points(group=group), key=lambda entry: entry.name):
+        other = out.setdefault(entry.name, entry)
+        if other is not entry:
+            raise PluginError(
+                f"{package_of(other)} and {package_of(entry)} both bring {entry.name!r} of "
+                f"{group}: uninstall one of them"
+            )
+    return out
+
+
+def package_of(entry: EntryPoint) -> str:
+    """Name of the package that declares a plug-in."""
+    return entry.dist.name if entry.dist is not None else "a package"
+
+
+def load(group: Group[Declaration], name: str) -> Declaration:
+    """The declaration of one plug-in; the others are not imported.
+
+    Raises:
+        PluginError: it is not installed, cannot be imported, or is something else.
+    """
+    known = installed(group)
+    if name not in known:
+        raise PluginError(
+            f"no {group.noun} {name!r} is installed{nearest(name, known)} Installed: "
+            f"{', '.join(known) or 'none'}. Install the package that brings it: "
+            "docs/how-to/plugins.md"
+        )
+    entry = known[name]
+    where = f"the {group.noun} {name!r} of {package_of(entry)}"
+    try:
+        found = entry.load()
+    except (Exception, SystemExit) as error:
+        raise PluginError(f"{where} cannot be imported: {in_words(error)}") from error
+    if not isinstance(found, group.kind):
+        raise PluginError(
+            f"{where}: {entry.value} is of type {type(found).__name__}, wanted a "
+            f"vla_zenoh.plugins.{group.kind.__name__}"
+        )
+    return found
+
+
+def load_all(group: Group[Declaration]) -> dict[str, Declaration]:
+    """Every plug-in of a group that can be imported, by name; `broken` has the others."""
+    out: dict[str, Declaration] = {}
+    for name in installed(group):
+        try:
+            out[name] = load(group, name)
+        except PluginError:
+            continue
+    return out
+
+
+def broken(group: Group[Any]) -> dict[str, str]:
+    """Name -> reason of every plug-in of a group that cannot be imported."""
+    out: dict[str, str] = {}
+    for name in installed(group):
+        try:
+            load(group, name)
+        except PluginError as error:
+            out[name] = str(error)
+    return out
+
+
+def faults_of(
+    driver: str, check: Callable[[Any, Any], Iterable[Fault]], profile: Any, options: Any
+) -> list[Fault]:
+    """What a `check` of a robot driver finds; that it fails is a fault as well."""
+    try:
+        return list(check(profile, options))
+    except Exception as error:
+        return [(("robot", "driver"), f"the check of {driver} itself failed: {in_words(error)}")]
+
+
+def in_own_environment() -> bool:
+    """Whether this process runs in an environment made for one model."""
+    return OWN_ENVIRONMENT_VARIABLE in os.environ
+
+
+def how_to_repeat(group: Group[Any], name: str) -> list[str]:
+    """Options of ``uv run`` that put the package of a plug-in into another environment."""
+    entry = installed(group)[name]
+    if entry.dist is None:
+        return []
+    origin = json.loads(entry.dist.read_text("direct_url.json") or "{}")
+    url = str(origin.get("url", ""))
+    if origin.get("dir_info", {}).get("editable"):
+        return ["--with-editable", url.removeprefix("file://")]
+    pinned = f"{entry.dist.name} @ {url}" if url else f"{entry.dist.name}=={entry.dist.version}"
+    return ["--with", pinned]
