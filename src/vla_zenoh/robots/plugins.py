@@ -9,7 +9,6 @@ from pydantic import Field
 
 from vla_zenoh.errors import VlaZenohError
 from vla_zenoh.plugins import Fault, RobotPlugin
-from vla_zenoh.policy.loader import IS_ROBOT, find_model, find_robot_maker, is_robot, make_robot
 from vla_zenoh.profile.profile import Profile
 from vla_zenoh.profile.robot import Options
 from vla_zenoh.profile.section import Section, Word
@@ -32,7 +31,10 @@ class ArmOptions(Section):
         return Path(self.file).expanduser()
 
 
+# Every command that reads a profile imports this file, so the loader of models is imported below.
 def _make(profile: Profile, options: ArmOptions) -> Robot:
+    from vla_zenoh.policy.loader import make_robot
+
     return make_robot(options.path, options.options)
 
 
@@ -42,6 +44,8 @@ def _script(options: ArmOptions) -> Path | None:
 
 def _check(profile: Profile, options: ArmOptions) -> Iterator[Fault]:
     """Faults of the class in the file, which is not made: that may move something."""
+    from vla_zenoh.policy.loader import IS_ROBOT, find_model, find_robot_maker, is_robot
+
     if not options.path.is_file():
         yield ("arm", "file"), f"there is no file {options.file}"
         return
