@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import socket
-import sys
 import threading
 import time
 from collections.abc import Mapping
-from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Literal
 
 import zenoh
@@ -253,45 +249,3 @@ def alive_robots(session: zenoh.Session, keys: Keys) -> list[str]:
         named = [Keys.of(str(r.ok.key_expr), keys.root) for r in replies if r.ok is not None]
         found |= {one.robot for one in named if one is not None}
     return sorted(found)
-
-
-OPEN_FILES = "/proc/self/fd"
-
-
-class TcpUserTimeout:
-    """TCP_USER_TIMEOUT of this process's connections: the kernel closes dead ones. Linux only.
-
-    Zenoh closes a link that fell silent. But if the kernel still holds data for it, the end of a
-    TLS session waits until that is sent, i.e. as long as the network is down. A client that
-    reconnects before then is taken for a second link of the old session, and is lost with it
-    (eclipse-zenoh/zenoh#2806). So the kernel has to drop such data.
-
-    The sockets belong to Zenoh; they are found among the open files of the process.
-    """
-
-    def __init__(self, timeout_s: float) -> None:
-        self._timeout_ms = round(timeout_s * 1e3)
-        self._known: set[str] = set()
-
-    def apply(self) -> int:
-        """Set the timeout on every new connection; returns the number of all connections."""
-        if sys.platform != "linux":
-            return 0
-        found: set[str] = set()
-        for name in os.listdir(OPEN_FILES):
-            with suppress(OSError):  # closed in the meantime
-                target = os.readlink(f"{OPEN_FILES}/{name}")
-                if not target.startswith("socket:"):
-                    continue
-                if target in self._known or self._set_timeout(int(name)):
-                    found.add(target)
-        self._known = found
-        return len(found)
-
-    def _set_timeout(self, descriptor: int) -> bool:
-        with socket.socket(fileno=os.dup(descriptor)) as known:
-            internet = known.family in (socket.AF_INET, socket.AF_INET6)
-            if not internet or known.type != socket.SOCK_STREAM:
-                return False
-            known.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, self._timeout_ms)
-            return True

@@ -12,7 +12,7 @@ from typing import Any
 import zenoh
 
 from vla_zenoh.bus.node import Node
-from vla_zenoh.bus.session import TcpUserTimeout, open_session, session_config
+from vla_zenoh.bus.session import open_session, session_config
 from vla_zenoh.errors import NodeError
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.schema import address_of, is_loopback
@@ -45,7 +45,6 @@ def run_router(
     os.environ.setdefault(RUNTIME_VARIABLE, RUNTIME)
     with open_session(profile.session, **options) as session:
         node = Node(options["identity"], profile, session, host=host, routes=True)
-        impatience = TcpUserTimeout(profile.session.lease_ms / 1e3)
         expiry = CertificateExpiry(profile.session.security)
         clients = Clients(session)
         detail: dict[str, Any] = {"listen": list(profile.session.listen)}
@@ -55,7 +54,6 @@ def run_router(
             here = all(map(is_loopback, profile.session.listen))
             detail["security"] = "loopback" if here else "insecure"
         while not stop.wait(POLL_S):
-            impatience.apply()
             detail |= {"clients": clients.known(), "links": len(list(session.info.links()))}
             if profile.session.security is not None:
                 detail["certificates"] = expiry.outlook._asdict()
