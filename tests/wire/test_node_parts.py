@@ -16,7 +16,8 @@ import zenoh
 from camera_rig import await_match, free_endpoint, until
 
 from vla_zenoh.bus.buffers import CallbackRing, LatestSample, ReceivedSample, ZenohRing
-from vla_zenoh.bus.clock import ADOPT_S, Clock, decode_stamps
+from vla_zenoh.bus.clock import ADOPT_S, Clock
+from vla_zenoh.bus.name_check import AWAY_S, NEW_S, NameCheck
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import MAX_MESSAGE_BYTES, alive_nodes, open_session
 from vla_zenoh.errors import CodecError, NodeError
@@ -27,8 +28,8 @@ from vla_zenoh.types import Header, SingleWriterFilter
 
 SILENCE_NS = 500_000_000
 STEP_TOLERANCE_S = 0.002
-AWAY_NS = 300_000_000
-"""An absence of a node, in this test, after which it may have been replaced."""
+SOON_S = 0.3
+"""For so long a node of these tests is new."""
 
 
 def refused(speaker: SingleWriterFilter, header: Header, mono_ns: int) -> str | None:
@@ -134,7 +135,9 @@ def test_a_second_node_of_a_name_that_a_new_router_did_not_know_of_ends(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     with two_sessions() as (profile, one, other):
+        monkeypatch.setattr("vla_zenoh.bus.name_check.NEW_S", SOON_S)
         first = Node("command", profile, one)
+        time.sleep(SOON_S)
         monkeypatch.setattr("vla_zenoh.bus.node.alive_nodes", lambda *_, **__: set())
         second = Node("command", profile, other)
 
@@ -155,12 +158,12 @@ def test_a_second_node_of_a_name_that_a_new_router_did_not_know_of_ends(
 
 STOPPED_NODE = """
 import sys, time
-from vla_zenoh.bus import clock
+from vla_zenoh.bus import name_check
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.profile import load_profile, override
 
-clock.AWAY_NS = 1_500_000_000  # it asks once a second
+name_check.AWAY_S = 1.5
 where = {"listen": [sys.argv[1]], "connect": [sys.argv[1]]}
 profile = override(load_profile("panda_sim"), {"session": where})
 with open_session(profile.session) as session:
@@ -172,7 +175,10 @@ with open_session(profile.session) as session:
 """
 
 
-def test_a_stopped_node_that_was_replaced_ends_when_it_goes_on_and_not_the_new_one() -> None:
+def test_a_stopped_node_that_was_replaced_ends_when_it_goes_on_and_not_the_new_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("vla_zenoh.bus.name_check.NEW_S", SOON_S)
     with two_sessions() as (profile, one, other):
         words = [sys.executable, "-c", STOPPED_NODE, *profile.session.connect]
         with subprocess.Popen(
@@ -187,6 +193,7 @@ def test_a_stopped_node_that_was_replaced_ends_when_it_goes_on_and_not_the_new_o
                 time.sleep(2.0)
                 until("its token is gone", lambda: not alive_nodes(one, profile.keys), 30.0)
                 replacement = Node("command", profile, other)
+                time.sleep(SOON_S)
                 process.send_signal(signal.SIGCONT)
 
                 def ends() -> bool:
@@ -201,37 +208,28 @@ def test_a_stopped_node_that_was_replaced_ends_when_it_goes_on_and_not_the_new_o
                 process.kill()
 
 
-@pytest.mark.parametrize("replaced", [True, False])
-def test_the_age_of_a_node_begins_again_after_a_long_absence_and_not_after_a_short_one(
-    monkeypatch: pytest.MonkeyPatch, replaced: bool
+@pytest.mark.parametrize(
+    ("away_s", "ends"), [(AWAY_S - 1.0, False), (AWAY_S + 1.0, True)], ids=["short", "long"]
+)
+def test_a_node_that_was_away_for_long_asks_whether_it_was_replaced(
+    monkeypatch: pytest.MonkeyPatch, away_s: float, ends: bool
 ) -> None:
-    endpoint = free_endpoint()
-    where = {"session": {"listen": [endpoint], "connect": [endpoint]}}
-    profile = override(load_profile("panda_sim"), where)
-    router = open_session(profile.session, mode="router")
-    with open_session(profile.session) as session:
-        node = Node("command", profile, session)
-        began_ns = time.monotonic_ns()
-        if replaced:
-            monkeypatch.setattr("vla_zenoh.bus.clock.AWAY_NS", AWAY_NS)
-        router.close()
-        until("the link is lost", lambda: not session.info.routers_zid())
-        time.sleep(2 * AWAY_NS / 1e9)
-        node.publish_status("inactive")
-        with (
-            open_session(profile.session, mode="router"),
-            open_session(profile.session) as asking,
-        ):
-            came_ns = time.monotonic_ns()
-            until("it answers", lambda: list(asking.get(profile.keys.clock("command"))), 30.0)
-            answer = next(iter(asking.get(profile.keys.clock("command"))))
-            age_ns = decode_stamps(answer.ok.payload.to_bytes())[2]
-            now_ns = time.monotonic_ns()
-            if replaced:
-                assert age_ns < now_ns - came_ns
-            else:
-                assert age_ns > came_ns - began_ns
-        node.close()
+    now_s = [0.0]
+    monkeypatch.setattr(NameCheck, "_now_s", staticmethod(lambda: now_s[0]))
+    with two_sessions() as (profile, one, other):
+        key = profile.keys.clock("command")
+        check = NameCheck(one, key)
+        replacement = Node("command", profile, other)
+        until("the other one answers", lambda: list(one.get(key)))
+        for passed_s in (NEW_S + 1.0, away_s):
+            now_s[0] += passed_s
+            check.poll()
+        if ends:
+            until("it is told", lambda: check.taken)
+        else:
+            assert list(one.get(key))
+            assert not check.taken
+        replacement.close()
 
 
 @pytest.mark.parametrize("make", [LatestSample, partial(CallbackRing, 4), partial(ZenohRing, 4)])

@@ -11,7 +11,6 @@ counts, and half its round trip is the uncertainty: a bound, not a guess.
 
 from __future__ import annotations
 
-import random
 import threading
 import time
 from collections import deque
@@ -36,8 +35,6 @@ ASK_PERIOD_S = 1.0
 FIRST_ASKS, FIRST_PERIOD_S = 8, 0.1
 """The first queries follow each other quickly: one of them will be undisturbed."""
 PATIENCE_S = 2.0
-AWAY_NS = 10_000_000_000
-"""A node that was away for longer may have been replaced."""
 FORGET_S = 30.0
 """An offset is discarded after this time without a reply."""
 HEARD_PATIENCE_S = 2.0
@@ -287,11 +284,7 @@ class _Peer:
 
 class ClockSync:
     """Clock offsets of the nodes other than `name`, and stamps converted with them, see
-    `ClockOffsetFilter`.
-
-    `duplicate`: another node of this `name`, which has been there for longer, replied as well.
-    `routes` means a router's session.
-    """
+    `ClockOffsetFilter`."""
 
     def __init__(
         self,
@@ -300,19 +293,12 @@ class ClockSync:
         clock: Clock,
         name: str,
         bound_s: float,
-        *,
-        routes: bool = False,
     ) -> None:
         self._session, self._keys, self._clock, self._name = session, keys, clock, name
         self._bound_s = bound_s
-        self._routes = routes
-        self._since_ns = self._linked_ns = time.monotonic_ns() + suspended_ns()
         self._lock = threading.Lock()
         self._peers: dict[str, _Peer] = {}
         self._next_look_s = 0.0
-        own = ClockOffsetFilter(bound_s)
-        self._own = _Peer(keys.clock(name), own, time.monotonic(), alive=True)
-        self.duplicate = False
 
     def track(self, node: str, *, alive: bool = True) -> None:
         """Measure the clock of `node` from now on; invalid names are ignored."""
@@ -339,36 +325,28 @@ class ClockSync:
         if now_s < self._next_look_s:
             return
         self._next_look_s = now_s + FIRST_PERIOD_S / 2
-        for node, peer in [*self._peers.items(), (self._name, self._own)]:
+        for node, peer in list(self._peers.items()):
             if now_s >= peer.next_ask_s:
                 peer.asks += 1
                 peer.next_ask_s = now_s + (
                     FIRST_PERIOD_S if peer.asks <= FIRST_ASKS else ASK_PERIOD_S
                 )
-                if peer is self._own and (self._routes or self._session.info.routers_zid()):
-                    self._age_ns()
                 self._ask(peer)
-            if peer is not self._own and peer.forgotten(now_s):
+            if peer.forgotten(now_s):
                 with self._lock:  # room for others; it comes back with its next sample
                     del self._peers[node]
 
     def _ask(self, peer: _Peer) -> None:
         asked_ns = time.monotonic_ns()
-        own = peer is self._own
 
         def on_reply(reply: zenoh.Reply) -> None:
             got_ns = time.monotonic_ns()
             if reply.ok is None:
                 return
             try:
-                heard_ns, said_ns, age_ns = decode_stamps(
-                    bytes_of(reply.ok.payload, MAX_STAMPS_BYTES)
-                )
+                heard_ns, said_ns = decode_stamps(bytes_of(reply.ok.payload, MAX_STAMPS_BYTES))
             except CodecError:
                 return  # not one of our nodes' clocks
-            if own:
-                self.duplicate |= age_ns > self._age_ns()
-                return
             with self._lock:
                 if peer.filter.add(Exchange(asked_ns, heard_ns, said_ns, got_ns)):
                     peer.answered_s = time.monotonic()
@@ -377,26 +355,13 @@ class ClockSync:
             peer.key,
             zenoh.handlers.Callback(on_reply, indirect=False),
             timeout=PATIENCE_S,
-            allowed_destination=zenoh.Locality.REMOTE if own else None,
             **QOS[Kind.CONTROL],
         )
-
-    def _age_ns(self) -> int:
-        """For how long this node has been there; called while it has a link.
-
-        It begins again after a long absence (lost link, stopped process, sleep of the computer):
-        who was started meanwhile in its place stays. Chance decides between two that were away.
-        """
-        now_ns = time.monotonic_ns() + suspended_ns()
-        if now_ns - self._linked_ns > AWAY_NS:
-            self._since_ns = now_ns + random.randrange(1_000_000_000)
-        self._linked_ns = now_ns
-        return now_ns - self._since_ns
 
     def reply(self, query: zenoh.Query) -> None:
         """Reply to a query of this node's clock with the times of its arrival and of this reply."""
         reply = {"heard_ns": self._clock.wall_ns(), "said_ns": self._clock.wall_ns()}
-        query.reply(self._own.key, message.pack(reply | {"age_ns": self._age_ns()}))
+        query.reply(self._keys.clock(self._name), message.pack(reply))
 
     def offsets(self) -> dict[str, ClockOffset]:
         """Node -> its clock minus ours, of those that replied lately."""
@@ -421,12 +386,11 @@ class ClockSync:
         return shift_stamps(header, record, ahead_ns) if ahead_ns else (header, record)
 
 
-def decode_stamps(payload: bytes) -> tuple[int, int, int]:
-    """Times (ns) of arrival and reply of a query on the peer's wall clock, and for how long (ns)
-    the peer has been there, or a `CodecError`."""
+def decode_stamps(payload: bytes) -> tuple[int, int]:
+    """Times (ns) of arrival and reply of a query on the peer's wall clock, or a `CodecError`."""
     found = message.unpack(payload)
     found = found if isinstance(found, dict) else {}
-    heard, said, age = (found.get(name) for name in ("heard_ns", "said_ns", "age_ns"))
-    if type(heard) is not int or type(said) is not int or type(age) is not int:
-        raise CodecError("shape", "a clock replies with heard_ns, said_ns and age_ns")
-    return heard, said, age
+    heard, said = found.get("heard_ns"), found.get("said_ns")
+    if type(heard) is not int or type(said) is not int:
+        raise CodecError("shape", "a clock replies with heard_ns and said_ns")
+    return heard, said

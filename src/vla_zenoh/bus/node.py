@@ -24,6 +24,7 @@ from vla_zenoh.bus.buffers import (
 from vla_zenoh.bus.clock import Clock, ClockSync
 from vla_zenoh.bus.host import own_host_id
 from vla_zenoh.bus.metrics import EventThrottle, Traffic
+from vla_zenoh.bus.name_check import NameCheck
 from vla_zenoh.bus.reception import REMEDY, SHARE, Reception, lost_in_words
 from vla_zenoh.bus.session import QOS, alive_nodes, open_session
 from vla_zenoh.codec import records
@@ -142,7 +143,8 @@ class Node:
         if alive_nodes(session, self.keys, name, routes=routes):
             raise self._duplicate()
         bound_s = profile.timing.max_clock_offset_s
-        self.clocks = ClockSync(session, self.keys, self.clock, name, bound_s, routes=routes)
+        self.clocks = ClockSync(session, self.keys, self.clock, name, bound_s)
+        self._name_check = NameCheck(session, self.keys.clock(name), routes=routes)
         self.serve(self.keys.clock(name), self.clocks.reply)
         self._token = session.liveliness().declare_token(self.keys.alive(name))
         self._status = self.declare_publisher(self.keys.status(name), Kind.TELEMETRY)
@@ -233,17 +235,17 @@ class Node:
         """Whether `publish_status` would publish now; lets a fast loop skip collecting details.
 
         Raises:
-            NodeError: a node of this name has been there for longer, which a router that had just
-                been restarted did not know of yet; or which took the place of this one.
+            NodeError: another node of this name was there already, see `NameCheck`.
         """
         self._poll()
-        if self.clocks.duplicate:
+        if self._name_check.taken:
             raise self._duplicate()
         due = time.monotonic() - self._status_s >= STATUS_PERIOD_S
         return due or state != self._last_state
 
     def _poll(self) -> None:
         self.clocks.poll()
+        self._name_check.poll()
         self._report_rejected()
         self._events.poll()
 

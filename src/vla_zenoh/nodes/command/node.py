@@ -21,7 +21,6 @@ from vla_zenoh.control.commanded_part import CommandedPart
 from vla_zenoh.control.commander import Commander, Outputs, Setting
 from vla_zenoh.control.commander_io import State
 from vla_zenoh.control.reachability import ReachabilityFilter
-from vla_zenoh.errors import NodeError
 from vla_zenoh.keys import Kind
 from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.nodes.command.inputs import CommandInputs
@@ -96,7 +95,6 @@ class CommandNode:
         self._task_out = node.declare_publisher(keys.task, Kind.CONTROL)
         self._last_task = 0.0
         self._next_chores_ns = self._busy_ns = 0
-        self._replaced: NodeError | None = None
         self._serve_settings()
 
     def _serve_settings(self) -> None:
@@ -117,21 +115,20 @@ class CommandNode:
         """Run until `stop` is set, then brake and exit.
 
         Raises:
-            NodeError: another node of this name runs; the arm was braked first.
+            NodeError: another node of this name was there already.
         """
         sys.setswitchinterval(SWITCH_INTERVAL_S)
         gc.collect()
         gc.freeze()
-        with realtime_thread() as self._status.realtime:
-            self._loop(stop)
-        if self._latch is not None:
-            self._latch.close()
-        if self._replaced is None:
+        try:
+            with realtime_thread() as self._status.realtime:
+                self._loop(stop)
+        finally:
+            if self._latch is not None:
+                self._latch.close()
             self.node.publish_end()
-        self.node.close()
-        gc.unfreeze()  # so that the interpreter frees everything at exit
-        if self._replaced is not None:
-            raise self._replaced
+            self.node.close()
+            gc.unfreeze()  # so that the interpreter frees everything at exit
 
     def _loop(self, stop: threading.Event) -> None:
         timing, arrival = self.node.profile.timing, self._inputs.chunk_arrival
@@ -157,12 +154,9 @@ class CommandNode:
                 if tick.computed_s < tick.stall_s / 2:
                     why += ": this computer was too busy with something else, or suspended"
                 extra = [Setting("lose", why)]
-            if stop.is_set() or self._replaced is not None:
+            if stop.is_set():
                 give_up = give_up or time.monotonic() + BRAKE_BEFORE_EXIT_S
-                if self._replaced is not None:
-                    extra.append(Setting("lose", "another command node of this robot runs"))
-                else:
-                    extra.append(Setting("active", False))
+                extra.append(Setting("active", False))
                 if not self.commander.streaming or time.monotonic() > give_up:
                     break
             plans = arrived and tick_first
@@ -206,10 +200,7 @@ class CommandNode:
             if why is not None:
                 self.node.counters["command.latch_failed"] += 1
                 self.node.emit(Event("error", "fault", "latch", why))
-            try:
-                self._status.publish(out, self._inputs.chunks.dropped)
-            except NodeError as error:
-                self._replaced = error
+            self._status.publish(out, self._inputs.chunks.dropped)
         busy = inputs.chunks or inputs.settings or not self.commander.at_rest
         if busy or any(self._awaits(part, now_ns) for part in self.commander.parts):
             self._busy_ns = tick.nominal_ns
