@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from command_rig import Rig
+from command_rig import LIMIT_RTOL, Rig
 
 from vla_zenoh.control.commander import Setting
 from vla_zenoh.control.joint_space import JointBounds
@@ -156,8 +156,9 @@ class Joints:
         """Velocity and acceleration of the commanded TCP as finite differences."""
         dt_s, limits = self.rig.period_ns / 1e9, self.profile.limits.translation
         speed = np.diff(np.array(self.places_m), axis=0) / dt_s
-        assert np.abs(speed).max() <= share * limits.velocity_m_s
-        assert np.abs(np.diff(speed, axis=0)).max() / dt_s <= share * limits.acceleration_m_s2
+        most = share * (1 + LIMIT_RTOL)
+        assert np.abs(speed).max() <= most * limits.velocity_m_s
+        assert np.abs(np.diff(speed, axis=0)).max() / dt_s <= most * limits.acceleration_m_s2
 
 
 def _numbers(command: JointCommand) -> tuple[FloatArray, FloatArray, FloatArray]:

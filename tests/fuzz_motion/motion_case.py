@@ -57,8 +57,9 @@ EXTREMES: dict[str, dict[str, Any]] = {
 }
 """Changes of the shipped profile; where there are none the box is made in `make_case`."""
 OTHER_ARMS = {"five joints": so101, "six joints": ur5}
-IN_JOINTS = ("seven joints", *OTHER_ARMS)
-"""Policies that act in joints, by those of the arm."""
+AS_POSES = "joints as poses"
+IN_JOINTS = ("seven joints", AS_POSES, *OTHER_ARMS)
+"""Policies that act in joints, by those of the arm; `AS_POSES` of a robot that takes poses."""
 FAMILIES = (
     *("pose", "joint", "net", "pose", "extreme", "joint net", "pose", "reach"),
     *IN_JOINTS,
@@ -147,7 +148,7 @@ def make_case(family: str, seed: int) -> Case:
     rng = random.Random(zlib.crc32(f"{family} {seed}".encode()))
     extreme = rng.choice(sorted(EXTREMES)) if family == "extreme" else ""
     changes: dict[str, Any] = dict(EXTREMES.get(extreme, {}))
-    if family.startswith("joint") or family in IN_JOINTS:
+    if family != AS_POSES and (family.startswith("joint") or family in IN_JOINTS):
         changes["robot"] = {"command": "joint"}
     joint = changes.get("robot") is not None
     mode = rng.choice(["replace", "replace", "blend", "ensemble"])
@@ -160,7 +161,7 @@ def make_case(family: str, seed: int) -> Case:
         changes["limits"] = {"workspace": _box(start.position_m, 0.002)}
     elif extreme == "home outside":
         changes["limits"] = {"workspace": _box(start.position_m - [0.13, 0, 0], 0.1)}
-    elif not joint and family != "reach" and rng.random() < 0.5:
+    elif not joint and family not in ("reach", AS_POSES) and rng.random() < 0.5:
         changes["limits"] = {
             **changes.get("limits", {}),
             "workspace": _box(start.position_m, rng.choice([0.01, 0.03, 0.1])),
@@ -190,7 +191,7 @@ def make_case(family: str, seed: int) -> Case:
         profile,
         spec,
         start,
-        reach=joint or family == "reach",
+        reach=joint or family in ("reach", AS_POSES),
         guard_hz=1000.0 if hz > 250 or rng.random() < 0.25 else 250.0,
         noise_m=rng.choice([0.0, 1e-16, 1e-15, 1e-14, 1e-12]),
         lag_s=rng.choice([0.0, 0.0, 0.0, 0.02, 0.05]),

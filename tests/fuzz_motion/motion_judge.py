@@ -260,7 +260,7 @@ class Judge:
         self._box("goal outside the box", whole_m)
         ahead_m = np.linalg.norm(goal_m - self._position_m[where], axis=1)
         turn = log_of(np.einsum("nij,nkj->nik", goal_rotation, self._rotation[where]))
-        if self._case.in_joints:
+        if self._case.in_joints and self._case.joint:
             return  # its leash is on the joints
         lag = self._case.joint
         # Where a late tick takes the arm is foreseen with the acceleration it had.

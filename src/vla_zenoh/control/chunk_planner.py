@@ -436,7 +436,8 @@ class ChunkPlanner:
         far_m, far_rad = bounds.ways(start_rad, way_rad)
         part, slower, hits = 1.0, None, list[LimitHit]()
         if plan.action.targets:
-            part, slower = self._approach(plan, far_m, far_rad, bounds.full_speed_s(way_rad))
+            full_s = bounds.full_speed_s(start_rad, way_rad)
+            part, slower = self._approach(plan, far_m, far_rad, full_s)
         else:
             for name, far, most in (
                 ("step_m", far_m, limits.step_m),

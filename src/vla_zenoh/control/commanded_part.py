@@ -372,7 +372,7 @@ class CommandedPart:
         measured_rad = self.measured_rad
         if measured_rad is None or not motion.streaming:
             return
-        commanded_rad, in_joints = motion.joints_rad, motion.in_joints
+        commanded_rad, in_joints = motion.joints_rad, motion.joints_asked
         found = monitor.update(measured_rad, commanded_rad, now_ns, in_joints=in_joints)
         self.too_near = found or self.too_near  # until the arm brakes for it
         motion.pace.joint_slowdown = monitor.slowdown

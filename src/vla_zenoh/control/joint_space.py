@@ -5,7 +5,8 @@ workspace box stop the motion across them and leave that along them; near the ar
 table a step is shortened as in `vla_zenoh.control.reachability`. A singularity does not matter.
 
 The TCP of a straight motion of the joints goes along a curve. So the box is checked in between too,
-and the velocity and acceleration of the TCP are bounded by their shares of the joints' limits.
+and the velocity and acceleration of the TCP are bounded by their shares of the joints' limits. A
+robot that takes poses goes to the poses of the joints instead, see `MotionPipeline`.
 """
 
 from __future__ import annotations
@@ -76,6 +77,9 @@ class JointBounds:
         self.limits, self.kinematics, self.barriers = profile.limits, kinematics, barriers
         self._floors = Floors(barriers)
         self.motion = joint_motion_limits(profile, kinematics)
+        self._tcp_rates: FloatArray | None = None
+        if profile.robot.command == "pose":
+            self._tcp_rates = motion_limits(profile.limits).box[0]
         margin_rad = joint_margins(self.limits.reach, kinematics)
         self.lower_rad = kinematics.lower_rad + margin_rad
         self.upper_rad = kinematics.upper_rad - margin_rad
@@ -84,19 +88,27 @@ class JointBounds:
 
     def ways(self, start_rad: FloatArray, way_rad: FloatArray) -> tuple[float, float]:
         """Lengths of a straight motion: of the TCP or a sliding joint, m, of others, rad."""
-        slides, jacobian = self.kinematics.slides, self.kinematics.jacobian
+        slides = self.kinematics.slides
         turned_rad = float(np.abs(way_rad[~slides]).max(initial=0.0))
         slid_m = float(np.abs(way_rad[slides]).max(initial=0.0))
         # The TCP's curve, were all of it as fast as its fastest piece: no less than its length,
         # and much more than the distance of its ends where joints turn far.
-        pieces = 1 + int(turned_rad / ARC_RAD)
-        places = (np.arange(pieces) + 0.5) / pieces
-        rates = [jacobian(start_rad + place * way_rad) @ way_rad for place in places]
-        return max(slid_m, *(norm3(rate[:3]) for rate in rates)), turned_rad
+        far_m = max(norm3(rate[:3]) for rate in self._twists(start_rad, way_rad))
+        return max(slid_m, far_m), turned_rad
 
-    def full_speed_s(self, way_rad: FloatArray) -> float:
-        """Time (s) of a straight motion by `way_rad` (n,) at full speed of the joints."""
-        return float(np.max(np.abs(way_rad) / self.motion.velocity_rad_s))
+    def full_speed_s(self, start_rad: FloatArray, way_rad: FloatArray) -> float:
+        """Time (s) of a straight motion at full speed: of the joints, or of the TCP's poses."""
+        if self._tcp_rates is None:
+            return float(np.max(np.abs(way_rad) / self.motion.velocity_rad_s))
+        rates = np.abs(self._twists(start_rad, way_rad))
+        return float((rates / self._tcp_rates).max())
+
+    def _twists(self, start_rad: FloatArray, way_rad: FloatArray) -> FloatArray:
+        """(k, 6) of the TCP on the pieces of a straight motion that takes a second."""
+        pieces = 1 + int(float(np.abs(way_rad).max()) / ARC_RAD)
+        places = (np.arange(pieces) + 0.5) / pieces
+        jacobian = self.kinematics.jacobian
+        return np.array([jacobian(start_rad + place * way_rad) @ way_rad for place in places])
 
     def in_chain_order(self, action: ActionSpec, steps: FloatArray) -> FloatArray:
         """Steps (n, D) of joints with their columns in the order of the kinematics."""

@@ -38,8 +38,6 @@ PIECE_M, PIECE_RAD, PIECE_S = 0.02, 0.1, 0.5
 """A way that is no step of a plan is bounded in pieces of this length, each in this time."""
 DROPPED = 1e-5
 """m and rad: less of a chunk that is not executed is rounding."""
-SAME_POSE = 1e-6
-"""m and rad: joints whose TCP is this near to a pose reach it."""
 
 
 class MotionPipeline:
@@ -69,11 +67,11 @@ class MotionPipeline:
 
             self._joints = PoseToJoint(profile, reach.kinematics, reach.barriers)
         self._path: JointPath | None = None
-        if planner.joint_bounds is not None:
+        """Of commanded joints. Commanded poses follow the TCP of goals that are joints."""
+        if self._joints is not None and planner.joint_bounds is not None:
             self._path = JointPath(profile, planner.joint_bounds)
         self._changing = False
         """It brakes, because the goals in force are joints and it moves in poses, or vice versa."""
-        self._no_joints = ""
         self.timeline: GoalTimeline | None = None
         self.goal: Goal | None = None
         self.streaming = False
@@ -95,6 +93,11 @@ class MotionPipeline:
     def in_joints(self) -> bool:
         """The arm moves in joints."""
         return isinstance(self._mover, JointPath)
+
+    @property
+    def joints_asked(self) -> bool:
+        """The goals in force are joints, whichever way the arm moves to them."""
+        return self.timeline is not None and self.timeline.plan.goals[0].arm is not None
 
     @property
     def at_rest(self) -> bool:
@@ -139,8 +142,8 @@ class MotionPipeline:
     def stuck(self) -> str:
         """Why the arm will not reach its goal, empty while it follows."""
         if self._joints is None or self.in_joints:
-            return self._no_joints
-        return self._no_joints or self._joints.stuck
+            return ""
+        return self._joints.stuck
 
     @property
     def failures(self) -> int:
@@ -181,7 +184,7 @@ class MotionPipeline:
         standing = not self.streaming or self.at_rest
         if standing:
             self._enter(joints=False)
-        self._no_joints, self._changing = "", False
+        self._changing = False
         if self._poses is None:
             followed = None if self._joints is None else self._joints.shares
             self._poses = self._mover = PosePath(start, self._profile, followed)
@@ -216,26 +219,15 @@ class MotionPipeline:
 
     def _enter(self, *, joints: bool) -> None:
         """Act in joints or in poses from now on; only while the arm stands."""
-        path, poses, reach = self._path, self._poses, self._reach
-        if joints is self.in_joints or path is None or poses is None or reach is None:
+        path, poses, follower = self._path, self._poses, self._joints
+        if joints is self.in_joints or path is None or poses is None or follower is None:
             return
         self.goal = None
-        if not joints:
-            poses.reset(path.motion.pose)
-            if self._joints is not None:
-                self._joints.restart(path.state.position)
-        elif self._joints is not None:
-            path.stand(self._joints.position_rad)
+        if joints:
+            path.stand(follower.position_rad)
         else:
-            pose = poses.motion.pose
-            path.stand(reach.joints_at(pose))
-            apart = pose_distance(path.motion.pose, pose)
-            if max(apart) > SAME_POSE:
-                self._no_joints = (
-                    f"no joints were found for the commanded pose: {apart[0]:.4f} m and "
-                    f"{apart[1]:.4f} rad are left"
-                )
-                return
+            poses.reset(path.motion.pose)
+            follower.restart(path.state.position)
         self._mover = path if joints else poses
         self.pace.stand()
 
@@ -340,7 +332,7 @@ class MotionPipeline:
         found = self._planner.bound_due(plans, now_ns)
         events = limit_events(found) if found else []
         goal = self._aggregator.goal(plans, now_ns)
-        joints = goal.arm is not None
+        joints = goal.arm is not None and self._path is not None
         if joints is not self.in_joints and self.at_rest:
             self._enter(joints=joints)
         self._changing = joints is not self.in_joints
@@ -374,6 +366,11 @@ class MotionPipeline:
 
         A shifted goal lies between bounded goals.
         """
+        asked_rad = None if goal.arm is None else goal.joints_rad
+        if asked_rad is not None and cut.arm is not None and cut.joints_rad is None:
+            assert self._reach is not None
+            joints_rad = self._reach.joints_near(cut.pose, asked_rad)
+            cut = joint_goal(cut.arm, joints_rad, cut.width_m, cut.slowdown)
         if len(plans) == 1:
             plans[0].shift_rest(plans[0].index_at(now_ns), cut, self._limits)
             return cut

@@ -308,6 +308,10 @@ class ReachabilityFilter:
         found = self._solver.approach(pose, joints_rad, bounded=False)
         return found.joints_rad if found.solved else None
 
+    def joints_near(self, pose: Pose, joints_rad: FloatArray) -> FloatArray:
+        """Joints (n,) of `pose`, or as near to it as they get, solved from `joints_rad` (n,)."""
+        return self._solver.approach(pose, joints_rad, bounded=False).joints_rad
+
     def joints_at(self, pose: Pose) -> FloatArray:
         """Joints (n,) of `pose`, or as near to it as they get, with the robot's elbow."""
         measured_rad = self._measured_rad

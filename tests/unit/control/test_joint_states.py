@@ -128,7 +128,7 @@ def test_a_load_on_the_tcp_ends_a_joint_motion() -> None:
 
 # -- from one space to the other ------------------------------------------------------------------
 @pytest.mark.parametrize("command", ["joint", "pose"])
-def test_a_tcp_worker_takes_over_from_moving_joints_after_the_arm_has_come_to_rest(
+def test_a_tcp_worker_takes_over_from_moving_joints_within_the_limits(
     command: str,
 ) -> None:
     arm = moving_of(command, OF_JOINTS, TCP)
@@ -149,7 +149,7 @@ def test_a_tcp_worker_takes_over_from_moving_joints_after_the_arm_has_come_to_re
 
 
 @pytest.mark.parametrize("command", ["joint", "pose"])
-def test_a_joint_worker_takes_over_from_a_moving_tcp_after_the_arm_has_come_to_rest(
+def test_a_joint_worker_takes_over_from_a_moving_tcp_and_ends_where_it_asks(
     command: str,
 ) -> None:
     arm = moving_of(command, TCP, OF_JOINTS)
