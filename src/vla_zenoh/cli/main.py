@@ -118,7 +118,6 @@ COMMANDS: Mapping[str, Mapping[str, str | Group]] = {
                 "serve": "lab.cli.serve:serve",
                 "rolling": "lab.cli.rolling:rolling",
                 "save": "lab.cli.rolling:save",
-                "audit": "lab.cli.rolling:audit",
             },
         ),
     },

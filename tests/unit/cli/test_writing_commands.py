@@ -35,7 +35,6 @@ READ = {
     "web certificate",
     "web key",
     "lab compare file",
-    "lab audit folder",
     "profile bridge-config certificates",  # a name on another computer
 }
 """Files and folders that commands read."""

@@ -55,7 +55,7 @@ def test_a_ring_goes_on_with_what_a_process_before_left(tmp_path: Path) -> None:
 
 def test_what_is_saved_outlives_the_ring_and_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
     kept = filled(tmp_path / "ring", [10] * 3)
-    log = tmp_path / "audit-000000000000.jsonl"
+    log = tmp_path / "log.jsonl"
     log.write_text("a line\n")
     folder = tmp_path / "saved" / "stop"
     assert kept.save(folder, [log], {"asked": False}) == 3

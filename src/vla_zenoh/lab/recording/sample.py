@@ -31,6 +31,8 @@ class Sample:
             attachment.
         kind: type of the record; None for images, settings, unknown bytes, and off the wire.
         fields: of the record as decoded, not validated; None as `kind`.
+        client: number of the Zenoh session that put a setting, as that session says; empty: it
+            does not, or it is off a recording.
     """
 
     key: str
@@ -41,6 +43,7 @@ class Sample:
     attachment: bytes | None = None
     kind: type | None = field(default=None, compare=False)
     fields: Mapping[str, Any] | None = field(default=None, compare=False)
+    client: str = field(default="", compare=False)
 
     @property
     def stamp_ns(self) -> int:
@@ -76,11 +79,16 @@ class Sample:
 
 
 def received_sample(
-    key: str, payload: bytes, encoding: str, attachment: bytes | None, received_ns: int
+    key: str,
+    payload: bytes,
+    encoding: str,
+    attachment: bytes | None,
+    received_ns: int,
+    client: str = "",
 ) -> Sample:
     """A sample off the wire; an attachment that is no header is kept as bytes."""
     header = None
     if attachment is not None:
         with suppress(CodecError):
             header, attachment = records.decode_header(attachment), None
-    return Sample(key, payload, encoding, header, received_ns, attachment)
+    return Sample(key, payload, encoding, header, received_ns, attachment, client=client)

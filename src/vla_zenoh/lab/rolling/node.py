@@ -1,9 +1,9 @@
-"""The node `rolling`: a ring of the last minutes on disk, and the audit log.
+"""The node `rolling`: a ring of the last minutes on disk, and a log of settings.
 
 Everything but raw images goes into short MCAP files, of which the oldest are deleted. At a stop, a
 fault, a rejected activation or a put on `save` the files are kept in a folder of their own, some
 seconds later, so that what followed is in them. Settings, with the session that put them, and what
-the command node made of them go into the audit log at once.
+the command node made of them go into the log at once.
 
 Whatever the disk does, the node goes on: it says so, counts what is missing, and tries again.
 """
@@ -28,12 +28,13 @@ from vla_zenoh.bus.node import Node
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, RecordingError
 from vla_zenoh.keys import ROLLING, last_chunk
+from vla_zenoh.lab.rate_limit import RateLimit
 from vla_zenoh.lab.recording.recorder import COMMIT_S, SWITCH_INTERVAL_S, WRITE_S, recorded_keys
+from vla_zenoh.lab.recording.sample import Sample
 from vla_zenoh.lab.recording.sample_queue import SampleQueue
 from vla_zenoh.lab.recording.writer import RecordingWriter
-from vla_zenoh.lab.rolling.audit_log import PATTERN, AuditLog
-from vla_zenoh.lab.rolling.audit_queue import AuditQueue, Put, allowance
 from vla_zenoh.lab.rolling.ring import PART, Ring, RingLimits, delete_oldest_saved
+from vla_zenoh.lab.rolling.settings_log import SettingsLog, logs_of
 from vla_zenoh.profile import Profile, to_yaml
 from vla_zenoh.types import MAX_TEXT, Event, NodeStatus
 
@@ -47,6 +48,9 @@ AGAIN_S = 5.0
 KEPT_SAVED = 20
 """Automatically saved folders; those that a person asked for are never deleted."""
 MAX_CLIENTS = 1024
+BURST, RATE_HZ = 256, 5.0
+"""Lines of one key at once, and per second in the long run: who floods one key does not push out
+what the log has of others."""
 LOST_EVERY_S = 5.0
 """Between two lines that say how many puts were not logged."""
 STOPS = ("->stopped", "->fault")
@@ -59,11 +63,11 @@ USUAL = RingLimits()
 
 
 class RollingRecord:
-    """The node `rolling`: keeps a ring of recordings on disk and writes the audit log.
+    """The node `rolling`: keeps a ring of recordings on disk and writes the log of settings.
 
     Args:
         session: an open session; the caller closes it.
-        folder: of the record: ``ring/``, ``saved/`` and the audit log.
+        folder: of the record: ``ring/``, ``saved/`` and the log.
 
     Raises:
         RecordingError: the folder cannot be used.
@@ -74,22 +78,22 @@ class RollingRecord:
     ) -> None:
         self.node = Node(ROLLING, profile, session)
         self._profile, self._folder, self._limits = profile, folder, limits
-        self._log = AuditLog(folder)
+        self._log = SettingsLog(folder)
         self._ring = Ring(folder / "ring", limits)
         for part in (folder / "saved").glob(f"*{PART}"):
             shutil.rmtree(part, ignore_errors=True)
         self._queue = SampleQueue(
             session, max_bytes=QUEUE_BYTES, max_samples=QUEUE_SAMPLES, clock=self.node.clock
         )
-        self._audit = AuditQueue(session, self.node.clock)
         self._writer: RecordingWriter | None = None
         self._path = Path()
         self._began_s = self._committed_s = self._try_s = 0.0
         self._seen_drops: Counter[str] = Counter()
-        self._why = self._audit_why = ""
+        self._why = self._log_why = ""
         self._lost: Counter[str] = Counter()
         self._lost_s = 0.0
-        self._allowed = allowance()
+        self._settings: set[str] = set()
+        self._allowances: dict[str, RateLimit] = {}
         self._clients: dict[str, tuple[str, str, str]] = {}
         self._reasons: list[str] = []
         self._save_s, self._asked, self._refused_s = 0.0, False, -1e9
@@ -103,11 +107,9 @@ class RollingRecord:
         settings = (keys.prompt, keys.active, keys.worker, keys.rate, keys.speed, keys.slower)
         held = [keys.of_part(part).held for part in self._profile.parts] or [keys.held]
         orders = (keys.stop, keys.reset, keys.save, keys.sim_reset)
-        self._audit.subscribe(
-            (*settings, *held, *orders, keys.event("command"), f"{keys.status('router')}$*")
-        )
+        self._settings = {*settings, *held, *orders}
         self.node.follow_senders()
-        self._queue.subscribe(recorded_keys(keys))
+        self._queue.subscribe(recorded_keys(keys), settings=keys.full("*"))
         for expression in recorded_keys(keys):
             self.node.reception.watch(expression, self._queue.arrived)
         while not stop.wait(WRITE_S):
@@ -115,14 +117,15 @@ class RollingRecord:
         self.close()
 
     def step(self) -> None:
-        """One round: the audit log first, then the ring, then what is to be saved."""
+        """One round: the log first, then the ring, then what is to be saved."""
         clock_step_s = self.node.clock.adopt_system_time()
         if clock_step_s:
             self._add("clock", step_s=round(clock_step_s, 3))
             self.node.reject("clock_step", f"the wall clock was set by {clock_step_s:+.3f} s")
-        self._take_audit()
-        self._write_audit()
-        self._write_samples()
+        samples = self._queue.take()
+        self._note(samples)
+        self._write_log()
+        self._write_samples(samples)
         now_s = time.monotonic()
         if self._save_s and now_s >= self._save_s:
             self._save()
@@ -130,7 +133,6 @@ class RollingRecord:
 
     def close(self) -> None:
         """Write what there is, and leave."""
-        self._audit.close()
         self.node.reception.unwatch(self._queue.arrived)
         self._queue.close()
         self.step()
@@ -139,7 +141,7 @@ class RollingRecord:
         self._finish_segment()
         self._note_lost()
         self._add(ENDED)
-        self._write_audit()
+        self._write_log()
         self._log.close()
         self.node.publish_end(self._detail())
         self.node.close()
@@ -148,8 +150,6 @@ class RollingRecord:
         last = self._log.last_what
         if last not in ("", ENDED):
             self._add("after_gap", why="the record before this one was killed, or lost its power")
-        if self._log.cut_bytes:
-            self._add("cut", bytes=self._log.cut_bytes)
         profile = to_yaml(self._profile)
         self._add(
             "began",
@@ -159,26 +159,35 @@ class RollingRecord:
             host=socket.gethostname(),
             pid=os.getpid(),
         )
-        self._write_audit()
+        self._write_log()
 
-    # -- the audit log ------------------------------------------------------------------------
+    # -- the log ------------------------------------------------------------------------------
     def _add(self, what: str, wall_ns: int | None = None, **facts: Any) -> None:
         self._log.add(what, self.node.clock.wall_ns() if wall_ns is None else wall_ns, **facts)
 
-    def _take_audit(self) -> None:
-        puts, lost = self._audit.take()
-        for put in puts:
-            name = self.node.keys.short(put.key)
-            group = name.partition("/")[0]
-            if group == "status":
-                self._note_clients(put)
-            elif group == "event":
-                self._note_event(put)
-            else:
-                self._note_setting(name, put)
-        self._lost.update(lost)
+    def _note(self, samples: list[Sample]) -> None:
+        keys = self.node.keys
+        while self._queue.deletions:
+            key = self._queue.deletions.popleft()
+            if key in self._settings:
+                self._note_setting(Sample(key, b"", "", None, self.node.clock.wall_ns()), True)
+        for sample in samples:
+            if sample.key in self._settings:
+                self._note_setting(sample)
+            elif sample.key == keys.event("command"):
+                self._note_event(sample)
+            elif sample.key.startswith(keys.status("router")):
+                self._note_clients(sample)
         if self._lost and time.monotonic() - self._lost_s > LOST_EVERY_S:
             self._note_lost()
+
+    def _may_note(self, key: str) -> bool:
+        now_s = time.monotonic()
+        limit = self._allowances.setdefault(key, RateLimit(RATE_HZ, BURST, now_s))
+        if limit.take(now_s):
+            return True
+        self._lost[key] += 1
+        return False
 
     def _note_lost(self) -> None:
         self._lost_s = time.monotonic()
@@ -186,49 +195,52 @@ class RollingRecord:
             self._add("lost", key=self.node.keys.short(key), puts=count)
         self._lost.clear()
 
-    def _note_setting(self, name: str, put: Put) -> None:
-        text = put.payload[: 4 * MAX_TEXT].decode("utf-8", "replace")[:MAX_TEXT]
-        facts: dict[str, Any] = {"key": name, "text": text, "client": put.client}
-        if put.size > len(put.payload):
-            facts["bytes"] = put.size
-        if put.deleted:
+    def _note_setting(self, sample: Sample, deleted: bool = False) -> None:
+        if not self._may_note(sample.key):
+            return
+        name = self.node.keys.short(sample.key)
+        text = sample.payload[: 4 * MAX_TEXT].decode("utf-8", "replace")[:MAX_TEXT]
+        facts: dict[str, Any] = {"key": name, "text": text, "client": sample.client}
+        if len(sample.payload) > 4 * MAX_TEXT:
+            facts["bytes"] = len(sample.payload)
+        if deleted:
             facts["deleted"] = True
-        self._add("put", put.received_ns, **facts)
-        if put.deleted:
+        self._add("put", sample.received_ns, **facts)
+        if deleted:
             return
         if name == "save":
             self._want(f"asked: {text}"[:MAX_TEXT], asked=True)
         elif name == "stop":
             self._want("stop")
 
-    def _note_event(self, put: Put) -> None:
+    def _note_event(self, sample: Sample) -> None:
         try:
-            event = records.decode(Event, put.payload)
+            event = records.decode(Event, sample.payload)
         except CodecError:
             return
         refused = event.kind == "refusal" and event.what.endswith("_refused")
-        if event.kind != "transition" and not refused:
+        if (event.kind != "transition" and not refused) or not self._may_note(sample.key):
             return
-        self._add("command", put.received_ns, event=event.what, why=event.why)
+        self._add("command", sample.received_ns, event=event.what, why=event.why)
         if event.what.endswith(STOPS):
             self._want(event.what.rpartition("->")[2])
         elif event.what == REFUSED and time.monotonic() - self._refused_s > APART_S:
             self._refused_s = time.monotonic()
             self._want("activation refused")
 
-    def _note_clients(self, put: Put) -> None:
+    def _note_clients(self, sample: Sample) -> None:
         """Which certificate and address a session has, as its router says."""
         try:
-            found = records.decode(NodeStatus, put.payload).detail.get("clients")
+            found = records.decode(NodeStatus, sample.payload).detail.get("clients")
         except CodecError:
             return
-        router = last_chunk(put.key)
+        router = last_chunk(sample.key)
         for number, told in found.items() if isinstance(found, dict) else ():
             if not (isinstance(told, (list, tuple)) and len(told) == 2):
                 continue
             certificate, address = map(str, told)
             known = (router, certificate, address)
-            if self._clients.get(number) != known and self._allowed.take(time.monotonic()):
+            if self._clients.get(number) != known and self._may_note(sample.key):
                 self._clients[number] = known
                 self._add(
                     "client", client=number, certificate=certificate, address=address, by=router
@@ -236,23 +248,23 @@ class RollingRecord:
         while len(self._clients) > MAX_CLIENTS:
             del self._clients[next(iter(self._clients))]
 
-    def _write_audit(self) -> None:
+    def _write_log(self) -> None:
         try:
             self._log.write()
         except RecordingError as error:
-            self._fault("audit_failed", self._audit_why, str(error))
-            self._audit_why = str(error)
+            self._fault("log_failed", self._log_why, str(error))
+            self._log_why = str(error)
             return
-        if self._audit_why:
-            self._audit_why = ""
+        if self._log_why:
+            self._log_why = ""
             self._add("disk", why="the log could not be written for a while")
         if self._log.lost:
             self._add("lost", lines=self._log.lost)
             self._log.lost = 0
 
     # -- the ring -----------------------------------------------------------------------------
-    def _write_samples(self) -> None:
-        samples, now_s = self._queue.take(), time.monotonic()
+    def _write_samples(self, samples: list[Sample]) -> None:
+        now_s = time.monotonic()
         try:
             if self._writer is None:
                 if now_s < self._try_s:
@@ -293,7 +305,7 @@ class RollingRecord:
         dropped = Counter(self._queue.dropped)
         new, self._seen_drops = dropped - self._seen_drops, dropped
         if new:
-            self._add("dropped", samples=new.total())
+            self._add("dropped", samples={self.node.keys.short(key): new[key] for key in new})
         try:
             writer.finish({"dropped": dict(new)})
         except RecordingError as error:
@@ -332,10 +344,10 @@ class RollingRecord:
         word = SEGMENT_WORDS.sub("-", reasons[0])[:40].strip("-") or "saved"
         saved = self._folder / "saved"
         folder = _new_folder(saved, f"{time.strftime('%Y%m%d-%H%M%S')}-{word}")
-        facts = {"reasons": reasons, "asked": asked, "head": self._log.link.head}
+        facts = {"reasons": reasons, "asked": asked}
         try:
-            self._write_audit()
-            count = self._ring.save(folder, sorted(self._folder.glob(PATTERN)), facts)
+            self._write_log()
+            count = self._ring.save(folder, logs_of(self._folder), facts)
         except RecordingError as error:
             self._add("not_saved", reasons=reasons, why=str(error))
             self._fault("not_saved", "", f"the rolling record was not saved: {error}")
@@ -355,13 +367,11 @@ class RollingRecord:
             "seconds": round(self._ring.seconds, 1),
             "size_bytes": self._ring.size_bytes + size,
             "saved": self._saved,
-            "audit_lines": self._log.link.number,
-            "audit_head": self._log.link.head,
-            "why": self._why or self._audit_why,
+            "why": self._why or self._log_why,
         }
 
     def _report(self) -> None:
-        state = "failed" if self._why or self._audit_why else "recording"
+        state = "failed" if self._why or self._log_why else "recording"
         if not self.node.status_due(state):
             return
         self.node.counters["dropped"] = self._queue.dropped.total()
