@@ -1,6 +1,6 @@
 """Access rehearsal: every identity of a lab tries every act on every key, with real sessions.
 
-What `vla_zenoh.lab.doctor.access_check` reads off the rules is tried here at a router on this
+What `access_check` reads off the rules is tried here at a router on this
 computer, with the rules of the profile and certificates of its own.
 """
 
@@ -15,17 +15,16 @@ from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import zenoh
-
-from vla_zenoh.bus.session import open_session
-from vla_zenoh.keys import Keys
-from vla_zenoh.lab.certificates.lab_certificates import LabCertificates
-from vla_zenoh.lab.doctor.access_check import (
-    REPLY_S,
+from access_check import (
     identities_of_all,
     obligations,
     probes,
     token_selectors,
 )
+
+from vla_zenoh.bus.session import open_session
+from vla_zenoh.keys import Keys
+from vla_zenoh.lab.certificates.lab_certificates import LabCertificates
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.schema import SecurityProfile
 from vla_zenoh.security.roles import EVERY_MESSAGE, Act, Identity, Role, access_control
@@ -35,6 +34,7 @@ Done = set[tuple[str, Act, str]]
 Sessions = Mapping[str, zenoh.Session]
 """Common name -> session."""
 
+REPLY_S = 2.0
 SETTLE_S = 0.4
 """From a declaration until all sessions on one computer know of it."""
 WITNESS = Identity(Role.ROUTER, "witness", "rehearsal")

@@ -64,7 +64,7 @@ ALLOWED = {
             "lab/benchmark/run.py",
             "lab/check/model_runner.py",
             "lab/demo/runner.py",
-            "lab/doctor/access_check.py",
+            "lab/doctor/access.py",
             "lab/episode.py",
             "lab/inference_views.py",
             "lab/newest_records.py",

@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from access_check import check_access
 from access_rehearsal import surprises
 from camera_rig import PATIENCE_S, camera_rig, free_endpoint, grey, until
 
@@ -21,7 +22,6 @@ from vla_zenoh.bus.session import open_session, second_link
 from vla_zenoh.codec.image import decode_jpeg
 from vla_zenoh.control.preflight import PeerSnapshot, reasons_of_worker
 from vla_zenoh.keys import Kind
-from vla_zenoh.lab.doctor.access_check import check_access
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, ObservationSpec
 from vla_zenoh.policy.observation import prepare_image, size_variant
 from vla_zenoh.profile import Profile, load_profile, override

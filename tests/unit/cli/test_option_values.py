@@ -106,8 +106,6 @@ LINES = [
     ("rate -.5", FAILED, "is out of range: give 0.05 to 100"),
     ("speed -5", FAILED, "speed '-5' percent is out of range: give 0 to 100 percent"),
     ("rate --nosuch", USAGE, "No such option: --nosuch"),
-    ("doctor --rules absent.json5 --profile panda_sim", USAGE, "absent.json5"),
-    ("doctor --rules .", USAGE, "--rules"),
     ("web --certificate junk --key junk", FAILED, "are no certificate and its key"),
 ]
 

@@ -22,7 +22,6 @@ READ = {
     "view file",
     "replay file",
     "eval paths",
-    "doctor rules",
     "dataset export runs",
     "dataset stats folder",
     "bench compare a",

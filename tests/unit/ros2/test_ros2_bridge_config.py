@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 import zenoh
+from access_check import Passage, allows, passages
 from typer.testing import CliRunner
 
 from vla_zenoh.errors import ProfileError
@@ -17,7 +18,6 @@ from vla_zenoh.lab.certificates.bridge import bridge_locks, bridges
 from vla_zenoh.lab.certificates.lab_certificates import LabCertificates
 from vla_zenoh.lab.cli.profile import profile_app
 from vla_zenoh.lab.cli.secure import secure_app
-from vla_zenoh.lab.doctor.access_check import Passage, allows, passages
 from vla_zenoh.lab.profile.ros2_bridge import bridge_command, bridge_config, bridge_text
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.ros2.keys import Ros2Dds

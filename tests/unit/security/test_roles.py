@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import pytest
+from access_check import Passage, allows, missing, passages
 from hypothesis import given
 from hypothesis import strategies as st
 
 from vla_zenoh.bus.session import covers
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.keys import KEY_PATHS, NODE_KINDS, Keys
-from vla_zenoh.lab.doctor.access_check import Passage, allows, missing, passages
 from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh.security.roles import (
     TABLE,

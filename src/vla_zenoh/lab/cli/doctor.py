@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import os
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -17,7 +16,6 @@ from vla_zenoh.bus.session import open_session
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
     PROFILE_VARIABLE,
-    AlsoOption,
     JsonOption,
     effective_profile,
 )
@@ -84,16 +82,6 @@ def doctor(
         str | None, typer.Option("--host", help="Only what this host of the profile needs.")
     ] = None,
     as_json: JsonOption = False,
-    rules: Annotated[
-        Path | None,
-        typer.Option(
-            "--rules",
-            exists=True,
-            dir_okay=False,
-            help="Check the access rules in this Zenoh configuration instead.",
-        ),
-    ] = None,
-    also: AlsoOption = None,
 ) -> None:
     """Check this computer: what is missing, and the package or setting that helps.
 
@@ -101,10 +89,6 @@ def doctor(
     """
     if host is not None and profile is None:
         raise typer.BadParameter("--host names a host of a profile: give --profile too")
-    if also and profile is None:
-        raise typer.BadParameter("--also names robots beside that of a profile: give --profile too")
-    if rules is not None and profile is None:
-        raise typer.BadParameter("--rules are of a secured profile: give --profile too")
     zenoh.init_log_from_env_or("off")
     needs, session, loaded = Needs(), SessionProfile(), None
     if profile is not None:
@@ -118,7 +102,7 @@ def doctor(
             findings += robot(loaded, host)
             findings += ros2_bridge(loaded, host)
             findings += robot_driver(loaded, host)
-            findings += access(loaded, rules, also or ())
+            findings += access(loaded)
     report(findings, as_json=as_json)
 
 

@@ -6,32 +6,26 @@ import datetime as dt
 import re
 import socket
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
+from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import MissingExtraError, SecurityError, VlaZenohError
 from vla_zenoh.lab.certificates.bridge import NODE as BRIDGE
 from vla_zenoh.lab.certificates.lab_certificates import unused_certificates
-from vla_zenoh.lab.doctor.access_check import AccessVerdict, check_access, read_access, try_identity
 from vla_zenoh.lab.doctor.needs import HostFinding, judged
-from vla_zenoh.profile import Profile, load_profile
+from vla_zenoh.profile import Profile
 from vla_zenoh.profile.schema import is_loopback
 
 if TYPE_CHECKING:
     from vla_zenoh.security.certificates import Entry
 
-SHOWN_FAULTS = 6
+REPLY_S = 2.0
 SERVERS = ("router", BRIDGE)
 """Nodes whose certificates are not presented to the router."""
 
 
-def access(profile: Profile, file: Path | None, also: Sequence[str]) -> Iterator[HostFinding]:
-    """Certificates of this computer, rules of the profile, and the running router.
-
-    Args:
-        file: Zenoh's configuration with other rules; None: those of the profile.
-        also: profiles of other robots of the router.
-    """
+def access(profile: Profile) -> Iterator[HostFinding]:
+    """Certificates of this computer, and whether the running router takes them."""
     security = profile.session.security
     if security is None:
         yield _without(profile)
@@ -48,11 +42,6 @@ def access(profile: Profile, file: Path | None, also: Sequence[str]) -> Iterator
     yield certificates(host, entries)
     for path, why in unused_certificates(profile, entries).items():
         yield HostFinding(f"certificate {path.name}", "warn", why)
-    try:
-        given = None if file is None else read_access(file)
-        yield from map(rules, check_access(profile, given, [load_profile(name) for name in also]))
-    except VlaZenohError as error:
-        yield HostFinding("access", "fail", f"the rules could not be checked: {error}")
     for entry in entries:
         if entry.node not in SERVERS and not entry.faults:
             yield _accepted(profile, entry)
@@ -74,30 +63,32 @@ def certificates(host: str, entries: Sequence[Entry]) -> HostFinding:
     return HostFinding(name, "ok", f"{len(entries)}, all valid until {end:%Y-%m-%d}")
 
 
-def rules(verdict: AccessVerdict) -> HostFinding:
-    """Finding on the access of one identity."""
-    name = f"access {verdict.identity.common_name}"
-    if not verdict.faults:
-        found = f"can do all {verdict.must} acts of its role, none of {verdict.must_not} others"
-        return HostFinding(name, "ok", found)
-    shown = list(verdict.faults[:SHOWN_FAULTS])
-    if len(verdict.faults) > SHOWN_FAULTS:
-        shown.append(f"and {len(verdict.faults) - SHOWN_FAULTS} more")
-    return HostFinding(
-        name,
-        "fail",
-        "\n".join(shown),
-        "regenerate the router's rules: vla-zenoh node router --config > FILE",
-    )
-
-
 def _accepted(profile: Profile, entry: Entry) -> HostFinding:
     name = f"router takes {entry.node}@{entry.host}"
     try:
-        why = try_identity(profile, entry.node)
+        why = _refusal(profile, entry.node)
     except VlaZenohError as error:
         return HostFinding(name, "warn", str(error))
     return judged(name, not why, why or "and grants it access", level="fail")
+
+
+def _refusal(profile: Profile, node: str | None) -> str:
+    """Why the running router does not serve this computer's certificate for `node` (None: the
+    operator's); empty: it does.
+
+    Raises:
+        SessionError: no router answers, or it rejects the certificate.
+        SecurityError: no such certificate.
+    """
+    with open_session(profile.session, identity=node) as session:
+        for selector in (profile.keys.all_alive, profile.keys.all_holding):
+            replies = session.liveliness().get(selector, timeout=REPLY_S)
+            if any(reply.ok is not None for reply in replies):
+                return ""
+    return (
+        "the router accepts the certificate but grants it no access: its rules lack this name. "
+        "Restart the router with this profile, or check that any node is up"
+    )
 
 
 def _without(profile: Profile) -> HostFinding:

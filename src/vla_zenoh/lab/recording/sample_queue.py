@@ -15,7 +15,7 @@ from vla_zenoh.bus.clock import Clock
 from vla_zenoh.errors import CodecError, RecordingError
 from vla_zenoh.lab.recording.sample import Sample, received_sample
 
-CHANNEL = 64
+CHANNEL = 256
 """Samples that wait in Zenoh for the thread that takes settings."""
 
 
@@ -82,7 +82,10 @@ class SampleQueue:
     def _receive_from(self, channel: Any) -> None:
         with suppress(zenoh.ZError):  # empty, and the subscriber is closed
             while True:
-                self.receive(channel.recv())
+                sample = channel.recv()
+                while sample is not None:
+                    self.receive(sample)
+                    sample = channel.try_recv()
 
     def receive(self, sample: zenoh.Sample) -> None:
         """Add a sample from Zenoh, also from the reply to a query."""

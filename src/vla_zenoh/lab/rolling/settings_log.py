@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import os
-import time
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +58,7 @@ class SettingsLog:
         if len(self._waiting) >= MAX_WAITING:
             self.lost += 1
             return
-        at = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(wall_ns // 10**9))
+        at = datetime.fromtimestamp(wall_ns / 1e9).isoformat(" ", "milliseconds")
         self._waiting.append(json.dumps({"at": at, "wall_ns": wall_ns, "what": what, **facts}))
 
     def write(self) -> None:

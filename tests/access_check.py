@@ -1,23 +1,18 @@
 """Access check: every role can do what it must by the router's rules, and nothing else.
 
 Zenoh drops silently what a rule forbids, so that a missing rule looks like a node that hangs. This
-check reads the rules as Zenoh applies them; a test of this package tries the same acts with real
+check reads the rules as Zenoh applies them; `access_rehearsal` tries the same acts with real
 sessions at a real router.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
-from pathlib import Path
 from typing import Any
 
-import zenoh
-
-from vla_zenoh.bus.session import covers, open_session
-from vla_zenoh.errors import SecurityError
+from vla_zenoh.bus.session import covers
 from vla_zenoh.keys import Keys
 from vla_zenoh.profile import Profile
 from vla_zenoh.security.roles import (
@@ -106,7 +101,6 @@ def missing(config: Mapping[str, Any], identity: Identity, act: Act, key: str) -
     ]
 
 
-REPLY_S = 2.0
 RobotIdentity = tuple[Keys, Identity]
 """An identity at one robot."""
 
@@ -205,37 +199,3 @@ def _verdict(
             faults.append(f"{one.common_name} can {act.value} {key} and must not: {why}")
     count = sum(wanted.values())
     return AccessVerdict(one, count, len(wanted) - count, tuple(faults))
-
-
-def try_identity(profile: Profile, node: str | None) -> str:
-    """Why the running router does not serve this computer's certificate for `node`; empty: it does.
-
-    Args:
-        node: of the certificate; None: the operator's.
-
-    Raises:
-        SessionError: no router answers, or it rejects the certificate.
-        SecurityError: no such certificate.
-    """
-    with open_session(profile.session, identity=node) as session:
-        for selector in token_selectors(profile.keys):
-            replies = session.liveliness().get(selector, timeout=REPLY_S)
-            if any(reply.ok is not None for reply in replies):
-                return ""
-    return (
-        "the router accepts the certificate but grants it no access: its rules lack this name. "
-        "Restart the router with this profile, or check that any node is up"
-    )
-
-
-def read_access(file: Path) -> dict[str, Any]:
-    """The section ``access_control`` of a Zenoh configuration file.
-
-    Raises:
-        SecurityError: it cannot be read.
-    """
-    try:
-        text = zenoh.Config.from_file(str(file)).get_json("access_control")
-    except (zenoh.ZError, OSError) as error:
-        raise SecurityError(f"{file} is no Zenoh configuration: {error}") from error
-    return dict(json.loads(text) or {})
