@@ -21,9 +21,9 @@ import typer
 
 from benchmarks.chain.process import free_port
 from vla_zenoh.bus.buffers import CallbackRing, bytes_of
-from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.cli.options import options
+from vla_zenoh.client.client import Client
 from vla_zenoh.codec import records
 from vla_zenoh.errors import NodeError, SessionError
 from vla_zenoh.lab.cli.bench_file import ResultOptions, write_json

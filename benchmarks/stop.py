@@ -19,9 +19,9 @@ import typer
 import zenoh
 
 from vla_zenoh.bus.buffers import bytes_of, header_of
-from vla_zenoh.bus.client import Client
 from vla_zenoh.cli.options import effective_profile
 from vla_zenoh.cli.output import console, errors, new_table
+from vla_zenoh.client.client import Client
 from vla_zenoh.codec import records
 from vla_zenoh.errors import NodeError, VlaZenohError
 from vla_zenoh.lab.cli.loopback import own_address

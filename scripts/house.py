@@ -232,7 +232,7 @@ def traced_program(out: Path, arguments: list[str]) -> None:
     threading.Thread(target=keep, daemon=True).start()
     threading.setprofile(note)
     sys.setprofile(note)
-    from vla_zenoh.cli.entry import main
+    from vla_zenoh.program.entry import main
 
     sys.argv = ["vla-zenoh", *arguments]
     main()

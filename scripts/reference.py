@@ -24,11 +24,11 @@ from typer.main import get_command
 from vla_zenoh_franka.check import BY_FCI, JOINTS
 
 import vla_zenoh
-from vla_zenoh.cli.main import app, examples
 from vla_zenoh.keys import KEY_PATHS
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.profile.section import Section
+from vla_zenoh.program.main import app, examples
 from vla_zenoh.security.roles import OWN, TABLE
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -23,8 +23,8 @@ import zenoh
 from camera_rig import PATIENCE_S, free_endpoint, until
 from numpy.typing import NDArray
 
-from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.session import open_session
+from vla_zenoh.client.client import Client
 from vla_zenoh.codec import records
 from vla_zenoh.errors import SessionError
 from vla_zenoh.keys import Keys

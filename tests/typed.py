@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import pytest
 
-from vla_zenoh.cli.entry import main
+from vla_zenoh.program.entry import main
 
 HANDLED = (signal.SIGINT, signal.SIGTERM)
 

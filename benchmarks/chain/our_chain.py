@@ -19,8 +19,8 @@ from benchmarks.chain import report
 from benchmarks.chain.process import Server, free_port
 from benchmarks.peers import Pictures
 from vla_zenoh.bus.buffers import CallbackRing, LatestSample
-from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.node import Node
+from vla_zenoh.client.client import Client
 from vla_zenoh.errors import NodeError, SessionError
 from vla_zenoh.lab.bench.command_runner import cpu_s
 from vla_zenoh.nodes.camera.camera_publisher import OK, CameraPublisher

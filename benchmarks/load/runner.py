@@ -22,9 +22,9 @@ import zenoh
 from benchmarks.chain.process import Server
 from benchmarks.picture import HEIGHT, WIDTH, noisy_picture
 from vla_zenoh.bus.buffers import bytes_of, header_of
-from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.metrics import Percentiles
 from vla_zenoh.bus.session import open_session
+from vla_zenoh.client.client import Client
 from vla_zenoh.codec.image import MAX_IMAGE_BYTES
 from vla_zenoh.errors import CodecError, NodeError, SessionError
 from vla_zenoh.keys import worker_node

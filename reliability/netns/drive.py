@@ -13,8 +13,8 @@ import numpy as np
 from camera_rig import until
 from chain import READY_PATIENCE_S, FloatArray, Recorder
 
-from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.session import open_session
+from vla_zenoh.client.client import Client
 from vla_zenoh.errors import SessionError
 from vla_zenoh.profile import load_profile
 

@@ -22,8 +22,8 @@ import zenoh
 from chain import READY_PATIENCE_S
 
 from vla_zenoh.bus.buffers import header_of
-from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.session import open_session
+from vla_zenoh.client.client import Client
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, SessionError
 from vla_zenoh.profile import load_profile

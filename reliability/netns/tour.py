@@ -11,8 +11,8 @@ import threading
 
 from chain import READY_PATIENCE_S
 
-from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.session import open_session
+from vla_zenoh.client.client import Client
 from vla_zenoh.lab.demo.runner import MotionRunner
 from vla_zenoh.lab.demo.segments import tour
 from vla_zenoh.profile import load_profile

@@ -17,8 +17,8 @@ import zenoh
 from camera_rig import until
 from chain import READY_PATIENCE_S, Recorder
 
-from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.session import open_session
+from vla_zenoh.client.client import Client
 from vla_zenoh.codec import records
 from vla_zenoh.keys import last_chunk, worker_node
 from vla_zenoh.profile import load_profile

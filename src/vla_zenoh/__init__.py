@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from vla_zenoh.client.primitives import PrimitiveError
+    from vla_zenoh.client.remote_robot import RemoteRobot, connect
     from vla_zenoh.errors import (
         CodecError,
         ProfileError,
@@ -26,8 +28,6 @@ if TYPE_CHECKING:
         SpecError,
         VlaZenohError,
     )
-    from vla_zenoh.lab.primitives.client import PrimitiveError
-    from vla_zenoh.lab.primitives.remote_robot import RemoteRobot, connect
     from vla_zenoh.policy import (
         ActionSpec,
         ActionSteps,
@@ -91,9 +91,7 @@ def lazy_names(package: str, *modules: str) -> Callable[[str], Any]:
     return find
 
 
-_find = lazy_names(
-    __name__, "errors", "types", "robot", "policy", "profile", "lab.primitives.remote_robot"
-)
+_find = lazy_names(__name__, "errors", "types", "robot", "policy", "profile", "client.remote_robot")
 
 
 def __getattr__(name: str) -> Any:

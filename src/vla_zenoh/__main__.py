@@ -8,6 +8,6 @@ if __name__ == "__main__":
 
         die_with_parent()  # before the imports of a node, which take long
 
-    from vla_zenoh.cli.entry import main
+    from vla_zenoh.program.entry import main
 
     main()

@@ -14,7 +14,7 @@ from camera_rig import until
 from chain import READY_PATIENCE_S, command_line, write_profile
 from test_supervisor import Up, client_of, up
 
-from vla_zenoh.bus.client import Client
+from vla_zenoh.client.client import Client
 from vla_zenoh.runtime.supervisor import GIVE_UP_AFTER
 
 pytestmark = pytest.mark.long

@@ -123,7 +123,7 @@ def test_a_recorder_that_gets_few_of_the_images_says_so_and_fails(lab: Lab) -> N
     lab.sender()
     keeps_it = (
         "from vla_zenoh.bus import session; session.obstacle = lambda: ''; import sys; "
-        "from vla_zenoh.cli.entry import main; main()"
+        "from vla_zenoh.program.entry import main; main()"
     )
     words = ("record", "-e", lab.endpoint, "-o", "deaf.mcap", "-s", "10", "--json")
     deaf = lab.start(sys.executable, "-c", keeps_it, *words, prefix=LITTLE)

@@ -26,6 +26,8 @@ from vla_zenoh.bus.clock import decode_stamps
 from vla_zenoh.cli import status_table as cli_status
 from vla_zenoh.cli.options import model_options
 from vla_zenoh.cli.output import Screen
+from vla_zenoh.client import messages
+from vla_zenoh.client.messages import decode_request
 from vla_zenoh.codec import image, message, records, settings
 from vla_zenoh.errors import CodecError, PeerError, ProfileError, SpecError, VlaZenohError
 from vla_zenoh.keys import Keys
@@ -37,8 +39,6 @@ from vla_zenoh.lab.cli.output import plain_types
 from vla_zenoh.lab.demo.scripted_motions import parse_scripted
 from vla_zenoh.lab.evaluation.mcap_file import evaluate_loaded
 from vla_zenoh.lab.inference_views import InferenceView
-from vla_zenoh.lab.primitives import messages
-from vla_zenoh.lab.primitives.messages import decode_request
 from vla_zenoh.lab.recording.record_types import RECORDS, record_from_json, record_to_json
 from vla_zenoh.lab.recording.run import load_run
 from vla_zenoh.lab.serve import mcp, openpi_server

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -28,11 +29,13 @@ ORDER = (
     ("guard",),
     ("ros2", "security", "simulation"),
     ("bus",),
+    ("client",),
     ("runtime",),
     ("nodes",),
     ("robots",),
-    ("cli", "__main__"),
+    ("cli",),
     ("lab",),
+    ("program", "__main__"),
 )
 LEVEL = {room: level for level, rooms in enumerate(ORDER) for room in rooms}
 
@@ -41,6 +44,7 @@ NODE = frozenset({"typer", "torch", "mujoco", "asyncio"})
 ALLOWED = {
     # folder or file, the longest one counts: what of IO it may import
     "bus": IO - NODE,
+    "client": IO - NODE,
     "runtime": IO - NODE,
     "nodes": IO - NODE,
     "lab/policy_servers/adapter.py": frozenset({"time"}),
@@ -50,6 +54,7 @@ ALLOWED = {
     "robots": IO - NODE,
     "simulation": frozenset({"mujoco"}),
     "cli": IO - {"torch", "mujoco", "asyncio"},
+    "program": IO - {"torch", "mujoco", "asyncio"},
     "__main__.py": IO - {"torch", "mujoco", "asyncio"},
     "lab/cli": IO - {"torch", "mujoco", "asyncio"},
     # What of the lab listens to a robot, drives it or starts processes.
@@ -68,9 +73,7 @@ ALLOWED = {
             "lab/episode.py",
             "lab/inference_views.py",
             "lab/newest_records.py",
-            "lab/primitives/client.py",
             "lab/primitives/node.py",
-            "lab/primitives/remote_robot.py",
             "lab/recording/recorder.py",
             "lab/recording/replay.py",
             "lab/recording/sample_queue.py",
@@ -149,6 +152,47 @@ def test_a_module_imports_no_folder_above_its_own(path: Path) -> None:
     assert {name for name in ours if LEVEL[room(name)] > LEVEL[here]} == set()
 
 
+OUTSIDE = ("lab", "program", "__main__")
+"""What is not the core: the lab, and the program that has commands of both."""
+CORE = [path for path in SOURCES if path.parts[0].removesuffix(".py") not in OUTSIDE]
+OF_THE_LAB = re.compile(r"(vla_zenoh\.)?lab\.[A-Za-z_.]+(:[a-z_]+)?")
+
+
+def names_of_the_lab(source: str) -> set[str]:
+    """Modules of the lab that a file imports, or names in a string for a later import."""
+    texts = {
+        node.value
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    }
+    return {name for name in texts | imported_names(source) if OF_THE_LAB.fullmatch(name)}
+
+
+@pytest.mark.parametrize("path", CORE, ids=str)
+def test_no_module_of_the_core_imports_the_lab_at_any_time(path: Path) -> None:
+    assert names_of_the_lab((PACKAGE / path).read_text()) == set()
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "from vla_zenoh.lab.doctor import HostFinding",
+        "def f():\n    import vla_zenoh.lab.web",
+        "TABLE = {'web': 'lab.cli.web:web'}",
+        "import_module('vla_zenoh.lab.view')",
+    ],
+)
+def test_every_way_to_import_the_lab_is_seen(source: str) -> None:
+    assert names_of_the_lab(source)
+
+
+def test_connecting_and_the_nodes_load_nothing_of_the_lab() -> None:
+    nodes = "nodes.camera.node, nodes.worker.node, nodes.command.node, robots.node, cli.up"
+    modules = ", ".join(f"vla_zenoh.{name}" for name in nodes.split(", "))
+    loaded = loaded_after(f"vla_zenoh, {modules}; vla_zenoh.connect")
+    assert not any(name.startswith("vla_zenoh.lab") for name in loaded)
+
+
 def test_no_module_imports_itself_by_way_of_others() -> None:
     """Imports for types alone count."""
     modules = {module_name(path): path for path in SOURCES}
@@ -196,7 +240,7 @@ def loaded_after(module: str) -> set[str]:
 def core_modules() -> list[str]:
     beside = [path.stem for path in PACKAGE.glob("*.py") if not path.stem.startswith("__")]
     folders = [path.parent.name for path in PACKAGE.glob("*/__init__.py")]
-    outer = ("bus", "runtime", "nodes", "robots", "cli", "simulation")
+    outer = ("bus", "client", "runtime", "nodes", "robots", "cli", "program", "simulation")
     core = [name for name in beside + folders if name not in outer]
     return sorted(core)
 
@@ -239,7 +283,7 @@ def test_the_command_line_knows_every_command_without_any_optional_library() -> 
     """A model's environment has what the package itself needs, and no more."""
     code = (
         f"import sys\nfor name in {OPTIONAL!r}: sys.modules[name] = None\n"
-        "import typer, vla_zenoh.cli.main as main\n"
+        "import typer, vla_zenoh.program.main as main\n"
         "for name, found in typer.main.get_command(main.app).commands.items():\n"
         "    assert found.name == name and found.help, name"
     )
@@ -251,7 +295,9 @@ def test_the_command_line_knows_every_command_without_any_optional_library() -> 
 
 def test_a_command_that_is_not_called_is_not_imported() -> None:
     """Every node and every word of a person waits for the import of the command line."""
-    loaded = loaded_after("vla_zenoh.cli.main")
-    light = {"vla_zenoh.cli.main", "vla_zenoh.cli.options"}
-    assert {name for name in loaded if name.startswith("vla_zenoh.cli.")} == light
+    loaded = loaded_after("vla_zenoh.program.main")
+    assert {name for name in loaded if name.startswith("vla_zenoh.cli.")} == {
+        "vla_zenoh.cli.options"
+    }
+    assert not any(name.startswith("vla_zenoh.lab") for name in loaded)
     assert loaded.isdisjoint({"numpy", "pydantic", "vla_zenoh.nodes"})

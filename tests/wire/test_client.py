@@ -12,16 +12,16 @@ import pytest
 import zenoh
 from camera_rig import PATIENCE_S, await_match, free_endpoint, until
 
-from vla_zenoh.bus.client import MAX_OTHERS, MAX_WHY, Client
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.cli.drive import _reaches
+from vla_zenoh.client.client import MAX_OTHERS, MAX_WHY, Client
+from vla_zenoh.client.remote_robot import RemoteRobot
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import MAX_JPEG_BYTES
 from vla_zenoh.errors import SessionError
 from vla_zenoh.keys import Kind
 from vla_zenoh.lab.inference_views import MAX_SAMPLES, InferenceDebugSubscriber
-from vla_zenoh.lab.primitives.remote_robot import RemoteRobot
 from vla_zenoh.lab.web.robot_link import RobotLink
 from vla_zenoh.policy import MAX_CAMERAS
 from vla_zenoh.profile import Profile, load_profile, override

@@ -18,8 +18,8 @@ import zenoh
 from camera_rig import await_match, free_endpoint, until
 
 from vla_zenoh.bus.buffers import bytes_of, header_of
-from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.session import open_session
+from vla_zenoh.client.client import Client
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, WorkerError
 from vla_zenoh.nodes.worker.node import WorkerNode

@@ -17,11 +17,11 @@ import pytest
 from camera_rig import until
 from chain import LONG_PATIENCE_S, Chain, command_line, running_chain
 
+from vla_zenoh.client.messages import Answer, decode_answer
+from vla_zenoh.client.primitives import PrimitiveError, ask
+from vla_zenoh.client.remote_robot import RemoteRobot, connect
 from vla_zenoh.keys import PRIMITIVES, worker_node
 from vla_zenoh.kinematics.so3 import Pose, pose_distance, pose_of, rotation_from_quat
-from vla_zenoh.lab.primitives.client import PrimitiveError, ask
-from vla_zenoh.lab.primitives.messages import Answer, decode_answer
-from vla_zenoh.lab.primitives.remote_robot import RemoteRobot, connect
 
 pytestmark = pytest.mark.long
 

@@ -15,15 +15,15 @@ import zenoh
 from camera_rig import free_endpoint, until
 
 from vla_zenoh.bus.buffers import CallbackRing
-from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import open_session
+from vla_zenoh.client.client import Client
+from vla_zenoh.client.messages import Answer
+from vla_zenoh.client.primitives import ask
 from vla_zenoh.errors import NodeError
 from vla_zenoh.keys import PRIMITIVES, Kind, worker_node
 from vla_zenoh.kinematics.so3 import Pose
-from vla_zenoh.lab.primitives.client import ask
 from vla_zenoh.lab.primitives.endings import Arrival
-from vla_zenoh.lab.primitives.messages import Answer
 from vla_zenoh.lab.primitives.node import PrimitivesNode
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.types import GripperState, JointState, PoseState, Task

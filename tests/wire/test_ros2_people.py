@@ -18,9 +18,9 @@ from camera_rig import await_match, until
 from ros2_peer import Ros2Peer
 from ros2_rig import write_profile
 
-from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import open_session
+from vla_zenoh.client.client import Client
 from vla_zenoh.codec import records
 from vla_zenoh.keys import Keys
 from vla_zenoh.profile import load_profile

@@ -16,8 +16,8 @@ from camera_rig import PATIENCE_S, until
 from chain import LONG_PATIENCE_S, READY_PATIENCE_S, Chain, command_line, running_chain
 
 from vla_zenoh.bus.buffers import LatestSample
-from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.session import open_session
+from vla_zenoh.client.client import Client
 from vla_zenoh.codec import records
 from vla_zenoh.errors import SessionError
 from vla_zenoh.types import ActionChunk, ObjectPoses

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.session import open_session
+from vla_zenoh.client.client import Client
 from vla_zenoh.keys import CRASHED, STARTING
 from vla_zenoh.profile import load_profile, override
 

@@ -14,8 +14,8 @@ import pytest
 from camera_rig import free_endpoint, until
 from chain import READY_PATIENCE_S, Recorder, write_profile
 
-from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.session import open_session
+from vla_zenoh.client.client import Client
 from vla_zenoh.errors import SessionError
 from vla_zenoh.profile import load_profile
 

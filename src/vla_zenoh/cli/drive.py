@@ -19,7 +19,7 @@ from vla_zenoh.errors import CodecError, SecurityError, SessionError, StartingEr
 from vla_zenoh.keys import CRASHED, STARTING, worker_node
 
 if TYPE_CHECKING:
-    from vla_zenoh.bus.client import Client
+    from vla_zenoh.client.client import Client
     from vla_zenoh.types import Task
 
 PATIENCE_S = 3.0

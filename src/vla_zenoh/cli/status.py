@@ -19,7 +19,7 @@ from vla_zenoh.cli.plain import fail
 from vla_zenoh.cli.target import RobotTarget
 
 if TYPE_CHECKING:
-    from vla_zenoh.bus.client import Client
+    from vla_zenoh.client.client import Client
 
 LISTEN_S = 1.2
 """A node publishes its status twice a second."""

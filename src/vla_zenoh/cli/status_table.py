@@ -11,7 +11,6 @@ from rich.live import Live
 from rich.padding import Padding
 from rich.text import Text
 
-from vla_zenoh.bus.client import DROPPED_HINT
 from vla_zenoh.cli.node_rows import (
     MODE_WORDS,
     NodeRow,
@@ -22,11 +21,12 @@ from vla_zenoh.cli.node_rows import (
     node_rows,
 )
 from vla_zenoh.cli.output import ENDLESS, console, new_table, styled
+from vla_zenoh.client.client import DROPPED_HINT
 from vla_zenoh.sanitize import one_line, printable
 from vla_zenoh.types import Event, Header, NodeStatus
 
 if TYPE_CHECKING:
-    from vla_zenoh.bus.client import Client
+    from vla_zenoh.client.client import Client
 
 REFRESH_HZ = 4.0
 MAX_EVENTS = 8

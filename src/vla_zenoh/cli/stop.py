@@ -18,11 +18,11 @@ from contextlib import contextmanager, suppress
 
 import zenoh
 
-from vla_zenoh.bus.client import Client, StopOutcome, StopProgress
 from vla_zenoh.bus.session import alive_robots, put_text
-from vla_zenoh.cli.entry import BEGAN_S, silence
 from vla_zenoh.cli.plain import BOLD_RED, say, say_marked, warn
+from vla_zenoh.cli.silence import BEGAN_S, silence
 from vla_zenoh.cli.target import RobotTarget
+from vla_zenoh.client.client import Client, StopOutcome, StopProgress
 from vla_zenoh.errors import SecurityError, SessionError
 from vla_zenoh.keys import Keys
 from vla_zenoh.profile import Profile
@@ -30,7 +30,7 @@ from vla_zenoh.profile import Profile
 EXIT_STATUS = {StopOutcome.CONFIRMED: 0, StopOutcome.HEARD: 3, StopOutcome.NOT_CONFIRMED: 4}
 FIRST_WORD_S, LEAST_WAIT_S = 0.8, 0.3
 """Without an answer that is said so long after the program began, and after it asked. Where the
-imports alone take longer, `cli.entry` has said it."""
+imports alone take longer, `cli.silence` has said it."""
 GIVE_UP_S = 10.0
 """It tries, and watches the arm, for so long."""
 AGAIN_S, RETRY_S, POLL_S = 0.5, 0.2, 0.05

@@ -29,7 +29,7 @@ from vla_zenoh.security.roles import Role, operator_role
 from vla_zenoh.security.store import local_role, operator_hosts
 
 if TYPE_CHECKING:
-    from vla_zenoh.bus.client import Client
+    from vla_zenoh.client.client import Client
 
 
 SILENCE_S = 0.8
@@ -104,7 +104,7 @@ class RobotTarget:
         finally:
             alarm.cancel()
         with session:
-            from vla_zenoh.bus.client import Client
+            from vla_zenoh.client.client import Client
 
             yield Client(profile, session).subscribe()
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from vla_zenoh.bus.client import Client
+from vla_zenoh.client.client import Client
 from vla_zenoh.errors import NodeError, SessionError
 from vla_zenoh.keys import STARTING, worker_node
 from vla_zenoh.lab.newest_records import NewestRecords

@@ -16,11 +16,11 @@ from typing import IO, Any
 
 import zenoh
 
-from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.clock import Clock
 from vla_zenoh.bus.host import HOST_VARIABLE, HostId, own_boot_id, own_host_id
 from vla_zenoh.bus.node import Publisher
 from vla_zenoh.bus.session import open_session
+from vla_zenoh.client.client import Client
 from vla_zenoh.errors import NodeError, ProfileError, SessionError, VlaZenohError
 from vla_zenoh.keys import (
     CRASHED,

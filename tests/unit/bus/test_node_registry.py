@@ -7,7 +7,7 @@ import dataclasses
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vla_zenoh.bus.client import MAX_OTHERS, MAX_STATUS_BYTES, NodeRegistry
+from vla_zenoh.client.client import MAX_OTHERS, MAX_STATUS_BYTES, NodeRegistry
 from vla_zenoh.types import NodeStatus
 
 OURS = ("sim", "command")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from typing import Any, cast
 
-from vla_zenoh.bus.client import Client
+from vla_zenoh.client.client import Client
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import NodeStatus, Task
 

@@ -9,11 +9,11 @@ from threading import Event
 import pytest
 from typer.testing import CliRunner
 
-from vla_zenoh.cli.main import app
 from vla_zenoh.errors import SecurityError
 from vla_zenoh.lab.cli.loopback import require_loopback
 from vla_zenoh.lab.recording.writer import RecordingWriter
 from vla_zenoh.profile import Profile, load_profile, override, to_yaml
+from vla_zenoh.program.main import app
 
 SERVE = ("lab", "serve", "--worker", "no_such_model", "--port", "8123")
 VIEW = ("view", "--serve", "--port", "9123", "--seconds", "0.1")

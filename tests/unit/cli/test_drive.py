@@ -14,13 +14,13 @@ import pytest
 from typed import typed
 from typer.testing import CliRunner
 
-from vla_zenoh.bus.client import Client
 from vla_zenoh.cli import drive
-from vla_zenoh.cli.main import app
 from vla_zenoh.cli.plain import json_answer, say, warn
+from vla_zenoh.client.client import Client
 from vla_zenoh.errors import SessionError, StartingError
 from vla_zenoh.keys import STARTING
 from vla_zenoh.profile import load_profile
+from vla_zenoh.program.main import app
 from vla_zenoh.types import NodeStatus, Task
 
 FIRST_LINE_S = 1.2
@@ -37,7 +37,7 @@ def after_typing(*words: str, printed: str) -> str:
     """What a process prints after the command line has run in it."""
     code = (
         f"import os, sys\nsys.argv = {['vla-zenoh', *words]!r}\n"
-        "from vla_zenoh.cli.entry import main\n"
+        "from vla_zenoh.program.entry import main\n"
         "try: main()\nexcept SystemExit: pass\n"
         f"print({printed})"
     )

@@ -10,7 +10,7 @@ import pytest
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from vla_zenoh.cli.main import COMPLETIONS, app, examples
+from vla_zenoh.program.main import COMPLETIONS, app, examples
 
 LEAST_EXAMPLES = 2
 ROOT: Any = get_command(app)

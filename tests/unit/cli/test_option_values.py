@@ -10,8 +10,8 @@ import pytest
 from typed import typed
 from typer.main import get_command
 
-from vla_zenoh.cli.main import app
 from vla_zenoh.profile.schema import network_address
+from vla_zenoh.program.main import app
 
 USAGE, FAILED = 2, 1
 SERVING = "secure init --folder keys -o lab.yaml --profile panda_sim_two_hosts"

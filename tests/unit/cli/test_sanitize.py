@@ -234,8 +234,8 @@ def fault(node: ast.AST, rich: set[str]) -> str:
 
 
 PRINTS = {
-    "cli/entry.py": "that a stop is not confirmed, in our own words, before the imports have ended",
-    "cli/main.py": "the version",
+    "cli/silence.py": "that a stop is not confirmed, before the imports have ended",
+    "program/main.py": "the version",
     "cli/plain.py": "lines made printable there",
     "cli/nodes.py": "the profile's name, for a program that waits for it",
     "lab/cli/profile.py": "a profile or a bridge's configuration as a file",

@@ -15,8 +15,8 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 from benchmarks.__main__ import app as benchmarks
-from vla_zenoh.cli.main import app
 from vla_zenoh.errors import VlaZenohError
+from vla_zenoh.program.main import app
 
 READ = {
     "view file",

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from vla_zenoh.cli.main import app
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.lab.bench import command_runner
+from vla_zenoh.program.main import app
 
 
 def test_a_robot_of_parts_is_rejected_before_anything_starts(

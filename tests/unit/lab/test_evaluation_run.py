@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from vla_zenoh.cli.main import app
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import encode_jpeg
 from vla_zenoh.keys import Keys
@@ -32,6 +31,7 @@ from vla_zenoh.lab.recording.sample import JPEG, MSGPACK, TEXT, Sample
 from vla_zenoh.lab.recording.writer import RecordingWriter
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, ObservationSpec
 from vla_zenoh.profile import load_profile, to_yaml
+from vla_zenoh.program.main import app
 from vla_zenoh.types import (
     ActionChunk,
     Cause,

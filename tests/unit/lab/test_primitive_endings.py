@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from vla_zenoh.client.messages import Until
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.lab.primitives.endings import (
     GRIPPED_S,
@@ -19,7 +20,6 @@ from vla_zenoh.lab.primitives.endings import (
     RunEnding,
     Sight,
 )
-from vla_zenoh.lab.primitives.messages import Until
 from vla_zenoh.types import GripperState, PoseState
 
 PERIOD_S = 0.01

@@ -11,14 +11,14 @@ from typing import Any, cast, get_args
 import pytest
 
 from vla_zenoh import plugins
-from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.host import own_boot_id
-from vla_zenoh.cli.main import COMMANDS, Group
+from vla_zenoh.client.client import Client
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.keys import NODE_KINDS
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.profile.robot import RobotProfile
 from vla_zenoh.profile.schema import NodeKind
+from vla_zenoh.program.main import COMMANDS, Group
 from vla_zenoh.runtime.launch import Host, node_commands
 from vla_zenoh.runtime.supervisor import STOP_ORDER
 from vla_zenoh.types import NodeStatus

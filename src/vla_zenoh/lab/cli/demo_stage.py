@@ -16,9 +16,9 @@ from typing import Any
 
 from rich.progress import Progress
 
-from vla_zenoh.bus.client import Client
 from vla_zenoh.cli.options import effective_profile
 from vla_zenoh.cli.output import errors
+from vla_zenoh.client.client import Client
 from vla_zenoh.lab.cli.bench_file import running_nodes
 from vla_zenoh.lab.cli.loopback import own_address
 from vla_zenoh.lab.cli.options import DemoOptions

@@ -13,10 +13,10 @@ import typer
 from rich.live import Live
 from rich.table import Table
 
-from vla_zenoh.bus.client import Client
 from vla_zenoh.cli.options import MAX_SECONDS, node_name, options
 from vla_zenoh.cli.output import console, errors, fail, new_table
 from vla_zenoh.cli.target import RobotTarget
+from vla_zenoh.client.client import Client
 from vla_zenoh.codec.image import decode_jpeg
 from vla_zenoh.errors import CodecError
 from vla_zenoh.lab.cli.output_path import ForceOption, if_wanted, output_folder

@@ -17,12 +17,12 @@ from rich.pretty import pretty_repr
 from rich.table import Table
 
 from vla_zenoh.bus.buffers import CallbackRing, bytes_of, header_of
-from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.cli.options import MAX_SECONDS, JsonOption, key_expression, options
 from vla_zenoh.cli.output import console, fail, new_table, styled
 from vla_zenoh.cli.plain import warn
 from vla_zenoh.cli.target import RobotTarget
+from vla_zenoh.client.client import Client
 from vla_zenoh.codec import message
 from vla_zenoh.codec.image import MAX_IMAGE_BYTES
 from vla_zenoh.errors import CodecError, ProfileError, nearest

@@ -131,7 +131,7 @@ def mcp(target: RobotTarget) -> None:
     With the rights of this computer's certificate. It ends with its stdin; then the arm brakes.
     """
     from vla_zenoh.bus.session import open_session
-    from vla_zenoh.lab.primitives.remote_robot import RemoteRobot
+    from vla_zenoh.client.remote_robot import RemoteRobot
     from vla_zenoh.lab.serve.mcp_server import McpServer
     from vla_zenoh.security.store import local_role
 

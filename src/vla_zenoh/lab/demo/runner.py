@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from vla_zenoh.bus.client import Client
+from vla_zenoh.client.client import Client
 from vla_zenoh.errors import NodeError
 from vla_zenoh.kinematics.so3 import Pose, exp3, log3, rotation_from_quat
 from vla_zenoh.lab.demo.segments import DemoSegment, RestPose, SegmentOutcome, judge_segment

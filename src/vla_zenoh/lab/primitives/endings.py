@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vla_zenoh.client.messages import Until
 from vla_zenoh.kinematics.so3 import Pose, pose_distance, pose_of
-from vla_zenoh.lab.primitives.messages import Until
 from vla_zenoh.types import FloatArray, GripperState, PoseState
 
 NEAR_M, NEAR_RAD = 1e-3, 2e-3

@@ -18,13 +18,7 @@ import numpy as np
 import zenoh
 
 from vla_zenoh.bus.buffers import Wake, bytes_of
-from vla_zenoh.control.commander_io import DEACTIVATED
-from vla_zenoh.control.reachability import ReachabilityFilter
-from vla_zenoh.errors import CodecError, NodeError, SessionError, VlaZenohError
-from vla_zenoh.keys import PRIMITIVES, last_chunk, worker_node
-from vla_zenoh.kinematics.so3 import Pose, pose_of, rotation_from_quat
-from vla_zenoh.lab.primitives.endings import NEAR_RAD, Arrival, Ending, Gripped, RunEnding, Sight
-from vla_zenoh.lab.primitives.messages import (
+from vla_zenoh.client.messages import (
     MAX_REQUEST_BYTES,
     Answer,
     Grip,
@@ -34,8 +28,14 @@ from vla_zenoh.lab.primitives.messages import (
     RunModel,
     decode_request,
 )
+from vla_zenoh.client.remote_robot import TIMEOUT_S, RemoteRobot
+from vla_zenoh.control.commander_io import DEACTIVATED
+from vla_zenoh.control.reachability import ReachabilityFilter
+from vla_zenoh.errors import CodecError, NodeError, SessionError, VlaZenohError
+from vla_zenoh.keys import PRIMITIVES, last_chunk, worker_node
+from vla_zenoh.kinematics.so3 import Pose, pose_of, rotation_from_quat
+from vla_zenoh.lab.primitives.endings import NEAR_RAD, Arrival, Ending, Gripped, RunEnding, Sight
 from vla_zenoh.lab.primitives.policy import CHUNK_HZ, Target, TargetPolicy
-from vla_zenoh.lab.primitives.remote_robot import TIMEOUT_S, RemoteRobot
 from vla_zenoh.lab.primitives.target_check import TargetCheck
 from vla_zenoh.nodes.worker.node import InferenceDebugPublisher
 from vla_zenoh.nodes.worker.robot_session import RobotSession
@@ -67,7 +67,7 @@ class _Asked(NamedTuple):
 
 
 class PrimitivesNode:
-    """Answers on `Keys.primitive`, see `vla_zenoh.lab.primitives.messages`.
+    """Answers on `Keys.primitive`, see `vla_zenoh.client.messages`.
 
     Args:
         session: with the rights of a worker and of an operator.

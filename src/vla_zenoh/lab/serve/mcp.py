@@ -11,8 +11,8 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+from vla_zenoh.client.messages import REQUESTS
 from vla_zenoh.errors import CodecError
-from vla_zenoh.lab.primitives.messages import REQUESTS
 
 VERSIONS = ("2024-11-05", "2025-03-26", "2025-06-18", "2025-11-25")
 MAX_LINE = 256 * 1024

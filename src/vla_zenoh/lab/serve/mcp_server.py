@@ -14,11 +14,11 @@ from dataclasses import asdict
 from typing import IO, Any
 
 from vla_zenoh import __version__
-from vla_zenoh.bus.client import StopOutcome
+from vla_zenoh.client.client import StopOutcome
+from vla_zenoh.client.primitives import ask
+from vla_zenoh.client.remote_robot import RemoteRobot
 from vla_zenoh.errors import SessionError, VlaZenohError, in_words
 from vla_zenoh.keys import worker_node
-from vla_zenoh.lab.primitives.client import ask
-from vla_zenoh.lab.primitives.remote_robot import RemoteRobot
 from vla_zenoh.lab.serve.mcp import (
     DESCRIPTIONS,
     LOOKING,

@@ -14,7 +14,7 @@ from collections.abc import Callable
 
 import zenoh
 
-from vla_zenoh.bus.client import Client, StopOutcome
+from vla_zenoh.client.client import Client, StopOutcome
 from vla_zenoh.errors import NodeError, PeerError
 from vla_zenoh.keys import CRASHED, STARTING
 from vla_zenoh.lab.teleop.keyboard import (

@@ -10,7 +10,7 @@ from typing import Protocol
 
 import numpy as np
 
-from vla_zenoh.bus.client import Client
+from vla_zenoh.client.client import Client
 from vla_zenoh.errors import NodeError, SessionError
 from vla_zenoh.keys import worker_node
 from vla_zenoh.lab.episode import EpisodeRunner, EpisodeView, Interrupted

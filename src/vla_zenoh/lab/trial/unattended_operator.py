@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
-from vla_zenoh.bus.client import Client
+from vla_zenoh.client.client import Client
+from vla_zenoh.client.primitives import ask
 from vla_zenoh.codec.image import encode_jpeg
 from vla_zenoh.errors import NodeError, RecordingError
 from vla_zenoh.lab.durable import write_whole, writing
 from vla_zenoh.lab.episode import EpisodeRunner
 from vla_zenoh.lab.newest_records import NewestRecords, StreamSlot
-from vla_zenoh.lab.primitives.client import ask
 from vla_zenoh.lab.tasks.judge import TaskJudge
 from vla_zenoh.lab.trial.automatic_judge import Frame, Judge, JudgedEpisode, StateSample
 from vla_zenoh.lab.trial.episode_fsm import EpisodeFsm, Phase

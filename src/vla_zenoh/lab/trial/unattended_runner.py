@@ -11,7 +11,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from vla_zenoh.bus.client import Client
+from vla_zenoh.client.client import Client
 from vla_zenoh.errors import NodeError, OutputError, RecordingError, SessionError
 from vla_zenoh.lab.episode import Interrupted
 from vla_zenoh.lab.trial.automatic_judge import Judge, make_judge, post_json

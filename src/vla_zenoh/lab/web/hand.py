@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import zenoh
 
-from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.session import open_session
+from vla_zenoh.client.client import Client
 from vla_zenoh.errors import NodeError
 from vla_zenoh.keys import worker_node
 from vla_zenoh.lab.teleop.policy import OperatorInput, TeleopPolicy, speeds_of

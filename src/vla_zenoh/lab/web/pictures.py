@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from vla_zenoh.bus.buffers import bytes_of, header_of
-from vla_zenoh.bus.client import Client
+from vla_zenoh.client.client import Client
 from vla_zenoh.codec.image import decode_depth, encode_jpeg
 from vla_zenoh.errors import CodecError, ProfileError
 from vla_zenoh.lab.newest_records import StreamSlot

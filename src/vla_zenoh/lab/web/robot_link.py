@@ -12,13 +12,13 @@ from typing import Any
 import zenoh
 
 from vla_zenoh.bus.buffers import ReceivedSample, ZenohRing, bytes_of
-from vla_zenoh.bus.client import Client, StopOutcome
 from vla_zenoh.cli.node_rows import NodeRow, acting_limits, mode_of, node_rows
+from vla_zenoh.client.client import Client, StopOutcome
+from vla_zenoh.client.primitives import ask
 from vla_zenoh.codec import records
 from vla_zenoh.codec.settings import decode_held
 from vla_zenoh.errors import CodecError, RecordError, SessionError, VlaZenohError
 from vla_zenoh.keys import ENDED, PRIMITIVES, ROLLING, last_chunk, worker_node
-from vla_zenoh.lab.primitives.client import ask
 from vla_zenoh.lab.teleop.policy import OperatorInput
 from vla_zenoh.lab.trial.plan import MAX_SETUPS
 from vla_zenoh.lab.web.hand import HandWorker

@@ -12,8 +12,8 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any
 
-from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.session import open_session
+from vla_zenoh.client.client import Client
 from vla_zenoh.errors import NodeError, VlaZenohError
 from vla_zenoh.keys import key_chunk, worker_node
 from vla_zenoh.lab.cli.output_path import RUNS

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import zenoh
 
 from vla_zenoh.bus.buffers import bytes_of
-from vla_zenoh.bus.client import Client
+from vla_zenoh.client.client import Client
 from vla_zenoh.codec import settings
 from vla_zenoh.errors import CodecError, SessionError
 from vla_zenoh.profile import Profile

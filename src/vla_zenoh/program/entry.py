@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sys
-import threading
-import time
 from contextlib import suppress
+
+from vla_zenoh.cli.silence import silence
 
 EXTRA_OF = {
     **dict.fromkeys(("pinocchio", "ruckig"), "control"),
@@ -16,27 +15,9 @@ EXTRA_OF = {
     "rerun": "view",
 }
 """Module -> extra that brings it, for the error of a missing import."""
-BEGAN_S = time.monotonic()
-"""When this program began, before its slow imports."""
 HASTE = -20
 """Niceness of a stop."""
-SILENCE_S = 0.9
-"""A stop that has said nothing for so long says that it is not confirmed, whatever it waits for."""
-UNHEARD = (
-    "NOT CONFIRMED: no answer yet. The stop may still arrive. USE THE ROBOT'S OWN EMERGENCY STOP"
-)
 QUIET_OPTIONS = {"--help", "--wait-key"}
-
-
-def _say_unheard() -> None:
-    unknown = {"robot": None, "heard_by": [], "speed_rad_s": None, "message": UNHEARD}
-    line = json.dumps({"ok": False, "outcome": "not_confirmed", **unknown})
-    print(line if "--json" in sys.argv else UNHEARD, flush=True)
-
-
-silence = threading.Timer(SILENCE_S, _say_unheard)
-"""Runs during the slow imports of `vla-zenoh stop`; its first line cancels it."""
-silence.daemon = True
 
 
 def main() -> None:
@@ -50,7 +31,7 @@ def main() -> None:
         if QUIET_OPTIONS.isdisjoint(sys.argv):
             silence.start()
     try:
-        from vla_zenoh.cli.main import app
+        from vla_zenoh.program.main import app
 
         try:
             app()

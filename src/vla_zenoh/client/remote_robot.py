@@ -10,15 +10,15 @@ from typing import Any, Literal, TypeVar
 import zenoh
 
 from vla_zenoh.bus.buffers import LatestSample, ReceivedSample, bytes_of, header_of
-from vla_zenoh.bus.client import Client
 from vla_zenoh.bus.clock import Clock
 from vla_zenoh.bus.session import open_session
+from vla_zenoh.client.client import Client
+from vla_zenoh.client.messages import DEFAULT_TIMEOUT_S, Answer
+from vla_zenoh.client.primitives import PrimitiveError, ask
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import MAX_IMAGE_BYTES, decode_jpeg, decode_raw
 from vla_zenoh.codec.records import MAX_RECORD_BYTES
 from vla_zenoh.errors import SessionError
-from vla_zenoh.lab.primitives.client import PrimitiveError, ask
-from vla_zenoh.lab.primitives.messages import DEFAULT_TIMEOUT_S, Answer
 from vla_zenoh.profile import Profile, as_robot, load_profile, override
 from vla_zenoh.types import ActionChunk, GripperState, Image, JointState, PoseState, Stamped
 
@@ -140,7 +140,7 @@ class RemoteRobot(Client):
 
         Args:
             worker: the worker that moves it.
-            until: conditions, `vla_zenoh.lab.primitives.messages.Until`: ``{"gripper": "closed"}``.
+            until: conditions, `vla_zenoh.client.messages.Until`: ``{"gripper": "closed"}``.
             prompt: for the worker; None: the present one.
             timeout_s: then the arm is braked.
 
