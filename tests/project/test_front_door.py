@@ -8,11 +8,14 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import vla_zenoh
 
 ROOT = Path(__file__).parents[2]
+HOME_M, STEP_M = 0.16, 0.01
+"""Height of the TCP at home, and a step of the example's model."""
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 
 
@@ -47,6 +50,20 @@ def test_types_and_modules_export_the_same_names() -> None:
 def test_an_example_is_in_the_table_of_the_docs(path: Path) -> None:
     text = (ROOT / "docs" / "how-to" / "python.md").read_text("utf-8")
     assert f"`examples/{path.name}`" in text
+
+
+def test_the_loop_in_one_process_is_short_and_lifts_the_arm_by_a_centimetre_a_step() -> None:
+    path = ROOT / "examples" / "in_one_process.py"
+    assert len(path.read_text("utf-8").splitlines()) <= 80
+    done = subprocess.run(
+        [sys.executable, path], capture_output=True, text=True, check=True, timeout=120
+    )
+    *heights_m, unit = done.stdout.split()
+    assert unit == "m"
+    rises_m = np.diff([float(height_m) for height_m in heights_m])
+    assert float(heights_m[0]) == pytest.approx(HOME_M, abs=0.001)
+    assert rises_m[0] == pytest.approx(0.0, abs=0.001)  # it is not activated before the first chunk
+    assert rises_m[2:] == pytest.approx(STEP_M, abs=0.002)
 
 
 def test_the_reference_pages_are_those_of_the_code() -> None:
