@@ -43,6 +43,9 @@ FROM_CAMERA: Reasons = {"command": frozenset({"stale"}), "worker": BEGUN_ANEW}
 RESTARTED: Mapping[str, Reasons] = {"sim": {"sim": frozenset({"pose_inactive"})}}
 """Kind of node that was killed -> who refuses what for it. A simulator is back after 0.7 s, its
 arm at home; the stream to the old one brakes, and ends 0.5 s after the arm stands."""
+BRAKED_ITSELF: Reasons = {"sim": frozenset({"pose_braking", "pose_inactive", "pose_jump"})}
+"""The robot hears a stop as well and brakes by itself. Reset, it rejects what is left of the stream
+with which the command node braked."""
 WHO_LIVES: Reasons = {"command": frozenset({"foreign_spec", "foreign_status"})}
 """Who was away, or hears of one who was, is told what they say before it knows that they live."""
 NEVER = frozenset({"simulation_fault", "inference_failed", "contract", "reset_failed", "seen"})
@@ -72,7 +75,7 @@ EXPLAINS: Mapping[str, Reasons] = {
     "worker": {},
     "rate": {},
     "toggle": ASKED_EARLY,
-    "stop": ASKED_EARLY,
+    "stop": joined(ASKED_EARLY, BRAKED_ITSELF),
     "kill": joined(ASKED_EARLY, WHO_LIVES),
     "freeze": joined(ASKED_EARLY, WHO_LIVES),
     "junk": ASKED_EARLY,

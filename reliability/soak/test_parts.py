@@ -51,7 +51,7 @@ def test_a_refusal_needs_a_cause() -> None:
     assert unexplained(found, "junk", 0.0) == {}
     rest = {"sim.pose_inactive": 4}
     assert unexplained(rest, "kill", 0.0, "sim") == {}
-    for action, whom in (("kill", "camera"), ("prompt", ""), ("stop", "")):
+    for action, whom in (("kill", "camera"), ("prompt", ""), ("toggle", "")):
         assert unexplained(rest, action, 0.0, whom) == rest
     jump = {"sim.pose_jump": 1}
     assert unexplained(jump, "kill", 0.0, "sim") == jump
@@ -69,6 +69,8 @@ def test_a_refusal_needs_a_cause() -> None:
         ("command.stale", "freeze", "sim", False),
         ("command.foreign_status", "freeze", "command", True),
         ("command.activate_refused", "stop", "", True),
+        ("sim.pose_inactive", "stop", "", True),
+        ("sim.pose_too_fast", "stop", "", False),
         ("command.activate_refused", "prompt", "", False),
         ("camera.stale", "freeze", "router", False),
     ],

@@ -23,7 +23,7 @@ from witness import FloatArray, Witness
 ROBOT = Path(__file__).with_name("panda_robot.py")
 ROBOT_READY_S = 30.0
 STEP_M, MIDDLE_M, MOVING_M_S = 0.01, 0.45, 0.05
-WIDTH, HEIGHT, CAMERA_HZ, STATE_HZ = 160, 120, 20, 200
+WIDTH, HEIGHT, CAMERA_HZ, STATE_HZ = 80, 60, 20, 200
 ON_TIME, PICTURE_AGE_MS = 0.85, 50.0
 
 PROFILE = """\

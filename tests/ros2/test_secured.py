@@ -40,7 +40,7 @@ TOKENS = "@/*/@ros2_lv/**"
 PLAIN = """\
 extends: panda_ros2
 cameras:
-  front: {{width: 160, height: 120, rate_hz: 20, check: {{same_s: 0}}}}
+  front: {{width: 80, height: 60, rate_hz: 20, check: {{same_s: 0}}}}
   wrist: null
 task: {{prompt: hold, rate_hz: 5, worker: scripted}}
 session:
