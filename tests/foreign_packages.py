@@ -19,7 +19,7 @@ def write_page(folder: Path) -> None:
     """Write the files of the page into `folder`, and beside each package what installs it."""
     for name, text in files_of_the_page().items():
         path = folder / name
-        path.parent.mkdir(exist_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, "utf-8")
         if path.name == "pyproject.toml":
             install(path)

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from typing import get_args
 
 from vla_zenoh import plugins
-from vla_zenoh.profile.schema import CAMERA_SOURCES, NodeKind
+from vla_zenoh.profile.schema import NodeKind
 
 
 def any_of(names: Iterable[str]) -> str:
@@ -22,6 +22,7 @@ def any_of(names: Iterable[str]) -> str:
 
 DRIVERS = tuple(plugins.installed(plugins.ROBOTS))
 """What `robot.driver` may be."""
+CAMERA_SOURCES = plugins.load_all(plugins.CAMERAS)
 CAMERAS = ", ".join(kind.written for kind in CAMERA_SOURCES.values())
 
 WRONG: list[tuple[str, str]] = [
@@ -202,6 +203,11 @@ WRONG: list[tuple[str, str]] = [
     (
         "cameras: {front: {source: webcam}}",
         f"'webcam' is not a camera: write one of {CAMERAS}",
+    ),
+    (
+        "cameras: {front: {source: 'v4l:0'}}",
+        "lab.yaml:2: cameras.front.source: 'v4l:0': no camera source 'v4l' is installed; did you "
+        "mean 'v4l2'? Installed: file, realsense, ros2, rtsp, rtsps, sim, v4l2. Install the",
     ),
     (
         "cameras: {front: {source: 'sim:'}}",

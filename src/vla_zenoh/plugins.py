@@ -33,6 +33,10 @@ def _nothing(profile: Any, options: Any) -> Iterable[Any]:
     return ()
 
 
+def _right(text: str) -> str:
+    return ""
+
+
 def _no_script(options: Any) -> Path | None:
     return None
 
@@ -69,6 +73,47 @@ class RobotPlugin:
     check_robot: Callable[[Any, Any], Iterable[Any]] | None = None
 
 
+@dataclass(frozen=True, kw_only=True)
+class CameraPlugin:
+    """What the ``source`` of a camera may begin with. Group ``vla_zenoh.cameras``.
+
+    Args:
+        written: how a profile names one, as ``v4l2:DEVICE``; the word before the colon is the name
+            of the plug-in.
+        make: of the text behind the colon and the `CameraProfile`: returns a
+            `vla_zenoh.nodes.camera.source.Source`, not open yet. None: no camera node reads it.
+        check: of the text behind the colon: what is wrong with it; empty: nothing.
+        is_path: that text is a file or folder, relative to the profile.
+        has_lens: its images may be cropped, flipped and undistorted.
+        has_intrinsics: it reports those of its lens.
+        has_depth: it measures depth.
+        has_locks: its exposure and white balance can be fixed.
+        same_moving_s: how long an image may repeat while the arm moves, s; 0: indefinitely.
+    """
+
+    written: str
+    make: Callable[[str, Any], Any] | None = None
+    check: Callable[[str], str] = _right
+    is_path: bool = False
+    has_lens: bool = False
+    has_intrinsics: bool = False
+    has_depth: bool = False
+    has_locks: bool = False
+    same_moving_s: float = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilePlugin:
+    """A model or benchmark in a Python file. Groups ``vla_zenoh.models``, ``vla_zenoh.benchmarks``.
+
+    Args:
+        file: the file, or a folder with a ``model.py``. A PEP 723 header asks for an environment of
+            its own, in which the package that brings the file is not installed.
+    """
+
+    file: Path
+
+
 Declaration = TypeVar("Declaration")
 
 
@@ -87,6 +132,10 @@ class Group(NamedTuple, Generic[Declaration]):
 
 
 ROBOTS = Group("vla_zenoh.robots", "robot driver", RobotPlugin)
+CAMERAS = Group("vla_zenoh.cameras", "camera source", CameraPlugin)
+MODELS = Group("vla_zenoh.models", "model", FilePlugin)
+BENCHMARKS = Group("vla_zenoh.benchmarks", "benchmark", FilePlugin)
+GROUPS: tuple[Group[Any], ...] = (ROBOTS, CAMERAS, MODELS, BENCHMARKS)
 
 
 def installed(group: Group[Any]) -> Mapping[str, EntryPoint]:
@@ -178,6 +227,12 @@ def faults_of(
 def in_own_environment() -> bool:
     """Whether this process runs in an environment made for one model."""
     return OWN_ENVIRONMENT_VARIABLE in os.environ
+
+
+def file_here(name: str) -> Path | None:
+    """The file of the model `name` for which the environment of this process was made."""
+    own, _, path = os.environ.get(OWN_ENVIRONMENT_VARIABLE, "").partition("=")
+    return Path(path) if path and own == name else None
 
 
 def how_to_repeat(group: Group[Any], name: str) -> list[str]:

@@ -1,7 +1,8 @@
 """Finds models, scenes, profiles and robot descriptions, in a checkout and in a wheel alike.
 
 Looked through in this order, first hit wins: an explicit path, each folder in ``VLA_ZENOH_PATH``
-(``<folder>/profiles/name.yaml``), what the package ships. Nothing is ever fetched from the net.
+(``<folder>/profiles/name.yaml``), what the package ships; of models and benchmarks instead what
+installed packages bring, this one among them. Nothing is ever fetched from the net.
 """
 
 from __future__ import annotations
@@ -9,12 +10,15 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from vla_zenoh import plugins
 from vla_zenoh.errors import MissingExtraError, ProfileError, ResourceError, nearest
 
 PROFILE_SUFFIXES = (".yaml", ".yml")
 BENCHMARKS = "sim/benchmarks"
 KINDS = {"models": (".py", ""), "profiles": PROFILE_SUFFIXES, "sim": ("",), BENCHMARKS: (".py",)}
 ONE = {"models": "model", "profiles": "profile", "sim": "scene", BENCHMARKS: "benchmark"}
+PLUGINS = {"models": plugins.MODELS, BENCHMARKS: plugins.BENCHMARKS}
+"""What packages bring, and no folder of this one is searched for."""
 SEARCH_PATH_VARIABLE = "VLA_ZENOH_PATH"
 ROBOT_DATA_PREFIX = "example-robot-data:"
 
@@ -34,12 +38,13 @@ def folders(kind: str) -> list[Path]:
     """Folders that are searched for `kind`, first match wins."""
     parts = os.environ.get(SEARCH_PATH_VARIABLE, "").split(os.pathsep)
     named = [Path(part) / kind for part in parts if part]
-    return [folder for folder in named if folder.is_dir()] + [shipped(kind)]
+    own = [] if kind in PLUGINS else [shipped(kind)]
+    return [folder for folder in named if folder.is_dir()] + own
 
 
 def names(kind: str) -> list[str]:
     """Names of everything of `kind` that is found, sorted."""
-    found: set[str] = set()
+    found = set(plugins.installed(PLUGINS[kind])) if kind in PLUGINS else set()
     for folder in folders(kind):
         for entry in folder.iterdir():
             if entry.name.startswith((".", "_")) or f"{kind}/{entry.name}" in KINDS:
@@ -68,6 +73,11 @@ def find(kind: str, name: str) -> Path:
             path = folder / f"{name}{suffix}"
             if path.exists() and (suffix or path.is_dir()):
                 return path
+    if kind in PLUGINS:
+        if file := plugins.file_here(name):
+            return file
+        if name in plugins.installed(PLUGINS[kind]):
+            return plugins.load(PLUGINS[kind], name).file
     known = names(kind)
     own = f"by a profile's models: {{{name[:80]}: PATH}}, " if kind == "models" else ""
     raise ResourceError(

@@ -12,14 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from typer.testing import CliRunner
-from wrong_profiles import DRIVERS
+from wrong_profiles import CAMERA_SOURCES, DRIVERS
 
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.lab.cli.profile import profile_app
 from vla_zenoh.policy.loader import make_robot
 from vla_zenoh.profile import load_profile
-from vla_zenoh.profile.schema import CAMERA_SOURCES
 from vla_zenoh.resources import robot_urdf
 from vla_zenoh.ros2.writers import position
 from vla_zenoh.types import JointCommand

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,14 +15,19 @@ import pytest
 from driver_report import Report
 from foreign_packages import install, write_page
 
-from vla_zenoh import plugins
+from vla_zenoh import plugins, resources
 from vla_zenoh.errors import PluginError, ProfileError
+from vla_zenoh.lab.check.examination import Examination
+from vla_zenoh.lab.check.model_runner import ModelRunner
 from vla_zenoh.lab.doctor.plugins import installed_plugins, robot_driver
 from vla_zenoh.lab.profile.check import check_profile
+from vla_zenoh.nodes.camera.node import make_source
+from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import load_profile, read_profile, to_yaml
 from vla_zenoh.robots.python_driver import PythonDriver
 from vla_zenoh.types.records import JointReference
 
+PATIENCE_S, RUNS = 20.0, 3
 BROKEN = """\
 [project]
 name = "broken-robot"
@@ -34,11 +43,10 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """With the files of the page; its packages are installed."""
     write_page(tmp_path)
     before = set(sys.modules)
-    for project in tmp_path.glob("*/pyproject.toml"):
-        monkeypatch.syspath_prepend(str(project.parent))
+    monkeypatch.syspath_prepend(str(tmp_path / "acme"))
     yield tmp_path
     for name in set(sys.modules) - before:
-        if name.startswith("acme_"):
+        if name.startswith("acme_lab"):
             del sys.modules[name]
 
 
@@ -51,6 +59,20 @@ def broken(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     install(package / "pyproject.toml")
     monkeypatch.syspath_prepend(str(package))
     return folder
+
+
+def vla_zenoh(folder: Path, *words: str) -> str:
+    """What a command prints where the packages of the page are installed."""
+    path = os.pathsep.join([str(folder / "acme"), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [sys.executable, "-m", "vla_zenoh", *words],
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 def edited(folder: Path, before: str, after: str) -> str:
@@ -114,6 +136,55 @@ def test_its_profile_passes_the_check_and_the_doctor_asks_it(folder: Path) -> No
     assert finding.found == "controller at 10.0.0.7"
 
 
+# -- a camera, a model ------------------------------------------------------------------------
+def test_a_camera_of_a_package_delivers_images_at_its_rate(folder: Path) -> None:
+    camera = load_profile(str(folder / "acme.yaml")).cameras["front"]
+    source = make_source(camera)
+    source.open()
+    grabbed_ns = [source.grab(threading.Event()) for _ in range(3)]
+    image = source.retrieve()
+    source.close()
+    assert image is not None
+    assert image.shape == (camera.height, camera.width, 3)
+    assert all(ns is not None for ns in grabbed_ns)
+    assert not camera.from_ros2
+
+
+def test_what_a_camera_cannot_do_is_a_fault_like_ours(folder: Path) -> None:
+    with pytest.raises(ProfileError, match=r"depth_unit_m: is set, and acme: measures no depth"):
+        load_profile(edited(folder, '"acme:1234"', '"acme:1234", depth_unit_m: 0.001'))
+    with pytest.raises(ProfileError, match=r"'acme:' is not a camera: write one of acme:SERIAL, "):
+        load_profile(edited(folder, "acme:1234", "acme:"))
+    load_profile(edited(folder, '"acme:1234"', '"acme:1234", flip: both'))
+
+
+def test_a_model_of_a_package_is_found_by_name_and_keeps_its_contract(folder: Path) -> None:
+    model = find_model("acme_nod")
+    assert model.name == "acme_nod"
+    assert "acme_nod" in resources.names("models")
+    profile = load_profile(str(folder / "acme.yaml"))
+    report = Examination(
+        make_policy(model), "acme_nod", ModelRunner(PATIENCE_S), profile=profile, runs=RUNS
+    ).run()
+    assert report.ok, report.findings
+
+
+def test_a_benchmark_of_a_package_lists_its_tasks(folder: Path) -> None:
+    about = json.loads(vla_zenoh(folder, "bench", "sim", "acme_tasks", "--list"))
+    assert about["suites"] == ["reach"]
+    assert [task["name"] for task in about["tasks"]] == ["up"]
+
+
+def test_every_file_of_models_is_declared() -> None:
+    for kind, group in resources.PLUGINS.items():
+        files = [path for path in resources.shipped(kind).iterdir() if path.name[0] not in "._"]
+        assert {path.stem for path in files} == {
+            name
+            for name, entry in plugins.installed(group).items()
+            if entry.value.startswith("vla_zenoh.shipped")
+        }
+
+
 # -- not installed ----------------------------------------------------------------------------
 def test_a_computer_without_the_package_loads_the_profile_and_says_what_the_node_lacks(
     tmp_path: Path,
@@ -121,11 +192,29 @@ def test_a_computer_without_the_package_loads_the_profile_and_says_what_the_node
     write_page(tmp_path)
     path = str(tmp_path / "acme.yaml")
     assert load_profile(path).robot.node == "arm"
-    (error,) = check_profile(path).errors
-    assert "acme.yaml:2: robot.driver: no robot driver 'acme' is installed. Installed: " in error
-    assert "docs/how-to/plugins.md" in error
-    with pytest.raises(PluginError, match="no robot driver 'acme' is installed"):
+    errors = check_profile(path).errors
+    for line, place, what in (
+        (2, "robot.driver", "robot driver 'acme' is installed"),
+        (4, "cameras.front.source", "camera source 'acme' is installed"),
+        (5, "workers", "model called 'acme_nod'"),
+    ):
+        assert any(f"acme.yaml:{line}: {place}: no {what}" in error for error in errors), errors
+    with pytest.raises(PluginError, match=r"no robot driver 'acme' .*docs/how-to/plugins\.md"):
         PythonDriver(load_profile(path))
+    with pytest.raises(PluginError, match="no camera source 'acme' is installed"):
+        make_source(load_profile(path).cameras["front"])
+
+
+def test_in_an_environment_of_its_own_a_model_reads_the_profile_and_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_page(tmp_path)
+    model = tmp_path / "acme" / "acme_lab" / "nod.py"
+    monkeypatch.setenv(plugins.OWN_ENVIRONMENT_VARIABLE, f"acme_nod={model}")
+    path = tmp_path / "bare.yaml"
+    path.write_text((tmp_path / "acme.yaml").read_text("utf-8").replace("acme: {", "other: {"))
+    assert load_profile(str(path)).robot.driver == "acme"
+    assert find_model("acme_nod").path == model
 
 
 def test_a_section_of_no_driver_stays_an_unknown_key(folder: Path) -> None:

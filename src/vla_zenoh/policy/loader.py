@@ -123,6 +123,8 @@ def find_model(name: str, kind: str = "models") -> ModelFile:
         if not path.is_file():
             raise ResourceError(f"{path.parent} is a folder without a {ENTRY_FILE}")
     stem = path.parent.name if path.name == ENTRY_FILE else path.stem
+    if not resources.is_path(name):
+        stem = name
     header = _read_header(path)
     dependencies = header.get("dependencies", [])
     requires = header.get("requires-python")

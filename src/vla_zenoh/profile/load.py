@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from vla_zenoh import plugins
 from vla_zenoh.errors import PluginError, ProfileError
 from vla_zenoh.profile.profile import Profile
-from vla_zenoh.profile.schema import PATH_SOURCES
+from vla_zenoh.profile.schema import names_file
 from vla_zenoh.profile.section import WITH_REMOVABLE, Lines, Place, explain, merge
 from vla_zenoh.resources import ROBOT_DATA_PREFIX, extended_profile, is_path, profile_file
 from vla_zenoh.types import shown
@@ -143,7 +143,7 @@ def is_relative(text: str) -> bool:
 PATHS: Mapping[str, Callable[[str], bool]] = {
     "robot.description": lambda text: not text.startswith(ROBOT_DATA_PREFIX),
     "parts.*.robot.description": lambda text: not text.startswith(ROBOT_DATA_PREFIX),
-    "cameras.*.source": lambda text: text.startswith(PATH_SOURCES),
+    "cameras.*.source": names_file,
     "cameras.*.intrinsics": lambda text: True,
     "cameras.*.check.reference": lambda text: True,
     "models.*": is_path,
@@ -156,7 +156,7 @@ PATHS: Mapping[str, Callable[[str], bool]] = {
 
 def paths_in(data: dict[str, Any]) -> Iterator[tuple[dict[str, Any], str, str]]:
     """Paths of files in `data`: (section, key, prefix of the path in the value)."""
-    for place, names_file in PATHS.items():
+    for place, is_file in PATHS.items():
         *above, last = place.split(".")
         sections: list[dict[str, Any]] = [data]
         for key in above:
@@ -165,7 +165,7 @@ def paths_in(data: dict[str, Any]) -> Iterator[tuple[dict[str, Any], str, str]]:
         for section in sections:
             for name in list(section) if last == "*" else [last]:
                 text = section.get(name)
-                if isinstance(text, str) and names_file(text):
+                if isinstance(text, str) and is_file(text):
                     yield section, name, text[: text.index(":") + 1] if last == "source" else ""
     for name in data.keys() - Profile.model_fields.keys():
         if isinstance(data[name], dict):

@@ -5,11 +5,13 @@ from __future__ import annotations
 import ipaddress
 import re
 from collections.abc import Iterator, Sequence
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
 
-from vla_zenoh.errors import nearest
+from vla_zenoh import plugins
+from vla_zenoh.errors import PluginError, nearest
+from vla_zenoh.plugins import CameraPlugin
 from vla_zenoh.profile.section import Distinct, Fault, Name, Names, Place, Section, Text, Word
 from vla_zenoh.types import MAX_DEPTH_UNIT_M, MIN_DEPTH_UNIT_M
 
@@ -203,38 +205,47 @@ MIN_PERIODS = 3
 """A healthy link may be silent for up to this many periods."""
 
 
-class SourceKind(NamedTuple):
-    """A kind of camera source."""
-
-    written: str  # how a profile names one
-    is_path: bool = False  # it names a file or folder, relative to the profile
-    has_lens: bool = False  # a camera node may crop, flip and undistort its images
-    has_depth: bool = False  # it measures depth
-    has_locks: bool = False  # its exposure and white balance can be fixed
-    same_moving_s: float = 1.0  # an image may repeat while the arm moves; 0: indefinitely
+EVERYTHING = CameraPlugin(
+    written="", has_lens=True, has_intrinsics=True, has_depth=True, has_locks=True
+)
+"""Stands for a camera source that is not installed here: another computer checks it."""
 
 
-CAMERA_SOURCES = {
-    "sim": SourceKind("sim:CAMERA", has_depth=True),
-    "v4l2": SourceKind("v4l2:DEVICE", has_lens=True, has_locks=True),
-    "realsense": SourceKind("realsense:SERIAL", has_lens=True, has_depth=True, has_locks=True),
-    "rtsp": SourceKind("rtsp://HOST/PATH", has_lens=True, same_moving_s=5.0),
-    "rtsps": SourceKind("rtsps://HOST/PATH", has_lens=True, same_moving_s=5.0),
-    "file": SourceKind("file:VIDEO_OR_FOLDER", is_path=True, has_lens=True, same_moving_s=0.0),
-    "ros2": SourceKind("ros2:TOPIC", has_depth=True, same_moving_s=2.0),
-}
-"""What a camera's source begins with -> its kind. `nodes.camera.node.make_source` opens them."""
-PATH_SOURCES = tuple(f"{name}:" for name, kind in CAMERA_SOURCES.items() if kind.is_path)
-"""What sources that name a file or folder begin with."""
+def camera_plugin(source: str) -> CameraPlugin:
+    """The plug-in of a camera's source.
+
+    Raises:
+        PluginError: it is installed, and cannot be imported.
+    """
+    kind = source.partition(":")[0]
+    if kind not in plugins.installed(plugins.CAMERAS):
+        return EVERYTHING
+    return plugins.load(plugins.CAMERAS, kind)
+
+
+def names_file(source: str) -> bool:
+    """Whether a camera's source is the path of a file or folder, behind its colon."""
+    kind, colon, _ = source.partition(":")
+    try:
+        return bool(colon) and camera_plugin(kind).is_path
+    except PluginError:
+        return False
 
 
 def _source(value: str) -> str:
     kind, colon, rest = value.partition(":")
-    if not colon or not rest or kind not in CAMERA_SOURCES:
-        known = ", ".join(one.written for one in CAMERA_SOURCES.values())
-        raise ValueError(f"{value!r} is not a camera: write one of {known}")
-    if kind in ("rtsp", "rtsps") and not rest.removeprefix("//"):
-        raise ValueError(f"{value!r} lacks the host: write rtsp://HOST/PATH")
+    known = plugins.installed(plugins.CAMERAS)
+    try:
+        if not colon or not rest:
+            found = plugins.load_all(plugins.CAMERAS).values()
+            written = ", ".join(plugin.written for plugin in found)
+            raise ValueError(f"{value!r} is not a camera: write one of {written}")
+        if kind in known or (nearest(kind, known, "") and not plugins.in_own_environment()):
+            why = plugins.load(plugins.CAMERAS, kind).check(rest)
+            if why:
+                raise ValueError(f"{value!r} {why}")
+    except PluginError as error:
+        raise ValueError(f"{value!r}: {error}") from error
     return value
 
 
@@ -348,10 +359,11 @@ class CameraProfile(Section):
     """A camera.
 
     Args:
-        source: ``sim:<camera of the scene>``, ``v4l2:<device>`` (a serial number, a name in
-            /dev/v4l/by-id, or a path; `vla-zenoh camera list`), ``realsense:<serial number>``,
-            ``rtsp://...``, ``rtsps://...``, ``file:<video or folder of images>`` (relative to the
-            profile), or ``ros2:<topic>``.
+        source: name of an installed plug-in, and what it is to read: ``sim:<camera of the scene>``,
+            ``v4l2:<device>`` (a serial number, a name in /dev/v4l/by-id, or a path; `vla-zenoh
+            camera list`), ``realsense:<serial number>``, ``rtsp://...``, ``rtsps://...``,
+            ``file:<video or folder of images>`` (relative to the profile), ``ros2:<topic>``;
+            packages bring more.
         width: of published images, pixels.
         height: of published images, pixels.
         rate_hz: largest rate of images.
@@ -393,20 +405,20 @@ class CameraProfile(Section):
     check: CameraCheck = CameraCheck()
 
     def contradictions(self) -> Iterator[Fault]:
-        kind = self.source.partition(":")[0]
-        if self.depth_unit_m is not None and not CAMERA_SOURCES[kind].has_depth:
-            known = ", ".join(one.written for one in CAMERA_SOURCES.values() if one.has_depth)
+        kind, plugin = self.source.partition(":")[0], camera_plugin(self.source)
+        others = plugins.load_all(plugins.CAMERAS)
+        if self.depth_unit_m is not None and not plugin.has_depth:
+            known = ", ".join(one.written for one in others.values() if one.has_depth)
             yield ("depth_unit_m",), f"is set, and {kind}: measures no depth; these do: {known}"
         for names, trait in (
             (("intrinsics", "undistort", "crop", "flip"), "has_lens"),
             (("exposure_us", "white_balance_k"), "has_locks"),
         ):
-            kinds = [name for name, one in CAMERA_SOURCES.items() if getattr(one, trait)]
             for name in names:
-                if getattr(self, name) not in (None, False, "none") and kind not in kinds:
-                    known = ", ".join(f"{one}:" for one in kinds)
+                if getattr(self, name) not in (None, False, "none") and not getattr(plugin, trait):
+                    known = ", ".join(f"{one}:" for one in others if getattr(others[one], trait))
                     yield (name,), f"is set, and works with {known} only"
-        if self.undistort and self.intrinsics is None and kind != "realsense":
+        if self.undistort and self.intrinsics is None and not plugin.has_intrinsics:
             yield ("intrinsics",), "is missing: undistort needs the file with the lens"
 
     @property
@@ -414,7 +426,7 @@ class CameraProfile(Section):
         """How long its images may stay the same while the arm moves, s; 0: indefinitely."""
         if self.check.same_s is not None:
             return self.check.same_s
-        return CAMERA_SOURCES[self.source.partition(":")[0]].same_moving_s
+        return camera_plugin(self.source).same_moving_s
 
     @property
     def from_ros2(self) -> bool:

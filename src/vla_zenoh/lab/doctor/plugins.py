@@ -9,12 +9,10 @@ from vla_zenoh.errors import PluginError
 from vla_zenoh.lab.doctor.needs import HostFinding, nodes_on
 from vla_zenoh.profile import Profile
 
-GROUPS = (plugins.ROBOTS,)
-
 
 def installed_plugins() -> Iterator[HostFinding]:
     """The plug-ins of every group, and those that cannot be imported."""
-    for group in GROUPS:
+    for group in plugins.GROUPS:
         name = f"plug-ins: {group.noun}s"
         try:
             known, faults = plugins.installed(group), plugins.broken(group)

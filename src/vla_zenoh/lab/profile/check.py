@@ -12,8 +12,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+from vla_zenoh import plugins
 from vla_zenoh.cli.options import effective_profile
-from vla_zenoh.errors import ProfileError, VlaZenohError, nearest
+from vla_zenoh.errors import PluginError, ProfileError, VlaZenohError, nearest
 from vla_zenoh.lab.profile.robot_check import (
     ProfileFault,
     arm,
@@ -27,7 +28,7 @@ from vla_zenoh.lab.profile.robot_check import (
 )
 from vla_zenoh.policy.loader import find_worker, make_policy
 from vla_zenoh.profile import HostProfile, Profile, load_with_lines
-from vla_zenoh.profile.schema import ANYWHERE, PATH_SOURCES, address_of, host_of, is_loopback
+from vla_zenoh.profile.schema import ANYWHERE, address_of, host_of, is_loopback, names_file
 from vla_zenoh.profile.section import located, located_fault
 
 
@@ -93,13 +94,17 @@ def check_profile(
 
 # -- cameras ----------------------------------------------------------------------------------
 def _cameras(profile: Profile, part: HostProfile) -> Iterator[ProfileFault]:
-    """Files of recorded cameras."""
+    """Cameras that no plug-in reads, and files of recorded ones."""
     for camera in profile.cameras_of(part):
         source = profile.cameras[camera].source
         path = Path(source.partition(":")[2]).expanduser()
-        if source.startswith(PATH_SOURCES) and not path.exists():
-            why = f"there is no file or folder {path}"
-            yield ProfileFault(("cameras", camera, "source"), why, "camera")
+        place = ("cameras", camera, "source")
+        try:
+            plugins.load(plugins.CAMERAS, source.partition(":")[0])
+        except PluginError as error:
+            yield ProfileFault(place, str(error), "camera")
+        if names_file(source) and not path.exists():
+            yield ProfileFault(place, f"there is no file or folder {path}", "camera")
 
 
 # -- workers ----------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ import numpy as np
 import zenoh
 from numpy.typing import NDArray
 
+from vla_zenoh import plugins
 from vla_zenoh.bus.buffers import LatestSample, ReceivedSample, ZenohRing
 from vla_zenoh.bus.node import Node
 from vla_zenoh.errors import MissingExtraError, NodeError, RecordError, VlaZenohError, in_words
@@ -23,7 +24,7 @@ from vla_zenoh.nodes.camera.source import STALL_S, Grabber, Source, prepare_open
 from vla_zenoh.policy import CameraSpec, ModelSpec
 from vla_zenoh.policy.observation import size_variant
 from vla_zenoh.profile import Profile
-from vla_zenoh.profile.schema import CAMERA_SOURCES, CameraProfile
+from vla_zenoh.profile.schema import CameraProfile
 from vla_zenoh.simulation.backend import AUTO, RAYCAST, choose_backend
 from vla_zenoh.simulation.robot_model import robot_models
 from vla_zenoh.types import Event, SceneState, SingleWriterFilter, Stamped
@@ -35,7 +36,12 @@ SIM, ROS2 = "sim:", "ros2:"
 
 
 def choose_cameras(profile: Profile, cameras: tuple[str, ...] | None) -> dict[str, CameraProfile]:
-    """The named cameras, or all except those of ROS 2; `NodeError`: there is none of that name."""
+    """The named cameras, or all except those of ROS 2.
+
+    Raises:
+        NodeError: there is none of that name.
+        PluginError: what reads one of them is not installed.
+    """
     ours = {name: one for name, one in profile.cameras.items() if not one.source.startswith(ROS2)}
     known = f"this node can serve: {', '.join(ours) or 'none'}"
     for name in cameras or ():
@@ -46,26 +52,24 @@ def choose_cameras(profile: Profile, cameras: tuple[str, ...] | None) -> dict[st
     chosen = ours if cameras is None else {name: ours[name] for name in cameras}
     if not chosen:
         raise NodeError(f"profile {profile.name!r} has no camera for this node to serve")
+    for camera in chosen.values():
+        plugins.load(plugins.CAMERAS, camera.source.partition(":")[0])
     return chosen
 
 
 def make_source(profile: CameraProfile) -> Source:
-    """The source of a camera, not open yet. Call it before threads start: it configures OpenCV."""
-    from vla_zenoh.nodes.camera.opencv_sources import FileSource, RtspSource, V4l2Source
-    from vla_zenoh.nodes.camera.realsense import RealsenseSource
+    """The source of a camera, not open yet. Call it before threads start: it configures OpenCV.
 
-    prepare_opencv()
+    Raises:
+        PluginError: no plug-in for it is installed.
+        NodeError: another node publishes it.
+    """
     kind, _, rest = profile.source.partition(":")
-    if kind == "v4l2":
-        return V4l2Source(rest, profile)
-    if kind in ("rtsp", "rtsps"):
-        return RtspSource(profile.source)
-    if kind == "file":
-        return FileSource(rest, profile.rate_hz)
-    if kind == "realsense":
-        return RealsenseSource(rest, profile)
-    known = ", ".join(name for name in CAMERA_SOURCES if name not in ("sim", "ros2"))
-    raise NodeError(f"no camera source called {kind!r}; there are: {known}, sim")
+    plugin = plugins.load(plugins.CAMERAS, kind)
+    if plugin.make is None:
+        raise NodeError(f"{profile.source!r}: no camera node reads {kind}:")
+    prepare_opencv()
+    return plugin.make(rest, profile)
 
 
 SILENCE_S = 5.0

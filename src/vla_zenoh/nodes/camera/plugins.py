@@ -1,0 +1,67 @@
+"""Declarations of the camera sources; see `vla_zenoh.plugins`.
+
+Every command that reads a profile with cameras imports this file, so that the sources and their
+libraries are imported below.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from vla_zenoh.plugins import CameraPlugin
+from vla_zenoh.profile.schema import CameraProfile
+
+if TYPE_CHECKING:
+    from vla_zenoh.nodes.camera.source import Source
+
+
+def _v4l2(device: str, profile: CameraProfile) -> Source:
+    from vla_zenoh.nodes.camera.opencv_sources import V4l2Source
+
+    return V4l2Source(device, profile)
+
+
+def _rtsp(place: str, profile: CameraProfile) -> Source:
+    from vla_zenoh.nodes.camera.opencv_sources import RtspSource
+
+    return RtspSource(profile.source)
+
+
+def _rtsp_fault(place: str) -> str:
+    return "" if place.removeprefix("//") else "lacks the host: write rtsp://HOST/PATH"
+
+
+def _file(path: str, profile: CameraProfile) -> Source:
+    from vla_zenoh.nodes.camera.opencv_sources import FileSource
+
+    return FileSource(path, profile.rate_hz)
+
+
+def _realsense(serial: str, profile: CameraProfile) -> Source:
+    from vla_zenoh.nodes.camera.realsense import RealsenseSource
+
+    return RealsenseSource(serial, profile)
+
+
+# Drawn by the camera node from the simulator's scene, and served by the node ros2.
+SIM = CameraPlugin(written="sim:CAMERA", has_depth=True)
+ROS2 = CameraPlugin(written="ros2:TOPIC", has_depth=True, same_moving_s=2.0)
+
+V4L2 = CameraPlugin(written="v4l2:DEVICE", make=_v4l2, has_lens=True, has_locks=True)
+REALSENSE = CameraPlugin(
+    written="realsense:SERIAL",
+    make=_realsense,
+    has_lens=True,
+    has_intrinsics=True,
+    has_depth=True,
+    has_locks=True,
+)
+RTSP = CameraPlugin(
+    written="rtsp://HOST/PATH", make=_rtsp, check=_rtsp_fault, has_lens=True, same_moving_s=5.0
+)
+RTSPS = CameraPlugin(
+    written="rtsps://HOST/PATH", make=_rtsp, check=_rtsp_fault, has_lens=True, same_moving_s=5.0
+)
+FILE = CameraPlugin(
+    written="file:VIDEO_OR_FOLDER", make=_file, is_path=True, has_lens=True, same_moving_s=0.0
+)

@@ -1,0 +1,17 @@
+"""Declarations of the models and benchmarks in this package; see `vla_zenoh.plugins`.
+
+Each is an entry point in ``pyproject.toml``: ``NAME = "vla_zenoh.shipped:NAME"``.
+"""
+
+from __future__ import annotations
+
+from vla_zenoh.plugins import FilePlugin
+from vla_zenoh.resources import BENCHMARKS, shipped
+
+
+def __getattr__(name: str) -> FilePlugin:
+    for kind in ("models", BENCHMARKS):
+        for file in (shipped(kind) / name, shipped(kind) / f"{name}.py"):
+            if not name.startswith("_") and file.exists():
+                return FilePlugin(file=file)
+    raise AttributeError(f"vla-zenoh ships no model or benchmark {name!r}")
