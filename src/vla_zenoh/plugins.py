@@ -15,12 +15,14 @@ from dataclasses import dataclass
 from functools import lru_cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, TypeVar
-
-from pydantic import BaseModel
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
 from vla_zenoh.errors import PluginError, in_words, nearest
-from vla_zenoh.robot import Robot
+
+if TYPE_CHECKING:  # a command that only lists names loads neither
+    from pydantic import BaseModel
+
+    from vla_zenoh.robot import Robot
 
 OWN_ENVIRONMENT_VARIABLE = "VLA_ZENOH_WORKER_ENVIRONMENT"
 """Set in an environment made for one model: ``NAME=PATH``. It may lack all other plug-ins."""

@@ -21,6 +21,7 @@ ORDER = (
     ("keys", "robot", "sanitize", "types"),
     ("plugins",),
     ("resources",),
+    ("shipped",),
     ("policy",),
     ("profile",),
     ("codec",),
