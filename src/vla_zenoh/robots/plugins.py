@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pydantic import Field
 
@@ -12,7 +13,9 @@ from vla_zenoh.plugins import Fault, RobotPlugin
 from vla_zenoh.profile.profile import Profile
 from vla_zenoh.profile.robot import Options
 from vla_zenoh.profile.section import Section, Word
-from vla_zenoh.robot import Robot
+
+if TYPE_CHECKING:  # numpy: who only reads a profile does not need it
+    from vla_zenoh.robot import Robot
 
 
 class ArmOptions(Section):
