@@ -18,8 +18,8 @@ import time
 from collections.abc import Callable
 
 import numpy as np
+from vla_zenoh_benchmarks.contract import make_benchmark
 
-from vla_zenoh.lab.benchmark.contract import make_benchmark
 from vla_zenoh.policy.loader import find_model
 from vla_zenoh.resources import BENCHMARKS
 

@@ -12,8 +12,8 @@ from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
+from vla_zenoh_benchmarks.contract import BenchmarkObservation, BenchmarkTask
 
-from vla_zenoh.lab.benchmark.contract import BenchmarkObservation, BenchmarkTask
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.types import GripperState, PoseState, PrivilegedState
 

@@ -10,9 +10,10 @@ import subprocess
 import sys
 import tempfile
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 
-from bootstrap import CONSTRAINTS, ROOT, bring_openmp, uv_environment
+from bootstrap import CONSTRAINTS, PLUGINS, ROOT, bring_openmp, uv_environment
 
 DIST = ROOT / "dist"
 UV = Path(sys.executable).parent / "uv"
@@ -21,8 +22,8 @@ LIMIT_S = 1200
 ATTEMPTS = 3
 """Of a demo, which runs in real time: on a busy computer the arm may brake."""
 
-LEFT_OUT = re.compile(r"training/|\.safetensors|(?<!/sim/)benchmarks/|tests/|openvla/measure\.py")
-"""Of the wheel; environments of others' benchmarks in ``sim/`` belong to it."""
+LEFT_OUT = re.compile(r"training/|\.safetensors|benchmarks/|tests/|openvla/measure\.py|plugins/")
+"""Of the wheel."""
 
 TRIALS = [
     ["--help"],
@@ -39,6 +40,12 @@ TRIALS = [
         "runs",
         "--force",
     ],
+]
+
+
+WITH_PLUGINS = [
+    ["bench", "sim", "--help"],
+    ["profile", "check", "fr3", "ur5e_rtde"],
 ]
 
 
@@ -70,8 +77,11 @@ def only(pattern: str) -> Path:
     return found[0]
 
 
-def try_out(archive: Path, extra: str) -> None:
-    """Installs `archive` into an empty environment and runs the command from an empty folder."""
+def try_out(archive: Path, extra: str, plugins: Sequence[Path] = ()) -> None:
+    """Installs `archive` into an empty environment and runs the command from an empty folder.
+
+    Then it installs the wheels of `plugins` beside it, and runs what they bring.
+    """
     with tempfile.TemporaryDirectory(prefix="vla-zenoh-build-") as name:
         folder = Path(name)
         work = folder / "work"
@@ -86,6 +96,10 @@ def try_out(archive: Path, extra: str) -> None:
             run(folder / "venv" / "bin" / "vla-zenoh", *trial, cwd=work, attempts=attempts)
         if not any((work / "runs").rglob("*")):
             sys.exit("build: the demo left nothing in the folder named with --output")
+        if plugins:
+            run(UV, "--quiet", "pip", "install", *target, "--no-deps", *plugins)
+        for trial in WITH_PLUGINS if plugins else ():
+            run(folder / "venv" / "bin" / "vla-zenoh", *trial, cwd=work)
 
 
 def main() -> None:
@@ -96,7 +110,9 @@ def main() -> None:
     shutil.rmtree(DIST, ignore_errors=True)
     # The wheel is made from the sdist, so a file missing there is missed here.
     run(UV, "--quiet", "build", "--out-dir", DIST, ROOT)
-    wheel, sdist = only("*.whl"), only("*.tar.gz")
+    for folder in PLUGINS:  # their version is that of the checkout
+        run(UV, "--quiet", "build", "--wheel", "--out-dir", DIST, folder)
+    wheel, sdist = only("vla_zenoh-*.whl"), only("*.tar.gz")
     with zipfile.ZipFile(wheel) as archive:
         surplus = [name for name in archive.namelist() if LEFT_OUT.search(name)]
     if surplus:
@@ -104,7 +120,7 @@ def main() -> None:
     print(f"build: {wheel.name} has {wheel.stat().st_size / 1e6:.2f} MB")
     if options.only_build:
         return
-    try_out(wheel, "all")
+    try_out(wheel, "all", [only(f"{folder.name.replace('-', '_')}-*.whl") for folder in PLUGINS])
     try_out(sdist, "all")
     print(f"build: {wheel.name} and {sdist.name} work")
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from vla_zenoh_benchmarks.contract import Benchmark, BenchmarkObservation, make_benchmark
+from vla_zenoh_benchmarks.episode import EpisodeRequest
 
-from vla_zenoh.lab.benchmark.contract import Benchmark, BenchmarkObservation, make_benchmark
-from vla_zenoh.lab.benchmark.episode import EpisodeRequest
 from vla_zenoh.policy import ActionSpec, ModelSpec, ObservationSpec
 from vla_zenoh.policy.loader import find_model
 from vla_zenoh.types import ActionChunk

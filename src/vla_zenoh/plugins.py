@@ -13,8 +13,9 @@ import sys
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint, distribution, entry_points
 from pathlib import Path
+from types import FunctionType
 from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
 from vla_zenoh.errors import PluginError, in_words, nearest
@@ -137,7 +138,9 @@ ROBOTS = Group("vla_zenoh.robots", "robot driver", RobotPlugin)
 CAMERAS = Group("vla_zenoh.cameras", "camera source", CameraPlugin)
 MODELS = Group("vla_zenoh.models", "model", FilePlugin)
 BENCHMARKS = Group("vla_zenoh.benchmarks", "benchmark", FilePlugin)
-GROUPS: tuple[Group[Any], ...] = (ROBOTS, CAMERAS, MODELS, BENCHMARKS)
+COMMANDS = Group("vla_zenoh.commands", "command", FunctionType)
+"""``GROUP.NAME`` -> function of a command below a group of commands, as ``bench.sim``."""
+GROUPS: tuple[Group[Any], ...] = (ROBOTS, CAMERAS, MODELS, BENCHMARKS, COMMANDS)
 
 
 def installed(group: Group[Any]) -> Mapping[str, EntryPoint]:
@@ -189,7 +192,7 @@ def load(group: Group[Declaration], name: str) -> Declaration:
     if not isinstance(found, group.kind):
         raise PluginError(
             f"{where}: {entry.value} is of type {type(found).__name__}, wanted a "
-            f"vla_zenoh.plugins.{group.kind.__name__}"
+            f"{group.kind.__name__}; see vla_zenoh.plugins"
         )
     return found
 
@@ -237,14 +240,12 @@ def file_here(name: str) -> Path | None:
     return Path(path) if path and own == name else None
 
 
-def how_to_repeat(group: Group[Any], name: str) -> list[str]:
-    """Options of ``uv run`` that put the package of a plug-in into another environment."""
-    entry = installed(group)[name]
-    if entry.dist is None:
-        return []
-    origin = json.loads(entry.dist.read_text("direct_url.json") or "{}")
+def how_to_repeat(package: str) -> list[str]:
+    """Options of ``uv run`` that put an installed package into another environment."""
+    found = distribution(package)
+    origin = json.loads(found.read_text("direct_url.json") or "{}")
     url = str(origin.get("url", ""))
     if origin.get("dir_info", {}).get("editable"):
         return ["--with-editable", url.removeprefix("file://")]
-    pinned = f"{entry.dist.name} @ {url}" if url else f"{entry.dist.name}=={entry.dist.version}"
+    pinned = f"{found.name} @ {url}" if url else f"{found.name}=={found.version}"
     return ["--with", pinned]

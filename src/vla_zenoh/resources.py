@@ -14,7 +14,7 @@ from vla_zenoh import plugins
 from vla_zenoh.errors import MissingExtraError, ProfileError, ResourceError, nearest
 
 PROFILE_SUFFIXES = (".yaml", ".yml")
-BENCHMARKS = "sim/benchmarks"
+BENCHMARKS = "benchmarks"
 KINDS = {"models": (".py", ""), "profiles": PROFILE_SUFFIXES, "sim": ("",), BENCHMARKS: (".py",)}
 ONE = {"models": "model", "profiles": "profile", "sim": "scene", BENCHMARKS: "benchmark"}
 PLUGINS = {"models": plugins.MODELS, BENCHMARKS: plugins.BENCHMARKS}
@@ -47,7 +47,7 @@ def names(kind: str) -> list[str]:
     found = set(plugins.installed(PLUGINS[kind])) if kind in PLUGINS else set()
     for folder in folders(kind):
         for entry in folder.iterdir():
-            if entry.name.startswith((".", "_")) or f"{kind}/{entry.name}" in KINDS:
+            if entry.name.startswith((".", "_")):
                 continue
             if entry.is_dir() and "" in KINDS[kind]:
                 found.add(entry.name)

@@ -110,6 +110,6 @@ def environments(parent: int) -> list[int]:
                 said = (each / "cmdline").read_bytes()
             except OSError:
                 continue
-            if int(stat[1]) == parent and b"vla_zenoh.lab.benchmark.process" in said:
+            if int(stat[1]) == parent and b"vla_zenoh_benchmarks.process" in said:
                 out.append(int(each.name))
     return sorted(out) if len(out) == 3 else []

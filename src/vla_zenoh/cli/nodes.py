@@ -124,7 +124,8 @@ def arm(node: NodeOptions) -> None:
 
     profile = node.load()
     if (path := script_of(profile)) is not None:
-        packages = plugins.how_to_repeat(plugins.ROBOTS, profile.robot.driver)
+        driver = plugins.installed(plugins.ROBOTS)[profile.robot.driver]
+        packages = plugins.how_to_repeat(plugins.package_of(driver))
         script = find_model(str(path))
         run_in_own_environment(script, None, extra="control", packages=packages)
 

@@ -12,6 +12,7 @@ import shlex
 from collections import UserDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from importlib import import_module
+from importlib.metadata import EntryPoint
 from importlib.resources import files
 from textwrap import indent
 from typing import Any, NamedTuple
@@ -20,9 +21,9 @@ import typer
 import zenoh
 from typer.core import TyperCommand, TyperGroup
 
-from vla_zenoh import __version__, resources
+from vla_zenoh import __version__, plugins, resources
 from vla_zenoh.cli.options import DEFAULT_PROFILE, PROFILE_VARIABLE
-from vla_zenoh.errors import VlaZenohError, describe_fault
+from vla_zenoh.errors import PluginError, VlaZenohError, describe_fault
 from vla_zenoh.keys import KEY_PATHS
 
 PROGRAM = "vla-zenoh"
@@ -104,7 +105,6 @@ COMMANDS: Mapping[str, Mapping[str, str | Group]] = {
             {
                 "command": "lab.cli.bench_command:command",
                 "task": "lab.cli.bench_task:task",
-                "sim": "lab.cli.bench_sim:sim",
                 "compare": "lab.cli.bench_compare:compare",
             },
         ),
@@ -135,30 +135,52 @@ class _Command(TyperCommand):
         return super().parse_args(ctx, args)
 
 
+def _function(entry: str | EntryPoint) -> Any:
+    if isinstance(entry, str):
+        module, _, attribute = entry.partition(":")
+        return getattr(import_module(f"vla_zenoh.{module}"), attribute)
+    try:
+        return plugins.load(plugins.COMMANDS, entry.name)
+    except PluginError as error:
+        why = str(error)
+
+    def broken() -> None:
+        raise PluginError(why)
+
+    broken.__doc__ = why
+    return broken
+
+
 class _LazyCommands(UserDict[str, Any]):
     """Name -> command, imported when it is first looked up."""
 
     def __init__(
-        self, panels: Mapping[str, Mapping[str, str | Group]], path: Sequence[str]
+        self, panels: Mapping[str, Mapping[str, str | EntryPoint | Group]], path: Sequence[str]
     ) -> None:
         super().__init__({name: one for group in panels.values() for name, one in group.items()})
         self._path = path
 
     def __getitem__(self, name: str) -> Any:
         found = self.data[name]
-        if isinstance(found, (str, Group)):
+        if isinstance(found, (str, EntryPoint, Group)):
             found = self.data[name] = _load((*self._path, name), found)
         return found
 
 
-def _load(path: Sequence[str], entry: str | Group) -> Any:
+def _commands_of(group: Group, word: str) -> dict[str, str | EntryPoint]:
+    """Commands of a group, with those that packages bring."""
+    entries = plugins.installed(plugins.COMMANDS)
+    more = {name.removeprefix(f"{word}."): name for name in entries if name.startswith(f"{word}.")}
+    return {**group.commands, **{name: entries[entry] for name, entry in more.items()}}
+
+
+def _load(path: Sequence[str], entry: str | EntryPoint | Group) -> Any:
     name = path[-1]
     if isinstance(entry, Group):
-        group = _lazy_group({"Commands": entry.commands}, path)
+        group = _lazy_group({"Commands": _commands_of(entry, name)}, path)
         found: Any = typer.Typer(cls=group, help=entry.help, no_args_is_help=True)
     else:
-        module, _, attribute = entry.partition(":")
-        found = getattr(import_module(f"vla_zenoh.{module}"), attribute)
+        found = _function(entry)
     around = typer.Typer(rich_markup_mode=None, add_completion=False)
     around.callback()(lambda: None)  # makes it a group even with a single command
     if isinstance(found, typer.Typer):
@@ -176,7 +198,7 @@ def _load(path: Sequence[str], entry: str | Group) -> Any:
 
 
 def _lazy_group(
-    panels: Mapping[str, Mapping[str, str | Group]], path: Sequence[str] = ()
+    panels: Mapping[str, Mapping[str, str | EntryPoint | Group]], path: Sequence[str] = ()
 ) -> type[TyperGroup]:
     class LazyGroup(TyperGroup):
         def __init__(self, **attributes: Any) -> None:

@@ -17,10 +17,10 @@ from vla_zenoh.codec import records
 from vla_zenoh.codec.image import encode_raw, raw_schema
 from vla_zenoh.errors import CodecError, NodeError
 from vla_zenoh.keys import LOADING, Kind, worker_node
-from vla_zenoh.lab.benchmark.contract import BenchmarkObservation
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import ActionChunk, Image, NodeStatus, Task
+from vla_zenoh_benchmarks.contract import BenchmarkObservation
 
 NODE = "sim"
 RATE_HZ = 1000.0

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from vla_zenoh.codec.image import decode_jpeg
-from vla_zenoh.lab.benchmark.episode import EpisodeOutcome, EpisodeRequest
-from vla_zenoh.lab.benchmark.journal import actions_file
-from vla_zenoh.lab.benchmark.process import FRAME_HZ, BenchmarkProcess
 from vla_zenoh.lab.durable import page_template
 from vla_zenoh.lab.statistics import wilson_95
 from vla_zenoh.lab.video import VideoWriter
+from vla_zenoh_benchmarks.episode import EpisodeOutcome, EpisodeRequest
+from vla_zenoh_benchmarks.journal import actions_file
+from vla_zenoh_benchmarks.process import FRAME_HZ, BenchmarkProcess
 
 TEMPLATE = "page.html.j2"
 VIDEOS = "failures"
@@ -54,7 +54,7 @@ def write_page(folder: Path, result: Mapping[str, Any]) -> None:
     """Write `index.html` of a run; videos of failures are found in its folder."""
     videos = sorted(each.name for each in (folder / VIDEOS).glob("*.mp4"))
     shown = ("benchmark", "suite", "worker", "options", "mode", "delay_ms", "replan")
-    page = page_template("vla_zenoh.lab.benchmark", TEMPLATE).render(
+    page = page_template("vla_zenoh_benchmarks", TEMPLATE).render(
         title=f"{result['benchmark']} {result['suite']}, {result['worker']}",
         conditions={name: result[name] for name in shown},
         versions=result["versions"],

@@ -25,9 +25,16 @@ import numpy as np
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec.image import encode_jpeg
 from vla_zenoh.errors import NodeError, VlaZenohError, WorkerError, in_words
-from vla_zenoh.lab.benchmark.asked_worker import AskedWorker
-from vla_zenoh.lab.benchmark.contract import Benchmark, BenchmarkTask, make_benchmark, raw_steps
-from vla_zenoh.lab.benchmark.episode import (
+from vla_zenoh.plugins import how_to_repeat
+from vla_zenoh.policy.loader import ModelFile, find_model
+from vla_zenoh.profile import as_robot, load_profile
+from vla_zenoh.resources import BENCHMARKS
+from vla_zenoh.runtime.environments import environment_command
+from vla_zenoh.runtime.process import PARENT_VARIABLE, die_with_parent
+from vla_zenoh.types import FloatArray, Image
+from vla_zenoh_benchmarks.asked_worker import AskedWorker
+from vla_zenoh_benchmarks.contract import Benchmark, BenchmarkTask, make_benchmark, raw_steps
+from vla_zenoh_benchmarks.episode import (
     Asked,
     EpisodeClock,
     EpisodeConditions,
@@ -35,12 +42,6 @@ from vla_zenoh.lab.benchmark.episode import (
     EpisodeRequest,
     state_hash,
 )
-from vla_zenoh.policy.loader import ModelFile, find_model
-from vla_zenoh.profile import as_robot, load_profile
-from vla_zenoh.resources import BENCHMARKS
-from vla_zenoh.runtime.environments import environment_command
-from vla_zenoh.runtime.process import PARENT_VARIABLE, die_with_parent
-from vla_zenoh.types import FloatArray, Image
 
 ANSWER_PATIENCE_S = 300.0
 FRAME_HZ = 10
@@ -90,10 +91,11 @@ class BenchmarkProcess:
         if python is not None:
             command = [python]
         elif lacks:
-            command = [*environment_command(file, extra=extra), "python"]
+            ours = how_to_repeat("vla-zenoh-benchmarks")
+            command = [*environment_command(file, extra=extra), *ours, "python"]
         given = json.dumps({**asdict(setting), "benchmark": str(file.path), "robot": robot})
         self._process = subprocess.Popen(
-            [*command, "-m", "vla_zenoh.lab.benchmark.process", given],
+            [*command, "-m", "vla_zenoh_benchmarks.process", given],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -202,7 +204,7 @@ def run_episode(
     worker.begin(request.task.prompt)
     clock = EpisodeClock(benchmark, request, worker)
     if conditions.mode == "command":
-        from vla_zenoh.lab.benchmark.command_path import run_through_command_node
+        from vla_zenoh_benchmarks.command_path import run_through_command_node
 
         run_through_command_node(clock, conditions)
         return clock.finish(began_s)

@@ -11,14 +11,14 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_zenoh.lab.benchmark.contract import (
+from vla_zenoh.policy import ModelSpec
+from vla_zenoh.types import ActionChunk, FloatArray
+from vla_zenoh_benchmarks.contract import (
     Benchmark,
     BenchmarkObservation,
     BenchmarkTask,
     standing_step,
 )
-from vla_zenoh.policy import ModelSpec
-from vla_zenoh.types import ActionChunk, FloatArray
 
 Mode = Literal["native", "live", "command"]
 

@@ -19,8 +19,8 @@ import numpy as np
 from libero.libero import benchmark, get_libero_path
 from libero.libero.envs.env_wrapper import ControlEnv
 from numpy.typing import NDArray
+from vla_zenoh_benchmarks.contract import BenchmarkObservation, BenchmarkTask
 
-from vla_zenoh.lab.benchmark.contract import BenchmarkObservation, BenchmarkTask
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.policy.spec import ControllerSpec
 from vla_zenoh.types import GripperState, JointState, PoseState, PrivilegedState

@@ -1,4 +1,4 @@
-"""The benchmark contract: what a file in `sim/benchmarks` has to have.
+"""The benchmark contract: what the file of a benchmark has to have.
 
 A benchmark is a class with `action`, `cameras`, ``tasks``, ``reset``, ``observe`` and ``step``, in
 a file with a PEP 723 header that names its packages. It runs in an environment of its own.

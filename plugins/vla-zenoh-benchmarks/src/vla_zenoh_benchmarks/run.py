@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from vla_zenoh.errors import MissingExtraError, NodeError
-from vla_zenoh.lab.benchmark.episode import EpisodeOutcome, EpisodeRequest
-from vla_zenoh.lab.benchmark.process import BenchmarkLost, BenchmarkProcess, BenchmarkSetting
 from vla_zenoh.lab.cli.bench_file import running_nodes
 from vla_zenoh.lab.cli.loopback import free_port
 from vla_zenoh.profile import load_profile, override, to_yaml
 from vla_zenoh.profile.profile import Profile
+from vla_zenoh_benchmarks.episode import EpisodeOutcome, EpisodeRequest
+from vla_zenoh_benchmarks.process import BenchmarkLost, BenchmarkProcess, BenchmarkSetting
 
 ATTEMPTS = 3
 POLL_S = 0.2
@@ -206,7 +206,7 @@ def connect_ray(address: str) -> Any:
     try:
         import ray  # pyright: ignore[reportMissingImports]
     except ImportError as error:
-        raise MissingExtraError("ray", "ray") from error
+        raise MissingExtraError("ray", "ray", "vla-zenoh-benchmarks") from error
     try:
         ray.init(address, log_to_driver=False, logging_level="ERROR")
     except (ConnectionError, RuntimeError, ValueError) as error:

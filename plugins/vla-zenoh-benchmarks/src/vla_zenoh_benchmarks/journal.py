@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from vla_zenoh.errors import OutputError, RecordError
-from vla_zenoh.lab.benchmark.episode import EpisodeOutcome, EpisodeRequest
 from vla_zenoh.lab.durable import append_line, whole_lines
+from vla_zenoh_benchmarks.episode import EpisodeOutcome, EpisodeRequest
 
 PLAN, EPISODES, ACTIONS = "run.json", "episodes.jsonl", "actions"
 

@@ -18,8 +18,8 @@ import mujoco
 import numpy as np
 import ogbench.manipspace  # noqa: F401 # registers its environments
 from numpy.typing import NDArray
+from vla_zenoh_benchmarks.contract import BenchmarkObservation, BenchmarkTask
 
-from vla_zenoh.lab.benchmark.contract import BenchmarkObservation, BenchmarkTask
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.types import GripperState, JointState, PoseState, PrivilegedState
 

@@ -17,8 +17,8 @@ import metaworld
 import numpy as np
 from metaworld.env_dict import ALL_V3_ENVIRONMENTS, MT10_V3
 from numpy.typing import NDArray
+from vla_zenoh_benchmarks.contract import BenchmarkObservation, BenchmarkTask
 
-from vla_zenoh.lab.benchmark.contract import BenchmarkObservation, BenchmarkTask
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.types import GripperState, PoseState, PrivilegedState
 

@@ -20,8 +20,8 @@ import numpy as np
 from lerobot_env_so101 import SO101PickPlaceGymEnv
 from lerobot_env_so101.policy import DEFAULT_ACTION_SCALE
 from numpy.typing import NDArray
+from vla_zenoh_benchmarks.contract import BenchmarkObservation, BenchmarkTask
 
-from vla_zenoh.lab.benchmark.contract import BenchmarkObservation, BenchmarkTask
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.types import GripperState, JointState, PoseState, PrivilegedState
 

@@ -1,0 +1,56 @@
+"""The package works where none of the packages in plugins/ is installed."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import sysconfig
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """An environment that has all of this one but the packages in plugins/."""
+    site = tmp_path_factory.mktemp("site")
+    for entry in Path(sysconfig.get_path("purelib")).iterdir():
+        if not entry.name.lstrip("_").startswith("vla_zenoh_"):
+            (site / entry.name).symlink_to(entry)
+    robots = next(iter(site.glob("cmeel.prefix/lib/python*/site-packages")))
+    path = os.pathsep.join(map(str, (ROOT / "src", site, robots)))
+    return {**os.environ, "PYTHONPATH": path}
+
+
+def run(alone: dict[str, str], *words: str) -> subprocess.CompletedProcess[str]:
+    """Run ``vla-zenoh`` there."""
+    return subprocess.run(
+        [sys.executable, "-S", "-m", "vla_zenoh", *words],
+        env=alone,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_the_simulator_needs_no_plug_in(alone: dict[str, str]) -> None:
+    done = run(alone, "profile", "check", "panda_sim")
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_robot_of_a_plug_in_is_named_with_what_is_installed(alone: dict[str, str]) -> None:
+    done = run(alone, "profile", "check", "fr3")
+    assert done.returncode == 1
+    assert "robot.driver: no robot driver 'franka' is installed" in done.stderr
+    assert "Installed: arm, ros2, sim." in done.stderr
+    assert run(alone, "profile", "show", "fr3").returncode == 0
+
+
+def test_its_commands_are_listed_and_those_of_plug_ins_are_not(alone: dict[str, str]) -> None:
+    done = run(alone, "bench", "--help")
+    assert done.returncode == 0, done.stderr
+    assert "  task " in done.stdout
+    assert "  sim " not in done.stdout
