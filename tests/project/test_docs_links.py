@@ -47,7 +47,9 @@ def test_every_link_leads_to_a_heading(page: Path) -> None:
 @pytest.mark.parametrize("page", ABOUT_OUR_FILES, ids=lambda page: page.stem)
 def test_every_file_that_is_named_without_its_folder_exists(page: Path) -> None:
     names = {
-        file.name for folder in ("src", "models", "tests") for file in (ROOT / folder).rglob("*.py")
+        file.name
+        for folder in ("src", "models", "plugins", "tests")
+        for file in (ROOT / folder).rglob("*.py")
     }
     assert {found[1] for found in BARE.finditer(page.read_text("utf-8"))} <= names
 
