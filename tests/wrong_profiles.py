@@ -567,38 +567,38 @@ task: {worker: second}
 ros2: {cameras: {wrist: {topic: /wrist}}}
 """
 EXTENDED: list[tuple[str, str]] = [
-    # (text behind "extends: base", part of what is said): the extended file is not blamed
+    # (text behind "extends: base", part of what is said): the line is that of the loaded file
     (
         "workers: [scriptd]",
-        "lab.yaml:2: workers: lacks 'second', but task.worker ({here}/base.yaml:6) names it. List",
+        "lab.yaml:2: task.worker ({here}/base.yaml:6): 'second' is not among workers. Known: scri",
     ),
     (
         "workers: [scripted, secnd]",
-        "lab.yaml:2: workers: lacks 'second', but task.worker ({here}/base.yaml:6) names it; is "
-        "'secnd' a slip for it? List it, or name another one there",
+        "lab.yaml:2: task.worker ({here}/base.yaml:6): 'second' is not among workers; did you mean "
+        "'secnd'? Known: scripted, secnd",
     ),
     (
         "workers: [scripted]\ntask: {worker: scripted}",
-        "lab.yaml:2: workers: lacks 'second', but options.second ({here}/base.yaml:4) names it. "
-        "List it, or remove that too: options: {second: null}",
+        "lab.yaml:2: options.second ({here}/base.yaml:4): 'second' is not among workers. "
+        "Known: scripted. To remove it: options: {second: null}",
     ),
     (
         "workers: [scripted]\ntask: {worker: scripted}",
-        "workers: lacks 'second', but models.second ({here}/base.yaml:3) names it. List it, or "
-        "remove that too: models: {second: null}",
+        "lab.yaml:2: models.second ({here}/base.yaml:3): 'second' is not among workers. "
+        "Known: scripted. To remove it: models: {second: null}",
     ),
     (
         "workers: [scripted]\ntask: {worker: scripted}\nmodels: null\noptions: null",
-        "workers: lacks 'second', but serves.second ({here}/base.yaml:5) names it. List it, or re",
+        "lab.yaml:2: serves.second ({here}/base.yaml:5): 'second' is not among workers. Known: scr",
     ),
     (
         "cameras: {wrist: null}",
-        "lab.yaml:2: cameras.wrist: is removed, but ros2.cameras.wrist ({here}/base.yaml:7) names "
-        "it: remove that too: ros2: {cameras: {wrist: null}}",
+        "lab.yaml:2: ros2.cameras.wrist ({here}/base.yaml:7): 'wrist' is not among cameras. "
+        "Known: front. To remove it: ros2: {cameras: {wrist: null}}",
     ),
     (
         "cameras: null",
-        "lab.yaml:2: cameras: leaves none for the node camera in hosts.here.nodes (",
+        "lab.yaml:2: hosts.here.nodes (",
     ),
     ("options: {third: {a: b}}", "lab.yaml:2: options.third: 'third' is not among workers. Known"),
     ("task: {worker: first}", "lab.yaml:2: task.worker: 'first' is not among workers. Known: scri"),

@@ -518,7 +518,7 @@ def _hosts(profile: Profile) -> Iterator[Fault]:
                 (*place, "nodes"),
                 "has camera, and there is no camera for it to serve: describe one in cameras, or "
                 "take camera out of nodes",
-                [(("cameras",), "leaves none for the node camera in {}: take it out of nodes")],
+                [("cameras",)],
             )
         for kind in host.nodes:
             if NODE_KINDS[kind].only_one:

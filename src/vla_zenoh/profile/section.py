@@ -16,10 +16,10 @@ from vla_zenoh.types import MAX_TEXT, shown
 
 Place = tuple[str, ...]
 """Keys from the top of the profile down to a value."""
-Fault = tuple[Place, str] | tuple[Place, str, "Sequence[tuple[Place, str]]"]
-"""Where something is wrong, and a sentence that continues ``PLACE: ``. If places contradict each
-other, also the other ones with their sentences: the fault is reported where the loaded file itself
-sets a value, because the file that it extends may be right. ``{}`` stands for the first place."""
+Fault = tuple[Place, str] | tuple[Place, str, "Sequence[Place]"]
+"""Where something is wrong, a sentence that continues ``PLACE: ``, and, if that contradicts other
+places, those: the line that is named is the one that the loaded file itself has, because the file
+that it extends may be right."""
 Lines = dict[Place, str]
 """Place -> ``file:line``."""
 
@@ -131,15 +131,15 @@ def located(place: Place, why: str, lines: Lines) -> str:
 
 
 def located_fault(fault: Fault, lines: Lines, above: Place = ()) -> str:
-    """Sentence about the first of a fault's places that the loaded file itself gives."""
-    below, why, *rest = fault
+    """Sentence about a fault, with the line of the first of its places in the loaded file."""
+    below, why, *others = fault
     place = (*above, *below)
-    own, first = _file(lines.get((), "")), _line_of(place, lines)
-    if rest and _file(first) != own:
-        for other, sentence in rest[0]:
-            if _file(lines.get(other, "")) == own:
-                named = f"{'.'.join(place)} ({first})"
-                return located(other, sentence.replace("{}", named, 1), lines)
+    own, line = _file(lines.get((), "")), _line_of(place, lines)
+    if others and _file(line) != own:
+        for other in others[0]:
+            given = lines.get(other, "")
+            if _file(given) == own:
+                return f"{given}: {'.'.join(place)} ({line}): {why}"
     return located(place, why, lines)
 
 
@@ -158,23 +158,17 @@ def unlisted(
     place: Place, named: Iterable[str], section: str, known: Collection[str]
 ) -> Iterator[Fault]:
     """Faults of names at `place` that `section` does not list; of a map each entry's."""
-    of_map = isinstance(named, Mapping)
+    listed = ", ".join(known) or "none"
     for name in named:
         if name in known:
             continue
-        at, near, listed = (*place, name), nearest(name, known, ""), ", ".join(known) or "none"
-        # Of a map the entry goes, of any other value only its content can change.
-        to_do = ": {".join(at) + ": null" + "}" * (len(at) - 1)
-        remedy = f"remove that too: {to_do}" if of_map else "name another one there"
-        slip = f"; is {near.split(chr(39))[1]!r} a slip for it?" if near else "."
-        yield (
-            at if of_map else place,
-            f"{name!r} is not among {section}{near or '.'} Known: {listed}",
-            (
-                ((section, name), f"is removed, but {{}} names it: {remedy}"),
-                ((section,), f"lacks {name!r}, but {{}} names it{slip} List it, or {remedy}"),
-            ),
-        )
+        at, remedy = place, ""
+        if isinstance(named, Mapping):
+            at = (*place, name)
+            remedy = f". To remove it: {': {'.join(at)}: null{'}' * len(place)}"
+        near = nearest(name, known) or "."
+        why = f"{name!r} is not among {section}{near} Known: {listed}{remedy}"
+        yield at, why, ((section, name), (section,))
 
 
 def _why(fault: Any, place: Place, model: type[Section]) -> str:

@@ -79,7 +79,7 @@ def check_profile(
     hints = advice(profile)
     for place, why, node, other in found:
         if not node or node in here:
-            fault = (place, why, ((other, why),)) if other else (place, why)
+            fault = (place, why, (other,)) if other else (place, why)
             errors.append(located_fault(fault, lines))
         else:
             hints.append(f"{'.'.join(place)}: on this computer: {why}")
