@@ -174,7 +174,14 @@ def test_plain_pictures_are_taken_while_none_come_in_the_own_size_and_no_longer(
         plain = camera.declare_publisher(keys.camera_jpeg("front"), Kind.FRAME)
         images = History(1)
         ears = CameraStream(
-            *(worker, "front", (own.key, plain.key), images, lambda data, _: decode_jpeg(data)),
+            *(
+                worker,
+                "front",
+                (own.key, plain.key),
+                images,
+                Image,
+                lambda data, _: decode_jpeg(data),
+            ),
             history_s=0.0,
             changed=Wake(),
         )
@@ -209,7 +216,7 @@ def test_a_worker_knows_where_its_pictures_are_and_where_those_of_all() -> None:
         images = History(1)
         keys_of_it = colour_keys(wanted, worker, jpeg=True)
         ears = CameraStream(
-            *(worker, "front", keys_of_it, images, lambda data, _: decode_jpeg(data)),
+            *(worker, "front", keys_of_it, images, Image, lambda data, _: decode_jpeg(data)),
             history_s=0.0,
             changed=Wake(),
         )

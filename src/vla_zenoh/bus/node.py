@@ -370,20 +370,25 @@ class Node:
         arrival: ReceivedSample,
         writer_filter: SingleWriterFilter | None = None,
         header: Header | None = None,
+        read: Callable[[zenoh.Sample], Record] | None = None,
     ) -> Stamped[Record] | None:
         """Decode a sample, with its stamps on this node's clock, see `ClockSync`.
 
-        None if it was rejected, which is counted and reported. `header`: if it is decoded already.
+        None if it was rejected, which is counted and reported. `header`: if it is decoded already;
+        `read`: decodes what is no record of msgpack.
         """
         key = str(arrival.sample.key_expr)
         try:
             header = header or header_of(arrival.sample)
             if writer_filter is not None:  # first: a flood by another source must cost little
                 writer_filter.check(header, arrival.mono_ns)
-            unknown: list[str] = []
-            record = records.decode(kind, bytes_of(arrival.sample.payload), unknown)
-            if unknown:
-                self._count_unknown(header.source, unknown)
+            if read is None:
+                unknown: list[str] = []
+                record = records.decode(kind, bytes_of(arrival.sample.payload), unknown)
+                if unknown:
+                    self._count_unknown(header.source, unknown)
+            else:
+                record = read(arrival.sample)
             here, record = self.clocks.to_local_clock(header, record)
         except CodecError as error:
             self.reject_sample(key, error)

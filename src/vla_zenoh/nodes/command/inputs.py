@@ -7,12 +7,13 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from operator import itemgetter
-from typing import Any
+from typing import Any, TypeVar
 
 from vla_zenoh.bus.buffers import CallbackRing, ReceivedSample, ZenohRing, header_of
 from vla_zenoh.bus.host import HostId
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import MAX_MESSAGE_BYTES
+from vla_zenoh.bus.stream import Stream
 from vla_zenoh.codec import settings
 from vla_zenoh.codec.records import SMALL_BYTES
 from vla_zenoh.control.commander_io import Inputs, NewStates, Setting
@@ -28,10 +29,10 @@ from vla_zenoh.types import (
     JointState,
     NodeStatus,
     PoseState,
-    SingleWriterFilter,
     Stamped,
 )
 
+Record = TypeVar("Record")
 STATES = 32
 """States buffered between two ticks: the robot's, and room for those of another source."""
 CHUNKS = 64
@@ -175,17 +176,14 @@ class _PartInputs:
     """Subscriptions to the states of one part, and to what it holds."""
 
     def __init__(self, node: Node, keys: Keys) -> None:
-        self._node = node
-        self._rings: dict[type[Any], CallbackRing] = {
-            kind: node.subscribe(key, CallbackRing(STATES, SMALL_BYTES))
-            for kind, key in (
-                (PoseState, keys.state_pose),
-                (JointState, keys.state_joint),
-                (GripperState, keys.state_gripper),
-            )
-        }
         silence_s = node.profile.timing.state_timeout_s
-        self._writers = {kind: SingleWriterFilter(silence_s) for kind in self._rings}
+
+        def stream(key: str, kind: type[Record]) -> Stream[Record, CallbackRing]:
+            return Stream(node, key, kind, CallbackRing(STATES, SMALL_BYTES), silence_s)
+
+        self._pose = stream(keys.state_pose, PoseState)
+        self._joint = stream(keys.state_joint, JointState)
+        self._gripper = stream(keys.state_gripper, GripperState)
         self.held = node.subscribe(keys.held, ZenohRing(16, WORDS))
         self._last_joint = 0.0
 
@@ -194,18 +192,10 @@ class _PartInputs:
         an activation is `requested`."""
         joint, now_s = None, time.monotonic()
         if requested or now_s - self._last_joint >= JOINT_PERIOD_S:
-            joint = self._state(JointState)
+            joint = self._joint.newest()
             if joint is not None:
                 self._last_joint = now_s
-        return NewStates(self._state(PoseState), joint=joint, gripper=self._state(GripperState))
-
-    def _state(self, kind: type[Any]) -> Stamped[Any] | None:
-        """The newest state from the robot's source, whatever other sources publish."""
-        for arrival in reversed(self._rings[kind].drain()):
-            found = self._node.decode(kind, arrival, self._writers[kind])
-            if found is not None:
-                return found
-        return None
+        return NewStates(self._pose.newest(), joint=joint, gripper=self._gripper.newest())
 
 
 class PeerMonitor:

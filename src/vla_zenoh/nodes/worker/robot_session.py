@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import zenoh
 
@@ -21,6 +21,7 @@ from vla_zenoh.bus.buffers import (
 )
 from vla_zenoh.bus.metrics import Percentiles, RateMeter
 from vla_zenoh.bus.node import Node
+from vla_zenoh.bus.stream import Stream
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import MAX_IMAGE_BYTES, decode_depth, decode_jpeg, decode_raw
 from vla_zenoh.codec.records import SMALL_BYTES
@@ -40,7 +41,7 @@ from vla_zenoh.policy.observation import (
     state_names,
 )
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import ActionChunk, Event, Header, SingleWriterFilter, Stamped, Task
+from vla_zenoh.types import ActionChunk, Depth, Event, Header, Image, Stamped, Task
 
 SPEC_PERIOD_S = 1.0
 TASK_PATIENCE_S = 1.5
@@ -85,19 +86,19 @@ class RobotSession:
         node.serve(
             keys.spec(name), lambda query: query.reply(keys.spec(name), records.encode(self.spec))
         )
-        self._tasks = node.subscribe(keys.task, LatestSample(SMALL_BYTES))
+        self._tasks = Stream(node, keys.task, Task, LatestSample(SMALL_BYTES), TASK_PATIENCE_S)
         streams = self._streams = Streams.of(self.spec.observation, self.spec.parts)
         history_s, jpeg = self.spec.observation.history_span_s, images == "jpeg"
         camera_stream = partial(CameraStream, node, history_s=history_s, changed=changed)
         decode_image = (lambda payload, _: decode_jpeg(payload)) if jpeg else decode_raw
-        self._cameras = [
-            camera_stream(name, colour_keys(one, node, jpeg=jpeg), kept, decode_image)
+        self._cameras: list[CameraStream] = [
+            camera_stream(name, colour_keys(one, node, jpeg=jpeg), kept, Image, decode_image)
             for one, (name, kept) in zip(
                 self.spec.observation.cameras, streams.images.items(), strict=True
             )
         ]
         self._cameras += [
-            camera_stream(name, [keys.camera_depth(name)], kept, decode_depth)
+            camera_stream(name, [keys.camera_depth(name)], kept, Depth, decode_depth)
             for name, kept in streams.depth.items()
         ]
         self._every_state = bool(history_s) or not self._cameras
@@ -113,7 +114,6 @@ class RobotSession:
             for name, (part, what) in state_names(self.spec.observation, self.spec.parts).items()
         ]
         self._frozen, self._repeats = FrozenImages.of(profile.cameras), False
-        self._task_writer = SingleWriterFilter(TASK_PATIENCE_S)
         self.task: Task | None = None
         self._task_received_s = -1e9
         self._episode = -1
@@ -145,11 +145,9 @@ class RobotSession:
 
     def poll(self) -> None:
         """Decode what was received since the last call."""
-        arrival = self._tasks.pop()
-        if arrival is not None:
-            task = self.node.decode(Task, arrival, self._task_writer)
-            if task is not None:
-                self._set_task(task)
+        task = self._tasks.newest()
+        if task is not None:
+            self._set_task(task)
         for camera in self._cameras:
             camera.poll()
         self.poll_states()
@@ -307,11 +305,7 @@ class RobotSession:
         self.node.close()
 
 
-class _Source(NamedTuple):
-    """A subscription to images, and the filter of their writer."""
-
-    buffer: CallbackRing
-    writer: SingleWriterFilter
+ImageStream = Stream[Any, CallbackRing]
 
 
 class CameraStream:
@@ -331,13 +325,14 @@ class CameraStream:
         camera: str,
         keys: Sequence[str],
         images: History,
+        kind: type[Any],
         decode: Callable[[bytes, str], Any],
         *,
         history_s: float,
         changed: Wake,
     ) -> None:
         self._node, self.camera, self._keys, self._changed = node, camera, keys, changed
-        self.images, self._decode = images, decode
+        self.images, self._kind, self._decode = images, kind, decode
         self._queue, self._patience_s = 1, PATIENCE_S
         settings = node.profile.cameras.get(camera)
         if settings is not None:
@@ -349,7 +344,7 @@ class CameraStream:
         self.received_s = 0.0
         """When the newest of `images` arrived, monotonic clock; 0: there is none."""
         self._preferred = self._subscribe(keys[0])
-        self._fallback: _Source | None = None
+        self._fallback: ImageStream | None = None
         self._preferred_s = time.monotonic()
 
     @property
@@ -366,13 +361,13 @@ class CameraStream:
             if self._queue == 1:
                 break
 
-    def _pop(self) -> tuple[ReceivedSample, _Source] | None:
+    def _pop(self) -> tuple[ReceivedSample, ImageStream] | None:
         source = self._preferred
         arrival = source.buffer.pop()
         if arrival is not None:
             self._preferred_s = time.monotonic()
             if self._fallback is not None:
-                self._node.unsubscribe(self._fallback.buffer)
+                self._fallback.close()
                 self._fallback = None
                 why = f"there are images on {self._node.keys.short(self._keys[0])} again"
                 self._node.emit(Event("info", "notice", f"{self.camera}:own_pictures", why))
@@ -388,26 +383,27 @@ class CameraStream:
             )
         return None if arrival is None else (arrival, source)
 
-    def _subscribe(self, key: str) -> _Source:
+    def _subscribe(self, key: str) -> ImageStream:
         ring = CallbackRing(self._queue, MAX_IMAGE_BYTES, self._changed)
-        self._node.subscribe(key, ring, Kind.FRAME)
-        return _Source(ring, SingleWriterFilter(STREAM_PATIENCE_S))
+        return Stream(
+            self._node,
+            key,
+            self._kind,
+            ring,
+            STREAM_PATIENCE_S,
+            quality=Kind.FRAME,
+            read=self._read,
+        )
 
-    def _receive(self, arrival: ReceivedSample, source: _Source) -> None:
-        node, sample, mono_ns = self._node, arrival.sample, arrival.mono_ns
-        try:
-            header = header_of(sample)
-            source.writer.check(header, mono_ns)
-            payload = bytes_of(sample.payload, MAX_IMAGE_BYTES)
-            image = self._decode(payload, str(sample.encoding).partition(";")[2])
-        except CodecError as error:
-            node.reject(error.reason, f"camera {self.camera}: {error}")
-            return
-        source.writer.accept(header, mono_ns)
-        node.traffic.received(str(sample.key_expr), header, arrival.nth)
-        header, image = node.clocks.to_local_clock(header, image)
-        self.images.add(Stamped(header, image, node.clock.wall_at(mono_ns)))
-        self.received_s = mono_ns / 1e9
+    def _read(self, sample: zenoh.Sample) -> Any:
+        payload = bytes_of(sample.payload, MAX_IMAGE_BYTES)
+        return self._decode(payload, str(sample.encoding).partition(";")[2])
+
+    def _receive(self, arrival: ReceivedSample, source: ImageStream) -> None:
+        image = source.decode(arrival)
+        if image is not None:
+            self.images.add(image)
+            self.received_s = arrival.mono_ns / 1e9
 
 
 def colour_keys(spec: CameraSpec, node: Node, *, jpeg: bool) -> list[str]:
@@ -428,16 +424,17 @@ class StateStream:
     def __init__(
         self, node: Node, key: str, kind: type[Any], states: History, size: int, *, every: bool
     ) -> None:
-        self._node, self._kind, self._states, self._every = node, kind, states, every
-        self._writer = SingleWriterFilter(STREAM_PATIENCE_S)
+        self._node, self._states, self._every = node, states, every
         ring = CallbackRing if every else ZenohRing
-        self._ring: CallbackRing | ZenohRing = node.subscribe(key, ring(size, SMALL_BYTES))
+        self._stream: Stream[Any, CallbackRing | ZenohRing] = Stream(
+            node, key, kind, ring(size, SMALL_BYTES), STREAM_PATIENCE_S
+        )
 
     def poll(self, since_ns: int) -> None:
         """Decode what was received since the last call: the last before `since_ns`, and later."""
-        arrivals = self._ring.drain()
+        arrivals = self._stream.buffer.drain()
         for arrival in arrivals if self._every else arrivals[self._first(arrivals, since_ns) :]:
-            state = self._node.decode(self._kind, arrival, self._writer)
+            state = self._stream.decode(arrival)
             if state is not None:
                 self._states.add(state)
 
@@ -449,7 +446,7 @@ class StateStream:
                 header = header_of(arrivals[number].sample)
             except CodecError:
                 continue
-            if self._writer.is_next(header):
+            if self._stream.writer.is_next(header):
                 first = number
                 header, _ = self._node.clocks.to_local_clock(header, None)
                 if header.stamp_wall_ns <= since_ns:
