@@ -440,7 +440,11 @@ CHECKED: list[tuple[str, str]] = [
     ),
     (
         "limits: {workspace: {x_m: [0.6, 0.75]}}",
-        "lab.yaml:2: limits.workspace: with robot.home_rad the TCP is at (0.430, -0.000, 0.160)",
+        "lab.yaml:2: robot.home_rad (",
+    ),
+    (
+        "limits: {workspace: {x_m: [0.6, 0.75]}}",
+        "panda_sim.yaml:20): puts the TCP at (0.430, -0.000, 0.160) m",
     ),
     ("workers: [scripted, pi9]", "lab.yaml:2: workers: no model called 'pi9'. Known: brick, gro"),
     (

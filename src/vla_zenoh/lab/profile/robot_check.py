@@ -34,7 +34,7 @@ class ProfileFault(NamedTuple):
         place: in the profile.
         why: continues ``PLACE: ``.
         node: the node that fails, as kind or worker; "": no computer can run this profile.
-        other: place that contradicts it, and is named where only that is in the checked file.
+        other: place that contradicts it; its line is named where only that is in the checked file.
     """
 
     place: Place
@@ -84,7 +84,7 @@ def arm(profile: Profile) -> Iterator[ProfileFault]:
         box = profile.limits.workspace
         yield ProfileFault(
             ("robot", "home_rad"),
-            f"with robot.home_rad the TCP is at ({where}) m, {outside_m:.3f} m outside "
+            f"puts the TCP at ({where}) m, {outside_m:.3f} m outside "
             f"limits.workspace x {box.x_m} y {box.y_m} z {box.z_m}: the simulated arm starts there "
             "and could not be activated",
             other=("limits", "workspace"),
