@@ -23,7 +23,8 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))
 
 IN_REAL_TIME = {"wire", "fault", "netns", "ros2"}
 """Folders of tests that begin processes and wait for them: one file at a time on two cores."""
-
+LEFT_OUT = {**dict.fromkeys(IN_REAL_TIME, "realtime"), "franka": "franka", "models": "models"}
+"""Folder -> mark of everything in it."""
 
 ROOT = Path(__file__).parent
 
@@ -36,6 +37,13 @@ def pytest_configure() -> None:
             if lacking := sorted(wanted.keys() - entry_points(group=group).names):
                 names = ", ".join(lacking)
                 raise pytest.UsageError(f"{group} lacks {names} of {file}: run `make setup`")
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Do not even import a folder that -m leaves out: that takes as long as many tests."""
+    mark = LEFT_OUT.get(collection_path.name)
+    within = collection_path.parent.name in ("tests", "reliability")
+    return True if within and mark and f"not {mark}" in config.option.markexpr else None
 
 
 @pytest.hookimpl(tryfirst=True)  # before -m chooses

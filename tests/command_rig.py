@@ -9,6 +9,7 @@ import itertools
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -39,14 +40,31 @@ SOURCE = "worker-scripted-1"
 LIMIT_RTOL = 1e-6
 STANDING = 0.01  # m/s and rad/s, in the first tick of a move at most
 START_M = np.array([0.43, 0.0, 0.3])
+_REACHES: dict[str, ReachabilityFilter] = {}
 DOWN = np.array([1.0, 0.0, 0.0, 0.0])  # tool straight down
+
+
+@cache
+def shipped() -> Profile:
+    return load_profile("panda_sim")
 
 
 def profile(**parts: dict[str, Any]) -> Profile:
     """The shipped profile with other numbers: ``profile(timing={"watchdog_s": 1.0})``."""
-    base = load_profile("panda_sim")
+    base = shipped()
     changes = {name: getattr(base, name).model_copy(update=part) for name, part in parts.items()}
     return base.model_copy(update=changes)
+
+
+def reach_of(of: Profile) -> ReachabilityFilter:
+    """The filter of this profile, at home: one for all tests, for its collisions take long."""
+    key = repr(of)
+    if key not in _REACHES:
+        _REACHES[key] = ReachabilityFilter(of)
+    reach = _REACHES[key]
+    reach.hold(None)
+    reach.reset(reach.kinematics.ordered(of.robot.arm_joints, of.robot.home_rad))
+    return reach
 
 
 def model_spec(name: str = WORKER, **action: Any) -> ModelSpec:

@@ -5,22 +5,21 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from command_rig import LIMIT_RTOL, Rig
+from command_rig import LIMIT_RTOL, Rig, reach_of, shipped
 
 from vla_zenoh.control.commander import Setting
 from vla_zenoh.control.joint_space import JointBounds
 from vla_zenoh.control.limits import workspace_corners
-from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.kinematics.kinematics import pose_error
 from vla_zenoh.kinematics.so3 import Pose, rotation_from_quat
-from vla_zenoh.profile import Profile, load_profile, override
+from vla_zenoh.profile import Profile, override
 from vla_zenoh.types import FloatArray, JointCommand
 
 BOX_M = 1e-3
 
 
 def panda(command: str = "joint", **parts: Any) -> Profile:
-    return override(load_profile("panda_sim"), {"robot": {"command": command}, **parts})
+    return override(shipped(), {"robot": {"command": command}, **parts})
 
 
 class Joints:
@@ -36,7 +35,7 @@ class Joints:
         self, of: Profile | None = None, names: tuple[str, ...] = (), **action: Any
     ) -> None:
         self.profile = of or panda()
-        self.reach = ReachabilityFilter(self.profile)
+        self.reach = reach_of(self.profile)
         self.kinematics = self.reach.kinematics
         self.names = names or self.kinematics.arm_joints
         fields = {"space": "joint", "joints": self.names, "kind": "absolute", "gripper": "none"}

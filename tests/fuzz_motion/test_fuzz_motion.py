@@ -13,7 +13,7 @@ TICKS, JOINT_TICKS = 10_000, 6_000
 """Kinematics take their time."""
 PARITY_TICKS = 2_000
 SLOW = ("joint", "joint net", "reach", *IN_JOINTS)
-FIRST, SHORT = 101, 0.4
+FIRST, SHORT = 101, 0.25
 CASES = [
     *(pytest.param(family, FIRST, SHORT) for family in dict.fromkeys(CYCLE)),
     *(

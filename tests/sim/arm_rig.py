@@ -27,6 +27,7 @@ from vla_zenoh.policy import (
     ObservationSpec,
 )
 from vla_zenoh.profile import Profile, load_profile
+from vla_zenoh.profile.load import override
 from vla_zenoh.simulation.world import World, build_world
 from vla_zenoh.types import ActionChunk, FloatArray, PoseCommand
 
@@ -41,6 +42,10 @@ STILL_M_S = 2e-3
 AT_REST = 1e-6
 WOBBLE_FACTOR = 2.0
 TICK_S = 1 / 250
+STARTED_S = 0.7
+"""From standing to the speed that is asked for; it is steady later."""
+READY_S = 0.2
+"""Until every node has heard of the others."""
 
 
 class Asked:
@@ -74,7 +79,8 @@ class Asked:
 
 @cache
 def shipped() -> Profile:
-    return load_profile("panda_sim")
+    # From the first request on at the rate of the tests, so that none waits for a slower one.
+    return override(load_profile("panda_sim"), {"task": {"rate_hz": RATE_HZ}})
 
 
 @cache
@@ -114,7 +120,7 @@ def begin(
     loop = Lockstep(shipped(), world, Asked(), reach=reach, others=others)
     loop.put("rate", rate_hz)
     loop.put("prompt", prompt)
-    loop.run(1.1)  # the first request was due at the rate of the profile
+    loop.run(READY_S)
     activate(loop)
     return loop
 
@@ -125,6 +131,21 @@ def moving(seconds: float = 1.4, prompt: str = UP, rate_hz: float = RATE_HZ) -> 
     loop.run(seconds)
     assert speed_m_s(loop)[-1] > 0.5 * SPEED_M_S
     return loop
+
+
+def after(seconds: float, tamper: Tamper | None = None) -> FloatArray:
+    """The measured path up, and of what follows with `tamper` on the wire."""
+    loop = moving(STARTED_S)
+    loop.tamper = tamper
+    loop.run(seconds)
+    check_motion(loop)
+    return path_m(loop)
+
+
+@cache
+def undisturbed(seconds: float) -> FloatArray:
+    """What `after` is compared with."""
+    return after(seconds)
 
 
 def activate(loop: Lockstep) -> None:

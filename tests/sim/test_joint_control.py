@@ -23,6 +23,8 @@ CHANGE_LIMIT_M, CHANGE_LIMIT_RAD = 2e-4, 2e-3
 LOAD_NM = 2.0
 SAME_POSE_M = 1e-9
 REST_RAD_S = 1e-3
+TAKEN_OVER = [(0.0, 0.3), (FRICTION_NM, 0.3), (FRICTION_NM, SETTLE_S)]
+"""Friction, and how long the first law has held the arm: it has found the friction, or has not."""
 SWING_RAD = np.array([0.5, 0.3, -0.4, 0.4, 0.5, -0.4, 0.8])
 
 
@@ -124,8 +126,7 @@ def test_the_reference_pose_is_where_the_held_joints_put_the_tcp() -> None:
 
 
 # -- from one law to the other ----------------------------------------------------------------
-@pytest.mark.parametrize("friction_nm", [0.0, FRICTION_NM])
-@pytest.mark.parametrize("waits_s", [0.3, SETTLE_S])
+@pytest.mark.parametrize(("friction_nm", "waits_s"), TAKEN_OVER)
 def test_the_arm_does_not_move_when_joints_take_over_from_a_pose(
     friction_nm: float, waits_s: float
 ) -> None:
@@ -139,8 +140,7 @@ def test_the_arm_does_not_move_when_joints_take_over_from_a_pose(
     assert moved_rad < CHANGE_LIMIT_RAD
 
 
-@pytest.mark.parametrize("friction_nm", [0.0, FRICTION_NM])
-@pytest.mark.parametrize("waits_s", [0.3, SETTLE_S])
+@pytest.mark.parametrize(("friction_nm", "waits_s"), TAKEN_OVER)
 def test_the_arm_does_not_move_when_a_pose_takes_over_from_joints(
     friction_nm: float, waits_s: float
 ) -> None:

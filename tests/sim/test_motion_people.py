@@ -10,6 +10,7 @@ import pytest
 from arm_rig import (
     HOLD,
     SPEED_M_S,
+    STARTED_S,
     STEP_M,
     STILL_M_S,
     TICK_S,
@@ -35,7 +36,7 @@ from vla_zenoh.types import FloatArray, GripperCommand, PoseCommand, PoseReferen
 EXACT_M = 1e-3
 BRAKE_STOP_S, BRAKE_WAY_M = 0.20, 0.021
 SLIP_M = 1e-3
-TOGGLES_S = 10.0
+TOGGLES_S = 5.0
 MOVES_M_S, TOGGLED_WAY_M = 0.02, 0.3
 GRIPPER_S = 6.0
 STALL_S = 1.0
@@ -114,7 +115,7 @@ def test_stop_in_motion_stops_the_arm_and_only_a_reset_frees_it() -> None:
 
 @pytest.mark.parametrize("wait_s", [0.02, 0.06, 0.12])
 def test_activated_while_it_still_moves_it_does_not_jump(wait_s: float) -> None:
-    loop = moving()
+    loop = moving(STARTED_S)
     loop.put("active", False)
     loop.run(wait_s)
     activate(loop)
@@ -125,7 +126,7 @@ def test_activated_while_it_still_moves_it_does_not_jump(wait_s: float) -> None:
 
 @pytest.mark.parametrize("wait_s", [0.14, 0.2, 0.35])
 def test_activated_during_or_after_the_robots_own_brake_it_does_not_jump(wait_s: float) -> None:
-    loop = moving()
+    loop = moving(STARTED_S)
     loop.tamper = dropped(PoseCommand)
     loop.run(wait_s)
     loop.tamper = None
@@ -171,8 +172,8 @@ def test_active_toggled_ten_times_a_second_stays_smooth() -> None:
     # Often, so that the arm is under way each time before it is told to stop again.
     loop = begin(UP, rate_hz=30.0)
     for toggle in range(round(TOGGLES_S * 10)):
-        if toggle % 50 == 0:  # there and back, for the workspace ends
-            loop.put("prompt", UP if toggle % 100 == 0 else f"0 0 -{STEP_M}")
+        if toggle % 25 == 0:  # there and back, for the workspace ends
+            loop.put("prompt", UP if toggle % 50 == 0 else f"0 0 -{STEP_M}")
         loop.put("active", toggle % 2 == 1)
         loop.run(0.1)
     since = mark(loop)

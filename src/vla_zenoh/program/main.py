@@ -10,7 +10,8 @@ import os
 import re
 import shlex
 from collections import UserDict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cache
 from importlib import import_module
 from importlib.metadata import EntryPoint
 from importlib.resources import files
@@ -230,16 +231,19 @@ def _lazy_group(
 
 
 # -- help, examples and completion ----------------------------------------------------------------
-def examples() -> Iterator[tuple[list[str], str]]:
+@cache
+def examples() -> list[tuple[list[str], str]]:
     """Words and text of every example; the text begins with its comment, if it has one."""
+    found: list[tuple[list[str], str]] = []
     comment = ""
     text = files("vla_zenoh.cli").joinpath("examples.txt").read_text("utf-8")
     for line in text.splitlines():
         if line.startswith("#"):
             comment = f"{line}\n"
         elif line:
-            yield shlex.split(line, comments=True), comment + line
+            found.append((shlex.split(line, comments=True), comment + line))
             comment = ""
+    return found
 
 
 def add_help(command: Any, path: Sequence[str]) -> None:

@@ -164,13 +164,16 @@ def coarse_stl(file: Path, grid_m: float) -> tuple[FloatArray, NDArray[np.int32]
     """Vertices (n, 3) and faces (m, 3) of a binary STL, with one vertex in each cell of a grid."""
     triangle = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", "<u2")])
     corners = np.fromfile(file, triangle, offset=84)["corners"].reshape(-1, 3)
-    _, cell = np.unique(np.round(corners / grid_m).astype(np.int64), axis=0, return_inverse=True)
-    cell = cell.ravel()
+    cells = np.round(corners / grid_m).astype(np.int64)
+    cells -= cells.min(axis=0)
+    _, cell = np.unique(np.ravel_multi_index(cells.T, cells.max(axis=0) + 1), return_inverse=True)
     total = [np.bincount(cell, corners[:, axis]) for axis in range(3)]
     vertices = np.column_stack(total) / np.bincount(cell)[:, None]
     faces = cell.reshape(-1, 3).astype(np.int32)
     a, b, c = faces.T
-    return vertices, np.unique(faces[(a != b) & (b != c) & (c != a)], axis=0)
+    faces = faces[(a != b) & (b != c) & (c != a)]
+    _, once = np.unique(np.ravel_multi_index(faces.T, [len(vertices)] * 3), return_index=True)
+    return vertices, faces[once]
 
 
 def _named(element: Any, kind: str, name: str, known: list[str]) -> Any:

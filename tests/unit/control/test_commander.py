@@ -18,12 +18,12 @@ from command_rig import (
     model_spec,
     profile,
     quat_of,
+    reach_of,
 )
 
 from vla_zenoh.control.axis_smoothing import AxisSmoother
 from vla_zenoh.control.commander import MAX_ANSWER_S, Commander, Inputs, Setting
 from vla_zenoh.control.motion_pipeline import LINGER_NS
-from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.keys import OPENING
 from vla_zenoh.kinematics.so3 import norm3
 from vla_zenoh.profile import load_profile, override
@@ -425,8 +425,9 @@ def test_a_robot_that_swings_past_its_last_command_is_not_activated_before_it_st
 
 def test_a_robot_whose_joints_swing_past_their_last_command_is_not_activated_then() -> None:
     of = override(load_profile("panda_sim"), {"robot": {"command": "joint"}})
-    kinematics = ReachabilityFilter(of).kinematics
-    rig = Rig(of, reach=ReachabilityFilter(of))
+    reach = reach_of(of)
+    kinematics = reach.kinematics
+    rig = Rig(of, reach=reach)
     rig.stand_at(kinematics, np.array(of.robot.home_rad))
     rig.activate()
     rig.put("active", False)
@@ -661,8 +662,9 @@ def test_why_an_arm_stopped_by_itself_is_said_when_it_is_activated_again() -> No
 def stuck_rig(**robot: str) -> Rig:
     """Just stopped, because the joints cannot follow."""
     of = override(load_profile("panda_sim"), {"robot": {"command": "joint", **robot}})
-    kinematics, rng = ReachabilityFilter(of).kinematics, np.random.default_rng(0)
-    rig = Rig(of, reach=ReachabilityFilter(of))
+    reach, rng = reach_of(of), np.random.default_rng(0)
+    kinematics = reach.kinematics
+    rig = Rig(of, reach=reach)
     rig.stand_at(kinematics, np.array(of.robot.home_rad))
     rig.activate()
     step = rng.normal(size=6)
@@ -1115,7 +1117,7 @@ def test_a_router_whose_clock_was_set_back_does_not_keep_an_arm_stopped() -> Non
 
 def test_the_measured_joints_are_monitored_however_many_chunks_arrive() -> None:
     of = profile()
-    reach = ReachabilityFilter(of)
+    reach = reach_of(of)
     rig = Rig(of, reach=reach)
     joints_rad, end_rad = reach.joints_rad.copy(), reach.kinematics.upper_rad[6] - 1e-3
     joints_rad[6] = end_rad - 0.2
@@ -1140,7 +1142,7 @@ def test_a_chunk_planned_before_its_tick_gives_the_commands_that_the_tick_would(
     of = profile(robot={"command": command})
     moved: list[list[np.ndarray]] = []
     for early in (False, True):
-        reach = ReachabilityFilter(of)
+        reach = reach_of(of)
         rig = Rig(of, reach=reach)
         rig.stand_at(reach.kinematics, reach.joints_rad.copy())
         rig.joints_rad = None
@@ -1190,7 +1192,7 @@ def test_a_goal_without_a_trajectory_is_a_fault_and_the_arm_brakes(
     command: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     of = profile(robot={"command": command})
-    reach = ReachabilityFilter(of)
+    reach = reach_of(of)
     rig = Rig(of, reach=reach)
     rig.stand_at(reach.kinematics, reach.joints_rad.copy())
     rig.joints_rad = None

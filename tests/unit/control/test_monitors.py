@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command_rig import DOWN, START_M, START_NS, Rig, profile
+from command_rig import DOWN, START_M, START_NS, Rig, profile, reach_of
 
 from vla_zenoh.control.contact import Contact
-from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.kinematics.so3 import Pose, quat_from_rotation, rotation_from_quat
 from vla_zenoh.profile import ContactLimits, Profile, load_profile, override
@@ -26,7 +25,7 @@ class Arm(Rig):
 
     def __init__(self, of: Profile | None = None, *, command: str = "pose") -> None:
         of = of or profile(robot={"command": command})
-        reach = ReachabilityFilter(of)
+        reach = reach_of(of)
         super().__init__(of, reach=reach)
         self.reach = reach
         self.at_rad: FloatArray = reach.joints_rad.copy()

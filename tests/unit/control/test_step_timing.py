@@ -19,7 +19,7 @@ answer as often as it is asked, and answers unevenly, `UNEVEN_RIPPLE`."""
 UNEVEN_RIPPLE = 0.5
 STOP_AND_GO = 1.5
 AT_GOAL_M = 1e-6
-STEP_M, STEPS = 0.01, 50
+STEP_M, STEPS = 0.01, 24
 PICTURE_NS, CAMERA_NS = 33_333_333, 15 * MS
 PATH_M = 1e-5
 LIMIT = 1 + 1e-6

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from chain import command_line
+from typed import typed
 
 from vla_zenoh.codec import records
 from vla_zenoh.errors import RecordError
@@ -59,18 +59,20 @@ def recording(tmp_path: Path) -> Path:
     return tmp_path / "run.mcap"
 
 
-def test_their_difference_is_found(recording: Path) -> None:
-    done = command_line("lab", "compare", "a", "b", str(recording), "--json")
-    assert done.returncode == 0, done.stderr
+def test_their_difference_is_found(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    done = typed(capsys, "lab", "compare", "a", "b", str(recording), "--json")
+    assert done.code == 0, done.stderr
     found = json.loads(done.stdout)
     assert (found["pairs"], found["only_a"], found["only_b"]) == (PAIRS, 0, 0)
     assert found["bias"] == pytest.approx([BIAS_M, 0, 0, 0, 0, 0], abs=ATOL_M)
     assert found["cosine"] == pytest.approx(1.0)
 
 
-def test_a_worker_that_is_not_in_it_is_named_with_those_that_are(recording: Path) -> None:
-    done = command_line("lab", "compare", "a", "ghost", str(recording))
-    assert done.returncode == 1
+def test_a_worker_that_is_not_in_it_is_named_with_those_that_are(
+    recording: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    done = typed(capsys, "lab", "compare", "a", "ghost", str(recording))
+    assert done.code == 1
     assert "has no chunks of 'ghost'; it has: a, b" in done.stderr
 
 

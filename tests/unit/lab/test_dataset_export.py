@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from chain import command_line
 from dataset_rig import (
     CHUNK_MS,
     CHUNKS,
@@ -25,6 +24,7 @@ from dataset_rig import (
     steps_of,
 )
 from dataset_rig import write_run as make_run
+from typed import typed
 
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.dataset.episodes import episodes_of, fps_of
@@ -188,12 +188,12 @@ def test_figures_of_pictures_are_those_of_their_pixels() -> None:
 
 @pytest.mark.parametrize(("unit_m", "unit"), [(0.001, "mm"), (0.0001, "m")])
 def test_depth_is_a_column_of_files_with_every_count_of_the_recording(
-    tmp_path: Path, unit_m: float, unit: str
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], unit_m: float, unit: str
 ) -> None:
     run = make_run(tmp_path / "deep.mcap", depth_unit_m=unit_m)
     out, name = tmp_path / "out", "observation.images.front_depth"
-    done = command_line("dataset", "export", str(run), "--output", str(out), "--json")
-    assert done.returncode == 0, done.stderr
+    done = typed(capsys, "dataset", "export", str(run), "--output", str(out), "--json")
+    assert done.code == 0, done.stderr
     assert json.loads(done.stdout)["depth"] == ["front"]
     info = json.loads((out / "meta" / "info.json").read_text())["features"][name]
     assert (info["dtype"], info["shape"]) == ("image", [HEIGHT, WIDTH, 1])
@@ -214,10 +214,10 @@ def test_depth_is_a_column_of_files_with_every_count_of_the_recording(
         np.testing.assert_allclose(np.reshape(kept[key], 1), wanted[key], rtol=1e-5)
 
 
-def test_depth_may_be_left_out(tmp_path: Path) -> None:
+def test_depth_may_be_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = make_run(tmp_path / "deep.mcap", depth_unit_m=0.001)
     args = ("--output", str(tmp_path / "out"), "--no-depth", "--json")
-    done = command_line("dataset", "export", str(run), *args)
+    done = typed(capsys, "dataset", "export", str(run), *args)
     assert json.loads(done.stdout)["depth"] == []
     info = json.loads((tmp_path / "out" / "meta" / "info.json").read_text())
     assert not [name for name in info["features"] if "depth" in name]
@@ -315,17 +315,19 @@ def test_what_cannot_become_a_dataset_is_named(run_file: Path, tmp_path: Path) -
         openvla_statistics(tmp_path, "x")
 
 
-def test_the_commands_make_a_dataset_and_its_statistics(run_file: Path, tmp_path: Path) -> None:
+def test_the_commands_make_a_dataset_and_its_statistics(
+    run_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "bricks"
-    done = command_line("dataset", "export", str(run_file.parent), "--output", str(out), "--json")
-    assert done.returncode == 0, done.stderr
+    done = typed(capsys, "dataset", "export", str(run_file.parent), "--output", str(out), "--json")
+    assert done.code == 0, done.stderr
     said = json.loads(done.stdout)
     assert (said["episodes"], said["frames"], said["cameras"]) == (2, 40, ["front"])
-    done = command_line("dataset", "stats", str(out), "--name", "mine")
-    assert done.returncode == 0, done.stderr
+    done = typed(capsys, "dataset", "stats", str(out), "--name", "mine")
+    assert done.code == 0, done.stderr
     assert json.loads((out / "dataset_statistics.json").read_text()).keys() == {"mine"}
-    done = command_line("dataset", "export", str(run_file), "--output", str(out))
-    assert done.returncode == 1
+    done = typed(capsys, "dataset", "export", str(run_file), "--output", str(out))
+    assert done.code == 1
     assert "bricks exists; give another --output, or --force" in done.stderr
 
 

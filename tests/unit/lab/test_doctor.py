@@ -13,14 +13,15 @@ from pathlib import Path
 
 import pytest
 import typer
+from click.testing import Result
 from typer.testing import CliRunner
 from vla_zenoh_franka.check import network_card
 from vla_zenoh_franka.plugin import FrankaOptions
 
 from vla_zenoh.errors import ProfileError, how_to_install
 from vla_zenoh.lab.cli.doctor import doctor as doctor_command
-from vla_zenoh.lab.cli.doctor import try_zenoh
-from vla_zenoh.lab.doctor import HostFinding, Needs, examine, needs_of
+from vla_zenoh.lab.cli.doctor import report, try_zenoh
+from vla_zenoh.lab.doctor import HostFinding, needs_of
 from vla_zenoh.lab.doctor.access import router
 from vla_zenoh.lab.doctor.computer import (
     TIME_ERROR,
@@ -63,13 +64,6 @@ def test_an_old_python_fails_and_a_new_one_passes() -> None:
     old = python_version((3, 10, 9))
     assert (old.level, old.advice) == ("fail", "install Python 3.11 or newer")
     assert python_version((3, 11, 0)).level == "ok"
-
-
-def test_the_environment_of_the_tests_has_every_library() -> None:
-    for role in MODULES:
-        finding = libraries(role, required=True)
-        assert finding.level == "ok", finding
-    assert msgpack_in_c().level == "ok"
 
 
 def test_a_missing_library_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -328,32 +322,50 @@ def test_an_unknown_host_gets_the_list() -> None:
 
 
 # -- the whole --------------------------------------------------------------------------------
-def test_every_finding_that_is_not_well_has_an_advice() -> None:
-    needs = Needs(endpoints=(f"tcp/127.0.0.1:{free_port()}",))
-    findings = list(examine(needs, refuse))
-    assert {"Python", "processors", "disk", "wall clock"} <= {f.name for f in findings}
-    for finding in findings:
+@pytest.fixture(scope="module")
+def told(tmp_path_factory: pytest.TempPathFactory) -> Result:
+    """The command with a profile whose camera is not there."""
+    profile = tmp_path_factory.mktemp("doctor") / "lab.yaml"
+    profile.write_text(
+        "extends: panda_sim\ncameras:\n  front: {source: 'v4l2:/dev/video_absent'}\n"
+    )
+    return CliRunner().invoke(app(), ["--profile", str(profile), "--json"])
+
+
+def findings_of(told: Result) -> dict[str, HostFinding]:
+    return {each["name"]: HostFinding(**each) for each in json.loads(told.stdout)}
+
+
+def test_every_finding_that_is_not_well_has_an_advice(told: Result) -> None:
+    findings = findings_of(told)
+    assert {"Python", "processors", "disk", "wall clock"} <= findings.keys()
+    for finding in findings.values():
         assert finding.found
         assert bool(finding.advice) == (finding.level != "ok"), finding
 
 
-def test_json_is_a_list_of_findings() -> None:
-    result = CliRunner().invoke(app(), ["--json"])
-    findings = json.loads(result.stdout)
-    assert set(findings[0]) == {"name", "level", "found", "advice"}
-    failed = any(finding["level"] == "fail" for finding in findings)
-    assert result.exit_code == int(failed)
+def test_the_environment_of_the_tests_has_every_library(told: Result) -> None:
+    found = [each for name, each in findings_of(told).items() if name.startswith("libraries: ")]
+    assert len(found) == len(MODULES)
+    assert {finding.level for finding in found} == {"ok"}, found
+    assert msgpack_in_c().level == "ok"
 
 
-def test_a_missing_camera_makes_the_command_fail(tmp_path: Path) -> None:
-    profile = tmp_path / "lab.yaml"
-    profile.write_text(
-        "extends: panda_sim\ncameras:\n  front: {source: 'v4l2:/dev/video_absent'}\n"
-    )
-    result = CliRunner().invoke(app(), ["--profile", str(profile)])
-    assert result.exit_code == 1
-    assert "video_absent" in result.stdout.replace("\n", "")
-    assert "will not work" in result.stdout
+def test_a_missing_camera_makes_the_command_fail(told: Result) -> None:
+    assert told.exit_code == 1
+    assert any("video_absent" in each.found for each in findings_of(told).values())
+
+
+def test_only_what_will_not_work_makes_a_report_fail(capsys: pytest.CaptureFixture[str]) -> None:
+    findings = [HostFinding("disk", "warn", "full", "tidy up"), HostFinding("Python", "ok", "new")]
+    report(findings, as_json=False)
+    assert "0 will not work, 1 could work better" in capsys.readouterr().out
+    with pytest.raises(typer.Exit) as ended:
+        report([*findings, HostFinding("camera", "fail", "absent", "plug it in")], as_json=False)
+    assert ended.value.exit_code == 1
+    shown = capsys.readouterr().out
+    assert "plug it in" in shown
+    assert "1 will not work" in shown
 
 
 def test_a_host_without_a_profile_is_refused() -> None:

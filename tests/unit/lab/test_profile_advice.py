@@ -9,7 +9,7 @@ import pytest
 
 from vla_zenoh import resources
 from vla_zenoh.lab.profile.check import advice
-from vla_zenoh.lab.profile.robot_check import shapes_advice
+from vla_zenoh.lab.profile.robot_check import barriers_advice
 from vla_zenoh.profile import load_profile, override
 
 SIM = load_profile("panda_sim")
@@ -91,10 +91,10 @@ def test_a_link_and_a_tool_without_a_collision_shape_are_named(tmp_path: Path) -
     path = tmp_path / "probe.urdf"
     path.write_text(text.replace("</robot>", TOOL))
     probe = {"robot": {"description": str(path), "tcp_frame": "probe"}}
-    bare, tool = shapes_advice(override(SIM, probe))
+    bare, tool = barriers_advice(override(SIM, probe))
     assert bare.endswith(": probe")
     assert "the TCP is 0.290 m from every collision shape" in tool
 
 
 def test_the_shipped_arms_have_shapes_up_to_their_tool() -> None:
-    assert list(shapes_advice(SIM)) == []
+    assert list(barriers_advice(SIM)) == []

@@ -18,12 +18,11 @@ from vla_zenoh.errors import PluginError, ProfileError, VlaZenohError, nearest
 from vla_zenoh.lab.profile.robot_check import (
     ProfileFault,
     arm,
+    barriers_advice,
     braking_advice,
     driver,
-    home_advice,
     joints_advice,
     ros2,
-    shapes_advice,
     simulator,
 )
 from vla_zenoh.policy.loader import find_worker, make_policy
@@ -84,8 +83,7 @@ def check_profile(
         else:
             hints.append(f"{'.'.join(place)}: on this computer: {why}")
     hints += [
-        *home_advice(profile),
-        *shapes_advice(profile),
+        *barriers_advice(profile),
         *joints_advice(profile),
         *braking_advice(profile),
     ]

@@ -91,28 +91,8 @@ def arm(profile: Profile) -> Iterator[ProfileFault]:
         )
 
 
-def home_advice(profile: Profile) -> Iterator[str]:
-    """Advice for a home that is too near to something."""
-    for part in profile.parts or [""]:
-        own = profile.of_part(part)
-        try:
-            from vla_zenoh.control.reachability import ReachabilityFilter
-
-            reach = ReachabilityFilter(own)
-            home_rad = reach.kinematics.ordered(own.robot.arm_joints, own.robot.home_rad)
-        except (ImportError, ValueError, VlaZenohError):
-            continue  # `arm` says so
-        for hit in reach.barriers.inside(home_rad):
-            yield (
-                f"{f'parts.{part}.' if part else ''}robot.home_rad: {hit.name}{hit.at} is "
-                f"{hit.value:.4f} m with the arm at home, and must be over {hit.limit:.4g} m: from "
-                "there the arm may only move away. Give another home_rad; or, if the convex hulls "
-                "of two links touch and the links do not, name them in limits.reach.may_touch"
-            )
-
-
-def shapes_advice(profile: Profile) -> Iterator[str]:
-    """Advice for what no barrier protects: links without a shape, a tool beyond all shapes."""
+def barriers_advice(profile: Profile) -> Iterator[str]:
+    """Advice for a home that is too near to something, and for what no barrier protects."""
     for part in profile.parts or [""]:
         own = profile.of_part(part)
         try:
@@ -122,6 +102,14 @@ def shapes_advice(profile: Profile) -> Iterator[str]:
         except (ImportError, ValueError, VlaZenohError):
             continue  # `arm` says so
         at = f"parts.{part}." if part else ""
+        home_rad = reach.kinematics.ordered(own.robot.arm_joints, own.robot.home_rad)
+        for hit in reach.barriers.inside(home_rad):
+            yield (
+                f"{at}robot.home_rad: {hit.name}{hit.at} is "
+                f"{hit.value:.4f} m with the arm at home, and must be over {hit.limit:.4g} m: from "
+                "there the arm may only move away. Give another home_rad; or, if the convex hulls "
+                "of two links touch and the links do not, name them in limits.reach.may_touch"
+            )
         bare = ", ".join(reach.kinematics.described.shapeless)
         if bare:
             yield (
