@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from chain import command_line
 from peer_rig import ADAPTERS, KINDS, free_port, of, reachable
-from typed import typed
 
 from vla_zenoh import resources
 from vla_zenoh.lab.check import fit
@@ -397,28 +397,26 @@ def test_the_chart_differs_from_all_its_mirror_images_and_channel_orders() -> No
 # -- the command ----------------------------------------------------------------------------------
 
 
-def test_the_command_prints_json_and_fails_with_1(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_prints_json_and_fails_with_1() -> None:
     words = ("check", str(BROKEN), "--set", "fault=millimetres", "--runs", "3", "--json")
-    done = typed(capsys, *words)
-    assert done.code == 1, done.stderr
+    done = command_line(*words)
+    assert done.returncode == 1, done.stderr
     said = json.loads(done.stdout)
     assert said["ok"] is False
     assert [finding["name"] for finding in said["findings"]] == ["position_units"]
 
 
-def test_the_command_passes_a_good_one_and_a_warning_only_when_it_is_not_strict(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    done = typed(capsys, "check", str(BROKEN), "--profile", "panda_sim", "--runs", "12")
-    assert done.code == 0, done.stdout + done.stderr
+def test_the_command_passes_a_good_one_and_a_warning_only_when_it_is_not_strict() -> None:
+    done = command_line("check", str(BROKEN), "--profile", "panda_sim", "--runs", "12")
+    assert done.returncode == 0, done.stdout + done.stderr
     assert "keeps its contract, 0 warnings" in done.stdout
     deaf = ("check", str(BROKEN), "--set", "fault=deaf", "--runs", "3", "--strict")
-    assert typed(capsys, *deaf).code == 1
+    assert command_line(*deaf).returncode == 1
 
 
-def test_a_file_that_is_no_model_is_named(capsys: pytest.CaptureFixture[str]) -> None:
-    done = typed(capsys, "check", "replay", "--json")
-    assert done.code == 1
+def test_a_file_that_is_no_model_is_named() -> None:
+    done = command_line("check", "replay", "--json")
+    assert done.returncode == 1
     (finding,) = json.loads(done.stdout)["findings"]
     assert finding["name"] == "cannot_be_made"
     assert "Its options: file" in finding["why"]

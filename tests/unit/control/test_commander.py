@@ -129,7 +129,7 @@ def test_steps_are_neither_lost_nor_counted_twice_whatever_rate_latency_and_jitt
     jitter = random.Random(rate_hz)
     rig = Rig(profile(timing={"watchdog_s": 2.0}))
     rig.activate()
-    given, due_s, steps = 0.0, 0.0, 12
+    given, due_s, steps = 0.0, 0.0, 8
     began_ns = rig.now_ns
     for _ in range(steps):
         # The observation is later than the last publication; the chunk comes after the latency.

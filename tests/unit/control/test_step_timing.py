@@ -6,6 +6,7 @@ import itertools
 import random
 from collections import deque
 from dataclasses import dataclass, field
+from functools import cache
 
 import numpy as np
 import pytest
@@ -164,6 +165,7 @@ def curve() -> list[list[float]]:
     return [[*way, 0, 0, 0.02, 0] for way in ways]
 
 
+@cache
 def path_at(percent: float) -> np.ndarray:
     """Positions (n, 3) m of the commands that carry the curve out."""
     timing = {"max_open_loop_s": 60.0, "watchdog_s": 5.0, "max_observation_age_s": 10.0}
