@@ -41,7 +41,7 @@ def after_typing(line: str) -> dict[str, Any]:
     """State of a process after the command line has run in it."""
     code = (
         "import json, os, sys\n"
-        "import vla_zenoh.program.stop as stop\n"
+        "import vla_zenoh.cli.stop as stop\n"
         f"stop.GIVE_UP_S = {GIVE_UP_S}\n"
         f"sys.argv = {['vla-zenoh', *line.split(), *NOWHERE]!r}\n"
         "from vla_zenoh.program.entry import main\n"

@@ -13,8 +13,7 @@ from pathlib import Path
 
 import pytest
 import typer
-from click.testing import Result
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 from vla_zenoh_franka.check import network_card
 from vla_zenoh_franka.plugin import FrankaOptions
 
