@@ -13,6 +13,7 @@ import numpy as np
 import zenoh
 
 from vla_zenoh.bus import shared_memory
+from vla_zenoh.bus.bounded import Bounded
 from vla_zenoh.bus.session import covers
 from vla_zenoh.types import Event, Header
 
@@ -89,8 +90,8 @@ class Traffic:
         """Whose links are listed."""
         self._reported_s = time.monotonic()
         self._sent: dict[str, tuple[int, int]] = {}
-        # (key, source) -> its first seq, our count then, losses since; the newest comes last
-        self._received: dict[tuple[str, str], tuple[int, int, int]] = {}
+        # (key, source) -> its first seq, our count then, losses since
+        self._received: Bounded[tuple[str, str], tuple[int, int, int]] = Bounded(MAX_SENDERS)
         self.lost: Counter[str] = Counter()
         """Key -> records that never arrived here."""
         self._links: list[str] = []
@@ -107,14 +108,12 @@ class Traffic:
         if arrivals == 0:
             self._received.pop(who, None)
             return
-        seq, count, before = self._received.pop(who, (header.seq, arrivals, 0))
+        seq, count, before = self._received.get(who, (header.seq, arrivals, 0))
         lost = max((header.seq - seq) - (arrivals - count), before)
         self._received[who] = (seq, count, lost)
         if lost > before:
             full = key not in self.lost and len(self.lost) >= MAX_SENDERS
             self.lost[OTHERS if full else key] += lost - before
-        if len(self._received) > MAX_SENDERS:
-            del self._received[next(iter(self._received))]
 
     def forget(self, expression: str) -> None:
         """A subscription has ended: what is published until the next one is not lost."""

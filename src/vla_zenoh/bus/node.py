@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 
 import zenoh
 
+from vla_zenoh.bus.bounded import Bounded
 from vla_zenoh.bus.buffers import (
     CallbackRing,
     ReceivedSample,
@@ -127,7 +128,7 @@ class Node:
         self.clock = Clock()
         self.source = f"{name}#{secrets.token_hex(4)}"
         self.counters: Counter[str] = Counter()
-        self._newer_sources: set[str] = set()
+        self._newer_sources: Bounded[str, None] = Bounded(MAX_NEWER_SOURCES)
         self.started_wall_ns = time.time_ns()
         self._declared: list[Any] = []
         self._publishers: list[Publisher] = []
@@ -401,9 +402,9 @@ class Node:
     def _count_unknown(self, source: str, fields: list[str]) -> None:
         """Count ignored fields, and name them once for each sender."""
         self.counters["unknown_fields"] += len(fields)
-        if source in self._newer_sources or len(self._newer_sources) >= MAX_NEWER_SOURCES:
+        if source in self._newer_sources:
             return
-        self._newer_sources.add(source)
+        self._newer_sources[source] = None
         named = ", ".join(fields[:MAX_UNKNOWN_NAMED])
         why = f"{source[:60]} sends {named}, which this version does not know: ignored"
         self.emit(Event("info", "notice", "unknown_fields", why[:1000]))

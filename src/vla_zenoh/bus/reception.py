@@ -13,6 +13,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
+from vla_zenoh.bus.bounded import Bounded
 from vla_zenoh.bus.session import covers
 from vla_zenoh.keys import Keys
 from vla_zenoh.types import NodeStatus
@@ -57,16 +58,14 @@ class _Stream:
     """One key, as one subscription receives it."""
 
     def __init__(self) -> None:
-        self.senders: dict[tuple[str, int], int] = {}
+        self.senders: Bounded[tuple[str, int], int] = Bounded(MAX_SENDERS)
         self.sent = self.received = 0
         self.first_received = -1
         self.window: deque[tuple[float, int, int]] = deque()
 
     def add(self, now_s: float, sender: tuple[str, int], count: int, received: int) -> None:
-        before = self.senders.pop(sender, None)
+        before = self.senders.get(sender)
         self.senders[sender] = count
-        if len(self.senders) > MAX_SENDERS:
-            del self.senders[next(iter(self.senders))]
         if self.first_received < 0:  # the comparison begins with the sender's first status
             self.first_received = received
         elif before is not None:
@@ -92,7 +91,7 @@ class Reception:
         self._keys, self._clock = keys, clock
         self._lock = threading.Lock()
         self._watches: list[_Watch] = []
-        self._streams: dict[str, _Stream] = {}
+        self._streams: Bounded[str, _Stream] = Bounded(MAX_STREAMS)
 
     def watch(self, expression: str, arrived: Mapping[str, int]) -> None:
         """Follow a subscription: `arrived` has the number of samples of each key, and grows."""
@@ -122,9 +121,7 @@ class Reception:
             watch = next((one for one in self._watches if covers(one.expression, key)), None)
             if watch is None or now_s - watch.since_s < SETTLE_S:
                 return
-            if key not in self._streams and len(self._streams) >= MAX_STREAMS:
-                return
-            stream = self._streams.setdefault(key, _Stream())
+            stream = self._streams[key] = self._streams.get(key) or _Stream()
             stream.add(now_s, sender, count, watch.arrived.get(key, 0))
 
     def short(self) -> dict[str, str]:

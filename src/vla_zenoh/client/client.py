@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import zenoh
 
+from vla_zenoh.bus.bounded import Bounded
 from vla_zenoh.bus.buffers import ReceivedSample, SampleBuffer, bytes_of, header_of
 from vla_zenoh.bus.reception import Reception
 from vla_zenoh.bus.session import put_text
@@ -37,8 +38,8 @@ MAX_EVENTS, MAX_REFUSALS = 4096, 256
 MAX_EVENT_BYTES = 64 * 1024
 MAX_WHAT, MAX_WHY = 128, 1000
 """Characters of an event that are kept; our nodes publish no more."""
-MAX_OTHERS = 256
-"""Names of nodes beside those of the profile."""
+MAX_NODES = 256
+"""Names of nodes, those of the profile among them."""
 MAX_STATUS_BYTES = 64 * 1024
 """Of one status; ours have a few thousand bytes."""
 DROPPED_HINT = (
@@ -51,8 +52,7 @@ class NodeRegistry:
     """Live nodes and their last status, of any name; safe to use from several threads.
 
     Any client that may publish a status may do so under any name. So there is always a place for
-    the `expected` nodes of the profile, and a quota for all others; `up` runs for weeks. `dropped`
-    counts statuses and tokens that were not kept, or made room for others.
+    the `expected` nodes of the profile, and a bound for all others; `up` runs for weeks.
     """
 
     def __init__(
@@ -61,9 +61,9 @@ class NodeRegistry:
         self._expected = frozenset(expected)
         self._clock = clock
         self._lock = threading.Lock()
-        self._alive: set[str] = set()
-        self._statuses: dict[str, tuple[NodeStatus, float]] = {}  # the newest comes last
-        self.dropped = 0
+        self._alive: Bounded[str, None] = Bounded(MAX_NODES, self._is_expected)
+        self._statuses: Bounded[str, tuple[NodeStatus, float]] = Bounded(MAX_NODES, self._rank)
+        self._invalid = 0
 
     @property
     def alive(self) -> frozenset[str]:
@@ -71,30 +71,32 @@ class NodeRegistry:
         with self._lock:
             return frozenset(self._alive)
 
+    @property
+    def dropped(self) -> int:
+        """Statuses and tokens that were not kept, or made room for others."""
+        with self._lock:
+            return self._invalid + self._alive.dropped + self._statuses.dropped
+
     def token_appeared(self, name: str) -> None:
         """A liveliness token appeared."""
         with self._lock:
-            full = len(self._alive - self._expected) >= MAX_OTHERS
-            if self._fit(name) and (name in self._expected or not full):
-                self._alive.add(name)
+            if self._fit(name):
+                self._alive[name] = None
             else:
-                self.dropped += 1
+                self._invalid += 1
 
     def token_gone(self, name: str) -> None:
         """A liveliness token is gone."""
         with self._lock:
-            self._alive.discard(name)
+            self._alive.pop(name, None)
 
     def status_received(self, name: str, status: NodeStatus, size: int) -> None:
         """Keep the status of the node that its key names; `size`: in bytes."""
         with self._lock:
-            fits = self._fit(name) and size <= MAX_STATUS_BYTES
-            if fits:
-                self._statuses.pop(name, None)
-            if fits and (name in self._expected or self._make_room()):
+            if self._fit(name) and size <= MAX_STATUS_BYTES:
                 self._statuses[name] = (status, self._clock())
             else:
-                self.dropped += 1
+                self._invalid += 1
 
     def status(self, name: str) -> NodeStatus | None:
         """The last status of a node, None before the first."""
@@ -127,17 +129,12 @@ class NodeRegistry:
         except ProfileError:
             return False
 
-    def _make_room(self) -> bool:
-        """Whether one more status fits, after dropping the oldest of a node that is gone."""
-        others = [name for name in self._statuses if name not in self._expected]
-        if len(others) < MAX_OTHERS:
-            return True
-        oldest = next((name for name in others if name not in self._alive), None)
-        if oldest is None:
-            return False
-        del self._statuses[oldest]
-        self.dropped += 1
-        return True
+    def _is_expected(self, name: str) -> bool:
+        return name in self._expected
+
+    def _rank(self, name: str) -> int:
+        """Whose status stays: a node of the profile, before one that is alive, before the rest."""
+        return 2 * self._is_expected(name) + (name in self._alive)
 
 
 class StopOutcome(StrEnum):

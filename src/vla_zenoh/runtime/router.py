@@ -11,6 +11,7 @@ from typing import Any
 
 import zenoh
 
+from vla_zenoh.bus.bounded import Bounded
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import open_session, session_config
 from vla_zenoh.errors import NodeError
@@ -66,7 +67,7 @@ class Clients:
 
     def __init__(self, session: zenoh.Session) -> None:
         self._lock = threading.Lock()
-        self._known: dict[str, list[str]] = {}
+        self._known: Bounded[str, list[str]] = Bounded(MAX_CLIENTS)
         handler = zenoh.handlers.Callback(self._heard, indirect=False)
         self._listener = session.info.declare_link_events_listener(handler, history=True)
 
@@ -75,10 +76,7 @@ class Clients:
             return
         number = str(event.link.zid)
         with self._lock:
-            self._known.pop(number, None)
             self._known[number] = [event.link.auth_identifier or "", str(event.link.dst)]
-            if len(self._known) > MAX_CLIENTS:
-                del self._known[next(iter(self._known))]
 
     def known(self) -> dict[str, list[str]]:
         """Session number -> [name of the certificate or empty, address] of the last

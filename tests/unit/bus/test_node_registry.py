@@ -7,7 +7,7 @@ import dataclasses
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vla_zenoh.client.client import MAX_OTHERS, MAX_STATUS_BYTES, NodeRegistry
+from vla_zenoh.client.client import MAX_NODES, MAX_STATUS_BYTES, NodeRegistry
 from vla_zenoh.types import NodeStatus
 
 OURS = ("sim", "command")
@@ -39,8 +39,8 @@ def test_a_flood_of_names_leaves_the_lab_s_own_nodes_and_is_counted() -> None:
     for number in range(FLOOD):
         here.status_received(f"ghost{number}", status(), SMALL)
         here.token_appeared(f"ghost{number}")
-    assert len(here.snapshot()) <= MAX_OTHERS
-    assert len(here.alive) <= MAX_OTHERS
+    assert len(here.snapshot()) <= MAX_NODES
+    assert len(here.alive) <= MAX_NODES
     assert here.dropped >= FLOOD
     for name in OURS:
         here.status_received(name, status(name), MAX_STATUS_BYTES)
@@ -89,7 +89,7 @@ def test_whatever_comes_no_more_is_kept_than_there_is_room_for(acts) -> None:
         else:
             getattr(here, act)(name)
     others = [found.pid for name, (found, _, _) in here.snapshot().items() if name not in OURS]
-    assert len(others) <= MAX_OTHERS
+    assert len(others) <= MAX_NODES
     assert all(size <= MAX_STATUS_BYTES for size in others)
     if any(
         act == "said" and name == "sim" and size <= MAX_STATUS_BYTES for act, name, size in acts
