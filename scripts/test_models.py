@@ -21,6 +21,7 @@ from pathlib import Path
 
 from bootstrap import uv_environment
 
+from vla_zenoh.plugins import how_to_repeat
 from vla_zenoh.policy.loader import find_model
 from vla_zenoh.runtime.environments import environment_command
 
@@ -53,6 +54,7 @@ def run_model(
     extra = TESTS / name / "requirements.txt"
     more = [line for line in extra.read_text().split("\n") if line] if extra.is_file() else []
     command = environment_command(find_model(name), [*TOOLS, *more, *added])
+    command += how_to_repeat(f"vla-zenoh-{name}") if name == "lerobot" else []  # its arm, too
     made = subprocess.run(
         [*command, "python", "-c", ""], env=environ, capture_output=True, text=True, check=False
     )

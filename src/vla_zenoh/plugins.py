@@ -144,24 +144,15 @@ GROUPS: tuple[Group[Any], ...] = (ROBOTS, CAMERAS, MODELS, BENCHMARKS, COMMANDS)
 
 
 def installed(group: Group[Any]) -> Mapping[str, EntryPoint]:
-    """Name -> entry point of every plug-in of a group, sorted; nothing is imported.
-
-    Raises:
-        PluginError: two packages bring the same name.
-    """
-    return _found(group.name, tuple(sys.path))
+    """Name -> entry point of every plug-in of a group, sorted; nothing is imported."""
+    return {name: entries[0] for name, entries in _found(group.name, tuple(sys.path)).items()}
 
 
 @lru_cache(maxsize=16)
-def _found(group: str, path: tuple[str, ...]) -> Mapping[str, EntryPoint]:
-    out: dict[str, EntryPoint] = {}
+def _found(group: str, path: tuple[str, ...]) -> Mapping[str, list[EntryPoint]]:
+    out: dict[str, list[EntryPoint]] = {}
     for entry in sorted(entry_points(group=group), key=lambda entry: entry.name):
-        other = out.setdefault(entry.name, entry)
-        if other is not entry:
-            raise PluginError(
-                f"{package_of(other)} and {package_of(entry)} both bring {entry.name!r} of "
-                f"{group}: uninstall one of them"
-            )
+        out.setdefault(entry.name, []).append(entry)
     return out
 
 
@@ -174,7 +165,8 @@ def load(group: Group[Declaration], name: str) -> Declaration:
     """The declaration of one plug-in; the others are not imported.
 
     Raises:
-        PluginError: it is not installed, cannot be imported, or is something else.
+        PluginError: it is not installed, cannot be imported, is something else, or two packages
+            bring this name.
     """
     known = installed(group)
     if name not in known:
@@ -183,7 +175,10 @@ def load(group: Group[Declaration], name: str) -> Declaration:
             f"{', '.join(known) or 'none'}. Install the package that brings it: "
             "docs/how-to/plugins.md"
         )
-    entry = known[name]
+    entry, *others = _found(group.name, tuple(sys.path))[name]
+    if others:
+        packages = " and ".join(map(package_of, (entry, *others)))
+        raise PluginError(f"{packages} both bring the {group.noun} {name!r}: uninstall one of them")
     where = f"the {group.noun} {name!r} of {package_of(entry)}"
     try:
         found = entry.load()

@@ -276,8 +276,9 @@ def test_two_packages_with_one_name_are_told_apart_by_no_guess(
     project.write_text(BROKEN.replace("absent =", "acme ="), "utf-8")
     install(project)
     monkeypatch.syspath_prepend(str(project.parent))
-    with pytest.raises(PluginError, match=r"both bring 'acme' of vla_zenoh.robots: uninstall one"):
+    with pytest.raises(PluginError, match=r"both bring the robot driver 'acme': uninstall one"):
         plugins.load(plugins.ROBOTS, "acme")
+    assert load_profile("panda_sim").driver_options is None
 
 
 def test_a_check_that_fails_itself_is_a_fault_by_name(folder: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from vla_zenoh import plugins
-from vla_zenoh.errors import PluginError
+from vla_zenoh.errors import PluginError, in_words
 from vla_zenoh.lab.doctor.needs import HostFinding, nodes_on
 from vla_zenoh.profile import Profile
 
@@ -14,11 +14,7 @@ def installed_plugins() -> Iterator[HostFinding]:
     """The plug-ins of every group, and those that cannot be imported."""
     for group in plugins.GROUPS:
         name = f"plug-ins: {group.noun}s"
-        try:
-            known, faults = plugins.installed(group), plugins.broken(group)
-        except PluginError as error:
-            yield HostFinding(name, "fail", str(error))
-            continue
+        known, faults = plugins.installed(group), plugins.broken(group)
         works = ", ".join(entry for entry in known if entry not in faults)
         yield HostFinding(name, "ok" if works else "fail", works or "none: run make setup")
         for why in faults.values():
@@ -34,4 +30,8 @@ def robot_driver(profile: Profile, host: str | None) -> Iterator[HostFinding]:
     except PluginError as error:
         yield HostFinding("robot driver", "fail", str(error))
         return
-    yield from robot.check_host(profile, profile.driver_options)
+    try:
+        yield from robot.check_host(profile, profile.driver_options)
+    except Exception as error:
+        why = f"the check of {profile.robot.driver} itself failed: {in_words(error)}"
+        yield HostFinding("robot driver", "warn", why)
