@@ -35,20 +35,20 @@ NODES = frozenset({"up", "worker", "node"})
 """Commands that write a log, which includes Zenoh's own."""
 
 
-class Group(NamedTuple):
+class CommandGroup(NamedTuple):
     """Several commands under one word: name -> ``module:function`` inside the package."""
 
     help: str
     commands: Mapping[str, str]
 
 
-COMMANDS: Mapping[str, Mapping[str, str | Group]] = {
+COMMANDS: Mapping[str, Mapping[str, str | CommandGroup]] = {
     "Run": {
         "demo": "lab.cli.demo:demo",
         "up": "cli.up:up",
         "worker": "cli.nodes:worker",
         "teleop": "lab.cli.teleop:teleop",
-        "node": Group(
+        "node": CommandGroup(
             "Run one node by hand; `up` runs all nodes of a host, `worker` a model.",
             {
                 "router": "cli.nodes:router",
@@ -70,7 +70,7 @@ COMMANDS: Mapping[str, Mapping[str, str | Group]] = {
         "speed": "cli.drive:speed",
         "stop": "cli.drive:stop",
         "reset": "cli.drive:reset",
-        "do": Group(
+        "do": CommandGroup(
             "Guarded motions: go to a pose, home, grip, run a model until a condition holds.",
             {
                 "move-to": "lab.cli.primitives:move_to",
@@ -80,7 +80,7 @@ COMMANDS: Mapping[str, Mapping[str, str | Group]] = {
             },
         ),
         "web": "lab.cli.web:web",
-        "serve": Group("Let agents drive the robot.", {"mcp": "lab.cli.serve:mcp"}),
+        "serve": CommandGroup("Let agents drive the robot.", {"mcp": "lab.cli.serve:mcp"}),
     },
     "Watch and record": {
         "status": "cli.status:status",
@@ -95,13 +95,13 @@ COMMANDS: Mapping[str, Mapping[str, str | Group]] = {
         "check": "lab.cli.check:check",
         "doctor": "lab.cli.doctor:doctor",
         "profile": "lab.cli.profile:profile_app",
-        "robot": Group(
+        "robot": CommandGroup(
             "Compare a robot with its profile.", {"check": "lab.cli.doctor:robot_check"}
         ),
-        "camera": Group("Cameras of this computer.", {"list": "lab.cli.camera:camera_list"}),
+        "camera": CommandGroup("Cameras of this computer.", {"list": "lab.cli.camera:camera_list"}),
         "secure": "lab.cli.secure:secure_app",
         "dataset": "lab.cli.dataset:dataset_app",
-        "bench": Group(
+        "bench": CommandGroup(
             "Measure this computer, and how well models do tasks.",
             {
                 "command": "lab.cli.bench_command:command",
@@ -109,7 +109,7 @@ COMMANDS: Mapping[str, Mapping[str, str | Group]] = {
                 "compare": "lab.cli.bench_compare:compare",
             },
         ),
-        "lab": Group(
+        "lab": CommandGroup(
             "Compare and inspect models, and the network between the hosts; the rolling record.",
             {
                 "trial": "lab.cli.trial:trial",
@@ -156,28 +156,30 @@ class _LazyCommands(UserDict[str, Any]):
     """Name -> command, imported when it is first looked up."""
 
     def __init__(
-        self, panels: Mapping[str, Mapping[str, str | EntryPoint | Group]], path: Sequence[str]
+        self,
+        panels: Mapping[str, Mapping[str, str | EntryPoint | CommandGroup]],
+        path: Sequence[str],
     ) -> None:
         super().__init__({name: one for group in panels.values() for name, one in group.items()})
         self._path = path
 
     def __getitem__(self, name: str) -> Any:
         found = self.data[name]
-        if isinstance(found, (str, EntryPoint, Group)):
+        if isinstance(found, (str, EntryPoint, CommandGroup)):
             found = self.data[name] = _load((*self._path, name), found)
         return found
 
 
-def _commands_of(group: Group, word: str) -> dict[str, str | EntryPoint]:
+def _commands_of(group: CommandGroup, word: str) -> dict[str, str | EntryPoint]:
     """Commands of a group, with those that packages bring."""
     entries = plugins.installed(plugins.COMMANDS)
     more = {name.removeprefix(f"{word}."): name for name in entries if name.startswith(f"{word}.")}
     return {**group.commands, **{name: entries[entry] for name, entry in more.items()}}
 
 
-def _load(path: Sequence[str], entry: str | EntryPoint | Group) -> Any:
+def _load(path: Sequence[str], entry: str | EntryPoint | CommandGroup) -> Any:
     name = path[-1]
-    if isinstance(entry, Group):
+    if isinstance(entry, CommandGroup):
         group = _lazy_group({"Commands": _commands_of(entry, name)}, path)
         found: Any = typer.Typer(cls=group, help=entry.help, no_args_is_help=True)
     else:
@@ -191,7 +193,7 @@ def _load(path: Sequence[str], entry: str | EntryPoint | Group) -> Any:
     group = typer.main.get_command(around)
     assert isinstance(group, TyperGroup)
     command = group.commands[name]
-    if isinstance(entry, Group):
+    if isinstance(entry, CommandGroup):
         command.short_help = entry.help
     else:
         add_help(command, path)
@@ -199,7 +201,7 @@ def _load(path: Sequence[str], entry: str | EntryPoint | Group) -> Any:
 
 
 def _lazy_group(
-    panels: Mapping[str, Mapping[str, str | EntryPoint | Group]], path: Sequence[str] = ()
+    panels: Mapping[str, Mapping[str, str | EntryPoint | CommandGroup]], path: Sequence[str] = ()
 ) -> type[TyperGroup]:
     class LazyGroup(TyperGroup):
         def __init__(self, **attributes: Any) -> None:

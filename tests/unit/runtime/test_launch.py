@@ -18,7 +18,7 @@ from vla_zenoh.keys import NODE_KINDS
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.profile.robot import RobotProfile
 from vla_zenoh.profile.schema import NodeKind
-from vla_zenoh.program.main import COMMANDS, Group
+from vla_zenoh.program.main import COMMANDS, CommandGroup
 from vla_zenoh.runtime.launch import Host, node_commands
 from vla_zenoh.runtime.supervisor import STOP_ORDER
 from vla_zenoh.types import NodeStatus
@@ -57,7 +57,7 @@ def test_every_kind_of_node_may_stand_in_a_profile_and_every_robot_driver_is_one
 
 def test_every_kind_of_node_has_a_command() -> None:
     nodes = COMMANDS["Run"]["node"]
-    assert isinstance(nodes, Group)
+    assert isinstance(nodes, CommandGroup)
     assert {*nodes.commands, "worker"} == set(NODE_KINDS)
     assert "worker" in COMMANDS["Run"]
 
