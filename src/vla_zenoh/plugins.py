@@ -224,6 +224,14 @@ def faults_of(
         return [(("robot", "driver"), f"the check of {driver} itself failed: {in_words(error)}")]
 
 
+def faults_of_text(kind: str, check: Callable[[str], str], text: str) -> str:
+    """What a `check` of a camera source says of `text`; that it fails is a fault as well."""
+    try:
+        return check(text)
+    except Exception as error:
+        return f"cannot be checked: the check of {kind} itself failed: {in_words(error)}"
+
+
 def in_own_environment() -> bool:
     """Whether this process runs in an environment made for one model."""
     return OWN_ENVIRONMENT_VARIABLE in os.environ

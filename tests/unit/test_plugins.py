@@ -17,7 +17,7 @@ from driver_report import Report
 from foreign_packages import install, write_page
 
 from vla_zenoh import plugins, resources
-from vla_zenoh.errors import PluginError, ProfileError
+from vla_zenoh.errors import NodeError, PluginError, ProfileError
 from vla_zenoh.lab.check.examination import Examination
 from vla_zenoh.lab.check.model_runner import ModelRunner
 from vla_zenoh.lab.doctor.plugins import installed_plugins, robot_driver
@@ -158,6 +158,35 @@ def test_what_a_camera_cannot_do_is_a_fault_like_ours(folder: Path) -> None:
     with pytest.raises(ProfileError, match=r"'acme:' is not a camera: write one of acme:SERIAL, "):
         load_profile(edited(folder, "acme:1234", "acme:"))
     load_profile(edited(folder, '"acme:1234"', '"acme:1234", flip: both'))
+
+
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        ("raise OSError('no bus')", "'acme:1234' cannot be made: OSError: no bus"),
+        ("return object()", "'acme:1234': object is no vla_zenoh.nodes.camera.source.Source"),
+    ],
+)
+def test_a_camera_that_cannot_be_made_is_named(folder: Path, body: str, said: str) -> None:
+    file = folder / "acme" / "acme_lab" / "camera.py"
+    file.write_text(f"def AcmeCamera(serial, profile):\n    {body}\n", "utf-8")
+    with pytest.raises(NodeError) as caught:
+        make_source(load_profile(str(folder / "acme.yaml")).cameras["front"])
+    assert str(caught.value) == said
+
+
+def test_a_check_of_a_camera_that_fails_itself_is_a_fault_by_name(folder: Path) -> None:
+    file = folder / "acme" / "acme_lab" / "__init__.py"
+    text = file.read_text("utf-8").replace("has_lens=True", "check=lambda text: 1 / 0")
+    file.write_text(text, "utf-8")
+    with pytest.raises(ProfileError, match=r"source: 'acme:1234' cannot be checked: .* of acme"):
+        load_profile(str(folder / "acme.yaml"))
+
+
+def test_a_driver_that_needs_an_environment_of_its_own_is_installed_there() -> None:
+    words = plugins.how_to_repeat("vla-zenoh-lerobot")
+    assert words[0] in ("--with", "--with-editable")
+    assert "vla-zenoh-lerobot" in words[1]
 
 
 def test_a_model_of_a_package_is_found_by_name_and_keeps_its_contract(folder: Path) -> None:

@@ -241,8 +241,8 @@ def _source(value: str) -> str:
             written = ", ".join(plugin.written for plugin in found)
             raise ValueError(f"{value!r} is not a camera: write one of {written}")
         if kind in known or (nearest(kind, known, "") and not plugins.in_own_environment()):
-            why = plugins.load(plugins.CAMERAS, kind).check(rest)
-            if why:
+            plugin = plugins.load(plugins.CAMERAS, kind)
+            if why := plugins.faults_of_text(kind, plugin.check, rest):
                 raise ValueError(f"{value!r} {why}")
     except PluginError as error:
         raise ValueError(f"{value!r}: {error}") from error

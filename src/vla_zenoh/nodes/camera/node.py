@@ -62,14 +62,24 @@ def make_source(profile: CameraProfile) -> Source:
 
     Raises:
         PluginError: no plug-in for it is installed.
-        NodeError: another node publishes it.
+        NodeError: another node publishes it, or its plug-in fails.
     """
     kind, _, rest = profile.source.partition(":")
     plugin = plugins.load(plugins.CAMERAS, kind)
     if plugin.make is None:
         raise NodeError(f"{profile.source!r}: no camera node reads {kind}:")
     prepare_opencv()
-    return plugin.make(rest, profile)
+    try:
+        source = plugin.make(rest, profile)
+    except VlaZenohError:
+        raise
+    except Exception as error:
+        raise NodeError(f"{profile.source!r} cannot be made: {in_words(error)}") from error
+    if not isinstance(source, Source):
+        raise NodeError(
+            f"{profile.source!r}: {type(source).__name__} is no {Source.__module__}.Source"
+        )
+    return source
 
 
 SILENCE_S = 5.0
