@@ -138,17 +138,6 @@ def spoil(value: Any, make: Callable[[Any], Any]) -> Any:
     return make(value)
 
 
-def filled(with_: float) -> Callable[[Any], Any]:
-    def make(value: Any) -> Any:
-        return np.full_like(value, with_) if isinstance(value, np.ndarray) else with_
-
-    return make
-
-
-def wrong_shape(value: Any) -> Any:
-    return np.zeros((3, 1, 5)) if isinstance(value, np.ndarray) else [value]
-
-
 def junk_for_stream(key: str, payload: bytes, attachment: bytes, seq: int) -> Iterator[Junk]:
     true = records.decode_header(attachment)
     stranger = records.encode_header(Header(time.time_ns(), seq, STRANGER))
@@ -165,9 +154,9 @@ def junk_for_stream(key: str, payload: bytes, attachment: bytes, seq: int) -> It
     schema = message.unpack(attachment) | {"schema": SCHEMA + 1}
     yield Junk("schema", key, payload, message.pack(schema))
     for what, make in (
-        ("nan", filled(np.nan)),
-        ("1e9", filled(1e9)),
-        ("wrong shape", wrong_shape),
+        ("nan", lambda value: np.nan),
+        ("1e9", lambda value: 1e9),
+        ("wrong shape", lambda value: [value]),
     ):
         yield Junk(what, key, message.pack(spoil(fields, make)), forged)
         yield Junk(f"foreign {what}", key, message.pack(spoil(fields, make)), stranger)

@@ -21,6 +21,7 @@ from vla_zenoh.policy import (
 from vla_zenoh.types import (
     ActionChunk,
     Cause,
+    ClockReply,
     Event,
     GripperCommand,
     GripperState,
@@ -256,6 +257,12 @@ RECORDS: dict[type, st.SearchStrategy[Any]] = {
         st.dictionaries(texts, finite | texts | st.booleans(), max_size=4),
         st.booleans(),
     ),
+}
+"""Records that have a key."""
+ALL_RECORDS = RECORDS | {
+    Cause: causes,
+    ClockReply: st.builds(ClockReply, counts, counts),
+    Header: headers,
 }
 
 

@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any
 
 from vla_zenoh_model_origami import wire
 
-from vla_zenoh.codec.message import MAX_PAYLOAD_BYTES
 from vla_zenoh.errors import CodecError, PeerError, SpecError
 from vla_zenoh.lab.policy_servers.adapter import Adapter
+from vla_zenoh.lab.policy_servers.message import MAX_PAYLOAD_BYTES
 
 if TYPE_CHECKING:
     import zenoh

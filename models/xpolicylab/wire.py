@@ -28,8 +28,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from vla_zenoh.codec import message
 from vla_zenoh.errors import CodecError, PeerError, SpecError
+from vla_zenoh.lab.policy_servers import message
 from vla_zenoh.lab.policy_servers.field_mapping import FieldMapping
 from vla_zenoh.lab.policy_servers.presets import Presets
 from vla_zenoh.types import shown

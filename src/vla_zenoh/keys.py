@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 from vla_zenoh.errors import ProfileError
 
-SCHEMA = 1
+SCHEMA = 2
 """Version of the wire. Raise it when a record means something else than before, or lacks a field
 that it had. Decoders ignore fields that they do not know, so a new field alone does not raise it:
 an old node must do right without what it ignores."""
@@ -200,7 +200,7 @@ class Keys:
     alive = _KeyOf("alive/{node}", "Liveliness token.")
     clock = _KeyOf(
         "clock/{node}",
-        "Query for the four stamps of NTP: the reply has its times of arrival, reply and start.",
+        "Query for the four stamps of NTP; the reply is a `ClockReply`.",
     )
 
     # -- the simulator's own ------------------------------------------------------------------
@@ -213,7 +213,9 @@ class Keys:
     )
     sim_step = _Key(
         "sim/step",
-        "Query in lockstep mode: advance by a number of nanoseconds, reply with the state.",
+        "Query in lockstep mode with a map ``{ns}``: time advances by it. The reply is a map of "
+        "``time_ns`` and of the records ``joint``, ``pose`` and ``gripper``, of a robot of several "
+        "parts one such map of each.",
     )
 
     # -- selectors ----------------------------------------------------------------------------

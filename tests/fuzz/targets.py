@@ -22,7 +22,6 @@ import numpy as np
 import typer
 from model_wires import groot, lerobot_server, npy, openpi, openvla_rest, origami, xpolicylab
 
-from vla_zenoh.bus.clock import decode_stamps
 from vla_zenoh.cli import status_table as cli_status
 from vla_zenoh.cli.options import model_options
 from vla_zenoh.cli.output import Screen
@@ -39,6 +38,7 @@ from vla_zenoh.lab.cli.output import plain_types
 from vla_zenoh.lab.demo.scripted_motions import parse_scripted
 from vla_zenoh.lab.evaluation.mcap_file import evaluate_loaded
 from vla_zenoh.lab.inference_views import InferenceView
+from vla_zenoh.lab.policy_servers import message as arrays
 from vla_zenoh.lab.recording.record_types import RECORDS, record_from_json, record_to_json
 from vla_zenoh.lab.recording.run import load_run
 from vla_zenoh.lab.serve import mcp, openpi_server
@@ -51,7 +51,7 @@ from vla_zenoh.ros2.bridge_view import read_view
 from vla_zenoh.ros2.keys import Attachment
 from vla_zenoh.ros2.messages import Messages, parse
 from vla_zenoh.ros2.pictures import COMPRESSED_IMAGE, IMAGE
-from vla_zenoh.types import Depth, Event, Header, InferenceDebug, NodeStatus
+from vla_zenoh.types import ClockReply, Depth, Event, Header, InferenceDebug, NodeStatus
 
 OF_TORCH = Path(__file__).parents[1] / "contract" / "lerobot_actions.pickle"
 CORPUS = Path(__file__).parent / "corpus"
@@ -342,7 +342,13 @@ def _targets() -> Iterator[Target]:
         "message",
         message.unpack,
         codec,
-        lambda: [message.pack({"a": [1, 2.5, None, "x", b"y"], "b": np.arange(3.0)})],
+        lambda: [message.pack({"a": [1, 2.5, None, "x", b"y"], "b": [0.0]})],
+    )
+    yield Target(
+        "arrays",
+        arrays.unpack,
+        codec,
+        lambda: [arrays.pack({"a": [1, 2.5, None, "x", b"y"], "b": np.arange(3.0)})],
     )
     head = _header_bytes
     yield Target("header", records.decode_header, codec, lambda: [head()])
@@ -390,9 +396,9 @@ def _targets() -> Iterator[Target]:
     yield Target("raw", _raw, codec, lambda: [b"rgb8;2x2\n" + bytes(12)])
     yield Target(
         "stamps",
-        decode_stamps,
+        partial(records.decode, ClockReply),
         codec,
-        lambda: [message.pack({"heard_ns": 1, "said_ns": 2})],
+        lambda: [records.encode(ClockReply(1, 2))],
     )
     # -- other systems
     yield Target(
@@ -407,7 +413,7 @@ def _targets() -> Iterator[Target]:
         "openpi",
         _all_of(openpi.read_metadata, openpi.read_answer, openpi_server.read_observation),
         peer,
-        lambda: [message.pack({"actions": np.zeros((2, 7), np.float32)})],
+        lambda: [arrays.pack({"actions": np.zeros((2, 7), np.float32)})],
     )
     yield Target(
         "groot",
@@ -420,7 +426,7 @@ def _targets() -> Iterator[Target]:
         lambda data: xpolicylab.read_actions(xpolicylab.read_answer(data, "infer", "1")),
         peer,
         lambda: [
-            message.pack(
+            arrays.pack(
                 {
                     "message_type": "infer_result",
                     "message_id": "1",
@@ -447,7 +453,7 @@ def _targets() -> Iterator[Target]:
         lambda data: origami.read_answer(data, "infer", "1"),
         peer,
         lambda: [
-            message.pack(
+            arrays.pack(
                 {
                     "protocol_version": origami.PROTOCOL,
                     "operation": "infer",

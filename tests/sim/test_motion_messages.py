@@ -278,7 +278,7 @@ def test_a_second_worker_moves_nothing_while_the_first_has_the_arm() -> None:
 def test_a_second_process_under_the_name_of_the_worker_moves_nothing() -> None:
     def forge(sent: Message) -> Iterable[Message]:
         header = replace(sent.header, source="worker-scripted-2", seq=sent.header.seq + 100)
-        steps = -message.unpack(sent.payload)["steps"]
+        steps = -np.array(message.unpack(sent.payload)["steps"])
         return [sent, replace(with_fields(sent, steps=steps), header=header)]
 
     np.testing.assert_array_equal(after(1.0, chunks_only(forge)), undisturbed(1.0))
@@ -295,11 +295,9 @@ BROKEN: list[tuple[type, str, float, float]] = [
 
 def spoil(value: Any, by: float) -> Any:
     """One number of it is not one."""
-    if isinstance(value, np.ndarray):
-        spoilt = value.copy()
-        spoilt.reshape(-1)[-1] = by
-        return spoilt
-    return by
+    spoilt = np.array(value)
+    spoilt.reshape(-1)[-1] = by
+    return spoilt
 
 
 @pytest.mark.parametrize(
@@ -349,9 +347,10 @@ def test_no_record_carries_a_number_that_is_none(by: float) -> None:
         data = message.unpack(one.payload)
         for field in dataclasses.fields(kind):
             value = data[field.name]
-            if isinstance(value, (float, np.ndarray)):
+            numbers = isinstance(value, (float, list)) and np.ravel(value).dtype.kind == "f"
+            if numbers and np.size(value):
                 tried += 1
-                with pytest.raises(CodecError, match=r"invalid|NaN|number|finite|norm"):
+                with pytest.raises(CodecError, match="allowed"):
                     records.decode(kind, with_fields(one, **{field.name: spoil(value, by)}).payload)
     assert tried >= 20
     assert way_m(loop, 1) < EXACT_M

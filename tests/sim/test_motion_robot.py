@@ -112,7 +112,7 @@ def shifted(by_m: float) -> Tamper:
     def tamper(sent: Message) -> Iterable[Message]:
         if sent.kind is not PoseState or sent.header.seq % 2:
             return [sent]
-        measured_m = message.unpack(sent.payload)["position_m"]
+        measured_m = np.array(message.unpack(sent.payload)["position_m"])
         return [with_fields(sent, position_m=measured_m + np.array([by_m, by_m, 0.0]))]
 
     return tamper

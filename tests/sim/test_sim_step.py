@@ -60,7 +60,7 @@ def step(session: zenoh.Session, profile: Profile, ns: int = STEP_NS) -> dict[st
 def rise(session: zenoh.Session, profile: Profile) -> list[dict[str, Any]]:
     """Up at `SPEED_M_S` from where it stands, then nothing more is said; every state on the way."""
     states = [step(session, profile, MS_NS)]
-    start = records.decode(PoseState, states[0]["pose"])
+    start = records.from_map(PoseState, states[0]["pose"])
     assert start.reference_position_m is not None
     assert start.reference_quat_xyzw is not None
     for number in range(STEPS):
@@ -94,7 +94,7 @@ def test_the_same_commands_give_the_same_states_to_the_bit(tmp_path: Path) -> No
         with lockstep_sim(folder) as (session, profile):
             runs.append(rise(session, profile))
     assert runs[0] == runs[1]
-    first, last = (records.decode(PoseState, runs[0][index]["pose"]) for index in (0, -1))
+    first, last = (records.from_map(PoseState, runs[0][index]["pose"]) for index in (0, -1))
     way_m = SPEED_M_S * STEPS * STEP_NS / 1e9
     assert last.position_m[2] - first.position_m[2] == pytest.approx(way_m, abs=FOLLOW_M)
 
@@ -109,11 +109,11 @@ def test_time_stands_still_between_questions_and_silence_is_measured_in_it(
         time.sleep(2 * profile.timing.command_timeout_s)  # nobody's clock but the world's counts
         state = step(session, profile)
         assert state["time_ns"] == times_ns[-1] + STEP_NS
-        going_on = records.decode(PoseState, state["pose"])
+        going_on = records.from_map(PoseState, state["pose"])
         assert going_on.twist[2] > SPEED_M_S / 2
 
         timeout_ns = int(profile.timing.command_timeout_s * 1e9)
-        stands = records.decode(
+        stands = records.from_map(
             PoseState, step(session, profile, timeout_ns + 50 * STEP_NS)["pose"]
         )
         assert np.abs(stands.twist).max() < STILL_TWIST

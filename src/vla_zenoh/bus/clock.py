@@ -21,10 +21,10 @@ import zenoh
 
 from vla_zenoh.bus.buffers import bytes_of
 from vla_zenoh.bus.session import QOS
-from vla_zenoh.codec import message
+from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, ProfileError
 from vla_zenoh.keys import Keys, Kind
-from vla_zenoh.types import Header
+from vla_zenoh.types import ClockReply, Header
 
 ADOPT_S = 0.005
 """A smaller difference to the system's wall clock is slewing, and is followed silently."""
@@ -344,11 +344,11 @@ class ClockSync:
             if reply.ok is None:
                 return
             try:
-                heard_ns, said_ns = decode_stamps(bytes_of(reply.ok.payload, MAX_STAMPS_BYTES))
+                there = records.decode(ClockReply, bytes_of(reply.ok.payload, MAX_STAMPS_BYTES))
             except CodecError:
                 return  # not one of our nodes' clocks
             with self._lock:
-                if peer.filter.add(Exchange(asked_ns, heard_ns, said_ns, got_ns)):
+                if peer.filter.add(Exchange(asked_ns, there.heard_ns, there.said_ns, got_ns)):
                     peer.answered_s = time.monotonic()
 
         self._session.get(
@@ -360,8 +360,8 @@ class ClockSync:
 
     def reply(self, query: zenoh.Query) -> None:
         """Reply to a query of this node's clock with the times of its arrival and of this reply."""
-        reply = {"heard_ns": self._clock.wall_ns(), "said_ns": self._clock.wall_ns()}
-        query.reply(self._keys.clock(self._name), message.pack(reply))
+        reply = ClockReply(self._clock.wall_ns(), self._clock.wall_ns())
+        query.reply(self._keys.clock(self._name), records.encode(reply))
 
     def offsets(self) -> dict[str, ClockOffset]:
         """Node -> its clock minus ours, of those that replied lately."""
@@ -384,13 +384,3 @@ class ClockSync:
         with self._lock:
             ahead_ns = peer.filter.applied_ns(self._clock.offset_ns, time.monotonic_ns())
         return shift_stamps(header, record, ahead_ns) if ahead_ns else (header, record)
-
-
-def decode_stamps(payload: bytes) -> tuple[int, int]:
-    """Times (ns) of arrival and reply of a query on the peer's wall clock, or a `CodecError`."""
-    found = message.unpack(payload)
-    found = found if isinstance(found, dict) else {}
-    heard, said = found.get("heard_ns"), found.get("said_ns")
-    if type(heard) is not int or type(said) is not int:
-        raise CodecError("shape", "a clock replies with heard_ns and said_ns")
-    return heard, said

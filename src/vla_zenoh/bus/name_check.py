@@ -15,10 +15,12 @@ from contextlib import suppress
 import zenoh
 
 from vla_zenoh.bus.buffers import bytes_of
-from vla_zenoh.bus.clock import MAX_STAMPS_BYTES, decode_stamps, suspended_ns
+from vla_zenoh.bus.clock import MAX_STAMPS_BYTES, suspended_ns
 from vla_zenoh.bus.session import PATIENCE_S, QOS
+from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError
 from vla_zenoh.keys import Kind
+from vla_zenoh.types import ClockReply
 
 NEW_S = 5.0
 """A node counts as new for this long after it came; after a router's restart a node is linked again
@@ -60,7 +62,7 @@ class NameCheck:
         def on_reply(reply: zenoh.Reply) -> None:
             with suppress(CodecError):  # not one of our nodes
                 if reply.ok is not None:
-                    decode_stamps(bytes_of(reply.ok.payload, MAX_STAMPS_BYTES))
+                    records.decode(ClockReply, bytes_of(reply.ok.payload, MAX_STAMPS_BYTES))
                     self._answered.set()
 
         self._session.get(

@@ -1,32 +1,35 @@
-"""Structured records as msgpack maps with string keys: the field names of `vla_zenoh.types`."""
+"""Records as plain msgpack maps: the field names of `vla_zenoh.types`."""
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
-from functools import cache
 from typing import Any, TypeVar
+
+from msgspec import Raw
 
 from vla_zenoh import keys
 from vla_zenoh.codec import message
 from vla_zenoh.errors import CodecError, RecordError, SpecError
-from vla_zenoh.types import Header, shown
+from vla_zenoh.types import Header
+from vla_zenoh.types.form import Form, form_of, shown
 
 Record = TypeVar("Record")
 
 MAX_RECORD_BYTES = 4 * 1024 * 1024
 SMALL_BYTES = 1024 * 1024
-"""All records but chunks, specs and node statuses are smaller."""
+"""All records but chunks and node statuses are smaller."""
+MAX_SPEC_BYTES = 64 * 1024
 
 
 def encode(record: Any) -> bytes:
-    """Bytes of a record dataclass, or of a `vla_zenoh.policy.ModelSpec`.
+    """Bytes of a record, or of a `vla_zenoh.policy.ModelSpec`.
 
     Raises:
         CodecError: larger than `MAX_RECORD_BYTES`, which every receiver rejects.
     """
-    payload = message.pack(_map_of(record))
-    _check_length(type(record), payload)
+    to_dict = getattr(record, "to_dict", None)  # of a ModelSpec
+    payload = message.pack(record if to_dict is None else to_dict())
+    _check_length(type(record), payload, MAX_RECORD_BYTES)
     return payload
 
 
@@ -38,85 +41,60 @@ def decode(kind: type[Record], payload: bytes, unknown: list[str] | None = None)
 
     Raises:
         CodecError: reason ``oversize``, ``malformed`` (not such a map) or ``invalid`` (a value that
-            the record rejects: NaN, wrong shape, out of range).
+            the record rejects: NaN, wrong length, out of range).
     """
-    _check_length(kind, payload)
-    return from_map(kind, message.unpack(payload), unknown)
-
-
-def from_map(kind: type[Record], data: Any, unknown: list[str] | None = None) -> Record:
-    """The record of what `encode` packs; raises as `decode`."""
-    if not isinstance(data, dict):
-        raise CodecError("malformed", f"{kind.__name__} is a map, this is a {type(data).__name__}")
-    from_dict = getattr(kind, "from_dict", None)  # of a ModelSpec
-    if from_dict is not None:
-        try:
-            return from_dict(data)
-        except SpecError as error:
-            raise CodecError("invalid", str(error)) from error
-    return _record(kind, data, unknown)
-
-
-def _check_length(kind: type, payload: bytes) -> None:
-    if len(payload) > MAX_RECORD_BYTES:
-        raise CodecError(
-            "oversize", f"{kind.__name__} of {len(payload)} bytes, at most {MAX_RECORD_BYTES}"
-        )
-
-
-def _map_of(record: Any) -> Any:
-    """A record as a map of its fields; other values as they are."""
-    to_dict = getattr(record, "to_dict", None)  # of a ModelSpec
-    if to_dict is not None:
-        return to_dict()
-    if dataclasses.is_dataclass(record):
-        names = _names(type(record))
-        return {name: _map_of(getattr(record, name)) for name in names}
-    return dict(record) if isinstance(record, Mapping) else record
-
-
-@cache
-def _names(kind: type) -> tuple[str, ...]:
-    return tuple(field.name for field in dataclasses.fields(kind))
-
-
-@cache
-def _required(kind: type) -> tuple[str, ...]:
-    missing = dataclasses.MISSING
-    return tuple(
-        field.name
-        for field in dataclasses.fields(kind)
-        if field.default is missing and field.default_factory is missing
-    )
-
-
-def _record(
-    kind: type[Record], data: Mapping[Any, Any], unknown: list[str] | None = None
-) -> Record:
-    missing = [name for name in _required(kind) if name not in data]
-    if missing:
-        raise CodecError("malformed", f"{kind.__name__} lacks {', '.join(missing)}")
-    fields = {name: data[name] for name in _names(kind) if name in data}
-    if unknown is not None and len(fields) < len(data):
-        others = (name for name in data if name not in fields)
-        unknown.extend(f"{kind.__name__}.{shown(name)}" for name in others)
-    cause = fields.get("cause")
-    if cause is not None:
-        if not isinstance(cause, dict):
-            raise CodecError("malformed", "cause is a map or nothing")
-        from vla_zenoh.types import Cause  # brings numpy
-
-        fields["cause"] = _record(Cause, cause, unknown)
-    return _made(kind, fields)
-
-
-def _made(kind: type[Record], data: Mapping[Any, Any]) -> Record:
+    _check_length(kind, payload, MAX_RECORD_BYTES)
+    if _is_spec(kind):
+        _check_length(kind, payload, MAX_SPEC_BYTES)
+        return _spec(kind, message.unpack(payload))
+    fields = message.fields_of(kind.__name__, payload)
+    form = form_of(kind)
+    _check_names(form, fields, unknown)
     try:
-        return kind(**data)
+        return form.read(payload)
     except RecordError as error:
         raise CodecError("invalid", f"{kind.__name__}: {error}") from error
-    except (TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise CodecError("malformed", f"{kind.__name__}: {error}") from error
+    except message.DECODING_ERRORS as error:
+        raise message.malformed(error, kind.__name__) from error
+
+
+def from_map(kind: type[Record], data: Any) -> Record:
+    """The record of what `message.unpack` makes of its bytes; raises as `decode`."""
+    if _is_spec(kind):
+        return _spec(kind, data)
+    return decode(kind, message.pack(data))
+
+
+def _is_spec(kind: type[Any]) -> bool:
+    return hasattr(kind, "from_dict")  # a ModelSpec
+
+
+def _spec(kind: Any, data: Any) -> Any:
+    try:
+        return kind.from_dict(data)
+    except SpecError as error:
+        raise CodecError("invalid", str(error)) from error
+
+
+def _check_length(kind: type, payload: bytes, most: int) -> None:
+    if len(payload) > most:
+        raise CodecError("oversize", f"{kind.__name__} of {len(payload)} bytes, at most {most}")
+
+
+def _check_names(form: Form, fields: Mapping[str, Raw], unknown: list[str] | None) -> None:
+    missing = [field for field in form.required if field not in fields]
+    if missing:
+        raise CodecError("malformed", f"{form.kind.__name__} lacks {', '.join(missing)}")
+    if unknown is not None:
+        unknown.extend(_unknown(form, fields))
+        for field, part in form.parts.items():
+            if field in fields:
+                unknown.extend(_unknown(part, message.fields_of(field, bytes(fields[field]))))
+
+
+def _unknown(form: Form, fields: Mapping[str, Raw]) -> list[str]:
+    name = form.kind.__name__
+    return [f"{name}.{shown(field)}" for field in fields if field not in form.names]
 
 
 MAX_HEADER_BYTES = 1024
@@ -124,7 +102,7 @@ MAX_HEADER_BYTES = 1024
 
 def encode_header(header: Header) -> bytes:
     """Bytes of the attachment: a map of ``schema``, ``stamp_wall_ns``, ``seq`` and ``source``."""
-    return message.pack({"schema": keys.SCHEMA, **_map_of(header)})
+    return message.pack({"schema": keys.SCHEMA, **{n: getattr(header, n) for n in _HEADER.names}})
 
 
 def decode_header(attachment: bytes | None) -> Header:
@@ -138,16 +116,20 @@ def decode_header(attachment: bytes | None) -> Header:
         raise CodecError("no_header", "the sample has no attachment; streams carry a header there")
     if len(attachment) > MAX_HEADER_BYTES:
         raise CodecError("malformed", f"a header of {len(attachment)} bytes")
-    try:
-        data = message.unpack(attachment)
-        if not isinstance(data, dict):
-            raise CodecError("malformed", f"the header is a {type(data).__name__}, wanted a map")
-        schema = data.get("schema")
-        if type(schema) is not int or schema != keys.SCHEMA:
-            why = f"schema {shown(schema)} is not ours ({keys.SCHEMA}); update one side"
-            raise CodecError("schema", why)
-        return Header(data["stamp_wall_ns"], data["seq"], data["source"])
-    except KeyError as error:
-        raise CodecError("malformed", f"the header lacks {error}") from error
-    except RecordError as error:
-        raise CodecError("invalid", str(error)) from error
+    fields = message.fields_of("the header", attachment)
+    schema = message.unpack(bytes(fields["schema"])) if "schema" in fields else None
+    if type(schema) is not int or schema != keys.SCHEMA:
+        raise CodecError("schema", _other_version(schema))
+    return decode(Header, attachment)
+
+
+def _other_version(schema: Any) -> str:
+    newer = type(schema) is int and schema > keys.SCHEMA
+    stale = "this side" if newer else "the sender"
+    return (
+        f"schema {shown(schema)} of the wire, this program has {keys.SCHEMA}: update vla-zenoh on "
+        f"{stale}"
+    )
+
+
+_HEADER = form_of(Header)

@@ -41,7 +41,7 @@ from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import Pose, norm3
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.profile import REJECT_FACTOR, Profile
-from vla_zenoh.types import Cause, FloatArray, JointCommand, computed
+from vla_zenoh.types import Cause, FloatArray, JointCommand
 
 HALVINGS = 7
 INSIDE_M = 0.002
@@ -448,7 +448,7 @@ class JointPath(AxisSmoother):
 
     def command(self, state: str, cause: Cause | None) -> JointCommand:
         """The joint command of this tick."""
-        return computed(JointCommand, self._names, *self.state, state, cause)
+        return JointCommand(self._names, *self.state, state, cause)
 
 
 def followed_shares(

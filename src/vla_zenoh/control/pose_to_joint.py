@@ -35,7 +35,7 @@ from vla_zenoh.control.smoothing import Motion, Smoother
 from vla_zenoh.kinematics.kinematics import Kinematics, pose_error
 from vla_zenoh.kinematics.so3 import Pose, exp3, log3, pose_distance
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import Cause, FloatArray, JointCommand, computed
+from vla_zenoh.types import Cause, FloatArray, JointCommand
 
 REST_RAD_S = 1e-5
 PULL_1_S = 25.0
@@ -268,7 +268,7 @@ class PoseToJoint:
 
     def command(self, state: str, cause: Cause | None) -> JointCommand:
         """The joint command of this tick."""
-        return computed(JointCommand, self._names, *self._now[:3], state, cause)
+        return JointCommand(self._names, *self._now[:3], state, cause)
 
 
 def _joint_way(jacobian: FloatArray, way: FloatArray) -> FloatArray:

@@ -40,7 +40,7 @@ from vla_zenoh.kinematics.so3 import (
     spatial_rates,
 )
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import Cause, FloatArray, PoseCommand, computed
+from vla_zenoh.types import Cause, FloatArray, PoseCommand
 
 
 class Motion(NamedTuple):
@@ -246,8 +246,7 @@ def pose_command(motion: Motion, goal: Goal | None, state: str, cause: Cause | N
     """The command of a tick on the way to `goal`; None: where the arm is."""
     (position_m, rotation), twist, acceleration = motion
     heads_m, heads = (position_m, rotation) if goal is None else goal.pose
-    return computed(
-        PoseCommand,
+    return PoseCommand(
         position_m,
         quat_from_rotation(rotation),
         twist,

@@ -18,7 +18,7 @@ import zenoh
 from vla_zenoh.bus.buffers import CallbackRing, bytes_of
 from vla_zenoh.bus.clock import Tick
 from vla_zenoh.bus.node import Node
-from vla_zenoh.codec import message, records, settings
+from vla_zenoh.codec import message, settings
 from vla_zenoh.errors import CodecError, NodeError
 from vla_zenoh.guard.arm_guard import Measured
 from vla_zenoh.keys import Kind
@@ -205,9 +205,9 @@ class SimDriver(RobotDriver):
             state: dict[str, Any] = {"time_ns": self.ticks * STEP_NS}
             for name, arm in self.world.parts.items():
                 found = {
-                    "joint": records.encode(arm.joint_state()),
-                    "pose": records.encode(arm.pose_state(self._parts[name].reference)),
-                    "gripper": records.encode(arm.gripper_state()),
+                    "joint": arm.joint_state(),
+                    "pose": arm.pose_state(self._parts[name].reference),
+                    "gripper": arm.gripper_state(),
                 }
                 state |= {name: found} if name else found
         query.reply(node.node.keys.sim_step, message.pack(state))

@@ -41,7 +41,6 @@ from vla_zenoh.types import (
     JointState,
     PoseReference,
     PoseState,
-    vector,
 )
 
 STEP_NS = round(STEP_S * 1e9)
@@ -97,7 +96,7 @@ class World:
                 self.model,
                 self._data,
                 model,
-                vector("home_rad", home, len(model.arm_joints)),
+                _home_rad(model, home),
                 gains or ImpedanceGains(),
                 self._refresh,
             )
@@ -206,6 +205,13 @@ class World:
             mujoco.mj_kinematics(self.model, self._data)
             mujoco.mj_comPos(self.model, self._data)
             self._fresh = True
+
+
+def _home_rad(robot: RobotModel, home_rad: ArrayLike) -> FloatArray:
+    home, joints = np.array(home_rad, float), len(robot.arm_joints)
+    if home.shape != (joints,) or not np.isfinite(home).all():
+        raise RecordError(f"home_rad is {home_rad}, allowed: {joints} finite numbers")
+    return home
 
 
 def build_world(profile: Profile) -> World:

@@ -1,121 +1,110 @@
-"""Checks of record fields that are arrays, see ``stream.py``."""
+"""Field types of records that are arrays in the program and lists of numbers on the wire."""
 
 from __future__ import annotations
 
 import math
-from typing import Any, TypeVar
+from collections.abc import Mapping
+from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from msgspec import Meta
+from numpy.typing import NDArray
 
 from vla_zenoh.errors import RecordError
-from vla_zenoh.types.stream import set_field, shown
+from vla_zenoh.types.form import MAX_ENTRIES, MAX_NAMES, Finite, Name, Wire
 
 FloatArray = NDArray[np.float64]
-Record = TypeVar("Record")
-_FLOAT64 = np.dtype(np.float64)
 
 QUATERNION_NORM_TOLERANCE = 1e-3
-MAX_VECTOR, MAX_CHUNK_NUMBERS = 10_000, 100_000
-FEW = 64
-"""Records are made at every tick: on so few numbers Python is faster than numpy."""
-_NUMBER_KINDS = "iuf"
+_UNIT = 1e-15
+"""Nearer to one than this a norm is not improved by dividing."""
+MAX_MEASURE = 1e6
+"""Of a measured or commanded quantity in SI units: more is a wrong unit, or broken."""
+MAX_VECTOR = 10_000
+MAX_STEPS, MAX_COLUMNS = 1000, 100
+_MAX_FLOAT32 = float(np.finfo(np.float32).max)
 
 
-def numbers(name: str, value: ArrayLike) -> NDArray[Any]:
-    """`value` as an array of numbers; text, truth values and objects are rejected."""
-    if isinstance(value, np.ndarray) and value.dtype.kind in _NUMBER_KINDS:
-        return value
-    try:
-        array = np.asarray(value)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise RecordError(f"{name} is not a list of numbers: {error}") from error
-    if array.dtype.kind not in _NUMBER_KINDS or _holds_bool(value):
-        raise RecordError(f"{name} is not a list of numbers: {shown(value)}")
-    return array
-
-
-def _holds_bool(value: Any) -> bool:
-    """Whether a list that became an array of numbers had a truth value among them."""
-    if isinstance(value, (list, tuple)):
-        return any(_holds_bool(item) for item in value)
-    return isinstance(value, (bool, np.bool_))
-
-
-def vector(name: str, value: ArrayLike, size: int | None = None) -> FloatArray:
-    """Copy `value` into a finite, read-only float64 vector of `size` (None: any size)."""
-    if (
-        type(value) is np.ndarray
-        and value.dtype is _FLOAT64
-        and type(value.base) is bytes  # which never change
-        and value.shape == (size,)
-        and math.isfinite(sum(value.tolist()))
-    ):
-        return value  # of a record that was just read: a short cut
-    array = numbers(name, value)
-    if array.ndim != 1 or (size is not None and array.shape[0] != size):
-        wanted = "(n,)" if size is None else f"({size},)"
-        raise RecordError(f"{name} has shape {array.shape}, wanted {wanted}")
-    if len(array) > MAX_VECTOR:
-        raise RecordError(f"{name} has {len(array)} numbers, at most {MAX_VECTOR} are allowed")
-    if type(array.base) is not bytes or array.dtype is not _FLOAT64:  # bytes never change
-        array = np.array(array, dtype=np.float64, order="C")
-        array.setflags(write=False)
-    if not is_finite(array):
-        raise RecordError(f"{name} is not finite: {shown(array.tolist())}")
-    return array
-
-
-def float32_table(name: str, value: ArrayLike) -> NDArray[np.float32]:
-    """Copy `value` into a finite, read-only float32 array (H, D) of `MAX_CHUNK_NUMBERS` at most."""
-    array = numbers(name, value)
-    if array.ndim != 2 or 0 in array.shape:
-        raise RecordError(f"{name} has shape {array.shape}, wanted (H, D)")
-    if array.size > MAX_CHUNK_NUMBERS:
-        raise RecordError(f"{name} has {array.size} numbers, at most {MAX_CHUNK_NUMBERS}")
-    table = to_float32(array)
-    if not is_finite(table):
-        raise RecordError(f"{name} holds NaN or infinity")
-    table.setflags(write=False)
-    return table
-
-
-def to_float32(array: NDArray[Any]) -> NDArray[np.float32]:
-    """Copy numbers into float32, row by row; what float32 cannot hold becomes infinite."""
-    with np.errstate(over="ignore"):
-        return np.array(array, dtype=np.float32, order="C")
-
-
-def is_finite(array: NDArray[Any]) -> bool:
-    """Whether no number of an array is NaN or infinite."""
-    if array.size <= FEW:
-        values = array.tolist() if array.ndim == 1 else array.ravel().tolist()
-        return math.isfinite(sum(values)) or all(map(math.isfinite, values))  # a sum may overflow
-    return bool(np.isfinite(array).all())
-
-
-def unit_quaternion(name: str, value: ArrayLike) -> FloatArray:
-    """Like `vector` for four numbers x, y, z, w; normalised, rejected when far from unit."""
-    array = vector(name, value, 4)
-    norm = math.hypot(*array.tolist())
-    if abs(norm - 1.0) > QUATERNION_NORM_TOLERANCE:
-        raise RecordError(f"{name} has norm {norm:.6g}, wanted a unit quaternion x, y, z, w")
-    if norm == 1.0:
-        return array
-    array = array / norm
+def _array(name: str, value: Any) -> FloatArray:
+    array = np.array(value, np.float64)
     array.setflags(write=False)
     return array
 
 
-def computed(kind: type[Record], *values: Any) -> Record:
-    """A record of values that this program has just computed, all in their final form.
+def unit_quaternion(name: str, value: Any) -> FloatArray:
+    """Four numbers x, y, z, w, normalised and read-only.
 
-    Only whether vectors are finite is checked, and they are not copied: a record for every tick.
+    Raises:
+        RecordError: they are far from unit.
     """
-    record, total = object.__new__(kind), 0.0
-    for name, value in zip(kind.__match_args__, values, strict=True):  # pyright: ignore
-        if type(value) is np.ndarray:
-            total += sum(value.tolist())
-            value.setflags(write=False)
-        set_field(record, name, value)
-    return record if math.isfinite(total) else kind(*values)  # which names what is not finite
+    norm = math.hypot(*value)
+    if abs(norm - 1.0) > QUATERNION_NORM_TOLERANCE:
+        raise RecordError(f"{name} has norm {norm:.6g}, allowed: a unit quaternion x, y, z, w")
+    if abs(norm - 1.0) > _UNIT:
+        value = np.asarray(value) / norm
+    return _array(name, value)
+
+
+def _positions(name: str, value: Any) -> FloatArray:
+    return _array(name, np.reshape(value, (-1, 3)))
+
+
+def _quaternions(name: str, value: Any) -> FloatArray:
+    rows = [unit_quaternion(f"{name}[{index}]", row) for index, row in enumerate(value)]
+    return _array(name, np.reshape(rows, (-1, 4)))
+
+
+def _table(name: str, value: Any) -> NDArray[np.float32]:
+    if any(len(row) != len(value[0]) for row in value):
+        raise RecordError(f"{name} has rows of several lengths, allowed: rows of one length")
+    table = np.array(value, np.float32)
+    table.setflags(write=False)
+    return table
+
+
+def _vectors(name: str, value: Any) -> dict[str, FloatArray]:
+    return {key: _array(key, numbers) for key, numbers in value.items()}
+
+
+_Measure = Annotated[float, Meta(ge=-MAX_MEASURE, le=MAX_MEASURE)]
+
+
+def _list(of: Any, least: int, most: int) -> Any:
+    return Annotated[list[of], Meta(min_length=least, max_length=most)]
+
+
+_Three, _Four, _Six = (_list(_Measure, size, size) for size in (3, 4, 6))
+_Any = _list(Finite, 0, MAX_VECTOR)
+_Number32 = Annotated[float, Meta(ge=-_MAX_FLOAT32, le=_MAX_FLOAT32)]
+_Rows = _list(_list(_Number32, 1, MAX_COLUMNS), 1, MAX_STEPS)
+
+Vector3 = Annotated[FloatArray, Wire(_Three, _array)]
+Vector6 = Annotated[FloatArray, Wire(_Six, _array)]
+Quaternion = Annotated[FloatArray, Wire(_Four, unit_quaternion)]
+"""x, y, z, w; within `QUATERNION_NORM_TOLERANCE` of unit, and made unit."""
+PerJoint = Annotated[FloatArray, Wire(_list(_Measure, 1, MAX_NAMES), _array)]
+"""One number per joint."""
+Vector = Annotated[FloatArray, Wire(_Any, _array)]
+"""Any number of finite numbers."""
+Positions = Annotated[FloatArray, Wire(_list(_Three, 0, MAX_ENTRIES), _positions)]
+Quaternions = Annotated[FloatArray, Wire(_list(_Four, 0, MAX_ENTRIES), _quaternions)]
+Steps = Annotated[NDArray[np.float32], Wire(_Rows, _table)]
+"""(H, D): rows of numbers, one row a step."""
+Vectors = Annotated[
+    Mapping[str, FloatArray],
+    Wire(Annotated[dict[Name, _Any], Meta(max_length=MAX_ENTRIES)], _vectors),
+]
+
+
+def check_lengths(record: Any, *names: str) -> None:
+    """Raise a `RecordError` unless arrays have one entry for each of the record's `names`, which
+    differ."""
+    joints = record.names
+    if not joints or len(set(joints)) != len(joints):
+        raise RecordError(f"names is {joints}, allowed: at least one name, none of them twice")
+    for name in names:
+        value = getattr(record, name)
+        if value is not None and len(value) != len(joints):
+            raise RecordError(
+                f"{name} has {len(value)} numbers, allowed: one for each of the {len(joints)} names"
+            )

@@ -5,31 +5,41 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import ArrayLike, NDArray
 
 from vla_zenoh.errors import RecordError
-from vla_zenoh.types.arrays import FloatArray, float32_table, numbers, unit_quaternion, vector
-from vla_zenoh.types.stream import (
-    MAX_DEPTH_UNIT_M,
+from vla_zenoh.types.arrays import (
+    FloatArray,
+    PerJoint,
+    Positions,
+    Quaternion,
+    Quaternions,
+    Steps,
+    Vector,
+    Vector3,
+    Vector6,
+    Vectors,
+    check_lengths,
+)
+from vla_zenoh.types.form import (
     MAX_ENTRIES,
     MAX_TEXT,
-    MIN_DEPTH_UNIT_M,
-    boolean,
-    details,
-    entries,
-    integer,
-    joint_names,
-    keep,
-    keep_given,
-    number,
-    set_field,
+    Count,
+    Details,
+    Name,
+    Names,
+    Record,
+    Text,
     shown,
-    text,
-    texts,
 )
+from vla_zenoh.types.stream import MAX_DEPTH_UNIT_M, MIN_DEPTH_UNIT_M
+
+_LongText = Annotated[str, Meta(max_length=512)]
+_State = Annotated[str, Meta(max_length=32)]
 
 """Metres of one count of a depth image: from 0.65 m to 6.5 km in all."""
 MAX_COUNT = 2**16 - 1
@@ -45,7 +55,7 @@ LATENCY_STAGES = (
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class JointState:
+class JointState(Record):
     """Arm joints, without the fingers: all arrays have one entry per name.
 
     In rad and Nm, of a joint that slides in m and N.
@@ -60,21 +70,18 @@ class JointState:
             none or the robot does not report them.
     """
 
-    names: tuple[str, ...]
-    position_rad: FloatArray
-    velocity_rad_s: FloatArray
-    effort_nm: FloatArray | None
-    reference_rad: FloatArray | None = None
+    names: Names
+    position_rad: PerJoint
+    velocity_rad_s: PerJoint
+    effort_nm: PerJoint | None
+    reference_rad: PerJoint | None = None
 
-    def __post_init__(self) -> None:
-        keep(self, joint_names, "names")
-        joints = len(self.names)
-        keep(self, vector, "position_rad", "velocity_rad_s", size=joints)
-        keep_given(self, vector, "effort_nm", "reference_rad", size=joints)
+    def _check(self) -> None:
+        check_lengths(self, "position_rad", "velocity_rad_s", "effort_nm", "reference_rad")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PoseState:
+class PoseState(Record):
     """Measured TCP pose in the base frame.
 
     Args:
@@ -87,26 +94,20 @@ class PoseState:
             neither.
     """
 
-    position_m: FloatArray
-    quat_xyzw: FloatArray
-    twist: FloatArray
-    wrench: FloatArray | None = None
-    reference_position_m: FloatArray | None = None
-    reference_quat_xyzw: FloatArray | None = None
+    position_m: Vector3
+    quat_xyzw: Quaternion
+    twist: Vector6
+    wrench: Vector6 | None = None
+    reference_position_m: Vector3 | None = None
+    reference_quat_xyzw: Quaternion | None = None
 
-    def __post_init__(self) -> None:
-        keep(self, vector, "position_m", size=3)
-        keep(self, unit_quaternion, "quat_xyzw")
-        keep(self, vector, "twist", size=6)
-        keep_given(self, vector, "wrench", size=6)
+    def _check(self) -> None:
         if (self.reference_position_m is None) != (self.reference_quat_xyzw is None):
             raise RecordError("a reference pose needs both position and quaternion")
-        keep_given(self, vector, "reference_position_m", size=3)
-        keep_given(self, unit_quaternion, "reference_quat_xyzw")
 
 
 @dataclass(frozen=True, slots=True)
-class GripperState:
+class GripperState(Record):
     """Gripper and robot condition.
 
     Args:
@@ -115,31 +116,22 @@ class GripperState:
         faults: reported by the robot.
     """
 
-    width_m: float
+    width_m: Annotated[float, Meta(ge=-0.01, le=1.0)]
     moving: bool
     holding: bool
-    mode: str = "ready"
-    faults: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        keep(self, number, "width_m", minimum=-0.01, maximum=1.0)
-        keep(self, boolean, "moving", "holding")
-        keep(self, text, "mode", limit=128)
-        keep(self, texts, "faults", limit=512)
+    mode: Name = "ready"
+    faults: Annotated[tuple[_LongText, ...], Meta(max_length=MAX_ENTRIES)] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PrivilegedState:
+class PrivilegedState(Record):
     """What only a simulation can know, for a benchmark's own expert: name -> (n,) numbers."""
 
-    values: Mapping[str, FloatArray]
-
-    def __post_init__(self) -> None:
-        keep(self, entries, "values", of=vector)
+    values: Vectors
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SceneState:
+class SceneState(Record):
     """All generalised positions of a simulation, enough for a renderer to draw it.
 
     Args:
@@ -147,34 +139,26 @@ class SceneState:
         seed: of the last reset, which determines how a scene with a varied look appears; or None.
     """
 
-    scene: str
-    qpos: FloatArray
-    seed: int | None = None
-
-    def __post_init__(self) -> None:
-        keep(self, text, "scene", limit=512)
-        keep(self, vector, "qpos")
-        keep_given(self, integer, "seed")
+    scene: _LongText
+    qpos: Vector
+    seed: Count | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ObjectPoses:
+class ObjectPoses(Record):
     """True poses of a simulation's objects in the base frame: (n, 3) and (n, 4)."""
 
-    names: tuple[str, ...]
-    position_m: FloatArray
-    quat_xyzw: FloatArray
+    names: Names
+    position_m: Positions
+    quat_xyzw: Quaternions
 
-    def __post_init__(self) -> None:
-        keep(self, texts, "names", limit=128)
-        for name, size, check in (("position_m", 3, vector), ("quat_xyzw", 4, unit_quaternion)):
-            rows, shape = numbers(name, getattr(self, name)), (len(self.names), size)
-            if not self.names and rows.size == 0:  # an empty list does not say how wide it is
-                rows = rows.reshape(shape)
-            if rows.shape != shape:
-                raise RecordError(f"{name} has shape {rows.shape}, wanted {shape}")
-            checked = np.array([check(name, row) for row in rows], np.float64)
-            set_field(self, name, _locked(checked.reshape(shape)))
+    def _check(self) -> None:
+        for name in ("position_m", "quat_xyzw"):
+            if len(getattr(self, name)) != len(self.names):
+                raise RecordError(
+                    f"{name} has {len(getattr(self, name))} rows, allowed: one for each of the "
+                    f"{len(self.names)} names"
+                )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -189,7 +173,7 @@ class Image:
             raise RecordError("an image must be a uint8 array (H, W, 3) in RGB order")
         if rgb.ndim != 3 or rgb.shape[2] != 3 or 0 in rgb.shape:
             raise RecordError(f"an image has shape {rgb.shape}, wanted (H, W, 3)")
-        set_field(self, "rgb", _locked(rgb))
+        object.__setattr__(self, "rgb", _locked(rgb))
 
 
 def _locked(array: NDArray[Any]) -> NDArray[Any]:
@@ -213,8 +197,12 @@ class Depth:
             raise RecordError("a depth image must be a uint16 array (H, W)")
         if 0 in counts.shape:
             raise RecordError(f"a depth image has shape {counts.shape}, wanted (H, W)")
-        set_field(self, "counts", _locked(counts))
-        keep(self, number, "unit_m", minimum=MIN_DEPTH_UNIT_M, maximum=MAX_DEPTH_UNIT_M)
+        object.__setattr__(self, "counts", _locked(counts))
+        if not MIN_DEPTH_UNIT_M <= self.unit_m <= MAX_DEPTH_UNIT_M:
+            raise RecordError(
+                f"unit_m is {shown(self.unit_m)}, allowed: {MIN_DEPTH_UNIT_M:g} to "
+                f"{MAX_DEPTH_UNIT_M:g} m a count"
+            )
 
     @staticmethod
     def of_metres(depth_m: ArrayLike, unit_m: float) -> Depth:
@@ -226,7 +214,7 @@ class Depth:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ActionChunk:
+class ActionChunk(Record):
     """What a model asks for: `H` steps of `D` numbers whose meaning its spec declares.
 
     Args:
@@ -239,28 +227,21 @@ class ActionChunk:
         done: the policy reports that its task is finished when these steps are.
     """
 
-    worker: str
-    spec_hash: str
-    episode: int
-    observation_stamp_ns: int
-    observation_seq: int
-    valid_until_ns: int
-    steps: NDArray[np.float32]
-    observed_ns: int
-    inference_start_ns: int
-    inference_end_ns: int
+    worker: Name
+    spec_hash: Name
+    episode: Count
+    observation_stamp_ns: Count
+    observation_seq: Count
+    valid_until_ns: Count
+    steps: Steps
+    observed_ns: Count
+    inference_start_ns: Count
+    inference_end_ns: Count
     done: bool = False
-
-    def __post_init__(self) -> None:
-        keep(self, text, "worker", "spec_hash", limit=128)
-        keep(self, integer, "episode", "observation_stamp_ns", "observation_seq", "valid_until_ns")
-        keep(self, integer, "observed_ns", "inference_start_ns", "inference_end_ns")
-        keep(self, boolean, "done")
-        keep(self, float32_table, "steps")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class InferenceDebug:
+class InferenceDebug(Record):
     """One inference, for debugging; fields of its `ActionChunk` are as there.
 
     Its images travel beside it, one key per camera, with the same stamp and number.
@@ -270,25 +251,16 @@ class InferenceDebug:
         raw: output before the steps: tokens, normalised action, whatever the model reports.
     """
 
-    worker: str
-    chunk_seq: int
-    spec_hash: str
-    episode: int
-    observation_stamp_ns: int
-    prompt: str
-    steps: NDArray[np.float32]
-    inference_ms: float
-    raw: Mapping[str, Any] = field(default_factory=dict)
+    worker: Name
+    chunk_seq: Count
+    spec_hash: Name
+    episode: Count
+    observation_stamp_ns: Count
+    prompt: Text
+    steps: Steps
+    inference_ms: Annotated[float, Meta(ge=0.0, le=1e9)]
+    raw: Details = field(default_factory=dict)
     done: bool = False
-
-    def __post_init__(self) -> None:
-        keep(self, text, "worker", "spec_hash", limit=128)
-        keep(self, text, "prompt")
-        keep(self, integer, "chunk_seq", "episode", "observation_stamp_ns")
-        keep(self, number, "inference_ms", minimum=0.0)
-        keep(self, float32_table, "steps")
-        keep(self, entries, "raw", of=details)
-        keep(self, boolean, "done")
 
 
 def plain_values(raw: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -322,22 +294,17 @@ def _plain(value: Any, depth: int) -> Any:
 
 
 @dataclass(frozen=True, slots=True)
-class Cause:
+class Cause(Record):
     """Which chunk a command executes, and when that chunk passed each stage (wall clock)."""
 
-    worker: str
-    chunk_seq: int
-    observation_stamp_ns: int
-    observed_ns: int
-    inference_start_ns: int
-    inference_end_ns: int
-    published_ns: int
-    received_ns: int
-
-    def __post_init__(self) -> None:
-        worker, *numbers = self.__match_args__
-        keep(self, text, worker, limit=128)
-        keep(self, integer, *numbers)
+    worker: Name
+    chunk_seq: Count
+    observation_stamp_ns: Count
+    observed_ns: Count
+    inference_start_ns: Count
+    inference_end_ns: Count
+    published_ns: Count
+    received_ns: Count
 
     def latency_ms(self, command_ns: int) -> dict[str, float]:
         """Duration of each of `LATENCY_STAGES` for a command stamped `command_ns` (wall clock)."""
@@ -352,7 +319,7 @@ class Cause:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PoseCommand:
+class PoseCommand(Record):
     """Where the TCP has to be now, in the base frame, with feed-forward.
 
     Args:
@@ -363,25 +330,18 @@ class PoseCommand:
         cause: the chunk being executed, None: none is.
     """
 
-    position_m: FloatArray
-    quat_xyzw: FloatArray
-    twist: FloatArray
-    acceleration: FloatArray
-    goal_position_m: FloatArray
-    goal_quat_xyzw: FloatArray
-    state: str
+    position_m: Vector3
+    quat_xyzw: Quaternion
+    twist: Vector6
+    acceleration: Vector6
+    goal_position_m: Vector3
+    goal_quat_xyzw: Quaternion
+    state: _State
     cause: Cause | None = None
-
-    def __post_init__(self) -> None:
-        keep(self, vector, "position_m", "goal_position_m", size=3)
-        keep(self, unit_quaternion, "quat_xyzw", "goal_quat_xyzw")
-        keep(self, vector, "twist", "acceleration", size=6)
-        keep(self, text, "state", limit=32)
-        keep_given(self, _cause, "cause")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class JointCommand:
+class JointCommand(Record):
     """Where the joints have to be now, with feed-forward; all arrays have one entry per name.
 
     In rad, of a joint that slides in m.
@@ -393,39 +353,24 @@ class JointCommand:
         cause: the chunk being executed, None: none is.
     """
 
-    names: tuple[str, ...]
-    position_rad: FloatArray
-    velocity_rad_s: FloatArray
-    acceleration_rad_s2: FloatArray
-    state: str
+    names: Names
+    position_rad: PerJoint
+    velocity_rad_s: PerJoint
+    acceleration_rad_s2: PerJoint
+    state: _State
     cause: Cause | None = None
 
-    def __post_init__(self) -> None:
-        keep(self, joint_names, "names")
-        fields = ("position_rad", "velocity_rad_s", "acceleration_rad_s2")
-        keep(self, vector, *fields, size=len(self.names))
-        keep(self, text, "state", limit=32)
-        keep_given(self, _cause, "cause")
-
-
-def _cause(name: str, value: Any) -> Cause:
-    if not isinstance(value, Cause):
-        raise RecordError(f"{name} is not a Cause: {shown(value)}")
-    return value
+    def _check(self) -> None:
+        check_lengths(self, "position_rad", "velocity_rad_s", "acceleration_rad_s2")
 
 
 @dataclass(frozen=True, slots=True)
-class GripperCommand:
+class GripperCommand(Record):
     """An absolute opening to go to; a newer one replaces it."""
 
-    width_m: float
-    speed_m_s: float
-    force_n: float
-
-    def __post_init__(self) -> None:
-        keep(self, number, "width_m", minimum=0.0, maximum=1.0)
-        keep(self, number, "speed_m_s", minimum=1e-4, maximum=10.0)
-        keep(self, number, "force_n", minimum=0.0, maximum=1000.0)
+    width_m: Annotated[float, Meta(ge=0.0, le=1.0)]
+    speed_m_s: Annotated[float, Meta(ge=1e-4, le=10.0)]
+    force_n: Annotated[float, Meta(ge=0.0, le=1000.0)]
 
 
 class PoseReference(NamedTuple):

@@ -1,40 +1,40 @@
 """What every sample carries and every node publishes: headers, and the filter that lets one writer
-through at a time; status, events, and the task in force. At the end the checks of record fields:
-each returns the value in its final form, or raises a `RecordError`.
-
-Without numpy, which a command that only drives does not load; fields with arrays are checked in
-``arrays.py``.
+through at a time; status, events, and the task in force. Without numpy, see ``form.py``.
 """
 
 from __future__ import annotations
 
-import math
-import reprlib
-import sys
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from numbers import Integral, Real
-from typing import Any, Generic, Literal, NamedTuple, TypeVar
+from typing import Annotated, Generic, Literal, NamedTuple, TypeVar
 
-from vla_zenoh.errors import CodecError, RecordError
+from msgspec import Meta
+
+from vla_zenoh.errors import CodecError
+from vla_zenoh.types.form import (
+    MAX_WHOLE,
+    Count,
+    Counts,
+    Details,
+    Finite,
+    Name,
+    Numbers,
+    Pairs,
+    Record,
+    Text,
+    Wire,
+    as_read,
+)
 
 EVENT_LEVELS = ("info", "warning", "error")
 EVENT_KINDS = ("refusal", "transition", "limit", "fault", "notice")
 LEAST_PERCENT = 1.0
-MAX_TEXT = 4096
-MAX_SHOWN = 300
-MAX_NAMES = 1024
-MAX_ENTRIES = 1024
-MAX_DETAIL_TEXT = 65_536
-MAX_DETAIL_DEPTH = 3
 MIN_DEPTH_UNIT_M, MAX_DEPTH_UNIT_M = 1e-5, 0.1
 
-set_field = object.__setattr__
-"""Puts the final form of a field into a frozen record."""
+_Word = Annotated[str, Meta(max_length=256)]
 
 
 @dataclass(frozen=True, slots=True)
-class Header:
+class Header(Record):
     """Header of a streamed sample; it travels as the sample's attachment.
 
     Args:
@@ -43,25 +43,20 @@ class Header:
         source: node name and a number that differs after every restart.
     """
 
-    stamp_wall_ns: int
-    seq: int
-    source: str
-
-    def __post_init__(self) -> None:
-        set_field(self, "stamp_wall_ns", integer("stamp_wall_ns", self.stamp_wall_ns))
-        set_field(self, "seq", integer("seq", self.seq))
-        text("source", self.source, 128)
+    stamp_wall_ns: Count
+    seq: Count
+    source: Name
 
 
-Record = TypeVar("Record")
+Received = TypeVar("Received")
 
 
 @dataclass(frozen=True, slots=True)
-class Stamped(Generic[Record]):
+class Stamped(Generic[Received]):
     """A record as received at `received_ns`, on the wall clock of the receiver's host."""
 
     header: Header
-    record: Record
+    record: Received
     received_ns: int
 
 
@@ -143,7 +138,7 @@ class HeldBox(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class NodeStatus:
+class NodeStatus(Record):
     """Status of a node, published by itself.
 
     Args:
@@ -159,35 +154,21 @@ class NodeStatus:
         boot: unique id of its computer's last boot; empty if unknown.
     """
 
-    node: str
-    state: str
-    host: str
-    pid: int
-    started_wall_ns: int
-    ages_s: Mapping[str, float] = field(default_factory=dict)
-    rates_hz: Mapping[str, float] = field(default_factory=dict)
-    latency_ms: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    counters: Mapping[str, int] = field(default_factory=dict)
-    detail: Mapping[str, Any] = field(default_factory=dict)
-    boot: str = ""
-
-    def __post_init__(self) -> None:
-        keep(self, text, "node", "state", "host", "boot", limit=256)
-        keep(self, integer, "pid", "started_wall_ns")
-        keep(self, entries, "ages_s", "rates_hz", of=number)
-        keep(self, entries, "counters", of=integer)
-        keep(self, entries, "latency_ms", of=_pair)
-        keep(self, entries, "detail", of=details)
-
-
-def _pair(name: str, value: Any) -> tuple[float, float]:
-    if not isinstance(value, (list, tuple)) or len(value) != 2:
-        raise RecordError(f"{name} is not a pair of numbers: {shown(value)}")
-    return number(name, value[0]), number(name, value[1])
+    node: _Word
+    state: _Word
+    host: _Word
+    pid: Count
+    started_wall_ns: Count
+    ages_s: Numbers = field(default_factory=dict)
+    rates_hz: Numbers = field(default_factory=dict)
+    latency_ms: Pairs = field(default_factory=dict)
+    counters: Counts = field(default_factory=dict)
+    detail: Details = field(default_factory=dict)
+    boot: _Word = ""
 
 
 @dataclass(frozen=True, slots=True)
-class Event:
+class Event(Record):
     """Something that happened once.
 
     Args:
@@ -199,25 +180,29 @@ class Event:
         count: how many of the same this stands for.
     """
 
-    level: str
-    kind: str
-    what: str
-    why: str = ""
-    value: float | None = None
-    limit: float | None = None
-    count: int = 1
-
-    def __post_init__(self) -> None:
-        keep(self, text, "level", "kind", "what", "why")
-        for name, allowed in (("level", EVENT_LEVELS), ("kind", EVENT_KINDS)):
-            if (given := getattr(self, name)) not in allowed:
-                raise RecordError(f"{name} is {shown(given)}, allowed: {', '.join(allowed)}")
-        keep(self, integer, "count", minimum=1)
-        keep_given(self, number, "value", "limit")
+    level: Annotated[str, Wire(Literal[EVENT_LEVELS], as_read)]
+    kind: Annotated[str, Wire(Literal[EVENT_KINDS], as_read)]
+    what: Text
+    why: Text = ""
+    value: Finite | None = None
+    limit: Finite | None = None
+    count: Annotated[int, Meta(ge=1, le=MAX_WHOLE)] = 1
 
 
 @dataclass(frozen=True, slots=True)
-class Task:
+class ClockReply(Record):
+    """Reply to a query of a node's clock, on its wall clock.
+
+    Args:
+        heard_ns, said_ns: arrival of the query, and this reply.
+    """
+
+    heard_ns: Count
+    said_ns: Count
+
+
+@dataclass(frozen=True, slots=True)
+class Task(Record):
     """The task in force, as the command node has accepted it.
 
     Args:
@@ -229,20 +214,12 @@ class Task:
         speed_percent: speed override, percent of the planned speed; 0: the arm stands, active.
     """
 
-    episode: int
+    episode: Count
     active: bool
-    prompt: str
-    worker: str
-    rate_hz: float
-    speed_percent: float = 100.0
-
-    def __post_init__(self) -> None:
-        keep(self, integer, "episode")
-        keep(self, boolean, "active")
-        keep(self, text, "prompt")
-        keep(self, text, "worker", limit=128)
-        keep(self, number, "rate_hz", minimum=0.01, maximum=1000.0)
-        keep(self, number, "speed_percent", minimum=0.0, maximum=100.0)
+    prompt: Text
+    worker: Name
+    rate_hz: Annotated[float, Meta(ge=0.01, le=1000.0)]
+    speed_percent: Annotated[float, Meta(ge=0.0, le=100.0)] = 100.0
 
     @property
     def speed(self) -> float:
@@ -254,129 +231,3 @@ class Task:
         """Chunks per second requested of the worker now: at half the speed half as many, 0 if the
         arm stands. A worker that is not the chosen one is asked at the full rate."""
         return self.rate_hz * (self.speed if self.active else 1.0)
-
-
-def shown(value: Any) -> str:
-    """`value` in short, for an error message: it may be huge, nested, or refuse to be printed."""
-    if isinstance(value, (str, bytes)):
-        value = value[:80]
-    return reprlib.repr(value)[:MAX_SHOWN]
-
-
-def is_bool(value: Any) -> bool:
-    """Whether `value` is a bool, of numpy too, which is not imported for it."""
-    numpy = sys.modules.get("numpy")
-    return isinstance(value, bool) or (numpy is not None and isinstance(value, numpy.bool_))
-
-
-def number(name: str, value: Any, minimum: float = -math.inf, maximum: float = math.inf) -> float:
-    """A finite float within ``[minimum, maximum]``."""
-    if type(value) is float and minimum <= value <= maximum and math.isfinite(value):
-        return value
-    if isinstance(value, bool) or not isinstance(value, Real):
-        raise RecordError(f"{name} is not a number: {shown(value)}")
-    try:
-        result = float(value)
-    except OverflowError:
-        result = math.inf
-    if not math.isfinite(result) or not minimum <= result <= maximum:
-        raise RecordError(
-            f"{name} is {shown(value)}, wanted a number in [{minimum:g}, {maximum:g}]"
-        )
-    return result
-
-
-def integer(name: str, value: Any, minimum: int = 0, maximum: int = 2**63 - 1) -> int:
-    """An int within ``[minimum, maximum]``."""
-    if type(value) is int and minimum <= value <= maximum:
-        return value
-    if isinstance(value, bool) or not isinstance(value, Integral):
-        raise RecordError(f"{name} is not a whole number: {shown(value)}")
-    result = int(value)
-    if not minimum <= result <= maximum:
-        raise RecordError(
-            f"{name} is {shown(value)}, wanted a whole number in [{minimum}, {maximum}]"
-        )
-    return result
-
-
-def text(name: str, value: Any, limit: int = MAX_TEXT) -> str:
-    """A str of at most `limit` characters, all of which UTF-8 can carry."""
-    if not isinstance(value, str):
-        raise RecordError(f"{name} is not text: {type(value).__name__}")
-    if len(value) > limit:
-        raise RecordError(f"{name} has {len(value)} characters, at most {limit} are allowed")
-    if not value.isascii():
-        try:
-            value.encode("utf-8")
-        except UnicodeEncodeError as error:
-            raise RecordError(f"{name} holds half a character (a surrogate)") from error
-    return value
-
-
-def texts(name: str, value: Any, limit: int) -> tuple[str, ...]:
-    """A tuple of texts, of a list or tuple; a single str is not a list of its letters."""
-    if not isinstance(value, (list, tuple)):
-        raise RecordError(f"{name} is not a list of texts: {shown(value)}")
-    if len(value) > MAX_NAMES:
-        raise RecordError(f"{name} has {len(value)} entries, at most {MAX_NAMES} are allowed")
-    return tuple(text(name, item, limit) for item in value)
-
-
-def joint_names(name: str, value: Any) -> tuple[str, ...]:
-    """Names of joints: at least one, none of them twice."""
-    names = texts(name, value, 128)
-    if not names or len(set(names)) != len(names):
-        raise RecordError(f"joint names must be present and differ: {shown(names)}")
-    return names
-
-
-def boolean(name: str, value: Any) -> bool:
-    """A bool; 0 and 1 are rejected."""
-    if not is_bool(value):
-        raise RecordError(f"{name} is not true or false: {shown(value)}")
-    return bool(value)
-
-
-def entries(name: str, value: Any, of: Callable[..., Any], **bounds: Any) -> dict[str, Any]:
-    """A copy of a map from short names to what the check `of` returns."""
-    if not isinstance(value, Mapping):
-        raise RecordError(f"{name} is not a map: {shown(value)}")
-    if len(value) > MAX_ENTRIES:
-        raise RecordError(f"{name} has {len(value)} entries, at most {MAX_ENTRIES} are allowed")
-    return {
-        text(f"a name in {name}", key, 256): of(f"{name}.{key}", item, **bounds)
-        for key, item in value.items()
-    }
-
-
-def details(name: str, value: Any, depth: int = MAX_DETAIL_DEPTH) -> Any:
-    """Text, finite numbers, bools and None, in lists and maps that are not nested deep."""
-    if value is None:
-        return None
-    if is_bool(value):
-        return bool(value)
-    if isinstance(value, str):
-        return text(name, value, MAX_DETAIL_TEXT)
-    if isinstance(value, Integral):
-        return integer(name, value, -(2**63))
-    if isinstance(value, Real):
-        return number(name, value)
-    if depth == 0:
-        raise RecordError(f"{name} is nested too deep")
-    if isinstance(value, Mapping):
-        return entries(name, value, details, depth=depth - 1)
-    if isinstance(value, (list, tuple)) and len(value) <= MAX_ENTRIES:
-        return [details(name, item, depth - 1) for item in value]
-    raise RecordError(f"{name} is not text, a number, a bool, a list or a map: {shown(value)}")
-
-
-def keep(record: Any, check: Callable[..., Any], *names: str, **bounds: Any) -> None:
-    """Put fields of a frozen record into the final form that `check` returns."""
-    for name in names:
-        set_field(record, name, check(name, getattr(record, name), **bounds))
-
-
-def keep_given(record: Any, check: Callable[..., Any], *names: str, **bounds: Any) -> None:
-    """`keep` for fields that may be None."""
-    keep(record, check, *(name for name in names if getattr(record, name) is not None), **bounds)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any
 
@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from random_records import RECORDS, headers, refusal, same
+from random_records import ALL_RECORDS as RECORDS
+from random_records import headers, refusal, same
 
 from vla_zenoh import types
 from vla_zenoh.codec import message, records
-from vla_zenoh.errors import CodecError
+from vla_zenoh.errors import CodecError, RecordError
 from vla_zenoh.keys import SCHEMA
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.types import (
@@ -33,6 +34,7 @@ from vla_zenoh.types import (
     PoseState,
     Task,
 )
+from vla_zenoh.types.form import Count, Record
 
 # A record drawn at random normalises its quaternion once more when it is read: one bit may differ.
 QUATERNION_TOLERANCE = 1e-15
@@ -68,7 +70,11 @@ def as_map(record: Any) -> Any:
     if dataclasses.is_dataclass(record):
         names = [field.name for field in dataclasses.fields(record)]
         return {name: as_map(getattr(record, name)) for name in names}
-    return dict(record) if isinstance(record, Mapping) else record
+    if isinstance(record, np.ndarray):
+        return record.tolist()
+    if isinstance(record, Mapping):
+        return {name: as_map(value) for name, value in record.items()}
+    return list(record) if isinstance(record, tuple) else record
 
 
 def test_every_kind_of_record_is_tested_here() -> None:
@@ -78,7 +84,7 @@ def test_every_kind_of_record_is_tested_here() -> None:
         for kind in vars(module).values()
         if dataclasses.is_dataclass(kind) and kind.__module__.startswith(f"{types.__name__}.")
     }
-    beside = {types.Header, types.Stamped, types.Image, types.Depth, types.Cause}
+    beside = {types.Stamped, types.Image, types.Depth}
     assert kinds - beside == set(RECORDS) - {ModelSpec}
 
 
@@ -96,7 +102,7 @@ def test_a_record_comes_back_as_it_was(kind: type, data: st.DataObject) -> None:
 @NOTHING_TAKEN
 def test_a_record_is_written_as_a_map_of_its_fields(kind: type, data: st.DataObject) -> None:
     record = data.draw(RECORDS[kind])
-    assert records.encode(record) == message.pack(as_map(record))
+    assert records.encode(record) == msgpack.packb(as_map(record))
 
 
 @by_kind
@@ -131,8 +137,7 @@ def test_what_was_written_before_makes_no_difference() -> None:
     joints = JointState(("a", "b"), np.ones(2), np.zeros(2), None)
     more = JointState(("a", "b", "c"), np.ones(3), np.zeros(3), np.ones(3))
     for record in (pose, wrench, pose, shut, whole, shut, joints, more, joints, pose):
-        fields = {name: getattr(record, name) for name in record.__dataclass_fields__}
-        assert records.encode(record) == message.pack(fields)
+        assert message.unpack(records.encode(record)) == as_map(record)
         assert same(records.decode(type(record), records.encode(record)), record)
 
 
@@ -163,24 +168,19 @@ def test_flipped_bits_are_refused_or_read(kind: type, data: st.DataObject) -> No
     assert decoded_or_refused(kind, bytes(payload))
 
 
-def outcome(read: Callable[[], Any]) -> Any:
-    try:
-        return as_map(read())
-    except CodecError as error:
-        return error.reason, str(error)
-
-
 @by_kind
 @given(data=st.data())
 @NOTHING_TAKEN
-def test_what_was_read_before_makes_no_difference(kind: type, data: st.DataObject) -> None:
+def test_a_spoilt_record_that_is_read_holds_what_any_reader_finds(
+    kind: type, data: st.DataObject
+) -> None:
     payload = bytearray(records.encode(data.draw(RECORDS[kind])))
-    records.decode(kind, bytes(payload))
     for _ in range(data.draw(st.integers(0, 9))):
         payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
-    after = outcome(lambda: records.decode(kind, bytes(payload)))
-    alone = outcome(lambda: records.from_map(kind, message.unpack(bytes(payload))))
-    np.testing.assert_equal(after, alone)
+    with suppress(CodecError):
+        read = records.decode(kind, bytes(payload))
+        plain = records.from_map(kind, message.unpack(bytes(payload)))
+        np.testing.assert_equal(as_map(read), as_map(plain))
 
 
 ANY_KEY = st.text(max_size=5) | st.binary(max_size=5)
@@ -222,67 +222,80 @@ COMMAND = PoseCommand(np.zeros(3), UNIT, np.zeros(6), np.zeros(6), np.zeros(3), 
 CAUSE = Cause("w", *range(7))
 JOINTS = JointState(("a", "b"), np.zeros(2), np.zeros(2), np.zeros(2))
 JOINT_COMMAND = JointCommand(("a", "b"), np.zeros(2), np.zeros(2), np.zeros(2), "active")
+OBJECTS = ObjectPoses(("a",), np.zeros((1, 3)), np.array([[0, 0, 0, 1.0]]))
 HEADER_REASONS = {"schema", "invalid", "malformed"}
 
 
 @pytest.mark.parametrize(
     ("record", "fields", "said"),
     [
-        (TASK, {"rate_hz": True}, "rate_hz is not a number"),
-        (TASK, {"rate_hz": "5"}, "rate_hz is not a number"),
+        (TASK, {"rate_hz": True}, "rate_hz is True, allowed: a number from 0.01 to 1000"),
+        (TASK, {"rate_hz": "5"}, "rate_hz is '5'"),
         (TASK, {"rate_hz": float("nan")}, "rate_hz is nan"),
         (TASK, {"rate_hz": float("inf")}, "rate_hz is inf"),
-        (TASK, {"episode": 1.0}, "episode is not a whole number"),
+        (TASK, {"episode": 1.0}, "episode is 1.0, allowed: a whole number from 0"),
         (TASK, {"episode": 2**63}, "episode is 9223372036854775808"),
         (TASK, {"episode": -1}, "episode is -1"),
-        (TASK, {"active": 1}, "active is not true or false"),
-        (TASK, {"prompt": b"go"}, "prompt is not text"),
-        (TASK, {"prompt": "x" * 5000}, "prompt has 5000 characters"),
-        (POSE, {"position_m": [True, 0, 0]}, "position_m is not a list of numbers"),
-        (POSE, {"position_m": ["1", "2", "3"]}, "position_m is not a list of numbers"),
-        (POSE, {"position_m": [[1], [2, 3]]}, "position_m is not a list of numbers"),
-        (POSE, {"position_m": {"x": 1}}, "position_m is not a list of numbers"),
-        (POSE, {"position_m": None}, "position_m is not a list of numbers"),
-        (POSE, {"position_m": np.zeros((1, 3))}, r"position_m has shape \(1, 3\)"),
-        (POSE, {"position_m": np.full(3, np.nan)}, "position_m is not finite"),
-        (POSE, {"twist": np.zeros(5)}, r"twist has shape \(5,\), wanted \(6,\)"),
+        (TASK, {"active": 1}, "active is 1, allowed: true or false"),
+        (TASK, {"prompt": b"go"}, "prompt is b'go', allowed: text of at most 4096 characters"),
+        (TASK, {"prompt": "x" * 5000}, "prompt is 'xxx"),
+        (POSE, {"position_m": [True, 0, 0]}, r"position_m\[0\] is True"),
+        (POSE, {"position_m": ["1", "2", "3"]}, r"position_m\[0\] is '1'"),
+        (
+            POSE,
+            {"position_m": [[1], [2, 3]]},
+            r"position_m is \[\[1\], \[2, 3\]\], allowed: a list of 3",
+        ),
+        (POSE, {"position_m": {"x": 1}}, "position_m is {'x': 1}"),
+        (POSE, {"position_m": None}, "position_m is None"),
+        (POSE, {"position_m": np.zeros((1, 3))}, "position_m is .* allowed: a list of 3"),
+        (POSE, {"position_m": np.full(3, np.nan)}, r"position_m\[0\] is nan"),
+        (POSE, {"twist": np.zeros(5)}, "twist is .* allowed: a list of 6"),
         (POSE, {"quat_xyzw": [0, 0, 0, 0.9]}, "quat_xyzw has norm 0.9"),
         (POSE, {"quat_xyzw": [0, 0, 0, 0]}, "quat_xyzw has norm 0"),
         (POSE, {"reference_position_m": [0, 0, 0]}, "needs both position and quaternion"),
-        (JOINTS, {"reference_rad": [0]}, r"reference_rad has shape \(1,\), wanted \(2,\)"),
-        (JOINTS, {"reference_rad": [0, np.nan]}, "reference_rad is not finite"),
-        (JOINT_COMMAND, {"names": ["a", "a"]}, "joint names must be present and differ"),
-        (JOINT_COMMAND, {"names": []}, "joint names must be present and differ"),
-        (JOINT_COMMAND, {"position_rad": [0, np.inf]}, "position_rad is not finite"),
-        (JOINT_COMMAND, {"velocity_rad_s": np.zeros(3)}, r"velocity_rad_s has shape \(3,\)"),
-        (JOINT_COMMAND, {"acceleration_rad_s2": None}, "acceleration_rad_s2 is not a list"),
-        (JOINT_COMMAND, {"state": 1}, "state is not text"),
-        (GRIPPER, {"faults": "fire"}, "faults is not a list of texts"),
-        (GRIPPER, {"faults": [b"fire"]}, "faults is not text"),
-        (GRIPPER, {"width_m": 40}, "width_m is 40"),
-        (STATUS, {"rates_hz": {"a": float("nan")}}, "rates_hz.a is nan"),
-        (STATUS, {"counters": {"a": 1.5}}, "counters.a is not a whole number"),
-        (STATUS, {"counters": {b"a": 1}}, "a name in counters is not text"),
-        (STATUS, {"latency_ms": {"a": [1]}}, "latency_ms.a is not a pair of numbers"),
-        (STATUS, {"detail": {"a": b"x"}}, "detail.a is not text, a number"),
-        (STATUS, {"detail": {"a": {"b": {"c": {"d": {}}}}}}, "detail.a.b.c.d is nested too deep"),
-        (STATUS, {"detail": {"a": np.zeros(2)}}, "detail.a is not text, a number"),
+        (JOINTS, {"reference_rad": [0]}, "reference_rad has 1 numbers, allowed: one for each of"),
+        (JOINTS, {"reference_rad": [0, np.nan]}, r"reference_rad\[1\] is nan"),
+        (JOINT_COMMAND, {"names": ["a", "a"]}, "allowed: at least one name, none of them twice"),
+        (JOINT_COMMAND, {"names": []}, "allowed: at least one name, none of them twice"),
+        (JOINT_COMMAND, {"position_rad": [0, np.inf]}, r"position_rad\[1\] is inf"),
+        (JOINT_COMMAND, {"velocity_rad_s": np.zeros(3)}, "velocity_rad_s has 3 numbers"),
+        (JOINT_COMMAND, {"acceleration_rad_s2": None}, "acceleration_rad_s2 is None"),
+        (JOINT_COMMAND, {"state": 1}, "state is 1, allowed: text of at most 32 characters"),
+        (GRIPPER, {"faults": "fire"}, "faults is 'fire', allowed: a list of"),
+        (GRIPPER, {"faults": [b"fire"]}, r"faults\[0\] is b'fire'"),
+        (GRIPPER, {"width_m": 40}, "width_m is 40, allowed: a number from -0.01 to 1"),
+        (STATUS, {"rates_hz": {"a": float("nan")}}, "rates_hz.a is nan, allowed: a finite number"),
+        (STATUS, {"counters": {"b": 1, "a": 1.5}}, "counters.a is 1.5, allowed: a whole number"),
+        (STATUS, {"counters": {b"a": 1}}, "a name in counters is wrong"),
+        (STATUS, {"latency_ms": {"a": [1]}}, r"latency_ms.a is \[1\], allowed: a list of 2"),
+        (STATUS, {"detail": {"a": b"x"}}, "detail.a is b'x', allowed: text, numbers"),
+        (STATUS, {"detail": {"a": {"b": {"c": {"d": {}}}}}}, "detail.a is .* nested 3 deep"),
         (STATUS, {"detail": {"a": float("nan")}}, "detail.a is nan"),
-        (STATUS, {"detail": [1]}, "detail is not a map"),
-        (STATUS, {"detail": {str(n): n for n in range(1025)}}, "detail has 1025 entries"),
-        (Event("info", "notice", "x"), {"level": "loud"}, "level is 'loud', allowed: info"),
-        (Event("info", "notice", "x"), {"kind": "x"}, "kind is 'x', allowed: refusal"),
-        (Event("info", "notice", "x"), {"count": 0}, "count is 0"),
+        (STATUS, {"detail": [1]}, r"detail is \[1\], allowed: a map"),
+        (STATUS, {"detail": {str(n): n for n in range(1025)}}, "detail is .* 0 to 1024 names"),
         (
-            ObjectPoses(("a",), np.zeros((1, 3)), np.array([[0, 0, 0, 1.0]])),
+            Event("info", "notice", "x"),
+            {"level": "loud"},
+            "level is 'loud', allowed: error or info",
+        ),
+        (Event("info", "notice", "x"), {"kind": "x"}, "kind is 'x', allowed: fault or"),
+        (Event("info", "notice", "x"), {"count": 0}, "count is 0, allowed: a whole number from 1"),
+        (COMMAND, {"cause": 5}, "cause is 5, allowed: null or a Cause"),
+        (COMMAND, {"cause": {}}, "cause lacks worker"),
+        (JOINT_COMMAND, {"cause": {}}, "cause lacks worker"),
+        (
+            COMMAND,
+            {"cause": {**dataclasses.asdict(CAUSE), "chunk_seq": -1}},
+            "cause.chunk_seq is -1, allowed: a whole number from 0",
+        ),
+        (
+            OBJECTS,
             {"position_m": np.zeros((3, 1))},
-            r"position_m has shape \(3, 1\), wanted \(1, 3\)",
+            r"position_m\[0\] is \[0.0\], allowed: a list of 3",
         ),
-        (
-            ObjectPoses(("a",), np.zeros((1, 3)), np.array([[0, 0, 0, 1.0]])),
-            {"quat_xyzw": np.ones((1, 4))},
-            "quat_xyzw has norm 2",
-        ),
+        (OBJECTS, {"position_m": np.zeros((2, 3))}, "position_m has 2 rows, allowed: one for each"),
+        (OBJECTS, {"quat_xyzw": np.ones((1, 4))}, r"quat_xyzw\[0\] has norm 2"),
     ],
 )
 def test_a_wrong_value_is_refused_by_name(record: Any, fields: Any, said: str) -> None:
@@ -294,11 +307,11 @@ def test_a_wrong_value_is_refused_by_name(record: Any, fields: Any, said: str) -
 @pytest.mark.parametrize(
     ("record", "name", "wrong", "said"),
     [
-        (POSE, "position_m", [0, 0, np.nan], "position_m is not finite"),
+        (POSE, "position_m", [0, 0, np.nan], r"position_m\[2\] is nan"),
         (POSE, "quat_xyzw", [0, 0, 0, 0.9], "quat_xyzw has norm 0.9"),
-        (JOINTS, "effort_nm", [-np.inf, 0], "effort_nm is not finite"),
+        (JOINTS, "effort_nm", [-np.inf, 0], r"effort_nm\[0\] is -inf"),
         (COMMAND, "goal_quat_xyzw", [1, 1, 1, 1], "goal_quat_xyzw has norm 2"),
-        (JOINT_COMMAND, "velocity_rad_s", [0, np.inf], "velocity_rad_s is not finite"),
+        (JOINT_COMMAND, "velocity_rad_s", [0, np.inf], r"velocity_rad_s\[1\] is inf"),
     ],
 )
 def test_a_wrong_number_in_a_stream_is_refused_by_name(
@@ -324,20 +337,15 @@ def test_numbers_of_any_kind_are_read_where_they_fit() -> None:
 def test_fields_that_are_missing_are_named() -> None:
     with pytest.raises(CodecError, match="Task lacks episode, active, prompt, worker, rate_hz"):
         records.decode(Task, message.pack({}))
-    with pytest.raises(CodecError, match="Task is a map, this is a list"):
+    with pytest.raises(CodecError, match=r"Task is a map of its fields: .* got `array`"):
         records.decode(Task, message.pack([1]))
-    with pytest.raises(CodecError, match="cause is a map or nothing"):
-        records.decode(PoseCommand, forged(COMMAND, cause=5))
-    for command in (COMMAND, JOINT_COMMAND):
-        with pytest.raises(CodecError, match="Cause lacks worker"):
-            records.decode(type(command), forged(command, cause={}))
 
 
 def test_unknown_fields_are_ignored_and_named() -> None:
     cause = {**as_map(CAUSE), "later": np.zeros(3)}
     for record, more, named in (
         (TASK, {"episodes": 1}, ["Task.'episodes'"]),
-        (TASK, {"a": 1, "b": b"x"}, ["Task.'a'", "Task.'b'"]),
+        (TASK, {"a": [[1]], "b": b"x"}, ["Task.'a'", "Task.'b'"]),
         (COMMAND, {"cause": cause}, ["Cause.'later'"]),
         (POSE, {}, []),
     ):
@@ -378,24 +386,27 @@ def test_an_invalid_value_is_rejected_at_the_tenth_decode_as_at_the_first(
                 assert near(record, records.decode(kind, good))
 
 
-@by_kind
-@given(data=st.data())
-@settings(max_examples=5)
-def test_every_decode_runs_the_checks_of_the_record(kind: type, data: st.DataObject) -> None:
-    if kind is ModelSpec:
-        return
-    payload = records.encode(data.draw(RECORDS[kind]))
-    check, ran = kind.__post_init__, list[Any]()
+def test_a_record_is_checked_when_it_is_built_as_when_it_is_read() -> None:
+    checked = 0
 
-    def counted(self: Any) -> None:
-        ran.append(self)
-        check(self)
+    @dataclasses.dataclass(frozen=True, slots=True)
+    class Counted(Record):
+        seq: Count
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(kind, "__post_init__", counted)
-        for count in range(1, DECODES + 1):
-            records.decode(kind, payload)
-            assert len(ran) == count
+        def _check(self) -> None:
+            nonlocal checked
+            checked += 1
+            if self.seq == 7:
+                raise RecordError("seq is 7, allowed: any other")
+
+    payload = records.encode(Counted(6))
+    for count in range(2, DECODES):
+        assert records.decode(Counted, payload).seq == 6
+        assert checked == count
+    with pytest.raises(RecordError, match="allowed: any other"):
+        Counted(7)
+    with pytest.raises(CodecError, match="Counted: seq is 7, allowed: any other"):
+        records.decode(Counted, message.pack({"seq": 7}))
 
 
 def test_an_error_message_stays_short_whatever_is_in_the_field() -> None:
@@ -459,12 +470,12 @@ def test_flipped_bits_in_a_header_are_refused_or_read(written: Any, data: st.Dat
 
 @given(st.sampled_from(["schema", "stamp_wall_ns", "seq", "source"]), ANY_VALUE)
 def test_a_header_field_may_hold_anything(name: str, value: Any) -> None:
-    fields = {"schema": 1, "stamp_wall_ns": 1, "seq": 1, "source": "a"} | {name: value}
+    fields = {"schema": SCHEMA, "stamp_wall_ns": 1, "seq": 1, "source": "a"} | {name: value}
     error = refusal(records.decode_header, message.pack(fields))
     assert error is None or error.reason in HEADER_REASONS
 
 
-GOOD = {"schema": 1, "stamp_wall_ns": 5, "seq": 6, "source": "sim#1"}
+GOOD = {"schema": SCHEMA, "stamp_wall_ns": 5, "seq": 6, "source": "sim#1"}
 
 
 @pytest.mark.parametrize(
@@ -474,10 +485,10 @@ GOOD = {"schema": 1, "stamp_wall_ns": 5, "seq": 6, "source": "sim#1"}
         (b"", "malformed"),
         (b"\xc1", "malformed"),
         (msgpack.packb([1]), "malformed"),
-        (msgpack.packb(GOOD | {"schema": 2}), "schema"),
+        (msgpack.packb(GOOD | {"schema": SCHEMA + 1}), "schema"),
         (msgpack.packb(GOOD | {"schema": True}), "schema"),
-        (msgpack.packb(GOOD | {"schema": 1.0}), "schema"),
-        (msgpack.packb({"schema": 1}), "malformed"),
+        (msgpack.packb(GOOD | {"schema": float(SCHEMA)}), "schema"),
+        (msgpack.packb({"schema": SCHEMA}), "malformed"),
         (msgpack.packb(GOOD | {"seq": -1}), "invalid"),
         (msgpack.packb(GOOD | {"source": "x" * 200}), "invalid"),
         (msgpack.packb(GOOD | {"padding": b"x" * 2000}), "malformed"),

@@ -38,7 +38,6 @@ from vla_zenoh.lab.doctor.software import (
     MODULES,
     libraries,
     load_errors,
-    msgpack_in_c,
     opengl,
     python_version,
     robot,
@@ -347,7 +346,6 @@ def test_the_environment_of_the_tests_has_every_library(told: Result) -> None:
     found = [each for name, each in findings_of(told).items() if name.startswith("libraries: ")]
     assert len(found) == len(MODULES)
     assert {finding.level for finding in found} == {"ok"}, found
-    assert msgpack_in_c().level == "ok"
 
 
 def test_a_missing_camera_makes_the_command_fail(told: Result) -> None:

@@ -28,7 +28,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import encode_jpeg, encode_raw, raw_schema
 from vla_zenoh.errors import RecordingError
-from vla_zenoh.keys import Keys
+from vla_zenoh.keys import SCHEMA, Keys
 from vla_zenoh.lab.recording.reader import open_recording
 from vla_zenoh.lab.recording.sample import JPEG, MSGPACK, TEXT, Sample, received_sample
 from vla_zenoh.lab.recording.writer import RecordingWriter, topic_of
@@ -164,11 +164,21 @@ def test_a_header_that_fits_into_no_message_is_kept(tmp_path: Path) -> None:
     ]
 
 
+def test_a_recording_of_another_version_of_the_wire_is_rejected_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    about = {"schema": "1", "version": "0.9"}
+    RecordingWriter(
+        path, KEYS, profile_yaml="about: test\n", base_frame="base", began_ns=START_NS, about=about
+    ).finish({"dropped": {}})
+    with pytest.raises(RecordingError, match=r"version 1 of the wire, .* reads 2: use .*0\.9"):
+        open_recording(path)
+
+
 def test_facts_profile_and_order_are_kept(tmp_path: Path) -> None:
     put = [prompt("hold"), *[each(i) for i in range(40) for each in (pose, picture, chunk)]]
     run = open_recording(written(tmp_path / "a.mcap", *put))
     assert run.profile_yaml == "about: test\n"
-    assert (run.keys, run.about["schema"]) == (KEYS, "1")
+    assert (run.keys, run.about["schema"]) == (KEYS, str(SCHEMA))
     assert list(run.entries()) == put
     assert (run.damage, run.ended) == ("", {"dropped": {}})
 

@@ -10,7 +10,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Annotated, Any
 
-import numpy as np
 import typer
 import zenoh
 from rich.pretty import pretty_repr
@@ -280,15 +279,14 @@ def decode(payload: bytes, encoding: str) -> Any:
 
 
 def _json_types(value: Any) -> Any:
-    """Arrays as lists, bytes as their number, so that JSON can carry it."""
-    if isinstance(value, np.ndarray):
-        return [round(float(v), 6) for v in value] if value.ndim == 1 else value.tolist()
-    if isinstance(value, np.generic):
-        return value.item()
+    """Numbers with six digits, bytes as their number, so that a reader sees them and JSON can carry
+    it."""
+    if isinstance(value, float):
+        return round(value, 6)
     if isinstance(value, dict):
         return {str(key): _json_types(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [_json_types(item) for item in value]
     if isinstance(value, bytes):
         return f"<{len(value)} bytes>"
-    return value
+    return value if value is None or isinstance(value, (bool, int, str)) else str(value)

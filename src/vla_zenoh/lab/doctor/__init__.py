@@ -18,7 +18,7 @@ from vla_zenoh.lab.doctor.computer import (
     wall_clock,
 )
 from vla_zenoh.lab.doctor.needs import HostFinding, Level, Needs, Role, needs_of
-from vla_zenoh.lab.doctor.software import libraries, msgpack_in_c, opengl, python_version
+from vla_zenoh.lab.doctor.software import libraries, opengl, python_version
 
 __all__ = ["HostFinding", "Level", "Needs", "Role", "examine", "needs_of"]
 
@@ -34,8 +34,6 @@ def examine(needs: Needs, try_zenoh: Callable[[str], str]) -> Iterator[HostFindi
     yield python_version()
     results = {role: libraries(role, required=role in needs.roles) for role in ROLES}
     yield from results.values()
-    if results["base"].level == "ok":
-        yield msgpack_in_c()
     if results["sim"].level == "ok":
         yield opengl()
     yield processors()

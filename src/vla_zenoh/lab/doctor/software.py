@@ -22,6 +22,7 @@ MODULES: Mapping[Role, Mapping[str, str]] = {
     "base": {
         "zenoh": "eclipse-zenoh",
         "msgpack": "msgpack",
+        "msgspec": "msgspec",
         "numpy": "numpy",
         "cv2": "opencv-python-headless",
         "pydantic": "pydantic",
@@ -128,19 +129,6 @@ def libraries(role: Role, *, required: bool) -> HostFinding:
         return HostFinding(name, level, text, f"{install} --force-reinstall")
     text = "; ".join(fault for fault in wrong if fault) or ", ".join(versions)
     return judged(name, not any(wrong), text, f"{install} --upgrade", level)
-
-
-def msgpack_in_c() -> HostFinding:
-    """msgpack is compiled; its Python fallback is some thirty times slower."""
-    import msgpack
-
-    compiled = msgpack.Packer.__module__ == "msgpack._cmsgpack"
-    return judged(
-        "msgpack",
-        compiled,
-        "compiled" if compiled else "the slow fallback in Python",
-        "unset MSGPACK_PUREPYTHON, or: pip install --force-reinstall --only-binary :all: msgpack",
-    )
 
 
 NAME = "pictures"

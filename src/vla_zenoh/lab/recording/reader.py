@@ -39,7 +39,7 @@ from mcap.summary import Summary
 from zstandard import ZstdError
 
 from vla_zenoh.errors import CodecError, RecordError, RecordingError, counted
-from vla_zenoh.keys import Keys
+from vla_zenoh.keys import SCHEMA, Keys
 from vla_zenoh.lab.recording import ros2_messages
 from vla_zenoh.lab.recording.record_types import RECORDS, bytes_from_json, record_from_json
 from vla_zenoh.lab.recording.sample import Sample, received_sample
@@ -71,6 +71,12 @@ class Recording:
     """
 
     def __init__(self, path: Path, about: dict[str, str], profile_yaml: str) -> None:
+        schema = about.get("schema")
+        if schema != str(SCHEMA):
+            raise RecordingError(
+                f"{path} holds records of version {schema} of the wire, this program reads "
+                f"{SCHEMA}: use the vla-zenoh that recorded it ({about.get('version')})"
+            )
         self.path, self.about, self.profile_yaml = path, about, profile_yaml
         self.keys = Keys(about["robot"], about["root"])
         self.ended: dict[str, Any] | None = None

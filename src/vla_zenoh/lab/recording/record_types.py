@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import json
-import typing
 from base64 import b64decode, b64encode
-from functools import cache
 from typing import Any
-
-import numpy as np
 
 from vla_zenoh.codec import message
 from vla_zenoh.errors import CodecError, ProfileError
@@ -121,7 +117,7 @@ def record_to_json(kind: type, payload: bytes) -> tuple[str, dict[str, Any]]:
         raise CodecError("malformed", f"{kind.__name__} is a map with the names of its fields")
     try:
         text = _dumps(fields)
-        exact = message.pack(_with_arrays(kind, json.loads(text))) == payload
+        exact = message.pack(json.loads(text)) == payload
     except (TypeError, ValueError) as error:
         raise CodecError("malformed", f"{kind.__name__}: {error}") from error
     return text if exact else _dumps({**fields, PAYLOAD: _base64(payload)}), fields
@@ -136,7 +132,6 @@ def record_from_json(kind: type, text: str) -> tuple[bytes, dict[str, Any]]:
     fields = _loads(text)
     try:
         if PAYLOAD not in fields:
-            fields = _with_arrays(kind, fields)
             return message.pack(fields), fields
         payload = b64decode(fields[PAYLOAD])
         fields = message.unpack(payload)
@@ -169,32 +164,6 @@ def bytes_from_json(text: str) -> tuple[bytes, bytes | None]:
         raise CodecError("malformed", f"no bytes in base64: {str(error)[:200]}") from error
 
 
-@cache
-def _array_types(kind: type) -> dict[str, np.dtype[Any]]:
-    """Element type of each array field of a record."""
-    if kind is ModelSpec:
-        return {}
-    return {
-        name: np.dtype("<f4" if "float32" in str(hint) else "<f8")
-        for name, hint in typing.get_type_hints(kind).items()
-        if "ndarray" in str(hint)
-    }
-
-
-def _with_arrays(kind: type, fields: dict[str, Any]) -> dict[str, Any]:
-    types = _array_types(kind)
-    return {
-        name: _array(value, types[name]) if name in types and value is not None else value
-        for name, value in fields.items()
-    }
-
-
-def _array(value: Any, dtype: np.dtype[Any]) -> Any:
-    if isinstance(value, dict):  # of a field that maps names to arrays
-        return {name: np.array(part, dtype) for name, part in value.items()}
-    return np.array(value, dtype)
-
-
 def _dumps(value: dict[str, Any]) -> str:
     return json.dumps(value, default=_plain, allow_nan=False, separators=(",", ":"))
 
@@ -214,4 +183,6 @@ def _base64(data: bytes) -> str:
 
 
 def _plain(value: Any) -> Any:
-    return _base64(value) if isinstance(value, bytes) else value.tolist()
+    if isinstance(value, bytes):
+        return _base64(value)
+    raise TypeError(f"{type(value).__name__} has no JSON form")

@@ -13,8 +13,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from vla_zenoh.codec import message
 from vla_zenoh.errors import CodecError, PeerError, SpecError, in_words
+from vla_zenoh.lab.policy_servers import message
 from vla_zenoh.lab.serve.served_policy import ServedPolicy
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.policy.inference import Committed

@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh import __version__
-from vla_zenoh.codec import message
 from vla_zenoh.codec.image import decode_jpeg, decode_png
 from vla_zenoh.errors import CodecError, PeerError, in_words
+from vla_zenoh.lab.policy_servers import message
 from vla_zenoh.lab.serve.served_policy import DefaultNames, ServedPolicy
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.types import shown
