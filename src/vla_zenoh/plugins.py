@@ -173,7 +173,7 @@ def load(group: Group[Declaration], name: str) -> Declaration:
         raise PluginError(
             f"no {group.noun} {name!r} is installed{nearest(name, known)} Installed: "
             f"{', '.join(known) or 'none'}. Install the package that brings it: "
-            "docs/how-to/plugins.md"
+            "docs/how-to/install.md"
         )
     entry, *others = _found(group.name, tuple(sys.path))[name]
     if others:

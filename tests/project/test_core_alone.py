@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -22,6 +23,7 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
             (site / entry.name).symlink_to(entry)
     robots = next(iter(site.glob("cmeel.prefix/lib/python*/site-packages")))
     path = os.pathsep.join(map(str, (ROOT / "src", site, robots)))
+    (site / "cryptography").unlink()  # of the extra secure
     return {**os.environ, "PYTHONPATH": path}
 
 
@@ -47,6 +49,14 @@ def test_a_robot_of_a_plug_in_is_named_with_what_is_installed(alone: dict[str, s
     assert "robot.driver: no robot driver 'franka' is installed" in done.stderr
     assert "Installed: arm, ros2, sim." in done.stderr
     assert run(alone, "profile", "show", "fr3").returncode == 0
+
+
+def test_the_doctor_needs_no_extra_and_lists_the_plug_ins(alone: dict[str, str]) -> None:
+    done = run(alone, "doctor", "--json")
+    assert "cryptography" not in done.stderr
+    found = {each["name"]: each["found"] for each in json.loads(done.stdout)}
+    assert found["plug-ins: robot drivers"] == "arm, ros2, sim"
+    assert found["plug-ins: benchmarks"] == "none"
 
 
 def test_its_commands_are_listed_and_those_of_plug_ins_are_not(alone: dict[str, str]) -> None:

@@ -256,7 +256,7 @@ def test_a_computer_without_the_package_loads_the_profile_and_says_what_the_node
         (5, "workers", "model called 'acme_nod'"),
     ):
         assert any(f"acme.yaml:{line}: {place}: no {what}" in error for error in errors), errors
-    with pytest.raises(PluginError, match=r"no robot driver 'acme' .*docs/how-to/plugins\.md"):
+    with pytest.raises(PluginError, match=r"no robot driver 'acme' .*docs/how-to/install\.md"):
         PythonDriver(load_profile(path))
     with pytest.raises(PluginError, match="no camera source 'acme' is installed"):
         make_source(load_profile(path).cameras["front"])
