@@ -179,15 +179,15 @@ def load(group: Group[Declaration], name: str) -> Declaration:
     if others:
         packages = " and ".join(map(package_of, (entry, *others)))
         raise PluginError(f"{packages} both bring the {group.noun} {name!r}: uninstall one of them")
-    where = f"the {group.noun} {name!r} of {package_of(entry)}"
     try:
         found = entry.load()
     except (Exception, SystemExit) as error:
+        where = f"the {group.noun} {name!r} of {package_of(entry)}"
         raise PluginError(f"{where} cannot be imported: {in_words(error)}") from error
     if not isinstance(found, group.kind):
         raise PluginError(
-            f"{where}: {entry.value} is of type {type(found).__name__}, wanted a "
-            f"{group.kind.__name__}; see vla_zenoh.plugins"
+            f"the {group.noun} {name!r} of {package_of(entry)}: {entry.value} is of type "
+            f"{type(found).__name__}, wanted a {group.kind.__name__}; see vla_zenoh.plugins"
         )
     return found
 
