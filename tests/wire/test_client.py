@@ -15,7 +15,7 @@ from camera_rig import PATIENCE_S, await_match, free_endpoint, until
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.cli.drive import _reaches
-from vla_zenoh.client.client import MAX_OTHERS, MAX_WHY, Client
+from vla_zenoh.client.client import MAX_NODES, MAX_WHY, Client
 from vla_zenoh.client.remote_robot import RemoteRobot
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import MAX_JPEG_BYTES
@@ -60,15 +60,15 @@ def test_names_of_strangers_neither_fill_a_client_nor_hide_a_node(profile: Profi
             there.put(
                 keys.status(f"ghost{number}"), ghost, attachment=who, congestion_control=SURELY
             )
-        until("all have come", lambda: client.dropped > STRANGERS - 2 * MAX_OTHERS)
+        until("all have come", lambda: client.dropped > STRANGERS - 2 * MAX_NODES)
         node = Node("sim", profile, there)
         node.publish_status("running", now=True)
         until("the node is there", lambda: "sim" in client.alive and client.status("sim"))
         found = client.snapshot()
         assert found["sim"][0].state == "running"
         assert found["sim"][2]
-        assert len(found) <= MAX_OTHERS + 1
-        assert len(client.alive) <= MAX_OTHERS + 1
+        assert len(found) <= MAX_NODES
+        assert len(client.alive) <= MAX_NODES
         node.close()
         until("it is gone", lambda: "sim" not in client.alive)
         assert client.snapshot()["sim"][2] is False
