@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 from collections.abc import Generator, Iterable
 from copy import copy
-from typing import Any
 
 import numpy as np
 
@@ -244,6 +243,8 @@ class JointBounds:
 class JointPath(AxisSmoother):
     """Smooth motion of the joints themselves, with the motion of their TCP."""
 
+    stuck = ""
+
     def __init__(self, profile: Profile, bounds: JointBounds) -> None:
         self.kinematics, self._bounds = bounds.kinematics, bounds
         self._names = bounds.kinematics.arm_joints
@@ -251,7 +252,6 @@ class JointPath(AxisSmoother):
         self._ticks = 0
         self._hits: list[LimitHit] = []
         self._asked: tuple[Goal, Shares, bool]
-        self._sent: tuple[tuple[Any, ...], JointCommand | None] = (), None
         self._held = False
         """It braked before a bound, on the way to what was asked for last."""
         home_rad = self.kinematics.ordered(profile.robot.arm_joints, profile.robot.home_rad)
@@ -426,6 +426,24 @@ class JointPath(AxisSmoother):
         return hits
 
     # -- the same interface as for poses ------------------------------------------------------
+    @property
+    def stands(self) -> bool:
+        """No joint moves."""
+        return self.at_rest
+
+    @property
+    def joints_rad(self) -> FloatArray:
+        """(n,) joints commanded."""
+        return self.state.position
+
+    def step(self, *, follows: bool, braking: bool) -> None:
+        """Advance by one tick."""
+        self.tick()
+
+    def stop(self, shares: Shares | None) -> None:
+        """Come to rest, as `brake`."""
+        self.brake(shares)
+
     def way_to(self, goal: Goal) -> FloatArray:
         """(n,) from the commanded joints to those of `goal`."""
         assert goal.joints_rad is not None
@@ -446,7 +464,7 @@ class JointPath(AxisSmoother):
             way_rad, self.box, now, np.abs(ways).max(axis=0), bends, ROOM * self._tcp_box, BEND
         )
 
-    def command(self, state: str, cause: Cause | None) -> JointCommand:
+    def command(self, state: str, cause: Cause | None, goal: Goal | None) -> JointCommand:
         """The joint command of this tick."""
         return JointCommand(self._names, *self.state, state, cause)
 

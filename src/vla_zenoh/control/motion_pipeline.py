@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,9 +13,10 @@ from vla_zenoh.control.contact import Contact, Retreat
 from vla_zenoh.control.joint_space import JointPath
 from vla_zenoh.control.limits import FULL, LimitHit, Shares, into_workspace
 from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan, PlanAggregator, joint_goal
+from vla_zenoh.control.pose_to_joint import FollowedPath, PoseToJoint
 from vla_zenoh.control.preflight import FOLLOWS_JOINT_RAD, LINGER_NS, Settling, follows, held_joints
 from vla_zenoh.control.reachability import ReachabilityFilter
-from vla_zenoh.control.smoothing import PosePath, pose_command
+from vla_zenoh.control.smoothing import PosePath
 from vla_zenoh.control.step_timing import GoalPace, Mover, TimedGoal
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.kinematics.so3 import Pose, held_pose, interpolate, pose_distance, pose_of
@@ -30,9 +30,6 @@ from vla_zenoh.types import (
     PoseState,
     Task,
 )
-
-if TYPE_CHECKING:
-    from vla_zenoh.control.pose_to_joint import PoseToJoint
 
 PIECE_M, PIECE_RAD, PIECE_S = 0.02, 0.1, 0.5
 """A way that is no step of a plan is bounded in pieces of this length, each in this time."""
@@ -55,35 +52,33 @@ class MotionPipeline:
     def __init__(
         self, profile: Profile, reach: ReachabilityFilter | None, planner: ChunkPlanner
     ) -> None:
-        self._profile, self._limits = profile, profile.limits
+        self._limits = profile.limits
         self._dt_s = 1.0 / profile.timing.command_hz
         self._reach, self._planner = reach, planner
         self._aggregator = PlanAggregator(profile.composition)
         self._joints: PoseToJoint | None = None
-        if profile.robot.command == "joint":
-            if reach is None:
-                raise ProfileError("robot.command is joint, which needs the robot's kinematics")
-            from vla_zenoh.control.pose_to_joint import PoseToJoint
-
-            self._joints = PoseToJoint(profile, reach.kinematics, reach.barriers)
         self._path: JointPath | None = None
         """Of commanded joints. Commanded poses follow the TCP of goals that are joints."""
-        if self._joints is not None and planner.joint_bounds is not None:
+        self._poses = PosePath(profile)
+        if profile.robot.command == "joint":
+            if reach is None or planner.joint_bounds is None:
+                raise ProfileError("robot.command is joint, which needs the robot's kinematics")
+            self._joints = PoseToJoint(profile, reach.kinematics, reach.barriers)
             self._path = JointPath(profile, planner.joint_bounds)
+            self._poses = FollowedPath(profile, self._joints)
+        self._mover: Mover = self._poses
+        """What moves the arm: `_poses` or `_path`."""
         self._changing = False
         """It brakes, because the goals in force are joints and it moves in poses, or vice versa."""
         self.timeline: GoalTimeline | None = None
         self.goal: Goal | None = None
         self.streaming = False
-        self.pace = GoalPace(joints_follow=self._joints is not None)
+        self.pace = GoalPace()
         self.held = False
         """The arm has to stand: another part is too near."""
         self.contact = Contact(profile.limits.contact)
         self.retreat = Retreat(profile.limits, self.contact)
         self._back: Pose | None = None
-        self._poses: PosePath | None = None
-        self._mover: Mover | None = None
-        """What moves the arm: `_poses` or `_path`; None before any activation."""
         commanded = None if self._joints is None or reach is None else reach.kinematics
         self._settling = Settling(commanded)
         self._rest_since_ns: int | None = None
@@ -102,32 +97,21 @@ class MotionPipeline:
     @property
     def at_rest(self) -> bool:
         """The commanded motion stands still."""
-        mover = self._mover
-        still = self.in_joints or self._joints is None or self._joints.at_rest
-        return mover is None or (mover.at_rest and still)
+        return self._mover.stands
 
     @property
     def commanded(self) -> Pose | None:
         """The pose streamed last, None while nothing is streamed."""
-        mover = self._mover
-        return mover.motion.pose if mover is not None and self.streaming else None
+        return self._mover.motion.pose if self.streaming else None
 
     @property
     def joints_rad(self) -> FloatArray | None:
         """(n,) joints commanded, None where poses are."""
-        if self._joints is None:
-            return None
-        mover = self._mover
-        return mover.state.position if isinstance(mover, JointPath) else self._joints.position_rad
+        return self._mover.joints_rad
 
     def stopping_rad(self, ahead_s: float) -> list[FloatArray]:
         """(n,) each, commanded joints on the way to rest and at rest, from a brake in `ahead_s`."""
-        assert self._joints is not None
-        mover = self._mover
-        if isinstance(mover, JointPath):
-            return mover.stopping_rad(ahead_s)
-        joints = self._joints
-        return [joints.position_rad] if mover is None else joints.stopping_rad(mover, ahead_s)
+        return self._mover.stopping_rad(ahead_s)
 
     def wanted_rad(self, now_ns: int) -> FloatArray | None:
         """(n,) joints of the goal in force, None where it has none."""
@@ -141,14 +125,12 @@ class MotionPipeline:
     @property
     def stuck(self) -> str:
         """Why the arm will not reach its goal, empty while it follows."""
-        if self._joints is None or self.in_joints:
-            return ""
-        return self._joints.stuck
+        return self._mover.stuck
 
     @property
     def failures(self) -> int:
         """Times Ruckig found no trajectory and the arm braked instead."""
-        return sum(mover.failures for mover in (self._poses, self._path) if mover)
+        return self._poses.failures + (0 if self._path is None else self._path.failures)
 
     # -- activation ---------------------------------------------------------------------------
     def anchor(
@@ -185,10 +167,7 @@ class MotionPipeline:
         if standing:
             self._enter(joints=False)
         self._changing = False
-        if self._poses is None:
-            followed = None if self._joints is None else self._joints.shares
-            self._poses = self._mover = PosePath(start, self._profile, followed)
-        elif standing and not (
+        if standing and not (
             self.streaming and follows(*pose_distance(self._poses.motion.pose, start))
         ):
             self._poses.reset(start)
@@ -202,7 +181,6 @@ class MotionPipeline:
             self._enter(joints=True)
         # The goal of a blocked arm is where it is. Otherwise a brake continues, and the goal is
         # where it ends.
-        assert self._mover is not None
         goal = self._mover.resting_goal(actual, width_m)
         if blocked and goal.arm is None:
             goal = Goal(self._within_reach(self._mover.motion.pose, actual)[0], width_m)
@@ -220,7 +198,7 @@ class MotionPipeline:
     def _enter(self, *, joints: bool) -> None:
         """Act in joints or in poses from now on; only while the arm stands."""
         path, poses, follower = self._path, self._poses, self._joints
-        if joints is self.in_joints or path is None or poses is None or follower is None:
+        if joints is self.in_joints or path is None or follower is None:
             return
         self.goal = None
         if joints:
@@ -240,8 +218,7 @@ class MotionPipeline:
 
     def unsettled(self) -> list[str]:
         """Reasons against an activation now: the robot still moves to the end of the stream."""
-        mover = self._mover
-        return [] if mover is None else self._settling.unsettled(mover.motion.pose, self.joints_rad)
+        return self._settling.unsettled(self._mover.motion.pose, self.joints_rad)
 
     # -- one tick -----------------------------------------------------------------------------
     def advance(
@@ -259,7 +236,7 @@ class MotionPipeline:
         Returns:
             whether a trajectory was found (if not, the arm brakes), and events.
         """
-        if self._mover is None or self.timeline is None:
+        if self.timeline is None:
             return True, []
         if task.speed != self.pace.override or task.speed != self.timeline.clock.override:
             # Plan time passes at the override, and the motion to the goal is planned again.
@@ -277,27 +254,18 @@ class MotionPipeline:
         mover = self._mover  # which may be another by now
         # A stream that begins must begin at rest: no ticks are made up for.
         for _ in range(ticks if went_on else 1):
-            if self._joints is None or isinstance(mover, JointPath):
-                mover.tick()
-            else:
-                active = self._follows(state)
-                braking = not active and self._back is None
-                self._joints.tick(mover, braking=braking, elbow=active)
-        if isinstance(mover, JointPath):
-            events += limit_events(mover.taken_hits())
+            active = self._follows(state)
+            mover.step(follows=active, braking=not active and self._back is None)
+        events += limit_events(mover.taken_hits())
         return self.failures == failures, events
 
     def command(self, state: State) -> PoseCommand | JointCommand | None:
         """The set-point of the robot, while streaming."""
-        mover = self._mover
-        if not self.streaming or mover is None:
+        if not self.streaming:
             return None
         plan = None if self.timeline is None else self.timeline.plan
         cause = plan.cause if plan is not None and state is State.ACTIVE else None
-        if self._joints is None:
-            return pose_command(mover.motion, self.goal, state.value, cause)
-        arm = mover if isinstance(mover, JointPath) else self._joints
-        return arm.command(state.value, cause)
+        return self._mover.command(state.value, cause, self.goal)
 
     def _follows(self, state: State) -> bool:
         """Whether the arm follows a goal, and does not brake."""
@@ -310,7 +278,7 @@ class MotionPipeline:
         Returns what of the plan is dropped; None: it is kept.
         """
         timeline, mover = self.timeline, self._mover
-        if timeline is None or mover is None:
+        if timeline is None:
             return None
         cause = timeline.plan.cause
         if cause is None or cause.observation_stamp_ns >= oldest_ns:
@@ -337,13 +305,12 @@ class MotionPipeline:
             self._enter(joints=joints)
         self._changing = joints is not self.in_joints
         mover = self._mover
-        assert mover is not None
         if self.held and not self._changing:
             near = mover.near(goal)  # so that the arm can retreat
             if near is not goal:
                 self._shorten(plans, goal, near, now_ns)
         if self.pace.override == 0.0 or self._changing or self.held:
-            self._stop(mover, FULL)  # on the path, to continue from there later
+            mover.stop(FULL)  # on the path, to continue from there later
             self.goal = None
             return events
         # The leash starts where the arm is in this tick: it may be moving away from the last goal.
@@ -384,12 +351,12 @@ class MotionPipeline:
         if state is not State.INACTIVE or self.held:
             self.retreat.end()
         back, event = self.retreat.step(mover.motion.pose, now_ns, at_rest=self.at_rest)
-        if back is not None and isinstance(mover, JointPath) and self._poses is not None:
+        if back is not None and isinstance(mover, JointPath):
             self._enter(joints=False)
             mover = self._poses
         dropped: list[Event] = []
         if back is None:
-            self._stop(mover)
+            mover.stop(None)
             self.goal = None
             if timeline.plan.cause is not None and mover.at_rest:
                 # So that nothing pulls the arm further.
@@ -423,13 +390,6 @@ class MotionPipeline:
             if bounded.hits:
                 return here, bounded.hits
         return here, []
-
-    def _stop(self, mover: Mover, shares: Shares | None = None) -> None:
-        """Come to rest as fast as joints that follow can; without them see `AxisSmoother.brake`."""
-        if self._joints is None or isinstance(mover, JointPath):
-            mover.brake(shares)
-        else:
-            self._joints.brake(mover)
 
     def _must_stream(self, state: State, now_ns: int) -> bool:
         if state in OBEYING or self.retreat.busy or not self.at_rest:

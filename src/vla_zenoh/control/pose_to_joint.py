@@ -10,7 +10,6 @@ follows them. An arm that stops does not make up for its lag.
 from __future__ import annotations
 
 from copy import copy
-from typing import Any
 
 import numpy as np
 
@@ -23,6 +22,7 @@ from vla_zenoh.control.joint_follower import (
 )
 from vla_zenoh.control.joint_space import followed_shares
 from vla_zenoh.control.limits import (
+    FULL,
     Shares,
     between,
     into_workspace,
@@ -30,8 +30,9 @@ from vla_zenoh.control.limits import (
     joint_motion_limits,
     stop_way,
 )
+from vla_zenoh.control.plan_timeline import Goal
 from vla_zenoh.control.reachability import Barriers
-from vla_zenoh.control.smoothing import Motion, Smoother
+from vla_zenoh.control.smoothing import Motion, PosePath, Smoother
 from vla_zenoh.kinematics.kinematics import Kinematics, pose_error
 from vla_zenoh.kinematics.so3 import Pose, exp3, log3, pose_distance
 from vla_zenoh.profile import Profile
@@ -109,7 +110,6 @@ class PoseToJoint:
         self._dt_s = 1.0 / profile.timing.command_hz
         self._names = kinematics.arm_joints
         self._held: set[str] = set()
-        self._sent: tuple[tuple[Any, ...], JointCommand | None] = (), None
         self.restart(home_rad)
 
     def restart(self, joints_rad: FloatArray) -> None:
@@ -269,6 +269,53 @@ class PoseToJoint:
     def command(self, state: str, cause: Cause | None) -> JointCommand:
         """The joint command of this tick."""
         return JointCommand(self._names, *self._now[:3], state, cause)
+
+
+class FollowedPath(PosePath):
+    """Motion to goals that are poses, of a robot that takes joints.
+
+    Args:
+        profile: limits, rate.
+        joints: follow the pose.
+    """
+
+    def __init__(self, profile: Profile, joints: PoseToJoint) -> None:
+        self.joints = joints
+        # Commanded joints have distance constraints of their own.
+        super().__init__(profile, inside=False)
+
+    @property
+    def stuck(self) -> str:
+        return self.joints.stuck
+
+    @property
+    def stands(self) -> bool:
+        return self.at_rest and self.joints.at_rest
+
+    @property
+    def joints_rad(self) -> FloatArray:
+        return self.joints.position_rad
+
+    def stopping_rad(self, ahead_s: float) -> list[FloatArray]:
+        return self.joints.stopping_rad(self, ahead_s)
+
+    def step(self, *, follows: bool, braking: bool) -> None:
+        self.joints.tick(self, braking=braking, elbow=follows)
+
+    def stop(self, shares: Shares | None) -> None:
+        """Come to rest as fast as the joints can."""
+        self.joints.brake(self)
+
+    def command(self, state: str, cause: Cause | None, goal: Goal | None) -> JointCommand:
+        return self.joints.command(state, cause)
+
+    def go_to(self, goal: Goal, shares: Shares = FULL, *, all_to_stop: bool = False) -> bool:
+        """Move to the pose of `goal` within `shares`: joints that follow could do no more."""
+        return super().go_to(goal, shares)
+
+    def shares(self, goal: Goal) -> Shares:
+        """Shares of the limits that the joints can follow on the way to a goal."""
+        return self.joints.shares(self.motion, goal.pose, self.box)
 
 
 def _joint_way(jacobian: FloatArray, way: FloatArray) -> FloatArray:

@@ -9,7 +9,6 @@ that of `vla_zenoh.control.axis_smoothing`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -40,7 +39,7 @@ from vla_zenoh.kinematics.so3 import (
     spatial_rates,
 )
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import Cause, FloatArray, PoseCommand
+from vla_zenoh.types import Cause, FloatArray, JointCommand, PoseCommand
 
 
 class Motion(NamedTuple):
@@ -171,26 +170,66 @@ class Smoother(AxisSmoother):
 
 
 class PosePath(Smoother):
-    """Motion to goals that are poses; `JointPath` is the same for joints.
+    """Motion to goals that are poses, of a robot that takes poses.
+
+    `FollowedPath` and `JointPath` are the same of a robot that takes joints.
 
     Args:
-        start: pose to stand at.
         profile: limits, rate.
-        followed: shares of the limits of a motion to a pose that joints can follow; None: poses are
-            commanded.
+        inside: no motion leaves the workspace box.
     """
 
-    def __init__(
-        self,
-        start: Pose,
-        profile: Profile,
-        followed: Callable[[Motion, Pose, FloatArray], Shares] | None,
-    ) -> None:
+    stuck = ""
+    """Why the arm will not reach its goal, empty while it follows."""
+
+    def __init__(self, profile: Profile, *, inside: bool = True) -> None:
+        start = Pose(np.zeros(3), np.eye(3))  # until `reset`
         limits = self._bounds = profile.limits
-        self._followed = followed
-        # Commanded joints have distance constraints of their own.
-        inside = workspace_corners(limits) if followed is None else None
-        super().__init__(start, 1.0 / profile.timing.command_hz, motion_limits(limits), inside)
+        box = workspace_corners(limits) if inside else None
+        super().__init__(start, 1.0 / profile.timing.command_hz, motion_limits(limits), box)
+
+    @property
+    def stands(self) -> bool:
+        """Nothing that is commanded moves."""
+        return self.at_rest
+
+    @property
+    def joints_rad(self) -> FloatArray | None:
+        """(n,) joints commanded, None where poses are."""
+        return None
+
+    def stopping_rad(self, ahead_s: float) -> list[FloatArray]:
+        """(n,) each, commanded joints on the way to rest and at rest, from a brake in `ahead_s`."""
+        return []
+
+    def step(self, *, follows: bool, braking: bool) -> None:
+        """Advance by one tick; `follows`: to a goal, `braking`: to rest."""
+        self.tick()
+
+    def stop(self, shares: Shares | None) -> None:
+        """Come to rest, as `AxisSmoother.brake`."""
+        self.brake(shares)
+
+    def taken_hits(self) -> list[LimitHit]:
+        """Limits that acted on the motion since the last call."""
+        return []
+
+    def command(
+        self, state: str, cause: Cause | None, goal: Goal | None
+    ) -> PoseCommand | JointCommand:
+        """The command of this tick on the way to `goal`; None: where the arm is."""
+        (position_m, rotation), twist, acceleration = self.motion
+        heads_m, heads = (position_m, rotation) if goal is None else goal.pose
+        return PoseCommand(
+            position_m,
+            quat_from_rotation(rotation),
+            twist,
+            acceleration,
+            heads_m,
+            quat_from_rotation(heads),
+            state,
+            cause,
+        )
 
     def leash(self, goal: Goal, ahead_s: float) -> tuple[Goal, list[LimitHit]]:
         """`goal`, or a nearer one on the leash, and the limits that acted.
@@ -236,23 +275,5 @@ class PosePath(Smoother):
         return self.motion.axis_rates()
 
     def shares(self, goal: Goal) -> Shares:
-        """Shares of the limits that the joints can follow on the way to a goal."""
-        if self._followed is None:
-            return FULL
-        return self._followed(self.motion, goal.pose, self.box)
-
-
-def pose_command(motion: Motion, goal: Goal | None, state: str, cause: Cause | None) -> PoseCommand:
-    """The command of a tick on the way to `goal`; None: where the arm is."""
-    (position_m, rotation), twist, acceleration = motion
-    heads_m, heads = (position_m, rotation) if goal is None else goal.pose
-    return PoseCommand(
-        position_m,
-        quat_from_rotation(rotation),
-        twist,
-        acceleration,
-        heads_m,
-        quat_from_rotation(heads),
-        state,
-        cause,
-    )
+        """Shares of the limits for the way to a goal."""
+        return FULL

@@ -191,14 +191,9 @@ class TimedGoal(NamedTuple):
 
 
 class GoalPace:
-    """The motion to each goal, as fast as steps, slowdowns and the speed override allow.
+    """The motion to each goal, as fast as steps, slowdowns and the speed override allow."""
 
-    Args:
-        joints_follow: the pose, where goals are poses.
-    """
-
-    def __init__(self, *, joints_follow: bool) -> None:
-        self._joints_follow = joints_follow
+    def __init__(self) -> None:
         self.override = 1.0
         self.slowing = False
         """The arm may still be faster than the override allows."""
@@ -210,8 +205,8 @@ class GoalPace:
         self.part_slowdown: Slowdown | None = None
         """Of the distance to another part of the robot."""
         self._slowed_by: set[str] = set()
-        self._timings: dict[bool, StepTiming] = {}
-        """Of joints, and of poses, since the arm stood."""
+        self._timings: dict[Mover, StepTiming] = {}
+        """Since the arm stood."""
 
     def begin(self) -> None:
         """Start an activation."""
@@ -246,10 +241,9 @@ class GoalPace:
             name, _, value, limit, *_ = slower
             events.append(make_event("info", "limit", name, f"slower{slower.at}", value, limit))
         goal, plan, rate_hz, overdue_ns, now_ns = timed
-        in_joints = isinstance(mover, JointPath)
         override, speed = self.override, self.speed * self.override
         if not plan.soonest:
-            timing = self._timings.setdefault(in_joints, StepTiming(mover.box))
+            timing = self._timings.setdefault(mover, StepTiming(mover.box))
             way, (velocity, _) = mover.way_to(goal), mover.axis_rates()
             index, left_s = plan.index_at(now_ns), (overdue_ns - now_ns) / 1e9
             share = timing.share(plan, index, now_ns, 1.0 / rate_hz, left_s, way, velocity)
@@ -258,8 +252,7 @@ class GoalPace:
         # with the cube. Until a faster arm has slowed down it brakes as hard as it may.
         change, jerk = (override**2, override**3) if _within(mover, override) else FULL[1:]
         shares = Shares(*map(min, mover.shares(goal), Shares(speed, change, jerk)))
-        hard = self.slowing and (in_joints or not self._joints_follow)
-        enough = mover.go_to(goal, shares, all_to_stop=hard)
+        enough = mover.go_to(goal, shares, all_to_stop=self.slowing)
         self.slowing &= not (enough and _within(mover, override))
         return events
 
