@@ -200,7 +200,7 @@ VARIABLES = {
     "VLA_ZENOH_PATH": "folders with `profiles/`, `models/` and `sim/` of your own, separated "
     "by `:`; their contents are found by name: `vla-zenoh up ur5`",
     "VLA_ZENOH_RENDERER": "`egl` or `raycast`, where `sim.renderer` is `auto`",
-    "VLA_ZENOH_API_KEY": "of `lab serve`, as `--api-key`",
+    "VLA_ZENOH_API_KEY": "of `serve policy`, as `--api-key`",
 }
 
 

@@ -4,7 +4,7 @@
 # ///
 """Queries a policy server with openpi's protocol.
 
-vllm-omni and ``vla-zenoh lab serve`` implement it as well.
+vllm-omni and ``vla-zenoh serve policy`` implement it as well.
 """
 
 from __future__ import annotations

@@ -60,9 +60,7 @@ def test_fifty_steps_are_exact_over_a_link_like_a_bad_radio(site: Site) -> None:
     time.sleep(STANDS_S)
     way_m = flight(site).position_m[-1] - start_m
     carried = {host: site.hosts.shape(host) for host in ("gpu", "desk")}
-    net = json.loads(
-        site.vla("robot", "lab", "net", "--profile", str(site.profile("robot")), "--json")
-    )
+    net = json.loads(site.vla("robot", "net", "--profile", str(site.profile("robot")), "--json"))
     print(f"way {way_m}, {found}, frames {carried}, keys {net['keys']}")
     assert found["begun_anew"] == []
     assert way_m == pytest.approx([0.0, 0.0, STEPS * STEP_M], abs=TOLERANCE_M)

@@ -46,9 +46,7 @@ def site() -> Iterator[Site]:
 
 
 def test_net_shows_every_pair_of_hosts_and_what_each_key_costs(site: Site) -> None:
-    shown = json.loads(
-        site.vla("robot", "lab", "net", "--profile", str(site.profile("robot")), "--json")
-    )
+    shown = json.loads(site.vla("robot", "net", "--profile", str(site.profile("robot")), "--json"))
     pairs = {(pair["seen_from"], pair["host"]): pair for pair in shown["hosts"]}
     assert {("robot", "gpu"), ("gpu", "robot"), ("this computer", "gpu")} <= set(pairs)
     for pair in pairs.values():  # the hosts are one machine: their clocks are the same one

@@ -2,7 +2,7 @@
 
     python reliability/night/night.py --episodes 50 --output runs/night
 
-`vla-zenoh up` and `vla-zenoh lab trial --unattended` run as processes. Their nodes and the trial
+`vla-zenoh up` and `vla-zenoh trial --unattended` run as processes. Their nodes and the trial
 itself are killed at random, and once everything is at the same time. Of two tasks one is always
 done and the other never, by a Python judge that measures how far the arm rose; so the right table
 is known. Prints what was found as JSON; exit code 1: something is not as it has to be.
@@ -148,7 +148,7 @@ class Night:
 
     def _start_trial(self) -> None:
         plan = str(self.folder / "plan.yaml")
-        words = ("lab", "trial", "--unattended", plan, "--output", str(self.output), "--json")
+        words = ("trial", "--unattended", plan, "--output", str(self.output), "--json")
         self.trial = self._start("trial", *words)
 
     def _kill_one(self) -> None:

@@ -72,7 +72,7 @@ def test_bench_task_runs_a_path_and_bench_compare_reads_what_it_wrote(
             *words, "--set", f"step_m={step_m}", "--output", str(folder), timeout_s=TIMEOUT_S
         )
         assert done.returncode == 0, done.stderr
-    found = command_line("bench", "compare", str(still), str(moved), "--json")
+    found = command_line("compare", str(still), str(moved), "--json")
     assert found.returncode == WORSE, found.stderr
     said = json.loads(found.stdout)
     assert (said["pairs"], said["only_a"], said["b_is_worse"]) == (6, 6, True)

@@ -141,7 +141,7 @@ def test_a_rejected_activation_is_saved_once_a_minute_at_most(chain: Chain, tmp_
 
 def test_it_is_saved_on_request(chain: Chain, tmp_path: Path) -> None:
     with kept(chain, tmp_path) as record:
-        done = command_line("lab", "save", "it looked odd", profile=chain.profile_file)
+        done = command_line("save", "it looked odd", profile=chain.profile_file)
         assert done.returncode == 0, done.stderr
         (folder,) = record.saved()
         assert str(folder) in done.stdout
@@ -151,7 +151,7 @@ def test_it_is_saved_on_request(chain: Chain, tmp_path: Path) -> None:
 
 
 def test_without_a_rolling_record_a_request_says_so(chain: Chain) -> None:
-    done = command_line("lab", "save", profile=chain.profile_file)
+    done = command_line("save", profile=chain.profile_file)
     assert done.returncode == 1
     assert "no rolling record runs" in done.stderr
 

@@ -281,8 +281,8 @@ def test_the_log_of_a_lab_names_the_certificate_of_who_put_a_setting(lab: Lab) -
     until("it is logged", lambda: prompt in [each["text"] for each in facts("put")])
     until("its author is known", author)
     assert author() == "operator@desk"
-    done = command_line("lab", "save", "by the desk", profile=lab.profile("desk"))
+    done = command_line("save", "by the desk", profile=lab.profile("desk"))
     assert done.returncode == 0, done.stderr
-    done = command_line("lab", "save", "by the wall", profile=lab.profile("wall"))
+    done = command_line("save", "by the wall", profile=lab.profile("wall"))
     assert done.returncode == 1
     assert not list((rolling / "saved").glob("*by-the-wall"))

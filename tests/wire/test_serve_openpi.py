@@ -59,7 +59,7 @@ print(json.dumps([client.get_server_metadata()["action_dim"], steps, said]))
 def serving(*more: str) -> Iterator[int]:
     """The command, until the block ends; gives its port."""
     port = free_port()
-    command = [sys.executable, "-m", "vla_zenoh", "lab", "serve", "--port", str(port), *more]
+    command = [sys.executable, "-m", "vla_zenoh", "serve", "policy", "--port", str(port), *more]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None

@@ -1,4 +1,4 @@
-"""``vla-zenoh lab trial`` on a simulated arm with two workers, judged by lines on stdin."""
+"""``vla-zenoh trial`` on a simulated arm with two workers, judged by lines on stdin."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def trial(
 ) -> Iterator[subprocess.Popen[str]]:
     """The command at work, ended with the block."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "vla_zenoh", "lab", "trial", "--output", str(out), *words],
+        [sys.executable, "-m", "vla_zenoh", "trial", "--output", str(out), *words],
         stdin=stdin,
         stdout=subprocess.PIPE,
         stderr=err,

@@ -221,7 +221,7 @@ def test_what_a_model_sees_is_shown_with_its_prompt_raw_output_and_steps(
 
         out = tmp_path / "out"
         said = command_line(
-            *("lab", "inspect", "--count", "2", "--json", "--output", str(out)),
+            *("inspect", "--count", "2", "--json", "--output", str(out)),
             profile=chain.profile_file,
         )
         assert said.returncode == 0, said.stderr
@@ -243,7 +243,7 @@ def test_two_workers_are_compared_while_one_of_them_moves_the_arm(
         file = str(tmp_path / "both.mcap")
         said = command_line("record", "--seconds", "2", "-o", file, profile=chain.profile_file)
         assert said.returncode == 0, said.stderr
-        words = ("lab", "compare", "scripted", "riser", file, "--tolerance", "0.2", "--json")
+        words = ("compare", "scripted", "riser", file, "--tolerance", "0.2", "--json")
         said = command_line(*words)
         assert said.returncode == 0, said.stderr
         found = json.loads(said.stdout)
@@ -265,7 +265,7 @@ def test_two_workers_are_compared_while_one_of_them_moves_the_arm(
 
 @pytest.mark.slow
 def test_who_shows_nothing_is_named(chain: Chain) -> None:
-    said = command_line("lab", "inspect", "ghost", "--json", profile=chain.profile_file)
+    said = command_line("inspect", "ghost", "--json", profile=chain.profile_file)
     assert said.returncode == 1
     assert "no inference of ghost of robot panda" in said.stderr
     assert "does it run?" in said.stderr

@@ -51,7 +51,7 @@ class ActionSteps(NamedTuple):
         steps: (H, D), H at most the declared horizon; anything numpy can read.
         done: the policy reports that the task is finished with these steps.
         raw: intermediate output for debugging, as text and numbers: tokens, normalised actions.
-            Shown by ``vla-zenoh lab inspect``, otherwise unused.
+            Shown by ``vla-zenoh inspect``, otherwise unused.
         pictures: camera -> (H, W, 3) RGB uint8 as it went into the network, if the model itself
             changes what it is given (a crop).
     """

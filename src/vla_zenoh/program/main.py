@@ -58,6 +58,7 @@ COMMANDS: Mapping[str, Mapping[str, str | CommandGroup]] = {
                 "camera": "cli.nodes:camera",
                 "command": "cli.nodes:command",
                 "primitives": "lab.cli.primitives:node",
+                "rolling": "lab.cli.rolling:rolling",
             },
         ),
     },
@@ -80,12 +81,16 @@ COMMANDS: Mapping[str, Mapping[str, str | CommandGroup]] = {
             },
         ),
         "web": "lab.cli.web:web",
-        "serve": CommandGroup("Let agents drive the robot.", {"mcp": "lab.cli.serve:mcp"}),
+        "serve": CommandGroup(
+            "Let agents drive the robot; offer a model to clients of other frameworks.",
+            {"mcp": "lab.cli.serve:mcp", "policy": "lab.cli.serve:serve"},
+        ),
     },
     "Watch and record": {
         "status": "cli.status:status",
         "view": "lab.cli.view:view",
         "record": "lab.cli.record:record",
+        "save": "lab.cli.rolling:save",
         "replay": "lab.cli.replay:replay",
         "eval": "lab.cli.evaluate:evaluation",
         "keys": "lab.cli.keys:keys",
@@ -106,21 +111,12 @@ COMMANDS: Mapping[str, Mapping[str, str | CommandGroup]] = {
             {
                 "command": "lab.cli.bench_command:command",
                 "task": "lab.cli.bench_task:task",
-                "compare": "lab.cli.bench_compare:compare",
             },
         ),
-        "lab": CommandGroup(
-            "Compare and inspect models, and the network between the hosts; the rolling record.",
-            {
-                "trial": "lab.cli.trial:trial",
-                "compare": "lab.cli.compare:compare",
-                "inspect": "lab.cli.inspect:inspect",
-                "net": "lab.cli.net:net",
-                "serve": "lab.cli.serve:serve",
-                "rolling": "lab.cli.rolling:rolling",
-                "save": "lab.cli.rolling:save",
-            },
-        ),
+        "compare": "lab.cli.compare:compare",
+        "inspect": "lab.cli.inspect:inspect",
+        "net": "lab.cli.net:net",
+        "trial": "lab.cli.trial:trial",
     },
 }
 
@@ -309,7 +305,7 @@ COMPLETIONS: Mapping[str, Callable[[Any], Iterable[str]]] = {
     ),
     "model": lambda context: [*_profile(context).workers, *resources.names("models")],
     **dict.fromkeys(
-        ("worker", "workers", "lab compare.a", "lab compare.b"),
+        ("worker", "workers", "compare.a", "compare.b"),
         lambda context: _profile(context).workers,
     ),
     "host": lambda context: _profile(context).hosts,
@@ -324,7 +320,7 @@ def add_completion(parameter: Any, command: str) -> None:
     """Let the shell complete a parameter of the command of these words."""
     name = f"{command}.{parameter.name}"
     words = COMPLETIONS.get(name) or COMPLETIONS.get(parameter.name)
-    if words is None or name == "lab serve.host":  # an address
+    if words is None or name == "serve policy.host":  # an address
         return
 
     def complete(context: Any, incomplete: str) -> list[Candidate]:

@@ -209,7 +209,7 @@ class Host:
         files = (self.profile_file, worker_options, worker_arguments, self._also)
         commands = node_commands(profile, self.host, *files, dry_run=dry_run)
         if rolling is not None and "command" in part.nodes:
-            words = ("lab", ROLLING, "--folder", str(rolling), "--profile", str(self.profile_file))
+            words = ("node", ROLLING, "--folder", str(rolling), "--profile", str(self.profile_file))
             commands.append(NodeCommand(ROLLING, ROLLING, words))
         self.supervisor = Supervisor(
             commands,

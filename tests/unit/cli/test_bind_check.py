@@ -15,7 +15,7 @@ from vla_zenoh.lab.recording.writer import RecordingWriter
 from vla_zenoh.profile import Profile, load_profile, override, to_yaml
 from vla_zenoh.program.main import app
 
-SERVE = ("lab", "serve", "--worker", "no_such_model", "--port", "8123")
+SERVE = ("serve", "policy", "--worker", "no_such_model", "--port", "8123")
 VIEW = ("view", "--serve", "--port", "9123", "--seconds", "0.1")
 
 

@@ -56,7 +56,7 @@ def test_every_example_is_accepted_by_its_command(words: list[str], text: str) -
     assert shlex.split(text.splitlines()[-1])
 
 
-@pytest.mark.parametrize("path", [(), ("up",), ("lab",), ("secure", "init")], ids=str)
+@pytest.mark.parametrize("path", [(), ("up",), ("bench",), ("secure", "init")], ids=str)
 def test_help_has_neither_boxes_nor_colours(path: tuple[str, ...]) -> None:
     shown = CliRunner().invoke(app, [*path, "--help"], color=True).output
     assert not set("│╭╰─\x1b") & set(shown)
@@ -83,7 +83,7 @@ def complete(line: str, path: tuple[str, ...], name: str) -> list[str]:
         ("--profile panda_sim camera/fr", ("echo",), "key", "camera/front/jpeg"),
         ("panda_sim_lab ", ("profile", "check"), "host", "gpu"),
         ("panda_s", ("profile", "show"), "name", "panda_sim"),
-        ("", ("lab", "compare"), "b", "scripted"),
+        ("", ("compare",), "b", "scripted"),
         ("wr", ("node", "camera"), "cameras", "wrist"),
     ],
 )
@@ -93,7 +93,7 @@ def test_words_are_completed(line: str, path: tuple[str, ...], name: str, word: 
 
 
 def test_the_address_of_a_policy_server_is_no_host_of_a_lab() -> None:
-    assert complete("", ("lab", "serve"), "host") == []
+    assert complete("", ("serve", "policy"), "host") == []
 
 
 def test_every_profile_option_and_key_is_completed() -> None:

@@ -84,7 +84,7 @@ LINES = [
     ("web --bind 10.0.0.300", USAGE, "'10.0.0.300' is no address"),
     ("web --name lab:80", USAGE, "'lab:80' is no address"),
     ("view --serve --bind nosuch:5", USAGE, "'nosuch:5' is no address"),
-    ("lab serve --worker scripted --host 10.0.0.300", USAGE, "is no address"),
+    ("serve policy --worker scripted --host 10.0.0.300", USAGE, "is no address"),
     ("up panda_sim --listen tcp/10.0.0.300:7447", FAILED, "10.0.0.300 is no IPv4 address"),
     (f"status --host nosuch {TALKING}", FAILED, "has no host 'nosuch'"),
     (f"stop --host a/b {TALKING}", FAILED, "has no host 'a/b'"),
@@ -94,7 +94,7 @@ LINES = [
     (f"record --name a/b {TALKING}", USAGE, "cannot be part of a key"),
     ("check scripted --name a/b", USAGE, "cannot be part of a key"),
     (f"do run a/b {TALKING}", USAGE, "cannot be part of a key"),
-    (f"lab inspect a/b {TALKING}", USAGE, "cannot be part of a key"),
+    (f"inspect a/b {TALKING}", USAGE, "cannot be part of a key"),
     ("secure add a/b --role operator", USAGE, "cannot be part of a key"),
     (f"echo a//b {TALKING}", USAGE, "is no key"),
     (f"record --keys a//b {TALKING}", USAGE, "is no key"),
@@ -135,8 +135,8 @@ def test_a_bad_value_is_named_with_what_is_allowed(
         ("prompt", "  "),
         ("demo", "--prompt", ""),
         ("do", "run", "scripted", "--prompt", ""),
-        ("lab", "save", ""),
-        ("lab", "serve", "--worker", "scripted", "--api-key", ""),
+        ("save", ""),
+        ("serve", "policy", "--worker", "scripted", "--api-key", ""),
     ],
 )
 def test_an_empty_text_is_rejected_with_what_to_give(

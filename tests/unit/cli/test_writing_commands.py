@@ -24,20 +24,18 @@ READ = {
     "eval paths",
     "dataset export runs",
     "dataset stats folder",
-    "bench compare a",
-    "bench compare b",
     "bench sim replay",
-    "lab trial setups",
-    "lab trial unattended",
+    "trial setups",
+    "trial unattended",
     "teleop leader",
     "web people",
     "web certificate",
     "web key",
-    "lab compare file",
+    "compare file",
     "profile bridge-config certificates",  # a name on another computer
 }
 """Files and folders that commands read."""
-LOGS = {"up log_dir", "lab rolling folder"}
+LOGS = {"up log_dir", "node rolling folder"}
 """Folders of files that are appended to, and turned over."""
 CERTIFICATES = {"secure init folder", "secure here folder", "secure show folder"}
 """Folders whose files only ``secure add --renew`` replaces; see `tests/unit/security`."""
@@ -74,8 +72,8 @@ WRITERS = {
     "bench task": Writer("bench task --model hold", "out"),
     "bench sim": Writer("bench sim metaworld --worker scripted", "out"),
     "camera list": Writer("camera list", "out"),
-    "lab trial": Writer("lab trial --workers a --prompt go", "out"),
-    "lab inspect": Writer("lab inspect", "out"),
+    "trial": Writer("trial --workers a --prompt go", "out"),
+    "inspect": Writer("inspect", "out"),
     "secure init": Writer(
         "secure init --profile own.yaml --folder keys", "out.yaml", ("own.yaml",)
     ),
@@ -88,7 +86,7 @@ MORE = {
     "bench task": Writer("bench task --model hold --lockstep", "out"),
 }
 """The same commands in another mode."""
-CONTINUE = ("lab trial", "bench sim", "delay")
+CONTINUE = ("trial", "bench sim", "delay")
 """Their output is filled by several calls."""
 CONTINUING = [WRITERS[name] for name in CONTINUE if name in WRITERS]
 CASES = [*WRITERS.values(), *MORE.values()]

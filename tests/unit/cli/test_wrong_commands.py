@@ -122,7 +122,7 @@ WRONG: list[tuple[str, int, str]] = [
         "error: /absent.mcap cannot be read: No such file or directory",
     ),
     ("view /absent.mcap", FAILED, "error: /absent.mcap cannot be read: No such file or directory"),
-    ("bench compare /a /b", FAILED, "error: /a cannot be read: No such file or directory"),
+    ("compare /a /b", FAILED, "error: /a cannot be read: No such file or directory"),
     ("bench task --model nosuch", FAILED, "error: no model called 'nosuch'. Known: brick, groot,"),
     (
         "check nosuch",
@@ -151,8 +151,8 @@ WRONG: list[tuple[str, int, str]] = [
         FAILED,
         "error: profile panda_sim is not secured: run `vla-zenoh secure in",
     ),
-    ("lab compare", USAGE, "Missing argument 'a'"),
-    ("lab trial", USAGE, "Missing option '--output' / '-o'"),
+    ("compare", USAGE, "Missing argument 'a'"),
+    ("trial", USAGE, "Missing option '--output' / '-o'"),
     ("doctor --host desk", USAGE, "--host names a host of a profile: give --profile too"),
 ]
 WITHOUT_A_ROUTER = (

@@ -60,7 +60,7 @@ def recording(tmp_path: Path) -> Path:
 
 
 def test_their_difference_is_found(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    done = typed(capsys, "lab", "compare", "a", "b", str(recording), "--json")
+    done = typed(capsys, "compare", "a", "b", str(recording), "--json")
     assert done.code == 0, done.stderr
     found = json.loads(done.stdout)
     assert (found["pairs"], found["only_a"], found["only_b"]) == (PAIRS, 0, 0)
@@ -71,7 +71,7 @@ def test_their_difference_is_found(recording: Path, capsys: pytest.CaptureFixtur
 def test_a_worker_that_is_not_in_it_is_named_with_those_that_are(
     recording: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    done = typed(capsys, "lab", "compare", "a", "ghost", str(recording))
+    done = typed(capsys, "compare", "a", "ghost", str(recording))
     assert done.code == 1
     assert "has no chunks of 'ghost'; it has: a, b" in done.stderr
 

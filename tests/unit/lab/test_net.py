@@ -1,4 +1,4 @@
-"""What `vla-zenoh lab net` makes of what nodes say."""
+"""What `vla-zenoh net` makes of what nodes say."""
 
 from __future__ import annotations
 

@@ -326,7 +326,7 @@ def test_only_one_at_a_time_goes_on_with_a_trial(tmp_path: Path) -> None:
     begun(tmp_path)
     with (
         TrialFolder(tmp_path).lock(),
-        pytest.raises(RecordingError, match="another `vla-zenoh lab trial` is at work"),
+        pytest.raises(RecordingError, match="another `vla-zenoh trial` is at work"),
         TrialFolder(tmp_path).lock(),
     ):
         pass

@@ -1,4 +1,4 @@
-"""``vla-zenoh lab trial`` without a robot: what a person types, what is refused, and the report."""
+"""``vla-zenoh trial`` without a robot: what a person types, what is refused, and the report."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from vla_zenoh import plugins
 from vla_zenoh.bus.host import own_boot_id
 from vla_zenoh.client.client import Client
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.keys import NODE_KINDS
+from vla_zenoh.keys import NODE_KINDS, ROLLING
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.profile.robot import RobotProfile
 from vla_zenoh.profile.schema import NodeKind
@@ -58,7 +58,7 @@ def test_every_kind_of_node_may_stand_in_a_profile_and_every_robot_driver_is_one
 def test_every_kind_of_node_has_a_command() -> None:
     nodes = COMMANDS["Run"]["node"]
     assert isinstance(nodes, CommandGroup)
-    assert {*nodes.commands, "worker"} == set(NODE_KINDS)
+    assert {*nodes.commands, "worker"} == {*NODE_KINDS, ROLLING}
     assert "worker" in COMMANDS["Run"]
 
 

@@ -1,4 +1,4 @@
-"""vla-zenoh lab inspect: what a model got and what it answered."""
+"""vla-zenoh inspect: what a model got and what it answered."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def inspect(
 
 def _fail(target: RobotTarget, client: Client, worker: str | None) -> NoReturn:
     """End with the reason why no worker published an inference."""
-    words = ("lab", "inspect", *([] if worker is None else [worker]))
+    words = ("inspect", *([] if worker is None else [worker]))
     if "command" not in client.alive:
         fail(target.no_node(client, *words, kind="command node"))
     if why := target.not_operator(client.profile, *words):

@@ -1,4 +1,4 @@
-"""vla-zenoh lab net: round trips and clocks between hosts, and what each key costs."""
+"""vla-zenoh net: round trips and clocks between hosts, and what each key costs."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def net(
         own_links = tuple(sorted(str(link.dst) for link in client.session.info.links()))
         pairs = pairs_of(statuses, _own(clocks, statuses, own_links))
         lines = lines_of(statuses)
-        why = "" if statuses else target.no_node(client, "lab", "net")
+        why = "" if statuses else target.no_node(client, "net")
     bound_ms = bound_s * 1e3
     if as_json:
         print_json({"hosts": pairs, "keys": lines, "max_clock_offset_ms": bound_ms})

@@ -1,4 +1,4 @@
-"""vla-zenoh lab rolling, save: the rolling record that `up` keeps."""
+"""vla-zenoh node rolling, save: the rolling record that `up` keeps."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def rolling(
 ) -> None:
     """Keep the last minutes and a log of settings, as `up` does beside the command node.
 
-    At a stop, a fault, a rejected activation or `vla-zenoh lab save` the minutes are kept in a
+    At a stop, a fault, a rejected activation or `vla-zenoh save` the minutes are kept in a
     folder of their own. It runs at a low priority.
     """
     from vla_zenoh.lab.rolling.node import NICE, RingLimits, RollingRecord
@@ -63,7 +63,7 @@ def save(
     ] = "by hand",
 ) -> None:
     """Keep the last minutes of the rolling record, which `up` keeps, in a folder of their own."""
-    with target.operator("lab", "save", why) as client:
+    with target.operator("save", why) as client:
         if not client.wait_for(lambda: ROLLING in client.alive, HEARD_S):
             fail("no rolling record runs; `vla-zenoh up` keeps one beside the command node")
         client.publish(client.keys.save, why)

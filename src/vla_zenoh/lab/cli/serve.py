@@ -1,4 +1,4 @@
-"""vla-zenoh lab serve, serve mcp: a model for foreign clients, the robot for agents."""
+"""vla-zenoh serve policy, serve mcp: a model for foreign clients, the robot for agents."""
 
 from __future__ import annotations
 

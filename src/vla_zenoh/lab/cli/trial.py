@@ -1,4 +1,4 @@
-"""vla-zenoh lab trial: models on a real arm, judged by a person."""
+"""vla-zenoh trial: models on a real arm, judged by a person."""
 
 from __future__ import annotations
 
@@ -171,7 +171,7 @@ def _unattended(
         try:
             why = run_unattended(
                 trial,
-                lambda: target.operator("lab", "trial", "--output", str(output)),
+                lambda: target.operator("trial", "--output", str(output)),
                 plan_file.parent,
                 stop,
                 _warn,
@@ -217,7 +217,7 @@ def _run(
     errors().print(text, markup=False)
     person = TrialPerson(plan, sys.stdin.fileno(), stop, lays=yes_setup)
     try:
-        with target.operator("lab", "trial", "--output", str(folder.path)) as client:
+        with target.operator("trial", "--output", str(folder.path)) as client:
             return TrialRunner(client, plan, folder, person, stop).run()
     except Interrupted:
         done = score(plan, folder.episodes()).done

@@ -125,7 +125,7 @@ class TrialFolder:
             at = ".".join(map(str, fault["loc"]))
             raise RecordingError(
                 f"{self.path / where}: {at}{': ' if at else ''}{fault['msg']}; restore it as "
-                "`vla-zenoh lab trial` wrote it, or give another --output"
+                "`vla-zenoh trial` wrote it, or give another --output"
             ) from error
 
     # -- writing ------------------------------------------------------------------------------
@@ -140,7 +140,7 @@ class TrialFolder:
             self.path.mkdir(exist_ok=True)
             folder = lock_folder(self.path)
         if folder is None:
-            raise RecordingError(f"another `vla-zenoh lab trial` is at work in {self.path}")
+            raise RecordingError(f"another `vla-zenoh trial` is at work in {self.path}")
         try:
             yield
         finally:

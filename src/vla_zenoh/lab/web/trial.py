@@ -1,6 +1,6 @@
 """A trial that a person at a page runs and judges, blind to the model.
 
-It is `vla-zenoh lab trial` with buttons in place of lines: the same plan, order, folder and files.
+It is `vla-zenoh trial` with buttons in place of lines: the same plan, order, folder and files.
 """
 
 from __future__ import annotations
