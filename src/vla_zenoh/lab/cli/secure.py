@@ -170,7 +170,7 @@ def init(
     ] = None,
     folder: FolderOption = None,
     lab: Annotated[str, typer.Option("--lab", help="Name of the lab, in its certificates.")] = (
-        "vla-zenoh lab"
+        "our lab"
     ),
     at: Annotated[
         list[str] | None,
