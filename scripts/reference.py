@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import ast
 import inspect
+import json
 import re
 import sys
 import types
@@ -17,6 +18,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
@@ -26,10 +28,15 @@ from vla_zenoh_franka.check import BY_FCI, JOINTS
 import vla_zenoh
 from vla_zenoh.keys import KEY_PATHS
 from vla_zenoh.kinematics.kinematics import make_kinematics
+from vla_zenoh.lab.recording.record_types import RECORDS
+from vla_zenoh.policy import ModelSpec
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.profile.section import Section
 from vla_zenoh.program.main import app, examples
 from vla_zenoh.security.roles import OWN, TABLE
+from vla_zenoh.types import Cause, ClockReply, Header
+from vla_zenoh.types.form import described as in_words
+from vla_zenoh.types.form import form_of
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = ROOT / "docs" / "reference"
@@ -187,6 +194,47 @@ def keys_page() -> str:
         about = path.payload.replace("|", "\\|")
         rows.append(f"| `{text}` | {about} | {', '.join(writers)} | {', '.join(readers)} |")
     return "\n\n".join([*out, "\n".join(rows)]) + "\n"
+
+
+# -- records ------------------------------------------------------------------------------------
+def records_page() -> str:
+    """Every record that travels, its fields with their limits, and what they mean."""
+    out = ["# Records", MADE.strip()]
+    out.append(
+        "Each is a msgpack map with these names; [The wire](wire.md) says how it travels. A field "
+        "with a default may be left out. Poses are those of the tool centre point (TCP) in the "
+        "robot's base frame, quaternions are x, y, z, w; a twist is linear m/s, then angular "
+        "rad/s, a wrench N, then Nm, along the base frame's axes at the TCP. Times end in `_ns`: "
+        "nanoseconds since the Unix epoch. `wire/records.schema.json` is the same as a JSON "
+        "Schema. A `ModelSpec` is described in [Models](../how-to/models.md)."
+    )
+    for kind in (Header, ClockReply, Cause, *RECORDS):
+        if kind is ModelSpec:
+            continue
+        text, _, arguments = inspect.cleandoc(kind.__doc__ or "").partition("\n\nArgs:\n")
+        meanings = field_meanings(arguments)
+        rows = ["| field | on the wire | default | meaning |", "|---|---|---|---|"]
+        for field in msgspec.inspect.type_info(form_of(kind).struct).fields:
+            empty = field.default_factory is not msgspec.NODEFAULT
+            given = "{}" if empty else "" if field.required else json.dumps(field.default)
+            meaning = meanings.get(field.name, "")
+            rows.append(f"| `{field.name}` | {in_words(field.type)} | {given} | {meaning} |")
+        out += [f"## {kind.__name__}", text, "\n".join(rows)]
+    return "\n\n".join(out) + "\n"
+
+
+def field_meanings(arguments: str) -> dict[str, str]:
+    """Field -> text of the lines below ``Args:``, where several fields may share one."""
+    found: dict[str, str] = {}
+    names: list[str] = []
+    for line in arguments.splitlines():
+        start = re.match(r"    (\w+(?:, \w+)*): ?(.*)", line)
+        if start:
+            names = start[1].split(", ")
+            found |= dict.fromkeys(names, start[2])
+        else:
+            found |= {name: f"{found[name]} {line.strip()}" for name in names}
+    return found
 
 
 # -- commands -----------------------------------------------------------------------------------
@@ -479,6 +527,7 @@ def _unit(name: str) -> str:
 PAGE_OF = {
     "profile.md": profile_page,
     "keys.md": keys_page,
+    "records.md": records_page,
     "cli.md": cli_page,
     "counters.md": counters_page,
     "franka-limits.md": franka_limits_page,
