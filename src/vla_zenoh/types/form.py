@@ -173,7 +173,7 @@ class Form:
                 path += f".{name}" if path else name
                 value, node = _item(value, name), _field(node, name)
             elif index == "...":
-                entry = self._wrong_entry(fields, path, value)
+                entry = self._wrong_entry(path, value)
                 path += f".{entry}"
                 value, node = _item(value, entry), _inner(node)
                 break
@@ -186,13 +186,14 @@ class Form:
             return f"{path} lacks {what.split('`')[1]}"
         return f"{path} is {shown(value)}, allowed: {described(node)}"
 
-    def _wrong_entry(self, fields: Mapping[str, Any], field: str, entries: Any) -> str:
+    def _wrong_entry(self, field: str, entries: Any) -> str:
         """Name of the entry of a map that is not allowed."""
-        for name, value in entries.items():
+        for name, value in entries.items() if isinstance(entries, Mapping) else ():
             try:
-                self._decoder.decode(encode_plain({**fields, field: {name: value}}))
-            except MsgspecError:
-                return name
+                self._decoder.decode(encode_plain({field: {name: value}}))
+            except MsgspecError as error:  # also that other fields are missing
+                if f"$.{field}" in str(error):
+                    return name
         return "..."
 
 

@@ -416,6 +416,19 @@ def test_an_error_message_stays_short_whatever_is_in_the_field() -> None:
         assert len(str(caught.value)) < 1000
 
 
+def test_a_map_with_an_entry_that_is_not_even_text_is_rejected_by_its_field() -> None:
+    payload = forged(STATUS, latency_ms={"z": "12345678"}).replace(b"12345678", b"\xff" * 8)
+    with pytest.raises(CodecError, match=r"NodeStatus: latency_ms\.\.\.\. is"):
+        records.decode(NodeStatus, payload)
+
+
+def test_the_wrong_entry_is_named_beside_another_field_that_is_too_large_to_show() -> None:
+    large = {str(n): "x" * 1000 for n in range(100)}
+    payload = forged(STATUS, detail=large, rates_hz={"good": 1.0, "bad": float("nan")})
+    with pytest.raises(CodecError, match=r"NodeStatus: rates_hz\.bad is nan"):
+        records.decode(NodeStatus, payload)
+
+
 def test_an_oversize_record_is_refused_before_it_is_read() -> None:
     payload = b"\xdf" + b"\xff" * (records.MAX_RECORD_BYTES + 1)
     with pytest.raises(CodecError) as caught:
