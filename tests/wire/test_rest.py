@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from chain import Chain, running_chain, write_profile
+from chain import LONG_PATIENCE_S, Chain, running_chain, write_profile
 
 from vla_zenoh.nodes.command.node import REST_S
 
@@ -89,8 +89,9 @@ def test_at_700_hz_chunks_are_planned_after_the_ticks_and_the_arm_goes_as_far(
     tmp_path: Path,
 ) -> None:
     base = tmp_path / "base.yaml"
-    base.write_text("extends: panda_sim\ntiming: {command_hz: 700}\n")
-    fast = write_profile(tmp_path, extends=str(base))
+    # Nobody falls silent here, and at this rate the nodes fill a small computer: it may be late.
+    base.write_text("extends: panda_sim\ntiming: {command_hz: 700, watchdog_s: 1.0}\n")
+    fast = write_profile(tmp_path, extends=str(base), patience_s=LONG_PATIENCE_S)
     with running_chain(tmp_path, profile_file=fast) as chain:
         chain.activate_when_ready()
         assert chain.go("up", 10) == pytest.approx(0.1, abs=0.005)
