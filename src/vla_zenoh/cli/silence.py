@@ -22,6 +22,22 @@ def _say_unheard() -> None:
     print(line if "--json" in sys.argv else UNHEARD, flush=True)
 
 
-silence = threading.Timer(SILENCE_S, _say_unheard)
-"""Runs during the slow imports of `vla-zenoh stop`; its first line cancels it."""
-silence.daemon = True
+class Silence:
+    """Runs during the slow imports of `vla-zenoh stop`; its first line cancels it."""
+
+    def __init__(self) -> None:
+        self._timer: threading.Timer | None = None
+
+    def start(self) -> None:
+        """Say that nobody answered in `SILENCE_S`, unless it is cancelled before."""
+        self._timer = threading.Timer(SILENCE_S, _say_unheard)
+        self._timer.daemon = True
+        self._timer.start()
+
+    def cancel(self) -> None:
+        """Say nothing; also where it was not started."""
+        if self._timer is not None:
+            self._timer.cancel()
+
+
+silence = Silence()

@@ -150,8 +150,11 @@ def test_a_wrong_file_of_intrinsics_is_named(tmp_path: Path, text: str, why: str
 @pytest.mark.parametrize(
     ("fields", "why"),
     [
-        ({"source": "sim:front", "flip": "both"}, "flip: is set, and works with v4l2:, realsense:"),
-        ({"source": "rtsp://a/b", "exposure_us": 100.0}, "works with v4l2:, realsense: only"),
+        (
+            {"source": "sim:front", "flip": "both"},
+            "flip: is set, and works with file:, realsense:, rtsp:, rtsps:, v4l2: only",
+        ),
+        ({"source": "rtsp://a/b", "exposure_us": 100.0}, "works with realsense:, v4l2: only"),
         ({"source": "v4l2:0", "depth_unit_m": 0.001}, "v4l2: measures no depth"),
         ({"source": "v4l2:0", "undistort": True}, "undistort needs the file with the lens"),
     ],
