@@ -15,6 +15,8 @@ WHICH := not long
 # Real arms brake when their computer stands still for a tenth of a second, and so do those of the tests: one that
 # fails in real time is tried twice more, and told in the summary.
 AGAIN := --reruns 2 -r fEsR
+# What fails then is tried once more at the end, when whatever kept the computer busy may be over.
+AT_THE_END := --last-failed --last-failed-no-failures none --reruns 0 -r fEs
 # Where a container forbids Python to keep what it has compiled, every process of every test would compile it anew.
 export PYTHONDONTWRITEBYTECODE :=
 
@@ -41,7 +43,8 @@ AT_ONCE := $(shell $(PYTHON) -c 'import os; print(1 if os.cpu_count() < 4 else 2
 FILES := --max-worker-restart 0 --dist loadfile --no-loadscope-reorder
 test: $(READY) ## Run the tests that take up to six seconds each
 	$(BIN)/python -m pytest -n auto $(FILES) -m "$(SUITE) and $(WHICH) and not realtime" $(ARGS) || [ $$? = 5 ]
-	$(BIN)/python -m pytest -n $(AT_ONCE) $(FILES) $(AGAIN) -m "$(SUITE) and $(WHICH) and realtime" $(ARGS) || [ $$? = 5 ]
+	$(BIN)/python -m pytest -n $(AT_ONCE) $(FILES) $(AGAIN) -m "$(SUITE) and $(WHICH) and realtime" $(ARGS) || [ $$? = 5 ] || \
+		$(BIN)/python -m pytest $(AT_THE_END) -m "$(SUITE) and $(WHICH) and realtime" $(ARGS)
 
 test-long: $(READY) ## Run those that take longer, too, and the files of many whole robots
 	@$(MAKE) --no-print-directory test WHICH=long
@@ -60,9 +63,12 @@ soak: $(READY) ## Run the whole chain with random faults; MINUTES=3 for a short 
 
 # Of ROS 2 itself the distribution jazzy and what is quick; everything with ALL=1.
 DISTRIBUTIONS := jazzy $(if $(ALL),kilted)
+RCLPY := rclpy$(if $(ALL),, and not slow)
 test-ros2: $(READY) ros2-bridge ros2-environment ## Run the tests with a real ROS 2 bridge, a DDS robot and ROS 2's rclpy; ALL=1 for all
-	$(BIN)/python -m pytest $(AGAIN) -m ros2 $(ARGS) || [ $$? = 5 ]
-	ROS2_DISTRIBUTIONS="$(DISTRIBUTIONS)" $(BIN)/python -m pytest $(AGAIN) -m "rclpy$(if $(ALL),, and not slow)" $(ARGS) || [ $$? = 5 ]
+	$(BIN)/python -m pytest $(AGAIN) -m ros2 $(ARGS) || [ $$? = 5 ] || \
+		$(BIN)/python -m pytest $(AT_THE_END) -m ros2 $(ARGS)
+	ROS2_DISTRIBUTIONS="$(DISTRIBUTIONS)" $(BIN)/python -m pytest $(AGAIN) -m "$(RCLPY)" $(ARGS) || [ $$? = 5 ] || \
+		ROS2_DISTRIBUTIONS="$(DISTRIBUTIONS)" $(BIN)/python -m pytest $(AT_THE_END) -m "$(RCLPY)" $(ARGS)
 
 test-franka: $(READY) ## Run the tests of the driver franka against franka-sim, in an environment of its own
 	$(BIN)/python scripts/test_franka.py $(AGAIN) $(ARGS)

@@ -438,7 +438,10 @@ class Chain:
         """What happened, for the message of a test that fails."""
         news = [f"  {node} {e.what}: {e.why}" for node, _, e in list(self.client.events)[-12:]]
         lines = [f"  {node} | {line}" for node, line in self.lines[-25:]]
-        states = {name: found.state for name, (found, _, _) in self.client.snapshot().items()}
+        states = {
+            name: (found.state, dict(found.rates_hz), dict(found.latency_ms))
+            for name, (found, _, _) in self.client.snapshot().items()
+        }
         newest = self.recorder.newest_state()  # not `measured`, which waits, and tells this
         z_m = f"{newest.position_m[2] if newest else np.nan:.3f} m, at {self.client.task}"
         refused = {name: count for name, count in self.refused().items() if count}

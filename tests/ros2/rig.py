@@ -41,6 +41,10 @@ ros2:
   services: true
   cameras: {{wrist: null}}
 """
+PATIENT = """\
+timing: {command_timeout_s: 0.25, state_timeout_s: 0.35, watchdog_s: 1.0}
+"""
+"""For tests that measure no brake: a busy computer makes the arm brake again and again."""
 APART = """\
   connect: ["{endpoint}"]
 """
@@ -163,6 +167,7 @@ def running_lab(
     topology: Topology = "beside",
     state_hz: int = STATE_HZ,
     watch_goals: bool = True,
+    timing: str = "",
 ) -> Iterator[Lab]:
     """Everything up while the block lasts.
 
@@ -174,6 +179,7 @@ def running_lab(
             ``apart``: it is one, but only the node ``ros2`` speaks to it, and we have our own.
         state_hz: rate of the robot's joint states.
         watch_goals: the witness listens to what the robot is told, too.
+        timing: YAML of this section; empty as shipped.
     """
     domain, ours = free_domain(), free_endpoint()
     theirs = free_endpoint() if topology == "apart" else ours
@@ -182,7 +188,7 @@ def running_lab(
     text = PROFILE.format(**sizes, endpoint=ours, domain=domain)
     if topology == "apart":
         text += APART.format(endpoint=theirs)
-    profile.write_text(text)
+    profile.write_text(text + timing)
     pictures = ("--width", WIDTH, "--height", HEIGHT, "--camera-hz", CAMERA_HZ)
     with ExitStack() as stack:
         settings = generated(profile, beside=topology == "beside")

@@ -22,9 +22,9 @@ STEPS, STEP_M, WAY_TOLERANCE_M = 10, 0.01, 0.002
 
 
 def test_joint_states_at_30_hz_are_enough(tmp_path: Path, bridge_program: Path) -> None:
-    from rig import running_lab
+    from rig import PATIENT, running_lab
 
-    with running_lab(tmp_path, bridge_program, state_hz=STATE_HZ) as lab:
+    with running_lab(tmp_path, bridge_program, state_hz=STATE_HZ, timing=PATIENT) as lab:
         lab.chain.activate_when_ready()
         began_m = lab.activate_at_rest()
         lab.chain.go("up", STEPS)
@@ -36,9 +36,9 @@ def test_the_settings_of_the_bridge_let_through_what_is_needed_and_nothing_else(
     tmp_path: Path, bridge_program: Path
 ) -> None:
     from panda_robot import CURRENT_POSE
-    from rig import running_lab
+    from rig import PATIENT, running_lab
 
-    with running_lab(tmp_path, bridge_program) as lab:
+    with running_lab(tmp_path, bridge_program, timing=PATIENT) as lab:
         set_active = lab.witness.node.client(
             "/vla/set_active", ros.SetBoolRequest, ros.SetBoolResponse
         )
@@ -67,9 +67,9 @@ def test_the_settings_of_the_bridge_let_through_what_is_needed_and_nothing_else(
 def test_a_robot_whose_controller_does_not_listen_is_not_activated(
     tmp_path: Path, bridge_program: Path
 ) -> None:
-    from rig import running_lab
+    from rig import PATIENT, running_lab
 
-    with running_lab(tmp_path, bridge_program, watch_goals=False) as lab:
+    with running_lab(tmp_path, bridge_program, watch_goals=False, timing=PATIENT) as lab:
         lab.chain.activate_when_ready()
         lab.move()
         lab.robot.switch_controller()
