@@ -1,15 +1,17 @@
 # Every target sets up ./.venv by itself. Needed from the system: make and Python 3.11 or newer.
 # Another interpreter: make setup PYTHON=python3.12        Options for a command: make test ARGS="-k brake"
-# Less to install: make demo EXTRAS=all, without viewer, page, gamepads and what only tests and benchmarks need.
+# `make demo` installs what the demo needs, the other targets everything.
 
 PYTHON ?= python3
 EXTRAS ?= all,dev
+DEMO_EXTRAS ?= brick,sim
 ARGS ?=
 SECONDS ?= 60
 MINUTES ?= 60
 BIN := .venv/bin
 COMMA := ,
 READY := .venv/.ready-$(subst $(COMMA),-,$(EXTRAS))
+DEMO_READY := .venv/.ready-$(subst $(COMMA),-,$(DEMO_EXTRAS))
 SUITE := not slow and not models and not ros2 and not rclpy and not franka
 WHICH := not long
 # Real arms brake when their computer stands still for a tenth of a second, and so do those of the tests: one that
@@ -32,7 +34,12 @@ $(READY): pyproject.toml constraints.txt scripts/bootstrap.py $(wildcard plugins
 	@$(PYTHON) scripts/bootstrap.py $(EXTRAS)
 	@touch $@
 
-demo: $(READY) ## Simulator, model and command node at work, no GPU needed
+$(DEMO_READY): pyproject.toml constraints.txt scripts/bootstrap.py $(wildcard plugins/*/pyproject.toml)
+	@$(PYTHON) scripts/bootstrap.py $(DEMO_EXTRAS)
+	@touch $@
+
+# Nothing to install where everything is there already.
+demo: $(if $(wildcard $(READY)),$(READY),$(DEMO_READY)) ## Simulator, model and command node at work, no GPU needed
 	$(BIN)/vla-zenoh demo $(ARGS)
 
 # Files that depend on time run one at a time, two where there are four cores or more: one robot with its camera, model and

@@ -32,6 +32,7 @@ OLDEST_PYTHON = (3, 11)
 OLDEST_UV = (0, 8)
 
 EVERYTHING = "all,dev"
+SIZES_GB = {EVERYTHING: 2.7, "brick,sim": 1.5}
 
 OPENMP = "libgomp.so.1"
 """Pinocchio needs it and no wheel of ours brings it; a bare Debian has no package that does."""
@@ -207,7 +208,7 @@ def main() -> None:
         fail("a part of the system is missing. On Debian and Ubuntu: sudo apt install " + packages)
     uv = uv or install_uv()
     make_venv(uv)
-    size = " (once; 2.7 GB on disk)" if extras == EVERYTHING else ""
+    size = f" (once; {SIZES_GB[extras]} GB on disk)" if extras in SIZES_GB else ""
     say(f"installing the package with the extras {extras} into .venv{size}")
     quiet = [] if sys.stderr.isatty() else ["--quiet"]
     target = ["--python", VENV / "bin" / "python", "--constraint", CONSTRAINTS]
