@@ -22,12 +22,15 @@ MAX_SIDE = 8192
 MAX_PIXELS = 8192 * 4096
 """A few forged bytes of JPEG can ask for this many pixels; three bytes of memory each."""
 MAX_JPEG_BYTES = 32 * 1024 * 1024
+MAX_SCANS = 100
+"""Progressive files have about ten, of a few bytes each, and each is a pass over all pixels."""
 MAX_IMAGE_BYTES = 3 * MAX_PIXELS
 """Of an image in any form."""
 DEFAULT_JPEG_QUALITY = 90
 MAX_PNG_BYTES = 64 * 1024 * 1024
 
 PNG_BEGINS, PNG_ENDS = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
+_PIXEL_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
 _GREY_16 = bytes((16, 0, 0, 0, 0))
 """Bits, colour type, compression, filter and interlace of a PNG's first chunk."""
 # For noisy camera images: the fastest setting, and the smallest file.
@@ -84,6 +87,9 @@ def decode_jpeg(payload: bytes) -> Image:
     if payload.rstrip(b"\0")[-2:] != b"\xff\xd9":
         raise CodecError("truncated", "a JPEG file without its end")
     check_size(*_jpeg_size(payload))
+    scans = payload.count(b"\xff\xda")
+    if scans > MAX_SCANS:
+        raise CodecError("invalid", f"a JPEG file of {scans} scans, at most {MAX_SCANS}")
     return _rgb(payload, "JPEG")
 
 
@@ -94,7 +100,21 @@ def decode_png(payload: bytes) -> Image:
     if len(payload) < 24 or not payload.startswith(PNG_BEGINS):
         raise CodecError("malformed", "not a PNG file")
     _checked_png_size(payload)
-    return _rgb(payload, "PNG")
+    return _rgb(_pixels_of_png(payload), "PNG")
+
+
+def _pixels_of_png(payload: bytes) -> bytes:
+    """A PNG file without its ancillary chunks: texts and colour profiles may unpack to gigabytes,
+    and animations hold further images."""
+    kept, at = [PNG_BEGINS], len(PNG_BEGINS)
+    while at < len(payload):
+        end = at + 12 + int.from_bytes(payload[at : at + 4], "big")
+        if end > len(payload):
+            raise CodecError("malformed", "not a PNG file that can be decoded: a chunk is cut off")
+        if payload[at + 4 : at + 8] in _PIXEL_CHUNKS:
+            kept.append(payload[at:end])
+        at = end
+    return b"".join(kept)
 
 
 def _checked_png_size(payload: bytes) -> tuple[int, int]:
@@ -162,7 +182,7 @@ def decode_png16(payload: bytes) -> NDArray[np.uint16]:
     size = _checked_png_size(payload)
     if payload[24:29] != _GREY_16:
         raise CodecError("invalid", "a depth image is a PNG file of one channel of 16 bits")
-    counts = _pixels(payload, "PNG", cv2.IMREAD_UNCHANGED)
+    counts = _pixels(_pixels_of_png(payload), "PNG", cv2.IMREAD_UNCHANGED)
     if counts is None or counts.shape != size or counts.dtype != np.uint16:
         raise CodecError("malformed", "not a PNG file that can be decoded as depth")
     return np.asarray(counts, np.uint16)

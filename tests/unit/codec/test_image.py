@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import struct
 import subprocess
 import sys
 import textwrap
+import time
+import zlib
 
 import cv2
 import numpy as np
@@ -14,6 +17,7 @@ from hypothesis import strategies as st
 from random_records import images, refusal
 
 from vla_zenoh.codec import image
+from vla_zenoh.codec.image import MAX_SCANS, PNG_BEGINS, decode_jpeg, decode_png, decode_png16
 from vla_zenoh.errors import CodecError
 from vla_zenoh.types import Image
 
@@ -201,3 +205,46 @@ def test_a_picture_that_nobody_would_read_is_not_written() -> None:
     long = Image(np.broadcast_to(np.zeros(3, np.uint8), (1, image.MAX_SIDE + 1, 3)))
     with pytest.raises(CodecError, match=f"sides are 1 to {image.MAX_SIDE}"):
         image.encode_jpeg(long)
+
+
+def test_a_progressive_jpeg_of_endless_scans_is_refused_before_it_is_decoded() -> None:
+    pixels = np.zeros((16, 16, 3), np.uint8)
+    _, made = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])
+    data = made.tobytes()
+    assert decode_jpeg(data).rgb.shape == (16, 16, 3)
+    last_scan = data[data.rfind(b"\xff\xda") : -2]
+    with pytest.raises(CodecError, match="scans, at most"):
+        decode_jpeg(data[:-2] + MAX_SCANS * last_scan + data[-2:])
+
+
+def png_of(*chunks: tuple[bytes, bytes]) -> bytes:
+    made = [PNG_BEGINS]
+    for name, data in chunks:
+        crc = zlib.crc32(name + data)
+        made.append(struct.pack(">I", len(data)) + name + data + struct.pack(">I", crc))
+    return b"".join(made)
+
+
+UNPACKED_BYTES, PATIENCE_S = 7 * 2**20, 2.0
+BOMB = zlib.compress(bytes(UNPACKED_BYTES), 9)
+
+
+@pytest.mark.parametrize("chunk", [(b"zTXt", b"a\0\0" + BOMB), (b"iTXt", b"a\0\1\0\0\0" + BOMB)])
+def test_texts_in_a_png_that_unpack_to_gigabytes_are_not_unpacked(
+    chunk: tuple[bytes, bytes],
+) -> None:
+    head = (b"IHDR", struct.pack(">IIBBBBB", 4, 2, 16, 0, 0, 0, 0))
+    pixels = (b"IDAT", zlib.compress(bytes(2 * 9)))
+    data = png_of(head, *[chunk] * 500, pixels, (b"IEND", b""))
+    began_s = time.process_time()
+    assert decode_png16(data).shape == (2, 4)
+    assert decode_png(data).rgb.shape == (2, 4, 3)
+    assert time.process_time() - began_s < PATIENCE_S
+
+
+def test_an_animated_png_is_its_still_image() -> None:
+    head = (b"IHDR", struct.pack(">IIBBBBB", 4, 2, 16, 0, 0, 0, 0))
+    animation = (b"acTL", struct.pack(">II", 2, 0))
+    frame = (b"fcTL", struct.pack(">IIIIIHHBB", 0, 4, 2, 0, 0, 1, 1, 0, 0))
+    with pytest.raises(CodecError, match="decoded"):
+        decode_png16(png_of(head, animation, frame, (b"IDAT", b""), (b"IEND", b"")))
