@@ -257,7 +257,8 @@ class Timing(Section):
         state_hz: rate of the simulated robot's state; a real robot has its own.
         watchdog_s: the arm brakes and holds if no new chunk arrives for this long after the last
             one ran out.
-        max_hold_s: after holding for this long the arm needs a new activation.
+        max_hold_s: an arm that has held for this long does not move again by itself: it needs a new
+            activation.
         state_timeout_s: older robot state brakes the arm, which then needs a new activation.
         command_timeout_s: the robot brakes by itself if the command stream is silent for this long.
         max_observation_age_s: a chunk inferred from an older observation is rejected.
@@ -272,7 +273,7 @@ class Timing(Section):
     command_hz: float = Field(default=250.0, ge=50, le=1000)
     state_hz: float = Field(default=200.0, ge=20, le=1000)
     watchdog_s: float = Field(default=0.3, ge=0.02, le=5)
-    max_hold_s: float = Field(default=60.0, ge=1, le=3600)
+    max_hold_s: float = Field(default=10.0, ge=1, le=3600)
     state_timeout_s: float = Field(default=0.15, ge=0.02, le=2)
     command_timeout_s: float = Field(default=0.1, ge=0.01, le=1)
     max_observation_age_s: float = Field(default=1.0, gt=0, le=10)

@@ -185,6 +185,16 @@ def test_an_arm_that_holds_for_long_needs_activation_again() -> None:
     np.testing.assert_allclose(rig.moved_m(), [0, 0, STEP_M], atol=AT_GOAL_M)
 
 
+def test_by_default_an_arm_that_held_for_10_s_does_not_move_by_itself() -> None:
+    rig = Rig()
+    rig.activate()
+    rig.send([UP])
+    rig.run(9.0)
+    assert rig.state == "holding"
+    rig.run(3.0)
+    assert rig.state == "inactive"
+
+
 def test_a_chunk_whose_observation_does_not_show_the_last_chunk_replaces_it() -> None:
     rig = Rig()
     rig.activate()
