@@ -1,13 +1,17 @@
-"""A worker that still imports its model is in the status, and so is that it failed."""
+"""What is starting is in the status, and commands wait for it."""
 
 from __future__ import annotations
 
+import json
+import signal
 import subprocess
 import sys
 from pathlib import Path
+from subprocess import DEVNULL, PIPE
 
 import pytest
 import zenoh
+from chain import LONG_PATIENCE_S, write_profile
 
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.client.client import Client
@@ -41,3 +45,31 @@ def test_a_worker_that_imports_its_model_is_starting_and_then_crashed(tmp_path: 
                 assert client.wait_for(lambda: has(CRASHED), 30.0)
             finally:
                 worker.kill()
+
+
+@pytest.mark.long
+def test_commands_that_are_typed_before_up_wait_for_it(tmp_path: Path) -> None:
+    path = write_profile(tmp_path, patience_s=LONG_PATIENCE_S)
+    words = [sys.executable, "-m", "vla_zenoh"]
+    script = f"""
+import vla_zenoh
+with vla_zenoh.connect({str(path)!r}) as robot:
+    print(robot.set_speed(50).speed_percent)
+"""
+    with (
+        subprocess.Popen([sys.executable, "-c", script], stdout=PIPE, stderr=PIPE, text=True) as py,
+        subprocess.Popen(
+            [*words, "activate", "--json", "--profile", str(path)], stdout=PIPE, text=True
+        ) as activation,
+        subprocess.Popen([*words, "up", str(path)], stdout=DEVNULL, stderr=DEVNULL) as up,
+    ):
+        try:
+            answer = json.loads(activation.communicate(timeout=60)[0])
+            said, logged = py.communicate(timeout=60)
+        finally:
+            up.send_signal(signal.SIGINT)
+            up.wait(30)
+    assert answer["ok"], answer
+    assert "waiting, at most 20 s: no Zenoh router answers" in answer["warnings"][0]
+    assert said == "50.0\n", logged
+    assert "waiting, at most 20 s: no Zenoh router answers" in logged

@@ -7,31 +7,25 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
-from functools import partial, wraps
+from functools import wraps
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
 from vla_zenoh.cli.options import AnswerOption, options
-from vla_zenoh.cli.plain import fail, json_answer, say, warn
+from vla_zenoh.cli.plain import fail, json_answer, say
 from vla_zenoh.cli.target import OWN_STOP, RobotTarget
-from vla_zenoh.errors import CodecError, SecurityError, SessionError, StartingError, nearest
-from vla_zenoh.keys import CRASHED, STARTING, worker_node
+from vla_zenoh.client.client import ABSENT_PATIENCE_S, Client
+from vla_zenoh.errors import CodecError, SecurityError, nearest
+from vla_zenoh.keys import CRASHED, worker_node
 
 if TYPE_CHECKING:
-    from vla_zenoh.client.client import Client
     from vla_zenoh.types import Task
 
 PATIENCE_S = 3.0
 DISCOVERY_S, POLL_S = 1.0, 0.05
 """A router's first answers may lack robots that are alive: `stop --all` asks for this long."""
 MODE_PATIENCE_S = 1.0
-ABSENT_PATIENCE_S = 1.5
-"""A command node that is alive may take this long to appear."""
-START_PATIENCE_S, START_PERIOD_S = 20.0, 0.5
-"""How long `activate` waits for what is still starting, and how often it tries."""
-SILENT_S = 2.0
-"""The command node publishes its status twice a second."""
 LEAVING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
 
 
@@ -80,42 +74,18 @@ def activate(
 ) -> None:
     """Let the worker move the arm. Rejected with every reason while something is not ready.
 
-    While the only reasons are that nodes, cameras or the model are starting, it waits up to 20 s.
+    While the only reasons are that router, nodes, cameras or the model are starting, it waits up to
+    20 s, as do the other commands that need the command node.
     """
     from vla_zenoh.runtime.process import stop_on_signals
 
     with target.operator("activate") as client:
         stop = stop_on_signals() if held else None
-        hold = partial(client.activate_with_deadman, "person")
-        task = patiently(client, client.activate if stop is None else hold)
+        task = client.activate() if stop is None else client.activate_with_deadman("person")
         what = f"worker {task.worker}, prompt {task.prompt!r}, {task.rate_hz:g} Hz"
         _show(target, client, f"{_mode(client)} | active: {what}")
         if stop is not None:
             _hold(target, client, task, stop)
-
-
-def patiently(client: Client, activate: Callable[[], Task]) -> Task:
-    """Activate; wait while it is rejected only because something is still starting."""
-    give_up_s, shown = time.monotonic() + START_PATIENCE_S, ""
-    while True:
-        try:
-            return activate()
-        except SessionError as error:
-            starts = isinstance(error, StartingError) or are_starting(client)
-            if not starts or time.monotonic() > give_up_s:
-                raise
-            if str(error) != shown:
-                shown = str(error)
-                warn(f"waiting, at most {START_PATIENCE_S:g} s: {shown}")
-            time.sleep(START_PERIOD_S)
-
-
-def are_starting(client: Client) -> bool:
-    """Whether a node of the profile is starting, by its host's `up`."""
-    return any(
-        name in client.expected and not alive and status.state == STARTING and age_s < SILENT_S
-        for name, (status, age_s, alive) in client.snapshot().items()
-    )
 
 
 def _mode(client: Client) -> str:
@@ -183,8 +153,9 @@ def use(
 
 def _require_worker(client: Client, worker: str) -> None:
     """Exit with the list of live workers if `worker` is not among them: it may be mistyped."""
-    found = client.wait_for(lambda: worker_node(worker) in client.alive, ABSENT_PATIENCE_S)
-    if not found and "command" in client.alive:  # otherwise that is reported
+    if (
+        not client.await_start(worker_node(worker)) and "command" in client.alive
+    ):  # otherwise that is reported
         named = worker_node("")
         alive = sorted(name[len(named) :] for name in client.alive if name.startswith(named))
         said = client.status(worker_node(worker))

@@ -8,12 +8,11 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 import zenoh
 
-from vla_zenoh.bus.session import open_session
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
     PROFILE_VARIABLE,
@@ -23,14 +22,11 @@ from vla_zenoh.cli.options import (
     effective_profile,
 )
 from vla_zenoh.cli.plain import warn
+from vla_zenoh.client.client import ANSWER_S, START_PATIENCE_S, Client, open_patiently
 from vla_zenoh.errors import SecurityError, SessionError
 from vla_zenoh.profile import Profile, as_robot
 from vla_zenoh.security.roles import Role, operator_role
 from vla_zenoh.security.store import local_role, operator_hosts
-
-if TYPE_CHECKING:
-    from vla_zenoh.client.client import Client
-
 
 SILENCE_S = 0.8
 OWN_STOP = "The arm may still be moving: use the robot's own emergency stop"
@@ -77,14 +73,15 @@ class RobotTarget:
             SecurityError: there is no certificate.
             SessionError: no router answers.
         """
-        return _first(_choices(profile, stop=True))
+        return _first(_choices(profile, stop=True))[:2]
 
     @contextmanager
-    def client(self, *, stop: bool = False) -> Iterator[Client]:
+    def client(self, *, stop: bool = False, wait_s: float = 0.0) -> Iterator[Client]:
         """A connected client that will know the nodes in a moment.
 
         Args:
             stop: prefer a certificate that may stop the robot, and try every one.
+            wait_s: for a router, and of settings for nodes, that are starting.
 
         Raises:
             ProfileError: the profile is invalid.
@@ -98,31 +95,33 @@ class RobotTarget:
         if stop:
             alarm.start()
         try:
-            profile, session = _first(choices)
+            profile, session, cold = _first(choices, wait_s)
         except SessionError as error:
             raise SessionError(f"{error}. {OWN_STOP}") if stop else error from error
         finally:
             alarm.cancel()
         with session:
-            from vla_zenoh.client.client import Client
-
-            yield Client(profile, session).subscribe()
+            patience_s = max(wait_s, ANSWER_S)
+            yield Client(profile, session, patience_s=patience_s, tell=warn, cold=cold).subscribe()
 
     @contextmanager
     def operator(self, *command: str) -> Iterator[Client]:
         """A connected client that may change settings; errors name the robot and the others.
 
+        It waits for a router and a command node that are starting, at most `START_PATIENCE_S`.
+
         Raises:
             SecurityError: the certificate here is not an operator's.
             SessionError: the session or the block failed.
         """
-        with self.client() as client:
+        with self.client(wait_s=START_PATIENCE_S) as client:
             if why := self.not_operator(client.profile, *command):
                 raise SecurityError(why)
+            client.await_start("command")
             try:
                 yield client
             except SessionError as error:
-                if "command" in client.alive:
+                if "command" in client.alive or client.starting():
                     raise
                 raise SessionError(self.no_node(client, *command, kind="command node")) from error
 
@@ -184,12 +183,14 @@ def _with_host(profile: Profile, host: str | None) -> Profile:
     return profile.model_copy(update={"session": session})
 
 
-def _first(choices: Sequence[Profile]) -> tuple[Profile, zenoh.Session]:
-    """A session with the first certificate that the router accepts, or the first one's error."""
+def _first(choices: Sequence[Profile], wait_s: float = 0.0) -> tuple[Profile, zenoh.Session, bool]:
+    """A session with the first certificate that the router accepts, or the first one's error; and
+    whether the router had to be waited for."""
     failed: list[SecurityError | SessionError] = []
     for profile in choices:
         try:
-            return profile, open_session(profile.session)
+            session, cold = open_patiently(profile, wait_s, warn)
+            return profile, session, cold
         except (SecurityError, SessionError) as error:
             failed.append(error)
             security = profile.session.security

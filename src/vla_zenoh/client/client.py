@@ -17,10 +17,10 @@ import zenoh
 from vla_zenoh.bus.bounded import Bounded
 from vla_zenoh.bus.buffers import ReceivedSample, SampleBuffer, bytes_of, header_of
 from vla_zenoh.bus.reception import Reception
-from vla_zenoh.bus.session import put_text
+from vla_zenoh.bus.session import open_session, put_text
 from vla_zenoh.codec import records, settings
 from vla_zenoh.errors import CodecError, ProfileError, SessionError, StartingError
-from vla_zenoh.keys import NO_DEADMAN_TOKEN, key_chunk, last_chunk
+from vla_zenoh.keys import NO_DEADMAN_TOKEN, STARTING, key_chunk, last_chunk
 from vla_zenoh.security.roles import expected_nodes, identities
 from vla_zenoh.types import Event, Header, NodeStatus, Task
 
@@ -29,6 +29,14 @@ if TYPE_CHECKING:
 
 Value = TypeVar("Value")
 POLL_S, HOLD_PATIENCE_S = 0.02, 1.0
+ANSWER_S = 3.0
+"""The command node answers a setting within this."""
+START_PATIENCE_S, START_PERIOD_S = 20.0, 0.5
+"""How long people and scripts wait for a system that is starting, and how often they try."""
+ABSENT_PATIENCE_S = 1.5
+"""A command node that is alive, or is being started, may take this long to appear."""
+SILENT_S = 5.0
+"""`up` publishes twice a second which of its nodes are starting."""
 WHY_PATIENCE_S = 1.0
 """The command node publishes its status twice a second, and at every transition."""
 RESET_AGAIN_S = 0.3
@@ -46,6 +54,29 @@ DROPPED_HINT = (
     "statuses or liveliness tokens dropped, because they are too many or too large: they come from "
     "a process that is not one of our nodes"
 )
+
+
+def waiting(most_s: float, why: str) -> str:
+    """The sentence about what a command waits for."""
+    return f"waiting, at most {most_s:g} s: {why}"
+
+
+def open_patiently(
+    profile: Profile, wait_s: float, tell: Callable[[str], None]
+) -> tuple[zenoh.Session, bool]:
+    """A session, and whether its router had to be waited for, at most `wait_s`.
+
+    Raises:
+        SecurityError: the certificate is missing.
+        SessionError: no router answers.
+    """
+    try:
+        return open_session(profile.session), False
+    except SessionError as error:
+        if wait_s <= 0:
+            raise
+        tell(waiting(wait_s, str(error)))
+        return open_session(profile.session, wait_s=wait_s), True
 
 
 class NodeRegistry:
@@ -211,11 +242,24 @@ class Client(NodeRegistry):
             robot.activate_with_deadman("my script")
 
     `expected` has the nodes that the profile assigns to hosts, each with its host; `reception`
-    tells what this client does not receive, of its subscriptions by `watch`.
+    tells what this client does not receive, of its subscriptions by `watch`. `patience_s` is how
+    long a setting or an activation waits while nodes are starting, where it is given no time of its
+    own; `tell` gets a sentence about that. `cold` means that the router has just begun to answer,
+    so an absent command node is taken for one that starts.
     """
 
-    def __init__(self, profile: Profile, session: zenoh.Session) -> None:
+    def __init__(
+        self,
+        profile: Profile,
+        session: zenoh.Session,
+        *,
+        patience_s: float = ANSWER_S,
+        tell: Callable[[str], None] = lambda _: None,
+        cold: bool = False,
+    ) -> None:
         super().__init__(one.node for one in identities(profile))
+        self.patience_s, self.tell = patience_s, tell
+        self._cold_until_s = time.monotonic() + patience_s if cold else 0.0
         self.profile, self.session, self.keys = profile, session, profile.keys
         self.expected = expected_nodes(profile)
         self.reception = Reception(profile.keys)
@@ -391,8 +435,12 @@ class Client(NodeRegistry):
         """Put plain text on a key, as any Zenoh client could."""
         put_text(self.session, key, text)
 
-    def set_prompt(self, prompt: str, timeout_s: float = 2.0) -> Task:
+    def set_prompt(self, prompt: str, timeout_s: float | None = None) -> Task:
         """Set the prompt, and wait until the command node has accepted it.
+
+        Args:
+            prompt: in words.
+            timeout_s: while it does not answer, or is starting; None: `patience_s`.
 
         Raises:
             SessionError: it was rejected, with the reasons, or not accepted in time.
@@ -400,30 +448,30 @@ class Client(NodeRegistry):
         wanted = settings.decode_text(prompt.encode())
         return self._set("prompt", prompt, lambda task: task.prompt == wanted, timeout_s)
 
-    def set_rate(self, rate_hz: float, timeout_s: float = 2.0) -> Task:
+    def set_rate(self, rate_hz: float, timeout_s: float | None = None) -> Task:
         """Set the rate of action chunks, as `set_prompt`; `CodecError`: it is not allowed."""
         settings.decode_rate(f"{rate_hz:g}".encode())
         return self._set_number("rate", rate_hz, lambda task: task.rate_hz, timeout_s)
 
-    def set_speed(self, percent: float, timeout_s: float = 2.0) -> Task:
+    def set_speed(self, percent: float, timeout_s: float | None = None) -> Task:
         """Set the speed override, 0 to 100 percent of the planned speed, as `set_prompt`."""
         settings.decode_percent(f"{percent:g}".encode())
         return self._set_number("speed", percent, lambda task: task.speed_percent, timeout_s)
 
-    def slow_down(self, percent: float, timeout_s: float = 2.0) -> Task:
+    def slow_down(self, percent: float, timeout_s: float | None = None) -> Task:
         """Lower the speed override; rejected if that would make the arm faster."""
         settings.decode_percent(f"{percent:g}".encode())
         return self._set_number("slower", percent, lambda task: task.speed_percent, timeout_s)
 
     def _set_number(
-        self, what: str, value: float, of: Callable[[Task], float], timeout_s: float
+        self, what: str, value: float, of: Callable[[Task], float], timeout_s: float | None
     ) -> Task:
         def taken(task: Task) -> bool:
             return math.isclose(of(task), value, rel_tol=1e-5, abs_tol=1e-9)
 
         return self._set(what, f"{value:g}", taken, timeout_s)
 
-    def set_worker(self, worker: str, timeout_s: float = 2.0) -> Task:
+    def set_worker(self, worker: str, timeout_s: float | None = None) -> Task:
         """Choose the worker whose chunks are executed, as `set_prompt`.
 
         Raises:
@@ -432,19 +480,19 @@ class Client(NodeRegistry):
         settings.decode_name(worker.encode())
         return self._set("worker", worker, lambda task: task.worker == worker, timeout_s)
 
-    def activate(self, timeout_s: float = 3.0, holder: str = "") -> Task:
-        """Activate the arm, and wait until it is active.
+    def activate(self, timeout_s: float | None = None, holder: str = "") -> Task:
+        """Activate the arm, and wait until it is active, also while nodes are starting.
 
         `holder`: another client, whose liveliness token on `Keys.holding` makes it the deadman.
 
         Raises:
-            StartingError: rejected only because something is still starting: try again.
+            StartingError: rejected only because something is still starting.
             SessionError: rejected, with every reason.
         """
         text = f"true {settings.WHILE} {holder}" if holder else "true"
         return self._set("activate", text, lambda task: task.active, timeout_s)
 
-    def activate_with_deadman(self, what: str, timeout_s: float = 3.0) -> Task:
+    def activate_with_deadman(self, what: str, timeout_s: float | None = None) -> Task:
         """Activate the arm for as long as this process is alive and connected: as its deadman.
 
         If the process ends before `deactivate`, also by kill -9 or a pulled cable, the arm brakes:
@@ -519,7 +567,55 @@ class Client(NodeRegistry):
             return False
         return status.detail.get("at_rest") is True
 
-    def _set(self, what: str, text: str, taken: Callable[[Task], bool], timeout_s: float) -> Task:
+    def starting(self) -> list[str]:
+        """Nodes of the profile that are being started."""
+        found = [name for name in self.expected if self.is_starting(name)]
+        absent = "command" not in self.alive
+        return sorted({*found, "command"}) if absent and self._cold else found
+
+    @property
+    def _cold(self) -> bool:
+        return time.monotonic() < self._cold_until_s
+
+    def is_starting(self, node: str) -> bool:
+        """Whether a node of any name is being started, by `up` on its host or by hand."""
+        status, age_s, alive = self.snapshot().get(node, (None, 0.0, False))
+        return status is not None and not alive and status.state == STARTING and age_s < SILENT_S
+
+    def await_start(self, node: str) -> bool:
+        """Wait while `node` is being started; True if it is alive."""
+
+        def starts() -> bool:
+            return self.is_starting(node) or node in self.starting()
+
+        self.wait_for(lambda: node in self.alive or starts(), ABSENT_PATIENCE_S)
+        if starts():
+            self.tell(waiting(self.patience_s, f"{node} is starting"))
+            self.wait_for(lambda: not starts(), self.patience_s)
+        return node in self.alive
+
+    def _set(
+        self, what: str, text: str, taken: Callable[[Task], bool], timeout_s: float | None
+    ) -> Task:
+        """Put a setting until it is taken or rejected for good; see `_ask`."""
+        patience_s = self.patience_s if timeout_s is None else timeout_s
+        give_up_s, told = time.monotonic() + patience_s, ""
+        while True:
+            left_s = max(0.0, give_up_s - time.monotonic())
+            try:
+                return self._ask(
+                    what, text, taken, min(left_s, ANSWER_S) if timeout_s is None else left_s
+                )
+            except SessionError as error:
+                starts = isinstance(error, StartingError) or self.starting()
+                if not starts or time.monotonic() + START_PERIOD_S > give_up_s:
+                    raise
+                if str(error) != told:
+                    told = str(error)
+                    self.tell(waiting(patience_s, told))
+            time.sleep(START_PERIOD_S)
+
+    def _ask(self, what: str, text: str, taken: Callable[[Task], bool], timeout_s: float) -> Task:
         """Put a setting, and wait for a newer task that has it, or a newer rejection.
 
         If neither comes in time, an activation is taken back: it must not take effect later.
@@ -527,9 +623,12 @@ class Client(NodeRegistry):
         activates = what == "activate"
         began_s, key = time.monotonic(), self.keys.active if activates else getattr(self.keys, what)
         self.publish(key, text)
-        self.wait_for(
-            lambda: self._refused(what, began_s) or self._taken(taken, began_s), timeout_s
-        )
+
+        def over() -> bool:
+            lost = time.monotonic() > began_s + ANSWER_S and "command" in self.starting()
+            return bool(self._refused(what, began_s) or self._taken(taken, began_s)) or lost
+
+        self.wait_for(over, timeout_s)
         if self._refused(what, began_s):
             time.sleep(0.1)  # the other reasons follow the first
             rejections = self._refused(what, began_s)
@@ -542,10 +641,15 @@ class Client(NodeRegistry):
         if activates:
             self.publish(key, "false")
         if "command" not in self.alive:
-            raise SessionError(f"{what}: no command node of robot {self.keys.robot!r} is running")
+            names = ", ".join(self.starting())
+            starts = f"; starting: {names}" if names else ""
+            raise SessionError(
+                f"{what}: no command node of robot {self.keys.robot!r} is running{starts}"
+            )
         status = self.status("command")
         state = f"its state is {status.state}" if status else "it has not reported its state yet"
-        raise SessionError(
+        silent = StartingError if self._cold else SessionError
+        raise silent(
             f"{what}: the command node of robot {self.keys.robot!r} is alive, but did not accept "
             f"this within {timeout_s:g} s; {state}. It may just have started: try again, or see "
             "`vla-zenoh status`"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -11,8 +12,7 @@ import zenoh
 
 from vla_zenoh.bus.buffers import LatestSample, ReceivedSample, bytes_of, header_of
 from vla_zenoh.bus.clock import Clock
-from vla_zenoh.bus.session import open_session
-from vla_zenoh.client.client import Client
+from vla_zenoh.client.client import ANSWER_S, START_PATIENCE_S, Client, open_patiently
 from vla_zenoh.client.messages import DEFAULT_TIMEOUT_S, Answer
 from vla_zenoh.client.primitives import PrimitiveError, ask
 from vla_zenoh.codec import records
@@ -38,8 +38,8 @@ class RemoteRobot(Client):
     `SessionError` is raised; messages that cannot be decoded raise `CodecError`.
     """
 
-    def __init__(self, profile: Profile, session: zenoh.Session) -> None:
-        super().__init__(profile, session)
+    def __init__(self, profile: Profile, session: zenoh.Session, **patience: Any) -> None:
+        super().__init__(profile, session, **patience)
         self._buffers: dict[str, LatestSample] = {}
         self._newest: dict[str, Stamped[Any]] = {}
         self._wall = Clock()
@@ -227,7 +227,7 @@ def connect(
     *,
     endpoints: Sequence[str] = (),
     robot: str | None = None,
-    wait_s: float = 0.0,
+    wait_s: float = START_PATIENCE_S,
 ) -> Iterator[RemoteRobot]:
     """A session with the router of a profile, and the robot there.
 
@@ -235,7 +235,8 @@ def connect(
         profile: name or path, or a loaded one.
         endpoints: routers, such as ``tcp/10.0.0.2:7447``, instead of the profile's.
         robot: name, instead of the profile's.
-        wait_s: keep trying to reach the router for this long.
+        wait_s: how long to wait for the router, and settings and activations for nodes that are
+            starting; what is waited for is logged as a warning of the logger ``vla_zenoh``.
 
     Raises:
         ProfileError: the profile is wrong.
@@ -247,7 +248,10 @@ def connect(
         loaded = override(loaded, {"session": {"connect": list(endpoints)}})
     if robot is not None:
         loaded = as_robot(loaded, robot)
-    with open_session(loaded.session, wait_s=wait_s) as session:
-        found = RemoteRobot(loaded, session)
+    tell = logging.getLogger("vla_zenoh").warning
+    session, cold = open_patiently(loaded, wait_s, tell)
+    with session:
+        patience_s = max(wait_s, ANSWER_S)
+        found = RemoteRobot(loaded, session, patience_s=patience_s, tell=tell, cold=cold)
         found.subscribe()
         yield found

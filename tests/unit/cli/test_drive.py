@@ -8,6 +8,7 @@ import resource
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from functools import cache
 from typing import Any, cast
 
@@ -15,8 +16,9 @@ import pytest
 from typed import typed
 from typer.testing import CliRunner
 
-from vla_zenoh.cli import drive
+from vla_zenoh.cli import target
 from vla_zenoh.cli.plain import json_answer, say, warn
+from vla_zenoh.client import client as client_module
 from vla_zenoh.client.client import Client
 from vla_zenoh.errors import SessionError, StartingError
 from vla_zenoh.keys import STARTING
@@ -41,8 +43,9 @@ def after_typing(line: str) -> dict[str, Any]:
     """State of a process after the command line has run in it."""
     code = (
         "import json, os, sys\n"
-        "import vla_zenoh.cli.stop as stop\n"
+        "import vla_zenoh.cli.stop as stop, vla_zenoh.cli.target as target\n"
         f"stop.GIVE_UP_S = {GIVE_UP_S}\n"
+        "target.START_PATIENCE_S = 0.0\n"
         f"sys.argv = {['vla-zenoh', *line.split(), *NOWHERE]!r}\n"
         "from vla_zenoh.program.entry import main\n"
         "try: main()\nexcept SystemExit: pass\n"
@@ -71,14 +74,16 @@ def test_a_stop_starts_with_raised_priority_where_permitted() -> None:
 
 @pytest.mark.parametrize("line", ["prompt go", "activate", "reset", "use brick", "rate 5"])
 def test_with_json_a_failure_is_one_object_and_nothing_else(
-    capsys: pytest.CaptureFixture[str], line: str
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, line: str
 ) -> None:
+    monkeypatch.setattr(target, "START_PATIENCE_S", 0.2)
     done = typed(capsys, *line.split(), "--json", *NOWHERE)
     assert done.code == 1
     assert done.stderr == ""
     answer = json.loads(done.stdout)
     assert answer["ok"] is False
     assert "no Zenoh router answers" in answer["errors"][0]
+    assert answer["warnings"][0].startswith("waiting, at most 0.2 s: no Zenoh router answers")
 
 
 def test_with_json_every_reason_of_a_rejection_is_an_entry(
@@ -152,36 +157,60 @@ def test_a_stop_without_a_router_says_at_once_that_nobody_confirmed_it(form: lis
     assert took_s < FIRST_LINE_S
 
 
-def test_activate_waits_while_something_starts_and_says_for_what(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(drive, "START_PERIOD_S", 0.0)
-    client = Client(load_profile("panda_sim"), cast(Any, None))
-    task = Task(1, True, "go up", "scripted", 5.0, 100.0)
-    answers: list[Any] = [StartingError("a camera is being opened")] * 2 + [task]
+class Scripted(Client):
+    """A client whose command node gives these answers."""
 
-    def activate() -> Task:
-        answer = answers.pop(0)
-        if isinstance(answer, Exception):
+    def __init__(self, answers: Sequence[Task | SessionError], **patience: Any) -> None:
+        super().__init__(load_profile("panda_sim"), cast(Any, None), **patience)
+        self.answers: list[Task | SessionError] = [*answers]
+
+    def _ask(self, what: str, text: str, taken: Any, timeout_s: float) -> Task:
+        answer = self.answers.pop(0)
+        if isinstance(answer, SessionError):
             raise answer
         return answer
 
-    assert drive.patiently(client, activate) is task
-    assert capsys.readouterr().err.count("a camera is being opened") == 1
-    answers[:] = [SessionError("no prompt")]
+
+OPENING = "a camera is being opened"
+TASK = Task(1, True, "go up", "scripted", 5.0, 100.0)
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(client_module, "START_PERIOD_S", 0.0)
+
+
+@pytest.mark.usefixtures("quick")
+def test_activate_waits_while_something_starts_and_says_for_what() -> None:
+    told: list[str] = []
+    client = Scripted([StartingError(OPENING), StartingError(OPENING), TASK], tell=told.append)
+    assert client.activate() is TASK
+    assert told == [f"waiting, at most 3 s: {OPENING}"]
+    client.answers = [SessionError("no prompt")]
     with pytest.raises(SessionError, match="no prompt"):
-        drive.patiently(client, activate)
-    monkeypatch.setattr(drive, "START_PATIENCE_S", 0.0)
-    answers[:] = [StartingError("a camera is being opened")] * 2
-    with pytest.raises(StartingError):
-        drive.patiently(client, activate)
+        client.activate()
 
 
-def test_activate_waits_while_a_node_is_started_by_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    client = Client(load_profile("panda_sim"), cast(Any, None))
-    assert not drive.are_starting(client)
+@pytest.mark.usefixtures("quick")
+def test_what_is_missing_is_said_when_the_time_is_over() -> None:
+    client = Scripted([StartingError(OPENING), TASK])
+    with pytest.raises(StartingError, match=OPENING):
+        client.activate(timeout_s=-1.0)
+    assert len(client.answers) == 1
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_setting_waits_while_a_node_is_started_by_up() -> None:
+    client = Scripted([SessionError("no command node is running"), TASK])
+    assert client.starting() == []
     status = NodeStatus("command", STARTING, "here", 1, 1)
     client.status_received("command", status, 100)
-    assert drive.are_starting(client)
+    assert client.starting() == ["command"]
+    assert client.set_prompt("go up") is TASK
     client.token_appeared("command")
-    assert not drive.are_starting(client)
+    assert client.starting() == []
+
+
+def test_an_absent_command_node_of_a_router_that_just_appeared_is_starting() -> None:
+    assert Scripted([], cold=True, patience_s=20.0).starting() == ["command"]
+    assert Scripted([], cold=True, patience_s=0.0).starting() == []

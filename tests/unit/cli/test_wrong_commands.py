@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 from typed import typed
 
+from vla_zenoh.cli import target
+
 USAGE, FAILED = 2, 1
 NOWHERE = ("--connect", "tcp/127.0.0.1:9")
 
@@ -185,8 +187,9 @@ def test_what_is_typed_wrong_gets_one_sentence(
 
 @pytest.mark.parametrize("line", WITHOUT_A_ROUTER)
 def test_without_a_router_it_is_said_where_one_was_looked_for(
-    capsys: pytest.CaptureFixture[str], line: str
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, line: str
 ) -> None:
+    monkeypatch.setattr(target, "START_PATIENCE_S", 0.0)
     done = typed(capsys, *line.split(), *NOWHERE)
     assert done.code == FAILED
     assert done.stdout == ""
