@@ -90,10 +90,10 @@ def exactness(lab: RosLab) -> None:
         way_m = ended[:3, 3] - began[:3, 3]
         turn_rad = panda_dh.turn_between(ended[:3, :3], began[:3, :3])
         asked_m, asked_rad = np.zeros(3), np.zeros(3)
+        axis = {"go": 2, "yaw": 2, "roll": 0, "pitch": 1}[words.split()[0]]
         if words.startswith("go"):
             asked_m[2] = (1 if words == "go up" else -1) * 0.01 * count
         else:
-            axis = {"yaw": 2, "roll": 0, "pitch": 1}[words.split()[0]]
             asked_rad[axis] = np.sign(turn_rad[axis]) * 0.05 * count
         off_mm = 1e3 * np.linalg.norm(way_m - asked_m)
         off_rad = np.linalg.norm(turn_rad - asked_rad)
@@ -347,8 +347,40 @@ def with_clock(folder: Path, program: Path, distribution: str) -> None:
             )
 
 
+def returns(folder: Path, program: Path, distribution: str, count: int) -> None:
+    """The robot's node is killed in motion, and started at home while the bridge keeps a pose."""
+    away_mm, moved_mm, late_ms = [], [], []
+    for number in range(count):
+        here = folder / f"return{number}"
+        here.mkdir()
+        with running_ros_lab(here, program, distribution) as lab:
+            lab.chain.activate_when_ready()
+            lab.settle()
+            lab.move()
+            lab.arm.kill()
+            lab.chain.until("inactive", lambda lab=lab: lab.chain.state() == "inactive")
+            before = len(lab.arm.told)
+            lab.arm.start()
+            time.sleep(RESTART_S)
+            joints = [line["q"] for line in lab.arm.since(before, "q")]
+            places_m = np.array([panda_dh.forward(np.array(q))[:3, 3] for q in joints])
+            goals = lab.arm.since(before, "goal")
+        moved_mm.append(1e3 * np.linalg.norm(places_m - places_m[0], axis=1).max())
+        if len(goals) > 1:  # the last is ours to stay
+            away_mm.append(1e3 * np.linalg.norm(np.array(goals[0]["goal"]) - places_m[0]))
+            late_ms.append((goals[-1]["t"] - goals[0]["t"]) / 1e6)
+    say(f"\nrobot's node killed in motion and started at home, {count} times:")
+    say(f"an old pose came {len(away_mm)} times\n| | p50 | p95 | n | most |\n|---|---|---|---|---|")
+    for what, values in (
+        ("the old pose was away, mm", away_mm),
+        ("ours to stay came after it, ms", late_ms),
+        ("the arm moved, mm", moved_mm),
+    ):
+        say(f"| {what} | {p50_p95(values)} | {max(values, default=0.0):.1f} |")
+
+
 # -------------------------------------------------------------------------------------------------
-SECTIONS = ("exactness", "latency", "stops", "restarts", "faults", "loss", "clock")
+SECTIONS = ("exactness", "latency", "stops", "restarts", "faults", "loss", "clock", "returns")
 
 
 def main() -> None:
@@ -357,6 +389,7 @@ def main() -> None:
     parser.add_argument("--distribution", default="jazzy")
     parser.add_argument("--only", choices=SECTIONS, action="append", help="default: everything")
     parser.add_argument("--stops", type=int, default=30)
+    parser.add_argument("--returns", type=int, default=10)
     parser.add_argument("--seconds", type=float, default=10.0, help="of the measured latency")
     chosen = parser.parse_args()
     only = chosen.only or SECTIONS
@@ -387,6 +420,8 @@ def main() -> None:
             with_loss(folder, program, chosen.distribution, 0.05)
         if "clock" in only:
             with_clock(folder, program, chosen.distribution)
+        if "returns" in only:
+            returns(folder, program, chosen.distribution, chosen.returns)
     say(f"load {os.getloadavg()[0]:.1f} at the end")
 
 

@@ -32,6 +32,7 @@ POSITION_TOLERANCE_M = 1e-6
 PERIOD_S = 0.004
 BRAKED_M = 3e-5
 SPEED_M_S = 0.02
+RETURNED_RAD = 0.05
 BACK_M = 0.0002
 """What a test's thread that is held up between two clocks makes of a steady stream."""
 SILENCE_S = 0.3
@@ -120,22 +121,39 @@ def test_a_robot_that_falls_silent_and_comes_back_is_told(rig: Ros2Rig) -> None:
     assert not rig.happened("robot_returned"), "no set-point was sent meanwhile"
 
 
-def test_a_robot_that_returns_and_may_be_sent_an_old_set_point_is_told(
+def test_a_robot_that_returns_is_sent_no_older_set_point_than_one_where_it_is(
     rig: Ros2Rig,
 ) -> None:
-    before = rig.counted("ros2.commands_sent")
+    """A bridge keeps the last one for a subscriber that died, and may send it to its successor."""
+    robot = rig.robot
+    before = len(robot.goal_times_s)
     with Commander(rig):
-        rig.wait("it moves", lambda: rig.counted("ros2.commands_sent") > before)
+        rig.wait("goals arrive", lambda: len(robot.goal_times_s) > before)
         rig.events.clear()
-        rig.robot.silent = True
+        robot.silent = True
         rig.wait("silence", lambda: rig.happened("running->silent"))
-    assert not rig.happened("robot_returned")
-    rig.robot.silent = False
+    rig.wait("it stands", lambda: time.monotonic() - robot.goal_times_s[-1] > 2 * SILENCE_S)
+    told, sent = len(rig.happened("robot_returned")), len(robot.goals)
+    reported: list[Any] = []
+
+    def elsewhere(fields: dict[str, Any]) -> None:
+        fields["position"][0] += RETURNED_RAD
+        reported.append(fields["position"][:7].copy())
+
+    robot.alter = elsewhere
+    robot.silent = False
     rig.wait("voice", lambda: rig.statuses[-1].state == "running")
-    kept = rig.profile.ros2 is not None and rig.profile.ros2.bridge == "ros2dds"
-    told = rig.happened("robot_returned")
-    assert len(told) == kept
-    assert all("best effort" in event.why for event in told)
+    bridge = rig.profile.ros2 is not None and rig.profile.ros2.bridge == "ros2dds"
+    rig.wait("a set-point", lambda: len(robot.goals) == sent + bridge)
+    time.sleep(2 * SILENCE_S)
+    events = rig.happened("robot_returned")[told:]
+    assert len(events) == bridge
+    assert len(robot.goals) == sent + bridge
+    if bridge:
+        assert "best effort" in events[0].why
+        at = robot.goals[-1].pose.position
+        expected = panda().forward(reported[0]).position_m
+        assert (at.x, at.y, at.z) == pytest.approx(expected, abs=POSITION_TOLERANCE_M)
 
 
 def test_bytes_that_are_no_message_are_counted(rig: Ros2Rig) -> None:

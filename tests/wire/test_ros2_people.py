@@ -100,7 +100,7 @@ def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
             profile,
             ours,
             link,
-            Bridges(ours, profile.ros2),
+            Bridges(ours, profile),
             messages,
             "/vla",
             lambda *_: None,

@@ -76,6 +76,16 @@ def endpoints_key(side: str, topic: str) -> str:
     return f"@/*/ros2/dds/*/{side}/*/{topic}"
 
 
+def route_key(topic: str) -> str:
+    """Key expression of a bridge's route from us to the DDS topic of a ROS name, ``/..``."""
+    return f"@/*/ros2/route/topic/sub{topic}"
+
+
+def any_active(replies: Replies) -> bool:
+    """Whether a route in replies to `route_key` passes messages on."""
+    return any(_json(payload).get("is_active") is True for _, payload in replies)
+
+
 def vendors(replies: Replies) -> frozenset[str]:
     """Middleware of the ends in replies to `endpoints_key`."""
     chunks = [key.split("/") for key, _ in replies]

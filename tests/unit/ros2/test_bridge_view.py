@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 
 from vla_zenoh.ros2.bridge_view import (
+    any_active,
     any_transient_local,
     endpoints_key,
     read_view,
+    route_key,
     vendors,
 )
 
@@ -47,3 +49,10 @@ def test_a_transient_local_writer_is_told_by_its_qos() -> None:
     assert not any_transient_local([writer({}), writer({"durability": {"kind": "VOLATILE"}})])
     assert vendors([latched]) == {"Fast DDS"}
     assert endpoints_key("writer", "rt/vla/active") == "@/*/ros2/dds/*/writer/*/rt/vla/active"
+
+
+def test_a_route_passes_messages_on_while_it_is_active() -> None:
+    key = "@/a/ros2/route/topic/sub/desired_pose"
+    assert route_key("/desired_pose") == "@/*/ros2/route/topic/sub/desired_pose"
+    assert any_active([(key, b'{"is_active": false}'), (key, b'{"is_active": true}')])
+    assert not any_active([(key, b'{"is_active": false}'), (key, b"{}"), (key, b"[]"), (key, b"")])

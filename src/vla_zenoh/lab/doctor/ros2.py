@@ -25,7 +25,7 @@ def ros2_bridge(profile: Profile, host: str | None = None) -> Iterator[HostFindi
         yield HostFinding(NAME, "warn", "not reached: it does not run, or its router", start)
         return
     with session:
-        bridges = Bridges(session, ros2)
+        bridges = Bridges(session, profile)
         view = bridges.view()
         faults = dict(bridges.faults(view))
     if not view.participants:

@@ -119,7 +119,7 @@ class Ros2Driver(RobotDriver):
             self._own_session or session, ros2, self._messages, f"vla_{name}"
         )
         simulated = self._simulated = SimulatedClock() if ros2.use_sim_time else None
-        bridges = Bridges(graph.session, ros2)
+        bridges = Bridges(graph.session, profile)
         watch = self._middleware = MiddlewareWatch(bridges, self._emit)
         if self.has_arm:
             self.gripper = Gripper(
@@ -226,7 +226,7 @@ class Ros2Driver(RobotDriver):
         fresh = states.update()
         self.measured_ns = states.received_ns
         self._check_clock()
-        self._check_return()
+        returned = self._returned()
         if not fresh:
             return None
         stamp_ns = states.state.stamp_ns
@@ -236,6 +236,8 @@ class Ros2Driver(RobotDriver):
             topic = self._ros2.joint_states
             self._node.reject("invalid", f"{topic}: {error}", topic)
             return None
+        if returned:
+            self._stay(measured, self._node.clock.wall_at(mono_ns))
         return measured._replace(gripper=self._gripper_state(stamp_ns))
 
     def move(self, reference: PoseReference | JointReference, now_ns: int) -> None:
@@ -283,25 +285,39 @@ class Ros2Driver(RobotDriver):
             )
             self._node.emit(Event("warning", "notice", "robot_clock", why))
 
-    def _check_return(self) -> None:
-        """Emit an event when a robot is heard again that a set-point was sent to meanwhile.
+    def _returned(self) -> bool:
+        """Whether a robot is heard again that a set-point was sent to meanwhile: it is reported.
 
-        A bridge keeps the last one until the lease of a subscriber that died ends, and sends it to
-        a new one on Fast DDS that is reliable.
+        A bridge keeps the last set-point until the lease of a subscriber that died ends, and sends
+        it to a new one on Fast DDS that is reliable.
         """
         states, sent_ns = self.states, self._moved_ns
         silent_s = states.silent_ns / 1e9
         if silent_s <= self.profile.timing.state_timeout_s or self._ros2.bridge != "ros2dds":
-            return
+            return False
         if sent_ns is None or sent_ns < states.silent_from_ns:
-            return  # it was alive and acknowledged it
+            return False  # it was alive and acknowledged it
         age_s = (time.monotonic_ns() - sent_ns) / 1e9
         why = (
-            f"joint states again after {silent_s:.1f} s. A robot's node that was restarted may now "
-            f"be sent the set-point of {age_s:.1f} s ago by the bridge: "
-            f"let it subscribe to {self._output.topic[:100]} best effort, which prevents this"
+            f"joint states again after {silent_s:.1f} s. A robot's node that was restarted may be "
+            f"sent the set-point of {age_s:.1f} s ago by the bridge, before ours to stay where it "
+            f"is: let it subscribe to {self._output.topic[:100]} best effort, which prevents this"
         )
         self._node.emit(Event("warning", "notice", "robot_returned", why))
+        return True
+
+    def _stay(self, measured: Measurement, now_ns: int) -> None:
+        """Send a set-point where the arm is, unless it is being moved.
+
+        It replaces the one that the bridge keeps, or ends the motion to it.
+        """
+        if self._arm is None or self._arm.guard.moving:
+            return
+        nothing = np.zeros(6)
+        reference: PoseReference | JointReference = PoseReference(*measured.tcp, nothing, nothing)
+        if self.profile.robot.command == "joint":
+            reference = JointReference.at_rest(measured.joints.position_rad)
+        self.move(reference, now_ns)
 
     def _check_peers(self) -> None:
         """Emit an event when the other side appears or disappears."""

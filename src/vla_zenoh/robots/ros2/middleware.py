@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -12,23 +13,25 @@ import zenoh
 from vla_zenoh.bus.buffers import bytes_of
 from vla_zenoh.errors import CodecError
 from vla_zenoh.profile import Profile, SessionProfile
-from vla_zenoh.profile.robot import GRIPPER_ACTIONS, Ros2Profile
+from vla_zenoh.profile.robot import GRIPPER_ACTIONS
 from vla_zenoh.profile.schema import TRUSTED_PROTOCOLS
 from vla_zenoh.ros2.bridge_view import (
     MAX_REPLY_BYTES,
     SERVES,
     VIEW_KEYS,
     BridgeView,
+    any_active,
     any_transient_local,
     endpoints_key,
     read_view,
+    route_key,
     vendors,
 )
 from vla_zenoh.types import Event
 
 ASK_S = 1.0
 """Timeout of a query."""
-PERIOD_S = 5.0
+PERIOD_S, ROUTED_S = 5.0, 2.0
 GRIPPER = "gripper_middleware"
 
 
@@ -38,8 +41,13 @@ class Bridges:
     With rmw_zenoh there is neither, and nothing is found.
     """
 
-    def __init__(self, session: zenoh.Session, ros2: Ros2Profile) -> None:
+    def __init__(self, session: zenoh.Session, profile: Profile) -> None:
+        ros2 = profile.ros2
+        assert ros2 is not None
         self._session, self._ros2 = session, ros2
+        command = ros2.joint_command if profile.robot.command == "joint" else ros2.pose_command
+        drives = profile.robot.driver == "ros2"
+        self._commanded = command.topic if drives and command is not None else None
 
     def view(self) -> BridgeView:
         """Bridges and the middleware that they see."""
@@ -62,6 +70,14 @@ class Bridges:
                 f"end all but one ({', '.join(view.doubled)})"
             )
             yield "two_bridges", why
+        if self._cut_off():
+            why = (
+                f"a node subscribes to {self._commanded}, and the bridge sends it nothing: restart "
+                "the bridge. It loses a node that was started again within the lease of the one "
+                "before (Fast DDS: 20 s), and lets through what its settings had when it started "
+                "(vla-zenoh profile bridge-config)"
+            )
+            yield "not_routed", why
         callers = self._callers() - {SERVES}
         if callers:
             why = (
@@ -77,6 +93,20 @@ class Bridges:
                 f"with {SERVES}"
             )
             yield GRIPPER, why
+
+    def _cut_off(self) -> bool:
+        """Whether a robot's node subscribes to our set-points and a bridge passes none on.
+
+        It routes a new subscriber within a second, so it is asked twice.
+        """
+        topic = self._commanded
+        for pause_s in (ROUTED_S, 0.0):
+            if topic is None or not self._ask(endpoints_key("reader", f"rt{topic}")):
+                return False
+            if any_active(self._ask(route_key(topic))):
+                return False
+            time.sleep(pause_s)
+        return True
 
     def _callers(self) -> frozenset[str]:
         if self._ros2.prefix is None or not self._ros2.services:
