@@ -65,6 +65,7 @@ ALLOWED = {
             "lab/bench/task_lockstep.py",
             "lab/bench/task_runner.py",
             "lab/check/model_runner.py",
+            "lab/conform/peer.py",
             "lab/demo/runner.py",
             "lab/doctor/access.py",
             "lab/episode.py",

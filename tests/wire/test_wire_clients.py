@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 import time
@@ -10,12 +11,16 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from camera_rig import free_endpoint
-from chain import LONG_PATIENCE_S, Chain, running_chain
+from camera_rig import free_endpoint, until
+from chain import LONG_PATIENCE_S, READY_PATIENCE_S, Chain, command_line, running_chain
 
+from vla_zenoh.bus.session import alive_nodes, open_session
+from vla_zenoh.errors import SessionError
+from vla_zenoh.lab.conform import rules
 from vla_zenoh.lab.newest_records import NewestRecords
 from vla_zenoh.lab.tasks.judge import judge_of
 from vla_zenoh.lab.tasks.order import parse_prompt
+from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.types import GripperState, ObjectPoses
 
 CLIENTS = Path(__file__).parents[2] / "examples" / "wire"
@@ -40,17 +45,23 @@ def profile_of(folder: Path, extends: str, more: str) -> Path:
     return path
 
 
+def program(profile: Profile, name: str, *arguments: str, before: str = "") -> list[str]:
+    """Words that start a client; `before` runs first."""
+    (endpoint,) = profile.session.connect
+    robot = f"{profile.root}/{profile.robot.name}"
+    lines = [
+        ALONE,
+        f"sys.path.insert(0, {str(CLIENTS)!r})",
+        before,
+        f"import {name.removesuffix('.py')} as client",
+        f"client.main({', '.join(map(repr, (endpoint, robot, *arguments)))})",
+    ]
+    return [sys.executable, "-u", "-c", "\n".join(lines)]
+
+
 @contextmanager
 def client(chain: Chain, name: str, *arguments: str) -> Iterator[subprocess.Popen[str]]:
-    (endpoint,) = chain.profile.session.connect
-    robot = f"{chain.profile.root}/{chain.profile.robot.name}"
-    file = str(CLIENTS / name)
-    run = (
-        f"{ALONE}; import runpy; sys.path.insert(0, {str(CLIENTS)!r}); "
-        f"sys.argv = {[file, endpoint, robot, *arguments]!r}; "
-        f"runpy.run_path({file!r}, run_name='__main__')"
-    )
-    words = [sys.executable, "-u", "-c", run]
+    words = program(chain.profile, name, *arguments)
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
         try:
             yield process
@@ -120,3 +131,76 @@ def test_a_robot_in_plain_python_moves_exactly_stops_and_is_reset(plain_robot: C
         "it is reset", lambda: chain.state() == "inactive" and chain.state("arm") == "running"
     )
     chain.activate_when_ready()
+
+
+WRONG_ROBOT = """
+import robot
+robot.OneWriter.check = lambda self, header: None
+robot.Arm.stop = lambda self: None
+robot.Arm.tick = lambda self: None
+"""
+"""The plain robot without its duties: it takes commands of all writers, and obeys no stop."""
+OUR_ROBOT = [sys.executable, "-m", "vla_zenoh", "node", "sim"]
+
+
+@contextmanager
+def alone(profile_file: Path, *words: str) -> Iterator[None]:
+    """A router and a robot, and nothing else."""
+    router = [sys.executable, "-m", "vla_zenoh", "node", "router", "--profile", str(profile_file)]
+    with subprocess.Popen(router, stdout=subprocess.DEVNULL) as first:
+        try:
+            until("the router listens", lambda: _listens(profile_file), READY_PATIENCE_S)
+            with subprocess.Popen(words, stdout=subprocess.DEVNULL) as process:
+                try:
+                    yield
+                finally:
+                    process.terminate()
+        finally:
+            first.terminate()
+
+
+def _listens(profile_file: Path) -> bool:
+    try:
+        open_session(load_profile(str(profile_file)).session).close()
+    except SessionError:
+        return False
+    return True
+
+
+def conform(profile_file: Path, node: str) -> tuple[int, dict[str, bool | None], str]:
+    def there() -> bool:
+        profile = load_profile(str(profile_file))
+        with open_session(profile.session) as session:
+            return node in alive_nodes(session, profile.keys, node)
+
+    until("the robot is there", there, READY_PATIENCE_S)
+    words = ("conform", "robot", "--move", "--json", "--profile", str(profile_file))
+    done = command_line(*words)
+    assert done.stdout, done.stderr
+    found = {each["rule"]: each["right"] for each in json.loads(done.stdout)}
+    return done.returncode, found, done.stdout + done.stderr
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("which", ["ours", "plain", "wrong"])
+def test_conform_tells_a_right_robot_from_a_wrong_one(tmp_path: Path, which: str) -> None:
+    extends = "panda_sim" if which == "ours" else str(CLIENTS / "robot.yaml")
+    path = profile_of(tmp_path, extends, "")
+    profile = load_profile(str(path))
+    words = program(profile, "robot.py", str(LONG_PATIENCE_S["command"]))
+    if which == "ours":
+        words = [*OUR_ROBOT, "--profile", str(path)]
+    elif which == "wrong":
+        words = program(profile, "robot.py", before=WRONG_ROBOT)
+    with alone(path, *words):
+        status, found, told = conform(path, profile.robot.node)
+    wrong = {rule for rule, right in found.items() if right is False}
+    assert set(rules.TRIALS) <= set(found), told
+    if which == "wrong":
+        assert wrong >= {rules.REPLAYED, rules.FOREIGN, rules.STALE, rules.STOP, rules.LATCHED}, (
+            told
+        )
+        assert status == 1
+    else:
+        assert not wrong, told
+        assert status == 0

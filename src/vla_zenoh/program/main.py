@@ -98,6 +98,14 @@ COMMANDS: Mapping[str, Mapping[str, str | CommandGroup]] = {
     },
     "Check and measure": {
         "check": "lab.cli.check:check",
+        "conform": CommandGroup(
+            "Judge a robot, worker or camera of others by the rules of the wire.",
+            {
+                "robot": "lab.cli.conform:robot",
+                "worker": "lab.cli.conform:worker",
+                "camera": "lab.cli.conform:camera",
+            },
+        ),
         "doctor": "lab.cli.doctor:doctor",
         "profile": "lab.cli.profile:profile_app",
         "robot": CommandGroup(

@@ -13,7 +13,14 @@ from vla_zenoh.bus.node import Node, Publisher, publish_together
 from vla_zenoh.codec.records import SMALL_BYTES
 from vla_zenoh.control.preflight import STOP_LATCHED
 from vla_zenoh.errors import CodecError
-from vla_zenoh.guard.arm_guard import SETTLE_NS, ArmGuard, GripperGuard, HeldReference, Measured
+from vla_zenoh.guard.arm_guard import (
+    OLDEST_NS,
+    SETTLE_NS,
+    ArmGuard,
+    GripperGuard,
+    HeldReference,
+    Measured,
+)
 from vla_zenoh.keys import Kind
 from vla_zenoh.kinematics.so3 import Pose, quat_from_rotation
 from vla_zenoh.robots.driver import Measurement, RobotDriver
@@ -168,6 +175,10 @@ class Arm:
         kind: Any = JointCommand if mode == "joint" else PoseCommand
         command = self._node.decode(kind, arrival)
         if command is None:
+            return
+        age_ns = command.received_ns - command.header.stamp_wall_ns
+        if age_ns > OLDEST_NS and not guard.following and not self._driver.lockstep:
+            self._reject(mode, "stale", f" by {command.header.source[:60]!r}")
             return
         # Silence is measured on the clock of the ticks.
         received_ns = mono_ns if self._driver.lockstep else arrival.mono_ns

@@ -1,0 +1,1 @@
+"""Judges a live peer of others by the rules of the wire."""

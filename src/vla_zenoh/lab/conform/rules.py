@@ -1,0 +1,356 @@
+"""The rules of the wire, each a function from what was recorded to findings. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from vla_zenoh.errors import SpecError
+from vla_zenoh.kinematics.kinematics import Kinematics
+from vla_zenoh.kinematics.so3 import Pose, pose_distance, rotation_from_quat
+from vla_zenoh.lab.conform.samples import Arrived, of_key
+from vla_zenoh.policy import ModelSpec, check_steps
+from vla_zenoh.profile import Profile
+from vla_zenoh.types import ActionChunk, ClockReply, JointState, PoseState, Task
+
+LEAST_STATE_HZ = 20.0
+MOST_AGE_S, MOST_AHEAD_S = 1.0, 0.1
+"""Of a stamp, on our clock."""
+RATE_SHARE = 0.7
+"""Of the rate that was asked for."""
+APART_M, APART_RAD = 0.01, 0.05
+"""Of the reported pose from that of the joints, as in the command node."""
+RANGE_RAD = 0.1
+WIDTH_M = 0.01
+FOLLOWED, IGNORED = 0.8, 0.3
+"""Shares of the way that commands asked for: a good stream is followed at least so far, a wrong one
+at most."""
+STOPPED_S = 1.0
+"""From a stop, or the end of the robot's patience with silence, until the arm stands."""
+STOPPED_SHARE = 0.25
+"""Of the way, while the arm brakes from the speed it has in the middle of it."""
+ROBOT_KEYS = ("state/joint", "state/pose", "state/gripper")
+
+
+class Finding(NamedTuple):
+    """What one rule found; `right` is None where there was nothing to judge."""
+
+    rule: str
+    right: bool | None
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What was recorded of a peer.
+
+    Args:
+        node: its name.
+        samples: in the order of their arrival.
+        seconds: how long was listened.
+        clocks: its replies, with the times of asking and arrival, wall clock, ns.
+        replied: spec that a worker answered on a query.
+    """
+
+    node: str
+    samples: Sequence[Arrived]
+    seconds: float
+    alive: bool = True
+    clocks: Sequence[tuple[int, ClockReply, int]] = ()
+    replied: ModelSpec | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """How the arm moved while it was sent commands.
+
+    Args:
+        what: one of `TRIALS`.
+        asked: way that the commands lead, rad of a joint or m.
+        track: (time in s, way, mode) of every state, from the first command on.
+        event_s: when the stop was put, or the stream ended.
+        patience_s: for so long the robot may go on then.
+    """
+
+    what: str
+    asked: float
+    track: Sequence[tuple[float, float, str]] = ()
+    event_s: float = 0.0
+    patience_s: float = 0.0
+
+
+# -- every stream -----------------------------------------------------------------------------
+def presence(seen: Seen) -> Iterator[Finding]:
+    """Liveliness token and clock."""
+    name = f"alive/{seen.node}"
+    yield Finding("alive", seen.alive, name if seen.alive else f"there is no token {name}")
+    if not seen.clocks:
+        yield Finding("clock", False, f"no valid reply on clock/{seen.node}")
+        return
+    asked_ns, reply, got_ns = min(seen.clocks, key=lambda each: each[2] - each[0])
+    offset_s = ((reply.heard_ns - asked_ns) + (reply.said_ns - got_ns)) / 2e9
+    if reply.said_ns < reply.heard_ns:
+        yield Finding("clock", False, "said_ns is before heard_ns")
+    else:
+        yield Finding("clock", True, f"{1e3 * offset_s:+.1f} ms from this one")
+
+
+def stream(seen: Seen, key: str, least_hz: float) -> Iterator[Finding]:
+    """Records, writer, order, stamps and rate of one key."""
+    samples = of_key(seen.samples, key)
+    if not samples:
+        yield Finding(f"{key}: rate", False, f"nothing in {seen.seconds:.0f} s")
+        return
+    bad = [sample.why for sample in samples if sample.why]
+    text = f"{len(bad)} of {len(samples)}: {bad[0]}" if bad else f"{len(samples)} valid"
+    yield Finding(f"{key}: records", not bad, text)
+    unknown = sorted({name for sample in samples for name in sample.unknown})
+    if unknown:
+        yield Finding(f"{key}: fields", False, f"not of this version: {', '.join(unknown[:8])}")
+    good = [sample for sample in samples if sample.header is not None]
+    if good:
+        yield from _headers(seen, key, good)
+    hz = len(samples) / seen.seconds
+    text = f"{hz:.1f} Hz, at least {least_hz:g} are wanted"
+    yield Finding(f"{key}: rate", hz >= least_hz, text)
+
+
+def _headers(seen: Seen, key: str, samples: Sequence[Arrived]) -> Iterator[Finding]:
+    headers: list[Any] = [sample.header for sample in samples]
+    sources = sorted({header.source for header in headers})
+    named = all(source.startswith(f"{seen.node}#") for source in sources)
+    right = len(sources) == 1 and named
+    wanted = f"{', '.join(sources[:4])}; wanted: one, {seen.node}#..."
+    yield Finding(f"{key}: source", right, sources[0] if right else wanted)
+    steps = [after.seq - before.seq for before, after in pairwise(headers)]
+    wrong = sum(step <= 0 for step in steps)
+    lost = sum(step - 1 for step in steps if step > 1)
+    text = f"{wrong} do not grow" if wrong else f"grows, {lost} missing"
+    yield Finding(f"{key}: seq", not wrong, text)
+    back = sum(b.stamp_wall_ns <= a.stamp_wall_ns for a, b in pairwise(headers))
+    ages_s = [
+        (each.received_ns - h.stamp_wall_ns) / 1e9 for each, h in zip(samples, headers, strict=True)
+    ]
+    old_s, young_s = max(ages_s), min(ages_s)
+    if back:
+        yield Finding(f"{key}: stamps", False, f"{back} do not grow")
+    elif old_s > MOST_AGE_S or young_s < -MOST_AHEAD_S:
+        text = f"{young_s:.3f} to {old_s:.3f} s old: nanoseconds of another clock, or of no clock?"
+        yield Finding(f"{key}: stamps", False, text)
+    else:
+        yield Finding(f"{key}: stamps", True, f"{young_s:.3f} to {old_s:.3f} s old")
+
+
+# -- robot ------------------------------------------------------------------------------------
+def robot(seen: Seen, profile: Profile, kinematics: Kinematics) -> Iterator[Finding]:
+    """All rules of a robot that is only looked at."""
+    yield from presence(seen)
+    for key in ROBOT_KEYS:
+        yield from stream(seen, key, LEAST_STATE_HZ)
+    by_key = {key: _by_stamp(of_key(seen.samples, key)) for key in ROBOT_KEYS}
+    pairs = [set(found) for found in by_key.values()]
+    together = set.intersection(*pairs)
+    share = len(together) / max(map(len, pairs)) if any(pairs) else 0.0
+    text = f"{100 * share:.0f} % have stamp and seq of all three"
+    yield Finding("states belong together", share > RATE_SHARE, text)
+    joints, poses, grippers = by_key.values()
+    yield from _joints(list(joints.values()), profile, kinematics)
+    yield from _poses([(joints[at], poses[at]) for at in sorted(together)], profile, kinematics)
+    widths_m = [gripper.width_m for gripper in grippers.values()]
+    if widths_m:
+        most_m = profile.robot.gripper.max_width_m
+        text = f"up to {max(widths_m):.4g} m; the profile's gripper opens {most_m:g} m"
+        yield Finding("gripper width in m", max(widths_m) <= most_m + WIDTH_M, text)
+
+
+def _by_stamp(samples: Sequence[Arrived]) -> dict[tuple[int, int], Any]:
+    return {
+        (each.header.stamp_wall_ns, each.header.seq): each.record
+        for each in samples
+        if each.header is not None and each.record is not None
+    }
+
+
+def _joints(
+    joints: Sequence[JointState], profile: Profile, kinematics: Kinematics
+) -> Iterator[Finding]:
+    wanted = sorted(profile.robot.arm_joints)
+    if not joints:
+        yield Finding("joint names", None, "no joints to judge")
+        return
+    names = {name for state in joints for name in state.names}
+    right = sorted(names) == wanted
+    text = f"{len(names)} of the profile" if right else f"{sorted(names)}, wanted: {wanted}"
+    yield Finding("joint names", right, text)
+    if not right:
+        return
+    measured = np.array([kinematics.joints_of(state) for state in joints])
+    low, high = kinematics.lower_rad - RANGE_RAD, kinematics.upper_rad + RANGE_RAD
+    outside = np.any((measured < low) | (measured > high), axis=0).tolist()
+    where = ", ".join(name for name, out in zip(kinematics.arm_joints, outside, strict=True) if out)
+    text = f"out of range: {where}; degrees, or another zero?" if where else "within their ranges"
+    yield Finding("joints in rad", not where, text)
+
+
+def _poses(
+    pairs: Sequence[tuple[JointState, PoseState]], profile: Profile, kinematics: Kinematics
+) -> Iterator[Finding]:
+    wanted = sorted(profile.robot.arm_joints)
+    apart = [
+        _apart(kinematics, joint, pose) for joint, pose in pairs if sorted(joint.names) == wanted
+    ]
+    if not apart:
+        yield Finding("pose is that of the joints", None, "no pose with joints to judge")
+        return
+    apart_m, apart_rad = np.max(apart, axis=0)
+    right = apart_m <= APART_M and apart_rad <= APART_RAD
+    text = f"{1e3 * apart_m:.1f} mm and {apart_rad:.3f} rad apart at most"
+    hint = "" if right else "; another unit, base or TCP?"
+    yield Finding("pose is that of the joints", bool(right), text + hint)
+
+
+def _apart(kinematics: Kinematics, joint: JointState, pose: PoseState) -> tuple[float, float]:
+    measured = Pose(pose.position_m, rotation_from_quat(pose.quat_xyzw))
+    return pose_distance(kinematics.forward(kinematics.joints_of(joint)), measured)
+
+
+# -- robot that is moved ------------------------------------------------------------------------
+FOLLOW, SILENT, STOP = "follows commands", "brakes when they fall silent", "brakes on a stop"
+LATCHED, AFTER_RESET = "obeys nothing until reset", "follows commands after a reset"
+NAN, REPLAYED = "rejects NaN", "rejects a seq that does not grow"
+FOREIGN, STALE = "rejects a second writer", "rejects commands that are 2 s old"
+DURATION_S, PEAK = 2.0, 1.875
+"""Of the motion that commands ask for, and its greatest speed in ways per duration."""
+WRONG = (NAN, REPLAYED, FOREIGN, STALE)
+TRIALS = (FOLLOW, NAN, REPLAYED, FOREIGN, STALE, SILENT, STOP, LATCHED, AFTER_RESET)
+
+
+def way_at(time_s: float) -> float:
+    """Share of the way at a time of the motion: minimum jerk, from rest to rest."""
+    s = min(max(time_s / DURATION_S, 0.0), 1.0)
+    return s**3 * (10 - 15 * s + 6 * s * s)
+
+
+def moved(trials: Sequence[Trial]) -> Iterator[Finding]:
+    """The rules of a robot that was sent commands."""
+    for trial in trials:
+        if not trial.track:
+            yield Finding(trial.what, False, "no valid states while it was commanded")
+            continue
+        yield _moved(trial)
+
+
+def _moved(trial: Trial) -> Finding:
+    way = max((abs(way) for _, way, _ in trial.track), default=0.0)
+    share = way / trial.asked
+    text = f"{100 * share:.0f} % of the way"
+    if trial.what in (FOLLOW, AFTER_RESET):
+        return Finding(trial.what, share >= FOLLOWED, text)
+    if trial.what in (*WRONG, LATCHED):
+        return Finding(trial.what, share <= IGNORED, text)
+    stands_s = _stands_s(trial)
+    until = min(trial.event_s, DURATION_S)
+    most = way_at(until) + PEAK * trial.patience_s / DURATION_S + STOPPED_SHARE
+    right = share <= most and stands_s <= trial.patience_s + STOPPED_S
+    text = f"{text}, stands after {stands_s:.2f} s"
+    mode = trial.track[-1][2]
+    if trial.what == STOP and mode == "ready":
+        return Finding(trial.what, False, f"{text}; its mode is still 'ready'")
+    return Finding(trial.what, right, text)
+
+
+STILL_SHARE = 0.01
+
+
+def _stands_s(trial: Trial) -> float:
+    """From the event until the arm is, and stays, where it ends."""
+    end = trial.track[-1][1]
+    moving = [at_s for at_s, way, _ in trial.track if abs(way - end) > STILL_SHARE * trial.asked]
+    return max(0.0, moving[-1] - trial.event_s) if moving else 0.0
+
+
+# -- worker -----------------------------------------------------------------------------------
+def worker(seen: Seen, profile: Profile) -> Iterator[Finding]:
+    """All rules of a worker, whose node is ``worker-NAME``."""
+    name = seen.node.removeprefix("worker-")
+    yield from presence(seen)
+    yield from stream(seen, f"spec/{name}", RATE_SHARE)
+    specs = [each.record for each in of_key(seen.samples, f"spec/{name}") if each.record]
+    tasks = [each.record for each in of_key(seen.samples, "task") if each.record]
+    spec: ModelSpec | None = specs[-1] if specs else None
+    same = spec is not None and seen.replied == spec
+    yield Finding("spec on query", same, "as published" if same else "not what it publishes")
+    if not tasks:
+        yield Finding("chunks", None, "no command node publishes a task")
+        return
+    yield from stream(seen, f"delta/{name}", RATE_SHARE * tasks[-1].rate_hz)
+    chunks = [each for each in of_key(seen.samples, f"delta/{name}") if each.record]
+    if spec is not None and chunks:
+        yield from _chunks(name, chunks, spec, tasks, profile)
+
+
+def _chunks(
+    name: str, chunks: Sequence[Arrived], spec: ModelSpec, tasks: Sequence[Task], profile: Profile
+) -> Iterator[Finding]:
+    found: list[ActionChunk] = [each.record for each in chunks]
+    named = all(chunk.worker == name for chunk in found)
+    yield Finding("worker in chunks", named, name if named else found[0].worker)
+    hashes = {chunk.spec_hash for chunk in found}
+    text = spec.hash if hashes == {spec.hash} else f"{hashes}, that of its spec is {spec.hash}"
+    yield Finding("spec_hash", hashes == {spec.hash}, text)
+    episodes = {task.episode for task in tasks}
+    wrong = {chunk.episode for chunk in found} - episodes
+    yield Finding("episode", not wrong, f"{sorted(wrong)} was not asked for" if wrong else "asked")
+    late = sum(not _in_order(each) for each in chunks)
+    text = f"{late} not: observation, observed, start, end, published, valid until"
+    yield Finding("times in order", not late, text if late else "in order")
+    yield _steps(found, spec, profile)
+
+
+def _in_order(chunk: Arrived) -> bool:
+    record, header = chunk.record, chunk.header
+    assert header is not None
+    times = (
+        *(record.observation_stamp_ns, record.observed_ns, record.inference_start_ns),
+        *(record.inference_end_ns, header.stamp_wall_ns, record.valid_until_ns),
+    )
+    return all(before <= after for before, after in pairwise(times))
+
+
+def _steps(chunks: Sequence[ActionChunk], spec: ModelSpec, profile: Profile) -> Finding:
+    action, rule = spec.action, "steps as its spec says"
+    try:
+        for chunk in chunks:
+            check_steps(action, chunk.steps)
+    except SpecError as error:
+        return Finding(rule, False, str(error))
+    if action.space == "tcp" and not action.parts:
+        most_m = np.abs(np.concatenate([chunk.steps[:, :3] for chunk in chunks])).max()
+        most_m *= action.position_scale_m
+        limit_m = 10.0 if action.targets else 4 * profile.limits.step_m
+        if most_m > limit_m:
+            return Finding(rule, False, f"x, y, z up to {most_m:g} m: another unit?")
+    return Finding(rule, True, f"{len(chunks)} chunks")
+
+
+# -- camera -----------------------------------------------------------------------------------
+def camera(seen: Seen, name: str, profile: Profile) -> Iterator[Finding]:
+    """All rules of a camera's node."""
+    yield from presence(seen)
+    key, wanted = f"camera/{name}/raw", profile.cameras[name]
+    yield from stream(seen, key, RATE_SHARE * wanted.rate_hz)
+    images = [each.record for each in of_key(seen.samples, key) if each.record is not None]
+    sizes = {image.rgb.shape[:2] for image in images}
+    if not sizes:
+        return
+    right = sizes == {(wanted.height, wanted.width)}
+    shown = ", ".join(f"{width}x{height}" for height, width in sorted(sizes))
+    text = f"{shown}, of the profile {wanted.width}x{wanted.height}"
+    yield Finding("size", right, text)
+    same = sum(np.array_equal(before.rgb, after.rgb) for before, after in pairwise(images))
+    text = f"{same} of {len(images)} repeat the one before"
+    yield Finding("images change", same < len(images) - 1, text)

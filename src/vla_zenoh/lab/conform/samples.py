@@ -1,0 +1,84 @@
+"""Samples as they arrived, decoded and judged by nobody yet."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from vla_zenoh.codec import records
+from vla_zenoh.codec.image import decode_jpeg, decode_raw
+from vla_zenoh.errors import CodecError
+from vla_zenoh.policy import ModelSpec
+from vla_zenoh.types import (
+    ActionChunk,
+    GripperState,
+    Header,
+    JointState,
+    PoseState,
+    Task,
+)
+
+KINDS = {
+    "state/joint": JointState,
+    "state/pose": PoseState,
+    "state/gripper": GripperState,
+    "task": Task,
+    "spec": ModelSpec,
+    "delta": ActionChunk,
+}
+"""Key, or the part of it before a worker's name -> kind of record."""
+
+
+class Raw(NamedTuple):
+    """A sample as it arrived at `received_ns`, wall clock; `key` is below the robot."""
+
+    key: str
+    payload: bytes
+    attachment: bytes | None
+    encoding: str
+    received_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Arrived:
+    """One sample.
+
+    Args:
+        header, record: None where they do not decode.
+        why: it does not.
+        unknown: fields that this version does not know.
+    """
+
+    key: str
+    received_ns: int
+    header: Header | None
+    record: Any
+    why: str = ""
+    unknown: tuple[str, ...] = ()
+
+
+def arrived(raw: Raw) -> Arrived:
+    """The sample of its bytes."""
+    unknown: list[str] = []
+    header = None
+    try:
+        header = records.decode_header(raw.attachment)
+        record = _record(raw, unknown)
+    except CodecError as error:
+        return Arrived(raw.key, raw.received_ns, header, None, f"{error.reason}: {error}")
+    return Arrived(raw.key, raw.received_ns, header, record, unknown=tuple(unknown))
+
+
+def _record(raw: Raw, unknown: list[str]) -> Any:
+    kind = KINDS.get(raw.key) or KINDS.get(raw.key.partition("/")[0])
+    if kind is not None:
+        return records.decode(kind, raw.payload, unknown)
+    if raw.encoding.startswith("image/jpeg"):
+        return decode_jpeg(raw.payload)
+    return decode_raw(raw.payload, raw.encoding.partition(";")[2])
+
+
+def of_key(samples: Iterable[Arrived], key: str) -> list[Arrived]:
+    """The samples of a key, in the order of their arrival."""
+    return [sample for sample in samples if sample.key == key]
