@@ -21,6 +21,7 @@ import cv2
 import numpy as np
 import typer
 from model_wires import groot, lerobot_server, npy, openpi, openvla_rest, origami, xpolicylab
+from vla_zenoh_mcp import protocol
 
 from vla_zenoh.cli import status_table as cli_status
 from vla_zenoh.cli.options import model_options
@@ -41,7 +42,7 @@ from vla_zenoh.lab.inference_views import InferenceView
 from vla_zenoh.lab.policy_servers import message as arrays
 from vla_zenoh.lab.recording.record_types import RECORDS, record_from_json, record_to_json
 from vla_zenoh.lab.recording.run import load_run
-from vla_zenoh.lab.serve import mcp, openpi_server
+from vla_zenoh.lab.serve import openpi_server
 from vla_zenoh.lab.tasks.order import parse_prompt
 from vla_zenoh.policy import ActionSpec, ModelSpec, ObservationSpec
 from vla_zenoh.policy.loader import find_model, make_policy
@@ -58,7 +59,7 @@ CORPUS = Path(__file__).parent / "corpus"
 """Inputs that once broke a reader, or nearly: a folder for each target."""
 
 
-MCP_TOOLS = mcp.tools(["front"], list(mcp.DESCRIPTIONS))
+MCP_TOOLS = protocol.tools(["front"], list(protocol.DESCRIPTIONS))
 MAX_SHOWN = 50_000
 """Characters that a few nodes may fill a screen with."""
 
@@ -403,7 +404,7 @@ def _targets() -> Iterator[Target]:
     # -- other systems
     yield Target(
         "mcp",
-        lambda data: mcp.read(data, MCP_TOOLS, "1"),
+        lambda data: protocol.read(data, MCP_TOOLS, "1"),
         (),
         lambda: [
             b'{"jsonrpc": "2.0", "id": 1, "method": "tools/call", "params": {"name": "home"}}'

@@ -82,8 +82,7 @@ COMMANDS: Mapping[str, Mapping[str, str | CommandGroup]] = {
         ),
         "web": "lab.cli.web:web",
         "serve": CommandGroup(
-            "Let agents drive the robot; offer a model to clients of other frameworks.",
-            {"mcp": "lab.cli.serve:mcp", "policy": "lab.cli.serve:serve"},
+            "Offer a model to clients of other frameworks.", {"policy": "lab.cli.serve:serve"}
         ),
     },
     "Watch and record": {

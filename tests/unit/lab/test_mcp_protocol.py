@@ -6,8 +6,7 @@ import json
 from typing import Any
 
 import pytest
-
-from vla_zenoh.lab.serve.mcp import (
+from vla_zenoh_mcp.protocol import (
     DESCRIPTIONS,
     INVALID_PARAMS,
     INVALID_REQUEST,

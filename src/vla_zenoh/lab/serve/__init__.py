@@ -1,1 +1,1 @@
-"""Serves our models to the clients of other policy servers."""
+"""Serves our models to the clients of openpi."""

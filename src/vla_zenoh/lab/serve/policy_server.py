@@ -1,4 +1,4 @@
-"""Serves one of our models over WebSocket, without Zenoh, in the protocol of another server.
+"""Serves one of our models to clients of openpi over WebSocket, without Zenoh.
 
 It serves one client at a time, as a model may keep state; a second client is rejected.
 """
@@ -6,14 +6,12 @@ It serves one client at a time, as a model may keep state; a second client is re
 from __future__ import annotations
 
 import hmac
-import logging
 import threading
-from collections.abc import Callable
 from http import HTTPStatus
 
 from vla_zenoh.errors import MissingExtraError
-from vla_zenoh.lab.serve.openpi_server import OpenPiConversation
-from vla_zenoh.lab.serve.vla_eval import VlaEvalConversation
+from vla_zenoh.lab.serve.openpi_server import HEALTH_PATH, MAX_BYTES, OpenPiConversation
+from vla_zenoh.lab.serve.served_policy import ServedPolicy
 
 try:
     from websockets.exceptions import ConnectionClosed
@@ -23,40 +21,25 @@ except ImportError as error:
     raise MissingExtraError(error.name or "websockets", "serve") from error
 
 INTERNAL_ERROR, TRY_AGAIN_LATER = 1011, 1013
-LOG = logging.getLogger("vla_zenoh.serve")
-Conversation = OpenPiConversation | VlaEvalConversation
-"""What is said on one connection: `greeting` is the first frame, where the server begins, `reply`
-the answer to a frame. None: none; text is the reason why the connection is closed."""
 
 
 class PolicyServer:
     """WebSocket server of one model.
 
     Args:
-        converse: begins the conversation of a new connection.
         port: to listen on; 0: any.
-        health: path of the health check.
         api_key: required of clients; empty: none.
     """
 
-    def __init__(
-        self,
-        converse: Callable[[], Conversation],
-        host: str,
-        port: int,
-        *,
-        health: str,
-        max_bytes: int,
-        api_key: str = "",
-    ) -> None:
-        self._converse, self._health, self._key = converse, health, api_key
+    def __init__(self, policy: ServedPolicy, host: str, port: int, api_key: str = "") -> None:
+        self._policy, self._key = policy, api_key
         self._busy = threading.Lock()
         self._server: Server = serve(
             self._handle,
             host,
             port,
             compression=None,
-            max_size=max_bytes,
+            max_size=MAX_BYTES,
             process_request=self._admit,
         )
         self.port: int = self._server.socket.getsockname()[1]
@@ -71,7 +54,7 @@ class PolicyServer:
 
     # -- connections --------------------------------------------------------------------------
     def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
-        if request.path == self._health:
+        if request.path == HEALTH_PATH:
             return connection.respond(HTTPStatus.OK, "OK\n")
         given = request.headers.get("Authorization", "").encode()
         if self._key and not hmac.compare_digest(given, f"Api-Key {self._key}".encode()):
@@ -94,14 +77,11 @@ class PolicyServer:
             self._busy.release()
 
     def _serve(self, connection: ServerConnection) -> None:
-        conversation = self._converse()
-        greeting = conversation.greeting()
-        if greeting is not None:
-            connection.send(greeting)
+        conversation = OpenPiConversation(self._policy)
+        connection.send(conversation.greeting())
         while True:
             reply = conversation.reply(connection.recv())
-            if reply is not None:
-                connection.send(reply)
+            connection.send(reply)
             if isinstance(reply, str):
                 connection.close(INTERNAL_ERROR, "the reason is in the frame before")
                 return

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -151,28 +151,16 @@ def _pixels(name: str, value: Any) -> NDArray[np.uint8]:
     return np.ascontiguousarray(scale * given).astype(np.uint8)
 
 
-class DefaultNames(NamedTuple):
-    """Default names of the clients' fields.
-
-    Args:
-        camera: with a place for the name of the camera.
-        state: with a place for joint, pose or gripper.
-    """
-
-    camera: str = "observation/{}"
-    state: str = "observation/{}"
-    prompt: str = "prompt"
-
-
 def make_served_policy(
     policy: Policy,
     map_option: str,
     joints: tuple[str, ...],
     max_width_m: float,
-    names: DefaultNames = DefaultNames(),  # noqa: B008  # cannot be changed
     reference: tuple[float, ...] = IDENTITY,
 ) -> ServedPolicy:
-    """The offer of a model; `map_option` names things otherwise than `names`.
+    """The offer of a model: ``prompt`` and fields ``observation/CAMERA``, ``observation/pose``, ...
+
+    `map_option` names things otherwise.
 
     The model is given the quaternion, of the two, that is nearer to the `reference` x, y, z, w,
     whatever the client sends.
@@ -201,12 +189,12 @@ def make_served_policy(
     fields = dict(own)
     for camera in cameras:
         if camera not in named:
-            fields[names.camera.format(camera)] = FieldSource(camera=camera)
+            fields[f"observation/{camera}"] = FieldSource(camera=camera)
     for part in spec.observation.state:
         if part not in covered:
-            fields[names.state.format(part)] = FieldSource(parts=read_parts(_OF_PART[part]))
+            fields[f"observation/{part}"] = FieldSource(parts=read_parts(_OF_PART[part]))
     if not any(source.prompt for source in own.values()):
-        fields[names.prompt] = FieldSource(prompt=True)
+        fields["prompt"] = FieldSource(prompt=True)
     parts = {part for source in fields.values() for part in source.parts}
     if "pose" in spec.observation.state and not ("position" in parts and parts & set(ROTATIONS)):
         raise SpecError(f"map must give the whole pose: position and one of {', '.join(ROTATIONS)}")

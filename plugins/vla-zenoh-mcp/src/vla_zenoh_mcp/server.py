@@ -19,7 +19,7 @@ from vla_zenoh.client.primitives import ask
 from vla_zenoh.client.remote_robot import RemoteRobot
 from vla_zenoh.errors import SessionError, VlaZenohError, in_words
 from vla_zenoh.keys import worker_node
-from vla_zenoh.lab.serve.mcp import (
+from vla_zenoh_mcp.protocol import (
     DESCRIPTIONS,
     LOOKING,
     MAX_LINE,
