@@ -88,8 +88,6 @@ ALLOWED = {
             "lab/web/pictures.py",
             "lab/web/recordings.py",
             "lab/web/robot_link.py",
-            "lab/web/runs.py",
-            "lab/web/trial.py",
         ),
         IO - NODE,
     ),

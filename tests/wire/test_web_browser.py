@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,8 +11,6 @@ import pytest
 from camera_rig import PATIENCE_S, until
 from chain import Chain, running_chain, write_profile
 from web_rig import OPERATOR, Site, serving, write_people
-
-from vla_zenoh.lab.trial.folder import TrialFolder
 
 pytest.importorskip("starlette", reason="needs the extra web")
 webdriver = pytest.importorskip("selenium.webdriver", reason="needs selenium")
@@ -144,40 +141,6 @@ def tab(site: Site) -> Iterator[Tab]:
             driver.quit()
 
 
-def test_a_finished_run_is_listed_with_its_report_and_its_video(chain: Chain, tab: Tab) -> None:
-    tab.click("Record")
-    tab.until("it records", lambda: "web-" in tab.text("recording"))
-    time.sleep(2.0)
-    tab.click("Stop and keep")
-    tab.until("it is kept", lambda: "not recording" in tab.text("recording"))
-
-    def listed() -> str | None:
-        tab.click("List")
-        return tab.run(
-            "const r = document.querySelector('#run-rows tr'); return r && r.cells[0].textContent"
-        )
-
-    row = tab.until("a run", listed)
-    tab.click(f"Video of {row}")
-    tab.until(
-        "the video plays",
-        lambda: tab.run(
-            "const f = document.getElementById('film');"
-            "return f.videoWidth > 0 && f.currentTime > 0.2"
-        ),
-    )
-    tab.click(f"Report of {row}")
-    tab.click(f"open the report of {row}")
-    tab.until("a second tab", lambda: len(tab.driver.window_handles) == 2)
-    tab.driver.switch_to.window(tab.driver.window_handles[1])
-    tab.until("its plots", lambda: tab.run("return document.querySelectorAll('.plotly').length"))
-    assert tab.run("try { return sessionStorage.length } catch (e) { return e.name }") == (
-        "SecurityError"
-    )
-    tab.driver.close()
-    tab.driver.switch_to.window(tab.driver.window_handles[0])
-
-
 def test_settings_are_those_of_the_page(chain: Chain, tab: Tab) -> None:
     def said(field: str) -> Any:
         return getattr(chain.client.task, field)
@@ -280,34 +243,3 @@ def test_home_goes_while_its_button_is_pressed(chain: Chain, tab: Tab) -> None:
 def test_the_last_minutes_are_saved_on_a_touch(chain: Chain, tab: Tab) -> None:
     tab.click("Save the last minutes")
     tab.until("the log says so", lambda: "rolling: saved" in tab.text("events"))
-
-
-def test_a_trial_is_judged_by_buttons(chain: Chain, tab: Tab) -> None:
-    tab.run(
-        "for (const [id, text] of Object.entries({name: 'seen', workers: 'scripted',"
-        " prompt: 'HARD: go up', episodes: '1', seconds: '20'}))"
-        " document.getElementById(`trial-${id}`).value = text"
-    )
-    tab.click("Begin")
-    tab.click("Scene is ready: go")
-    for _ in range(20):
-        words = tab.until(
-            "an answer",
-            lambda: (
-                tab.text("trial-words").startswith(("It runs", "Not activated"))
-                and tab.text("trial-words")
-            ),
-        )
-        if words.startswith("It runs"):
-            break
-        tab.click("Try again")
-        time.sleep(0.5)
-    shown = [tab.run("return document.getElementById('worker').value"), tab.text("latency")]
-    assert not any("scripted" in words for words in shown)
-    tab.click("End it")
-    tab.until("the question", lambda: tab.text("trial-words").startswith("Did it succeed?"))
-    tab.run("document.getElementById('trial-note').value = 'in the box'")
-    tab.click("Success")
-    tab.until("the result", lambda: tab.text("trial-result") == "finished: scripted 1 of 1")
-    (only,) = TrialFolder(chain.profile_file.parent / "runs" / "seen").episodes()
-    assert (only.verdict, only.note, only.end) == ("success", "in the box", "person")

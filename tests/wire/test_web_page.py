@@ -8,7 +8,6 @@ import random
 import signal
 import time
 from collections.abc import Iterator
-from shutil import rmtree
 from typing import Any
 
 import numpy as np
@@ -267,69 +266,6 @@ def test_a_recording_ends_with_the_verdict_of_a_person(chain: Chain, site: Site)
     assert not list(file.entries(lambda _: False))  # what is told at the end is known there
     assert verdict_in(file.ended, "scripted") == "success"
     assert (file.ended or {})["trial"]["note"] == "went well"
-
-
-def made(page: Browser, name: str, kind: str) -> dict[str, Any]:
-    """The answer to a request to make a page or film."""
-    page.heard.clear()
-    page.send(do="make", name=name, kind=kind)
-    return page.wait("made", timeout_s=READY_PATIENCE_S)
-
-
-def test_finished_runs_are_listed_and_opened_with_report_and_video(
-    chain: Chain, site: Site
-) -> None:
-    with browsing(site) as page, browsing(site, VIEWER) as viewer:
-        end_recording(page)
-        assert page.ask(do="record", on=True, verdict="", note="")["is"] == "done"
-        time.sleep(2.0)
-        page.send(do="runs")
-        before = page.wait("runs")["runs"]
-        assert page.ask(do="record", on=False, verdict="failure", note="")["is"] == "done"
-        page.heard.clear()
-        page.send(do="runs")
-        (name,) = {run["name"] for run in page.wait("runs")["runs"]} - {
-            run["name"]
-            for run in before  # the one that was being written is none yet
-        }
-        report = made(page, name, "report")
-        status, headers, body = site.ask("GET", report["url"])
-        assert status == 200
-        assert headers["content-security-policy"].startswith("sandbox allow-scripts; default-src")
-        assert "allow-same-origin" not in headers["content-security-policy"]
-        assert b"data:image/jpeg" in body
-        film = made(page, name, "film")
-        status, headers, body = site.ask("GET", film["url"])
-        assert (status, headers["content-type"]) == (200, "video/mp4")
-        assert b"ftyp" in body[:32]
-        # A viewer reads what is not a picture.
-        assert made(viewer, name, "film")["why"].startswith("your token is a viewer's")
-        status, _, body = site.ask("GET", made(viewer, name, "report")["url"])
-        assert status == 200
-        assert b"data:image/jpeg" not in body
-
-
-def test_no_path_of_a_browser_is_opened(chain: Chain, site: Site) -> None:
-    (chain.profile_file.parent / "secret.html").write_text("secret")
-    night = chain.profile_file.parent / "runs" / "night"
-    rmtree(night, ignore_errors=True)
-    night.mkdir(parents=True)
-    (night / "index.html").write_text("a page")
-    (night / "strip.jpg").write_bytes(b"a picture")
-    (night / "away.html").symlink_to(chain.profile_file.parent / "secret.html")
-    with browsing(site) as page, browsing(site, VIEWER) as viewer:
-        for name in ("../secret.html", "/etc/passwd", "night/../night", "", ".", "x" * 900):
-            assert "there is no run" in made(page, name, "report")["why"]
-        url, poor = made(page, "night", "report")["url"], made(viewer, "night", "report")["url"]
-        base = url.removesuffix("index.html")
-        assert site.ask("GET", url)[2] == b"a page"
-        assert site.ask("GET", f"{base}strip.jpg")[2] == b"a picture"
-        assert site.ask("GET", poor)[0] == 200
-        assert site.ask("GET", poor.replace("index.html", "strip.jpg"))[0] == 404
-        for rest in ("../../secret.html", "..%2f..%2fsecret.html", "away.html", "/etc/passwd", ""):
-            assert site.ask("GET", f"{base}{rest}")[0] == 404, rest
-        for ticket in ("", "x", "..", "%2e%2e"):
-            assert site.ask("GET", f"/runs/{ticket}/index.html")[0] in (403, 404), ticket
 
 
 def test_pictures_come_newest_first_and_no_faster_than_they_are_drawn(

@@ -239,7 +239,6 @@ PRINTS = {
     "cli/plain.py": "lines made printable there",
     "cli/nodes.py": "the profile's name, for a program that waits for it",
     "lab/cli/profile.py": "a profile or a bridge's configuration as a file",
-    "lab/web/runs.py": "the share that is done, for the server that began it",
     "runtime/process.py": "what this computer lacks for shared memory, in our own words",
     "runtime/environments.py": "the packages of a model that is about to run here",
 }

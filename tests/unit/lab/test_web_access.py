@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 from contextlib import suppress
 from pathlib import Path
+from typing import get_args
 
 import pytest
 from hypothesis import given
@@ -12,9 +14,10 @@ from hypothesis import strategies as st
 
 from vla_zenoh.errors import CodecError, SecurityError
 from vla_zenoh.lab.rate_limit import RateLimit
+from vla_zenoh.lab.web import requests
 from vla_zenoh.lab.web.access import People, Person, host_is_ours, origin_is_ours, read_people
 from vla_zenoh.lab.web.hold import HOLD_S, Hold
-from vla_zenoh.lab.web.requests import FIELDS, MAX_BYTES, parse
+from vla_zenoh.lab.web.requests import MAX_BYTES, AnyRequest, name_of, parse
 
 ANNA = Person("anna", "operator", "0123456789abcdef")
 WALL = Person("wall", "viewer", "fedcba9876543210")
@@ -115,7 +118,7 @@ def test_a_rate_limit_lets_a_burst_through_and_then_its_rate() -> None:
 # -- messages ---------------------------------------------------------------------------------
 def test_a_request_has_its_fields() -> None:
     request = parse('{"do": "prompt", "text": "lift the brick"}')
-    assert (request.do, dict(request.values)) == ("prompt", {"text": "lift the brick"})
+    assert request == requests.Prompt("lift the brick")
 
 
 @pytest.mark.parametrize(
@@ -156,17 +159,33 @@ VALUES = st.recursive(
 )
 
 
-@given(st.sampled_from(sorted(FIELDS)), st.data())
+KINDS = {kind.__struct_config__.tag: kind for kind in get_args(AnyRequest)}
+
+
+@given(st.sampled_from(sorted(KINDS)), st.data())
 def test_whatever_a_field_holds_it_is_taken_or_named(do: str, data: st.DataObject) -> None:
-    message = {"do": do, **{name: data.draw(VALUES) for name in FIELDS[do]}}
+    fields = KINDS[do].__struct_fields__
+    message = {"do": do, **{name: data.draw(VALUES) for name in fields}}
     with suppress(CodecError):
-        assert parse(json.dumps(message)).do == do
+        assert name_of(parse(json.dumps(message))) == do
+
+
+def test_the_page_asks_for_what_the_server_knows_and_hears_what_it_says() -> None:
+    """Kinds of messages are declared in `requests`, and in the table RECEIVE of the page."""
+    folder = Path(requests.__file__).parent
+    page = (folder / "static/page.js").read_text("utf-8")
+    asked = set(re.findall(r'do: "([a-z_]+)"', page)) | {"activate", "deactivate", "reset"}
+    assert asked == KINDS.keys()
+    server = (folder / "server.py").read_text() + (folder / "tables.py").read_text()
+    table = page.partition("const RECEIVE = {")[2].partition("};")[0]
+    heard = set(re.findall(r"^  ([a-z_]+): ", table, re.M))
+    assert set(re.findall(r'"is": "([a-z_]+)"', server)) == heard
 
 
 @given(st.text())
 def test_any_text_is_a_request_or_is_named(text: str) -> None:
     with suppress(CodecError):
-        assert parse(text).do in FIELDS
+        assert name_of(parse(text)) in KINDS
 
 
 # -- hold-to-run ------------------------------------------------------------------------------

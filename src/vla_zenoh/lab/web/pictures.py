@@ -16,7 +16,7 @@ from vla_zenoh.codec.image import decode_depth, encode_jpeg
 from vla_zenoh.errors import CodecError, ProfileError
 from vla_zenoh.lab.newest_records import StreamSlot
 from vla_zenoh.lab.rate_limit import RateLimit
-from vla_zenoh.lab.web.requests import parse
+from vla_zenoh.lab.web.requests import Drawn, Look, parse
 from vla_zenoh.profile import CameraProfile
 from vla_zenoh.types import Image
 
@@ -152,7 +152,7 @@ def _coloured(png: bytes, encoding: str) -> tuple[bytes, str]:
     return encode_jpeg(Image(rgb)), f"{near * depth.unit_m:.2f} to {far * depth.unit_m:.2f} m"
 
 
-class Look:
+class PageView:
     """What a page looks at. `now_s`: monotonic."""
 
     def __init__(self, now_s: float) -> None:
@@ -168,12 +168,12 @@ class Look:
             request = parse(text)
             if not self.limit.take(now_s):
                 return "too_fast"
-            if request.do == "look":
-                pictures.change(self.streams, request.values["streams"])
-                self.streams = tuple(dict.fromkeys(request.values["streams"]))
-                self.period_s = 1 / min(max(request.values["hz"], 0.1), MAX_PICTURE_HZ)
-            elif request.do == "drawn":
-                self.drawn = max(self.drawn, min(request.values["frame"], self.sent))
+            if isinstance(request, Look):
+                pictures.change(self.streams, request.streams)
+                self.streams = tuple(dict.fromkeys(request.streams))
+                self.period_s = 1 / min(max(request.hz, 0.1), MAX_PICTURE_HZ)
+            elif isinstance(request, Drawn):
+                self.drawn = max(self.drawn, min(request.frame, self.sent))
         except CodecError:
             return "bad_message"
         return ""

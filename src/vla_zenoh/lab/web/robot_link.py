@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
@@ -20,12 +20,11 @@ from vla_zenoh.codec.settings import decode_held
 from vla_zenoh.errors import CodecError, RecordError, SessionError, VlaZenohError
 from vla_zenoh.keys import ENDED, PRIMITIVES, ROLLING, last_chunk, worker_node
 from vla_zenoh.lab.teleop.policy import OperatorInput
-from vla_zenoh.lab.trial.plan import MAX_SETUPS
+from vla_zenoh.lab.web import requests
 from vla_zenoh.lab.web.hand import HandWorker
 from vla_zenoh.lab.web.hold import Hold
 from vla_zenoh.lab.web.part_streams import PartStreams
 from vla_zenoh.lab.web.recordings import Recordings
-from vla_zenoh.lab.web.trial import PageTrial
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import ActionChunk, Event, NodeStatus, Task
@@ -66,7 +65,6 @@ class RobotLink:
         self._hand = OperatorInput()
         self.hand = HandWorker(profile, self.client, self._read_hand)
         self.recordings = Recordings(profile, session)
-        self.trial = PageTrial(profile)
         self._watcher = threading.Thread(target=self._watch_hold, name="hold", daemon=True)
         self._watcher.start()
 
@@ -171,7 +169,6 @@ class RobotLink:
             "done": detail.get("policy_done", False),
             "task": None if task is None else asdict(task),
             "jog": self.hand.has_arm,
-            "trial": self.trial.state(),
             "primitives": worker_node(PRIMITIVES) in self.client.alive,
             "rolling": ROLLING in self.client.alive,
             "seen": [] if task is None else self._seen.get(task.worker, []),
@@ -209,6 +206,34 @@ class RobotLink:
             "stands_s": round(took_s, 3) if stands else None,
             "at_ms": time.time_ns() // 1_000_000,
         }
+
+    def set(self, asked: requests.Changes) -> Any:
+        """Change a setting, and wait for the robot's confirmation."""
+        match asked:
+            case requests.Prompt():
+                return self.client.set_prompt(asked.text)
+            case requests.Worker():
+                return self.client.set_worker(asked.name)
+            case requests.Rate():
+                return self.client.set_rate(asked.hz)
+            case requests.Speed():
+                return self.client.set_speed(asked.percent)
+            case requests.Held():
+                return self.hold_box(asked.part, asked.text)
+            case requests.Activate():
+                return self.client.activate()
+            case requests.Deactivate():
+                return self.deactivate()
+            case requests.Reset():
+                return self.reset()
+            case requests.Jog():
+                if asked.on:
+                    return self.hand.take(asked.frame, asked.level, asked.part)
+                return self.hand.give_back()
+            case requests.Save():
+                return self.save(asked.note)
+            case requests.Record():
+                return self.record(asked.on, asked.verdict, asked.note)
 
     # -- hold-to-run --------------------------------------------------------------------------
     def press(self, page: int, press: int, tick_ms: int) -> None:
@@ -354,7 +379,6 @@ class RobotLink:
         self._closed.set()
         self._wake.set()
         self._watcher.join()
-        self.trial.close()
         self.hand.close()
         self.recordings.close()
         self.client.release_deadman()
@@ -362,37 +386,3 @@ class RobotLink:
             subscriber.undeclare()
         for part in self._parts.values():
             part.close()
-
-
-SETTINGS: dict[str, Callable[[RobotLink, Any], Any]] = {
-    "prompt": lambda link, given: link.client.set_prompt(given["text"]),
-    "worker": lambda link, given: link.client.set_worker(given["name"]),
-    "rate": lambda link, given: link.client.set_rate(given["hz"]),
-    "speed": lambda link, given: link.client.set_speed(given["percent"]),
-    "held": lambda link, given: link.hold_box(given["part"], given["text"]),
-    "activate": lambda link, _: link.client.activate(),
-    "deactivate": lambda link, _: link.deactivate(),
-    "reset": lambda link, _: link.reset(),
-    "jog": lambda link, given: (
-        link.hand.take(given["frame"], given["level"], given["part"])
-        if given["on"]
-        else link.hand.give_back()
-    ),
-    "end_trial": lambda link, _: link.trial.end(),
-    "save": lambda link, given: link.save(given["note"]),
-    "record": lambda link, given: link.record(given["on"], given["verdict"], given["note"]),
-}
-"""Request -> what changes the robot; it waits for the confirmation."""
-
-
-def asked_trial(page: int, given: Mapping[str, Any]) -> tuple[int, str, dict[str, Any]]:
-    """Arguments of `PageTrial.begin`; what is left empty is as the folder has it."""
-    workers = tuple(name.strip() for name in given["workers"].split(",") if name.strip())
-    asked = {
-        "workers": workers or None,
-        "prompt": given["prompt"].strip() or None,
-        "setups": ("",) * min(given["episodes"], MAX_SETUPS + 1) or None,
-        "seconds": float(given["seconds"]) or None,
-        "blind": None if given["blind"] else False,
-    }
-    return page, given["name"], asked

@@ -17,24 +17,22 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from vla_zenoh.errors import CodecError, MissingExtraError, RecordingError, VlaZenohError
+from vla_zenoh.errors import CodecError, MissingExtraError, VlaZenohError
 from vla_zenoh.lab.rate_limit import RateLimit
 from vla_zenoh.lab.teleop.policy import OperatorInput
-from vla_zenoh.lab.web import metrics
+from vla_zenoh.lab.web import metrics, requests
 from vla_zenoh.lab.web.access import People, Person, host_is_ours, origin_is_ours, with_headers
 from vla_zenoh.lab.web.arm import surroundings
-from vla_zenoh.lab.web.pictures import Look, Pictures
-from vla_zenoh.lab.web.requests import FILM, PageRequest, parse
-from vla_zenoh.lab.web.robot_link import SETTINGS, RobotLink, asked_trial
-from vla_zenoh.lab.web.runs import HEADERS as RUN_HEADERS
-from vla_zenoh.lab.web.runs import KINDS, Runs
+from vla_zenoh.lab.web.pictures import PageView, Pictures
+from vla_zenoh.lab.web.requests import AnyRequest, name_of, parse
+from vla_zenoh.lab.web.robot_link import RobotLink
 from vla_zenoh.lab.web.tables import node_table, noted_event
 
 try:
     import uvicorn  # noqa: F401  # pyright: ignore[reportMissingImports]
     from starlette.applications import Starlette  # pyright: ignore[reportMissingImports]
     from starlette.requests import Request as HttpRequest  # pyright: ignore[reportMissingImports]
-    from starlette.responses import FileResponse, Response  # pyright: ignore[reportMissingImports]
+    from starlette.responses import Response  # pyright: ignore[reportMissingImports]
     from starlette.routing import Route, WebSocketRoute  # pyright: ignore[reportMissingImports]
     from starlette.websockets import (  # pyright: ignore[reportMissingImports]
         WebSocket,
@@ -62,22 +60,16 @@ RATE_HZ, BURST = 50.0, 100.0
 """Requests of one page; a stop is always taken."""
 PICTURE_POLL_S = 0.01
 POLICY_VIOLATION, TRY_LATER = 1008, 1013
-VIEWERS_TOO = ("runs", "make")
-NOT_HERE = ("enter", "look", "drawn")
+NOT_HERE = (requests.Enter, requests.Look, requests.Drawn)
 """The first request of a socket, and those of the socket for images."""
 OPERATORS_ONLY = "your token is a viewer's, which may look and nothing else"
-Masked = Callable[[dict[str, Any]], dict[str, Any] | None]
 
 
 class Page:
-    """One open page: what waits to be sent to it.
+    """One open page: what waits to be sent to it."""
 
-    Args:
-        masked: what may be told of a message; None: nothing.
-    """
-
-    def __init__(self, number: int, person: Person, masked: Masked) -> None:
-        self.number, self.person, self._masked = number, person, masked
+    def __init__(self, number: int, person: Person) -> None:
+        self.number, self.person = number, person
         self.limit = RateLimit(RATE_HZ, BURST, time.monotonic())
         self.complaints = RateLimit(5.0, 10.0, time.monotonic())
         self.answers: deque[str] = deque(maxlen=MAX_ANSWERS)
@@ -86,10 +78,8 @@ class Page:
 
     def tell(self, message: dict[str, Any]) -> None:
         """Send a message as soon as the connection takes it; the oldest give way."""
-        may = self._masked(message)
-        if may is not None:
-            self.answers.append(json.dumps(may))
-            self.changed.set()
+        self.answers.append(json.dumps(message))
+        self.changed.set()
 
 
 class PageServer:
@@ -100,7 +90,6 @@ class PageServer:
     ) -> None:
         self._link, self._people = link, people
         self._names, self._secure = tuple(names), secure
-        self._runs = Runs()
         self._pictures = Pictures(link.client, link.profile.cameras)
         self._pages: dict[int, Page] = {}
         self._news: deque[dict[str, Any]] = deque(maxlen=MAX_NEWS)
@@ -116,7 +105,6 @@ class PageServer:
             *(Route(path, self._file) for path in FILES),
             Route("/favicon.ico", lambda _: Response(status_code=204)),
             Route("/metrics", self._metrics),
-            Route("/runs/{ticket}/{rest:path}", self._made),
             Route("/stop", self._stop_by_post, methods=["POST"]),
             WebSocketRoute("/control", self._control),
             WebSocketRoute("/pictures", self._show_pictures),
@@ -172,15 +160,6 @@ class PageServer:
         text = metrics.exposition(self._link.rows(), self.counters, len(self._pages))
         return Response(text, headers={"content-type": metrics.CONTENT_TYPE_LATEST})
 
-    async def _made(self, request: HttpRequest) -> Response:
-        """A page or film of a run, by its ticket."""
-        found = request.path_params
-        path = await asyncio.to_thread(self._runs.opened, found["ticket"], found["rest"])
-        if path is None:
-            await asyncio.sleep(DENIED_S)
-            return Response("no such address, or not any more: ask the page for it again\n", 404)
-        return FileResponse(path, headers={**RUN_HEADERS, "content-type": KINDS[path.suffix]})
-
     async def _stop_by_post(self, request: HttpRequest) -> Response:
         """The way of a page whose WebSocket is broken."""
         person = await self._bearer(request)
@@ -211,7 +190,7 @@ class PageServer:
                 self._tell_all(news)
             if self._pages:
                 state = {**self._link.state(), "arms": self._link.arms(), "pages": len(self._pages)}
-                self._state = json.dumps(self._link.trial.masked(state))[1:]
+                self._state = json.dumps(state)[1:]
                 if now_s - nodes_s > NODES_S:
                     nodes_s = now_s
                     self._tell_all(self._node_message())
@@ -240,7 +219,7 @@ class PageServer:
         await socket.accept()
         try:
             request = parse(await asyncio.wait_for(_receive(socket), ENTER_S))
-            token = request.values["token"] if request.do == "enter" else ""
+            token = request.token if isinstance(request, requests.Enter) else ""
         except (CodecError, TimeoutError):
             token = ""
         person = await self._person(token)
@@ -258,7 +237,7 @@ class PageServer:
             if person is None:
                 return
             self._next += 1
-            page = self._pages[self._next] = Page(self._next, person, self._link.trial.masked)
+            page = self._pages[self._next] = Page(self._next, person)
             sending = asyncio.create_task(self._send_state(page, socket))
             try:
                 self._welcome(page)
@@ -266,7 +245,6 @@ class PageServer:
                     await self._read(page, await _receive(socket))
             finally:
                 self._link.release(page.number, gone=True)
-                self._link.trial.gone(page.number)
                 del self._pages[page.number]
                 sending.cancel()
 
@@ -308,20 +286,20 @@ class PageServer:
         except CodecError as error:
             self._complain(page, "bad_message", str(error))
             return
-        if request.do in NOT_HERE:
-            self._complain(page, "bad_message", f"{request.do} is no request of this socket now")
+        what = name_of(request)
+        if isinstance(request, NOT_HERE):
+            self._complain(page, "bad_message", f"{what} is no request of this socket now")
             return
-        if request.values.get("tick", 0) > time.monotonic() * 1e3:
-            why = f"{request.do}: tick is newer than the last one sent"
+        if isinstance(request, requests.Press) and request.tick > time.monotonic() * 1e3:
+            why = f"{what}: tick is newer than the last one sent"
             self._complain(page, "bad_message", why)
-            if "press" in request.values:
-                page.tell({"is": "hold_ended", "press": request.values["press"], "why": why})
+            page.tell({"is": "hold_ended", "press": request.press, "why": why})
             return
-        if not page.limit.take(time.monotonic()) and request.do != "stop":
+        if not page.limit.take(time.monotonic()) and not isinstance(request, requests.Stop):
             self._complain(page, "too_fast", f"more than {RATE_HZ:g} messages per second")
             return
         self.counters["message"] += 1
-        if not page.person.drives and request.do not in VIEWERS_TOO:
+        if not page.person.drives:
             self._complain(page, "not_allowed", OPERATORS_ONLY)
             return
         await self._obey(page, request)
@@ -333,65 +311,32 @@ class PageServer:
             page.tell({"is": "rejected", "what": what, "why": why})
 
     # -- requests -----------------------------------------------------------------------------
-    async def _obey(self, page: Page, request: PageRequest) -> None:
-        link, values, name = self._link, request.values, page.person.name
-        if request.do == "stop":
-            self._begin(self._stop(page.person))
-        elif request.do == "hold":
-            self._press(page, request, lambda: link.activate_held(page.number, name))
-        elif request.do == "primitive":
-            self._press(page, request, lambda: link.primitive(page.number, name, values["name"]))
-        elif request.do == "beat":
-            hand = OperatorInput(tuple(values["twist"]), values["opening"])
-            if not link.beat(page.number, values["press"], values["tick"], hand):
-                page.tell({"is": "hold_ended", "press": values["press"]})
-        elif request.do == "release":
-            link.release(page.number)
-        elif request.do == "answer":
-            link.trial.answer(page.number, values["number"], values["line"])
-        elif request.do == "watched":
-            link.trial.watched(page.number, values["tick"] / 1e3)
-        elif request.do == "trial":
-            self._change(page, "trial", lambda: link.trial.begin(*asked_trial(page.number, values)))
-        elif request.do == "runs":
-            self._begin(self._tell_runs(page))
-        elif request.do == "make":
-            self._begin(self._make(page, values["name"], values["kind"]))
-        else:
-            self._change(page, request.do, lambda: SETTINGS[request.do](link, values))
+    async def _obey(self, page: Page, request: AnyRequest) -> None:
+        link, name = self._link, page.person.name
+        match request:
+            case requests.Stop():
+                self._begin(self._stop(page.person))
+            case requests.Hold():
+                self._press(page, request, lambda: link.activate_held(page.number, name))
+            case requests.Primitive():
+                self._press(page, request, lambda: link.primitive(page.number, name, request.name))
+            case requests.Beat():
+                hand = OperatorInput(request.twist, request.opening)
+                if not link.beat(page.number, request.press, request.tick, hand):
+                    page.tell({"is": "hold_ended", "press": request.press})
+            case requests.Release():
+                link.release(page.number)
+            case requests.Setting():
+                self._change(page, name_of(request), lambda: link.set(request))
 
-    def _press(self, page: Page, request: PageRequest, call: Callable[[], Any]) -> None:
+    def _press(self, page: Page, request: requests.Press, call: Callable[[], Any]) -> None:
         """Begin a hold, and `call` with it."""
-        press = request.values["press"]
         try:
-            self._link.press(page.number, press, request.values["tick"])
+            self._link.press(page.number, request.press, request.tick)
         except VlaZenohError as error:
-            page.tell({"is": "hold_ended", "press": press, "why": str(error)})
+            page.tell({"is": "hold_ended", "press": request.press, "why": str(error)})
             return
-        self._change(page, request.do, call, press)
-
-    async def _tell_runs(self, page: Page) -> None:
-        try:
-            page.tell({"is": "runs", "runs": await asyncio.to_thread(self._runs.listed)})
-        except OSError as error:  # one was removed meanwhile
-            self._complain(page, "runs", f"the folder of runs cannot be read: {error}")
-
-    async def _make(self, page: Page, name: str, kind: str) -> None:
-        """Make the page or film of a run, and tell how far it is."""
-        loop = asyncio.get_running_loop()
-        message = {"is": "making", "name": name, "kind": kind}
-
-        def told(share: float) -> None:
-            loop.call_soon_threadsafe(page.tell, {**message, "share": share})
-
-        try:
-            if kind == FILM and not page.person.drives:
-                raise RecordingError(OPERATORS_ONLY)
-            page.tell(message)
-            url = await asyncio.to_thread(self._runs.make, name, kind, page.person.drives, told)
-            page.tell({**message, "is": "made", "url": url})
-        except (VlaZenohError, OSError) as error:
-            page.tell({**message, "is": "made", "why": str(error)})
+        self._change(page, name_of(request), call, request.press)
 
     def _change(self, page: Page, what: str, call: Callable[[], Any], press: int = 0) -> None:
         """Run what waits for the robot on a thread, in turn for each page, and tell its end."""
@@ -451,7 +396,7 @@ class PageServer:
             if await self._enter(socket, lambda: self._looking, viewers=False) is None:
                 return
             self._looking += 1
-            look = Look(time.monotonic())
+            look = PageView(time.monotonic())
             sending = asyncio.create_task(self._send_pictures(look, socket))
             try:
                 while True:
@@ -462,7 +407,7 @@ class PageServer:
                 sending.cancel()
                 self._pictures.change(look.streams, ())
 
-    async def _send_pictures(self, look: Look, socket: WebSocket) -> None:
+    async def _send_pictures(self, look: PageView, socket: WebSocket) -> None:
         """Send the newest picture of each stream, as fast as asked and as the page draws them."""
         with contextlib.suppress(*GONE):
             while True:

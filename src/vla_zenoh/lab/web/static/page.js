@@ -58,9 +58,6 @@ const RECEIVE = {
   hold_ended: (message) => { if (message.press === press) endHold(message.why || "the hold ended: press again"); },
   stopped: showStopped,
   recording: showRecording,
-  runs: showRuns,
-  making: showMaking,
-  made: showMade,
 };
 function receive(message) { (RECEIVE[message.is] || (() => {}))(message); }
 
@@ -156,7 +153,6 @@ function showState(message) {
   for (const button of $("primitives").children) button.disabled = !message.primitives;
   setText($("primitives-words"), message.primitives ? "They move while the button is pressed, from an arm that stands." : "They need the node primitives: `vla-zenoh node primitives`.");
   $("save").disabled = !message.rolling || !welcome.drives;
-  showTrial(message.trial || {});
   streams(message.seen || []);
   drawArms(message.arms || {});
   if (stopping && message.state === "stopped") setText($("stop-words"), `${welcome.robot}: stopped, coming to rest`);
@@ -310,86 +306,6 @@ function showRecording(message) {
 }
 
 $("save").addEventListener("click", () => send({ do: "save", note: $("note").value }));
-
-// -- a trial ------------------------------------------------------------------------------
-const numberOf = (id) => Number($(id).value) || 0;
-const FIRST = { label: "Scene is ready: go", line: "" };
-const JUDGE = [{ label: "Success", line: "y" }, { label: "Failure", line: "n" }, { label: "Void: repeat it", line: "x" }];
-const CHOICES = {
-  setup: [FIRST], blocked: [{ label: "Try again", line: "" }, JUDGE[2]], judge: JUDGE,
-  run: [{ label: "End it", line: "" }, JUDGE[0], JUDGE[1]],
-};
-let asked = 0, watchedMs = 0;
-$("trial-form").addEventListener("submit", (event) => {
-  event.preventDefault();
-  send({ do: "trial", name: $("trial-name").value, workers: $("trial-workers").value, prompt: $("trial-prompt").value,
-    episodes: numberOf("trial-episodes"), seconds: numberOf("trial-seconds"), blind: $("trial-blind").checked });
-});
-$("trial-end").addEventListener("click", () => send({ do: "end_trial" }));
-function showTrial(trial) {
-  const on = trial.on === true;
-  $("trial-begin").hidden = on;
-  $("trial-now").hidden = !on;
-  setText($("trial-result"), on ? "" : trial.text || "");
-  if (!on) return;
-  const phase = trial.phase, judged = phase === "judge" || phase === "run";
-  if (phase === "run" && !document.hidden && performance.now() - watchedMs > 200) { watchedMs = performance.now(); send({ do: "watched", tick }); }
-  setText($("trial-at"), `episode ${trial.at} of ${trial.of}: ${trial.prompt}${trial.worker ? ` (${trial.worker})` : ""}`);
-  const words = { setup: `Set up ${trial.words || `number ${trial.setup}`}.`, blocked: "Not activated:", brake: "The arm brakes.",
-    run: `It runs: ${trial.time_s} of ${trial.seconds} s, ${trial.chunks} chunks, ${trial.state}.`, judge: "Did it succeed?", start: "It is activated." }[phase] || "";
-  setText($("trial-words"), `${words} ${trial.text || ""}`);
-  $("trial-judge").hidden = !judged;
-  const notes = (trial.notes || []).join("\n");
-  if ($("trial-notes").dataset.all !== notes) {
-    $("trial-notes").dataset.all = notes;
-    $("trial-notes").replaceChildren(...(trial.notes || []).map((note) => el("option", null, { value: note })));
-  }
-  if (asked === trial.number) return;
-  asked = trial.number;
-  if (phase === "setup") $("trial-note").value = "";
-  $("trial-buttons").replaceChildren(...(CHOICES[phase] || []).map((choice) => {
-    const button = el("button", choice.label);
-    button.addEventListener("click", () => send({ do: "answer", number: trial.number, line: choice.line && `${choice.line} ${$("trial-note").value}` }));
-    return button;
-  }));
-}
-
-// -- finished runs ------------------------------------------------------------------------
-const making = new Map(); // NAME KIND -> its cell
-$("runs-list").addEventListener("click", () => send({ do: "runs" }));
-function showRuns(message) {
-  making.clear();
-  setText($("runs-words"), message.runs.length ? "" : "nothing was recorded yet");
-  $("run-rows").replaceChildren(...message.runs.map((run) => el("tr", null, {}, ...cells(
-    run.name, new Date(run.at_ms).toLocaleString(), `${run.mb} MB`, run.closed || run.said,
-    maker(run, "report"), run.page ? "" : maker(run, "film")))));
-}
-function maker(run, kind) {
-  const button = el("button", kind === "film" ? "Video" : "Report", { className: "small", disabled: Boolean(run.closed) || (kind === "film" && !welcome.drives) });
-  const cell = el("span", null, { className: "making" }, button);
-  button.setAttribute("aria-label", `${button.textContent} of ${run.name}`);
-  button.addEventListener("click", () => send({ do: "make", name: run.name, kind }));
-  making.set(`${run.name} ${kind}`, cell);
-  return cell;
-}
-function showMaking(message) {
-  const cell = making.get(`${message.name} ${message.kind}`);
-  if (!cell) return;
-  cell.replaceChildren(message.share === undefined ? "is being made" : el("progress", null, { value: message.share, max: 1 }));
-}
-function showMade(message) {
-  const cell = making.get(`${message.name} ${message.kind}`);
-  setText($("runs-words"), message.why || "");
-  if (!cell || message.why) { if (cell) cell.replaceChildren(el("span", "not made", { className: "bad" })); return; }
-  const link = el("a", "open", { href: message.url, target: "_blank", rel: "noopener" });
-  link.setAttribute("aria-label", `open the ${message.kind} of ${message.name}`);
-  cell.replaceChildren(link);
-  if (message.kind !== "film") return;
-  $("film").hidden = false;
-  $("film").setAttribute("aria-label", `video of ${message.name}`);
-  $("film").src = message.url;
-  $("film").play().catch(() => {}); // a browser may want a touch first
-}
 
 // -- pictures -----------------------------------------------------------------------------
 let offered = "", chosen = null;
