@@ -20,6 +20,7 @@ from vla_zenoh.keys import key_chunk
 if TYPE_CHECKING:  # Pydantic and the schema: `up` has more to do while it loads them
     from vla_zenoh.policy.loader import ModelFile
     from vla_zenoh.profile import Profile
+    from vla_zenoh.profile.stop_profile import StopProfile
 
 MAX_SECONDS = 7 * 24 * 3600
 """Longest time that an option of a command takes: a week."""
@@ -151,7 +152,7 @@ def effective_profile(
 
     loaded = load_profile(profile) if isinstance(profile, str) else profile
     if host is not None:
-        _check_host(loaded, host)
+        require_host(loaded, host)
     changes: dict[str, Any] = {"connect": connect} if connect else {}
     changes |= {"listen": listen} if listen else {}
     if host is not None and loaded.session.security is not None:
@@ -159,7 +160,8 @@ def effective_profile(
     return override(loaded, {"session": changes}) if changes else loaded
 
 
-def _check_host(profile: Profile, host: str) -> None:
+def require_host(profile: Profile | StopProfile, host: str) -> None:
+    """Raise a `ProfileError` if the profile has no such host, with those it has."""
     security = profile.session.security
     people = () if security is None else tuple(security.people)
     known = (*profile.hosts, *people)

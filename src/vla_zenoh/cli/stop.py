@@ -22,10 +22,11 @@ from vla_zenoh.bus.session import alive_robots, put_text
 from vla_zenoh.cli.plain import BOLD_RED, say, say_marked, warn
 from vla_zenoh.cli.silence import BEGAN_S, silence
 from vla_zenoh.cli.target import RobotTarget
-from vla_zenoh.client.client import Client, StopOutcome, StopProgress
+from vla_zenoh.client.client import Client, StopClient, StopOutcome, StopProgress
 from vla_zenoh.errors import SecurityError, SessionError
 from vla_zenoh.keys import Keys
 from vla_zenoh.profile import Profile
+from vla_zenoh.profile.stop_profile import StopProfile
 
 EXIT_STATUS = {StopOutcome.CONFIRMED: 0, StopOutcome.HEARD: 3, StopOutcome.NOT_CONFIRMED: 4}
 FIRST_WORD_S, LEAST_WAIT_S = 0.8, 0.3
@@ -44,9 +45,9 @@ class StopAttempt:
     `clients` has a client of every robot that is to stop; `why` is why there is none yet.
     """
 
-    def __init__(self, target: RobotTarget, profile: Profile, *, every: bool) -> None:
+    def __init__(self, target: RobotTarget, profile: Profile | StopProfile, *, every: bool) -> None:
         self.target, self.profile, self._every = target, profile, every
-        self.clients: list[Client] = []
+        self.clients: list[StopClient] = []
         self.why = "the router does not answer"
         self.over = threading.Event()
         threading.Thread(target=self._run, name="stop", daemon=True).start()
@@ -65,25 +66,25 @@ class StopAttempt:
                 self.why = str(error)
             return
 
-    def _stop(self, profile: Profile, session: zenoh.Session) -> None:
+    def _stop(self, profile: Profile | StopProfile, session: zenoh.Session) -> None:
         put_text(session, profile.keys.stop, "stop")
         self.why = "no node of it answers"
         known = [profile.robot.name]
-        self._add(profile, session, profile.robot.name)
+        self._add(session, profile.keys)
         while not self.over.is_set():
             for robot in alive_robots(session, profile.keys) if self._every else ():
                 if robot not in known:
-                    put_text(session, Keys(robot, profile.keys.root).stop, "stop")
+                    keys = Keys(robot, profile.keys.root)
+                    put_text(session, keys.stop, "stop")
                     known.append(robot)
-                    self._add(profile, session, robot)
+                    self._add(session, keys)
             self.over.wait(AGAIN_S)
             for client in self.clients:
                 if client.stop_progress().outcome is StopOutcome.NOT_CONFIRMED:
                     client.publish(client.keys.stop, "stop")
 
-    def _add(self, profile: Profile, session: zenoh.Session, robot: str) -> None:
-        named = profile.robot.model_copy(update={"name": robot})
-        client = Client(profile.model_copy(update={"robot": named}), session).subscribe()
+    def _add(self, session: zenoh.Session, keys: Keys) -> None:
+        client = StopClient(session, keys, self.profile.part_names).subscribe()
         client.stop()
         self.clients.append(client)
 

@@ -8,7 +8,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any, TypeVar
 
 import typer
 import zenoh
@@ -20,14 +20,17 @@ from vla_zenoh.cli.options import (
     HostOption,
     ProfileOption,
     effective_profile,
+    require_host,
 )
 from vla_zenoh.cli.plain import warn
-from vla_zenoh.client.client import ANSWER_S, START_PATIENCE_S, Client, open_patiently
+from vla_zenoh.client.client import ANSWER_S, START_PATIENCE_S, Client, StopClient, open_patiently
 from vla_zenoh.errors import SecurityError, SessionError
 from vla_zenoh.profile import Profile, as_robot
+from vla_zenoh.profile.stop_profile import StopProfile, load_for_stop
 from vla_zenoh.security.roles import Role, operator_role
 from vla_zenoh.security.store import local_role, operator_hosts
 
+AnyProfile = TypeVar("AnyProfile", bound=Profile | StopProfile)
 SILENCE_S = 0.8
 OWN_STOP = "The arm may still be moving: use the robot's own emergency stop"
 
@@ -62,11 +65,18 @@ class RobotTarget:
         profile = effective_profile(self.profile, self.connect, host=self.host)
         return profile if self.robot is None else as_robot(profile, self.robot)
 
-    def load_for_stop(self) -> Profile:
-        """Load the profile alone: no certificate is read, no router asked."""
-        return self._load()
+    def load_for_stop(self) -> StopProfile:
+        """Load what a stop needs of the profile: no certificate is read, no router asked."""
+        changes: dict[str, Any] = {"session": {"connect": self.connect}} if self.connect else {}
+        if self.robot is not None:
+            changes["robot"] = {"name": self.robot}
+        profile = load_for_stop(self.profile, changes)
+        if self.host is None:
+            return profile
+        require_host(profile, self.host)
+        return profile if profile.session.security is None else _with_host(profile, self.host)
 
-    def stop_session(self, profile: Profile) -> tuple[Profile, zenoh.Session]:
+    def stop_session(self, profile: AnyProfile) -> tuple[AnyProfile, zenoh.Session]:
         """A session with the best certificate that may stop the robot and that works.
 
         Raises:
@@ -125,7 +135,7 @@ class RobotTarget:
                     raise
                 raise SessionError(self.no_node(client, *command, kind="command node")) from error
 
-    def named(self, client: Client) -> str:
+    def named(self, client: StopClient) -> str:
         """Robot and profile."""
         return f"robot {client.keys.robot} (profile {self.profile})"
 
@@ -136,7 +146,7 @@ class RobotTarget:
         none = "No other robot is visible on this router; `vla-zenoh up` starts one"
         return f"no {kind} of {self.named(client)} is alive. {there if others else none}"
 
-    def others(self, client: Client) -> list[str]:
+    def others(self, client: StopClient) -> list[str]:
         """Other robots whose command node is alive."""
         from vla_zenoh.bus.session import alive_robots
 
@@ -144,7 +154,7 @@ class RobotTarget:
             name for name in alive_robots(client.session, client.keys) if name != client.keys.robot
         ]
 
-    def not_operator(self, profile: Profile, *command: str) -> str:
+    def not_operator(self, profile: Profile | StopProfile, *command: str) -> str:
         """Why the certificate here may not drive, with what to type; empty if it may."""
         role = local_role(profile)
         if role is None or role is Role.OPERATOR:
@@ -168,13 +178,13 @@ class RobotTarget:
         )
 
 
-def _choices(profile: Profile, *, stop: bool) -> list[Profile]:
+def _choices(profile: AnyProfile, *, stop: bool) -> list[AnyProfile]:
     """The profile with each certificate of an operator or viewer on this computer, best first."""
     hosts = operator_hosts(profile, stop=stop)
     return [_with_host(profile, host) for host in hosts] or [profile]
 
 
-def _with_host(profile: Profile, host: str | None) -> Profile:
+def _with_host(profile: AnyProfile, host: str | None) -> AnyProfile:
     security = profile.session.security
     assert security is not None
     session = profile.session.model_copy(
@@ -183,13 +193,15 @@ def _with_host(profile: Profile, host: str | None) -> Profile:
     return profile.model_copy(update={"session": session})
 
 
-def _first(choices: Sequence[Profile], wait_s: float = 0.0) -> tuple[Profile, zenoh.Session, bool]:
+def _first(
+    choices: Sequence[AnyProfile], wait_s: float = 0.0
+) -> tuple[AnyProfile, zenoh.Session, bool]:
     """A session with the first certificate that the router accepts, or the first one's error; and
     whether the router had to be waited for."""
     failed: list[SecurityError | SessionError] = []
     for profile in choices:
         try:
-            session, cold = open_patiently(profile, wait_s, warn)
+            session, cold = open_patiently(profile.session, wait_s, warn)
             return profile, session, cold
         except (SecurityError, SessionError) as error:
             failed.append(error)

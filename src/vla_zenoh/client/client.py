@@ -7,10 +7,10 @@ import secrets
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeVar
 
 import zenoh
 
@@ -20,12 +20,12 @@ from vla_zenoh.bus.reception import Reception
 from vla_zenoh.bus.session import open_session, put_text
 from vla_zenoh.codec import records, settings
 from vla_zenoh.errors import CodecError, ProfileError, SessionError, StartingError
-from vla_zenoh.keys import NO_DEADMAN_TOKEN, STARTING, key_chunk, last_chunk
+from vla_zenoh.keys import NO_DEADMAN_TOKEN, STARTING, Keys, key_chunk, last_chunk
 from vla_zenoh.security.roles import expected_nodes, identities
 from vla_zenoh.types import Event, Header, NodeStatus, Task
 
 if TYPE_CHECKING:
-    from vla_zenoh.profile import Profile
+    from vla_zenoh.profile import Profile, SessionProfile
 
 Value = TypeVar("Value")
 POLL_S, HOLD_PATIENCE_S = 0.02, 1.0
@@ -62,7 +62,7 @@ def waiting(most_s: float, why: str) -> str:
 
 
 def open_patiently(
-    profile: Profile, wait_s: float, tell: Callable[[str], None]
+    profile: SessionProfile, wait_s: float, tell: Callable[[str], None]
 ) -> tuple[zenoh.Session, bool]:
     """A session, and whether its router had to be waited for, at most `wait_s`.
 
@@ -71,12 +71,12 @@ def open_patiently(
         SessionError: no router answers.
     """
     try:
-        return open_session(profile.session), False
+        return open_session(profile), False
     except SessionError as error:
         if wait_s <= 0:
             raise
         tell(waiting(wait_s, str(error)))
-        return open_session(profile.session, wait_s=wait_s), True
+        return open_session(profile, wait_s=wait_s), True
 
 
 class NodeRegistry:
@@ -231,70 +231,38 @@ class Standstill:
         return quiet_s >= STANDS_S and self.speed_rad_s(since_s) is not None
 
 
-class Client(NodeRegistry):
-    """Client of one robot: settings, activation, and the last status of every node.
+class StopClient(NodeRegistry):
+    """Client that stops a robot and follows what becomes of it.
 
-    ::
-
-        with open_session(profile.session) as session:
-            robot = Client(profile, session).subscribe()
-            robot.set_prompt("pick up the red brick")
-            robot.activate_with_deadman("my script")
-
-    `expected` has the nodes that the profile assigns to hosts, each with its host; `reception`
-    tells what this client does not receive, of its subscriptions by `watch`. `patience_s` is how
-    long a setting or an activation waits while nodes are starting, where it is given no time of its
-    own; `tell` gets a sentence about that. `cold` means that the router has just begun to answer,
-    so an absent command node is taken for one that starts.
+    Args:
+        part_names: of the robot's arms; of a robot that is one arm one empty name.
+        expected: nodes of the profile, whose statuses are always kept.
     """
 
     def __init__(
         self,
-        profile: Profile,
         session: zenoh.Session,
-        *,
-        patience_s: float = ANSWER_S,
-        tell: Callable[[str], None] = lambda _: None,
-        cold: bool = False,
+        keys: Keys,
+        part_names: Sequence[str],
+        expected: Iterable[str] = (),
     ) -> None:
-        super().__init__(one.node for one in identities(profile))
-        self.patience_s, self.tell = patience_s, tell
-        self._cold_until_s = time.monotonic() + patience_s if cold else 0.0
-        self.profile, self.session, self.keys = profile, session, profile.keys
-        self.expected = expected_nodes(profile)
-        self.reception = Reception(profile.keys)
-        self.events: deque[tuple[str, Header, Event]] = deque(maxlen=MAX_EVENTS)
-        self.task: Task | None = None
-        self._task_heard_s = -1e9
-        self._refusals: deque[tuple[float, Event]] = deque(maxlen=MAX_REFUSALS)
+        super().__init__(expected)
+        self.session, self.keys = session, keys
+        self._part_names = part_names
         self._subscriptions: list[Any] = []
-        self._token: Any = None
-        self._stop_s = self._reset_s = 0.0
+        self._stop_s = 0.0
         self._standstill: list[Standstill] = []
 
-    def subscribe(self) -> Client:
-        """Subscribe to status, events, liveliness and the task; returns the client."""
-        liveliness = self.session.liveliness()
+    def subscribe(self) -> Self:
+        """Subscribe to statuses and liveliness; returns the client."""
         on_alive = zenoh.handlers.Callback(self._on_alive, indirect=False)
         self._subscriptions += [
             self._subscribe(self.keys.all_status, self._on_status),
-            self._subscribe(self.keys.all_events, self._on_event),
-            self._subscribe(self.keys.task, self._on_task),
-            liveliness.declare_subscriber(self.keys.all_alive, on_alive, history=True),
+            self.session.liveliness().declare_subscriber(
+                self.keys.all_alive, on_alive, history=True
+            ),
         ]
         return self
-
-    def watch(self, key: str, buffer: SampleBuffer) -> Callable[[], None]:
-        """Subscribe with `buffer`, whose samples are compared with what is sent; what is returned
-        ends that."""
-        subscriber = buffer.subscribe(self.session, key)
-        self.reception.watch(key, buffer.arrived)
-
-        def end() -> None:
-            subscriber.undeclare()
-            self.reception.unwatch(buffer.arrived)
-
-        return end
 
     def _subscribe(self, key: str, callback: Callable[[zenoh.Sample], None]) -> Any:
         return self.session.declare_subscriber(
@@ -315,54 +283,13 @@ class Client(NodeRegistry):
         if found is not None:
             name = last_chunk(str(sample.key_expr))
             self.status_received(name, found[1], len(sample.payload))
-            self.reception.status_received(found[1])
-
-    def _on_event(self, sample: zenoh.Sample) -> None:
-        found = self._decode(Event, sample, MAX_EVENT_BYTES)
-        if found is not None:
-            header, event = found
-            event = replace(event, what=event.what[:MAX_WHAT], why=event.why[:MAX_WHY])
-            with self._lock:
-                self.events.append((last_chunk(str(sample.key_expr))[:MAX_WHAT], header, event))
-                if event.kind == "refusal":
-                    self._refusals.append((time.monotonic(), event))
-
-    def _on_task(self, sample: zenoh.Sample) -> None:
-        found = self._decode(Task, sample)
-        if found is not None:
-            with self._lock:
-                self.task, self._task_heard_s = found[1], time.monotonic()
 
     def _on_alive(self, sample: zenoh.Sample) -> None:
         name = last_chunk(str(sample.key_expr))
         if sample.kind == zenoh.SampleKind.PUT:
             self.token_appeared(name)
-            return
-        self.token_gone(name)
-        if name == "command":  # the task is no longer in force
-            with self._lock:
-                self.task = None
-
-    def note(self, name: str, event: Event) -> None:
-        """Add an event of this program to those of the nodes."""
-        with self._lock:
-            self.events.append((name, Header(time.time_ns(), 0, name), event))
-
-    def pop_events(self) -> list[tuple[str, Header, Event]]:
-        """Events since the last call, oldest first."""
-        with self._lock:
-            events = list(self.events)
-            self.events.clear()
-        return events
-
-    def wait_for(self, condition: Callable[[], Value | None], timeout_s: float) -> Value | None:
-        """Poll until `condition` returns something true; None after `timeout_s`."""
-        give_up = time.monotonic() + timeout_s
-        while True:
-            found = condition()
-            if found or time.monotonic() > give_up:
-                return found or None
-            time.sleep(POLL_S)
+        else:
+            self.token_gone(name)
 
     def stop(self) -> None:
         """Trigger the emergency stop; it latches until `reset`. `stop_progress` follows it."""
@@ -374,7 +301,7 @@ class Client(NodeRegistry):
         """Watch what becomes of a stop put at `since_s` on the monotonic clock, by anybody."""
         self._stop_s = since_s
         if not self._standstill:
-            for name in self.profile.part_names:
+            for name in self._part_names:
                 watch = Standstill()
                 self._standstill.append(watch)
                 key = self.keys.of_part(name).state_joint
@@ -409,6 +336,120 @@ class Client(NodeRegistry):
             if alive and status.detail.get("stop_latched")
         ]
 
+    def publish(self, key: str, text: str) -> None:
+        """Put plain text on a key, as any Zenoh client could."""
+        put_text(self.session, key, text)
+
+
+class Client(StopClient):
+    """Client of one robot: settings, activation, and the last status of every node.
+
+    ::
+
+        with open_session(profile.session) as session:
+            robot = Client(profile, session).subscribe()
+            robot.set_prompt("pick up the red brick")
+            robot.activate_with_deadman("my script")
+
+    `expected` has the nodes that the profile assigns to hosts, each with its host; `reception`
+    tells what this client does not receive, of its subscriptions by `watch`. `patience_s` is how
+    long a setting or an activation waits while nodes are starting, where it is given no time of its
+    own; `tell` gets a sentence about that. `cold` means that the router has just begun to answer,
+    so an absent command node is taken for one that starts.
+    """
+
+    def __init__(
+        self,
+        profile: Profile,
+        session: zenoh.Session,
+        *,
+        patience_s: float = ANSWER_S,
+        tell: Callable[[str], None] = lambda _: None,
+        cold: bool = False,
+    ) -> None:
+        nodes = [one.node for one in identities(profile)]
+        super().__init__(session, profile.keys, profile.part_names, nodes)
+        self.profile = profile
+        self.patience_s, self.tell = patience_s, tell
+        self._cold_until_s = time.monotonic() + patience_s if cold else 0.0
+        self.expected = expected_nodes(profile)
+        self.reception = Reception(profile.keys)
+        self.events: deque[tuple[str, Header, Event]] = deque(maxlen=MAX_EVENTS)
+        self.task: Task | None = None
+        self._task_heard_s = -1e9
+        self._refusals: deque[tuple[float, Event]] = deque(maxlen=MAX_REFUSALS)
+        self._token: Any = None
+        self._reset_s = 0.0
+
+    def subscribe(self) -> Self:
+        """Subscribe to status, events, liveliness and the task; returns the client."""
+        self._subscriptions += [
+            self._subscribe(self.keys.all_events, self._on_event),
+            self._subscribe(self.keys.task, self._on_task),
+        ]
+        return super().subscribe()
+
+    def watch(self, key: str, buffer: SampleBuffer) -> Callable[[], None]:
+        """Subscribe with `buffer`, whose samples are compared with what is sent; what is returned
+        ends that."""
+        subscriber = buffer.subscribe(self.session, key)
+        self.reception.watch(key, buffer.arrived)
+
+        def end() -> None:
+            subscriber.undeclare()
+            self.reception.unwatch(buffer.arrived)
+
+        return end
+
+    def status_received(self, name: str, status: NodeStatus, size: int) -> None:
+        """Keep the status of a node, and what it says that it has sent."""
+        super().status_received(name, status, size)
+        self.reception.status_received(status)
+
+    def _on_event(self, sample: zenoh.Sample) -> None:
+        found = self._decode(Event, sample, MAX_EVENT_BYTES)
+        if found is not None:
+            header, event = found
+            event = replace(event, what=event.what[:MAX_WHAT], why=event.why[:MAX_WHY])
+            with self._lock:
+                self.events.append((last_chunk(str(sample.key_expr))[:MAX_WHAT], header, event))
+                if event.kind == "refusal":
+                    self._refusals.append((time.monotonic(), event))
+
+    def _on_task(self, sample: zenoh.Sample) -> None:
+        found = self._decode(Task, sample)
+        if found is not None:
+            with self._lock:
+                self.task, self._task_heard_s = found[1], time.monotonic()
+
+    def token_gone(self, name: str) -> None:
+        """A liveliness token is gone; with the command node's the task is no longer in force."""
+        super().token_gone(name)
+        if name == "command":
+            with self._lock:
+                self.task = None
+
+    def note(self, name: str, event: Event) -> None:
+        """Add an event of this program to those of the nodes."""
+        with self._lock:
+            self.events.append((name, Header(time.time_ns(), 0, name), event))
+
+    def pop_events(self) -> list[tuple[str, Header, Event]]:
+        """Events since the last call, oldest first."""
+        with self._lock:
+            events = list(self.events)
+            self.events.clear()
+        return events
+
+    def wait_for(self, condition: Callable[[], Value | None], timeout_s: float) -> Value | None:
+        """Poll until `condition` returns something true; None after `timeout_s`."""
+        give_up = time.monotonic() + timeout_s
+        while True:
+            found = condition()
+            if found or time.monotonic() > give_up:
+                return found or None
+            time.sleep(POLL_S)
+
     def reset(self) -> None:
         """Clear a latched emergency stop or fault; the arm stays inactive."""
         self._reset_s = time.monotonic()
@@ -430,10 +471,6 @@ class Client(NodeRegistry):
             if faults <= {"command"}:
                 Client.reset(self)  # a subclass's may wait for this
         return False
-
-    def publish(self, key: str, text: str) -> None:
-        """Put plain text on a key, as any Zenoh client could."""
-        put_text(self.session, key, text)
 
     def set_prompt(self, prompt: str, timeout_s: float | None = None) -> Task:
         """Set the prompt, and wait until the command node has accepted it.

@@ -249,7 +249,7 @@ def connect(
     if robot is not None:
         loaded = as_robot(loaded, robot)
     tell = logging.getLogger("vla_zenoh").warning
-    session, cold = open_patiently(loaded, wait_s, tell)
+    session, cold = open_patiently(loaded.session, wait_s, tell)
     with session:
         patience_s = max(wait_s, ANSWER_S)
         found = RemoteRobot(loaded, session, patience_s=patience_s, tell=tell, cold=cold)

@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import yaml
 from pydantic import ValidationError
@@ -16,7 +16,7 @@ from vla_zenoh import plugins
 from vla_zenoh.errors import PluginError, ProfileError
 from vla_zenoh.profile.profile import Profile
 from vla_zenoh.profile.schema import names_file
-from vla_zenoh.profile.section import WITH_REMOVABLE, Lines, Place, explain, merge
+from vla_zenoh.profile.section import WITH_REMOVABLE, Lines, Place, Section, explain, merge
 from vla_zenoh.resources import ROBOT_DATA_PREFIX, extended_profile, is_path, profile_file
 from vla_zenoh.types import shown
 
@@ -50,9 +50,19 @@ def load_profile(name: str) -> Profile:
 def load_with_lines(name: str) -> tuple[Profile, Lines]:
     """The effective profile `name`, and where each value comes from; see `load_profile`."""
     path = profile_file(name)
-    data, lines = _read(path, ())
+    data, lines = read_file(path)
     data.setdefault("name", path.stem)
     return _checked(data, lines), lines
+
+
+def read_file(path: Path, changes: Mapping[str, Any] | None = None) -> tuple[dict[str, Any], Lines]:
+    """A file with what it extends and `changes`, and where each value comes from; not checked.
+
+    Raises:
+        ProfileError: it cannot be read.
+    """
+    data, lines = _read(path, ())
+    return merge(data, lines, changes or {}, {}, ())
 
 
 def followed(name: str) -> list[tuple[Path, str]]:
@@ -98,10 +108,18 @@ def to_yaml(profile: Profile) -> str:
 
 def _checked(data: Mapping[str, Any], lines: Lines) -> Profile:
     given = {key: v for key, v in data.items() if v is not None or (key,) not in WITH_REMOVABLE}
+    return checked(Profile, given, lines)
+
+
+Checked = TypeVar("Checked", bound=Section)
+
+
+def checked(model: type[Checked], data: Mapping[str, Any], lines: Lines) -> Checked:
+    """`data` as a section. Raises ProfileError: every fault, with its line."""
     try:
-        return Profile.model_validate(given)
+        return model.model_validate(data)
     except ValidationError as error:
-        raise ProfileError("\n".join(explain(error, lines, Profile))) from error
+        raise ProfileError("\n".join(explain(error, lines, model))) from error
 
 
 def _read(path: Path, seen: tuple[Path, ...]) -> tuple[dict[str, Any], Lines]:

@@ -59,7 +59,7 @@ from vla_zenoh.profile.section import (
 from vla_zenoh.resources import is_path
 
 
-def _root(value: str) -> str:
+def checked_root(value: str) -> str:
     for part in value.split("/"):
         keys.key_chunk(part, "root")
     return value
@@ -111,7 +111,7 @@ class Profile(Section):
 
     name: Name
     about: Text = ""
-    root: Annotated[Word, AfterValidator(_root)] = keys.DEFAULT_ROOT
+    root: Annotated[Word, AfterValidator(checked_root)] = keys.DEFAULT_ROOT
     robot: RobotProfile
     parts: dict[Name, PartProfile] = Field(default_factory=dict, max_length=4)
     limits: Limits = Limits()

@@ -23,6 +23,7 @@ from vla_zenoh.keys import KEY_PATHS, NODE_KINDS, PRIMITIVES, ROLLING, Keys, wor
 
 if TYPE_CHECKING:
     from vla_zenoh.profile import Profile
+    from vla_zenoh.profile.stop_profile import StopProfile
 
 
 class Role(Enum):
@@ -71,7 +72,7 @@ class Identity:
         return f"{self.node}@{self.host}"
 
 
-def operator_role(profile: Profile, host: str) -> Role | None:
+def operator_role(profile: Profile | StopProfile, host: str) -> Role | None:
     """Role of a person at `host`; None: the profile does not know that host."""
     if host in (people := _people(profile)):
         return Role(people[host])
@@ -119,7 +120,7 @@ def expected_nodes(profile: Profile) -> dict[str, str]:
     return found
 
 
-def _people(profile: Profile) -> Mapping[str, str]:
+def _people(profile: Profile | StopProfile) -> Mapping[str, str]:
     return profile.session.security.people if profile.session.security is not None else {}
 
 

@@ -24,6 +24,7 @@ from vla_zenoh.security.roles import PEOPLE, Role, operator_role
 
 if TYPE_CHECKING:
     from vla_zenoh.profile import Profile
+    from vla_zenoh.profile.stop_profile import StopProfile
 
 AUTHORITY = "ca"
 THIS_HOST = ".this_host"
@@ -121,7 +122,7 @@ def open_to_others(key: Path) -> str:
     return ""
 
 
-def operator_hosts(profile: Profile, *, stop: bool = False) -> list[str]:
+def operator_hosts(profile: Profile | StopProfile, *, stop: bool = False) -> list[str]:
     """Hosts whose operator certificates are on this computer, the preferred one first.
 
     This computer's own host if it is known, then operators before viewers, in the order of the
@@ -146,7 +147,7 @@ def operator_hosts(profile: Profile, *, stop: bool = False) -> list[str]:
     return sorted(ranks, key=ranks.__getitem__) or ([own] if own is not None else [])
 
 
-def local_role(profile: Profile) -> Role | None:
+def local_role(profile: Profile | StopProfile) -> Role | None:
     """Role of the operator at this computer; None: unrestricted, or unknown."""
     security = profile.session.security
     if security is None:

@@ -9,7 +9,9 @@ import pytest
 
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.cli.up import target_of
+from vla_zenoh.errors import ProfileError
 from vla_zenoh.profile import load_profile, override
+from vla_zenoh.resources import names
 from vla_zenoh.runtime.launch import Host
 
 VARIABLES = ("VLA_ZENOH_PROFILE", "VLA_ZENOH_CONNECT", "VLA_ZENOH_HOST")
@@ -48,6 +50,57 @@ def test_another_robot_has_the_profile_of_this_one() -> None:
     assert profile.keys.stop == "vla/ur/stop"
     assert profile.session.connect == ("tcp/10.0.0.2:7447",)
     assert profile.robot.description == load_profile("panda_sim").robot.description
+
+
+@pytest.mark.parametrize("name", names("profiles"))
+def test_a_stop_leads_where_the_whole_profile_does(name: str) -> None:
+    whole, brief = load_profile(name), RobotTarget(name).load_for_stop()
+    assert brief.keys == whole.keys
+    assert brief.part_names == whole.part_names
+    assert brief.session == whole.session
+    assert brief.name == whole.name
+
+
+FAULTS = """
+robot: {driver: none_of_that_name, description: ./gone.urdf}
+cameras: {front: {sauce: 3}}
+limits: {contact: 7}
+colour: red
+workers: [a, a]
+"""
+
+
+def test_a_stop_needs_nothing_that_is_wrong_elsewhere_in_the_profile(tmp_path: Path) -> None:
+    file = tmp_path / "lab.yaml"
+    file.write_text(f"extends: panda_sim\nroot: lab{FAULTS}")
+    with pytest.raises(ProfileError):
+        load_profile(str(file))
+    there = ["tcp/10.0.0.2:7447"]
+    brief = RobotTarget(str(file), there, robot="ur").load_for_stop()
+    assert brief.keys.stop == "lab/ur/stop"
+    assert brief.session.connect == tuple(there)
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("session: {connect: [nowhere]}", "lab.yaml:2: session.connect.0"),
+        ("session: {lease: 3}", "lab.yaml:2: session.lease: unknown key"),
+        ("robot: {name: a/b}", "lab.yaml:2: robot.name"),
+        ("robot: 3", "lab.yaml:2: robot"),
+    ],
+)
+def test_what_a_stop_needs_is_checked(text: str, named: str, tmp_path: Path) -> None:
+    file = tmp_path / "lab.yaml"
+    file.write_text(f"extends: panda_sim\n{text}\n")
+    with pytest.raises(ProfileError) as caught:
+        RobotTarget(str(file)).load_for_stop()
+    assert named in str(caught.value)
+
+
+def test_a_stop_knows_the_hosts_of_the_profile() -> None:
+    with pytest.raises(ProfileError, match="has no host 'nowhere'"):
+        RobotTarget("panda_sim", host="nowhere").load_for_stop()
 
 
 @pytest.mark.parametrize(
