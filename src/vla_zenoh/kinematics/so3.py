@@ -1,39 +1,22 @@
-"""Poses and rotations: Pinocchio's exp and log with the few helpers this package needs."""
+"""Poses and rotations: Pinocchio's exp and log with the few helpers this package needs.
+
+Pinocchio is imported where it is called: a model's environment has none, and reads poses there.
+"""
 
 from __future__ import annotations
 
-import importlib
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from vla_zenoh.errors import MissingExtraError
 from vla_zenoh.policy.meaning import quat_of_matrix
 from vla_zenoh.types import FloatArray, PoseState
 
 MEAN_ITERATIONS = 10
 MEAN_RAD = 1e-10
 """The mean of rotations has converged when it moves by less."""
-
-
-class _Pinocchio:
-    """Pinocchio, imported at first use: the command line must load also where a model runs, which
-    has no Pinocchio. Found attributes are kept, so later calls cost nothing.
-    """
-
-    def __getattr__(self, name: str) -> Any:
-        try:
-            library = importlib.import_module("pinocchio")
-        except ImportError as error:
-            raise MissingExtraError("pinocchio", "control") from error
-        found = getattr(library, name)
-        setattr(self, name, found)
-        return found
-
-
-pin = _Pinocchio()
 
 
 class Pose(NamedTuple):
@@ -45,16 +28,22 @@ class Pose(NamedTuple):
 
 def exp3(rotvec: FloatArray) -> FloatArray:
     """Rotation matrix of a rotation vector (rad)."""
+    import pinocchio as pin
+
     return pin.exp3(np.asarray(rotvec, dtype=np.float64))
 
 
 def log3(rotation: FloatArray) -> FloatArray:
     """Rotation vector (rad) of a rotation matrix, angle within [0, pi]."""
+    import pinocchio as pin
+
     return pin.log3(np.asarray(rotation, dtype=np.float64))
 
 
 def rotation_from_rpy(rpy: FloatArray) -> FloatArray:
     """Extrinsic x, y, z: ``R = Rz(yaw) Ry(pitch) Rx(roll)``."""
+    import pinocchio as pin
+
     return pin.rpy.rpyToMatrix(float(rpy[0]), float(rpy[1]), float(rpy[2]))
 
 
