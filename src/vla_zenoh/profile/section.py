@@ -12,6 +12,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from vla_zenoh.errors import describe_fault, nearest
 from vla_zenoh.keys import key_chunk
+from vla_zenoh.profile.former import former
 from vla_zenoh.types import MAX_TEXT, shown
 
 Place = tuple[str, ...]
@@ -173,6 +174,8 @@ def unlisted(
 
 def _why(fault: Any, place: Place, model: type[Section]) -> str:
     words, given = describe_fault(fault), fault.get("input")
+    if remedy := former(place):
+        return remedy
     if fault["type"] == "extra_forbidden":
         allowed = field_names(model, place[:-1])
         near = nearest(place[-1], allowed)
