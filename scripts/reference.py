@@ -387,10 +387,10 @@ COUNTERS = {
     "ros2.unstamped": "joint states without a time stamp",
     "samples": "recorder, replay: samples written or published",
     "unknown_fields": "fields of records that this version does not know, ignored",
-    "sim.overruns": "simulation steps that took longer than they last",
+    "sim.overruns": "ticks of the simulator that were late, and stepped the world further",
     "sim.resets": "resets of the scene",
     "sim.stream_silences": "times the command stream fell silent",
-    "sim.time_given_up_ms": "simulated time that was skipped to catch up",
+    "sim.time_given_up_ms": "time in which the simulated world stood still: its process paused",
     "sim.torque_saturated": "control periods in which a torque limit acted",
 }
 REJECTING = {

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 REFRESH_HZ = 4.0
 MAX_EVENTS = 8
+SLOW = 0.9
+"""A simulator whose time goes slower than this, over real time, says so."""
 MAX_LINES, MAX_LINE = 12, 60
 """Lines of one cell, and characters of each."""
 MAX_WORDS = 400
@@ -220,6 +222,9 @@ def _message(row: NodeRow, found: NodeStatus, mode: str) -> str:
     if bad := _bad_cameras(_fields(detail.get("cameras"))):
         return _cell(bad, MAX_WORDS)
     text = str(detail.get("complaint") or detail.get("fault") or detail.get("renderer") or "")
+    factor = detail.get("real_time_factor")
+    if not text and isinstance(factor, (int, float)) and factor < SLOW:
+        return f"slower than real time: x {factor:.2f}"
     if not text and "obeyed" in detail:
         return f"{mode}: in control" if detail["obeyed"] else "shadow mode"
     certificates = _fields(detail.get("certificates"))

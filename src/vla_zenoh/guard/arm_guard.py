@@ -176,9 +176,10 @@ class ArmGuard:
         self._guards[mode].anchor(measured.at(mode))
         return None
 
-    def tick(self, now_ns: int) -> PoseReference | JointReference:
+    def tick(self, now_ns: int, dt_s: float | None = None) -> PoseReference | JointReference:
+        """The reference to follow at `now_ns`, `dt_s` after the last tick; None: one period."""
         self._now_ns = now_ns
-        self._active.tick(now_ns)
+        self._active.tick(now_ns, dt_s)
         return self.reference
 
     def anchor(self) -> None:

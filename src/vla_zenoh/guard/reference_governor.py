@@ -209,8 +209,8 @@ class ReferenceGovernor(Generic[Reference]):
         limits = np.array(brake[:3])
         self._brake = limits * brake.axis
         self._own = limits / BRAKE_MARGIN
-        jerk = self._target_jerk = ORDINARY * self._own[2]
-        self._reach = np.stack([jerk * dt_s, jerk * dt_s**2, jerk * (dt_s**3 / 2)])
+        self._target_jerk = ORDINARY * self._own[2]
+        self._reach = self._reach_in(dt_s)
         self._axis = brake.beside
         velocity, acceleration, jerk = self._own
         changes = [acceleration * dt_s / velocity, jerk * dt_s / acceleration, 0.0 * jerk]
@@ -223,6 +223,16 @@ class ReferenceGovernor(Generic[Reference]):
         self._time_s, self._length = 0.0, jerk
         self._taken = self._known = limits
         self.put(motion)
+
+    def set_period(self, dt_s: float) -> None:
+        """Let the next tick last `dt_s`."""
+        if dt_s != self._dt_s:
+            self._dt_s, self._reach = dt_s, self._reach_in(dt_s)
+
+    def _reach_in(self, dt_s: float) -> FloatArray:
+        """(3, n) what the jerk of the commanded path changes within a tick."""
+        jerk = self._target_jerk
+        return np.stack([jerk * dt_s, jerk * dt_s**2, jerk * (dt_s**3 / 2)])
 
     def put(self, motion: Reference) -> None:
         """Hold the place of `motion` at once."""

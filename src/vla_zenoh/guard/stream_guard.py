@@ -334,9 +334,12 @@ class StreamGuard(ABC, Generic[Reference]):
         )
         return None
 
-    def tick(self, now_ns: int) -> Reference:
-        """The reference to follow at `now_ns`."""
+    def tick(self, now_ns: int, dt_s: float | None = None) -> Reference:
+        """The reference to follow at `now_ns`, `dt_s` after the last tick; None: one period."""
         governor = self._governor
+        if dt_s is not None:
+            self._dt_s = dt_s
+            governor.set_period(dt_s)
         if self._stream.live(now_ns) and self._extrapolation is not None:
             steady = not self._stream.may_step(now_ns, self._dt_s)
             governor.follow(self._extrapolation.at(self._stream.ahead_s(now_ns)), steady=steady)

@@ -67,6 +67,7 @@ class Arm:
             (mode, node.subscribe(subscribed[mode], CallbackRing(BUFFER, SMALL_BYTES)))
             for mode in driver.modes
         ]
+        self._waiting: dict[str, list[ReceivedSample]] = {mode: [] for mode in driver.modes}
         nowhere = np.zeros(len(profile.robot.arm_joints))
         self._unknown = Measured(Pose(np.zeros(3), np.eye(3)), nowhere, nowhere)
         self._measured = driver.state_now()
@@ -83,8 +84,10 @@ class Arm:
         self._joint_out = node.declare_publisher(keys.state_joint, Kind.STATE)
         self._pose_out = node.declare_publisher(keys.state_pose, Kind.STATE)
         self._gripper_out = node.declare_publisher(keys.state_gripper, Kind.STATE)
-        # A little less than the period: readings come at multiples of another one.
-        self._period_ns = 0.9e9 / profile.timing.state_hz
+        # Less than the period: readings come at multiples of another one. A simulated robot is read
+        # at this rate as it is, give or take a tick.
+        share = 0.5 if driver.simulated else 0.9
+        self._period_ns = share * 1e9 / profile.timing.state_hz
         self._seq = self._published_ns = self._mono_ns = 0
         self._gripper = GripperState(profile.robot.gripper.max_width_m, False, False)
         self._published_fault = self._was = ""
@@ -156,7 +159,7 @@ class Arm:
         away = self._driver.away
         reason = away or ("stalled" if self.stalled else "")
         for mode, buffer in self._streams:
-            for arrival in buffer.drain():
+            for arrival in self._arrived(mode, buffer, mono_ns):
                 if self._measured is None or self.stop_latched or not self.accepting:
                     continue
                 if reason:
@@ -167,6 +170,18 @@ class Arm:
             self._lead(self._measured, now_ns, mono_ns, away)
         if away or self._silent:
             self._hold.invalidate()
+
+    def _arrived(self, mode: str, buffer: CallbackRing, mono_ns: int) -> list[ReceivedSample]:
+        """Commands that arrived by `mono_ns`.
+
+        A simulation that is late gets those after it in later ticks, else it would follow them in
+        steps.
+        """
+        arrivals = self._waiting[mode] + buffer.drain()
+        late = self._driver.simulated and not self._driver.lockstep
+        count = sum(arrival.mono_ns <= mono_ns for arrival in arrivals) if late else len(arrivals)
+        self._waiting[mode] = arrivals[count:]
+        return arrivals[:count]
 
     def _offer(self, mode: str, arrival: ReceivedSample, mono_ns: int) -> None:
         guard = self.guard
@@ -192,7 +207,7 @@ class Arm:
     def _lead(self, measured: Measured, now_ns: int, mono_ns: int, away: str) -> None:
         guard = self.guard
         if self._driver.simulated:
-            self._driver.move(guard.tick(mono_ns), now_ns)
+            self._driver.move(guard.tick(mono_ns, self._driver.period_s), now_ns)
             return
         was_moving = guard.moving or self._resting
         self._resting = False

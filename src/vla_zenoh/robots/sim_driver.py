@@ -1,8 +1,8 @@
-"""Driver of the simulated robot: MuJoCo and its torque controllers, stepped by 1 ms per tick.
+"""Driver of the simulated robot: MuJoCo and its torque controllers.
 
-The arm follows poses or joint positions. Real time by default: ticks keep to the clock, and up to
-`CATCH_UP_NS` of lost time is caught up; more is given up and counted. In lockstep simulated time
-stands still until a query on ``sim/step`` advances it.
+The arm follows poses or joint positions. Real time by default, as far as the computer keeps up (see
+`vla_zenoh.simulation.pace`). In lockstep simulated time stands still until a query on ``sim/step``
+advances it, by 1 ms per tick.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,14 +27,16 @@ from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import Profile
 from vla_zenoh.robots.arm import Arm
 from vla_zenoh.robots.driver import DriverStatus, Measurement, RobotDriver
-from vla_zenoh.simulation.world import STEP_NS, build_world
-from vla_zenoh.types import FloatArray, GripperCommand, ObjectPoses, SceneState
-from vla_zenoh.types.records import JointReference, PoseReference
+from vla_zenoh.simulation.pace import CONTROL_STEPS, Pace
+from vla_zenoh.simulation.world import STEP_NS, STEP_S, build_world
+from vla_zenoh.types import Event, FloatArray, GripperCommand, ObjectPoses, SceneState
+from vla_zenoh.types.records import JointReference, JointState, PoseReference
 
 if TYPE_CHECKING:
     from vla_zenoh.robots.node import RobotNode
 
-CATCH_UP_NS = 50_000_000
+SLOW, FAST_AGAIN = 0.9, 0.97
+"""Simulated over real time below which an event reports it, and above which it is over."""
 
 
 def _every(rate_hz: float) -> int:
@@ -47,6 +50,26 @@ MAX_STEP_BYTES = 1024
 WATCH_S = 0.2
 LEAST_FORCE_N = 0.1
 """A gripper that may press with no force would not move."""
+
+
+def stretched(
+    reference: PoseReference | JointReference, stretch: float
+) -> PoseReference | JointReference:
+    """A reference of real time in the time of a world that goes slower by the factor `stretch`."""
+    if stretch == 1.0:
+        return reference
+    if isinstance(reference, JointReference):
+        return JointReference(
+            reference.position_rad,
+            reference.velocity_rad_s * stretch,
+            reference.acceleration_rad_s2 * stretch**2,
+        )
+    return PoseReference(
+        reference.position_m,
+        reference.rotation,
+        reference.twist * stretch,
+        reference.acceleration * stretch**2,
+    )
 
 
 class SimDriver(RobotDriver):
@@ -64,8 +87,12 @@ class SimDriver(RobotDriver):
         super().__init__(profile)
         self.world = build_world(profile)
         self.lockstep = lockstep
-        self.modes, self.period_s = ("pose", "joint"), STEP_NS / 1e9
+        self.modes = ("pose", "joint")
+        self.steps = 1 if lockstep else CONTROL_STEPS
+        self.period_s = self.steps * STEP_S
         self.ticks = self.stamp_ns = 0
+        self._pace: Pace | None = None
+        self._slow = False
         self._was_reset = False
         self._step_lock = threading.Lock()
         self._node: Node | None = None
@@ -92,11 +119,12 @@ class SimDriver(RobotDriver):
         self._objects = node.declare_publisher(keys.sim_objects, Kind.TELEMETRY)
         self._scene_wanted = self._objects_wanted = False
 
-    # -- one millisecond ----------------------------------------------------------------------
+    # -- one tick -----------------------------------------------------------------------------
     def poll(self, mono_ns: int) -> None:
         """Execute resets."""
         if self._node is None:
             return
+        self._watch_pace()
         for arrival in self._resets.drain():
             # In a tuple: no seed is a valid one, no tuple a rejection.
             found = self._node.decode_text(lambda text: (settings.decode_seed(text),), arrival)
@@ -113,11 +141,18 @@ class SimDriver(RobotDriver):
 
     def step_world(self, mono_ns: int) -> None:
         """Step the world towards the references of all parts."""
-        self.ticks += 1
+        self.ticks += self.steps
         self.measured_ns = mono_ns
         if not self.fault:
+            stretch = self.stretch
             try:
-                self.world.tick({name: part.reference for name, part in self._parts.items()})
+                self.world.tick(
+                    {
+                        name: stretched(part.reference, stretch)
+                        for name, part in self._parts.items()
+                    },
+                    self.steps,
+                )
             except NodeError as error:
                 self.fault = str(error)
                 self.report.reject("simulation_fault", self.fault)
@@ -126,14 +161,14 @@ class SimDriver(RobotDriver):
 
     def _publish_scene(self) -> None:
         """Publish what is due and has subscribers."""
-        ticks, world = self.ticks, self.world
-        if ticks % LOOK_EVERY == 0:
+        world = self.world
+        if self.due(LOOK_EVERY):
             self._scene_wanted = self._scene.has_subscribers
             self._objects_wanted = self._objects.has_subscribers
-        if self._scene_wanted and ticks % SCENE_EVERY == 0:
+        if self._scene_wanted and self.due(SCENE_EVERY):
             scene = SceneState(self.profile.sim.scene, world.qpos(), world.seed)
             self._scene.publish(scene, stamp_wall_ns=self.stamp_ns)
-        if self._objects_wanted and ticks % OBJECTS_EVERY == 0:
+        if self._objects_wanted and self.due(OBJECTS_EVERY):
             objects = world.objects()
             poses = ObjectPoses(
                 tuple(objects),
@@ -141,6 +176,15 @@ class SimDriver(RobotDriver):
                 np.array([quat_xyzw for _, quat_xyzw in objects.values()]).reshape(-1, 4),
             )
             self._objects.publish(poses, stamp_wall_ns=self.stamp_ns)
+
+    def due(self, every: int) -> bool:
+        """Whether the last tick reached or passed a multiple of `every` steps."""
+        return self.ticks % every < self.steps
+
+    @property
+    def stretch(self) -> float:
+        """Real time over simulated time."""
+        return self.period_s / (self.steps * STEP_S)
 
     def reset(self, seed: int | None) -> None:
         """Reset arm and objects to their initial state; `seed` None: that of the profile."""
@@ -155,24 +199,38 @@ class SimDriver(RobotDriver):
 
     # -- time ---------------------------------------------------------------------------------
     def pace(self) -> Callable[[], Tick]:
-        """Ticks of 1 ms on the monotonic clock; late ones follow each other at once."""
-        report, next_ns = self.report, time.monotonic_ns()
+        """Ticks on the monotonic clock; late ones follow each other at once."""
+        pace = self._pace = Pace(time.monotonic_ns())
+        report = self.report
         report.counters["sim.overruns"] = 0
 
         def wait() -> Tick:
-            nonlocal next_ns
-            next_ns += STEP_NS
-            late_ns = time.monotonic_ns() - next_ns
-            if late_ns < 0:
-                time.sleep(-late_ns / 1e9)
-            elif late_ns > CATCH_UP_NS:
-                report.counters["sim.time_given_up_ms"] += late_ns // 1_000_000
-                next_ns += late_ns
-            elif late_ns > STEP_NS:
+            tick = pace.next(time.monotonic_ns())
+            if tick.wait_ns > 0:
+                time.sleep(tick.wait_ns / 1e9)
+            if tick.steps > CONTROL_STEPS:
                 report.counters["sim.overruns"] += 1
-            return Tick(1, next_ns, 0.0, 0.0)
+            if tick.given_up_ns:
+                report.counters["sim.time_given_up_ms"] += tick.given_up_ns // 1_000_000
+            self.steps, self.period_s = tick.steps, tick.period_s
+            for part in self._parts.values():
+                part.period_s = tick.period_s
+            return Tick(1, tick.time_ns, 0.0, 0.0)
 
         return wait
+
+    def _watch_pace(self) -> None:
+        """Report that the world is slower than real time, once until it is not."""
+        factor = 1.0 if self._pace is None else self._pace.factor
+        if factor < SLOW and not self._slow:
+            why = (
+                f"the simulator is slower than real time: x {factor:.2f}; this computer is too "
+                "slow or busy. The arm stays on its commands, but objects move and fall slower"
+            )
+            self.report.emit(Event("warning", "notice", "slow", why, factor, SLOW))
+            self._slow = True
+        elif factor > FAST_AGAIN:
+            self._slow = False
 
     def serve_lockstep(self, node: RobotNode, stop: threading.Event) -> None:
         """Publish the first state, and answer ``sim/step`` until `stop` is set."""
@@ -216,7 +274,12 @@ class SimDriver(RobotDriver):
     def status(self) -> DriverStatus:
         """Scene, command mode and fault."""
         self.report.counters["sim.torque_saturated"] = self.world.saturated
-        detail = {"scene": self.profile.sim.scene, "command": self._first.guard.mode}
+        detail: dict[str, Any] = {
+            "scene": self.profile.sim.scene,
+            "command": self._first.guard.mode,
+        }
+        if self._pace is not None:
+            detail["real_time_factor"] = round(self._pace.factor, 3)
         return DriverStatus({**detail, "lockstep": self.lockstep, "fault": self.fault})
 
 
@@ -257,21 +320,29 @@ class SimPart(RobotDriver):
         if self._is_first:
             sim.step_world(mono_ns)
         self.fault, self.measured_ns = sim.fault, sim.measured_ns
-        return None if sim.ticks % self._state_every else self.measure()
+        return self.measure() if sim.due(self._state_every) else None
 
     def measure(self) -> Measurement:
         """State of the arm after the last step."""
         arm, stamp_ns = self._arm, self._sim.stamp_ns
         if self.fault and self._newest is not None:  # a diverged state may not be finite
             return self._newest._replace(stamp_ns=stamp_ns)
-        pose = arm.pose_state(self.reference)
-        self._newest = Measurement(
-            stamp_ns, arm.joint_state(), Pose(*arm.tcp()), pose, arm.gripper_state()
-        )
+        pose, joints = arm.pose_state(self.reference), self._joints()
+        stretch = self._sim.stretch
+        if stretch != 1.0:
+            pose = replace(pose, twist=pose.twist / stretch)
+        self._newest = Measurement(stamp_ns, joints, Pose(*arm.tcp()), pose, arm.gripper_state())
         return self._newest
 
+    def _joints(self) -> JointState:
+        """State of the joints; their velocity is in real time, as are the stamps."""
+        state, stretch = self._arm.joint_state(), self._sim.stretch
+        if stretch == 1.0:
+            return state
+        return replace(state, velocity_rad_s=state.velocity_rad_s / stretch)
+
     def state_now(self) -> Measured:
-        state = self._arm.joint_state()
+        state = self._joints()
         return Measured(Pose(*self._arm.tcp()), state.position_rad, state.velocity_rad_s)
 
     @property

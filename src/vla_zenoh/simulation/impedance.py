@@ -106,17 +106,23 @@ class ImpedanceGains:
 class _Impedance:
     """What both laws have: torque limits, and integral action clamped to `limit`.
 
-    `rate` is ki K dt; `integral` the torque (n,) in Nm, or the wrench (6,) in N and Nm.
+    `rate` is ki K; `integral` the torque (n,) in Nm, or the wrench (6,) in N and Nm.
     """
 
-    def __init__(self, effort_nm: FloatArray, rate: FloatArray, limit: FloatArray) -> None:
+    def __init__(
+        self, effort_nm: FloatArray, rate: FloatArray, limit: FloatArray, period_s: float
+    ) -> None:
         self._effort_nm = np.array(effort_nm, float)
-        self._rate, self._limit = rate, limit
+        self._rate, self._limit, self._period_s = rate, limit, period_s
         self.integral = np.zeros(len(limit))
+
+    def set_period(self, period_s: float) -> None:
+        """Let the torque of the next call last `period_s`."""
+        self._period_s = period_s
 
     def _integrate(self, error: FloatArray, held: bool | NDArray[np.bool_]) -> None:
         """Integrate; where `held`, towards zero only: the arm is blocked, or a torque is cut."""
-        step = self._rate * error
+        step = self._rate * self._period_s * error
         if held is not False:
             step[held & ~(step * self.integral < 0.0)] = 0.0  # NaN as well
         self.integral = _bounded(self.integral + step, self._limit)
@@ -151,9 +157,9 @@ class CartesianImpedance(_Impedance):
         self._stiffness = np.repeat([gains.translational_n_m, gains.rotational_nm_rad], 3)
         # zeta * sqrt(K_j) scales the columns of Lambda^1/2; its transpose gives the other half.
         self._damping_scale = gains.damping_ratio * np.sqrt(self._stiffness)
-        rate = gains.integral_1_s * period_s * self._stiffness
+        rate = gains.integral_1_s * self._stiffness
         most = np.repeat([gains.max_integral_n, gains.max_integral_nm], 3)
-        super().__init__(effort_nm, rate, most)
+        super().__init__(effort_nm, rate, most, period_s)
         self._task_space: _TaskSpace | None = None
 
     def take_over(self, torque_nm: FloatArray, state: ArmDynamics) -> None:
@@ -234,8 +240,9 @@ class JointImpedance(_Impedance):
         self._stiffness = _per_joint(gains.stiffness_nm_rad, joints)
         # zeta * sqrt(K_j) scales the columns of M^1/2; its transpose gives the other half.
         self._damping_scale = gains.damping_ratio * np.sqrt(self._stiffness)
-        rate = gains.integral_1_s * period_s * self._stiffness
-        super().__init__(effort_nm, rate, _per_joint(gains.max_integral_nm, joints))
+        rate = gains.integral_1_s * self._stiffness
+        most = _per_joint(gains.max_integral_nm, joints)
+        super().__init__(effort_nm, rate, most, period_s)
 
     def take_over(self, torque_nm: FloatArray, state: ArmDynamics) -> None:
         """Take over from the other law, see `CartesianImpedance.take_over`."""

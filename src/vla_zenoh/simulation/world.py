@@ -131,8 +131,11 @@ class World:
     def tick(
         self,
         reference: PoseReference | JointReference | Mapping[str, PoseReference | JointReference],
+        steps: int = 1,
     ) -> None:
-        """Step by one millisecond towards a reference of the TCP or joints, or one of each part.
+        """Step by milliseconds towards a reference of the TCP or joints, or one of each part.
+
+        The controllers compute their torque once, and it stays for all `steps`.
 
         Raises:
             NodeError: the simulation diverged; `reset` makes it usable again.
@@ -140,13 +143,15 @@ class World:
         mujoco.mj_step1(self.model, self._data)
         for name, part in self.parts.items():
             self.saturated += part.torque(
-                reference[name] if isinstance(reference, Mapping) else reference
+                reference[name] if isinstance(reference, Mapping) else reference, steps
             )
         mujoco.mj_step2(self.model, self._data)
-        self._ticks += 1
+        if steps > 1:
+            mujoco.mj_step(self.model, self._data, steps - 1)
+        self._ticks += steps
         self._fresh = False
         for part in self.parts.values():
-            part.filter_wrench()
+            part.filter_wrench(steps)
         if self._warnings.any():
             raised = [
                 mujoco.mjtWarning(kind).name.removeprefix("mjWARN_").lower()
@@ -304,8 +309,8 @@ class SimulatedPart:
         self._held_rad: FloatArray | None = None
         self._filtered_wrench = np.zeros(6)
 
-    def torque(self, reference: PoseReference | JointReference) -> bool:
-        """Set the torques of this tick; whether an effort limit cut them.
+    def torque(self, reference: PoseReference | JointReference, steps: int = 1) -> bool:
+        """Set the torques of the next steps; whether an effort limit cut them.
 
         Raises:
             NodeError: the reference is not finite.
@@ -318,11 +323,12 @@ class SimulatedPart:
         if self._active_law not in (None, law):
             law.take_over(self._data.ctrl[self._actuators], state)
         self._active_law = law
+        law.set_period(steps * STEP_S)
         output = law.torque(reference, state)  # pyright: ignore[reportArgumentType]  # of its law
         if not math.isfinite(sum(output.torque_nm.tolist())):
             raise NodeError(f"the reference is not finite: {reference}")
         self._data.ctrl[self._actuators] = output.torque_nm
-        self.gripper.step()
+        self.gripper.step(steps)
         return output.saturated
 
     def _dynamics(self) -> ArmDynamics:
@@ -341,10 +347,11 @@ class SimulatedPart:
             bias_nm=self._bias_nm,
         )
 
-    def filter_wrench(self) -> None:
-        """Follow the wrench of the last step."""
+    def filter_wrench(self, steps: int = 1) -> None:
+        """Follow the wrench of the last step, which stands for all `steps`."""
         error = self._contact_wrench() - self._filtered_wrench
-        self._filtered_wrench += (STEP_S / WRENCH_FILTER_S) * error
+        left = (1.0 - STEP_S / WRENCH_FILTER_S) ** steps
+        self._filtered_wrench += (1.0 - left) * error
 
     # -- geometry -----------------------------------------------------------------------------
     def _in_base(
@@ -478,17 +485,17 @@ class SimulatedGripper:
         # reversal starts at the fingers, else it would lag by the whole squeeze.
         if (target - self._measured_m) * (self._set_m - self._measured_m) <= 0.0:
             self._set_m = self._measured_m
-        self._target_m, self._step_m = target, speed_m_s * STEP_S
+        self._target_m, self._step_m = target, speed_m_s * STEP_S  # of one millisecond
         if abs(target - self._measured_m) > HELD_MARGIN_M and not self._holding:
             self._rest_ticks = 0
         self._bound_force(force_n)
 
-    def step(self) -> None:
-        """Set the actuator for this tick."""
+    def step(self, steps: int = 1) -> None:
+        """Set the actuator for the next steps."""
         self._measured_m, rate_m_s = self._opening()
-        self._rest_ticks = self._rest_ticks + 1 if abs(rate_m_s) < AT_REST_M_S else 0
-        left = self._target_m - self._set_m
-        self._set_m += min(max(left, -self._step_m), self._step_m)
+        self._rest_ticks = self._rest_ticks + steps if abs(rate_m_s) < AT_REST_M_S else 0
+        left, most = self._target_m - self._set_m, self._step_m * steps
+        self._set_m += min(max(left, -most), most)
         self._data.ctrl[self._actuator] = self._set_m
 
     def state(self) -> GripperState:

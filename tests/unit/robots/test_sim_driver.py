@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
+import zenoh
 from camera_rig import routed_session
 from driver_report import Report
 
@@ -65,9 +68,27 @@ def test_it_goes_to_joint_positions(driver: SimDriver) -> None:
 
 def test_measurements_come_at_the_state_rate(driver: SimDriver) -> None:
     driver.reset(None)
-    found = [driver.parts[""].read(step * STEP_NS) for step in range(1, 1001)]
+    ticks = 1000 // driver.steps
+    found = [driver.parts[""].read(tick * driver.steps * STEP_NS) for tick in range(1, ticks + 1)]
     count = sum(measurement is not None for measurement in found)
     assert count == pytest.approx(driver.profile.timing.state_hz, rel=0.01)
+
+
+def test_states_are_published_at_the_state_rate_in_real_time() -> None:
+    with routed_session() as session:
+        node = RobotNode(SimDriver(load_profile("panda_sim")), session)
+        driver, found = node.driver, list[zenoh.Sample]()
+        key = node.node.keys.state_pose
+        subscriber = session.declare_subscriber(key, found.append)
+        ticks = round(1.0 / driver.period_s)
+        for tick in range(1, ticks + 1):
+            node.step(Tick(1, round(tick * driver.period_s * 1e9), 0.0, 0.0))
+        until_s = time.monotonic() + 5.0
+        while len(found) < 0.95 * driver.profile.timing.state_hz and time.monotonic() < until_s:
+            time.sleep(0.01)
+        assert len(found) == pytest.approx(driver.profile.timing.state_hz, rel=0.05)
+        subscriber.undeclare()
+        node._close()
 
 
 def test_the_gripper_closes(driver: SimDriver) -> None:
