@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import fcntl
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from vla_zenoh.errors import MissingExtraError, VlaZenohError
 
@@ -36,15 +36,30 @@ def write_whole(path: Path, content: str | bytes) -> None:
     _sync_folder(path.parent)
 
 
-def append_line(path: Path, line: str) -> None:
-    """Append a line to a file; it is on the disk when this returns."""
-    with path.open("ab+") as file:
-        file.seek(0)
-        file.truncate(file.read().rfind(b"\n") + 1)
-        file.write(line.encode() + b"\n")
-        file.flush()
+def append_lines(path: Path, lines: Iterable[str]) -> None:
+    """Append lines to a file; all are on the disk when this returns, none after an error."""
+    data = "".join(f"{line}\n" for line in lines).encode()
+    with path.open("ab+", buffering=0) as file:
+        end = _end_of_lines(file)
+        file.truncate(end)
+        try:
+            while data:
+                data = data[file.write(data) :]
+        except OSError:
+            file.truncate(end)
+            raise
         os.fsync(file.fileno())
     _sync_folder(path.parent)
+
+
+def _end_of_lines(file: IO[bytes]) -> int:
+    """Where the last complete line of a file ends."""
+    size = file.seek(0, os.SEEK_END)
+    file.seek(max(size - 1, 0))
+    if file.read() in (b"", b"\n"):
+        return size
+    file.seek(0)
+    return file.read().rfind(b"\n") + 1
 
 
 def whole_lines(path: Path) -> tuple[list[bytes], bool]:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from vla_zenoh.errors import OutputError, RecordError
-from vla_zenoh.lab.durable import append_line, whole_lines
+from vla_zenoh.lab.durable import append_lines, whole_lines
 from vla_zenoh_benchmarks.episode import EpisodeOutcome, EpisodeRequest
 
 PLAN, EPISODES, ACTIONS = "run.json", "episodes.jsonl", "actions"
@@ -55,7 +55,7 @@ class RunJournal:
             return
         with actions_file(self.folder, request).open("wb") as file:
             np.save(file, np.asarray(outcome.actions, np.float64))
-        append_line(self.folder / EPISODES, json.dumps(outcome.to_dict()))
+        append_lines(self.folder / EPISODES, [json.dumps(outcome.to_dict())])
 
 
 def actions_file(folder: Path, request: EpisodeRequest) -> Path:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from vla_zenoh.errors import RecordingError
-from vla_zenoh.lab.durable import lock_folder
+from vla_zenoh.lab.durable import append_lines, lock_folder, whole_lines, writing
 
 LOG, BEFORE = "settings.jsonl", "settings-before.jsonl"
 """The newest lines, and those that no longer fit into that file."""
@@ -43,10 +43,6 @@ class SettingsLog:
                     f"another rolling record writes into {folder}: end it, or give this one "
                     "another --folder (`up`: another --log-dir, or --no-record)"
                 )
-            found = self._path.read_bytes() if self._path.exists() else b""
-            self._size = found.rfind(b"\n") + 1
-            if self._size < len(found):
-                os.truncate(self._path, self._size)
         except OSError as error:
             raise RecordingError(f"{folder} cannot be used: {error.strerror}") from error
         last = entries_of(folder)[-1:]
@@ -69,20 +65,11 @@ class SettingsLog:
         """
         if not self._waiting:
             return
-        data = "".join(f"{line}\n" for line in self._waiting).encode()
-        try:
-            if self._size and self._size + len(data) > self._file_bytes:
+        with writing(self._path, RecordingError):
+            size = self._path.stat().st_size if self._path.exists() else 0
+            if size and size + sum(len(line) + 1 for line in self._waiting) > self._file_bytes:
                 self._path.replace(self._folder / BEFORE)
-                self._size = 0
-            with self._path.open("ab", buffering=0) as file:
-                file.truncate(self._size)
-                written = 0
-                while written < len(data):
-                    written += file.write(data[written:])
-                os.fsync(file.fileno())
-        except OSError as error:
-            raise RecordingError(f"{self._path}: {error.strerror}") from error
-        self._size += len(data)
+            append_lines(self._path, self._waiting)
         self._waiting.clear()
 
     def close(self) -> None:
@@ -100,8 +87,7 @@ def entries_of(folder: Path) -> list[dict[str, Any]]:
     """The complete lines of the log of a folder, oldest first."""
     found = []
     for path in logs_of(folder):
-        whole, _, _ = path.read_text("utf-8", "replace").rpartition("\n")
-        for line in whole.splitlines():
+        for line in whole_lines(path)[0]:
             try:
                 entry = json.loads(line)
             except ValueError:

@@ -20,7 +20,7 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from vla_zenoh.errors import RecordingError
-from vla_zenoh.lab.durable import append_line, lock_folder, whole_lines, write_whole, writing
+from vla_zenoh.lab.durable import append_lines, lock_folder, whole_lines, write_whole, writing
 from vla_zenoh.lab.trial.plan import TrialPlan
 from vla_zenoh.lab.trial.verdict import EpisodeVerdict
 
@@ -156,4 +156,4 @@ class TrialFolder:
         """Append a verdict and sync it to the disk. Raises RecordingError: it cannot be written."""
         path = self.path / TRIALS
         with writing(path, RecordingError):
-            append_line(path, json.dumps(asdict(verdict)))
+            append_lines(path, [json.dumps(asdict(verdict))])

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from vla_zenoh.errors import OutputError
-from vla_zenoh.lab.durable import append_line, page_template, whole_lines, write_whole, writing
+from vla_zenoh.lab.durable import append_lines, page_template, whole_lines, write_whole, writing
 from vla_zenoh.lab.trial.folder import TrialFolder
 from vla_zenoh.lab.trial.plan import TrialPlan
 from vla_zenoh.lab.trial.score import TrialScore, score
@@ -145,7 +145,7 @@ class UnattendedTrial:
         line = {"what": what, "why": why, "time_s": time.time(), "episodes": len(self.episodes())}
         file = self.path / JOURNAL
         with writing(file, OutputError):
-            append_line(file, json.dumps(line))
+            append_lines(file, [json.dumps(line)])
 
     def journal(self) -> list[dict[str, Any]]:
         """Lines of the journal; one that was cut off is none."""
