@@ -148,7 +148,7 @@ def evaluate_loaded(run: Run, *, pictures: int = 0) -> Evaluation:
     out.width_m = np.array([entry.record.width_m for entry in run.grippers])
     out.width_t_s = np.array([(e.header.stamp_wall_ns - zero_ns) / 1e9 for e in run.grippers])
     _seams(out, run.commands)
-    _joint_jerk(out, run.joint_commands)
+    _jerk(out, run)
     _idle(out, run, measured)
     out.refusals = _counted(run.first_statuses, run.statuses, "refused.")
     out.skipped = _counted(run.first_statuses, run.statuses, "skipped.")
@@ -254,13 +254,10 @@ def _motion(out: Evaluation, measured: MeasuredMotion, commanded: MeasuredMotion
 
 
 def _seams(out: Evaluation, commands: Sequence[RecordedSample]) -> None:
-    """Jerk of the command stream, and steps where a chunk replaces another."""
-    jerk: list[float] = []
+    """Steps of the command stream where a chunk replaces another."""
     goal_mm: list[float] = []
     velocity_mm_s: list[float] = []
-    for before, after, apart_s, times in _neighbours(commands):
-        change = after.acceleration[:3] - before.acceleration[:3]
-        jerk += [float(np.linalg.norm(change)) / apart_s] * times
+    for before, after, apart_s, _ in _neighbours(commands):
         if before.cause and after.cause and _chunk(before.cause) != _chunk(after.cause):
             goal = after.goal_position_m - before.goal_position_m
             goal_mm.append(float(np.linalg.norm(goal)) * 1e3)
@@ -268,7 +265,6 @@ def _seams(out: Evaluation, commands: Sequence[RecordedSample]) -> None:
             gained = (before.acceleration[:3] + after.acceleration[:3]) / 2 * apart_s
             step = after.twist[:3] - before.twist[:3] - gained
             velocity_mm_s.append(float(np.linalg.norm(step)) * 1e3)
-    out.jerk = np.array(jerk)
     out.seam_goal_mm, out.seam_velocity_mm_s = np.array(goal_mm), np.array(velocity_mm_s)
 
 
@@ -303,13 +299,18 @@ def _chunk(cause: Cause) -> tuple[str, int]:
     return cause.worker, cause.chunk_seq
 
 
-def _joint_jerk(out: Evaluation, commands: Sequence[RecordedSample]) -> None:
+def _jerk(out: Evaluation, run: Run) -> None:
+    """Norm of the jerk of pose commands; without these, the largest of a joint."""
     jerk: list[float] = []
-    for before, after, apart_s, times in _neighbours(commands):
-        change = after.acceleration_rad_s2 - before.acceleration_rad_s2
-        jerk += [float(np.abs(change).max()) / apart_s] * times
-    if jerk and not len(out.jerk):
-        out.jerk, out.jerk_unit = np.array(jerk), "rad_s3"
+    for before, after, apart_s, times in _neighbours(run.commands or run.joint_commands):
+        if isinstance(before, PoseCommand):
+            size = np.linalg.norm(after.acceleration[:3] - before.acceleration[:3])
+        else:
+            size = np.abs(after.acceleration_rad_s2 - before.acceleration_rad_s2).max()
+        jerk += [float(size) / apart_s] * times
+    out.jerk = np.array(jerk)
+    if jerk and not run.commands:
+        out.jerk_unit = "rad_s3"
 
 
 # -- activity -------------------------------------------------------------------------------------

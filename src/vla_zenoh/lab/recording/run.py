@@ -299,14 +299,16 @@ def seen_pictures(file: Recording, worker: str, camera: str) -> Iterator[Recorde
 
 def depths(file: Recording, camera: str) -> Iterator[Sample]:
     """Every depth image of a camera, oldest first, one in memory at a time."""
-    key = file.keys.camera_depth(camera)
-    for entry in file.entries(lambda each: each == key):
-        if entry.header is not None and entry.encoding.startswith(DEPTH):
-            yield entry
+    return _images(file, file.keys.camera_depth(camera), DEPTH)
 
 
 def _jpegs(file: Recording, key: str) -> Iterator[RecordedImage]:
+    for entry in _images(file, key, JPEG):
+        assert entry.header is not None
+        yield RecordedImage(entry.stamp_ns, entry.header.seq, entry.payload)
+
+
+def _images(file: Recording, key: str, encoding: str) -> Iterator[Sample]:
     for entry in file.entries(lambda each: each == key):
-        if entry.header is not None and entry.encoding == JPEG:
-            stamp_ns, seq = entry.header.stamp_wall_ns, entry.header.seq
-            yield RecordedImage(stamp_ns, seq, entry.payload)
+        if entry.header is not None and entry.encoding.startswith(encoding):
+            yield entry
