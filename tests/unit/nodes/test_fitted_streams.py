@@ -47,13 +47,13 @@ def test_who_fell_silent_asks_for_nothing_any_more() -> None:
     assert list(asked.sizes("front", 1.1 * SILENCE_S)) == ["200x200-stretch"]
 
 
-def test_made_up_workers_take_a_bounded_place_and_give_it_back() -> None:
+def test_made_up_workers_take_a_bounded_place_and_keep_out_no_other() -> None:
     asked = RequestedSizes()
     heard = [asked.add(f"ghost{number}", spec(100), 0.0) for number in range(2 * MAX_MODELS)]
     assert sum(heard) == MAX_MODELS
-    assert not asked.add("late", spec(200), 0.9 * SILENCE_S)
-    assert asked.add("late", spec(200), 1.1 * SILENCE_S)
-    assert list(asked.sizes("front", 1.1 * SILENCE_S)) == ["200x200-stretch"]
+    assert not asked.add("late", spec(200), 0.1)
+    assert asked.add("late", spec(200), 0.2)
+    assert list(asked.sizes("front", 0.2)) == ["100x100-stretch", "200x200-stretch"]
 
 
 @pytest.mark.parametrize("camera", ["front", "wrist"])

@@ -24,6 +24,7 @@ from typing import Any
 
 import zenoh
 
+from vla_zenoh.bus.bounded import Bounded
 from vla_zenoh.bus.node import Node
 from vla_zenoh.codec import records
 from vla_zenoh.errors import CodecError, RecordingError
@@ -94,7 +95,7 @@ class RollingRecord:
         self._lost_s = 0.0
         self._settings: set[str] = set()
         self._allowances: dict[str, RateLimit] = {}
-        self._clients: dict[str, tuple[str, str, str]] = {}
+        self._clients: Bounded[str, tuple[str, str, str]] = Bounded(MAX_CLIENTS)
         self._reasons: list[str] = []
         self._save_s, self._asked, self._refused_s = 0.0, False, -1e9
         self._saved = ""
@@ -245,8 +246,6 @@ class RollingRecord:
                 self._add(
                     "client", client=number, certificate=certificate, address=address, by=router
                 )
-        while len(self._clients) > MAX_CLIENTS:
-            del self._clients[next(iter(self._clients))]
 
     def _write_log(self) -> None:
         try:

@@ -13,6 +13,7 @@ import zenoh
 from numpy.typing import NDArray
 
 from vla_zenoh import plugins
+from vla_zenoh.bus.bounded import Bounded
 from vla_zenoh.bus.buffers import LatestSample, ReceivedSample, ZenohRing
 from vla_zenoh.bus.node import Node
 from vla_zenoh.errors import MissingExtraError, NodeError, RecordError, VlaZenohError, in_words
@@ -91,29 +92,22 @@ class RequestedSizes:
     """Image sizes that live workers ask for, from the newest spec of each; `now_s`: monotonic."""
 
     def __init__(self) -> None:
-        self._specs: dict[str, tuple[float, ModelSpec]] = {}
+        self._specs: Bounded[str, tuple[float, ModelSpec]] = Bounded(MAX_MODELS)
 
     def add(self, worker: str, spec: ModelSpec, now_s: float) -> bool:
-        """Keep a worker's spec; False if there are `MAX_MODELS` of other workers already."""
-        self._forget(now_s)
-        if worker not in self._specs and len(self._specs) >= MAX_MODELS:
-            return False
+        """Keep a worker's spec; False if that of another worker had to make room."""
+        dropped = self._specs.dropped
         self._specs[worker] = (now_s, spec)
-        return True
+        return self._specs.dropped == dropped
 
     def sizes(self, camera: str, now_s: float) -> dict[str, CameraSpec]:
-        """Variant name -> spec of the camera, in the order in which workers appeared."""
-        self._forget(now_s)
+        """Variant name -> spec of the camera."""
         return {
             variant: one
-            for _, spec in self._specs.values()
+            for heard_s, spec in self._specs.values()
             for one in spec.observation.cameras
-            if one.camera == camera and (variant := size_variant(one)) is not None
-        }
-
-    def _forget(self, now_s: float) -> None:
-        self._specs = {
-            worker: heard for worker, heard in self._specs.items() if now_s - heard[0] <= SILENCE_S
+            if one.camera == camera and now_s - heard_s <= SILENCE_S
+            if (variant := size_variant(one)) is not None
         }
 
 
@@ -226,7 +220,7 @@ class CameraNode:
             with self._node_lock:
                 stamped = self.node.decode(ModelSpec, arrival)
                 if stamped is not None and not self._requested.add(worker, stamped.record, now_s):
-                    why = f"specs of {MAX_MODELS} workers are known; that of {worker!r} is ignored"
+                    why = f"more than {MAX_MODELS} workers have a spec; the newest: {worker!r}"
                     self.node.reject("too_many_models", why)
         if now_s - self._sized_s < SIZES_PERIOD_S:
             return
