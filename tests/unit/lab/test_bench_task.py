@@ -80,15 +80,6 @@ def test_families_take_turns_and_every_episode_has_a_layout_of_its_own() -> None
     asked = list(TaskPlan("m", 7, SEED).requests())
     assert [each.seed for each in asked] == list(range(SEED, SEED + 7))
     assert [each.family for each in asked[:3]] == list(FAMILIES)
-    assert all(each.target is None for each in asked)
-
-
-def test_pairs_ask_for_another_brick_in_the_same_layout() -> None:
-    asked = list(TaskPlan("m", 6, SEED, family="put", pairs=True).requests())
-    for first, other in zip(asked[0::2], asked[1::2], strict=True):
-        assert first.seed == other.seed
-        assert {first.target, other.target} <= set(COLOURS)
-        assert first.target != other.target
 
 
 def scattered(names: list[str]) -> ObjectPoses:
@@ -109,12 +100,8 @@ CROWDED = ObjectPoses(
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-def test_the_task_is_of_the_family_and_about_the_brick_asked_for(family: str) -> None:
-    for target in COLOURS:
-        episode = TaskRequest(SEED, family, target).draw(OBJECTS, held_out=False)
-        assert episode.order.family == family
-        if family != "push":
-            assert episode.order.target == target
+def test_the_task_is_of_the_family_asked_for(family: str) -> None:
+    assert TaskRequest(SEED, family).draw(OBJECTS, held_out=False).order.family == family
 
 
 def test_where_nothing_can_be_pushed_another_task_is_asked_instead_of_leaving_the_layout_out() -> (
@@ -185,12 +172,6 @@ def test_a_run_that_was_ended_before_its_first_episode_has_no_rate() -> None:
     result = score()
     assert result["success_rate"] is None
     assert result["wilson_95"] == [0.0, 1.0]
-
-
-def test_of_pairs_the_other_brick_is_told_apart() -> None:
-    result = score(ended("put"), ended("put", "wrong_brick"), pairs=True)
-    assert result["pairs"]["first_brick"]["successes"] == 1
-    assert result["pairs"]["other_brick"]["failures"] == {"wrong_brick": 1}
 
 
 def test_a_result_says_with_which_options_it_was_made_and_keeps_secrets() -> None:

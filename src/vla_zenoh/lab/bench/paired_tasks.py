@@ -230,7 +230,7 @@ def _nothing_in_common(a: TaskResultFile, b: TaskResultFile) -> str:
     if seeds[0] & seeds[1]:
         return (
             "the layouts are the same, and other tasks were asked in them: run both with the same "
-            "--family and --pairs"
+            "--family"
         )
     spans = [f"{min(each)} to {max(each)}" for each in seeds]
     return (

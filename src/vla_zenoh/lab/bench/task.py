@@ -16,7 +16,6 @@ from vla_zenoh.lab.statistics import wilson_95
 from vla_zenoh.lab.tasks.episode import TaskEpisode, draw_episode, draw_stay
 from vla_zenoh.lab.tasks.judge import LIMIT_S, judge_of
 from vla_zenoh.lab.tasks.order import (
-    COLOURS,
     DIRECTIONS,
     FAMILIES,
     LIFT,
@@ -55,7 +54,6 @@ class TaskPlan:
         model: name of the worker, or of one of `BASELINES`.
         seed: of the first layout; the others follow.
         family: one of `FAMILIES` or ``stay``; None: all three in turn.
-        pairs: every layout twice, the second time with another brick.
         prompt: in place of the episode's own.
         rate_hz: chunks per second; None: of the profile.
     """
@@ -65,7 +63,6 @@ class TaskPlan:
     seed: int
     family: str | None = None
     held_out: bool = False
-    pairs: bool = False
     prompt: str | None = None
     limit_s: float = LIMIT_S
     rate_hz: float | None = None
@@ -78,12 +75,7 @@ class TaskPlan:
     def requests(self) -> Iterator[TaskRequest]:
         families = (self.family,) if self.family else FAMILIES
         for index in range(self.episodes):
-            layout = index // 2 if self.pairs else index
-            yield TaskRequest(
-                self.seed + layout,
-                families[layout % len(families)],
-                COLOURS[(layout + index % 2) % len(COLOURS)] if self.pairs else None,
-            )
+            yield TaskRequest(self.seed + index, families[index % len(families)])
 
     def prompt_for(self, episode: TaskEpisode) -> str:
         """The prompt to publish for `episode`."""
@@ -95,22 +87,19 @@ class TaskRequest:
     """One episode of a plan, before its layout is known.
 
     Args:
-        target: colour of the brick, None: any.
         prompt: of the user, in place of a task that is drawn; judged as ``stay`` if it is unknown.
         order: what the prompt is taken for; None: what its wording says.
     """
 
     seed: int
     family: str
-    target: str | None = None
     prompt: str | None = None
     order: Order | None = None
 
     def draw(self, objects: ObjectPoses, *, held_out: bool) -> TaskEpisode:
         """Draw the task in this layout.
 
-        Where the target cannot be pushed, another brick is; where none can, another family is drawn
-        instead of skipping the layout.
+        Where no brick can be pushed, another family is drawn instead of skipping the layout.
         """
         if self.prompt is not None:
             order = self.order or parse_prompt(self.prompt) or Order(STAY)
@@ -119,15 +108,11 @@ class TaskRequest:
             return TaskEpisode(self.seed, Order(LIFT), LIFT_PROMPT)
         if self.family == STAY:
             return draw_stay(self.seed)
-        for family, target in ((self.family, self.target), (self.family, None)):
-            try:
-                return draw_episode(
-                    self.seed, objects, family=family, target=target, held_out=held_out
-                )
-            except ResourceError:
-                continue
         others = [family for family in FAMILIES if family != self.family]
-        return draw_episode(self.seed, objects, family=others[0], held_out=held_out)
+        try:
+            return draw_episode(self.seed, objects, family=self.family, held_out=held_out)
+        except ResourceError:
+            return draw_episode(self.seed, objects, family=others[0], held_out=held_out)
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,7 +167,7 @@ class TaskScore:
     def to_dict(self) -> dict[str, Any]:
         plan = self.plan
         families = sorted({each.episode.order.family for each in self.ended})
-        out: dict[str, Any] = {
+        return {
             "model": plan.model,
             "options": shown(self.options),
             "mode": self.mode,
@@ -200,10 +185,6 @@ class TaskScore:
             "wall_s": round(self.wall_s, 1),
             "all": [each.to_dict() for each in self.ended],
         }
-        if plan.pairs:
-            first, second = self.ended[0::2], self.ended[1::2]
-            out["pairs"] = {"first_brick": _figures(first), "other_brick": _figures(second)}
-        return out
 
 
 def _figures(ended: Sequence[TaskOutcome]) -> dict[str, Any]:
@@ -243,7 +224,7 @@ class DemoPlan(TaskPlan):
 
     def requests(self) -> Iterator[TaskRequest]:
         for prompt in self.prompts:
-            yield TaskRequest(self.seed, STAY, None, prompt, self.orders.get(prompt))
+            yield TaskRequest(self.seed, STAY, prompt, self.orders.get(prompt))
         if not self.prompts:
             for family in FAMILIES:
                 yield TaskRequest(self.seed, family)

@@ -65,9 +65,6 @@ class EpisodeOptions:
     held_out: Annotated[
         bool, typer.Option("--held-out", help="Prompts in words that no model was trained with.")
     ] = False
-    pairs: Annotated[
-        bool, typer.Option("--pairs", help="Every layout twice, with another brick to fetch.")
-    ] = False
     prompt: Annotated[
         str | None, typer.Option("--prompt", help="Prompt in place of the episode's.")
     ] = None
@@ -258,8 +255,7 @@ def _real_time(
 def _print(result: dict[str, Any]) -> None:
     columns = ("", "done", "of", "rate", "95 %", "time p50", "p95", "failures")
     table = new_table(*columns, title=_title(result), left=("", "failures"))
-    rows = [("all", result), *result["by_family"].items(), *result.get("pairs", {}).items()]
-    for name, row in rows:
+    for name, row in [("all", result), *result["by_family"].items()]:
         times = row["time_to_success_s"]
         table.add_row(
             name,
