@@ -72,8 +72,8 @@ class RobotNode:
         self._stops = node.subscribe(keys.stop, CallbackRing(HEARD, MAX_MESSAGE_BYTES))
         self._resets = node.subscribe(keys.reset, CallbackRing(HEARD, MAX_MESSAGE_BYTES))
         self._stopped_at: ReceivedSample | None = None
-        self._latch = None if latch is None else EstopLatch(latch)
-        if self._latch is not None and self._latch.read() is not None:
+        self._latch = EstopLatch(latch)
+        if self._latch.read() is not None:
             for arm in self.arms.values():
                 arm.latch_stop()
         self._rate = RateMeter()
@@ -127,10 +127,9 @@ class RobotNode:
         except NodeError as error:  # an exception before this one matters more
             self.node.reject("robot_failed", str(error))
         finally:
-            if self._latch is not None:
-                if self._stops.drain():
-                    self._latch.set("emergency stop")
-                self._latch.close()
+            if self._stops.drain():
+                self._latch.set("emergency stop")
+            self._latch.close()
             self.node.publish_end()
             self.node.close()
 
@@ -175,8 +174,7 @@ class RobotNode:
         if stops:
             for arm in self.arms.values():
                 arm.latch_stop()
-            if self._latch is not None:
-                self._latch.set("emergency stop")
+            self._latch.set("emergency stop")
         valid = [reset for reset in resets if not self._overtaken(reset)]
         if resets and (stops or not valid):  # within a tick their order is not known
             why = "a reset was put before the last emergency stop, or with it; put it again"
@@ -184,8 +182,7 @@ class RobotNode:
         elif valid:
             for arm in self.arms.values():
                 arm.stop_latched = False
-            if self._latch is not None:
-                self._latch.set(None)
+            self._latch.set(None)
             if self.driver.recovers:
                 self.driver.recover()
 
@@ -258,7 +255,7 @@ class RobotNode:
         node.adopt_system_time()
         if not (node.status_due(self.state) or now):
             return
-        why = None if self._latch is None else self._latch.failure()
+        why = self._latch.failure()
         if why is not None:
             node.emit(Event("error", "fault", "latch", why))
         found = driver.status()

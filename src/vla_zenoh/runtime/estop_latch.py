@@ -11,9 +11,13 @@ FLUSH_S = 0.5
 
 
 class EstopLatch:
-    """Latch file with a thread that writes: a full or slow disk must not block the command loop."""
+    """Latch file with a thread that writes: a full or slow disk must not block the command loop.
 
-    def __init__(self, path: Path) -> None:
+    Args:
+        path: of the file; None: a restarted node is not latched.
+    """
+
+    def __init__(self, path: Path | None) -> None:
         self._path = path
         self._wanted: queue.SimpleQueue[str | threading.Event | None] = queue.SimpleQueue()
         self._failures: queue.SimpleQueue[str] = queue.SimpleQueue()
@@ -21,6 +25,8 @@ class EstopLatch:
 
     def read(self) -> str | None:
         """Why it is latched; None if it is not. A file that cannot be read counts as latched."""
+        if self._path is None:
+            return None
         try:
             return self._path.read_text("utf-8", errors="replace")
         except FileNotFoundError:
@@ -50,6 +56,8 @@ class EstopLatch:
             if isinstance(wanted, threading.Event):
                 wanted.set()
                 return
+            if self._path is None:
+                continue
             try:
                 if wanted is None:
                     self._path.unlink(missing_ok=True)

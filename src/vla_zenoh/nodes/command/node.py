@@ -77,8 +77,8 @@ class CommandNode:
         reach = {name: ReachabilityFilter(part) for name, part in parts.items()}
         node = self.node = Node("command", profile, session)
         self.commander = Commander(profile, reach=reach, dry_run=dry_run)
-        self._latch = None if latch is None else EstopLatch(latch)
-        before = None if self._latch is None else self._latch.read()
+        self._latch = EstopLatch(latch)
+        before = self._latch.read()
         if before is not None:
             self.commander.latch(f"stopped before this node was started: {before}")
         keys = node.keys
@@ -124,8 +124,7 @@ class CommandNode:
             with realtime_thread() as self._status.realtime:
                 self._loop(stop)
         finally:
-            if self._latch is not None:
-                self._latch.close()
+            self._latch.close()
             self.node.publish_end()
             self.node.close()
             gc.unfreeze()  # so that the interpreter frees everything at exit
@@ -190,13 +189,13 @@ class CommandNode:
         self._command(out, now_ns)
         self._status.add_tick(now_ns, tick.stall_s, time.perf_counter() - began)
         self._report(out)
-        if self._latch is not None and any(event.kind == "transition" for event in out.events):
+        if any(event.kind == "transition" for event in out.events):
             latched = self.commander.state in (State.STOPPED, State.FAULT)
             self._latch.set(self.commander.why if latched else None)
         if chores:
             self._inputs.read_news(now_ns)
         if chores or out.events or out.task_changed:
-            why = None if self._latch is None else self._latch.failure()
+            why = self._latch.failure()
             if why is not None:
                 self.node.counters["command.latch_failed"] += 1
                 self.node.emit(Event("error", "fault", "latch", why))
