@@ -175,7 +175,7 @@ def draw(path: Path, rows: list[dict[str, Any]]) -> None:
         matplotlib.rcParams["svg.hashsalt"] = "delay"
         from matplotlib import pyplot as plt
     except ImportError as error:
-        raise MissingExtraError("matplotlib", "sim") from error
+        raise MissingExtraError("matplotlib", "dev") from error
     figure, axes = plt.subplots(figsize=(7.0, 4.0), layout="constrained")
     for index, (way, marker) in enumerate(zip(WAYS, "osD^", strict=True)):
         points = [row for row in rows if row["way"] == way and row["episodes"]]

@@ -199,7 +199,7 @@ def small(picture: Path, out: Path) -> None:
 
 def main() -> None:
     states = ("status_sim", "status_dry_run", "status_missing")
-    names = ("tasks", "plot", "report", "report_dark", "report_phone", "view", *states)
+    names = ("tasks", "report", "report_dark", "report_phone", "view", *states)
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path, help="run folder of a demo")
     parser.add_argument("what", choices=[*names, []], nargs="*")
@@ -214,8 +214,6 @@ def main() -> None:
                 continue
             if name == "tasks":
                 png.write_bytes((given.run / "tasks.jpg").read_bytes())
-            elif name == "plot":
-                png.write_bytes((given.run / "plot.png").read_bytes())
             elif name == "view":
                 picture_view(file, given.at, png)
             elif name == "report":

@@ -22,7 +22,7 @@ from vla_zenoh.lab.cli.output_path import ForceOption, if_wanted, output_folder
 from vla_zenoh.profile import Profile
 
 if TYPE_CHECKING:
-    from vla_zenoh.lab.recording.run import Run
+    from vla_zenoh.lab.evaluation.result import Evaluation
 
 
 @dataclass(frozen=True)
@@ -73,16 +73,15 @@ class _Run:
     Args:
         profile: of a simulated robot.
         measured: motions and conditions.
-        out: folder for plots; it exists.
         stop: set by Ctrl-C.
     """
 
-    def __init__(
-        self, profile: Profile, measured: MotionOptions, out: Path | None, stop: threading.Event
-    ) -> None:
-        self._profile, self._out, self._stop = profile, out, stop
+    def __init__(self, profile: Profile, measured: MotionOptions, stop: threading.Event) -> None:
+        self._profile, self._stop = profile, stop
         self._cases, self._conditions = measured.cases(), measured.conditions()
         self.rows: list[dict[str, Any]] = []
+        self.evaluated: list[Evaluation] = []
+        """Each row that real nodes ran."""
         self.bars = progress_bars(44)
         total = len(self._cases) * len(self._conditions)
         self._everything = self.bars.add_task("all rows", total=total)
@@ -116,6 +115,7 @@ class _Run:
         self, profile: Profile, conditions: Sequence[Conditions], current: TaskID
     ) -> None:
         from benchmarks.motion.real_time import run_in_real_time
+        from vla_zenoh.lab.evaluation.mcap_file import evaluate_loaded
 
         def progress(case: MotionCase, each: Conditions, done: int) -> None:
             self.bars.update(current, description=f"{case.name} at {each.name}", completed=done)
@@ -133,18 +133,9 @@ class _Run:
             ):
                 self.rows.append(row)
                 self.bars.update(self._everything, advance=1)
-                if self._out is not None:
-                    _plot(self._out, profile, row, run)
-
-
-def _plot(folder: Path, profile: Profile, row: dict[str, Any], run: Run) -> None:
-    from vla_zenoh.lab.evaluation.mcap_file import evaluate_loaded
-    from vla_zenoh.lab.evaluation.plot_image import write_plot
-
-    name = f"{row['prompt']}_{row['rate_hz']:g}Hz_{row['horizon']}.png".replace(" ", "_")
-    found = evaluate_loaded(run)
-    found.name = f"{row['prompt']}, {row['rate_hz']:g} Hz, {profile.name}"
-    write_plot(folder / name, found)
+                found = evaluate_loaded(run)
+                found.name = f"{row['prompt']}, {row['rate_hz']:g} Hz, {row['horizon']} steps"
+                self.evaluated.append(found)
 
 
 @options
@@ -157,7 +148,7 @@ def motion(
     profile: SimulatedProfileOption = DEFAULT_PROFILE,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="New folder for result.json and a plot of every row."),
+        typer.Option("--output", "-o", help="New folder for result.json and report.html."),
     ] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -171,13 +162,17 @@ def motion(
 
     with if_wanted(output_folder, output, force=force) as folder:
         stop = stop_on_signals()
-        run = _Run(effective_profile(profile), measured, folder, stop)
+        run = _Run(effective_profile(profile), measured, stop)
         try:
             with run.bars:
                 run.in_lockstep() if lockstep else run.in_real_time()
         finally:
             if folder is not None and run.rows:
                 write_json(folder / "result.json", run.rows)
+                if run.evaluated:
+                    from vla_zenoh.lab.evaluation.report import page
+
+                    (folder / "report.html").write_text(page(run.evaluated, {}), "utf-8")
     if as_json:
         print_json(run.rows)
     else:

@@ -10,7 +10,7 @@ from vla_zenoh.cli.silence import silence
 
 EXTRA_OF = {
     **dict.fromkeys(("pinocchio", "ruckig"), "control"),
-    **dict.fromkeys(("mujoco", "matplotlib", "av"), "sim"),
+    **dict.fromkeys(("mujoco", "av"), "sim"),
     **dict.fromkeys(("mcap", "plotly", "jinja2", "rosbags"), "record"),
     "rerun": "view",
 }

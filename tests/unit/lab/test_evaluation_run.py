@@ -19,9 +19,8 @@ from vla_zenoh.codec.image import encode_jpeg
 from vla_zenoh.keys import Keys
 from vla_zenoh.lab.evaluation.evaluate import evaluate
 from vla_zenoh.lab.evaluation.mcap_file import evaluate_loaded
-from vla_zenoh.lab.evaluation.plot_image import write_plot
 from vla_zenoh.lab.evaluation.report import page
-from vla_zenoh.lab.evaluation.result import TASKS, Evaluation, PlotTrace
+from vla_zenoh.lab.evaluation.result import TASKS, PlotTrace
 from vla_zenoh.lab.evaluation.timelines import unbroken
 from vla_zenoh.lab.recording.film import Film, write_film
 from vla_zenoh.lab.recording.reader import open_recording
@@ -374,13 +373,6 @@ def test_the_film_is_as_long_as_the_run_and_shows_every_camera(
     assert frames == pytest.approx(run.seconds * 10, abs=1)
     film = cv2.VideoCapture(str(tmp_path / "a.mp4"))
     assert (film.get(cv2.CAP_PROP_FRAME_WIDTH), film.get(cv2.CAP_PROP_FRAME_COUNT)) == (64, frames)
-
-
-def test_the_curves_are_drawn_into_a_picture(judged: Path, tmp_path: Path) -> None:
-    assert write_plot(tmp_path / "plot.png", evaluate_loaded(load_run(judged)))
-    assert cv2.imread(str(tmp_path / "plot.png")).shape[1] > 1000
-    assert not write_plot(tmp_path / "none.png", Evaluation("empty"))
-    assert not (tmp_path / "none.png").exists()
 
 
 def test_a_reset_and_a_gap_break_a_curve() -> None:

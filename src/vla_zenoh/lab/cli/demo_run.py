@@ -145,7 +145,7 @@ def _show(
     rates = ", ".join(f"{name} {value:.1f} Hz" for name, value in summary["rates_hz"].items())
     refused = ", ".join(f"{reason} {count}" for reason, count in summary["refusals"].items())
     screen.print(f"rates: {rates}; rejections: {refused or 'none'}")
-    files = "run.mcap, summary.json, chunks.npz, plot.png, video.mp4"
+    files = "run.mcap, summary.json, chunks.npz, report.html, video.mp4"
     screen.print(f"run folder: {stage.path} ({files})")
     if interrupted:
         screen.print("interrupted; the arm braked", style="yellow")

@@ -26,7 +26,7 @@ from vla_zenoh.lab.cli.output import progress_bars
 from vla_zenoh.lab.cli.output_path import RUNS, output_folder
 from vla_zenoh.lab.episode import Interrupted
 from vla_zenoh.lab.evaluation.mcap_file import evaluate_parts
-from vla_zenoh.lab.evaluation.plot_image import write_plot
+from vla_zenoh.lab.evaluation.report import page
 from vla_zenoh.lab.recording.film import Film, write_film
 from vla_zenoh.lab.recording.recorder import Recorder
 from vla_zenoh.lab.recording.run import Run, load_run
@@ -101,18 +101,18 @@ class Stage:
         (self.folder / "summary.json").write_text(text, "utf-8")
 
     def draw(self, run: Run, verdicts: Sequence[tuple[int, str, bool]] = ()) -> None:
-        """Write plots, of a robot of parts of each, and video.mp4 with `verdicts` in it.
+        """Write report.html, and video.mp4 with `verdicts` in it.
 
         Args:
             verdicts: ns, text, success.
         """
         with progress_bars(24, counted=False) as bars:
-            drawing = bars.add_task("drawing plots", total=len(run.part_names))
-            for part, found in zip(run.part_names, evaluate_parts(run), strict=True):
-                found.name = f"{self.path.name}/{part}" if part else self.path.name
-                path = f"plot_{part}.png" if part else "plot.png"
-                write_plot(self.folder / path, found)
-                bars.update(drawing, advance=1)
+            reporting = bars.add_task("writing report.html", total=None)
+            parts = evaluate_parts(run)
+            for name, part in zip(run.part_names, parts, strict=True):
+                part.name = f"{self.path.name}/{name}" if name else self.path.name
+            (self.folder / "report.html").write_text(page(parts, {}), "utf-8")
+            bars.update(reporting, completed=1, total=1)
             filming = bars.add_task("writing video.mp4", total=None)
             written = write_film(
                 self.folder / "video.mp4",

@@ -146,5 +146,5 @@ def _show(ended: list[TaskOutcome], summary: dict[str, Any], folder: Path) -> No
     screen = console()
     screen.print(table)
     screen.print(latency_line(summary["latency_ms"]))
-    plots = ", ".join(path.name for path in sorted(folder.glob("plot*.png")))
-    screen.print(f"run folder: {folder} (run.mcap, summary.json, tasks.jpg, {plots}, video.mp4)")
+    files = "run.mcap, summary.json, tasks.jpg, report.html, video.mp4"
+    screen.print(f"run folder: {folder} ({files})")

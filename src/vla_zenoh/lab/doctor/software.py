@@ -29,7 +29,7 @@ MODULES: Mapping[Role, Mapping[str, str]] = {
         "yaml": "pyyaml",
     },
     "control": {"pinocchio": "pin", "ruckig": "ruckig"},
-    "sim": {"mujoco": "mujoco-core", "av": "av", "matplotlib": "matplotlib"},
+    "sim": {"mujoco": "mujoco-core", "av": "av"},
     "ros2": {"rosbags": "rosbags"},
 }
 PURPOSE: Mapping[Role, str] = {

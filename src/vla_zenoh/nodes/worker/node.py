@@ -30,7 +30,7 @@ from vla_zenoh.types.records import plain_values
 
 POLL_PERIOD_S = 0.25
 NAP_S, NAPS = 0.004, 5
-BLIND_NAP_S, IDLE_NAP_S, SILENT_NAP_S = 0.002, 0.02, 0.1
+BLIND_NAP_S, IDLE_NAP_S = 0.002, 0.02
 SEEN_QUALITY = 95
 """Of the JPEG images a model was given."""
 
@@ -170,9 +170,8 @@ class WorkerNode:
         if not due:
             stop.wait(max(0.0, min(*others_s, POLL_PERIOD_S)))
         elif self.spec.observation.camera_names:
-            silent = all(robot.cameras_silent for robot in self.sessions)
-            for nap_s in (SILENT_NAP_S,) if silent else (NAP_S,) * NAPS:
-                if self._changed.wait(nap_s) and any(robot.has_images for robot in due):
+            for _ in range(NAPS):
+                if self._changed.wait(NAP_S) and any(robot.has_images for robot in due):
                     return
                 # States decoded while idle cost no time once the image is there.
                 for robot in self.sessions:

@@ -17,7 +17,6 @@ from vla_zenoh.bus.buffers import (
     Wake,
     ZenohRing,
     bytes_of,
-    header_of,
 )
 from vla_zenoh.bus.metrics import Percentiles, RateMeter
 from vla_zenoh.bus.node import Node
@@ -25,7 +24,7 @@ from vla_zenoh.bus.stream import Stream
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import MAX_IMAGE_BYTES, decode_depth, decode_jpeg, decode_raw
 from vla_zenoh.codec.records import SMALL_BYTES
-from vla_zenoh.errors import CodecError, PeerError, SpecError, in_words
+from vla_zenoh.errors import PeerError, SpecError, in_words
 from vla_zenoh.keys import LOADING, NO_TASK, STARTING, Kind, worker_node
 from vla_zenoh.policy import ActionSteps, CameraSpec, Observation, Policy, check_steps, reset_of
 from vla_zenoh.policy.frozen import FrozenImages
@@ -47,11 +46,10 @@ SPEC_PERIOD_S = 1.0
 TASK_PATIENCE_S = 1.5
 AFTER_A_FAILURE_S = 0.5
 FRESH_PATIENCE_S = 0.05
-SILENT_S = 0.5
 FRESH_TOLERANCE_S = 0.005
 STREAM_PATIENCE_S = 0.5
 """After this silence of a stream's writer another one is accepted."""
-MAX_QUEUE = 96
+MAX_QUEUE, STATES = 96, 256
 PATIENCE_S, PERIODS = 1.0, 3
 """Without images on the preferred stream for this long, and for this many periods of a slow camera,
 a worker subscribes to the common one as well."""
@@ -101,18 +99,12 @@ class RobotSession:
             camera_stream(name, [keys.camera_depth(name)], kept, Depth, decode_depth)
             for name, kept in streams.depth.items()
         ]
-        self._every_state = bool(history_s) or not self._cameras
-        self._states = [
-            StateStream(
-                node,
-                getattr(keys.of_part(part), f"state_{what}"),
-                STATE_KINDS[what],
-                streams.states[name],
-                MAX_STATES if history_s else 256,
-                every=self._every_state,
-            )
-            for name, (part, what) in state_names(self.spec.observation, self.spec.parts).items()
-        ]
+        self._states: list[tuple[Stream[Any, ZenohRing], History]] = []
+        for name, (part, what) in state_names(self.spec.observation, self.spec.parts).items():
+            key = getattr(keys.of_part(part), f"state_{what}")
+            ring = ZenohRing(MAX_STATES if history_s else STATES, SMALL_BYTES)
+            stream = Stream(node, key, STATE_KINDS[what], ring, STREAM_PATIENCE_S)
+            self._states.append((stream, streams.states[name]))
         self._frozen, self._repeats = FrozenImages.of(profile.cameras), False
         self.task: Task | None = None
         self._task_received_s = -1e9
@@ -137,12 +129,6 @@ class RobotSession:
                 return False
         return new
 
-    @property
-    def cameras_silent(self) -> bool:
-        """Whether no image came lately: none is expected in the next moment."""
-        newest_s = max((camera.received_s for camera in self._cameras), default=0.0)
-        return time.monotonic() - newest_s > SILENT_S
-
     def poll(self) -> None:
         """Decode what was received since the last call."""
         task = self._tasks.newest()
@@ -153,14 +139,12 @@ class RobotSession:
         self.poll_states()
 
     def poll_states(self) -> None:
-        """Decode the states received since the last call, unless the cameras fell silent."""
-        known = all(states.entries for states in self._streams.states.values())
-        seen = any(camera.received_s for camera in self._cameras)
-        if seen and known and not self._every_state and self.cameras_silent:
-            return  # those near the next image are in their rings when it comes
-        since_ns = min((camera.images.newest_ns for camera in self._cameras), default=0)
-        for stream in self._states:
-            stream.poll(since_ns)
+        """Decode the states that were received since the last call."""
+        for stream, states in self._states:
+            for arrival in stream.buffer.drain():
+                state = stream.decode(arrival)
+                if state is not None:
+                    states.add(state)
 
     def _set_task(self, task: Stamped[Task]) -> None:
         before, self.task, self._task_received_s = self.task, task.record, time.monotonic()
@@ -415,40 +399,3 @@ def colour_keys(spec: CameraSpec, node: Node, *, jpeg: bool) -> list[str]:
     if settings is None or not settings.fit_for_workers or size is None:
         return [keys.camera_jpeg(name)]
     return [keys.camera_fitted(name, size), keys.camera_jpeg(name)]
-
-
-class StateStream:
-    """One stream of states, of at most `size` samples between two calls of `poll`, from these to
-    `states`. Unless `every` one is needed, those that no image needs are not decoded."""
-
-    def __init__(
-        self, node: Node, key: str, kind: type[Any], states: History, size: int, *, every: bool
-    ) -> None:
-        self._node, self._states, self._every = node, states, every
-        ring = CallbackRing if every else ZenohRing
-        self._stream: Stream[Any, CallbackRing | ZenohRing] = Stream(
-            node, key, kind, ring(size, SMALL_BYTES), STREAM_PATIENCE_S
-        )
-
-    def poll(self, since_ns: int) -> None:
-        """Decode what was received since the last call: the last before `since_ns`, and later."""
-        arrivals = self._stream.buffer.drain()
-        for arrival in arrivals if self._every else arrivals[self._first(arrivals, since_ns) :]:
-            state = self._stream.decode(arrival)
-            if state is not None:
-                self._states.add(state)
-
-    def _first(self, arrivals: Sequence[ReceivedSample], since_ns: int) -> int:
-        """The last that the writer measured before `since_ns`, or its first; not a repetition."""
-        first = 0
-        for number in reversed(range(len(arrivals))):
-            try:
-                header = header_of(arrivals[number].sample)
-            except CodecError:
-                continue
-            if self._stream.writer.is_next(header):
-                first = number
-                header, _ = self._node.clocks.to_local_clock(header, None)
-                if header.stamp_wall_ns <= since_ns:
-                    break
-        return first
