@@ -13,7 +13,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -104,6 +104,7 @@ class Program:
         domain: ROS domain id.
         settings: its argument.
         environ: variables beside those of this process.
+        arguments: of ROS, as a launch file gives them.
     """
 
     def __init__(
@@ -113,11 +114,13 @@ class Program:
         domain: int,
         settings: Mapping[str, Any] | None = None,
         environ: Mapping[str, str] | None = None,
+        arguments: Sequence[str] = (),
     ) -> None:
         self._words = [
             str(ros_python(distribution)),
             str(SIDE / f"{name}.py"),
             json.dumps(settings or {}),
+            *arguments,
         ]
         self._environ = {
             **{key: value for key, value in os.environ.items() if not key.startswith("PYTHON")},
@@ -225,7 +228,8 @@ class Arm(Program):
 
     def __init__(self, distribution: str, domain: int, **settings: Any) -> None:
         environ = settings.pop("environ", None)
-        super().__init__("arm", distribution, domain, settings, environ)
+        arguments = settings.pop("arguments", ())
+        super().__init__("arm", distribution, domain, settings, environ, arguments)
 
     def track(self, since_ns: int = 0) -> Track:
         """How it moved, by the joints of its log; stamps are monotonic."""
@@ -251,10 +255,10 @@ class Arm(Program):
     def joints_rad(self) -> FloatArray:
         """Its joints now."""
 
-        def newest() -> FloatArray | None:
-            return next((np.array(line["q"]) for line in reversed(self.told) if "q" in line), None)
+        def newest() -> list[float]:
+            return next((line["q"] for line in reversed(self.told) if "q" in line), [])
 
-        return until("joints of the robot", lambda: newest() is not None) and newest()
+        return np.array(until("joints of the robot", newest))
 
     def tcp(self) -> FloatArray:
         """Its TCP now, (4, 4)."""
@@ -407,6 +411,7 @@ def running_ros_lab(
     distribution: str,
     *,
     arm: Mapping[str, Any] | None = None,
+    space: str = "",
     gripper: str = BY_TOPIC,
     more: str = "",
     size: tuple[int, int] = (WIDTH, HEIGHT),
@@ -419,7 +424,8 @@ def running_ros_lab(
         folder: for profile, settings and logs.
         program: the bridge.
         distribution: of ROS 2.
-        arm: settings of the robot; `environ` among them: variables.
+        arm: settings of the robot; among them variables, `environ`, and `arguments` of ROS.
+        space: what the names of topics begin with in the profile.
         gripper: its section of the profile, `BY_TOPIC` or `BY_ACTION`.
         more: YAML at the end of the profile's section ros2.
         size: of the pictures, width and height.
@@ -431,13 +437,14 @@ def running_ros_lab(
         folder,
         distribution,
         domain,
+        space=space,
         gripper=gripper,
         size=size,
         more=more,
         patience_s=patience_s,
     )
     made = pictures(folder / "pictures", *size)
-    seen = camera_settings(folder / "pictures", size=size)
+    seen = camera_settings(folder / "pictures", space, size)
     cameras(seen)
     with ExitStack() as stack:
         settings = generated(profile, beside=True)

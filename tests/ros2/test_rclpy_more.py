@@ -30,6 +30,7 @@ from rclpy_rig import (
     heard,
     library,
     pictures,
+    request,
     running_ros_lab,
     write_profile,
 )
@@ -44,6 +45,7 @@ pytestmark = [pytest.mark.rclpy, pytest.mark.slow]
 
 STEP_M, EXACT_M = 0.01, 1e-6
 STANDS_M = 1e-6
+CALL_S = 20.0
 LEASE_PATIENCE_S = 45.0
 """Fast DDS gives a participant up after 20 s; then the bridge is asked every few seconds."""
 
@@ -118,6 +120,18 @@ def test_two_robots_of_one_domain_move_each_by_its_own_topics(
             assert after[mine] - before[mine] == pytest.approx((0, 0, 5 * STEP_M), abs=EXACT_M)
             assert after[1 - mine] == pytest.approx(before[1 - mine], abs=STANDS_M)
             chain.settle()
+
+
+def test_a_robot_whose_launch_file_remaps_its_names_moves_exactly(
+    tmp_path: Path, built_bridge: Path, distribution: str
+) -> None:
+    names = ("joint_states", "desired_pose", "gripper_width")
+    remapped = [word for name in names for word in ("-r", f"{name}:=/cell/{name}")]
+    launched = {"arguments": ["--ros-args", *remapped, "-r", "__node:=panda_of_a_cell"]}
+    with running_ros_lab(tmp_path, built_bridge, distribution, arm=launched, space="/cell") as lab:
+        lab.chain.activate_when_ready()
+        lab.settle()
+        up_and_down(lab)
 
 
 def test_a_robot_of_another_domain_is_not_seen_and_the_wrong_domain_is_told(
@@ -227,6 +241,36 @@ def test_a_robot_that_the_bridge_lost_after_a_restart_is_named_with_the_remedy(
         lab.settle()
         up_and_down(lab)
         lab.chain.until("it is routed", lambda: "not_routed" not in faults())
+
+
+# -- services on Fast DDS -------------------------------------------------------------------------
+def test_a_caller_of_our_services_on_fast_dds_is_named_and_its_topic_stops_the_arm(
+    tmp_path: Path, built_bridge: Path, distribution: str
+) -> None:
+    """The bridge carries no call of Fast DDS: the caller waits, and the status tells why."""
+    with (
+        running_ros_lab(tmp_path, built_bridge, distribution, more="  services: true\n") as lab,
+        ExitStack() as stack,
+    ):
+        lab.chain.activate_when_ready()
+        lab.settle()
+        lab.move()
+        caller = Program("person", distribution, lab.domain).start()
+        stack.callback(caller.end)
+        caller.do("call", service="/vla/stop", type="std_srvs/srv/Trigger", patience_s=CALL_S)
+        why = lab.chain.until(
+            "it is told",
+            lambda: lab.chain.detail("ros2_faults", "ros2").get("services_middleware"),
+            CALL_S,
+        )
+        assert "Fast DDS" in why
+        assert "topics below /vla" in why
+        assert lab.chain.state() != "stopped"
+        assert request(lab, "stop")["ok"]
+        assert lab.chain.state() == "stopped"
+        said = until("the call is given up", lambda: caller.since(0, "called"), 2 * CALL_S)
+        assert said[0]["found"]
+        assert said[0]["answer"] is None
 
 
 # -- the gripper's actions ------------------------------------------------------------------------
