@@ -13,8 +13,10 @@ import pytest
 import zenoh
 from chain import LONG_PATIENCE_S, write_profile
 
+import vla_zenoh
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.client.client import Client
+from vla_zenoh.errors import SessionError
 from vla_zenoh.keys import CRASHED, STARTING
 from vla_zenoh.profile import load_profile, override
 
@@ -22,9 +24,37 @@ pytestmark = pytest.mark.realtime
 AT = "tcp/127.0.0.1:17472"
 
 
-def test_a_worker_that_imports_its_model_is_starting_and_then_crashed(tmp_path: Path) -> None:
+MODEL = """
+import time
+from vla_zenoh.errors import WorkerError
+from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, ObservationSpec
+
+WHY = "action is scaled by MEAN_STD, and there are no statistics of it"
+
+
+class Model:
+    spec = ModelSpec(
+        name="slow",
+        observation=ObservationSpec(cameras=(CameraSpec(camera="front"),)),
+        action=ActionSpec(horizon=1, dt_s=0.1, gripper="none"),
+    )
+
+    def load(self):
+        raise WorkerError(WHY)
+
+    def infer(self, observation):
+        raise WorkerError(WHY)
+"""
+BROKEN = {"import": "import time\ntime.sleep(4)\nraise ValueError('no model')\n", "load": MODEL}
+WHY = {"import": "no model", "load": "action is scaled by MEAN_STD, and there are no statistics"}
+
+
+@pytest.mark.parametrize("how", BROKEN)
+def test_a_worker_that_is_started_by_hand_is_starting_and_then_crashed(
+    tmp_path: Path, how: str
+) -> None:
     model = tmp_path / "slow.py"
-    model.write_text('import time\ntime.sleep(4)\nraise ValueError("no model")\n')
+    model.write_text(BROKEN[how])
     config = zenoh.Config()
     config.insert_json5("mode", '"router"')
     config.insert_json5("listen/endpoints", f'["{AT}"]')
@@ -41,10 +71,14 @@ def test_a_worker_that_imports_its_model_is_starting_and_then_crashed(tmp_path: 
 
         with subprocess.Popen(words, stderr=subprocess.DEVNULL) as worker:
             try:
-                assert client.wait_for(lambda: has(STARTING), 30.0)
+                if how == "import":
+                    assert client.wait_for(lambda: has(STARTING), 30.0)
                 assert client.wait_for(lambda: has(CRASHED), 30.0)
             finally:
                 worker.kill()
+        status = client.status("worker-slow")
+        assert status is not None
+        assert WHY[how] in status.detail["complaint"]
 
 
 @pytest.mark.long
@@ -73,3 +107,29 @@ with vla_zenoh.connect({str(path)!r}) as robot:
     assert "waiting, at most 20 s: no Zenoh router answers" in answer["warnings"][0]
     assert said == "50.0\n", logged
     assert "waiting, at most 20 s: no Zenoh router answers" in logged
+
+
+@pytest.mark.long
+def test_an_activation_names_why_the_model_of_a_worker_started_by_hand_failed(
+    tmp_path: Path,
+) -> None:
+    path, model = write_profile(tmp_path, patience_s=LONG_PATIENCE_S), tmp_path / "slow.py"
+    model.write_text(MODEL)
+    words = [sys.executable, "-m", "vla_zenoh"]
+    with subprocess.Popen([*words, "up", str(path)], stdout=DEVNULL, stderr=DEVNULL) as up:
+        try:
+            with vla_zenoh.connect(str(path)) as robot:
+                robot.set_prompt("hold")
+                failed = subprocess.run(
+                    [*words, "worker", str(model), "--profile", str(path)],
+                    capture_output=True,
+                    check=False,
+                    timeout=60,
+                )
+                assert failed.returncode == 1
+                robot.set_worker("slow")
+                with pytest.raises(SessionError, match=rf"'slow' is not alive: {WHY['load']}"):
+                    robot.activate()
+        finally:
+            up.send_signal(signal.SIGINT)
+            up.wait(30)

@@ -34,6 +34,7 @@ from vla_zenoh.runtime.process import (
 )
 
 if TYPE_CHECKING:
+    from vla_zenoh.policy.inference import Policy
     from vla_zenoh.profile import Profile
     from vla_zenoh.robots.driver import RobotDriver
 
@@ -196,30 +197,36 @@ def worker(
     from vla_zenoh.nodes.worker.node import WorkerNode
     from vla_zenoh.policy.loader import make_policy
     from vla_zenoh.runtime.environments import run_in_own_environment
-    from vla_zenoh.runtime.starting import shown_as_starting
+    from vla_zenoh.runtime.starting import shown_as_crashed, shown_as_starting
 
     profile = effective_profile(node.profile, node.connect, host=host)
     chosen = model_options.choose(profile, model, name)
     # Returns only if this environment has what the model's header asks for.
     run_in_own_environment(chosen.model, model_options.python)
-    with shown_as_starting(profile, worker_node(chosen.name), host):
-        policy = make_policy(chosen.model, chosen.options, profile=node.profile)
     own = None if host is None else profile.hosts.get(host)
-    if sys.stdout.isatty():
-        say(f"worker {chosen.name} of robot {profile.robot.name} is running; Ctrl-C stops it")
-    run_node(
-        profile,
-        lambda session, stop: WorkerNode(
+    identity = worker_node(chosen.name)
+
+    def another() -> Policy:
+        return make_policy(chosen.model, chosen.options, profile=node.profile)
+
+    with shown_as_crashed(profile, identity, host):
+        with shown_as_starting(profile, identity, host):
+            policy = another()
+        if sys.stdout.isatty():
+            say(f"worker {chosen.name} of robot {profile.robot.name} is running; Ctrl-C stops it")
+        run_node(
             profile,
-            session,
-            policy,
-            chosen.name,
-            images="raw" if own is None or "camera" in own.nodes else "jpeg",
-            host=host,
-            delay_s=delay_ms / 1e3,
-            robots=profile.serves.get(chosen.name, ()),
-            another=lambda: make_policy(chosen.model, chosen.options, profile=node.profile),
-        ).run(stop),
-        identity=worker_node(chosen.name),
-    )
+            lambda session, stop: WorkerNode(
+                profile,
+                session,
+                policy,
+                chosen.name,
+                images="raw" if own is None or "camera" in own.nodes else "jpeg",
+                host=host,
+                delay_s=delay_ms / 1e3,
+                robots=profile.serves.get(chosen.name, ()),
+                another=another,
+            ).run(stop),
+            identity=identity,
+        )
     os._exit(0)  # threads of a model's library may keep the process alive

@@ -221,7 +221,8 @@ def _message(row: NodeRow, found: NodeStatus, mode: str) -> str:
         return _cell(short, MAX_WORDS)
     if bad := _bad_cameras(_fields(detail.get("cameras"))):
         return _cell(bad, MAX_WORDS)
-    text = str(detail.get("complaint") or detail.get("fault") or detail.get("renderer") or "")
+    told = (detail.get(name) for name in ("complaint", "fault", "busy", "renderer"))
+    text = str(next(filter(None, told), ""))
     factor = detail.get("real_time_factor")
     if not text and isinstance(factor, (int, float)) and factor < SLOW:
         return f"slower than real time: x {factor:.2f}"

@@ -23,6 +23,7 @@ from vla_zenoh.bus.metrics import RateMeter
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import MAX_MESSAGE_BYTES
 from vla_zenoh.control.commander import LATE_NS
+from vla_zenoh.control.lateness import Lateness
 from vla_zenoh.errors import NodeError
 from vla_zenoh.guard.arm_guard import max_braking_time_s
 from vla_zenoh.robots.arm import Arm
@@ -77,6 +78,8 @@ class RobotNode:
             for arm in self.arms.values():
                 arm.latch_stop()
         self._rate = RateMeter()
+        self._lateness = Lateness(driver.period_s, f"node {driver.name!r}")
+        self._busy = ""
         self._realtime = False
         self._watched_s = 0.0
         self._brake_until_ns = 0
@@ -157,6 +160,7 @@ class RobotNode:
         if tick.periods > 1:
             self.node.counters[f"{self.node.name}.missed_ticks"] += tick.periods - 1
         mono_ns = tick.nominal_ns
+        self._lateness.add(tick.periods - 1, mono_ns)
         self._hear_stop()
         self.driver.poll(mono_ns)
         now_ns = mono_ns if self.driver.lockstep else self.node.clock.wall_at(mono_ns)
@@ -247,6 +251,9 @@ class RobotNode:
         if not changed and time.monotonic() - self._watched_s < WATCH_S:
             return
         self._watched_s = time.monotonic()
+        before, self._busy = self._busy, self._lateness.sentence()
+        if self._busy and not before:
+            self.node.emit(Event("warning", "notice", "busy", self._busy))
         self.watch(now=changed)
 
     def watch(self, *, now: bool = False) -> None:
@@ -259,7 +266,7 @@ class RobotNode:
         if why is not None:
             node.emit(Event("error", "fault", "latch", why))
         found = driver.status()
-        detail = {**found.detail, "realtime": self._realtime}
+        detail = {**found.detail, "realtime": self._realtime, "busy": self._busy}
         arms = self.arms.values()
         if arms:
             guards = [arm.guard for arm in arms]

@@ -25,7 +25,9 @@ from lerobot.policies.rtc.modeling_rtc import RTCProcessor
 from safetensors.torch import load_file, save_file
 
 from vla_zenoh.errors import WorkerError
+from vla_zenoh.lab.check.examination import Examination
 from vla_zenoh.lab.check.examples import example_observation
+from vla_zenoh.lab.check.model_runner import ModelRunner
 from vla_zenoh.policy import check_steps
 from vla_zenoh.policy.inference import Committed
 from vla_zenoh.policy.loader import find_model, make_policy
@@ -284,6 +286,15 @@ def test_a_policy_saved_without_statistics_is_refused(tmp_path: Path) -> None:
     tiny_act.write(tmp_path / "act", statistics={})
     with pytest.raises(WorkerError, match=r"images.front is scaled by MEAN_STD, and"):
         loaded(tmp_path / "act")
+
+
+def test_check_names_the_feature_that_has_no_statistics(folder: Path) -> None:
+    change(folder, "policy_postprocessor.json", lambda content: content.clear())
+    report = Examination(make(folder), "act", ModelRunner(60.0), runs=1).run()
+    (finding,) = (each for each in report.findings if each.level == "error")
+    assert finding.name == "load_failed"
+    assert "action is scaled by MEAN_STD" in finding.why
+    assert "there are no statistics of it" in finding.why
 
 
 def test_a_pipeline_that_does_not_scale_is_refused(folder: Path) -> None:

@@ -11,6 +11,7 @@ from camera_rig import routed_session
 from driver_report import Report
 
 from vla_zenoh.bus.clock import Tick
+from vla_zenoh.client.client import Client
 from vla_zenoh.codec import records
 from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.profile import load_profile
@@ -135,6 +136,36 @@ def test_every_arm_brakes_by_itself_when_a_stop_is_put(name: str, mode: str) -> 
             assert arm.state == "latched"
             assert not arm.guard.moving
         assert speed_rad_s < 0.02
+        node._close()
+
+
+def test_a_starved_robot_node_says_how_late_and_how_many_ticks_were_missed() -> None:
+    with routed_session() as session:
+        node = RobotNode(SimDriver(load_profile("panda_sim"), lockstep=True), session)
+        client = Client(node.node.profile, session).subscribe()
+        at = 0
+        for periods in (1, 1, 300, 1, 300, 1):
+            at += periods
+            node.step(Tick(periods, at * STEP_NS, 0.0, 0.0))
+            node._watched_s = 0.0
+        node._watch()
+        why = (
+            "this computer is too busy: in the last 2 s 30% of the ticks of node 'sim' were "
+            "missed, the latest was 0.299 s late"
+        )
+        node.watch(now=True)
+        assert client.wait_for(lambda: client.events and client.status("sim"), 5.0)
+        status = client.status("sim")
+        assert status is not None
+        assert status.detail["busy"] == why
+        busy = [event.why for _, _, event in client.pop_events() if event.what == "busy"]
+        assert len(busy) == 1
+        assert "the latest was 0.299 s late" in busy[0]
+        node.step(Tick(1, (at + 3000) * STEP_NS, 0.0, 0.0))
+        node._watched_s = 0.0
+        node._watch()
+        node.watch(now=True)
+        assert client.wait_for(lambda: client.status("sim").detail["busy"] == "", 5.0)  # pyright: ignore[reportOptionalMemberAccess]
         node._close()
 
 

@@ -324,10 +324,8 @@ class PeerMonitor:
             alive = name in self._alive
             known, heard_s = self._status_sources.get(name, (source, now_s))
             ours = alive and (known == source or now_s - heard_s > SILENT_S)
-        if source.startswith(ON_BEHALF) and not alive and name not in self._expected:
-            return  # a worker that was started by hand, and imports its model
         # `up` may see a node start later than we do.
-        if source.startswith(ON_BEHALF) if alive else name in self._expected:
+        if source.startswith(ON_BEHALF) or (not alive and name in self._expected):
             self._receive_on_behalf(name, arrival, header)
             return
         stamped = self._node.decode(NodeStatus, arrival, header=header) if ours else None
@@ -352,13 +350,15 @@ class PeerMonitor:
                 self._update_camera(name, camera, fields, now_ns)
 
     def _receive_on_behalf(self, name: str, arrival: ReceivedSample, header: Header) -> None:
-        """Keep why a node is down, as its host's `up` reports it; for display only."""
+        """Keep why a node is down, as its host's `up` reports it, or the command of a worker that
+        was started by hand; for display only."""
         stamped = self._node.decode(NodeStatus, arrival, header=header)
         why = None if stamped is None else stamped.record.detail.get("complaint")
         if stamped is None or stamped.record.state != CRASHED or not isinstance(why, str):
             return
         with self._lock:
-            if name not in self._alive:
+            room = name in self._expected or name in self._down or len(self._down) < MAX_WORKERS
+            if name not in self._alive and room:
                 self._down[name], self._changed = why[:MAX_WHY], True
 
     def _receive_spec(self, arrival: ReceivedSample) -> None:
