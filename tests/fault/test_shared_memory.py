@@ -141,7 +141,7 @@ def test_cameras_that_are_killed_and_restarted_leave_no_more_than_the_bound(lab:
     reader = lab.recorder("reader")
     before = held_bytes()
     bound = before + 3 * SENDER_BYTES
-    for _ in range(5):
+    for _ in range(10):
         sender = lab.sender(str(bound))
         until("images arrive", lab.grown, PATIENCE_S)
         sender.send_signal(signal.SIGKILL)
