@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 import pytest
+from motions import circle, make_world
 
 from vla_zenoh.guard.arm_guard import ArmGuard, Measured
-from vla_zenoh.kinematics.so3 import Pose, quat_from_rotation
+from vla_zenoh.kinematics.so3 import Pose, angle_between, quat_from_rotation
 from vla_zenoh.profile import load_profile
-from vla_zenoh.robots.sim_driver import stretched
-from vla_zenoh.simulation.pace import STEP_NS, Pace
+from vla_zenoh.robots.sim_driver import in_world_time
+from vla_zenoh.simulation.pace import CONTROL_STEPS, MAX_STEPS, STEP_NS, Pace
 from vla_zenoh.simulation.world import STEP_S, World, build_world
 from vla_zenoh.types import Header, PoseCommand, Stamped
 
 COMMAND_NS = 4_000_000
 UP_M, DURATION_S = 0.15, 0.8
 """At most 0.35 m/s and 1.3 m/s^2, well within the limits of the profile."""
+FOLLOW_LIMIT_M, FOLLOW_LIMIT_RAD = 1e-3, 5e-3
 LAG_M = 0.005
 """The arm is nearer to its command than this; ``limits.tracking_m`` is 0.05 m."""
 
@@ -61,7 +64,7 @@ def largest_lag_m(world: World, slowness: float, pauses_ns: dict[int, int]) -> f
             assert rejected is None, rejected
             sent_ns, seq = sent_ns + COMMAND_NS, seq + 1
         reference = guard.tick(tick.time_ns, tick.period_s)
-        world.tick(stretched(reference, tick.stretch), tick.steps)
+        world.tick(in_world_time(reference, tick.stretch, tick.steps), tick.steps)
         wanted_m = rise.at(tick.time_ns / 1e9).position_m
         worst_m = max(worst_m, float(np.linalg.norm(world.tcp()[0] - wanted_m)))
         now_ns += round(tick.steps * STEP_NS * slowness) + pauses_ns.pop(seq, 0)
@@ -79,3 +82,20 @@ def test_an_arm_stays_on_its_command_where_the_world_is_slower_than_real_time(
 def test_it_stays_there_through_pauses_of_the_process(slowness: float) -> None:
     pauses_ns = {seq: 40_000_000 for seq in range(20, 200, 30)}
     assert largest_lag_m(build_world(load_profile("panda_sim")), slowness, pauses_ns) < LAG_M
+
+
+@pytest.mark.parametrize("steps", [CONTROL_STEPS, MAX_STEPS])
+def test_an_arm_follows_within_a_millimetre_with_control_computed_every_few_steps(
+    steps: int,
+) -> None:
+    world = make_world()
+    worst_m = worst_rad = 0.0
+    for reference in islice(
+        circle(world.hold_reference(), 0.08, 0.4, 3.0, 1.0), steps - 1, None, steps
+    ):
+        world.tick(in_world_time(reference, 1.0, steps), steps)
+        position_m, rotation = world.tcp()
+        worst_m = max(worst_m, float(np.linalg.norm(position_m - reference.position_m)))
+        worst_rad = max(worst_rad, angle_between(rotation, reference.rotation))
+    assert worst_m < FOLLOW_LIMIT_M
+    assert worst_rad < FOLLOW_LIMIT_RAD

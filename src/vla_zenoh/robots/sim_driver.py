@@ -23,7 +23,7 @@ from vla_zenoh.codec import message, settings
 from vla_zenoh.errors import CodecError, NodeError
 from vla_zenoh.guard.arm_guard import Measured
 from vla_zenoh.keys import Kind
-from vla_zenoh.kinematics.so3 import Pose
+from vla_zenoh.kinematics.so3 import Pose, exp3
 from vla_zenoh.profile import Profile
 from vla_zenoh.robots.arm import Arm
 from vla_zenoh.robots.driver import DriverStatus, Measurement, RobotDriver
@@ -52,22 +52,26 @@ LEAST_FORCE_N = 0.1
 """A gripper that may press with no force would not move."""
 
 
-def stretched(
-    reference: PoseReference | JointReference, stretch: float
+def in_world_time(
+    reference: PoseReference | JointReference, stretch: float, steps: int
 ) -> PoseReference | JointReference:
-    """A reference of real time in the time of a world that goes slower by the factor `stretch`."""
-    if stretch == 1.0:
-        return reference
+    """The reference for the end of a tick of some `steps`, in real time, as that of its first step.
+
+    It is in the time of a world that goes slower than real time by the factor `stretch`.
+    """
+    back_s = (steps - 1) * STEP_S
     if isinstance(reference, JointReference):
+        velocity_rad_s = reference.velocity_rad_s * stretch
         return JointReference(
-            reference.position_rad,
-            reference.velocity_rad_s * stretch,
+            reference.position_rad - velocity_rad_s * back_s,
+            velocity_rad_s,
             reference.acceleration_rad_s2 * stretch**2,
         )
+    twist = reference.twist * stretch
     return PoseReference(
-        reference.position_m,
-        reference.rotation,
-        reference.twist * stretch,
+        reference.position_m - twist[:3] * back_s,
+        exp3(-twist[3:] * back_s) @ reference.rotation,
+        twist,
         reference.acceleration * stretch**2,
     )
 
@@ -144,15 +148,14 @@ class SimDriver(RobotDriver):
         self.ticks += self.steps
         self.measured_ns = mono_ns
         if not self.fault:
-            stretch = self.stretch
+            references = {name: part.reference for name, part in self._parts.items()}
+            if not self.lockstep:
+                references = {
+                    name: in_world_time(reference, self.stretch, self.steps)
+                    for name, reference in references.items()
+                }
             try:
-                self.world.tick(
-                    {
-                        name: stretched(part.reference, stretch)
-                        for name, part in self._parts.items()
-                    },
-                    self.steps,
-                )
+                self.world.tick(references, self.steps)
             except NodeError as error:
                 self.fault = str(error)
                 self.report.reject("simulation_fault", self.fault)

@@ -135,7 +135,8 @@ class World:
     ) -> None:
         """Step by milliseconds towards a reference of the TCP or joints, or one of each part.
 
-        The controllers compute their torque once, and it stays for all `steps`.
+        The controllers compute their torque once, for the reference of the first step, and it stays
+        for all `steps`.
 
         Raises:
             NodeError: the simulation diverged; `reset` makes it usable again.
