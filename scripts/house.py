@@ -5,9 +5,10 @@
 For each folder of ``src/vla_zenoh``: files, lines and tokens (Python's, without comments,
 docstrings, indentation and line ends). For the whole: tokens of all tracked Python by top folder,
 modules that Python loads for the four nodes of a simulated robot (where the package can be
-imported), import cycles (imports for types count), and class names that occur twice. ``--trace``
-adds the files that run between an image and a motion: it starts the nodes, lets a model that needs
-a camera move the arm, and records which functions are called meanwhile.
+imported), constants of ``control`` and ``guard`` and their conditions on poses or joints, import
+cycles (imports for types count), and class names that occur twice. ``--trace`` adds the files that
+run between an image and a motion: it starts the nodes, lets a model that needs a camera move the
+arm, and records which functions are called meanwhile.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import argparse
 import ast
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -37,6 +39,13 @@ NODES = (
     ("robots.sim_driver", "nodes.sim"),
 )
 LAB, FRONT = "lab", ("lab", "cli")
+MOTION = ("control", "guard")
+OF_SPACE = re.compile(
+    r"\b(in_joints|JointGoal|Joint(Path|Command|Reference)|PoseCommand|joint_bounds|_joint_steps"
+    r"|_path|bounds is|bounds is not|mode [!=]=)\b|\.(space|command|arm)\b"
+    r"|joints(_rad)? is (not )?None"
+)
+"""In a condition: it asks whether a motion is of poses or of joints."""
 PROGRAMS = ("router", "sim", "camera", "worker", "command")
 NOT_COUNTED = {
     tokenize.COMMENT,
@@ -178,6 +187,26 @@ def says_nothing(path: Path) -> bool:
     return all(isinstance(node, ast.Expr) for node in body)
 
 
+def constants_in(path: Path) -> int:
+    """Names in capitals that a module assigns."""
+    return sum(
+        isinstance(node, ast.Name) and node.id.isupper()
+        for statement in ast.parse(path.read_text("utf-8")).body
+        for target in getattr(statement, "targets", [getattr(statement, "target", None)])
+        if target is not None
+        for node in ast.walk(target)
+    )
+
+
+def branches_on_space(path: Path) -> int:
+    """Conditions that ask whether a motion is of poses or of joints."""
+    return sum(
+        OF_SPACE.search(ast.unparse(node.test)) is not None
+        for node in ast.walk(ast.parse(path.read_text("utf-8")))
+        if isinstance(node, ast.If | ast.IfExp | ast.While | ast.Assert)
+    )
+
+
 def measure(src: Path) -> dict[str, Any]:
     """Everything that needs no process."""
     modules = modules_in(src)
@@ -192,6 +221,7 @@ def measure(src: Path) -> dict[str, Any]:
         files[room] += 1
         sizes[room] += lines[name]
         tokens[room] += tokens_in(path)
+    motion = [path for folder in MOTION for path in sorted((src / PACKAGE / folder).glob("*.py"))]
     roots = [f"{PACKAGE}.{name}" for names in NODES for name in names]
     present = [name for name in roots if name in modules and modules[name].name != "__init__.py"]
     loaded = loaded_by(src, present, modules)
@@ -207,6 +237,8 @@ def measure(src: Path) -> dict[str, Any]:
         "tokens_outside_tests": sum(tops.values()) - tops.get("tests", 0),
         "node_modules": None if loaded is None else len(loaded),
         "node_lines": None if loaded is None else sum(lines[name] for name in loaded),
+        "motion_constants": sum(map(constants_in, motion)),
+        "motion_branches": sum(map(branches_on_space, motion)),
         "cycles": in_cycles(imports),
         "class_names_twice": class_names_twice(modules),
     }
@@ -319,6 +351,8 @@ def show(found: dict[str, Any]) -> None:
     if "trace" in found:
         print(f"files that run between an image and a motion: {len(found['trace'])}")
         print("  " + " ".join(found["trace"]))
+    print(f"control/ and guard/: {found['motion_constants']} constants, ", end="")
+    print(f"{found['motion_branches']} branches on the space")
     print(f"modules in cycles: {len(found['cycles'])} {' '.join(found['cycles'])}".rstrip())
     twice = found["class_names_twice"]
     print(f"class names that occur twice: {len(twice)}")

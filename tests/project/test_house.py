@@ -33,6 +33,17 @@ def test_tokens_are_those_of_code_without_docstrings_comments_and_line_ends(tmp_
     assert house.tokens_in(path) == 3 + 6 + 4
 
 
+def test_constants_are_names_in_capitals_and_conditions_on_the_space_are_counted(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "module.py"
+    code = "SLOW, FAST = 1, 2\nBOTH: int = 3\nother = 4\n"
+    code += "if action.space == 'joint':\n    pass\nwhile other:\n    pass\n"
+    path.write_text(code, "utf-8")
+    assert house.constants_in(path) == 3
+    assert house.branches_on_space(path) == 1
+
+
 def test_modules_that_cannot_be_imported_are_left_out_and_it_says_what_to_do(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
