@@ -11,6 +11,21 @@ get a profile that leaves at full jerk and comes back. So values that Ruckig can
 are set to zero before planning, and a plan in which an axis leaves the range between its start, its
 target and its stop is replaced by one in which each axis moves as fast as it can.
 
+Limits are (3, n): velocity, acceleration and jerk of every axis, per second, s^2 and s^3::
+
+    box          all that an axis may do
+    limits       the shares asked for, and as much jerk as ends each acceleration before its axis
+                 exceeds the velocity limit: jerk >= a^2 / (2 (v_max - |v|))
+    unreversed   and as much as ends a deceleration before its axis reverses: jerk >= a^2 / (2 |v|)
+    hardest      velocity of `limits`, acceleration and jerk of the box
+
+A motion is planned with the first of the last three that takes no detour, each in up to three ways
+(`_WAYS`): nine plans at most, one as a rule. If all of them take one, one of the hardest is
+executed: a detour within the limits is better than no plan.
+
+A plan with shares s, s^2, s^3 of the box is the same motion in 1/s of the time. Ruckig, which
+rounds absolute values, is given it in a time of its own, at a `pace` of s.
+
 Ruckig: Berscheid and Kroeger, "Jerk-limited real-time trajectory generation with arbitrary target
 states", RSS 2021.
 """
@@ -53,7 +68,9 @@ ASIDE = 2e-7
 BESIDE = 0.01
 """Part of the limits for motion beside the line."""
 _ASIDE = np.array([[ASIDE], *([quiet] for quiet in QUIET[1:])])
+"""(3, 1) the same of displacement, velocity and acceleration."""
 TINY, MOST = 1e-12, 1e9
+"""Ruckig takes no limit of zero and none that is infinite."""
 DONE = (Result.Working, Result.Finished)
 _WAYS = ((Synchronization.Time, False), (Synchronization.No, False), (Synchronization.No, True))
 """Attempts at planning a motion, in order: how axes are synchronised, `slowly` of `_input`."""

@@ -39,7 +39,9 @@ from vla_zenoh.profile import ContactLimits, Limits
 from vla_zenoh.types import Event, FloatArray, JointState, PoseState, Stamped
 
 FILTER_S = 0.02
+"""Shorter: impacts that are over at once stop the arm; longer: a rising force is seen late."""
 DRIFT_S = 10.0
+"""Shorter: a push slows the arm down for a moment only; longer: a load just picked up does."""
 LONGEST_S = 0.1
 """Longest time between two states that the filters integrate."""
 FROZEN_M = 0.05
@@ -50,7 +52,9 @@ STEPS = 10
 """Number of speed shares; each change of the share replans the motion."""
 
 STEP_M = 0.005
+"""A retreat looks at the load after each of these: longer ones go back further than needed."""
 RELIEF_M = 0.02
+"""As far as an arm of 2000 N/m is pressed into what stops it at 40 N."""
 SETTLE_NS = 50_000_000
 """Wait after each step, for the external load to settle."""
 SPARE_NS = 4_000_000_000
@@ -58,6 +62,7 @@ SPARE_NS = 4_000_000_000
 SPACE_M = 0.002
 """Distance between the poses of a trail."""
 PLACES = 60
+"""Of a trail: 0.12 m, so that a detour of up to this is left out."""
 RAD_AS_M = 0.05
 """A rotation by 1 rad counts as this distance."""
 STRAY_M, STRAY_RAD = 0.01, 0.05

@@ -55,6 +55,7 @@ BACK_SHARE = 0.7
 NEAR_END_RAD = 0.1
 """A joint further from the end of its range is not reported as held by it."""
 HALVINGS = 8
+"""Of the search for an acceleration: to 1/256 of the range allowed."""
 NEAR_SHARE, FAR_SHARE = 0.7, 0.1
 """Part of the joints' acceleration and jerk available for a distance constraint: they follow the
 pose besides. And for the first test whether a constraint is far away."""
@@ -63,6 +64,7 @@ ELBOW_COST = 1e-2
 BACK_JERK = 0.4
 """Rate of the correction in units of jerk over acceleration, at most one per tick."""
 ROUNDING_RAD_S = 1e-9
+"""A smaller excess of a velocity is rounding; smaller divisors would be noise."""
 NEAR_M = 0.08
 """A pair further from its stop than this is no constraint until the next update."""
 PEEK_RAD = 1e-3

@@ -43,6 +43,7 @@ from vla_zenoh.profile import REJECT_FACTOR, Profile
 from vla_zenoh.types import Cause, FloatArray, JointCommand
 
 HALVINGS = 7
+"""Of the search for the feasible part of a step: to 1/128 of it."""
 INSIDE_M = 0.002
 """A step ends this far inside the box, so that the curve to its end stays in it."""
 CORRECTIONS = 4
@@ -57,16 +58,20 @@ ARC_RAD = 0.25
 """A motion is taken apart into pieces of this length to see how fast its TCP moves."""
 ROUNDING = 1e-6
 NAMED = {"rad": "radians", "m": "metres"}
+"""Units of joints in sentences."""
 NEARER_M = 5e-4
 """m by which a motion may come nearer than a stop: goals are bounded step by step."""
 CHECK_TICKS = 4
+"""Between two checks of distances, which cost too much for every tick; they look as far ahead."""
 ROOM = np.array([[0.95], [0.8], [0.8]])
 """Parts of the TCP's velocity, acceleration and jerk that a straight motion is planned with."""
 BEND = 0.5
 """Part of the acceleration that the curve of the TCP may take."""
 LEAST_SHARE = 0.02
 NOTHING = 1e-9
+"""A shorter displacement has no direction."""
 PEEK_RAD = 1e-4
+"""Displacement for the rate of the Jacobian: shorter is rounding, longer is curved."""
 
 
 class JointBounds:

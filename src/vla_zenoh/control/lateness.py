@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 
 WINDOW_S = 2.0
+"""What was late longer ago explains nothing that is too late now."""
 BUSY_S = 0.05
 """A computer that lets a loop wait for this long is too busy for it; less is seen in any log."""
 

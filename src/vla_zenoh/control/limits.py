@@ -65,6 +65,7 @@ class Shares(NamedTuple):
 
 
 FULL = Shares()
+"""All of the limits."""
 
 
 class JointMotionLimits(NamedTuple):

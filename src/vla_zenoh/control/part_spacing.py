@@ -28,14 +28,17 @@ from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray
 
 NAME = "part_distance"
+"""Of the limit."""
 FAR_M = 0.25
 """Arms this much further apart than they may come are looked at now and then."""
 FAR_TICKS = 4
 NOISE_M = 2e-5
+"""Distances of the same joints differ by less: without it arms at the stop could not go on."""
 SPARE_M = 5e-3
 """Arms that brake end this much before the stop: joints that begin to lag in a brake end elsewhere
 than their pose would. 3.4 mm were found in 2.5 million ticks of ``fuzz_parts.py``."""
 SLOWEST = 0.05
+"""Least share of the speed near the stop: the arms are held there, and have to come away again."""
 STEPS = 20
 """Number of speed shares, so that the share does not change at every tick."""
 STANDS_RAD = 2e-3

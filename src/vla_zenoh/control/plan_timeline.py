@@ -52,6 +52,7 @@ if TYPE_CHECKING:
 HISTORY_NS = 15_000_000_000
 """Observations are rejected long before they are this old."""
 FOREVER_NS = 1 << 62
+"""A time that does not come."""
 WHOLE_STEP = 1e-6
 """Parts of steps that add up to one within this are a whole step."""
 

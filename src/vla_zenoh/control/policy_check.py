@@ -33,8 +33,11 @@ from vla_zenoh.profile import POSE_JOINTS, REACH_M, REJECT_FACTOR, Limits, Profi
 from vla_zenoh.types import QUATERNION_NORM_TOLERANCE, ActionChunk, FloatArray, Stamped, Task
 
 FUTURE_TOLERANCE_NS = 50_000_000
+"""Clocks of two hosts may differ by this; more says that a clock was set."""
 ROUNDING = 1e-6
+"""Chunks are float32: a step of exactly the limit is within it."""
 SOURCE_CHARS = 60
+"""A source is foreign text, and a sentence has to stay readable."""
 
 
 class Finding(NamedTuple):
@@ -258,6 +261,7 @@ def beyond_gripper(
 
 # -- joints ----------------------------------------------------------------------------------------
 NEAR_RAD, FAR_M = 0.3, 0.1
+"""Numbers this near to the joints, and as a pose this far from the TCP, are joints."""
 LEAST_M, LEAST_RAD = 0.002, 0.01
 """Less than this of a chunk is noise."""
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -265,6 +269,7 @@ AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 _WEIGHTS = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])
 """A rotation of 1 rad counts as much as a motion of 0.3 m."""
 LOST_SHARE = 0.3
+"""Part of the motion asked for that joints may leave out: less is the curve of their path."""
 
 
 def joints_as_pose(

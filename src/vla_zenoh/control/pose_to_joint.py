@@ -39,6 +39,7 @@ from vla_zenoh.profile import Profile
 from vla_zenoh.types import Cause, FloatArray, JointCommand
 
 REST_RAD_S = 1e-5
+"""Slower joints stand: an elbow approaches its posture for ever."""
 PULL_1_S = 25.0
 """Rate at which the pull to the posture rises and falls, as a critically damped spring."""
 LONGEST_RAD = POSTURE_RAD_S / POSTURE_1_S
@@ -69,6 +70,7 @@ CREEPING, STUCK_S = 0.05, 0.5
 OUTSIDE_M = 1e-3
 """An arm further outside the box than this started there, and is moved inside."""
 DAMPING = 1e-5 * np.eye(6)
+"""Of the inverse for lengths alone: at a singularity they are large, and finite."""
 LAGS = 0.5
 """Joints that lag by this much, see `PoseToJoint._lag`, may stop by themselves."""
 RESTING_STEPS = 2

@@ -25,9 +25,11 @@ CHUNK_PATIENCE_S = 2.0
 CLOCK_TOLERANCE_S = 0.02
 """A state may be stamped this far in the future before clocks count as different."""
 CAMERA_PATIENCE_S = 1.0
+"""Slower than any camera that a model can use, and what a status is late by."""
 FIRST_REAL_NS = 10**18
 """Stamps before this (2001) are no time of day."""
 JOINT_PATIENCE_S = 0.1
+"""Beside ``state_timeout_s``: some robots report joints less often than poses."""
 SAME_TCP_M, SAME_TCP_RAD = 0.005, 0.02
 """Largest difference of the TCP by kinematics from the TCP that the robot reports."""
 HELD_RAD = 0.1
@@ -89,6 +91,7 @@ class PeerSnapshot:
 
 
 STARTS = (LOADING, NO_TASK, NOTHING_YET)
+"""Beginnings of what a worker complains of while it starts."""
 
 
 class Passing(str):

@@ -67,7 +67,9 @@ NOISE = 2e-6
 SHRINKING = 1e-6
 """A barrier that changes by less counts as constant."""
 HALVINGS = 4
+"""Tries for a part that is feasible, the first a guess; then nothing of the step is left."""
 REFINEMENTS = 4
+"""Halvings of what is between the feasible part and the next: to 1/16 of it."""
 SMALLEST_FRACTION = 1 / 128
 """A smaller part of a step counts as nothing."""
 GUESS_SHORT = 0.95
@@ -77,7 +79,9 @@ SOLVER_ITERATIONS = 12
 EFFORT = 5
 """Iterations of the solver per evaluation; one with more counts as several."""
 SAME_POSE = 1e-9
+"""Poses nearer to each other than this have the same joints: rounding of a sum of steps."""
 NEWTON_STEPS = 8
+"""From joints that are near a few suffice; without a solution it ends somewhere near."""
 
 
 class Margins(NamedTuple):

@@ -14,7 +14,7 @@ is how long a stop from v takes: braking for W_k, where the arm would stand, beg
 and not before, and by then the next goal is there. So the speed is constant while goals come in
 time and evenly, and the arm is ``v m`` behind them. Where no goal follows it comes to rest at the
 last one, before the watchdog would brake it. ``x`` is a phase-locked clock of the arrivals (an
-alpha-beta filter), ``spare`` twice their mean deviation from it: what an inference takes varies.
+alpha-beta filter), ``spare`` three times their mean deviation from it: an inference varies.
 
 Only the speed is bounded by this. Which goal is in force when, and where the arm ends, are those of
 `vla_zenoh.control.plan_timeline`.
@@ -47,7 +47,9 @@ MOVING = 0.85
 SLOWEST = 1e-3
 """Least share of the velocity limits."""
 SOON_NS = 1_000_000
+"""A goal that is overdue has this much time: the share is that of full speed then."""
 MARGIN_NS = 10_000_000
+"""Spare time at least: two ticks at 250 Hz, and what a message takes on one host."""
 EASING = 0.1
 """Part of the time by which what is kept in reserve may change; half of it how late the arm is."""
 

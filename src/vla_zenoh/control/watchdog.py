@@ -21,10 +21,13 @@ FIRST_CHUNK_PATIENCE_S = 1.0
 BACK_OFF_M, BACK_OFF_RAD = 0.005, 0.02
 """A blocked arm that comes back counts as blocked again if it strays by this much more."""
 PERIOD_NS = 30_000_000
+"""Between two checks of the same measured values: noise has to be seen apart from motion."""
 PAST_M, PAST_SINGULAR = 0.005, 0.005
+"""The measured arm brakes this far past a stop: goals end at the stop, and the arm lags."""
 PAST_MARGIN = 0.5
 """Part of ``joint_margin_rad``."""
 BAND_RAD, BAND_M, BAND_SINGULAR = 2e-3, 5e-4, 5e-4
+"""Width of the band that follows a value: wider than noise, narrower than `PAST_M`."""
 STEPS = 20
 """Number of speed shares, so that the share does not change at every update."""
 

@@ -63,7 +63,9 @@ GIVES_WAY = (BRAKE_MARGIN - ORDINARY - SLACK - REVERSAL) / ORDINARY
 """How fast the acceleration of the difference goes back where that of the commanded path begins to
 rise, as a share of how fast this does."""
 GRID = 8
+"""Roots a side of the polynomials that `_tests` takes: more tests, and a tighter bound."""
 AT_REST = np.zeros(6)
+"""Twist and acceleration of a pose that stands."""
 
 Reference = TypeVar("Reference")
 
