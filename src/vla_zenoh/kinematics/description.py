@@ -20,6 +20,13 @@ from vla_zenoh.errors import ProfileError, ResourceError, nearest
 MOVING = ("revolute", "prismatic", "continuous")
 """Types of joints that have one degree of freedom."""
 KINDS = (*MOVING, "fixed", "floating", "planar")
+SHAPES: Mapping[str, Mapping[str, int]] = {
+    "box": {"size": 3},
+    "sphere": {"radius": 1},
+    "cylinder": {"radius": 1, "length": 1},
+    "mesh": {},
+}
+"""Collision shapes, with how many numbers above 0 each attribute has."""
 PLACE = ("robot", "description")
 TO_URDF = {
     "mujoco": "MJCF, the format of MuJoCo: give the maker's URDF",
@@ -91,6 +98,9 @@ class Description:
         self.path, self.name = path, path.name
         root = self._root()
         self.links = tuple(self._named(link, "link") for link in root.findall("link"))
+        for link in root.findall("link"):
+            for collision in link.findall("collision"):
+                self._check_shape(collision, f"link {link.attrib['name']!r}")
         found = [self._joint(joint) for joint in root.findall("joint")]
         self._check_names(found)
         self.joints: Mapping[str, DescribedJoint] = {joint.name: joint for joint in found}
@@ -210,32 +220,61 @@ class Description:
             if link is None or not link.get("link"):
                 raise self._error(f"has joint {name!r} without <{end} link=...>")
             ends.append(str(link.get("link")))
-        x, y, z = self._vector(element.find("origin"), "xyz", name)
+        whose, origin = f"joint {name!r}", element.find("origin")
+        x, y, z = self._vector(origin, "xyz", whose)
+        self._vector(origin, "rpy", whose)
         axis = element.find("axis")
-        if kind in MOVING and axis is not None and not any(self._vector(axis, "xyz", name)):
+        if kind in MOVING and axis is not None and not any(self._vector(axis, "xyz", whose)):
             raise self._error(f"has joint {name!r} with an axis of length 0")
         lower, upper, velocity = self._limits(element, name, kind)
-        mimic = self._mimic(element.find("mimic"), name)
+        mimic = self._mimic(element.find("mimic"), whose)
         return DescribedJoint(
             name, kind, ends[0], ends[1], (x, y, z), lower, upper, velocity, mimic
         )
 
+    def _check_shape(self, collision: ElementTree.Element, whose: str) -> None:
+        """Pinocchio leaves a shape out that it does not understand, and so would every barrier."""
+        origin = collision.find("origin")
+        self._vector(origin, "xyz", whose)
+        self._vector(origin, "rpy", whose)
+        geometry = collision.find("geometry")
+        shapes = [] if geometry is None else list(geometry)
+        if len(shapes) != 1 or shapes[0].tag not in SHAPES:
+            found = ", ".join(f"<{shape.tag}>" for shape in shapes) or "nothing"
+            raise self._error(
+                f"has {whose} with a collision shape that is {found}; shapes are: "
+                f"{', '.join(SHAPES)}. A link that must not have one needs no <collision>"
+            )
+        shape = shapes[0]
+        if shape.tag == "mesh" and not shape.get("filename"):
+            raise self._error(f"has {whose} with a collision mesh without a filename")
+        for attribute, count in SHAPES[shape.tag].items():
+            sizes = self._numbers(shape.get(attribute, ""), attribute, whose, count)
+            if min(sizes) <= 0:
+                given = shape.get(attribute)
+                raise self._error(f"has {whose} with {attribute} {given!r}: give metres above 0")
+
     def _vector(
-        self, element: ElementTree.Element | None, attribute: str, joint: str
+        self, element: ElementTree.Element | None, attribute: str, whose: str
     ) -> tuple[float, float, float]:
         text = "0 0 0" if element is None else element.get(attribute, "0 0 0")
-        values = [self._number(each, attribute, joint) for each in text.split()]
-        if len(values) != 3:
-            raise self._error(f"has joint {joint!r} with {attribute} {text!r}: give three numbers")
-        return values[0], values[1], values[2]
+        x, y, z = self._numbers(text, attribute, whose, 3)
+        return x, y, z
 
-    def _number(self, text: str, attribute: str, joint: str) -> float:
+    def _numbers(self, text: str, attribute: str, whose: str, count: int) -> list[float]:
+        values = [self._number(each, attribute, whose) for each in text.split()]
+        if len(values) != count:
+            many = "three numbers" if count == 3 else "one number"
+            raise self._error(f"has {whose} with {attribute} {text!r}: give {many}")
+        return values
+
+    def _number(self, text: str, attribute: str, whose: str) -> float:
         try:
             value = float(text)
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise self._error(f"has joint {joint!r} with {attribute} {text[:40]!r}: no number")
+            raise self._error(f"has {whose} with {attribute} {text[:40]!r}: no number")
         return value
 
     def _limits(
@@ -243,10 +282,10 @@ class Description:
     ) -> tuple[float, float, float]:
         if kind not in MOVING:
             return 0.0, 0.0, 0.0
-        limit = element.find("limit")
+        limit, whose = element.find("limit"), f"joint {name!r}"
         if kind == "continuous":
             given = None if limit is None else limit.get("velocity")
-            velocity = math.inf if given is None else self._number(given, "velocity", name)
+            velocity = math.inf if given is None else self._number(given, "velocity", whose)
             return -math.inf, math.inf, velocity
         attributes = {} if limit is None else limit.attrib
         lacking = [each for each in ("effort", "velocity") if each not in attributes]
@@ -255,23 +294,25 @@ class Description:
                 f"has joint {name!r} without {' and '.join(lacking)} in its <limit>: "
                 "every joint that turns or slides needs lower, upper, effort and velocity"
             )
-        self._number(attributes["effort"], "effort", name)
-        velocity = self._number(attributes["velocity"], "velocity", name)
-        lower = self._number(attributes.get("lower", "0"), "lower", name)
-        upper = self._number(attributes.get("upper", "0"), "upper", name)
+        self._number(attributes["effort"], "effort", whose)
+        velocity = self._number(attributes["velocity"], "velocity", whose)
+        if velocity < 0:
+            raise self._error(f"has {whose} with velocity {velocity:g}: give one above 0")
+        lower = self._number(attributes.get("lower", "0"), "lower", whose)
+        upper = self._number(attributes.get("upper", "0"), "upper", whose)
         soft = element.find("safety_controller")
         if soft is not None and {"soft_lower_limit", "soft_upper_limit"} & soft.attrib.keys():
-            low = self._number(soft.get("soft_lower_limit", "0"), "soft_lower_limit", name)
-            high = self._number(soft.get("soft_upper_limit", "0"), "soft_upper_limit", name)
+            low = self._number(soft.get("soft_lower_limit", "0"), "soft_lower_limit", whose)
+            high = self._number(soft.get("soft_upper_limit", "0"), "soft_upper_limit", whose)
             lower, upper = max(lower, low), min(upper, high)
         return lower, upper, velocity
 
-    def _mimic(self, element: ElementTree.Element | None, joint: str) -> Mimic | None:
+    def _mimic(self, element: ElementTree.Element | None, whose: str) -> Mimic | None:
         if element is None:
             return None
         leader = element.get("joint", "")
-        multiplier = self._number(element.get("multiplier", "1"), "multiplier", joint)
-        offset = self._number(element.get("offset", "0"), "offset", joint)
+        multiplier = self._number(element.get("multiplier", "1"), "multiplier", whose)
+        offset = self._number(element.get("offset", "0"), "offset", whose)
         return Mimic(leader, multiplier, offset)
 
     # -- checks -----------------------------------------------------------------------------------

@@ -260,6 +260,7 @@ class Refused(NamedTuple):
 
 
 WHOLE = urdf([*arm(SIX), TOOL])
+BALL = '<sphere radius="0.02"/>'
 NO_EFFORT = '<limit lower="-1" upper="1" velocity="2"/>'
 DEGREES = [row._replace(ends=(-170.0, 170.0), velocity=150.0) for row in arm(SIX)]
 MILLIMETRES = [row._replace(at_m=(0.0, 0.0, 200.0)) for row in arm(SIX)]
@@ -351,6 +352,34 @@ REFUSED: dict[str, Refused] = {
         urdf([*arm(SIX, j1=Row("j1", at_m=(2000.0, 0.0, 0.0))), TOOL]),
         ("limits.workspace", "2e+03 m"),
     ),
+    "a velocity below 0": Refused(
+        urdf([*arm(SIX, j2=Row("j2", axis=Y, velocity=-2.0)), TOOL]),
+        ("joint 'j2' with velocity -2",),
+    ),
+    "an endless turn": Refused(
+        WHOLE.replace('xyz="0.0 0.0 0.2"', 'xyz="0 0 0.2" rpy="inf 0 0"', 1),
+        ("joint 'j1' with rpy 'inf'",),
+    ),
+    "a shape without a size": Refused(
+        WHOLE.replace(BALL, "<sphere/>", 1), ("link 'base' with radius ''",)
+    ),
+    "a shape of a size below 0": Refused(
+        WHOLE.replace(BALL, '<sphere radius="-0.02"/>', 1), ("link 'base' with radius '-0.02'",)
+    ),
+    "a shape of no size": Refused(
+        WHOLE.replace(BALL, '<box size="0.1 nan 0.1"/>', 1), ("link 'base' with size 'nan'",)
+    ),
+    "a box of two numbers": Refused(
+        WHOLE.replace(BALL, '<box size="0.1 0.1"/>', 1), ("size '0.1 0.1': give three numbers",)
+    ),
+    "a shape that is unknown": Refused(
+        WHOLE.replace(BALL, '<cone radius="0.02" length="0.1"/>', 1),
+        ("link 'base'", "<cone>; shapes are: box"),
+    ),
+    "a mesh without a file": Refused(
+        WHOLE.replace(BALL, "<mesh/>", 1), ("link 'base' with a collision mesh without a filename",)
+    ),
+    "an empty shape": Refused(WHOLE.replace(BALL, "", 1), ("link 'base'", "that is nothing")),
     "a finger that is shut nowhere": Refused(
         urdf([*arm(SIX), TOOL, finger("left", -0.03, 0.05)]),
         ("'left'", "joint_open_m"),
