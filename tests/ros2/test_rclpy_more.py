@@ -155,6 +155,28 @@ def test_a_robot_of_another_domain_is_not_seen_and_the_wrong_domain_is_told(
             chain.client.activate()
 
 
+def test_a_bridge_with_settings_older_than_the_profile_is_named(
+    tmp_path: Path, built_bridge: Path, distribution: str
+) -> None:
+    domain = free_domain()
+    profile = write_profile(tmp_path, distribution, domain)
+    config = generated(profile, beside=True)
+    assert "^/desired_pose$" in config
+    config = config.replace("^/desired_pose$", "^/pose_of_yesterday$")
+    with ExitStack() as stack:
+        bridge = Bridge(built_bridge, tmp_path, config, distribution).start()
+        stack.callback(bridge.kill)
+        arm = Arm(distribution, domain).start()
+        stack.callback(arm.end)
+        chain = stack.enter_context(running_chain(tmp_path, profile_file=profile))
+        why = chain.until(
+            "it is told",
+            lambda: (chain.detail("ros2_faults", "ros2") or {}).get("not_routed"),
+            30.0,
+        )
+        assert "bridge-config" in why
+
+
 # -- QoS, encodings, bytes ------------------------------------------------------------------------
 def test_cameras_of_every_reliability_and_states_of_a_bag_are_read(
     tmp_path: Path, built_bridge: Path, distribution: str
