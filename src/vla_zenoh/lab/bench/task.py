@@ -56,7 +56,6 @@ class TaskPlan:
         family: one of `FAMILIES` or ``stay``; None: all three in turn.
         prompt: in place of the episode's own.
         rate_hz: chunks per second; None: of the profile.
-        speed_percent: speed override, in real time; None: it stays as it is.
     """
 
     model: str
@@ -68,7 +67,6 @@ class TaskPlan:
     limit_s: float = LIMIT_S
     rate_hz: float | None = None
     delay_ms: float = 0.0
-    speed_percent: float | None = None
 
     @property
     def worker(self) -> str:

@@ -64,8 +64,6 @@ class TaskRunner:
         self._runner.wait_until_ready(self._plan.worker, self._states)
         if self._plan.rate_hz is not None:
             self._client.set_rate(self._plan.rate_hz)
-        if self._plan.speed_percent is not None:
-            self._client.set_speed(self._plan.speed_percent)
         for request in self._plan.requests():
             yield run_task(self, self._plan, request)
             self._client.deactivate()

@@ -15,7 +15,6 @@ from vla_zenoh.lab.bench.task import SCENE, DemoPlan, TaskOutcome, is_judged, or
 from vla_zenoh.lab.bench.task_runner import TaskRunner
 from vla_zenoh.lab.bench.task_sheet import sheet
 from vla_zenoh.lab.cli.bench_file import shown_camera
-from vla_zenoh.lab.cli.demo_capacity import HALF_SPEED_PERCENT
 from vla_zenoh.lab.cli.demo_stage import Stage, latency_line, open_stage
 from vla_zenoh.lab.cli.options import DemoOptions
 from vla_zenoh.lab.cli.output import print_json
@@ -49,8 +48,7 @@ def run_task_demo(prompts: list[str], seed: int, profile: str, given: DemoOption
             rate_hz=given.rate_hz,
             prompts=tuple(prompts),
             orders=orders,
-            limit_s=given.seconds or (2 * LIMIT_S if stage.slow else LIMIT_S),
-            speed_percent=HALF_SPEED_PERCENT if stage.slow else None,
+            limit_s=given.seconds or LIMIT_S,
         )
         ended = _run(stage, plan)
         run = stage.recorded()
