@@ -1,4 +1,4 @@
-"""Run on a host of the lab: all fixed motions, done and judged as `vla-zenoh demo --tour` does.
+"""Run on a host of the lab: all fixed motions, done and judged as `vla-zenoh demo --prompt` does.
 
 tour.py PROFILE
 """
@@ -14,10 +14,23 @@ from chain import READY_PATIENCE_S
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.client.client import Client
 from vla_zenoh.lab.demo.runner import MotionRunner
-from vla_zenoh.lab.demo.segments import tour
+from vla_zenoh.lab.demo.segments import make_segment
 from vla_zenoh.profile import load_profile
 
 RATE_HZ = 10.0
+TOUR: tuple[tuple[str, int], ...] = (
+    ("HARD: go up", 15),
+    ("HARD: roll right", 6),
+    ("HARD: roll left", 6),
+    ("HARD: pitch down", 6),
+    ("HARD: pitch up", 6),
+    ("HARD: yaw left", 10),
+    ("HARD: yaw right", 10),
+    ("HARD: close gripper", 2),
+    ("HARD: open gripper", 2),
+    ("HARD: go down", 15),
+)
+"""Prompt and steps: every axis there and back, and the gripper, within reach of the home pose."""
 
 
 def main(name: str) -> None:
@@ -26,7 +39,8 @@ def main(name: str) -> None:
         client = Client(profile, session).subscribe()
         run = MotionRunner(client, threading.Event())
         run.begin(RATE_HZ)
-        outcomes = [run.run_segment(segment, RATE_HZ) for segment in tour()]
+        segments = [make_segment(prompt, steps) for prompt, steps in TOUR]
+        outcomes = [run.run_segment(segment, RATE_HZ) for segment in segments]
         client.deactivate()
     print(json.dumps([outcome.to_dict() for outcome in outcomes]))
 

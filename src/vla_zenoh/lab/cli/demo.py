@@ -25,9 +25,6 @@ def demo(
             "'HARD: go up'. Default: one task of every kind.",
         ),
     ] = None,
-    tour: Annotated[
-        bool, typer.Option("--tour", help="All fixed motions in place of tasks.")
-    ] = False,
     steps: Annotated[
         int, typer.Option("--steps", help="Steps of a fixed motion.", min=1, max=10_000)
     ] = DEFAULT_STEPS,
@@ -40,16 +37,11 @@ def demo(
     Exits with 0 only when the arm did what was asked.
     """
     # Imported here: simulation, kinematics and plots take long to load.
-    if tour and prompt is not None:
-        raise typer.BadParameter("give either --tour or --prompt")
-    fixed = prompt is not None and prompt.strip().lower().startswith(("hard", "hold"))
-    if tour or fixed:
+    if prompt is not None and prompt.strip().lower().startswith(("hard", "hold")):
         from vla_zenoh.lab.cli.demo_run import run_demo
         from vla_zenoh.lab.demo.segments import make_segment
-        from vla_zenoh.lab.demo.segments import tour as all_motions
 
-        segments = all_motions() if prompt is None else [make_segment(prompt, steps)]
-        run_demo(segments, given.profile or DEFAULT_PROFILE, given)
+        run_demo(make_segment(prompt, steps), given.profile or DEFAULT_PROFILE, given)
         return
     from vla_zenoh.lab.bench.task import FIRST_SEED
     from vla_zenoh.lab.cli.demo_tasks import run_task_demo

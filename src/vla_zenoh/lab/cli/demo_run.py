@@ -1,4 +1,4 @@
-"""``vla-zenoh demo --tour``: fixed motions, compared with what their prompts ask."""
+"""``vla-zenoh demo --prompt "HARD: ..."``: a fixed motion, compared with what its prompt asks."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import typer
 
-from vla_zenoh.cli.output import console, new_table, styled
+from vla_zenoh.cli.output import console, new_table
 from vla_zenoh.keys import worker_node
+from vla_zenoh.lab.cli.bench_file import counts
 from vla_zenoh.lab.cli.demo_stage import Stage, latency_line, open_stage
 from vla_zenoh.lab.cli.options import DemoOptions
 from vla_zenoh.lab.cli.output import print_json
@@ -21,60 +22,48 @@ from vla_zenoh.lab.recording.run import Run
 from vla_zenoh.policy.loader import find_worker, make_policy
 
 
-def run_demo(segments: list[DemoSegment], profile: str, given: DemoOptions) -> None:
-    """Run fixed motions and show how far each came."""
+def run_demo(segment: DemoSegment, profile: str, given: DemoOptions) -> None:
+    """Run a fixed motion and show how far it came."""
     if given.seconds is not None:
-        steps = max(round(given.seconds * given.rate_hz), 1)
-        segments = [replace(segment, steps=steps) for segment in segments]
+        segment = replace(segment, steps=max(round(given.seconds * given.rate_hz), 1))
     with open_stage(profile, given) as stage:
         stage.profile.require_one_arm("fixed motions of demo")
-        outcomes = _run(stage, segments, given.rate_hz)
-        run, interrupted = stage.recorded(), len(outcomes) < len(segments)
-        summary = _summary(stage, given.rate_hz, outcomes, run)
-        summary["ok"] = summary["ok"] and not interrupted
+        outcome = _run(stage, segment, given.rate_hz)
+        run = stage.recorded()
+        summary = _summary(stage, given.rate_hz, outcome, run)
         stage.write(summary)
         _write_chunks(stage, run)
         stage.draw(run)
     if given.as_json:
         print_json({**summary, "folder": stage.path})
     else:
-        _show(summary, outcomes, stage, interrupted=interrupted)
+        _show(summary, outcome, stage)
     if not summary["ok"]:
-        raise typer.Exit(130 if interrupted else 1)
+        raise typer.Exit(130 if outcome is None else 1)
 
 
-def _run(stage: Stage, segments: list[DemoSegment], rate_hz: float) -> list[SegmentOutcome]:
-    """The segments that ended."""
-    outcomes: list[SegmentOutcome] = []
-    facts = stage.facts[TASKS] = list[dict[str, Any]]()
+def _run(stage: Stage, segment: DemoSegment, rate_hz: float) -> SegmentOutcome | None:
+    """What became of the segment; None: it was interrupted."""
     with stage.nodes(24) as (running, client, bars):
         run = MotionRunner(client, stage.stop, running.poll)
         run.begin(rate_hz)
-        for segment in segments:
-            bar = bars.add_task(segment.prompt, total=segment.steps)
-            outcome = run.run_segment(
-                segment, rate_hz, lambda done, bar=bar: bars.update(bar, completed=done)
-            )
-            bars.update(bar, completed=segment.steps)
-            outcomes.append(outcome)
-            facts.append(_fact(outcome))
-    return outcomes
+        bar = bars.add_task(segment.prompt, total=segment.steps)
+        outcome = run.run_segment(segment, rate_hz, lambda done: bars.update(bar, completed=done))
+        bars.update(bar, completed=segment.steps)
+        stage.facts[TASKS] = [_fact(outcome)]
+        return outcome
+    return None
 
 
 def _summary(
-    stage: Stage, rate_hz: float, outcomes: list[SegmentOutcome], run: Run
+    stage: Stage, rate_hz: float, outcome: SegmentOutcome | None, run: Run
 ) -> dict[str, Any]:
     profile, statuses = stage.profile, stage.statuses
-    rows = [outcome.to_dict() for outcome in outcomes]
-    only = rows[0] if len(rows) == 1 else {}
     worker, command = statuses.get(worker_node(profile.task.worker)), statuses.get("command")
     return {
-        "ok": bool(rows) and all(row["ok"] for row in rows),
+        **({"ok": False} if outcome is None else outcome.to_dict()),
         "profile": profile.name,
         "rate_hz": rate_hz,
-        **{key: only[key] for key in ("prompt", "steps", "steps_done", "asked", "reached") if only},
-        "drift_mm": max((row["drift_mm"] for row in rows), default=None),
-        "rotation_drift_rad": max((row["rotation_drift_rad"] for row in rows), default=None),
         "latency_ms": latencies(run.first_commands()),
         "rates_hz": {
             "command": _rate(run.commands or run.joint_commands),
@@ -83,7 +72,6 @@ def _summary(
         },
         "missed_ticks": command.counters.get("command.missed_ticks", 0) if command else 0,
         "refusals": stage.refusals(),
-        "segments": rows,
     }
 
 
@@ -123,36 +111,32 @@ def _write_chunks(stage: Stage, run: Run) -> None:
     np.savez_compressed(file, spec=json.dumps(spec.to_dict()), steps=steps, length=length)
 
 
-def _show(
-    summary: dict[str, Any], outcomes: list[SegmentOutcome], stage: Stage, *, interrupted: bool
-) -> None:
-    columns = ("prompt", "steps", "asked", "reached", "drift", "rotation drift", "verdict")
-    title = "asked and reached, measured at rest"
-    table = new_table(*columns, title=title, left=("prompt", "verdict"))
-    for outcome in outcomes:
-        faults = outcome.faults()
+def _show(summary: dict[str, Any], outcome: SegmentOutcome | None, stage: Stage) -> None:
+    screen = console()
+    if outcome is not None:
+        columns = ("prompt", "steps", "asked", "reached", "drift", "rotation drift")
+        title = "asked and reached, measured at rest"
+        table = new_table(*columns, title=title, left=("prompt",))
         table.add_row(
             outcome.segment.prompt,
             f"{outcome.steps_done}/{outcome.segment.steps}",
             *_amounts(outcome),
             f"{outcome.drift_mm:.2f} mm",
             f"{outcome.drift_rad * 1e3:.2f} mrad",
-            styled("; ".join(faults), "red") if faults else styled("ok", "green"),
         )
-    screen = console()
-    screen.print(table)
+        screen.print(table)
     screen.print(latency_line(summary["latency_ms"]))
     rates = ", ".join(f"{name} {value:.1f} Hz" for name, value in summary["rates_hz"].items())
-    refused = ", ".join(f"{reason} {count}" for reason, count in summary["refusals"].items())
-    screen.print(f"rates: {rates}; rejections: {refused or 'none'}")
+    screen.print(f"rates: {rates}; rejections: {counts(summary['refusals']) or 'none'}")
     files = "run.mcap, summary.json, chunks.npz, report.html, video.mp4"
     screen.print(f"run folder: {stage.path} ({files})")
-    if interrupted:
+    if outcome is None:
         screen.print("interrupted; the arm braked", style="yellow")
     elif summary["ok"]:
         screen.print("the arm did what was asked", style="bold green")
     else:
-        screen.print("the arm did not do what was asked", style="bold red")
+        faults = "; ".join(outcome.faults())
+        screen.print(f"the arm did not do what was asked: {faults}", style="bold red")
 
 
 def _amounts(outcome: SegmentOutcome) -> tuple[str, str]:

@@ -115,7 +115,7 @@ def _not_understood(prompt: str) -> str:
             f"{one_line(prompt, 80)!r} is no task that the shipped policy understands"
             f"{nearest(prompt, known) or '.'} Known, in any of the colours {', '.join(COLOURS)}:",
             *(f"  {text}" for text in known),
-            "  HARD: go up, and the other fixed motions; all of them: --tour",
+            "  HARD: go up, and the other fixed motions",
             "For another prompt or model: `vla-zenoh up`, then `vla-zenoh prompt`",
         ]
     )

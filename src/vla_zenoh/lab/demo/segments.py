@@ -13,19 +13,6 @@ from vla_zenoh.lab.demo.scripted_motions import ScriptedMotion, ScriptedPrompt, 
 from vla_zenoh.lab.statistics import percentiles
 from vla_zenoh.types import LATENCY_STAGES, Cause, FloatArray
 
-TOUR: tuple[tuple[str, int], ...] = (
-    ("HARD: go up", 15),
-    ("HARD: roll right", 6),
-    ("HARD: roll left", 6),
-    ("HARD: pitch down", 6),
-    ("HARD: pitch up", 6),
-    ("HARD: yaw left", 10),
-    ("HARD: yaw right", 10),
-    ("HARD: close gripper", 2),
-    ("HARD: open gripper", 2),
-    ("HARD: go down", 15),
-)
-"""Prompt and steps: every axis there and back, and the gripper, within reach of the home pose."""
 TOLERANCE_M, TOLERANCE_RAD = 0.002, 0.005
 DRIFT_MM = 1.0
 TOLERANCE_WIDTH_M = 0.002
@@ -83,10 +70,6 @@ def make_segment(prompt: str, steps: int) -> DemoSegment:
     name = f"HARD: {parsed.motion.name}" if parsed.motion else "hold"
     steps = steps if parsed.steps is None else parsed.steps
     return DemoSegment(name, steps, parsed.motion, parsed.within)
-
-
-def tour() -> list[DemoSegment]:
-    return [make_segment(prompt, steps) for prompt, steps in TOUR]
 
 
 @dataclass(frozen=True, slots=True)
