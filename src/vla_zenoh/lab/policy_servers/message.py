@@ -12,16 +12,13 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Callable
-from functools import cache, lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgpack
+import numpy as np
 
 from vla_zenoh.errors import CodecError
 from vla_zenoh.types import shown
-
-if TYPE_CHECKING:
-    import numpy as np
 
 MAX_PAYLOAD_BYTES = 64 * 1024 * 1024
 MAX_DEPTH = 32
@@ -47,14 +44,6 @@ _SCALARS: dict[str, tuple[type, ...]] = {
     "S": (bytes,),
     "U": (str,),
 }
-
-
-@cache
-def _numpy() -> Any:
-    """numpy, loaded with the first array: a command that only puts text needs none."""
-    import numpy
-
-    return numpy
 
 
 def pack(value: Any, to_map: Callable[[Any], Any] | None = None) -> bytes:
@@ -150,7 +139,6 @@ def array_parts(array: np.ndarray[Any, Any]) -> tuple[bytes, str, tuple[int, ...
 
 
 def _to_map(value: Any) -> dict[bytes, Any]:
-    np = _numpy()
     if isinstance(value, np.ndarray):
         data, dtype, shape = array_parts(value)
         return {b"__ndarray__": True, b"data": data, b"dtype": dtype, b"shape": shape}
@@ -170,7 +158,6 @@ def _from_map(value: dict[Any, Any]) -> Any:
 
 def make_array(data: Any, dtype_name: Any, shape: Any) -> np.ndarray[Any, Any]:
     """A read-only view of received bytes; `CodecError`: dtype or shape do not fit them."""
-    np = _numpy()
     dtype = _dtype(dtype_name)
     if not isinstance(data, bytes) or not isinstance(shape, list):
         raise CodecError("malformed", "an array needs bytes 'data' and a list 'shape'")
@@ -194,7 +181,6 @@ def make_array(data: Any, dtype_name: Any, shape: Any) -> np.ndarray[Any, Any]:
 
 
 def _scalar(value: dict[Any, Any]) -> np.generic:
-    np = _numpy()
     dtype, data = _dtype(value.get(b"dtype")), value.get(b"data")
     if type(data) not in _SCALARS[dtype.kind]:
         raise CodecError("malformed", f"a numpy scalar {dtype} of a {type(data).__name__}")
@@ -206,16 +192,9 @@ def _scalar(value: dict[Any, Any]) -> np.generic:
 
 
 def _dtype(name: Any) -> np.dtype[Any]:
-    if not isinstance(name, str):
+    if not isinstance(name, str) or not _DTYPE.fullmatch(name):
         raise CodecError("malformed", f"an array with dtype {shown(name)} is not carried")
-    return _dtype_of(name)
-
-
-@lru_cache(maxsize=64)
-def _dtype_of(name: str) -> np.dtype[Any]:
-    if not _DTYPE.fullmatch(name):
-        raise CodecError("malformed", f"an array with dtype {shown(name)} is not carried")
-    return _numpy().dtype(name)
+    return np.dtype(name)
 
 
 def _check_kind(dtype: np.dtype[Any]) -> None:
