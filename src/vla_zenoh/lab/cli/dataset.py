@@ -10,7 +10,8 @@ from typing import Annotated
 import typer
 
 from vla_zenoh.cli.options import JsonOption, not_empty
-from vla_zenoh.cli.output import console, errors, fail
+from vla_zenoh.cli.output import console, fail
+from vla_zenoh.cli.plain import warn
 from vla_zenoh.errors import RecordingError, counted, nearest
 from vla_zenoh.lab.cli.output import print_json, progress
 from vla_zenoh.lab.cli.output_path import ForceOption, output_file, output_folder
@@ -82,7 +83,7 @@ def export(
             status.update(f"reading {path.name} ({number} of {len(files)})")
             run = load_run(path)
             for problem in run.problems:
-                errors().print(f"{path.name}: {problem}", style="yellow")
+                warn(f"{path.name}: {problem}")
             workers |= {heard.record.worker for heard in run.chunks}
             found = episodes_of(run, worker)
             for episode in found:

@@ -14,6 +14,7 @@ import typer
 
 from vla_zenoh.cli.options import JsonOption
 from vla_zenoh.cli.output import console, errors, fail, new_table
+from vla_zenoh.cli.plain import warn
 from vla_zenoh.lab.cli.output import plain_types, print_json, progress_bars
 from vla_zenoh.lab.cli.output_path import ForceOption, output_file
 from vla_zenoh.lab.evaluation import tables
@@ -69,7 +70,7 @@ def evaluation(
         print_json(to_mapping(runs, faults)) if as_json else _show(runs)
         for run in runs:
             for problem in run.problems:
-                errors().print(f"{run.name}: {problem}", style="yellow")
+                warn(f"{run.name}: {problem}")
         for why in faults.values():
             errors().print(f"not evaluated: {why}", style="red")
         for kind, part in zip(kinds, parts, strict=True):

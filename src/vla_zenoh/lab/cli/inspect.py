@@ -13,12 +13,14 @@ import typer
 from rich.live import Live
 from rich.table import Table
 
-from vla_zenoh.cli.options import MAX_SECONDS, node_name, options
+from vla_zenoh.cli.options import node_name, options
 from vla_zenoh.cli.output import console, errors, fail, new_table
+from vla_zenoh.cli.plain import warn
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.client.client import Client
 from vla_zenoh.codec.image import decode_jpeg
 from vla_zenoh.errors import CodecError
+from vla_zenoh.lab.cli.options import EndAfterOption
 from vla_zenoh.lab.cli.output_path import ForceOption, if_wanted, output_folder
 from vla_zenoh.lab.inference_views import InferenceDebugSubscriber, InferenceView
 from vla_zenoh.policy import MAX_CAMERAS
@@ -45,10 +47,7 @@ def inspect(
         ),
     ] = None,
     force: ForceOption = False,
-    seconds: Annotated[
-        float | None,
-        typer.Option("--seconds", "-s", min=0.1, max=MAX_SECONDS, help="End after this time."),
-    ] = None,
+    seconds: EndAfterOption = None,
     count: Annotated[
         int | None,
         typer.Option("--count", "-n", min=1, max=10**9, help="End after this many inferences."),
@@ -98,7 +97,7 @@ def inspect(
         errors().print(f"{received} inferences in {output}")
     if left_out := subscriber.left_out:
         why = ", ".join(f"{reason} {count}" for reason, count in sorted(left_out.items()))
-        errors().print(f"left out: {why}", style="yellow")
+        warn(f"left out: {why}")
 
 
 def _fail(target: RobotTarget, client: Client, worker: str | None) -> NoReturn:

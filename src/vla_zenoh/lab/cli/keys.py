@@ -26,6 +26,7 @@ from vla_zenoh.codec import message
 from vla_zenoh.codec.image import MAX_IMAGE_BYTES
 from vla_zenoh.errors import CodecError, ProfileError, nearest
 from vla_zenoh.keys import KEY_PATHS, PART_KEYS, Keys
+from vla_zenoh.lab.cli.options import EndAfterOption
 from vla_zenoh.lab.cli.output import print_json
 from vla_zenoh.profile import Profile
 from vla_zenoh.sanitize import one_line
@@ -180,10 +181,7 @@ def echo(
         int | None,
         typer.Option("--count", "-n", min=1, max=10**9, help="End after this many samples."),
     ] = None,
-    seconds: Annotated[
-        float | None,
-        typer.Option("--seconds", "-s", min=0.1, max=MAX_SECONDS, help="End after this time."),
-    ] = None,
+    seconds: EndAfterOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Print what is published on a key, decoded."""

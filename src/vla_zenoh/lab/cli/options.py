@@ -8,11 +8,16 @@ from typing import Annotated
 
 import typer
 
-from vla_zenoh.cli.options import JsonOption
+from vla_zenoh.cli.options import MAX_SECONDS, JsonOption
 from vla_zenoh.lab.cli.output_path import ForceOption
 
 SimulatedProfileOption = Annotated[
     str, typer.Option("--profile", "-p", help="Name or path of a simulated robot's profile.")
+]
+
+EndAfterOption = Annotated[
+    float | None,
+    typer.Option("--seconds", "-s", min=0.1, max=MAX_SECONDS, help="End after this time."),
 ]
 
 

@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vla_zenoh.cli.options import MAX_SECONDS, JsonOption, key_expression, node_name, options
+from vla_zenoh.cli.options import JsonOption, key_expression, node_name, options
 from vla_zenoh.cli.output import console, errors, fail
+from vla_zenoh.cli.plain import warn
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import counted
+from vla_zenoh.lab.cli.options import EndAfterOption
 from vla_zenoh.lab.cli.output import print_json
 from vla_zenoh.lab.cli.output_path import RUNS, ForceOption, output_file
 from vla_zenoh.runtime.process import run_node
@@ -40,10 +42,7 @@ def record(
         ),
     ] = None,
     raw: Annotated[bool, typer.Option("--raw", help="Raw images too; they are 1 MB each.")] = False,
-    seconds: Annotated[
-        float | None,
-        typer.Option("--seconds", "-s", min=0.1, max=MAX_SECONDS, help="End after this time."),
-    ] = None,
+    seconds: EndAfterOption = None,
     name: Annotated[
         str,
         typer.Option(
@@ -132,4 +131,4 @@ def _show(recorded: RecordingResult, path: Path, as_json: bool) -> None:
         )
     if recorded.dropped:
         worst = ", ".join(f"{key} {count}" for key, count in recorded.dropped.most_common(5))
-        errors().print(f"dropped, because the disk did not keep up: {worst}", style="yellow")
+        warn(f"dropped, because the disk did not keep up: {worst}")

@@ -9,6 +9,7 @@ import typer
 
 from vla_zenoh.cli.options import JsonOption, options
 from vla_zenoh.cli.output import console, errors, fail
+from vla_zenoh.cli.plain import warn
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import counted
 from vla_zenoh.lab.cli.output import print_json
@@ -67,7 +68,7 @@ def replay(
     for node, count in replayed.left_out.items():
         errors().print(f"left out: {count} samples of node {node}, which is alive itself")
     if replayed.damage:
-        errors().print(f"{file} is {replayed.damage}", style="yellow")
+        warn(f"{file} is {replayed.damage}")
     if replayed.failure:
         fail(replayed.failure)
 

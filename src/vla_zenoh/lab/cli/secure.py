@@ -24,7 +24,8 @@ from vla_zenoh.cli.options import (
     network_address,
     node_name,
 )
-from vla_zenoh.cli.output import console, errors, fail, new_table, styled
+from vla_zenoh.cli.output import console, fail, new_table, styled
+from vla_zenoh.cli.plain import warn
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import SecurityError, VlaZenohError
 from vla_zenoh.lab.certificates.authority import AUTHORITY_DAYS, CERTIFICATE_DAYS
@@ -229,10 +230,9 @@ def init(
     key = store.folder / "ca.key"
     out.print(f"Keep {key} here: anyone with it can make certificates.", soft_wrap=True)
     if len(written.hosts) > 1 and all("127.0.0.1" in each for each in written.session.listen):
-        errors().print(
+        warn(
             "the router listens on its own computer only; for a network give its address: "
-            "--at HOST=ADDRESS",
-            style="yellow",
+            "--at HOST=ADDRESS"
         )
 
 
@@ -280,7 +280,7 @@ def add(
             part.write_text(new, "utf-8")
         loaded = load_profile(profile)
     for path, why in unused_certificates(loaded, store.entries(_now(), host)).items():
-        errors().print(f"{path} {why}", style="yellow", highlight=False, soft_wrap=True)
+        warn(f"{path} {why}")
     here, file = store.known_host(), profile_file(profile)
     routers = [name for name, part in loaded.hosts.items() if "router" in part.nodes]
     changed = [name for name in routers if new and name not in (host, here)]

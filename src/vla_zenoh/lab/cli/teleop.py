@@ -11,6 +11,7 @@ import typer
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.cli.options import model_options, node_name, options
 from vla_zenoh.cli.output import errors
+from vla_zenoh.cli.plain import warn
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import SecurityError
 from vla_zenoh.keys import worker_node
@@ -73,7 +74,7 @@ def teleop(
             try:
                 settings = stack.enter_context(open_session(loaded.session))
             except SecurityError as error:
-                errors().print(f"enter, tab and x will do nothing: {error}", style="yellow")
+                warn(f"enter, tab and x will do nothing: {error}")
             node = Teleop(
                 loaded,
                 session,

@@ -12,6 +12,7 @@ import typer
 
 from vla_zenoh.cli.options import MAX_INDEX, MAX_SECONDS, JsonOption, options
 from vla_zenoh.cli.output import console, errors, fail, new_table
+from vla_zenoh.cli.plain import warn
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.cli.output import print_json
@@ -108,7 +109,7 @@ def trial(
             fail(f"{output} holds no trial")
         found = folder.episodes()
         if (done := score(plan, found).done) < plan.episodes:
-            _warn(
+            warn(
                 f"{done} of {plan.episodes} episodes done: p and intervals hold where the number "
                 "of episodes was fixed beforehand, not where the results so far decide when to stop"
             )
@@ -119,7 +120,7 @@ def trial(
             plan = _plan(folder, asked)
             found = folder.episodes()
             if folder.truncated:
-                _warn("the last line of trials.jsonl was cut off; its episode is repeated")
+                warn("the last line of trials.jsonl was cut off; its episode is repeated")
             if plan.next_due(found) is not None:
                 found = _run(folder, plan, found, target, yes_setup)
     result = score(plan, found)
@@ -174,10 +175,10 @@ def _unattended(
                 lambda: target.operator("trial", "--output", str(output)),
                 plan_file.parent,
                 stop,
-                _warn,
+                warn,
             )
         except Interrupted:
-            errors().print("interrupted; the same command continues", markup=False)
+            errors().print("interrupted; the same command continues")
             raise typer.Exit(130) from None
     found = trial.scores()
     if as_json:
@@ -189,9 +190,9 @@ def _unattended(
     else:
         for each, result, _ in found:
             _show(trial.trial(each)[1], result)
-        console().print(f"page: {output / PAGE}", markup=False)
+        console().print(f"page: {output / PAGE}")
     if why:
-        _warn(f"stopped by a rule or a person: {why}")
+        warn(f"stopped by a rule or a person: {why}")
         raise typer.Exit(STOPPED)
 
 
@@ -214,19 +215,15 @@ def _run(
     done = score(plan, found).done
     blind = "; blind" if plan.blind else ""
     text = f"{folder.path}: {plan.prompt!r}, {done} of {plan.episodes} episodes done{blind}"
-    errors().print(text, markup=False)
+    errors().print(text)
     person = TrialPerson(plan, sys.stdin.fileno(), stop, lays=yes_setup)
     try:
         with target.operator("trial", "--output", str(folder.path)) as client:
             return TrialRunner(client, plan, folder, person, stop).run()
     except Interrupted:
         done = score(plan, folder.episodes()).done
-        errors().print(f"{done} of {plan.episodes} done; the same command continues", markup=False)
+        errors().print(f"{done} of {plan.episodes} done; the same command continues")
         raise typer.Exit(130) from None
-
-
-def _warn(text: str) -> None:
-    errors().print(text, style="yellow", markup=False)
 
 
 def _mapping(plan: TrialPlan, result: TrialScore, found: list[EpisodeVerdict]) -> dict[str, Any]:
@@ -278,7 +275,6 @@ def _show(plan: TrialPlan, result: TrialScore) -> None:
             f"{one} minus {other} over {pair.setups} setups that both did: {pair.difference:+.1%}"
             f"{between}, exact McNemar p = {pair.p:.3g}; both {pair.both}, "
             f"{one} alone {pair.first}, {other} alone {pair.second}, neither {pair.neither}",
-            markup=False,
             soft_wrap=True,
         )
         if pair.too_few:

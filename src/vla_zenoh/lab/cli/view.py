@@ -12,11 +12,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vla_zenoh.cli.options import MAX_SECONDS, bind_address, options
+from vla_zenoh.cli.options import bind_address, options
 from vla_zenoh.cli.output import errors, fail
+from vla_zenoh.cli.plain import warn
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import MissingExtraError, OutputError, ProfileError, counted
 from vla_zenoh.lab.cli.loopback import require_loopback
+from vla_zenoh.lab.cli.options import EndAfterOption
 from vla_zenoh.lab.cli.output import progress
 from vla_zenoh.lab.cli.output_path import ForceOption, if_wanted, output_file
 from vla_zenoh.lab.view.viewer import Viewer, open_server, open_window
@@ -125,10 +127,7 @@ def view(
         Path | None,
         typer.Argument(help="A file of `vla-zenoh record`; default: the running robot."),
     ] = None,
-    seconds: Annotated[
-        float | None,
-        typer.Option("--seconds", "-s", min=0.1, max=MAX_SECONDS, help="End after this time."),
-    ] = None,
+    seconds: EndAfterOption = None,
 ) -> None:
     """View a robot and its model in Rerun, live or from a recording.
 
@@ -171,7 +170,7 @@ def _live(profile: Profile, output: ViewOutput, part: Path | None, seconds: floa
                 logger.dropped = listener.dropped.total()
                 before, short = short, listener.reception.short()
                 for why in [why for name, why in short.items() if name not in before]:
-                    errors().print(why, style="yellow")
+                    warn(why)
                 stop.wait(POLL_S)
             listener.close()
             done.append(logger)
@@ -193,7 +192,7 @@ def _recorded(path: Path, profile_name: str, output: ViewOutput, part: Path | No
     try:
         profile = read_profile(file.profile_yaml, f"profile in {file.path}")
     except ProfileError as error:
-        errors().print(f"{error}; showing the robot of --profile {profile_name}", style="yellow")
+        warn(f"{error}; showing the robot of --profile {profile_name}")
         profile = RobotTarget(profile_name).load()
     output.check(profile)
     with output.open(path.stem, part) as (stream, viewer):
@@ -205,7 +204,7 @@ def _recorded(path: Path, profile_name: str, output: ViewOutput, part: Path | No
                 logger.log(sample)
         _summarise(logger)
         if file.damage:
-            errors().print(f"{path} is {file.damage}", style="yellow")
+            warn(f"{path} is {file.damage}")
         while viewer is not None and not stop.is_set() and not viewer.closed:
             stop.wait(POLL_S)
     if not logger.shown and not stop.is_set():
@@ -214,13 +213,10 @@ def _recorded(path: Path, profile_name: str, output: ViewOutput, part: Path | No
 
 def _summarise(logger: RerunLogger) -> None:
     logger.close()
-    screen = errors()
-    screen.print(f"{logger.shown.total():,} samples of {counted(len(logger.shown), 'key')}")
+    errors().print(f"{logger.shown.total():,} samples of {counted(len(logger.shown), 'key')}")
     if logger.rejected:
         worst = logger.rejected.most_common(SHOWN_REASONS)
         reasons = ", ".join(f"{why} ({count})" for why, count in worst)
-        screen.print(f"not shown: {reasons}", style="yellow")
+        warn(f"not shown: {reasons}")
     if logger.dropped:
-        screen.print(
-            f"dropped, because this was too slow: {logger.dropped} samples", style="yellow"
-        )
+        warn(f"dropped, because this was too slow: {logger.dropped} samples")
