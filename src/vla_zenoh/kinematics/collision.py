@@ -235,14 +235,17 @@ class CollisionModel:
 
 def _allowed(known: Sequence[str], may_touch: Iterable[tuple[str, str]]) -> list[set[str]]:
     """The pairs of `may_touch`, if their names are known."""
+    place = ("limits", "reach", "may_touch")
     for pair in may_touch:
         for name in pair:
             if name not in known:
                 raise ProfileError(
                     f"there is no {name!r} with a collision shape{nearest(name, known)} "
                     f"Known: {', '.join(known)}",
-                    ("limits", "reach", "may_touch"),
+                    place,
                 )
+        if len(set(pair)) < len(pair):
+            raise ProfileError(f"{pair[0]!r} touches itself: name two links", place)
     return [set(pair) for pair in may_touch]
 
 

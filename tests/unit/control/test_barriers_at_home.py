@@ -105,6 +105,9 @@ def test_declared_pairs_may_touch_and_unknown_ones_are_named() -> None:
     wrong = LIMITS.model_copy(update={"may_touch": (("panda_link5", "panda_hnd"),)})
     with pytest.raises(ProfileError, match=r"panda_hnd.*panda_hand"):
         Barriers(KINEMATICS, wrong, HOME_RAD)
+    same = LIMITS.model_copy(update={"may_touch": (("panda_hand", "panda_hand"),)})
+    with pytest.raises(ProfileError, match="'panda_hand' touches itself: name two links"):
+        Barriers(KINEMATICS, same, HOME_RAD)
 
 
 def test_neighbours_are_those_that_are_never_far_apart() -> None:
