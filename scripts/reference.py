@@ -35,8 +35,8 @@ from vla_zenoh.profile.section import Section
 from vla_zenoh.program.main import app, examples
 from vla_zenoh.security.roles import OWN, TABLE
 from vla_zenoh.types import Cause, ClockReply, Header
+from vla_zenoh.types.form import bound_text, form_of
 from vla_zenoh.types.form import described as in_words
-from vla_zenoh.types.form import form_of
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = ROOT / "docs" / "reference"
@@ -145,7 +145,9 @@ def bounds_text(field: FieldInfo) -> str:
     signs = {"gt": ">", "ge": "≥", "lt": "<", "le": "≤"}
     found = []
     for item in field.metadata:
-        found += [f"{s} {getattr(item, n):g}" for n, s in signs.items() if hasattr(item, n)]
+        found += [
+            f"{s} {bound_text(getattr(item, n))}" for n, s in signs.items() if hasattr(item, n)
+        ]
     return ", ".join(found)
 
 

@@ -15,46 +15,30 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import msgpack
 import msgspec
 import numpy as np
 
+from vla_zenoh import types
 from vla_zenoh.codec import message, records, settings
 from vla_zenoh.errors import CodecError
 from vla_zenoh.keys import SCHEMA
 from vla_zenoh.policy import ActionSpec, ModelSpec
-from vla_zenoh.types import (
-    ActionChunk,
-    Cause,
-    ClockReply,
-    Event,
-    GripperCommand,
-    GripperState,
-    Header,
-    InferenceDebug,
-    JointCommand,
-    JointState,
-    NodeStatus,
-    ObjectPoses,
-    PoseCommand,
-    PoseState,
-    PrivilegedState,
-    SceneState,
-    Task,
-)
 from vla_zenoh.types.form import form_of
 
 WIRE = Path(__file__).resolve().parents[1] / "wire"
 AT_NS = 1_700_000_000_000_000_000
 NAN, INFINITE = float("nan"), float("inf")
 DOWN = (1.0, 0.0, 0.0, 0.0)
-CAUSE = Cause("pi0", 7, AT_NS, AT_NS + 1, AT_NS + 2, AT_NS + 3, AT_NS + 4, AT_NS + 5)
+CAUSE = types.Cause("pi0", 7, AT_NS, AT_NS + 1, AT_NS + 2, AT_NS + 3, AT_NS + 4, AT_NS + 5)
+NEGATIVE = {**asdict(CAUSE), "chunk_seq": -1}
 NAMES = ("joint1", "joint2")
 
 VALID: tuple[Any, ...] = (
-    JointState(NAMES, np.array([0.1, -0.2]), np.zeros(2), np.array([1.5, 0.0])),
-    JointState(NAMES, np.zeros(2), np.zeros(2), None, np.array([0.1, -0.2])),
-    PoseState(np.array([0.4, 0.0, 0.3]), np.array(DOWN), np.zeros(6)),
-    PoseState(
+    types.JointState(NAMES, np.array([0.1, -0.2]), np.zeros(2), np.array([1.5, 0.0])),
+    types.JointState(NAMES, np.zeros(2), np.zeros(2), None, np.array([0.1, -0.2])),
+    types.PoseState(np.array([0.4, 0.0, 0.3]), np.array(DOWN), np.zeros(6)),
+    types.PoseState(
         np.array([0.4, 0.0, 0.3]),
         np.array(DOWN),
         np.zeros(6),
@@ -62,32 +46,32 @@ VALID: tuple[Any, ...] = (
         np.array([0.4, 0.0, 0.31]),
         np.array(DOWN),
     ),
-    GripperState(0.04, moving=False, holding=True),
-    GripperState(0.0, moving=True, holding=False, mode="reflex", faults=("over current",)),
-    PrivilegedState({"expert": np.array([0.5, -1.0])}),
-    SceneState("table", np.array([0.0, 1.0]), 3),
-    ObjectPoses(("brick",), np.array([[0.4, 0.1, 0.02]]), np.array([[0.0, 0.0, 0.0, 1.0]])),
-    ActionChunk(
+    types.GripperState(0.04, moving=False, holding=True),
+    types.GripperState(0.0, moving=True, holding=False, mode="reflex", faults=("over current",)),
+    types.PrivilegedState({"expert": np.array([0.5, -1.0])}),
+    types.SceneState("table", np.array([0.0, 1.0]), 3),
+    types.ObjectPoses(("brick",), np.array([[0.4, 0.1, 0.02]]), np.array([[0.0, 0.0, 0.0, 1.0]])),
+    types.ActionChunk(
         *("pi0", "0123456789abcdef", 2, AT_NS, 41, AT_NS + 10**9),
         np.array([[0.01, 0.0, 0.0, 1.0], [0.02, 0.0, 0.0, 1.0]], np.float32),
         *(AT_NS + 1, AT_NS + 2, AT_NS + 3),
     ),
-    InferenceDebug(
+    types.InferenceDebug(
         *("pi0", 7, "0123456789abcdef", 2, AT_NS, "put the brick away"),
         np.zeros((1, 4), np.float32),
         85.5,
         {"tokens": [1, 2], "note": None},
     ),
     CAUSE,
-    PoseCommand(
+    types.PoseCommand(
         *(np.array([0.4, 0.0, 0.3]), np.array(DOWN), np.zeros(6), np.zeros(6)),
         *(np.array([0.5, 0.0, 0.3]), np.array(DOWN), "active", CAUSE),
     ),
-    JointCommand(NAMES, np.array([0.1, -0.2]), np.zeros(2), np.zeros(2), "holding"),
-    GripperCommand(0.04, 0.1, 20.0),
-    Task(2, True, "put the brick away", "pi0", 5.0),
-    Task(3, False, "", "pi0", 5.0, 30.0),
-    NodeStatus(
+    types.JointCommand(NAMES, np.array([0.1, -0.2]), np.zeros(2), np.zeros(2), "holding"),
+    types.GripperCommand(0.04, 0.1, 20.0),
+    types.Task(2, True, "put the brick away", "pi0", 5.0),
+    types.Task(3, False, "", "pi0", 5.0, 30.0),
+    types.NodeStatus(
         *("command", "active", "lab-pc", 4711, AT_NS),
         {"state/pose": 0.004},
         {"command/pose": 250.0},
@@ -95,50 +79,54 @@ VALID: tuple[Any, ...] = (
         {"refused.stale": 2},
         {"why": "ready", "clocks": {"sim": None}},
     ),
-    Event("warning", "refusal", "stale_chunk", "it is 2.1 s old", 2.1, 1.0, 3),
-    ClockReply(AT_NS, AT_NS + 1000),
+    types.Event("warning", "refusal", "stale_chunk", "it is 2.1 s old", 2.1, 1.0, 3),
+    types.ClockReply(AT_NS, AT_NS + 1000),
     ModelSpec(name="pi0", action=ActionSpec(horizon=10, dt_s=0.1)),
 )
 
 INVALID: tuple[tuple[type, str, dict[str, Any]], ...] = (
-    (JointState, "a joint twice", {"names": ["a", "a"]}),
-    (JointState, "a velocity is missing", {"velocity_rad_s": [0.0]}),
-    (JointState, "NaN", {"position_rad": [0.0, NAN]}),
-    (PoseState, "infinity", {"twist": [0.0, 0.0, INFINITE, 0.0, 0.0, 0.0]}),
-    (PoseState, "two of three numbers", {"position_m": [0.4, 0.0]}),
-    (PoseState, "text for a number", {"position_m": ["0.4", "0.0", "0.3"]}),
-    (PoseState, "true for a number", {"position_m": [True, 0.0, 0.3]}),
-    (PoseState, "more than 1e6", {"position_m": [2e6, 0.0, 0.3]}),
-    (PoseState, "a quaternion that is not unit", {"quat_xyzw": [0.0, 0.0, 0.0, 0.9]}),
-    (PoseState, "half a reference", {"reference_position_m": [0.4, 0.0, 0.3]}),
-    (GripperState, "millimetres", {"width_m": 40.0}),
-    (GripperState, "1 for true", {"moving": 1}),
-    (PrivilegedState, "NaN", {"values": {"expert": [NAN]}}),
-    (SceneState, "a negative seed", {"seed": -1}),
-    (ObjectPoses, "a name without a pose", {"names": ["brick", "bin"]}),
-    (ActionChunk, "NaN", {"steps": [[0.01, 0.0, 0.0, NAN]]}),
-    (ActionChunk, "rows of several lengths", {"steps": [[0.01, 0.0], [0.02]]}),
-    (ActionChunk, "no steps", {"steps": []}),
-    (ActionChunk, "one row instead of a list of rows", {"steps": [0.01, 0.0]}),
-    (ActionChunk, "a negative time", {"valid_until_ns": -1}),
-    (ActionChunk, "seconds in place of nanoseconds", {"observed_ns": 1.7e9}),
-    (InferenceDebug, "a negative duration", {"inference_ms": -1.0}),
-    (Cause, "a text for a number", {"chunk_seq": "7"}),
-    (PoseCommand, "a cause that is none", {"cause": 5}),
-    (PoseCommand, "a cause with a negative number", {"cause": {**asdict(CAUSE), "chunk_seq": -1}}),
-    (JointCommand, "no joints", {"names": []}),
-    (JointCommand, "a state of 33 characters", {"state": "x" * 33}),
-    (GripperCommand, "no speed", {"speed_m_s": 0.0}),
-    (GripperCommand, "opens further than 1 m", {"width_m": 1.5}),
-    (Task, "more than 100 percent", {"speed_percent": 130.0}),
-    (Task, "no rate", {"rate_hz": 0.0}),
-    (Task, "bytes for text", {"prompt": b"go"}),
-    (NodeStatus, "an age that is NaN", {"ages_s": {"state/pose": NAN}}),
-    (NodeStatus, "a detail nested too deep", {"detail": {"a": [[[[1]]]]}}),
-    (Event, "an unknown level", {"level": "loud"}),
-    (Event, "an unknown kind", {"kind": "x"}),
-    (Event, "none of them", {"count": 0}),
-    (ClockReply, "a negative time", {"heard_ns": -5}),
+    (types.JointState, "a joint twice", {"names": ["a", "a"]}),
+    (types.JointState, "a velocity is missing", {"velocity_rad_s": [0.0]}),
+    (types.JointState, "NaN", {"position_rad": [0.0, NAN]}),
+    (types.PoseState, "infinity", {"twist": [0.0, 0.0, INFINITE, 0.0, 0.0, 0.0]}),
+    (types.PoseState, "two of three numbers", {"position_m": [0.4, 0.0]}),
+    (types.PoseState, "text for a number", {"position_m": ["0.4", "0.0", "0.3"]}),
+    (types.PoseState, "true for a number", {"position_m": [True, 0.0, 0.3]}),
+    (types.PoseState, "more than 1e6", {"position_m": [2e6, 0.0, 0.3]}),
+    (types.PoseState, "a quaternion that is not unit", {"quat_xyzw": [0.0, 0.0, 0.0, 0.9]}),
+    (types.PoseState, "half a reference", {"reference_position_m": [0.4, 0.0, 0.3]}),
+    (types.GripperState, "millimetres", {"width_m": 40.0}),
+    (types.GripperState, "1 for true", {"moving": 1}),
+    (types.PrivilegedState, "NaN", {"values": {"expert": [NAN]}}),
+    (types.SceneState, "a negative seed", {"seed": -1}),
+    (types.ObjectPoses, "a name without a pose", {"names": ["brick", "bin"]}),
+    (types.ActionChunk, "NaN", {"steps": [[0.01, 0.0, 0.0, NAN]]}),
+    (types.ActionChunk, "rows of several lengths", {"steps": [[0.01, 0.0], [0.02]]}),
+    (types.ActionChunk, "no steps", {"steps": []}),
+    (types.ActionChunk, "one row instead of a list of rows", {"steps": [0.01, 0.0]}),
+    (types.ActionChunk, "a negative time", {"valid_until_ns": -1}),
+    (types.ActionChunk, "seconds in place of nanoseconds", {"observed_ns": 1.7e9}),
+    (types.InferenceDebug, "a negative duration", {"inference_ms": -1.0}),
+    (types.Cause, "a text for a number", {"chunk_seq": "7"}),
+    (types.PoseCommand, "a cause that is none", {"cause": 5}),
+    (
+        types.PoseCommand,
+        "a cause with a negative number",
+        {"cause": {**asdict(CAUSE), "chunk_seq": -1}},
+    ),
+    (types.JointCommand, "no joints", {"names": []}),
+    (types.JointCommand, "a state of 33 characters", {"state": "x" * 33}),
+    (types.GripperCommand, "no speed", {"speed_m_s": 0.0}),
+    (types.GripperCommand, "opens further than 1 m", {"width_m": 1.5}),
+    (types.Task, "more than 100 percent", {"speed_percent": 130.0}),
+    (types.Task, "no rate", {"rate_hz": 0.0}),
+    (types.Task, "bytes for text", {"prompt": b"go"}),
+    (types.NodeStatus, "an age that is NaN", {"ages_s": {"state/pose": NAN}}),
+    (types.NodeStatus, "a detail nested too deep", {"detail": {"a": [[[[1]]]]}}),
+    (types.Event, "an unknown level", {"level": "loud"}),
+    (types.Event, "an unknown kind", {"kind": "x"}),
+    (types.Event, "none of them", {"count": 0}),
+    (types.ClockReply, "a negative time", {"heard_ns": -5}),
     (ModelSpec, "an unknown field", {"colour": "red"}),
 )
 
@@ -169,16 +157,22 @@ def vectors() -> Iterator[dict[str, Any]]:
         payload = records.encode(record)
         yield _vector("record", type(record).__name__, "valid", payload, message.unpack, payload)
     firsts = {type(record): message.unpack(records.encode(record)) for record in reversed(VALID)}
-    later = firsts[Task] | {"later": 1}
-    yield _vector("record", "Task", "a field of a later version", message.pack(later), _known(Task))
+    later = firsts[types.Task] | {"later": 1}
+    task = _known(types.Task)
+    yield _vector("record", "Task", "a field of a later version", message.pack(later), task)
+    singles = msgpack.packb(firsts[types.ActionChunk], use_single_float=True)
+    chunk = _known(types.ActionChunk)
+    yield _vector("record", "ActionChunk", "numbers of 32 bits", singles, chunk)
+    whole = message.pack(firsts[types.PoseState] | {"position_m": [1, 0, 0]})
+    yield _vector("record", "PoseState", "whole numbers", whole, _known(types.PoseState))
     for kind, about, changes in INVALID:
         yield _vector(
             "record", kind.__name__, about, message.pack(firsts[kind] | changes), _known(kind)
         )
     for about, payload in (("not a map", b"\x93\x01\x02\x03"), ("cut off", b"\x86\xa7episode")):
-        yield _vector("record", "Task", about, payload, _known(Task))
-    yield _vector("record", "Task", "no fields", message.pack({}), _known(Task))
-    head = {"schema": SCHEMA, **asdict(Header(AT_NS, 41, "sim#5f3a"))}
+        yield _vector("record", "Task", about, payload, task)
+    yield _vector("record", "Task", "no fields", message.pack({}), task)
+    head = {"schema": SCHEMA, **asdict(types.Header(AT_NS, 41, "sim#5f3a"))}
     for about, changes in HEADERS:
         read = lambda payload: asdict(records.decode_header(payload))  # noqa: E731
         yield _vector("header", "Header", about, message.pack(head | changes), read)
@@ -214,7 +208,7 @@ def wire() -> str:
 def schema() -> str:
     """Text of records.schema.json."""
     kinds = [type(record) for record in VALID if type(record) is not ModelSpec]
-    structs = [form_of(kind).struct for kind in dict.fromkeys((Header, *kinds))]
+    structs = [form_of(kind).struct for kind in dict.fromkeys((types.Header, *kinds))]
     _, found = msgspec.json.schema_components(structs, ref_template="#/$defs/{name}")
     spec = ModelSpec.model_json_schema(ref_template="#/$defs/{model}")
     found |= {**spec.pop("$defs"), "ModelSpec": spec}

@@ -20,11 +20,12 @@ from vla_zenoh.bus.clock import ADOPT_S, Clock
 from vla_zenoh.bus.name_check import AWAY_S, NEW_S, NameCheck
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import MAX_MESSAGE_BYTES, alive_nodes, open_session
+from vla_zenoh.codec import message, records
 from vla_zenoh.errors import CodecError, NodeError
 from vla_zenoh.keys import Keys
 from vla_zenoh.profile import Profile, SessionProfile, load_profile, override
 from vla_zenoh.runtime.process import is_running
-from vla_zenoh.types import Header, SingleWriterFilter
+from vla_zenoh.types import GripperState, Header, SingleWriterFilter
 
 SILENCE_NS = 500_000_000
 STEP_TOLERANCE_S = 0.002
@@ -353,3 +354,33 @@ def test_a_dead_process_is_not_running_even_before_it_is_buried() -> None:
         process.wait()
     assert not is_running(pid)
     assert is_running(os.getpid())
+
+
+def test_unknown_fields_of_headers_and_records_are_counted() -> None:
+    state = records.encode(GripperState(0.04, False, False))
+    later = message.pack({**message.unpack(state), "temperature": 30.0})
+    with two_sessions() as (profile, one, other):
+        node = Node("command", profile, one)
+        key = profile.keys.state_gripper
+        ring = node.subscribe(key, CallbackRing(8, 1000))
+        publisher = other.declare_publisher(key)
+        await_match(other, key)
+        for source, payload, more in (
+            ("old#1", state, {}),
+            ("new#1", state, {"hop": 1}),
+            ("new#1", state, {"hop": 2}),
+            ("newer#1", later, {"hop": 1, "lane": 2}),
+        ):
+            header = message.unpack(records.encode_header(Header(time.time_ns(), 1, source)))
+            publisher.put(payload, attachment=message.pack({**header, **more}))
+        arrivals: list[ReceivedSample] = []
+
+        def all_there() -> bool:
+            arrivals.extend(ring.drain())
+            return len(arrivals) == 4
+
+        until("all arrived", all_there)
+        read = [node.decode(GripperState, arrival) for arrival in arrivals]
+        assert None not in read
+        assert node.counters["unknown_fields"] == 5
+        node.close()

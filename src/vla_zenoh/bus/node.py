@@ -383,13 +383,13 @@ class Node:
             header = header or header_of(arrival.sample)
             if writer_filter is not None:  # first: a flood by another source must cost little
                 writer_filter.check(header, arrival.mono_ns)
+            unknown = records.unknown_header_fields(bytes_of(arrival.sample.attachment))
             if read is None:
-                unknown: list[str] = []
                 record = records.decode(kind, bytes_of(arrival.sample.payload), unknown)
-                if unknown:
-                    self._count_unknown(header.source, unknown)
             else:
                 record = read(arrival.sample)
+            if unknown:
+                self._count_unknown(header.source, unknown)
             here, record = self.clocks.to_local_clock(header, record)
         except CodecError as error:
             self.reject_sample(key, error)

@@ -123,6 +123,12 @@ def decode_header(attachment: bytes | None) -> Header:
     return decode(Header, attachment)
 
 
+def unknown_header_fields(attachment: bytes) -> list[str]:
+    """Names of the fields of a decoded header that this version does not know."""
+    fields = message.fields_of("the header", attachment)
+    return _unknown(_HEADER, {name: raw for name, raw in fields.items() if name != "schema"})
+
+
 def _other_version(schema: Any) -> str:
     newer = type(schema) is int and schema > keys.SCHEMA
     stale = "this side" if newer else "the sender"

@@ -318,7 +318,7 @@ def described(node: Any) -> str:
         case inspect.FloatType() if node.le == sys.float_info.max:
             return "a finite number"
         case inspect.FloatType():
-            return f"a number from {node.ge:g} to {node.le:g}"
+            return f"a number from {bound_text(node.ge)} to {bound_text(node.le)}"
         case inspect.IntType():
             most = "2^63 - 1" if node.le == MAX_WHOLE else node.le
             least = "-2^63" if node.ge == -(2**63) else node.ge
@@ -347,6 +347,11 @@ def described(node: Any) -> str:
             return " or ".join(described(kind) for kind in reversed(node.types))
         case _:
             return str(node)
+
+
+def bound_text(value: Any) -> str:
+    """A bound as a person writes it: -1e6, not -1e+06."""
+    return re.sub(r"e\+?(-?)0*", r"e\1", f"{value:g}")
 
 
 def _length(node: Any) -> str:

@@ -26,6 +26,7 @@ from vla_zenoh.types import (
     Cause,
     Event,
     GripperState,
+    Header,
     JointCommand,
     JointState,
     NodeStatus,
@@ -34,7 +35,7 @@ from vla_zenoh.types import (
     PoseState,
     Task,
 )
-from vla_zenoh.types.form import Count, Record
+from vla_zenoh.types.form import Count, Record, bound_text
 
 # A record drawn at random normalises its quaternion once more when it is read: one bit may differ.
 QUATERNION_TOLERANCE = 1e-15
@@ -354,6 +355,20 @@ def test_unknown_fields_are_ignored_and_named() -> None:
         assert unknown == named
         if "cause" not in more:
             assert same(found, record)
+
+
+def test_unknown_fields_of_a_header_are_named() -> None:
+    header = message.unpack(records.encode_header(Header(1, 2, "sim#1")))
+    assert records.unknown_header_fields(message.pack(header)) == []
+    assert records.unknown_header_fields(message.pack({**header, "hop": 1})) == ["Header.'hop'"]
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(1e6, "1e6"), (-1e6, "-1e6"), (1e-4, "0.0001"), (1e-5, "1e-5"), (1e10, "1e10"), (0.0, "0")],
+)
+def test_bounds_are_written_as_a_person_does(value: float, text: str) -> None:
+    assert bound_text(value) == text
 
 
 def invalid_values(value: Any) -> list[Any]:
