@@ -20,6 +20,7 @@ from vla_zenoh.cli.options import effective_profile
 from vla_zenoh.cli.output import errors
 from vla_zenoh.client.client import Client
 from vla_zenoh.lab.cli.bench_file import running_nodes
+from vla_zenoh.lab.cli.demo_capacity import measure_capacity, small
 from vla_zenoh.lab.cli.loopback import own_address
 from vla_zenoh.lab.cli.options import DemoOptions
 from vla_zenoh.lab.cli.output import progress_bars
@@ -133,6 +134,9 @@ def open_stage(profile: str, given: DemoOptions) -> Iterator[Stage]:
         OutputError: the folder cannot be had; see `output_folder`.
     """
     loaded = own_address(effective_profile(profile))
+    capacity = measure_capacity()
+    if not capacity.enough:
+        loaded = small(loaded)
     path = given.output or RUNS / time.strftime("demo-%Y%m%d-%H%M%S")
     with output_folder(path, force=given.force) as part:
         stop = stop_on_signals()
@@ -141,6 +145,8 @@ def open_stage(profile: str, given: DemoOptions) -> Iterator[Stage]:
         screen.print(f"profile {loaded.name}, router at {here}, run folder {path}")
         watch = f"watch it from another terminal: vla-zenoh status --connect {here}"
         screen.print(watch, style="dim")
+        if not capacity.enough:
+            screen.print(capacity.said(), style="yellow")
         yield Stage(loaded, part, path, stop)
 
 
