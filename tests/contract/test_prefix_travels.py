@@ -16,7 +16,6 @@ from vla_zenoh.errors import PeerError
 from vla_zenoh.lab.check.examples import example_observation
 from vla_zenoh.lab.policy_servers.action_semantics import read_action_semantics
 from vla_zenoh.lab.serve import openpi_server
-from vla_zenoh.lab.serve.openpi_server import OpenPiConversation
 from vla_zenoh.lab.serve.policy_server import PolicyServer
 from vla_zenoh.lab.serve.served_policy import make_served_policy
 from vla_zenoh.policy import (
@@ -67,13 +66,7 @@ def served(model: Remembers) -> Iterator[Any]:
     """An adapter that asks a server of the model."""
     robot = load_profile("panda_sim").robot
     offer = make_served_policy(model, "", robot.arm_joints, robot.gripper.max_width_m)
-    server = PolicyServer(
-        lambda: OpenPiConversation(offer),
-        "127.0.0.1",
-        0,
-        health=openpi_server.HEALTH_PATH,
-        max_bytes=openpi_server.MAX_BYTES,
-    )
+    server = PolicyServer(offer, "127.0.0.1", 0)
     thread = threading.Thread(target=server.serve_forever)
     thread.start()
     options = {"url": f"ws://127.0.0.1:{server.port}", "preset": "own", "timeout_s": "20"}

@@ -13,7 +13,7 @@ from vla_zenoh.codec import message, records
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.lab.conform import rules
-from vla_zenoh.lab.conform.rules import Finding, Seen, Trial
+from vla_zenoh.lab.conform.rules import RuleFinding, Seen, Trial
 from vla_zenoh.lab.conform.samples import Arrived, Raw, arrived
 from vla_zenoh.policy import ActionSpec, ModelSpec
 from vla_zenoh.profile import load_profile
@@ -39,7 +39,7 @@ CLOCK = (AT_NS, ClockReply(AT_NS + MS, AT_NS + MS), AT_NS + 2 * MS)
 Change = Callable[[Arrived], Arrived | None]
 
 
-def broken(findings: Iterable[Finding]) -> set[str]:
+def broken(findings: Iterable[RuleFinding]) -> set[str]:
     return {found.rule for found in findings if found.right is False}
 
 

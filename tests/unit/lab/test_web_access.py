@@ -118,7 +118,7 @@ def test_a_rate_limit_lets_a_burst_through_and_then_its_rate() -> None:
 # -- messages ---------------------------------------------------------------------------------
 def test_a_request_has_its_fields() -> None:
     request = parse('{"do": "prompt", "text": "lift the brick"}')
-    assert request == requests.Prompt("lift the brick")
+    assert request == requests.PromptRequest("lift the brick")
 
 
 @pytest.mark.parametrize(

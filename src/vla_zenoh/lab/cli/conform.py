@@ -10,13 +10,13 @@ import typer
 from vla_zenoh.cli.options import MAX_SECONDS, JsonOption, options
 from vla_zenoh.cli.output import console, fail, styled
 from vla_zenoh.cli.target import RobotTarget
-from vla_zenoh.errors import NodeError
+from vla_zenoh.errors import NodeError, counted
 from vla_zenoh.keys import worker_node
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.lab.cli.output import print_json, progress
 from vla_zenoh.lab.conform import rules
 from vla_zenoh.lab.conform.peer import Mover, look
-from vla_zenoh.lab.conform.rules import Finding
+from vla_zenoh.lab.conform.rules import RuleFinding
 
 SecondsOption = Annotated[
     float, typer.Option("--seconds", "-s", min=1.0, max=MAX_SECONDS, help="How long to listen.")
@@ -56,7 +56,7 @@ def robot(
             with progress("moving it"):
                 findings += rules.moved(list(mover.run()))
         elif move:
-            findings.append(Finding("moves", None, "not tried: its states are wrong"))
+            findings.append(RuleFinding("moves", None, "not tried: its states are wrong"))
     _report(findings, as_json=as_json)
 
 
@@ -100,8 +100,8 @@ def camera(
     _report(rules.camera(seen, name, client.profile), as_json=as_json)
 
 
-def _report(findings: Iterable[Finding], *, as_json: bool) -> None:
-    found: Sequence[Finding] = list(findings)
+def _report(findings: Iterable[RuleFinding], *, as_json: bool) -> None:
+    found: Sequence[RuleFinding] = list(findings)
     if as_json:
         print_json([finding._asdict() for finding in found])
     else:
@@ -111,4 +111,4 @@ def _report(findings: Iterable[Finding], *, as_json: bool) -> None:
             console().print(styled(f"{word:<5}", style), f"{rule:<{width}}", text)
     wrong = sum(finding.right is False for finding in found)
     if wrong:
-        fail(f"{wrong} of {len(found)} rules are broken")
+        fail(f"of {counted(len(found), 'rule')}, {wrong} broken")

@@ -17,6 +17,7 @@ from vla_zenoh.bus.node import MSGPACK
 from vla_zenoh.bus.session import QOS, alive_nodes, put_text
 from vla_zenoh.codec import message, records
 from vla_zenoh.codec.image import MAX_IMAGE_BYTES
+from vla_zenoh.codec.records import MAX_HEADER_BYTES
 from vla_zenoh.errors import CodecError, NodeError
 from vla_zenoh.keys import Keys, Kind
 from vla_zenoh.lab.conform import rules
@@ -44,7 +45,7 @@ OLD_NS = 2_000_000_000
 RESET_S = 0.5
 
 
-class Recording:
+class Listener:
     """Keeps the samples of some keys as they arrive."""
 
     def __init__(self, session: zenoh.Session, keys: Keys, wanted: Sequence[str]) -> None:
@@ -58,12 +59,16 @@ class Recording:
     def _keep(self, sample: zenoh.Sample) -> None:
         if len(self.raw) == MAX_SAMPLES or sample.kind != zenoh.SampleKind.PUT:
             return
-        attachment = sample.attachment
+        try:
+            payload = bytes_of(sample.payload, MAX_IMAGE_BYTES)
+            header = bytes_of(sample.attachment, MAX_HEADER_BYTES)
+        except CodecError:  # neither can be decoded then
+            payload = header = b""
         self.raw.append(
             Raw(
                 self._keys.short(str(sample.key_expr)),
-                bytes_of(sample.payload, MAX_IMAGE_BYTES),
-                None if attachment is None else attachment.to_bytes(),
+                payload,
+                header or None,
                 str(sample.encoding),
                 time.time_ns(),
             )
@@ -76,9 +81,9 @@ class Recording:
 
 
 @contextmanager
-def recording(session: zenoh.Session, keys: Keys, wanted: Sequence[str]) -> Iterator[Recording]:
-    """A `Recording` while the block lasts."""
-    found = Recording(session, keys, wanted)
+def recording(session: zenoh.Session, keys: Keys, wanted: Sequence[str]) -> Iterator[Listener]:
+    """A `Listener` while the block lasts."""
+    found = Listener(session, keys, wanted)
     try:
         yield found
     finally:
@@ -179,7 +184,7 @@ class Mover:
         patience_s = self._profile.timing.command_timeout_s
         return Trial(what, asked, track, event_s, patience_s if what == rules.SILENT else PERIOD_S)
 
-    def _state(self, kept: Recording) -> Any:
+    def _state(self, kept: Listener) -> Any:
         kind = JointState if self._joint else PoseState
         for raw in reversed(kept.raw):
             record = arrived(raw).record

@@ -36,7 +36,7 @@ STOPPED_SHARE = 0.25
 ROBOT_KEYS = ("state/joint", "state/pose", "state/gripper")
 
 
-class Finding(NamedTuple):
+class RuleFinding(NamedTuple):
     """What one rule found; `right` is None where there was nothing to judge."""
 
     rule: str
@@ -84,69 +84,69 @@ class Trial:
 
 
 # -- every stream -----------------------------------------------------------------------------
-def presence(seen: Seen) -> Iterator[Finding]:
+def presence(seen: Seen) -> Iterator[RuleFinding]:
     """Liveliness token and clock."""
     name = f"alive/{seen.node}"
-    yield Finding("alive", seen.alive, name if seen.alive else f"there is no token {name}")
+    yield RuleFinding("alive", seen.alive, name if seen.alive else f"there is no token {name}")
     if not seen.clocks:
-        yield Finding("clock", False, f"no valid reply on clock/{seen.node}")
+        yield RuleFinding("clock", False, f"no valid reply on clock/{seen.node}")
         return
     asked_ns, reply, got_ns = min(seen.clocks, key=lambda each: each[2] - each[0])
     offset_s = ((reply.heard_ns - asked_ns) + (reply.said_ns - got_ns)) / 2e9
     if reply.said_ns < reply.heard_ns:
-        yield Finding("clock", False, "said_ns is before heard_ns")
+        yield RuleFinding("clock", False, "said_ns is before heard_ns")
     else:
-        yield Finding("clock", True, f"{1e3 * offset_s:+.1f} ms from this one")
+        yield RuleFinding("clock", True, f"{1e3 * offset_s:+.1f} ms from this one")
 
 
-def stream(seen: Seen, key: str, least_hz: float) -> Iterator[Finding]:
+def stream(seen: Seen, key: str, least_hz: float) -> Iterator[RuleFinding]:
     """Records, writer, order, stamps and rate of one key."""
     samples = of_key(seen.samples, key)
     if not samples:
-        yield Finding(f"{key}: rate", False, f"nothing in {seen.seconds:.0f} s")
+        yield RuleFinding(f"{key}: rate", False, f"nothing in {seen.seconds:.0f} s")
         return
     bad = [sample.why for sample in samples if sample.why]
     text = f"{len(bad)} of {len(samples)}: {bad[0]}" if bad else f"{len(samples)} valid"
-    yield Finding(f"{key}: records", not bad, text)
+    yield RuleFinding(f"{key}: records", not bad, text)
     unknown = sorted({name for sample in samples for name in sample.unknown})
     if unknown:
-        yield Finding(f"{key}: fields", False, f"not of this version: {', '.join(unknown[:8])}")
+        yield RuleFinding(f"{key}: fields", False, f"not of this version: {', '.join(unknown[:8])}")
     good = [sample for sample in samples if sample.header is not None]
     if good:
         yield from _headers(seen, key, good)
     hz = len(samples) / seen.seconds
     text = f"{hz:.1f} Hz, at least {least_hz:g} are wanted"
-    yield Finding(f"{key}: rate", hz >= least_hz, text)
+    yield RuleFinding(f"{key}: rate", hz >= least_hz, text)
 
 
-def _headers(seen: Seen, key: str, samples: Sequence[Arrived]) -> Iterator[Finding]:
+def _headers(seen: Seen, key: str, samples: Sequence[Arrived]) -> Iterator[RuleFinding]:
     headers: list[Any] = [sample.header for sample in samples]
     sources = sorted({header.source for header in headers})
     named = all(source.startswith(f"{seen.node}#") for source in sources)
     right = len(sources) == 1 and named
     wanted = f"{', '.join(sources[:4])}; wanted: one, {seen.node}#..."
-    yield Finding(f"{key}: source", right, sources[0] if right else wanted)
+    yield RuleFinding(f"{key}: source", right, sources[0] if right else wanted)
     steps = [after.seq - before.seq for before, after in pairwise(headers)]
     wrong = sum(step <= 0 for step in steps)
     lost = sum(step - 1 for step in steps if step > 1)
     text = f"{wrong} do not grow" if wrong else f"grows, {lost} missing"
-    yield Finding(f"{key}: seq", not wrong, text)
+    yield RuleFinding(f"{key}: seq", not wrong, text)
     back = sum(b.stamp_wall_ns <= a.stamp_wall_ns for a, b in pairwise(headers))
     ages_s = [
         (each.received_ns - h.stamp_wall_ns) / 1e9 for each, h in zip(samples, headers, strict=True)
     ]
     old_s, young_s = max(ages_s), min(ages_s)
     if back:
-        yield Finding(f"{key}: stamps", False, f"{back} do not grow")
+        yield RuleFinding(f"{key}: stamps", False, f"{back} do not grow")
     elif old_s > MOST_AGE_S or young_s < -MOST_AHEAD_S:
         text = f"{young_s:.3f} to {old_s:.3f} s old: nanoseconds of another clock, or of no clock?"
-        yield Finding(f"{key}: stamps", False, text)
+        yield RuleFinding(f"{key}: stamps", False, text)
     else:
-        yield Finding(f"{key}: stamps", True, f"{young_s:.3f} to {old_s:.3f} s old")
+        yield RuleFinding(f"{key}: stamps", True, f"{young_s:.3f} to {old_s:.3f} s old")
 
 
 # -- robot ------------------------------------------------------------------------------------
-def robot(seen: Seen, profile: Profile, kinematics: Kinematics) -> Iterator[Finding]:
+def robot(seen: Seen, profile: Profile, kinematics: Kinematics) -> Iterator[RuleFinding]:
     """All rules of a robot that is only looked at."""
     yield from presence(seen)
     for key in ROBOT_KEYS:
@@ -156,7 +156,7 @@ def robot(seen: Seen, profile: Profile, kinematics: Kinematics) -> Iterator[Find
     together = set.intersection(*pairs)
     share = len(together) / max(map(len, pairs)) if any(pairs) else 0.0
     text = f"{100 * share:.0f} % have stamp and seq of all three"
-    yield Finding("states belong together", share > RATE_SHARE, text)
+    yield RuleFinding("states belong together", share > RATE_SHARE, text)
     joints, poses, grippers = by_key.values()
     yield from _joints(list(joints.values()), profile, kinematics)
     yield from _poses([(joints[at], poses[at]) for at in sorted(together)], profile, kinematics)
@@ -164,7 +164,7 @@ def robot(seen: Seen, profile: Profile, kinematics: Kinematics) -> Iterator[Find
     if widths_m:
         most_m = profile.robot.gripper.max_width_m
         text = f"up to {max(widths_m):.4g} m; the profile's gripper opens {most_m:g} m"
-        yield Finding("gripper width in m", max(widths_m) <= most_m + WIDTH_M, text)
+        yield RuleFinding("gripper width in m", max(widths_m) <= most_m + WIDTH_M, text)
 
 
 def _by_stamp(samples: Sequence[Arrived]) -> dict[tuple[int, int], Any]:
@@ -177,15 +177,15 @@ def _by_stamp(samples: Sequence[Arrived]) -> dict[tuple[int, int], Any]:
 
 def _joints(
     joints: Sequence[JointState], profile: Profile, kinematics: Kinematics
-) -> Iterator[Finding]:
+) -> Iterator[RuleFinding]:
     wanted = sorted(profile.robot.arm_joints)
     if not joints:
-        yield Finding("joint names", None, "no joints to judge")
+        yield RuleFinding("joint names", None, "no joints to judge")
         return
     names = {name for state in joints for name in state.names}
     right = sorted(names) == wanted
     text = f"{len(names)} of the profile" if right else f"{sorted(names)}, wanted: {wanted}"
-    yield Finding("joint names", right, text)
+    yield RuleFinding("joint names", right, text)
     if not right:
         return
     measured = np.array([kinematics.joints_of(state) for state in joints])
@@ -193,24 +193,24 @@ def _joints(
     outside = np.any((measured < low) | (measured > high), axis=0).tolist()
     where = ", ".join(name for name, out in zip(kinematics.arm_joints, outside, strict=True) if out)
     text = f"out of range: {where}; degrees, or another zero?" if where else "within their ranges"
-    yield Finding("joints in rad", not where, text)
+    yield RuleFinding("joints in rad", not where, text)
 
 
 def _poses(
     pairs: Sequence[tuple[JointState, PoseState]], profile: Profile, kinematics: Kinematics
-) -> Iterator[Finding]:
+) -> Iterator[RuleFinding]:
     wanted = sorted(profile.robot.arm_joints)
     apart = [
         _apart(kinematics, joint, pose) for joint, pose in pairs if sorted(joint.names) == wanted
     ]
     if not apart:
-        yield Finding("pose is that of the joints", None, "no pose with joints to judge")
+        yield RuleFinding("pose is that of the joints", None, "no pose with joints to judge")
         return
     apart_m, apart_rad = np.max(apart, axis=0)
     right = apart_m <= APART_M and apart_rad <= APART_RAD
     text = f"{1e3 * apart_m:.1f} mm and {apart_rad:.3f} rad apart at most"
     hint = "" if right else "; another unit, base or TCP?"
-    yield Finding("pose is that of the joints", bool(right), text + hint)
+    yield RuleFinding("pose is that of the joints", bool(right), text + hint)
 
 
 def _apart(kinematics: Kinematics, joint: JointState, pose: PoseState) -> tuple[float, float]:
@@ -235,23 +235,23 @@ def way_at(time_s: float) -> float:
     return s**3 * (10 - 15 * s + 6 * s * s)
 
 
-def moved(trials: Sequence[Trial]) -> Iterator[Finding]:
+def moved(trials: Sequence[Trial]) -> Iterator[RuleFinding]:
     """The rules of a robot that was sent commands."""
     for trial in trials:
         if not trial.track:
-            yield Finding(trial.what, False, "no valid states while it was commanded")
+            yield RuleFinding(trial.what, False, "no valid states while it was commanded")
             continue
         yield _moved(trial)
 
 
-def _moved(trial: Trial) -> Finding:
+def _moved(trial: Trial) -> RuleFinding:
     way = max((abs(way) for _, way, _ in trial.track), default=0.0)
     share = way / trial.asked
     text = f"{100 * share:.0f} % of the way"
     if trial.what in (FOLLOW, AFTER_RESET):
-        return Finding(trial.what, share >= FOLLOWED, text)
+        return RuleFinding(trial.what, share >= FOLLOWED, text)
     if trial.what in (*WRONG, LATCHED):
-        return Finding(trial.what, share <= IGNORED, text)
+        return RuleFinding(trial.what, share <= IGNORED, text)
     stands_s = _stands_s(trial)
     until = min(trial.event_s, DURATION_S)
     most = way_at(until) + PEAK * trial.patience_s / DURATION_S + STOPPED_SHARE
@@ -259,8 +259,8 @@ def _moved(trial: Trial) -> Finding:
     text = f"{text}, stands after {stands_s:.2f} s"
     mode = trial.track[-1][2]
     if trial.what == STOP and mode == "ready":
-        return Finding(trial.what, False, f"{text}; its mode is still 'ready'")
-    return Finding(trial.what, right, text)
+        return RuleFinding(trial.what, False, f"{text}; its mode is still 'ready'")
+    return RuleFinding(trial.what, right, text)
 
 
 STILL_SHARE = 0.01
@@ -274,7 +274,7 @@ def _stands_s(trial: Trial) -> float:
 
 
 # -- worker -----------------------------------------------------------------------------------
-def worker(seen: Seen, profile: Profile) -> Iterator[Finding]:
+def worker(seen: Seen, profile: Profile) -> Iterator[RuleFinding]:
     """All rules of a worker, whose node is ``worker-NAME``."""
     name = seen.node.removeprefix("worker-")
     yield from presence(seen)
@@ -283,9 +283,9 @@ def worker(seen: Seen, profile: Profile) -> Iterator[Finding]:
     tasks = [each.record for each in of_key(seen.samples, "task") if each.record]
     spec: ModelSpec | None = specs[-1] if specs else None
     same = spec is not None and seen.replied == spec
-    yield Finding("spec on query", same, "as published" if same else "not what it publishes")
+    yield RuleFinding("spec on query", same, "as published" if same else "not what it publishes")
     if not tasks:
-        yield Finding("chunks", None, "no command node publishes a task")
+        yield RuleFinding("chunks", None, "no command node publishes a task")
         return
     yield from stream(seen, f"delta/{name}", RATE_SHARE * tasks[-1].rate_hz)
     chunks = [each for each in of_key(seen.samples, f"delta/{name}") if each.record]
@@ -295,19 +295,21 @@ def worker(seen: Seen, profile: Profile) -> Iterator[Finding]:
 
 def _chunks(
     name: str, chunks: Sequence[Arrived], spec: ModelSpec, tasks: Sequence[Task], profile: Profile
-) -> Iterator[Finding]:
+) -> Iterator[RuleFinding]:
     found: list[ActionChunk] = [each.record for each in chunks]
     named = all(chunk.worker == name for chunk in found)
-    yield Finding("worker in chunks", named, name if named else found[0].worker)
+    yield RuleFinding("worker in chunks", named, name if named else found[0].worker)
     hashes = {chunk.spec_hash for chunk in found}
     text = spec.hash if hashes == {spec.hash} else f"{hashes}, that of its spec is {spec.hash}"
-    yield Finding("spec_hash", hashes == {spec.hash}, text)
+    yield RuleFinding("spec_hash", hashes == {spec.hash}, text)
     episodes = {task.episode for task in tasks}
     wrong = {chunk.episode for chunk in found} - episodes
-    yield Finding("episode", not wrong, f"{sorted(wrong)} was not asked for" if wrong else "asked")
+    yield RuleFinding(
+        "episode", not wrong, f"{sorted(wrong)} was not asked for" if wrong else "asked"
+    )
     late = sum(not _in_order(each) for each in chunks)
     text = f"{late} not: observation, observed, start, end, published, valid until"
-    yield Finding("times in order", not late, text if late else "in order")
+    yield RuleFinding("times in order", not late, text if late else "in order")
     yield _steps(found, spec, profile)
 
 
@@ -321,24 +323,24 @@ def _in_order(chunk: Arrived) -> bool:
     return all(before <= after for before, after in pairwise(times))
 
 
-def _steps(chunks: Sequence[ActionChunk], spec: ModelSpec, profile: Profile) -> Finding:
+def _steps(chunks: Sequence[ActionChunk], spec: ModelSpec, profile: Profile) -> RuleFinding:
     action, rule = spec.action, "steps as its spec says"
     try:
         for chunk in chunks:
             check_steps(action, chunk.steps)
     except SpecError as error:
-        return Finding(rule, False, str(error))
+        return RuleFinding(rule, False, str(error))
     if action.space == "tcp" and not action.parts:
         most_m = np.abs(np.concatenate([chunk.steps[:, :3] for chunk in chunks])).max()
         most_m *= action.position_scale_m
         limit_m = 10.0 if action.targets else 4 * profile.limits.step_m
         if most_m > limit_m:
-            return Finding(rule, False, f"x, y, z up to {most_m:g} m: another unit?")
-    return Finding(rule, True, f"{len(chunks)} chunks")
+            return RuleFinding(rule, False, f"x, y, z up to {most_m:g} m: another unit?")
+    return RuleFinding(rule, True, f"{len(chunks)} chunks")
 
 
 # -- camera -----------------------------------------------------------------------------------
-def camera(seen: Seen, name: str, profile: Profile) -> Iterator[Finding]:
+def camera(seen: Seen, name: str, profile: Profile) -> Iterator[RuleFinding]:
     """All rules of a camera's node."""
     yield from presence(seen)
     key, wanted = f"camera/{name}/raw", profile.cameras[name]
@@ -350,7 +352,7 @@ def camera(seen: Seen, name: str, profile: Profile) -> Iterator[Finding]:
     right = sizes == {(wanted.height, wanted.width)}
     shown = ", ".join(f"{width}x{height}" for height, width in sorted(sizes))
     text = f"{shown}, of the profile {wanted.width}x{wanted.height}"
-    yield Finding("size", right, text)
+    yield RuleFinding("size", right, text)
     same = sum(np.array_equal(before.rgb, after.rgb) for before, after in pairwise(images))
     text = f"{same} of {len(images)} repeat the one before"
-    yield Finding("images change", same < len(images) - 1, text)
+    yield RuleFinding("images change", same < len(images) - 1, text)

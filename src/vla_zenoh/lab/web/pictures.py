@@ -16,7 +16,7 @@ from vla_zenoh.codec.image import decode_depth, encode_jpeg
 from vla_zenoh.errors import CodecError, ProfileError
 from vla_zenoh.lab.newest_records import StreamSlot
 from vla_zenoh.lab.rate_limit import RateLimit
-from vla_zenoh.lab.web.requests import Drawn, Look, parse
+from vla_zenoh.lab.web.requests import DrawnRequest, LookRequest, parse
 from vla_zenoh.profile import CameraProfile
 from vla_zenoh.types import Image
 
@@ -168,11 +168,11 @@ class PageView:
             request = parse(text)
             if not self.limit.take(now_s):
                 return "too_fast"
-            if isinstance(request, Look):
+            if isinstance(request, LookRequest):
                 pictures.change(self.streams, request.streams)
                 self.streams = tuple(dict.fromkeys(request.streams))
                 self.period_s = 1 / min(max(request.hz, 0.1), MAX_PICTURE_HZ)
-            elif isinstance(request, Drawn):
+            elif isinstance(request, DrawnRequest):
                 self.drawn = max(self.drawn, min(request.frame, self.sent))
         except CodecError:
             return "bad_message"

@@ -22,115 +22,139 @@ Count = Annotated[int, Meta(ge=0, lt=2**53)]
 Level = Annotated[int, Meta(ge=0, lt=5)]
 
 
-class Request(Struct, forbid_unknown_fields=True, tag_field="do", tag=str.lower):
-    """A request; its ``do`` is the name of its class in small letters. All fields are required."""
+def _tag(name: str) -> str:
+    return name.removesuffix("Request").lower()
 
 
-class Enter(Request):
+class PageRequest(Struct, forbid_unknown_fields=True, tag_field="do", tag=_tag):
+    """A request; its ``do`` is the first word of its class's name. All fields are required."""
+
+
+class EnterRequest(PageRequest):
     token: Text
 
 
-class Stop(Request):
+class StopRequest(PageRequest):
     pass
 
 
-class Setting(Request):
+class SettingRequest(PageRequest):
     """Changes the robot, and waits for its confirmation."""
 
 
-class Reset(Setting):
+class ResetRequest(SettingRequest):
     pass
 
 
-class Prompt(Setting):
+class PromptRequest(SettingRequest):
     text: Text
 
 
-class Worker(Setting):
+class WorkerRequest(SettingRequest):
     name: Text
 
 
-class Rate(Setting):
+class RateRequest(SettingRequest):
     hz: Number
 
 
-class Speed(Setting):
+class SpeedRequest(SettingRequest):
     percent: Number
 
 
-class Held(Setting):
+class HeldRequest(SettingRequest):
     part: Text
     text: Text
 
 
-class Activate(Setting):
+class ActivateRequest(SettingRequest):
     pass
 
 
-class Deactivate(Setting):
+class DeactivateRequest(SettingRequest):
     pass
 
 
-class Press(Request):
+class PressRequest(PageRequest):
     """Begins a hold."""
 
     press: Count
     tick: Count
 
 
-class Hold(Press):
+class HoldRequest(PressRequest):
     pass
 
 
-class Primitive(Press):
+class PrimitivePress(PressRequest, tag="primitive"):
     name: Literal["home", "open", "closed"]
 
 
-class Beat(Press):
+class BeatRequest(PressRequest):
     """Extends a hold, with the motion by hand for as long as it is in force."""
 
     twist: tuple[Share, Share, Share, Share, Share, Share]
     opening: Share
 
 
-class Release(Request):
+class ReleaseRequest(PageRequest):
     pass
 
 
-class Jog(Setting):
+class JogRequest(SettingRequest):
     on: bool
     frame: Literal["base", "tcp"]
     level: Level
     part: Text
 
 
-class Record(Setting):
+class RecordRequest(SettingRequest):
     on: bool
     verdict: Literal["success", "failure", "void", ""]
     note: Text
 
 
-class Save(Setting):
+class SaveRequest(SettingRequest):
     note: Text
 
 
-class Look(Request):
+class LookRequest(PageRequest):
     streams: Annotated[list[Text], Meta(max_length=MAX_STREAMS)]
     hz: Number
 
 
-class Drawn(Request):
+class DrawnRequest(PageRequest):
     frame: Count
 
 
 Changes = (
-    Reset | Prompt | Worker | Rate | Speed | Held | Activate | Deactivate | Jog | Record | Save
+    ResetRequest
+    | PromptRequest
+    | WorkerRequest
+    | RateRequest
+    | SpeedRequest
+    | HeldRequest
+    | ActivateRequest
+    | DeactivateRequest
+    | JogRequest
+    | RecordRequest
+    | SaveRequest
 )
-AnyRequest = Enter | Stop | Changes | Hold | Primitive | Beat | Release | Look | Drawn
+AnyRequest = (
+    EnterRequest
+    | StopRequest
+    | Changes
+    | HoldRequest
+    | PrimitivePress
+    | BeatRequest
+    | ReleaseRequest
+    | LookRequest
+    | DrawnRequest
+)
 _DECODER = msgspec.json.Decoder(AnyRequest)
 
 
-def name_of(request: Request) -> str:
+def name_of(request: PageRequest) -> str:
     """The ``do`` of a request."""
     return str(request.__struct_config__.tag)
 

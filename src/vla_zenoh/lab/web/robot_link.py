@@ -210,29 +210,29 @@ class RobotLink:
     def set(self, asked: requests.Changes) -> Any:
         """Change a setting, and wait for the robot's confirmation."""
         match asked:
-            case requests.Prompt():
+            case requests.PromptRequest():
                 return self.client.set_prompt(asked.text)
-            case requests.Worker():
+            case requests.WorkerRequest():
                 return self.client.set_worker(asked.name)
-            case requests.Rate():
+            case requests.RateRequest():
                 return self.client.set_rate(asked.hz)
-            case requests.Speed():
+            case requests.SpeedRequest():
                 return self.client.set_speed(asked.percent)
-            case requests.Held():
+            case requests.HeldRequest():
                 return self.hold_box(asked.part, asked.text)
-            case requests.Activate():
+            case requests.ActivateRequest():
                 return self.client.activate()
-            case requests.Deactivate():
+            case requests.DeactivateRequest():
                 return self.deactivate()
-            case requests.Reset():
+            case requests.ResetRequest():
                 return self.reset()
-            case requests.Jog():
+            case requests.JogRequest():
                 if asked.on:
                     return self.hand.take(asked.frame, asked.level, asked.part)
                 return self.hand.give_back()
-            case requests.Save():
+            case requests.SaveRequest():
                 return self.save(asked.note)
-            case requests.Record():
+            case requests.RecordRequest():
                 return self.record(asked.on, asked.verdict, asked.note)
 
     # -- hold-to-run --------------------------------------------------------------------------

@@ -60,7 +60,7 @@ RATE_HZ, BURST = 50.0, 100.0
 """Requests of one page; a stop is always taken."""
 PICTURE_POLL_S = 0.01
 POLICY_VIOLATION, TRY_LATER = 1008, 1013
-NOT_HERE = (requests.Enter, requests.Look, requests.Drawn)
+NOT_HERE = (requests.EnterRequest, requests.LookRequest, requests.DrawnRequest)
 """The first request of a socket, and those of the socket for images."""
 OPERATORS_ONLY = "your token is a viewer's, which may look and nothing else"
 
@@ -219,7 +219,7 @@ class PageServer:
         await socket.accept()
         try:
             request = parse(await asyncio.wait_for(_receive(socket), ENTER_S))
-            token = request.token if isinstance(request, requests.Enter) else ""
+            token = request.token if isinstance(request, requests.EnterRequest) else ""
         except (CodecError, TimeoutError):
             token = ""
         person = await self._person(token)
@@ -290,12 +290,12 @@ class PageServer:
         if isinstance(request, NOT_HERE):
             self._complain(page, "bad_message", f"{what} is no request of this socket now")
             return
-        if isinstance(request, requests.Press) and request.tick > time.monotonic() * 1e3:
+        if isinstance(request, requests.PressRequest) and request.tick > time.monotonic() * 1e3:
             why = f"{what}: tick is newer than the last one sent"
             self._complain(page, "bad_message", why)
             page.tell({"is": "hold_ended", "press": request.press, "why": why})
             return
-        if not page.limit.take(time.monotonic()) and not isinstance(request, requests.Stop):
+        if not page.limit.take(time.monotonic()) and not isinstance(request, requests.StopRequest):
             self._complain(page, "too_fast", f"more than {RATE_HZ:g} messages per second")
             return
         self.counters["message"] += 1
@@ -314,22 +314,22 @@ class PageServer:
     async def _obey(self, page: Page, request: AnyRequest) -> None:
         link, name = self._link, page.person.name
         match request:
-            case requests.Stop():
+            case requests.StopRequest():
                 self._begin(self._stop(page.person))
-            case requests.Hold():
+            case requests.HoldRequest():
                 self._press(page, request, lambda: link.activate_held(page.number, name))
-            case requests.Primitive():
+            case requests.PrimitivePress():
                 self._press(page, request, lambda: link.primitive(page.number, name, request.name))
-            case requests.Beat():
+            case requests.BeatRequest():
                 hand = OperatorInput(request.twist, request.opening)
                 if not link.beat(page.number, request.press, request.tick, hand):
                     page.tell({"is": "hold_ended", "press": request.press})
-            case requests.Release():
+            case requests.ReleaseRequest():
                 link.release(page.number)
-            case requests.Setting():
+            case requests.SettingRequest():
                 self._change(page, name_of(request), lambda: link.set(request))
 
-    def _press(self, page: Page, request: requests.Press, call: Callable[[], Any]) -> None:
+    def _press(self, page: Page, request: requests.PressRequest, call: Callable[[], Any]) -> None:
         """Begin a hold, and `call` with it."""
         try:
             self._link.press(page.number, request.press, request.tick)
