@@ -165,7 +165,7 @@ class Arm:
                 if reason:
                     self._reject(mode, reason)
                 else:
-                    self._offer(mode, arrival, mono_ns)
+                    self._offer(mode, arrival, now_ns, mono_ns)
         if self._measured is not None:
             self._lead(self._measured, now_ns, mono_ns, away)
         if away or self._silent:
@@ -183,7 +183,7 @@ class Arm:
         self._waiting[mode] = arrivals[count:]
         return arrivals[:count]
 
-    def _offer(self, mode: str, arrival: ReceivedSample, mono_ns: int) -> None:
+    def _offer(self, mode: str, arrival: ReceivedSample, now_ns: int, mono_ns: int) -> None:
         guard = self.guard
         if not (guard.following or guard.braking or self.holds):
             guard.anchor()  # no controller holds our set-point: begin where the arm is
@@ -191,7 +191,7 @@ class Arm:
         command = self._node.decode(kind, arrival)
         if command is None:
             return
-        age_ns = command.received_ns - command.header.stamp_wall_ns
+        age_ns = now_ns - command.header.stamp_wall_ns
         if age_ns > OLDEST_NS and not guard.following and not self._driver.lockstep:
             self._reject(mode, "stale", f" by {command.header.source[:60]!r}")
             return

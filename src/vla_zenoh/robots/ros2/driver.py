@@ -98,6 +98,7 @@ class Ros2Driver(RobotDriver):
         self._bad_cameras: tuple[bool, ...] = ()
         self._clock_reported = self._fingers_lost = False
         self._moved_ns: int | None = None
+        self._read_ns: int | None = None
         self._own_session: zenoh.Session | None = None
 
     def attach(self, node: Node, arm: Arm | None) -> None:
@@ -226,7 +227,11 @@ class Ros2Driver(RobotDriver):
         fresh = states.update()
         self.measured_ns = states.received_ns
         self._check_clock()
-        returned = self._returned()
+        # Where this loop stood still, the silence says nothing about the robot.
+        since_ns = 0 if self._read_ns is None else mono_ns - self._read_ns
+        self._read_ns = mono_ns
+        stood_still = since_ns > self.profile.timing.state_timeout_s * 1e9
+        returned = not stood_still and self._returned()
         if not fresh:
             return None
         stamp_ns = states.state.stamp_ns
