@@ -159,7 +159,9 @@ def ros2_turns(folder: Path, monkeypatch: pytest.MonkeyPatch, more: str = "") ->
 
             handler = zenoh.handlers.Callback(keep, indirect=False)
             subscribers.append(session.declare_subscriber(key, handler))
-        robot = Turns(ros2, arm, node, peer, session, goals, states, mono_ns=10**12)
+        mono_ns = 10**12
+        times = {"mono_ns": mono_ns, "wall_ns": node.clock.wall_at(mono_ns)}
+        robot = Turns(ros2, arm, node, peer, session, goals, states, **times)
         clock = SimpleNamespace(monotonic_ns=lambda: robot.mono_ns)
         monkeypatch.setattr(slots, "time", clock)
         robot.turn()
