@@ -31,7 +31,7 @@ cameras:
 session:
   listen: [{endpoint}]
   connect: [{endpoint}]
-timing: {{command_timeout_s: 0.5, state_timeout_s: 0.5}}
+timing: {{command_timeout_s: 0.5, state_timeout_s: 0.5, command_hz: 100, state_hz: 100}}
 """
 
 
