@@ -80,7 +80,7 @@ class MoveServer:
         self._status = node.publisher(f"{base}/status", GoalStatusArray, kept=True, depth=1)
 
     def tick(self) -> None:
-        """One millisecond on."""
+        """One tick of the robot on."""
         self._ticks += 1
         if self._ticks % POLL_EVERY == 0:
             for server in (self._send, self._cancel, self._result):

@@ -68,6 +68,10 @@ FOLLOW_1_S = 30.0
 """How stiffly the desired pose is followed: in motion the arm is two time constants behind it."""
 MAX_ACCELERATION = np.array([10.0, 10.0, 10.0, 30.0, 30.0, 30.0])
 """m/s^2 and rad/s^2: what the motors can do is not exceeded by a pose some way off."""
+STEPS = 2
+PERIOD_NS = STEPS * STEP_NS
+"""Of the controller; the world is stepped by 1 ms."""
+SHOW_EVERY = 5
 CATCH_UP_NS = 50_000_000
 PRIORITY = 40
 
@@ -117,7 +121,7 @@ class PandaRobot:
         self.controlled = True
         self._gripper = MoveServer(self._node, MOVE, self.world)
         self._finger_joints = tuple(profile.robot.finger_joints)
-        self._state_every = max(1, round(1e9 / STEP_NS / state_hz))
+        self._state_every = max(1, round(1e9 / PERIOD_NS / state_hz))
         self._ticks = 0
         self._show()
 
@@ -128,7 +132,7 @@ class PandaRobot:
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
         next_ns = time.monotonic_ns()
         while not stop.is_set():
-            next_ns += STEP_NS
+            next_ns += PERIOD_NS
             late_ns = time.monotonic_ns() - next_ns
             if late_ns < 0:
                 time.sleep(-late_ns / 1e9)
@@ -143,12 +147,12 @@ class PandaRobot:
         for goal in self._goals.take(10) if self._goals is not None else ():
             if goal.sample_info.valid_data:
                 self._follower.lead(goal)
-        self.world.tick(self._follower.tick(STEP_NS / 1e9))
+        self.world.tick(self._follower.tick(PERIOD_NS / 1e9), STEPS)
         self._ticks += 1
         self._gripper.tick()
         if self._ticks % self._state_every == 0:
             self._publish()
-        if self._ticks % 10 == 0:
+        if self._ticks % SHOW_EVERY == 0:
             self._show()
 
     def _switch_controller(self) -> None:
