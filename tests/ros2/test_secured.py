@@ -54,6 +54,7 @@ ros2:
 hosts:
   robot: {{nodes: [router, ros2, command]}}
   gpu: {{nodes: [worker]}}
+timing: {{command_hz: 100, state_hz: 100}}
 """
 BY_TLS = """\
 extends: plain_secure
@@ -114,7 +115,7 @@ class SecuredLab:
 def running(folder: Path, program: Path, protocol: str) -> Iterator[SecuredLab]:
     """Made by the commands of docs/how-to/ros2.md; `protocol` is how the bridge is reached."""
     from bridge import Bridge
-    from rig import HEIGHT, WIDTH, Lab, Robot
+    from rig import HEIGHT, STATE_HZ, WIDTH, Lab, Robot
     from ros_node import free_domain
     from witness import Witness
 
@@ -139,7 +140,7 @@ def running(folder: Path, program: Path, protocol: str) -> Iterator[SecuredLab]:
         bridge = Bridge(program, folder, settings).start()
         stack.callback(bridge.kill)
         pictures = ("--width", str(WIDTH), "--height", str(HEIGHT), "--camera-hz", "20")
-        robot = Robot(domain, "--camera", "front", *pictures)
+        robot = Robot(domain, "--camera", "front", "--state-hz", str(STATE_HZ), *pictures)
         stack.callback(robot.end)
         witness = Witness(domain)
         stack.callback(witness.close)
