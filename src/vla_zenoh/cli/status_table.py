@@ -30,8 +30,6 @@ if TYPE_CHECKING:
 
 REFRESH_HZ = 4.0
 MAX_EVENTS = 8
-SLOW = 0.9
-"""A simulator whose time goes slower than this, over real time, says so."""
 MAX_LINES, MAX_LINE = 12, 60
 """Lines of one cell, and characters of each."""
 MAX_WORDS = 400
@@ -221,11 +219,8 @@ def _message(row: NodeRow, found: NodeStatus, mode: str) -> str:
         return _cell(short, MAX_WORDS)
     if bad := _bad_cameras(_fields(detail.get("cameras"))):
         return _cell(bad, MAX_WORDS)
-    told = (detail.get(name) for name in ("complaint", "fault", "busy", "renderer"))
+    told = (detail.get(name) for name in ("complaint", "fault", "busy", "slow", "renderer"))
     text = str(next(filter(None, told), ""))
-    factor = detail.get("real_time_factor")
-    if not text and isinstance(factor, (int, float)) and factor < SLOW:
-        return f"slower than real time: x {factor:.2f}"
     if not text and "obeyed" in detail:
         return f"{mode}: in control" if detail["obeyed"] else "shadow mode"
     certificates = _fields(detail.get("certificates"))

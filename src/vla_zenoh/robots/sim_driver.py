@@ -96,7 +96,7 @@ class SimDriver(RobotDriver):
         self.period_s = self.steps * STEP_S
         self.ticks = self.stamp_ns = 0
         self._pace: Pace | None = None
-        self._slow = False
+        self._slow = ""
         self._was_reset = False
         self._step_lock = threading.Lock()
         self._node: Node | None = None
@@ -228,12 +228,13 @@ class SimDriver(RobotDriver):
         if factor < SLOW and not self._slow:
             why = (
                 f"the simulator is slower than real time: x {factor:.2f}; this computer is too "
-                "slow or busy. The arm stays on its commands, but objects move and fall slower"
+                "slow or busy. The arm stays on its commands, so it meets objects harder than it "
+                "should; they move and fall slower"
             )
             self.report.emit(Event("warning", "notice", "slow", why, factor, SLOW))
-            self._slow = True
+            self._slow = f"slower than real time: x {factor:.2f}"
         elif factor > FAST_AGAIN:
-            self._slow = False
+            self._slow = ""
 
     def serve_lockstep(self, node: RobotNode, stop: threading.Event) -> None:
         """Publish the first state, and answer ``sim/step`` until `stop` is set."""
@@ -283,6 +284,7 @@ class SimDriver(RobotDriver):
         }
         if self._pace is not None:
             detail["real_time_factor"] = round(self._pace.factor, 3)
+            detail["slow"] = self._slow
         return DriverStatus({**detail, "lockstep": self.lockstep, "fault": self.fault})
 
 
