@@ -42,3 +42,12 @@ def test_a_reason_takes_a_few_lines_on_a_narrow_terminal(width: int) -> None:
 
 def test_on_a_wide_terminal_it_is_a_table() -> None:
     assert any(line.split()[:3] == ["node", "state", "age"] for line in lines(160))
+
+
+def test_a_simulator_that_is_too_slow_says_so_in_its_row() -> None:
+    why = "slower than real time: x 0.70"
+    sim = NodeStatus("sim", "running", "h", 1, 2, detail={"slow": why, "renderer": "egl"})
+    screen = Screen(file=io.StringIO(), width=120, force_terminal=True, color_system=None)
+    screen.print(status_table.render("panda", {"sim": (sim, 0.2, True)}, [], width=120))
+    assert isinstance(screen.file, io.StringIO)
+    assert why in screen.file.getvalue()
