@@ -169,6 +169,26 @@ def test_a_starved_robot_node_says_how_late_and_how_many_ticks_were_missed() -> 
         node._close()
 
 
+def test_a_world_that_is_slower_than_real_time_is_reported_once_until_it_is_not() -> None:
+    with routed_session() as session:
+        driver = SimDriver(load_profile("panda_sim"))
+        node = RobotNode(driver, session)
+        client = Client(node.node.profile, session).subscribe()
+        driver.pace()
+        pace = driver._pace
+        assert pace is not None
+        slower = "slower than real time: x 0.70"
+        for factor, told in ((1.0, ""), (0.7, slower), (0.93, slower), (1.0, "")):
+            pace.factor = factor
+            driver._watch_pace()
+            assert driver.status().detail["slow"] == told
+        assert client.wait_for(lambda: client.events, 5.0)
+        slow = [event.why for _, _, event in client.pop_events() if event.what == "slow"]
+        assert len(slow) == 1
+        assert "it meets objects harder" in slow[0]
+        node._close()
+
+
 class StreamWriter:
     """A command node that does not hear the stop: it goes on to lead one joint, or the TCP down."""
 
