@@ -1,4 +1,4 @@
-"""Plug-ins: robots, cameras, models and benchmarks that installed packages bring.
+"""Plug-ins: robots, cameras, models, benchmarks and commands that installed packages bring.
 
 A package declares an entry point in one of the groups below, whose value is one small declaration
 from this module. Ours are declared in the same way, in ``pyproject.toml``. Whoever reads a profile
@@ -18,7 +18,7 @@ from pathlib import Path
 from types import FunctionType
 from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
-from vla_zenoh.errors import PluginError, in_words, nearest
+from vla_zenoh.errors import PluginError, how_to_install, in_words, nearest
 
 if TYPE_CHECKING:  # a command that only lists names loads neither
     from pydantic import BaseModel
@@ -139,8 +139,14 @@ CAMERAS = Group("vla_zenoh.cameras", "camera source", CameraPlugin)
 MODELS = Group("vla_zenoh.models", "model", FilePlugin)
 BENCHMARKS = Group("vla_zenoh.benchmarks", "benchmark", FilePlugin)
 COMMANDS = Group("vla_zenoh.commands", "command", FunctionType)
-"""``GROUP.NAME`` -> function of a command below a group of commands, as ``bench.sim``."""
+"""Words of a command, joined by dots as ``bench.sim``, -> the function that runs it. A command of
+this package cannot be replaced."""
 GROUPS: tuple[Group[Any], ...] = (ROBOTS, CAMERAS, MODELS, BENCHMARKS, COMMANDS)
+PACKAGES: Mapping[str, str] = {
+    "bench.sim": "vla-zenoh-benchmarks",
+    "serve.mcp": "vla-zenoh-mcp",
+}
+"""Command of a package in ``plugins/`` -> that package, for a computer that lacks it."""
 
 
 def installed(group: Group[Any]) -> Mapping[str, EntryPoint]:
@@ -159,6 +165,22 @@ def _found(group: str, path: tuple[str, ...]) -> Mapping[str, list[EntryPoint]]:
 def package_of(entry: EntryPoint) -> str:
     """Name of the package that declares a plug-in."""
     return entry.dist.name if entry.dist is not None else "a package"
+
+
+def lacking(command: str) -> str:
+    """What must be installed for a command that a package brings; empty: nothing.
+
+    Args:
+        command: its words, joined by dots.
+    """
+    if command in installed(COMMANDS):
+        return ""
+    package = PACKAGES[command]
+    words = command.replace(".", " ")
+    return (
+        f"`vla-zenoh {words}` needs the package {package}; "
+        f"install it with: {how_to_install(package=package)}"
+    )
 
 
 def load(group: Group[Declaration], name: str) -> Declaration:

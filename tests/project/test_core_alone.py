@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from vla_zenoh import plugins
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -64,3 +66,15 @@ def test_its_commands_are_listed_and_those_of_plug_ins_are_not(alone: dict[str, 
     assert done.returncode == 0, done.stderr
     assert "  task " in done.stdout
     assert "  sim " not in done.stdout
+
+
+@pytest.mark.parametrize("command", plugins.PACKAGES)
+@pytest.mark.parametrize("after", [(), ("--help",), ("a-word", "--an-option=1")], ids=str)
+def test_a_command_of_a_package_that_is_missing_says_how_to_install_it(
+    alone: dict[str, str], command: str, after: tuple[str, ...]
+) -> None:
+    done = run(alone, *command.split("."), *after)
+    assert done.returncode == 1
+    package = plugins.PACKAGES[command]
+    assert f"needs the package {package}; install it with: pip install" in done.stderr
+    assert f". './plugins/{package}' in a checkout" in done.stderr

@@ -8,7 +8,8 @@ import shutil
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+import tomllib
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ from vla_zenoh.lab.profile.check import check_profile
 from vla_zenoh.nodes.camera.node import make_source
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import load_profile, read_profile, to_yaml
+from vla_zenoh.program.main import COMMANDS, OF_A_PACKAGE, CommandGroup
 from vla_zenoh.robots.python_driver import PythonDriver
 from vla_zenoh.types.records import JointReference
 
@@ -63,16 +65,21 @@ def broken(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def vla_zenoh(folder: Path, *words: str) -> str:
-    """What a command prints where the packages of the page are installed."""
+def started(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    """Run a command where the packages of the page are installed."""
     path = os.pathsep.join([str(folder / "acme"), os.environ.get("PYTHONPATH", "")])
-    done = subprocess.run(
+    return subprocess.run(
         [sys.executable, "-m", "vla_zenoh", *words],
         env={**os.environ, "PYTHONPATH": path},
         capture_output=True,
         text=True,
         check=False,
     )
+
+
+def vla_zenoh(folder: Path, *words: str) -> str:
+    """What a command prints there."""
+    done = started(folder, *words)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -204,6 +211,65 @@ def test_a_benchmark_of_a_package_lists_its_tasks(folder: Path) -> None:
     about = json.loads(vla_zenoh(folder, "bench", "sim", "acme_tasks", "--list"))
     assert about["suites"] == ["reach"]
     assert [task["name"] for task in about["tasks"]] == ["up"]
+
+
+# -- commands ---------------------------------------------------------------------------------
+@pytest.mark.parametrize("words", [("acme",), ("robot", "acme")], ids=" ".join)
+def test_a_command_of_a_package_runs_alone_or_in_a_group(
+    folder: Path, words: tuple[str, ...]
+) -> None:
+    told = vla_zenoh(folder, *words, "--profile", str(folder / "acme.yaml"))
+    assert told == f"{load_profile(str(folder / 'acme.yaml')).robot.name}\n"
+    assert "Print the name of the robot." in vla_zenoh(folder, *words[:-1], "--help")
+
+
+def test_a_package_may_have_a_group_of_its_own_and_replaces_no_command_of_ours(
+    folder: Path,
+) -> None:
+    edit_commands(folder, '"stop" = "acme_lab.cli:name"\n"lab.one.two" = "acme_lab.cli:name"')
+    asked = "--profile", str(folder / "acme.yaml")
+    assert vla_zenoh(folder, "lab", "one", "two", *asked) == "panda\n"
+    assert "Print the name" not in vla_zenoh(folder, "stop", "--help")
+
+
+def test_a_command_that_cannot_be_imported_says_why_whatever_follows_it(folder: Path) -> None:
+    edit_commands(folder, '"wave" = "acme_lab.no_such_module:wave"')
+    for words in (["wave"], ["wave", "--help"], ["wave", "twice", "--hands=2"]):
+        done = started(folder, *words)
+        assert done.returncode == 1
+        assert "'wave' of acme-lab cannot be imported" in done.stderr
+    assert "wave" in vla_zenoh(folder, "--help")
+
+
+def edit_commands(folder: Path, entries: str) -> None:
+    """Let the package declare other commands."""
+    project = folder / "acme" / "pyproject.toml"
+    before, title, _ = project.read_text("utf-8").partition("vla_zenoh.commands")
+    project.write_text(f'{before}{title}"]\n{entries}\n', "utf-8")
+    install(project)
+
+
+def test_the_package_of_every_command_in_plugins_is_known() -> None:
+    declared = {}
+    for file in (Path(__file__).parents[2] / "plugins").glob("*/pyproject.toml"):
+        project = tomllib.loads(file.read_text("utf-8"))["project"]
+        commands = project.get("entry-points", {}).get(plugins.COMMANDS.name, {})
+        declared |= dict.fromkeys(commands, project["name"])
+    assert declared == plugins.PACKAGES
+    assert commands_of_packages() == declared.keys()
+
+
+def commands_of_packages(
+    entries: Mapping[str, str | CommandGroup | None] | None = None, path: str = ""
+) -> set[str]:
+    """Words, joined by dots, of the commands that the table leaves to packages."""
+    if entries is None:
+        entries = {name: one for panel in COMMANDS.values() for name, one in panel.items()}
+    found = {f"{path}{name}" for name, entry in entries.items() if entry is OF_A_PACKAGE}
+    for name, entry in entries.items():
+        if isinstance(entry, CommandGroup):
+            found |= commands_of_packages(entry.commands, f"{path}{name}.")
+    return found
 
 
 def test_every_file_of_models_is_declared() -> None:

@@ -9,11 +9,9 @@ from __future__ import annotations
 import os
 import re
 import shlex
-from collections import UserDict
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import cache
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import cache, cached_property
 from importlib import import_module
-from importlib.metadata import EntryPoint
 from importlib.resources import files
 from textwrap import indent
 from typing import Any, NamedTuple
@@ -35,14 +33,21 @@ NODES = frozenset({"up", "worker", "node"})
 """Commands that write a log, which includes Zenoh's own."""
 
 
+OF_A_PACKAGE = None
+"""Of a command that a package in ``plugins/`` brings; `plugins.PACKAGES` has its name."""
+OTHERS = "Of other packages"
+
+
 class CommandGroup(NamedTuple):
     """Several commands under one word: name -> ``module:function`` inside the package."""
 
     help: str
-    commands: Mapping[str, str]
+    commands: Mapping[str, str | None]
 
 
-COMMANDS: Mapping[str, Mapping[str, str | CommandGroup]] = {
+Panels = Mapping[str, Mapping[str, str | CommandGroup | None]]
+"""Heading in the help -> the commands below it."""
+COMMANDS: Panels = {
     "Run": {
         "demo": "lab.cli.demo:demo",
         "up": "cli.up:up",
@@ -82,7 +87,8 @@ COMMANDS: Mapping[str, Mapping[str, str | CommandGroup]] = {
         ),
         "web": "lab.cli.web:web",
         "serve": CommandGroup(
-            "Offer a model to clients of other frameworks.", {"policy": "lab.cli.serve:serve"}
+            "Offer a model to clients of other frameworks.",
+            {"policy": "lab.cli.serve:serve", "mcp": OF_A_PACKAGE},
         ),
     },
     "Watch and record": {
@@ -118,6 +124,7 @@ COMMANDS: Mapping[str, Mapping[str, str | CommandGroup]] = {
             {
                 "command": "lab.cli.bench_command:command",
                 "task": "lab.cli.bench_task:task",
+                "sim": OF_A_PACKAGE,
             },
         ),
         "compare": "lab.cli.compare:compare",
@@ -139,54 +146,82 @@ class _Command(TyperCommand):
         return super().parse_args(ctx, args)
 
 
-def _function(entry: str | EntryPoint) -> Any:
-    if isinstance(entry, str):
-        module, _, attribute = entry.partition(":")
-        return getattr(import_module(f"vla_zenoh.{module}"), attribute)
-    try:
-        return plugins.load(plugins.COMMANDS, entry.name)
-    except PluginError as error:
-        why = str(error)
+class _Unavailable(TyperCommand):
+    """A command that cannot be loaded: whatever follows it, the error says why.
 
-    def broken() -> None:
-        raise PluginError(why)
+    Args:
+        hidden: its package is not installed, so that no help lists it.
+    """
 
-    broken.__doc__ = why
-    return broken
+    def __init__(self, name: str, why: str, *, hidden: bool = False) -> None:
+        def fail() -> None:
+            raise PluginError(why)
+
+        anything = {"ignore_unknown_options": True, "allow_extra_args": True}
+        super().__init__(
+            name,
+            callback=fail,
+            help=why,
+            short_help=why,
+            hidden=hidden,
+            add_help_option=False,
+            context_settings=anything,
+        )
 
 
-class _LazyCommands(UserDict[str, Any]):
-    """Name -> command, imported when it is first looked up."""
+class _LazyCommands(Mapping[str, Any]):
+    """Name -> command, imported when it is first looked up; those of other packages come last."""
 
-    def __init__(
-        self,
-        panels: Mapping[str, Mapping[str, str | EntryPoint | CommandGroup]],
-        path: Sequence[str],
-    ) -> None:
-        super().__init__({name: one for group in panels.values() for name, one in group.items()})
+    def __init__(self, panels: Panels, path: Sequence[str]) -> None:
+        self._entries = {name: one for panel in panels.values() for name, one in panel.items()}
         self._path = path
+        self._loaded: dict[str, Any] = {}
 
     def __getitem__(self, name: str) -> Any:
-        found = self.data[name]
-        if isinstance(found, (str, EntryPoint, CommandGroup)):
-            found = self.data[name] = _load((*self._path, name), found)
+        if name not in self._loaded:
+            # Who runs a command of ours does not wait until all packages are read.
+            entries = self._entries if name in self._entries else self.others
+            self._loaded[name] = _load((*self._path, name), entries[name])
+        return self._loaded[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter((*self._entries, *self.others))
+
+    def __len__(self) -> int:
+        return len(self._entries) + len(self.others)
+
+    @cached_property
+    def others(self) -> dict[str, CommandGroup | None]:
+        """Those that packages bring and the table does not name."""
+        depth = len(self._path)
+        found: dict[str, CommandGroup | None] = {}
+        for entry in plugins.installed(plugins.COMMANDS):
+            words = entry.split(".")
+            if words[:depth] != [*self._path] or len(words) == depth:
+                continue
+            name = words[depth]
+            is_group = len(words) > depth + 1
+            if name not in self._entries:
+                found[name] = CommandGroup(f"Commands of {name}.", {}) if is_group else OF_A_PACKAGE
         return found
 
 
-def _commands_of(group: CommandGroup, word: str) -> dict[str, str | EntryPoint]:
-    """Commands of a group, with those that packages bring."""
-    entries = plugins.installed(plugins.COMMANDS)
-    more = {name.removeprefix(f"{word}."): name for name in entries if name.startswith(f"{word}.")}
-    return {**group.commands, **{name: entries[entry] for name, entry in more.items()}}
-
-
-def _load(path: Sequence[str], entry: str | EntryPoint | CommandGroup) -> Any:
+def _load(path: Sequence[str], entry: str | CommandGroup | None) -> Any:
     name = path[-1]
     if isinstance(entry, CommandGroup):
-        group = _lazy_group({"Commands": _commands_of(entry, name)}, path)
+        group = _lazy_group({"Commands": entry.commands}, path)
         found: Any = typer.Typer(cls=group, help=entry.help, no_args_is_help=True)
+    elif entry is None:
+        command = ".".join(path)
+        if why := plugins.lacking(command):
+            return _Unavailable(name, why, hidden=True)
+        try:
+            found = plugins.load(plugins.COMMANDS, command)
+        except PluginError as error:
+            return _Unavailable(name, str(error))
     else:
-        found = _function(entry)
+        module, _, attribute = entry.partition(":")
+        found = getattr(import_module(f"vla_zenoh.{module}"), attribute)
     around = typer.Typer(rich_markup_mode=None, add_completion=False)
     around.callback()(lambda: None)  # makes it a group even with a single command
     if isinstance(found, typer.Typer):
@@ -203,20 +238,22 @@ def _load(path: Sequence[str], entry: str | EntryPoint | CommandGroup) -> Any:
     return command
 
 
-def _lazy_group(
-    panels: Mapping[str, Mapping[str, str | EntryPoint | CommandGroup]], path: Sequence[str] = ()
-) -> type[TyperGroup]:
+def _lazy_group(panels: Panels, path: Sequence[str] = ()) -> type[TyperGroup]:
     class LazyGroup(TyperGroup):
         def __init__(self, **attributes: Any) -> None:
             super().__init__(**attributes)
             self.commands = _LazyCommands(panels, path)  # pyright: ignore[reportAttributeAccessIssue]
 
         def format_commands(self, ctx: Any, formatter: Any) -> None:
-            width = max(len(name) for names in panels.values() for name in names)
-            for title, names in panels.items():
+            commands: Any = self.commands
+            width = max(map(len, commands))
+            for title, names in {**panels, OTHERS: commands.others}.items():
+                shown = [name for name in names if not commands[name].hidden]
+                if not shown:
+                    continue
                 with formatter.section(title):
                     formatter.write_dl(
-                        (f"{name:<{width}}", self.commands[name].short_help) for name in names
+                        (f"{name:<{width}}", commands[name].short_help) for name in shown
                     )
 
         def invoke(self, ctx: Any) -> Any:
