@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import cv2
@@ -13,12 +14,12 @@ from vla_zenoh.lab.bench.task import STAY, TaskOutcome, is_judged
 from vla_zenoh.types import Image
 
 FRAME_WIDTH, FRAME_HEIGHT, TITLE_HEIGHT, GAP = 560, 420, 56, 8
+WIDTH, HEIGHT = 2 * FRAME_WIDTH + 3 * GAP, TITLE_HEIGHT + FRAME_HEIGHT + GAP
+LABEL_WIDTH, LABEL_HEIGHT, RADIUS = 100, 32, 17
 MAX_EPISODES, ROWS = 30, 15
 """A JPEG's side is 8192 px at most: with more than 15 episodes there are two columns."""
-MARK_PX = 34
-GREEN, RED, GREY = (24, 140, 60), (200, 30, 30), (110, 110, 110)
-INK, PAPER, SOFT = (25, 30, 36), 255, (90, 98, 106)
-FONT = cv2.FONT_HERSHEY_SIMPLEX
+GREEN, RED, GREY, INK = (24, 140, 60), (200, 30, 30), (110, 110, 110), (25, 30, 36)
+PAPER, EMPTY = 255, 235
 
 Picture = NDArray[np.uint8]
 
@@ -33,58 +34,34 @@ def sheet(ended: Sequence[TaskOutcome]) -> bytes | None:
     shown = [each for each in ended if each.pictures is not None][:MAX_EPISODES]
     if not shown:
         return None
-    rows = [_row(each) for each in shown]
-    columns = [np.vstack(rows[at : at + ROWS]) for at in range(0, len(rows), ROWS)]
-    height = columns[0].shape[0]
-    filled = [
-        np.pad(each, ((0, height - len(each)), (0, 0), (0, 0)), constant_values=PAPER)
-        for each in columns
-    ]
-    return encode_jpeg(Image(np.ascontiguousarray(np.hstack(filled))))
+    columns = math.ceil(len(shown) / ROWS)
+    page = np.full((min(len(shown), ROWS) * HEIGHT, columns * WIDTH, 3), PAPER, np.uint8)
+    for index, each in enumerate(shown):
+        column, row = divmod(index, ROWS)
+        left, top = column * WIDTH, row * HEIGHT
+        _draw(page[top : top + HEIGHT, left : left + WIDTH], each)
+    return encode_jpeg(Image(page))
 
 
-def _row(ended: TaskOutcome) -> Picture:
+def _draw(row: Picture, ended: TaskOutcome) -> None:
+    """Draw an outcome: a disc in its colour, prompt and verdict, then both pictures."""
     assert ended.pictures is not None
-    width, height = 2 * FRAME_WIDTH + 3 * GAP, TITLE_HEIGHT + FRAME_HEIGHT + GAP
-    row = np.full((height, width, 3), PAPER, np.uint8)
-    told = ended.episode.order.family != STAY or is_judged(ended.prompt)
-    judged = told or not ended.success
-    colour = GREY if not judged else GREEN if ended.success else RED
-    _mark(row, colour, done=ended.success, judged=judged)
-    word = "not judged" if not judged else ended.failure.replace("_", " ") or "done"
-    text = f"{word}, {ended.time_s:.1f} s"
-    size, _ = cv2.getTextSize(text, FONT, 0.7, 2)
-    prompt = ended.prompt.encode("ascii", "replace").decode()  # OpenCV draws only ASCII
-    _write(row, prompt, (GAP + MARK_PX + 14, 36), 0.8, INK)
-    _write(row, text, (width - size[0] - 2 * GAP, 36), 0.7, colour)
+    colour, word = GREEN if ended.success else RED, ended.failure.replace("_", " ") or "done"
+    if ended.success and ended.episode.order.family == STAY and not is_judged(ended.prompt):
+        colour, word = GREY, "not judged"
+    cv2.circle(row, (GAP + RADIUS, TITLE_HEIGHT // 2), RADIUS, colour, -1, cv2.LINE_AA)
+    _write(row, f"{ended.prompt}: {word}, {ended.time_s:.1f} s", 2 * (GAP + RADIUS), 36, colour)
     for index, (jpeg, label) in enumerate(zip(ended.pictures, ("before", "after"), strict=True)):
         left = GAP + index * (FRAME_WIDTH + GAP)
         frame = row[TITLE_HEIGHT : TITLE_HEIGHT + FRAME_HEIGHT, left : left + FRAME_WIDTH]
-        frame[:] = 235
+        frame[:] = EMPTY
         if jpeg:
             small = decode_jpeg(jpeg).rgb
             frame[:] = cv2.resize(small, (FRAME_WIDTH, FRAME_HEIGHT), interpolation=cv2.INTER_AREA)
-        size, _ = cv2.getTextSize(label, FONT, 0.6, 1)
-        frame[: size[1] + 16, : size[0] + 20] = PAPER
-        _write(frame, label, (10, size[1] + 7), 0.6, SOFT)
-    return row
+        frame[:LABEL_HEIGHT, :LABEL_WIDTH] = PAPER
+        _write(frame, label, GAP, LABEL_HEIGHT - GAP, INK)
 
 
-def _mark(row: Picture, colour: tuple[int, int, int], *, done: bool, judged: bool) -> None:
-    """A disc with a tick, a cross, or a dash if it was not judged."""
-    x, y, r = GAP + MARK_PX // 2, TITLE_HEIGHT // 2, MARK_PX // 2
-    cv2.circle(row, (x, y), r, colour, -1, cv2.LINE_AA)
-    if not judged:
-        lines = [((-8, 0), (8, 0))]
-    elif done:
-        lines = [((-8, 1), (-2, 7)), ((-2, 7), (8, -6))]
-    else:
-        lines = [((-6, -6), (6, 6)), ((-6, 6), (6, -6))]
-    for (x0, y0), (x1, y1) in lines:
-        cv2.line(row, (x + x0, y + y0), (x + x1, y + y1), (255, 255, 255), 3, cv2.LINE_AA)
-
-
-def _write(
-    picture: Picture, text: str, at: tuple[int, int], scale: float, colour: tuple[int, int, int]
-) -> None:
-    cv2.putText(picture, text, at, FONT, scale, colour, 1 if scale < 0.7 else 2, cv2.LINE_AA)
+def _write(picture: Picture, text: str, x: int, y: int, colour: tuple[int, int, int]) -> None:
+    plain = text.encode("ascii", "replace").decode()  # OpenCV draws only ASCII
+    cv2.putText(picture, plain, (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.7, colour, 2, cv2.LINE_AA)
