@@ -22,11 +22,11 @@ from benchmarks.motion.protocol import (
     make_row,
     path_length,
 )
+from benchmarks.motion.segments import DemoSegment, RestPose, judge_segment, make_segment
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.errors import NodeError
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.lab.bench.task_lockstep import in_processes
-from vla_zenoh.lab.demo.segments import DemoSegment, RestPose, judge_segment, make_segment
 from vla_zenoh.lab.lockstep.loop import Lockstep
 from vla_zenoh.lab.lockstep.worker import Delays
 from vla_zenoh.policy.loader import find_model, make_policy

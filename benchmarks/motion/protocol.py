@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.motion.segments import DemoSegment, SegmentOutcome, make_segment
 from vla_zenoh.kinematics.so3 import Pose, log3, norm3
-from vla_zenoh.lab.demo.segments import DemoSegment, SegmentOutcome, make_segment
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray
 

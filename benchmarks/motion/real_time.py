@@ -22,10 +22,10 @@ from benchmarks.motion.protocol import (
     make_row,
     path_length,
 )
+from benchmarks.motion.runner import MotionRunner
+from benchmarks.motion.segments import make_segment
 from vla_zenoh.errors import NodeError
 from vla_zenoh.kinematics.so3 import pose_of
-from vla_zenoh.lab.demo.runner import MotionRunner
-from vla_zenoh.lab.demo.segments import make_segment
 from vla_zenoh.lab.recording.recorder import Recorder
 from vla_zenoh.lab.recording.run import Run, load_run
 from vla_zenoh.runtime.launch import Host

@@ -11,10 +11,10 @@ import threading
 
 from chain import READY_PATIENCE_S
 
+from benchmarks.motion.runner import MotionRunner
+from benchmarks.motion.segments import make_segment
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.client.client import Client
-from vla_zenoh.lab.demo.runner import MotionRunner
-from vla_zenoh.lab.demo.segments import make_segment
 from vla_zenoh.profile import load_profile
 
 RATE_HZ = 10.0

@@ -65,7 +65,6 @@ ALLOWED = {
             "lab/bench/task_runner.py",
             "lab/check/model_runner.py",
             "lab/conform/peer.py",
-            "lab/demo/runner.py",
             "lab/doctor/access.py",
             "lab/episode.py",
             "lab/inference_views.py",

@@ -13,9 +13,9 @@ from benchmarks.motion.protocol import (
     make_row,
     path_length,
 )
+from benchmarks.motion.segments import SegmentOutcome
 from benchmarks.motion.table import motion_table
 from vla_zenoh.kinematics.so3 import Pose, exp3
-from vla_zenoh.lab.demo.segments import SegmentOutcome
 from vla_zenoh.profile import load_profile
 
 PROFILE = load_profile("panda_sim")

@@ -13,11 +13,12 @@ from contextlib import contextmanager
 from typing import Any
 
 from vla_zenoh.errors import NodeError
-from vla_zenoh.lab.demo.runner import MotionRunner
-from vla_zenoh.lab.episode import Interrupted
+from vla_zenoh.lab.episode import EpisodeRunner, Interrupted
+from vla_zenoh.lab.newest_records import NewestRecords
 from vla_zenoh.nodes.command.node import SPREAD_S
 from vla_zenoh.profile import Profile, override
 from vla_zenoh.runtime.launch import Host
+from vla_zenoh.types import PoseState
 
 
 def cpu_s(pid: int) -> float:
@@ -56,8 +57,10 @@ def measure_command(
         assert host.client is not None
         client = host.client
 
-        MotionRunner(client, stop, host.poll).begin(RATE_HZ)
-        client.set_prompt(PROMPT)
+        run = EpisodeRunner(client, stop, host.poll)
+        streams = NewestRecords(client.session, {PoseState: client.keys.state_pose})
+        run.wait_until_ready(profile.task.worker, streams)
+        run.start(PROMPT, RATE_HZ)
         if stop.wait(STATUS_S):
             raise Interrupted
         pid = host.supervisor.pids()["command"]

@@ -39,9 +39,8 @@ def demo(
     # Imported here: simulation, kinematics and plots take long to load.
     if prompt is not None and prompt.strip().lower().startswith(("hard", "hold")):
         from vla_zenoh.lab.cli.demo_run import run_demo
-        from vla_zenoh.lab.demo.segments import make_segment
 
-        run_demo(make_segment(prompt, steps), given.profile or DEFAULT_PROFILE, given)
+        run_demo(prompt, steps, given.profile or DEFAULT_PROFILE, given)
         return
     from vla_zenoh.lab.bench.task import FIRST_SEED
     from vla_zenoh.lab.cli.demo_tasks import run_task_demo

@@ -17,7 +17,7 @@ from typing import Any
 from rich.progress import Progress
 
 from vla_zenoh.cli.options import effective_profile
-from vla_zenoh.cli.output import errors
+from vla_zenoh.cli.output import console, errors
 from vla_zenoh.client.client import Client
 from vla_zenoh.lab.cli.bench_file import running_nodes
 from vla_zenoh.lab.cli.demo_capacity import measure_capacity, small
@@ -28,13 +28,15 @@ from vla_zenoh.lab.cli.output_path import RUNS, output_folder
 from vla_zenoh.lab.episode import Interrupted
 from vla_zenoh.lab.evaluation.mcap_file import evaluate_parts
 from vla_zenoh.lab.evaluation.report import page
+from vla_zenoh.lab.evaluation.result import Evaluation
 from vla_zenoh.lab.recording.film import Film, write_film
 from vla_zenoh.lab.recording.recorder import Recorder
 from vla_zenoh.lab.recording.run import Run, load_run
+from vla_zenoh.lab.statistics import percentiles
 from vla_zenoh.profile import Profile, to_yaml
 from vla_zenoh.runtime.launch import Host
 from vla_zenoh.runtime.process import die_with_parent, stop_on_signals
-from vla_zenoh.types import NodeStatus
+from vla_zenoh.types import LATENCY_STAGES, NodeStatus
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,8 +103,10 @@ class Stage:
         text = json.dumps(summary, indent=2) + "\n"
         (self.folder / "summary.json").write_text(text, "utf-8")
 
-    def draw(self, run: Run, verdicts: Sequence[tuple[int, str, bool]] = ()) -> None:
-        """Write report.html, and video.mp4 with `verdicts` in it.
+    def draw(
+        self, run: Run, verdicts: Sequence[tuple[int, str, bool]] = ()
+    ) -> Sequence[Evaluation]:
+        """Write report.html, and video.mp4 with `verdicts` in it; returns what is on the page.
 
         Args:
             verdicts: ns, text, success.
@@ -124,6 +128,7 @@ class Stage:
             )
             if not written:
                 bars.update(filming, description="no images, no video", completed=1, total=1)
+        return parts
 
 
 @contextmanager
@@ -150,8 +155,21 @@ def open_stage(profile: str, given: DemoOptions) -> Iterator[Stage]:
         yield Stage(loaded, part, path, stop)
 
 
-def latency_line(latency: Mapping[str, Any]) -> str:
-    """The latency of a run, see `vla_zenoh.lab.demo.segments.latencies`, in one line."""
+def latencies(run: Run) -> dict[str, Any]:
+    """Latency from the camera's stamp to the first pose command of a chunk, and its stages, ms."""
+    rows = [cause.latency_ms(stamp_ns) for cause, stamp_ns in run.first_commands()]
+    stages = {name: percentiles([row[name] for row in rows]) for name in LATENCY_STAGES}
+    return {**stages.pop("end_to_end"), "chunks": len(rows), "stages": stages}
+
+
+def print_end(stage: Stage, summary: Mapping[str, Any], *files: str) -> None:
+    """Print the latency of a run, and where its files are."""
+    console().print(_latency_line(summary["latency_ms"]))
+    names = ", ".join(["run.mcap", "summary.json", *files, "report.html", "video.mp4"])
+    console().print(f"run folder: {stage.path} ({names})")
+
+
+def _latency_line(latency: Mapping[str, Any]) -> str:
     if latency.get("p50") is None:
         return "latency: no chunk was executed"
     stages = ", ".join(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
 from typing import Any
 
 import typer
@@ -15,10 +14,9 @@ from vla_zenoh.lab.bench.task import SCENE, DemoPlan, TaskOutcome, is_judged, or
 from vla_zenoh.lab.bench.task_runner import TaskRunner
 from vla_zenoh.lab.bench.task_sheet import sheet
 from vla_zenoh.lab.cli.bench_file import shown_camera
-from vla_zenoh.lab.cli.demo_stage import Stage, latency_line, open_stage
+from vla_zenoh.lab.cli.demo_stage import Stage, latencies, open_stage, print_end
 from vla_zenoh.lab.cli.options import DemoOptions
 from vla_zenoh.lab.cli.output import print_json
-from vla_zenoh.lab.demo.segments import latencies
 from vla_zenoh.lab.evaluation.result import TASKS
 from vla_zenoh.lab.tasks.judge import FAILURES, LIMIT_S
 from vla_zenoh.lab.tasks.order import COLOURS, DIRECTIONS, PUSH, PUT, STACK, Order, phrase
@@ -59,7 +57,7 @@ def run_task_demo(prompts: list[str], seed: int, profile: str, given: DemoOption
             "rate_hz": given.rate_hz,
             "seed": seed,
             "tasks": [each.to_dict() for each in ended],
-            "latency_ms": latencies(run.first_commands()),
+            "latency_ms": latencies(run),
             "refusals": stage.refusals(),
         }
         stage.write(summary)
@@ -71,7 +69,8 @@ def run_task_demo(prompts: list[str], seed: int, profile: str, given: DemoOption
     if given.as_json:
         print_json({**summary, "folder": stage.path})
     else:
-        _show(ended, summary, stage.path)
+        _show(ended)
+        print_end(stage, summary, "tasks.jpg")
     if stage.stop.is_set():
         raise typer.Exit(130)
     if not summary["ok"]:
@@ -136,15 +135,11 @@ def _fact(ended: TaskOutcome) -> dict[str, Any]:
     }
 
 
-def _show(ended: list[TaskOutcome], summary: dict[str, Any], folder: Path) -> None:
+def _show(ended: list[TaskOutcome]) -> None:
     table = new_table("prompt", "verdict", title="prompts, judged by the true poses")
     for each in ended:
         colour = "green" if each.success else "red"
         why = FAILURES.get(each.failure, each.why)
         said = Text.assemble(styled(_word(each), colour), printable(f": {why}") if why else "")
         table.add_row(each.prompt, said)
-    screen = console()
-    screen.print(table)
-    screen.print(latency_line(summary["latency_ms"]))
-    files = "run.mcap, summary.json, tasks.jpg, report.html, video.mp4"
-    screen.print(f"run folder: {folder} ({files})")
+    console().print(table)

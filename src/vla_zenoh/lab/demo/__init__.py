@@ -1,1 +1,1 @@
-"""Demo: motion segments on a simulated robot, judged by measured poses, with a run folder."""
+"""Fixed motions by prompt: what the scripted models do, and what a demo compares."""

@@ -67,6 +67,13 @@ class ScriptedPrompt(NamedTuple):
     steps: int | None
     within: float | None = None
 
+    @property
+    def text(self) -> str:
+        """The prompt, as `parse_scripted` reads it."""
+        name = "hold" if self.motion is None else f"HARD: {self.motion.name}"
+        count = "" if self.steps is None else f" x{self.steps}"
+        return name + count + ("" if self.within is None else f" within {self.within:g}")
+
     def offset(self, steps: float) -> float:
         """Where the asked axis is after `steps` of them, in m or rad from the start."""
         if self.motion is None:

@@ -8,10 +8,10 @@ from collections.abc import Callable
 
 import numpy as np
 
+from benchmarks.motion.segments import DemoSegment, RestPose, SegmentOutcome, judge_segment
 from vla_zenoh.client.client import Client
 from vla_zenoh.errors import NodeError
 from vla_zenoh.kinematics.so3 import Pose, exp3, log3, rotation_from_quat
-from vla_zenoh.lab.demo.segments import DemoSegment, RestPose, SegmentOutcome, judge_segment
 from vla_zenoh.lab.episode import EpisodeRunner
 from vla_zenoh.lab.newest_records import NewestRecords
 from vla_zenoh.types import GripperState, PoseState

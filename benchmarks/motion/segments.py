@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,8 +9,7 @@ import numpy as np
 
 from vla_zenoh.kinematics.so3 import Pose, log3
 from vla_zenoh.lab.demo.scripted_motions import ScriptedMotion, ScriptedPrompt, parse_scripted
-from vla_zenoh.lab.statistics import percentiles
-from vla_zenoh.types import LATENCY_STAGES, Cause, FloatArray
+from vla_zenoh.types import FloatArray
 
 TOLERANCE_M, TOLERANCE_RAD = 0.002, 0.005
 DRIFT_MM = 1.0
@@ -190,14 +188,3 @@ def _split(vector: FloatArray, asked: FloatArray) -> tuple[float, float]:
         return 0.0, float(np.linalg.norm(vector))
     along = float(vector @ asked) / norm
     return along, float(np.linalg.norm(vector - along * asked / norm))
-
-
-def latencies(first_commands: Sequence[tuple[Cause, int]]) -> dict[str, Any]:
-    """Latency from the camera's stamp to the first pose command of a chunk, and its stages, ms.
-
-    Args:
-        first_commands: for each chunk, its cause and that command's stamp (wall ns).
-    """
-    rows = [cause.latency_ms(stamp_ns) for cause, stamp_ns in first_commands]
-    stages = {name: percentiles([row[name] for row in rows]) for name in LATENCY_STAGES}
-    return {**stages.pop("end_to_end"), "chunks": len(rows), "stages": stages}
