@@ -3,7 +3,7 @@
 Measures from a touch on STOP to an arm that stands, how an arm brakes whose page vanishes, what the
 page costs, and makes the screenshots of the docs. Needs Debian's ``chromium`` and
 ``chromium-driver``,
-and ``pip install selenium`` beside the extra ``web``.
+and ``pip install selenium`` beside the package ``vla-zenoh-web``.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ UV_IN_VENV = TOOLS / "venv" / "bin" / "uv"
 UV_IN_FOLDER = TOOLS / "uv" / "bin" / "uv"
 CONSTRAINTS = ROOT / "constraints.txt"
 PLUGINS = sorted(path.parent for path in (ROOT / "plugins").glob("*/pyproject.toml"))
-"""Packages that bring robots and benchmarks; their extras are left to who needs them."""
+"""Packages that bring robots, benchmarks and commands; their extras are left to who needs them."""
 
 OLDEST_PYTHON = (3, 11)
 OLDEST_UV = (0, 8)

@@ -407,16 +407,9 @@ REJECTING = {
 
 
 def counted_in_code() -> tuple[set[str], set[str]]:
-    """Reasons of rejections, and names of other counters, that are written in the code.
-
-    Those of the operator's page are no node's: they are among its metrics.
-    """
+    """Reasons of rejections, and names of other counters, that are written in the code."""
     reasons, counters = set(), set()
-    source = [
-        path
-        for path in SOURCE.rglob("*.py")
-        if not {"cli", "web"} & set(path.relative_to(SOURCE).parts)
-    ]
+    source = [path for path in SOURCE.rglob("*.py") if "cli" not in path.relative_to(SOURCE).parts]
     for path in (*source, *(ROOT / "models").glob("*/wire.py")):
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
             if isinstance(node, ast.Call) and node.args:

@@ -145,6 +145,7 @@ GROUPS: tuple[Group[Any], ...] = (ROBOTS, CAMERAS, MODELS, BENCHMARKS, COMMANDS)
 PACKAGES: Mapping[str, str] = {
     "bench.sim": "vla-zenoh-benchmarks",
     "serve.mcp": "vla-zenoh-mcp",
+    "web": "vla-zenoh-web",
 }
 """Command of a package in ``plugins/`` -> that package, for a computer that lacks it."""
 

@@ -82,15 +82,9 @@ ALLOWED = {
             "lab/trial/unattended_runner.py",
             "lab/view/listener.py",
             "lab/view/viewer.py",
-            "lab/web/hand.py",
-            "lab/web/part_streams.py",
-            "lab/web/pictures.py",
-            "lab/web/recordings.py",
-            "lab/web/robot_link.py",
         ),
         IO - NODE,
     ),
-    **dict.fromkeys(("lab/web/serve.py", "lab/web/server.py"), IO - NODE | {"asyncio"}),
 }
 HEAVY = ("zenoh", "typer", "torch", "mujoco", "matplotlib", "av", "pyarrow", "rerun")
 
@@ -171,8 +165,8 @@ def test_no_module_of_the_core_imports_the_lab_at_any_time(path: Path) -> None:
     "source",
     [
         "from vla_zenoh.lab.doctor import HostFinding",
-        "def f():\n    import vla_zenoh.lab.web",
-        "TABLE = {'web': 'lab.cli.web:web'}",
+        "def f():\n    import vla_zenoh.lab.trial",
+        "TABLE = {'teleop': 'lab.cli.teleop:teleop'}",
         "import_module('vla_zenoh.lab.view')",
     ],
 )

@@ -12,7 +12,7 @@ from camera_rig import PATIENCE_S, until
 from chain import Chain, running_chain, write_profile
 from web_rig import OPERATOR, Site, serving, write_people
 
-pytest.importorskip("starlette", reason="needs the extra web")
+pytest.importorskip("starlette", reason="needs vla-zenoh-web")
 webdriver = pytest.importorskip("selenium.webdriver", reason="needs selenium")
 CHROMIUM, DRIVER = Path("/usr/bin/chromium"), Path("/usr/bin/chromedriver")
 if not (CHROMIUM.exists() and DRIVER.exists()):

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from camera_rig import PATIENCE_S, until
 from chain import READY_PATIENCE_S, Chain
+from vla_zenoh_web.hold import HOLD_S
 from web_rig import (
     METRICS,
     OPERATOR,
@@ -27,12 +28,11 @@ from web_rig import (
 
 from vla_zenoh.lab.recording.reader import open_recording
 from vla_zenoh.lab.trial.verdict import verdict_in
-from vla_zenoh.lab.web.hold import HOLD_S
 
 pytestmark = pytest.mark.long
 
-pytest.importorskip("starlette", reason="needs the extra web")
-pytest.importorskip("uvicorn", reason="needs the extra web")
+pytest.importorskip("starlette", reason="needs vla-zenoh-web")
+pytest.importorskip("uvicorn", reason="needs vla-zenoh-web")
 parser = pytest.importorskip("prometheus_client.openmetrics.parser")
 
 from websockets.exceptions import ConnectionClosed, InvalidStatus  # noqa: E402

@@ -14,8 +14,8 @@ from vla_zenoh.errors import SessionError
 from vla_zenoh.profile import load_profile
 from vla_zenoh.runtime.launch import Host
 
-pytest.importorskip("starlette", reason="needs the extra web")
-pytest.importorskip("uvicorn", reason="needs the extra web")
+pytest.importorskip("starlette", reason="needs vla-zenoh-web")
+pytest.importorskip("uvicorn", reason="needs vla-zenoh-web")
 
 READY_S, PATIENCE_S = 90.0, 20.0
 POLL_S = 0.05

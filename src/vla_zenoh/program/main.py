@@ -85,7 +85,7 @@ COMMANDS: Panels = {
                 "run": "lab.cli.primitives:run",
             },
         ),
-        "web": "lab.cli.web:web",
+        "web": OF_A_PACKAGE,
         "serve": CommandGroup(
             "Offer a model to clients of other frameworks.",
             {"policy": "lab.cli.serve:serve", "mcp": OF_A_PACKAGE},

@@ -11,13 +11,13 @@ from typing import get_args
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from vla_zenoh_web import requests
+from vla_zenoh_web.access import People, Person, host_is_ours, origin_is_ours, read_people
+from vla_zenoh_web.hold import HOLD_S, Hold
+from vla_zenoh_web.requests import MAX_BYTES, AnyRequest, name_of, parse
 
 from vla_zenoh.errors import CodecError, SecurityError
 from vla_zenoh.lab.rate_limit import RateLimit
-from vla_zenoh.lab.web import requests
-from vla_zenoh.lab.web.access import People, Person, host_is_ours, origin_is_ours, read_people
-from vla_zenoh.lab.web.hold import HOLD_S, Hold
-from vla_zenoh.lab.web.requests import MAX_BYTES, AnyRequest, name_of, parse
 
 ANNA = Person("anna", "operator", "0123456789abcdef")
 WALL = Person("wall", "viewer", "fedcba9876543210")

@@ -7,18 +7,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from random_records import statuses
+from vla_zenoh_web.arm import ArmLines
 
 from vla_zenoh.cli.node_rows import NodeRow
 from vla_zenoh.errors import RecordError
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.kinematics.so3 import Pose
-from vla_zenoh.lab.web.arm import ArmLines
 from vla_zenoh.policy import ActionSpec, ModelSpec, ObservationSpec
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import JointState, NodeStatus
 
-parser = pytest.importorskip("prometheus_client.openmetrics.parser", reason="needs the extra web")
-metrics = pytest.importorskip("vla_zenoh.lab.web.metrics", exc_type=ImportError)
+parser = pytest.importorskip("prometheus_client.openmetrics.parser", reason="needs vla-zenoh-web")
+metrics = pytest.importorskip("vla_zenoh_web.metrics", exc_type=ImportError)
 exposition, MAX_SERIES = metrics.exposition, metrics.MAX_SERIES
 
 ATOL_M = 2e-4

@@ -20,14 +20,14 @@ from vla_zenoh.codec.settings import decode_held
 from vla_zenoh.errors import CodecError, RecordError, SessionError, VlaZenohError
 from vla_zenoh.keys import ENDED, PRIMITIVES, ROLLING, last_chunk, worker_node
 from vla_zenoh.lab.teleop.policy import OperatorInput
-from vla_zenoh.lab.web import requests
-from vla_zenoh.lab.web.hand import HandWorker
-from vla_zenoh.lab.web.hold import Hold
-from vla_zenoh.lab.web.part_streams import PartStreams
-from vla_zenoh.lab.web.recordings import Recordings
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import ActionChunk, Event, NodeStatus, Task
+from vla_zenoh_web import requests
+from vla_zenoh_web.hand import HandWorker
+from vla_zenoh_web.hold import Hold
+from vla_zenoh_web.part_streams import PartStreams
+from vla_zenoh_web.recordings import Recordings
 
 STAND_S, STAND_POLL_S = 3.0, 0.01
 WATCH_S = 0.05

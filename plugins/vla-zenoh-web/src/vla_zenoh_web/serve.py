@@ -10,20 +10,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import uvicorn
 import zenoh
 
-from vla_zenoh.errors import MissingExtraError
-from vla_zenoh.lab.web.access import People
-from vla_zenoh.lab.web.requests import MAX_BYTES
-from vla_zenoh.lab.web.robot_link import RobotLink
-from vla_zenoh.lab.web.server import PageServer
 from vla_zenoh.profile import Profile
-
-try:
-    import uvicorn  # pyright: ignore[reportMissingImports]
-    import websockets  # noqa: F401
-except ImportError as error:
-    raise MissingExtraError(error.name or "uvicorn", "web") from error
+from vla_zenoh_web.access import People
+from vla_zenoh_web.requests import MAX_BYTES
+from vla_zenoh_web.robot_link import RobotLink
+from vla_zenoh_web.server import PageServer
 
 CLOSE_S = 1.0
 PING_S = 5.0

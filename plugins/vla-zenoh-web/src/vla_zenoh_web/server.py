@@ -17,29 +17,22 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from vla_zenoh.errors import CodecError, MissingExtraError, VlaZenohError
+from starlette.applications import Starlette
+from starlette.requests import Request as HttpRequest
+from starlette.responses import Response
+from starlette.routing import Route, WebSocketRoute
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from vla_zenoh.errors import CodecError, VlaZenohError
 from vla_zenoh.lab.rate_limit import RateLimit
 from vla_zenoh.lab.teleop.policy import OperatorInput
-from vla_zenoh.lab.web import metrics, requests
-from vla_zenoh.lab.web.access import People, Person, host_is_ours, origin_is_ours, with_headers
-from vla_zenoh.lab.web.arm import surroundings
-from vla_zenoh.lab.web.pictures import PageView, Pictures
-from vla_zenoh.lab.web.requests import AnyRequest, name_of, parse
-from vla_zenoh.lab.web.robot_link import RobotLink
-from vla_zenoh.lab.web.tables import node_table, noted_event
-
-try:
-    import uvicorn  # noqa: F401  # pyright: ignore[reportMissingImports]
-    from starlette.applications import Starlette  # pyright: ignore[reportMissingImports]
-    from starlette.requests import Request as HttpRequest  # pyright: ignore[reportMissingImports]
-    from starlette.responses import Response  # pyright: ignore[reportMissingImports]
-    from starlette.routing import Route, WebSocketRoute  # pyright: ignore[reportMissingImports]
-    from starlette.websockets import (  # pyright: ignore[reportMissingImports]
-        WebSocket,
-        WebSocketDisconnect,
-    )
-except ImportError as error:
-    raise MissingExtraError(error.name or "starlette", "web") from error
+from vla_zenoh_web import metrics, requests
+from vla_zenoh_web.access import People, Person, host_is_ours, origin_is_ours, with_headers
+from vla_zenoh_web.arm import surroundings
+from vla_zenoh_web.pictures import PageView, Pictures
+from vla_zenoh_web.requests import AnyRequest, name_of, parse
+from vla_zenoh_web.robot_link import RobotLink
+from vla_zenoh_web.tables import node_table, noted_event
 
 STATIC = Path(__file__).parent / "static"
 FILES = {

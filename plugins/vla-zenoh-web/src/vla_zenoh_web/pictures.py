@@ -16,9 +16,9 @@ from vla_zenoh.codec.image import decode_depth, encode_jpeg
 from vla_zenoh.errors import CodecError, ProfileError
 from vla_zenoh.lab.newest_records import StreamSlot
 from vla_zenoh.lab.rate_limit import RateLimit
-from vla_zenoh.lab.web.requests import DrawnRequest, LookRequest, parse
 from vla_zenoh.profile import CameraProfile
 from vla_zenoh.types import Image
+from vla_zenoh_web.requests import DrawnRequest, LookRequest, parse
 
 MAX_PICTURE_BYTES = 4 * 1024 * 1024
 MAX_STREAMS = 32

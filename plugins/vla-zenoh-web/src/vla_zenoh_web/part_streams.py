@@ -14,7 +14,6 @@ from vla_zenoh.codec.settings import decode_held
 from vla_zenoh.errors import CodecError, RecordError, SpecError, VlaZenohError
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.kinematics.so3 import Pose, rotation_from_quat
-from vla_zenoh.lab.web.arm import ArmLines, Line, corners_of, rounded
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
@@ -26,6 +25,7 @@ from vla_zenoh.types import (
     PoseCommand,
     PoseState,
 )
+from vla_zenoh_web.arm import ArmLines, Line, corners_of, rounded
 
 SILENT_S = 1.0
 GOALS = 100

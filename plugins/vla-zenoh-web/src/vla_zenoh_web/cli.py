@@ -14,11 +14,11 @@ from vla_zenoh.cli.options import bind_address, network_address, options
 from vla_zenoh.cli.output import errors
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import NodeError, SecurityError
-from vla_zenoh.lab.web.access import People, Person, read_people
 from vla_zenoh.profile.schema import is_loopback_address
 from vla_zenoh.runtime.process import run_node
 from vla_zenoh.security.roles import Role
 from vla_zenoh.security.store import local_role
+from vla_zenoh_web.access import People, Person, read_people
 
 PORT = 8088
 
@@ -62,7 +62,7 @@ def web(
     person has a token, and the rights of a viewer or operator.
     """
     _require_tls(bind, certificate, key)
-    from vla_zenoh.lab.web.serve import TlsFiles, serve_page
+    from vla_zenoh_web.serve import TlsFiles, serve_page
 
     tls = None if certificate is None or key is None else TlsFiles(certificate, key)
     profile = target.load()

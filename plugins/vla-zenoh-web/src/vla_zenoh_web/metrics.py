@@ -10,24 +10,13 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
+from prometheus_client import CollectorRegistry
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, StateSetMetricFamily
+from prometheus_client.openmetrics.exposition import CONTENT_TYPE_LATEST, generate_latest
+
 from vla_zenoh.cli.node_rows import NodeRow
-from vla_zenoh.errors import MissingExtraError
 from vla_zenoh.keys import ENDED
 from vla_zenoh.sanitize import one_line
-
-try:
-    from prometheus_client import CollectorRegistry  # pyright: ignore[reportMissingImports]
-    from prometheus_client.core import (  # pyright: ignore[reportMissingImports]
-        CounterMetricFamily,
-        GaugeMetricFamily,
-        StateSetMetricFamily,
-    )
-    from prometheus_client.openmetrics.exposition import (  # pyright: ignore[reportMissingImports]
-        CONTENT_TYPE_LATEST,
-        generate_latest,
-    )
-except ImportError as error:
-    raise MissingExtraError(error.name or "prometheus_client", "web") from error
 
 __all__ = ["CONTENT_TYPE_LATEST", "exposition"]
 
