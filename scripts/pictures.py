@@ -49,6 +49,8 @@ VIEW_PX, REPORT_PX, PHONE_PX = (1600, 1000), (1500, 1330), (500, 1500)
 AT_S = 4.2
 """The first brick is in the gripper."""
 MOST_BYTES = 200_000
+FILM_PX, FILM_HZ, FILM_BYTES = (800, 325), 7.5, 3_000_000
+"""Of the moving picture."""
 DARK = ("--force-dark-mode", "--blink-settings=preferredColorScheme=0")
 STATUS_COLUMNS = 116
 UP_WORDS = {"sim": (), "dry_run": ("--dry-run",), "missing": ("--host", "robot")}
@@ -188,6 +190,24 @@ def crashed(status: dict[str, Any]) -> None:
         raise RuntimeError("not yet")
 
 
+def picture_demo(video: Path, out: Path) -> None:
+    """The video of a demo as an animated WebP of at most `FILM_BYTES`."""
+    source = cv2.VideoCapture(str(video))
+    every = round(source.get(cv2.CAP_PROP_FPS) / FILM_HZ)
+    frames: list[cv2.typing.MatLike] = []
+    while source.grab():
+        if source.get(cv2.CAP_PROP_POS_FRAMES) % every == 0:
+            frames.append(cv2.resize(source.retrieve()[1], FILM_PX, interpolation=cv2.INTER_AREA))
+    film = cv2.Animation()
+    film.frames = frames
+    film.durations = [round(1000 / FILM_HZ)] * len(frames)
+    for quality in range(80, 20, -10):
+        cv2.imwriteanimation(str(out), film, [cv2.IMWRITE_WEBP_QUALITY, quality])
+        if out.stat().st_size <= FILM_BYTES:
+            return
+    sys.exit(f"{out} has {out.stat().st_size} bytes, at most {FILM_BYTES}")
+
+
 def small(picture: Path, out: Path) -> None:
     """`picture` as JPEG of at most `MOST_BYTES`."""
     for quality in range(92, 20, -4):
@@ -199,7 +219,7 @@ def small(picture: Path, out: Path) -> None:
 
 def main() -> None:
     states = ("status_sim", "status_dry_run", "status_missing")
-    names = ("tasks", "report", "report_dark", "report_phone", "view", *states)
+    names = ("demo", "tasks", "report", "report_dark", "report_phone", "view", *states)
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path, help="run folder of a demo")
     parser.add_argument("what", choices=[*names, []], nargs="*")
@@ -211,6 +231,10 @@ def main() -> None:
         for name in given.what or names:
             if name in states:
                 picture_status(name.removeprefix("status_"), IMAGES / f"{name}.svg")
+                continue
+            if name == "demo":
+                picture_demo(given.run / "video.mp4", IMAGES / "demo.webp")
+                print(IMAGES / "demo.webp")
                 continue
             if name == "tasks":
                 png.write_bytes((given.run / "tasks.jpg").read_bytes())
