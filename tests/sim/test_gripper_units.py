@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from brick_rig import JAW_M, held, hold
 from model_wires import groot, lerobot_server, openpi, openvla_rest, xpolicylab
 from motions import make_world
 
 from vla_zenoh.control.reachability import ReachabilityFilter
-from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.lab.lockstep.loop import Lockstep
 from vla_zenoh.lab.lockstep.worker import Delays
 from vla_zenoh.lab.policy_servers.field_mapping import FieldMapping, read_field_mapping
@@ -24,15 +24,10 @@ from vla_zenoh.policy.inference import Committed
 from vla_zenoh.policy.meaning import unturned
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.simulation.world import World, build_world
-from vla_zenoh.types import JointReference
 
 pytestmark = pytest.mark.long
 
 SO101, PANDA = load_profile("so101_sim"), load_profile("panda_sim")
-JAW_M = 0.022
-"""From the fixed jaw's tip of the SO-101, which is its TCP, to the middle of what it holds."""
-SLIPPED_M = 0.01
-CLOSE_TICKS = 2400
 LATE = Delays(inference_s=0.15, camera_s=0.02)
 SO101_OPTIONS = {
     "map": "state=joint_deg+gripper_open, prompt=prompt",
@@ -83,30 +78,6 @@ class Keeps:
         return [0.0, 0.0, 0.0, *unturned(self.mapping.semantics.rotation)]
 
 
-def hold(world: World, by_m: np.ndarray, profile: Profile) -> np.ndarray:
-    """Shut the fingers on the brick; where it is then, (3,) m in the axes of the TCP."""
-    home = JointReference.at_rest(np.array(profile.robot.home_rad))
-    still = home if profile is SO101 else world.hold_reference()
-    world.set_gripper(0.0, 0.1, 25.0)
-    for tick in range(CLOSE_TICKS):
-        if tick < CLOSE_TICKS // 2:
-            position_m, rotation = world.tcp()
-            world.place(name_of(world), position_m + rotation @ by_m, quat_from_rotation(rotation))
-        world.tick(still)
-    assert world.gripper_state().holding
-    return brick_m(world)
-
-
-def name_of(world: World) -> str:
-    return next(name for name in world.objects() if name in ("brick", "red_brick"))
-
-
-def brick_m(world: World) -> np.ndarray:
-    """Where the brick is, in the axes of the TCP."""
-    position_m, rotation = world.tcp()
-    return rotation.T @ (world.objects()[name_of(world)][0] - position_m)
-
-
 def run(profile: Profile, world: World, policy: Keeps, seconds: float) -> None:
     loop = Lockstep(profile, world, policy, delays=LATE, reach=ReachabilityFilter(profile))
     loop.put("rate", 5.0)
@@ -116,11 +87,6 @@ def run(profile: Profile, world: World, policy: Keeps, seconds: float) -> None:
     loop.run(seconds)
     assert loop.commander.task.active
     assert len(policy.told) > 3 * seconds
-
-
-def held(world: World, was_m: np.ndarray) -> None:
-    assert world.gripper_state().holding
-    assert np.linalg.norm(brick_m(world) - was_m) < SLIPPED_M
 
 
 @pytest.mark.parametrize(

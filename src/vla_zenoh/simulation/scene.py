@@ -43,6 +43,8 @@ HIDDEN_GROUP = 3  # MuJoCo's own convention: groups from here on are not drawn
 
 # Creep of a held brick in 10 s, measured: 1.06 mm with a pyramidal cone and impratio 1, 0.03 mm so.
 IMPRATIO = 10.0
+# Between the jaws of an SO-101, which pinch at an angle, it crept 2.6 mm so, and 0.1 mm with these.
+JAW_NOSLIP_ITERATIONS = 5
 STIFF_SOLREF = (0.004, 1.0)
 PAD_FRICTION = (1.5, 0.02, 0.001)  # sliding, torsional, rolling
 PAD_CONDIM = 4
@@ -106,7 +108,7 @@ def build_model(
             if robot.camera is not None:
                 camera = f"{robot.part}_{robot.camera.name}" if robot.part else robot.camera.name
                 spec.camera(prefix_of(robot) + robot.camera.name).name = camera
-        _set_solver(spec)
+        _set_solver(spec, jaw=any(len(robot.finger_joints) == 1 for robot in robots))
         model = spec.compile()
     except (ValueError, mujoco.FatalError) as error:
         described = " and ".join(dict.fromkeys(robot.description for robot in robots))
@@ -211,12 +213,13 @@ def _add_actuators(spec: mujoco.MjSpec, robot: RobotModel) -> None:
     servo.forcelimited, servo.forcerange = True, (-1.0, 1.0)
 
 
-def _set_solver(spec: mujoco.MjSpec) -> None:
+def _set_solver(spec: mujoco.MjSpec, *, jaw: bool) -> None:
     option = spec.option
     option.timestep = STEP_S
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     option.impratio = IMPRATIO
+    option.noslip_iterations = JAW_NOSLIP_ITERATIONS if jaw else 0
     # A state that diverged must stay visible; MuJoCo would reset it silently.
     option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     # Multisampling costs ten times the rest of a software-rendered frame.

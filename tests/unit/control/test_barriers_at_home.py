@@ -62,6 +62,7 @@ def test_no_barrier_is_lost_whatever_the_home(seed: int) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 def test_no_barrier_is_lost_at_1000_homes() -> None:
     for home_rad in homes(1000, 1000):
         assert lost(home_rad) == []

@@ -1,0 +1,44 @@
+"""A brick between the fingers of a simulated arm, and whether it stays there."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vla_zenoh.kinematics.so3 import quat_from_rotation
+from vla_zenoh.profile import Profile
+from vla_zenoh.simulation.world import World
+from vla_zenoh.types import JointReference
+
+JAW_M = 0.022
+"""From the fixed jaw's tip of the SO-101, which is its TCP, to the middle of what it holds."""
+SLIPPED_M = 0.003
+CLOSE_TICKS = 2400
+
+
+def hold(world: World, by_m: np.ndarray, profile: Profile) -> np.ndarray:
+    """Shut the fingers on the brick; where it is then, (3,) m in the axes of the TCP."""
+    home = JointReference.at_rest(np.array(profile.robot.home_rad))
+    still = home if profile.robot.command == "joint" else world.hold_reference()
+    world.set_gripper(0.0, 0.1, 25.0)
+    for tick in range(CLOSE_TICKS):
+        if tick < CLOSE_TICKS // 2:
+            position_m, rotation = world.tcp()
+            world.place(name_of(world), position_m + rotation @ by_m, quat_from_rotation(rotation))
+        world.tick(still)
+    assert world.gripper_state().holding
+    return brick_m(world)
+
+
+def name_of(world: World) -> str:
+    return next(name for name in world.objects() if name in ("brick", "red_brick"))
+
+
+def brick_m(world: World) -> np.ndarray:
+    """Where the brick is, in the axes of the TCP."""
+    position_m, rotation = world.tcp()
+    return rotation.T @ (world.objects()[name_of(world)][0] - position_m)
+
+
+def held(world: World, was_m: np.ndarray) -> None:
+    assert world.gripper_state().holding
+    assert np.linalg.norm(brick_m(world) - was_m) < SLIPPED_M
