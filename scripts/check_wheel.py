@@ -47,6 +47,7 @@ WITH_PLUGINS = [
     ["bench", "sim", "--help"],
     ["profile", "check", "fr3", "ur5e_rtde"],
     ["web", "--help"],
+    ["node", "rolling", "--help"],
 ]
 
 

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 from chain import READY_PATIENCE_S, Chain, running_chain
+from vla_zenoh_rolling.settings_log import entries_of
 
 from vla_zenoh.keys import ROLLING
 from vla_zenoh.lab.recording.run import load_run
-from vla_zenoh.lab.rolling.settings_log import entries_of
 
 pytestmark = pytest.mark.slow
 

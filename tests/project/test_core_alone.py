@@ -10,6 +10,7 @@ import sysconfig
 from pathlib import Path
 
 import pytest
+from camera_rig import free_endpoint
 
 from vla_zenoh import plugins
 
@@ -78,3 +79,26 @@ def test_a_command_of_a_package_that_is_missing_says_how_to_install_it(
     package = plugins.PACKAGES[command]
     assert f"needs the package {package}; install it with: pip install" in done.stderr
     assert f". './plugins/{package}' in a checkout" in done.stderr
+
+
+@pytest.mark.realtime
+def test_up_runs_without_a_rolling_record_and_names_its_package(
+    alone: dict[str, str], tmp_path: Path
+) -> None:
+    router = free_endpoint()
+    words = ["up", "panda_sim", "--dry-run", "--connect", router, "--listen", router]
+    said = []
+    with subprocess.Popen(
+        [sys.executable, "-S", "-m", "vla_zenoh", *words, "--log-dir", str(tmp_path)],
+        env=alone,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as lab:
+        assert lab.stdout is not None
+        for line in lab.stdout:
+            said.append(line)
+            if "watch: " in line:
+                lab.terminate()
+    (sentence,) = [line for line in said if "rolling record" in line]
+    assert "`vla-zenoh node rolling` needs the package vla-zenoh-rolling; install" in sentence
+    assert "all nodes have stopped" in said[-1]

@@ -73,7 +73,6 @@ ALLOWED = {
             "lab/recording/recorder.py",
             "lab/recording/replay.py",
             "lab/recording/sample_queue.py",
-            "lab/rolling/node.py",
             "lab/teleop/leader.py",
             "lab/teleop/node.py",
             "lab/trial/runner.py",

@@ -14,15 +14,15 @@ from typing import Any
 import pytest
 import zenoh
 from chain import Chain, command_line
+from vla_zenoh_rolling.node import RingLimits, RollingRecord
+from vla_zenoh_rolling.ring import PART
+from vla_zenoh_rolling.settings_log import LOG, entries_of
 
 from vla_zenoh.bus import clock
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import SessionError
 from vla_zenoh.keys import ROLLING
 from vla_zenoh.lab.recording.run import load_run
-from vla_zenoh.lab.rolling.node import RingLimits, RollingRecord
-from vla_zenoh.lab.rolling.ring import PART
-from vla_zenoh.lab.rolling.settings_log import LOG, entries_of
 
 SHORT = RingLimits(keep_s=4.0, max_bytes=40 * 1024**2, segment_s=1.0, after_s=0.5)
 LOGGED_S = 30.0

@@ -22,12 +22,12 @@ from chain import READY_PATIENCE_S, Chain, command_line, running_chain, write_pr
 from recording_rig import recording
 from teleop_rig import Screen, teleop
 from typer.testing import CliRunner
+from vla_zenoh_rolling.settings_log import entries_of
 
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.keys import Keys
 from vla_zenoh.lab.cli.secure import secure_app
 from vla_zenoh.lab.recording.reader import open_recording
-from vla_zenoh.lab.rolling.settings_log import entries_of
 from vla_zenoh.profile import load_profile
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(180)]

@@ -13,12 +13,12 @@ import time
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from vla_zenoh import plugins
 from vla_zenoh.bus.shared_memory import obstacle
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
@@ -112,8 +112,8 @@ def up(
         show(node, sentence, "bold")
 
     others = [effective_profile(name, host=host) for name in also or ()]
-    can_record = all(find_spec(name) for name in ("mcap", "rosbags", "zstandard"))
-    record = rolling_folder(logs, loaded) if can_record and not no_record else None
+    missing = plugins.lacking(f"node.{ROLLING}")
+    record = None if no_record or missing else rolling_folder(logs, loaded)
     given: dict[str, Any] = {"also": others, "dry_run": dry_run, "rolling": record}
     with Host(loaded, host, log=log, tell=tell, **given) as running:
         where = ", ".join(running.profile.session.connect)
@@ -123,10 +123,11 @@ def up(
         tell("up", f"log: {file}")
         if loaded.session.shared_memory and (why := obstacle()):
             tell("up", f"no shared memory: {why}")
-        if ROLLING in {child.command.kind for child in running.supervisor.children}:
+        kinds = {child.command.kind for child in running.supervisor.children}
+        if ROLLING in kinds:
             tell("up", f"rolling record: {record}")
-        elif not (no_record or can_record):
-            tell("up", "no rolling record: it needs the extra record, as in vla-zenoh[record]")
+        elif "command" in kinds and not no_record:
+            tell("up", f"no rolling record: {missing}")
         target = target_of(profile, running)
         status, activate, end = (target.typed(word) for word in ("status", "activate", "stop"))
         tell("up", f"watch: {status}; drive: {activate}, also prompt; stop: {end}; end: Ctrl-C")

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 from dataset_rig import KEYS, ZERO_NS, put
+from vla_zenoh_rolling.ring import FACTS, PART, Ring, RingLimits, delete_oldest_saved
 
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.evaluation.evaluate import recordings
 from vla_zenoh.lab.recording.reader import open_recording
 from vla_zenoh.lab.recording.run import load_run
 from vla_zenoh.lab.recording.writer import RecordingWriter
-from vla_zenoh.lab.rolling.ring import FACTS, PART, Ring, RingLimits, delete_oldest_saved
 from vla_zenoh.types import Task
 
 SEGMENT_S = 30.0

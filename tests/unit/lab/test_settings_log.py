@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from vla_zenoh_rolling.settings_log import LOG, SettingsLog, entries_of
 
 from vla_zenoh.errors import RecordingError
-from vla_zenoh.lab.rolling.settings_log import LOG, SettingsLog, entries_of
 
 
 def filled(folder: Path, *texts: str, file_bytes: int = 10**6) -> None:

@@ -34,10 +34,10 @@ from vla_zenoh.lab.recording.recorder import COMMIT_S, SWITCH_INTERVAL_S, WRITE_
 from vla_zenoh.lab.recording.sample import Sample
 from vla_zenoh.lab.recording.sample_queue import SampleQueue
 from vla_zenoh.lab.recording.writer import RecordingWriter
-from vla_zenoh.lab.rolling.ring import PART, Ring, RingLimits, delete_oldest_saved
-from vla_zenoh.lab.rolling.settings_log import SettingsLog, logs_of
 from vla_zenoh.profile import Profile, to_yaml
 from vla_zenoh.types import MAX_TEXT, Event, NodeStatus
+from vla_zenoh_rolling.ring import PART, Ring, RingLimits, delete_oldest_saved
+from vla_zenoh_rolling.settings_log import SettingsLog, logs_of
 
 NICE = 10
 """Everything that moves the arm goes first."""

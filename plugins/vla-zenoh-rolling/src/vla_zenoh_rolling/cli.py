@@ -41,7 +41,7 @@ def rolling(
     At a stop, a fault, a rejected activation or `vla-zenoh save` the minutes are kept in a
     folder of their own. It runs at a low priority.
     """
-    from vla_zenoh.lab.rolling.node import NICE, RingLimits, RollingRecord
+    from vla_zenoh_rolling.node import NICE, RingLimits, RollingRecord
 
     loaded = target.load()
     place = folder or rolling_folder(default_log_folder(), loaded)
