@@ -269,9 +269,22 @@ def test_an_image_comes_as_bytes_or_floats_and_with_its_channels_first_or_last(
     assert np.abs(off).max() <= 1  # floats are cut off, as there
 
 
+@pytest.mark.parametrize("width", [None, True, "0.05", b"0.05", 0.05 + 1j, [[0.05]], []])
+def test_a_gripper_that_is_no_number_is_named(width: Any) -> None:
+    with pytest.raises(PeerError, match="gripper"):
+        offer().observe({**ASKED, "observation/gripper": width}, 5)
+
+
+@pytest.mark.parametrize(("value", "level"), [(1 + 1e-6, 255), (1.009, 255), (-0.009, 0)])
+def test_floats_of_an_image_that_was_resized_are_cut_off(value: float, level: int) -> None:
+    given = {**ASKED, "observation/front": np.full((48, 64, 3), value)}
+    assert (offer().observe(given, 5).images["front"] == level).all()
+
+
 @pytest.mark.parametrize(
     ("image", "why"),
     [
+        (np.zeros((0, 64, 3), np.uint8), "is no image"),
         (np.full((48, 64, 3), -0.5), "numbers from -0.5 to -0.5; wanted 0 to 1"),
         (np.full((48, 64, 3), 51.0), "wanted 0 to 1, as it holds floats"),
         (np.full((48, 64, 3), np.nan), "wanted 0 to 1"),

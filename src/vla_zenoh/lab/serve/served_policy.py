@@ -23,6 +23,8 @@ from vla_zenoh.policy.meaning import IDENTITY
 from vla_zenoh.policy.observation import prepare_image
 from vla_zenoh.types import GripperState, Image, JointState, PoseState, Task, shown
 
+ROUNDING = 0.01
+"""Floats of an image that was resized are beyond 0 to 1 by this much."""
 _OF_PART = {"pose": "position+quat_xyzw", "gripper": "gripper_m", "joint": "joint"}
 
 
@@ -100,9 +102,7 @@ class ServedPolicy:
                     image = Image(_pixels(name, value))
                     images[source.camera] = prepare_image(image, cameras[source.camera])
                 else:
-                    # One number comes without a shape, too: a gripper's.
-                    numbers = np.atleast_1d(np.asarray(value, np.float64))
-                    state |= self.states[name].decode(numbers)
+                    state |= self.states[name].decode(_numbers(name, value))
             return Observation(
                 stamp_wall_ns=stamp_wall_ns,
                 seq=0,
@@ -126,6 +126,14 @@ class ServedPolicy:
         return out
 
 
+def _numbers(name: str, value: Any) -> NDArray[np.float64]:
+    """(n,) of what a client sends; one number comes without a shape, too: a gripper's."""
+    given = np.asarray(value)
+    if given.dtype.kind not in "iuf":
+        raise PeerError("peer_request", f"{name} holds no numbers: {shown(value)}")
+    return np.atleast_1d(given).astype(np.float64)
+
+
 def _pixels(name: str, value: Any) -> NDArray[np.uint8]:
     """(H, W, 3) of what a client sends, as openpi's own policies read it.
 
@@ -133,22 +141,19 @@ def _pixels(name: str, value: Any) -> NDArray[np.uint8]:
     first.
     """
     given = np.asarray(value)
-    if given.ndim != 3 or given.dtype.kind not in "uif":
+    if given.ndim != 3 or not given.size or given.dtype.kind not in "uif":
         raise PeerError("peer_request", f"{name} is no image: {shown(value)}")
     if given.shape[0] == 3 != given.shape[2]:
         given = np.moveaxis(given, 0, -1)
-    if given.dtype.kind != "f":
-        beyond = given.size and (given.min() < 0 or given.max() > 255)
-        wanted, scale = "0 to 255", 1
-    else:
-        beyond = not (given.size and given.min() >= 0.0 and given.max() <= 1.0)
-        wanted, scale = "0 to 1, as it holds floats", 255
-    if beyond:
+    most, scale, rounding, wanted = 255, 1, 0.0, "0 to 255"
+    if given.dtype.kind == "f":
+        most, scale, rounding, wanted = 1, 255, ROUNDING, "0 to 1, as it holds floats"
+    if not (given.min() >= -rounding and given.max() <= most + rounding):
         raise PeerError(
             "peer_request",
             f"{name} holds numbers from {given.min():.4g} to {given.max():.4g}; wanted {wanted}",
         )
-    return np.ascontiguousarray(scale * given).astype(np.uint8)
+    return np.ascontiguousarray(scale * given.clip(0, most)).astype(np.uint8)
 
 
 def make_served_policy(
