@@ -287,6 +287,12 @@ def state_numbers(
             "the state has gripper_closed, which is 0 open to 1 shut, and gripper_range says other "
             "numbers: name gripper_open, which has them"
         )
+    turned = any(units.joint_zeros) or min(units.joint_scales) < 0
+    if "joint_deg" in names and turned:
+        raise SpecError(
+            "the state has joint_deg, degrees from the profile's zero, and joint_zero or "
+            "joint_scale_rad says another zero or direction: name joint, which has them"
+        )
     robot = profile.robot
     cut = any(_WHOLE.get(name, (name,))[0] in CUT for name in names)
     given = units.rotation_reference

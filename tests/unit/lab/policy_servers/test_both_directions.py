@@ -257,3 +257,10 @@ def test_a_gripper_that_is_told_closed_has_no_range() -> None:
     units = meaning("degrees", "percent").state_units
     with pytest.raises(SpecError, match="gripper_range says other numbers: name gripper_open"):
         state_numbers(read_parts("joint+gripper_closed"), SO101, units)
+
+
+@pytest.mark.parametrize("arm", ["degrees from another zero", "one unit each"])
+def test_joints_of_another_zero_or_direction_are_no_degrees_of_the_profile(arm: str) -> None:
+    units = meaning(arm, "percent").state_units
+    with pytest.raises(SpecError, match="another zero or direction: name joint"):
+        state_numbers(read_parts("joint_deg+gripper_open"), SO101, units)
