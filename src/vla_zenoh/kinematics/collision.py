@@ -9,7 +9,7 @@ happens to stand takes no pair away.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import coal
@@ -136,6 +136,14 @@ class CollisionModel:
             if shape.parentJoint == frame.parentJoint:
                 nearest_m = min(nearest_m, _distance_m(shape, frame.placement))
         return float(nearest_m)
+
+    def reaches_m(self) -> Iterator[tuple[str, float]]:
+        """Each link that moves, and how far from its joint its hull ends."""
+        for shape in list(self._geometry.geometryObjects)[: self._links]:
+            if shape.parentJoint:
+                points = np.array(shape.geometry.points()) @ shape.placement.rotation.T
+                ends_m = np.linalg.norm(points + shape.placement.translation, axis=1)
+                yield shape.name, float(ends_m.max())
 
     def links(self) -> Any:
         """A geometry model of the arm's links alone, a hull each."""

@@ -28,6 +28,8 @@ SHAPES: Mapping[str, Mapping[str, int]] = {
 }
 """Collision shapes, with how many numbers above 0 each attribute has."""
 PLACE = ("robot", "description")
+WORLD = "universe"
+"""What Pinocchio calls that which does not move."""
 TO_URDF = {
     "mujoco": "MJCF, the format of MuJoCo: give the maker's URDF",
     "sdf": "SDF, the format of Gazebo: give the maker's URDF",
@@ -138,8 +140,8 @@ class Description:
 
     def model_name(self, joint: str) -> str:
         """Name of a joint in Pinocchio's model, which needs another one than every link has."""
-        name = joint
-        while name in self.links or (name != joint and name in self.joints):
+        name, taken = joint, {WORLD, *self.links}
+        while name in taken or (name != joint and name in self.joints):
             name += "_"
         return name
 
@@ -193,9 +195,11 @@ class Description:
             if b"xacro" in data:
                 raise self._error(XACRO.format(name=self.name, stem=self.path.stem)) from error
             raise self._error(f"is no XML: {error}") from error
-        tag = root.tag.rpartition("}")[2]
+        space, _, tag = root.tag.rpartition("}")
         if tag != "robot":
             raise self._error(f"is {TO_URDF.get(tag, f'no URDF: it begins with <{tag[:40]}>')}")
+        if space:
+            raise self._error(f"has the namespace {space[1:]!r}: a URDF has none, remove xmlns")
         if _is_xacro(root):
             raise self._error(XACRO.format(name=self.name, stem=self.path.stem))
         return root
@@ -323,6 +327,8 @@ class Description:
                     raise self._error(f"has {count} {what}s named {name!r}")
         if not self.links:
             raise self._error("has no links")
+        if WORLD in self.links:
+            raise self._error(f"has a link named {WORLD!r}, which means the world: rename it")
         for joint in joints:
             for link in (joint.parent, joint.child):
                 if link not in self.links:

@@ -91,6 +91,8 @@ class Kinematics:
         self.finger_signs: FloatArray = np.array([end.sign for end in ends], np.float64)
         """(k,) 1 for a finger joint whose position grows as the hand opens, else -1; as the first
         where the profile says where they are open and shut."""
+        self.fingers_m = sum(abs(end.open) for end in ends)
+        """How far finger joints that slide open in all."""
         opened = {name: end.open for name, end in zip(finger_joints, ends, strict=True)}
         self.full_model: Any = pin.buildModelFromXML(described.text(followers), mimic=True)
         self.locked_joints: list[int] = [

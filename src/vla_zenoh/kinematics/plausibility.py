@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from vla_zenoh.kinematics.collision import CollisionModel
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.profile import Limits
 
@@ -16,9 +17,13 @@ MAX_SPEED_RAD_S = 50.0
 """The quickest joints of arms make 10 rad/s; a velocity in degrees is beyond this."""
 MAX_LENGTH_M = 10.0
 """Between two joints, or from the root of the description to the base."""
+MAX_LINK_M = 3.0
+"""From a joint to the end of the link that it moves."""
 
 
-def implausible(kinematics: Kinematics, limits: Limits) -> Iterator[str]:
+def implausible(
+    kinematics: Kinematics, limits: Limits, collisions: CollisionModel
+) -> Iterator[str]:
     """What cannot be right about an arm, each with the unit that it is probably in."""
     name = kinematics.urdf.name
     for index, joint in enumerate(kinematics.arm_joints):
@@ -56,6 +61,13 @@ def implausible(kinematics: Kinematics, limits: Limits) -> Iterator[str]:
             yield (
                 f"{name} has {what!r} {length_m:g} m from the joint before it: are these "
                 "millimetres? A URDF is in metres"
+            )
+    for link, reach_m in collisions.reaches_m():
+        if reach_m > MAX_LINK_M:
+            yield (
+                f"{name} has link {link!r} with a collision shape that ends {reach_m:.3g} m from "
+                'its joint: is it in millimetres? Give its mesh scale="0.001 0.001 0.001", or '
+                "correct its size: no barrier can keep it from the arm itself"
             )
     yield from _out_of_reach(kinematics, limits, sum(length for length, _ in lengths_m))
 

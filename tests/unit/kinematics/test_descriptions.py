@@ -70,6 +70,9 @@ TAKEN: dict[str, Taken] = {
     "a joint with the name of another link": Taken(
         [row._replace(child=f"j{n % 6 + 1}") for n, row in enumerate(arm(SIX), 1)] + [TOOL]
     ),
+    "a joint with the name of the world": Taken(
+        [Row("universe"), *arm(SIX)[1:], TOOL], ("universe", *JOINTS_6[1:])
+    ),
     "a torso that lifts": Taken([SLIDE, *arm(SIX), TOOL], locked={"lift": 0.25}),
     "a torso that turns": Taken(
         [Row("waist", at_m=(0.1, 0.0, 0.8)), *arm(SEVEN), TOOL], JOINTS_7, {"waist": -0.3}
@@ -283,6 +286,13 @@ REFUSED: dict[str, Refused] = {
     "MJCF": Refused("<mujoco><worldbody/></mujoco>", ("is MJCF", "URDF")),
     "SDF": Refused("<sdf version='1.7'><model/></sdf>", ("is SDF",)),
     "a page": Refused("<html><body/></html>", ("begins with <html>",)),
+    "a namespace": Refused(
+        WHOLE.replace("<robot ", '<robot xmlns="http://robots.org" '),
+        ("namespace 'http://robots.org'", "remove xmlns"),
+    ),
+    "a link with the name of the world": Refused(
+        WHOLE.replace('"j3_link"', '"universe"'), ("link named 'universe'", "rename it")
+    ),
     "no links": Refused("<robot name='x'/>", ("has no links",)),
     "no effort": Refused(
         urdf([*arm(SIX, j3=Row("j3", axis=Y, limit=NO_EFFORT)), TOOL]),
@@ -348,6 +358,13 @@ REFUSED: dict[str, Refused] = {
         urdf([*arm(SIX, j2=Row("j2", axis=Y, velocity=180.0)), TOOL]), ("180 rad/s", "degrees")
     ),
     "millimetres": Refused(urdf([*MILLIMETRES, TOOL]), ("200 m", "millimetres")),
+    "a mesh in millimetres": Refused(
+        WHOLE.replace(
+            f'<link name="j3_link"><collision><geometry>{BALL}',
+            '<link name="j3_link"><collision><geometry><box size="60 60 90"/>',
+        ),
+        ("'j3_link'", "ends 61.8", "millimetres"),
+    ),
     "a base on a map": Refused(
         urdf([*arm(SIX, j1=Row("j1", at_m=(2000.0, 0.0, 0.0))), TOOL]),
         ("limits.workspace", "2e+03 m"),
@@ -463,6 +480,25 @@ def test_what_is_assumed_of_joints_that_are_not_commanded_is_said(tmp_path: Path
 def test_a_locked_joint_is_one_that_can_be_there(tmp_path: Path, more: str, says: str) -> None:
     errors, _ = checked(tmp_path, urdf([SLIDE, *arm(SIX), TOOL]), more=more)
     assert says in errors
+
+
+@pytest.mark.parametrize(
+    ("far_m", "fingers", "wrong"),
+    [
+        (0.04, ("left", "right"), False),
+        (0.05, ("left", "right"), False),
+        (0.04, ("left",), True),
+        (0.004, ("left", "right"), True),
+        (0.4, ("left", "right"), True),
+    ],
+)
+def test_fingers_that_do_not_add_up_to_the_width_are_told(
+    tmp_path: Path, far_m: float, fingers: tuple[str, ...], wrong: bool
+) -> None:
+    rows = [*arm(SIX), TOOL, finger("left", 0.0, far_m), finger("right", -far_m, 0.0)]
+    errors, advice = checked(tmp_path, urdf(rows), fingers=fingers)
+    assert not errors
+    assert ("finger_joints open by" in advice) is wrong
 
 
 def test_a_home_outside_the_workspace_is_told_for_a_real_arm_too(tmp_path: Path) -> None:

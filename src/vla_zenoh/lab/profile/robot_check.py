@@ -21,6 +21,8 @@ from vla_zenoh.profile.section import Place
 
 TOOL_M = 0.06
 """A TCP further from all shapes has a tool without one; between open fingers it is nearer."""
+WIDTHS = 1.5
+"""Factor between the widths of a description and a profile: one finger of two is twice as much."""
 LONG_BRAKE_S = 2.5
 """`up` ends a robot's node 2.8 s after Ctrl-C, less the time until the node gets the signal.
 See `STOP_ORDER` in `vla_zenoh.runtime.supervisor`."""
@@ -66,7 +68,7 @@ def arm(profile: Profile) -> Iterator[ProfileFault]:
         yield ProfileFault(place, f"{profile.robot.description!r} cannot be read: {error}")
         return
     kinematics = reach.kinematics
-    for why in implausible(kinematics, profile.limits):
+    for why in implausible(kinematics, profile.limits, reach.barriers.collisions):
         yield ProfileFault(place, why)
     home_rad = kinematics.ordered(profile.robot.arm_joints, profile.robot.home_rad)
     for index, joint in enumerate(kinematics.arm_joints):
@@ -145,6 +147,7 @@ def joints_advice(profile: Profile) -> Iterator[str]:
             "States that have it elsewhere are rejected; a robot that does not publish it is "
             "believed"
         )
+    yield from _fingers_advice(profile, kinematics.fingers_m)
     home_rad = kinematics.ordered(profile.robot.arm_joints, profile.robot.home_rad)
     at_m = kinematics.forward(home_rad).position_m
     _, outside_m = into_workspace(profile.limits, at_m)
@@ -165,6 +168,20 @@ def joints_advice(profile: Profile) -> Iterator[str]:
         "shortened to nothing, activation is rejected while its newest chunk asks for one, and "
         "models with absolute poses or joint positions are rejected altogether"
     )
+
+
+def _fingers_advice(profile: Profile, described_m: float) -> Iterator[str]:
+    """Advice where the sliding fingers of the description do not add up to the width."""
+    gripper = profile.robot.gripper
+    if gripper.joint_ends is not None or not profile.robot.finger_joints:
+        return
+    share = described_m / gripper.max_width_m
+    if not 1 / WIDTHS < share < WIDTHS:
+        yield (
+            f"robot.gripper.max_width_m: is {gripper.max_width_m:g}, and finger_joints open by "
+            f"{described_m:g} m in all, which counts as the width. Name every finger in "
+            "finger_joints, or give joint_open_m and joint_shut_m"
+        )
 
 
 # -- robot node -------------------------------------------------------------------------------
