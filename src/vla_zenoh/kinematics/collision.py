@@ -1,8 +1,9 @@
 """Distances of an arm to itself, to the table, to keep-outs and to another arm.
 
 Every link is the convex hull of its collision shapes. The pairs to check are found once, by
-sampling the joint space: links that are always near are neighbours by construction, pairs that
-never come near need no check, and a distance that no joint changes cannot be kept. Where the arm
+sampling the joint space, and downhill from the nearest samples: links that are always near are
+neighbours by construction, pairs that never come near need no check, and a distance that no joint
+changes cannot be kept. Where the arm
 happens to stand takes no pair away.
 """
 
@@ -25,12 +26,18 @@ from vla_zenoh.types import FloatArray, HeldBox
 SAMPLES = 1000
 NEVER_SPARE_M = 0.03
 """A pair may come nearer than in any of the samples by this much."""
+STARTS, DOWNHILL = 8, 15
+"""Samples from which a pair that is not near in any of them is moved nearer, in so many steps."""
+DOWNHILL_RAD = 0.4
+"""Longest of these steps; it is as long as the distance needs if its slope stays the same."""
 NEIGHBOURS_M = 0.03
 """Links that are never further apart are neighbours: they touch at a joint."""
 CONSTANT_M = 1e-3
 """A distance that varies by less over the joint space depends on no joint."""
 TABLE = "table"
 HELD = "the held object"
+FLAT = 1e-6
+"""m/rad: a distance with a smaller slope is at its minimum."""
 POINT_M = 1e-4
 FREE_M = 10.0
 """Distance of a held object while there is none."""
@@ -116,7 +123,11 @@ class CollisionModel:
         constant = farthest_m - nearest_m < CONSTANT_M
         allowed = _allowed([shape.name for shape in shapes], may_touch)
         told = np.array([{shapes[a].name, shapes[b].name} in allowed for a, b in pairs], bool)
-        wanted = (nearest_m < near_m + NEVER_SPARE_M) & ~(neighbours | constant | told)
+        varied = ~(neighbours | constant | told)
+        wanted = (nearest_m < near_m + NEVER_SPARE_M) & varied
+        for index in np.flatnonzero(varied & ~wanted):
+            starts_rad = samples_rad[np.argsort(distances[:, index])[:STARTS]]
+            wanted[index] = self._comes_near(pairs[index], starts_rad, near_m, kinematics)
         used = [pair for pair, keep in zip(pairs, wanted, strict=True) if keep]
         apart: list[tuple[int, int]] = []
         for name, shape in (keep_out or {}).items():
@@ -223,6 +234,32 @@ class CollisionModel:
         box = pin.GeometryObject(HELD, joint, 0, self._tcp, coal.Box(np.full(3, 1e-3)))
         added = self._geometry.addGeometryObject(box)
         return [(added, other) for other in others]
+
+    def _comes_near(
+        self,
+        pair: tuple[int, int],
+        starts_rad: FloatArray,
+        near_m: float,
+        kinematics: Kinematics,
+    ) -> bool:
+        """Whether two get nearer than `near_m` downhill from some of these configurations."""
+        self._use([pair])
+        lower, upper = kinematics.lower_rad, kinematics.upper_rad
+        for start_rad in starts_rad:
+            joints_rad = start_rad
+            for _ in range(DOWNHILL):
+                distance_m = float(self.distances(joints_rad)[0])
+                if distance_m < near_m:
+                    return True
+                slope = self.gradients(joints_rad, [0])[0]
+                slope[(joints_rad <= lower) & (slope > 0)] = 0.0
+                slope[(joints_rad >= upper) & (slope < 0)] = 0.0
+                steep = float(np.linalg.norm(slope))
+                if steep < FLAT:
+                    break
+                step_rad = min(distance_m / steep, DOWNHILL_RAD) / steep
+                joints_rad = np.clip(joints_rad - step_rad * slope, lower, upper)
+        return False
 
     def _use(self, pairs: Sequence[tuple[int, int]]) -> None:
         self._geometry.removeAllCollisionPairs()
