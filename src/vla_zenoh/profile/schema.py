@@ -29,6 +29,8 @@ _HOST_AND_PORT = re.compile(
 
 _LABEL = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9-]{0,61}[A-Za-z0-9])?")
 """Part of a host name between dots (RFC 1123)."""
+_NAME = re.compile(r"[A-Za-z0-9_](?:[A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?")
+"""The same with underscores, which names of containers have, and no certificate."""
 
 
 def _endpoint(value: str) -> str:
@@ -51,6 +53,8 @@ def _endpoint(value: str) -> str:
     host = match["host"]
     if host.rpartition(".")[2].isdigit() and not _is_ipv4(host):
         raise ValueError(f"{value!r}: {host} is no IPv4 address: it has four numbers up to 255")
+    if not host.startswith("[") and not all(map(_NAME.fullmatch, host.split("."))):
+        raise ValueError(f"{value!r}: {host} is no host name")
     if int(match["port"]) > 65535:
         raise ValueError(f"{value!r}: a port is at most 65535")
     return value
@@ -64,8 +68,11 @@ def _is_ipv4(host: str) -> bool:
     return True
 
 
-def network_address(text: str) -> str:
+def network_address(text: str, label: re.Pattern[str] = _LABEL) -> str:
     """`text` if it is the IP address or host name of one computer, without protocol and port.
+
+    Args:
+        label: that the parts of a host name between dots match.
 
     Raises:
         ValueError: it is not.
@@ -74,7 +81,7 @@ def network_address(text: str) -> str:
         found = ipaddress.ip_address(text)
     except ValueError:
         labels = text.split(".")
-        if not all(map(_LABEL.fullmatch, labels)) or labels[-1].isdigit():
+        if not all(map(label.fullmatch, labels)) or labels[-1].isdigit():
             raise ValueError(
                 f"{text!r} is no address: write an IP address or a host name, without protocol "
                 "and port, such as 10.0.0.2, fd00::2 or lab-pc.local"
@@ -85,6 +92,13 @@ def network_address(text: str) -> str:
     return text
 
 
+def reachable_address(text: str) -> str:
+    """`network_address` of what is only connected to: the name of a container will do."""
+    return network_address(text, _NAME)
+
+
+Address = Annotated[str, AfterValidator(reachable_address)]
+"""Of a device or server that a profile names."""
 Endpoint = Annotated[str, Field(max_length=512), AfterValidator(_endpoint)]
 Endpoints = Annotated[tuple[Endpoint, ...], Field(strict=False, max_length=16), Distinct]
 

@@ -10,6 +10,9 @@ import pytest
 from typed import typed
 from typer.main import get_command
 
+from vla_zenoh.errors import ProfileError, SpecError
+from vla_zenoh.lab.policy_servers.model_options import address as address_option
+from vla_zenoh.profile import load_profile, override
 from vla_zenoh.profile.schema import network_address
 from vla_zenoh.program.main import app
 
@@ -78,6 +81,33 @@ def test_no_certificate_is_made_for_what_is_no_address(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("address", [*ADDRESSES[:2], *ADDRESSES[3:-1]])
+def test_what_a_profile_connects_to_is_an_address(address: str) -> None:
+    for profile, driver in (("ur5e_rtde", "ur"), ("fr3", "franka")):
+        with pytest.raises(ProfileError, match=rf"{driver}\.address: .*address"):
+            override(load_profile(profile), {driver: {"address": address}})
+
+
+@pytest.mark.parametrize(
+    "source", ["rtsp:camera", "rtsp://10.0.0.300/a", "rtsp://a b/c", "rtsps://me:word@a..b/c"]
+)
+def test_a_camera_on_the_network_has_an_address(source: str) -> None:
+    with pytest.raises(ProfileError, match=r"cameras\.front\.source: .*host"):
+        override(load_profile("panda_sim"), {"cameras": {"front": {"source": source}}})
+    for good in ("rtsp://me:word@10.0.0.2:554/a", "rtsps://[fd00::2]/a", "rtsp://lab_camera/a"):
+        override(load_profile("panda_sim"), {"cameras": {"front": {"source": good}}})
+
+
+@pytest.mark.parametrize(
+    "url", ["ws://10.0.0.300:8000", "ws://a b:1", "ws://a..b", "ws://[::1:80", "ws://:80", ""]
+)
+def test_a_policy_server_has_an_address(url: str) -> None:
+    with pytest.raises(SpecError, match="wanted ws://HOST:PORT"):
+        address_option(url, "ws", "wss")
+    for good in ("10.0.0.2:8000", "wss://policy_server/x", "ws://[::1]:8000"):
+        assert address_option(good, "ws", "wss").hostname
+
+
 LINES = [
     (f"{SERVING} --at robot=10.0.0.2 --at robot=10.0.0.3", USAGE, "two addresses"),
     (f"{SERVING} --address 10.0.0.2:7447", USAGE, "is no address"),
@@ -85,6 +115,7 @@ LINES = [
     ("web --name lab:80", USAGE, "'lab:80' is no address"),
     ("view --serve --bind nosuch:5", USAGE, "'nosuch:5' is no address"),
     ("serve policy --worker scripted --host 10.0.0.300", USAGE, "is no address"),
+    ("profile bridge-config -e tcp/a..b:7447", FAILED, "a..b is no host name"),
     ("up panda_sim --listen tcp/10.0.0.300:7447", FAILED, "10.0.0.300 is no IPv4 address"),
     (f"status --host nosuch {TALKING}", FAILED, "has no host 'nosuch'"),
     (f"stop --host a/b {TALKING}", FAILED, "has no host 'a/b'"),
@@ -94,6 +125,10 @@ LINES = [
     (f"record --name a/b {TALKING}", USAGE, "cannot be part of a key"),
     ("check scripted --name a/b", USAGE, "cannot be part of a key"),
     (f"do run a/b {TALKING}", USAGE, "cannot be part of a key"),
+    (f"conform robot a/b {TALKING}", USAGE, "cannot be part of a key"),
+    (f"conform worker a/b {TALKING}", USAGE, "cannot be part of a key"),
+    (f"conform camera a/b {TALKING}", USAGE, "cannot be part of a key"),
+    (f"conform camera front --node a/b {TALKING}", USAGE, "cannot be part of a key"),
     (f"inspect a/b {TALKING}", USAGE, "cannot be part of a key"),
     ("secure add a/b --role operator", USAGE, "cannot be part of a key"),
     (f"echo a//b {TALKING}", USAGE, "is no key"),
@@ -134,6 +169,10 @@ def test_a_bad_value_is_named_with_what_is_allowed(
         ("prompt", ""),
         ("prompt", "  "),
         ("demo", "--prompt", ""),
+        ("check", "scripted", "--prompt", ""),
+        ("bench", "task", "--model", "scripted", "--prompt", ""),
+        ("secure", "init", "--folder", ""),
+        ("secure", "show", "--folder", " "),
         ("do", "run", "scripted", "--prompt", ""),
         ("save", ""),
         ("serve", "policy", "--worker", "scripted", "--api-key", ""),

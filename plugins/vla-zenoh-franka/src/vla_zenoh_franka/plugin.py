@@ -9,7 +9,8 @@ from pydantic import Field
 
 from vla_zenoh.plugins import RobotPlugin
 from vla_zenoh.profile import Profile
-from vla_zenoh.profile.section import Section, Vector3, Word
+from vla_zenoh.profile.schema import Address
+from vla_zenoh.profile.section import Section, Vector3
 
 if TYPE_CHECKING:
     from vla_zenoh.lab.doctor import HostFinding
@@ -59,7 +60,7 @@ class FrankaOptions(Section):
         hand: the robot has a Franka Hand.
     """
 
-    address: Word
+    address: Address
     fci: Literal[5, 10] = 10
     realtime: Literal["enforce", "ignore"] = "enforce"
     stiffness_n_m: Stiffness = 2000.0

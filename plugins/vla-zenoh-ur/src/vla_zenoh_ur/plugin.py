@@ -9,7 +9,8 @@ from pydantic import Field
 
 from vla_zenoh.plugins import RobotPlugin
 from vla_zenoh.profile import Profile
-from vla_zenoh.profile.section import Section, Vector3, Word
+from vla_zenoh.profile.schema import Address
+from vla_zenoh.profile.section import Section, Vector3
 
 if TYPE_CHECKING:
     from vla_zenoh.lab.doctor import HostFinding
@@ -30,7 +31,7 @@ class UrOptions(Section):
         watchdog_hz: the robot stops its program if messages from this computer come less often.
     """
 
-    address: Word
+    address: Address
     lookahead_s: float = Field(default=0.1, ge=0.03, le=0.2)
     gain: float = Field(default=300.0, ge=100, le=2000)
     tcp_m: Vector3 = (0.0, 0.0, 0.0)

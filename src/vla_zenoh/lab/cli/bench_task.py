@@ -18,6 +18,7 @@ from vla_zenoh.cli.options import (
     JsonOption,
     ModelOptions,
     effective_profile,
+    not_empty,
     options,
 )
 from vla_zenoh.cli.output import console, new_table
@@ -66,7 +67,8 @@ class EpisodeOptions:
         bool, typer.Option("--held-out", help="Prompts in words that no model was trained with.")
     ] = False
     prompt: Annotated[
-        str | None, typer.Option("--prompt", help="Prompt in place of the episode's.")
+        str | None,
+        typer.Option("--prompt", parser=not_empty, help="Prompt in place of the episode's."),
     ] = None
     limit_s: Annotated[
         float, typer.Option("--limit", min=1, max=600, help="Seconds per episode.")

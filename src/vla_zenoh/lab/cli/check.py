@@ -18,6 +18,7 @@ from vla_zenoh.cli.options import (
     ModelOptions,
     WorkerChoice,
     node_name,
+    not_empty,
     options,
 )
 from vla_zenoh.cli.output import console, new_table, styled
@@ -39,7 +40,8 @@ class CheckPlan:
     """Options for what is tried with the model."""
 
     prompts: Annotated[
-        list[str] | None, typer.Option("--prompt", help="Prompt to try; repeatable.")
+        list[str] | None,
+        typer.Option("--prompt", parser=not_empty, help="Prompt to try; repeatable."),
     ] = None
     rate_hz: Annotated[
         float | None, typer.Option("--rate", help="Required chunks per second.", min=0.01, max=1000)

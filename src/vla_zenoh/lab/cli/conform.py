@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from vla_zenoh.cli.options import MAX_SECONDS, JsonOption, options
+from vla_zenoh.cli.options import MAX_SECONDS, JsonOption, node_name, options
 from vla_zenoh.cli.output import console, fail, styled
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import NodeError, counted
@@ -27,7 +27,9 @@ MARKS = {True: ("right", "green"), False: ("wrong", "red"), None: ("-", "dim")}
 @options
 def robot(
     target: RobotTarget,
-    name: Annotated[str | None, typer.Argument(help="Its node; default: the profile's.")] = None,
+    name: Annotated[
+        str | None, typer.Argument(parser=node_name, help="Its node; default: the profile's.")
+    ] = None,
     seconds: SecondsOption = 3.0,
     move: Annotated[
         bool,
@@ -63,7 +65,7 @@ def robot(
 @options
 def worker(
     target: RobotTarget,
-    name: Annotated[str, typer.Argument(help="The worker.")],
+    name: Annotated[str, typer.Argument(parser=node_name, help="The worker.")],
     seconds: SecondsOption = 5.0,
     as_json: JsonOption = False,
 ) -> None:
@@ -82,8 +84,10 @@ def worker(
 @options
 def camera(
     target: RobotTarget,
-    name: Annotated[str, typer.Argument(help="The camera.")],
-    node: Annotated[str, typer.Option("--node", help="The node that serves it.")] = "camera",
+    name: Annotated[str, typer.Argument(parser=node_name, help="The camera.")],
+    node: Annotated[
+        str, typer.Option("--node", parser=node_name, help="The node that serves it.")
+    ] = "camera",
     seconds: SecondsOption = 3.0,
     as_json: JsonOption = False,
 ) -> None:

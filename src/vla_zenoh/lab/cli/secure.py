@@ -23,6 +23,7 @@ from vla_zenoh.cli.options import (
     ProfileOption,
     network_address,
     node_name,
+    not_empty,
 )
 from vla_zenoh.cli.output import console, fail, new_table, styled
 from vla_zenoh.cli.plain import warn
@@ -149,7 +150,10 @@ secure_app = typer.Typer(
 )
 
 FolderOption = Annotated[
-    str | None, typer.Option("--folder", help=f"Of the certificates; default: {DEFAULT_FOLDER}.")
+    str | None,
+    typer.Option(
+        "--folder", parser=not_empty, help=f"Of the certificates; default: {DEFAULT_FOLDER}."
+    ),
 ]
 AddressOption = Annotated[
     list[str] | None,

@@ -10,6 +10,7 @@ from typing import Any
 from urllib.parse import SplitResult, urlsplit
 
 from vla_zenoh.errors import SpecError, WorkerError
+from vla_zenoh.profile.schema import reachable_address
 
 SECRET = "api_"
 """Prefix of the names of options that must not be shown (`api_key`)."""
@@ -72,15 +73,16 @@ def address(text: str, *schemes: str) -> SplitResult:
     """The option `url`; without a scheme the first of `schemes` is meant.
 
     Raises:
-        SpecError: another scheme, or no host.
+        SpecError: another scheme, or no host of this name can be.
     """
-    parts = urlsplit(text if "://" in text else f"{schemes[0]}://{text}")
+    wanted = " or ".join(f"{scheme}://HOST:PORT" for scheme in schemes)
     try:
-        fits = parts.scheme in schemes and bool(parts.hostname) and parts.port != 0
-    except ValueError:  # an invalid port
-        fits = False
+        parts = urlsplit(text if "://" in text else f"{schemes[0]}://{text}")
+        fits = parts.scheme in schemes and parts.port != 0
+        reachable_address(parts.hostname or "")
+    except ValueError as error:
+        raise SpecError(f"url is {text!r}, wanted {wanted}: {error}") from error
     if not fits:
-        wanted = " or ".join(f"{scheme}://HOST:PORT" for scheme in schemes)
         raise SpecError(f"url is {text!r}, wanted {wanted}")
     return parts
 

@@ -7,9 +7,10 @@ libraries are imported below.
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
 
 from vla_zenoh.plugins import CameraPlugin
-from vla_zenoh.profile.schema import CameraProfile
+from vla_zenoh.profile.schema import CameraProfile, reachable_address
 
 if TYPE_CHECKING:
     from vla_zenoh.nodes.camera.source import Source
@@ -28,7 +29,16 @@ def _rtsp(place: str, profile: CameraProfile) -> Source:
 
 
 def _rtsp_fault(place: str) -> str:
-    return "" if place.removeprefix("//") else "lacks the host: write rtsp://HOST/PATH"
+    host = place.removeprefix("//").partition("/")[0].rpartition("@")[2]
+    if not host or not place.startswith("//"):
+        return "lacks the host: write rtsp://HOST/PATH"
+    try:
+        parts = urlsplit(f"//{host}")
+        reachable_address(parts.hostname or "")
+        fits = parts.port != 0
+    except ValueError as error:
+        return f"has a host or port that cannot be: {error}"
+    return "" if fits else "has port 0, which leads nowhere"
 
 
 def _file(path: str, profile: CameraProfile) -> Source:
