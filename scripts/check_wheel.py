@@ -48,6 +48,7 @@ WITH_PLUGINS = [
     ["profile", "check", "fr3", "ur5e_rtde"],
     ["web", "--help"],
     ["node", "rolling", "--help"],
+    ["nights", "--help"],
 ]
 
 

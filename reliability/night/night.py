@@ -2,7 +2,7 @@
 
     python reliability/night/night.py --episodes 50 --output runs/night
 
-`vla-zenoh up` and `vla-zenoh trial --unattended` run as processes. Their nodes and the trial
+`vla-zenoh up` and `vla-zenoh nights` run as processes. Their nodes and the trial
 itself are killed at random, and once everything is at the same time. Of two tasks one is always
 done and the other never, by a Python judge that measures how far the arm rose; so the right table
 is known. Prints what was found as JSON; exit code 1: something is not as it has to be.
@@ -28,10 +28,10 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 import contextlib
 
 from chain import write_profile
+from vla_zenoh_nights.trial import UnattendedTrial
 
 from vla_zenoh.lab.recording.reader import open_recording
 from vla_zenoh.lab.trial.folder import TrialFolder
-from vla_zenoh.lab.trial.unattended import UnattendedTrial
 from vla_zenoh.lab.trial.verdict import verdict_in
 
 MODELS = """\
@@ -148,7 +148,7 @@ class Night:
 
     def _start_trial(self) -> None:
         plan = str(self.folder / "plan.yaml")
-        words = ("trial", "--unattended", plan, "--output", str(self.output), "--json")
+        words = ("nights", plan, "--output", str(self.output), "--json")
         self.trial = self._start("trial", *words)
 
     def _kill_one(self) -> None:

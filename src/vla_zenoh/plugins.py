@@ -144,6 +144,7 @@ this package cannot be replaced."""
 GROUPS: tuple[Group[Any], ...] = (ROBOTS, CAMERAS, MODELS, BENCHMARKS, COMMANDS)
 PACKAGES: Mapping[str, str] = {
     "bench.sim": "vla-zenoh-benchmarks",
+    "nights": "vla-zenoh-nights",
     "node.rolling": "vla-zenoh-rolling",
     "save": "vla-zenoh-rolling",
     "serve.mcp": "vla-zenoh-mcp",

@@ -131,6 +131,7 @@ COMMANDS: Panels = {
         "inspect": "lab.cli.inspect:inspect",
         "net": "lab.cli.net:net",
         "trial": "lab.cli.trial:trial",
+        "nights": OF_A_PACKAGE,
     },
 }
 

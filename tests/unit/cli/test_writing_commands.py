@@ -26,7 +26,7 @@ READ = {
     "dataset stats folder",
     "bench sim replay",
     "trial setups",
-    "trial unattended",
+    "nights plan_file",
     "teleop leader",
     "web people",
     "web certificate",
@@ -73,6 +73,7 @@ WRITERS = {
     "bench sim": Writer("bench sim metaworld --worker scripted", "out"),
     "camera list": Writer("camera list", "out"),
     "trial": Writer("trial --workers a --prompt go", "out"),
+    "nights": Writer("nights plan.yaml", "out"),
     "inspect": Writer("inspect", "out"),
     "secure init": Writer(
         "secure init --profile own.yaml --folder keys", "out.yaml", ("own.yaml",)
@@ -86,9 +87,15 @@ MORE = {
     "bench task": Writer("bench task --model hold --lockstep", "out"),
 }
 """The same commands in another mode."""
-CONTINUE = ("trial", "bench sim", "delay")
+CONTINUE = ("trial", "nights", "bench sim", "delay")
 """Their output is filled by several calls."""
 CONTINUING = [WRITERS[name] for name in CONTINUE if name in WRITERS]
+PLAN = """\
+workers: [a]
+tasks: [{name: cup, prompt: lift the cup, episodes: 1, seconds: 1}]
+reset: {primitive: home}
+judge: {file: judge.py}
+"""
 CASES = [*WRITERS.values(), *MORE.values()]
 
 
@@ -114,6 +121,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     write_run(tmp_path / "RUN")
     (tmp_path / "DATASET" / "meta").mkdir(parents=True)
     (tmp_path / "DATASET" / "meta" / "info.json").write_text("{}")
+    (tmp_path / "plan.yaml").write_text(PLAN)
     (tmp_path / "own.yaml").write_text("extends: panda_sim\n")
     yield tmp_path
     for each, handler in handlers:

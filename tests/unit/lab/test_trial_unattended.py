@@ -14,21 +14,21 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-from vla_zenoh.codec.image import encode_jpeg
-from vla_zenoh.errors import NodeError, OutputError, RecordError
-from vla_zenoh.lab.trial.automatic_judge import Frame, JudgedEpisode, make_judge
-from vla_zenoh.lab.trial.folder import TrialFolder
-from vla_zenoh.lab.trial.unattended import JOURNAL, PAGE, UnattendedTrial, write_page
-from vla_zenoh.lab.trial.unattended_operator import film_strip, strip_path
-from vla_zenoh.lab.trial.unattended_plan import (
+from vla_zenoh_nights.judge import Frame, JudgedEpisode, make_judge
+from vla_zenoh_nights.operator import film_strip, strip_path
+from vla_zenoh_nights.plan import (
     JudgeChoice,
     StopRules,
     UnattendedPlan,
     checked_plan,
     read_plan,
 )
-from vla_zenoh.lab.trial.unattended_runner import Webhook
+from vla_zenoh_nights.runner import Webhook
+from vla_zenoh_nights.trial import JOURNAL, PAGE, UnattendedTrial, write_page
+
+from vla_zenoh.codec.image import encode_jpeg
+from vla_zenoh.errors import NodeError, OutputError, RecordError
+from vla_zenoh.lab.trial.folder import TrialFolder
 from vla_zenoh.lab.trial.verdict import EpisodeVerdict
 from vla_zenoh.types import Image
 

@@ -22,9 +22,6 @@ from vla_zenoh.lab.trial.plan import TrialPlan
 from vla_zenoh.lab.trial.score import TrialScore, score
 from vla_zenoh.lab.trial.verdict import EpisodeVerdict
 
-STOPPED = 3
-"""Exit code of an unattended trial that a rule or a person stopped."""
-
 
 @dataclass(frozen=True)
 class PlanOptions:
@@ -81,27 +78,12 @@ def trial(
     ] = False,
     report: Annotated[bool, typer.Option("--report", help="Only show the results so far.")] = False,
     as_json: JsonOption = False,
-    unattended: Annotated[
-        Path | None,
-        typer.Option(
-            "--unattended", help="Plan (YAML) of tasks, resets and judge: no person is needed."
-        ),
-    ] = None,
 ) -> None:
     """Try models on a real arm; you judge whether each episode succeeded.
 
     Every worker does every setup, in an order that you do not see. Enter ends an episode, Ctrl-C
-    the trial; the arm brakes first. The same command continues it. With --unattended a program
-    resets and judges without a person.
+    the trial; the arm brakes first. The same command continues it.
     """
-    if unattended is not None:
-        robot = target.load().robot.name
-        if report or any(
-            value for name, value in plan_options.asked(robot).items() if name != "robot"
-        ):
-            raise typer.BadParameter("--unattended PLAN says it all: leave the other options out")
-        _unattended(output, unattended, target, robot, as_json=as_json)
-        return
     folder = TrialFolder(output)
     if report:
         plan = folder.plan()
@@ -125,9 +107,9 @@ def trial(
                 found = _run(folder, plan, found, target, yes_setup)
     result = score(plan, found)
     if as_json:
-        print_json(_mapping(plan, result, found))
+        print_json(mapping_of(plan, result, found))
     else:
-        _show(plan, result)
+        show_score(plan, result)
 
 
 def _setups(episodes: int | None, file: Path | None) -> tuple[str, ...] | None:
@@ -152,48 +134,6 @@ def _plan(folder: TrialFolder, asked: dict[str, Any]) -> TrialPlan:
         return folder.agreed(asked)
     except RecordingError as error:
         fail(str(error))
-
-
-def _unattended(
-    output: Path, plan_file: Path, target: RobotTarget, robot: str, *, as_json: bool
-) -> None:
-    from vla_zenoh.lab.episode import Interrupted
-    from vla_zenoh.lab.trial.unattended import PAGE, PLAN, UnattendedTrial
-    from vla_zenoh.lab.trial.unattended_plan import read_plan
-    from vla_zenoh.lab.trial.unattended_runner import run_unattended
-    from vla_zenoh.runtime.process import stop_on_signals
-
-    plan = read_plan(plan_file)
-    check_folder(output, begun=(output / PLAN).exists())
-    stop = stop_on_signals()
-    signal.signal(signal.SIGHUP, lambda *_: stop.set())
-    with TrialFolder(output).lock():
-        trial = UnattendedTrial(output, plan, robot)
-        try:
-            why = run_unattended(
-                trial,
-                lambda: target.operator("trial", "--output", str(output)),
-                plan_file.parent,
-                stop,
-                warn,
-            )
-        except Interrupted:
-            errors().print("interrupted; the same command continues")
-            raise typer.Exit(130) from None
-    found = trial.scores()
-    if as_json:
-        tasks = {
-            each.name: _mapping(trial.trial(each)[1], result, episodes)
-            for each, result, episodes in found
-        }
-        print_json({"stopped": why, "tasks": tasks})
-    else:
-        for each, result, _ in found:
-            _show(trial.trial(each)[1], result)
-        console().print(f"page: {output / PAGE}")
-    if why:
-        warn(f"stopped by a rule or a person: {why}")
-        raise typer.Exit(STOPPED)
 
 
 def _run(
@@ -226,7 +166,8 @@ def _run(
         raise typer.Exit(130) from None
 
 
-def _mapping(plan: TrialPlan, result: TrialScore, found: list[EpisodeVerdict]) -> dict[str, Any]:
+def mapping_of(plan: TrialPlan, result: TrialScore, found: list[EpisodeVerdict]) -> dict[str, Any]:
+    """Plan, results and episodes of a trial, as JSON has them."""
     pair = result.paired
     return {
         "plan": asdict(plan),
@@ -246,7 +187,8 @@ def _mapping(plan: TrialPlan, result: TrialScore, found: list[EpisodeVerdict]) -
     }
 
 
-def _show(plan: TrialPlan, result: TrialScore) -> None:
+def show_score(plan: TrialPlan, result: TrialScore) -> None:
+    """Print the table of a trial, and of two workers their difference."""
     title = f"{plan.prompt!r}: {result.done} of {result.of} episodes"
     columns = ("worker", "done", "of", "rate", "95 %", "time p50", "brakes", "taken", "void")
     table = new_table(*columns, title=title, left=("worker",))

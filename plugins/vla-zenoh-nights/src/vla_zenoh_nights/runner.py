@@ -14,10 +14,10 @@ from typing import Any
 from vla_zenoh.client.client import Client
 from vla_zenoh.errors import NodeError, OutputError, RecordingError, SessionError
 from vla_zenoh.lab.episode import Interrupted
-from vla_zenoh.lab.trial.automatic_judge import Judge, make_judge, post_json
 from vla_zenoh.lab.trial.runner import TrialRunner
-from vla_zenoh.lab.trial.unattended import UnattendedTrial, write_page
-from vla_zenoh.lab.trial.unattended_operator import TrialStopped, UnattendedOperator
+from vla_zenoh_nights.judge import Judge, make_judge, post_json
+from vla_zenoh_nights.operator import TrialStopped, UnattendedOperator
+from vla_zenoh_nights.trial import UnattendedTrial, write_page
 
 PATIENCE_S, ATTEMPTS, BACK_OFF_S = 5.0, 3, 1.0
 MAX_WAITING = 50

@@ -14,11 +14,11 @@ from vla_zenoh.lab.durable import append_lines, page_template, whole_lines, writ
 from vla_zenoh.lab.trial.folder import TrialFolder
 from vla_zenoh.lab.trial.plan import TrialPlan
 from vla_zenoh.lab.trial.score import TrialScore, score
-from vla_zenoh.lab.trial.unattended_operator import strip_path
-from vla_zenoh.lab.trial.unattended_plan import UnattendedPlan, UnattendedTask, checked_plan
 from vla_zenoh.lab.trial.verdict import END_WORDS, EpisodeVerdict
+from vla_zenoh_nights.operator import strip_path
+from vla_zenoh_nights.plan import UnattendedPlan, UnattendedTask, checked_plan
 
-TEMPLATE, PAGE = "unattended.html.j2", "index.html"
+TEMPLATE, PAGE = "page.html.j2", "index.html"
 
 
 def write_page(trial: UnattendedTrial) -> None:
@@ -37,7 +37,7 @@ def write_page(trial: UnattendedTrial) -> None:
     ]
     done, of = (sum(getattr(each["score"], name) for each in tasks) for name in ("done", "of"))
     journal = [{**line, "at": f"{_at(line['time_s']):%F %T}"} for line in trial.journal()]
-    page = page_template("vla_zenoh.lab.trial", TEMPLATE).render(
+    page = page_template("vla_zenoh_nights", TEMPLATE).render(
         title=trial.path.name,
         robot=trial.robot,
         plan=trial.plan,
@@ -98,7 +98,7 @@ class UnattendedTrial:
             )
         found = known or plan
         if found is None:
-            raise OutputError(f"{path} holds no unattended trial: give --unattended PLAN")
+            raise OutputError(f"{path} holds no unattended trial yet")
         self.plan = found
 
     def begin(self) -> None:

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from vla_zenoh.codec.image import decode_jpeg
 from vla_zenoh.errors import NodeError, in_words
-from vla_zenoh.lab.trial.unattended_plan import JudgeChoice
 from vla_zenoh.types import GripperState, PoseState
+from vla_zenoh_nights.plan import JudgeChoice
 
 MODEL_PATIENCE_S = 120.0
 MAX_ANSWER_BYTES = 1_000_000

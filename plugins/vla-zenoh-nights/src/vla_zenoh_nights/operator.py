@@ -18,13 +18,13 @@ from vla_zenoh.lab.durable import write_whole, writing
 from vla_zenoh.lab.episode import EpisodeRunner
 from vla_zenoh.lab.newest_records import NewestRecords, StreamSlot
 from vla_zenoh.lab.tasks.judge import TaskJudge
-from vla_zenoh.lab.trial.automatic_judge import Frame, Judge, JudgedEpisode, StateSample
 from vla_zenoh.lab.trial.episode_fsm import EpisodeFsm, Phase
 from vla_zenoh.lab.trial.folder import TrialFolder
 from vla_zenoh.lab.trial.plan import TrialPlan
-from vla_zenoh.lab.trial.unattended_plan import UnattendedPlan, UnattendedTask, is_contact_loss
 from vla_zenoh.lab.video import decoded_at_height
 from vla_zenoh.types import GripperState, Image, ObjectPoses, PoseState
+from vla_zenoh_nights.judge import Frame, Judge, JudgedEpisode, StateSample
+from vla_zenoh_nights.plan import UnattendedPlan, UnattendedTask, is_contact_loss
 
 FRAME_S, STATE_S = 1.0, 0.05
 MAX_STATES, MAX_FRAMES = 40_000, 1_000
