@@ -34,7 +34,7 @@ MAX_LINES, MAX_LINE = 12, 60
 """Lines of one cell, and characters of each."""
 MAX_WORDS = 400
 """Characters of one sentence."""
-NARROW = 100
+NARROW = 132
 """On a terminal of fewer columns a node has lines of its own in place of a row."""
 NARROW_LINES = 4
 """Of one message there."""

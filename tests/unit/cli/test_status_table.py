@@ -31,7 +31,7 @@ def lines(width: int) -> list[str]:
     return screen.file.getvalue().splitlines()
 
 
-@pytest.mark.parametrize("width", [40, 60, 80, 99])
+@pytest.mark.parametrize("width", [40, 60, 80, 99, 100, 120, 131])
 def test_a_reason_takes_a_few_lines_on_a_narrow_terminal(width: int) -> None:
     shown = lines(width)
     assert any("command" in line and "inactive" in line for line in shown)
