@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -16,7 +17,9 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+from tempfile import mkdtemp
 from types import ModuleType
 from typing import Any
 
@@ -30,6 +33,7 @@ from numpy.typing import NDArray
 from ros_node import free_domain
 
 SIDE = Path(__file__).with_name("ros_side")
+ROS2_PAGE = ROOT / "docs" / "how-to" / "ros2.md"
 
 FloatArray = NDArray[np.float64]
 START_S = 30.0
@@ -95,6 +99,15 @@ def ros_python(distribution: str) -> Path:
     return python
 
 
+@cache
+def fast_dds_3() -> str:
+    """File of the settings that the docs give for Fast DDS 3."""
+    (settings,) = re.findall(r"```xml\n(.*?)```", ROS2_PAGE.read_text("utf-8"), re.DOTALL)
+    file = Path(mkdtemp()) / "fastdds.xml"
+    file.write_text(settings)
+    return str(file)
+
+
 class Program:
     """One of the programs of `ros_side/`, as a process.
 
@@ -129,6 +142,7 @@ class Program:
             "ROS_DOMAIN_ID": str(domain),
             "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
             "RMW_IMPLEMENTATION": FAST_DDS,
+            **({"FASTDDS_DEFAULT_PROFILES_FILE": fast_dds_3()} if distribution == "kilted" else {}),
             **(environ or {}),
         }
         self.told: list[dict[str, Any]] = []

@@ -265,6 +265,27 @@ def test_a_robot_that_the_bridge_lost_after_a_restart_is_named_with_the_remedy(
         lab.chain.until("it is routed", lambda: "not_routed" not in faults())
 
 
+def test_a_node_on_fast_dds_3_that_the_bridge_does_not_match_is_named_with_the_remedy(
+    tmp_path: Path, built_bridge: Path, distribution: str
+) -> None:
+    """Without the settings of the docs a node that is started again is never heard."""
+    if distribution != "kilted":
+        pytest.skip("Fast DDS 3 comes with Kilted")
+    without = {"environ": {"FASTDDS_DEFAULT_PROFILES_FILE": ""}}
+    with running_ros_lab(tmp_path, built_bridge, distribution, arm=without) as lab:
+        lab.chain.activate_when_ready()
+        lab.settle()
+        lab.arm.kill()
+        lab.arm.start()
+        why = lab.chain.until(
+            "it is told",
+            lambda: (lab.chain.detail("ros2_faults", "ros2") or {}).get("not_matched"),
+            LEASE_PATIENCE_S,
+        )
+        assert "/joint_states" in why
+        assert "fastdds.type_propagation" in why
+
+
 # -- services on Fast DDS -------------------------------------------------------------------------
 def test_a_caller_of_our_services_on_fast_dds_is_named_and_its_topic_stops_the_arm(
     tmp_path: Path, built_bridge: Path, distribution: str

@@ -120,7 +120,7 @@ class Ros2Driver(RobotDriver):
             self._own_session or session, ros2, self._messages, f"vla_{name}"
         )
         simulated = self._simulated = SimulatedClock() if ros2.use_sim_time else None
-        bridges = Bridges(graph.session, profile)
+        bridges = Bridges(graph.session, profile, self._silent)
         watch = self._middleware = MiddlewareWatch(bridges, self._emit)
         if self.has_arm:
             self.gripper = Gripper(
@@ -179,6 +179,15 @@ class Ros2Driver(RobotDriver):
         return pose_writer(self._messages, output.type, np.array(self.profile.robot.home_rad))
 
     # -- for the threads ----------------------------------------------------------------------
+    def _silent(self) -> list[str]:
+        """Topics of the robot on which nothing comes."""
+        topics = [camera.topic for camera in self._cameras if camera.silent]
+        if self.has_arm:
+            last_ns = self.states.received_ns
+            if last_ns is None or time.monotonic_ns() - last_ns > STALL_S * 1e9:
+                topics.append(self._ros2.joint_states)
+        return topics
+
     def _emit(self, event: Event) -> None:
         self._deferred.append(lambda: self._node.emit(event))
 
@@ -391,6 +400,8 @@ class Camera:
         reject: Callable[[str, str, str], None],
         simulated: SimulatedClock | None,
     ) -> None:
+        self.topic = topic.topic
+        self.silent = False
         self._topic, self._node, self._messages, self._reject = topic, node, messages, reject
         self._simulated = simulated
         self.publisher = CameraPublisher(
@@ -417,8 +428,9 @@ class Camera:
                 if arrival is not None and self._handle(arrival):
                     last_s = time.monotonic()
             silent_s = time.monotonic() - last_s
-            if silent_s > STALL_S:
-                self.publisher.lose(f"no image on {self._topic.topic} for {silent_s:.0f} s")
+            self.silent = silent_s > STALL_S
+            if self.silent:
+                self.publisher.lose(f"no image on {self.topic} for {silent_s:.0f} s")
 
     def _handle(self, arrival: ReceivedSample) -> bool:
         """Publish an image, or check it now and then; whether it is a valid one."""
@@ -438,7 +450,7 @@ class Camera:
             if image.stamp_ns:
                 self._stamps.check(image.stamp_ns)
         except CodecError as error:
-            self._reject(error.reason, f"{self._topic.topic}: {error}", publisher.name)
+            self._reject(error.reason, f"{self.topic}: {error}", publisher.name)
             if error.reason in ("encoding", "frame"):  # true for all further images
                 publisher.lose(str(error))
             return False

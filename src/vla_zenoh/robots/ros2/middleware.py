@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import zenoh
@@ -39,12 +39,19 @@ class Bridges:
     """Queries to the bridges that a session reaches, about DDS; each waits up to `ASK_S`.
 
     With rmw_zenoh there is neither, and nothing is found.
+
+    Args:
+        session: that reaches the bridges.
+        profile: of the robot.
+        silent: gives the robot's topics on which nothing comes.
     """
 
-    def __init__(self, session: zenoh.Session, profile: Profile) -> None:
+    def __init__(
+        self, session: zenoh.Session, profile: Profile, silent: Callable[[], Iterable[str]] = tuple
+    ) -> None:
         ros2 = profile.ros2
         assert ros2 is not None
-        self._session, self._ros2 = session, ros2
+        self._session, self._ros2, self._silent = session, ros2, silent
         command = ros2.joint_command if profile.robot.command == "joint" else ros2.pose_command
         drives = profile.robot.driver == "ros2"
         self._commanded = command.topic if drives and command is not None else None
@@ -78,6 +85,16 @@ class Bridges:
                 "(vla-zenoh profile bridge-config)"
             )
             yield "not_routed", why
+        published = [
+            topic for topic in self._silent() if self._ask(endpoints_key("writer", f"rt{topic}"))
+        ]
+        if published:
+            why = (
+                f"a node publishes {' and '.join(published)}, and nothing of it comes through the "
+                "bridge: restart the bridge. A node on Fast DDS 3 (ROS 2 Kilted) that is started "
+                "after it needs the property fastdds.type_propagation=disabled"
+            )
+            yield "not_matched", why
         callers = self._callers() - {SERVES}
         if callers:
             why = (
