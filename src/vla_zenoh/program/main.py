@@ -140,9 +140,15 @@ NEGATIVE = re.compile(r"-\.?[0-9].*")
 
 
 class _Command(TyperCommand):
-    """Takes a negative number for an argument, whose range is then the error, and no option."""
+    """Takes a negative number for an argument, whose range is then the error, and no option.
+
+    An empty argument is an error: as a path it would be this folder.
+    """
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if "" in args:
+            before = ["the first argument", *args][args.index("")]
+            raise typer.BadParameter(f"{before}: an empty text; leave it out or give one", ctx=ctx)
         ctx.ignore_unknown_options = any(map(NEGATIVE.fullmatch, args))
         return super().parse_args(ctx, args)
 
