@@ -49,6 +49,8 @@ WITH_PLUGINS = [
     ["web", "--help"],
     ["node", "rolling", "--help"],
     ["nights", "--help"],
+    ["conform", "robot", "--help"],
+    ["teleop", "--help"],
 ]
 
 

@@ -144,10 +144,14 @@ this package cannot be replaced."""
 GROUPS: tuple[Group[Any], ...] = (ROBOTS, CAMERAS, MODELS, BENCHMARKS, COMMANDS)
 PACKAGES: Mapping[str, str] = {
     "bench.sim": "vla-zenoh-benchmarks",
+    "conform.camera": "vla-zenoh-conform",
+    "conform.robot": "vla-zenoh-conform",
+    "conform.worker": "vla-zenoh-conform",
     "nights": "vla-zenoh-nights",
     "node.rolling": "vla-zenoh-rolling",
     "save": "vla-zenoh-rolling",
     "serve.mcp": "vla-zenoh-mcp",
+    "teleop": "vla-zenoh-teleop",
     "web": "vla-zenoh-web",
 }
 """Command of a package in ``plugins/`` -> that package, for a computer that lacks it."""

@@ -64,7 +64,6 @@ ALLOWED = {
             "lab/bench/task_lockstep.py",
             "lab/bench/task_runner.py",
             "lab/check/model_runner.py",
-            "lab/conform/peer.py",
             "lab/doctor/access.py",
             "lab/episode.py",
             "lab/inference_views.py",
@@ -73,8 +72,6 @@ ALLOWED = {
             "lab/recording/recorder.py",
             "lab/recording/replay.py",
             "lab/recording/sample_queue.py",
-            "lab/teleop/leader.py",
-            "lab/teleop/node.py",
             "lab/trial/runner.py",
             "lab/view/listener.py",
             "lab/view/viewer.py",
@@ -162,7 +159,7 @@ def test_no_module_of_the_core_imports_the_lab_at_any_time(path: Path) -> None:
     [
         "from vla_zenoh.lab.doctor import HostFinding",
         "def f():\n    import vla_zenoh.lab.trial",
-        "TABLE = {'teleop': 'lab.cli.teleop:teleop'}",
+        "TABLE = {'trial': 'lab.cli.trial:trial'}",
         "import_module('vla_zenoh.lab.view')",
     ],
 )

@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 from camera_rig import free_endpoint, until
 from chain import LONG_PATIENCE_S, READY_PATIENCE_S, Chain, command_line, running_chain
+from vla_zenoh_conform import rules
 
 from vla_zenoh.bus.session import alive_nodes, open_session
 from vla_zenoh.errors import SessionError
-from vla_zenoh.lab.conform import rules
 from vla_zenoh.lab.newest_records import NewestRecords
 from vla_zenoh.lab.tasks.judge import judge_of
 from vla_zenoh.lab.tasks.order import parse_prompt

@@ -52,7 +52,7 @@ COMMANDS: Panels = {
         "demo": "lab.cli.demo:demo",
         "up": "cli.up:up",
         "worker": "cli.nodes:worker",
-        "teleop": "lab.cli.teleop:teleop",
+        "teleop": OF_A_PACKAGE,
         "node": CommandGroup(
             "Run one node by hand; `up` runs all nodes of a host, `worker` a model.",
             {
@@ -105,11 +105,7 @@ COMMANDS: Panels = {
         "check": "lab.cli.check:check",
         "conform": CommandGroup(
             "Judge a robot, worker or camera of others by the rules of the wire.",
-            {
-                "robot": "lab.cli.conform:robot",
-                "worker": "lab.cli.conform:worker",
-                "camera": "lab.cli.conform:camera",
-            },
+            dict.fromkeys(("robot", "worker", "camera"), OF_A_PACKAGE),
         ),
         "doctor": "lab.cli.doctor:doctor",
         "profile": "lab.cli.profile:profile_app",

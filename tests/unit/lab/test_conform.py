@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from vla_zenoh_conform import rules
+from vla_zenoh_conform.rules import RuleFinding, Seen, Trial
+from vla_zenoh_conform.samples import Arrived, Raw, arrived
 
 from vla_zenoh.codec import message, records
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.kinematics.so3 import quat_from_rotation
-from vla_zenoh.lab.conform import rules
-from vla_zenoh.lab.conform.rules import RuleFinding, Seen, Trial
-from vla_zenoh.lab.conform.samples import Arrived, Raw, arrived
 from vla_zenoh.policy import ActionSpec, ModelSpec
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import (

@@ -12,10 +12,10 @@ import numpy as np
 from vla_zenoh.errors import SpecError
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import Pose, pose_distance, rotation_from_quat
-from vla_zenoh.lab.conform.samples import Arrived, of_key
 from vla_zenoh.policy import ModelSpec, check_steps
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import ActionChunk, ClockReply, JointState, PoseState, Task
+from vla_zenoh_conform.samples import Arrived, of_key
 
 LEAST_STATE_HZ = 20.0
 MOST_AGE_S, MOST_AHEAD_S = 1.0, 0.1

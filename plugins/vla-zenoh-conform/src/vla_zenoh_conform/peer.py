@@ -20,9 +20,6 @@ from vla_zenoh.codec.image import MAX_IMAGE_BYTES
 from vla_zenoh.codec.records import MAX_HEADER_BYTES
 from vla_zenoh.errors import CodecError, NodeError
 from vla_zenoh.keys import Keys, Kind
-from vla_zenoh.lab.conform import rules
-from vla_zenoh.lab.conform.rules import Seen, Trial
-from vla_zenoh.lab.conform.samples import Raw, arrived
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
@@ -34,6 +31,9 @@ from vla_zenoh.types import (
     PoseCommand,
     PoseState,
 )
+from vla_zenoh_conform import rules
+from vla_zenoh_conform.rules import Seen, Trial
+from vla_zenoh_conform.samples import Raw, arrived
 
 ASKS, REPLY_S = 3, 1.0
 MAX_SAMPLES = 200_000

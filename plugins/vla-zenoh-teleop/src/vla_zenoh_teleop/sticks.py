@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from typing import Any
 
-from vla_zenoh.errors import MissingExtraError, NodeError, PeerError, in_words
+from vla_zenoh.errors import NodeError, PeerError, in_words
 from vla_zenoh.lab.teleop.policy import OperatorInput, clipped_twist, without_dead_zone
 
 MAX_READS = 64
@@ -40,11 +40,9 @@ class Gamepad:
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
         os.environ.setdefault("SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS", "1")
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-        try:
-            import pygame
-            from pygame._sdl2 import controller
-        except ImportError as error:
-            raise MissingExtraError("pygame", "teleop") from error
+        import pygame
+        from pygame._sdl2 import controller
+
         self._pygame = pygame
         pygame.display.init()
         controller.init()
@@ -106,10 +104,8 @@ class SpaceMouse:
     """
 
     def __init__(self) -> None:
-        try:
-            import pyspacemouse
-        except ImportError as error:
-            raise MissingExtraError("pyspacemouse", "teleop") from error
+        import pyspacemouse
+
         try:
             self._mouse: Any = pyspacemouse.open(axis_convention=pyspacemouse.AxisConvention.ROS)
         except Exception as error:  # of the system's HID library too

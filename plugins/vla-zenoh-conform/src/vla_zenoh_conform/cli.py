@@ -14,9 +14,9 @@ from vla_zenoh.errors import NodeError, counted
 from vla_zenoh.keys import worker_node
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.lab.cli.output import print_json, progress
-from vla_zenoh.lab.conform import rules
-from vla_zenoh.lab.conform.peer import Mover, look
-from vla_zenoh.lab.conform.rules import RuleFinding
+from vla_zenoh_conform import rules
+from vla_zenoh_conform.peer import Mover, look
+from vla_zenoh_conform.rules import RuleFinding
 
 SecondsOption = Annotated[
     float, typer.Option("--seconds", "-s", min=1.0, max=MAX_SECONDS, help="How long to listen.")

@@ -50,9 +50,9 @@ def teleop(
     `vla-zenoh use teleop` (or Tab, Y of a gamepad, the second button of a SpaceMouse) selects it,
     also while a model moves the arm; Tab again gives the arm back. It is recorded as any worker is.
     """
-    from vla_zenoh.lab.teleop.leader import LeaderArm
-    from vla_zenoh.lab.teleop.node import Teleop
-    from vla_zenoh.lab.teleop.sticks import DEVICES
+    from vla_zenoh_teleop.leader import LeaderArm
+    from vla_zenoh_teleop.node import Teleop
+    from vla_zenoh_teleop.sticks import DEVICES
 
     loaded = target.load()
     if leader is not None:

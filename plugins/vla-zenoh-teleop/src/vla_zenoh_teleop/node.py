@@ -17,7 +17,12 @@ import zenoh
 from vla_zenoh.client.client import Client, StopOutcome
 from vla_zenoh.errors import NodeError, PeerError
 from vla_zenoh.keys import CRASHED, STARTING
-from vla_zenoh.lab.teleop.keyboard import (
+from vla_zenoh.lab.teleop.policy import OperatorInput, TeleopPolicy, combined
+from vla_zenoh.nodes.worker.node import WorkerNode
+from vla_zenoh.policy import Frame
+from vla_zenoh.profile import Profile
+from vla_zenoh.sanitize import one_line
+from vla_zenoh_teleop.keyboard import (
     ACTIVATE,
     BEGIN,
     END,
@@ -29,13 +34,8 @@ from vla_zenoh.lab.teleop.keyboard import (
     Keyboard,
     KeystrokeParser,
 )
-from vla_zenoh.lab.teleop.leader import LeaderArm, LeaderPolicy
-from vla_zenoh.lab.teleop.policy import OperatorInput, TeleopPolicy, combined
-from vla_zenoh.lab.teleop.sticks import Gamepad, SpaceMouse
-from vla_zenoh.nodes.worker.node import WorkerNode
-from vla_zenoh.policy import Frame
-from vla_zenoh.profile import Profile
-from vla_zenoh.sanitize import one_line
+from vla_zenoh_teleop.leader import LeaderArm, LeaderPolicy
+from vla_zenoh_teleop.sticks import Gamepad, SpaceMouse
 
 SHOW_PERIOD_S = 0.2
 DEVICE_S = 0.02

@@ -1,0 +1,1 @@
+"""A person as a worker: keyboard, gamepad, SpaceMouse or a leader arm."""
