@@ -5,9 +5,9 @@ from __future__ import annotations
 import secrets
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import zenoh
@@ -35,6 +35,7 @@ from vla_zenoh_conform import rules
 from vla_zenoh_conform.rules import Seen, Trial
 from vla_zenoh_conform.samples import Raw, arrived
 
+Record = TypeVar("Record")
 ASKS, REPLY_S = 3, 1.0
 MAX_SAMPLES = 200_000
 PERIOD_S, BEFORE_S, AFTER_S, REST_S = 0.01, 0.3, 1.0, 0.7
@@ -98,35 +99,25 @@ def look(
         began_s = time.monotonic()
         alive = node in alive_nodes(session, keys, node)
         clocks = [found for _ in range(ASKS) if (found := _clock(session, keys.clock(node)))]
-        spec = _spec(session, keys.spec(node.removeprefix("worker-")))
+        spec = _reply(session, keys.spec(node.removeprefix("worker-")), ModelSpec)
         time.sleep(max(seconds - (time.monotonic() - began_s), 0.0))
         took_s = time.monotonic() - began_s
     return Seen(node, [arrived(raw) for raw in kept.raw], took_s, alive, clocks, spec)
 
 
-def _replies(session: zenoh.Session, key: str) -> Iterator[bytes]:
+def _reply(session: zenoh.Session, key: str, kind: type[Record]) -> Record | None:
+    """The first valid reply to a query."""
     for reply in session.get(key, timeout=REPLY_S):
         if reply.ok is not None:
-            yield bytes_of(reply.ok.payload)
+            with suppress(CodecError):
+                return records.decode(kind, bytes_of(reply.ok.payload))
+    return None
 
 
 def _clock(session: zenoh.Session, key: str) -> tuple[int, ClockReply, int] | None:
     asked_ns = time.time_ns()
-    for payload in _replies(session, key):
-        try:
-            return asked_ns, records.decode(ClockReply, payload), time.time_ns()
-        except CodecError:
-            continue
-    return None
-
-
-def _spec(session: zenoh.Session, key: str) -> ModelSpec | None:
-    for payload in _replies(session, key):
-        try:
-            return records.decode(ModelSpec, payload)
-        except CodecError:
-            continue
-    return None
+    reply = _reply(session, key, ClockReply)
+    return None if reply is None else (asked_ns, reply, time.time_ns())
 
 
 class Mover:

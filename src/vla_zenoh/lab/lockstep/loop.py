@@ -261,12 +261,12 @@ class Lockstep:
         shown = [(camera, self._picture(camera)) for camera in cameras]
         depth = _half_a_metre(self._seq[CAMERA])
         for camera, record in [*shown, *((camera, depth) for camera in with_depth)]:
-            picture = Stamped(header, record, arrival_ns)
+            picture, take = Stamped(header, record, arrival_ns), partial(self._take_picture, camera)
             if self.tamper is None:  # else an image would be encoded that nobody needs
-                self._deliver(arrival_ns, partial(self._take_picture, camera, picture))
+                self._deliver(arrival_ns, partial(take, picture))
                 continue
             for arriving in self.tamper(_image_message(camera, picture)):
-                self._deliver(arriving.arrival_ns, partial(self._arrive_image, arriving))
+                self._deliver(arriving.arrival_ns, partial(self._arrive, arriving, take))
 
     # -- the wire -----------------------------------------------------------------------------
     def _send(
@@ -295,20 +295,11 @@ class Lockstep:
     def _arrive(self, message: Message, take: Callable[[Stamped[Any]], None]) -> None:
         try:
             header = records.decode_header(records.encode_header(message.header))
-            record = records.decode(message.kind, message.payload)
+            record = _decoded(message)
         except CodecError as error:
             self.refused[error.reason] += 1
             return
         take(Stamped(header, record, message.arrival_ns))
-
-    def _arrive_image(self, message: Message) -> None:
-        decode = decode_depth if message.kind is Depth else decode_raw
-        try:
-            image = decode(message.payload, message.encoding)
-        except CodecError as error:
-            self.refused[error.reason] += 1
-            return
-        self._take_picture(message.camera, Stamped(message.header, image, message.arrival_ns))
 
     def _at(self, node: str, arrived: Stamped[Any]) -> Stamped[Any]:
         """With the time of arrival on the clock of `node`."""
@@ -378,6 +369,14 @@ def _half_a_metre(seq: int) -> Depth:
     counts = np.full((48, 64), 500, np.uint16)
     counts[0] += np.uint16(seq % 101)
     return Depth(counts, 0.001)
+
+
+def _decoded(message: Message) -> Any:
+    if message.kind is Depth:
+        return decode_depth(message.payload, message.encoding)
+    if message.kind is Image:
+        return decode_raw(message.payload, message.encoding)
+    return records.decode(message.kind, message.payload)
 
 
 def _image_message(camera: str, picture: Stamped[Image] | Stamped[Depth]) -> Message:
