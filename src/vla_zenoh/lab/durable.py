@@ -25,10 +25,15 @@ def writing(path: Path, kind: type[VlaZenohError]) -> Iterator[None]:
         raise kind(f"{path} cannot be written: {error.strerror}") from error
 
 
-def write_whole(path: Path, content: str | bytes) -> None:
-    """Write a file; a reader sees the old one or the new one, never half of one."""
+def write_whole(path: Path, content: str | bytes, mode: int = 0o644) -> None:
+    """Write a file; a reader sees the old one or the new one, never half of one.
+
+    Args:
+        mode: that it has from the start.
+    """
     part = path.with_name(f"{path.name}.part")
-    with part.open("wb") as file:
+    part.unlink(missing_ok=True)
+    with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
         file.write(content.encode() if isinstance(content, str) else content)
         file.flush()
         os.fsync(file.fileno())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime as dt
-import os
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -11,6 +10,7 @@ from vla_zenoh.errors import SecurityError
 from vla_zenoh.lab.certificates import authority as ca
 from vla_zenoh.lab.certificates.authority import KeyPair
 from vla_zenoh.lab.certificates.bridge import bridges
+from vla_zenoh.lab.durable import write_whole, writing
 from vla_zenoh.profile import Profile
 from vla_zenoh.security.certificates import CheckedStore, Entry, read, read_file
 from vla_zenoh.security.roles import Identity, Role, identities
@@ -92,10 +92,8 @@ class LabCertificates(CheckedStore):
     def _keep(self, host: str, node: str, pair: KeyPair) -> Path:
         files = self.files(host, node)
         for folder in (self.folder, files.key.parent):
-            try:
+            with writing(folder, SecurityError):
                 folder.mkdir(mode=FOLDER_MODE, parents=True, exist_ok=True)
-            except OSError as error:
-                raise SecurityError(f"{folder} cannot be made: {error.strerror}") from error
         _write(files.key, pair.key, KEY_MODE)
         _write(files.certificate, pair.certificate, 0o644)
         return files.certificate
@@ -117,17 +115,8 @@ class LabCertificates(CheckedStore):
 
 
 def _write(path: Path, content: bytes, mode: int) -> None:
-    """Write a file atomically; it has its mode from the start."""
-    beside = path.with_name(f".{path.name}.new")
-    try:
-        beside.unlink(missing_ok=True)
-        number = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
-        with os.fdopen(number, "wb") as file:
-            file.write(content)
-        beside.chmod(mode)
-        beside.replace(path)
-    except OSError as error:
-        raise SecurityError(f"{path} cannot be written: {error.strerror}") from error
+    with writing(path, SecurityError):
+        write_whole(path, content, mode)
 
 
 def unused_certificates(profile: Profile, entries: Iterable[Entry]) -> dict[Path, str]:
