@@ -239,16 +239,13 @@ def _motion(out: Evaluation, measured: MeasuredMotion, commanded: MeasuredMotion
             setattr(out, name, PlotTrace(motion.t_s, motion.position_m, turns, speed_m_s))
     if not (len(measured.t_s) and len(commanded.t_s) > 1):
         return
-    later = np.clip(np.searchsorted(commanded.t_s, measured.t_s), 1, len(commanded.t_s) - 1)
-    before_s, after_s = commanded.t_s[later - 1], commanded.t_s[later]
-    within = (measured.t_s >= before_s) & (measured.t_s <= after_s) & (after_s - before_s < GAP_S)
-    share = (measured.t_s - before_s) / np.where(after_s > before_s, after_s - before_s, 1.0)
-    between = (
-        commanded.position_m[later - 1] * (1 - share[:, None])
-        + commanded.position_m[later] * share[:, None]
-    )
-    off = np.linalg.norm(between - measured.position_m, axis=1)
-    nearer = np.where(share < 0.5, later - 1, later)
+    times_s, now_s = commanded.t_s, measured.t_s
+    later = np.clip(np.searchsorted(times_s, now_s), 1, len(times_s) - 1)
+    before_s, after_s = times_s[later - 1], times_s[later]
+    within = (now_s >= before_s) & (now_s <= after_s) & (after_s - before_s < GAP_S)
+    between = [np.interp(now_s, times_s, axis) for axis in commanded.position_m.T]
+    off = np.linalg.norm(np.column_stack(between) - measured.position_m, axis=1)
+    nearer = np.where(now_s - before_s < after_s - now_s, later - 1, later)
     turned = angles_rad(commanded.quat_xyzw[nearer], measured.quat_xyzw)
     out.tracking_mm, out.tracking_mrad = off[within] * 1e3, turned[within] * 1e3
 
@@ -315,16 +312,13 @@ def _jerk(out: Evaluation, run: Run) -> None:
 
 # -- activity -------------------------------------------------------------------------------------
 def _idle(out: Evaluation, run: Run, measured: MeasuredMotion) -> None:
-    active = [
-        ((since_ns - run.began_ns) / 1e9, (end_ns - run.began_ns) / 1e9)
-        for since_ns, end_ns, _ in run.activations()
-    ]
+    active = run.activations()
     if not active:
         return
-    out.active_s = sum(until_s - since_s for since_s, until_s in active)
-    out.idle_s = 0.0
-    for since_s, until_s in active:
-        part = measured.part(since_s, until_s)
+    out.active_s = out.idle_s = 0.0
+    for since_ns, until_ns, _ in active:
+        out.active_s += (until_ns - since_ns) / 1e9
+        part = measured.part((since_ns - run.began_ns) / 1e9, (until_ns - run.began_ns) / 1e9)
         if len(part.t_s) > 1:
             speed = np.linalg.norm(part.twist[:-1, :3], axis=1)
             turn = np.linalg.norm(part.twist[:-1, 3:], axis=1)

@@ -30,6 +30,10 @@ THESIS_NAMES = {"e2e": "end_to_end", "backend": "inference", "outbound": "outbou
 """Names of the thesis for its three stages."""
 
 
+def _empty() -> FloatArray:
+    return np.zeros(0)
+
+
 @dataclass(frozen=True, slots=True)
 class PromptSegment:
     """Motion of the arm during one prompt.
@@ -108,7 +112,7 @@ class PlotTrace:
     t_s: FloatArray
     position_m: FloatArray
     rotvec_rad: FloatArray
-    speed_m_s: FloatArray = field(default_factory=lambda: np.zeros(0))
+    speed_m_s: FloatArray = field(default_factory=_empty)
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,23 +187,23 @@ class Evaluation:
     seconds: float = 0.0
     prompts: list[str] = field(default_factory=list)
     stages_ms: dict[str, FloatArray] = field(default_factory=dict)
-    request_t_s: FloatArray = field(default_factory=lambda: np.zeros(0))
+    request_t_s: FloatArray = field(default_factory=_empty)
     path_m: float | None = None
     path_rad: float | None = None
     command_path_m: float | None = None
     command_path_rad: float | None = None
-    tracking_mm: FloatArray = field(default_factory=lambda: np.zeros(0))
-    tracking_mrad: FloatArray = field(default_factory=lambda: np.zeros(0))
-    jerk: FloatArray = field(default_factory=lambda: np.zeros(0))
+    tracking_mm: FloatArray = field(default_factory=_empty)
+    tracking_mrad: FloatArray = field(default_factory=_empty)
+    jerk: FloatArray = field(default_factory=_empty)
     jerk_unit: str = "m_s3"
     active_s: float | None = None
     idle_s: float | None = None
-    seam_goal_mm: FloatArray = field(default_factory=lambda: np.zeros(0))
-    seam_velocity_mm_s: FloatArray = field(default_factory=lambda: np.zeros(0))
+    seam_goal_mm: FloatArray = field(default_factory=_empty)
+    seam_velocity_mm_s: FloatArray = field(default_factory=_empty)
     refusals: Counter[str] = field(default_factory=Counter)
     skipped: Counter[str] = field(default_factory=Counter)
-    width_m: FloatArray = field(default_factory=lambda: np.zeros(0))
-    width_t_s: FloatArray = field(default_factory=lambda: np.zeros(0))
+    width_m: FloatArray = field(default_factory=_empty)
+    width_t_s: FloatArray = field(default_factory=_empty)
     gripper_orders: int | None = None
     segments: list[PromptSegment] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
