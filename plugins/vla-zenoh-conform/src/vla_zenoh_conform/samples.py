@@ -9,25 +9,8 @@ from typing import Any, NamedTuple
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import decode_jpeg, decode_raw
 from vla_zenoh.errors import CodecError
-from vla_zenoh.policy import ModelSpec
-from vla_zenoh.types import (
-    ActionChunk,
-    GripperState,
-    Header,
-    JointState,
-    PoseState,
-    Task,
-)
-
-KINDS = {
-    "state/joint": JointState,
-    "state/pose": PoseState,
-    "state/gripper": GripperState,
-    "task": Task,
-    "spec": ModelSpec,
-    "delta": ActionChunk,
-}
-"""Key, or the part of it before a worker's name -> kind of record."""
+from vla_zenoh.lab.recording.record_types import record_of
+from vla_zenoh.types import Header
 
 
 class Raw(NamedTuple):
@@ -71,7 +54,7 @@ def arrived(raw: Raw) -> Arrived:
 
 
 def _record(raw: Raw, unknown: list[str]) -> Any:
-    kind = KINDS.get(raw.key) or KINDS.get(raw.key.partition("/")[0])
+    kind = record_of(raw.key)
     if kind is not None:
         return records.decode(kind, raw.payload, unknown)
     if raw.encoding.startswith("image/jpeg"):

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 from base64 import b64decode, b64encode
+from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any
 
 from vla_zenoh.codec import message
-from vla_zenoh.errors import CodecError, ProfileError
-from vla_zenoh.keys import NOT_PARTS, PART_KEYS, Keys, last_chunk
+from vla_zenoh.errors import CodecError
+from vla_zenoh.keys import KEY_PATHS, NOT_PARTS, PART_KEYS, Keys
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.types import (
     ActionChunk,
@@ -27,24 +29,37 @@ from vla_zenoh.types import (
     Task,
 )
 
-RECORDS: tuple[type, ...] = (
-    JointState,
-    PoseState,
-    GripperState,
-    PrivilegedState,
-    PoseCommand,
-    JointCommand,
-    GripperCommand,
-    Task,
-    ActionChunk,
-    ModelSpec,
-    NodeStatus,
-    Event,
-    SceneState,
-    ObjectPoses,
-    InferenceDebug,
-)
+RECORD_OF: Mapping[str, type] = {
+    "state/joint": JointState,
+    "state/pose": PoseState,
+    "state/gripper": GripperState,
+    "state/privileged": PrivilegedState,
+    "command/pose": PoseCommand,
+    "command/joint": JointCommand,
+    "command/gripper": GripperCommand,
+    "task": Task,
+    "delta/*": ActionChunk,
+    "spec/*": ModelSpec,
+    "status/*": NodeStatus,
+    "event/*": Event,
+    "sim/scene": SceneState,
+    "sim/objects": ObjectPoses,
+    "seen/*": InferenceDebug,
+}
+"""Key below the robot -> its record; a star is the name of a node or worker."""
+RECORDS = tuple(RECORD_OF.values())
 """Every record that has a key."""
+OF_PARTS = frozenset(KEY_PATHS[name].path for name in PART_KEYS)
+
+
+@lru_cache(maxsize=1000)
+def record_of(key: str) -> type | None:
+    """The record of a key below the robot; None for images, plain text and unknown keys."""
+    first, _, rest = key.partition("/")
+    if first not in NOT_PARTS:
+        return RECORD_OF.get(rest) if rest in OF_PARTS else None
+    of_name = f"{first}/*" if rest and "/" not in rest else ""
+    return RECORD_OF.get(key) or RECORD_OF.get(of_name)
 
 
 def part_of(keys: Keys, key: str) -> str:
@@ -60,47 +75,14 @@ def group_of(keys: Keys, key: str) -> str:
 
 
 class RecordTypes:
-    """Record types of the keys of one robot; look-ups are cached."""
+    """Record types of the keys of one robot."""
 
     def __init__(self, keys: Keys) -> None:
         self._keys = keys
-        self._of_parts = {getattr(keys, member) for member in PART_KEYS}
-        self._known: dict[str, type | None] = {
-            keys.state_joint: JointState,
-            keys.state_pose: PoseState,
-            keys.state_gripper: GripperState,
-            keys.state_privileged: PrivilegedState,
-            keys.command_pose: PoseCommand,
-            keys.command_joint: JointCommand,
-            keys.command_gripper: GripperCommand,
-            keys.task: Task,
-            keys.sim_scene: SceneState,
-            keys.sim_objects: ObjectPoses,
-        }
 
     def of(self, key: str) -> type | None:
-        """The record type of `key`; None for images, plain text and unknown keys."""
-        if key not in self._known:
-            self._known[key] = self._look_up(key)
-        return self._known[key]
-
-    def _look_up(self, key: str) -> type | None:
-        families = (
-            (self._keys.delta, ActionChunk),
-            (self._keys.spec, ModelSpec),
-            (self._keys.status, NodeStatus),
-            (self._keys.event, Event),
-            (self._keys.seen_record, InferenceDebug),
-        )
-        name = last_chunk(key)
-        part, _, rest = self._keys.short(key).partition("/")
-        of_part = self._keys.full(rest)
-        if part not in NOT_PARTS and of_part in self._of_parts:
-            return self._known[of_part]
-        try:
-            return next((kind for make, kind in families if make(name) == key), None)
-        except ProfileError:
-            return None
+        """The record type of a whole key, as `record_of`."""
+        return record_of(self._keys.short(key))
 
 
 PAYLOAD, ATTACHMENT = "_payload", "_attachment"

@@ -32,7 +32,7 @@ from vla_zenoh.codec import image as image_codec
 from vla_zenoh.errors import CodecError, RecordingError
 from vla_zenoh.keys import Keys
 from vla_zenoh.lab.recording import ros2_messages
-from vla_zenoh.lab.recording.record_types import RecordTypes, bytes_to_json, record_to_json
+from vla_zenoh.lab.recording.record_types import bytes_to_json, record_of, record_to_json
 from vla_zenoh.lab.recording.ros2_messages import serialize, standard_message
 from vla_zenoh.lab.recording.sample import DEPTH, JPEG, MSGPACK, RAW, Sample
 
@@ -169,7 +169,6 @@ class RecordingWriter:
     ) -> None:
         ros2_messages.messages()
         self._robot, self._frame = robot, base_frame
-        self._types: dict[str, RecordTypes] = {}
         self._schemas: dict[str, int] = {}
         self._channels: dict[tuple[Any, ...], int] = {}
         self.counts: Counter[str] = Counter()
@@ -293,11 +292,7 @@ class RecordingWriter:
 
     def _record_type(self, key: str) -> type | None:
         robot = Keys.of(key, self._robot.root)
-        if robot is None:
-            return None
-        if robot.robot not in self._types:
-            self._types[robot.robot] = RecordTypes(robot)
-        return self._types[robot.robot].of(key)
+        return None if robot is None else record_of(robot.short(key))
 
     # -- MCAP ---------------------------------------------------------------------------------
     def _put_json(self, sample: Sample, text: str, json_of: str, *below: str) -> None:
