@@ -34,8 +34,7 @@ class DemoSegment:
     @property
     def prompt_with_count(self) -> str:
         """The prompt that ends by itself after the steps."""
-        within = "" if self.within is None else f" within {self.within:g}"
-        return f"{self.prompt} x{self.steps}{within}"
+        return self._parsed.text
 
     @property
     def asked(self) -> FloatArray:
