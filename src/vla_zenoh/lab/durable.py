@@ -25,11 +25,11 @@ def writing(path: Path, kind: type[VlaZenohError]) -> Iterator[None]:
         raise kind(f"{path} cannot be written: {error.strerror}") from error
 
 
-def write_whole(path: Path, content: str | bytes, mode: int = 0o644) -> None:
+def write_whole(path: Path, content: str | bytes, mode: int = 0o666) -> None:
     """Write a file; a reader sees the old one or the new one, never half of one.
 
     Args:
-        mode: that it has from the start.
+        mode: that it has from the start, less what the umask forbids.
     """
     part = path.with_name(f"{path.name}.part")
     part.unlink(missing_ok=True)

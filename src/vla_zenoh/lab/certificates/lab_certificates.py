@@ -117,6 +117,7 @@ class LabCertificates(CheckedStore):
 def _write(path: Path, content: bytes, mode: int) -> None:
     with writing(path, SecurityError):
         write_whole(path, content, mode)
+        path.chmod(mode)  # whatever the umask
 
 
 def unused_certificates(profile: Profile, entries: Iterable[Entry]) -> dict[Path, str]:
