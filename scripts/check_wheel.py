@@ -51,6 +51,7 @@ WITH_PLUGINS = [
     ["nights", "--help"],
     ["conform", "robot", "--help"],
     ["teleop", "--help"],
+    ["dataset", "export", "--help"],
 ]
 
 

@@ -54,7 +54,9 @@ def run_model(
     extra = TESTS / name / "requirements.txt"
     more = [line for line in extra.read_text().split("\n") if line] if extra.is_file() else []
     command = environment_command(find_model(name), [*TOOLS, *more, *added])
-    command += how_to_repeat(f"vla-zenoh-{name}") if name == "lerobot" else []  # its arm, too
+    if name == "lerobot":  # its arm and data sets, too
+        for package in ("vla-zenoh-lerobot", "vla-zenoh-dataset"):
+            command += how_to_repeat(package)
     made = subprocess.run(
         [*command, "python", "-c", ""], env=environ, capture_output=True, text=True, check=False
     )

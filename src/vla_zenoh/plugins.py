@@ -147,6 +147,8 @@ PACKAGES: Mapping[str, str] = {
     "conform.camera": "vla-zenoh-conform",
     "conform.robot": "vla-zenoh-conform",
     "conform.worker": "vla-zenoh-conform",
+    "dataset.export": "vla-zenoh-dataset",
+    "dataset.stats": "vla-zenoh-dataset",
     "nights": "vla-zenoh-nights",
     "node.rolling": "vla-zenoh-rolling",
     "save": "vla-zenoh-rolling",

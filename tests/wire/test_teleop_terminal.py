@@ -12,11 +12,11 @@ from camera_rig import until
 from chain import LONG_PATIENCE_S, READY_PATIENCE_S, Chain, command_line, write_profile
 from recording_rig import recording
 from teleop_rig import Screen, teleop
+from vla_zenoh_dataset.episodes import episodes_of
 from vla_zenoh_teleop.keyboard import END
 
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import records
-from vla_zenoh.lab.dataset.episodes import episodes_of
 from vla_zenoh.lab.recording.run import load_run
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import GripperState

@@ -19,9 +19,9 @@ from typing import Any
 import pytest
 from camera_rig import until
 from chain import READY_PATIENCE_S, Chain, running_chain
+from vla_zenoh_dataset.episodes import episodes_of
+from vla_zenoh_dataset.success import succeeded
 
-from vla_zenoh.lab.dataset.episodes import episodes_of
-from vla_zenoh.lab.dataset.success import succeeded
 from vla_zenoh.lab.recording.run import load_run
 from vla_zenoh.lab.trial.folder import TrialFolder
 

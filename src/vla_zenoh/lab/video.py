@@ -35,15 +35,14 @@ class VideoWriter:
 
     Args:
         path: of the file; its folder is made.
-        extra: optional dependencies to name where PyAV is missing.
         options: of the encoder, such as ``crf``, the constant rate factor.
     """
 
-    def __init__(self, path: Path, rate_hz: int, *, extra: str, **options: str) -> None:
+    def __init__(self, path: Path, rate_hz: int, **options: str) -> None:
         try:
             import av
         except ImportError as error:
-            raise MissingExtraError("av", extra) from error
+            raise MissingExtraError("av", "sim") from error
         path.parent.mkdir(parents=True, exist_ok=True)
         self._av, self._rate_hz = av, rate_hz
         self._options = {"preset": "veryfast", **options}

@@ -114,7 +114,10 @@ COMMANDS: Panels = {
         ),
         "camera": CommandGroup("Cameras of this computer.", {"list": "lab.cli.camera:camera_list"}),
         "secure": "lab.cli.secure:secure_app",
-        "dataset": "lab.cli.dataset:dataset_app",
+        "dataset": CommandGroup(
+            "Turn recorded runs into training data.",
+            dict.fromkeys(("export", "stats"), OF_A_PACKAGE),
+        ),
         "bench": CommandGroup(
             "Measure this computer, and how well models do tasks.",
             {

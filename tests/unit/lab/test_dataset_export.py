@@ -25,12 +25,12 @@ from dataset_rig import (
 )
 from dataset_rig import write_run as make_run
 from typed import typed
+from vla_zenoh_dataset.episodes import episodes_of, fps_of
+from vla_zenoh_dataset.features import Histogram, action_names, of_numbers, usual_state
+from vla_zenoh_dataset.lerobot import export
+from vla_zenoh_dataset.openvla import openvla_statistics
 
 from vla_zenoh.errors import RecordingError
-from vla_zenoh.lab.dataset.episodes import episodes_of, fps_of
-from vla_zenoh.lab.dataset.features import Histogram, action_names, of_numbers, usual_state
-from vla_zenoh.lab.dataset.lerobot import export
-from vla_zenoh.lab.dataset.openvla import openvla_statistics
 from vla_zenoh.lab.policy_servers.state_vector import read_parts
 from vla_zenoh.lab.recording.run import Run, load_run
 from vla_zenoh.policy import standing_step

@@ -21,12 +21,11 @@ from dataset_rig import (
     write_mixed_run,
     write_run,
 )
-from typer.testing import CliRunner
+from typed import typed
+from vla_zenoh_dataset.episodes import RecordedEpisode, Span, episodes_of, together
+from vla_zenoh_dataset.lerobot import export
 
 from vla_zenoh.errors import RecordingError
-from vla_zenoh.lab.cli.dataset import dataset_app
-from vla_zenoh.lab.dataset.episodes import RecordedEpisode, Span, episodes_of, together
-from vla_zenoh.lab.dataset.lerobot import export
 from vla_zenoh.lab.policy_servers.state_vector import read_parts
 from vla_zenoh.lab.recording.run import load_run
 from vla_zenoh.lab.trial.verdict import FACT
@@ -147,7 +146,7 @@ def test_the_column_has_the_name_and_type_of_lerobots_own(tmp_path: Path) -> Non
 
 
 def test_episodes_are_chosen_by_their_label_and_discarded_ones_only_where_they_are_named(
-    tmp_path: Path,
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     runs = tmp_path / "runs"
     for verdict in ("success", "failure", "void"):
@@ -156,9 +155,9 @@ def test_episodes_are_chosen_by_their_label_and_discarded_ones_only_where_they_a
 
     def exported(*words: str) -> list[str]:
         out = tmp_path / f"out{len(list(tmp_path.iterdir()))}"
-        command = ["export", str(runs), "--output", str(out), *words, "--json"]
-        done = CliRunner().invoke(dataset_app, command)
-        assert done.exit_code == 0, done.output
+        command = ("export", str(runs), "--output", str(out), *words, "--json")
+        done = typed(capsys, "dataset", *command)
+        assert done.code == 0, done.said
         said = json.loads(done.stdout)
         assert said["interventions"] == EACH * said["episodes"]
         table = pq.read_table(out / "meta/episodes/chunk-000/file-000.parquet")
@@ -168,11 +167,10 @@ def test_episodes_are_chosen_by_their_label_and_discarded_ones_only_where_they_a
     assert exported() == ["failure", "success"]
     assert exported("--label", "success") == ["success"]
     assert exported("--label", "discarded", "--label", "failure") == ["discarded", "failure"]
-    done = CliRunner().invoke(
-        dataset_app, ["export", str(runs), "-o", str(tmp_path / "none"), "--label", "unknown"]
-    )
-    assert done.exit_code == 1
-    assert "no episode has the label unknown; there are: 1 failure, 1 success" in done.output
+    words = ("export", str(runs), "-o", str(tmp_path / "none"), "--label", "unknown")
+    done = typed(capsys, "dataset", *words)
+    assert done.code == 1
+    assert "no episode has the label unknown; there are: 1 failure, 1 success" in done.said
 
 
 def test_a_person_who_begins_gives_the_arm_to_a_model_in_the_same_episode(tmp_path: Path) -> None:

@@ -7,12 +7,12 @@ from dataclasses import asdict
 from pathlib import Path
 
 import pyarrow.parquet as pq
+import pytest
 from dataset_rig import PROMPTS, write_run
-from typer.testing import CliRunner
+from typed import typed
+from vla_zenoh_dataset.episodes import episodes_of
+from vla_zenoh_dataset.success import succeeded
 
-from vla_zenoh.lab.cli.dataset import dataset_app
-from vla_zenoh.lab.dataset.episodes import episodes_of
-from vla_zenoh.lab.dataset.success import succeeded
 from vla_zenoh.lab.recording.run import load_run
 from vla_zenoh.lab.trial.verdict import FACT, EpisodeVerdict, Verdict
 
@@ -25,7 +25,7 @@ def fact(verdict: Verdict, worker: str = "teacher") -> dict[str, object]:
 
 
 def test_only_what_a_person_called_a_success_is_exported_where_that_is_asked(
-    tmp_path: Path,
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The prompt is no task that a program can judge."""
     verdicts: tuple[Verdict, ...] = ("failure", "success")
@@ -44,9 +44,9 @@ def test_only_what_a_person_called_a_success_is_exported_where_that_is_asked(
         assert succeeded(episode) is known
 
     out = tmp_path / "good"
-    words = ["export", str(tmp_path), "--output", str(out), "--label", "success", "--json"]
-    done = CliRunner().invoke(dataset_app, words)
-    assert done.exit_code == 0, done.output
+    words = ("export", str(tmp_path), "--output", str(out), "--label", "success", "--json")
+    done = typed(capsys, "dataset", *words)
+    assert done.code == 0, done.said
     assert json.loads(done.stdout)["episodes"] == 1
     table = pq.read_table(out / "meta/episodes/chunk-000/file-000.parquet")
     assert table["run"].to_pylist() == ["success.mcap"]

@@ -88,7 +88,7 @@ def write_videos(
             steps = np.load(actions_file(folder, request))
             place.replay(request, steps, camera, Path(pictures))
             part = file.with_suffix(".part.mp4")
-            video = VideoWriter(part, FRAME_HZ, extra="dataset")
+            video = VideoWriter(part, FRAME_HZ)
             for jpeg in sorted(Path(pictures).glob("*.jpg")):
                 video.add(decode_jpeg(jpeg.read_bytes()).rgb)
             video.close()

@@ -56,7 +56,7 @@ def write_film(
     total, done = max(1, int(run.seconds * look.rate_hz)), 0
     newest: dict[str, bytes] = {}
     shown: dict[str, tuple[bytes, Picture]] = {}
-    writer = VideoWriter(path, look.rate_hz, extra="sim", crf=str(look.quality))
+    writer = VideoWriter(path, look.rate_hz, crf=str(look.quality))
 
     def draw(until_ns: int) -> None:
         nonlocal done

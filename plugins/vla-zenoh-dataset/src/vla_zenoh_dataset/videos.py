@@ -12,12 +12,12 @@ import numpy as np
 
 from vla_zenoh.codec import image as image_codec
 from vla_zenoh.errors import RecordingError
-from vla_zenoh.lab.dataset.episodes import RecordedEpisode
-from vla_zenoh.lab.dataset.features import PICTURE, Histogram
 from vla_zenoh.lab.recording.run import Run, depths, pictures
 from vla_zenoh.lab.recording.sample import Sample
 from vla_zenoh.lab.video import VideoWriter
 from vla_zenoh.types import Depth
+from vla_zenoh_dataset.episodes import RecordedEpisode
+from vla_zenoh_dataset.features import PICTURE, Histogram
 
 OPTIONS = {"crf": "18", "g": "2", "bf": "0"}
 """Every second frame is a key frame, so that training can seek to any frame quickly."""
@@ -76,10 +76,7 @@ def write_videos(
         RecordingError: images of one episode differ in size.
         CodecError: one is no JPEG file.
     """
-    videos = [
-        EpisodeVideo(VideoWriter(path, fps, extra="dataset", **OPTIONS), Histogram())
-        for path, _ in wanted
-    ]
+    videos = [EpisodeVideo(VideoWriter(path, fps, **OPTIONS), Histogram()) for path, _ in wanted]
     users: dict[int, list[tuple[int, int]]] = {}
     for which, (_, numbers) in enumerate(wanted):
         for number in sorted(set(numbers)):

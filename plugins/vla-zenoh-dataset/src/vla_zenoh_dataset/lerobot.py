@@ -16,11 +16,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from vla_zenoh.errors import MissingExtraError, RecordingError
-from vla_zenoh.lab.dataset.episodes import RecordedEpisode, fps_of
-from vla_zenoh.lab.dataset.features import (
+from vla_zenoh.errors import RecordingError
+from vla_zenoh.lab.video import CODEC, PIXEL_FORMAT
+from vla_zenoh_dataset.episodes import RecordedEpisode, fps_of
+from vla_zenoh_dataset.features import (
     ACTION,
     INTERVENTION,
     PICTURE,
@@ -32,8 +35,7 @@ from vla_zenoh.lab.dataset.features import (
     of_numbers,
     states_of,
 )
-from vla_zenoh.lab.dataset.videos import DepthColumn, EpisodeVideo, chosen, stamps_of, write_videos
-from vla_zenoh.lab.video import CODEC, PIXEL_FORMAT
+from vla_zenoh_dataset.videos import DepthColumn, EpisodeVideo, chosen, stamps_of, write_videos
 
 VERSION = "v3.0"
 FILES_IN_A_CHUNK = 1000
@@ -103,12 +105,6 @@ class _Dataset:
         parts: Sequence[str],
         depth: Sequence[str],
     ) -> None:
-        try:
-            import pyarrow
-            import pyarrow.parquet
-        except ImportError as error:
-            raise MissingExtraError("pyarrow", "dataset") from error
-        self._pa, self._pq = pyarrow, pyarrow.parquet
         self._root, self._episodes = root, list(episodes)
         self._cameras, self._parts = tuple(cameras), parts
         self._depths = [DepthColumn(camera) for camera in depth]
@@ -170,7 +166,6 @@ class _Dataset:
 
     def _write_data(self) -> list[dict[str, NDArray[Any]]]:
         """Write the frames; returns the rows of each episode."""
-        pa = self._pa
         numbers = {STATE: len(self._state_names), ACTION: self._spec.action.dimension}
         schema = pa.schema(
             [(name, pa.list_(pa.float32(), size)) for name, size in numbers.items()]
@@ -181,7 +176,7 @@ class _Dataset:
         for depth in self._depths:
             schema = schema.append(pa.field(depth.name, file))
         out, first = [], 0
-        with self._pq.ParquetWriter(self._place(DATA, 0), schema) as writer:
+        with pq.ParquetWriter(self._place(DATA, 0), schema) as writer:
             for number, (episode, states) in enumerate(
                 zip(self._episodes, self._states, strict=True)
             ):
@@ -211,7 +206,6 @@ class _Dataset:
         return out
 
     def _write_tasks(self) -> None:
-        pa = self._pa
         table = pa.table({"task_index": range(len(self._tasks)), "task": self._tasks})
         # LeRobot reads it with pandas and takes the tasks from the index.
         kinds = (("task_index", "int64", "int64"), ("task", "unicode", "object"))
@@ -232,7 +226,7 @@ class _Dataset:
             "pandas_version": "2.2.0",
         }
         table = table.replace_schema_metadata({"pandas": json.dumps(pandas)})
-        self._pq.write_table(table, self._place(TASKS, 0))
+        pq.write_table(table, self._place(TASKS, 0))
 
     def _write_episodes(
         self, rows: list[dict[str, NDArray[Any]]], videos: dict[str, list[EpisodeVideo]]
@@ -272,9 +266,9 @@ class _Dataset:
                 entry |= {f"stats/{name}/{what}": value for what, value in values.items()}
             for name, value in entry.items():
                 table.setdefault(name, []).append(value)
-        success = self._pa.array(table.pop("success"), self._pa.bool_())
-        made = self._pa.table(table).append_column("success", success)
-        self._pq.write_table(made, self._place(EPISODES, 0))
+        success = pa.array(table.pop("success"), pa.bool_())
+        made = pa.table(table).append_column("success", success)
+        pq.write_table(made, self._place(EPISODES, 0))
 
     def _write_json(
         self, rows: list[dict[str, NDArray[Any]]], videos: dict[str, list[EpisodeVideo]]

@@ -7,11 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from vla_zenoh.errors import MissingExtraError, RecordingError
-from vla_zenoh.lab.dataset.features import ACTION, STATE, of_numbers
-from vla_zenoh.lab.dataset.lerobot import INFO
+from vla_zenoh.errors import RecordingError
+from vla_zenoh_dataset.features import ACTION, STATE, of_numbers
+from vla_zenoh_dataset.lerobot import INFO
 
 FIGURES = ("mean", "std", "max", "min", "q01", "q99")
 
@@ -45,18 +47,13 @@ def read_numbers(folder: Path) -> tuple[dict[str, Any], dict[str, NDArray[np.flo
         RecordingError: the folder holds no LeRobot dataset.
     """
     try:
-        import pyarrow
-        import pyarrow.parquet as pq
-    except ImportError as error:
-        raise MissingExtraError("pyarrow", "dataset") from error
-    try:
         info = json.loads((folder / INFO).read_text("utf-8"))
         names = [name for name in (ACTION, STATE) if name in info["features"]]
         files = sorted((folder / "data").glob("*/*.parquet"))
         tables = [pq.read_table(file, columns=names) for file in files]
-        table = pyarrow.concat_tables(tables)
+        table = pa.concat_tables(tables)
         columns = {name: np.array(table[name].to_pylist(), np.float32) for name in names}
-    except (OSError, ValueError, TypeError, KeyError, pyarrow.ArrowException) as error:
+    except (OSError, ValueError, TypeError, KeyError, pa.ArrowException) as error:
         raise RecordingError(f"{folder} is no LeRobot dataset that can be read: {error}") from error
     if ACTION not in columns or not len(columns[ACTION]):
         raise RecordingError(f"{folder} holds no actions")

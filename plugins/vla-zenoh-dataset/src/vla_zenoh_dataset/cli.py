@@ -9,21 +9,17 @@ from typing import Annotated
 
 import typer
 
-from vla_zenoh.cli.options import JsonOption, not_empty
+from vla_zenoh.cli.options import JsonOption, not_empty, options
 from vla_zenoh.cli.output import console, fail
 from vla_zenoh.cli.plain import warn
 from vla_zenoh.errors import RecordingError, counted, nearest
 from vla_zenoh.lab.cli.output import print_json, progress
 from vla_zenoh.lab.cli.output_path import ForceOption, output_file, output_folder
-from vla_zenoh.lab.dataset.label import EpisodeLabel
 from vla_zenoh.lab.evaluation.evaluate import MCAP, recordings
-
-dataset_app = typer.Typer(
-    name="dataset", help="Turn recorded runs into training data.", no_args_is_help=True
-)
+from vla_zenoh_dataset.label import EpisodeLabel
 
 
-@dataset_app.command("export")
+@options
 def export(
     runs: Annotated[list[Path], typer.Argument(help="Recordings (.mcap), or folders of them.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="New folder for the dataset.")],
@@ -63,12 +59,12 @@ def export(
     Where a person took the arm from a model and gave it back that is one episode of the model; the
     column `intervention` says which frames the person led.
     """
-    from vla_zenoh.lab.dataset.episodes import episodes_of
-    from vla_zenoh.lab.dataset.features import usual_state
-    from vla_zenoh.lab.dataset.lerobot import export as write
-    from vla_zenoh.lab.dataset.success import succeeded, verdict_of_person
     from vla_zenoh.lab.policy_servers.state_vector import read_parts
     from vla_zenoh.lab.recording.run import load_run
+    from vla_zenoh_dataset.episodes import episodes_of
+    from vla_zenoh_dataset.features import usual_state
+    from vla_zenoh_dataset.lerobot import export as write
+    from vla_zenoh_dataset.success import succeeded, verdict_of_person
 
     parts, files = read_parts(state) if state else None, list(recordings(runs))
     if not files:
@@ -129,7 +125,7 @@ def export(
     )
 
 
-@dataset_app.command("stats")
+@options
 def stats(
     folder: Annotated[Path, typer.Argument(help="A LeRobot dataset v3.0.")],
     name: Annotated[
@@ -146,7 +142,7 @@ def stats(
     as_json: JsonOption = False,
 ) -> None:
     """Write OpenVLA's dataset_statistics.json for a dataset."""
-    from vla_zenoh.lab.dataset.openvla import openvla_statistics
+    from vla_zenoh_dataset.openvla import openvla_statistics
 
     path = output or folder / "dataset_statistics.json"
     inputs = (*folder.glob("meta/*.json"), *folder.rglob("*.parquet"))

@@ -6,7 +6,7 @@ the next one arrived, frames without motion fill the gap, so all frames are `dt_
 
 Where a person took the arm from a model and gave it back, without a deactivation in between, that
 is one episode of the model. The frames that the person led are what the arm was commanded to do,
-in the numbers of the model's spec (`vla_zenoh.lab.dataset.corrections`).
+in the numbers of the model's spec (`vla_zenoh_dataset.corrections`).
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from vla_zenoh.control.actions import as_deltas
 from vla_zenoh.errors import RecordingError
-from vla_zenoh.lab.dataset.corrections import commanded_motion
-from vla_zenoh.lab.dataset.label import EpisodeLabel
 from vla_zenoh.lab.recording.run import RecordedSample, Run, Span, is_within, newest
 from vla_zenoh.lab.teleop.policy import PERSON
 from vla_zenoh.policy import ActionSpec, ModelSpec, standing_step
+from vla_zenoh_dataset.corrections import commanded_motion
+from vla_zenoh_dataset.label import EpisodeLabel
 
 FPS_TOLERANCE = 0.01
 

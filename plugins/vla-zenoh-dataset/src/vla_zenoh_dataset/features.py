@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vla_zenoh.errors import RecordingError
-from vla_zenoh.lab.dataset.episodes import RecordedEpisode
 from vla_zenoh.lab.policy_servers.state_vector import StateNumbers, parts_of, state_numbers
 from vla_zenoh.lab.recording.run import Run, nearest
 from vla_zenoh.policy import ActionSpec, Observation
 from vla_zenoh.policy.meaning import ROTATION_FORMS
 from vla_zenoh.policy.spec import STREAM_OF
 from vla_zenoh.types import Task
+from vla_zenoh_dataset.episodes import RecordedEpisode
 
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 STRIDE = 4
