@@ -28,6 +28,9 @@ CONSTRAINTS = ROOT / "constraints.txt"
 PLUGINS = sorted(path.parent for path in (ROOT / "plugins").glob("*/pyproject.toml"))
 """Packages that bring robots, benchmarks and commands; their extras are left to who needs them."""
 
+LARGE = "vla-zenoh-view"
+"""The plug-in whose library unpacks to 500 MB: only `EVERYTHING` has it."""
+
 OLDEST_PYTHON = (3, 11)
 OLDEST_UV = (0, 8)
 
@@ -212,7 +215,8 @@ def main() -> None:
     say(f"installing the package with the extras {extras} into .venv{size}")
     quiet = [] if sys.stderr.isatty() else ["--quiet"]
     target = ["--python", VENV / "bin" / "python", "--constraint", CONSTRAINTS]
-    packages = [f".[{extras}]", *map(str, PLUGINS)]
+    plugins = [path for path in PLUGINS if extras == EVERYTHING or path.name != LARGE]
+    packages = [f".[{extras}]", *map(str, plugins)]
     editable = [word for package in packages for word in ("--editable", package)]
     run(uv, *quiet, "pip", "install", *target, *editable)
     bring_openmp(uv, VENV / "bin" / "python")

@@ -46,6 +46,7 @@ TRIALS = [
 WITH_PLUGINS = [
     ["bench", "sim", "--help"],
     ["profile", "check", "fr3", "ur5e_rtde"],
+    ["view", "--help"],
     ["web", "--help"],
     ["node", "rolling", "--help"],
     ["nights", "--help"],

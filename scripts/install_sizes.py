@@ -10,20 +10,21 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 from bootstrap import CONSTRAINTS, ROOT, uv_environment
 
 UV = Path(sys.executable).parent / "uv"
 ROWS = {
-    "drive, watch, cameras, own models": "",
-    "model host, shipped policy": "brick,secure",
-    "robot host": "control,record,secure",
-    "robot host, ROS 2": "record,ros2,secure",
-    "simulator and everything in the tutorial": "all",
-    "the same with the viewer": "all,view",
+    "drive, watch, cameras, own models": ("",),
+    "model host, shipped policy": ("brick,secure",),
+    "robot host": ("control,record,secure",),
+    "robot host, ROS 2": ("record,ros2,secure",),
+    "simulator and everything in the tutorial": ("all",),
+    "the same with the viewer": ("all", "vla-zenoh-view"),
 }
-"""What it is for, and its extras."""
+"""What it is for, its extras, and packages of ``plugins/``."""
 LARGEST = 3
 
 
@@ -33,14 +34,15 @@ def size_mb(folder: Path) -> float:
     return sum(sizes.values()) / 1e6
 
 
-def measure(extras: str, folder: Path) -> tuple[float, str]:
+def measure(extras: str, packages: Sequence[str], folder: Path) -> tuple[float, str]:
     """Installs, and returns its size in MB and its largest packages."""
-    name = f"{ROOT}[{extras}]" if extras else str(ROOT)
+    core = f"{ROOT}[{extras}]" if extras else str(ROOT)
+    wanted = [core, *(ROOT / "plugins" / package for package in packages)]
     environ = uv_environment(os.environ)
     python = folder / "bin" / "python"
     for command in (
         [UV, "--quiet", "venv", "--python", sys.executable, folder],
-        [UV, "--quiet", "pip", "install", "--python", python, "-c", CONSTRAINTS, name],
+        [UV, "--quiet", "pip", "install", "--python", python, "-c", CONSTRAINTS, *wanted],
         [folder / "bin" / "vla-zenoh", "--version"],
     ):
         subprocess.run(
@@ -55,10 +57,10 @@ def measure(extras: str, folder: Path) -> tuple[float, str]:
 def main() -> None:
     """Prints the table."""
     print("| for | extras | MB | largest |\n|---|---|---|---|")
-    for purpose, extras in ROWS.items():
+    for purpose, (extras, *packages) in ROWS.items():
         with tempfile.TemporaryDirectory(prefix="vla-zenoh-size-") as name:
-            size, largest = measure(extras, Path(name) / "venv")
-        label = f"`{extras}`" if extras else "none"
+            size, largest = measure(extras, packages, Path(name) / "venv")
+        label = ", ".join(f"`{each}`" for each in (extras, *packages) if each) or "none"
         print(f"| {purpose} | {label} | {size:.0f} | {largest} |", flush=True)
 
 

@@ -35,12 +35,12 @@ from rich._export_format import CONSOLE_SVG_FORMAT
 from rich.console import Console
 from rich.terminal_theme import MONOKAI
 from rich.text import Text
+from vla_zenoh_view.paths import TIMELINE
+from vla_zenoh_view.rerun_logger import APPLICATION, RerunLogger
+from vla_zenoh_view.viewer import open_window
 
 from vla_zenoh.lab.recording.reader import open_recording
 from vla_zenoh.lab.recording.run import load_run
-from vla_zenoh.lab.view.paths import TIMELINE
-from vla_zenoh.lab.view.rerun_logger import APPLICATION, RerunLogger
-from vla_zenoh.lab.view.viewer import open_window
 from vla_zenoh.profile import read_profile
 
 ROOT = Path(__file__).resolve().parent.parent

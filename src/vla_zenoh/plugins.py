@@ -154,6 +154,7 @@ PACKAGES: Mapping[str, str] = {
     "save": "vla-zenoh-rolling",
     "serve.mcp": "vla-zenoh-mcp",
     "teleop": "vla-zenoh-teleop",
+    "view": "vla-zenoh-view",
     "web": "vla-zenoh-web",
 }
 """Command of a package in ``plugins/`` -> that package, for a computer that lacks it."""

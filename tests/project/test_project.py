@@ -64,6 +64,10 @@ def test_a_camera_host_gets_no_simulator_and_no_kinematics(project: dict) -> Non
     assert heavy.isdisjoint(map(name_of, project["dependencies"]))
 
 
+def test_the_plug_in_that_a_small_set_up_leaves_out_exists(bootstrap: ModuleType) -> None:
+    assert bootstrap.LARGE in {path.name for path in bootstrap.PLUGINS}
+
+
 @pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
 def test_make_alone_lists_the_targets() -> None:
     done = subprocess.run(["make"], cwd=ROOT, capture_output=True, text=True, check=True)

@@ -17,10 +17,10 @@ import pytest
 from camera_rig import until
 from chain import LONG_PATIENCE_S, READY_PATIENCE_S, Chain, command_line
 from view_rig import Shown
+from vla_zenoh_view.listener import ViewListener
+from vla_zenoh_view.viewer import open_window
 
 from vla_zenoh.errors import NodeError
-from vla_zenoh.lab.view.listener import ViewListener
-from vla_zenoh.lab.view.viewer import open_window
 
 pytestmark = pytest.mark.long
 

@@ -12,7 +12,6 @@ EXTRA_OF = {
     **dict.fromkeys(("pinocchio", "ruckig"), "control"),
     **dict.fromkeys(("mujoco", "av"), "sim"),
     **dict.fromkeys(("mcap", "plotly", "jinja2", "rosbags"), "record"),
-    "rerun": "view",
 }
 """Module -> extra that brings it, for the error of a missing import."""
 HASTE = -20

@@ -93,7 +93,7 @@ COMMANDS: Panels = {
     },
     "Watch and record": {
         "status": "cli.status:status",
-        "view": "lab.cli.view:view",
+        "view": OF_A_PACKAGE,
         "record": "lab.cli.record:record",
         "save": OF_A_PACKAGE,
         "replay": "lab.cli.replay:replay",

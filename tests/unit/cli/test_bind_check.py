@@ -61,7 +61,7 @@ def test_pictures_are_not_served_to_a_network() -> None:
 
 
 def test_nor_those_of_a_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vla_zenoh.lab.cli.view.stop_on_signals", Event)
+    monkeypatch.setattr("vla_zenoh_view.cli.stop_on_signals", Event)
     path, profile = tmp_path / "run.mcap", load_profile("panda_sim")
     text = to_yaml(profile)
     RecordingWriter(path, profile.keys, profile_yaml=text, base_frame="base", began_ns=1).finish()

@@ -13,6 +13,8 @@ import pinocchio as pin
 import pytest
 import rerun as rr
 from view_rig import Shown
+from vla_zenoh_view.rerun_logger import DRAW_NS, RerunLogger
+from vla_zenoh_view.robot_model import archetype_of
 
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import depth_schema, encode_depth, encode_jpeg
@@ -21,8 +23,6 @@ from vla_zenoh.keys import Keys
 from vla_zenoh.lab.recording.reader import open_recording
 from vla_zenoh.lab.recording.sample import JPEG, MSGPACK, TEXT, Sample
 from vla_zenoh.lab.recording.writer import RecordingWriter
-from vla_zenoh.lab.view.rerun_logger import DRAW_NS, RerunLogger
-from vla_zenoh.lab.view.robot_model import archetype_of
 from vla_zenoh.policy import ActionSpec, ModelSpec
 from vla_zenoh.profile import (
     Profile,

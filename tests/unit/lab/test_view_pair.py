@@ -7,9 +7,9 @@ import pytest
 from pair_recording_rig import SPEED_M_S, WIDTH_M, pair_spec, write_pair_run
 from test_view import stream_to
 from view_rig import Shown
+from vla_zenoh_view.rerun_logger import RerunLogger
 
 from vla_zenoh.lab.recording.reader import open_recording
-from vla_zenoh.lab.view.rerun_logger import RerunLogger
 from vla_zenoh.profile import load_profile
 
 HERE = "Transform3D:translation"

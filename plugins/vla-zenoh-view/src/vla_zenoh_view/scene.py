@@ -12,11 +12,11 @@ import rerun as rr
 from vla_zenoh.control.actions import Steps, chunk_poses
 from vla_zenoh.control.plan_timeline import Goal, Plan
 from vla_zenoh.kinematics.so3 import Pose
-from vla_zenoh.lab.view import paths
-from vla_zenoh.lab.view.robot_model import RobotMeshes
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.profile import KeepOut, Profile
 from vla_zenoh.types import ActionChunk, FloatArray, ObjectPoses
+from vla_zenoh_view import paths
+from vla_zenoh_view.robot_model import RobotMeshes
 
 TRAIL_NS = 6_000_000_000
 TRAIL_PERIOD_NS = 100_000_000

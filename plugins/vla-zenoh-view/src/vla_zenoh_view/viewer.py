@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from vla_zenoh.errors import MissingExtraError, NodeError
+from vla_zenoh.errors import NodeError
 from vla_zenoh.lab.cli.loopback import free_port
 
 READY_PATIENCE_S = 30.0
@@ -93,10 +93,8 @@ def _data_url(host: str, port: int) -> str:
 
 
 def _program() -> Path:
-    try:
-        import rerun_cli
-    except ImportError as error:
-        raise MissingExtraError("rerun", "view") from error
+    import rerun_cli
+
     return Path(rerun_cli.__file__).with_name("rerun.exe" if os.name == "nt" else "rerun")
 
 

@@ -9,9 +9,9 @@ from typing import Any
 import rerun as rr
 from numpy.typing import NDArray
 
-from vla_zenoh.lab.view import paths
 from vla_zenoh.policy import ActionSpec, ModelSpec
 from vla_zenoh.types import Event, InferenceDebug, NodeStatus, Task
+from vla_zenoh_view import paths
 
 LEVELS = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
 BOUND_NS = 1_000_000_000

@@ -20,9 +20,9 @@ from vla_zenoh.errors import ResourceError, VlaZenohError
 from vla_zenoh.kinematics.fingers import Fingers
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.kinematics.so3 import Pose
-from vla_zenoh.lab.view import paths
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray
+from vla_zenoh_view import paths
 
 MEDIA_TYPES = {
     ".dae": "model/vnd.collada+xml",

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import rerun as rr
 
-from vla_zenoh.lab.view import paths
 from vla_zenoh.types import ActionChunk, Cause, FloatArray, NodeStatus
+from vla_zenoh_view import paths
 
 STAGE_COLOURS = {
     "capture_to_worker": (94, 166, 255),

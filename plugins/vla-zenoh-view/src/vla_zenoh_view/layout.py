@@ -7,7 +7,7 @@ from typing import Any
 
 import rerun.blueprint as rrb
 
-from vla_zenoh.lab.view import paths
+from vla_zenoh_view import paths
 
 WINDOW_S = 20.0
 """Length of plots, up to the cursor."""

@@ -16,17 +16,17 @@ from vla_zenoh.cli.options import bind_address, options
 from vla_zenoh.cli.output import errors, fail
 from vla_zenoh.cli.plain import warn
 from vla_zenoh.cli.target import RobotTarget
-from vla_zenoh.errors import MissingExtraError, OutputError, ProfileError, counted
+from vla_zenoh.errors import OutputError, ProfileError, counted
 from vla_zenoh.lab.cli.loopback import require_loopback
 from vla_zenoh.lab.cli.options import EndAfterOption
 from vla_zenoh.lab.cli.output import progress
 from vla_zenoh.lab.cli.output_path import ForceOption, if_wanted, output_file
-from vla_zenoh.lab.view.viewer import Viewer, open_server, open_window
 from vla_zenoh.profile import Profile, read_profile
 from vla_zenoh.runtime.process import run_node, stop_on_signals
+from vla_zenoh_view.viewer import Viewer, open_server, open_window
 
 if TYPE_CHECKING:
-    from vla_zenoh.lab.view.rerun_logger import RerunLogger
+    from vla_zenoh_view.rerun_logger import RerunLogger
 
 POLL_S = 0.03
 FLUSH_S = 5.0
@@ -90,7 +90,7 @@ class ViewOutput:
         """Open a stream of Rerun called `name`, and the viewer unless it goes only to `file`."""
         import rerun as rr
 
-        from vla_zenoh.lab.view.rerun_logger import APPLICATION
+        from vla_zenoh_view.rerun_logger import APPLICATION
 
         sinks: list[Any] = []
         if file is not None:
@@ -134,10 +134,6 @@ def view(
     Shows images, inputs and outputs of the model, the robot, poses with trails, chunks, latencies,
     limits, events. Ctrl-C or closing the window ends it.
     """
-    try:
-        import rerun  # noqa: F401  # before anything is opened
-    except ImportError as error:
-        raise MissingExtraError("rerun", "view") from error
     inputs = [] if file is None else [file]
     with if_wanted(output_file, output.output, force=output.force, inputs=inputs) as part:
         if file is None:
@@ -149,8 +145,8 @@ def view(
 
 
 def _live(profile: Profile, output: ViewOutput, part: Path | None, seconds: float | None) -> None:
-    from vla_zenoh.lab.view.listener import ViewListener
-    from vla_zenoh.lab.view.rerun_logger import RerunLogger
+    from vla_zenoh_view.listener import ViewListener
+    from vla_zenoh_view.rerun_logger import RerunLogger
 
     done: list[RerunLogger] = []
     output.check(profile)
@@ -185,7 +181,7 @@ def _live(profile: Profile, output: ViewOutput, part: Path | None, seconds: floa
 
 def _recorded(path: Path, profile_name: str, output: ViewOutput, part: Path | None) -> None:
     from vla_zenoh.lab.recording.reader import open_recording
-    from vla_zenoh.lab.view.rerun_logger import RerunLogger
+    from vla_zenoh_view.rerun_logger import RerunLogger
 
     stop = stop_on_signals()
     file = open_recording(path)

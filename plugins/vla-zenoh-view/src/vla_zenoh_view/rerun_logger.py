@@ -16,12 +16,6 @@ from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import Pose, pose_of, rotation_from_quat
 from vla_zenoh.lab.recording.record_types import RecordTypes, group_of, part_of
 from vla_zenoh.lab.recording.sample import DEPTH, JPEG, Sample
-from vla_zenoh.lab.view import paths
-from vla_zenoh.lab.view.charts import Charts
-from vla_zenoh.lab.view.layout import blueprint
-from vla_zenoh.lab.view.robot_model import load_robot_model
-from vla_zenoh.lab.view.scene import Scene
-from vla_zenoh.lab.view.texts import TextPanels
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.profile import Profile, to_yaml
 from vla_zenoh.types import (
@@ -39,6 +33,12 @@ from vla_zenoh.types import (
     SceneState,
     Task,
 )
+from vla_zenoh_view import paths
+from vla_zenoh_view.charts import Charts
+from vla_zenoh_view.layout import blueprint
+from vla_zenoh_view.robot_model import load_robot_model
+from vla_zenoh_view.scene import Scene
+from vla_zenoh_view.texts import TextPanels
 
 DRAW_NS = 33_000_000
 """Shortest interval between two drawings of a state or command; every cause is logged."""
