@@ -13,8 +13,9 @@ from vla_zenoh.errors import NodeError
 from vla_zenoh.lab.cli.demo_stage import Stage, latencies, open_stage, print_end
 from vla_zenoh.lab.cli.options import DemoOptions
 from vla_zenoh.lab.cli.output import print_json
-from vla_zenoh.lab.demo.scripted_motions import parse_scripted
+from vla_zenoh.lab.demo.scripted_motions import ScriptedPrompt, parse_scripted
 from vla_zenoh.lab.episode import EpisodeRunner
+from vla_zenoh.lab.evaluation.result import PromptSegment
 from vla_zenoh.lab.evaluation.tables import SEGMENT_COLUMNS, segment_rows
 from vla_zenoh.lab.newest_records import NewestRecords
 from vla_zenoh.lab.recording.run import Run
@@ -24,6 +25,9 @@ from vla_zenoh.types import GripperState, PoseState
 SETTLE_S = 0.8
 """From the end of the commanded motion until arm and integral action are at rest."""
 SLACK_S = 15.0
+EXACT_M, EXACT_RAD = 0.002, 0.005
+"""A fixed motion that is off by more was not done: distance, angle, drift and a gripper's width."""
+GRIPPER_AXIS = 6
 
 
 def run_demo(prompt: str, steps: int, profile: str, given: DemoOptions) -> None:
@@ -50,7 +54,8 @@ def run_demo(prompt: str, steps: int, profile: str, given: DemoOptions) -> None:
         (found,) = stage.draw(run)
         segment = next(each for each in found.segments if each.prompt == asked)
         found.segments = [replace(segment, requests=done)]  # not those after its end
-        faults = [segment.shortfall] if segment.shortfall else []
+        width_m = stage.profile.robot.gripper.max_width_m
+        faults = faults_of(segment, parse_scripted(asked), width_m)
         if done != steps:
             faults.append(f"{done} of {steps} steps were executed")
         summary = {
@@ -77,6 +82,27 @@ def run_demo(prompt: str, steps: int, profile: str, given: DemoOptions) -> None:
             screen.print("the arm did what was asked", style="bold green")
     if faults:
         raise typer.Exit(1)
+
+
+def faults_of(segment: PromptSegment, asked: ScriptedPrompt, max_width_m: float) -> list[str]:
+    """What a motion is off by, beyond the tolerances; empty: the arm did what was asked."""
+    off = [
+        ("distance", (segment.asked_m or 0.0) - (segment.along_m or 0.0), EXACT_M, "m"),
+        ("angle", (segment.asked_rad or 0.0) - (segment.along_rad or 0.0), EXACT_RAD, "rad"),
+        ("drift", segment.drift_m or 0.0, EXACT_M, "m"),
+        ("rotation drift", segment.drift_rad or 0.0, EXACT_RAD, "rad"),
+    ]
+    if segment.width_m is not None and asked.motion is not None:
+        before_m, after_m = segment.width_m
+        wanted_m = before_m
+        for index in range((asked.steps or 0) * (asked.motion.axis == GRIPPER_AXIS)):
+            wanted_m = min(max(wanted_m + asked.step(index), 0.0), max_width_m)
+        off.append(("gripper", after_m - wanted_m, EXACT_M, "m"))
+    return [
+        f"{name} off by {abs(value):.4g} {unit} (allowed {limit:g})"
+        for name, value, limit, unit in off
+        if not abs(value) <= limit
+    ]
 
 
 def _carry_out(stage: Stage, prompt: str, steps: int, rate_hz: float) -> int:
