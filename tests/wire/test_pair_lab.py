@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
 from chain import CHAIN_PATIENCE_S, Chain, command_line
 from recording_rig import recording
@@ -43,9 +41,8 @@ def test_the_demo_of_a_pair_does_its_task_and_shows_both_arms(demo: Path) -> Non
     summary = json.loads((demo / "summary.json").read_text())
     assert summary["ok"]
     assert [task["prompt"] for task in summary["tasks"]] == ["lift the bar"]
-    plots = [cv2.imread(str(demo / f"plot_{part}.png")) for part in PARTS]
-    assert all(plot.shape[1] > 1000 for plot in plots)
-    assert not np.array_equal(*plots)
+    report = (demo / "report.html").read_text()
+    assert all(f"demo/{part}" in report for part in PARTS)
     assert (demo / "tasks.jpg").exists()
     assert (demo / "video.mp4").exists()
 
