@@ -146,16 +146,24 @@ class CommandedPart:
 
     def _jump(self, measured: Pose, before: Pose, elapsed_ns: int) -> str:
         """Why a reported pose cannot follow the one `before`, empty if an arm can move so."""
-        apart_m, apart_rad = pose_distance(measured, before)
-        limits, elapsed_s = self.profile.limits, abs(elapsed_ns) / 1e9
+        elapsed_s = abs(elapsed_ns) / 1e9
+        apart = self._too_far(measured, before, elapsed_s)
+        if not apart:
+            return ""
+        return (
+            f"the reported TCP pose jumped by {apart} in {elapsed_s:.3f} s, faster than the arm "
+            "can move: was its tool frame set?"
+        )
+
+    def _too_far(self, pose: Pose, other: Pose, elapsed_s: float) -> str:
+        """The distance of two measured poses if no arm moves so far in `elapsed_s`, else empty."""
+        apart_m, apart_rad = pose_distance(pose, other)
+        limits = self.profile.limits
         most_m = FALSE_M + FASTER * elapsed_s * limits.translation.velocity_m_s
         most_rad = FALSE_RAD + FASTER * elapsed_s * limits.rotation.velocity_rad_s
         if apart_m <= most_m and apart_rad <= most_rad:
             return ""
-        return (
-            f"the reported TCP pose jumped by {apart_m * 1e3:.1f} mm and {apart_rad:.3f} rad in "
-            f"{elapsed_s:.3f} s, faster than the arm can move: was its tool frame set?"
-        )
+        return f"{apart_m * 1e3:.1f} mm and {apart_rad:.3f} rad"
 
     @property
     def doubt(self) -> str:
@@ -188,17 +196,13 @@ class CommandedPart:
             return None  # reported by the monitor of its joints
         before, after, share = around
         reported = interpolate(pose_of(before), pose_of(after), share)
-        apart_m, apart_rad = pose_distance(self.reach.kinematics.forward(joints_rad), reported)
-        limits = self.profile.limits
         unknown_s = max(stamp_ns - self.pose.header.stamp_wall_ns, 0) / 1e9
-        most_m = FALSE_M + FASTER * unknown_s * limits.translation.velocity_m_s
-        most_rad = FALSE_RAD + FASTER * unknown_s * limits.rotation.velocity_rad_s
-        if apart_m <= most_m and apart_rad <= most_rad:
+        apart = self._too_far(self.reach.kinematics.forward(joints_rad), reported, unknown_s)
+        if not apart:
             return ""
         return (
-            f"the measured joints put the TCP {apart_m * 1e3:.1f} mm and {apart_rad:.3f} rad from "
-            "where the robot reports it: one of the two is frozen or false, or the tool frame was "
-            "changed"
+            f"the measured joints put the TCP {apart} from where the robot reports it: one of the "
+            "two is frozen or false, or the tool frame was changed"
         )
 
     # -- what it holds ------------------------------------------------------------------------

@@ -113,16 +113,19 @@ class Load:
                 bias[index] += drift * (value - bias[index])
             if self._apart(bias, self._start_bias) > self.slow:
                 self._bias = bias = self._near(bias, self._start_bias)
-        self.value = self._apart(filtered, bias)
-        zeros = [0.0] * len(filtered)
-        self.most = max(self._apart(filtered, self._start_bias), self._apart(filtered, zeros))
+        self._measure()
 
     def zero(self) -> None:
         """Take the present load for the bias, as far as `slow`."""
         self._start_bias = self._near(self._filtered, [0.0] * len(self._filtered))
         self._bias = self._start_bias.copy()
+        self._measure()
+
+    def _measure(self) -> None:
+        zeros = [0.0] * len(self._filtered)
+        since_start = self._apart(self._filtered, self._start_bias)
         self.value = self._apart(self._filtered, self._bias)
-        self.most = max(self.value, self._apart(self._filtered, [0.0] * len(self._filtered)))
+        self.most = max(since_start, self._apart(self._filtered, zeros))
 
     def _near(self, values: list[float], middle: Sequence[float]) -> list[float]:
         apart = self._apart(values, middle)

@@ -134,12 +134,6 @@ class Watchdog:
     def blocked(self) -> str:
         """Why the arm counts as blocked, empty while it follows."""
         limits = self._limits
-        if (
-            self._excused == (0.0, 0.0)
-            and self.tracking_m <= limits.tracking_m
-            and self.tracking_rad <= limits.tracking_rad
-        ):
-            return ""
         for apart, limit, excused, back_off, unit in (
             (self.tracking_m, limits.tracking_m, self._excused[0], BACK_OFF_M, "m"),
             (self.tracking_rad, limits.tracking_rad, self._excused[1], BACK_OFF_RAD, "rad"),
