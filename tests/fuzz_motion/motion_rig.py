@@ -16,6 +16,7 @@ import numpy as np
 from motion_case import WORKER, Actions, Case
 
 from vla_zenoh.control.commander import Commander, Inputs, Outputs, Setting
+from vla_zenoh.control.plan_timeline import JointGoal
 from vla_zenoh.control.preflight import PeerSnapshot
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.guard.arm_guard import ArmGuard, Measured
@@ -245,7 +246,7 @@ class Rig:
                 before not in OBEYING and state in OBEYING,
                 record,
                 goal.pose if goal is not None else None,
-                goal.joints_rad if goal is not None and goal.arm is not None else None,
+                goal.joints_rad if isinstance(goal, JointGoal) else None,
                 float(getattr(self.commander.task, "speed_percent", 100.0)),
                 self.commander.retreating,
             )

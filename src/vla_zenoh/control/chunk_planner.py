@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vla_zenoh.control.actions import covered_step, step_joints, step_width
+from vla_zenoh.control.actions import step_width
 from vla_zenoh.control.commander_io import StateHistory
 from vla_zenoh.control.joint_space import JointBounds
 from vla_zenoh.control.limits import (
@@ -31,8 +31,6 @@ from vla_zenoh.control.limits import (
     BoundedStep,
     LimitHit,
     Slowdown,
-    bound_step,
-    full_speed_s,
     keep_slowdown,
     slowest,
 )
@@ -42,7 +40,6 @@ from vla_zenoh.control.plan_timeline import (
     GoalTimeline,
     Plan,
     StepBounding,
-    joint_goal,
 )
 from vla_zenoh.control.policy_check import (
     ROUNDING,
@@ -52,11 +49,11 @@ from vla_zenoh.control.policy_check import (
     validate_steps,
 )
 from vla_zenoh.control.reachability import ReachabilityFilter
-from vla_zenoh.errors import RecordError
-from vla_zenoh.kinematics.so3 import interpolate, pose_distance, pose_of
+from vla_zenoh.control.step_space import JointSteps, PoseSteps, StepSpace
+from vla_zenoh.kinematics.so3 import pose_distance
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import ActionChunk, Cause, FloatArray, JointState, PoseState, Stamped, Task
+from vla_zenoh.types import ActionChunk, Cause, JointState, PoseState, Stamped, Task
 
 MAX_QUEUED = 4
 """Of a burst of chunks only the newest few are kept; the newest valid one is executed."""
@@ -103,13 +100,17 @@ class ChunkPlanner:
         self._max_width_m = profile.robot.gripper.max_width_m
         self._pace = profile.composition.pace
         self._reach = reach
-        self.joint_bounds: JointBounds | None = None
-        if reach is not None:
-            self.joint_bounds = JointBounds(profile, reach.kinematics, reach.barriers)
         self._gap_ns = round(profile.timing.state_timeout_s * 1e9)
         self.poses: StateHistory[PoseState] = StateHistory()
         """Where chunks anchored at the measured pose begin."""
         self.joints: StateHistory[JointState] = StateHistory()
+        self._pose_steps = PoseSteps(self._limits, reach, self.poses, self._gap_ns)
+        self._joint_steps: JointSteps | None = None
+        self.joint_bounds: JointBounds | None = None
+        if reach is not None:
+            bounds = JointBounds(profile, reach.kinematics, reach.barriers)
+            self.joint_bounds = bounds
+            self._joint_steps = JointSteps(bounds, reach, self.joints, self._gap_ns)
         self._queue: deque[Stamped[ActionChunk]] = deque()
         self._pending: tuple[Stamped[ActionChunk], list[ChunkPlan]] | None = None
         self.budget = math.ceil(EVALUATIONS_1_S / profile.timing.command_hz)
@@ -233,9 +234,9 @@ class ChunkPlanner:
         observed_ns = record.observation_stamp_ns
         previous = timeline.in_force(observed_ns)
         base = previous.goal_at(observed_ns)
-        bounds = self._joint_bounds(action)
+        space = self._space(action)
         if action.anchor == "measured":
-            measured = self._measured(bounds, observed_ns, base.width_m)
+            measured = space.measured(observed_ns, base.width_m)
             if measured is None:
                 why = (
                     f"the arm was not measured within {self._gap_ns / 1e9:g} s before its "
@@ -243,14 +244,10 @@ class ChunkPlanner:
                 )
                 raise self._rejected(Rejection("not_measured", why))
             base = measured
-        steps = np.asarray(record.steps[:count, columns], np.float64)
-        if bounds is not None:
-            if base.arm is None:  # once: the elbow of a pose depends on the moment
-                base = joint_goal(bounds.kinematics, self._joints_at(base), base.width_m)
-            steps = bounds.in_chain_order(action, steps)
+        base = space.origin(base)
+        steps = space.ordered(action, np.asarray(record.steps[:count, columns], np.float64))
         rejection = validate_steps(action, steps, base, self._limits, self._max_width_m)
-        if rejection is None and bounds is not None and action.targets:
-            rejection = bounds.far_out_of_range(action, steps, self._joints_at(base))
+        rejection = rejection or space.far_target(action, steps, base)
         if rejection is not None:
             raise self._rejected(rejection)
         # Between two waypoints the joints and the speed are about those of the coming one.
@@ -278,6 +275,7 @@ class ChunkPlanner:
             clock=timeline.clock,
             soonest=(action.pace if self._pace == "spec" else self._pace) == "soonest",
             action=action,
+            space=space,
             steps=steps,
             base=replace(base, joints_rad=start_rad, slowdown=near.slowdown),
         )
@@ -296,23 +294,10 @@ class ChunkPlanner:
                 )
         return plan
 
-    def _measured(self, bounds: JointBounds | None, t_ns: int, width_m: float) -> Goal | None:
-        """Where the arm was measured at `t_ns`, its joints if these have bounds; None: nowhere."""
-        if bounds is not None:
-            states, arm = self.joints.around(t_ns, self._gap_ns), bounds.kinematics
-            if states is None:
-                return None
-            try:
-                before_rad, after_rad = (arm.joints_of(state) for state in states[:2])
-            except RecordError:
-                return None
-            return joint_goal(arm, before_rad + states[2] * (after_rad - before_rad), width_m)
-        found = self.poses.around(t_ns, self._gap_ns)
-        if found is None:
-            return None
-        before, after, share = found
-        pose = pose_of(before)
-        return Goal(interpolate(pose, pose_of(after), share) if share else pose, width_m)
+    def _space(self, action: ActionSpec) -> StepSpace:
+        if action.space == "joint" and self._joint_steps is not None:
+            return self._joint_steps
+        return self._pose_steps
 
     # -- bound --------------------------------------------------------------------------------
     def bound(self, plan: ChunkPlan, now_ns: int) -> bool:
@@ -379,7 +364,9 @@ class ChunkPlanner:
         slower = keep_slowdown(step.start.slowdown, slower, plan.dt_ns / 1e9, most_s)
         if state is not None and hits and step.shifted is None:
             state = state.stopped(step.asked, pose)
-        plan.goals[index] = Goal(pose, end.width_m, joints_rad, slower, state, end.arm)
+        plan.goals[index] = replace(
+            end, pose=pose, joints_rad=joints_rad, slowdown=slower, response=state
+        )
         plan.bounded, plan.current = index + 1, None
         plan.add_hits(hits)
         return hits
@@ -387,80 +374,30 @@ class ChunkPlanner:
     def _begin_step(self, plan: ChunkPlan) -> StepBounding:
         """The next step of `plan` within the limits of a step, and the search for its end."""
         start, shifted = plan.step_start, plan.shifted_goal
-        bounds = self._joint_bounds(plan.action)
-        if shifted is not None:
+        if shifted is None:
+            step = self._asked_step(plan, start)
+        else:
             step = StepBounding(start, shifted, shifted.pose, shifted)
-        else:
-            numbers = plan.steps[plan.bounded]
-            width_m = step_width(plan.action, numbers, start.width_m, self._max_width_m)
-            width_m = start.width_m if width_m is None else width_m
-            if bounds is None:
-                step = self._pose_step(plan, numbers, width_m)
-            else:
-                step = self._joint_step(plan, numbers, width_m, bounds)
-        if self._reach is None:
-            return step
-        end = step.end
-        if bounds is not None and end.joints_rad is not None:
-            self._reach.cost = 1
-            step.search = bounds.bound_in_pieces(self._joints_at(start), end.joints_rad)
-        else:
-            step.search = self._reach.bound_in_pieces(
-                start.pose, end.pose, plan.dt_ns / 1e9, start.joints_rad
-            )
-        next(step.search)  # up to its first evaluation
+        step.search = plan.space.search(start, step.end, plan.dt_ns / 1e9)
+        if step.search is not None:
+            next(step.search)  # up to its first evaluation
         return step
 
-    def _pose_step(self, plan: ChunkPlan, numbers: FloatArray, width_m: float) -> StepBounding:
-        start, limits = plan.step_start, self._limits
-        asked, response = covered_step(
-            plan.action, numbers, start.pose, plan.base.pose, start.response
-        )
+    def _asked_step(self, plan: ChunkPlan, start: Goal) -> StepBounding:
+        action, space = plan.action, plan.space
+        numbers = plan.steps[plan.bounded]
+        width_m = step_width(action, numbers, start.width_m, self._max_width_m)
+        width_m = start.width_m if width_m is None else width_m
+        asked = space.asked(action, numbers, start, plan.base, width_m)
         slower: Slowdown | None = None
-        if plan.action.targets:
-            full_s = full_speed_s(limits, start.pose, asked)
-            part, slower = self._approach(plan, *pose_distance(start.pose, asked), full_s)
-            asked = interpolate(start.pose, asked, part) if slower else asked
-        pose, hits = bound_step(limits, start.pose, asked)
-        cut = sum(pose_distance(pose, asked)) if hits else 0.0
-        end = Goal(pose, width_m, slowdown=slower, response=response)
-        return StepBounding(start, None, asked, end, hits, cut)
-
-    def _joint_step(
-        self, plan: ChunkPlan, numbers: FloatArray, width_m: float, bounds: JointBounds
-    ) -> StepBounding:
-        start, limits = plan.step_start, self._limits
-        start_rad = self._joints_at(start)
-        asked_rad = step_joints(plan.action, numbers, start_rad, self._joints_at(plan.base))
-        way_rad = asked_rad - start_rad
-        far_m, far_rad = bounds.ways(start_rad, way_rad)
-        part, slower, hits = 1.0, None, list[LimitHit]()
-        if plan.action.targets:
-            full_s = bounds.full_speed_s(start_rad, way_rad)
-            part, slower = self._approach(plan, far_m, far_rad, full_s)
-        else:
-            for name, far, most in (
-                ("step_m", far_m, limits.step_m),
-                ("step_rad", far_rad, limits.step_rad),
-            ):
-                if far > most * (1 + ROUNDING):
-                    hits.append(LimitHit(name, far, most))
-                    part = min(part, most / far)
-        if part < 1.0:
-            asked_rad = start_rad + part * way_rad
-        end = joint_goal(bounds.kinematics, asked_rad, width_m, slower)
-        return StepBounding(start, None, end.pose, end, hits)
-
-    def _joint_bounds(self, action: ActionSpec) -> JointBounds | None:
-        """None: the actions are poses."""
-        return self.joint_bounds if action.space == "joint" else None
-
-    def _joints_at(self, goal: Goal) -> FloatArray:
-        """(n,) joints of the goal, or those of its pose with the arm's present elbow."""
-        if goal.arm is not None and goal.joints_rad is not None:
-            return goal.joints_rad
-        assert self._reach is not None
-        return self._reach.joints_at(goal.pose)
+        if action.targets:
+            part, slower = self._approach(plan, *space.way(start, asked))
+            if part < 1.0:
+                asked = replace(start.between(asked, part), width_m=width_m)
+        end, hits = space.within_step(action, start, asked)
+        cut = sum(pose_distance(end.pose, asked.pose)) if hits else 0.0
+        end = replace(end, slowdown=slower)
+        return StepBounding(start, None, asked.pose, end, hits, cut)
 
     def _approach(
         self, plan: ChunkPlan, far_m: float, far_rad: float, full_s: float

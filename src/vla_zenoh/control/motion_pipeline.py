@@ -12,7 +12,14 @@ from vla_zenoh.control.commander_io import OBEYING, State, limit_events, make_ev
 from vla_zenoh.control.contact import Contact, Retreat
 from vla_zenoh.control.joint_space import JointPath
 from vla_zenoh.control.limits import FULL, LimitHit, Shares, into_workspace
-from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan, PlanAggregator, joint_goal
+from vla_zenoh.control.plan_timeline import (
+    Goal,
+    GoalTimeline,
+    JointGoal,
+    Plan,
+    PlanAggregator,
+    joint_goal,
+)
 from vla_zenoh.control.pose_to_joint import FollowedPath, PoseToJoint
 from vla_zenoh.control.preflight import FOLLOWS_JOINT_RAD, LINGER_NS, Settling, follows, held_joints
 from vla_zenoh.control.reachability import ReachabilityFilter
@@ -92,7 +99,7 @@ class MotionPipeline:
     @property
     def joints_asked(self) -> bool:
         """The goals in force are joints, whichever way the arm moves to them."""
-        return self.timeline is not None and self.timeline.plan.goals[0].arm is not None
+        return self.timeline is not None and isinstance(self.timeline.plan.goals[0], JointGoal)
 
     @property
     def at_rest(self) -> bool:
@@ -182,7 +189,7 @@ class MotionPipeline:
         # The goal of a blocked arm is where it is. Otherwise a brake continues, and the goal is
         # where it ends.
         goal = self._mover.resting_goal(actual, width_m)
-        if blocked and goal.arm is None:
+        if blocked and not isinstance(goal, JointGoal):
             goal = Goal(self._within_reach(self._mover.motion.pose, actual)[0], width_m)
         elif blocked and self._path is not None and measured_rad is not None:
             goal = joint_goal(self._path.kinematics, measured_rad, width_m)
@@ -300,7 +307,7 @@ class MotionPipeline:
         found = self._planner.bound_due(plans, now_ns)
         events = limit_events(found) if found else []
         goal = self._aggregator.goal(plans, now_ns)
-        joints = goal.arm is not None and self._path is not None
+        joints = isinstance(goal, JointGoal) and self._path is not None
         if joints is not self.in_joints and self.at_rest:
             self._enter(joints=joints)
         self._changing = joints is not self.in_joints
@@ -333,11 +340,10 @@ class MotionPipeline:
 
         A shifted goal lies between bounded goals.
         """
-        asked_rad = None if goal.arm is None else goal.joints_rad
-        if asked_rad is not None and cut.arm is not None and cut.joints_rad is None:
+        if isinstance(goal, JointGoal) and not isinstance(cut, JointGoal):
             assert self._reach is not None
-            joints_rad = self._reach.joints_near(cut.pose, asked_rad)
-            cut = joint_goal(cut.arm, joints_rad, cut.width_m, cut.slowdown)
+            joints_rad = self._reach.joints_near(cut.pose, goal.joints_rad)
+            cut = joint_goal(goal.arm, joints_rad, cut.width_m, cut.slowdown)
         if len(plans) == 1:
             plans[0].shift_rest(plans[0].index_at(now_ns), cut, self._limits)
             return cut

@@ -47,6 +47,7 @@ from vla_zenoh.profile import Composition, Limits
 from vla_zenoh.types import Cause, FloatArray
 
 if TYPE_CHECKING:
+    from vla_zenoh.control.step_space import StepSpace
     from vla_zenoh.kinematics.kinematics import Kinematics
 
 HISTORY_NS = 15_000_000_000
@@ -98,13 +99,12 @@ WALL_CLOCK = PlanClock()
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """A waypoint: TCP pose, or joints, and gripper width.
+    """A waypoint: TCP pose and gripper width; `JointGoal` is one of joints.
 
     Args:
         joints_rad: (n,) a joint solution of the pose; None: not computed.
         slowdown: why the arm moves there slower than at full speed.
         response: state there of a controller that covers only a part of each step; None: without.
-        arm: where joints are asked for, in chain order: the kinematics that make `pose` of them.
     """
 
     pose: Pose
@@ -112,37 +112,65 @@ class Goal:
     joints_rad: FloatArray | None = None
     slowdown: Slowdown | None = None
     response: Response | None = None
-    arm: Kinematics | None = None
 
     def between(self, coming: Goal, share: float, dt_s: float = 0.0) -> Goal:
         """The goal after `share` of a step of `dt_s` to `coming`, in the space asked for there."""
-        width_m = self.width_m + share * (coming.width_m - self.width_m)
-        if coming.arm is not None and coming.joints_rad is not None and self.joints_rad is not None:
-            way_rad = coming.joints_rad - self.joints_rad
-            return joint_goal(coming.arm, self.joints_rad + share * way_rad, width_m)
-        if coming.response is None or dt_s == 0.0:
-            return Goal(interpolate(self.pose, coming.pose, share), width_m)
-        pose, state = between(self.pose, coming.pose, coming.response, dt_s, share)
+        return coming.reached_from(self, share, dt_s)
+
+    def reached_from(self, start: Goal, share: float, dt_s: float) -> Goal:
+        """The goal after `share` of a step of `dt_s` from `start` to this one."""
+        width_m = start.width_m + share * (self.width_m - start.width_m)
+        if self.response is None or dt_s == 0.0:
+            return Goal(interpolate(start.pose, self.pose, share), width_m)
+        pose, state = between(start.pose, self.pose, self.response, dt_s, share)
         return Goal(pose, width_m, response=state)
 
     def shifted(self, old: Goal, new: Goal, limits: Limits) -> Goal:
         """This goal after what moves `old` to `new`, within the workspace box."""
-        if self.arm is not None and self.joints_rad is not None:
-            assert old.joints_rad is not None and new.joints_rad is not None
-            way_rad = new.joints_rad - old.joints_rad
-            return joint_goal(self.arm, self.joints_rad + way_rad, self.width_m)
         way_m = new.pose.position_m - old.pose.position_m
         turn = old.pose.rotation.T @ new.pose.rotation
         inside, _ = into_workspace(limits, self.pose.position_m + way_m, self.pose.position_m)
         moved = Pose(inside, orthonormal(self.pose.rotation @ turn))
         return Goal(moved, self.width_m, response=self.response)
 
+    def mean(self, goals: Sequence[Goal], weights: FloatArray) -> Goal:
+        """Weighted mean of goals in the space of this one, with its width."""
+        return Goal(mean_pose([goal.pose for goal in goals], weights), self.width_m)
+
+
+@dataclass(frozen=True, slots=True)
+class JointGoal(Goal):
+    """A waypoint of the joints `joints_rad` (n,) in chain order; `arm` makes its pose of them."""
+
+    joints_rad: FloatArray = field(kw_only=True)
+    arm: Kinematics = field(kw_only=True)
+
+    def reached_from(self, start: Goal, share: float, dt_s: float) -> Goal:
+        if start.joints_rad is None:
+            return Goal.reached_from(self, start, share, dt_s)
+        way_rad = self.joints_rad - start.joints_rad
+        width_m = start.width_m + share * (self.width_m - start.width_m)
+        return joint_goal(self.arm, start.joints_rad + share * way_rad, width_m)
+
+    def shifted(self, old: Goal, new: Goal, limits: Limits) -> Goal:
+        assert old.joints_rad is not None
+        assert new.joints_rad is not None
+        way_rad = new.joints_rad - old.joints_rad
+        return joint_goal(self.arm, self.joints_rad + way_rad, self.width_m)
+
+    def mean(self, goals: Sequence[Goal], weights: FloatArray) -> Goal:
+        joints = [goal.joints_rad for goal in goals if goal.joints_rad is not None]
+        if len(joints) < len(goals):
+            return Goal.mean(self, goals, weights)
+        return joint_goal(self.arm, weights / weights.sum() @ np.array(joints), self.width_m)
+
 
 def joint_goal(
     arm: Kinematics, joints_rad: FloatArray, width_m: float, slowdown: Slowdown | None = None
-) -> Goal:
+) -> JointGoal:
     """The goal of these joints (n,) in chain order."""
-    return Goal(arm.forward(joints_rad), width_m, joints_rad, slowdown, arm=arm)
+    pose = arm.forward(joints_rad)
+    return JointGoal(pose, width_m, slowdown=slowdown, joints_rad=joints_rad, arm=arm)
 
 
 @dataclass(slots=True)
@@ -249,7 +277,8 @@ class ChunkPlan(Plan):
 
     Args:
         action: the meaning of the numbers of a step.
-        steps: (n, D).
+        space: in which the steps are added up.
+        steps: (n, D), in its order.
         base: W_0, the goal that the first step starts from.
         approaches: one of its targets is further away than a step.
         announced: that has been reported.
@@ -261,6 +290,7 @@ class ChunkPlan(Plan):
     """
 
     action: ActionSpec = field(kw_only=True)
+    space: StepSpace = field(kw_only=True)
     steps: FloatArray = field(kw_only=True)
     base: Goal = field(kw_only=True)
     approaches: bool = False
@@ -454,7 +484,8 @@ class PlanAggregator:
             return _with_rest(mixed, waypoints)
         known = self._mean
         if known is None or [*map(id, known[0])] != [*map(id, waypoints)]:
-            mean = _with_rest(_mean_goal(waypoints, self._weights), waypoints)
+            weights = self._weights[: len(waypoints)]
+            mean = _with_rest(waypoints[-1].mean(waypoints, weights), waypoints)
             known = self._mean = waypoints, mean
         return known[1]
 
@@ -473,12 +504,3 @@ def _with_rest(mixed: Goal, waypoints: Sequence[Goal]) -> Goal:
     """A mix of `waypoints`, with the newest width and the least speed of them."""
     slower = slowest(*(goal.slowdown for goal in waypoints))
     return replace(mixed, width_m=waypoints[-1].width_m, slowdown=slower)
-
-
-def _mean_goal(goals: Sequence[Goal], weights: FloatArray) -> Goal:
-    """Weighted mean of goals, in the space (poses or joints) of the last of them."""
-    last, weights = goals[-1], weights[: len(goals)]
-    joints = [goal.joints_rad for goal in goals if goal.joints_rad is not None]
-    if last.arm is None or len(joints) < len(goals):
-        return Goal(mean_pose([goal.pose for goal in goals], weights), last.width_m)
-    return joint_goal(last.arm, weights / weights.sum() @ np.array(joints), last.width_m)

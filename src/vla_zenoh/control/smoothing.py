@@ -9,7 +9,6 @@ that of `vla_zenoh.control.axis_smoothing`.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -244,7 +243,9 @@ class PosePath(Smoother):
         if outside_m > OVERSHOOT:
             hits.append(LimitHit("workspace", outside_m, 0.0))
             pose = Pose(inside_m, pose.rotation)
-        return replace(goal, pose=pose, joints_rad=None) if hits else goal, hits
+        if not hits:
+            return goal, hits
+        return Goal(pose, goal.width_m, slowdown=goal.slowdown, response=goal.response), hits
 
     def near(self, goal: Goal) -> Goal:
         """`goal`, or one so near that the arm can retreat from there."""
@@ -253,7 +254,8 @@ class PosePath(Smoother):
         share = 1 / max(apart_m / HELD_LEAD_M, apart_rad / HELD_LEAD_RAD, 1.0)
         if share >= 1.0:
             return goal
-        return replace(goal, pose=interpolate(here, goal.pose, share), joints_rad=None)
+        nearer = interpolate(here, goal.pose, share)
+        return Goal(nearer, goal.width_m, slowdown=goal.slowdown, response=goal.response)
 
     def resting_goal(self, actual: Pose, width_m: float) -> Goal:
         """Brake; where that ends, no further outside the box than the `actual` arm is."""
