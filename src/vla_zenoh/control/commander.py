@@ -6,8 +6,8 @@ a simulator and on the robot.
 
 This module handles state and settings, which all parts of a robot have in common: one reason to
 brake, of whichever part, and all of them brake in that tick. `CommandedPart` has what each arm has
-of its own: `ChunkPlanner` makes plans of chunks, `MotionPipeline` makes commands of plans,
-`Watchdog` and `JointMonitor` find reasons to brake.
+of its own: `ChunkPlanner` makes plans of chunks, `MotionPipeline` makes commands of plans, and
+each `Monitor` may find a reason to brake.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from vla_zenoh.control.commander_io import (
     make_event,
 )
 from vla_zenoh.control.lateness import Lateness
-from vla_zenoh.control.limits import LimitHit
+from vla_zenoh.control.monitor import Brake, Seen, too_near
 from vla_zenoh.control.part_spacing import PartSpacing
 from vla_zenoh.control.plan_timeline import EpisodeProgress
 from vla_zenoh.control.policy_check import Lease, Rejection
@@ -37,12 +37,11 @@ from vla_zenoh.control.preflight import (
     STOP_LATCHED,
     Passing,
     PeerSnapshot,
-    reasons_of_part,
     reasons_of_worker,
     why_not_ready,
 )
 from vla_zenoh.control.reachability import ReachabilityFilter
-from vla_zenoh.control.watchdog import IS_GONE, Deadman
+from vla_zenoh.control.watchdog import Deadman, Watchdog
 from vla_zenoh.errors import RecordError
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import MAX_TEXT, ActionChunk, GripperState, HeldBox, Stamped, Task
@@ -99,7 +98,8 @@ class Commander:
         self.spacing = PartSpacing(profile, self.parts) if several else None
         first = self.parts[0]
         # All parts have the same chunks at the same time: one queue, one deadline.
-        self._planner, self._motion, self._watchdog = first.planner, first.motion, first.watchdog
+        self._planner, self._motion = first.planner, first.motion
+        self._watchdog = Watchdog(profile.timing)
         self._stop_put_ns = self._stop_came_ns = 0
         """Of the last emergency stop: when it was put, by the router's clock, and its tick."""
         self._lateness = Lateness(1.0 / profile.timing.command_hz)
@@ -144,10 +144,6 @@ class Commander:
                 part.follow_elbow(obeying=self.state in OBEYING)
             except RecordError as error:
                 self._change(Trigger.LOSE, part.says(str(error)))
-            if self.state in OBEYING:
-                part.monitor_joints(now_ns)
-                if part.too_near is not None:
-                    self._brake_at(part.too_near, part)
         if self.spacing is not None:
             self._keep_apart(self.spacing, now_ns, ticks)
         overdue_ns, all_planned = self._watchdog.deadline_ns, True
@@ -331,7 +327,7 @@ class Commander:
         reasons += self.deadman.reasons_against(holder, self._peers.holders)
         self._measure()
         for part in self.parts:
-            reasons += map(part.says, part.motion.unsettled() + part.contact.missing)
+            reasons += map(part.says, part.motion.unsettled())
         known = all(part.pose and part.gripper_state for part in self.parts)
         if lease is None or not known or reasons:
             passing = bool(reasons) and all(isinstance(why, Passing) for why in reasons)
@@ -380,13 +376,12 @@ class Commander:
         peers, task, chunk = self._peers, self.task, self._latest.get(worker)
         spec, reasons = peers.specs.get(worker), list[str]()
         for part in self.parts:
-            pose, gripper = part.pose, part.gripper_state
-            reasons += map(part.says, reasons_of_part(part.profile, peers, pose, gripper, now_ns))
+            reasons += part.reasons(self._seen(part, worker, now_ns))
         reasons += reasons_of_worker(
             self.profile, worker, task.prompt, peers, chunk, now_ns, task.rate_hz
         )
         for part in self.parts:
-            reasons += map(part.says, part.reasons_against(worker, spec, chunk, now_ns))
+            reasons += part.reasons_by_worker(worker, spec, chunk)
         if reasons or chunk is None or spec is None:
             return None, reasons
         return Lease(spec, chunk.header.source, now_ns, chunk.header.seq), []
@@ -473,35 +468,38 @@ class Commander:
             if why:  # joints of another arm
                 self._change(Trigger.LOSE, part.says(why))
 
+    def _seen(self, part: CommandedPart, worker: str, now_ns: int) -> Seen:
+        lease = self.lease if self.state in OBEYING else None
+        return part.seen(self._peers, worker, lease, now_ns, published=not self.dry_run)
+
     def _supervise(self, now_ns: int) -> None:
         self._measure()
+        worker = self.task.worker
         unheld = self.deadman.lost(self._peers.holders)
         for part in self.parts:
             if not part.retreat.busy:
                 continue
-            why = unheld or part.keeps_from_retreat(self._peers, now_ns)
+            why = unheld or part.keeps_from_retreat(self._seen(part, worker, now_ns))
             if why:
                 part.retreat.end()
                 self._emit("warning", "notice", "retreat", part.says(f"the retreat ends: {why}"))
         if self.state not in OBEYING:
             return
-        assert self.lease is not None
-        lost: dict[str, str] = {}
-        worker, moves = self.task.worker, not self.dry_run
+        lost: dict[str, Brake] = {}
         for part in self.parts:
-            why, events = part.lost(self._peers, worker, self.lease, now_ns, moves=moves)
+            brake, events = part.check(self._seen(part, worker, now_ns))
             self._out.events += part.tagged(events)
-            if why:
-                lost[part.says(why)] = why
+            if brake is not None:
+                lost[part.says(brake.why)] = brake
         # What all parts have lost is said once.
-        same = len(lost) == len(self.parts) and len(set(lost.values())) == 1
-        why = "; ".join(set(lost.values()) if same else lost)[:MAX_TEXT]
+        reasons = {brake.why for brake in lost.values()}
+        same = len(lost) == len(self.parts) and len(reasons) == 1
+        why = "; ".join(reasons if same else lost)[:MAX_TEXT]
         if not why and self._watchdog.given_up(now_ns):
             why = f"held for {self.profile.timing.max_hold_s:g} s without a fresh chunk"
         if why:
-            # A busy computer explains what came late, and no process that ended.
-            busy = "" if IS_GONE in why else self._lateness.explains()
-            self._change(Trigger.LOSE, why + busy)
+            busy = all(brake.late for brake in lost.values())
+            self._change(Trigger.LOSE, why + (self._lateness.explains() if busy else ""))
             return
         if unheld:
             self._change(Trigger.LOSE, unheld)
@@ -516,7 +514,9 @@ class Commander:
         if self.state in OBEYING and self._motion.streaming:
             measured = spacing.monitor(now_ns)
             if measured is not None:
-                self._brake_at(measured)
+                brake = too_near(measured)
+                self._out.events += [brake.event] if brake.event else []
+                self._change(Trigger.LOSE, brake.why)
         moves = self.state is State.ACTIVE or self.retreating
         ahead_s = ticks / self.profile.timing.command_hz
         slowdown, hit = spacing.look(now_ns, ahead_s, moves=moves)
@@ -525,14 +525,6 @@ class Commander:
             self._out.events.append(make_event("warning", "limit", what, why, hit.value, hit.limit))
         for part in self.parts:
             part.motion.pace.part_slowdown, part.motion.held = slowdown, hit is not None
-
-    def _brake_at(self, hit: LimitHit, part: CommandedPart | None = None) -> None:
-        """End the activation at a bound of the measured arm; `part`: of which, None: of several."""
-        why = f"the measured arm is too near to a bound: {hit.name}{hit.at} is {hit.value:.3g}"
-        why = f"{why}, the limit is {hit.limit:.3g}"
-        event = make_event("warning", "limit", hit.name, f"braked{hit.at}", hit.value, hit.limit)
-        self._out.events += part.tagged([event]) if part else [event]
-        self._change(Trigger.LOSE, part.says(why) if part else why)
 
 
 def _latched(gripper: Stamped[GripperState] | None) -> bool:

@@ -34,6 +34,7 @@ import numpy as np
 
 from vla_zenoh.control.commander_io import make_event
 from vla_zenoh.control.limits import SLOWEST, Slowdown, slowest
+from vla_zenoh.control.monitor import Brake, Monitor, Seen
 from vla_zenoh.kinematics.so3 import Pose, norm3, pose_distance
 from vla_zenoh.profile import ContactLimits, Limits
 from vla_zenoh.types import Event, FloatArray, JointState, PoseState, Stamped
@@ -139,7 +140,7 @@ def _greatest(values: Sequence[float], others: Sequence[float]) -> float:
     return max((abs(a - b) for a, b in zip(values, others, strict=True)), default=0.0)
 
 
-class Contact:
+class Contact(Monitor):
     """The external load on the arm, as far as the robot measures it.
 
     Args:
@@ -161,6 +162,8 @@ class Contact:
         """The efforts of the joints are monitored."""
         self._active = False
         self._begun: list[Load] = []
+        self._reported = True
+        """What was told last about `known`."""
         self._unchanged: tuple[FloatArray, FloatArray] | None = None
         """The newest wrench, and where the TCP was when it was first reported."""
 
@@ -211,6 +214,20 @@ class Contact:
         """The robot measures external loads."""
         return any(load.known for load in self._all)
 
+    def news(self) -> Event | None:
+        """Event when the robot begins or ceases to measure external loads; once each time."""
+        if self.known is self._reported:
+            return None
+        self._reported = self.known
+        if self.known:
+            why = "the robot measures external loads"
+            return make_event("info", "notice", "contact_told", why)
+        why = (
+            "the robot measures no external wrench: limits.contact has no effect, and a "
+            "blocked arm is detected by limits.tracking_m alone"
+        )
+        return make_event("warning", "notice", "contact_not_told", why)
+
     @property
     def lost(self) -> str:
         """Which load the robot measured when the activation began and does not now."""
@@ -218,6 +235,20 @@ class Contact:
             if not load.known:
                 return f"the robot no longer measures {load.name}, which limits.contact needs"
         return ""
+
+    def reasons(self, seen: Seen) -> list[str]:
+        return self.missing
+
+    def check(self, seen: Seen) -> Brake | None:
+        load = self.overload()
+        if load is None or seen.commanded is None or not seen.published:
+            return None
+        event = make_event("warning", "limit", load.name, "stopped", load.most, load.stop)
+        why = (
+            f"something presses against the arm: {load.name} {load.most:.1f} {load.unit}, "
+            f"at most {load.stop:g} {load.unit}; it retreats"
+        )
+        return Brake(why, event, retreats=True)
 
     @property
     def missing(self) -> list[str]:
@@ -254,6 +285,7 @@ class Contact:
         """The load above its stop limit, None without one."""
         return next((load for load in self._measured if load.most > load.stop), None)
 
+    @property
     def slowdown(self) -> Slowdown | None:
         """The slowdown of the greatest load, None without one."""
         slower: Slowdown | None = None
@@ -265,6 +297,16 @@ class Contact:
             if share < 1.0:
                 slower = slowest(slower, Slowdown(load.name, share, load.value, load.slow, ""))
         return slower
+
+
+class ContactSensing(Monitor):
+    """Loads that were measured when the activation began, and have to be until it ends."""
+
+    def __init__(self, contact: Contact) -> None:
+        self._contact = contact
+
+    def check(self, seen: Seen) -> Brake | None:
+        return Brake(self._contact.lost) if self._contact.lost else None
 
 
 # -- retreat ------------------------------------------------------------------------------------

@@ -201,9 +201,8 @@ class GoalPace:
         """The arm may still be faster than the override allows."""
         self.slower: Slowdown | None = None
         """What reduces the speed to the goal, besides the override."""
-        self.contact_slowdown: Slowdown | None = None
-        self.joint_slowdown: Slowdown | None = None
-        """Of the measured joints; both apply whatever the goal allows."""
+        self.monitored: Slowdown | None = None
+        """Of the monitors; it applies whatever the goal allows."""
         self.part_slowdown: Slowdown | None = None
         """Of the distance to another part of the robot."""
         self._slowed_by: set[str] = set()
@@ -213,7 +212,7 @@ class GoalPace:
     def begin(self) -> None:
         """Start an activation."""
         self._slowed_by.clear()
-        self.joint_slowdown = None
+        self.monitored = None
 
     def stand(self) -> None:
         """The arm stands, nothing was asked of it yet."""
@@ -226,8 +225,7 @@ class GoalPace:
 
     def slowest(self, goal: Goal) -> Slowdown | None:
         """What reduces the speed to `goal`."""
-        others = self.contact_slowdown, self.joint_slowdown, self.part_slowdown
-        return slowest(goal.slowdown, *others)
+        return slowest(goal.slowdown, self.monitored, self.part_slowdown)
 
     def changes(self, mover: Mover, slower: Slowdown | None) -> bool:
         """Whether the motion in progress must be planned again, with `slower` from now on."""

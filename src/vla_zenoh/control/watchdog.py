@@ -1,4 +1,4 @@
-"""Reasons to brake: messages lost or late, overdue chunks, a blocked arm, joints near a bound."""
+"""Reasons to brake: overdue chunks, nodes that are gone, joints near a bound, a deadman let go."""
 
 from __future__ import annotations
 
@@ -7,19 +7,15 @@ from collections.abc import Set as AbstractSet
 import numpy as np
 
 from vla_zenoh.control.limits import SLOWEST, LimitHit, Slowdown, joint_margins, slowest
-from vla_zenoh.control.policy_check import Lease
-from vla_zenoh.control.preflight import PeerSnapshot
+from vla_zenoh.control.monitor import Brake, Monitor, Seen, too_near
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.keys import NO_DEADMAN_TOKEN, worker_node
-from vla_zenoh.kinematics.so3 import Pose, pose_distance
-from vla_zenoh.profile import Profile
+from vla_zenoh.profile import Profile, Timing
 from vla_zenoh.types import FloatArray, Task
 
 NEVER_NS = 1 << 62
 FIRST_CHUNK_PATIENCE_S = 1.0
 """Extra time for the first chunk after activation: it needs an observation and an inference."""
-BACK_OFF_M, BACK_OFF_RAD = 0.005, 0.02
-"""A blocked arm that comes back counts as blocked again if it strays by this much more."""
 PERIOD_NS = 30_000_000
 """Between two checks of the same measured values: noise has to be seen apart from motion."""
 PAST_M, PAST_SINGULAR = 0.005, 0.005
@@ -55,24 +51,13 @@ class Deadline:
         self.set(self._left_ns, self._patience_ns / 1e9, now_ns, speed)
 
 
-IS_GONE = "is gone"
-"""What is said of a node that is not alive any more."""
-
-
 class Watchdog:
-    """Deadline of the next chunk, tracking error, and the peers that the arm depends on.
+    """Deadline of the next chunk, and of the motion without one."""
 
-    Args:
-        profile: its limits and timeouts.
-    """
-
-    def __init__(self, profile: Profile) -> None:
-        self._limits, self._timing = profile.limits, profile.timing
-        self.tracking_m = self.tracking_rad = 0.0
-        self._excused = (0.0, 0.0)
+    def __init__(self, timing: Timing) -> None:
+        self._timing = timing
         self._chunk, self._motion = Deadline(), Deadline()
 
-    # -- chunks -------------------------------------------------------------------------------
     def expect(self, left_ns: int | None, now_ns: int, task: Task) -> None:
         """Set the deadline of the next chunk, and that of the motion without one.
 
@@ -114,61 +99,27 @@ class Watchdog:
         """It is overdue by ``max_hold_s``: the arm must not resume by itself any more."""
         return now_ns > self._chunk.at_ns + int(self._timing.max_hold_s * 1e9)
 
-    # -- tracking -----------------------------------------------------------------------------
-    def begin(self, held: Pose, actual: Pose) -> bool:
-        """Start an activation; returns whether the arm is far from its controller's set-point.
 
-        Such an arm may come back: it does not count as blocked while the distance shrinks.
-        """
-        apart_m, apart_rad = pose_distance(held, actual)
-        blocked = apart_m > self._limits.tracking_m or apart_rad > self._limits.tracking_rad
-        self._excused = (apart_m, apart_rad) if blocked else (0.0, 0.0)
-        return blocked
+class PeerMonitor(Monitor):
+    """The nodes and cameras that an activation depends on."""
 
-    def measure(self, commanded: Pose | None, actual: Pose) -> None:
-        """Update the tracking error; `commanded` is None while nothing is streamed."""
-        self.tracking_m, self.tracking_rad = (
-            (0.0, 0.0) if commanded is None else pose_distance(commanded, actual)
-        )
-
-    def blocked(self) -> str:
-        """Why the arm counts as blocked, empty while it follows."""
-        limits = self._limits
-        for apart, limit, excused, back_off, unit in (
-            (self.tracking_m, limits.tracking_m, self._excused[0], BACK_OFF_M, "m"),
-            (self.tracking_rad, limits.tracking_rad, self._excused[1], BACK_OFF_RAD, "rad"),
-        ):
-            allowed = max(limit, excused + back_off if excused else 0.0)
-            if apart > allowed:
-                return (
-                    f"the arm does not follow: {apart:.3f} {unit} from its command, "
-                    f"at most {allowed:.3g} {unit} (is it blocked?)"
-                )
-        # The allowance of an arm that comes back only shrinks.
-        self._excused = (
-            min(self._excused[0], self.tracking_m),
-            min(self._excused[1], self.tracking_rad),
-        )
-        return ""
-
-    # -- peers --------------------------------------------------------------------------------
-    def lost(self, peers: PeerSnapshot, worker: str, lease: Lease) -> str:
-        """Which node or camera is lost, empty if none is."""
-        needed = [peers.robot_node, worker_node(worker)]
-        cameras = lease.spec.observation.camera_names
+    def check(self, seen: Seen) -> Brake | None:
+        assert seen.lease is not None
+        peers, cameras = seen.peers, seen.lease.spec.observation.camera_names
+        needed = [peers.robot_node, worker_node(seen.worker)]
         needed += [peers.camera_nodes.get(camera, "camera") for camera in cameras]
         for node in needed:
             if node not in peers.alive:
-                return f"node {node!r} {IS_GONE}"
+                return Brake(f"node {node!r} is gone", late=False)
         for camera in cameras:
             if camera in peers.camera_faults:
-                return f"camera {camera!r} {peers.camera_faults[camera]}"
-        if peers.spec_sources.get(worker) != lease.source:
-            return f"worker {worker!r} was restarted"
-        return ""
+                return Brake(f"camera {camera!r} {peers.camera_faults[camera]}")
+        if peers.spec_sources.get(seen.worker) != seen.lease.source:
+            return Brake(f"worker {seen.worker!r} was restarted")
+        return None
 
 
-class JointMonitor:
+class JointMonitor(Monitor):
     """Monitors the measured joints: how near the moving arm is to its bounds, and its elbow.
 
     Goals are bounded on a model of the arm; this monitors the arm itself. For every bound (end of a
@@ -218,9 +169,16 @@ class JointMonitor:
         """The slowdown of the arm, None for full speed."""
         return slowest(self._bound_slowdown, self._elbow_slowdown)
 
-    def due(self, now_ns: int) -> bool:
-        """The next check is due."""
-        return now_ns >= self._next_ns
+    def begin(self) -> None:
+        self.reset()
+
+    def check(self, seen: Seen) -> Brake | None:
+        if seen.measured_rad is None or seen.commanded is None:
+            return None
+        hit = self.update(
+            seen.measured_rad, seen.commanded_rad, seen.now_ns, in_joints=seen.in_joints
+        )
+        return None if hit is None else too_near(hit)
 
     def update(
         self,

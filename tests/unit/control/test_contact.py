@@ -53,7 +53,7 @@ def test_a_free_arm_has_all_its_speed() -> None:
     arm = active()
     arm.feels(0.5, -1.0, 0.5)
     assert arm.contact.overload() is None
-    assert arm.contact.slowdown() is None
+    assert arm.contact.slowdown is None
     assert arm.contact.quiet
 
 
@@ -87,7 +87,7 @@ def test_between_slow_and_stop_the_arm_gets_slower_the_more_it_presses() -> None
         arm = active()
         span_n = LIMITS.force_stop_n - LIMITS.force_slow_n
         arm.feels(LIMITS.force_slow_n + part * span_n, 0.0, 0.0, s=0.2)
-        slower = arm.contact.slowdown()
+        slower = arm.contact.slowdown
         assert slower is not None
         assert slower.name == "contact_force"
         shares.append(slower.share)
@@ -144,7 +144,7 @@ def test_a_robot_that_tells_no_wrench_is_not_felt() -> None:
     assert not arm.contact.known
     assert arm.contact.force_n is None
     assert arm.contact.overload() is None
-    assert arm.contact.slowdown() is None
+    assert arm.contact.slowdown is None
 
 
 def test_efforts_count_only_where_a_limit_says_that_they_are_external() -> None:
