@@ -17,6 +17,7 @@ import numpy as np
 from vla_zenoh.control.commander import Commander, Inputs, Outputs, Setting
 from vla_zenoh.control.preflight import PeerSnapshot
 from vla_zenoh.control.reachability import ReachabilityFilter
+from vla_zenoh.control.states import MODES
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import Pose, exp3, log3, quat_from_rotation, rotation_from_quat
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, ObservationSpec
@@ -130,6 +131,9 @@ class Rig:
             inputs.pose, inputs.gripper = self.pose_state(), self.gripper_state()
             inputs.joint = self.joint_state()
         out = self.commander.step(inputs, self.now_ns, ticks)
+        if self.state != "fault":  # one found in this tick ends what was done in it
+            modes = [part.motion.mode for part in self.commander.parts]
+            assert MODES[self.commander.state].issuperset(modes)
         self.events += out.events
         self.refused.update(refusal.reason for refusal in out.rejections)
         if out.pose is not None:

@@ -388,13 +388,13 @@ class ChunkPlanner:
         numbers = plan.steps[plan.bounded]
         width_m = step_width(action, numbers, start.width_m, self._max_width_m)
         width_m = start.width_m if width_m is None else width_m
-        asked = space.asked(action, numbers, start, plan.base, width_m)
+        asked = space.asked(plan, width_m)
         slower: Slowdown | None = None
         if action.targets:
             part, slower = self._approach(plan, *space.way(start, asked))
             if part < 1.0:
                 asked = replace(start.between(asked, part), width_m=width_m)
-        end, hits = space.within_step(action, start, asked)
+        end, hits = space.within_step(plan, asked)
         cut = sum(pose_distance(end.pose, asked.pose)) if hits else 0.0
         end = replace(end, slowdown=slower)
         return StepBounding(start, None, asked.pose, end, hits, cut)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from vla_zenoh.control.chunk_planner import ChunkPlanner
-from vla_zenoh.control.commander_io import MotionCommands, NewStates, State, make_event
+from vla_zenoh.control.commander_io import MotionCommands, NewStates, make_event
 from vla_zenoh.control.contact import ContactSensing
 from vla_zenoh.control.limits import slowest
 from vla_zenoh.control.monitor import Brake, Monitor, Seen
@@ -22,6 +22,7 @@ from vla_zenoh.control.preflight import (
 )
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.state_monitor import StateMonitor
+from vla_zenoh.control.states import State
 from vla_zenoh.control.tracking import FollowMonitor, TrackingMonitor
 from vla_zenoh.control.watchdog import JointMonitor, PeerMonitor
 from vla_zenoh.errors import RecordError, SpecError
@@ -194,7 +195,6 @@ class CommandedPart:
             pose=self.pose,
             gripper=self.gripper_state,
             joint=self.joint,
-            actual=self.states.actual,
             measured_rad=self.measured_rad,
             commanded=motion.commanded,
             commanded_rad=motion.joints_rad,

@@ -17,17 +17,7 @@ from dataclasses import replace
 
 from vla_zenoh.control.chunk_planner import ChunkOutcome
 from vla_zenoh.control.commanded_part import CommandedPart
-from vla_zenoh.control.commander_io import (
-    DEACTIVATED,
-    OBEYING,
-    Inputs,
-    Outputs,
-    Setting,
-    State,
-    Trigger,
-    limit_events,
-    make_event,
-)
+from vla_zenoh.control.commander_io import Inputs, Outputs, Setting, limit_events, make_event
 from vla_zenoh.control.lateness import Lateness
 from vla_zenoh.control.monitor import Brake, Seen, too_near
 from vla_zenoh.control.part_spacing import PartSpacing
@@ -41,6 +31,7 @@ from vla_zenoh.control.preflight import (
     why_not_ready,
 )
 from vla_zenoh.control.reachability import ReachabilityFilter
+from vla_zenoh.control.states import DEACTIVATED, OBEYING, State, Trigger
 from vla_zenoh.control.watchdog import Deadman, Watchdog
 from vla_zenoh.errors import RecordError
 from vla_zenoh.profile import Profile

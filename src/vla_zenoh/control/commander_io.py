@@ -1,4 +1,4 @@
-"""States of the `Commander`, inputs and outputs of one tick, and earlier states of the robot."""
+"""Inputs and outputs of one tick of the `Commander`, and earlier states of the robot."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from bisect import bisect_right
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from enum import StrEnum
 from operator import itemgetter
 from typing import Generic, NamedTuple, TypeVar
 
@@ -35,59 +34,6 @@ KEPT_NS = 2_500_000_000
 """Longer than any observation that is not rejected as stale by default."""
 MOST_STATES = 2500
 """Of a robot that publishes its state at up to 1 kHz all are kept."""
-
-
-class State(StrEnum):
-    """State of the command node; the values are wire names."""
-
-    INACTIVE = "inactive"  # stands and executes nothing
-    ACTIVE = "active"  # executes chunks
-    HOLDING = "holding"  # no fresh chunk: brakes, stands, resumes with the next fresh chunk
-    STOPPED = "stopped"  # emergency stop, latched until reset
-    FAULT = "fault"  # of the robot or the command node, latched until reset
-
-    def after(self, trigger: Trigger) -> State:
-        """The state after `trigger`; unchanged if `TABLE` has no such transition."""
-        return TABLE.get((self, trigger), self)
-
-
-class Trigger(StrEnum):
-    """Events that may change the state."""
-
-    ACTIVATE = "activate"  # requested, and preflight found no reason against it
-    DEACTIVATE = "deactivate"
-    FRESH = "fresh"  # a chunk came into force
-    STARVE = "starve"  # no fresh chunk within the watchdog
-    LOSE = "lose"  # robot, worker or camera gone, or the arm is blocked
-    STOP = "stop"
-    FAULT = "fault"
-    RESET = "reset"  # requested, and no fault is left
-
-
-TABLE: dict[tuple[State, Trigger], State] = {
-    (State.INACTIVE, Trigger.ACTIVATE): State.ACTIVE,
-    (State.INACTIVE, Trigger.STOP): State.STOPPED,
-    (State.INACTIVE, Trigger.FAULT): State.FAULT,
-    (State.ACTIVE, Trigger.DEACTIVATE): State.INACTIVE,
-    (State.ACTIVE, Trigger.STARVE): State.HOLDING,
-    (State.ACTIVE, Trigger.LOSE): State.INACTIVE,
-    (State.ACTIVE, Trigger.STOP): State.STOPPED,
-    (State.ACTIVE, Trigger.FAULT): State.FAULT,
-    (State.HOLDING, Trigger.FRESH): State.ACTIVE,
-    (State.HOLDING, Trigger.DEACTIVATE): State.INACTIVE,
-    (State.HOLDING, Trigger.LOSE): State.INACTIVE,
-    (State.HOLDING, Trigger.STOP): State.STOPPED,
-    (State.HOLDING, Trigger.FAULT): State.FAULT,
-    (State.STOPPED, Trigger.RESET): State.INACTIVE,
-    (State.FAULT, Trigger.RESET): State.INACTIVE,
-    (State.FAULT, Trigger.STOP): State.STOPPED,
-}
-"""All transitions of the command node."""
-
-OBEYING = frozenset({State.ACTIVE, State.HOLDING})
-"""States in which chunks of the leased worker are executed."""
-DEACTIVATED = "deactivated"
-"""The reason of an INACTIVE state that a client requested."""
 
 
 class Setting(NamedTuple):

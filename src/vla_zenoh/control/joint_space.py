@@ -35,6 +35,7 @@ from vla_zenoh.control.plan_timeline import Goal, joint_goal
 from vla_zenoh.control.policy_check import Rejection
 from vla_zenoh.control.reachability import Barriers, Floors
 from vla_zenoh.control.smoothing import Motion
+from vla_zenoh.control.states import Mode
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import Pose, norm3
 from vla_zenoh.policy import ActionSpec
@@ -430,7 +431,7 @@ class JointPath(AxisSmoother):
         """(n,) joints commanded."""
         return self.state.position
 
-    def step(self, *, follows: bool, braking: bool) -> None:
+    def step(self, mode: Mode) -> None:
         """Advance by one tick."""
         self.tick()
 

@@ -27,7 +27,6 @@ class Seen(NamedTuple):
         worker: the one that has the lease, or asks for it.
         lease: None before an activation.
         pose, gripper, joint: newest states; None: none was received.
-        actual: the measured TCP pose.
         measured_rad: (n,) measured joints; None: no kinematics, or no joints of this arm.
         commanded: the TCP pose streamed last; None: nothing is streamed.
         commanded_rad: (n,) joints streamed last; None: poses are.
@@ -43,7 +42,6 @@ class Seen(NamedTuple):
     pose: Stamped[PoseState] | None
     gripper: Stamped[GripperState] | None
     joint: Stamped[JointState] | None
-    actual: Pose | None
     measured_rad: FloatArray | None
     commanded: Pose | None
     commanded_rad: FloatArray | None

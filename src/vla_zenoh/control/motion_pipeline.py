@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from vla_zenoh.control.chunk_planner import LOOK_AHEAD, ChunkPlanner
-from vla_zenoh.control.commander_io import OBEYING, State, limit_events, make_event
+from vla_zenoh.control.commander_io import limit_events, make_event
 from vla_zenoh.control.contact import Contact, Retreat
 from vla_zenoh.control.joint_space import JointPath
 from vla_zenoh.control.limits import FULL, LimitHit, Shares, into_workspace
@@ -24,6 +24,7 @@ from vla_zenoh.control.pose_to_joint import FollowedPath, PoseToJoint
 from vla_zenoh.control.preflight import FOLLOWS_JOINT_RAD, LINGER_NS, Settling, follows, held_joints
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.smoothing import PosePath
+from vla_zenoh.control.states import OBEYING, Mode, State
 from vla_zenoh.control.step_timing import GoalPace, Mover, TimedGoal
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.kinematics.so3 import Pose, held_pose, interpolate, pose_distance, pose_of
@@ -75,17 +76,18 @@ class MotionPipeline:
             self._poses = FollowedPath(profile, self._joints)
         self._mover: Mover = self._poses
         """What moves the arm: `_poses` or `_path`."""
-        self._changing = False
-        """It brakes, because the goals in force are joints and it moves in poses, or vice versa."""
+        self.mode = Mode.BRAKE
+        """Of the last tick."""
         self.timeline: GoalTimeline | None = None
         self.goal: Goal | None = None
         self.streaming = False
         self.pace = GoalPace()
         self.held = False
-        """The arm has to stand: another part is too near."""
+        """Another part is too near: the arm has to pause."""
         self.contact = Contact(profile.limits.contact)
         self.retreat = Retreat(profile.limits, self.contact)
         self._back: Pose | None = None
+        """Where it retreats to."""
         commanded = None if self._joints is None or reach is None else reach.kinematics
         self._settling = Settling(commanded)
         self._rest_since_ns: int | None = None
@@ -173,7 +175,6 @@ class MotionPipeline:
         standing = not self.streaming or self.at_rest
         if standing:
             self._enter(joints=False)
-        self._changing = False
         if standing and not (
             self.streaming and follows(*pose_distance(self._poses.motion.pose, start))
         ):
@@ -261,8 +262,7 @@ class MotionPipeline:
         mover = self._mover  # which may be another by now
         # A stream that begins must begin at rest: no ticks are made up for.
         for _ in range(ticks if went_on else 1):
-            active = self._follows(state)
-            mover.step(follows=active, braking=not active and self._back is None)
+            mover.step(self.mode)
         events += limit_events(mover.taken_hits())
         return self.failures == failures, events
 
@@ -273,11 +273,6 @@ class MotionPipeline:
         plan = None if self.timeline is None else self.timeline.plan
         cause = plan.cause if plan is not None and state is State.ACTIVE else None
         return self._mover.command(state.value, cause, self.goal)
-
-    def _follows(self, state: State) -> bool:
-        """Whether the arm follows a goal, and does not brake."""
-        active = state is State.ACTIVE and self.pace.override > 0.0
-        return active and not self._changing and not self.held
 
     def forget_plan(self, oldest_ns: int, now_ns: int) -> list[Event] | None:
         """Stand where the arm is, if the plan's observation was taken before `oldest_ns`.
@@ -310,13 +305,19 @@ class MotionPipeline:
         joints = isinstance(goal, JointGoal) and self._path is not None
         if joints is not self.in_joints and self.at_rest:
             self._enter(joints=joints)
-        self._changing = joints is not self.in_joints
+        self._back = None
+        if joints is not self.in_joints:
+            self.mode = Mode.CHANGE
+        elif self.held or self.pace.override == 0.0:
+            self.mode = Mode.PAUSE
+        else:
+            self.mode = Mode.FOLLOW
         mover = self._mover
-        if self.held and not self._changing:
+        if self.held and self.mode is Mode.PAUSE:
             near = mover.near(goal)  # so that the arm can retreat
             if near is not goal:
                 self._shorten(plans, goal, near, now_ns)
-        if self.pace.override == 0.0 or self._changing or self.held:
+        if self.mode is not Mode.FOLLOW:
             mover.stop(FULL)  # on the path, to continue from there later
             self.goal = None
             return events
@@ -361,6 +362,7 @@ class MotionPipeline:
             self._enter(joints=False)
             mover = self._poses
         dropped: list[Event] = []
+        self.mode = Mode.BRAKE if back is None else Mode.RETREAT
         if back is None:
             mover.stop(None)
             self.goal = None

@@ -33,6 +33,7 @@ from vla_zenoh.control.limits import (
 from vla_zenoh.control.plan_timeline import Goal
 from vla_zenoh.control.reachability import Barriers
 from vla_zenoh.control.smoothing import Motion, PosePath, Smoother
+from vla_zenoh.control.states import STOPPING, Mode
 from vla_zenoh.kinematics.kinematics import Kinematics, pose_error
 from vla_zenoh.kinematics.so3 import Pose, exp3, log3, pose_distance
 from vla_zenoh.profile import Profile
@@ -301,8 +302,8 @@ class FollowedPath(PosePath):
     def stopping_rad(self, ahead_s: float) -> list[FloatArray]:
         return self.joints.stopping_rad(self, ahead_s)
 
-    def step(self, *, follows: bool, braking: bool) -> None:
-        self.joints.tick(self, braking=braking, elbow=follows)
+    def step(self, mode: Mode) -> None:
+        self.joints.tick(self, braking=mode in STOPPING, elbow=mode is Mode.FOLLOW)
 
     def stop(self, shares: Shares | None) -> None:
         """Come to rest as fast as the joints can."""

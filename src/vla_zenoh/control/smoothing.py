@@ -27,6 +27,7 @@ from vla_zenoh.control.limits import (
     workspace_corners,
 )
 from vla_zenoh.control.plan_timeline import Goal
+from vla_zenoh.control.states import Mode
 from vla_zenoh.kinematics.so3 import (
     Pose,
     exp3,
@@ -201,8 +202,8 @@ class PosePath(Smoother):
         """(n,) each, commanded joints on the way to rest and at rest, from a brake in `ahead_s`."""
         return []
 
-    def step(self, *, follows: bool, braking: bool) -> None:
-        """Advance by one tick; `follows`: to a goal, `braking`: to rest."""
+    def step(self, mode: Mode) -> None:
+        """Advance by one tick."""
         self.tick()
 
     def stop(self, shares: Shares | None) -> None:

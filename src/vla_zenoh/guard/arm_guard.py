@@ -7,8 +7,8 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from vla_zenoh.control.commander_io import OBEYING
 from vla_zenoh.control.limits import ROTATION_BOX
+from vla_zenoh.control.states import OBEYING
 from vla_zenoh.errors import CodecError
 from vla_zenoh.guard.reference_governor import BRAKE_MARGIN
 from vla_zenoh.guard.stream_guard import (

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 from command_rig import Rig
 
-from vla_zenoh.control.commander_io import OBEYING, TABLE, State, Trigger
+from vla_zenoh.control.states import MODES, OBEYING, TABLE, Mode, State, Trigger
 
 # Written down once more, so that an edge cannot come or go unnoticed.
 EDGES = [
@@ -53,6 +53,27 @@ def test_chunks_are_obeyed_after_an_activation_only(state: State) -> None:
     leading_in = {s for (s, t), new in TABLE.items() if new in OBEYING and s not in OBEYING}
     assert leading_in == {State.INACTIVE}
     assert state.after(Trigger.FRESH) is state
+
+
+def test_the_motion_follows_goals_while_active_only_and_retreats_while_inactive_only() -> None:
+    assert set(MODES) == set(State)
+    assert [state for state in State if Mode.FOLLOW in MODES[state]] == [State.ACTIVE]
+    assert [state for state in State if Mode.RETREAT in MODES[state]] == [State.INACTIVE]
+    assert all(Mode.BRAKE in MODES[state] for state in State if state is not State.ACTIVE)
+
+
+def test_the_motion_pauses_at_speed_0_goes_on_and_brakes_when_it_is_deactivated() -> None:
+    rig = Rig()
+    rig.activate()
+    rig.send([[0.02, 0, 0, 0, 0, 0, 0]] * 8)
+    motion = rig.commander.parts[0].motion
+    assert motion.mode is Mode.FOLLOW
+    rig.put("speed", 0.0)
+    assert motion.mode is Mode.PAUSE
+    rig.put("speed", 100.0)
+    assert motion.mode is Mode.FOLLOW
+    rig.put("active", False)
+    assert motion.mode is Mode.BRAKE
 
 
 def set_faults(rig: Rig, faults: tuple[str, ...]) -> None:

@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Iterator
 
-from vla_zenoh.control.commander_io import DEACTIVATED
+from vla_zenoh.control.states import DEACTIVATED
 from vla_zenoh.errors import NodeError, SessionError
 from vla_zenoh.keys import worker_node
 from vla_zenoh.lab.bench.task import (

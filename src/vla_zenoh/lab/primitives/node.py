@@ -29,8 +29,8 @@ from vla_zenoh.client.messages import (
     decode_request,
 )
 from vla_zenoh.client.remote_robot import TIMEOUT_S, RemoteRobot
-from vla_zenoh.control.commander_io import DEACTIVATED
 from vla_zenoh.control.reachability import ReachabilityFilter
+from vla_zenoh.control.states import DEACTIVATED
 from vla_zenoh.errors import CodecError, NodeError, SessionError, VlaZenohError
 from vla_zenoh.keys import PRIMITIVES, last_chunk, worker_node
 from vla_zenoh.kinematics.so3 import Pose, pose_of, rotation_from_quat

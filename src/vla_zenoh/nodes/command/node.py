@@ -19,8 +19,8 @@ from vla_zenoh.bus.node import Node
 from vla_zenoh.codec import records
 from vla_zenoh.control.commanded_part import CommandedPart
 from vla_zenoh.control.commander import Commander, Outputs, Setting
-from vla_zenoh.control.commander_io import State
 from vla_zenoh.control.reachability import ReachabilityFilter
+from vla_zenoh.control.states import State
 from vla_zenoh.keys import Kind
 from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.nodes.command.inputs import CommandInputs
