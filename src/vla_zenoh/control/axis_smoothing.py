@@ -47,7 +47,6 @@ from ruckig import (
 )
 
 from vla_zenoh.control.limits import FULL, Shares
-from vla_zenoh.kinematics.so3 import cross3, norm3
 from vla_zenoh.types import FloatArray
 
 REST_VELOCITY = 1e-6
@@ -281,7 +280,7 @@ class AxisSmoother:
         line = line_of(way, motion[0], motion[1], self._pace)
         if line is not None:
             return (line[:, None], [1.0]) if line.any() else (np.zeros((size, 0)), [])
-        length = norm3(way) if size == 3 else float(np.linalg.norm(way))
+        length = float(np.linalg.norm(way))
         if length == 0.0:
             return each
         along = way / length
@@ -467,12 +466,7 @@ class AxisSmoother:
 
 def _across(along: FloatArray) -> FloatArray:
     """(n - 1, n) unit vectors across `along` (n,) and across each other."""
-    if len(along) != 3:
-        return np.linalg.svd(along[None])[2][1:]
-    least = np.eye(3)[int(np.argmin(np.abs(along)))]
-    across = cross3(along, least)
-    across /= norm3(across)
-    return np.stack([across, cross3(along, across)])
+    return np.linalg.svd(along[None])[2][1:]
 
 
 def line_of(

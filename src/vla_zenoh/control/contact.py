@@ -28,7 +28,7 @@ Without a measured wrench the contact cannot be seen: then it moves all of `RELI
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 
@@ -79,22 +79,20 @@ class Load:
         unit: str,
         slow: float | None,
         stop: float | None,
-        apart: Callable[[Sequence[float], Sequence[float]], float],
+        size: Callable[[FloatArray], float],
     ) -> None:
         self.name, self.unit = name, unit  # of the limit
         self.stop = math.inf if stop is None else stop
         self.slow = self.stop if slow is None else slow
-        self._apart = apart
+        self._size = size
         self.known, self._stamp_ns = False, 0
-        self._filtered: list[float] = []
-        self._bias: list[float] = []
-        self._start_bias: list[float] = []
+        self._filtered = self._bias = self._start_bias = np.zeros(0)
         self.value = 0.0
         """The size of the load without its bias, in N or Nm."""
         self.most = 0.0
         """The size of the load that counts for the stop, in N or Nm: no bias follows it."""
 
-    def update(self, measured: Sequence[float] | None, stamp_ns: int, *, drifts: bool) -> None:
+    def update(self, measured: FloatArray | None, stamp_ns: int, *, drifts: bool) -> None:
         """Add what was measured at `stamp_ns`, None: nothing; `drifts`: let the bias follow."""
         if measured is None:
             self.known = False
@@ -102,42 +100,40 @@ class Load:
         dt_s = min(max((stamp_ns - self._stamp_ns) / 1e9, 0.0), LONGEST_S)
         self._stamp_ns = stamp_ns
         if not self.known or len(measured) != len(self._filtered):
-            self._filtered, self.known = list(measured), True
-            self._bias, self._start_bias = [0.0] * len(measured), [0.0] * len(measured)
-        filtered, bias = self._filtered, self._bias
+            self.known = True
+            self._filtered = measured
+            self._bias = self._start_bias = np.zeros(len(measured))
         share = -math.expm1(-dt_s / FILTER_S)
-        for index, value in enumerate(measured):
-            filtered[index] += share * (value - filtered[index])
-        if drifts and dt_s > 0:
-            drift = dt_s / DRIFT_S
-            for index, value in enumerate(filtered):
-                bias[index] += drift * (value - bias[index])
-            if self._apart(bias, self._start_bias) > self.slow:
-                self._bias = bias = self._near(bias, self._start_bias)
+        self._filtered = self._filtered + share * (measured - self._filtered)
+        if drifts:
+            drifted = self._bias + dt_s / DRIFT_S * (self._filtered - self._bias)
+            self._bias = self._near(drifted, self._start_bias)
         self._measure()
 
     def zero(self) -> None:
         """Take the present load for the bias, as far as `slow`."""
-        self._start_bias = self._near(self._filtered, [0.0] * len(self._filtered))
-        self._bias = self._start_bias.copy()
+        self._bias = self._start_bias = self._near(self._filtered, np.zeros(len(self._filtered)))
         self._measure()
 
     def _measure(self) -> None:
-        zeros = [0.0] * len(self._filtered)
-        since_start = self._apart(self._filtered, self._start_bias)
-        self.value = self._apart(self._filtered, self._bias)
-        self.most = max(since_start, self._apart(self._filtered, zeros))
+        self.value = self._size(self._filtered - self._bias)
+        since_start = self._size(self._filtered - self._start_bias)
+        self.most = max(since_start, self._size(self._filtered))
 
-    def _near(self, values: list[float], middle: Sequence[float]) -> list[float]:
-        apart = self._apart(values, middle)
+    def _near(self, values: FloatArray, middle: FloatArray) -> FloatArray:
+        """`values`, no further than `slow` from `middle`."""
+        apart = self._size(values - middle)
         if apart <= self.slow:
-            return values.copy()
-        share = self.slow / max(apart, 1e-9)
-        return [m + share * (v - m) for v, m in zip(values, middle, strict=True)]
+            return values
+        return middle + self.slow / apart * (values - middle)
 
 
-def _greatest(values: Sequence[float], others: Sequence[float]) -> float:
-    return max((abs(a - b) for a, b in zip(values, others, strict=True)), default=0.0)
+def _norm(values: FloatArray) -> float:
+    return float(np.linalg.norm(values))
+
+
+def _greatest(values: FloatArray) -> float:
+    return float(np.abs(values).max(initial=0.0))
 
 
 class Contact(Monitor):
@@ -148,11 +144,9 @@ class Contact(Monitor):
     """
 
     def __init__(self, limits: ContactLimits) -> None:
-        self._force = Load(
-            "contact_force", "N", limits.force_slow_n, limits.force_stop_n, math.dist
-        )
+        self._force = Load("contact_force", "N", limits.force_slow_n, limits.force_stop_n, _norm)
         self._torque = Load(
-            "contact_torque", "Nm", limits.torque_slow_nm, limits.torque_stop_nm, math.dist
+            "contact_torque", "Nm", limits.torque_slow_nm, limits.torque_stop_nm, _norm
         )
         self._effort = Load(
             "contact_effort", "Nm", limits.effort_slow_nm, limits.effort_stop_nm, _greatest
@@ -180,8 +174,7 @@ class Contact(Monitor):
             wrench = None
         force, torque = (None, None) if wrench is None else (wrench[:3], wrench[3:])
         for load, measured in ((self._force, force), (self._torque, torque)):
-            values = None if measured is None else measured.tolist()
-            load.update(values, stamp_ns, drifts=self._active)
+            load.update(measured, stamp_ns, drifts=self._active)
 
     def _is_frozen(self, wrench: FloatArray, position_m: FloatArray) -> bool:
         """The same numbers again, other than zero, however far the arm has moved meanwhile."""
@@ -194,9 +187,8 @@ class Contact(Monitor):
     def update_joints(self, state: Stamped[JointState]) -> None:
         """Add the newest joints; used if a limit of the profile says that efforts are external."""
         if self.wants_effort:
-            effort_nm = state.record.effort_nm
-            values = None if effort_nm is None else effort_nm.tolist()
-            self._effort.update(values, state.header.stamp_wall_ns, drifts=self._active)
+            stamp_ns = state.header.stamp_wall_ns
+            self._effort.update(state.record.effort_nm, stamp_ns, drifts=self._active)
 
     def begin(self) -> None:
         """Start an activation: the present load is not a contact."""
@@ -318,7 +310,7 @@ class CommandTrail:
 
     def __init__(self) -> None:
         self._poses: list[Pose] = []
-        self._places: list[list[float]] = []
+        self._places: list[FloatArray] = []
         self._newest: Pose | None = None
 
     def add(self, pose: Pose) -> None:
@@ -326,15 +318,14 @@ class CommandTrail:
         if pose is self._newest:
             return
         self._newest, place = pose, _place(pose)
-        if self._places and math.dist(self._places[-1], place) < SPACE_M:
-            return
         if self._places:
-            # Plain floats: of so few places numpy takes four times as long to find it.
-            apart = [math.dist(known, place) for known in self._places]
+            apart = np.linalg.norm(np.array(self._places) - place, axis=1)
+            if apart[-1] < SPACE_M:
+                return
             if apart[-1] > 10 * SPACE_M:
                 self.clear()  # poses in between are missing
-            elif min(apart) < SPACE_M:
-                keep = next(at for at, far in enumerate(apart, 1) if far < SPACE_M)
+            elif apart.min() < SPACE_M:
+                keep = int(np.argmax(apart < SPACE_M)) + 1
                 del self._poses[keep:], self._places[keep:]
                 return
         self._poses.append(pose)
@@ -351,17 +342,17 @@ class CommandTrail:
         found: list[Pose] = []
         gone_m = 0.0
         for index in range(len(self._poses) - 2, -1, -1):
-            gone_m += math.dist(self._places[index], self._places[index + 1])
+            gone_m += _norm(self._places[index] - self._places[index + 1])
             if gone_m > way_m + SPACE_M / 2:
                 break
             found.append(self._poses[index])
         return found
 
 
-def _place(pose: Pose) -> list[float]:
+def _place(pose: Pose) -> FloatArray:
     # The Frobenius norm of a difference of rotations is sqrt(2) times their small angle.
     turned = (pose.rotation * (RAD_AS_M / math.sqrt(2))).ravel()
-    return pose.position_m.tolist() + turned.tolist()
+    return np.concatenate([pose.position_m, turned])
 
 
 class Retreat:
@@ -433,7 +424,7 @@ class Retreat:
         start = _place(target)
         while self._ahead:
             target = self._ahead.pop(0)
-            if math.dist(_place(target), start) >= step_m:
+            if _norm(_place(target) - start) >= step_m:
                 break
         self._target = target
         return target, None
@@ -454,7 +445,7 @@ class Retreat:
             return None, make_event("warning", "notice", "retreat", why)
         on_m = norm3(measured.position_m - begun[1].position_m)
         # It does not return to a pose from which a person has pushed it away since.
-        here = np.array(_place(measured))
+        here = _place(measured)
         into = _place(commanded) - here
         self._ahead = [
             pose

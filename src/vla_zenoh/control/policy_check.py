@@ -21,13 +21,13 @@ from vla_zenoh.control.actions import (
     as_deltas,
     gripper_range,
     rotation_of,
-    step_pose,
     step_width,
     with_quaternions,
 )
-from vla_zenoh.control.limits import bound_step, workspace_corners
+from vla_zenoh.control.limits import workspace_corners
 from vla_zenoh.control.plan_timeline import Goal
 from vla_zenoh.errors import RecordError, SpecError
+from vla_zenoh.kinematics.so3 import log3
 from vla_zenoh.policy import ActionSpec, ModelSpec, check_steps
 from vla_zenoh.profile import POSE_JOINTS, REACH_M, REJECT_FACTOR, Limits, Profile
 from vla_zenoh.types import QUATERNION_NORM_TOLERANCE, ActionChunk, FloatArray, Stamped, Task
@@ -477,24 +477,21 @@ def validate_steps(
     if action.kind == "absolute":
         return _validate_targets(steps[:, :3] * action.position_scale_m, limits)
     action, steps = as_deltas(action, steps)
-    rotations = steps[:, action.rotation_columns]
-    lengths_m = steps[:, :3] * action.position_scale_m
-    if action.rotation == "quaternion":
-        most_rad = 2.0 * np.arccos(np.clip(np.abs(rotations[:, 3]) - ROUNDING, 0.0, 1.0))
-    else:  # three angles, or one: together at most as large as this
-        most_rad = np.abs(rotations).sum(axis=1)
-    most_m = np.abs(lengths_m).sum(axis=1)
-    suspect = most_m > limits.step_m * REJECT_FACTOR * (1 - ROUNDING)
-    suspect |= most_rad > limits.step_rad * REJECT_FACTOR * (1 - ROUNDING)
-    for index in suspect.nonzero()[0]:
-        asked = step_pose(action, steps[index], start.pose)
-        for hit in bound_step(limits, start.pose, asked)[1]:
-            if hit.fatal:
-                why = (
-                    f"a step of {hit.value:.4g} is over {REJECT_FACTOR:g} times its limit; "
-                    "is its unit right?"
-                )
-                return Rejection(hit.name, why, hit.value, hit.limit)
+    ways_m = np.linalg.norm(steps[:, :3] * action.position_scale_m, axis=1)
+    turns = [log3(rotation_of(action, numbers)) for numbers in steps[:, action.rotation_columns]]
+    turns_rad = np.linalg.norm(turns, axis=1)
+    for name, sizes, limit in (
+        ("step_m", ways_m, limits.step_m),
+        ("step_rad", turns_rad, limits.step_rad),
+    ):
+        beyond = ~(sizes <= REJECT_FACTOR * limit)  # true of what is no number
+        if beyond.any():
+            size = float(sizes[beyond][0])
+            why = (
+                f"a step of {size:.4g} is over {REJECT_FACTOR:g} times its limit; "
+                "is its unit right?"
+            )
+            return Rejection(name, why, size, limit)
     return None
 
 
