@@ -289,9 +289,9 @@ class Commander:
 
     def _change_worker(self, worker: str, now_ns: int) -> None:
         if self.state in OBEYING:
-            lease, reasons = self._preflight(worker, now_ns)
+            lease, of_parts, of_worker = self._preflight(worker, now_ns)
             if lease is None:
-                self._reject_setting("worker", reasons)
+                self._reject_setting("worker", of_parts + of_worker)
                 return
             self.lease = lease
         self._new_episode(now_ns, worker=worker)
@@ -308,8 +308,9 @@ class Commander:
             )
             self._reject_setting("activate", [why])
             return
-        lease, reasons = self._preflight(self.task.worker, now_ns)
-        if lease is None and self._is_answer_due(now_ns, reasons):
+        lease, of_parts, of_worker = self._preflight(self.task.worker, now_ns)
+        reasons = of_parts + of_worker
+        if of_worker and not of_parts and self._is_answer_due(now_ns):
             self._awaited = holder
             self.why = f"activation waits for worker {self.task.worker!r}: {'; '.join(reasons)}"[
                 :MAX_TEXT
@@ -335,20 +336,10 @@ class Commander:
         self._change(Trigger.ACTIVATE, "; ".join([what, *self._ended_before()])[:MAX_TEXT])
         self._new_episode(now_ns)
 
-    def _is_answer_due(self, now_ns: int, reasons: list[str]) -> bool:
-        """Whether all reasons are the worker's, which may not have heard the newest prompt yet."""
-        worker = self.task.worker
-        asked = reasons_of_worker(
-            self.profile,
-            worker,
-            self.task.prompt,
-            self._peers,
-            self._latest.get(worker),
-            now_ns,
-            self.task.rate_hz,
-        )
+    def _is_answer_due(self, now_ns: int) -> bool:
+        """Whether the worker may not have heard the newest prompt yet."""
         patience_s = min(ANSWER_S + 1.0 / self.task.rate_hz, MAX_ANSWER_S)
-        return 0 <= now_ns - self._asked_ns < patience_s * 1e9 and reasons == asked
+        return 0 <= now_ns - self._asked_ns < patience_s * 1e9
 
     def _ended_before(self) -> list[str]:
         """Why the last activation ended; nothing of it may have changed."""
@@ -363,19 +354,19 @@ class Commander:
             self.deadman.name = holder
             self._emit("info", "notice", "held", f"active from now on while {holder!r} holds it")
 
-    def _preflight(self, worker: str, now_ns: int) -> tuple[Lease | None, list[str]]:
+    def _preflight(self, worker: str, now_ns: int) -> tuple[Lease | None, list[str], list[str]]:
+        """A lease for `worker`, or the reasons of the parts and those of the worker against it."""
         peers, task, chunk = self._peers, self.task, self._latest.get(worker)
-        spec, reasons = peers.specs.get(worker), list[str]()
+        spec, of_parts = peers.specs.get(worker), list[str]()
         for part in self.parts:
-            reasons += part.reasons(self._seen(part, worker, now_ns))
-        reasons += reasons_of_worker(
+            of_parts += part.reasons(self._seen(part, worker, now_ns))
+            of_parts += part.reasons_by_worker(worker, spec, chunk)
+        of_worker = reasons_of_worker(
             self.profile, worker, task.prompt, peers, chunk, now_ns, task.rate_hz
         )
-        for part in self.parts:
-            reasons += part.reasons_by_worker(worker, spec, chunk)
-        if reasons or chunk is None or spec is None:
-            return None, reasons
-        return Lease(spec, chunk.header.source, now_ns, chunk.header.seq), []
+        if of_parts or of_worker or chunk is None or spec is None:
+            return None, of_parts, of_worker
+        return Lease(spec, chunk.header.source, now_ns, chunk.header.seq), [], []
 
     def _reject_setting(self, what: str, reasons: list[str], *, passing: bool = False) -> None:
         """Reject a setting; `passing`: only because something is still starting."""

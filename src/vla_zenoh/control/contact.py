@@ -33,7 +33,7 @@ from collections.abc import Callable
 import numpy as np
 
 from vla_zenoh.control.commander_io import make_event
-from vla_zenoh.control.limits import SLOWEST, Slowdown, slowest
+from vla_zenoh.control.limits import Slowdown, in_steps, slowest
 from vla_zenoh.control.monitor import Brake, Monitor, Seen
 from vla_zenoh.kinematics.so3 import Pose, norm3, pose_distance
 from vla_zenoh.profile import ContactLimits, Limits
@@ -49,8 +49,6 @@ FROZEN_M = 0.05
 """A wrench that stays the same to the last bit while the TCP moves this far is not measured."""
 QUIET = 0.2
 """Part of ``slow`` below which the arm is not in contact."""
-STEPS = 10
-"""Number of speed shares; each change of the share replans the motion."""
 
 STEP_M = 0.005
 """A retreat looks at the load after each of these: longer ones go back further than needed."""
@@ -285,7 +283,7 @@ class Contact(Monitor):
             if load.value <= load.slow:
                 continue
             left = max((load.stop - load.value) / max(load.stop - load.slow, 1e-9), 0.0)
-            share = max(math.ceil(left * STEPS) / STEPS, SLOWEST)
+            share = in_steps(left)
             if share < 1.0:
                 slower = slowest(slower, Slowdown(load.name, share, load.value, load.slow, ""))
         return slower

@@ -32,7 +32,7 @@ from vla_zenoh.control.limits import (
     workspace_corners,
 )
 from vla_zenoh.control.plan_timeline import Goal, joint_goal
-from vla_zenoh.control.policy_check import Rejection
+from vla_zenoh.control.policy_check import ROUNDING, Rejection
 from vla_zenoh.control.reachability import Barriers, Floors
 from vla_zenoh.control.smoothing import Motion
 from vla_zenoh.control.states import Mode
@@ -56,7 +56,6 @@ STOP_PLACES = np.linspace(0.125, 1.0, 8)
 """Parts of the time of a stop at which it is checked."""
 ARC_RAD = 0.25
 """A motion is taken apart into pieces of this length to see how fast its TCP moves."""
-ROUNDING = 1e-6
 NAMED = {"rad": "radians", "m": "metres"}
 """Units of joints in sentences."""
 NEARER_M = 5e-4

@@ -29,6 +29,11 @@ SLOWEST = 0.1
 """Least share of the speed close to a stop: the arm has to be able to work there."""
 HELD_LEAD_M, HELD_LEAD_RAD = 0.01, 0.02
 """The goal of an arm that another part holds up leads it by this much at most."""
+SPEED_STEPS = 20
+"""Number of speed shares of what is measured: each change of the share plans the motion again."""
+BEGIN_M, BEGIN_RAD, BEGIN_JOINT_RAD = 0.002, 0.01, 0.004
+"""A command stream begins this near to where the robot holds the arm, or its guard rejects it: what
+it begins with is one step of the controller's set-point."""
 LEAST = 0.02
 """Least share where the joints are too slow, or a far target is approached."""
 
@@ -230,6 +235,11 @@ class Slowdown(NamedTuple):
     def at(self) -> str:
         """ " at WHERE" for a sentence, empty for the whole arm."""
         return f" at {self.where}" if self.where else ""
+
+
+def in_steps(share: float, least: float = SLOWEST) -> float:
+    """A share of the speed, rounded up to one of `SPEED_STEPS`; not below `least`."""
+    return max(math.ceil(share * SPEED_STEPS) / SPEED_STEPS, least)
 
 
 def slowest(*reasons: Slowdown | None) -> Slowdown | None:

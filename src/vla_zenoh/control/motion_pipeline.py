@@ -11,7 +11,7 @@ from vla_zenoh.control.chunk_planner import LOOK_AHEAD, ChunkPlanner
 from vla_zenoh.control.commander_io import limit_events, make_event
 from vla_zenoh.control.contact import Contact, Retreat
 from vla_zenoh.control.joint_space import JointPath
-from vla_zenoh.control.limits import FULL, LimitHit, Shares, into_workspace
+from vla_zenoh.control.limits import BEGIN_JOINT_RAD, FULL, LimitHit, Shares, into_workspace
 from vla_zenoh.control.plan_timeline import (
     Goal,
     GoalTimeline,
@@ -21,7 +21,7 @@ from vla_zenoh.control.plan_timeline import (
     joint_goal,
 )
 from vla_zenoh.control.pose_to_joint import FollowedPath, PoseToJoint
-from vla_zenoh.control.preflight import FOLLOWS_JOINT_RAD, LINGER_NS, Settling, follows, held_joints
+from vla_zenoh.control.preflight import LINGER_NS, Settling, follows, held_joints
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.smoothing import PosePath
 from vla_zenoh.control.states import OBEYING, Mode, State
@@ -182,7 +182,7 @@ class MotionPipeline:
         if self._joints is not None and self._reach is not None and joint is not None:
             held_rad = held_joints(self._reach.kinematics, joint)
             apart_rad = float(np.abs(held_rad - self._joints.position_rad).max())
-            if standing and not (self.streaming and apart_rad <= FOLLOWS_JOINT_RAD):
+            if standing and not (self.streaming and apart_rad <= BEGIN_JOINT_RAD):
                 self._joints.restart(held_rad)
             self._joints.keep_elbow()
         if in_joints and standing:

@@ -16,12 +16,13 @@ arms that are nearer than the stop by more than `PAST_M`, and come nearer, have 
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 
 import numpy as np
 
 from vla_zenoh.control.commanded_part import CommandedPart
-from vla_zenoh.control.limits import LimitHit, Slowdown, between
+from vla_zenoh.control.limits import LimitHit, Slowdown, between, in_steps
 from vla_zenoh.control.watchdog import BAND_M, PAST_M, PERIOD_NS
 from vla_zenoh.kinematics.collision import Nearest, PlacedArm
 from vla_zenoh.profile import Profile
@@ -37,9 +38,6 @@ SPARE_M = 5e-3
 """Arms that brake end this much before the stop: joints that begin to lag in a brake end elsewhere
 than their pose would. 3.4 mm were found in 2.5 million ticks of ``fuzz_parts.py``."""
 SLOWEST = 0.05
-"""Least share of the speed near the stop: the arms are held there, and have to come away again."""
-STEPS = 20
-"""Number of speed shares, so that the share does not change at every tick."""
 STANDS_RAD = 2e-3
 """Arms whose joints go on by less than this stand."""
 PROBE_RAD = 0.01
@@ -125,8 +123,8 @@ class PartSpacing:
         if not self._slower:
             return None
         left = max(near.distance_m - self._stop_m, 0.0) / (self._slow_m - self._stop_m)
-        share = max(np.ceil(np.sqrt(left) * STEPS) / STEPS, SLOWEST)
-        return Slowdown(NAME, float(share), near.distance_m, self._slow_m, str(near))
+        share = in_steps(math.sqrt(left), SLOWEST)
+        return Slowdown(NAME, share, near.distance_m, self._slow_m, str(near))
 
     def _may_go_on(self, at: Sequence[FloatArray], now_ns: int, floor_m: float) -> bool:
         """Whether the first bit of the way to the goals is free."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from vla_zenoh.control import policy_check
 from vla_zenoh.control.joint_space import JointBounds
-from vla_zenoh.control.limits import into_workspace
+from vla_zenoh.control.limits import BEGIN_JOINT_RAD, BEGIN_M, BEGIN_RAD, into_workspace
 from vla_zenoh.errors import RecordError, SpecError, VlaZenohError
 from vla_zenoh.keys import LOADING, NO_TASK, NOTHING_YET, OPENING, worker_node
 from vla_zenoh.kinematics.kinematics import Kinematics
@@ -34,8 +34,6 @@ SAME_TCP_M, SAME_TCP_RAD = 0.005, 0.02
 """Largest difference of the TCP by kinematics from the TCP that the robot reports."""
 HELD_RAD = 0.1
 """Largest distance of a joint from where its controller holds it."""
-FOLLOWS_M, FOLLOWS_RAD, FOLLOWS_JOINT_RAD = 0.002, 0.01, 0.004
-"""A robot that holds a pose this near to the stream follows it: the stream continues."""
 SETTLED, SETTLED_NS = 5e-4, 100_000_000
 """A robot that moves by less than this, in m and rad, for this long stands."""
 LINGER_NS = 500_000_000
@@ -445,8 +443,8 @@ def held_joints(kinematics: Kinematics, joint: JointState) -> FloatArray:
 
 def follows(apart_m: float, apart_rad: float, joint_rad: float = 0.0) -> bool:
     """The robot holds the streamed pose: to restart there would be a step in the stream."""
-    near = apart_m <= FOLLOWS_M and apart_rad <= FOLLOWS_RAD
-    return near and joint_rad <= FOLLOWS_JOINT_RAD
+    near = apart_m <= BEGIN_M and apart_rad <= BEGIN_RAD
+    return near and joint_rad <= BEGIN_JOINT_RAD
 
 
 class Settling:

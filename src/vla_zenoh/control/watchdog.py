@@ -6,14 +6,14 @@ from collections.abc import Set as AbstractSet
 
 import numpy as np
 
-from vla_zenoh.control.limits import SLOWEST, LimitHit, Slowdown, joint_margins, slowest
+from vla_zenoh.control.limits import LimitHit, Slowdown, in_steps, joint_margins, slowest
 from vla_zenoh.control.monitor import Brake, Monitor, Seen, too_near
+from vla_zenoh.control.plan_timeline import FOREVER_NS
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.keys import NO_DEADMAN_TOKEN, worker_node
 from vla_zenoh.profile import Profile, Timing
 from vla_zenoh.types import FloatArray, Task
 
-NEVER_NS = 1 << 62
 FIRST_CHUNK_PATIENCE_S = 1.0
 """Extra time for the first chunk after activation: it needs an observation and an inference."""
 PERIOD_NS = 30_000_000
@@ -23,9 +23,6 @@ PAST_M, PAST_SINGULAR = 0.005, 0.005
 PAST_MARGIN = 0.5
 """Part of ``joint_margin_rad``."""
 BAND_RAD, BAND_M, BAND_SINGULAR = 2e-3, 5e-4, 5e-4
-"""Width of the band that follows a value: wider than noise, narrower than `PAST_M`."""
-STEPS = 20
-"""Number of speed shares, so that the share does not change at every update."""
 
 
 class Deadline:
@@ -38,7 +35,7 @@ class Deadline:
     def set(self, left_ns: float, patience_s: float, now_ns: int, speed: float) -> None:
         """`left_ns` of plan time from now at override `speed`, then `patience_s`; never at 0."""
         self._left_ns, self._patience_ns = left_ns, int(patience_s * 1e9)
-        self.at_ns = NEVER_NS
+        self.at_ns = FOREVER_NS
         if speed:
             left_ns = left_ns / speed if left_ns > 0 else left_ns
             self.at_ns = now_ns + round(left_ns) + self._patience_ns
@@ -258,7 +255,7 @@ class JointMonitor(Monitor):
 
 
 def _slowdown(name: str, share: float, value: float, limit: float, where: str) -> Slowdown | None:
-    share = max(float(np.ceil(share * STEPS)) / STEPS, SLOWEST)
+    share = in_steps(share)
     return None if share >= 1.0 else Slowdown(name, share, value, limit, where)
 
 

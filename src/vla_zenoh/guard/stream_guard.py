@@ -12,7 +12,15 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from vla_zenoh.control.limits import ROTATION_BOX, JointMotionLimits, MotionLimits, motion_limits
+from vla_zenoh.control.limits import (
+    BEGIN_JOINT_RAD,
+    BEGIN_M,
+    BEGIN_RAD,
+    ROTATION_BOX,
+    JointMotionLimits,
+    MotionLimits,
+    motion_limits,
+)
 from vla_zenoh.control.smoothing import Motion
 from vla_zenoh.guard.reference_governor import (
     AT_REST,
@@ -49,11 +57,9 @@ STILL = 1e-4
 
 JUMP_M, JUMP_RAD, JUMP_JOINT_RAD = 0.02, 0.1, 0.05
 """A command may be this far from the reference in force: TCP, or each joint."""
-BEGIN_M, BEGIN_RAD, BEGIN_JOINT_RAD = 0.002, 0.01, 0.004
-"""The first command of a stream may be this far from the reference. A stream that goes on after the
-robot has braked by itself would make it jerk."""
 BEGIN_M_S, BEGIN_RAD_S = 0.03, 0.1
-"""And it may move this fast, TCP or each joint: our streams begin at rest."""
+"""The first command of a stream may move this fast, TCP or each joint: our streams begin at rest.
+One that goes on after the robot has braked by itself would make it jerk."""
 TURN_BESIDE = 0.5
 """Share of a rotation limit for each axis, so that the norm of three stays within it, in an offset
 from a motion that rotates as well; in a stop it is `ROTATION_BOX`."""

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from guard_rig import stop_from
 
-from vla_zenoh.control.limits import JointMotionLimits
+from vla_zenoh.control.limits import BEGIN_JOINT_RAD, JointMotionLimits
 from vla_zenoh.guard.reference_governor import BRAKE_MARGIN
 from vla_zenoh.guard.stream_guard import (
-    BEGIN_JOINT_RAD,
     BEGIN_RAD_S,
     JUMP_JOINT_RAD,
     JointGuard,
