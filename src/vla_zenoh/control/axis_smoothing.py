@@ -23,8 +23,8 @@ A motion is planned with the first of the last three that takes no detour, each 
 (`_WAYS`): nine plans at most, one as a rule. If all of them take one, one of the hardest is
 executed: a detour within the limits is better than no plan.
 
-A plan with shares s, s^2, s^3 of the box is the same motion in 1/s of the time. Ruckig, which
-rounds absolute values, is given it in a time of its own, at a `pace` of s.
+A plan with shares s, s^2, s^3 of the box is the same motion in 1/s of the time. Ruckig, which rounds
+absolute values, is given it in a time of its own, at a `pace` of s.
 
 Ruckig: Berscheid and Kroeger, "Jerk-limited real-time trajectory generation with arbitrary target
 states", RSS 2021.
