@@ -23,8 +23,8 @@ A motion is planned with the first of the last three that takes no detour, each 
 (`_WAYS`): nine plans at most, one as a rule. If all of them take one, one of the hardest is
 executed: a detour within the limits is better than no plan.
 
-A plan with shares s, s^2, s^3 of the box is the same motion in 1/s of the time. Ruckig, which rounds
-absolute values, is given it in a time of its own, at a `pace` of s.
+A plan with shares s, s^2, s^3 of the box is the same motion in 1/s of the time. Ruckig, which
+rounds absolute values, is given it in a time of its own, at a `pace` of s.
 
 Ruckig: Berscheid and Kroeger, "Jerk-limited real-time trajectory generation with arbitrary target
 states", RSS 2021.
@@ -70,7 +70,6 @@ _ASIDE = np.array([[ASIDE], *([quiet] for quiet in QUIET[1:])])
 """(3, 1) the same of displacement, velocity and acceleration."""
 TINY, MOST = 1e-12, 1e9
 """Ruckig takes no limit of zero and none that is infinite."""
-DONE = (Result.Working, Result.Finished)
 _WAYS = ((Synchronization.Time, False), (Synchronization.No, False), (Synchronization.No, True))
 """Attempts at planning a motion, in order: how axes are synchronised, `slowly` of `_input`."""
 
@@ -371,7 +370,10 @@ class AxisSmoother:
         """The trajectory for `ask`, None if Ruckig finds none."""
         path = Trajectory(ask.degrees_of_freedom)
         try:
-            done = Ruckig(ask.degrees_of_freedom).calculate(ask, path) in DONE
+            done = Ruckig(ask.degrees_of_freedom).calculate(ask, path) in (
+                Result.Working,
+                Result.Finished,
+            )
         except (RuckigError, ValueError):
             return None
         return path if done else None

@@ -41,7 +41,6 @@ from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import Limits
 from vla_zenoh.types import FloatArray
 
-IDENTITY_6 = np.eye(6)
 POSTURE_1_S, POSTURE_RAD_S = 1.0, 0.2
 """Rate kp at which a redundant arm goes to its posture, and its greatest speed then."""
 DAMPED_BELOW, DAMPING = 0.03, 4e-4
@@ -339,7 +338,7 @@ class JointFollower:
             share = 1.0 - (singular_value / DAMPED_BELOW) ** 2
             damping += DAMPING * share * share
         right = np.stack([error / dt_s - taken, twist - taken, free @ posture], axis=1)
-        solved = free.T @ np.linalg.solve(free @ free.T + damping * IDENTITY_6, right)
+        solved = free.T @ np.linalg.solve(free @ free.T + damping * np.eye(6), right)
         whole, feed = solved[:, 0], solved[:, 1]
         back = min(1.0, self._back_1_s * dt_s) * (whole - feed)
         most = _stoppable(np.abs(back) * dt_s, BACK_SHARE * self.acceleration_rad_s2, dt_s)

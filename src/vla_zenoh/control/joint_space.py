@@ -21,6 +21,7 @@ from vla_zenoh.control.axis_smoothing import AxisSmoother, line_of
 from vla_zenoh.control.limits import (
     FULL,
     HELD_LEAD_RAD,
+    LEAST,
     BoundedStep,
     LimitHit,
     Shares,
@@ -66,7 +67,6 @@ ROOM = np.array([[0.95], [0.8], [0.8]])
 """Parts of the TCP's velocity, acceleration and jerk that a straight motion is planned with."""
 BEND = 0.5
 """Part of the acceleration that the curve of the TCP may take."""
-LEAST_SHARE = 0.02
 NOTHING = 1e-9
 """A shorter displacement has no direction."""
 PEEK_RAD = 1e-4
@@ -490,5 +490,5 @@ def followed_shares(
     fastest = min(rates[0] * velocity, float(np.min(np.sqrt(bend * limits[1] / bends))))
     reached = min(fastest, (now * now + rates[1]) ** 0.5)
     left = np.maximum(limits[1] - bends * reached * reached, (1 - bend) * limits[1])
-    parts = np.clip([fastest / rates[0], (left / needed[1]).min(), jerk], LEAST_SHARE, 1.0)
+    parts = np.clip([fastest / rates[0], (left / needed[1]).min(), jerk], LEAST, 1.0)
     return Shares(*(float(part) for part in parts))

@@ -38,6 +38,7 @@ SPARE_M = 5e-3
 """Arms that brake end this much before the stop: joints that begin to lag in a brake end elsewhere
 than their pose would. 3.4 mm were found in 2.5 million ticks of ``fuzz_parts.py``."""
 SLOWEST = 0.05
+"""Least share of the speed near the stop: the arms are held there, and have to come away again."""
 STANDS_RAD = 2e-3
 """Arms whose joints go on by less than this stand."""
 PROBE_RAD = 0.01

@@ -23,6 +23,7 @@ PAST_M, PAST_SINGULAR = 0.005, 0.005
 PAST_MARGIN = 0.5
 """Part of ``joint_margin_rad``."""
 BAND_RAD, BAND_M, BAND_SINGULAR = 2e-3, 5e-4, 5e-4
+"""Width of the band that follows a value: wider than noise, narrower than `PAST_M`."""
 
 
 class Deadline:
