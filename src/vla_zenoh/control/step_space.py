@@ -1,14 +1,14 @@
 """Spaces in which the steps of a chunk are added up: poses of the TCP, or joints.
 
-The planner asks the same of both, see `StepSpace`: what a step asks for, how far that is, where its
-limits end it, and how the arm's kinematics bound it. So it does not know which of them it plans in.
+The planner asks the same of both: what a step asks for, how far that is, where its limits end it,
+and how the arm's kinematics bound it. So it does not know which of them it plans in. Steps (n, D)
+are in a space's own order.
 """
 
 from __future__ import annotations
 
 from collections.abc import Generator
 from dataclasses import replace
-from typing import Protocol
 
 from vla_zenoh.control.actions import covered_step, step_joints
 from vla_zenoh.control.commander_io import StateHistory
@@ -25,42 +25,6 @@ from vla_zenoh.types import FloatArray, JointState, PoseState
 
 Search = Generator[None, None, BoundedStep]
 """Bounds a step by the arm's kinematics, in pieces; yields before every evaluation of the arm."""
-
-
-class StepSpace(Protocol):
-    """What a chunk is planned in. Steps (n, D) and numbers (D,) are in the space's own order."""
-
-    def origin(self, goal: Goal) -> Goal:
-        """`goal` in this space, where the first step can be added to it."""
-        ...
-
-    def measured(self, t_ns: int, width_m: float) -> Goal | None:
-        """Where the arm was measured at `t_ns`; None: nowhere near that time."""
-        ...
-
-    def ordered(self, action: ActionSpec, steps: FloatArray) -> FloatArray:
-        """Steps of a chunk in the order of this space."""
-        ...
-
-    def far_target(self, action: ActionSpec, steps: FloatArray, base: Goal) -> Rejection | None:
-        """Why targets are too far away to be intended, besides what `validate_steps` finds."""
-        ...
-
-    def asked(self, plan: ChunkPlan, width_m: float) -> Goal:
-        """The end of the next step of `plan` as its numbers say, with a gripper width."""
-        ...
-
-    def way(self, start: Goal, end: Goal) -> tuple[float, float, float]:
-        """Length of a step in m and in rad, and the time (s) that it takes at full speed."""
-        ...
-
-    def within_step(self, plan: ChunkPlan, asked: Goal) -> tuple[Goal, list[LimitHit]]:
-        """`asked` within the limits of one step, and the limits that acted."""
-        ...
-
-    def search(self, start: Goal, end: Goal, dt_s: float) -> Search | None:
-        """The search for the end of a step within what the arm can do; None: no kinematics."""
-        ...
 
 
 class PoseSteps:
@@ -86,9 +50,11 @@ class PoseSteps:
         self._gap_ns = gap_ns
 
     def origin(self, goal: Goal) -> Goal:
+        """`goal` in this space, where the first step can be added to it."""
         return goal
 
     def measured(self, t_ns: int, width_m: float) -> Goal | None:
+        """Where the arm was measured at `t_ns`; None: nowhere near that time."""
         found = self._states.around(t_ns, self._gap_ns)
         if found is None:
             return None
@@ -97,12 +63,15 @@ class PoseSteps:
         return Goal(interpolate(pose, pose_of(after), share) if share else pose, width_m)
 
     def ordered(self, action: ActionSpec, steps: FloatArray) -> FloatArray:
+        """Steps of a chunk in the order of this space."""
         return steps
 
     def far_target(self, action: ActionSpec, steps: FloatArray, base: Goal) -> Rejection | None:
+        """Why targets are too far away to be intended, besides what `validate_steps` finds."""
         return None
 
     def asked(self, plan: ChunkPlan, width_m: float) -> Goal:
+        """The end of the next step of `plan` as its numbers say, with a gripper width."""
         start, numbers = plan.step_start, plan.steps[plan.bounded]
         pose, response = covered_step(
             plan.action, numbers, start.pose, plan.base.pose, start.response
@@ -110,21 +79,24 @@ class PoseSteps:
         return Goal(pose, width_m, response=response)
 
     def way(self, start: Goal, end: Goal) -> tuple[float, float, float]:
+        """Length of a step in m and in rad, and the time (s) that it takes at full speed."""
         far_m, far_rad = pose_distance(start.pose, end.pose)
         return far_m, far_rad, full_speed_s(self._limits, start.pose, end.pose)
 
     def within_step(self, plan: ChunkPlan, asked: Goal) -> tuple[Goal, list[LimitHit]]:
+        """`asked` within the limits of one step, and the limits that acted."""
         pose, hits = bound_step(self._limits, plan.step_start.pose, asked.pose)
         return replace(asked, pose=pose), hits
 
     def search(self, start: Goal, end: Goal, dt_s: float) -> Search | None:
+        """The search for the end of a step that the arm can do; None: no kinematics."""
         if self._reach is None:
             return None
         return self._reach.bound_in_pieces(start.pose, end.pose, dt_s, start.joints_rad)
 
 
 class JointSteps:
-    """Steps of the joints, in the order of the kinematics.
+    """Steps of the joints, in the order of the kinematics; its methods are those of `PoseSteps`.
 
     Args:
         bounds: of the joints.
@@ -207,3 +179,7 @@ class JointSteps:
         self._reach.cost = 1
         start_rad = self.origin(start).joints_rad
         return self._bounds.bound_in_pieces(start_rad, self.origin(end).joints_rad)
+
+
+StepSpace = PoseSteps | JointSteps
+"""What a chunk is planned in."""
