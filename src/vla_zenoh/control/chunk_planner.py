@@ -16,8 +16,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -35,11 +35,9 @@ from vla_zenoh.control.limits import (
     slowest,
 )
 from vla_zenoh.control.plan_timeline import (
-    ChunkPlan,
     Goal,
     GoalTimeline,
     Plan,
-    StepBounding,
 )
 from vla_zenoh.control.policy_check import (
     ROUNDING,
@@ -49,11 +47,11 @@ from vla_zenoh.control.policy_check import (
     validate_steps,
 )
 from vla_zenoh.control.reachability import ReachabilityFilter
-from vla_zenoh.control.step_space import JointSteps, PoseSteps, StepSpace
-from vla_zenoh.kinematics.so3 import pose_distance
+from vla_zenoh.control.step_space import JointSteps, PoseSteps, Search, StepSpace
+from vla_zenoh.kinematics.so3 import Pose, pose_distance
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import ActionChunk, Cause, JointState, PoseState, Stamped, Task
+from vla_zenoh.types import ActionChunk, Cause, FloatArray, JointState, PoseState, Stamped, Task
 
 MAX_QUEUED = 4
 """Of a burst of chunks only the newest few are kept; the newest valid one is executed."""
@@ -85,6 +83,81 @@ class ChunkOutcome(NamedTuple):
     rejection: Rejection | None = None
     plan: ChunkPlan | None = None
     hits: Sequence[LimitHit] = ()
+
+
+@dataclass(slots=True)
+class ChunkPlan(Plan):
+    """The plan of a chunk, computed and bounded step by step.
+
+    Args:
+        action: the meaning of the numbers of a step.
+        space: in which the steps are added up.
+        steps: (n, D), in its order.
+        base: W_0, the goal that the first step starts from.
+        approaches: one of its targets is further away than a step.
+        announced: that has been reported.
+        first_step_ns: time that its first step has to approach its target; -1: a whole step.
+        evaluations: evaluations of the arm spent on it.
+        hits: limits that acted on it, each once by name and place, in path order.
+        reported: number of those that have been reported.
+        current: the step being bounded.
+    """
+
+    action: ActionSpec = field(kw_only=True)
+    space: StepSpace = field(kw_only=True)
+    steps: FloatArray = field(kw_only=True)
+    base: Goal = field(kw_only=True)
+    approaches: bool = False
+    announced: bool = False
+    first_step_ns: int = -1
+    evaluations: int = 0
+    hits: list[LimitHit] = field(default_factory=list)
+    reported: int = 0
+    current: StepBounding | None = None
+
+    @property
+    def step_start(self) -> Goal:
+        """The goal that the next step to be bounded starts from."""
+        return self.goals[self.bounded - 1] if self.bounded else self.base
+
+    @property
+    def shifted_goal(self) -> Goal | None:
+        """The end of that step, where the leash has shifted it since it was computed."""
+        return self.goals[self.bounded] if self.bounded < self.computed else None
+
+    def add_hits(self, hits: Iterable[LimitHit]) -> None:
+        """Keep the hits that are new by name and place."""
+        for hit in hits:
+            if all(hit.name != known.name or hit.where != known.where for known in self.hits):
+                self.hits.append(hit)
+
+    def unreported_hits(self) -> list[LimitHit]:
+        """The hits added since the last call."""
+        hits, self.reported = self.hits[self.reported :], len(self.hits)
+        return hits
+
+
+@dataclass(slots=True)
+class StepBounding:
+    """A step while it is bounded.
+
+    Args:
+        start: the goal it starts from.
+        shifted: its end, where that was computed before.
+        asked: its end as the numbers say.
+        end: its end within the limits of a step.
+        hits: limits that acted so far.
+        cut: m and rad that they cut off.
+        search: bounds it by the arm's kinematics, in pieces; None: there are no kinematics.
+    """
+
+    start: Goal
+    shifted: Goal | None
+    asked: Pose
+    end: Goal
+    hits: list[LimitHit] = field(default_factory=list)
+    cut: float = 0.0
+    search: Search | None = None
 
 
 class ChunkPlanner:
@@ -388,13 +461,13 @@ class ChunkPlanner:
         numbers = plan.steps[plan.bounded]
         width_m = step_width(action, numbers, start.width_m, self._max_width_m)
         width_m = start.width_m if width_m is None else width_m
-        asked = space.asked(plan, width_m)
+        asked = space.asked(action, numbers, start, plan.base, width_m)
         slower: Slowdown | None = None
         if action.targets:
             part, slower = self._approach(plan, *space.way(start, asked))
             if part < 1.0:
                 asked = replace(start.between(asked, part), width_m=width_m)
-        end, hits = space.within_step(plan, asked)
+        end, hits = space.within_step(action, start, asked)
         cut = sum(pose_distance(end.pose, asked.pose)) if hits else 0.0
         end = replace(end, slowdown=slower)
         return StepBounding(start, None, asked.pose, end, hits, cut)

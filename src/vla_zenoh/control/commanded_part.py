@@ -9,9 +9,8 @@ import numpy as np
 
 from vla_zenoh.control.chunk_planner import ChunkPlanner
 from vla_zenoh.control.commander_io import MotionCommands, NewStates, make_event
-from vla_zenoh.control.contact import ContactSensing
 from vla_zenoh.control.limits import slowest
-from vla_zenoh.control.monitor import Brake, Monitor, Seen
+from vla_zenoh.control.monitor import Brake, Monitor, PartSnapshot
 from vla_zenoh.control.motion_pipeline import MotionPipeline
 from vla_zenoh.control.policy_check import Lease
 from vla_zenoh.control.preflight import (
@@ -24,7 +23,7 @@ from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.state_monitor import StateMonitor
 from vla_zenoh.control.states import State
 from vla_zenoh.control.tracking import FollowMonitor, TrackingMonitor
-from vla_zenoh.control.watchdog import JointMonitor, PeerMonitor
+from vla_zenoh.control.watchdog import JointMonitor, NodeMonitor
 from vla_zenoh.errors import RecordError, SpecError
 from vla_zenoh.kinematics.so3 import held_pose, pose_of
 from vla_zenoh.policy import ModelSpec
@@ -82,10 +81,9 @@ class CommandedPart:
         self.tracking = TrackingMonitor(profile.limits, self.contact, self.states)
         self.monitors: list[Monitor] = [
             self.states,
-            PeerMonitor(),
+            NodeMonitor(),
             self.contact,
             self.tracking,
-            ContactSensing(self.contact),
             FollowMonitor(),
         ]
         """In the order in which they are asked."""
@@ -182,12 +180,12 @@ class CommandedPart:
         return ""
 
     # -- activation ---------------------------------------------------------------------------
-    def seen(
+    def snapshot(
         self, peers: PeerSnapshot, worker: str, lease: Lease | None, now_ns: int, *, published: bool
-    ) -> Seen:
+    ) -> PartSnapshot:
         """What the monitors look at in this tick; `published`: the commands reach the robot."""
         motion = self.motion
-        return Seen(
+        return PartSnapshot(
             now_ns=now_ns,
             peers=peers,
             worker=worker,
@@ -203,9 +201,9 @@ class CommandedPart:
             stuck=motion.stuck,
         )
 
-    def reasons(self, seen: Seen) -> list[str]:
+    def reasons(self, part: PartSnapshot) -> list[str]:
         """Reasons of all monitors against an activation, with the part that they are about."""
-        found = [why for monitor in self.monitors for why in monitor.reasons(seen)]
+        found = [why for monitor in self.monitors for why in monitor.reasons(part)]
         return [self.says(why) for why in found]
 
     def reasons_by_worker(
@@ -271,22 +269,22 @@ class CommandedPart:
         return MotionCommands(pose, arm if isinstance(arm, JointCommand) else None, width)
 
     # -- supervision --------------------------------------------------------------------------
-    def check(self, seen: Seen) -> tuple[Brake | None, list[Event]]:
+    def check(self, part: PartSnapshot) -> tuple[Brake | None, list[Event]]:
         """Why the arm cannot continue, None if it can; and events.
 
         All monitors are asked until one finds a reason; an arm that retreats begins to.
         """
         news = self.contact.news()
         events = [] if news is None else [news]
-        found = (monitor.check(seen) for monitor in self.monitors)
+        found = (monitor.check(part) for monitor in self.monitors)
         brake = next((brake for brake in found if brake is not None), None)
         self.motion.pace.monitored = slowest(*(monitor.slowdown for monitor in self.monitors))
         if brake is None:
             return None, events
         if brake.event is not None:
             events.append(brake.event)
-        if brake.retreats and seen.commanded is not None:
-            self.retreat.begin(seen.commanded)
+        if brake.retreats and part.commanded is not None:
+            self.retreat.begin(part.commanded)
         return brake, events
 
     def follow_elbow(self, *, obeying: bool) -> None:
@@ -305,14 +303,14 @@ class CommandedPart:
         commanded_rad = motion.joints_rad
         reach.set_elbow(measured_rad if commanded_rad is None else commanded_rad)
 
-    def keeps_from_retreat(self, seen: Seen) -> str:
+    def keeps_from_retreat(self, part: PartSnapshot) -> str:
         """Why the arm must not retreat, empty: the robot is ready, and its state can be trusted."""
-        if seen.pose is None or seen.gripper is None:
+        if part.pose is None or part.gripper is None:
             return "its state is not known"
-        if seen.peers.robot_node not in seen.peers.alive:
-            return f"node {seen.peers.robot_node!r} is gone"
-        why = self.states.lost(seen) or self.states.doubt
-        return why or why_not_ready(seen.gripper.record)
+        if part.peers.robot_node not in part.peers.alive:
+            return f"node {part.peers.robot_node!r} is gone"
+        why = self.states.lost(part) or self.states.doubt
+        return why or why_not_ready(part.gripper.record)
 
 
 class GripperArbiter:

@@ -19,7 +19,7 @@ from vla_zenoh.control.chunk_planner import ChunkOutcome
 from vla_zenoh.control.commanded_part import CommandedPart
 from vla_zenoh.control.commander_io import Inputs, Outputs, Setting, limit_events, make_event
 from vla_zenoh.control.lateness import Lateness
-from vla_zenoh.control.monitor import Brake, Seen, too_near
+from vla_zenoh.control.monitor import Brake, PartSnapshot, too_near
 from vla_zenoh.control.part_spacing import PartSpacing
 from vla_zenoh.control.plan_timeline import EpisodeProgress
 from vla_zenoh.control.policy_check import Lease, Rejection
@@ -359,7 +359,7 @@ class Commander:
         peers, task, chunk = self._peers, self.task, self._latest.get(worker)
         spec, of_parts = peers.specs.get(worker), list[str]()
         for part in self.parts:
-            of_parts += part.reasons(self._seen(part, worker, now_ns))
+            of_parts += part.reasons(self._snapshot(part, worker, now_ns))
             of_parts += part.reasons_by_worker(worker, spec, chunk)
         of_worker = reasons_of_worker(
             self.profile, worker, task.prompt, peers, chunk, now_ns, task.rate_hz
@@ -450,9 +450,9 @@ class Commander:
             if why:  # joints of another arm
                 self._change(Trigger.LOSE, part.says(why))
 
-    def _seen(self, part: CommandedPart, worker: str, now_ns: int) -> Seen:
+    def _snapshot(self, part: CommandedPart, worker: str, now_ns: int) -> PartSnapshot:
         lease = self.lease if self.state in OBEYING else None
-        return part.seen(self._peers, worker, lease, now_ns, published=not self.dry_run)
+        return part.snapshot(self._peers, worker, lease, now_ns, published=not self.dry_run)
 
     def _supervise(self, now_ns: int) -> None:
         self._measure()
@@ -461,7 +461,7 @@ class Commander:
         for part in self.parts:
             if not part.retreat.busy:
                 continue
-            why = unheld or part.keeps_from_retreat(self._seen(part, worker, now_ns))
+            why = unheld or part.keeps_from_retreat(self._snapshot(part, worker, now_ns))
             if why:
                 part.retreat.end()
                 self._emit("warning", "notice", "retreat", part.says(f"the retreat ends: {why}"))
@@ -469,7 +469,7 @@ class Commander:
             return
         lost: dict[str, Brake] = {}
         for part in self.parts:
-            brake, events = part.check(self._seen(part, worker, now_ns))
+            brake, events = part.check(self._snapshot(part, worker, now_ns))
             self._out.events += part.tagged(events)
             if brake is not None:
                 lost[part.says(brake.why)] = brake

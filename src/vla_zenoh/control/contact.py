@@ -34,7 +34,7 @@ import numpy as np
 
 from vla_zenoh.control.commander_io import make_event
 from vla_zenoh.control.limits import Slowdown, in_steps, slowest
-from vla_zenoh.control.monitor import Brake, Monitor, Seen
+from vla_zenoh.control.monitor import Brake, Monitor, PartSnapshot
 from vla_zenoh.kinematics.so3 import Pose, norm3, pose_distance
 from vla_zenoh.profile import ContactLimits, Limits
 from vla_zenoh.types import Event, FloatArray, JointState, PoseState, Stamped
@@ -226,13 +226,13 @@ class Contact(Monitor):
                 return f"the robot no longer measures {load.name}, which limits.contact needs"
         return ""
 
-    def reasons(self, seen: Seen) -> list[str]:
+    def reasons(self, part: PartSnapshot) -> list[str]:
         return self.missing
 
-    def check(self, seen: Seen) -> Brake | None:
+    def check(self, part: PartSnapshot) -> Brake | None:
         load = self.overload()
-        if load is None or seen.commanded is None or not seen.published:
-            return None
+        if load is None or part.commanded is None or not part.published:
+            return Brake(self.lost) if self.lost else None
         event = make_event("warning", "limit", load.name, "stopped", load.most, load.stop)
         why = (
             f"something presses against the arm: {load.name} {load.most:.1f} {load.unit}, "
@@ -287,16 +287,6 @@ class Contact(Monitor):
             if share < 1.0:
                 slower = slowest(slower, Slowdown(load.name, share, load.value, load.slow, ""))
         return slower
-
-
-class ContactSensing(Monitor):
-    """Loads that were measured when the activation began, and have to be until it ends."""
-
-    def __init__(self, contact: Contact) -> None:
-        self._contact = contact
-
-    def check(self, seen: Seen) -> Brake | None:
-        return Brake(self._contact.lost) if self._contact.lost else None
 
 
 # -- retreat ------------------------------------------------------------------------------------

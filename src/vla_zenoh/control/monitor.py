@@ -18,7 +18,7 @@ from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.types import Event, FloatArray, GripperState, JointState, PoseState, Stamped
 
 
-class Seen(NamedTuple):
+class PartSnapshot(NamedTuple):
     """What the monitors of one part look at in a tick.
 
     Args:
@@ -77,11 +77,11 @@ class Monitor:
     def begin(self) -> None:
         """Start an activation."""
 
-    def reasons(self, seen: Seen) -> list[str]:
+    def reasons(self, part: PartSnapshot) -> list[str]:
         """Sentences against an activation; all monitors' are reported at once."""
         return []
 
-    def check(self, seen: Seen) -> Brake | None:
+    def check(self, part: PartSnapshot) -> Brake | None:
         """Why the arm has to brake now; None: it may go on. Asked while it obeys."""
         return None
 

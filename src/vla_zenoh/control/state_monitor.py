@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from vla_zenoh.control.commander_io import NewStates, StateHistory
-from vla_zenoh.control.monitor import Brake, Monitor, Seen
+from vla_zenoh.control.monitor import Brake, Monitor, PartSnapshot
 from vla_zenoh.control.preflight import (
     JOINT_PATIENCE_S,
     joint_state_faults,
@@ -127,37 +127,37 @@ class StateMonitor(Monitor):
             "two is frozen or false, or the tool frame was changed"
         )
 
-    def reasons(self, seen: Seen) -> list[str]:
-        reasons = reasons_of_part(self._profile, seen.peers, seen.pose, seen.gripper, seen.now_ns)
-        pose, joint = seen.pose, seen.joint
+    def reasons(self, part: PartSnapshot) -> list[str]:
+        reasons = reasons_of_part(self._profile, part.peers, part.pose, part.gripper, part.now_ns)
+        pose, joint = part.pose, part.joint
         if pose is None:
             return reasons
         if self._arm is not None:
-            reasons += joint_state_faults(self._profile, self._arm, joint, pose, seen.now_ns)
+            reasons += joint_state_faults(self._profile, self._arm, joint, pose, part.now_ns)
         if joint is not None:
             writers = {joint.header.source, pose.header.source}
             if len(writers) > 1:
                 reasons.append(f"joints and pose have different writers: {', '.join(writers)}")
         return reasons
 
-    def check(self, seen: Seen) -> Brake | None:
-        why = self.lost(seen)
+    def check(self, part: PartSnapshot) -> Brake | None:
+        why = self.lost(part)
         patience_ns = self._profile.timing.state_timeout_s * 1e9
-        if not why and seen.now_ns - self._contradicts_ns > patience_ns:
+        if not why and part.now_ns - self._contradicts_ns > patience_ns:
             why = self._contradiction
         return Brake(why) if why else None
 
-    def lost(self, seen: Seen) -> str:
+    def lost(self, part: PartSnapshot) -> str:
         """Which state is missing, late, or stamped in the future; empty if none is."""
         patience_s = self._profile.timing.state_timeout_s
-        joint = seen.joint if self._wants_joints else None
+        joint = part.joint if self._wants_joints else None
         states: list[tuple[str, Stamped[Any] | None, float]] = [
-            ("pose", seen.pose, patience_s),
-            ("gripper", seen.gripper, patience_s),
+            ("pose", part.pose, patience_s),
+            ("gripper", part.gripper, patience_s),
             ("joints", joint, patience_s + JOINT_PATIENCE_S),
         ]
         for name, state, most_s in states:
-            why = "" if state is None else state_lost(name, state, most_s, seen.now_ns)
+            why = "" if state is None else state_lost(name, state, most_s, part.now_ns)
             if why:
                 return why
         return ""

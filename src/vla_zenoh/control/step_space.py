@@ -14,7 +14,7 @@ from vla_zenoh.control.actions import covered_step, step_joints
 from vla_zenoh.control.commander_io import StateHistory
 from vla_zenoh.control.joint_space import JointBounds
 from vla_zenoh.control.limits import BoundedStep, LimitHit, bound_step, full_speed_s
-from vla_zenoh.control.plan_timeline import ChunkPlan, Goal, JointGoal, joint_goal
+from vla_zenoh.control.plan_timeline import Goal, JointGoal, joint_goal
 from vla_zenoh.control.policy_check import ROUNDING, Rejection
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.errors import RecordError
@@ -70,12 +70,14 @@ class PoseSteps:
         """Why targets are too far away to be intended, besides what `validate_steps` finds."""
         return None
 
-    def asked(self, plan: ChunkPlan, width_m: float) -> Goal:
-        """The end of the next step of `plan` as its numbers say, with a gripper width."""
-        start, numbers = plan.step_start, plan.steps[plan.bounded]
-        pose, response = covered_step(
-            plan.action, numbers, start.pose, plan.base.pose, start.response
-        )
+    def asked(
+        self, action: ActionSpec, numbers: FloatArray, start: Goal, base: Goal, width_m: float
+    ) -> Goal:
+        """The end of a step from `start` as its numbers say, with a gripper width.
+
+        `base`: W_0 of its plan.
+        """
+        pose, response = covered_step(action, numbers, start.pose, base.pose, start.response)
         return Goal(pose, width_m, response=response)
 
     def way(self, start: Goal, end: Goal) -> tuple[float, float, float]:
@@ -83,9 +85,11 @@ class PoseSteps:
         far_m, far_rad = pose_distance(start.pose, end.pose)
         return far_m, far_rad, full_speed_s(self._limits, start.pose, end.pose)
 
-    def within_step(self, plan: ChunkPlan, asked: Goal) -> tuple[Goal, list[LimitHit]]:
-        """`asked` within the limits of one step, and the limits that acted."""
-        pose, hits = bound_step(self._limits, plan.step_start.pose, asked.pose)
+    def within_step(
+        self, action: ActionSpec, start: Goal, asked: Goal
+    ) -> tuple[Goal, list[LimitHit]]:
+        """`asked` within the limits of one step from `start`, and the limits that acted."""
+        pose, hits = bound_step(self._limits, start.pose, asked.pose)
         return replace(asked, pose=pose), hits
 
     def search(self, start: Goal, end: Goal, dt_s: float) -> Search | None:
@@ -144,10 +148,11 @@ class JointSteps:
             return None
         return self._bounds.far_out_of_range(action, steps, self.origin(base).joints_rad)
 
-    def asked(self, plan: ChunkPlan, width_m: float) -> Goal:
-        start_rad = self.origin(plan.step_start).joints_rad
-        base_rad = self.origin(plan.base).joints_rad
-        asked_rad = step_joints(plan.action, plan.steps[plan.bounded], start_rad, base_rad)
+    def asked(
+        self, action: ActionSpec, numbers: FloatArray, start: Goal, base: Goal, width_m: float
+    ) -> Goal:
+        start_rad, base_rad = self.origin(start).joints_rad, self.origin(base).joints_rad
+        asked_rad = step_joints(action, numbers, start_rad, base_rad)
         return joint_goal(self._bounds.kinematics, asked_rad, width_m)
 
     def way(self, start: Goal, end: Goal) -> tuple[float, float, float]:
@@ -156,11 +161,12 @@ class JointSteps:
         full_s = self._bounds.full_speed_s(start_rad, way_rad)
         return *self._bounds.ways(start_rad, way_rad), full_s
 
-    def within_step(self, plan: ChunkPlan, asked: Goal) -> tuple[Goal, list[LimitHit]]:
+    def within_step(
+        self, action: ActionSpec, start: Goal, asked: Goal
+    ) -> tuple[Goal, list[LimitHit]]:
         """One that is a target has been shortened on the approach to it."""
-        if plan.action.targets:
+        if action.targets:
             return asked, []
-        start = plan.step_start
         far_m, far_rad, _ = self.way(start, asked)
         limits = self._bounds.limits
         part, hits = 1.0, list[LimitHit]()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from vla_zenoh.control.contact import Contact
-from vla_zenoh.control.monitor import Brake, Monitor, Seen
+from vla_zenoh.control.monitor import Brake, Monitor, PartSnapshot
 from vla_zenoh.control.state_monitor import StateMonitor
 from vla_zenoh.kinematics.so3 import Pose, pose_distance
 from vla_zenoh.profile import Limits
@@ -51,8 +51,8 @@ class TrackingMonitor(Monitor):
         if commanded is not None:
             self.apart_m, self.apart_rad = pose_distance(commanded, actual)
 
-    def check(self, seen: Seen) -> Brake | None:
-        if seen.commanded is None or not seen.published:
+    def check(self, part: PartSnapshot) -> Brake | None:
+        if part.commanded is None or not part.published:
             return None
         why = self._blocked()
         if not why:
@@ -84,5 +84,5 @@ class TrackingMonitor(Monitor):
 class FollowMonitor(Monitor):
     """A motion that waits for its joints and will not reach its goal."""
 
-    def check(self, seen: Seen) -> Brake | None:
-        return Brake(seen.stuck) if seen.stuck else None
+    def check(self, part: PartSnapshot) -> Brake | None:
+        return Brake(part.stuck) if part.stuck else None

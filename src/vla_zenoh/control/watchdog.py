@@ -7,7 +7,7 @@ from collections.abc import Set as AbstractSet
 import numpy as np
 
 from vla_zenoh.control.limits import LimitHit, Slowdown, in_steps, joint_margins, slowest
-from vla_zenoh.control.monitor import Brake, Monitor, Seen, too_near
+from vla_zenoh.control.monitor import Brake, Monitor, PartSnapshot, too_near
 from vla_zenoh.control.plan_timeline import FOREVER_NS
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.keys import NO_DEADMAN_TOKEN, worker_node
@@ -98,13 +98,13 @@ class Watchdog:
         return now_ns > self._chunk.at_ns + int(self._timing.max_hold_s * 1e9)
 
 
-class PeerMonitor(Monitor):
+class NodeMonitor(Monitor):
     """The nodes and cameras that an activation depends on."""
 
-    def check(self, seen: Seen) -> Brake | None:
-        assert seen.lease is not None
-        peers, cameras = seen.peers, seen.lease.spec.observation.camera_names
-        needed = [peers.robot_node, worker_node(seen.worker)]
+    def check(self, part: PartSnapshot) -> Brake | None:
+        assert part.lease is not None
+        peers, cameras = part.peers, part.lease.spec.observation.camera_names
+        needed = [peers.robot_node, worker_node(part.worker)]
         needed += [peers.camera_nodes.get(camera, "camera") for camera in cameras]
         for node in needed:
             if node not in peers.alive:
@@ -112,8 +112,8 @@ class PeerMonitor(Monitor):
         for camera in cameras:
             if camera in peers.camera_faults:
                 return Brake(f"camera {camera!r} {peers.camera_faults[camera]}")
-        if peers.spec_sources.get(seen.worker) != seen.lease.source:
-            return Brake(f"worker {seen.worker!r} was restarted")
+        if peers.spec_sources.get(part.worker) != part.lease.source:
+            return Brake(f"worker {part.worker!r} was restarted")
         return None
 
 
@@ -170,11 +170,11 @@ class JointMonitor(Monitor):
     def begin(self) -> None:
         self.reset()
 
-    def check(self, seen: Seen) -> Brake | None:
-        if seen.measured_rad is None or seen.commanded is None:
+    def check(self, part: PartSnapshot) -> Brake | None:
+        if part.measured_rad is None or part.commanded is None:
             return None
         hit = self.update(
-            seen.measured_rad, seen.commanded_rad, seen.now_ns, in_joints=seen.in_joints
+            part.measured_rad, part.commanded_rad, part.now_ns, in_joints=part.in_joints
         )
         return None if hit is None else too_near(hit)
 
