@@ -14,7 +14,6 @@ from vla_zenoh.control.monitor import Brake, Monitor, PartSnapshot
 from vla_zenoh.control.motion_pipeline import MotionPipeline
 from vla_zenoh.control.policy_check import Lease
 from vla_zenoh.control.preflight import (
-    CLOCK_TOLERANCE_S,
     PeerSnapshot,
     reasons_by_joints,
     why_not_ready,
@@ -42,8 +41,6 @@ from vla_zenoh.types import (
     Stamped,
 )
 
-FUTURE_NS = round(CLOCK_TOLERANCE_S * 1e9)
-"""A pose that is stamped later than it arrived by more than this says nothing about the past."""
 LET_GO_M = 0.01
 """A gripper that opens by more than this lets go of what it holds."""
 SAME_WIDTH_M = 0.005
@@ -127,11 +124,11 @@ class CommandedPart:
         """Take the newest states."""
         if states.pose is not None:
             self.pose = states.pose
-            self.planner.poses.add(states.pose, FUTURE_NS)
+            self.planner.poses.add(states.pose)
             self.contact.update_pose(states.pose)
         if states.joint is not None:
             self.joint = states.joint
-            self.planner.joints.add(states.joint, FUTURE_NS)
+            self.planner.joints.add(states.joint)
             self.contact.update_joints(states.joint)
         self.states.update(states)
         if states.pose is not None and self.states.actual is not None:

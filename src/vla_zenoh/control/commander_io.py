@@ -12,7 +12,7 @@ from typing import Generic, NamedTuple, TypeVar
 
 from vla_zenoh.control.limits import APPROACH, LimitHit
 from vla_zenoh.control.policy_check import Rejection
-from vla_zenoh.control.preflight import PeerSnapshot
+from vla_zenoh.control.preflight import CLOCK_TOLERANCE_S, PeerSnapshot
 from vla_zenoh.types import (
     MAX_TEXT,
     ActionChunk,
@@ -73,15 +73,13 @@ class StateHistory(Generic[Measured]):
         if measured is not None:
             self._states.append((measured.header.stamp_wall_ns, measured.record))
 
-    def add(self, measured: Stamped[Measured], tolerance_ns: int) -> None:
+    def add(self, measured: Stamped[Measured]) -> None:
         """Add a state; if time goes back, a clock was set, and only this state is kept.
 
-        Args:
-            measured: with the time of its measurement.
-            tolerance_ns: the stamp may be later than the arrival by this at most.
+        One that is stamped later than it arrived, by more than `CLOCK_TOLERANCE_S`, is not kept.
         """
         stamp_ns = measured.header.stamp_wall_ns
-        if stamp_ns > measured.received_ns + tolerance_ns:
+        if stamp_ns - measured.received_ns > CLOCK_TOLERANCE_S * 1e9:
             return
         last_ns = self._states[-1][0] if self._states else -1
         if stamp_ns < last_ns:

@@ -66,7 +66,7 @@ CHECK_TICKS = 4
 ROOM = np.array([[0.95], [0.8], [0.8]])
 """Parts of the TCP's velocity, acceleration and jerk that a straight motion is planned with."""
 BEND = 0.5
-"""Part of the acceleration that the curve of the TCP may take."""
+"""Part of the acceleration that a curve may take, of the TCP or in joint space."""
 NOTHING = 1e-9
 """A shorter displacement has no direction."""
 PEEK_RAD = 1e-4

@@ -10,7 +10,7 @@ the first bit of the way towards their goals is free, for one arm alone and for 
 Arms that begin too near to each other may only move apart.
 
 That is computed for the commanded joints. The measured ones are monitored as in `JointMonitor`:
-arms that are nearer than the stop by more than `PAST_M`, and come nearer, have to brake.
+arms that are nearer than the stop by more than `PAST`, and come nearer, have to brake.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import numpy as np
 
 from vla_zenoh.control.commanded_part import CommandedPart
 from vla_zenoh.control.limits import LimitHit, Slowdown, between, in_steps
-from vla_zenoh.control.watchdog import BAND_M, PAST_M, PERIOD_NS
+from vla_zenoh.control.watchdog import BAND, PAST, PERIOD_NS
 from vla_zenoh.kinematics.collision import Nearest, PlacedArm
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray
@@ -170,10 +170,10 @@ class PartSpacing:
         if len(measured_rad) < len(found):
             return None
         begins = now_ns - self._monitor_ns > 2 * PERIOD_NS
-        self._monitor_ns, within_m = now_ns + PERIOD_NS, self._stop_m - PAST_M
+        self._monitor_ns, within_m = now_ns + PERIOD_NS, self._stop_m - PAST
         near = self._nearest(measured_rad, within_m)
         before_m = near.distance_m if begins else self._edge_m
-        self._edge_m = min(max(before_m, near.distance_m), near.distance_m + BAND_M)
+        self._edge_m = min(max(before_m, near.distance_m), near.distance_m + BAND)
         if near.distance_m >= within_m or self._edge_m >= before_m:
             return None
         return LimitHit(NAME, near.distance_m, self._stop_m, where=str(near))

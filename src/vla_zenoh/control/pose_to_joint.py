@@ -20,7 +20,7 @@ from vla_zenoh.control.joint_follower import (
     JointFollower,
     JointMotion,
 )
-from vla_zenoh.control.joint_space import followed_shares
+from vla_zenoh.control.joint_space import BEND, CHECK_TICKS, followed_shares
 from vla_zenoh.control.limits import (
     FULL,
     Shares,
@@ -52,18 +52,14 @@ NEAR_M, NEAR_RAD = 0.002, 0.01
 FAR = 5.0
 """At this multiple of that distance the pose waits for them."""
 SLOWEST = 1e-3
-"""Least pace: a standing pose cannot be planned with."""
+"""Least share of the speed: a pose that stands cannot be planned with."""
 ROOM = (0.95, 0.9, 0.9)
 """Parts of the joints' velocity, acceleration and jerk used for planning: the path is curved in
 joint space, and the elbow moves as well."""
-BEND = 0.5
-"""Part of the acceleration that the curvature of the path in joint space may take."""
 PLACES = 3
 """Places of a path at which the joints are computed."""
 BRAKE_BEND = 0.15
-"""The same for a brake, whose curvature effect falls with its speed."""
-CONSTRAINT_TICKS = 4
-"""Ticks between updates of the distance constraints."""
+"""`BEND` of a brake, whose curvature effect falls with its speed."""
 BRAKE_S = 0.1
 """A brake covers about the distance that the arm moves in this time."""
 CREEPING, STUCK_S = 0.05, 0.5
@@ -197,7 +193,7 @@ class PoseToJoint:
         """
         here = self._kinematics.forward(self._now.position_rad)
         lag = self._lag(here, smoother.motion.pose)
-        if self._ticks % CONSTRAINT_TICKS == 0:
+        if self._ticks % CHECK_TICKS == 0:
             self._constraints.update(self._now.position_rad)
         self._ticks += 1
         # Held joints approach a standing pose for as long as it takes.

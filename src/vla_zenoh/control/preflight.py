@@ -31,7 +31,7 @@ FIRST_REAL_NS = 10**18
 JOINT_PATIENCE_S = 0.1
 """Beside ``state_timeout_s``: some robots report joints less often than poses."""
 SAME_TCP_M, SAME_TCP_RAD = 0.005, 0.02
-"""Largest difference of the TCP by kinematics from the TCP that the robot reports."""
+"""Two measurements of one TCP differ by this at most."""
 HELD_RAD = 0.1
 """Largest distance of a joint from where its controller holds it."""
 SETTLED, SETTLED_NS = 5e-4, 100_000_000

@@ -31,6 +31,7 @@ from vla_zenoh.control.commander_io import make_event
 from vla_zenoh.control.joint_space import JointPath
 from vla_zenoh.control.limits import APPROACH, FULL, Shares, Slowdown, slowest
 from vla_zenoh.control.plan_timeline import Goal, Plan
+from vla_zenoh.control.pose_to_joint import SLOWEST
 from vla_zenoh.control.smoothing import PosePath
 from vla_zenoh.types import Event, FloatArray
 
@@ -44,8 +45,6 @@ CHANGE = 0.4
 """Part of the change to the wanted speed that a moving arm makes at each goal."""
 MOVING = 0.85
 """Part of the wanted speed above which it does so; a slower arm takes all of it."""
-SLOWEST = 1e-3
-"""Least share of the velocity limits."""
 SOON_NS = 1_000_000
 """A goal that is overdue has this much time: the share is that of full speed then."""
 MARGIN_NS = 10_000_000

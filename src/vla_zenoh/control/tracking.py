@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from vla_zenoh.control.contact import Contact
 from vla_zenoh.control.monitor import Brake, Monitor, PartSnapshot
+from vla_zenoh.control.preflight import SAME_TCP_M, SAME_TCP_RAD
 from vla_zenoh.control.state_monitor import StateMonitor
 from vla_zenoh.kinematics.so3 import Pose, pose_distance
 from vla_zenoh.profile import Limits
-
-BACK_OFF_M, BACK_OFF_RAD = 0.005, 0.02
-"""A blocked arm that comes back counts as blocked again if it strays by this much more."""
 
 
 class TrackingMonitor(Monitor):
@@ -33,7 +31,8 @@ class TrackingMonitor(Monitor):
         self._states = states
         self.apart_m = self.apart_rad = 0.0
         self._excused = (0.0, 0.0)
-        """Distance of an arm that was blocked when it was activated: it may come back."""
+        """Distance of an arm that was blocked when it was activated: it may
+        come back, and stray by what two measurements of one TCP may differ."""
 
     def excuse(self, held: Pose, actual: Pose) -> bool:
         """Start an activation; returns whether the arm is far from its controller's set-point.
@@ -66,11 +65,11 @@ class TrackingMonitor(Monitor):
         """Why the arm counts as blocked, empty while it follows."""
         limits = self._limits
         excused_m, excused_rad = self._excused
-        for apart, limit, excused, back_off, unit in (
-            (self.apart_m, limits.tracking_m, excused_m, BACK_OFF_M, "m"),
-            (self.apart_rad, limits.tracking_rad, excused_rad, BACK_OFF_RAD, "rad"),
+        for apart, limit, excused, same, unit in (
+            (self.apart_m, limits.tracking_m, excused_m, SAME_TCP_M, "m"),
+            (self.apart_rad, limits.tracking_rad, excused_rad, SAME_TCP_RAD, "rad"),
         ):
-            allowed = max(limit, excused + back_off if excused else 0.0)
+            allowed = max(limit, excused + same if excused else 0.0)
             if apart > allowed:
                 return (
                     f"the arm does not follow: {apart:.3f} {unit} from its command, "

@@ -18,12 +18,13 @@ FIRST_CHUNK_PATIENCE_S = 1.0
 """Extra time for the first chunk after activation: it needs an observation and an inference."""
 PERIOD_NS = 30_000_000
 """Between two checks of the same measured values: noise has to be seen apart from motion."""
-PAST_M, PAST_SINGULAR = 0.005, 0.005
-"""The measured arm brakes this far past a stop: goals end at the stop, and the arm lags."""
+PAST = 0.005
+"""The measured arm brakes this far past a stop, in m or of the singular value: goals end at the
+stop, and the arm lags."""
 PAST_MARGIN = 0.5
 """Part of ``joint_margin_rad``."""
-BAND_RAD, BAND_M, BAND_SINGULAR = 2e-3, 5e-4, 5e-4
-"""Width of the band that follows a value: wider than noise, narrower than `PAST_M`."""
+BAND_RAD, BAND = 2e-3, 5e-4
+"""Width of the band that follows a value: wider than noise, narrower than `PAST`."""
 
 
 class Deadline:
@@ -142,13 +143,12 @@ class JointMonitor(Monitor):
         barriers, slides = reach.barriers, reach.kinematics.slides
         limits = profile.limits
         self._elbow_limits = np.where(slides, limits.tracking_m, limits.elbow_rad)
-        margins, distances = joint_margins(limits.reach, reach.kinematics), len(barriers.stop) - 1
+        margins = joint_margins(limits.reach, reach.kinematics)
         self._stop = np.concatenate([margins, barriers.stop])
         self._slow = np.concatenate([2 * margins, barriers.slow])
-        past_m, band_m = [PAST_M] * distances, [BAND_M] * distances
-        band = np.where(slides, BAND_M, BAND_RAD)
-        self._past = np.concatenate([PAST_MARGIN * margins, [PAST_SINGULAR], past_m])
-        self._band = np.concatenate([band, [BAND_SINGULAR], band_m])
+        others = np.ones(len(barriers.stop))
+        self._past = np.concatenate([PAST_MARGIN * margins, PAST * others])
+        self._band = np.concatenate([np.where(slides, BAND, BAND_RAD), BAND * others])
         self.reset()
 
     def reset(self) -> None:

@@ -385,7 +385,7 @@ def test_a_pose_from_the_future_says_nothing_about_the_past() -> None:
     pose = rig.pose_state()
     history.restart(pose)
     ahead_ns = pose.received_ns + 1_000_000_000
-    history.add(replace(pose, header=replace(pose.header, stamp_wall_ns=ahead_ns)), 20_000_000)
+    history.add(replace(pose, header=replace(pose.header, stamp_wall_ns=ahead_ns)))
     assert history.around(ahead_ns, 20_000_000) is None
 
 
