@@ -271,8 +271,7 @@ class JointPath(AxisSmoother):
 
         A part of the way between two joints inside the box may be outside, and so may their mean.
         """
-        assert goal.joints_rad is not None
-        here_rad, goal_rad = self.state.position, goal.joints_rad
+        here_rad, goal_rad = self.state.position, goal.known_rad
         from_rad = here_rad + ahead_s * self.state.velocity
         hits: list[LimitHit] = []
         leashes = self._bounds.leashes
@@ -316,9 +315,8 @@ class JointPath(AxisSmoother):
 
     def go_to(self, goal: Goal, shares: Shares = FULL, *, all_to_stop: bool = False) -> bool:
         """Move to the joints of `goal`, or as near as the bounds allow; see `move_to`."""
-        assert goal.joints_rad is not None
         self._asked, self._held = (goal, shares, all_to_stop), False
-        here_rad, end_rad = self.state.position, goal.joints_rad
+        here_rad, end_rad = self.state.position, goal.known_rad
         hit = self._bounds.ahead_hit(here_rad, end_rad)
         if hit is not None:
             self._hits.append(hit)
@@ -372,9 +370,8 @@ class JointPath(AxisSmoother):
     def _go_on(self) -> None:
         """Continue after a brake before a bound, if the straight way to the goal is free."""
         goal, shares, all_to_stop = self._asked
-        assert goal.joints_rad is not None
         self._held = False
-        if self._bounds.ahead_hit(self.state.position, goal.joints_rad) is None:
+        if self._bounds.ahead_hit(self.state.position, goal.known_rad) is None:
             self.go_to(goal, shares, all_to_stop=all_to_stop)
 
     def _stop_hit(self) -> LimitHit | None:
@@ -440,8 +437,7 @@ class JointPath(AxisSmoother):
 
     def way_to(self, goal: Goal) -> FloatArray:
         """(n,) from the commanded joints to those of `goal`."""
-        assert goal.joints_rad is not None
-        return goal.joints_rad - self.state.position
+        return goal.known_rad - self.state.position
 
     def axis_rates(self) -> tuple[FloatArray, FloatArray]:
         """(n,) velocity and acceleration of the joints."""

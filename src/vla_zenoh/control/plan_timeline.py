@@ -111,6 +111,12 @@ class Goal:
     slowdown: Slowdown | None = None
     response: Response | None = None
 
+    @property
+    def known_rad(self) -> FloatArray:
+        """(n,) its joints, where they are known."""
+        assert self.joints_rad is not None
+        return self.joints_rad
+
     def between(self, coming: Goal, share: float, dt_s: float = 0.0) -> Goal:
         """The goal after `share` of a step of `dt_s` to `coming`, in the space asked for there."""
         return coming.reached_from(self, share, dt_s)
@@ -151,9 +157,7 @@ class JointGoal(Goal):
         return joint_goal(self.arm, start.joints_rad + share * way_rad, width_m)
 
     def shifted(self, old: Goal, new: Goal, limits: Limits) -> Goal:
-        assert old.joints_rad is not None
-        assert new.joints_rad is not None
-        way_rad = new.joints_rad - old.joints_rad
+        way_rad = new.known_rad - old.known_rad
         return joint_goal(self.arm, self.joints_rad + way_rad, self.width_m)
 
     def mean(self, goals: Sequence[Goal], weights: FloatArray) -> Goal:
