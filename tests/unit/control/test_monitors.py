@@ -130,6 +130,25 @@ def test_a_wrench_that_stays_the_same_while_the_arm_moves_is_not_measured() -> N
     assert "no longer measures contact_force" in contact.lost
 
 
+class Felt(Rig):
+    """An arm with a sensor of forces."""
+
+    wrench: FloatArray | None = np.zeros(6)
+
+    def pose_state(self) -> Stamped[PoseState]:
+        state = super().pose_state()
+        return replace(state, record=replace(state.record, wrench=self.wrench))
+
+
+def test_a_load_that_is_no_longer_measured_ends_the_activation() -> None:
+    rig = Felt()
+    rig.activate()
+    rig.wrench = None
+    rig.tick()
+    assert rig.state == "inactive"
+    assert "no longer measures contact_force" in rig.commander.why
+
+
 # -- poses against joints -----------------------------------------------------------------------
 @pytest.mark.parametrize("command", ["pose", "joint"])
 @pytest.mark.parametrize("jump_m", JUMPS_M)
