@@ -18,9 +18,10 @@ REASONS = {
         *("_robot", "reasons_of_part", "_too_old", "_worker", "_chunk", "_cameras", "_clocks"),
         *("unsettled", "why_not_ready", "state_lost"),
     },
-    "control/commanded_part.py": {"reasons_against"},
+    "control/commanded_part.py": {"reasons_by_worker"},
+    "control/state_monitor.py": {"reasons"},
     "control/watchdog.py": {"reasons_against"},
-    "control/contact.py": {"missing"},
+    "control/contact.py": {"missing", "reasons"},
     "control/commander.py": {"_activate", "_preflight", "_ended_before"},
 }
 """File -> functions that give reasons against an activation."""
