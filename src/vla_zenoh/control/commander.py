@@ -198,7 +198,10 @@ class Commander:
             self._awaited = None
         if stops:
             self._change(Trigger.STOP, "emergency stop")
-            self._stop_put_ns, self._stop_came_ns = max(stop.put_ns or 0 for stop in stops), now_ns
+            put_ns = max(stop.put_ns or 0 for stop in stops)
+            if 0 <= now_ns - self._stop_came_ns < LATE_NS:  # it may be the older one
+                put_ns = max(put_ns, self._stop_put_ns)
+            self._stop_put_ns, self._stop_came_ns = put_ns, now_ns
         for setting in settings:
             try:
                 self._set(setting, now_ns, stopped=bool(stops))
@@ -221,7 +224,9 @@ class Commander:
             if value != self.task.worker:
                 self._change_worker(value, now_ns)
         elif name == "rate" and isinstance(value, (int, float)):
+            before_hz = self.task.rate_hz
             self.task = replace(self.task, rate_hz=value)
+            self._watchdog.rate_changed(now_ns, before_hz, self.task)
         elif name in ("speed", "slower") and isinstance(value, (int, float)):
             if name == "slower" and value > self.task.speed_percent:
                 now = f"the {self.task.speed_percent:g} % in force"
@@ -238,7 +243,10 @@ class Commander:
             self._change(Trigger.DEACTIVATE, DEACTIVATED)
         elif name == "held":
             box = value if isinstance(value, HeldBox) else None
-            self._hold(next(part for part in self.parts if part.name == of_part), box)
+            parts = {part.name: part for part in self.parts}
+            if of_part not in parts:
+                raise RecordError(f"no part {of_part!r}; known: {', '.join(parts) or 'none'}")
+            self._hold(parts[of_part], box)
         elif name == "reset":
             grippers = [part.gripper_state.record for part in self.parts if part.gripper_state]
             faults = [fault for gripper in grippers for fault in gripper.faults]
@@ -246,6 +254,8 @@ class Commander:
                 raise RecordError(f"the robot still reports: {'; '.join(faults)}")
             self._change(Trigger.RESET, "reset")
         elif name == "lose":
+            for part in self.parts:
+                part.retreat.end()
             self._change(Trigger.LOSE, str(value))
         elif name != "stop":
             raise RecordError(f"{name!r} cannot be set to {value!r}")

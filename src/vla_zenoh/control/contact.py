@@ -52,6 +52,9 @@ QUIET = 0.2
 
 STEP_M = 0.005
 """A retreat looks at the load after each of these: longer ones go back further than needed."""
+RISE = 0.1
+"""A retreat ends where a load is above its stop and rose by this part of it since the last step:
+something is behind the arm. Less: a sensor's noise ends it."""
 RELIEF_M = 0.02
 """As far as an arm of 2000 N/m is pressed into what stops it at 40 N."""
 SETTLE_NS = 50_000_000
@@ -267,6 +270,11 @@ class Contact(Monitor):
         return self._torque.value if self._torque.known else None
 
     @property
+    def pressing(self) -> float:
+        """The greatest load as a part of its stop."""
+        return max((load.most / load.stop for load in self._measured), default=0.0)
+
+    @property
     def quiet(self) -> bool:
         """No contact, as far as the robot measures it."""
         return all(load.value <= QUIET * load.slow for load in self._measured)
@@ -362,6 +370,8 @@ class Retreat:
         self._target: Pose | None = None
         self._ahead: list[Pose] = []
         self._until_ns = self._rest_ns = 0
+        self._pressing = 0.0
+        """The load when its last step began."""
 
     @property
     def busy(self) -> bool:
@@ -394,6 +404,9 @@ class Retreat:
         begun, measured = self._begun, self._measured
         if begun is None or measured is None:
             return None, None
+        rises = self._contact.pressing > max(1.0, self._pressing + RISE)
+        if self._target is not None and rises:
+            return self._finish("something behind it presses")
         if not at_rest:
             self._rest_ns = now_ns
             if self._target is not None and now_ns > self._until_ns:
@@ -408,6 +421,7 @@ class Retreat:
             return self._finish("it stands")
         if not self._ahead or now_ns > self._until_ns:
             return self._finish("something still presses" if known else "it stands")
+        self._pressing = self._contact.pressing
         target, step_m = self._target, STEP_M if known else RELIEF_M
         start = _place(target)
         while self._ahead:
@@ -445,6 +459,7 @@ class Retreat:
         way_s = (apart_m + on_m + RELIEF_M) / speed_m_s + apart_rad / speed_rad_s
         self._until_ns = now_ns + round(2e9 * way_s) + SPARE_NS
         self._rest_ns = now_ns
+        self._pressing = self._contact.pressing
         self._target = measured
         return measured, None
 

@@ -302,7 +302,8 @@ class JointPath(AxisSmoother):
         share = HELD_LEAD_RAD / max(float(np.abs(way_rad).max()), HELD_LEAD_RAD)
         if share >= 1.0:
             return goal
-        return joint_goal(self.kinematics, self.state.position + share * way_rad, goal.width_m)
+        nearer_rad = self.state.position + share * way_rad
+        return joint_goal(self.kinematics, nearer_rad, goal.width_m, goal.slowdown)
 
     def resting_goal(self, _: Pose, width_m: float) -> Goal:
         """Brake; where that ends."""

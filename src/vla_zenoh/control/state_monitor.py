@@ -57,7 +57,9 @@ class StateMonitor(Monitor):
         self.actual: Pose | None = None
         self._pose: Stamped[PoseState] | None = None
         self._jumped = ""
-        """Why the measured pose may be false, until joints confirm it."""
+        """Why the measured pose may be false, until joints confirm it, or without joints a pose
+        near the one before the jump."""
+        self._before_jump: Pose | None = None
         self._contradiction = ""
         """Why the measured pose or the joints are false."""
         self._contradicts_ns = 0
@@ -77,10 +79,20 @@ class StateMonitor(Monitor):
             actual = pose_of(states.pose.record)
             if self._pose is not None and self.actual is not None:
                 elapsed_ns = states.pose.header.stamp_wall_ns - self._pose.header.stamp_wall_ns
-                self._jumped = self._jump(actual, self.actual, elapsed_ns) or self._jumped
+                jumped = self._jump(actual, self.actual, elapsed_ns)
+                if jumped and not self._jumped:
+                    self._before_jump = self.actual
+                self._jumped = jumped or self._jumped
+                if self._arm is None and self._is_back(actual):
+                    self._jumped, self._before_jump = "", None
             self._pose, self.actual = states.pose, actual
         if states.joint is not None:
             self._compare(states.joint)
+
+    def _is_back(self, actual: Pose) -> bool:
+        """Whether a pose is where the arm was before the jump: that was a single false one."""
+        before = self._before_jump
+        return before is not None and not self._too_far(actual, before, 0.0)
 
     def _jump(self, actual: Pose, before: Pose, elapsed_ns: int) -> str:
         """Why a reported pose cannot follow the one `before`, empty if an arm can move so."""

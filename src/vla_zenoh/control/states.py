@@ -1,6 +1,7 @@
-"""States of the command node, and what the motion does in each of them: all of it as tables.
+"""States of the command node, and what the motion may do in each of them, as tables.
 
-What changes the state, and what the arm may do then, is here and nowhere else.
+Every change of the state goes by `TABLE`. `motion_pipeline.py` chooses the mode of a motion; the
+tests hold it to `MODES` in every tick.
 """
 
 from __future__ import annotations

@@ -42,12 +42,16 @@ class Deadline:
             left_ns = left_ns / speed if left_ns > 0 else left_ns
             self.at_ns = now_ns + round(left_ns) + self._patience_ns
 
-    def override_changed(self, now_ns: int, before: float, speed: float) -> None:
-        """Keep the plan time that is left, of an override that was `before`."""
-        if before:
-            left_ns = self.at_ns - self._patience_ns - now_ns
-            self._left_ns = left_ns * before if left_ns > 0 else left_ns
-        self.set(self._left_ns, self._patience_ns / 1e9, now_ns, speed)
+    def left_ns(self, now_ns: int, speed: float) -> float:
+        """Plan time that is left at override `speed`; below 0: time since it passed."""
+        if not speed:
+            return self._left_ns
+        left_ns = self.at_ns - self._patience_ns - now_ns
+        return left_ns * speed if left_ns > 0 else left_ns
+
+    def move(self, left_ns: float, now_ns: int, speed: float) -> None:
+        """Set it to `left_ns` of plan time from now, with the same patience."""
+        self.set(left_ns, self._patience_ns / 1e9, now_ns, speed)
 
 
 class Watchdog:
@@ -75,8 +79,18 @@ class Watchdog:
 
     def override_changed(self, now_ns: int, before: float, speed: float) -> None:
         """Keep the plan time that is left until the deadlines, of an override that was `before`."""
-        self._chunk.override_changed(now_ns, before, speed)
-        self._motion.override_changed(now_ns, before, speed)
+        for deadline in (self._chunk, self._motion):
+            deadline.move(deadline.left_ns(now_ns, before), now_ns, speed)
+
+    def rate_changed(self, now_ns: int, before_hz: float, task: Task) -> None:
+        """The next chunk is due by the rate of `task`, which was `before_hz`.
+
+        At a lower rate later by what the period is longer, at a higher one within a period.
+        """
+        period_ns, left_ns = 1e9 / task.rate_hz, self._chunk.left_ns(now_ns, task.speed)
+        later_ns = period_ns - 1e9 / before_hz
+        left_ns = left_ns + later_ns if later_ns > 0 else min(left_ns, period_ns)
+        self._chunk.move(left_ns, now_ns, task.speed)
 
     @property
     def deadline_ns(self) -> int:
@@ -209,12 +223,11 @@ class JointMonitor(Monitor):
         kinematics, barriers = self._reach.kinematics, self._reach.barriers
         ends = np.minimum(measured_rad - kinematics.lower_rad, kinematics.upper_rad - measured_rad)
         left = barriers.at(measured_rad, kinematics.jacobian(measured_rad))
-        if in_joints:
-            left[0] = np.inf
         left = np.concatenate([ends - self._stop[: len(ends)], left])
         before = left if self._edge is None else self._edge
         self._edge = np.minimum(np.maximum(before, left), left + self._band)
         nearer = self._edge < before
+        nearer[len(ends)] &= not in_joints  # the singular value comes first after the joints' ends
         past = np.where(nearer, left + self._past, 1.0)
         worst = int(np.argmin(past))
         if past[worst] < 0:
@@ -234,9 +247,10 @@ class JointMonitor(Monitor):
         if expected_rad is None:
             start_rad = measured_rad if self._expected_rad is None else self._expected_rad
             pose = self._reach.kinematics.forward(measured_rad)
-            expected_rad = self._expected_rad = self._reach.solve(pose, start_rad)
-        if expected_rad is None:
-            return None
+            expected_rad = self._reach.solve(pose, start_rad)
+            if expected_rad is None:
+                return None  # the next solution starts where the last one was
+            self._expected_rad = expected_rad
         apart_rad = np.abs(measured_rad - expected_rad)
         worst = int(np.argmax(apart_rad / self._elbow_limits))
         self.elbow_rad, limit_rad = float(apart_rad[worst]), float(self._elbow_limits[worst])

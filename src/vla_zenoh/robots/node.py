@@ -72,7 +72,7 @@ class RobotNode:
         keys = node.keys
         self._stops = node.subscribe(keys.stop, CallbackRing(HEARD, MAX_MESSAGE_BYTES))
         self._resets = node.subscribe(keys.reset, CallbackRing(HEARD, MAX_MESSAGE_BYTES))
-        self._stopped_at: ReceivedSample | None = None
+        self._stop_put_ns = self._stop_came_ns = 0
         self._latch = EstopLatch(latch)
         if self._latch.read() is not None:
             for arm in self.arms.values():
@@ -174,7 +174,10 @@ class RobotNode:
     def _hear_stop(self) -> None:
         stops, resets = self._stops.drain(), self._resets.drain()
         for stop in stops:
-            self._stopped_at = stop
+            put_ns = stop.put_ns or 0
+            if stop.mono_ns - self._stop_came_ns < LATE_NS:  # it may be older, of a slow client
+                put_ns = max(put_ns, self._stop_put_ns)
+            self._stop_put_ns, self._stop_came_ns = put_ns, stop.mono_ns
         if stops:
             for arm in self.arms.values():
                 arm.latch_stop()
@@ -192,10 +195,8 @@ class RobotNode:
 
     def _overtaken(self, reset: ReceivedSample) -> bool:
         """Whether a reset was put before the last stop, which arrived first."""
-        stop = self._stopped_at
-        if stop is None or stop.put_ns is None or reset.put_ns is None:
-            return False
-        return reset.put_ns <= stop.put_ns and reset.mono_ns - stop.mono_ns < LATE_NS
+        late = reset.mono_ns - self._stop_came_ns < LATE_NS
+        return late and reset.put_ns is not None and reset.put_ns <= self._stop_put_ns
 
     # -- the last brake -----------------------------------------------------------------------
     def _may_end(self, mono_ns: int) -> bool:

@@ -1114,6 +1114,57 @@ def test_what_was_put_before_a_stop_and_arrives_after_it_is_rejected() -> None:
     assert rig.state == "inactive"
 
 
+@pytest.mark.parametrize("older_ns", [500, None])
+def test_a_stop_that_was_put_earlier_and_arrives_later_lets_nothing_older_pass(
+    older_ns: int | None,
+) -> None:
+    rig = Rig()
+    rig.activate()
+    rig.tick(Setting("stop", put_ns=1_000))
+    rig.run(0.05)
+    rig.tick(Setting("stop", put_ns=older_ns))
+    for name, value in (("reset", None), ("active", True)):
+        rig.tick(Setting(name, value, put_ns=700))
+        assert rig.state == "stopped"
+    rig.tick(Setting("reset", put_ns=1_100))
+    assert rig.state == "inactive"
+
+
+def test_a_slower_rate_moves_the_time_at_which_the_next_chunk_is_due() -> None:
+    rig = Rig()
+    rig.activate()
+    for _ in range(5):
+        rig.send([[0.001, 0, 0, 0, 0, 0, 0]])
+        rig.run(0.2)
+    rig.put("rate", 0.5)
+    rig.run(1.9)
+    assert rig.state == "active"
+    rig.run(1.5)
+    assert rig.state == "holding"
+
+
+def test_a_faster_rate_shortens_the_time_to_the_next_chunk_and_puts_of_it_do_not_lengthen_it() -> (
+    None
+):
+    rig = Rig()
+    rig.put("rate", 0.5)
+    rig.activate()
+    rig.send([[0.001, 0, 0, 0, 0, 0, 0]])
+    rig.run(0.2)
+    timing = rig.profile.timing
+    for _ in range(20):
+        rig.put("rate", 5.0)
+        rig.run(0.1)
+    assert timing.watchdog_s + 0.2 < 2.0
+    assert rig.state == "holding"
+
+
+def test_the_gripper_of_a_part_that_is_not_there_holds_nothing() -> None:
+    rig = Rig()
+    rig.tick(Setting("held", None, None, "left"))
+    assert "no part 'left'" in rig.events[-1].why
+
+
 def test_a_router_whose_clock_was_set_back_does_not_keep_an_arm_stopped() -> None:
     rig = Rig()
     rig.tick(Setting("stop", put_ns=2_000_000_000))

@@ -221,3 +221,35 @@ def test_a_step_is_judged_by_the_elbow_that_the_arm_really_has() -> None:
     arm.send([[0, 0, 0.001, 0, 0, 0, 0]])
     apart_rad = np.abs(shadow.joints_rad - joints_rad).max()
     assert apart_rad < 0.1 < np.abs(joints_rad - HOME_RAD).max()
+
+
+def test_a_standing_arm_near_a_singularity_approaches_none_when_its_goals_become_poses() -> None:
+    singular_rad = np.array([0.0, -0.3, 0.0, -2.2, 0.0, 0.0, 0.785])
+    shadow = ReachabilityFilter(PROFILE, KINEMATICS)
+    shadow.reset(singular_rad)
+    monitor, now_ns = JointMonitor(PROFILE, shadow), 0
+    for in_joints in [True] * 40 + [False] * 40:
+        now_ns += TICK_NS
+        assert monitor.update(singular_rad, singular_rad, now_ns, in_joints=in_joints) is None
+        assert monitor.slowdown is None
+
+
+def test_an_inverse_solution_that_fails_once_leaves_the_elbow_where_it_is_expected(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    watching = Watching()
+    joints_rad = HOME_RAD.copy()
+    watching.at(joints_rad)
+    way = np.linalg.svd(KINEMATICS.jacobian(joints_rad))[2][-1]
+    for _ in range(40):
+        now = np.linalg.svd(KINEMATICS.jacobian(joints_rad))[2][-1]
+        way = now if now @ way > 0 else -now
+        joints_rad = joints_rad + 0.01 * way
+        watching.at(joints_rad, 20)
+    apart_rad = watching.watch.elbow_rad
+    assert apart_rad > 0.1
+    with monkeypatch.context() as patched:
+        patched.setattr(watching.watch._reach, "solve", lambda *_: None)
+        watching.at(joints_rad, 20)
+    watching.at(joints_rad, 20)
+    assert watching.watch.elbow_rad == pytest.approx(apart_rad, abs=0.02)

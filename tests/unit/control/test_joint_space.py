@@ -10,7 +10,7 @@ from joint_rig import Joints, panda
 from panda_arm import HOME_RAD
 
 from vla_zenoh.control.joint_space import JointBounds, JointPath
-from vla_zenoh.control.limits import workspace_corners
+from vla_zenoh.control.limits import Slowdown, workspace_corners
 from vla_zenoh.control.plan_timeline import joint_goal
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.types import FloatArray
@@ -32,6 +32,13 @@ def made_path() -> JointPath:
 def outside_m(position_m: FloatArray) -> float:
     low, high = BOX
     return float(np.linalg.norm(position_m - np.clip(position_m, low, high)))
+
+
+def test_a_goal_near_an_arm_that_is_held_keeps_its_slowdown() -> None:
+    path = made_path()
+    slow = Slowdown("table_distance", 0.1, 0.01, 0.05, "")
+    asked = joint_goal(path.kinematics, HOME_RAD + 0.2, 0.0, slow)
+    assert path.near(asked).slowdown == slow
 
 
 def test_a_goal_that_the_leash_cuts_stays_inside_the_box_and_on_the_leash() -> None:

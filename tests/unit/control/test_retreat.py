@@ -10,6 +10,7 @@ from command_rig import START_M, Rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from vla_zenoh.control.commander_io import Setting
 from vla_zenoh.control.contact import RELIEF_M, SPACE_M, CommandTrail
 from vla_zenoh.control.preflight import state_lost
 from vla_zenoh.kinematics.so3 import Pose
@@ -95,6 +96,49 @@ def test_it_ends_where_nothing_presses_within_the_limits_and_never_goes_further_
     assert not rig.commander.streaming  # it lingers, and ends
     assert rig.state == "inactive"
     rig.assert_smooth()
+
+
+class Clamped(Walled):
+    """An arm of which something takes hold from behind while it stands."""
+
+    stiffness_n_m = 20_000.0
+
+    def __init__(self) -> None:
+        self.behind_m: float | None = None
+        self.aside_n = np.zeros(3)
+        self.forces_n: list[float] = []
+        super().__init__(np.array([1.0, 0, 0]), 0.06)
+
+    def pose_state(self) -> Stamped[PoseState]:
+        said = Rig.pose_state(self)
+        way_m = float((self.position_m - START_M) @ self.along)
+        at_m = min(way_m, self.gap_m)
+        at_m = at_m if self.behind_m is None else max(at_m, self.behind_m)
+        self.forces_n.append(self.stiffness_n_m * (way_m - at_m))
+        force_n = self.aside_n - self.forces_n[-1] * self.along
+        place_m = self.position_m + (at_m - way_m) * self.along
+        wrench = np.concatenate([force_n, np.zeros(3)])
+        return replace(said, record=replace(said.record, position_m=place_m, wrench=wrench))
+
+
+def test_it_ends_where_something_behind_the_arm_presses() -> None:
+    rig = Clamped()
+    rig.push(0.01)
+    rig.brake()
+    rig.behind_m, rig.aside_n = rig.gap_m - 0.002, np.array([0.0, 4.0, 0.0])
+    since = len(rig.forces_n)
+    rig.run(5.0)
+    stop_n, brake_m = rig.profile.limits.contact.force_stop_n, 0.003
+    assert stop_n is not None
+    assert min(rig.forces_n[since:]) > -(stop_n + brake_m * rig.stiffness_n_m)
+    assert "something behind it presses" in [e for e in rig.events if e.what == "retreat"][-1].why
+
+
+@pytest.mark.parametrize("why", ["the wall clock was set", "the command loop stood still"])
+def test_it_ends_with_a_loss_of_the_command_node(why: str) -> None:
+    rig = retreating_rig()
+    rig.tick(Setting("lose", why))
+    assert not rig.commander.retreating
 
 
 def test_it_goes_no_faster_than_the_profile_says() -> None:
@@ -313,3 +357,23 @@ def test_a_watch_says_which_state_is_missing() -> None:
     assert state_lost("pose", pose, most_s, rig.now_ns) == ""
     assert "pose" in state_lost("pose", pose, most_s, rig.now_ns + 10**9)
     assert "future: pose" in state_lost("pose", pose, most_s, rig.now_ns - 10**9)
+
+
+def test_a_single_false_pose_of_an_arm_without_kinematics_is_forgotten_when_it_is_back() -> None:
+    rig = Rig()
+    rig.activate()
+    states, here_m = rig.commander.parts[0].states, rig.position_m
+    rig.position_m = here_m + np.array([0.03, 0, 0])
+    rig.tick()
+    assert "jumped" in states.doubt
+    rig.position_m = here_m
+    rig.tick()
+    assert not states.doubt
+
+
+def test_a_pose_that_jumped_and_stays_there_is_not_trusted_without_kinematics() -> None:
+    rig = Rig()
+    rig.activate()
+    rig.position_m = rig.position_m + np.array([0.03, 0, 0])
+    rig.run(2.0)
+    assert "jumped" in rig.commander.parts[0].states.doubt
