@@ -31,7 +31,10 @@ def shipped(kind: str) -> Path:
         return inside_wheel
     if (checkout / kind).is_dir() and (checkout / "pyproject.toml").is_file():
         return checkout / kind
-    raise ResourceError(f"the installation of vla-zenoh is damaged: its {kind}/ folder is missing")
+    raise ResourceError(
+        f"the installation of vla-zenoh is damaged: {inside_wheel} is missing, and {checkout} is "
+        f"no checkout with pyproject.toml and {kind}/"
+    )
 
 
 def folders(kind: str) -> list[Path]:
