@@ -375,5 +375,6 @@ def test_a_pose_that_jumped_and_stays_there_is_not_trusted_without_kinematics() 
     rig = Rig()
     rig.activate()
     rig.position_m = rig.position_m + np.array([0.03, 0, 0])
+    rig.blocked = True  # it stays there
     rig.run(2.0)
     assert "jumped" in rig.commander.parts[0].states.doubt
