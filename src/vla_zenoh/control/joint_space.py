@@ -11,6 +11,7 @@ robot that takes poses goes to the poses of the joints instead, see `MotionPipel
 
 from __future__ import annotations
 
+import math
 from collections.abc import Generator, Iterable
 from copy import copy
 
@@ -340,7 +341,7 @@ class JointPath(AxisSmoother):
             self._brake_at(self._bounds.distance_hit(here_rad, stop_rad))
         before = self.state
         moves = self.advance(pace)
-        if moves and not self.braking:
+        if moves and not self.braking and not self._stops_inside(pace):
             hit = self._stop_hit()
             if hit is not None:
                 self.state = before  # a stop from there was found to end inside
@@ -387,6 +388,15 @@ class JointPath(AxisSmoother):
         stop_rad = [stop.at(float(time_s)).position for time_s in times_s]
         return self._bounds.face_hit(self.motion.pose.position_m, stop_rad)
 
+    def _stops_inside(self, pace: float) -> bool:
+        """Whether the TCP is too far from every face of the box for a stop to cross one."""
+        low, high = workspace_corners(self._bounds.limits)
+        place = self.motion.pose.position_m
+        room_m = float(np.minimum(place - low, high - place).min())
+        way = np.abs(stop_way(*self.state[1:], self.box, pace * self._dt_s))
+        # The TCP is further from an axis by at most its own way.
+        return float(way @ self._levers) * math.exp(float(way.sum())) < room_m
+
     def stopping_rad(self, ahead_s: float) -> list[FloatArray]:
         """(n,) each, joints on the way of a stop that begins in `ahead_s`, and at its end."""
         if self.at_rest:
@@ -401,6 +411,7 @@ class JointPath(AxisSmoother):
         """Compute the motion of the TCP."""
         joints_rad, velocity, acceleration = self.state
         pose, jacobian = self.kinematics.pose_and_jacobian(joints_rad)
+        self._levers = np.sqrt((jacobian[:3] ** 2).sum(axis=0))
         change = jacobian @ acceleration
         fastest = float(np.abs(velocity).max())
         if fastest > 0.0:

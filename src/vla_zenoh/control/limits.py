@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vla_zenoh.kinematics.so3 import Pose, exp3, log3, norm3, orthonormal
+from vla_zenoh.kinematics.so3 import Pose, exp3, log3, norm3, orthonormal, pose_distance
 from vla_zenoh.profile import REJECT_FACTOR, Limits, Profile, ReachLimits
 from vla_zenoh.types import FloatArray
 
@@ -185,16 +185,26 @@ def into_workspace(
 
     A step that starts at `before_m`, outside the box, may lead back or stay, but no further out.
     """
-    low, high = workspace_corners(limits)
+    box = limits.workspace
+    x, y, z = position_m.tolist()
+    (x_low, x_high), (y_low, y_high), (z_low, z_high) = box.x_m, box.y_m, box.z_m
     if before_m is not None:
-        low = np.minimum(low, before_m)
-        high = np.maximum(high, before_m)
-    inside = np.minimum(np.maximum(position_m, low), high)
+        x0, y0, z0 = before_m.tolist()
+        x_low, y_low, z_low = min(x_low, x0), min(y_low, y0), min(z_low, z0)
+        x_high, y_high, z_high = max(x_high, x0), max(y_high, y0), max(z_high, z0)
+    if x_low <= x <= x_high and y_low <= y <= y_high and z_low <= z <= z_high:
+        return position_m, 0.0
+    inside = np.array(
+        [min(max(x, x_low), x_high), min(max(y, y_low), y_high), min(max(z, z_low), z_high)]
+    )
     return inside, norm3(position_m - inside)
 
 
 def leash(limits: Limits, goal: Pose, commanded: Pose) -> tuple[Pose, list[LimitHit]]:
     """Keep the goal near the commanded pose, so that no backlog builds up."""
+    apart_m, apart_rad = pose_distance(goal, commanded)
+    if apart_m <= limits.lead_m and apart_rad <= limits.lead_rad:
+        return goal, []
     hits: list[LimitHit] = []
     ahead_m = goal.position_m - commanded.position_m
     turn = log3(goal.rotation @ commanded.rotation.T)

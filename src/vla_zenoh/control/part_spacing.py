@@ -31,7 +31,8 @@ from vla_zenoh.types import FloatArray
 NAME = "part_distance"
 """Of the limit."""
 FAR_M = 0.25
-"""Arms this much further apart than they may come have no distance."""
+"""Arms this much further apart than they may come are looked at now and then."""
+FAR_TICKS = 4
 NOISE_M = 2e-5
 """Distances of the same joints differ by less: without it arms at the stop could not go on."""
 SPARE_M = 5e-3
@@ -62,6 +63,7 @@ class PartSpacing:
         self._within_m = max(self._slow_m, self._stop_m) + FAR_M
         self.nearest = Nearest(self._within_m)
         """Distance of the commanded joints when last computed."""
+        self._skip = 0
         self._held = self._slower = False
         self._edge_m, self._monitor_ns = np.inf, 0
 
@@ -86,6 +88,10 @@ class PartSpacing:
         """
         if not moves:
             self._held = self._slower = False
+            self._skip = 0
+            return None, None
+        if self._skip > 0 and not self._held:
+            self._skip -= 1
             return None, None
         here = [part.motion.joints_rad for part in self._parts]
         at = [joints_rad for joints_rad in here if joints_rad is not None]
@@ -93,7 +99,7 @@ class PartSpacing:
             return None, None
         before, self.nearest = self.nearest, self._nearest(at)
         if self.nearest.distance_m >= self._within_m:
-            self._held = False
+            self._skip, self._held = FAR_TICKS - 1, False
             return None, None
         floor_m = min(self._stop_m + SPARE_M, self.nearest.distance_m - NOISE_M)
         stops = [part.motion.stopping_rad(ahead_s) for part in self._parts]

@@ -106,9 +106,11 @@ class PoseSpace:
         turn = exp3(way.value[3:])
         spin, spin_change = spatial_rates(way.value[3:], way.rate[3:], way.change[3:])
         twist, acceleration = base.twist + way.rate, base.acceleration + way.change
-        carried = turn @ base.twist[3:]
-        twist[3:] = spin + carried
-        acceleration[3:] = spin_change + turn @ base.acceleration[3:] + cross3(spin, carried)
+        if base.twist is not AT_REST:
+            carried = turn @ base.twist[3:]
+            spin_change += turn @ base.acceleration[3:] + cross3(spin, carried)
+            spin += carried
+        twist[3:], acceleration[3:] = spin, spin_change
         pose = Pose(base.pose.position_m + way.value[:3], turn @ base.pose.rotation)
         return Motion(pose, twist, acceleration)
 
@@ -240,6 +242,7 @@ class ReferenceGovernor(Generic[Reference]):
         self._way: GovernedPath | None = None
         self._cramped: NDArray[np.bool_] | None = None
         self._planned = self._stopping = False
+        self._stands = True  # nothing changes until the next command
 
     @property
     def moving(self) -> bool:
@@ -254,6 +257,7 @@ class ReferenceGovernor(Generic[Reference]):
             steady: it is known to continue the one of the last tick.
         """
         space, goes_on, on = self._space, steady, target
+        self._stands = False
         if self._stopping:
             self._advance()
             goes_on, on = False, self.target
@@ -276,9 +280,12 @@ class ReferenceGovernor(Generic[Reference]):
 
     def rest(self) -> None:
         """Advance by a tick without a command: to the last set-point, or to the end of a stop."""
+        if self._stands:
+            return
         if not self._stopping:
             moved = self._space.speed(self.target).rate.any()
             self.follow(self._space.rest(self.target), steady=not moved)
+            self._stands = self._way is None and not moved
             return
         self._advance()
         self.motion = self._beside_target()
@@ -287,7 +294,7 @@ class ReferenceGovernor(Generic[Reference]):
         """Brake to rest as fast as the limits allow, each axis by itself."""
         self._way, self._cramped = self._space.speed(self.motion), None
         self.target = self._space.rest(self.motion)
-        self._stopping = True
+        self._stopping, self._stands = True, False
         self._plan(self._way, self._brake, ControlInterface.Velocity)
         if not self._planned:  # nothing to stop, or no plan: stand at once
             self.put(self.motion)

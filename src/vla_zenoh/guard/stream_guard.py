@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -181,26 +182,35 @@ class Extrapolation(Generic[Reference]):
             gap_s = 0.0
         self._jerk, self._gap_s = jerk, gap_s
         self._first = GovernedPath(np.zeros(len(rate)), rate, change)
-        # Its motion if the next command does not come.
-        then = self._then = _on(self._first, jerk, gap_s)
+        self._limits = velocity_limit, jerk_limit
+        self._still = not (rate.any() or change.any() or jerk.any())
+
+    @cached_property
+    def _later(self) -> tuple[GovernedPath, FloatArray, FloatArray, FloatArray]:
+        """Motion if the next command does not come: start, steady time, fading time, jerk."""
+        velocity_limit, jerk_limit = self._limits
+        then = _on(self._first, self._jerk, self._gap_s)
         change, speed = np.maximum(np.abs(then.change), 1e-9), np.abs(then.rate)
         reversing = then.rate * then.change < 0
         # Twice the time the acceleration may last before the motion is too fast or reverses.
         room_s = 2 * np.where(reversing, speed, velocity_limit - speed) / change
         fading_s = np.maximum(np.minimum(room_s, FADING_S), change / jerk_limit)
-        fading_s *= np.maximum(space.sizes(change / fading_s / jerk_limit), 1.0)
-        steady_s = np.clip((room_s - fading_s) / 2, 0.0, ACCELERATE_S - gap_s)
-        steady_s[jerk * then.change < 0] = 0.0
-        self._steady_s, self._fading_s = steady_s, fading_s
+        fading_s *= np.maximum(self._space.sizes(change / fading_s / jerk_limit), 1.0)
+        steady_s = np.clip((room_s - fading_s) / 2, 0.0, ACCELERATE_S - self._gap_s)
+        steady_s[self._jerk * then.change < 0] = 0.0
+        return then, steady_s, fading_s, -then.change / fading_s
 
     def at(self, ahead_s: float) -> Reference:
         """The reference `ahead_s` after the command."""
+        if self._still:
+            return self._base
         if ahead_s <= self._gap_s:
             return self._space.beside(self._base, _on(self._first, self._jerk, ahead_s))
-        left_s = ahead_s - self._gap_s - self._steady_s
-        way = _on(self._then, 0.0, np.minimum(left_s, 0.0) + self._steady_s)
-        way = _on(way, -way.change / self._fading_s, np.clip(left_s, 0.0, self._fading_s))
-        left_s = np.maximum(left_s - self._fading_s, 0.0)
+        way, steady_s, fading_s, fade = self._later
+        left_s = ahead_s - self._gap_s - steady_s
+        way = _on(way, 0.0, np.minimum(left_s, 0.0) + steady_s)
+        way = _on(way, fade, np.clip(left_s, 0.0, fading_s))
+        left_s = np.maximum(left_s - fading_s, 0.0)
         way.change[left_s > 0.0] = 0.0
         return self._space.beside(self._base, _on(way, 0.0, left_s))
 
