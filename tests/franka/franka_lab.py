@@ -30,7 +30,10 @@ robot: {{command: {command}}}
 limits: {{workspace: {{z_m: [0.012, 0.95]}}}}
 task: {{prompt: hold, rate_hz: 10, worker: scripted}}
 session: {{listen: [{endpoint}], connect: [{endpoint}]}}
-timing: {{command_timeout_s: {patience_s[command]}, state_timeout_s: {patience_s[state]}}}
+timing:
+  command_hz: {command_hz}
+  command_timeout_s: {patience_s[command]}
+  state_timeout_s: {patience_s[state]}
 """
 
 
@@ -103,6 +106,7 @@ def running_lab(
     hand: bool = False,
     robot_options: Sequence[str] = (),
     with_cable: bool = False,
+    command_hz: int = 250,
     more: str = "",
 ) -> Iterator[Lab]:
     """A lab whose arm takes poses or joints.
@@ -114,6 +118,7 @@ def running_lab(
         hand: the arm has a Franka Hand.
         robot_options: of the simulator.
         with_cable: the arm is reached by `Lab.cable`, which can be pulled.
+        command_hz: rate of the commands; less where nothing is measured of the arm's motion.
         more: YAML at the end of the profile.
     """
     profile = folder / "lab.yaml"
@@ -122,6 +127,7 @@ def running_lab(
             address=FAR if with_cable else "127.0.0.1",
             endpoint=free_endpoint(),
             command=command,
+            command_hz=command_hz,
             franka="" if hand else ", hand: false",
             patience_s=CHAIN_PATIENCE_S,
         )
