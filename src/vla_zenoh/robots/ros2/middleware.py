@@ -91,8 +91,8 @@ class Bridges:
         if published:
             why = (
                 f"a node publishes {' and '.join(published)}, and nothing of it comes through the "
-                "bridge: restart the bridge. A node on Fast DDS 3 (ROS 2 Kilted) that is started "
-                "after it needs the property fastdds.type_propagation=disabled"
+                "bridge. A node on Fast DDS 3 (ROS 2 Kilted) that is started after it needs the "
+                "property fastdds.type_propagation=disabled: set it and start the node again"
             )
             yield "not_matched", why
         callers = self._callers() - {SERVES}
