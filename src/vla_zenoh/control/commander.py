@@ -40,6 +40,8 @@ from vla_zenoh.types import MAX_TEXT, ActionChunk, GripperState, HeldBox, Stampe
 ANSWER_S, MAX_ANSWER_S = 1.0, 2.0
 """A worker answers a new prompt within this and one period of its rate; at most the latter, as
 clients wait 3 s for an activation."""
+EMERGENCY_STOP = "emergency stop"
+"""Why the state is STOPPED, whether this node heard the stop or the robot node told of it first."""
 LATE_NS = 10_000_000_000
 """A setting that was put before a stop arrives at most this long after it. Stamps that say so later
 are those of a clock that was set."""
@@ -184,7 +186,7 @@ class Commander:
             # Once, when it begins: after a reset the robot's last state may still say so.
             latched = _latched(states.gripper) and not _latched(before)
             if latched and self.state is not State.STOPPED:
-                self._change(Trigger.STOP, part.says("the robot node heard an emergency stop"))
+                self._change(Trigger.STOP, EMERGENCY_STOP)
             if part.held is not None and part.let_go:
                 self._hold(part, None)
             why = why_not_ready(states.gripper.record) if states.gripper else ""
@@ -197,7 +199,7 @@ class Commander:
         if any(setting.name in ("stop", "reset", "active") for setting in settings):
             self._awaited = None
         if stops:
-            self._change(Trigger.STOP, "emergency stop")
+            self._change(Trigger.STOP, EMERGENCY_STOP)
             put_ns = max(stop.put_ns or 0 for stop in stops)
             if 0 <= now_ns - self._stop_came_ns < LATE_NS:  # it may be the older one
                 put_ns = max(put_ns, self._stop_put_ns)
@@ -496,8 +498,8 @@ class Commander:
         if unheld:
             self._change(Trigger.LOSE, unheld)
             return
-        arrives = any(not part.motion.at_rest for part in self.parts)
-        overdue = self._watchdog.overdue(now_ns, moves=arrives)
+        moves = any(not part.motion.arrived for part in self.parts)
+        overdue = self._watchdog.overdue(now_ns, moves=moves)
         if overdue:
             self._change(Trigger.STARVE, overdue + self._lateness.explains())
 

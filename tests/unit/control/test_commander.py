@@ -509,6 +509,22 @@ def test_a_stop_beats_whatever_else_is_put_in_the_same_tick(
     assert rig.refused["reset_refused"] == 1
 
 
+@pytest.mark.parametrize("first", ["command", "robot", "both", "robot alone"])
+def test_a_stop_has_the_same_reason_whichever_node_tells_of_it_first(first: str) -> None:
+    rig = moving_rig()
+    settings = ["stop"] if first in ("command", "both") else []
+    if first != "command":
+        rig.gripper = replace(rig.gripper, mode="latched")
+    rig.tick(*settings)
+    told = rig.state, rig.commander.why
+    rig.gripper = replace(rig.gripper, mode="latched")
+    rig.tick(*([] if first == "robot alone" else ["stop"]))
+    rig.run(0.1)
+    assert told == (rig.state, rig.commander.why) == ("stopped", "emergency stop")
+    stops = [event.why for event in rig.events if event.what == "active->stopped"]
+    assert stops == ["emergency stop"]
+
+
 def test_a_stop_and_a_chunk_in_one_tick_is_a_stop() -> None:
     rig = moving_rig()
     out = rig.tick("stop", chunks=[rig.chunk([UP])])
