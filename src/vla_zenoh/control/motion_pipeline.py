@@ -109,6 +109,11 @@ class MotionPipeline:
         return self._mover.stands
 
     @property
+    def arrived(self) -> bool:
+        """The motion to the goal is over; an elbow may still be on its way to its posture."""
+        return self._mover.at_rest
+
+    @property
     def commanded(self) -> Pose | None:
         """The pose streamed last, None while nothing is streamed."""
         return self._mover.motion.pose if self.streaming else None

@@ -259,6 +259,26 @@ def test_without_a_model_the_arm_stands_after_max_open_loop_at_any_rate(rate_hz:
     np.testing.assert_allclose(rig.position_m, stood_m, atol=1e-6)
 
 
+@pytest.mark.parametrize("posture", ["start", "home"])
+def test_an_elbow_on_its_way_to_its_posture_does_not_put_off_the_watchdog(posture: str) -> None:
+    robot = {"command": "joint", "posture": posture}
+    arm = Arm(override(load_profile("panda_sim"), {"robot": robot}))
+    arm.at_rad = arm.at_rad + np.array([0.3, 0.0, -0.3, 0.0, 0.3, 0.0, 0.0])
+    arm.stand_at(arm.reach.kinematics, arm.at_rad)
+    arm.activate()
+    arm.run(0.5)
+    arm.send([[0.0] * 7])
+    heard_ns, elbow_rad = arm.now_ns, arm.at_rad
+    while arm.state == "active":
+        arm.tick()
+    waited_s = (arm.now_ns - heard_ns) / 1e9
+    period_s = 1 / arm.commander.task.rate_hz
+    due_s = arm.spec.action.dt_s + period_s + arm.profile.timing.watchdog_s
+    assert waited_s == pytest.approx(due_s, abs=0.01)
+    assert (np.abs(arm.at_rad - elbow_rad).max() > 0.02) == (posture == "home")
+    assert "within the watchdog" in arm.commander.why
+
+
 # -- profiles -----------------------------------------------------------------------------------
 LEAST_LIMITS: dict[str, dict[str, float]] = {
     "translation": {"velocity_m_s": 1e-3, "acceleration_m_s2": 1e-2, "jerk_m_s3": 0.1},
