@@ -49,7 +49,7 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 @pytest.hookimpl(tryfirst=True)  # before -m chooses
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
-        if item.path.parent.name in IN_REAL_TIME:
+        if item.path.relative_to(ROOT).parts[1] in IN_REAL_TIME:
             item.add_marker(pytest.mark.realtime)
 
 

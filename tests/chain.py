@@ -54,8 +54,14 @@ session:
   listen: [{endpoint}]
   connect: [{endpoint}]
   lease_ms: {lease_ms}
-timing: {{command_timeout_s: {patience_s[command]}, state_timeout_s: {patience_s[state]}}}
+timing:
+  command_timeout_s: {patience_s[command]}
+  state_timeout_s: {patience_s[state]}
+  command_hz: {command_hz}
+  state_hz: {state_hz}
 {more}"""
+COMMAND_HZ, STATE_HZ = (250, 200) if (os.cpu_count() or 1) >= 4 else (100, 100)
+"""Two slow cores are not enough for robot, camera and model at 250 Hz, and a test beside them."""
 # A computer that is busy with other things stands still for a tenth of a second now and then, which
 # is where the shipped profiles rightly brake. tests/sim/test_motion_robot.py holds them to it, in
 # the arm's own time.
@@ -90,6 +96,8 @@ def write_profile(
             rate_hz=rate_hz,
             endpoint=endpoint or free_endpoint(),
             patience_s=patience_s,
+            command_hz=COMMAND_HZ,
+            state_hz=STATE_HZ,
             lease_ms=lease_ms,
             more=more,
         )

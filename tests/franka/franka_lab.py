@@ -23,6 +23,8 @@ REACHED_M, REACHED_RAD = 1e-3, 2e-3
 FAR, FAR_PORT = "127.0.0.2", 14370
 """Address of an arm behind a cable, and where its simulator listens."""
 SETTLE_S, LOOK_S, AGAIN_S = 2.5, 0.5, 30.0
+COMMAND_HZ = 250 if (os.cpu_count() or 1) >= 4 else 125
+"""At 250 Hz simulator, arm node and command node take more than two cores while the arm moves."""
 PROFILE = """
 extends: fr3
 franka: {{address: {address}, realtime: ignore{franka}}}
@@ -106,7 +108,6 @@ def running_lab(
     hand: bool = False,
     robot_options: Sequence[str] = (),
     with_cable: bool = False,
-    command_hz: int = 250,
     more: str = "",
 ) -> Iterator[Lab]:
     """A lab whose arm takes poses or joints.
@@ -118,7 +119,6 @@ def running_lab(
         hand: the arm has a Franka Hand.
         robot_options: of the simulator.
         with_cable: the arm is reached by `Lab.cable`, which can be pulled.
-        command_hz: rate of the commands; less where nothing is measured of the arm's motion.
         more: YAML at the end of the profile.
     """
     profile = folder / "lab.yaml"
@@ -127,7 +127,7 @@ def running_lab(
             address=FAR if with_cable else "127.0.0.1",
             endpoint=free_endpoint(),
             command=command,
-            command_hz=command_hz,
+            command_hz=COMMAND_HZ,
             franka="" if hand else ", hand: false",
             patience_s=CHAIN_PATIENCE_S,
         )

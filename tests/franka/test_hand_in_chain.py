@@ -23,9 +23,7 @@ OPTIONS = ("horizon=4", f"dt_s={1 / WISH_HZ}")
 def lab(tmp_path_factory: Any) -> Iterator[Lab]:
     folder = tmp_path_factory.mktemp("fr3")
     given = ("--gripper-object-width", str(BRICK_M))
-    with running_lab(
-        folder, "joint", options=OPTIONS, hand=True, robot_options=given, command_hz=125
-    ) as lab:
+    with running_lab(folder, "joint", options=OPTIONS, hand=True, robot_options=given) as lab:
         yield lab
 
 
