@@ -28,6 +28,8 @@ SHAPES: Mapping[str, Mapping[str, int]] = {
 }
 """Collision shapes, with how many numbers above 0 each attribute has."""
 PLACE = ("robot", "description")
+COMPRESSED = (b"\x1f\x8b", b"PK\x03\x04", b"BZh", b"\xfd7zXZ")
+"""How files of gzip, zip, bzip2 and xz begin."""
 WORLD = "universe"
 """What Pinocchio calls that which does not move."""
 TO_URDF = {
@@ -184,6 +186,8 @@ class Description:
             raise ResourceError(f"{self.path} cannot be read: {error.strerror}") from error
         if not data.strip():
             raise self._error("is empty")
+        if data.startswith(COMPRESSED):
+            raise self._error("is compressed: unpack it, and name the URDF in it")
         try:
             data.decode()
         except UnicodeDecodeError as error:

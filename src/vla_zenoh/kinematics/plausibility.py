@@ -15,8 +15,12 @@ MAX_TURN_RAD = 4 * math.pi + 0.1
 """Wrists turn by at most two turns to each side; a range in degrees is beyond this."""
 MAX_SPEED_RAD_S = 50.0
 """The quickest joints of arms make 10 rad/s; a velocity in degrees is beyond this."""
+MIN_SPEED_RAD_S, MIN_SPEED_M_S = 0.01, 0.001
+"""Slower joints are no arm's: a turn takes ten minutes."""
 MAX_LENGTH_M = 10.0
 """Between two joints, or from the root of the description to the base."""
+MIN_ARM_M = 0.05
+"""From the first joint to the TCP, stretched: the smallest desk arms have 0.2 m."""
 MAX_LINK_M = 3.0
 """From a joint to the end of the link that it moves."""
 
@@ -32,6 +36,7 @@ def implausible(
         slides = bool(kinematics.slides[index])
         furthest = MAX_LENGTH_M if slides else MAX_TURN_RAD
         fastest = MAX_LENGTH_M if slides else MAX_SPEED_RAD_S
+        slowest = MIN_SPEED_M_S if slides else MIN_SPEED_RAD_S
         unit, wrong = ("m", "millimetres") if slides else ("rad", "degrees")
         if max(abs(low), abs(high)) > furthest:
             yield (
@@ -42,6 +47,11 @@ def implausible(
             yield (
                 f"joint {joint!r} of {name} has a velocity of {velocity:g} {unit}/s: are these "
                 f"{wrong}? Correct the description"
+            )
+        if velocity < slowest:
+            yield (
+                f"joint {joint!r} of {name} has a velocity of {velocity:g} {unit}/s: it would "
+                f"take minutes. A URDF has {unit}/s: correct the description"
             )
     base_m = float(np.linalg.norm(kinematics.base_placement.translation))
     if base_m > MAX_LENGTH_M:
@@ -62,6 +72,12 @@ def implausible(
                 f"{name} has {what!r} {length_m:g} m from the joint before it: are these "
                 "millimetres? A URDF is in metres"
             )
+    length_m = sum(length for length, _ in lengths_m)
+    if length_m + _slides_m(kinematics) < MIN_ARM_M:
+        yield (
+            f"the arm of {name} is {length_m:.3g} m long from its first joint to the TCP: was it "
+            "divided by 1000? A URDF is in metres"
+        )
     for link, reach_m in collisions.reaches_m():
         if reach_m > MAX_LINK_M:
             yield (
@@ -69,18 +85,23 @@ def implausible(
                 'its joint: is it in millimetres? Give its mesh scale="0.001 0.001 0.001", or '
                 "correct its size: no barrier can keep it from the arm itself"
             )
-    yield from _out_of_reach(kinematics, limits, sum(length for length, _ in lengths_m))
+    yield from _out_of_reach(kinematics, limits, length_m)
+
+
+def _slides_m(kinematics: Kinematics) -> float:
+    """How far the sliding joints can be out, together."""
+    return float(np.sum(np.abs(kinematics.upper_rad)[kinematics.slides]))
 
 
 def _out_of_reach(kinematics: Kinematics, limits: Limits, length_m: float) -> Iterator[str]:
     """Whether the workspace lies where no joint position takes the TCP."""
-    slides_m = float(np.sum(np.abs(kinematics.upper_rad)[kinematics.slides]))
     first = kinematics.model.jointPlacements[1]
     foot_m = kinematics.base_placement.actInv(first).translation
     box = limits.workspace
     ends = np.array([box.x_m, box.y_m, box.z_m])
     nearest_m = np.clip(foot_m, ends[:, 0], ends[:, 1])
-    away_m, reach_m = float(np.linalg.norm(nearest_m - foot_m)), length_m + slides_m
+    away_m = float(np.linalg.norm(nearest_m - foot_m))
+    reach_m = length_m + _slides_m(kinematics)
     if away_m > reach_m:
         yield (
             f"limits.workspace is {away_m:.3g} m from the first joint, and the arm of "

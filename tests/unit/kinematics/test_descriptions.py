@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -276,6 +277,7 @@ REFUSED: dict[str, Refused] = {
     "latin-1": Refused(
         WHOLE.replace("made", "Gelenk für").encode("latin-1"), ("is not UTF-8 (line 1)",)
     ),
+    "a compressed file": Refused(gzip.compress(WHOLE.encode()), ("is compressed", "unpack it")),
     "a xacro": Refused(
         '<robot xmlns:xacro="http://ros.org/wiki/xacro"><xacro:arm prefix=""/></robot>',
         ("is a xacro", "xacrodoc arm.urdf"),
@@ -356,6 +358,13 @@ REFUSED: dict[str, Refused] = {
     "degrees": Refused(urdf([*DEGREES, TOOL]), ("-170 to 170 rad", "degrees", "'j1'")),
     "a velocity in degrees": Refused(
         urdf([*arm(SIX, j2=Row("j2", axis=Y, velocity=180.0)), TOOL]), ("180 rad/s", "degrees")
+    ),
+    "a velocity of almost nothing": Refused(
+        urdf([*arm(SIX, j2=Row("j2", axis=Y, velocity=0.002)), TOOL]), ("0.002 rad/s", "'j2'")
+    ),
+    "an arm of a thousandth": Refused(
+        urdf([row._replace(at_m=(0.0, 0.0, 0.0002)) for row in [*arm(SIX), TOOL]]),
+        ("m long from its first joint to the TCP", "divided by 1000"),
     ),
     "millimetres": Refused(urdf([*MILLIMETRES, TOOL]), ("200 m", "millimetres")),
     "a mesh in millimetres": Refused(
