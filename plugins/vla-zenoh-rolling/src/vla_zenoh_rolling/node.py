@@ -54,7 +54,8 @@ BURST, RATE_HZ = 256, 5.0
 what the log has of others."""
 LOST_EVERY_S = 5.0
 """Between two lines that say how many puts were not logged."""
-STOPS = ("->stopped", "->fault")
+STOPS = {"stopped": "stop", "fault": "fault"}
+"""State that was entered -> word in the name of the folder, the one of a put on `stop`."""
 REFUSED = "activate_refused"
 ENDED = "ended"
 SEGMENT_WORDS = re.compile(r"[^A-Za-z0-9]+")
@@ -223,8 +224,8 @@ class RollingRecord:
         if (event.kind != "transition" and not refused) or not self._may_note(sample.key):
             return
         self._add("command", sample.received_ns, event=event.what, why=event.why)
-        if event.what.endswith(STOPS):
-            self._want(event.what.rpartition("->")[2])
+        if why := STOPS.get(event.what.rpartition("->")[2]):
+            self._want(why)
         elif event.what == REFUSED and time.monotonic() - self._refused_s > APART_S:
             self._refused_s = time.monotonic()
             self._want("activation refused")
