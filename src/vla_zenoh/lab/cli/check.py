@@ -157,10 +157,8 @@ def _rows(report: CheckReport) -> list[tuple[str, str]]:
         ("inputs", _inputs(report)),
         (
             "outputs",
-            f"up to {action.horizon} x {action.dimension}, {action.dt_s:g} s each: {action.kind} "
-            + ("of joints" if action.space == "joint" else f"{action.frame} {action.rotation}")
-            + f"{_added_to(action)}, gripper {action.gripper}"
-            + (f", normalisation {action.normalisation}" if action.normalisation else ""),
+            f"up to {action.horizon} x {action.dimension}, {action.dt_s:g} s each: "
+            + _meaning(action),
         ),
     ]
     if report.shape is not None:
@@ -168,7 +166,7 @@ def _rows(report: CheckReport) -> list[tuple[str, str]]:
     if report.step_range:
         ranges = ", ".join(
             f"{column} {low:.3g}..{high:.3g}"
-            for column, (low, high) in zip(_columns(action), report.step_range, strict=True)
+            for column, (low, high) in zip(column_names(action), report.step_range, strict=True)
         )
         rows.append(("values", ranges))
     if report.latency_ms is not None:
@@ -203,21 +201,29 @@ def _added_to(action: ActionSpec) -> str:
     return out
 
 
-def _columns(action: ActionSpec) -> list[str]:
+def _meaning(action: ActionSpec) -> str:
+    """What the numbers of a step mean."""
+    if action.parts:
+        return "; ".join(f"{each.part} {_meaning(each.action)}" for each in action.parts)
+    motion = "of joints" if action.space == "joint" else f"{action.frame} {action.rotation}"
+    normalised = f", normalisation {action.normalisation}" if action.normalisation else ""
+    return f"{action.kind} {motion}{_added_to(action)}, gripper {action.gripper}{normalised}"
+
+
+def column_names(action: ActionSpec) -> list[str]:
     """Name and unit of each number of a step."""
+    if action.parts:
+        return [
+            f"{each.part} {name}" for each in action.parts for name in column_names(each.action)
+        ]
     per = "/s" if action.kind == "velocity" else ""
     gripper = ["gripper"] if action.gripper != "none" else []
     if action.space == "joint":
         return [*(f"{name} rad{per}" for name in action.joints), *gripper]
     scale = "" if action.position_scale_m == 1.0 else f"* {action.position_scale_m:g} "
-    unit = f"{scale}m{per}"
-    rotations = {
-        "rpy": ("roll rad", "pitch rad", "yaw rad"),
-        "rotvec": (f"rx rad{per}", f"ry rad{per}", f"rz rad{per}"),
-        "quaternion": ("qx", "qy", "qz", "qw"),
-    }
-    names = [*(f"{axis} {unit}" for axis in "xyz"), *rotations[action.rotation]]
-    return [*names, *gripper]
+    unit = f" rad{per}" if action.rotation in ("rpy", "rotvec") else ""
+    rotation = [f"{name}{unit}" for name in action.rotation_form.names]
+    return [*(f"{axis} {scale}m{per}" for axis in "xyz"), *rotation, *gripper]
 
 
 def _inputs(report: CheckReport) -> str:
