@@ -92,7 +92,7 @@ def rig(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Rig]:
         node = Node("ros2", profile, ours)
         messages = Messages(profile.ros2.distribution)
         graph = RosGraph(ours, profile.ros2, messages, "vla_panda")
-        gripper = Gripper(node, graph, messages, profile.ros2.gripper, lambda: rig.width_m)
+        gripper = Gripper(node, graph, messages, profile, lambda: rig.width_m)
         streams = [
             Publisher(theirs, profile.keys.command_gripper, Kind.ORDER, source, Clock())
             for source in ("command#1", "stranger#1")

@@ -13,7 +13,7 @@ from ros2_turns import SPEED_M_S, TICK_S, Turns, ros2_turns
 
 from vla_zenoh.bus.clock import Tick
 from vla_zenoh.robots.node import FAILURES, LEAST_S
-from vla_zenoh.robots.ros2.driver import Ros2Driver
+from vla_zenoh.robots.ros2.arm import Ros2Arm
 
 MOVING = 60
 """Turns after which the arm is in full motion."""
@@ -72,7 +72,7 @@ def breaks(loop: Loop, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
         raise RuntimeError("unforeseen" * 1000)
 
     def break_it(targets: int = 0) -> None:
-        driver, failing = cast("Ros2Driver", loop.turns.robot.driver), [unforeseen] * targets
+        driver, failing = cast("Ros2Arm", loop.turns.robot.driver.parts[""]), [unforeseen] * targets
         write = driver._write
         monkeypatch.setattr(loop.turns.robot, "_watch", unforeseen)
         monkeypatch.setattr(

@@ -84,11 +84,14 @@ class PartProfile(Section):
             in its own base frame.
         robot: what differs from the section `robot` of the profile.
         limits: what differs from its `limits`.
+        ros2: its own topics, where they differ from those in `ros2`: joint_states, finger_states,
+            wrench, joint_command and gripper.
     """
 
     base: PartBase = PartBase()
     robot: dict[str, Any] = Field(default_factory=dict)
     limits: dict[str, Any] = Field(default_factory=dict)
+    ros2: dict[str, Any] = Field(default_factory=dict)
 
 
 class Profile(Section):
@@ -209,8 +212,8 @@ class Profile(Section):
         if not name:
             return self
         part = self.parts[name]
-        robot, limits = _filled(self.robot, part.robot), _filled(self.limits, part.limits)
-        made = self.model_copy(update={"robot": robot, "limits": limits, "parts": {}})
+        own = {name: _filled(getattr(self, name), getattr(part, name)) for name in OF_PARTS}
+        made = self.model_copy(update={**own, "parts": {}})
         made._part = name
         return made
 
@@ -274,6 +277,9 @@ class Profile(Section):
 
 
 # -- checks across sections: (place, sentence) of every fault -------------------------------------
+OF_PARTS = ("robot", "limits", "ros2")
+"""Sections that a part may have of its own."""
+TOPICS_OF_PARTS = {"joint_states", "finger_states", "wrench", "joint_command", "gripper"}
 OWN_ROBOT = "A robot of your own is driver: arm, with a Python file: arm: {file: my_arm.py}"
 
 
@@ -354,9 +360,9 @@ def _joint_limits(place: Place, robot: RobotProfile, limits: Limits) -> Iterator
             )
 
 
-def _filled(section: Section, over: Mapping[str, Any]) -> Section:
+def _filled(section: Section | None, over: Mapping[str, Any]) -> Section | None:
     """`section` with the values of `over`, map by map."""
-    if not over:
+    if section is None or not over:
         return section
     return type(section).model_validate(merge(section.model_dump(), {}, over, {}, ("parts",))[0])
 
@@ -365,10 +371,10 @@ def _parts(profile: Profile) -> Iterator[Fault]:
     """What the parts of a robot have in common, and what only one arm can have."""
     if len(profile.parts) == 1:
         yield ("parts",), "names one part: leave it out, and describe the arm in robot and limits"
-    if profile.parts and profile.robot.driver != "sim":
+    if profile.parts and profile.robot.driver not in ("sim", "ros2"):
         yield (
             ("parts",),
-            f"go with robot.driver: sim, and it is {profile.robot.driver}: give each real arm a "
+            f"go with robot.driver: sim or ros2, and it is {profile.robot.driver}: give each arm a "
             "robot of its own",
         )
     if profile.parts and profile.robot.command != "joint":
@@ -377,13 +383,18 @@ def _parts(profile: Profile) -> Iterator[Fault]:
             "must be joint: the robot has parts, whose distance is only known where their joints "
             "are commanded",
         )
+    seen: dict[str, Profile] = {}
     for name, part in profile.parts.items():
         if name in NOT_PARTS:
             taken = ", ".join(sorted(NOT_PARTS))
             yield ("parts", name), f"is taken by keys; names that are taken: {taken}"
         for field in {"name", "driver", "command"} & set(part.robot):
             yield ("parts", name, "robot", field), "is that of the whole robot: leave it out"
-        for what in ("robot", "limits"):
+        for field in sorted(part.ros2.keys() - TOPICS_OF_PARTS):
+            yield ("parts", name, "ros2", field), "is that of the whole robot: leave it out"
+        if part.ros2 and profile.ros2 is None:
+            yield ("parts", name, "ros2"), "needs a section ros2 of the whole robot"
+        for what in OF_PARTS:
             try:
                 _filled(getattr(profile, what), getattr(part, what))
             except ValidationError as error:
@@ -394,6 +405,30 @@ def _parts(profile: Profile) -> Iterator[Fault]:
         else:
             own = profile.of_part(name)
             yield from _joint_limits(("parts", name), own.robot, own.limits)
+            if own.ros2 is not None and profile.robot.driver == "ros2":
+                yield from _ros2_arm(("parts", name), own.ros2, own.robot)
+                yield from _shared(name, own, seen)
+                seen[name] = own
+
+
+def _shared(name: str, own: Profile, others: Mapping[str, Profile]) -> Iterator[Fault]:
+    """What would move two arms by one command, or take one arm for another."""
+    assert own.ros2 is not None
+    for other, profile in others.items():
+        theirs = profile.ros2
+        assert theirs is not None
+        for what in ("joint_command", "gripper"):
+            ours, same = getattr(own.ros2, what), getattr(theirs, what)
+            if ours is not None and same is not None and ours.topic == same.topic:
+                why = f"has the topic of part {other}, {ours.topic}: both would follow one command"
+                yield ("parts", name, "ros2", what), why
+        joints = set(own.robot.arm_joints) & set(profile.robot.arm_joints)
+        if joints and own.ros2.joint_states == theirs.joint_states:
+            why = (
+                f"is {theirs.joint_states}, as that of part {other}, and both arms have joints "
+                f"{', '.join(sorted(joints)[:3])}: give each its own topic, or its own joint names"
+            )
+            yield ("parts", name, "ros2", "joint_states"), why
 
 
 def _cameras(profile: Profile) -> Iterator[Fault]:
@@ -412,13 +447,12 @@ def _cameras(profile: Profile) -> Iterator[Fault]:
 
 
 def _ros2(profile: Profile) -> Iterator[Fault]:
-    ros2, robot = profile.ros2, profile.robot
+    ros2 = profile.ros2
     if ros2 is None:
         return
+    if not profile.parts:
+        yield from _ros2_arm((), ros2, profile.robot)
     yield from unlisted(("ros2", "cameras"), ros2.cameras, "cameras", profile.cameras)
-    wanted = f"{robot.command}_command"
-    if robot.driver == "ros2" and getattr(ros2, wanted) is None:
-        yield ("ros2",), f"lacks {wanted}: robot.command is {robot.command}"
     for name, camera in ros2.cameras.items():
         source = profile.cameras[name].source if name in profile.cameras else ""
         if source.startswith("ros2:") and source.removeprefix("ros2:") != camera.topic:
@@ -428,22 +462,30 @@ def _ros2(profile: Profile) -> Iterator[Fault]:
             why = f"goes with cameras.{name}.depth_unit_m, and either is given without the other"
             yield ("ros2", "cameras", name, "depth"), why
     yield from _way_to_ros2(profile, ros2.connect)
+
+
+def _ros2_arm(place: Place, ros2: Ros2Profile, robot: RobotProfile) -> Iterator[Fault]:
+    """Commands of an arm and its gripper."""
+    place = (*place, "ros2")
+    wanted = f"{robot.command}_command"
+    if robot.driver == "ros2" and getattr(ros2, wanted) is None:
+        yield place, f"lacks {wanted}: robot.command is {robot.command}"
     joints = ros2.joint_command
     if joints is not None and joints.type not in JOINT_COMMANDS:
         wanted = " or ".join(JOINT_COMMANDS)
-        yield ("ros2", "joint_command", "type"), f"is {joints.type}: joints are sent as {wanted}"
+        yield (*place, "joint_command", "type"), f"is {joints.type}: joints are sent as {wanted}"
     gripper = ros2.gripper
     if gripper is not None:
         if gripper.grasp and gripper.type != "franka_msgs/action/Move":
-            yield ("ros2", "gripper", "grasp"), "goes with type franka_msgs/action/Move only"
-        yield from _gripper_position(gripper, robot.gripper.joint_ends is not None)
+            yield (*place, "gripper", "grasp"), "goes with type franka_msgs/action/Move only"
+        yield from _gripper_position(place, gripper, robot.gripper.joint_ends is not None)
         if gripper.type == JOINT_COMMANDS[0] and not robot.finger_joints:
-            yield ("ros2", "gripper", "type"), "is a trajectory, which needs robot.finger_joints"
+            yield (*place, "gripper", "type"), "is a trajectory, which needs robot.finger_joints"
 
 
-def _gripper_position(gripper: Ros2Gripper, has_ends: bool) -> Iterator[Fault]:
+def _gripper_position(place: Place, gripper: Ros2Gripper, has_ends: bool) -> Iterator[Fault]:
     """A number with the wrong meaning opens the gripper where it should close."""
-    place = ("ros2", "gripper", "position")
+    place = (*place, "gripper", "position")
     ends = "joint_open_rad and joint_shut_rad (_m where it slides) in robot.gripper"
     if gripper.says_width and gripper.position is not None:
         yield place, f"is not for {gripper.type}, which takes the width"

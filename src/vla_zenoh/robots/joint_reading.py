@@ -147,6 +147,13 @@ class SimulatedClock:
         return arrived_ns if arrived_ns - made_ns > OLDEST_NS else min(made_ns, arrived_ns)
 
 
+def wall_stamp_ns(stamp_ns: int, arrived_ns: int, simulated: SimulatedClock | None) -> int:
+    """When a message was made, in our time; a stamp of 0 is none."""
+    if simulated is not None:
+        return simulated.wall_ns(stamp_ns, arrived_ns)
+    return stamp_ns or arrived_ns
+
+
 class JointReading:
     """Newest state of one arm and its gripper, from its joint states; None before the first."""
 

@@ -145,8 +145,8 @@ class RobotNode:
                 self.step(tick)
         except Exception as error:
             how = "ends"
-            if self.arm is not None and not self.driver.simulated:
-                braked = self._brake_to_stop(self.arm, wait)
+            if self.arms and not self.driver.simulated:
+                braked = self._brake_to_stop(wait)
                 how = "braked, and ends" if braked else "not braked, and ends"
             if isinstance(error, NodeError):
                 self.node.reject("robot_failed", str(error))
@@ -201,10 +201,11 @@ class RobotNode:
     # -- the last brake -----------------------------------------------------------------------
     def _may_end(self, mono_ns: int) -> bool:
         """Whether the node may end at this tick; commands are rejected from the first call on."""
-        if self.arm is None or self.driver.simulated:
+        if not self.arms or self.driver.simulated:
             return True
-        self.arm.accepting = False
-        if not self.arm.guard.moving:
+        for arm in self.arms.values():
+            arm.accepting = False
+        if not self._moving:
             return True
         patience_s = max(LEAST_S, max_braking_time_s(self.node.profile) + SLACK_S)
         self._brake_until_ns = self._brake_until_ns or mono_ns + round(patience_s * 1e9)
@@ -216,24 +217,32 @@ class RobotNode:
         )
         return True
 
-    def _brake_to_stop(self, arm: Arm, wait: Callable[[], Tick]) -> bool:
-        """Brake after an exception, tolerating single failures; whether the arm came to rest."""
-        arm.accepting = False
-        failures = 0
-        while arm.guard.moving:
+    @property
+    def _moving(self) -> bool:
+        """Whether one of the arms moves."""
+        return any(arm.guard.moving for arm in self.arms.values())
+
+    def _brake_to_stop(self, wait: Callable[[], Tick]) -> bool:
+        """Brake after an exception, tolerating single failures; whether all arms came to rest."""
+        failures = dict.fromkeys(self.arms, 0)
+        for arm in self.arms.values():
+            arm.accepting = False
+        while self._moving:
             tick = wait()
-            try:
-                now_ns = self.node.clock.wall_at(tick.nominal_ns)
-                arm.begin_step(now_ns, tick.nominal_ns, tick.stall_s, reading=False)
-                failures = 0
-            except Exception as error:
-                failures += 1
-                if failures == FAILURES:
-                    self._emit_not_braked(f"it cannot be braked: {one_line(error, MAX_REASON)}")
-                    return False
+            now_ns = self.node.clock.wall_at(tick.nominal_ns)
+            for name, arm in self.arms.items():
+                try:
+                    arm.begin_step(now_ns, tick.nominal_ns, tick.stall_s, reading=False)
+                    failures[name] = 0
+                except Exception as error:
+                    failures[name] += 1
+                    if failures[name] == FAILURES:
+                        self._emit_not_braked(f"it cannot be braked: {one_line(error, MAX_REASON)}")
+            if all(count >= FAILURES for count in failures.values()):
+                return False
             if self._may_end(tick.nominal_ns):
                 break
-        return not arm.guard.moving
+        return not self._moving
 
     def _emit_not_braked(self, why: str) -> None:
         self.node.emit(Event("error", "fault", "not_braked", why))

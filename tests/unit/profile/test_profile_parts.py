@@ -9,7 +9,8 @@ import pytest
 
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.keys import Keys
-from vla_zenoh.profile import load_profile, override, read_profile, to_yaml
+from vla_zenoh.lab.profile.ros2_bridge import endpoints
+from vla_zenoh.profile import Profile, load_profile, override, read_profile, to_yaml
 
 PAIR = load_profile("two_pandas_sim")
 
@@ -62,6 +63,67 @@ def test_a_part_has_what_the_profile_says_where_its_own_sections_say_nothing() -
 def test_what_cannot_be_a_part_is_told_by_its_place(change: dict[str, Any], said: str) -> None:
     with pytest.raises(ProfileError, match=re.escape(said)):
         override(PAIR, change)
+
+
+NUMBERS = "std_msgs/msg/Float64MultiArray"
+
+
+def ros2_pair(left: dict[str, Any], right: dict[str, Any]) -> Profile:
+    """Two arms of one ROS 2 robot: what the sections ros2 of its parts say."""
+    own = {"left": {"ros2": left}, "right": {"ros2": right, "base": {"position_m": [1.0, 0, 0]}}}
+    robot = {"name": "pair", "command": "joint"}
+    changes = {
+        "robot": robot,
+        "parts": own,
+        "ros2": {"joint_command": {"topic": "/both", "type": NUMBERS}},
+    }
+    return override(load_profile("panda_ros2"), changes)
+
+
+def topics_of(space: str) -> dict[str, Any]:
+    """Topics of an arm below its namespace."""
+    return {
+        "joint_states": f"{space}/joint_states",
+        "joint_command": {"topic": f"{space}/commands"},
+        "gripper": {"topic": f"{space}/width", "type": "std_msgs/msg/Float64", "position": "width"},
+    }
+
+
+def test_the_parts_of_a_ros_2_robot_have_topics_of_their_own() -> None:
+    pair = ros2_pair(topics_of("/left"), topics_of("/right"))
+    for name in ("left", "right"):
+        ros2 = pair.of_part(name).ros2
+        assert ros2 is not None
+        assert ros2.joint_command is not None
+        assert (ros2.joint_states, ros2.joint_command.topic, ros2.joint_command.type) == (
+            f"/{name}/joint_states",
+            f"/{name}/commands",
+            NUMBERS,
+        )
+    names = {(end.role.value, end.name) for end in endpoints(pair)}
+    assert {("MS", "/left/joint_states"), ("MP", "/right/commands"), ("MP", "/left/width")} < names
+    assert ("MP", "/both") not in names
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"joint_command": {"topic": "/left/commands"}}, "both would follow one command"),
+        ({"gripper": {"topic": "/left/width"}}, "both would follow one command"),
+        ({"joint_states": "/left/joint_states"}, "both arms have joints panda_joint1"),
+        ({"domain": 3}, "parts.right.ros2.domain: is that of the whole robot"),
+        ({"joint_command": None}, "parts.right.ros2: lacks joint_command"),
+        ({"joint_states": "no topic"}, "is not a ROS topic"),
+    ],
+)
+def test_two_arms_of_ros_2_that_share_what_moves_them_are_rejected(
+    change: dict[str, Any], said: str
+) -> None:
+    right = topics_of("/right")
+    for field, value in change.items():
+        right[field] = {**right[field], **value} if isinstance(value, dict) else value
+    with pytest.raises(ProfileError, match=re.escape(said)):
+        ros2_pair(topics_of("/left"), right)
 
 
 def test_one_part_alone_is_no_robot_of_parts() -> None:

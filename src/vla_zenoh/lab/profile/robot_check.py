@@ -266,10 +266,7 @@ def ros2(profile: Profile) -> Iterator[ProfileFault]:
     try:
         from vla_zenoh.robots.ros2.driver import Ros2Driver
 
-        driver = Ros2Driver(profile)
-        output = getattr(profile.ros2, f"{profile.robot.command}_command")
-        if driver.has_arm and output is not None:
-            driver.writing(output)
+        Ros2Driver(profile)
     except ImportError as error:
         why = str(MissingExtraError(str(error.name), "ros2"))
         yield ProfileFault(("ros2",), why, "ros2")

@@ -176,9 +176,10 @@ def endpoints(profile: Profile) -> tuple[Endpoint, ...]:
     cameras = profile.ros2_cameras().values()
     topics = [one for camera in cameras for one in (camera, camera.depth) if one is not None]
     found = [Endpoint(EntityRole.SUBSCRIBER, one.topic, one.type) for one in topics]
-    if profile.robot.driver == "ros2":
-        found += _arm(ros2, profile.robot.command)
-        found += [] if ros2.gripper is None else _gripper(ros2.gripper)
+    for part in profile.part_names if profile.robot.driver == "ros2" else ():
+        own = profile.of_part(part).ros2 or ros2
+        found += _arm(own, profile.robot.command)
+        found += [] if own.gripper is None else _gripper(own.gripper)
     if ros2.prefix is not None:
         found += _operations(ros2.prefix, services=ros2.services)
     return tuple(dict.fromkeys(found))

@@ -16,7 +16,8 @@ from typing import Any, Literal
 
 from vla_zenoh.bus.node import Node
 from vla_zenoh.errors import CodecError
-from vla_zenoh.profile.robot import GRIPPER_ACTIONS, Ros2Gripper
+from vla_zenoh.profile import Profile
+from vla_zenoh.profile.robot import GRIPPER_ACTIONS
 from vla_zenoh.robots.ros2.ros_graph import CALL_S, RosGraph, ServiceClient
 from vla_zenoh.ros2 import writers
 from vla_zenoh.ros2.keys import COMMAND
@@ -93,7 +94,7 @@ class GoalSequencer:
 
 
 class Gripper:
-    """Sends accepted gripper commands to the robot; without a `profile` it has no gripper.
+    """Sends accepted gripper commands to the arm of `profile`; without ros2.gripper it has none.
 
     `width` measures the opening between the fingers (m), None while unknown; `wanted_m` is that of
     the newest command, None before the first. `blocked` says why goals do not reach the action;
@@ -105,13 +106,14 @@ class Gripper:
         node: Node,
         graph: RosGraph,
         messages: Messages,
-        profile: Ros2Gripper | None,
+        profile: Profile,
         width: Callable[[], float | None],
         blocked: Callable[[], str] = str,
         fingers: Mapping[str, float] | None = None,
     ) -> None:
-        self._node, self._messages, self._profile = node, messages, profile
-        self._limits = node.profile.robot.gripper
+        assert profile.ros2 is not None
+        gripper = self._profile = profile.ros2.gripper
+        self._node, self._messages, self._limits = node, messages, profile.robot.gripper
         self._blocked, self._fingers = blocked, fingers or {}
         self._measured_m, self._sent_m = width, self._limits.max_width_m
         self._goals = GoalSequencer(GOAL_TIMEOUT_S, self._limits.max_width_m)
@@ -121,14 +123,14 @@ class Gripper:
         self._held = False
         self._clients: dict[str, dict[str, ServiceClient]] = {}
         self._topic = None
-        if profile is None:
+        if gripper is None:
             return
-        if profile.type in GRIPPER_ACTIONS:
-            self._clients[profile.type] = graph.action_client(profile.topic, profile.type)
-            if profile.grasp is not None:
-                self._clients[GRASP] = graph.action_client(profile.grasp, GRASP)
+        if gripper.type in GRIPPER_ACTIONS:
+            self._clients[gripper.type] = graph.action_client(gripper.topic, gripper.type)
+            if gripper.grasp is not None:
+                self._clients[GRASP] = graph.action_client(gripper.grasp, GRASP)
         else:
-            self._topic = graph.publisher(profile.topic, profile.type, COMMAND)
+            self._topic = graph.publisher(gripper.topic, gripper.type, COMMAND)
 
     @property
     def busy(self) -> bool:

@@ -13,7 +13,7 @@ import zenoh
 from vla_zenoh.bus.buffers import bytes_of
 from vla_zenoh.errors import CodecError
 from vla_zenoh.profile import Profile, SessionProfile
-from vla_zenoh.profile.robot import GRIPPER_ACTIONS
+from vla_zenoh.profile.robot import GRIPPER_ACTIONS, Ros2Gripper
 from vla_zenoh.profile.schema import TRUSTED_PROTOCOLS
 from vla_zenoh.ros2.bridge_view import (
     MAX_REPLY_BYTES,
@@ -32,7 +32,11 @@ from vla_zenoh.types import Event
 ASK_S = 1.0
 """Timeout of a query."""
 PERIOD_S, ROUTED_S = 5.0, 2.0
-GRIPPER = "gripper_middleware"
+
+
+def gripper_fault(part: str) -> str:
+    """Name of the fault that a part's gripper is not reached; of one arm the part is empty."""
+    return f"{part}_gripper_middleware" if part else "gripper_middleware"
 
 
 class Bridges:
@@ -52,9 +56,9 @@ class Bridges:
         ros2 = profile.ros2
         assert ros2 is not None
         self._session, self._ros2, self._silent = session, ros2, silent
-        command = ros2.joint_command if profile.robot.command == "joint" else ros2.pose_command
-        drives = profile.robot.driver == "ros2"
-        self._commanded = command.topic if drives and command is not None else None
+        names = profile.part_names if profile.robot.driver == "ros2" else ()
+        self._arms = {name: profile.of_part(name).ros2 or ros2 for name in names}
+        self._command = f"{profile.robot.command}_command"
 
     def view(self) -> BridgeView:
         """Bridges and the middleware that they see."""
@@ -77,12 +81,13 @@ class Bridges:
                 f"end all but one ({', '.join(view.doubled)})"
             )
             yield "two_bridges", why
-        if self._cut_off():
+        cut_off = [topic for topic in self._commanded() if self._cut_off(topic)]
+        if cut_off:
             why = (
-                f"a node subscribes to {self._commanded}, and the bridge sends it nothing: restart "
-                "the bridge. It loses a node that was started again within the lease of the one "
-                "before (Fast DDS: 20 s), and lets through what its settings had when it started "
-                "(vla-zenoh profile bridge-config)"
+                f"a node subscribes to {' and '.join(cut_off)}, and the bridge sends it nothing: "
+                "restart the bridge. It loses a node that was started again within the lease of "
+                "the one before (Fast DDS: 20 s), and lets through what its settings had when it "
+                "started (vla-zenoh profile bridge-config)"
             )
             yield "not_routed", why
         published = [
@@ -102,23 +107,28 @@ class Bridges:
                 f"waits for ever. Use the topics below {ros2.prefix}, or {SERVES} there"
             )
             yield "services_middleware", why
-        servers = self._gripper_servers() - {SERVES}
-        if servers and ros2.gripper is not None:
-            why = (
-                f"the gripper's action {ros2.gripper.topic} is served by {_and(servers)}, to which "
-                "no bridge carries a goal: command it by a topic (ros2.gripper), or start its node "
-                f"with {SERVES}"
-            )
-            yield GRIPPER, why
+        for part, one in self._arms.items():
+            servers = self._servers(one.gripper) - {SERVES}
+            if servers and one.gripper is not None:
+                why = (
+                    f"the gripper's action {one.gripper.topic} is served by {_and(servers)}, to "
+                    "which no bridge carries a goal: command it by a topic (ros2.gripper), or "
+                    f"start its node with {SERVES}"
+                )
+                yield gripper_fault(part), why
 
-    def _cut_off(self) -> bool:
+    def _commanded(self) -> list[str]:
+        """Topics of our set-points."""
+        outputs = [getattr(one, self._command) for one in self._arms.values()]
+        return [output.topic for output in outputs if output is not None]
+
+    def _cut_off(self, topic: str) -> bool:
         """Whether a robot's node subscribes to our set-points and a bridge passes none on.
 
         It routes a new subscriber within a second, so it is asked twice.
         """
-        topic = self._commanded
         for pause_s in (ROUTED_S, 0.0):
-            if topic is None or not self._ask(endpoints_key("reader", f"rt{topic}")):
+            if not self._ask(endpoints_key("reader", f"rt{topic}")):
                 return False
             if any_active(self._ask(route_key(topic))):
                 return False
@@ -130,8 +140,7 @@ class Bridges:
             return frozenset()
         return vendors(self._ask(endpoints_key("writer", f"rq{self._ros2.prefix}/**")))
 
-    def _gripper_servers(self) -> frozenset[str]:
-        gripper = self._ros2.gripper
+    def _servers(self, gripper: Ros2Gripper | None) -> frozenset[str]:
         if gripper is None or gripper.type not in GRIPPER_ACTIONS:
             return frozenset()
         actions = [each for each in (gripper.topic, gripper.grasp) if each is not None]
