@@ -4,6 +4,7 @@
 
     joint_states     sensor_msgs/JointState      out, 200 Hz
     desired_pose     geometry_msgs/PoseStamped   in
+    joint_command    std_msgs/Float64MultiArray  in, rad: the arm is there at its next tick
     gripper_width    std_msgs/Float64            in, m between the fingers
     gripper/move, gripper/grasp                  franka_msgs actions, served
     /tf, /tf_static                              tf2_msgs/TFMessage, out
@@ -36,12 +37,13 @@ from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64
+from std_msgs.msg import Float64, Float64MultiArray
 from tf2_msgs.msg import TFMessage
 from told import obey, tell
 
 SETTINGS = {
     "namespace": "",
+    "prefix": "",  # of its joints and frames
     "state_hz": 200.0,
     "actions": False,
     "sim_time": 0.0,  # how fast simulated time goes; 0: none
@@ -83,6 +85,7 @@ class Arm:
         self._settings = settings
         self._node = node = rclpy.create_node("panda", namespace=settings["namespace"])
         self._lock = threading.Lock()
+        self._joint_goal_rad: Any = None
         self._q_rad = np.array(panda_dh.HOME_RAD)
         self._follower = Follower(panda_dh.forward(self._q_rad))
         self._width_m = self._goal_width_m = OPEN_M
@@ -103,6 +106,7 @@ class Arm:
             event_callbacks=subscribes("desired_pose"),
         )
         node.create_subscription(Float64, "gripper_width", self._on_width, 10)
+        node.create_subscription(Float64MultiArray, "joint_command", self._on_joints, 1)
         self._tf = node.create_publisher(TFMessage, "/tf", 100)
         fixed = node.create_publisher(TFMessage, "/tf_static", qos(transient_local=True, depth=1))
         mount = self._transform("front_color_optical_frame", np.eye(4))
@@ -122,6 +126,11 @@ class Arm:
             self._follower.goal_m = np.array(goal_m)
             self._follower.goal_rotation = panda_dh.rotation_of(quat)
         tell(goal=goal_m, quat=quat, stamp_ns=stamp_ns, wall_ns=wall_ns)
+
+    def _on_joints(self, message: Float64MultiArray) -> None:
+        with self._lock:
+            self._joint_goal_rad = np.array(message.data)
+        tell(joint_goal=list(message.data))
 
     def _on_width(self, message: Float64) -> None:
         tell(width=message.data)
@@ -170,6 +179,8 @@ class Arm:
                 self._q_rad = panda_dh.inverse(
                     self._follower.position_m, self._follower.rotation, before_rad
                 )
+                if self._joint_goal_rad is not None:
+                    self._q_rad = self._joint_goal_rad
                 most_m = self._finger_m_s * dt_s
                 self._width_m += np.clip(self._goal_width_m - self._width_m, -most_m, most_m)
             self._publish(now_ns, (self._q_rad - before_rad) / dt_s, ticks)
@@ -179,7 +190,8 @@ class Arm:
         fingers = [self._width_m / 2] * 2
         message = JointState()
         message.header.stamp, message.header.frame_id = self._stamp(), BASE
-        message.name = [*panda_dh.JOINTS, *panda_dh.FINGERS]
+        names = (*panda_dh.JOINTS, *panda_dh.FINGERS)
+        message.name = [self._settings["prefix"] + name for name in names]
         message.position = [*self._q_rad.tolist(), *fingers]
         message.velocity = [*velocity.tolist(), 0.0, 0.0]
         message.effort = [0.0] * 9
@@ -201,8 +213,9 @@ class Arm:
         return Time(sec=now_ns // 10**9, nanosec=now_ns % 10**9)
 
     def _transform(self, child: str, pose: Any) -> TransformStamped:
-        out = TransformStamped(child_frame_id=child)
-        out.header.stamp, out.header.frame_id = self._stamp(), BASE
+        prefix = self._settings["prefix"]
+        out = TransformStamped(child_frame_id=prefix + child)
+        out.header.stamp, out.header.frame_id = self._stamp(), prefix + BASE
         out.transform.translation.x, out.transform.translation.y, out.transform.translation.z = (
             pose[:3, 3].tolist()
         )
