@@ -79,6 +79,7 @@ def write_run(
     prompts: Sequence[str] = PROMPTS,
     silent: Sequence[int] = (),
     with_spec: bool = True,
+    percent: float = 100.0,
     ended: Mapping[str, Any] | None = None,
 ) -> Path:
     """One activation of 2 s for each prompt, half a second of rest after each.
@@ -90,6 +91,7 @@ def write_run(
         prompts: of the activations.
         silent: chunks that were never published, in each activation.
         with_spec: the worker says what its steps mean.
+        percent: speed override.
         ended: what stands at its end beside what was dropped.
     """
     said = of or spec()
@@ -102,9 +104,9 @@ def write_run(
     for number, prompt in enumerate(prompts):
         begin_ms = 500 + number * (lasts_ms + 500)
         for at_ms in range(begin_ms, begin_ms + lasts_ms, 100):
-            active = Task(number + 1, True, prompt, "teacher", 5.0)
+            active = Task(number + 1, True, prompt, "teacher", 5.0, percent)
             samples.append(put(KEYS.task, active, at_ms, at_ms))
-        idle = Task(number + 1, False, prompt, "teacher", 5.0)
+        idle = Task(number + 1, False, prompt, "teacher", 5.0, percent)
         samples.append(put(KEYS.task, idle, begin_ms + lasts_ms, begin_ms + lasts_ms))
         for chunk in range(CHUNKS):
             if chunk in silent:

@@ -19,6 +19,7 @@ from dataset_rig import (
     HORIZON,
     PROMPTS,
     WIDTH,
+    ZERO_NS,
     depth_counts,
     spec,
     steps_of,
@@ -83,6 +84,30 @@ def test_a_chunk_that_ran_out_is_followed_by_frames_that_stand_still(tmp_path: P
     np.testing.assert_array_equal(after[:HORIZON], ran_out)
     still = np.array([0, 0, 0, 0, 0, 0, ran_out[-1, -1]], np.float32)
     np.testing.assert_array_equal(after[HORIZON:], [still] * 2)
+
+
+@pytest.mark.parametrize(("percent", "used"), [(100.0, USED), (50.0, 1)])
+def test_at_a_lower_speed_override_only_steps_that_the_arm_had_time_for_are_frames(
+    percent: float, used: int, tmp_path: Path
+) -> None:
+    (episode,) = episodes_of(
+        load_run(make_run(tmp_path / "slow.mcap", prompts=PROMPTS[:1], percent=percent))
+    )
+    wanted = np.concatenate([steps_of(0, chunk)[:used] for chunk in range(CHUNKS)])
+    np.testing.assert_array_equal([frame.action for frame in episode.frames], wanted)
+    apart_s = np.diff([frame.stamp_ns for frame in episode.frames]) / 1e9
+    np.testing.assert_allclose(apart_s, DT_S * 100 / percent)
+
+
+@pytest.mark.parametrize("dt_s", [0.125, 0.4 / 3, 0.5, 0.04])
+def test_chunks_that_come_between_two_steps_do_not_add_any(dt_s: float, tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run.mcap", of=spec(dt_s=dt_s), prompts=PROMPTS[:1])
+    (episode,) = episodes_of(load_run(run))
+    lasts_s = CHUNK_MS * CHUNKS / 1000
+    assert abs(len(episode.frames) - lasts_s / dt_s) <= 1
+    stamps_s = (np.array([frame.stamp_ns for frame in episode.frames]) - ZERO_NS) / 1e9
+    even_s = stamps_s[0] + dt_s * np.arange(len(stamps_s))
+    assert np.abs(stamps_s - even_s).max() <= dt_s / 2 + 1e-6
 
 
 def test_standing_still_is_said_in_the_words_of_the_spec() -> None:

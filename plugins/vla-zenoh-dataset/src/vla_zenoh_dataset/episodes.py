@@ -2,7 +2,8 @@
 
 A frame is one step of that worker's chunks: step k of a chunk belongs to the stamp of its
 observation plus k steps. Steps that a newer chunk replaced are left out. If a chunk ran out before
-the next one arrived, frames without motion fill the gap, so all frames are `dt_s` apart.
+the next one arrived, frames without motion fill the gap, so all frames are `dt_s` apart. At a speed
+override of a share s a step takes dt_s / s: the frames are those of the same motion at full speed.
 
 Where a person took the arm from a model and gave it back, without a deactivation in between, that
 is one episode of the model. The frames that the person led are what the arm was commanded to do,
@@ -11,7 +12,9 @@ in the numbers of the model's spec (`vla_zenoh_dataset.corrections`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,7 +120,7 @@ def episodes_of(run: Run, worker: str | None = None) -> list[RecordedEpisode]:
         whose = next((each for _, _, each in led if each not in people), led[0][2])
         if worker in (None, whose):
             out.append(_episode(run, whose, led, carried_out, people))
-    return out
+    return [episode for episode in out if episode.frames]
 
 
 def _people(run: Run) -> set[str]:
@@ -164,18 +167,18 @@ def _episode(
     ]
     ends = [*begins[1:], led[-1][1]]
     frames: list[EpisodeFrame] = []
-    dt_ns = round(spec.action.dt_s * 1e9)
-    for (span, chunks), begin_ns, end_ns in zip(parts, begins, ends, strict=True):
+    clock = StepClock(run.tasks, begins[0], ends[-1], spec.action.dt_s)
+    for (span, chunks), end_ns in zip(parts, ends, strict=True):
         person = span[2] in people
         if chunks:
             last = span is led[-1]
-            frames += _frames(run, spec.action, chunks, end_ns, person=person, to_the_end=not last)
+            timed = (chunks, end_ns, clock)
+            frames += _frames(run, spec.action, timed, person=person, to_the_end=not last)
         elif motion is not None:
-            since_ns = max(begin_ns, frames[-1].stamp_ns + dt_ns if frames else begin_ns)
-            stamps = [since_ns + dt_ns * at for at in range(round((end_ns - since_ns) / dt_ns))]
+            stamps = [clock.when_ns(at) for at in range(len(frames), clock.count(end_ns) + 1)]
             frames += [
-                EpisodeFrame(at_ns, motion(at_ns, at_ns + dt_ns), _prompt(run, at_ns), person)
-                for at_ns in stamps
+                EpisodeFrame(at_ns, motion(at_ns, next_ns), _prompt(run, at_ns), person)
+                for at_ns, next_ns in pairwise(stamps)
             ]
     return RecordedEpisode(run, whose, spec, led[0][0], led[-1][1], frames, led)
 
@@ -221,27 +224,62 @@ def _as_deltas(
     return action, np.concatenate([rows for _, rows in own.values()], axis=1)
 
 
+class StepClock:
+    """Steps of an episode in time, at the speed override in force.
+
+    Args:
+        tasks: of the run, oldest first.
+        begin_ns, end_ns: of the episode, wall clock.
+        dt_s: of a step at full speed.
+    """
+
+    def __init__(
+        self, tasks: Sequence[RecordedSample], begin_ns: int, end_ns: int, dt_s: float
+    ) -> None:
+        self._begin_ns = begin_ns
+        first = newest(tasks, begin_ns) or tasks[0]
+        shares = {begin_ns: first.record.speed}
+        for task in tasks:
+            if begin_ns < task.header.stamp_wall_ns < end_ns:
+                shares[task.header.stamp_wall_ns] = task.record.speed
+        self._passed_s = (np.array([*shares, end_ns]) - begin_ns) / 1e9
+        each = np.diff(self._passed_s) * np.array([*shares.values()]) / dt_s
+        self._steps = np.concatenate([[0.0], np.cumsum(each)])
+
+    def steps(self, at_ns: int) -> float:
+        """How many steps have passed at a time."""
+        return float(np.interp((at_ns - self._begin_ns) / 1e9, self._passed_s, self._steps))
+
+    def count(self, at_ns: int) -> int:
+        """`steps` as a whole number: however often chunks come, no step is counted twice."""
+        return round(self.steps(at_ns))
+
+    def when_ns(self, steps: float) -> int:
+        """When so many steps have passed, wall clock."""
+        return self._begin_ns + round(np.interp(steps, self._steps, self._passed_s) * 1e9)
+
+
 def _frames(
     run: Run,
     spec: ActionSpec,
-    chunks: list[RecordedSample],
-    until_ns: int,
+    timed: tuple[list[RecordedSample], int, StepClock],
     *,
     person: bool = False,
     to_the_end: bool = False,
 ) -> list[EpisodeFrame]:
-    dt_ns = round(spec.dt_s * 1e9)
+    """Frames of chunks until a time; the last chunk does not go beyond its steps."""
+    chunks, until_ns, clock = timed
     begins = [chunk.record.observation_stamp_ns for chunk in chunks]
     ends = [*begins[1:], until_ns]
     out: list[EpisodeFrame] = []
     for chunk, begin_ns, end_ns in zip(chunks, begins, ends, strict=True):
         steps = chunk.record.steps
-        count = max(round((end_ns - begin_ns) / dt_ns), 1)
+        count = clock.count(end_ns) - clock.count(begin_ns)
         if chunk is chunks[-1] and not to_the_end:
             count = min(count, len(steps))
         rest = standing_step(spec, steps[-1])
         for index in range(count):
-            at_ns = begin_ns + index * dt_ns
+            at_ns = clock.when_ns(clock.steps(begin_ns) + index)
             # A chunk's observation may be from just before the activation.
             prompt = _prompt(run, max(at_ns, chunk.header.stamp_wall_ns))
             action = steps[index] if index < len(steps) else rest
