@@ -277,6 +277,8 @@ def test_the_state_of_an_arm_has_as_many_joints_as_it_was_recorded_with(
 
 
 JOINTS = ("shoulder", "elbow", "wrist")
+MAX_WIDTH_M = 0.08
+"""Of the profile that the runs were recorded with."""
 
 
 def joint_run(folder: Path, **action: str) -> Run:
@@ -287,18 +289,41 @@ def joint_run(folder: Path, **action: str) -> Run:
     return replace(run, joints=[heard._replace(record=joint) for heard in run.poses])
 
 
-def test_actions_of_joints_are_exported_as_joints_with_the_names_of_the_arm(tmp_path: Path) -> None:
-    episodes = episodes_of(joint_run(tmp_path, kind="absolute"))
-    assert usual_state(episodes) == "joint+gripper_m"
+@pytest.mark.parametrize(
+    ("gripper", "percent"),
+    [("open_fraction", 100.0), ("absolute_m", 100.0 / MAX_WIDTH_M), ("none", 0.0)],
+)
+def test_positions_of_joints_are_exported_in_the_numbers_of_lerobots_robots(
+    tmp_path: Path, gripper: str, percent: float
+) -> None:
+    episodes = episodes_of(joint_run(tmp_path, kind="absolute", gripper=gripper))
+    assert usual_state(episodes) == ("joint+gripper_open" if percent else "joint")
     export(tmp_path / "out", episodes, [], read_parts(usual_state(episodes)))
-    info = json.loads((tmp_path / "out" / "meta" / "info.json").read_text())
-    assert info["features"]["action"]["names"] == [*JOINTS, "gripper_open_fraction"]
-    assert info["features"]["observation.state"]["names"] == [*JOINTS, "gripper_m"]
+    features = json.loads((tmp_path / "out" / "meta" / "info.json").read_text())["features"]
+    names = [*(f"{name}.pos" for name in JOINTS), *(["gripper.pos"] if percent else [])]
+    assert features["observation.state"]["names"] == features["action"]["names"] == names
     rows = pq.read_table(next((tmp_path / "out" / "data").rglob("*.parquet")))
-    actions = np.array([row.as_py() for row in rows.column("action")], np.float32)
+    actions = np.array([row.as_py() for row in rows.column("action")])
     for number in range(2):
-        wanted = np.concatenate([steps_of(number, chunk, 4)[:USED] for chunk in range(CHUNKS)])
-        np.testing.assert_array_equal(actions[20 * number : 20 * number + 20], wanted)
+        wanted = np.concatenate(
+            [steps_of(number, chunk, len(names))[:USED] for chunk in range(CHUNKS)]
+        ).astype(np.float64)
+        found = actions[20 * number : 20 * number + 20]
+        np.testing.assert_allclose(np.radians(found[:, :3]), wanted[:, :3], rtol=1e-6)
+        if percent:
+            np.testing.assert_allclose(found[:, 3], percent * wanted[:, 3], rtol=1e-6)
+    state = rows.column("observation.state")[0].as_py()
+    np.testing.assert_allclose(np.radians(state[:3]), (0.1, 0.2, 0.3), rtol=1e-6)
+    if percent:
+        width_m = episodes[0].run.grippers[0].record.width_m
+        assert state[3] == pytest.approx(100.0 * width_m / MAX_WIDTH_M)
+
+
+def test_joints_that_are_no_positions_keep_our_names_and_units(tmp_path: Path) -> None:
+    for kind, gripper in (("delta", "open_fraction"), ("absolute", "delta_m")):
+        episodes = episodes_of(joint_run(tmp_path / kind, kind=kind, gripper=gripper))
+        assert usual_state(episodes) == "joint+gripper_m"
+        assert action_names(episodes[0].spec.action) == [*JOINTS, f"gripper_{gripper}"]
 
 
 def test_joint_deltas_on_the_start_of_their_chunk_become_deltas_on_the_step_before(

@@ -32,7 +32,7 @@ USED, COLUMNS = 2, 6
 NAMES = [
     f"{part}_{name}.pos" for part in ("left", "right") for name in ("joint1", "joint2", "gripper")
 ]
-STATE_ATOL = 1e-6
+STATE_ATOL, MAX_WIDTH_M = 1e-6, 0.08
 
 
 @pytest.fixture(scope="module")
@@ -91,12 +91,15 @@ def test_columns_of_a_dataset_have_the_names_of_lerobots_robots_with_two_arms(
     assert features["observation.state"]["names"] == NAMES
 
 
-def test_actions_come_out_to_the_bit_and_states_are_those_of_their_part(dataset: Path) -> None:
+def test_actions_and_states_of_each_part_are_in_the_numbers_of_lerobots_robots(
+    dataset: Path,
+) -> None:
     table = pq.read_table(next(dataset.glob("data/*/*.parquet")))
-    actions = np.array(table["action"].to_pylist(), np.float32)
+    unit = np.array([np.pi / 180, np.pi / 180, MAX_WIDTH_M / 100] * 2)
+    actions = np.array(table["action"].to_pylist()) * unit
     wanted = [steps_of(0, chunk, COLUMNS)[:USED] for chunk in range(CHUNKS)]
-    np.testing.assert_array_equal(actions, np.concatenate(wanted))
-    states = np.array(table["observation.state"].to_pylist())
+    np.testing.assert_allclose(actions, np.concatenate(wanted), rtol=1e-6)
+    states = np.array(table["observation.state"].to_pylist()) * unit
     for number, state in enumerate(states):
         at_ms = BEGIN_MS + 5 + 100 * number
         near_ms = (at_ms - 5, at_ms + 5)

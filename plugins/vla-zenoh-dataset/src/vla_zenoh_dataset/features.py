@@ -1,4 +1,9 @@
-"""Columns of a dataset, and the state of the robot as one of them."""
+"""Columns of a dataset, and the state of the robot as one of them.
+
+Actions that are positions of joints, and the state that goes with them, are in the numbers of
+LeRobot's own robots, whose names they have: ``JOINT.pos`` in degrees, ``gripper.pos`` from 0 shut
+to 100 open. All others are in ours.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +16,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vla_zenoh.errors import RecordingError
+from vla_zenoh.lab.policy_servers.action_semantics import (
+    NO_CONTROLLER,
+    ActionSemantics,
+    read_action_semantics,
+)
+from vla_zenoh.lab.policy_servers.presets import LEROBOT, LEROBOT_STATE
 from vla_zenoh.lab.policy_servers.state_vector import StateNumbers, parts_of, state_numbers
 from vla_zenoh.lab.recording.run import Run, nearest
 from vla_zenoh.policy import ActionSpec, Observation
@@ -95,16 +106,57 @@ NAMES = {
     "wrench": [*(f"force_{axis}" for axis in "xyz"), *(f"torque_{axis}" for axis in "xyz")],
     "fingers_m": ["left_finger", "right_finger"],
 }
-GRIPPER_POSITIONS = ("gripper_m", "gripper_absolute_m", "gripper_open", "gripper_open_fraction")
 NEAR_NS = 100_000_000
 """Largest distance in time between a frame and its state."""
 
 
-def state_names(parts: Sequence[str], joints: Sequence[str]) -> list[str]:
-    """Names of the numbers of a state."""
-    of_arm = {"joint": [*joints], "joint_deg": [f"{name}_deg" for name in joints]}
-    of_arm["effort"] = [f"{name}_effort" for name in joints]
-    return [name for part in parts for name in {**NAMES, **of_arm}.get(part, [part])]
+def in_lerobots_numbers(spec: ActionSpec) -> bool:
+    """Whether actions of one arm are positions of joints, so that LeRobot's robots have them."""
+    return spec.space == "joint" and spec.kind == "absolute" and spec.gripper != "delta_m"
+
+
+def worker_options(spec: ActionSpec) -> dict[str, str]:
+    """What the actions of one arm mean in a dataset, as options of the worker ``lerobot``."""
+    options = {"dt_s": repr(spec.dt_s), "gripper": spec.gripper}
+    if in_lerobots_numbers(spec):
+        grips = spec.gripper != "none"
+        return options | {each: LEROBOT[each] for each in LEROBOT if grips or "grip" not in each}
+    if spec.gripper in ("open_fraction", "binary"):
+        options["gripper_open"] = "high" if spec.gripper_open_is_high else "low"
+        options["gripper_threshold"] = repr(spec.gripper_threshold)
+    if spec.kind != "absolute":
+        controller = spec.controller
+        options["anchor"], options["relative_to"] = spec.anchor, spec.relative_to
+        options["controller"] = (
+            f"{controller.kp!r}:{controller.damping_ratio!r}" if controller else NO_CONTROLLER
+        )
+    if spec.space == "joint":
+        kind = {"absolute": "position"}.get(spec.kind, spec.kind)
+        return options | {"action": f"joint_{kind}", "joint_scale_rad": "1"}
+    rotation = {"quaternion": "quat_xyzw"}.get(spec.rotation, spec.rotation)
+    scale = repr(spec.position_scale_m)
+    arm = {"action": spec.kind, "frame": spec.frame, "rotation": rotation}
+    return options | arm | {"position_scale_m": scale}
+
+
+def semantics_of(spec: ActionSpec) -> ActionSemantics:
+    """The numbers of a dataset with actions of one arm."""
+    return read_action_semantics(
+        {**worker_options(spec), "horizon": str(spec.horizon)}, joints=spec.joints
+    )
+
+
+def state_names(
+    parts: Sequence[str], joints: Sequence[str], spec: ActionSpec | None = None
+) -> list[str]:
+    """Names of the numbers of a state; `spec`: of the actions that it goes with."""
+    own = {"joint": [*joints], "joint_deg": [f"{name}_deg" for name in joints]}
+    own["effort"] = [f"{name}_effort" for name in joints]
+    if spec is not None and in_lerobots_numbers(spec):
+        own["joint"] = [f"{name}.pos" for name in joints]
+        if spec.gripper != "none":
+            own["gripper_open"] = ["gripper.pos"]
+    return [name for part in parts for name in {**NAMES, **own}.get(part, [part])]
 
 
 def names_of_state(episode: RecordedEpisode, parts: Sequence[str]) -> list[str]:
@@ -113,47 +165,61 @@ def names_of_state(episode: RecordedEpisode, parts: Sequence[str]) -> list[str]:
     for part in episode.spec.parts:
         joints = episode.run.of_part(part).joints
         names = joints[0].record.names if joints else ()
-        out += _of_part(part, state_names(parts, names), names)
+        out += _of_part(part, state_names(parts, names, episode.spec.action.of(part)))
     return out
 
 
 def action_names(spec: ActionSpec) -> list[str]:
     """Names of the numbers of a step, one part of the robot after the other."""
     if spec.parts:
-        each = [
-            _of_part(
-                one.part,
-                action_names(one.action),
-                one.action.joints if one.action.kind == "absolute" else (),
-            )
-            for one in spec.parts
-        ]
+        each = [_of_part(one.part, action_names(one.action)) for one in spec.parts]
         return [name for names in each for name in names]
+    if in_lerobots_numbers(spec):
+        gripper = [] if spec.gripper == "none" else ["gripper.pos"]
+        return [*(f"{name}.pos" for name in spec.joints), *gripper]
     gripper = [] if spec.gripper == "none" else [f"gripper_{spec.gripper}"]
     arm = spec.joints if spec.space == "joint" else [*NAMES["position"], *NAMES[spec.rotation]]
     return [*arm, *gripper]
 
 
-def _of_part(part: str, names: Sequence[str], joints: Sequence[str]) -> list[str]:
+def _of_part(part: str, names: Sequence[str]) -> list[str]:
     """Names as of LeRobot's robots with two arms: ``left_joint1.pos``, ``left_gripper.pos``.
-
-    Those that LeRobot has no name for follow the part as they are. Units are ours: rad, and metres
-    or a share of the opening.
 
     Args:
         part: of the robot; empty: it is one arm, whose names stay.
     """
-    if not part:
-        return [*names]
-    own = {name: f"{name}.pos" for name in joints} | dict.fromkeys(GRIPPER_POSITIONS, "gripper.pos")
-    return [f"{part}_{own.get(name, name)}" for name in names]
+    return [f"{part}_{name}" if part else name for name in names]
 
 
 def usual_state(episodes: Sequence[RecordedEpisode]) -> str:
     """Parts of the state that go with the actions: joints with joints, else the pose."""
-    first = episodes[0].spec if episodes else None
-    joints = first is not None and first.action.of(first.parts[0]).space == "joint"
-    return "joint+gripper_m" if joints else "position+rpy+gripper_m"
+    first = episodes[0].spec.action.of(episodes[0].spec.parts[0]) if episodes else None
+    if first is None or first.space != "joint":
+        return "position+rpy+gripper_m"
+    if not in_lerobots_numbers(first):
+        return "joint+gripper_m"
+    return LEROBOT_STATE if first.gripper != "none" else "joint"
+
+
+def actions_of(episode: RecordedEpisode) -> NDArray[np.float32]:
+    """(n, D) actions of the frames, one part of the robot after the other."""
+    spec, steps = episode.spec, np.array([frame.action for frame in episode.frames], np.float32)
+    each = [
+        _actions(spec.action.of(part), steps[:, spec.action.columns(part)], episode.run, part)
+        for part in spec.parts
+    ]
+    return np.concatenate(each, axis=1).astype(np.float32)
+
+
+def _actions(spec: ActionSpec, steps: NDArray[np.float32], run: Run, part: str) -> NDArray[Any]:
+    if not in_lerobots_numbers(spec):
+        return steps
+    steps = steps.astype(np.float64)
+    if spec.gripper != "none":
+        max_width_m = run.of_part(part).profile.robot.gripper.max_width_m
+        shares = [spec.gripper_scale(max_width_m).decode(number) for number in steps[:, -1]]
+        steps[:, -1] = np.greater(shares, 0.5) if spec.gripper == "binary" else shares
+    return semantics_of(spec).rows(steps)
 
 
 def states_of(episode: RecordedEpisode, parts: Sequence[str]) -> NDArray[np.float32]:
@@ -162,24 +228,29 @@ def states_of(episode: RecordedEpisode, parts: Sequence[str]) -> NDArray[np.floa
     Raises:
         RecordingError: no state was recorded near a frame.
     """
-    each = [_states(episode, episode.run.of_part(part), parts) for part in episode.spec.parts]
+    each = [
+        _states(episode, episode.run.of_part(part), parts, episode.spec.action.of(part))
+        for part in episode.spec.parts
+    ]
     return np.concatenate(each, axis=1)
 
 
-def numbers_of(run: Run, parts: Sequence[str]) -> StateNumbers:
-    """The numbers of a state of the run's robot, whose joints come as they were recorded.
+def numbers_of(run: Run, parts: Sequence[str], spec: ActionSpec) -> StateNumbers:
+    """The numbers of a state that goes with actions of one arm, as it was recorded.
 
     Raises:
         RecordingError: the recording holds no profile.
     """
-    found = state_numbers(parts, run.profile)
+    found = state_numbers(parts, run.profile, semantics_of(spec).state_units)
     return replace(found, joints=run.joints[0].record.names) if run.joints else found
 
 
-def _states(episode: RecordedEpisode, run: Run, parts: Sequence[str]) -> NDArray[np.float32]:
+def _states(
+    episode: RecordedEpisode, run: Run, parts: Sequence[str], spec: ActionSpec
+) -> NDArray[np.float32]:
     streams: dict[str, Any] = {"joint": run.joints, "pose": run.poses, "gripper": run.grippers}
     wanted = {part: streams[STREAM_OF.get(part, part)] for part in parts_of(parts)}
-    numbers, place = numbers_of(run, parts), f"{run.part}/" if run.part else ""
+    numbers, place = numbers_of(run, parts, spec), f"{run.part}/" if run.part else ""
     task = Task(0, True, "", episode.worker, 1.0)
     rows = []
     for frame in episode.frames:

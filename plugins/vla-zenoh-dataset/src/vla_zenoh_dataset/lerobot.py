@@ -29,11 +29,13 @@ from vla_zenoh_dataset.features import (
     PICTURE,
     STATE,
     action_names,
+    actions_of,
     joined,
     names_of_state,
     numbers_of,
     of_numbers,
     states_of,
+    worker_options,
 )
 from vla_zenoh_dataset.videos import DepthColumn, EpisodeVideo, chosen, stamps_of, write_videos
 
@@ -184,7 +186,7 @@ class _Dataset:
                 tasks = [self._tasks.index(frame.prompt) for frame in episode.frames]
                 rows: dict[str, NDArray[Any]] = {
                     STATE: states,
-                    ACTION: np.array([frame.action for frame in episode.frames], np.float32),
+                    ACTION: actions_of(episode),
                     INTERVENTION: np.array([frame.intervention for frame in episode.frames]),
                     "timestamp": (np.arange(count) / self._fps).astype(np.float32),
                     "frame_index": np.arange(count),
@@ -298,6 +300,7 @@ class _Dataset:
         ours = {
             "spec": self._spec.to_dict(),
             "state": "+".join(self._parts),
+            "options": self._options(),
             "rotation_reference": self._references(),
             "episodes": [
                 {
@@ -319,7 +322,18 @@ class _Dataset:
         """Part of the robot -> x, y, z, w that signs and cuts of its rotations are nearest to."""
         first = self._episodes[0]
         each = {part: first.run.of_part(part) for part in first.spec.parts}
-        return {part: [*numbers_of(run, self._parts).reference] for part, run in each.items()}
+        return {
+            part: [*numbers_of(run, self._parts, first.spec.action.of(part)).reference]
+            for part, run in each.items()
+        }
+
+    def _options(self) -> dict[str, str] | None:
+        """Of the worker ``lerobot`` for a policy of this dataset; None: its arms have others."""
+        action, parts = self._spec.action, self._spec.parts
+        options = worker_options(action.of(parts[0]))
+        if any(worker_options(action.of(part)) != options for part in parts):
+            return None
+        return {**options, "state": "+".join(self._parts), "parts": ",".join(filter(None, parts))}
 
     def _features(self, videos: dict[str, list[EpisodeVideo]]) -> dict[str, Any]:
         out: dict[str, Any] = {}

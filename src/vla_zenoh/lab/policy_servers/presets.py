@@ -13,6 +13,7 @@ ratio 1), GR00T's LIBERO and SimplerEnv evaluation, OpenVLA's data statistics fo
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 Presets = Mapping[str, Mapping[str, str]]
@@ -36,3 +37,12 @@ OPENS_AT_1 = {"gripper": "binary", "gripper_open": "high"}
 ADDED = {"anchor": "goal", "relative_to": "previous", "controller": "none"}
 """Each step is added to the one before it, and all of it is executed."""
 BRIDGE = {"action": "delta", **ADDED, "rotation": "rpy", "dt_s": "0.2", **OPENS_AT_1}
+LEROBOT = {
+    "action": "joint_position",
+    "joint_scale_rad": repr(math.pi / 180),
+    "gripper": "open_fraction",
+    "gripper_range": "0:100",
+}
+"""LeRobot's robots: ``JOINT.pos`` in degrees, ``gripper.pos`` from 0 shut to 100 open."""
+LEROBOT_STATE = "joint+gripper_open"
+"""Their state, in the same units."""
