@@ -30,6 +30,7 @@ from pair_recording_rig import WIDTH_M, write_pair_run
 from vla_zenoh_dataset.episodes import episodes_of
 from vla_zenoh_dataset.lerobot import export
 
+from vla_zenoh.lab.policy_servers.presets import LEROBOT_STATE
 from vla_zenoh.lab.policy_servers.state_vector import read_parts
 from vla_zenoh.lab.recording.run import load_run
 
@@ -38,6 +39,7 @@ pytestmark = pytest.mark.models
 USED = 2
 FRAMES = USED * CHUNKS
 BRIGHTNESS = 3 / 255
+MAX_WIDTH_M = 0.08
 
 
 @pytest.fixture(scope="module")
@@ -137,7 +139,7 @@ def test_batches_are_made_and_one_episode_can_be_chosen(folder: Path) -> None:
 
 def test_a_run_of_two_arms_has_the_columns_of_a_robot_with_two_arms(tmp_path: Path) -> None:
     run = write_pair_run(tmp_path / "pair.mcap")
-    export(tmp_path / "pair", episodes_of(load_run(run)), ["front"], ("joint", "gripper_m"))
+    export(tmp_path / "pair", episodes_of(load_run(run)), ["front"], read_parts(LEROBOT_STATE))
     dataset = opened(tmp_path / "pair")
     for name in ("action", "observation.state"):
         names = dataset.features[name]["names"]
@@ -145,5 +147,7 @@ def test_a_run_of_two_arms_has_the_columns_of_a_robot_with_two_arms(tmp_path: Pa
         assert names[3:] == [each.replace("left", "right") for each in names[:3]]
     found = np.stack([dataset[index]["action"].numpy() for index in range(len(dataset))])
     wanted = [steps_of(0, chunk, 6)[:USED] for chunk in range(CHUNKS)]
-    np.testing.assert_array_equal(found, np.concatenate(wanted))
-    assert float(dataset[0]["observation.state"][5]) == pytest.approx(WIDTH_M["right"])
+    unit = np.array([np.pi / 180, np.pi / 180, MAX_WIDTH_M / 100] * 2)
+    np.testing.assert_allclose(found * unit, np.concatenate(wanted), rtol=1e-6)
+    opening = 100 * WIDTH_M["right"] / MAX_WIDTH_M
+    assert float(dataset[0]["observation.state"][5]) == pytest.approx(opening)
