@@ -127,6 +127,10 @@ COMMANDS: Panels = {
             },
         ),
         "compare": "lab.cli.compare:compare",
+        "figure": CommandGroup(
+            "Figures for a paper: PDF, SVG or PNG at the width of a column or a page.",
+            dict.fromkeys(("motion", "latency", "success"), OF_A_PACKAGE),
+        ),
         "inspect": "lab.cli.inspect:inspect",
         "net": "lab.cli.net:net",
         "trial": "lab.cli.trial:trial",
