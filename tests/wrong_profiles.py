@@ -329,17 +329,6 @@ WRONG: list[tuple[str, str]] = [
     ("extends: panda_simm", "extends is given twice"),
 ]
 
-UR5 = """\
-robot:
-  description: example-robot-data:ur_description/urdf/ur5_robot.urdf
-  base_frame: base_link
-  tcp_frame: tool0
-  arm_joints: [shoulder_pan_joint, shoulder_lift_joint, elbow_joint, wrist_1_joint, wrist_2_joint,
-    wrist_3_joint]
-  finger_joints: []
-  home_rad: [0.0, -1.2, 1.6, -2.0, -1.57, 0.0]
-limits: {joint: {velocity_rad_s: 1.0, acceleration_rad_s2: 3.0, jerk_rad_s3: 50.0}}
-"""
 ARM = """\
 robot: {driver: arm}
 cameras: {front: {source: "v4l2:/dev/video0"}, wrist: null}
@@ -429,11 +418,6 @@ CHECKED: list[tuple[str, str]] = [
         "robot.description: robot description 'example-robot-data:panda/panda.urdf' is not in",
     ),
     ("robot: {description: no_urdf.urdf}", "robot.description: no_urdf.urdf is no XML"),
-    (
-        UR5,
-        "lab.yaml:3: robot.description: the simulator (robot.driver: sim) cannot build ur5",
-    ),
-    (UR5, "It simulates the Franka Panda (extends: panda_sim); a real arm of another kind has dri"),
     (
         "robot: {home_rad: [0, 0, 0, -3.5, 0, 2.58, 0.78]}",
         "lab.yaml:2: robot.home_rad: puts panda_joint4 at -3.5 rad, its range is -3.07 to -0.0698",

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import coal
@@ -294,11 +295,15 @@ def _allowed(known: Sequence[str], may_touch: Iterable[tuple[str, str]]) -> list
     return [set(pair) for pair in may_touch]
 
 
-def _one_hull_a_link(kinematics: Kinematics) -> Any:
-    full, urdf = kinematics.full_model, kinematics.urdf
+def collision_shapes(model: Any, urdf: Path) -> Any:
+    """The collision shapes of a URDF, whose `model` of all joints is given, as Pinocchio's.
+
+    Raises:
+        ResourceError: they cannot be loaded, or there are none.
+    """
     try:
         geometry = pin.buildGeomFromUrdf(
-            full,
+            model,
             str(urdf),
             pin.GeometryType.COLLISION,
             # package://name/... is looked for beside the URDF and in every folder above it.
@@ -312,6 +317,12 @@ def _one_hull_a_link(kinematics: Kinematics) -> Any:
         ) from error
     if geometry.ngeoms == 0:
         raise ResourceError(f"{urdf.name} has no collision shapes; give it some, or do without")
+    return geometry
+
+
+def _one_hull_a_link(kinematics: Kinematics) -> Any:
+    full = kinematics.full_model
+    geometry = collision_shapes(full, kinematics.urdf)
     corners: dict[str, list[FloatArray]] = {}
     for shape in geometry.geometryObjects:
         corners.setdefault(full.frames[shape.parentFrame].name, []).append(_corners(shape))

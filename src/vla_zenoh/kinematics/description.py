@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -61,6 +61,7 @@ class DescribedJoint(NamedTuple):
         parent: link that it is attached to.
         child: link that it moves.
         offset_m: from the joint before to this one.
+        axis: that it turns about or slides along, of length 1 if it moves; in its own frame.
         lower: end of its range, narrowed by the soft limit of a ``safety_controller``;
             -inf: continuous.
         upper: the other end.
@@ -73,6 +74,7 @@ class DescribedJoint(NamedTuple):
     parent: str
     child: str
     offset_m: tuple[float, float, float]
+    axis: tuple[float, float, float]
     lower: float
     upper: float
     velocity: float
@@ -140,6 +142,19 @@ class Description:
             leader = mimic.joint
         return Mimic(leader, multiplier, offset)
 
+    def led_by(self, joints: Collection[str]) -> tuple[str, ...]:
+        """These joints, and those that follow them."""
+        return tuple(
+            name
+            for name, joint in self.joints.items()
+            if name in joints
+            or (
+                joint.mimic is not None
+                and joint.mimic.joint in self.joints
+                and self.follows(name).joint in joints
+            )
+        )
+
     def model_name(self, joint: str) -> str:
         """Name of a joint in Pinocchio's model, which needs another one than every link has."""
         name, taken = joint, {WORLD, *self.links}
@@ -204,7 +219,7 @@ class Description:
             raise self._error(f"is {TO_URDF.get(tag, f'no URDF: it begins with <{tag[:40]}>')}")
         if space:
             raise self._error(f"has the namespace {space[1:]!r}: a URDF has none, remove xmlns")
-        if _is_xacro(root):
+        if is_xacro(root):
             raise self._error(XACRO.format(name=self.name, stem=self.path.stem))
         return root
 
@@ -231,13 +246,17 @@ class Description:
         whose, origin = f"joint {name!r}", element.find("origin")
         x, y, z = self._vector(origin, "xyz", whose)
         self._vector(origin, "rpy", whose)
-        axis = element.find("axis")
-        if kind in MOVING and axis is not None and not any(self._vector(axis, "xyz", whose)):
-            raise self._error(f"has joint {name!r} with an axis of length 0")
+        axis = (1.0, 0.0, 0.0)
+        if kind in MOVING and (given := element.find("axis")) is not None:
+            x_axis, y_axis, z_axis = self._vector(given, "xyz", whose)
+            length = math.hypot(x_axis, y_axis, z_axis)
+            if not length:
+                raise self._error(f"has joint {name!r} with an axis of length 0")
+            axis = (x_axis / length, y_axis / length, z_axis / length)
         lower, upper, velocity = self._limits(element, name, kind)
         mimic = self._mimic(element.find("mimic"), whose)
         return DescribedJoint(
-            name, kind, ends[0], ends[1], (x, y, z), lower, upper, velocity, mimic
+            name, kind, ends[0], ends[1], (x, y, z), axis, lower, upper, velocity, mimic
         )
 
     def _check_shape(self, collision: ElementTree.Element, whose: str) -> None:
@@ -373,7 +392,7 @@ class Description:
             link = self._above[link].parent
 
 
-def _is_xacro(root: ElementTree.Element) -> bool:
+def is_xacro(root: ElementTree.Element) -> bool:
     """Whether links and joints are still to be made; expanded files may keep other remains."""
     parts = [element for tag in ("link", "joint") for element in root.findall(tag)]
     texts = [text for part in parts for element in part.iter() for text in element.attrib.values()]

@@ -19,6 +19,9 @@ class Fingers:
     Args:
         gripper: its section of the profile.
         count: number of finger joints; 0: one that is commanded and not measured.
+
+    Attributes:
+        slope: m of opening per m or rad of their mean position.
     """
 
     def __init__(self, gripper: GripperProfile, count: int) -> None:
@@ -26,19 +29,19 @@ class Fingers:
         ends = gripper.joint_ends
         # width = slope * mean position + offset
         if ends is None:
-            self._slope, self._offset_m = float(self._count), 0.0
+            self.slope, self._offset_m = float(self._count), 0.0
         else:
-            self._slope = gripper.max_width_m / (ends.open - ends.shut)
-            self._offset_m = -self._slope * ends.shut
+            self.slope = gripper.max_width_m / (ends.open - ends.shut)
+            self._offset_m = -self.slope * ends.shut
 
     def width_m(self, positions: ArrayLike) -> float:
         """Opening at the measured positions (k,), m or rad, each with its finger's sign."""
-        return self._slope * float(np.asarray(positions, np.float64).mean()) + self._offset_m
+        return self.slope * float(np.asarray(positions, np.float64).mean()) + self._offset_m
 
     def speed_m_s(self, velocities: ArrayLike) -> float:
         """Speed of the opening at joint velocities (k,), m/s or rad/s, with their signs."""
-        return abs(self._slope * float(np.asarray(velocities, np.float64).mean()))
+        return abs(self.slope * float(np.asarray(velocities, np.float64).mean()))
 
     def position(self, width_m: float) -> float:
         """Position of each joint at an opening, m or rad, to be multiplied by its sign."""
-        return (width_m - self._offset_m) / self._slope
+        return (width_m - self._offset_m) / self.slope

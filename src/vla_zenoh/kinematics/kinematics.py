@@ -22,7 +22,7 @@ from vla_zenoh.errors import ProfileError, RecordError, nearest
 from vla_zenoh.kinematics.description import MOVING, DescribedJoint, Description, Mimic
 from vla_zenoh.kinematics.so3 import Pose, log3, quat_from_rotation
 from vla_zenoh.policy.meaning import reference
-from vla_zenoh.profile import JointEnds, Profile
+from vla_zenoh.profile import JointEnds, Profile, RobotProfile
 from vla_zenoh.types import FloatArray, JointState
 
 BEYOND_LIMITS = 0.1
@@ -143,6 +143,12 @@ class Kinematics:
         """Of the positions of joint `index`: rad, or m where it slides."""
         return "m" if self.slides[index] else "rad"
 
+    @property
+    def tool_m(self) -> FloatArray:
+        """(3,) from the last joint that moves the TCP to the TCP, in the TCP's frame."""
+        placement = self.model.frames[self.tcp].placement
+        return placement.rotation.T @ placement.translation
+
     # -- joints -------------------------------------------------------------------------------
     def ordered(self, names: Sequence[str], values: ArrayLike) -> FloatArray:
         """`values` (n,) given for `names` in any order, in the order of `arm_joints`.
@@ -196,13 +202,17 @@ class Kinematics:
 
 
 def make_kinematics(profile: Profile) -> Kinematics:
-    """Kinematics of the profile's robot.
+    """Kinematics of the profile's robot; see `arm_kinematics`."""
+    return arm_kinematics(profile.robot)
+
+
+def arm_kinematics(robot: RobotProfile) -> Kinematics:
+    """Kinematics of a section `robot`.
 
     Raises:
         ResourceError: its description is missing.
         ProfileError: frames or joints that the description does not have.
     """
-    robot = profile.robot
     return Kinematics(
         resources.robot_urdf(robot.description),
         robot.tcp_frame,

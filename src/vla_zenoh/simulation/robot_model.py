@@ -1,13 +1,24 @@
-"""Description of a robot for the simulator, beside its URDF. The defaults are a Franka Panda."""
+"""Description of a robot for the simulator, beside its URDF. The defaults are a Franka Panda.
+
+The Panda and the SO-101 have numbers of their own here; any other arm is made of its profile and
+its URDF, see `vla_zenoh.simulation.any_arm`.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from vla_zenoh.profile import Profile, RobotProfile
+import numpy as np
+
+from vla_zenoh.profile import GripperProfile, Profile, RobotProfile
+from vla_zenoh.types import FloatArray
 
 Rgba = tuple[float, float, float, float]
 Vector3 = tuple[float, float, float]
+
+MIN_TOOL_M = 0.01
+CAMERA_OUT_M, CAMERA_BACK_M, CAMERA_AHEAD_M = 0.08, 0.08, 0.03
+"""Of a camera at a tool: beside it, behind its TCP, and how far ahead of that it looks."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,26 +58,31 @@ PANDA_WRIST = MountedCamera(
     fovy_rad=1.2,
 )
 
+PANDA_HAND = GripperProfile(max_width_m=0.08)
+
 
 @dataclass(frozen=True, slots=True)
 class RobotModel:
     """An arm with a gripper of parallel fingers, or of one jaw that turns.
 
     Kinematics, inertia and joint limits are those of the URDF, `description`, see
-    `vla_zenoh.resources.robot_urdf`. Details of its meshes that are smaller than `mesh_grid_m` are
-    merged, where they have too many faces to draw. Armature is the inertia of each motor, seen
-    through its gear; without it Pinocchio and MuJoCo compute the same dynamics.
+    `vla_zenoh.resources.robot_urdf`; of an arm that has no numbers here also those of `robot`.
+    Details of its meshes that are smaller than `mesh_grid_m` are merged, where they have too many
+    faces to draw. Armature is the inertia of each motor, seen through its gear; without it
+    Pinocchio and MuJoCo compute the same dynamics. A finger whose sign is -1 goes backwards to
+    open.
     """
 
     description: str = "example-robot-data:panda_description/urdf/panda.urdf"
+    robot: RobotProfile | None = None  # None: the Panda or the SO-101
     mesh_grid_m: float | None = None
     arm_joints: tuple[str, ...] = tuple(f"panda_joint{i}" for i in range(1, 8))  # base to tip
     armature_kg_m2: float = 0.0
     effort_nm: float | None = None  # limit of every joint; None: that of the URDF
     gains: JointGains = JointGains()
     finger_joints: tuple[str, ...] = ("panda_finger_joint1", "panda_finger_joint2")
-    finger_scale_m: float = 1.0  # opening by the sum of their positions, in m or rad
-    max_width_m: float = 0.08
+    finger_signs: tuple[float, ...] = (1.0, 1.0)  # -1: it goes backwards to open
+    gripper: GripperProfile = PANDA_HAND
     finger_links: tuple[str, ...] = ("panda_leftfinger", "panda_rightfinger")  # touch the object
     tcp_link: str = "panda_hand_tcp"
     camera: MountedCamera | None = PANDA_WRIST
@@ -96,6 +112,8 @@ SO101 = RobotModel(
         stiffness_nm_rad=(60.0, 60.0, 60.0, 40.0, 40.0), max_integral_nm=(1.5, 1.5, 1.5, 1.0, 1.0)
     ),
     finger_joints=("gripper",),
+    finger_signs=(1.0,),
+    gripper=GripperProfile(max_width_m=0.1, joint_open_rad=1.7, joint_shut_rad=0.0),
     finger_links=("gripper_link", "moving_jaw_so101_v1_link"),
     tcp_link="gripper_frame_link",
     camera=MountedCamera(
@@ -114,16 +132,68 @@ SO101 = RobotModel(
 
 
 def robot_model(robot: RobotProfile) -> RobotModel:
-    """The robot of a profile: the SO-101, else with camera, gripper and colours of a Panda."""
-    found = SO101 if robot.description == SO101.description else RobotModel()
-    ends = robot.gripper.joint_ends
-    found = replace(
-        found, description=robot.description, arm_joints=robot.arm_joints, tcp_link=robot.tcp_frame
+    """The robot of a profile.
+
+    Raises:
+        ResourceError, ProfileError: it is neither a Panda nor an SO-101, and its description is
+            missing or does not fit.
+    """
+    shipped = {model.description: model for model in (RobotModel(), SO101)}
+    found = shipped.get(robot.description) or _any_arm(robot)
+    return replace(
+        found,
+        description=robot.description,
+        arm_joints=robot.arm_joints,
+        tcp_link=robot.tcp_frame,
+        gripper=robot.gripper,
     )
-    if ends is None:
-        return found
-    width_m = robot.gripper.max_width_m
-    return replace(found, finger_scale_m=width_m / (ends.open - ends.shut), max_width_m=width_m)
+
+
+def _any_arm(robot: RobotProfile) -> RobotModel:
+    """An arm that has no numbers here."""
+    from vla_zenoh.kinematics.kinematics import arm_kinematics  # a camera node needs no Pinocchio
+
+    kinematics = arm_kinematics(robot)
+    described = kinematics.described
+    fingers = set(described.led_by(robot.finger_joints))
+    return RobotModel(
+        robot=robot,
+        armature_kg_m2=0.03,  # of geared motors: many descriptions have hardly any at the wrist
+        effort_nm=1e5,  # that of descriptions is often wrong; the gains bound what it presses with
+        finger_joints=robot.finger_joints,
+        finger_signs=tuple(kinematics.finger_signs.tolist()),
+        finger_links=tuple(
+            link
+            for link in described.links
+            if any(joint.name in fingers for joint in described.chain(described.root, link))
+        ),
+        camera=_behind_tcp(robot.tcp_frame, kinematics.tool_m),
+        colours=(),
+    )
+
+
+def _behind_tcp(link: str, tool_m: FloatArray) -> MountedCamera:
+    """A camera beside the tool that looks at the TCP.
+
+    Args:
+        link: of the TCP.
+        tool_m: (3,) from the last joint to the TCP, in its frame; of no length: along z.
+    """
+    length_m = float(np.linalg.norm(tool_m))
+    ahead = tool_m / length_m if length_m > MIN_TOOL_M else np.array([0.0, 0.0, 1.0])
+    # Whichever axis is most across the tool.
+    across = np.eye(3)[int(np.argmin(np.abs(ahead)))]
+    up = across - ahead * float(across @ ahead)
+    up /= np.linalg.norm(up)
+    position_m, look_at_m = CAMERA_OUT_M * up - CAMERA_BACK_M * ahead, CAMERA_AHEAD_M * ahead
+    return MountedCamera(
+        "wrist", link, _vector(position_m), _vector(look_at_m), _vector(up), fovy_rad=1.2
+    )
+
+
+def _vector(values: FloatArray) -> Vector3:
+    x, y, z = values.tolist()
+    return x, y, z
 
 
 def robot_models(profile: Profile) -> tuple[RobotModel, ...]:

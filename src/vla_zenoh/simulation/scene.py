@@ -29,6 +29,9 @@ from numpy.typing import NDArray
 
 from vla_zenoh import resources
 from vla_zenoh.errors import ResourceError
+from vla_zenoh.kinematics.fingers import Fingers
+from vla_zenoh.kinematics.kinematics import arm_kinematics
+from vla_zenoh.simulation.any_arm import arm_spec
 from vla_zenoh.simulation.robot_model import MountedCamera, RobotModel
 from vla_zenoh.types import FloatArray
 
@@ -46,6 +49,8 @@ IMPRATIO = 10.0
 # Between the jaws of an SO-101, which pinch at an angle, it crept 2.6 mm so, and 0.1 mm with these.
 JAW_NOSLIP_ITERATIONS = 5
 STIFF_SOLREF = (0.004, 1.0)
+FINGER_KG = 0.05
+"""What the servo of the opening moves at least, with its gear; thin fingers would shake."""
 PAD_FRICTION = (1.5, 0.02, 0.001)  # sliding, torsional, rolling
 PAD_CONDIM = 4
 PAD_SOLIMP = (0.99, 0.999, 0.001, 0.5, 2.0)  # the fingers are light, hence soft otherwise
@@ -122,21 +127,12 @@ def build_model(
 
 
 def _robot_spec(robot: RobotModel, joint_friction_nm: float) -> mujoco.MjSpec:
-    urdf = resources.robot_urdf(robot.description)
-    spec = mujoco.MjSpec.from_file(str(urdf))
-    meshes = resources.meshes_of(urdf)
-    for mesh in spec.meshes:
-        file = meshes / Path(mesh.file).name
-        if robot.mesh_grid_m is None:
-            mesh.file = str(file)
-        else:
-            vertices, faces = coarse_stl(file, robot.mesh_grid_m)
-            mesh.file, mesh.uservert, mesh.userface = "", vertices.ravel(), faces.ravel()
+    if robot.robot is None:
+        spec = _shipped_spec(robot)
+    else:
+        spec = arm_spec(arm_kinematics(robot.robot), robot.finger_joints)
     # Fusing would merge the TCP and the base into their parents and lose their frames.
     spec.compiler.fusestatic = False
-    for light in list(spec.lights):
-        spec.delete(light)
-
     colours = dict(robot.colours)
     for geom in spec.geoms:
         link = geom.parent.name
@@ -148,6 +144,9 @@ def _robot_spec(robot: RobotModel, joint_friction_nm: float) -> mujoco.MjSpec:
             geom.solref, geom.solimp = STIFF_SOLREF, PAD_SOLIMP
     for equality in spec.equalities:
         equality.solref = STIFF_SOLREF
+    if robot.robot is not None:
+        for name, share in zip(robot.finger_joints, finger_shares(robot), strict=True):
+            spec.joint(name).armature = FINGER_KG * share * share
     for name in robot.arm_joints:
         joint = _named(spec.joint(name), "joint", name, [joint.name for joint in spec.joints])
         joint.frictionloss, joint.armature = joint_friction_nm, robot.armature_kg_m2
@@ -159,6 +158,23 @@ def _robot_spec(robot: RobotModel, joint_friction_nm: float) -> mujoco.MjSpec:
         link = _named(spec.body(robot.camera.link), "link", robot.camera.link, links)
         _add_camera(link, robot.camera)
     _add_actuators(spec, robot)
+    return spec
+
+
+def _shipped_spec(robot: RobotModel) -> mujoco.MjSpec:
+    """With the meshes as they are, or coarse."""
+    urdf = resources.robot_urdf(robot.description)
+    spec = mujoco.MjSpec.from_file(str(urdf))
+    meshes = resources.meshes_of(urdf)
+    for mesh in spec.meshes:
+        file = meshes / Path(mesh.file).name
+        if robot.mesh_grid_m is None:
+            mesh.file = str(file)
+        else:
+            vertices, faces = coarse_stl(file, robot.mesh_grid_m)
+            mesh.file, mesh.uservert, mesh.userface = "", vertices.ravel(), faces.ravel()
+    for light in list(spec.lights):
+        spec.delete(light)
     return spec
 
 
@@ -204,13 +220,22 @@ def _add_actuators(spec: mujoco.MjSpec, robot: RobotModel) -> None:
             limit = (-robot.effort_nm, robot.effort_nm)
         motor = spec.add_actuator(name=name, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=name)
         motor.ctrllimited, motor.ctrlrange = True, limit
+    if not robot.finger_joints:
+        return
     width = spec.add_tendon(name=GRIPPER)
-    for name in robot.finger_joints:
-        width.wrap_joint(name, robot.finger_scale_m)
+    for name, share in zip(robot.finger_joints, finger_shares(robot), strict=True):
+        width.wrap_joint(name, share)
     # A servo of the opening; its whole force acts on either finger.
     servo = spec.add_actuator(name=GRIPPER, trntype=mujoco.mjtTrn.mjTRN_TENDON, target=GRIPPER)
     servo.set_to_position(kp=robot.gripper_stiffness_n_m, kv=robot.gripper_damping_ns_m)
     servo.forcelimited, servo.forcerange = True, (-1.0, 1.0)
+
+
+def finger_shares(robot: RobotModel) -> FloatArray:
+    """(k,) m of opening per m or rad of each finger joint."""
+    count = len(robot.finger_joints)
+    slope = Fingers(robot.gripper, count).slope
+    return np.array(robot.finger_signs) * slope / count
 
 
 def _set_solver(spec: mujoco.MjSpec, *, jaw: bool) -> None:

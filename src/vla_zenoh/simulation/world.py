@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vla_zenoh.errors import NodeError, RecordError, ResourceError
+from vla_zenoh.kinematics.fingers import Fingers
 from vla_zenoh.kinematics.so3 import quat_from_rotation, rotation_from_rpy
 from vla_zenoh.policy.meaning import reference as as_reference
 from vla_zenoh.policy.meaning import toward
@@ -31,6 +32,7 @@ from vla_zenoh.simulation.scene import (
     build_model,
     check_variations,
     draw_places,
+    finger_shares,
     objects_of,
     prefix_of,
 )
@@ -455,22 +457,28 @@ class SimulatedPart:
 
 
 class SimulatedGripper:
-    """Fingers with a width servo: the set width changes at a given speed, under a bounded force."""
+    """Fingers with a width servo: the set width changes at a given speed, under a bounded force.
+
+    A robot without finger joints has one in name: its width is the set one.
+    """
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, robot: RobotModel) -> None:
         self._model, self._data = model, data
         fingers = [model.joint(prefix_of(robot) + name) for name in robot.finger_joints]
         self._q = [data.qpos[joint.qposadr[0] :][:1] for joint in fingers]
         self._v = [data.qvel[joint.dofadr[0] :][:1] for joint in fingers]
-        self._scale_m, self._max_width_m = robot.finger_scale_m, robot.max_width_m
-        # Each opens as far as the others.
-        self._open = self._max_width_m / self._scale_m / len(fingers)
-        self._actuator = int(model.actuator(prefix_of(robot) + GRIPPER).id)
+        self._shares = finger_shares(robot).tolist() if fingers else []
+        self._signs, self._max_width_m = robot.finger_signs, robot.gripper.max_width_m
+        self._widths = Fingers(robot.gripper, len(fingers))
+        # The actuator's opening is without the constant part of the width.
+        self._shut_m = self._widths.width_m(0.0)
+        self._actuator = int(model.actuator(prefix_of(robot) + GRIPPER).id) if fingers else None
 
     def open(self) -> None:
         """Put the fingers at their widest, as after a reset."""
-        for joint in self._q:
-            joint[:] = self._open
+        opened = self._widths.position(self._max_width_m)
+        for joint, sign in zip(self._q, self._signs, strict=False):
+            joint[:] = sign * opened
         self._target_m = self._set_m = self._measured_m = self._max_width_m
         self._step_m = 0.0
         self._rest_ticks = AT_REST_TICKS
@@ -497,7 +505,8 @@ class SimulatedGripper:
         self._rest_ticks = self._rest_ticks + steps if abs(rate_m_s) < AT_REST_M_S else 0
         left, most = self._target_m - self._set_m, self._step_m * steps
         self._set_m += min(max(left, -most), most)
-        self._data.ctrl[self._actuator] = self._set_m
+        if self._actuator is not None:
+            self._data.ctrl[self._actuator] = self._set_m - self._shut_m
 
     def state(self) -> GripperState:
         """Opening between the fingers, and whether they move or hold an object."""
@@ -506,6 +515,8 @@ class SimulatedGripper:
     @property
     def force_n(self) -> float:
         """Force of either finger, inwards positive."""
+        if self._actuator is None:
+            return 0.0
         return -float(self._data.actuator_force[self._actuator])
 
     @property
@@ -518,9 +529,15 @@ class SimulatedGripper:
         return self._measured_m - self._set_m > HELD_MARGIN_M and not self._moving
 
     def _opening(self) -> tuple[float, float]:
-        q, v = (sum(at.item() for at in joints) for joints in (self._q, self._v))
-        return q * self._scale_m, v * self._scale_m
+        if not self._q:
+            return self._set_m, 0.0
+        q, v = (
+            sum(share * at.item() for share, at in zip(self._shares, joints, strict=True))
+            for joints in (self._q, self._v)
+        )
+        return q + self._shut_m, v
 
     def _bound_force(self, force_n: float) -> None:
         limit_n = min(force_n, MAX_FORCE_N)
-        self._model.actuator_forcerange[self._actuator] = (-limit_n, limit_n)
+        if self._actuator is not None:
+            self._model.actuator_forcerange[self._actuator] = (-limit_n, limit_n)

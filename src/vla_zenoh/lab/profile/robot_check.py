@@ -208,7 +208,7 @@ def simulator(profile: Profile) -> Iterator[ProfileFault]:
     try:
         resources.robot_urdf(profile.robot.description)
         world = build_world(profile)
-    except MissingExtraError:
+    except (MissingExtraError, ProfileError):
         return  # `arm` says so
     except (ResourceError, RecordError) as error:
         if Path(profile.robot.description).name in str(error) or "description" in str(error):
@@ -241,8 +241,8 @@ def _not_simulated(profile: Profile, error: VlaZenohError) -> Iterator[ProfileFa
         return  # `arm` says so
     yield ProfileFault(
         ("robot", "description"),
-        f"the simulator (robot.driver: sim) cannot build {urdf.name}: {error}. It simulates the "
-        "Franka Panda (extends: panda_sim); a real arm of another kind has driver arm or ros2",
+        f"the simulator (robot.driver: sim) cannot build {urdf.name}: {error}. A real arm has "
+        "another driver, as arm or ros2",
         other=("robot", "driver"),
     )
 
