@@ -15,7 +15,16 @@ PAGE = ROOT / "docs" / "how-to" / "not-activated.md"
 REASONS = {
     "control/preflight.py": {
         *("reasons_by_joints", "reasons_of_worker", "joint_state_faults", "_elbow_is_not_held"),
-        *("_robot", "reasons_of_part", "_too_old", "_worker", "_chunk", "_cameras", "_clocks"),
+        *(
+            "_robot",
+            "_guesses",
+            "reasons_of_part",
+            "_too_old",
+            "_worker",
+            "_chunk",
+            "_cameras",
+            "_clocks",
+        ),
         *("unsettled", "why_not_ready", "state_lost"),
     },
     "control/commanded_part.py": {"reasons_by_worker"},

@@ -109,7 +109,7 @@ def reasons_of_part(
 
     `now_ns`, here and below, is on the clock of the records' ``received_ns``.
     """
-    reasons = _robot(profile, peers, pose, now_ns)
+    reasons = [*_guesses(profile), *_robot(profile, peers, pose, now_ns)]
     if gripper is None:
         return [*reasons, Passing("the gripper is not known: nothing received on state/gripper")]
     lost = state_lost("gripper", gripper, profile.timing.state_timeout_s, now_ns)
@@ -242,6 +242,15 @@ def clock_remedy(stamp_ns: int, profile: Profile) -> str:
             "ros2.use_sim_time: true"
         )
     return "synchronise the clocks of both hosts (chrony or ptp)"
+
+
+def _guesses(profile: Profile) -> list[str]:
+    if profile.robot.driver == "sim" or not profile.unconfirmed:
+        return []
+    return [
+        f"guessed and not confirmed: {', '.join(profile.unconfirmed)}; look at each in the "
+        "profile, correct it, and delete it from unconfirmed"
+    ]
 
 
 def _robot(

@@ -53,6 +53,7 @@ from vla_zenoh.profile.section import (
     Section,
     Text,
     Word,
+    Words,
     merge,
     unlisted,
 )
@@ -105,6 +106,9 @@ class Profile(Section):
             worker that is not listed serves this robot only.
         options: worker -> options of its model as ``--set`` gives them, name -> text.
         ros2: required for a robot or camera of ROS 2.
+        unconfirmed: places of this profile that were guessed, as `vla-zenoh profile new` writes
+            them. While there are any, a real arm is not activated; a simulated one is. Look at
+            each, correct it, and delete its line.
 
     Further sections have the name of a robot driver, and hold its options. That of a driver which
     is not installed is a map: another computer runs it, and checks it.
@@ -132,6 +136,7 @@ class Profile(Section):
         default_factory=lambda: {"here": HostProfile(nodes=SIMULATED)}
     )
     ros2: Ros2Profile | None = None
+    unconfirmed: Words = ()
     _part: str = PrivateAttr("")
 
     @classmethod
