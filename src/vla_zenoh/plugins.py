@@ -154,6 +154,7 @@ PACKAGES: Mapping[str, str] = {
     "figure.success": "vla-zenoh-figures",
     "nights": "vla-zenoh-nights",
     "node.rolling": "vla-zenoh-rolling",
+    "profile.new": "vla-zenoh-newarm",
     "save": "vla-zenoh-rolling",
     "serve.mcp": "vla-zenoh-mcp",
     "teleop": "vla-zenoh-teleop",

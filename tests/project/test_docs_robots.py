@@ -16,9 +16,9 @@ from wrong_profiles import CAMERA_SOURCES, DRIVERS
 
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.kinematics.kinematics import make_kinematics
-from vla_zenoh.lab.cli.profile import profile_app
 from vla_zenoh.policy.loader import make_robot
 from vla_zenoh.profile import load_profile
+from vla_zenoh.program.main import app
 from vla_zenoh.resources import robot_urdf
 from vla_zenoh.ros2.writers import position
 from vla_zenoh.types import JointCommand
@@ -79,7 +79,7 @@ def test_every_robot_driver_is_on_this_page_and_in_the_reference(driver: str) ->
 
 
 def test_its_robot_is_right_and_needs_no_second_look(file: Path) -> None:
-    result = CliRunner().invoke(profile_app, ["check", str(file)])
+    result = CliRunner().invoke(app, ["profile", "check", str(file)])
     assert result.exit_code == 0
     assert result.stderr == ""
 
@@ -108,12 +108,12 @@ def test_a_description_of_the_robots_own_driver_needs_its_meshes_beside_it(folde
     (folder / "ur5e.urdf").write_text(text)
     (folder / "ur5e.yaml").write_text("extends: ur5\nrobot: {name: ur5e, description: ur5e.urdf}\n")
     words = ["check", str(folder / "ur5e.yaml")]
-    result = CliRunner().invoke(profile_app, words)
+    result = CliRunner().invoke(app, ["profile", *words])
     assert result.exit_code == 1
     assert "looked for as NAME/... beside the URDF" in result.stderr
 
     (folder / "ur_description").symlink_to(package)
-    result = CliRunner().invoke(profile_app, words)
+    result = CliRunner().invoke(app, ["profile", *words])
     assert (result.exit_code, result.stderr) == (0, "")
 
 
@@ -124,7 +124,7 @@ def test_a_gripper_that_turns_is_refused_until_its_two_angles_are_said(folder: P
     (folder / "ur5e_2f85.urdf").write_text(text.replace("</robot>", KNUCKLE))
     (folder / "ur5e.yaml").write_text("extends: ur5\nrobot: {name: ur5e}\n")
     file = folder / "ur5e_2f85.yaml"
-    result = CliRunner().invoke(profile_app, ["check", str(file)])
+    result = CliRunner().invoke(app, ["profile", "check", str(file)])
     assert (result.exit_code, result.stderr) == (0, "")
     profile = load_profile(str(file))
     assert profile.ros2 is not None
@@ -134,14 +134,14 @@ def test_a_gripper_that_turns_is_refused_until_its_two_angles_are_said(folder: P
 
     said = "".join(line for line in file.read_text().splitlines(True) if "_rad:" not in line)
     file.write_text(said.replace("GripperCommand}", "GripperCommand, position: width}"))
-    result = CliRunner().invoke(profile_app, ["check", str(file)])
+    result = CliRunner().invoke(app, ["profile", "check", str(file)])
     assert result.exit_code == 1
     assert "finger joint 'robotiq_85_left_knuckle_joint' of ur5e_2f85.urdf turns" in result.stderr
     assert "gripper: {joint_open_rad: ..., joint_shut_rad: ...}" in result.stderr
 
 
 def test_its_own_arm_is_right_and_goes_where_it_is_told_to(folder: Path) -> None:
-    result = CliRunner().invoke(profile_app, ["check", str(folder / "mine.yaml")])
+    result = CliRunner().invoke(app, ["profile", "check", str(folder / "mine.yaml")])
     assert result.exit_code == 0
     assert result.stderr == ""
     profile = load_profile(str(folder / "mine.yaml"))
@@ -181,7 +181,7 @@ def test_the_steps_of_the_page_on_a_ur5e_are_right(tmp_path: Path) -> None:
         lines[1], shell=True, check=True, cwd=tmp_path, env={**os.environ, "PATH": programs}
     )
     file = tmp_path / "ur5e.yaml"
-    result = CliRunner().invoke(profile_app, ["check", str(file)])
+    result = CliRunner().invoke(app, ["profile", "check", str(file)])
     assert result.exit_code == 0, result.output
     profile = load_profile(str(file))
     assert profile.arm is not None

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from vla_zenoh.lab.cli.profile import profile_app
 from vla_zenoh.lab.cli.secure import secure_app
+from vla_zenoh.program.main import app
 
 TEXT = (Path(__file__).parents[2] / "docs" / "how-to" / "ros2.md").read_text("utf-8")
 RUNNER = CliRunner()
@@ -27,7 +27,7 @@ def bridge_file(folder: Path, plain: str, *more: str) -> str:
     done = RUNNER.invoke(secure_app, [*init, "--folder", str(folder / "certificates")])
     assert done.exit_code == 0, done.output
     words = ["bridge-config", "--profile", "./lab_secure.yaml", *more]
-    done = RUNNER.invoke(profile_app, words)
+    done = RUNNER.invoke(app, ["profile", *words])
     assert done.exit_code == 0, done.output
     assert f"  vla-zenoh {' '.join(['profile', *words])} > bridge.json5" in TEXT
     assert "ROS_DISTRO=jazzy zenoh-bridge-ros2dds -c bridge.json5" in done.stderr

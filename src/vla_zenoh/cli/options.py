@@ -60,6 +60,9 @@ AlsoOption = Annotated[
     list[str] | None,
     typer.Option("--also", help="Profile of another robot that the router serves; repeatable."),
 ]
+SimOption = Annotated[
+    bool, typer.Option("--sim", help="Simulate the robot, whatever drives it in the profile.")
+]
 DryRunOption = Annotated[
     bool, typer.Option("--dry-run", help="Compute and check everything, command nothing.")
 ]
@@ -140,17 +143,21 @@ def effective_profile(
     connect: list[str] | None = None,
     listen: list[str] | None = None,
     host: str | None = None,
+    *,
+    sim: bool = False,
 ) -> Profile:
     """A profile with endpoints of the command line in place of its own.
 
-    `host` is this computer among the profile's hosts; it selects the certificates.
+    `host` is this computer among the profile's hosts; it selects the certificates. `sim` replaces
+    the robot by a simulated one.
 
     Raises:
         ProfileError: the profile is invalid.
     """
-    from vla_zenoh.profile import load_profile, override
+    from vla_zenoh.profile import load_profile, override, simulated
 
     loaded = load_profile(profile) if isinstance(profile, str) else profile
+    loaded = simulated(loaded) if sim else loaded
     if host is not None:
         require_host(loaded, host)
     changes: dict[str, Any] = {"connect": connect} if connect else {}

@@ -29,6 +29,7 @@ from vla_zenoh.cli.options import (
     HostOption,
     JsonOption,
     ListenOption,
+    SimOption,
     effective_profile,
 )
 from vla_zenoh.cli.output import console, errors, fail, styled
@@ -56,6 +57,7 @@ def up(
     connect: ConnectOption = None,
     listen: ListenOption = None,
     also: AlsoOption = None,
+    sim: SimOption = False,
     dry_run: DryRunOption = False,
     verbose: Annotated[
         bool, typer.Option("--verbose", "-v", help="Also show tracebacks and every restart.")
@@ -77,10 +79,11 @@ def up(
     """
     hosts = repeated("--host", None if host is None else [host])
     endpoints = (*repeated("--connect", connect), *repeated("--listen", listen))
-    with profile_check([profile, *hosts, *endpoints]) as check:
+    simulated = ["--sim"] if sim else []
+    with profile_check([profile, *hosts, *endpoints, *simulated]) as check:
         from vla_zenoh.runtime.launch import Host, choose_host, lock_host  # meanwhile
 
-        loaded = effective_profile(profile, connect, listen)
+        loaded = effective_profile(profile, connect, listen, sim=sim)
         name, _ = choose_host(loaded, host)
         lock_host(loaded, name).close()  # says at once that it runs already; `Host` takes it again
         reject_wrong(profile, check)

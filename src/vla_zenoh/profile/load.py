@@ -101,6 +101,29 @@ def as_robot(profile: Profile, name: str) -> Profile:
     return override(profile, {"robot": {"name": name}, "serves": dict.fromkeys(others)})
 
 
+def simulated(profile: Profile) -> Profile:
+    """The profile with a simulated robot and cameras in place of the real ones.
+
+    Raises:
+        ProfileError: the result is invalid.
+    """
+    if profile.robot.driver == "sim":
+        return profile
+    data = profile.model_dump()
+    data["ros2"] = None
+    data["robot"]["driver"] = "sim"
+    views = {name: "wrist" if "wrist" in name else "front" for name in profile.cameras}
+    data["cameras"] = {name: {"source": f"sim:{view}"} for name, view in views.items()}
+    hosts = data["hosts"].values()
+    serves = any("camera" in host["nodes"] for host in hosts)
+    for host in hosts:
+        kinds = ["sim" if kind in ("arm", "ros2") else kind for kind in host["nodes"]]
+        if "sim" in kinds and views and not serves:
+            kinds.append("camera")
+        host["nodes"] = list(dict.fromkeys(kinds))
+    return _checked(data, {})
+
+
 def to_yaml(profile: Profile) -> str:
     """The profile with every default written out; `read_profile` restores it."""
     return write_yaml(profile.model_dump(mode="json", exclude_none=True))

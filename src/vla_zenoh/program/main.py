@@ -108,7 +108,16 @@ COMMANDS: Panels = {
             dict.fromkeys(("robot", "worker", "camera"), OF_A_PACKAGE),
         ),
         "doctor": "lab.cli.doctor:doctor",
-        "profile": "lab.cli.profile:profile_app",
+        "profile": CommandGroup(
+            "List, show, check and make profiles.",
+            {
+                "bridge-config": "lab.cli.profile:bridge_config",
+                "list": "lab.cli.profile:list_profiles",
+                "show": "lab.cli.profile:show",
+                "check": "lab.cli.profile:check",
+                "new": OF_A_PACKAGE,
+            },
+        ),
         "robot": CommandGroup(
             "Compare a robot with its profile.", {"check": "lab.cli.doctor:robot_check"}
         ),

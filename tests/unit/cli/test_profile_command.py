@@ -9,8 +9,8 @@ import pytest
 from typer.testing import CliRunner
 
 from vla_zenoh import resources
-from vla_zenoh.lab.cli.profile import profile_app
 from vla_zenoh.profile import load_profile
+from vla_zenoh.program.main import app
 from vla_zenoh.resources import names, robot_urdf
 
 RUNNER = CliRunner()
@@ -27,7 +27,7 @@ def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_every_profile_is_listed(own_folder: Path) -> None:
     (own_folder / "lab.yaml").write_text("extends: panda_sim\nabout: our [lab] \u202e\n")
-    result = RUNNER.invoke(profile_app, ["list"])
+    result = RUNNER.invoke(app, ["profile", "list"])
     assert result.exit_code == 0
     assert all(name in result.stdout for name in names("profiles"))
     assert "our [lab] \\u202e" in result.stdout
@@ -35,12 +35,12 @@ def test_every_profile_is_listed(own_folder: Path) -> None:
 
 def test_a_profile_that_is_wrong_is_listed_with_its_fault(own_folder: Path) -> None:
     (own_folder / "lab.yaml").write_text("extends: nobody\n")
-    result = RUNNER.invoke(profile_app, ["list"])
+    result = RUNNER.invoke(app, ["profile", "list"])
     assert result.exit_code == 0
     assert "no profile called 'nobody'" in result.stdout
     rows = {
         row["name"]: row
-        for row in json.loads(RUNNER.invoke(profile_app, ["list", "--json"]).stdout)
+        for row in json.loads(RUNNER.invoke(app, ["profile", "list", "--json"]).stdout)
     }
     assert "lab.yaml:1: extends" in rows["lab"]["fault"]
     assert rows["panda_sim"]["hosts"] == ["here"]
@@ -49,7 +49,7 @@ def test_a_profile_that_is_wrong_is_listed_with_its_fault(own_folder: Path) -> N
 
 def test_what_is_shown_is_the_effective_profile_and_can_be_read_again(own_folder: Path) -> None:
     (own_folder / "lab.yaml").write_text("extends: panda_sim\nabout: ours\n")
-    result = RUNNER.invoke(profile_app, ["show", "lab"])
+    result = RUNNER.invoke(app, ["profile", "show", "lab"])
     assert result.exit_code == 0
     assert "\x1b" not in result.stdout
     again = own_folder / "again.yaml"
@@ -58,19 +58,19 @@ def test_what_is_shown_is_the_effective_profile_and_can_be_read_again(own_folder
 
 
 def test_a_script_gets_json() -> None:
-    result = RUNNER.invoke(profile_app, ["show", "panda_sim", "--json"])
+    result = RUNNER.invoke(app, ["profile", "show", "panda_sim", "--json"])
     assert json.loads(result.stdout) == load_profile("panda_sim").model_dump(mode="json")
 
 
 def test_a_terminal_gets_colours(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FORCE_COLOR", "1")
-    result = RUNNER.invoke(profile_app, ["show", "panda_sim"])
+    result = RUNNER.invoke(app, ["profile", "show", "panda_sim"])
     assert "\x1b[" in result.stdout
     assert "arm_joints" in result.stdout
 
 
 def test_nothing_of_that_name_is_one_line_on_stderr() -> None:
-    result = RUNNER.invoke(profile_app, ["show", "panda_simm"])
+    result = RUNNER.invoke(app, ["profile", "show", "panda_simm"])
     assert result.exit_code == 1
     assert result.stdout == ""
     assert result.stderr.startswith(
@@ -79,7 +79,7 @@ def test_nothing_of_that_name_is_one_line_on_stderr() -> None:
 
 
 def test_right_profiles_are_ok(own_folder: Path) -> None:
-    result = RUNNER.invoke(profile_app, ["check", "panda_sim", "panda_ros2"])
+    result = RUNNER.invoke(app, ["profile", "check", "panda_sim", "panda_ros2"])
     assert result.exit_code == 0
     assert result.stdout == "ok panda_sim\nok panda_ros2\n"
     assert result.stderr == ""
@@ -88,7 +88,7 @@ def test_right_profiles_are_ok(own_folder: Path) -> None:
 def test_wrong_ones_are_told_line_by_line_on_stderr(own_folder: Path) -> None:
     path = own_folder / "lab.yaml"
     path.write_text("extends: panda_sim\nlimts: {}\nlimits: {step_m: 9}\n")
-    result = RUNNER.invoke(profile_app, ["check", str(path), "panda_sim"])
+    result = RUNNER.invoke(app, ["profile", "check", str(path), "panda_sim"])
     assert result.exit_code == 1
     assert result.stdout == "ok panda_sim\n"
     lines = result.stderr.splitlines()
@@ -113,7 +113,7 @@ def test_what_the_description_of_the_robot_does_not_have_is_a_fault(
     own_folder: Path, robot: str, told: str
 ) -> None:
     (own_folder / "lab.yaml").write_text(f"extends: panda_sim\nrobot: {{{robot}}}\n")
-    result = RUNNER.invoke(profile_app, ["check", "lab"])
+    result = RUNNER.invoke(app, ["profile", "check", "lab"])
     assert result.exit_code == 1
     assert result.stdout == ""
     assert result.stderr.startswith(f"{own_folder / 'lab.yaml'}:2: robot: ")
@@ -124,7 +124,7 @@ def test_a_description_that_is_none_is_a_fault_wherever_it_is(own_folder: Path) 
     urdf = own_folder / "arm.urdf"
     urdf.write_text("no robot")
     (own_folder / "lab.yaml").write_text(f"extends: panda_sim\nrobot: {{description: {urdf}}}\n")
-    result = RUNNER.invoke(profile_app, ["check", "lab"])
+    result = RUNNER.invoke(app, ["profile", "check", "lab"])
     assert result.exit_code == 1
     assert "arm.urdf is no XML" in result.stderr
 
@@ -147,7 +147,7 @@ def test_a_robot_that_is_not_here_is_a_fault_where_the_command_node_runs_and_els
         told = "package://NAME/... is looked for as NAME/... beside the URDF"
     (own_folder / "lab.yaml").write_text(TWO_HOSTS.format(urdf=urdf))
     for words, code in (([], 0), (["--host", "gpu"], 0), (["--host", "desk"], 1)):
-        result = RUNNER.invoke(profile_app, ["check", "lab", *words])
+        result = RUNNER.invoke(app, ["profile", "check", "lab", *words])
         assert result.exit_code == code, result.stderr
         assert result.stderr.count(told) == 1
         assert result.stderr.count("advice robot.description") == 1 - code
@@ -155,14 +155,14 @@ def test_a_robot_that_is_not_here_is_a_fault_where_the_command_node_runs_and_els
     (own_folder / "one.yaml").write_text(
         "extends: lab\nhosts: {here: {nodes: [router, sim, command, camera, worker]}}\n"
     )
-    assert RUNNER.invoke(profile_app, ["check", "one"]).exit_code == 1
-    result = RUNNER.invoke(profile_app, ["check", "lab", "--host", "robot"])
+    assert RUNNER.invoke(app, ["profile", "check", "one"]).exit_code == 1
+    result = RUNNER.invoke(app, ["profile", "check", "lab", "--host", "robot"])
     assert result.exit_code == 1
     assert "hosts: has no 'robot'. It has: desk, gpu" in result.stderr
 
 
 def test_what_is_questionable_is_advice_and_no_failure() -> None:
-    result = RUNNER.invoke(profile_app, ["check", "panda_sim_two_hosts"])
+    result = RUNNER.invoke(app, ["profile", "check", "panda_sim_two_hosts"])
     assert result.exit_code == 0
     assert result.stdout == "ok panda_sim_two_hosts\n"
     assert (
@@ -179,11 +179,11 @@ def test_a_brake_that_up_would_cut_short_is_told(
     (own_folder / "lab.yaml").write_text(
         f"extends: panda_{driver}\nlimits: {{translation: {{acceleration_m_s2: {acceleration}}}}}\n"
     )
-    result = RUNNER.invoke(profile_app, ["check", "lab"])
+    result = RUNNER.invoke(app, ["profile", "check", "lab"])
     assert result.exit_code == 0
     told = "advice limits: braking from full speed may take 2.6 s" in result.stderr
     assert told == (said and driver == "ros2"), result.stderr
 
 
 def test_check_wants_a_name() -> None:
-    assert RUNNER.invoke(profile_app, ["check"]).exit_code == 2
+    assert RUNNER.invoke(app, ["profile", "check"]).exit_code == 2

@@ -16,10 +16,10 @@ from typer.testing import CliRunner
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.lab.certificates.bridge import bridge_locks, bridges
 from vla_zenoh.lab.certificates.lab_certificates import LabCertificates
-from vla_zenoh.lab.cli.profile import profile_app
 from vla_zenoh.lab.cli.secure import secure_app
 from vla_zenoh.lab.profile.ros2_bridge import bridge_command, bridge_config, bridge_text
 from vla_zenoh.profile import Profile, load_profile
+from vla_zenoh.program.main import app
 from vla_zenoh.ros2.keys import Ros2Dds
 from vla_zenoh.security import certificates
 from vla_zenoh.security.roles import Act, Role
@@ -231,7 +231,7 @@ def test_a_bridge_on_another_computer_gets_a_certificate_and_serves_the_node_alo
     made = certificates.read((folder / "bridge.pem").read_bytes())
     assert (made.common_name, made.addresses) == ("bridge@robot", ("10.0.0.5",))
 
-    done = RUNNER.invoke(profile_app, ["bridge-config", "--profile", str(file)])
+    done = RUNNER.invoke(app, ["profile", "bridge-config", "--profile", str(file)])
     assert done.exit_code == 0, done.output
     config_file = tmp_path / "bridge.json5"
     config_file.write_text(done.stdout)
@@ -278,7 +278,7 @@ def test_a_renewed_host_has_a_new_certificate_for_its_bridge(tmp_path: Path) -> 
 
 # -- the command ----------------------------------------------------------------------------------
 def test_the_command_prints_the_file_alone_and_says_beside_it_how_to_start_the_bridge() -> None:
-    done = RUNNER.invoke(profile_app, ["bridge-config", "--profile", "panda_ros2"])
+    done = RUNNER.invoke(app, ["profile", "bridge-config", "--profile", "panda_ros2"])
     profile = load_profile("panda_ros2")
     assert done.stdout == bridge_text(profile, bridge_config(profile))
     assert "ROS_DISTRO=jazzy zenoh-bridge-ros2dds -c bridge.json5" in done.stderr
@@ -292,6 +292,6 @@ def test_the_command_prints_the_file_alone_and_says_beside_it_how_to_start_the_b
     ],
 )
 def test_options_that_would_be_overlooked_are_refused(words: list[str]) -> None:
-    done = RUNNER.invoke(profile_app, words)
+    done = RUNNER.invoke(app, ["profile", *words])
     assert done.exit_code == 2
     assert done.stdout == ""

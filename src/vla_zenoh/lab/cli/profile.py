@@ -14,6 +14,7 @@ from vla_zenoh.cli.options import (
     JsonOption,
     ListenOption,
     NodeOptions,
+    SimOption,
     options,
 )
 from vla_zenoh.cli.output import console, errors, fail, new_table, styled
@@ -84,11 +85,6 @@ def _locks(profile: Profile, given: Path | None) -> tuple[dict[str, object], str
     )
 
 
-profile_app = typer.Typer(help="List, show and check profiles.", no_args_is_help=True)
-profile_app.command("bridge-config")(bridge_config)
-
-
-@profile_app.command("list")
 def list_profiles(as_json: JsonOption = False) -> None:
     """List your profiles on VLA_ZENOH_PATH, then the shipped ones."""
     rows = [_row(name) for name in names("profiles")]
@@ -109,7 +105,6 @@ def list_profiles(as_json: JsonOption = False) -> None:
     console().print(table)
 
 
-@profile_app.command("show")
 def show(
     name: Annotated[str, typer.Argument(help="Name or path of a profile.")],
     as_json: JsonOption = False,
@@ -129,12 +124,12 @@ def show(
         print(text, end="")
 
 
-@profile_app.command("check")
 def check(
     names: Annotated[list[str], typer.Argument(help="Names or paths of profiles.", metavar="NAME")],
     host: HostOption = None,
     connect: ConnectOption = None,
     listen: ListenOption = None,
+    sim: SimOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Check profiles: everything that `up` would fail with, with file and line; then advice.
@@ -143,7 +138,7 @@ def check(
     What only one host needs (files, meshes, packages) is an error on that host, which --host names
     if there are several, and advice elsewhere. Exits with 1 when a profile cannot run.
     """
-    reports = {name: check_profile(name, host, connect, listen) for name in names}
+    reports = {name: check_profile(name, host, connect, listen, sim=sim) for name in names}
     if as_json:
         print_json({name: report._asdict() for name, report in reports.items()})
     for name, report in ({} if as_json else reports).items():

@@ -48,6 +48,8 @@ def check_profile(
     host: str | None = None,
     connect: list[str] | None = None,
     listen: list[str] | None = None,
+    *,
+    sim: bool = False,
 ) -> ProfileReport:
     """Check a profile as `up` does before it starts the nodes.
 
@@ -55,10 +57,11 @@ def check_profile(
         name: of the profile, or its path.
         host: which of its hosts this computer is; None: the only one, or unknown. What a node needs
             is an error where it runs, and advice elsewhere.
+        sim: with its robot simulated.
     """
     try:
         loaded, lines = load_with_lines(name)
-        profile = effective_profile(loaded, connect, listen)
+        profile = effective_profile(loaded, connect, listen, sim=sim)
     except ProfileError as error:
         return ProfileReport(str(error).splitlines(), [])
     if host is None and len(profile.hosts) == 1:
@@ -181,7 +184,16 @@ def _certificates(profile: Profile, host: str) -> Iterator[ProfileFault]:
 # -- advice -----------------------------------------------------------------------------------
 def advice(profile: Profile) -> list[str]:
     """Warnings about a valid profile, each beginning with the path that it is about."""
-    return [*_network(profile), *_placement(profile), *_timing(profile)]
+    return [*_guesses(profile), *_network(profile), *_placement(profile), *_timing(profile)]
+
+
+def _guesses(profile: Profile) -> Iterator[str]:
+    if profile.unconfirmed:
+        yield (
+            f"unconfirmed: guessed and not confirmed: {', '.join(profile.unconfirmed)}. A "
+            "simulated arm is activated all the same, a real one is not: look at each, correct "
+            "it, and delete its line"
+        )
 
 
 def _network(profile: Profile) -> Iterator[str]:

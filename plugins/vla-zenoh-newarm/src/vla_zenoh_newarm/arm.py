@@ -1,0 +1,161 @@
+"""Everything about an arm that its profile needs, from its description and a person's answers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from vla_zenoh.kinematics.kinematics import Kinematics
+from vla_zenoh.profile import ReachLimits
+from vla_zenoh_newarm.answers import Answers, Guess
+from vla_zenoh_newarm.gripper import Gripper, gripper
+from vla_zenoh_newarm.mended import Mended
+from vla_zenoh_newarm.posture import Posture, posture
+from vla_zenoh_newarm.structure import Structure, structure
+
+VELOCITY_SHARE, FASTEST_RAD_S, FASTEST_M_S = 0.5, 1.0, 0.2
+"""Of the velocity that a description allows, and most of it."""
+ACCELERATION_1_S, JERK_1_S = 3.0, 20.0
+"""An acceleration as a multiple of the velocity, a jerk as one of the acceleration."""
+
+
+class JointMotion(NamedTuple):
+    """Limits of the joints: one number each, in rad or m."""
+
+    velocity: tuple[float, ...]
+    acceleration: tuple[float, ...]
+    jerk: tuple[float, ...]
+
+
+class Arm(NamedTuple):
+    """An arm as its profile describes it.
+
+    Args:
+        file: its description.
+        structure: its links and joints.
+        gripper: its gripper.
+        posture: its home and workspace.
+        motion: limits of its joints.
+        table_z_m: height of the table; None: there is none.
+        changes: what was changed in the description.
+        guesses: what nobody has confirmed.
+    """
+
+    file: Path
+    structure: Structure
+    gripper: Gripper
+    posture: Posture
+    motion: JointMotion
+    table_z_m: float | None
+    changes: Sequence[str]
+    guesses: Sequence[Guess]
+
+
+def found_arm(source: Path, copy: Path, arguments: Mapping[str, str], answers: Answers) -> Arm:
+    """The arm of a description.
+
+    Args:
+        source: the description.
+        copy: where a mended one is written.
+        arguments: of a xacro.
+        answers: of the person.
+
+    Raises:
+        ResourceError: the description, or its shapes, cannot be read.
+        ProfileError: no arm is found in it, or an answer does not fit; says what to do.
+    """
+    description = Mended(source, arguments)
+    links = _structure(description, answers)
+    description.give_ends([*links.arm, *links.fingers])
+    file = description.save(copy)
+    for made_up in description.guesses:
+        answers.guesses.append(Guess("robot.description", made_up))
+    hand = _gripper(file, links, answers)
+    kinematics = Kinematics(file, links.tcp, links.arm, base_frame=links.base)
+    heights = answers.numbers(
+        "table", [0.0], "limits.reach.table_z_m", "height of the table in the base frame, m", (1, 0)
+    )
+    table_z_m = heights[0] if heights else None
+    home = posture_of(kinematics, table_z_m, answers)
+    motion = _motion(kinematics, answers)
+    changes = [*description.changes, *([hand.why] if hand.why else [])]
+    return Arm(file, links, hand, home, motion, table_z_m, changes, answers.guesses)
+
+
+def _structure(description: Mended, answers: Answers) -> Structure:
+    described = description.described()
+    base = answers.option("base")
+    found = structure(described, base, answers.option("tcp"))
+    if found.other_tcps:
+        others = ", ".join(found.other_tcps)
+        tcp = answers.text("tcp", found.tcp, "robot.tcp_frame", f"there are also: {others}")
+        found = structure(described, base, tcp)
+    elif answers.option("tcp") is None:
+        what = "link that is controlled, the outermost that does not move with a finger"
+        tcp = answers.text("tcp", found.tcp, "robot.tcp_frame", what)
+        found = structure(described, base, tcp)
+    if found.base != described.root and base is None:
+        what = f"link of the first joint; what is before it stands still ({described.root})"
+        base = answers.text("base", found.base, "robot.base_frame", what)
+        found = structure(described, base, found.tcp)
+    return found
+
+
+def _gripper(file: Path, links: Structure, answers: Answers) -> Gripper:
+    from vla_zenoh.kinematics.description import Description
+
+    found = gripper(Description(file), links.fingers)
+    if not found.joints:
+        return found
+    names = tuple(found.values)
+    what = f"{', '.join(names)} of {', '.join(found.joints)}"
+    values = answers.numbers(
+        "gripper", list(found.values.values()), "robot.gripper", what, (len(names), 0)
+    )
+    if not values:
+        return Gripper()
+    return found._replace(values=dict(zip(names, values, strict=True)))
+
+
+def posture_of(kinematics: Kinematics, table_z_m: float | None, answers: Answers) -> Posture:
+    """Home and workspace: guessed, and then as the person wants them."""
+    reach = ReachLimits(table_z_m=table_z_m)
+    given = answers.option("home")
+    size = kinematics.size
+    home: tuple[float, ...] = ()
+    if given is not None:
+        home = answers.numbers("home", (), "robot.home_rad", "", (size,))
+    found = posture(kinematics, reach, home)
+    if given is None:
+        what = "joint positions at home, away from singularities, itself and the table"
+        home = answers.numbers("home", found.home_rad, "robot.home_rad", what, (size,))
+        if home != found.home_rad:
+            found = posture(kinematics, reach, home)
+    box = [edge for span in found.workspace_m for edge in span]
+    what = "box of the TCP, m: what the arm reaches"
+    x0, x1, y0, y1, z0, z1 = answers.numbers("workspace", box, "limits.workspace", what, (6,))
+    return found._replace(workspace_m=((x0, x1), (y0, y1), (z0, z1)))
+
+
+def _motion(kinematics: Kinematics, answers: Answers) -> JointMotion:
+    most = np.where(kinematics.slides, FASTEST_M_S, FASTEST_RAD_S)
+    velocity = np.minimum(VELOCITY_SHARE * kinematics.velocity_rad_s, most)
+    size = kinematics.size
+    acceleration = answers.numbers(
+        "acceleration",
+        (ACCELERATION_1_S * velocity).tolist(),
+        "limits.joint.acceleration_rad_s2",
+        f"{ACCELERATION_1_S:g} times the velocity; the maker publishes it, or not",
+        (1, size),
+    )
+    jerk = answers.numbers(
+        "jerk",
+        (JERK_1_S * np.array(acceleration)).tolist(),
+        "limits.joint.jerk_rad_s3",
+        f"{JERK_1_S:g} times the acceleration; the maker publishes it, or not",
+        (1, size),
+    )
+    return JointMotion(tuple(velocity.tolist()), acceleration, jerk)

@@ -1,0 +1,115 @@
+"""vla-zenoh profile new: a profile for an arm from its description."""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from vla_zenoh.cli.options import model_options, options
+from vla_zenoh.cli.output import console, errors, fail, styled
+from vla_zenoh.lab.profile.check import check_profile
+from vla_zenoh.resources import ROBOT_DATA_PREFIX, robot_urdf
+from vla_zenoh_newarm.answers import Answers
+from vla_zenoh_newarm.arm import Arm, found_arm
+from vla_zenoh_newarm.profile_text import profile_text
+
+
+@dataclass(frozen=True)
+class Given:
+    """What a person knows better than a guess."""
+
+    base: Annotated[
+        str | None, typer.Option("--base", help="Link in which poses are; default: the root.")
+    ] = None
+    tcp: Annotated[
+        str | None, typer.Option("--tcp", help="Link that is controlled; default: the outermost.")
+    ] = None
+    home: Annotated[
+        str | None, typer.Option("--home", help="Joint positions at home, as 0,-1.2,1.5,0.")
+    ] = None
+    workspace: Annotated[
+        str | None,
+        typer.Option("--workspace", help="Box of the TCP in m, as x0,x1,y0,y1,z0,z1."),
+    ] = None
+    table: Annotated[
+        str | None,
+        typer.Option("--table", help="Height of the table in the base frame in m, or none."),
+    ] = None
+    acceleration: Annotated[
+        str | None,
+        typer.Option("--acceleration", help="Of the joints: rad/s^2 (m/s^2), one or one each."),
+    ] = None
+    jerk: Annotated[
+        str | None, typer.Option("--jerk", help="Of the joints: rad/s^3 (m/s^3), one or one each.")
+    ] = None
+    gripper: Annotated[
+        str | None,
+        typer.Option(
+            "--gripper",
+            help="Its width in m; of a finger joint that turns also its positions when open and "
+            "shut, as 0.085,0,0.8; or none.",
+        ),
+    ] = None
+
+
+@options
+def new(
+    description: Annotated[
+        str, typer.Argument(help="URDF or xacro of the arm, or example-robot-data:PATH.")
+    ],
+    given: Given,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="The profile; default: NAME.yaml here.")
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Argument of a xacro as name=value; repeatable."),
+    ] = None,
+    yes: Annotated[
+        bool, typer.Option("--yes", "-y", help="Ask nothing: every guess is taken.")
+    ] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing profile.")] = False,
+) -> None:
+    """Write a profile for an arm from its description, and check it.
+
+    What the description does not say is guessed: an option answers it, on a terminal a question
+    does. Guesses are listed in the profile under `unconfirmed`; the simulated arm works with them,
+    a real one is not activated before they are gone.
+    """
+    source = robot_urdf(description)
+    name = re.sub(r"[^a-z0-9_]+", "_", source.name.partition(".")[0].lower()).strip("_") or "arm"
+    file = out or Path(f"{name}.yaml")
+    if file.exists() and not force:
+        fail(f"{file} exists: choose another --out, or replace it with --force")
+    answers = Answers(vars(given), ask=sys.stdin.isatty() and not yes)
+    copy = file.with_name(f"{file.stem}_mended.urdf")
+    arm = found_arm(source, copy, model_options(settings or []), answers)
+    named = description if arm.file == source and _is_named(description) else ""
+    path = named or os.path.relpath(arm.file.resolve(), file.resolve().parent)
+    file.write_text(profile_text(file.stem if out else name, description, path, arm), "utf-8")
+    _report(file, arm)
+
+
+def _is_named(description: str) -> bool:
+    return description.startswith(ROBOT_DATA_PREFIX)
+
+
+def _report(file: Path, arm: Arm) -> None:
+    report = check_profile(str(file))
+    for line in report.errors:
+        errors().print(styled(line, "red"), soft_wrap=True)
+    if report.errors:
+        fail(f"{file} was written and does not pass `vla-zenoh profile check`: correct it")
+    out = console()
+    out.print(styled("ok", "green"), str(file), soft_wrap=True)
+    for line in arm.changes:
+        out.print(line, soft_wrap=True)
+    for guess in arm.guesses:
+        out.print(styled("guess", "yellow"), f"{guess.place}: {guess.what}", soft_wrap=True)
+    out.print(f"simulate it: vla-zenoh up {file} --sim", soft_wrap=True)

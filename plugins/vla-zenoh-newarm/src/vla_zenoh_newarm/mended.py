@@ -1,0 +1,232 @@
+"""A robot description (URDF or xacro) with what this package needs and descriptions often lack.
+
+Endless joints get ends, joints without a velocity get one, meshes that cannot be found are replaced
+by plain shapes. What was changed is said; a description that lacks nothing is used as it is.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from vla_zenoh.errors import ProfileError, in_words
+from vla_zenoh.kinematics.description import Description, is_xacro
+from vla_zenoh.types import FloatArray
+
+ENDLESS_RAD = 3.1416
+"""End of the range of an endless joint, to both sides: no reading of it ever jumps by a turn."""
+SLOW_RAD_S, SLOW_M_S = 1.0, 0.1
+"""Velocity of a joint that has none."""
+THIN_M, THICK_M = 0.02, 0.05
+"""Least and greatest radius of a shape that is made up."""
+SLENDER = 0.2
+"""Its radius as a share of its length."""
+MESHES = (".stl", ".dae", ".obj")
+
+
+class Mended:
+    """A description that can be used, of a URDF or a xacro.
+
+    Args:
+        source: the file.
+        arguments: of a xacro.
+
+    Attributes:
+        changes: what was changed and is no guess, as sentences.
+        guesses: what was made up, as sentences.
+
+    Raises:
+        ResourceError: it cannot be read.
+        ProfileError: it is none, or not one robot; says what to do.
+    """
+
+    def __init__(self, source: Path, arguments: Mapping[str, str]) -> None:
+        self.source = source
+        expanded = _expanded(source, arguments)
+        self._robot = _robot(source) if expanded is None else ElementTree.fromstring(expanded)
+        self.changes = [] if expanded is None else [f"{source.name} is a xacro: it was expanded"]
+        self.guesses = [*_give_velocities(self._robot), *_give_shapes(self._robot, source)]
+
+    def described(self) -> Description:
+        """Its links and joints."""
+        if not (self.changes or self.guesses):
+            return Description(self.source)
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / self.source.name
+            self._write(path)
+            return Description(path)
+
+    def give_ends(self, joints: Collection[str]) -> None:
+        """Give those of `joints` that turn endlessly ends."""
+        endless = [name for name in _give_ends(self._robot) if name in joints]
+        if endless:
+            self.changes.append(f"{', '.join(endless)}: endless, here from -pi to pi")
+
+    def save(self, copy: Path) -> Path:
+        """The description to use: the given file, or where something was changed, a copy."""
+        if not (self.changes or self.guesses):
+            return self.source
+        self._write(copy)
+        return copy
+
+    def _write(self, path: Path) -> None:
+        _name_meshes(self._robot, self.source)
+        path.write_text(ElementTree.tostring(self._robot, encoding="unicode"), "utf-8")
+
+
+def _robot(source: Path) -> ElementTree.Element:
+    try:
+        found = ElementTree.parse(source).getroot()
+    except (OSError, ElementTree.ParseError):
+        found = None
+    if found is None or found.tag != "robot":
+        Description(source)  # says what it is instead
+        raise ProfileError(f"{source.name} is no URDF")
+    return found
+
+
+# -- xacro ----------------------------------------------------------------------------------------
+def _expanded(source: Path, arguments: Mapping[str, str]) -> str | None:
+    """The URDF that a xacro stands for; None: it is no xacro."""
+    try:
+        if not is_xacro(ElementTree.parse(source).getroot()):
+            return None
+    except (OSError, ElementTree.ParseError):
+        return None  # the reader of descriptions says why
+    try:
+        from xacrodoc import XacroDoc
+
+        made = XacroDoc.from_file(str(source), subargs=dict(arguments))
+        return str(made.to_urdf_string(use_protocols=False))
+    except Exception as error:
+        raise ProfileError(
+            f"{source.name} is a xacro and cannot be expanded: {in_words(error)}. Give its "
+            "arguments with --set name=value; packages are looked for in the folders above it"
+        ) from error
+
+
+# -- joints ---------------------------------------------------------------------------------------
+def _give_ends(robot: ElementTree.Element) -> Iterator[str]:
+    """Names of the joints that turned endlessly."""
+    for joint in robot.findall("joint"):
+        if joint.get("type") != "continuous":
+            continue
+        joint.set("type", "revolute")
+        limit = _limit(joint)
+        limit.set("lower", str(-ENDLESS_RAD))
+        limit.set("upper", str(ENDLESS_RAD))
+        yield str(joint.get("name"))
+
+
+def _give_velocities(robot: ElementTree.Element) -> Iterator[str]:
+    lacking: list[str] = []
+    for joint in robot.findall("joint"):
+        if joint.get("type") not in ("revolute", "prismatic"):
+            continue
+        limit = _limit(joint)
+        limit.set("effort", limit.get("effort", "10"))
+        if _number(limit.get("velocity")) > 0:
+            continue
+        slides = joint.get("type") == "prismatic"
+        limit.set("velocity", str(SLOW_M_S if slides else SLOW_RAD_S))
+        lacking.append(str(joint.get("name")))
+    if lacking:
+        yield (
+            f"velocity of {', '.join(lacking)}: {SLOW_RAD_S:g} rad/s ({SLOW_M_S:g} m/s where it "
+            "slides), since the description has none"
+        )
+
+
+def _limit(joint: ElementTree.Element) -> ElementTree.Element:
+    found = joint.find("limit")
+    return ElementTree.SubElement(joint, "limit") if found is None else found
+
+
+def _number(text: str | None) -> float:
+    try:
+        return float(text or "0")
+    except ValueError:
+        return math.nan  # the reader of descriptions names it
+
+
+# -- shapes ---------------------------------------------------------------------------------------
+def _give_shapes(robot: ElementTree.Element, source: Path) -> Iterator[str]:
+    """Shapes for links whose meshes are not there, and for all where no link has one."""
+    links = robot.findall("link")
+    if not any(link.findall("collision") for link in links):
+        for link in links:
+            for visual in link.findall("visual"):
+                collision = ElementTree.SubElement(link, "collision")
+                collision.extend(visual.findall("origin") + visual.findall("geometry"))
+        moved = {child.get("link") for child in robot.findall("joint/child")}
+        bare = [link for link in links if link.get("name") in moved]
+        bare = [link for link in bare if not link.findall("collision")]
+    else:
+        bare = []
+    missing: list[str] = []
+    for link in links:
+        meshes = link.findall("collision/geometry/mesh")
+        if link in bare or any(_mesh(mesh.get("filename", ""), source) is None for mesh in meshes):
+            for collision in link.findall("collision"):
+                link.remove(collision)
+            ends = list(_ends(robot, str(link.get("name"))))
+            link.extend(_plain_shape(end) for end in ends)
+            missing += [str(link.get("name"))] if ends else []
+    if missing:
+        yield (
+            f"shapes of {', '.join(missing)}: cylinders from joint to joint, since their meshes "
+            "were not found"
+        )
+
+
+def _ends(robot: ElementTree.Element, link: str) -> Iterator[FloatArray]:
+    """Where the joints of a link are that is on the way to others."""
+    for joint in robot.findall("joint"):
+        parent, origin = joint.find("parent"), joint.find("origin")
+        if parent is None or parent.get("link") != link:
+            continue
+        text = "0 0 0" if origin is None else origin.get("xyz", "0 0 0")
+        yield np.array([_number(word) for word in text.split()])
+
+
+def _plain_shape(end: FloatArray) -> ElementTree.Element:
+    """A cylinder from the origin of a link to `end`, or a ball there if that is near."""
+    length_m = float(np.linalg.norm(end))
+    radius_m = min(max(SLENDER * length_m, THIN_M), THICK_M)
+    collision = ElementTree.Element("collision")
+    geometry = ElementTree.SubElement(collision, "geometry")
+    if not length_m > radius_m:
+        ElementTree.SubElement(geometry, "sphere", radius=str(radius_m))
+        return collision
+    ElementTree.SubElement(geometry, "cylinder", radius=str(radius_m), length=str(length_m))
+    x, y, z = (end / length_m).tolist()
+    pitch, yaw = math.acos(max(-1.0, min(1.0, z))), math.atan2(y, x)
+    middle = " ".join(map(str, (end / 2).tolist()))
+    ElementTree.SubElement(collision, "origin", xyz=middle, rpy=f"0 {pitch} {yaw}")
+    return collision
+
+
+def _mesh(name: str, source: Path) -> Path | None:
+    """The file of a mesh, which is looked for as Pinocchio does."""
+    if Path(name).suffix.lower() not in MESHES:
+        return None
+    kind, _, rest = name.rpartition("://")
+    folders: Sequence[Path] = source.resolve().parents
+    if kind == "file":
+        folders, rest = [Path("/")], rest.lstrip("/")
+    for folder in folders:
+        if (found := folder / rest).is_file():
+            return found
+    return None
+
+
+def _name_meshes(robot: ElementTree.Element, source: Path) -> None:
+    """Give every mesh the whole path of its file: the copy may be anywhere."""
+    for mesh in robot.iter("mesh"):
+        if (found := _mesh(mesh.get("filename", ""), source)) is not None:
+            mesh.set("filename", str(found))

@@ -1,0 +1,132 @@
+"""Where an arm may work, and a home for it: away from singularities, from itself and the table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from vla_zenoh.control.reachability import Barriers
+from vla_zenoh.kinematics.kinematics import InverseKinematics, Kinematics, smallest_singular_value
+from vla_zenoh.kinematics.so3 import Pose
+from vla_zenoh.profile import POSE_JOINTS, ReachLimits
+from vla_zenoh.types import FloatArray
+
+SAMPLES = 3000
+BEST = 150
+"""Samples of which distances are computed, the best first."""
+INNER = 0.75
+"""Part of each joint's range, about its middle, in which a home lies."""
+WAY_M = 0.08
+"""A home has this way up and down."""
+ABOVE_TABLE = 0.2
+"""Height of the TCP at home over the table, as a share of the reach."""
+REACH_SHARE = 0.95
+"""Share of the samples that a workspace holds along each axis."""
+ABOVE_M = 0.012
+"""A workspace begins this far above the table."""
+MARGIN_M = 0.1
+"""Of a workspace around home, at least."""
+ENDLESS_RAD = 3.0
+"""Ranges beyond this are looked at up to here: half a turn has every direction."""
+
+Span = tuple[float, float]
+
+
+class Posture(NamedTuple):
+    """A home and a workspace.
+
+    Args:
+        home_rad: in the order of the arm's joints.
+        workspace_m: x, y and z.
+        reach_m: of the TCP from the base, horizontally.
+        free: the arm at home is near nothing; else `home_rad` is the best there is.
+    """
+
+    home_rad: tuple[float, ...]
+    workspace_m: tuple[Span, Span, Span]
+    reach_m: float
+    free: bool
+
+
+def posture(kinematics: Kinematics, reach: ReachLimits, home_rad: Sequence[float]) -> Posture:
+    """A home of an arm and its workspace, as guesses; a given `home_rad`, if not empty, is kept.
+
+    Raises:
+        ResourceError: the shapes of its description cannot be loaded.
+    """
+    random = np.random.default_rng(0)  # the same profile every time
+    low = np.maximum(kinematics.lower_rad, -ENDLESS_RAD)
+    high = np.minimum(kinematics.upper_rad, ENDLESS_RAD)
+    middle, half = (low + high) / 2, (high - low) / 2
+    shares = random.uniform(-1.0, 1.0, (SAMPLES, kinematics.size))
+    places_m = np.array([kinematics.forward(middle + half * each).position_m for each in shares])
+    table_m = reach.table_z_m if reach.table_z_m is not None else float(places_m[:, 2].min())
+    reach_m = float(np.quantile(np.linalg.norm(places_m[:, :2], axis=1), REACH_SHARE))
+    free = True
+    if home_rad:
+        home = np.array(home_rad, float)
+    else:
+        inner = middle + INNER * half * shares
+        home, free = _home(kinematics, reach, inner, table_m, reach_m)
+    at_m = kinematics.forward(home).position_m
+    edges = np.quantile(places_m, (1 - REACH_SHARE, REACH_SHARE), axis=0)
+    lower = np.minimum(np.floor(edges[0] * 20) / 20, at_m - MARGIN_M)
+    upper = np.maximum(np.ceil(edges[1] * 20) / 20, at_m + MARGIN_M)
+    if reach.table_z_m is not None:
+        lower[2] = min(max(lower[2], table_m + ABOVE_M), float(at_m[2]) - ABOVE_M)
+    x, y, z = zip(np.round(lower, 3).tolist(), np.round(upper, 3).tolist(), strict=True)
+    return Posture(tuple(home.tolist()), (x, y, z), reach_m, free)
+
+
+def _home(
+    kinematics: Kinematics,
+    reach: ReachLimits,
+    samples_rad: FloatArray,
+    table_m: float,
+    reach_m: float,
+) -> tuple[FloatArray, bool]:
+    """The best of the samples that is near nothing, and whether there is one."""
+    scores = np.array([_score(kinematics, each, table_m, reach_m) for each in samples_rad])
+    order = np.argsort(-scores)[:BEST]
+    found = samples_rad[order[0]]
+    barriers = Barriers(kinematics, reach, found)
+    for index in order:
+        home = np.round(samples_rad[index], 2)
+        if _is_free(kinematics, barriers, home):
+            return home, True
+    return np.round(found, 2), False
+
+
+def _score(kinematics: Kinematics, joints_rad: FloatArray, table_m: float, reach_m: float) -> float:
+    """How good a home is: nimble, in front of the base, at some height, the tool not upwards."""
+    here, jacobian = kinematics.pose_and_jacobian(joints_rad)
+    # Metres and radians alike, as the limits count; a small arm is as nimble as a large one.
+    scaled = jacobian.copy()
+    scaled[:3] /= max(reach_m, 0.1)
+    x_m, y_m, z_m = (here.position_m / max(reach_m, 0.1)).tolist()
+    height = z_m - table_m / max(reach_m, 0.1)
+    tool = here.rotation @ kinematics.tool_m
+    length_m = float(np.linalg.norm(tool))
+    up = float(tool[2]) / length_m if length_m > 1e-3 else 0.0
+    score = 4.0 * min(smallest_singular_value(scaled), 0.3)
+    score -= abs(x_m - 0.6) + abs(y_m) + 2.0 * max(0.0, ABOVE_TABLE - height)
+    score -= max(0.0, height - 0.6)
+    return score - 0.5 * up
+
+
+def _is_free(kinematics: Kinematics, barriers: Barriers, home_rad: FloatArray) -> bool:
+    """Whether home and the ways up and down from it are in no zone of a barrier."""
+    solver = InverseKinematics(kinematics, home_rad)
+    here = kinematics.forward(home_rad)
+    least = 0.5 * barriers.zone
+    if np.any(barriers.at(home_rad, kinematics.jacobian(home_rad)) < barriers.zone):
+        return False
+    for way_m in (WAY_M, -WAY_M):
+        goal = Pose(here.position_m + np.array([0.0, 0.0, way_m]), here.rotation)
+        found = solver.approach(goal, home_rad)
+        far = kinematics.size >= POSE_JOINTS and not found.solved
+        if far or np.any(barriers.at(found.joints_rad, found.jacobian) < least):
+            return False
+    return True

@@ -1,0 +1,108 @@
+"""The text of a profile, with comments where a person must look."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from vla_zenoh.profile import write_yaml
+from vla_zenoh_newarm.arm import Arm
+
+SMALL_M = 0.55
+"""Reach below which an arm is simulated on the desk of the small arm."""
+FIRST = """\
+# {name}, made by `vla-zenoh profile new {source}`.
+# What is listed under `unconfirmed`, at the end, was guessed. The simulated arm works with it; a
+# real one is not activated while anything is listed there: look at each, correct it, delete its
+# line.
+"""
+DRIVER = """\
+  # The simulator, until you say what drives the real arm: arm (a Python class with read and move),
+  # ros2, franka, ur or lerobot; see docs/how-to/own-arm.md. `vla-zenoh up FILE --sim` simulates it
+  # all the same.
+"""
+LIMITS = """\
+limits: # half the velocity of the description, at most 1 rad/s
+"""
+UNCONFIRMED = """\
+# Look at each, correct it above, and delete its line.
+"""
+
+
+def profile_text(name: str, source: str, description: str, arm: Arm) -> str:
+    """The profile of an arm.
+
+    Args:
+        name: of the robot.
+        source: what it was made from.
+        description: path that the profile names.
+        arm: what is known and guessed.
+    """
+    links, motion, home = arm.structure, arm.motion, arm.posture
+    guessed = {guess.place for guess in arm.guesses}
+
+    def mark(place: str) -> str:
+        return " # a guess" if place in guessed else ""
+
+    x_m, y_m, z_m = (_row(span) for span in home.workspace_m)
+    lines = [
+        FIRST.format(name=name, source=source).rstrip(),
+        f"about: {_text(name)} on a table, simulated until its driver is named",
+        "",
+        "robot:",
+        f"  name: {_text(name)}",
+        DRIVER.rstrip(),
+        "  driver: sim",
+        "  command: joint",
+        *(f"  # {change}" for change in arm.changes),
+        f"  description: {_text(description)}{mark('robot.description')}",
+        f"  base_frame: {_text(links.base)}{mark('robot.base_frame')}",
+        f"  tcp_frame: {_text(links.tcp)}{mark('robot.tcp_frame')}",
+        "  arm_joints:",
+        *(f"    - {_text(joint)}" for joint in links.arm),
+        f"  home_rad: {_row(home.home_rad)}{mark('robot.home_rad')}",
+    ]
+    if arm.gripper.joints:
+        lines += ["  finger_joints:", *(f"    - {_text(joint)}" for joint in arm.gripper.joints)]
+        lines += [f"  gripper:{mark('robot.gripper')}"]
+        lines += [f"    {key}: {value:g}" for key, value in arm.gripper.values.items()]
+    table = "null" if arm.table_z_m is None else f"{arm.table_z_m:g}"
+    acceleration, jerk = "limits.joint.acceleration_rad_s2", "limits.joint.jerk_rad_s3"
+    lines += [
+        "",
+        LIMITS.rstrip(),
+        f"  workspace: {{x_m: {x_m}, y_m: {y_m}, z_m: {z_m}}}{mark('limits.workspace')}",
+        "  translation: {velocity_m_s: 0.25, acceleration_m_s2: 1.0, jerk_m_s3: 10.0}",
+        "  rotation: {velocity_rad_s: 0.7, acceleration_rad_s2: 3.0, jerk_rad_s3: 30.0}",
+        "  joint:",
+        f"    velocity_rad_s: {_row(motion.velocity)}",
+        f"    acceleration_rad_s2: {_row(motion.acceleration)}{mark(acceleration)}",
+        f"    jerk_rad_s3: {_row(motion.jerk)}{mark(jerk)}",
+        f"  reach: {{table_z_m: {table}}}{mark('limits.reach.table_z_m')}",
+        "",
+        "cameras: # of the scene; a real arm has others",
+        '  front: {source: "sim:front"}',
+        '  wrist: {source: "sim:wrist"}',
+        f"sim: {{scene: {'desk' if home.reach_m < SMALL_M else 'bricks'}}}",
+        "",
+        "workers: [scripted]",
+        "task: {prompt: hold, rate_hz: 5, worker: scripted}",
+        "hosts:",
+        "  here:",
+        "    nodes: [router, sim, camera, command, worker]",
+    ]
+    if arm.guesses:
+        lines += ["", UNCONFIRMED.rstrip(), "unconfirmed:"]
+        for place in dict.fromkeys(guess.place for guess in arm.guesses):
+            what = [guess.what for guess in arm.guesses if guess.place == place]
+            lines += [f"  # {each}" for each in what]
+            lines += [f"  - {place}"]
+    return "\n".join(lines) + "\n"
+
+
+def _row(values: Sequence[float]) -> str:
+    return f"[{', '.join(f'{value:g}' for value in values)}]"
+
+
+def _text(value: str) -> str:
+    """A text as YAML, quoted where it must be."""
+    return write_yaml([value]).removeprefix("- ").strip()
