@@ -47,7 +47,12 @@ def prompt(
     target: RobotTarget,
     as_json: AnswerOption = False,
 ) -> None:
-    """Set the prompt. Any Zenoh client can: put the text on <root>/<robot>/prompt."""
+    """Set the prompt. Any Zenoh client can: put the text on <root>/<robot>/prompt.
+
+    A moving arm carries on with its plan until the worker has answered the new prompt; without an
+    answer it stands timing.max_open_loop_s and watchdog_s after the last chunk, 2.8 s by default.
+    `vla-zenoh speed 0` or `deactivate` stop it before that.
+    """
     from vla_zenoh.codec.settings import decode_text
 
     if not decode_text(text.encode()):  # rejects it before a router is asked

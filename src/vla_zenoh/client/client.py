@@ -475,6 +475,9 @@ class Client(StopClient):
     def set_prompt(self, prompt: str, timeout_s: float | None = None) -> Task:
         """Set the prompt, and wait until the command node has accepted it.
 
+        A moving arm carries on with its plan until the worker has answered the new prompt, for
+        ``timing.max_open_loop_s`` and ``watchdog_s`` after the last chunk at most.
+
         Args:
             prompt: in words.
             timeout_s: while it does not answer, or is starting; None: `patience_s`.

@@ -61,13 +61,15 @@ class Watchdog:
         self._timing = timing
         self._chunk, self._motion = Deadline(), Deadline()
 
-    def expect(self, left_ns: int | None, now_ns: int, task: Task) -> None:
+    def expect(
+        self, left_ns: int | None, now_ns: int, task: Task, *, carries_on: bool = False
+    ) -> None:
         """Set the deadline of the next chunk, and that of the motion without one.
 
         The next chunk is due one period at the requested rate, and the watchdog, after `left_ns` of
         plan time, of which ``max_open_loop_s`` count at most; None: the first chunk of an episode.
         Whatever the rate, the arm moves for ``max_open_loop_s`` of plan time and the watchdog at
-        most. At override 0 plan time stands still.
+        most; a motion that `carries_on` keeps its deadline. At override 0 plan time stands still.
         """
         patience_s = self._timing.watchdog_s
         first_s = patience_s + FIRST_CHUNK_PATIENCE_S
@@ -75,7 +77,8 @@ class Watchdog:
         plan_ns = min(left_ns or 0, open_loop_ns)
         chunk_s = first_s if left_ns is None else patience_s
         self._chunk.set(plan_ns + 1e9 / task.rate_hz, chunk_s, now_ns, task.speed)
-        self._motion.set(open_loop_ns, patience_s, now_ns, task.speed)
+        if not carries_on:
+            self._motion.set(open_loop_ns, patience_s, now_ns, task.speed)
 
     def override_changed(self, now_ns: int, before: float, speed: float) -> None:
         """Keep the plan time that is left until the deadlines, of an override that was `before`."""

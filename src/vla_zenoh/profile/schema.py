@@ -475,7 +475,8 @@ class TaskProfile(Section):
     """Initial values of the settings.
 
     Args:
-        prompt: instruction for the model.
+        prompt: instruction for the model. The plan of an old prompt, or worker, is followed until
+            the first chunk of the new one, for timing.max_open_loop_s and watchdog_s at most.
         rate_hz: requested rate of chunks.
         worker: whose chunks move the arm.
         speed_percent: share of the planned speed.
