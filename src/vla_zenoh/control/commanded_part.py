@@ -9,6 +9,7 @@ import numpy as np
 
 from vla_zenoh.control.chunk_planner import ChunkPlanner
 from vla_zenoh.control.commander_io import MotionCommands, NewStates, make_event
+from vla_zenoh.control.contact import LOAD_SETTLES_NS
 from vla_zenoh.control.limits import slowest
 from vla_zenoh.control.monitor import Brake, Monitor, PartSnapshot
 from vla_zenoh.control.motion_pipeline import MotionPipeline
@@ -45,8 +46,8 @@ LET_GO_M = 0.01
 """A gripper that opens by more than this lets go of what it holds."""
 SAME_WIDTH_M = 0.005
 """A gripper this near to the width sent last has reached it."""
-SETTLE_NS = 60_000_000
-"""Time until a command shows as movement in the state."""
+GRIPPER_STARTS_NS = 60_000_000
+"""Time until a command of the gripper shows as movement in its state."""
 
 
 class CommandedPart:
@@ -92,6 +93,11 @@ class CommandedPart:
         """What the gripper holds."""
         self._grasp_m = np.inf
         """Least width of the gripper since it holds something."""
+        self.brakes = False
+        """It brakes, and what presses on it then is not known yet."""
+        self._relieves = False
+        self._rests_ns: int | None = None
+        """Since when it stands after the brake."""
 
     # -- its name in messages -----------------------------------------------------------------
     def says(self, why: str) -> str:
@@ -284,6 +290,41 @@ class CommandedPart:
             self.retreat.begin(part.commanded)
         return brake, events
 
+    def brake(self, *, relieves: bool) -> None:
+        """The arm stops obeying: look at what presses on it once it stands, see `relief`.
+
+        `relieves`: it may retreat from that.
+        """
+        self.brakes, self._relieves, self._rests_ns = True, relieves, None
+
+    def stay(self) -> None:
+        """Stand where the brake ends, whatever presses."""
+        self.retreat.end()
+        self._relieves = False
+
+    def relief(self, part: PartSnapshot, *, stays: bool) -> Event | None:
+        """Begin to retreat from what presses where a brake ended, unless it `stays`; or say so.
+
+        Once for each brake; None: nothing presses, or the load has not settled yet.
+        """
+        if self.retreat.busy:
+            self._relieves = False
+        if self.retreat.busy or self._rests_ns is None or not self.motion.at_rest:
+            self._rests_ns = part.now_ns
+        if part.now_ns - self._rests_ns < LOAD_SETTLES_NS:
+            return None
+        self.brakes, load = False, self.contact.touching()
+        if load is None:
+            return None
+        retreats = self._relieves and not stays and not self.keeps_from_retreat(part)
+        if retreats and part.commanded is not None:
+            self.retreat.begin(part.commanded)
+        why = (
+            f"{load.name} {load.value:.1f} {load.unit} presses on the arm where it came to rest; "
+            + ("it retreats" if self.retreat.busy else "it stays there")
+        )
+        return make_event("warning", "notice", "pressed", why, load.value, load.slow)
+
     def follow_elbow(self, *, obeying: bool) -> None:
         """Begin to bound the next step with the elbow of the commanded or measured joints.
 
@@ -352,7 +393,7 @@ class GripperArbiter:
         if self.in_flight:
             settled = (
                 state is not None
-                and state.received_ns > self._sent_ns + SETTLE_NS
+                and state.received_ns > self._sent_ns + GRIPPER_STARTS_NS
                 and not state.record.moving
             )
             late = now_ns - self._sent_ns > profile.command_timeout_s * 1e9

@@ -241,7 +241,7 @@ class Commander:
             self._activate(now_ns, "" if value is True else value)
         elif name == "active" and value is False:
             for part in self.parts:
-                part.retreat.end()
+                part.stay()
             self._change(Trigger.DEACTIVATE, DEACTIVATED)
         elif name == "held":
             box = value if isinstance(value, HeldBox) else None
@@ -257,7 +257,7 @@ class Commander:
             self._change(Trigger.RESET, "reset")
         elif name == "lose":
             for part in self.parts:
-                part.retreat.end()
+                part.stay()
             self._change(Trigger.LOSE, str(value))
         elif name != "stop":
             raise RecordError(f"{name!r} cannot be set to {value!r}")
@@ -279,7 +279,7 @@ class Commander:
         if changes:
             self._ended, self._asked_ns = "", now_ns
         if self.state in OBEYING:
-            self._watchdog.expect(None, now_ns, self.task)
+            self._watchdog.expect(None, now_ns, self.task, carries_on=bool(changes))
 
     def _change_speed(self, percent: float, now_ns: int) -> None:
         before = self.task.speed
@@ -404,6 +404,9 @@ class Commander:
                 part.contact.end()
             if old in OBEYING:
                 self._ended = why if trigger is Trigger.LOSE else ""
+        if old in OBEYING and new is not State.ACTIVE:
+            for part in self.parts:
+                part.brake(relieves=trigger is Trigger.LOSE)
         asked = new in OBEYING or trigger in (Trigger.DEACTIVATE, Trigger.RESET)
         self._emit("info" if asked else "warning", "transition", f"{old.value}->{new.value}", why)
 
@@ -477,6 +480,12 @@ class Commander:
             if why:
                 part.retreat.end()
                 self._emit("warning", "notice", "retreat", part.says(f"the retreat ends: {why}"))
+        if self.state is not State.ACTIVE and not self.dry_run:
+            stays = self.state is not State.INACTIVE or bool(unheld)
+            for part in self.parts:
+                if part.brakes:
+                    event = part.relief(self._snapshot(part, worker, now_ns), stays=stays)
+                    self._out.events += [] if event is None else part.tagged([event])
         if self.state not in OBEYING:
             return
         lost: dict[str, Brake] = {}

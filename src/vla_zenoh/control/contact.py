@@ -23,6 +23,9 @@ has accumulated. So after the brake the command of a blocked arm moves
    `STEP_M` at a time, until nothing presses any more, but `RELIEF_M` at most.
 
 Without a measured wrench the contact cannot be seen: then it moves all of `RELIEF_M` at once.
+
+An arm that brakes for another loss, and comes to rest with a load above ``slow``, retreats as well.
+Where it was asked to stand, or may resume, an event `pressed` tells of the load.
 """
 
 from __future__ import annotations
@@ -57,8 +60,8 @@ RISE = 0.1
 something is behind the arm. Less: a sensor's noise ends it."""
 RELIEF_M = 0.02
 """As far as an arm of 2000 N/m is pressed into what stops it at 40 N."""
-SETTLE_NS = 50_000_000
-"""Wait after each step, for the external load to settle."""
+LOAD_SETTLES_NS = 50_000_000
+"""Time that the external load has to settle, once the command stands."""
 SPARE_NS = 4_000_000_000
 """Time that a retreat may take beyond that of its path."""
 SPACE_M = 0.002
@@ -283,6 +286,11 @@ class Contact(Monitor):
         """The load above its stop limit, None without one."""
         return next((load for load in self._measured if load.most > load.stop), None)
 
+    def touching(self) -> Load | None:
+        """The load furthest above its slow limit, None without one."""
+        loads = [load for load in self._measured if load.value > load.slow]
+        return max(loads, key=lambda load: load.value / load.slow, default=None)
+
     @property
     def slowdown(self) -> Slowdown | None:
         """The slowdown of the greatest load, None without one."""
@@ -414,7 +422,7 @@ class Retreat:
             return self._target, None
         if self._target is None:
             return self._set_out(begun, commanded, measured, now_ns)
-        if now_ns - self._rest_ns < SETTLE_NS:
+        if now_ns - self._rest_ns < LOAD_SETTLES_NS:
             return self._target, None
         known = self._contact.known
         if known and self._contact.quiet:

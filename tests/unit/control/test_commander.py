@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import random
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -36,6 +38,7 @@ DOWN_FAST = [0.0, 0.0, -0.03, 0.0, 0.0, 0.0, 0.0]
 BOX = HeldBox((0.1, 0.1, 0.6))
 STEP_M = 0.01
 AT_GOAL_M, AT_GOAL_RAD = 1e-6, 1e-6
+BRAKE_S = 0.4
 
 
 def moving_rig(**kwargs: object) -> Rig:
@@ -832,6 +835,29 @@ def test_a_new_prompt_in_motion_supersedes_chunks_under_way_without_a_jump() -> 
     assert rig.refused == {"superseded": 1}
     assert rig.send([FORTH]).accepted is not None
     rig.settle()
+    rig.assert_smooth()
+
+
+@pytest.mark.parametrize(("name", "values"), [("prompt", "ab"), ("worker", [OTHER, WORKER])])
+@pytest.mark.parametrize("velocity_m_s", [0.5, 0.01])
+def test_the_plan_of_an_old_prompt_or_worker_runs_out_within_its_time_and_no_further(
+    name: str, values: Sequence[str], velocity_m_s: float
+) -> None:
+    """However often another one is put, and however late the arm is."""
+    limits = profile().limits
+    slow = limits.translation.model_copy(update={"velocity_m_s": velocity_m_s})
+    rig = Rig(profile(limits={"translation": slow}))
+    rig.send([STAND], worker=OTHER)
+    rig.activate()
+    rig.send([[0.02, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]] * 16)
+    timing, heard_ns = rig.profile.timing, rig.now_ns
+    for value in itertools.islice(itertools.cycle(values), 40):
+        rig.put(name, value)
+        rig.run(0.096)
+        moves_on = np.abs(rig.commands[-1].twist).max() > 1e-6
+        late_s = (rig.now_ns - heard_ns) / 1e9 - timing.max_open_loop_s - timing.watchdog_s
+        assert not moves_on or late_s < BRAKE_S
+    assert rig.moved_m()[0] <= 16 * 0.02 + AT_GOAL_M
     rig.assert_smooth()
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from vla_zenoh.control.commanded_part import SETTLE_NS, GripperArbiter
+from vla_zenoh.control.commanded_part import GRIPPER_STARTS_NS, GripperArbiter
 from vla_zenoh.profile import GripperProfile
 from vla_zenoh.types import GripperState, Header, Stamped
 
@@ -80,7 +80,7 @@ def test_standing_still_right_after_a_command_is_not_its_end(gripper: GripperArb
     gripper.step(0, None)
     gripper.request(0.08)
     assert gripper.step(10 * MS, state(10 * MS, moving=False)) is None
-    late_ns = SETTLE_NS + 1
+    late_ns = GRIPPER_STARTS_NS + 1
     assert gripper.step(late_ns, state(late_ns, moving=False)) is not None
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -104,7 +105,7 @@ class Clamped(Walled):
     stiffness_n_m = 20_000.0
 
     def __init__(self) -> None:
-        self.behind_m: float | None = None
+        self.clamp_m: float | None = None
         self.aside_n = np.zeros(3)
         self.forces_n: list[float] = []
         super().__init__(np.array([1.0, 0, 0]), 0.06)
@@ -113,7 +114,7 @@ class Clamped(Walled):
         said = Rig.pose_state(self)
         way_m = float((self.position_m - START_M) @ self.along)
         at_m = min(way_m, self.gap_m)
-        at_m = at_m if self.behind_m is None else max(at_m, self.behind_m)
+        at_m = at_m if self.clamp_m is None else max(at_m, self.clamp_m)
         self.forces_n.append(self.stiffness_n_m * (way_m - at_m))
         force_n = self.aside_n - self.forces_n[-1] * self.along
         place_m = self.position_m + (at_m - way_m) * self.along
@@ -125,7 +126,7 @@ def test_it_ends_where_something_behind_the_arm_presses() -> None:
     rig = Clamped()
     rig.push(0.01)
     rig.brake()
-    rig.behind_m, rig.aside_n = rig.gap_m - 0.002, np.array([0.0, 4.0, 0.0])
+    rig.clamp_m, rig.aside_n = rig.gap_m - 0.002, np.array([0.0, 4.0, 0.0])
     since = len(rig.forces_n)
     rig.run(5.0)
     stop_n, brake_m = rig.profile.limits.contact.force_stop_n, 0.003
@@ -320,6 +321,103 @@ def test_a_robot_without_a_wrench_is_told_about_once() -> None:
     rig.run(4.0)
     rig.activate()
     assert [event.what for event in rig.events].count("contact_not_told") == 1
+
+
+# -- a brake for another reason, pressed ----------------------------------------------------------
+def pressing_rig(holder: str = "") -> Walled:
+    """Active, moving on into a wall that presses with 20 N: less than the stop of a contact."""
+    rig = Walled(np.array([1.0, 0, 0]), 0.06)
+    rig.peers = replace(rig.peers, holders=frozenset({holder}))
+    rig.tick(chunks=[rig.chunk([[0.0] * 7])])
+    rig.put("active", holder or True)
+    while np.linalg.norm(rig.force_n) < 20.0:
+        rig.send([[0.01, 0, 0, 0, 0, 0, 0]])
+        for _ in range(24):
+            rig.tick()
+            if np.linalg.norm(rig.force_n) >= 20.0:
+                break
+    assert rig.state == "active"
+    return rig
+
+
+def pressed(rig: Rig) -> list[str]:
+    return [event.why for event in rig.events if event.what == "pressed"]
+
+
+LOSSES: dict[str, Callable[[Rig], object]] = {
+    "camera": lambda rig: gone(rig, "camera"),
+    "worker": lambda rig: gone(rig, "worker-scripted"),
+    "worker restarted": lambda rig: setattr(
+        rig, "peers", replace(rig.peers, spec_sources={"scripted": "worker-scripted-2"})
+    ),
+    "command node": lambda rig: rig.tick(Setting("lose", "the command loop stood still")),
+}
+ENDS: dict[str, Callable[[Rig], object]] = {
+    "deactivated": lambda rig: rig.put("active", False),
+    "stopped": lambda rig: rig.tick("stop"),
+    "fault": lambda rig: setattr(rig, "gripper", replace(rig.gripper, faults=("reflex",))),
+    "robot in another mode": lambda rig: setattr(
+        rig, "gripper", replace(rig.gripper, mode="guiding")
+    ),
+    "deadman gone": lambda rig: setattr(rig, "peers", replace(rig.peers, holders=frozenset[str]())),
+}
+
+
+def gone(rig: Rig, node: str) -> None:
+    rig.peers = replace(rig.peers, alive=rig.peers.alive - {node})
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_an_arm_that_a_brake_for_another_reason_pressed_on_something_retreats(loss: str) -> None:
+    rig = pressing_rig()
+    LOSSES[loss](rig)
+    rig.run(6.0)
+    assert float(np.linalg.norm(rig.force_n)) < QUIET_N
+    assert rig.behind_m() <= RELIEF_M + 2 * SPACE_M
+    (why,) = pressed(rig)
+    assert "contact_force" in why
+    assert why.endswith("it retreats")
+    assert rig.state == "inactive"
+    assert not rig.commander.streaming
+    rig.assert_smooth()
+
+
+@pytest.mark.parametrize("end", ENDS)
+def test_an_arm_that_is_to_stand_says_what_presses_on_it_and_stays(end: str) -> None:
+    rig = pressing_rig("anna")
+    ENDS[end](rig)
+    rig.brake()
+    stood_m = rig.commands[-1].position_m
+    rig.run(4.0)
+    np.testing.assert_allclose(rig.commands[-1].position_m, stood_m, atol=1e-6)
+    (why,) = pressed(rig)
+    assert why.endswith("it stays there")
+
+
+def test_an_arm_that_holds_says_what_presses_and_retreats_when_it_gives_up() -> None:
+    rig = Walled(np.array([1.0, 0, 0]), 0.06)
+    rig.activate()
+    rig.send([[0.013, 0, 0, 0, 0, 0, 0]] * 6)
+    rig.run(3.0)
+    assert rig.state == "holding"
+    assert np.linalg.norm(rig.force_n) > rig.profile.limits.contact.force_slow_n
+    rig.run(rig.profile.timing.max_hold_s + 4.0)
+    assert rig.state == "inactive"
+    assert [why.rpartition("; ")[2] for why in pressed(rig)] == ["it stays there", "it retreats"]
+    assert float(np.linalg.norm(rig.force_n)) < QUIET_N
+
+
+@pytest.mark.parametrize("gap_m", [9.0, 0.055])
+def test_a_brake_that_ends_in_no_contact_is_followed_by_nothing(gap_m: float) -> None:
+    """Free, or with less than what slows an arm down."""
+    rig = Walled(np.array([1.0, 0, 0]), gap_m)
+    rig.activate()
+    rig.send([[0.03, 0, 0, 0, 0, 0, 0]] * 2)
+    rig.run(0.8)
+    assert np.linalg.norm(rig.force_n) < rig.profile.limits.contact.force_slow_n
+    gone(rig, "camera")
+    assert still_after_the_brake(rig)
+    assert pressed(rig) == []
 
 
 # -- the way it came ------------------------------------------------------------------------------
