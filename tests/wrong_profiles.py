@@ -26,6 +26,16 @@ CAMERA_SOURCES = plugins.load_all(plugins.CAMERAS)
 CAMERAS = ", ".join(kind.written for kind in CAMERA_SOURCES.values())
 
 WRONG: list[tuple[str, str]] = [
+    (
+        "cameras: {front: {mount: {frame: eye, link: panda_hnad, position_m: [0, 0, 0],"
+        " rpy_rad: [0, 0, 0]}}}",
+        "cameras.front.mount.link: is 'panda_hnad', no link of robot.description; did you mean",
+    ),
+    (
+        "cameras: {front: {mount: {frame: /eye, link: panda_hand, position_m: [0, 0, 0],"
+        " rpy_rad: [0, 0, 0]}}}",
+        "cameras.front.mount.frame: begins with a slash",
+    ),
     # (text behind "extends: panda_sim", part of one line of what is said)
     (
         "limts: {}",

@@ -10,6 +10,7 @@ import importlib.util
 import json
 import os
 import re
+import struct
 import subprocess
 import sys
 import threading
@@ -52,10 +53,10 @@ cameras:
   front:
     source: "ros2:{front}"
     {size}
-  wrist:
+{mount}{unit}  wrist:
     source: "ros2:{wrist}"
     {size}
-task: {{prompt: hold, rate_hz: 10, worker: scripted}}
+{unit}task: {{prompt: hold, rate_hz: 10, worker: scripted}}
 session: {{listen: ["{endpoint}"], connect: ["{endpoint}"], lease_ms: 4000}}
 timing: {{command_timeout_s: {patience_s[command]}, state_timeout_s: {patience_s[state]}}}
 ros2:
@@ -63,8 +64,8 @@ ros2:
   domain: {domain}
   joint_states: {space}/joint_states
   cameras:
-    front: {{topic: {front}, type: sensor_msgs/msg/Image}}
-    wrist: {{topic: {wrist}, type: sensor_msgs/msg/CompressedImage}}
+    front: {{topic: {front}, type: sensor_msgs/msg/Image{depth[front]}}}
+    wrist: {{topic: {wrist}, type: sensor_msgs/msg/CompressedImage{depth[wrist]}}}
   pose_command: {{topic: {space}/desired_pose, type: geometry_msgs/msg/PoseStamped}}
   gripper: {gripper}
 {more}"""
@@ -73,6 +74,12 @@ width: {width}
     height: {height}
     rate_hz: {hz}
     check: {{same_s: 0}}"""
+DEPTH_UNIT_M = 0.001
+DEPTH_TOPICS = {
+    "front": ", depth: {topic: /front/depth}",
+    "wrist": ", depth: {topic: /wrist/depth, type: sensor_msgs/msg/CompressedImage}",
+}
+COMPRESSED_DEPTH = "16UC1; compressedDepth png"
 BY_TOPIC = "{{topic: {space}/gripper_width, type: std_msgs/msg/Float64, position: width}}"
 BY_ACTION = (
     "{{topic: {space}/gripper/move, type: franka_msgs/action/Move, grasp: {space}/gripper/grasp}}"
@@ -380,9 +387,12 @@ def write_profile(
     gripper: str = BY_TOPIC,
     size: tuple[int, int] = (WIDTH, HEIGHT),
     more: str = "",
+    mount: str = "",
+    depth: bool = False,
     patience_s: Mapping[str, float] = CHAIN_PATIENCE_S,
 ) -> Path:
-    """A profile of the rclpy robot; `more` is YAML at the end of the section ros2."""
+    """A profile of the rclpy robot; `more` is YAML at the end of the section ros2, `mount` of the
+    camera front. With `depth` both cameras have it."""
     path = folder / f"{name}_rclpy.yaml"
     path.write_text(
         PROFILE.format(
@@ -397,9 +407,35 @@ def write_profile(
             patience_s=patience_s,
             gripper=gripper.format(space=space),
             more=more,
+            mount=mount,
+            unit=f"    depth_unit_m: {DEPTH_UNIT_M}\n" if depth else "",
+            depth=DEPTH_TOPICS if depth else {"front": "", "wrist": ""},
         )
     )
     return path
+
+
+def depth_counts(width: int, height: int) -> NDArray[np.uint16]:
+    """Depth in mm as the cameras publish it; in the first row nothing was measured."""
+    counts = np.arange(width * height, dtype=np.uint16).reshape(height, width) % 4000 + 500
+    counts[0] = 0
+    return counts
+
+
+def depth_settings(folder: Path, width: int, height: int) -> list[dict[str, Any]]:
+    """Topics of depth for `ros_side/camera.py`: raw metres, and millimetres as compressedDepth."""
+    counts = depth_counts(width, height)
+    metres = (counts / 1000.0).astype(np.float32)
+    metres[0, :3] = np.nan, np.inf, -np.inf
+    (folder / "0.32FC1").write_bytes(metres.tobytes())
+    done, png = cv2.imencode(".png", counts)
+    assert done
+    header = struct.pack("<iff", 0, 0.0, 0.0)
+    (folder / "0.depth").write_bytes(header + png.tobytes())
+    return [
+        {"topic": "/front/depth", "encoding": "32FC1"},
+        {"topic": "/wrist/depth", "encoding": "depth", "format": COMPRESSED_DEPTH},
+    ]
 
 
 def camera_settings(
@@ -428,6 +464,8 @@ def running_ros_lab(
     space: str = "",
     gripper: str = BY_TOPIC,
     more: str = "",
+    mount: str = "",
+    depth: bool = False,
     size: tuple[int, int] = (WIDTH, HEIGHT),
     cameras: Callable[[dict[str, Any]], None] = lambda settings: None,
     patience_s: Mapping[str, float] = CHAIN_PATIENCE_S,
@@ -442,6 +480,8 @@ def running_ros_lab(
         space: what the names of topics begin with in the profile.
         gripper: its section of the profile, `BY_TOPIC` or `BY_ACTION`.
         more: YAML at the end of the profile's section ros2.
+        mount: YAML at the end of its camera front.
+        depth: cameras have depth, see `depth_settings`.
         size: of the pictures, width and height.
         cameras: changes their settings.
         patience_s: of the profile, with commands and states that are late.
@@ -455,10 +495,14 @@ def running_ros_lab(
         gripper=gripper,
         size=size,
         more=more,
+        mount=mount,
+        depth=depth,
         patience_s=patience_s,
     )
     made = pictures(folder / "pictures", *size)
     seen = camera_settings(folder / "pictures", space, size)
+    if depth:
+        seen["topics"] += depth_settings(folder / "pictures", *size)
     cameras(seen)
     with ExitStack() as stack:
         settings = generated(profile, beside=True)

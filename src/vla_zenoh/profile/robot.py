@@ -315,6 +315,8 @@ class Ros2Profile(Section):
         prefix: of our own topics and services, as ``/vla/stop``; null: none.
         services: offer services beside these topics. They reach only callers of the robot's own
             rmw_zenoh, or of Cyclone DDS: with ROS 2's default, Fast DDS, a call waits for ever.
+        tf: publish set-point, links of the arms and mounts of cameras on /tf and /tf_static, each
+            unless a node of the robot publishes it, and compare the robot's frames with ours.
     """
 
     bridge: Literal["ros2dds", "rmw_zenoh"] = "ros2dds"
@@ -332,3 +334,4 @@ class Ros2Profile(Section):
     messages: dict[RosType, Word] = Field(default_factory=dict)
     prefix: Topic | None = "/vla"
     services: bool = False
+    tf: bool = False

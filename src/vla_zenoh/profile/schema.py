@@ -12,7 +12,17 @@ from pydantic import AfterValidator, Field
 from vla_zenoh import plugins
 from vla_zenoh.errors import PluginError, nearest
 from vla_zenoh.plugins import CameraPlugin
-from vla_zenoh.profile.section import Distinct, Fault, Name, Names, Place, Section, Text, Word
+from vla_zenoh.profile.section import (
+    Distinct,
+    Fault,
+    Name,
+    Names,
+    Place,
+    Section,
+    Text,
+    Vector3,
+    Word,
+)
 from vla_zenoh.types import MAX_DEPTH_UNIT_M, MIN_DEPTH_UNIT_M
 
 IP_PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws")
@@ -370,6 +380,28 @@ class Crop(Section):
     height: int = Field(ge=16, le=8192)
 
 
+class CameraMount(Section):
+    """Where a camera is: the pose of its optical frame, with z forward and x to the right.
+
+    Args:
+        frame: name of the optical frame in ROS, without a leading slash.
+        link: what it is fixed to, a link of robot.description.
+        position_m: of it in the link.
+        rpy_rad: its turn in the link, extrinsic x, y, z.
+    """
+
+    frame: Word
+    link: Word
+    position_m: Vector3
+    rpy_rad: Vector3
+
+    def contradictions(self) -> Iterator[Fault]:
+        if self.frame.startswith("/"):
+            yield ("frame",), "begins with a slash: names of tf2 have none"
+        if self.frame == self.link:
+            yield ("frame",), "is link: a frame cannot be its own parent"
+
+
 class CameraProfile(Section):
     """A camera.
 
@@ -400,6 +432,7 @@ class CameraProfile(Section):
         fit_for_workers: also publish images in the exact size of each model's spec, for workers on
             other hosts. Every source except ``ros2:`` supports it.
         check: when its images show that it cannot be trusted.
+        mount: where it is, for ``ros2.tf``; null: unknown.
     """
 
     source: Annotated[Word, AfterValidator(_source)]
@@ -418,6 +451,7 @@ class CameraProfile(Section):
     white_balance_k: float | None = Field(default=None, ge=1000, le=20_000)
     fit_for_workers: bool = False
     check: CameraCheck = CameraCheck()
+    mount: CameraMount | None = None
 
     def contradictions(self) -> Iterator[Fault]:
         kind, plugin = self.source.partition(":")[0], camera_plugin(self.source)

@@ -2,8 +2,9 @@
 
     camera.py '{"rate_hz": 30, "topics": [{"topic": "/f", "encoding": "rgb8", "reliable": false}]}'
 
-`encoding` is that of a sensor_msgs/Image, or ``jpeg`` for a CompressedImage. Pictures come in turn
-from the files `folder`/0.ENCODING and so on, which hold the bytes of `data`.
+`encoding` is that of a sensor_msgs/Image, or ``jpeg`` for a CompressedImage, or another name with
+the ``format`` of one. Pictures come in turn from the files `folder`/0.ENCODING and so on, which
+hold the bytes of `data`.
 """
 
 from __future__ import annotations
@@ -27,10 +28,10 @@ from told import obey, tell
 SETTINGS = {"rate_hz": 30.0, "width": 640, "height": 480, "frame": "front_color_optical_frame"}
 
 
-def message_of(settings: dict[str, Any], encoding: str, data: bytes) -> Any:
-    """A picture as a ROS message."""
-    if encoding == "jpeg":
-        out = CompressedImage(format="jpeg")
+def message_of(settings: dict[str, Any], encoding: str, form: str, data: bytes) -> Any:
+    """A picture as a ROS message, compressed in this form if there is one."""
+    if form:
+        out = CompressedImage(format=form)
     else:
         width, height = settings["width"], settings["height"]
         out = Image(encoding=encoding, width=width, height=height, step=len(data) // height)
@@ -44,13 +45,15 @@ def publish(settings: dict[str, Any], node: Any, stop: threading.Event) -> None:
     outs = []
     for one in settings["topics"]:
         encoding = one["encoding"]
-        kind = CompressedImage if encoding == "jpeg" else Image
+        form = one.get("format", "jpeg" if encoding == "jpeg" else "")
+        kind = CompressedImage if form else Image
         how = qos(reliable=one.get("reliable", False), depth=one.get("depth", 5))
         publisher = node.create_publisher(
             kind, one["topic"], how, event_callbacks=publishes(one["topic"])
         )
         files = sorted(Path(settings["folder"]).glob(f"*.{encoding}"))
-        outs.append((publisher, [message_of(settings, encoding, f.read_bytes()) for f in files]))
+        made = [message_of(settings, encoding, form, file.read_bytes()) for file in files]
+        outs.append((publisher, made))
     tell(ready=rclpy.get_rmw_implementation_identifier())
     next_s, count = time.monotonic(), 0
     while not stop.is_set():

@@ -98,9 +98,12 @@ ros2:
   joint_command: {topic: /joints, type: trajectory_msgs/msg/JointTrajectory}
   gripper: {grasp: /panda_gripper/grasp}
   prefix: null
+  tf: true
 """,
     )
     found = allowed(profile)
+    for way in ("publishers", "subscribers"):
+        assert {"/tf", "/tf_static"} <= set(found[way])
     assert {"/fingers", "/wrench"} <= set(found["publishers"])
     assert found["action_servers"] == ["/panda_gripper/grasp", "/panda_gripper/move"]
     assert found["service_clients"] == []

@@ -22,6 +22,7 @@ from vla_zenoh.lab.profile.robot_check import (
     braking_advice,
     driver,
     joints_advice,
+    mounts,
     ros2,
     simulator,
 )
@@ -70,7 +71,7 @@ def check_profile(
         known = ", ".join(profile.hosts)
         where = located(("hosts",), f"has no {host!r}{nearest(host, profile.hosts)}", lines)
         return ProfileReport([f"{where} It has: {known}"], [])
-    found = [*arm(profile), *simulator(profile), *driver(profile), *ros2(profile)]
+    found = [*arm(profile), *mounts(profile), *simulator(profile), *driver(profile), *ros2(profile)]
     found += _workers(profile, name)
     here: set[str] = set()  # nodes and workers of this computer, as far as its host is known
     if host is not None:

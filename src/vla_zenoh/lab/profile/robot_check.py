@@ -274,6 +274,24 @@ def ros2(profile: Profile) -> Iterator[ProfileFault]:
         yield ProfileFault(("ros2",), str(error), "ros2" if "cannot be read" in str(error) else "")
 
 
+def mounts(profile: Profile) -> Iterator[ProfileFault]:
+    """Links that cameras are mounted on."""
+    if all(camera.mount is None for camera in profile.cameras.values()):
+        return
+    try:
+        from vla_zenoh.kinematics.description import Description
+
+        own = [profile.of_part(part).robot.description for part in profile.part_names]
+        links = {link for each in own for link in Description(resources.robot_urdf(each)).links}
+    except (ImportError, VlaZenohError):
+        return  # `arm` says so
+    for name, camera in profile.cameras.items():
+        link = camera.mount.link if camera.mount is not None else ""
+        if link and link not in links:
+            why = f"is {link!r}, no link of robot.description{nearest(link, links)}"
+            yield ProfileFault(("cameras", name, "mount", "link"), why)
+
+
 def braking_advice(profile: Profile) -> Iterator[str]:
     """Advice where `up` would end the robot's node while it still brakes."""
     if profile.robot.driver == "sim":

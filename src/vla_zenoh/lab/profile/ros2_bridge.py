@@ -23,6 +23,7 @@ from vla_zenoh.ros2.keys import (
     EntityRole,
 )
 from vla_zenoh.ros2.readers import JOINT_STATE, WRENCH
+from vla_zenoh.ros2.transforms import TF, TF_MESSAGE, TF_STATIC
 from vla_zenoh.ros2.writers import DIAGNOSTICS, GRASP
 
 PROGRAM = "zenoh-bridge-ros2dds"
@@ -180,6 +181,9 @@ def endpoints(profile: Profile) -> tuple[Endpoint, ...]:
         own = profile.of_part(part).ros2 or ros2
         found += _arm(own, profile.robot.command)
         found += [] if own.gripper is None else _gripper(own.gripper)
+    if ros2.tf:
+        ends = (EntityRole.SUBSCRIBER, EntityRole.PUBLISHER)
+        found += [Endpoint(end, topic, TF_MESSAGE) for end in ends for topic in (TF, TF_STATIC)]
     if ros2.prefix is not None:
         found += _operations(ros2.prefix, services=ros2.services)
     return tuple(dict.fromkeys(found))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -37,11 +37,19 @@ LEAD_PERIODS = 2
 """A trajectory's point lies this many command periods ahead."""
 
 
+class Posture(NamedTuple):
+    """Joints of an arm, in the order of the chain, and their stamp by the robot's clock."""
+
+    stamp_ns: int
+    position_rad: FloatArray
+
+
 class Ros2Arm(RobotDriver):
     """One arm of a ROS 2 robot, with the topics of its own profile.
 
     It is in the ROS graph once it `join`s it, and is moved once it is attached to an `Arm`.
-    `sim_clock` translates its stamps, None if they are of real time.
+    `sim_clock` translates its stamps, None if they are of real time. For other threads: `posture`
+    has the newest joints, `setpoint` the newest reference, with when it was sent (monotonic, ns).
 
     Raises:
         ProfileError: ros2 lacks the topic for its commands, or its type cannot carry them.
@@ -64,7 +72,8 @@ class Ros2Arm(RobotDriver):
         self.silent_why = f"nothing on {ros2.joint_states}; is the robot or the bridge gone?"
         self.sim_clock = SimulatedClock() if ros2.use_sim_time else None
         self._clock_reported = self._fingers_lost = False
-        self._moved_ns: int | None = None
+        self.posture: Posture | None = None
+        self.setpoint: tuple[int, PoseReference | JointReference] | None = None
         self._read_ns: int | None = None
         self._arm: Arm | None = None
 
@@ -126,6 +135,9 @@ class Ros2Arm(RobotDriver):
             topic = self._ros2.joint_states
             self._node.reject("invalid", f"{topic}: {error}", topic)
             return None
+        made_ns = stamp_ns if self.sim_clock is None else self.sim_clock.newest_ns
+        position_rad = self.kinematics.joints_of(measured.joints)
+        self.posture = Posture(made_ns, position_rad)
         if returned:
             self._stay(measured, self._node.clock.wall_at(mono_ns))
         return measured._replace(gripper=self._gripper_state(stamp_ns))
@@ -136,7 +148,7 @@ class Ros2Arm(RobotDriver):
         stamp_ns = now_ns if self.sim_clock is None else self.sim_clock.newest_ns
         message = self._write(command, Stamp(stamp_ns, self._frame))
         self._writer.publish(self._messages.encode(message))
-        self._moved_ns = time.monotonic_ns()
+        self.setpoint = time.monotonic_ns(), reference
         self._node.counters["ros2.commands_sent"] += 1
 
     def grip(self, command: GripperCommand, now_ns: int) -> None:
@@ -181,7 +193,8 @@ class Ros2Arm(RobotDriver):
         A bridge keeps the last set-point until the lease of a subscriber that died ends, and sends
         it to a new one on Fast DDS that is reliable.
         """
-        states, sent_ns = self.states, self._moved_ns
+        states = self.states
+        sent_ns = None if self.setpoint is None else self.setpoint[0]
         silent_s = states.silent_ns / 1e9
         if silent_s <= self.profile.timing.state_timeout_s or self._ros2.bridge != "ros2dds":
             return False

@@ -32,6 +32,7 @@ class Camera:
     """One camera topic: `run` is the body of its thread, the only user of `messages`.
 
     It uses publishers and clock of the `node`; `emit` and `reject` may be called from any thread.
+    `frame` is that of its newest image, empty before.
     """
 
     def __init__(
@@ -46,7 +47,7 @@ class Camera:
         simulated: SimulatedClock | None,
     ) -> None:
         self.topic = topic.topic
-        self.silent = False
+        self.silent, self.frame = False, ""
         self._topic, self._node, self._messages, self._reject = topic, node, messages, reject
         self._simulated = simulated
         self.publisher = CameraPublisher(
@@ -99,6 +100,7 @@ class Camera:
             if error.reason in ("encoding", "frame"):  # true for all further images
                 publisher.lose(str(error))
             return False
+        self.frame = image.frame
         publisher.captured(arrival.mono_ns)
         publisher.set_state(OK)
         if wanted:

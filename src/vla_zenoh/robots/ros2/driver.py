@@ -24,6 +24,7 @@ from vla_zenoh.robots.driver import DriverStatus, Measurement, RobotDriver
 from vla_zenoh.robots.joint_reading import SimulatedClock
 from vla_zenoh.robots.ros2.arm import NAME, Ros2Arm
 from vla_zenoh.robots.ros2.camera import Camera
+from vla_zenoh.robots.ros2.frames import FrameTopics
 from vla_zenoh.robots.ros2.middleware import Bridges, MiddlewareWatch, bridge_session, gripper_fault
 from vla_zenoh.robots.ros2.operator_topics import OperatorTopics
 from vla_zenoh.robots.ros2.ros_graph import RosGraph
@@ -126,6 +127,17 @@ class Ros2Driver(RobotDriver):
                 services=ros2.services,
                 about=watch.about,
             )
+        self._frames = None
+        if ros2.tf:
+            self._frames = FrameTopics(
+                profile,
+                graph,
+                self._arms,
+                self._cameras,
+                read_messages(ros2),
+                self._emit,
+                self._reject,
+            )
         for buffer in graph.buffers:
             node.watch_buffer(buffer)
 
@@ -145,7 +157,7 @@ class Ros2Driver(RobotDriver):
 
     def connect(self) -> None:
         """Start the threads of cameras, operators' topics and what watches the middleware."""
-        threaded = (*self._cameras, self._operators, self._middleware)
+        threaded = (*self._cameras, self._operators, self._middleware, self._frames)
         bodies = [each.run for each in threaded if each is not None]
         self._threads = [
             threading.Thread(target=body, args=(self._halt,), name=f"ros2 {index}", daemon=True)
@@ -206,6 +218,8 @@ class Ros2Driver(RobotDriver):
             "middleware": self._middleware.view.middleware,
             "ros2_faults": dict(self._middleware.faults),
         }
+        if self._frames is not None:
+            detail |= self._frames.detail
         ages_s, rates_hz = {}, {name: rate_hz for name, (rate_hz, _) in figures.items()}
         arms = self._arms.values()
         if arms:

@@ -10,12 +10,14 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import zenoh
+import zenoh.ext
 
 from vla_zenoh.bus.buffers import CallbackRing, LatestSample, bytes_of
 from vla_zenoh.errors import CodecError
 from vla_zenoh.profile.robot import Ros2Profile
 from vla_zenoh.ros2.keys import (
     DEFAULT,
+    LATCHED,
     Attachment,
     Endpoint,
     EntityRole,
@@ -39,12 +41,17 @@ _ALL_COMPLETE = zenoh.QueryTarget.ALL_COMPLETE
 
 
 class RosPublisher:
-    """Publishes CDR bytes on one topic."""
+    """Publishes CDR bytes on one topic; its own session does not receive them."""
 
     def __init__(self, session: zenoh.Session, key: str, gid: bytes | None) -> None:
         drop, first = zenoh.CongestionControl.DROP, zenoh.Priority.REAL_TIME
         self._publisher = session.declare_publisher(
-            key, encoding=_CDR, congestion_control=drop, priority=first, express=True
+            key,
+            encoding=_CDR,
+            congestion_control=drop,
+            priority=first,
+            express=True,
+            allowed_destination=zenoh.Locality.REMOTE,
         )
         self._gid = gid
         self._seq = itertools.count(1)
@@ -178,6 +185,17 @@ class RosGraph:
         self.buffers.append(buffer)
         self._declared.append(buffer.subscribe(self.session, key))
         return buffer
+
+    def subscribe_latched(self, name: str, kind: str, buffer: CallbackRing) -> None:
+        """Subscribe to a transient_local topic, with what was published before."""
+        key, _ = self._declare(Endpoint(EntityRole.SUBSCRIBER, name, kind, LATCHED))
+        self.buffers.append(buffer)
+        handler = zenoh.handlers.Callback(buffer, indirect=False)
+        history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
+        subscriber = zenoh.ext.declare_advanced_subscriber(
+            self.session, key, handler, history=history
+        )
+        self._declared.append(subscriber)
 
     def listen(self, name: str, kind: str, on_sample: Callable[[zenoh.Sample], None]) -> None:
         """Subscribe to a topic; `on_sample` is called on Zenoh's thread."""
