@@ -27,7 +27,7 @@ from rclpy_rig import (
 
 from vla_zenoh.codec.image import decode_depth
 from vla_zenoh.ros2.messages import Messages
-from vla_zenoh.ros2.transforms import TF_MESSAGE, Frames, read_transforms
+from vla_zenoh.ros2.transforms import TF_MESSAGE, FrameTree, read_transforms
 
 pytestmark = pytest.mark.rclpy
 
@@ -153,9 +153,9 @@ def tf(lab: RosLab) -> dict[str, Any]:
     return lab.chain.detail("tf", "ros2") or found
 
 
-def received(lab: RosLab, before: int) -> Frames:
+def received(lab: RosLab, before: int) -> FrameTree:
     """The tree of what rclpy received: fixed transforms ever, the others since a line."""
-    messages, frames = Messages("jazzy"), Frames()
+    messages, frames = Messages("jazzy"), FrameTree()
     for topic, since in (("/tf_static", 0), ("/tf", before)):
         for line in heard(lab.person, topic, since):
             given = filled(messages, TF_MESSAGE, line["value"])

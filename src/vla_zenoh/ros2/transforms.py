@@ -102,7 +102,7 @@ def tf_message(messages: Messages, edges: Iterable[Edge], stamp_ns: int) -> Any:
     return messages.new(TF_MESSAGE, transforms=made)
 
 
-class Frames:
+class FrameTree:
     """The tree of the transforms that others publish."""
 
     def __init__(self) -> None:
@@ -183,7 +183,7 @@ class Frames:
         return base, self.pose(frame, base)
 
 
-def publishable(ours: Iterable[Edge], theirs: Frames) -> tuple[list[Edge], Mapping[str, str]]:
+def publishable(ours: Iterable[Edge], theirs: FrameTree) -> tuple[list[Edge], Mapping[str, str]]:
     """Which of our transforms may be published, and why not the others: frame -> reason.
 
     A frame that somebody else publishes would get two authorities, and a transform that closes a
@@ -191,7 +191,7 @@ def publishable(ours: Iterable[Edge], theirs: Frames) -> tuple[list[Edge], Mappi
     """
     allowed: list[Edge] = []
     refused: dict[str, str] = {}
-    together = Frames()
+    together = FrameTree()
     together.edges = dict(theirs.edges)
     for edge in ours:
         published = theirs.edges.get(edge.child)

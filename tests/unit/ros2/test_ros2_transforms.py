@@ -14,7 +14,7 @@ from vla_zenoh.ros2.transforms import (
     MAX_FRAMES,
     TF_MESSAGE,
     Edge,
-    Frames,
+    FrameTree,
     difference,
     placed,
     publishable,
@@ -30,8 +30,8 @@ def edge(parent: str, child: str, x_m: float = 0.0, **how: Any) -> Edge:
     return Edge(parent, child, placed((x_m, 0.0, 0.0), np.eye(3)), **{"fixed": True, **how})
 
 
-def tree(*edges: Edge) -> Frames:
-    frames = Frames()
+def tree(*edges: Edge) -> FrameTree:
+    frames = FrameTree()
     for each in edges:
         frames.add(each)
     return frames
@@ -167,7 +167,7 @@ def test_no_frame_is_published_that_another_node_publishes_or_that_closes_a_cycl
     assert refused == {"link1": "another node publishes it, in world"}
     _, refused = publishable(ours, tree(edge("top", "base")))
     assert list(refused) == ["top"]
-    assert publishable(ours, Frames())[1] == {}
+    assert publishable(ours, FrameTree())[1] == {}
 
 
 def test_a_difference_is_in_metres_and_radians() -> None:

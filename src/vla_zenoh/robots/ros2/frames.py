@@ -31,7 +31,7 @@ from vla_zenoh.ros2.transforms import (
     TF_MESSAGE,
     TF_STATIC,
     Edge,
-    Frames,
+    FrameTree,
     difference,
     placed,
     publishable,
@@ -131,7 +131,7 @@ class FrameTopics:
         graph.subscribe_latched(TF_STATIC, TF_MESSAGE, self._fixed)
         self._tf = graph.publisher(TF, TF_MESSAGE, Qos(depth=100))
         self._tf_static = graph.publisher(TF_STATIC, TF_MESSAGE, Qos(1, transient_local=True))
-        self._theirs = Frames()
+        self._theirs = FrameTree()
         self._told: dict[str, str] = {}
         self._sent_ns = 0
         self._sent_static_s = 0.0
