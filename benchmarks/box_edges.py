@@ -21,9 +21,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from vla_zenoh_benchmarks.lockstep.worker import Delays
 
 from benchmarks.lockstep_arm import activated, in_processes
-from vla_zenoh.lab.lockstep.worker import Delays
 from vla_zenoh.policy import ActionSpec, ActionSteps, ModelSpec, Observation, ObservationSpec
 from vla_zenoh.profile import load_profile, override
 

@@ -26,13 +26,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from vla_zenoh_benchmarks.lockstep.loop import Lockstep
+from vla_zenoh_benchmarks.lockstep.worker import Message
 
 from vla_zenoh import resources
 from vla_zenoh.codec import message
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.kinematics.so3 import norm3
-from vla_zenoh.lab.lockstep.loop import Lockstep
-from vla_zenoh.lab.lockstep.worker import Message
 from vla_zenoh.policy import (
     ActionSpec,
     ActionSteps,

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from vla_zenoh_benchmarks.paired_tasks import Comparison, compare, read_run
 
-from vla_zenoh.lab.bench.paired_tasks import Comparison, compare, read_run
 from vla_zenoh.lab.statistics import wilson_95
 
 LABELS = {"live": "the arm stands meanwhile", "command": "through the command node"}

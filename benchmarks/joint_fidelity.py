@@ -32,14 +32,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from vla_zenoh_benchmarks.lockstep.loop import Lockstep
+from vla_zenoh_benchmarks.lockstep.worker import Delays
 
 from benchmarks.lockstep_arm import LOOK_S, activated, in_processes
 from vla_zenoh.control.limits import joint_motion_limits, workspace_corners
 from vla_zenoh.control.reachability import Barriers, ReachabilityFilter
 from vla_zenoh.kinematics.kinematics import Kinematics, pose_error, smallest_singular_value
 from vla_zenoh.kinematics.so3 import quat_from_rotation
-from vla_zenoh.lab.lockstep.loop import Lockstep
-from vla_zenoh.lab.lockstep.worker import Delays
 from vla_zenoh.policy import ActionSpec, ActionSteps, ModelSpec, Observation, ObservationSpec
 from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh.types import FloatArray

@@ -23,12 +23,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from vla_zenoh_benchmarks.lockstep.loop import Lockstep
+from vla_zenoh_benchmarks.lockstep.worker import Delays
 
 from benchmarks.lockstep_arm import LOOK_S, activated, in_processes
 from benchmarks.motion.segments import make_segment
 from vla_zenoh.kinematics.so3 import log3, rotation_from_quat
-from vla_zenoh.lab.lockstep.loop import Lockstep
-from vla_zenoh.lab.lockstep.worker import Delays
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import load_profile
 

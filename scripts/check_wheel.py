@@ -45,6 +45,9 @@ TRIALS = [
 
 WITH_PLUGINS = [
     ["bench", "sim", "--help"],
+    ["bench", "task", "--help"],
+    ["compare", "--help"],
+    ["figure", "motion", "--help"],
     ["profile", "check", "fr3", "ur5e_rtde"],
     ["view", "--help"],
     ["web", "--help"],

@@ -7,10 +7,10 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+from vla_zenoh_benchmarks.lockstep.loop import Lockstep
 
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.kinematics.collision import PlacedArm
-from vla_zenoh.lab.lockstep.loop import Lockstep
 from vla_zenoh.policy import ActionSpec, ActionSteps, ModelSpec, Observation, ObservationSpec
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.simulation.world import World, build_world

@@ -14,6 +14,7 @@ from types import TracebackType
 
 import numpy as np
 from numpy.typing import NDArray
+from vla_zenoh_benchmarks.command_runner import cpu_s
 
 from benchmarks.chain import report
 from benchmarks.chain.process import Server, free_port
@@ -22,7 +23,6 @@ from vla_zenoh.bus.buffers import CallbackRing, LatestSample
 from vla_zenoh.bus.node import Node
 from vla_zenoh.client.client import Client
 from vla_zenoh.errors import NodeError, SessionError
-from vla_zenoh.lab.bench.command_runner import cpu_s
 from vla_zenoh.nodes.camera.camera_publisher import OK, CameraPublisher
 from vla_zenoh.profile import HostProfile, Profile, load_profile
 from vla_zenoh.runtime.launch import Host

@@ -13,6 +13,7 @@ from contextlib import ExitStack, contextmanager
 from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
+from vla_zenoh_benchmarks.command_runner import cpu_s
 
 from benchmarks import peers
 from benchmarks.chain import report
@@ -25,7 +26,6 @@ from benchmarks.chain.ways import Load, ServingWay
 from vla_zenoh import __version__
 from vla_zenoh.errors import NodeError
 from vla_zenoh.keys import worker_node
-from vla_zenoh.lab.bench.command_runner import cpu_s
 
 PERIOD_S = (0.012, 0.020)
 """From one request to the next, evenly drawn: two ticks of 250 Hz wide, so that every phase of the

@@ -18,6 +18,7 @@ from typing import Any
 
 import cv2
 import zenoh
+from vla_zenoh_benchmarks.command_runner import cpu_s
 
 from benchmarks.chain.process import Server
 from benchmarks.picture import HEIGHT, WIDTH, noisy_picture
@@ -28,7 +29,6 @@ from vla_zenoh.client.client import Client
 from vla_zenoh.codec.image import MAX_IMAGE_BYTES
 from vla_zenoh.errors import CodecError, NodeError, SessionError
 from vla_zenoh.keys import worker_node
-from vla_zenoh.lab.bench.command_runner import cpu_s
 from vla_zenoh.profile import Profile, as_robot, override, to_yaml
 from vla_zenoh.runtime.process import ROUTER_PATIENCE_S
 from vla_zenoh.runtime.supervisor import NodeCommand, Supervisor

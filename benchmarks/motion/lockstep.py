@@ -11,6 +11,9 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
+from vla_zenoh_benchmarks.lockstep.loop import Lockstep
+from vla_zenoh_benchmarks.lockstep.worker import Delays
+from vla_zenoh_benchmarks.task_lockstep import in_processes
 
 from benchmarks.motion.protocol import (
     PREPARATION_HZ,
@@ -26,9 +29,6 @@ from benchmarks.motion.segments import DemoSegment, RestPose, judge_segment, mak
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.errors import NodeError
 from vla_zenoh.kinematics.so3 import Pose
-from vla_zenoh.lab.bench.task_lockstep import in_processes
-from vla_zenoh.lab.lockstep.loop import Lockstep
-from vla_zenoh.lab.lockstep.worker import Delays
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import Profile
 from vla_zenoh.simulation.world import build_world

@@ -25,10 +25,10 @@ from typing import Any
 
 import numpy as np
 from uv import find_uv_bin
+from vla_zenoh_benchmarks.lockstep.worker import Delays
 
 from benchmarks.lockstep_arm import activated, in_processes
 from vla_zenoh.kinematics.so3 import log3
-from vla_zenoh.lab.lockstep.worker import Delays
 from vla_zenoh.policy import (
     ActionSpec,
     ActionSteps,

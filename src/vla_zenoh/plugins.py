@@ -143,7 +143,10 @@ COMMANDS = Group("vla_zenoh.commands", "command", FunctionType)
 this package cannot be replaced."""
 GROUPS: tuple[Group[Any], ...] = (ROBOTS, CAMERAS, MODELS, BENCHMARKS, COMMANDS)
 PACKAGES: Mapping[str, str] = {
+    "bench.command": "vla-zenoh-benchmarks",
     "bench.sim": "vla-zenoh-benchmarks",
+    "bench.task": "vla-zenoh-benchmarks",
+    "compare": "vla-zenoh-benchmarks",
     "conform.camera": "vla-zenoh-conform",
     "conform.robot": "vla-zenoh-conform",
     "conform.worker": "vla-zenoh-conform",

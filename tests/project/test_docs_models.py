@@ -19,10 +19,10 @@ from typing import Any
 import pytest
 from camera_rig import until
 from model_wires import groot, openpi, openvla_rest, origami
+from vla_zenoh_benchmarks.lockstep.loop import Lockstep
 
 from vla_zenoh.errors import PeerError
 from vla_zenoh.lab.check.examples import example_observation
-from vla_zenoh.lab.lockstep.loop import Lockstep
 from vla_zenoh.lab.policy_servers.action_semantics import ACTION_OPTIONS, read_action_semantics
 from vla_zenoh.lab.policy_servers.field_mapping import DEFAULTS, read_map
 from vla_zenoh.lab.policy_servers.state_vector import COORDINATES, PARTS, read_parts

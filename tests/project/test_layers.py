@@ -60,8 +60,6 @@ ALLOWED = {
     # What of the lab listens to a robot, drives it or starts processes.
     **dict.fromkeys(
         (
-            "lab/bench/command_runner.py",
-            "lab/bench/task_lockstep.py",
             "lab/bench/task_runner.py",
             "lab/check/model_runner.py",
             "lab/doctor/access.py",

@@ -38,10 +38,10 @@ from rich.table import Table
 from rig import Robot
 from ros_messages import CartesianImpedanceGoal, Header, Image, Pose, PoseStamped, Time
 from ros_node import Listener, RosNode, free_domain
+from vla_zenoh_benchmarks.command_runner import cpu_s
 
 from benchmarks.picture import noisy_picture
 from vla_zenoh.codec import records
-from vla_zenoh.lab.bench.command_runner import cpu_s
 from vla_zenoh.types import PoseCommand
 
 FRONT = CAMERAS["front"]

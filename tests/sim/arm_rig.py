@@ -12,12 +12,12 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+from vla_zenoh_benchmarks.lockstep.loop import Lockstep
+from vla_zenoh_benchmarks.lockstep.worker import Message, Tamper
 
 from vla_zenoh.codec import message
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.guard.reference_governor import BRAKE_MARGIN
-from vla_zenoh.lab.lockstep.loop import Lockstep
-from vla_zenoh.lab.lockstep.worker import Message, Tamper
 from vla_zenoh.policy import (
     ActionSpec,
     ActionSteps,

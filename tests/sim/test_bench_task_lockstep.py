@@ -6,12 +6,12 @@ import threading
 from pathlib import Path
 
 import pytest
+from vla_zenoh_benchmarks import task_lockstep
+from vla_zenoh_benchmarks.cli_task import _with_bricks
+from vla_zenoh_benchmarks.task_lockstep import run_in_lockstep
 
 from vla_zenoh.errors import NodeError
-from vla_zenoh.lab.bench import task_lockstep
 from vla_zenoh.lab.bench.task import BASELINES, TaskOutcome, TaskPlan
-from vla_zenoh.lab.bench.task_lockstep import run_in_lockstep
-from vla_zenoh.lab.cli.bench_task import _with_bricks
 from vla_zenoh.profile import load_profile, override
 
 SEED = 1_000_000

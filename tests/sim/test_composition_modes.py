@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from motions import make_world
+from vla_zenoh_benchmarks.lockstep.loop import Lockstep
+from vla_zenoh_benchmarks.lockstep.worker import Delays
 
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.kinematics.so3 import log3
-from vla_zenoh.lab.lockstep.loop import Lockstep
-from vla_zenoh.lab.lockstep.worker import Delays
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import Composition, Profile, load_profile
 from vla_zenoh.types import FloatArray

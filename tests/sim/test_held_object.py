@@ -9,9 +9,9 @@ import pytest
 from arm_rig import begin, check_motion, path_m, shipped
 from pair_rig import PARTS, Pair, tcp_steps
 from pair_rig import shipped as shipped_pair
+from vla_zenoh_benchmarks.lockstep.loop import Lockstep
 
 from vla_zenoh.kinematics.collision import HELD
-from vla_zenoh.lab.lockstep.loop import Lockstep
 from vla_zenoh.types import HeldBox
 
 BAR = HeldBox((0.04, 0.04, 0.2))

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from arm_rig import activate
 from panda_arm import ARM_JOINTS, HOME_RAD, panda
+from vla_zenoh_benchmarks.lockstep.loop import Lockstep
 
 from vla_zenoh.control.limits import workspace_corners
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.kinematics.kinematics import pose_error
-from vla_zenoh.lab.lockstep.loop import Lockstep
 from vla_zenoh.policy import (
     ActionSpec,
     ActionSteps,

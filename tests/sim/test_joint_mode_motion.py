@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from arm_rig import Asked, activate, mark, speed_m_s, stop_time_s, way_m, with_fields
+from vla_zenoh_benchmarks.lockstep.loop import Lockstep
+from vla_zenoh_benchmarks.lockstep.worker import Message
 
 from vla_zenoh.codec import message
 from vla_zenoh.control.reachability import ReachabilityFilter
-from vla_zenoh.lab.lockstep.loop import Lockstep
-from vla_zenoh.lab.lockstep.worker import Message
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.simulation.world import build_world
 from vla_zenoh.types import JointState

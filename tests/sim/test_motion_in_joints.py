@@ -31,13 +31,13 @@ from arm_rig import (
     with_fields,
 )
 from panda_arm import ARM_JOINTS, panda
+from vla_zenoh_benchmarks.lockstep.loop import CAMERA, COMMAND, SIM, Lockstep
+from vla_zenoh_benchmarks.lockstep.worker import Message, Tamper
 
 from vla_zenoh.codec import message
 from vla_zenoh.control.joint_space import JointBounds
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.kinematics.so3 import norm3
-from vla_zenoh.lab.lockstep.loop import CAMERA, COMMAND, SIM, Lockstep
-from vla_zenoh.lab.lockstep.worker import Message, Tamper
 from vla_zenoh.policy import (
     ActionSpec,
     ActionSteps,

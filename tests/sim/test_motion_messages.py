@@ -38,11 +38,11 @@ from arm_rig import (
     way_m,
     with_fields,
 )
+from vla_zenoh_benchmarks.lockstep.loop import CAMERA, COMMAND, SIM, Lockstep
+from vla_zenoh_benchmarks.lockstep.worker import Message
 
 from vla_zenoh.codec import message, records
 from vla_zenoh.errors import CodecError
-from vla_zenoh.lab.lockstep.loop import CAMERA, COMMAND, SIM, Lockstep
-from vla_zenoh.lab.lockstep.worker import Message
 from vla_zenoh.types import (
     ActionChunk,
     FloatArray,

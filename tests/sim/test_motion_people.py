@@ -28,9 +28,9 @@ from arm_rig import (
     stop_time_s,
     way_m,
 )
+from vla_zenoh_benchmarks.lockstep.loop import Lockstep
+from vla_zenoh_benchmarks.lockstep.worker import Message
 
-from vla_zenoh.lab.lockstep.loop import Lockstep
-from vla_zenoh.lab.lockstep.worker import Message
 from vla_zenoh.types import FloatArray, GripperCommand, PoseCommand, PoseReference, PoseState
 
 EXACT_M = 1e-3

@@ -29,11 +29,11 @@ from arm_rig import (
     way_m,
     with_fields,
 )
+from vla_zenoh_benchmarks.lockstep.loop import SIM, Lockstep
+from vla_zenoh_benchmarks.lockstep.worker import Message, Tamper
 
 from vla_zenoh.codec import message
 from vla_zenoh.kinematics.so3 import norm3
-from vla_zenoh.lab.lockstep.loop import SIM, Lockstep
-from vla_zenoh.lab.lockstep.worker import Message, Tamper
 from vla_zenoh.types import GripperCommand, GripperState, JointState, PoseCommand, PoseState
 
 BRAKE_STOP_S, BRAKE_WAY_M = 0.20, 0.021

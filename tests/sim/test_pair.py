@@ -23,10 +23,10 @@ from pair_rig import (
     tcp_steps,
     world,
 )
+from vla_zenoh_benchmarks.lockstep.loop import Lockstep
+from vla_zenoh_benchmarks.lockstep.worker import Message
 
 from vla_zenoh.codec import records
-from vla_zenoh.lab.lockstep.loop import Lockstep
-from vla_zenoh.lab.lockstep.worker import Message
 from vla_zenoh.lab.teleop.policy import OperatorInput, TeleopPolicy
 from vla_zenoh.types import GripperState, JointCommand, JointState, PoseState
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 from motions import make_world
+from vla_zenoh_benchmarks.lockstep.loop import Lockstep
+from vla_zenoh_benchmarks.lockstep.worker import Delays
 
-from vla_zenoh.lab.lockstep.loop import Lockstep
-from vla_zenoh.lab.lockstep.worker import Delays
 from vla_zenoh.policy import ActionSpec, ActionSteps, ModelSpec, Observation, ObservationSpec
 from vla_zenoh.policy.inference import Committed
 from vla_zenoh.profile import load_profile

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from vla_zenoh_benchmarks.lockstep.loop import Lockstep
+from vla_zenoh_benchmarks.lockstep.worker import Delays
 
-from vla_zenoh.lab.lockstep.loop import Lockstep
-from vla_zenoh.lab.lockstep.worker import Delays
 from vla_zenoh.policy import (
     ActionSpec,
     CameraSpec,

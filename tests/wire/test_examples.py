@@ -12,9 +12,9 @@ from pathlib import Path
 import cv2
 import pytest
 from chain import LONG_PATIENCE_S, READY_PATIENCE_S, Chain, command_line
+from vla_zenoh_benchmarks.lockstep.loop import Lockstep
 
 import vla_zenoh
-from vla_zenoh.lab.lockstep.loop import Lockstep
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import load_profile
 from vla_zenoh.simulation.world import build_world

@@ -7,9 +7,9 @@
     python evaluate.py --family put --episodes 50 --seed 10000 [--vary all] [--delay 0.14]
 
 The same commander, guard and controller as in the nodes, on a virtual clock, see
-`vla_zenoh.lab.lockstep`. With ``--collect DIR`` every situation that the policy reached is stored
-with the teacher's action, in the format of generate.py (dataset aggregation: Ross et al., AISTATS
-2011).
+`vla_zenoh_benchmarks.lockstep`. With ``--collect DIR`` every situation that the policy reached is
+stored with the teacher's action, in the format of generate.py (dataset aggregation: Ross et al.,
+AISTATS 2011).
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from expert import Hand as TeacherHand
 from expert import Point, foretell
 from generate import labelled
 from states import Situation
+from vla_zenoh_benchmarks.lockstep.loop import Lockstep
+from vla_zenoh_benchmarks.lockstep.worker import Delays
 from worker import HORIZON, Brick, Hand, Waypoints
 
-from vla_zenoh.lab.lockstep.loop import Lockstep
-from vla_zenoh.lab.lockstep.worker import Delays
 from vla_zenoh.lab.statistics import wilson_95
 from vla_zenoh.lab.tasks.episode import TaskEpisode, draw_episode, draw_stay
 from vla_zenoh.lab.tasks.judge import LIMIT_S, TaskJudge, Verdict

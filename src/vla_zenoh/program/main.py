@@ -129,13 +129,9 @@ COMMANDS: Panels = {
         ),
         "bench": CommandGroup(
             "Measure this computer, and how well models do tasks.",
-            {
-                "command": "lab.cli.bench_command:command",
-                "task": "lab.cli.bench_task:task",
-                "sim": OF_A_PACKAGE,
-            },
+            dict.fromkeys(("command", "task", "sim"), OF_A_PACKAGE),
         ),
-        "compare": "lab.cli.compare:compare",
+        "compare": OF_A_PACKAGE,
         "figure": CommandGroup(
             "Figures for a paper: PDF, SVG or PNG at the width of a column or a page.",
             dict.fromkeys(("motion", "latency", "success"), OF_A_PACKAGE),

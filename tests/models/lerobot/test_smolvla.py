@@ -11,10 +11,10 @@ import pytest
 pytest.importorskip("lerobot", reason="needs LeRobot's environment: make test-models")
 import tiny_smolvla
 from brick_rig import JAW_M, held, hold
+from vla_zenoh_benchmarks.lockstep.loop import Lockstep
+from vla_zenoh_benchmarks.lockstep.worker import Delays
 
 from vla_zenoh.control.reachability import ReachabilityFilter
-from vla_zenoh.lab.lockstep.loop import Lockstep
-from vla_zenoh.lab.lockstep.worker import Delays
 from vla_zenoh.policy import ActionSteps, Observation
 from vla_zenoh.policy.inference import Committed
 from vla_zenoh.policy.loader import find_model, make_policy

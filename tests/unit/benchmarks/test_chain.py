@@ -14,6 +14,7 @@ import msgpack
 import numpy as np
 import pytest
 from rich.console import Console
+from vla_zenoh_benchmarks.command_runner import cpu_s
 
 from benchmarks import peers
 from benchmarks.chain import report
@@ -25,7 +26,6 @@ from benchmarks.chain.ways import REFERENCE, WAYS, Load, ServingWay
 from benchmarks.peers import arrays
 from benchmarks.picture import NOISE_SIGMA, noisy_picture
 from vla_zenoh.errors import NodeError, how_to_install
-from vla_zenoh.lab.bench.command_runner import cpu_s
 
 SIGMA_TOLERANCE = 0.2  # grey levels
 PNG_BYTES = (300_000, 700_000)  # what a camera's picture of this size has

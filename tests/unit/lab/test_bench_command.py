@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
+from vla_zenoh_benchmarks import command_runner
 
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.lab.bench import command_runner
 from vla_zenoh.program.main import app
 
 

@@ -16,6 +16,7 @@ import typer
 from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
+from vla_zenoh_benchmarks.cli_task import _named, _varied, _with_bricks, task
 
 from vla_zenoh.codec.image import decode_jpeg, encode_jpeg
 from vla_zenoh.errors import NodeError
@@ -29,7 +30,6 @@ from vla_zenoh.lab.bench.task_sheet import (
     sheet,
 )
 from vla_zenoh.lab.cli.bench_file import LAST_LINES, up_with_last_lines
-from vla_zenoh.lab.cli.bench_task import _named, _varied, _with_bricks, task
 from vla_zenoh.lab.statistics import wilson_95
 from vla_zenoh.lab.tasks.episode import TaskEpisode
 from vla_zenoh.lab.tasks.judge import Verdict

@@ -14,12 +14,12 @@ from benchmark_rig import Reacher, own_benchmark, request
 from vla_zenoh_benchmarks.contract import make_benchmark, raw_steps
 from vla_zenoh_benchmarks.episode import EpisodeConditions, EpisodeOutcome, EpisodeRequest
 from vla_zenoh_benchmarks.journal import EPISODES, RunJournal
+from vla_zenoh_benchmarks.paired_tasks import compare, read_run
 from vla_zenoh_benchmarks.process import BenchmarkLost, replay_episode, run_episode
 from vla_zenoh_benchmarks.result import summary, write_page
 from vla_zenoh_benchmarks.run import run_at_places
 
 from vla_zenoh.errors import NodeError, OutputError, SpecError, WorkerError
-from vla_zenoh.lab.bench.paired_tasks import compare, read_run
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.policy.loader import find_model
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from typed import typed
+from vla_zenoh_benchmarks.disagreement import arm_state
 
 from vla_zenoh.codec import records
 from vla_zenoh.errors import RecordError
 from vla_zenoh.keys import Keys
-from vla_zenoh.lab.evaluation.disagreement import arm_state
 from vla_zenoh.lab.recording.run import load_run
 from vla_zenoh.lab.recording.sample import MSGPACK, Sample
 from vla_zenoh.lab.recording.writer import RecordingWriter

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from typer.testing import CliRunner
+from vla_zenoh_benchmarks.paired_tasks import read_run
 from vla_zenoh_figures.latency import latency
 from vla_zenoh_figures.motion import motion
 from vla_zenoh_figures.style import COLUMN_IN, LOOKS, PAGE_IN, FigureError, write
@@ -19,7 +20,6 @@ from vla_zenoh_figures.success import Result, success
 
 from vla_zenoh.codec import records
 from vla_zenoh.keys import Keys
-from vla_zenoh.lab.bench.paired_tasks import read_run
 from vla_zenoh.lab.evaluation.result import Evaluation, PlotTrace
 from vla_zenoh.lab.recording.sample import MSGPACK, TEXT, Sample
 from vla_zenoh.lab.recording.writer import RecordingWriter

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from vla_zenoh.kinematics.so3 import Pose, exp3, quat_from_rotation
-from vla_zenoh.lab.evaluation.disagreement import (
+from vla_zenoh_benchmarks.disagreement import (
     ArmState,
     Disagreement,
     disagreement,
 )
+
+from vla_zenoh.kinematics.so3 import Pose, exp3, quat_from_rotation
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.types import ActionChunk
 

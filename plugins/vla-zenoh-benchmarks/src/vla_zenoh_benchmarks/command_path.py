@@ -12,13 +12,13 @@ import numpy as np
 
 from vla_zenoh.errors import NodeError
 from vla_zenoh.kinematics.so3 import held_pose
-from vla_zenoh.lab.lockstep.loop import Lockstep
-from vla_zenoh.lab.lockstep.worker import Delays
 from vla_zenoh.policy import ActionSteps, ModelSpec, Observation, ObservationSpec
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.types import FloatArray, GripperState, JointState, PoseState
 from vla_zenoh.types.records import JointReference, PoseReference
 from vla_zenoh_benchmarks.episode import EpisodeClock, EpisodeConditions
+from vla_zenoh_benchmarks.lockstep.loop import Lockstep
+from vla_zenoh_benchmarks.lockstep.worker import Delays
 
 WARM_UP_S, ACTIVATE_PATIENCE_S, POLL_S = 0.3, 3.0, 0.02
 JOINTS = 7

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from vla_zenoh_benchmarks.paired_tasks import read_run
 
 from vla_zenoh.cli.options import JsonOption
 from vla_zenoh.errors import ResourceError
-from vla_zenoh.lab.bench.paired_tasks import read_run
 from vla_zenoh.lab.cli.output import print_json, progress
 from vla_zenoh.lab.cli.output_path import ForceOption
 from vla_zenoh.lab.evaluation.evaluate import EMPTY, evaluate, recordings

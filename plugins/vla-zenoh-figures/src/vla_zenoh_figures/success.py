@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from vla_zenoh.lab.bench.paired_tasks import PairedOutcome, TaskResultFile
+from vla_zenoh_benchmarks.paired_tasks import PairedOutcome, TaskResultFile
+
 from vla_zenoh.lab.statistics import wilson_95
 from vla_zenoh_figures.style import Drawn, FigureError, look, panels, styled
 

@@ -28,8 +28,6 @@ from vla_zenoh.lab.bench.task import (
     TaskRequest,
     run_task,
 )
-from vla_zenoh.lab.lockstep.loop import Lockstep
-from vla_zenoh.lab.lockstep.worker import Delays
 from vla_zenoh.policy import ActionSteps, ModelSpec, Observation, Policy, reset_of
 from vla_zenoh.policy.loader import find_worker, make_policy
 from vla_zenoh.profile import Profile
@@ -39,6 +37,8 @@ from vla_zenoh.simulation.render import Renderer
 from vla_zenoh.simulation.robot_model import robot_models
 from vla_zenoh.simulation.world import World, build_world
 from vla_zenoh.types import Image, ObjectPoses
+from vla_zenoh_benchmarks.lockstep.loop import Lockstep
+from vla_zenoh_benchmarks.lockstep.worker import Delays
 
 Result = TypeVar("Result")
 POLL_S = 0.2

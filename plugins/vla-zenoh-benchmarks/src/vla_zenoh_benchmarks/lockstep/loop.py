@@ -28,7 +28,6 @@ from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.errors import CodecError
 from vla_zenoh.guard.arm_guard import ArmGuard, GripperGuard, Measured
 from vla_zenoh.kinematics.so3 import Pose
-from vla_zenoh.lab.lockstep.worker import Delays, LockstepTrace, LockstepWorker, Message, Tamper
 from vla_zenoh.policy import Policy
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
@@ -41,6 +40,13 @@ from vla_zenoh.types import (
     Image,
     Stamped,
     Task,
+)
+from vla_zenoh_benchmarks.lockstep.worker import (
+    Delays,
+    LockstepTrace,
+    LockstepWorker,
+    Message,
+    Tamper,
 )
 
 if TYPE_CHECKING:

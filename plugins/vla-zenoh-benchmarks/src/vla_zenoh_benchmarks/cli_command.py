@@ -33,9 +33,9 @@ def command(
 
     The real nodes are started once per rate.
     """
-    from vla_zenoh.lab.bench.command_runner import measure_command
     from vla_zenoh.lab.cli.loopback import own_address
     from vla_zenoh.runtime.process import die_with_parent, stop_on_signals
+    from vla_zenoh_benchmarks.command_runner import measure_command
 
     rates_hz = number_list("--rates", rates, 50, 1000)
     chosen = effective_profile(profile)

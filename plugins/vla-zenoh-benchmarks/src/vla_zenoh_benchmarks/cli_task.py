@@ -135,6 +135,7 @@ def task(
     """
     from vla_zenoh.lab.bench.task_sheet import failure_sheet
     from vla_zenoh.lab.episode import Interrupted
+    from vla_zenoh.plugins import how_to_repeat
     from vla_zenoh.runtime.environments import run_in_own_environment
     from vla_zenoh.runtime.process import stop_on_signals
 
@@ -148,7 +149,8 @@ def task(
     if output.output is not None:  # before an environment is made, which may take minutes
         require_free_folder(output.output, force=output.force)
     if lockstep:  # this process makes the model; returns only where that can be done
-        run_in_own_environment(chosen.model, model_options.python, extra="sim")
+        ours = how_to_repeat("vla-zenoh-benchmarks")
+        run_in_own_environment(chosen.model, model_options.python, extra="sim", packages=ours)
     stop = stop_on_signals()
     mode = "lockstep" if lockstep else "real_time"
     score = TaskScore(plan, mode, loaded.name, varied, options=chosen.options)
@@ -157,7 +159,7 @@ def task(
     def outcomes(folder: Path | None) -> Iterator[tuple[TaskOutcome, Latencies]]:
         if not lockstep:
             return _real_time(loaded, plan, model_options, folder, stop, camera)
-        from vla_zenoh.lab.bench.task_lockstep import run_in_lockstep
+        from vla_zenoh_benchmarks.task_lockstep import run_in_lockstep
 
         return run_in_lockstep(loaded, plan, chosen.options, camera, stop, processes, named=profile)
 
