@@ -214,12 +214,12 @@ def actions_of(episode: RecordedEpisode) -> NDArray[np.float32]:
 def _actions(spec: ActionSpec, steps: NDArray[np.float32], run: Run, part: str) -> NDArray[Any]:
     if not in_lerobots_numbers(spec):
         return steps
-    steps = steps.astype(np.float64)
+    rows = steps.astype(np.float64)
     if spec.gripper != "none":
         max_width_m = run.of_part(part).profile.robot.gripper.max_width_m
-        shares = [spec.gripper_scale(max_width_m).decode(number) for number in steps[:, -1]]
-        steps[:, -1] = np.greater(shares, 0.5) if spec.gripper == "binary" else shares
-    return semantics_of(spec).rows(steps)
+        shares = [spec.gripper_scale(max_width_m).decode(number) for number in rows[:, -1]]
+        rows[:, -1] = np.greater(shares, 0.5) if spec.gripper == "binary" else shares
+    return semantics_of(spec).rows(rows)
 
 
 def states_of(episode: RecordedEpisode, parts: Sequence[str]) -> NDArray[np.float32]:
