@@ -63,10 +63,10 @@ def test_the_doctor_needs_no_extra_and_lists_the_plug_ins(alone: dict[str, str])
 
 
 def test_its_commands_are_listed_and_those_of_plug_ins_are_not(alone: dict[str, str]) -> None:
-    done = run(alone, "bench", "--help")
+    done = run(alone, "node", "--help")
     assert done.returncode == 0, done.stderr
-    assert "  task " in done.stdout
-    assert "  sim " not in done.stdout
+    assert "  camera " in done.stdout
+    assert "  rolling " not in done.stdout
 
 
 @pytest.mark.parametrize("command", plugins.PACKAGES)
