@@ -382,7 +382,7 @@ def test_with_five_per_cent_of_the_robots_datagrams_lost_the_arm_moves_exactly(
 def test_a_transform_and_a_static_one_are_as_in_ros(
     tmp_path: Path, built_bridge: Path, distribution: str
 ) -> None:
-    """The robot's own /tf, by rclpy: not ours yet, only that the bridge leaves it alone."""
+    """The robot's own /tf, by rclpy: without `ros2.tf` nothing of ours is there."""
     with running_ros_lab(tmp_path, built_bridge, distribution) as lab:
         person, kind = lab.person, "tf2_msgs/msg/TFMessage"
         late = {"transient_local": True, "depth": 1}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,13 @@ from rclpy_rig import (
 
 from vla_zenoh.codec.image import decode_depth
 from vla_zenoh.ros2.messages import Messages
-from vla_zenoh.ros2.transforms import TF_MESSAGE, FrameTree, read_transforms
+from vla_zenoh.ros2.transforms import (
+    TF_MESSAGE,
+    Edge,
+    FrameTree,
+    read_transforms,
+    tf_message,
+)
 
 pytestmark = pytest.mark.rclpy
 
@@ -145,6 +152,24 @@ def test_depth_comes_in_the_unit_of_the_profile_and_what_was_not_measured_is_zer
     subscriber.undeclare()
     assert found[-1].unit_m == DEPTH_UNIT_M
     assert (found[-1].counts == depth_counts(WIDTH, HEIGHT)).all()
+
+
+def test_a_frame_that_another_node_begins_to_publish_is_left_to_it_and_nonsense_is_named(
+    tf_lab: RosLab,
+) -> None:
+    lab, messages = tf_lab, Messages("jazzy")
+    lab.chain.until("links", lambda: "panda_link5" in tf(lab)["published"])
+    theirs = [Edge("world", "panda_link5", np.eye(4), fixed=False)]
+    message = tf_message(messages, theirs, time.time_ns())
+    said = {"topic": "/tf", "type": TF_MESSAGE}
+    lab.person.ask("say", "said", bytes=messages.encode(message).hex(), **said)
+    why = lab.chain.until("it is left", lambda: tf(lab)["refused"].get("panda_link5"))
+    assert why == "another node publishes it, in world"
+    assert "panda_link5" not in tf(lab)["published"]
+    message.transforms[0].transform.rotation.w = float("nan")
+    lab.person.ask("say", "said", bytes=messages.encode(message).hex(), **said)
+    lab.chain.until("it is named", lambda: lab.chain.refused().get("ros2.invalid"))
+    assert lab.chain.state("ros2") == "running"
 
 
 def tf(lab: RosLab) -> dict[str, Any]:

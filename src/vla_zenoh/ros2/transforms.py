@@ -25,6 +25,8 @@ MAX_FRAMES, MAX_PARENTS = 2000, 8
 NORM_TOLERANCE = 0.01
 """Of a quaternion's squared norm, as tf2 tolerates it."""
 FURTHEST_M = 1e6
+RESTARTED_NS = 1_000_000_000
+"""A stamp that is older by more means a clock that was set back: moving transforms begin anew."""
 STALE_S = 2.0
 """A moving transform that is older than the newest one by more says nothing about now."""
 
@@ -120,8 +122,10 @@ class FrameTree:
             known = self.parents.setdefault(edge.child, {before.parent})
             known |= {edge.parent} if len(known) < MAX_PARENTS else set()
         elif before is not None and not edge.fixed and edge.stamp_ns < before.stamp_ns:
-            why = f"a transform of {edge.child[:60]!r} that is older than the one before"
-            raise CodecError("out_of_order", why)
+            if before.stamp_ns - edge.stamp_ns < RESTARTED_NS:
+                why = f"a transform of {edge.child[:60]!r} that is older than the one before"
+                raise CodecError("out_of_order", why)
+            self.edges = {child: each for child, each in self.edges.items() if each.fixed}
         if edge.child in self.above(edge.parent):
             why = f"{edge.child[:60]!r} in {edge.parent[:60]!r}: it is above its own parent"
             raise CodecError("cycle", why)

@@ -154,6 +154,19 @@ def test_a_moving_transform_that_stopped_coming_is_not_used() -> None:
         frames.pose("gone", "base")
 
 
+def test_a_clock_that_is_set_back_begins_anew() -> None:
+    """As a simulation does that is reset: nothing of before is taken for new, or blocks it."""
+    frames = tree(
+        edge("base", "a", fixed=False, stamp_ns=100 * 10**9),
+        edge("base", "b", fixed=False, stamp_ns=100 * 10**9),
+        edge("b", "eye"),
+    )
+    frames.add(edge("base", "a", 0.5, fixed=False, stamp_ns=10**9))
+    assert frames.pose("a", "base")[0, 3] == pytest.approx(0.5)
+    with pytest.raises(CodecError, match="no transforms lead"):
+        frames.pose("eye", "base")
+
+
 def test_a_flood_of_frames_ends_at_a_limit() -> None:
     frames = tree(*(edge("base", f"frame{number}") for number in range(MAX_FRAMES)))
     with pytest.raises(CodecError, match="more than"):

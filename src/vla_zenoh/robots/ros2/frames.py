@@ -262,7 +262,7 @@ class FrameTopics:
         why = "; ".join(f"{frame}: {why}" for frame, why in self._refused.items())
         self._tell("refused", "frames_refused", f"not published: {why}" if why else "")
         moving = [edge for edge in allowed if not edge.fixed]
-        if moving and stamp_ns > self._sent_ns:
+        if moving and stamp_ns != self._sent_ns:
             self._sent_ns = stamp_ns
             self._tf.publish(self._messages.encode(tf_message(self._messages, moving, stamp_ns)))
         # Again and again: a bridge that was restarted has forgotten them.
