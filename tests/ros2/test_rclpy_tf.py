@@ -161,13 +161,17 @@ def test_a_frame_that_another_node_begins_to_publish_is_left_to_it_and_nonsense_
     lab.chain.until("links", lambda: "panda_link5" in tf(lab)["published"])
     theirs = [Edge("world", "panda_link5", np.eye(4), fixed=False)]
     message = tf_message(messages, theirs, time.time_ns())
-    said = {"topic": "/tf", "type": TF_MESSAGE}
-    lab.person.ask("say", "said", bytes=messages.encode(message).hex(), **said)
+
+    def say() -> None:
+        text = messages.encode(message).hex()
+        lab.person.ask("say", "said", topic="/tf", type=TF_MESSAGE, bytes=text)
+
+    say()
     why = lab.chain.until("it is left", lambda: tf(lab)["refused"].get("panda_link5"))
     assert why == "another node publishes it, in world"
     assert "panda_link5" not in tf(lab)["published"]
     message.transforms[0].transform.rotation.w = float("nan")
-    lab.person.ask("say", "said", bytes=messages.encode(message).hex(), **said)
+    say()
     lab.chain.until("it is named", lambda: lab.chain.refused().get("ros2.invalid"))
     assert lab.chain.state("ros2") == "running"
 
