@@ -24,7 +24,7 @@ from vla_zenoh.profile.schema import CameraMount
 from vla_zenoh.robots.ros2.arm import Ros2Arm
 from vla_zenoh.robots.ros2.camera import Camera
 from vla_zenoh.robots.ros2.ros_graph import RosGraph
-from vla_zenoh.ros2.keys import SENSOR, Qos
+from vla_zenoh.ros2.keys import LATCHED, SENSOR, Qos
 from vla_zenoh.ros2.messages import MAX_MESSAGE_BYTES, Messages
 from vla_zenoh.ros2.transforms import (
     TF,
@@ -127,8 +127,8 @@ class FrameTopics:
         self._cameras = {camera.publisher.name: camera for camera in cameras}
         self._moving = CallbackRing(BUFFER, MAX_MESSAGE_BYTES)
         self._fixed = CallbackRing(BUFFER, MAX_MESSAGE_BYTES)
-        graph.subscribe(TF, TF_MESSAGE, self._moving, SENSOR)
-        graph.subscribe_latched(TF_STATIC, TF_MESSAGE, self._fixed)
+        graph.subscribe_to_others(TF, TF_MESSAGE, self._moving, SENSOR)
+        graph.subscribe_to_others(TF_STATIC, TF_MESSAGE, self._fixed, LATCHED)
         self._tf = graph.publisher(TF, TF_MESSAGE, Qos(depth=100))
         self._tf_static = graph.publisher(TF_STATIC, TF_MESSAGE, Qos(1, transient_local=True))
         self._theirs = FrameTree()

@@ -17,7 +17,6 @@ from vla_zenoh.errors import CodecError
 from vla_zenoh.profile.robot import Ros2Profile
 from vla_zenoh.ros2.keys import (
     DEFAULT,
-    LATCHED,
     Attachment,
     Endpoint,
     EntityRole,
@@ -41,17 +40,12 @@ _ALL_COMPLETE = zenoh.QueryTarget.ALL_COMPLETE
 
 
 class RosPublisher:
-    """Publishes CDR bytes on one topic; its own session does not receive them."""
+    """Publishes CDR bytes on one topic."""
 
     def __init__(self, session: zenoh.Session, key: str, gid: bytes | None) -> None:
         drop, first = zenoh.CongestionControl.DROP, zenoh.Priority.REAL_TIME
         self._publisher = session.declare_publisher(
-            key,
-            encoding=_CDR,
-            congestion_control=drop,
-            priority=first,
-            express=True,
-            allowed_destination=zenoh.Locality.REMOTE,
+            key, encoding=_CDR, congestion_control=drop, priority=first, express=True
         )
         self._gid = gid
         self._seq = itertools.count(1)
@@ -186,14 +180,16 @@ class RosGraph:
         self._declared.append(buffer.subscribe(self.session, key))
         return buffer
 
-    def subscribe_latched(self, name: str, kind: str, buffer: CallbackRing) -> None:
-        """Subscribe to a transient_local topic, with what was published before."""
-        key, _ = self._declare(Endpoint(EntityRole.SUBSCRIBER, name, kind, LATCHED))
+    def subscribe_to_others(self, name: str, kind: str, buffer: CallbackRing, qos: Qos) -> None:
+        """Subscribe to a topic that we publish, too; to a transient_local one with its history."""
+        key, _ = self._declare(Endpoint(EntityRole.SUBSCRIBER, name, kind, qos))
         self.buffers.append(buffer)
         handler = zenoh.handlers.Callback(buffer, indirect=False)
-        history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
+        history = None
+        if qos.transient_local:
+            history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
         subscriber = zenoh.ext.declare_advanced_subscriber(
-            self.session, key, handler, history=history
+            self.session, key, handler, allowed_origin=zenoh.Locality.REMOTE, history=history
         )
         self._declared.append(subscriber)
 
