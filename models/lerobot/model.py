@@ -10,11 +10,13 @@
 # ///
 """Any policy that LeRobot saved (ACT, SmolVLA, pi0, ...), run by LeRobot itself.
 
-A policy directory does not define the meaning of its numbers, so the options do; they are checked
-against the sizes in its config. Weights are read from safetensors; nothing is unpickled.
+A policy directory does not define the meaning of its numbers. The data set that it was trained on
+does, if it is ours (dataset.py); else the options do, which override it. They are checked against
+the sizes in its config. Weights are read from safetensors; nothing is unpickled.
 Of a robot of several arms they say what the numbers of each are. The arms' numbers follow one
 another in the state and in the actions, as in ALOHA's data.
 
+    vla-zenoh worker lerobot --set checkpoint=DIR
     vla-zenoh worker lerobot --set checkpoint=DIR --set state=position+rpy+gripper_m \\
         --set action=delta --set rotation=rpy --set gripper=absolute_m --set dt_s=0.1
 """
@@ -26,6 +28,7 @@ from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+from vla_zenoh_model_lerobot.dataset import dataset_options
 from vla_zenoh_model_lerobot.environment import EXTRAS, policy_folder, requirement
 from vla_zenoh_model_lerobot.mapping import (
     ACTION,
@@ -80,6 +83,8 @@ class LeRobot:
         profile: of the robot: its arms and grippers.
         parts: names of the arms in the order of the policy's numbers, separated by commas; empty:
             as in the profile.
+        dataset: folder of the data set that says what the numbers mean; empty: the one that the
+            training names, if it is there.
         rtc: ``on``: a pi0, pi0.5 or SmolVLA continues the steps in execution, by LeRobot's own
             real-time chunking with the weights of the paper.
         meaning: of the actions, see lab/policy_servers/action_semantics.py. `horizon` defaults to
@@ -96,6 +101,7 @@ class LeRobot:
         device: str = "auto",
         profile: str = "panda_sim",
         parts: str = "",
+        dataset: str = "",
         rtc: str = "off",
         **meaning: str,
     ) -> None:
@@ -108,10 +114,12 @@ class LeRobot:
         steps = 1 if self._one_by_one else horizon(config, meaning.get("horizon", ""))
         one_of("resize", resize, get_args(Resize))
         robot = load_profile(profile)
+        known = dataset_options(self._folder, dataset)
+        state, parts = state or known.get("state", ""), parts or known.get("parts", "")
         arms = {name: robot.of_part(name) for name in arm_names(parts, tuple(robot.parts))}
         told = {**meaning, "horizon": str(steps)}
         self._meaning: dict[str, ActionSemantics] = {
-            name: read_action_semantics(told, joints=arm.robot.arm_joints)
+            name: read_action_semantics(told, known, "the data set", joints=arm.robot.arm_joints)
             for name, arm in arms.items()
         }
         inputs = features(self._folder, config, "input_features")

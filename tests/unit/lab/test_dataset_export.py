@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import av
 import cv2
@@ -27,14 +28,20 @@ from dataset_rig import (
 from dataset_rig import write_run as make_run
 from typed import typed
 from vla_zenoh_dataset.episodes import episodes_of, fps_of
-from vla_zenoh_dataset.features import Histogram, action_names, of_numbers, usual_state
+from vla_zenoh_dataset.features import (
+    Histogram,
+    action_names,
+    of_numbers,
+    semantics_of,
+    usual_state,
+)
 from vla_zenoh_dataset.lerobot import export
 from vla_zenoh_dataset.openvla import openvla_statistics
 
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.policy_servers.state_vector import read_parts
 from vla_zenoh.lab.recording.run import Run, load_run
-from vla_zenoh.policy import standing_step
+from vla_zenoh.policy import ActionSpec, standing_step
 from vla_zenoh.types import JointState
 
 FPS, USED = 10, 2
@@ -406,3 +413,31 @@ def test_wrench_and_effort_are_parts_of_a_state_where_the_robot_measured_them(
     rows = pq.read_table(next((tmp_path / "out" / "data").rglob("*.parquet")))
     for row in rows.column("observation.state"):
         np.testing.assert_array_equal(row.as_py(), [*felt, *effort])
+
+
+@pytest.mark.parametrize(
+    "action",
+    [
+        {},
+        {"kind": "absolute", "rotation": "quaternion", "gripper": "absolute_m"},
+        {"kind": "velocity", "frame": "tcp", "rotation": "rotvec", "gripper": "none"},
+        {"anchor": "measured", "gripper": "binary", "gripper_threshold": 0.0},
+        {"gripper": "open_fraction", "gripper_open_is_high": False},
+        {"controller": {"kp": 150.0, "damping_ratio": 0.5}, "rotation": "rotvec"},
+        {"space": "joint", "joints": JOINTS, "kind": "delta", "gripper": "delta_m"},
+        {"space": "joint", "joints": JOINTS, "kind": "velocity", "anchor": "measured"},
+        {"space": "joint", "joints": JOINTS, "kind": "absolute", "gripper": "delta_m"},
+    ],
+    ids=str,
+)
+def test_the_options_of_a_dataset_mean_what_its_spec_does(action: dict[str, Any]) -> None:
+    wanted = ActionSpec.model_validate({"horizon": HORIZON, "dt_s": 0.1, **action})
+    found = semantics_of(wanted)
+    # Where an option says nothing the spec has its default.
+    unused = {"rotation": wanted.rotation, "frame": wanted.frame, "anchor": wanted.anchor}
+    assert found.spec.model_copy(update=unused) == wanted
+    steps = np.random.default_rng(0).normal(0, 0.1, (HORIZON, wanted.dimension))
+    if wanted.rotation == "quaternion" and wanted.space == "tcp":
+        steps[:, wanted.rotation_columns] = 0.5
+    np.testing.assert_allclose(found.rows(steps), steps)
+    np.testing.assert_allclose(found.steps(steps), steps)

@@ -99,3 +99,53 @@ def test_the_old_format_comes_with_the_command_that_brings_it_up_to_date(
     command = "python -m lerobot.processor.migrate_policy_normalization"
     assert f"{command} --pretrained-path {folder}; " in str(error.value)
     assert f"checkpoint={folder}_migrated" in str(error.value)
+
+
+# -- the data set of a training -------------------------------------------------------------------
+@pytest.fixture(scope="module")
+def dataset_options(mapping: Any) -> Any:
+    return import_module("vla_zenoh_model_lerobot.dataset").dataset_options
+
+
+OPTIONS = {"action": "delta", "dt_s": "0.1", "state": "position+rpy", "parts": ""}
+
+
+def data_set(folder: Path, ours: Any = None, **info: Any) -> Path:
+    (folder / "meta").mkdir(parents=True)
+    (folder / "meta" / "info.json").write_text(json.dumps({"fps": 20, "robot_type": "x", **info}))
+    if ours is not None:
+        (folder / "meta" / "vla_zenoh.json").write_text(json.dumps(ours))
+    return folder
+
+
+def test_a_policy_has_the_options_of_the_data_set_that_its_training_names(
+    dataset_options: Any, tmp_path: Path
+) -> None:
+    made = policy(tmp_path / "act")
+    assert dataset_options(made, "") == {}, "a policy without a train_config.json"
+    (made / "train_config.json").write_text(
+        json.dumps({"dataset": {"root": str(tmp_path / "bricks")}})
+    )
+    assert dataset_options(made, "") == {}, "the data set is not here"
+    turned = {"": [1.0, 0.0, 0.0, 0.0]}
+    data_set(tmp_path / "bricks", {"options": OPTIONS, "rotation_reference": turned})
+    assert dataset_options(made, "") == {**OPTIONS, "rotation_reference": "1.0,0.0,0.0,0.0"}
+
+
+def test_a_data_set_that_lerobot_recorded_through_our_plug_in_is_known_by_its_robot(
+    dataset_options: Any, tmp_path: Path
+) -> None:
+    made = policy(tmp_path / "act")
+    found = dataset_options(made, str(data_set(tmp_path / "ours", robot_type="vla_zenoh")))
+    assert (found["action"], found["dt_s"]) == ("joint_position", "0.05")
+    assert found["state"] == "joint+gripper_open"
+
+
+def test_any_other_data_set_says_nothing_and_is_rejected_if_it_is_named(
+    dataset_options: Any, tmp_path: Path
+) -> None:
+    made = policy(tmp_path / "act")
+    arms_differ = data_set(tmp_path / "arms", {"options": None})
+    for other in (data_set(tmp_path / "others"), arms_differ, tmp_path / "nothing"):
+        with pytest.raises(WorkerError, match="no data set of `vla-zenoh dataset export`"):
+            dataset_options(made, str(other))
