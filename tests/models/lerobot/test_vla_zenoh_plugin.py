@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,9 +18,15 @@ from plugin_rig import (
     CAMERA_HZ,
     FPS,
     HEIGHT,
+    HOME_DEG,
+    JOINTS,
+    NAMES,
     SOURCE,
+    SWING_DEG,
     WIDTH,
+    Leader,
     running_arm,
+    write_leader,
 )
 
 sys.path.insert(0, str(SOURCE))
@@ -37,56 +42,12 @@ from lerobot_robot_vla_zenoh import (
 )
 from lerobot_robot_vla_zenoh.numbers import ArmNumbers
 
-from vla_zenoh.bus.node import Node
-from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.keys import Kind
-from vla_zenoh.profile import Profile, as_robot, load_profile
-from vla_zenoh.types import GripperState, JointState
+from vla_zenoh.profile import load_profile
 
 pytestmark = [pytest.mark.models, pytest.mark.timeout(280)]
 
-JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
-NAMES = [*(f"{name}.pos" for name in JOINTS), "gripper.pos"]
-HOME_DEG = np.degrees([0.0, -0.6, 0.6, 0.8, 0.0])
 REACHED_DEG, GRIPPED = 0.5, 1.0
-SWING_DEG, SWING_S = 15.0, 4.0
-EPISODE_S = 4
-LAG_S = 0.5
-"""The arm is this much behind its actions at most."""
-
-
-class Leader:
-    """States of a second arm whose pan swings, as its driver would publish them."""
-
-    def __init__(self, profile: Profile) -> None:
-        self.profile = as_robot(profile, "leader")
-        self._end = threading.Event()
-        self._thread = threading.Thread(target=self._run)
-
-    def __enter__(self) -> Leader:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._end.set()
-        self._thread.join()
-
-    def _run(self) -> None:
-        with open_session(self.profile.session) as session:
-            node = Node("arm", self.profile, session)
-            keys = node.keys
-            joint = node.declare_publisher(keys.state_joint, Kind.STATE)
-            gripper = node.declare_publisher(keys.state_gripper, Kind.STATE)
-            home_rad, still = np.radians(HOME_DEG), np.zeros(len(JOINTS))
-            began_s = time.monotonic()
-            while not self._end.wait(0.02):
-                passed = (time.monotonic() - began_s) / SWING_S
-                at_rad = home_rad.copy()
-                at_rad[0] = math.radians(SWING_DEG) * math.sin(2 * math.pi * passed)
-                joint.publish(JointState(JOINTS, at_rad, still, None))
-                gripper.publish(GripperState(0.05, moving=False, holding=False))
-            node.close()
 
 
 @pytest.fixture(scope="module")
@@ -231,8 +192,7 @@ def test_a_camera_reads_new_images_and_names_what_does_not_fit(arm: Chain) -> No
 
 
 def test_a_leader_is_read_in_the_numbers_of_the_follower(arm: Chain, tmp_path: Path) -> None:
-    leader = tmp_path / "leader.yaml"
-    leader.write_text(f"extends: {arm.profile_file}\nrobot: {{name: leader}}\n")
+    leader = write_leader(tmp_path, arm)
     teleop = VlaZenohTeleop(VlaZenohTeleopConfig(profile=str(leader)))
     assert teleop.action_features == dict.fromkeys(NAMES, float)
     with pytest.raises(DeviceNotConnectedError, match="state/joint"):

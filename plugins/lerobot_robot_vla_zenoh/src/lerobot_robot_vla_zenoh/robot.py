@@ -110,10 +110,11 @@ class VlaZenoh(Robot):
 
         Raises:
             DeviceNotConnectedError: the robot sends no states.
-            TimeoutError: a camera sends no images.
+            TimeoutError: an image is older than ``timing.max_observation_age_s``.
         """
         assert self._remote is not None
-        images = {name: camera.read_latest() for name, camera in self.cameras.items()}
+        oldest_ms = round(1e3 * self._profile.timing.max_observation_age_s)
+        images = {name: each.read_latest(oldest_ms) for name, each in self.cameras.items()}
         return {**self._numbers.measured(self._remote), **images}
 
     @check_if_not_connected
@@ -138,7 +139,9 @@ class VlaZenoh(Robot):
         if task.worker != self._worker.name:
             raise DeviceNotConnectedError(f"{self}: the arm follows worker {task.worker!r} now")
         if not self._worker.send(self._numbers.step(sent)):
-            raise DeviceNotConnectedError(f"{self}: no new state of the robot came")
+            raise DeviceNotConnectedError(
+                f"{self}: no new state of the robot came. {self._worker.complaint}".strip()
+            )
         return sent
 
     @check_if_not_connected

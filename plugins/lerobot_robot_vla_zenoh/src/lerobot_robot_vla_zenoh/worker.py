@@ -37,7 +37,12 @@ class LoopWorker:
         self.name = name
         self.spec = ModelSpec(
             name="lerobot",
-            observation=ObservationSpec(cameras=(), state=("joint", "gripper"), prompt=False),
+            observation=ObservationSpec(
+                cameras=(),
+                state=("joint", "gripper"),
+                prompt=False,
+                max_age_s=profile.timing.max_observation_age_s,
+            ),
             action=action,
         )
         self._joints = profile.robot.arm_joints
@@ -80,6 +85,11 @@ class LoopWorker:
     def ready(self) -> bool:
         """Whether a chunk was published."""
         return self._sent_s > 0.0
+
+    @property
+    def complaint(self) -> str:
+        """Why no chunk can be published; empty if one can, or nothing is wrong."""
+        return self._session.complaint
 
     def close(self) -> None:
         """End the worker."""
