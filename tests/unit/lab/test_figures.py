@@ -88,7 +88,7 @@ def test_a_figure_has_the_width_that_was_asked_for_and_text_of_8_points(
 ) -> None:
     drawn = drawings(width_in)[name]
     for end in (".pdf", ".svg", ".png"):
-        write(drawn, tmp_path / f"a{end}", force=False, inputs=[])
+        write(drawn, tmp_path / f"a{end}")
     box = re.search(rb"/MediaBox \[ *0 0 ([\d.]+)", (tmp_path / "a.pdf").read_bytes())
     assert box is not None
     assert float(box[1]) == pytest.approx(width_in * POINTS_PER_IN, abs=0.01)
@@ -108,7 +108,7 @@ def test_the_same_data_are_the_same_bytes(tmp_path: Path) -> None:
     for end in (".pdf", ".svg", ".png"):
         for name in ("one", "two"):
             drawn = drawings(COLUMN_IN)["motion"]
-            write(drawn, tmp_path / f"{name}{end}", force=False, inputs=[])
+            write(drawn, tmp_path / f"{name}{end}")
         assert (tmp_path / f"one{end}").read_bytes() == (tmp_path / f"two{end}").read_bytes()
 
 

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from vla_zenoh_benchmarks.paired_tasks import read_run
+from vla_zenoh_benchmarks.paired_tasks import TaskResultFile, read_run
 
 from vla_zenoh.cli.options import JsonOption
 from vla_zenoh.errors import ResourceError
 from vla_zenoh.lab.cli.output import print_json, progress
-from vla_zenoh.lab.cli.output_path import ForceOption
+from vla_zenoh.lab.cli.output_path import ForceOption, output_file
 from vla_zenoh.lab.evaluation.evaluate import EMPTY, evaluate, recordings
 from vla_zenoh.lab.evaluation.result import STAGES, Evaluation
 from vla_zenoh_figures import style
@@ -48,9 +49,10 @@ def motion(
 
     Prints the caption, with the number of prompts and chunks and how far the arm was behind.
     """
-    style.check_name(output)
-    files, found = _evaluated(runs)
-    _write(draw_motion(found, _width_in(page)), output, page, force, files, as_json)
+    with _output(output, force, files := _recordings(runs)) as file:
+        drawn = draw_motion(_evaluated(files), _width_in(page))
+        style.write(drawn, file)
+    _tell(drawn, output, page, as_json)
 
 
 def latency(
@@ -67,11 +69,12 @@ def latency(
 
     Prints the caption, with the number of requests, median and 95th percentile of each run.
     """
-    style.check_name(output)
     if stage not in STAGES:
         raise typer.BadParameter(f"--stage {stage!r}: {', '.join(STAGES)}")
-    files, found = _evaluated(runs)
-    _write(draw_latency(found, _width_in(page), stage), output, page, force, files, as_json)
+    with _output(output, force, files := _recordings(runs)) as file:
+        drawn = draw_latency(_evaluated(files), _width_in(page), stage)
+        style.write(drawn, file)
+    _tell(drawn, output, page, as_json)
 
 
 def success(
@@ -85,48 +88,58 @@ def success(
 
     Prints the caption, with the number of episodes and the seeds.
     """
-    style.check_name(output)
     files = [path / "result.json" if path.is_dir() else path for path in results]
-    read: list[Result] = []
-    for path, file in zip(results, files, strict=True):
-        try:
-            content = file.read_bytes()
-        except OSError as error:
-            raise ResourceError(f"{path} cannot be read: {error.strerror}") from error
-        read.append(Result("", read_run(content, str(path))))
-    named = [
-        each._replace(name=name) for each, name in zip(read, _names(read, results), strict=True)
-    ]
-    _write(draw_success(named, _width_in(page)), output, page, force, files, as_json)
+    with _output(output, force, files) as file:
+        read = [_result(path, name) for path, name in zip(files, results, strict=True)]
+        names = _names(read, results)
+        named = [Result(name, each) for name, each in zip(names, read, strict=True)]
+        drawn = draw_success(named, _width_in(page))
+        style.write(drawn, file)
+    _tell(drawn, output, page, as_json)
 
 
-def _names(read: list[Result], paths: list[Path]) -> list[str]:
+def _result(file: Path, given: Path) -> TaskResultFile:
+    try:
+        content = file.read_bytes()
+    except OSError as error:
+        raise ResourceError(f"{given} cannot be read: {error.strerror}") from error
+    return read_run(content, str(given))
+
+
+def _names(read: list[TaskResultFile], paths: list[Path]) -> list[str]:
     """The models, or the names of the files where two results have the same."""
-    models = [each.file.model for each in read]
+    models = [each.model for each in read]
     return models if len(set(models)) == len(models) else [path.stem for path in paths]
 
 
-def _evaluated(paths: list[Path]) -> tuple[list[Path], list[Evaluation]]:
-    """The files, and a run of each. Raises ResourceError: one cannot be evaluated."""
-    files = [file for path in paths for file in recordings([path])]
-    empty = [path for path in paths if not list(recordings([path]))]
-    if empty:
-        raise ResourceError(EMPTY.format(empty[0]))
+def _recordings(paths: list[Path]) -> list[Path]:
+    """The recordings in `paths`. Raises ResourceError: there are none in one of them."""
+    for path in paths:
+        if not list(recordings([path])):
+            raise ResourceError(EMPTY.format(path))
+    return list(recordings(paths))
+
+
+def _evaluated(files: list[Path]) -> list[Evaluation]:
+    """A run of each file. Raises ResourceError: one cannot be evaluated."""
     with progress("evaluating"):
         found, faults = evaluate(files)
     if faults:
         raise ResourceError(next(iter(faults.values())))
-    return files, found
+    return found
+
+
+def _output(path: Path, force: bool, inputs: list[Path]) -> AbstractContextManager[Path]:
+    """The file to write, tried before the work begins."""
+    style.check_name(path)
+    return output_file(path, force=force, inputs=inputs)
 
 
 def _width_in(page: bool) -> float:
     return style.PAGE_IN if page else style.COLUMN_IN
 
 
-def _write(
-    drawn: style.Drawn, output: Path, page: bool, force: bool, inputs: list[Path], as_json: bool
-) -> None:
-    style.write(drawn, output, force=force, inputs=inputs)
+def _tell(drawn: style.Drawn, output: Path, page: bool, as_json: bool) -> None:
     if as_json:
         told: dict[str, Any] = {"file": str(output), "width_in": _width_in(page)}
         print_json(told | {"caption": drawn.caption})

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, ParamSpec
 
 from vla_zenoh.errors import VlaZenohError
-from vla_zenoh.lab.cli.output_path import output_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -110,18 +109,15 @@ def check_name(path: Path) -> None:
         raise FigureError(f"--output {path}: its name must end in {', '.join(KINDS)}")
 
 
-def write(drawn: Drawn, path: Path, *, force: bool, inputs: list[Path]) -> None:
+def write(drawn: Drawn, file: Path) -> None:
     """Write it, the same bytes for the same data; the caption goes into the file as well."""
     import matplotlib as mpl
 
-    kind = path.suffix.lower()
+    kind = file.suffix.lower()
     about = {
         ".pdf": {"Subject": drawn.caption, "CreationDate": None},
         ".svg": {"Description": drawn.caption, "Date": None},
         ".png": {"Description": drawn.caption},
     }[kind]
-    with (
-        output_file(path, force=force, inputs=inputs) as part,
-        mpl.rc_context(SIZES),
-    ):
-        drawn.figure.savefig(part, format=kind[1:], dpi=PNG_DPI, metadata=about)
+    with mpl.rc_context(SIZES):
+        drawn.figure.savefig(file, format=kind[1:], dpi=PNG_DPI, metadata=about)
