@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import resource
+import shutil
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,6 +19,7 @@ from benchmarks.__main__ import app as benchmarks
 from vla_zenoh.errors import VlaZenohError
 from vla_zenoh.program.main import app
 
+SHIPPED = Path(__file__).parents[3] / "profiles"
 READ = {
     "view file",
     "replay file",
@@ -81,6 +83,7 @@ WRITERS = {
     "trial": Writer("trial --workers a --prompt go", "out"),
     "nights": Writer("nights plan.yaml", "out"),
     "inspect": Writer("inspect", "out"),
+    "profile new": Writer("profile new arm.urdf", "out.yaml", ("arm.urdf",)),
     "secure init": Writer(
         "secure init --profile own.yaml --folder keys", "out.yaml", ("own.yaml",)
     ),
@@ -128,6 +131,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     (tmp_path / "DATASET" / "meta").mkdir(parents=True)
     (tmp_path / "DATASET" / "meta" / "info.json").write_text("{}")
     (tmp_path / "plan.yaml").write_text(PLAN)
+    shutil.copy(SHIPPED / "ur5e.urdf", tmp_path / "arm.urdf")
     (tmp_path / "own.yaml").write_text("extends: panda_sim\n")
     yield tmp_path
     for each, handler in handlers:

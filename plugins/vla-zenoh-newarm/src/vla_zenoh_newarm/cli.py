@@ -11,8 +11,11 @@ from typing import Annotated
 
 import typer
 
-from vla_zenoh.cli.options import model_options, options
+from vla_zenoh.cli.options import JsonOption, model_options, options
 from vla_zenoh.cli.output import console, errors, fail, styled
+from vla_zenoh.errors import OutputError
+from vla_zenoh.lab.cli.output import print_json
+from vla_zenoh.lab.cli.output_path import ForceOption, output_file
 from vla_zenoh.lab.profile.check import check_profile
 from vla_zenoh.resources import ROBOT_DATA_PREFIX, robot_urdf
 from vla_zenoh_newarm.answers import Answers
@@ -64,8 +67,8 @@ def new(
         str, typer.Argument(help="URDF or xacro of the arm, or example-robot-data:PATH.")
     ],
     given: Given,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="The profile; default: NAME.yaml here.")
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="The profile; default: NAME.yaml here.")
     ] = None,
     settings: Annotated[
         list[str] | None,
@@ -74,7 +77,8 @@ def new(
     yes: Annotated[
         bool, typer.Option("--yes", "-y", help="Ask nothing: every guess is taken.")
     ] = False,
-    force: Annotated[bool, typer.Option("--force", help="Replace an existing profile.")] = False,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Write a profile for an arm from its description, and check it.
 
@@ -84,28 +88,34 @@ def new(
     """
     source = robot_urdf(description)
     name = re.sub(r"[^a-z0-9_]+", "_", source.name.partition(".")[0].lower()).strip("_") or "arm"
-    file = out or Path(f"{name}.yaml")
-    if file.exists() and not force:
-        fail(f"{file} exists: choose another --out, or replace it with --force")
-    answers = Answers(vars(given), ask=sys.stdin.isatty() and not yes)
+    file = output or Path(f"{name}.yaml")
     copy = file.with_name(f"{file.stem}_mended.urdf")
-    arm = found_arm(source, copy, model_options(settings or []), answers)
-    named = description if arm.file == source and _is_named(description) else ""
-    path = named or os.path.relpath(arm.file.resolve(), file.resolve().parent)
-    file.write_text(profile_text(file.stem if out else name, description, path, arm), "utf-8")
-    _report(file, arm)
+    with output_file(file, force=force, inputs=[source]) as part:
+        if copy.exists() and not force:
+            raise OutputError(f"{copy} exists; give another --output, or --force to replace it")
+        answers = Answers(vars(given), ask=sys.stdin.isatty() and not yes)
+        arm = found_arm(source, copy, model_options(settings or []), answers)
+        named = description if arm.file == source and _is_named(description) else ""
+        path = named or os.path.relpath(arm.file.resolve(), file.resolve().parent)
+        text = profile_text(file.stem if output else name, description, path, arm)
+        part.write_text(text, "utf-8")
+    _report(file, arm, as_json)
 
 
 def _is_named(description: str) -> bool:
     return description.startswith(ROBOT_DATA_PREFIX)
 
 
-def _report(file: Path, arm: Arm) -> None:
+def _report(file: Path, arm: Arm, as_json: bool) -> None:
     report = check_profile(str(file))
     for line in report.errors:
         errors().print(styled(line, "red"), soft_wrap=True)
     if report.errors:
         fail(f"{file} was written and does not pass `vla-zenoh profile check`: correct it")
+    if as_json:
+        guesses = {guess.place: guess.what for guess in arm.guesses}
+        print_json({"file": str(file), "changes": list(arm.changes), "guesses": guesses})
+        return
     out = console()
     out.print(styled("ok", "green"), str(file), soft_wrap=True)
     for line in arm.changes:
