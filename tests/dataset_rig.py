@@ -80,6 +80,8 @@ def write_run(
     silent: Sequence[int] = (),
     with_spec: bool = True,
     percent: float = 100.0,
+    cameras: Sequence[str] = ("front",),
+    profile_yaml: str = PROFILE,
     ended: Mapping[str, Any] | None = None,
 ) -> Path:
     """One activation of 2 s for each prompt, half a second of rest after each.
@@ -92,6 +94,8 @@ def write_run(
         silent: chunks that were never published, in each activation.
         with_spec: the worker says what its steps mean.
         percent: speed override.
+        cameras: those that were recorded.
+        profile_yaml: the profile in force.
         ended: what stands at its end beside what was dropped.
     """
     said = of or spec()
@@ -131,14 +135,17 @@ def write_run(
     for number in range(end_ms // 50):
         at_ns = ZERO_NS + 50 * number * MS
         header = Header(at_ns, number, "camera#1")
-        key = KEYS.camera_jpeg("front")
-        samples.append(Sample(key, picture(number), JPEG, header, at_ns + MS))
+        for camera in cameras:
+            key = KEYS.camera_jpeg(camera)
+            samples.append(Sample(key, picture(number), JPEG, header, at_ns + MS))
         if depth_unit_m is not None:
             depth = Depth(depth_counts(number), depth_unit_m)
             encoding = f"image/png;{depth_schema(depth)}"
             key = KEYS.camera_depth("front")
             samples.append(Sample(key, encode_depth(depth), encoding, header, at_ns + MS))
-    out = RecordingWriter(path, KEYS, profile_yaml=PROFILE, base_frame="base", began_ns=ZERO_NS)
+    out = RecordingWriter(
+        path, KEYS, profile_yaml=profile_yaml, base_frame="base", began_ns=ZERO_NS
+    )
     for sample in sorted(samples, key=lambda each: each.received_ns):
         out.write(sample)
     out.finish({"dropped": {}, **(ended or {})})

@@ -31,8 +31,10 @@ from vla_zenoh_dataset.episodes import episodes_of, fps_of
 from vla_zenoh_dataset.features import (
     Histogram,
     action_names,
+    numbers_of,
     of_numbers,
     semantics_of,
+    states_of,
     usual_state,
 )
 from vla_zenoh_dataset.lerobot import export
@@ -42,6 +44,8 @@ from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.policy_servers.state_vector import read_parts
 from vla_zenoh.lab.recording.run import Run, load_run
 from vla_zenoh.policy import ActionSpec, standing_step
+from vla_zenoh.profile import load_profile
+from vla_zenoh.profile.load import to_yaml
 from vla_zenoh.types import JointState
 
 FPS, USED = 10, 2
@@ -441,3 +445,88 @@ def test_the_options_of_a_dataset_mean_what_its_spec_does(action: dict[str, Any]
         steps[:, wanted.rotation_columns] = 0.5
     np.testing.assert_allclose(found.rows(steps), steps)
     np.testing.assert_allclose(found.steps(steps), steps)
+
+
+def test_a_camera_that_only_some_recordings_have_is_left_out_with_a_word(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs = tmp_path / "runs of today"
+    make_run(runs / "one" / "up.mcap", prompts=PROMPTS[:1], cameras=("front", "wrist"))
+    make_run(runs / "two" / "up.mcap", prompts=PROMPTS[:1])
+    words = ("export", str(runs), "-o", str(tmp_path / "out"), "--json")
+    done = typed(capsys, "dataset", *words)
+    assert done.code == 0, done.stderr
+    assert json.loads(done.stdout)["cameras"] == ["front"]
+    assert "camera wrist is left out: 1 of 2 recordings have no images of it" in done.said
+    assert "two/up.mcap" in done.said
+
+
+def test_a_recording_that_is_given_twice_is_exported_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = make_run(tmp_path / "runs" / "up.mcap", prompts=PROMPTS[:1])
+    words = ("export", str(run), str(run.parent), "-o", str(tmp_path / "out"), "--json")
+    done = typed(capsys, "dataset", *words)
+    assert done.code == 0, done.stderr
+    assert json.loads(done.stdout)["episodes"] == 1
+
+
+def recorded_joints(run: Run, **position_rad: float) -> Run:
+    """The run with these joints at rest."""
+    names, values = tuple(position_rad), np.array([*position_rad.values()])
+    record = JointState(names, values, np.zeros(len(names)), None)
+    return replace(run, joints=[heard._replace(record=record) for heard in run.poses])
+
+
+def states(folder: Path) -> np.ndarray:
+    rows = pq.read_table(next((folder / "data").rglob("*.parquet")))
+    return np.array(rows.column("observation.state").to_pylist())
+
+
+def test_joints_that_were_recorded_in_another_order_are_in_the_columns_of_their_names(
+    run_file: Path, tmp_path: Path
+) -> None:
+    run = load_run(run_file)
+    runs = recorded_joints(run, a=0.1, b=0.2), recorded_joints(run, b=0.2, a=0.1)
+    episodes = [episode for each in runs for episode in episodes_of(each)]
+    export(tmp_path / "out", episodes, [], read_parts("joint"))
+    np.testing.assert_allclose(states(tmp_path / "out"), [[0.1, 0.2]] * 80, atol=STATE_ATOL)
+    other = [*episodes, *episodes_of(recorded_joints(run, c=0.1, d=0.2))]
+    with pytest.raises(
+        RecordingError, match=r"teach\.mcap: the state has no joint a, b.*each robot"
+    ):
+        export(tmp_path / "none", other, [], read_parts("joint"))
+
+
+def test_joints_that_are_published_in_another_order_are_exported_as_a_policy_is_told_them(
+    run_file: Path,
+) -> None:
+    names = load_profile("panda_sim").robot.arm_joints
+    values = dict(zip(names, np.arange(len(names)) / 10, strict=True))
+    run = recorded_joints(
+        load_run(run_file), **{name: values[name] for name in sorted(names)[::-1]}
+    )
+    episode = episodes_of(run)[0]
+    found = states_of(episode, numbers_of(episode, ("joint",)))
+    np.testing.assert_allclose(found, [[*values.values()]] * len(found), atol=STATE_ATOL)
+
+
+def test_a_home_that_was_changed_between_runs_does_not_change_the_signs_of_rotations(
+    tmp_path: Path,
+) -> None:
+    profile = load_profile("panda_sim")
+    home_rad = list(profile.robot.home_rad)
+    home_rad[-1] += 2.0  # so far that the reference has the other sign
+    robot = profile.robot.model_copy(update={"home_rad": tuple(home_rad)})
+    other = to_yaml(profile.model_copy(update={"robot": robot}))
+    files = [
+        make_run(tmp_path / "before.mcap", prompts=PROMPTS[:1]),
+        make_run(tmp_path / "after.mcap", prompts=PROMPTS[:1], profile_yaml=other),
+    ]
+    episodes = [episode for file in files for episode in episodes_of(load_run(file))]
+    signs = [
+        np.sign(numbers_of(each, ("quat_xyzw",))[""].reference[:2]).tolist() for each in episodes
+    ]
+    assert signs[0] != signs[1]
+    export(tmp_path / "out", episodes, [], read_parts("quat_xyzw"))
+    assert len(np.unique(states(tmp_path / "out").round(6), axis=0)) == 1

@@ -19,7 +19,7 @@ from pair_recording_rig import (
     write_pair_run,
 )
 from vla_zenoh_dataset.episodes import episodes_of
-from vla_zenoh_dataset.features import action_names, names_of_state, usual_state
+from vla_zenoh_dataset.features import action_names, names_of_state, numbers_of, usual_state
 from vla_zenoh_dataset.lerobot import export
 from vla_zenoh_dataset.openvla import openvla_statistics
 
@@ -117,7 +117,7 @@ def test_numbers_that_are_no_positions_keep_their_names_behind_the_part(run_file
         for name in ("joint1", "joint2", "gripper_delta_m")
     ]
     (episode,) = episodes_of(load_run(run_file))
-    assert names_of_state(episode, read_parts("position"))[:4] == [
+    assert names_of_state(numbers_of(episode, read_parts("position")), episode.spec.action)[:4] == [
         *(f"left_{axis}" for axis in "xyz"),
         "right_x",
     ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from collections.abc import Mapping, Set
 from pathlib import Path
 from typing import Annotated
 
@@ -16,6 +17,7 @@ from vla_zenoh.errors import RecordingError, counted, nearest
 from vla_zenoh.lab.cli.output import print_json, progress
 from vla_zenoh.lab.cli.output_path import ForceOption, output_file, output_folder
 from vla_zenoh.lab.evaluation.evaluate import MCAP, recordings
+from vla_zenoh_dataset.episodes import RecordedEpisode
 from vla_zenoh_dataset.label import EpisodeLabel
 
 
@@ -70,7 +72,7 @@ def export(
     if not files:
         raise RecordingError(f"no {MCAP} file in {', '.join(map(str, runs))}")
     wanted = labels or [each for each in EpisodeLabel if each is not EpisodeLabel.DISCARDED]
-    episodes, seen, deep, workers, left_out = [], None, None, set[str](), Counter[str]()
+    episodes, workers, left_out = list[RecordedEpisode](), set[str](), Counter[str]()
     with (
         output_folder(output, force=force, inputs=files) as part,
         progress("reading the recordings") as status,
@@ -87,9 +89,6 @@ def export(
                 episode.discarded = verdict_of_person(episode) == "void"
             episodes += [each for each in found if each.label in wanted]
             left_out.update(each.label for each in found if each.label not in wanted)
-            if found:
-                seen = set(run.picture_counts) if seen is None else seen & set(run.picture_counts)
-                deep = run.depth_cameras if deep is None else deep & run.depth_cameras
         if worker is not None and worker not in workers:
             known = ", ".join(sorted(workers)) or "none"
             fail(
@@ -102,14 +101,17 @@ def export(
                 f"no episode has the label {' or '.join(wanted)}; there are: {those}. Choose "
                 "another --label"
             )
-        wanted_cameras = cameras or sorted(seen or ())
+        runs_used = list({id(each.run): each.run for each in episodes}.values())
+        pictures = {str(run.path): set(run.picture_counts) for run in runs_used}
+        wanted_cameras = cameras or in_all(pictures, "images")
+        depths = {str(run.path): run.depth_cameras & {*wanted_cameras} for run in runs_used}
         written = write(
             part,
             episodes,
             wanted_cameras,
             parts or read_parts(usual_state(episodes)),
             lambda doing: status.update(f"writing {doing} ({counted(len(episodes), 'episode')})"),
-            [camera for camera in wanted_cameras if depth and camera in (deep or ())],
+            in_all(depths, "depth images") if depth else [],
         )
     written = written._replace(folder=output)
     if as_json:
@@ -123,6 +125,25 @@ def export(
         f"depth {', '.join(written.depth) or 'none'}, "
         f"{counted(len(written.tasks), 'prompt')}"
     )
+
+
+def in_all(cameras: Mapping[str, Set[str]], what: str) -> list[str]:
+    """Cameras that every recording has; warns of those that only some of them have.
+
+    Args:
+        cameras: name of a recording -> its cameras.
+        what: kind of their images.
+    """
+    names = sorted(set[str]().union(*cameras.values()))
+    lacking = {name: [run for run, found in cameras.items() if name not in found] for name in names}
+    for name, runs in lacking.items():
+        if runs:
+            warn(
+                f"camera {name} is left out: {len(runs)} of {counted(len(cameras), 'recording')} "
+                f"have no {what} of it ({', '.join(runs[:3])}{', ...' if len(runs) > 3 else ''}); "
+                "leave those recordings out to keep it"
+            )
+    return [name for name in names if not lacking[name]]
 
 
 @options

@@ -8,14 +8,14 @@ to 100 open. All others are in ours.
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vla_zenoh.errors import RecordingError
+from vla_zenoh.errors import RecordingError, SpecError
 from vla_zenoh.lab.policy_servers.action_semantics import (
     NO_CONTROLLER,
     ActionSemantics,
@@ -159,14 +159,18 @@ def state_names(
     return [name for part in parts for name in {**NAMES, **own}.get(part, [part])]
 
 
-def names_of_state(episode: RecordedEpisode, parts: Sequence[str]) -> list[str]:
-    """Names of the numbers of an episode's state, one part of the robot after the other."""
-    out: list[str] = []
-    for part in episode.spec.parts:
-        joints = episode.run.of_part(part).joints
-        names = joints[0].record.names if joints else ()
-        out += _of_part(part, state_names(parts, names, episode.spec.action.of(part)))
-    return out
+def names_of_state(numbers: Mapping[str, StateNumbers], spec: ActionSpec) -> list[str]:
+    """Names of the numbers of a state, one part of the robot after the other.
+
+    Args:
+        numbers: of every part.
+        spec: of the actions that it goes with.
+    """
+    each = [
+        _of_part(part, state_names(own.names, own.joints, spec.of(part)))
+        for part, own in numbers.items()
+    ]
+    return [name for names in each for name in names]
 
 
 def action_names(spec: ActionSpec) -> list[str]:
@@ -222,35 +226,42 @@ def _actions(spec: ActionSpec, steps: NDArray[np.float32], run: Run, part: str) 
     return semantics_of(spec).rows(rows)
 
 
-def states_of(episode: RecordedEpisode, parts: Sequence[str]) -> NDArray[np.float32]:
+def states_of(episode: RecordedEpisode, numbers: Mapping[str, StateNumbers]) -> NDArray[np.float32]:
     """(n, S) state of the robot at each frame, one part of the robot after the other.
 
+    Args:
+        numbers: of every part, see `numbers_of`; the same for all episodes of a data set.
+
     Raises:
-        RecordingError: no state was recorded near a frame.
+        RecordingError: no state was recorded near a frame, or one of other joints.
     """
-    each = [
-        _states(episode, episode.run.of_part(part), parts, episode.spec.action.of(part))
-        for part in episode.spec.parts
-    ]
+    each = [_states(episode, episode.run.of_part(part), own) for part, own in numbers.items()]
     return np.concatenate(each, axis=1)
 
 
-def numbers_of(run: Run, parts: Sequence[str], spec: ActionSpec) -> StateNumbers:
-    """The numbers of a state that goes with actions of one arm, as it was recorded.
+def numbers_of(episode: RecordedEpisode, parts: Sequence[str]) -> dict[str, StateNumbers]:
+    """Part of the robot -> the numbers of its state, which go with the episode's actions.
+
+    The joints are in the order of the profile, in which a policy is told them, whatever the order
+    in which they were published. Where others were recorded, it is those.
 
     Raises:
         RecordingError: the recording holds no profile.
     """
-    found = state_numbers(parts, run.profile, semantics_of(spec).state_units)
-    return replace(found, joints=run.joints[0].record.names) if run.joints else found
+    out: dict[str, StateNumbers] = {}
+    for part in episode.spec.parts:
+        run, spec = episode.run.of_part(part), episode.spec.action.of(part)
+        own = state_numbers(parts, run.profile, semantics_of(spec).state_units)
+        recorded = run.joints[0].record.names if run.joints else own.joints
+        known = set(own.joints) <= set(recorded)
+        out[part] = own if known else replace(own, joints=recorded)
+    return out
 
 
-def _states(
-    episode: RecordedEpisode, run: Run, parts: Sequence[str], spec: ActionSpec
-) -> NDArray[np.float32]:
+def _states(episode: RecordedEpisode, run: Run, numbers: StateNumbers) -> NDArray[np.float32]:
     streams: dict[str, Any] = {"joint": run.joints, "pose": run.poses, "gripper": run.grippers}
-    wanted = {part: streams[STREAM_OF.get(part, part)] for part in parts_of(parts)}
-    numbers, place = numbers_of(run, parts, spec), f"{run.part}/" if run.part else ""
+    wanted = {part: streams[STREAM_OF.get(part, part)] for part in parts_of(numbers.names)}
+    place = f"{run.part}/" if run.part else ""
     task = Task(0, True, "", episode.worker, 1.0)
     rows = []
     for frame in episode.frames:
@@ -266,5 +277,10 @@ def _states(
             if found[name] is None:
                 raise RecordingError(f"{run.path}: its robot did not measure {part}")
         observation = Observation(frame.stamp_ns, 0, task, **found)
-        rows.append(numbers.encode(observation))
+        try:
+            rows.append(numbers.encode(observation))
+        except SpecError as error:
+            raise RecordingError(
+                f"{run.path}: {error}. Export the recordings of each robot by themselves"
+            ) from error
     return np.array(rows, np.float32)

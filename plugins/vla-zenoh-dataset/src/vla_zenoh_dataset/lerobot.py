@@ -112,8 +112,10 @@ class _Dataset:
         self._depths = [DepthColumn(camera) for camera in depth]
         self._spec = episodes[0].spec
         self._fps = fps_of(self._spec.action)
-        self._states = [states_of(episode, parts) for episode in self._episodes]
-        self._state_names = names_of_state(episodes[0], parts)
+        # One meaning for all runs, whatever their profiles say of joint order and home.
+        self._numbers = numbers_of(episodes[0], parts)
+        self._states = [states_of(episode, self._numbers) for episode in self._episodes]
+        self._state_names = names_of_state(self._numbers, self._spec.action)
         self._tasks = list(
             dict.fromkeys(frame.prompt for episode in self._episodes for frame in episode.frames)
         )
@@ -320,12 +322,7 @@ class _Dataset:
 
     def _references(self) -> dict[str, list[float]]:
         """Part of the robot -> x, y, z, w that signs and cuts of its rotations are nearest to."""
-        first = self._episodes[0]
-        each = {part: first.run.of_part(part) for part in first.spec.parts}
-        return {
-            part: [*numbers_of(run, self._parts, first.spec.action.of(part)).reference]
-            for part, run in each.items()
-        }
+        return {part: [*own.reference] for part, own in self._numbers.items()}
 
     def _options(self) -> dict[str, str] | None:
         """Of the worker ``lerobot`` for a policy of this dataset; None: its arms have others."""

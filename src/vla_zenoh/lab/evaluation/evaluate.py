@@ -30,16 +30,19 @@ _OF_A_ROBOT = {"requests", "executed", "seconds", "refusals", "skipped", "verdic
 def recordings(paths: Iterable[Path]) -> Iterator[Path]:
     """The given files, and the recordings below given folders in the order of their names.
 
-    A folder with a saved rolling record is one recording.
+    A folder with a saved rolling record is one recording. One that is given twice, by itself and by
+    its folder or a link, counts once.
     """
+    known = set[Path]()
     for path in paths:
-        if not path.is_dir():
-            yield path
-            continue
-        found = {
-            file.parent if fnmatch(file.name, SEGMENTS) else file for file in path.rglob(f"*{MCAP}")
-        }
-        yield from sorted(found)
+        found = {path}
+        if path.is_dir():
+            files = path.rglob(f"*{MCAP}")
+            found = {file.parent if fnmatch(file.name, SEGMENTS) else file for file in files}
+        for each in sorted(found):
+            if each.resolve() not in known:
+                known.add(each.resolve())
+                yield each
 
 
 def evaluate(
