@@ -26,6 +26,10 @@ FIGURES: Mapping[str, tuple[str, str]] = {
 }
 """Mode of scaling -> the statistics that it needs."""
 
+LEAST_SPREAD = 1e-6
+"""Of a number that changed in the data; of one over 1 a share of its size. What is less is
+rounding: scaled with it, a sensor's noise is a thousand times what the policy was trained on."""
+
 Statistics = Mapping[str, Mapping[str, NDArray[Any]]]
 
 
@@ -73,7 +77,7 @@ def check_statistics(pipeline: Path, wanted: list[Scaled]) -> None:
                     f"{pipeline}: {each.kind} is scaled by {mode or 'nothing'}, the policy's "
                     f"config says {each.mode}"
                 )
-            for why in _faults(each, found):
+            for why in faults(each, found):
                 raise WorkerError(f"{pipeline}: {each.name} is scaled by {mode}, and {why}")
 
 
@@ -99,7 +103,8 @@ def _statistics(pipeline: Path, step: Mapping[str, Any]) -> Statistics:
     return out
 
 
-def _faults(wanted: Scaled, found: Statistics) -> Iterator[str]:
+def faults(wanted: Scaled, found: Statistics) -> Iterator[str]:
+    """Why statistics cannot scale a feature."""
     own = found.get(wanted.name)
     if own is None:
         there = ", ".join(sorted(found)) or "none"
@@ -125,8 +130,9 @@ def _faults(wanted: Scaled, found: Statistics) -> Iterator[str]:
             return
     low, high = (own[name].astype(np.float64).reshape(-1) for name in (low_name, high_name))
     spread = high if wanted.mode == "MEAN_STD" else high - low
-    if (spread <= 0).any():
-        at = int(np.argmax(spread <= 0))
+    still = spread <= LEAST_SPREAD * np.maximum(np.abs(low), 1.0)
+    if still.any():
+        at = int(np.argmax(still))
         what = high_name if wanted.mode == "MEAN_STD" else f"{high_name} - {low_name}"
         yield (
             f"{what} of its number {at} is {spread[at]:g}: the number never changed in the data, "

@@ -7,6 +7,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from vla_zenoh.errors import WorkerError
@@ -30,6 +31,11 @@ def mapping() -> Any:
 @pytest.fixture(scope="module")
 def environment(mapping: Any) -> Any:
     return import_module("vla_zenoh_model_lerobot.environment")
+
+
+@pytest.fixture(scope="module")
+def normalisation(mapping: Any) -> Any:
+    return import_module("vla_zenoh_model_lerobot.normalisation")
 
 
 def policy(folder: Path, **changes: Any) -> Path:
@@ -149,3 +155,28 @@ def test_any_other_data_set_says_nothing_and_is_rejected_if_it_is_named(
     for other in (data_set(tmp_path / "others"), arms_differ, tmp_path / "nothing"):
         with pytest.raises(WorkerError, match="no data set of `vla-zenoh dataset export`"):
             dataset_options(made, str(other))
+
+
+@pytest.mark.parametrize(
+    ("mode", "low", "high", "number"),
+    [
+        ("MEAN_STD", [0.1, 0.2], [0.3, 1e-9], 1),
+        ("MEAN_STD", [1e-10, 0.2], [1e-9, 0.1], 0),
+        ("MEAN_STD", [90.0, 0.2], [1e-5, 0.1], 0),
+        ("MIN_MAX", [0.0, 0.5], [1.0, 0.5000001], 1),
+        ("QUANTILES", [0.5, 0.0], [0.5, 1.0], 0),
+        ("MEAN_STD", [0.0, 0.0], [1e-4, 1e-5], None),
+        ("MIN_MAX", [-3.0, 89.9], [-2.9, 90.0], None),
+    ],
+)
+def test_a_number_that_changed_in_the_data_by_rounding_alone_cannot_be_scaled(
+    normalisation: Any, mode: str, low: list[float], high: list[float], number: int | None
+) -> None:
+    wanted = normalisation.Scaled("observation.state", "STATE", (2,), mode)
+    names = normalisation.FIGURES[mode]
+    found = dict(zip(names, (np.array(low, np.float32), np.array(high, np.float32)), strict=True))
+    why = list(normalisation.faults(wanted, {"observation.state": found}))
+    assert len(why) == (number is not None)
+    if why:
+        assert f"of its number {number} is" in why[0]
+        assert "the number never changed in the data" in why[0]
