@@ -25,7 +25,7 @@ from vla_zenoh.errors import CodecError, NodeError
 from vla_zenoh.keys import Keys
 from vla_zenoh.profile import Profile, SessionProfile, load_profile, override
 from vla_zenoh.runtime.process import is_running
-from vla_zenoh.types import GripperState, Header, SingleWriterFilter
+from vla_zenoh.types import Event, GripperState, Header, SingleWriterFilter
 
 SILENCE_NS = 500_000_000
 STEP_TOLERANCE_S = 0.002
@@ -356,13 +356,18 @@ def test_a_dead_process_is_not_running_even_before_it_is_buried() -> None:
     assert is_running(os.getpid())
 
 
-def test_unknown_fields_of_headers_and_records_are_counted() -> None:
+def test_unknown_fields_of_headers_and_records_are_counted_and_named_for_each_sender() -> None:
     state = records.encode(GripperState(0.04, False, False))
     later = message.pack({**message.unpack(state), "temperature": 30.0})
     with two_sessions() as (profile, one, other):
         node = Node("command", profile, one)
         key = profile.keys.state_gripper
         ring = node.subscribe(key, CallbackRing(8, 1000))
+        events: list[str] = []
+        other.declare_subscriber(
+            profile.keys.event("command"),
+            lambda sample: events.append(records.decode(Event, sample.payload.to_bytes()).why),
+        )
         publisher = other.declare_publisher(key)
         await_match(other, key)
         for source, payload, more in (
@@ -383,4 +388,7 @@ def test_unknown_fields_of_headers_and_records_are_counted() -> None:
         read = [node.decode(GripperState, arrival) for arrival in arrivals]
         assert None not in read
         assert node.counters["unknown_fields"] == 5
+        until("both were named", lambda: len(events) == 2)
         node.close()
+    assert events[0].startswith("new#1 sends hop,")
+    assert events[1].startswith("newer#1 sends hop, lane, temperature,")

@@ -407,7 +407,7 @@ class Node:
         self._newer_sources[source] = None
         named = ", ".join(fields[:MAX_UNKNOWN_NAMED])
         why = f"{source[:60]} sends {named}, which this version does not know: ignored"
-        self.emit(Event("info", "notice", "unknown_fields", why[:1000]))
+        self._events.emit(Event("info", "notice", "unknown_fields", why[:1000]), source)
 
     def decode_text(
         self, decode: Callable[[bytes], Record], arrival: ReceivedSample
