@@ -301,6 +301,23 @@ def test_a_worker_breaks_the_rules_that_it_breaks_and_no_other(name: str) -> Non
     assert broken(found) == wanted
 
 
+@pytest.mark.parametrize(
+    ("percent", "every", "wanted"),
+    [(50.0, 2, set()), (50.0, 1, set()), (50.0, 4, {"delta/pi0: rate"}), (0.0, 100, set())],
+)
+def test_at_a_lower_speed_override_a_worker_may_send_as_few_chunks_as_are_asked_for(
+    percent: float, every: int, wanted: set[str]
+) -> None:
+    samples: list[Arrived] = []
+    for sample in worker_samples():
+        if sample.key == "task":
+            samples.append(replace(sample, record=replace(TASK, speed_percent=percent)))
+        elif sample.key != "delta/pi0" or (number(sample) + 1) % every == 0:
+            samples.append(sample)
+    seen = Seen("worker-pi0", samples, SECONDS, clocks=[CLOCK], replied=SPEC)
+    assert broken(rules.worker(seen, PROFILE)) == wanted
+
+
 # -- camera -----------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     ("width", "rate_hz", "changing", "wanted"),

@@ -287,7 +287,12 @@ def worker(seen: Seen, profile: Profile) -> Iterator[RuleFinding]:
     if not tasks:
         yield RuleFinding("chunks", None, "no command node publishes a task")
         return
-    yield from stream(seen, f"delta/{name}", RATE_SHARE * tasks[-1].rate_hz)
+    # A slower arm asks its worker less often; one that goes on at the task's rate is right, too.
+    least_hz = min(task.requested_hz for task in tasks)
+    if least_hz == 0.0:
+        yield RuleFinding("chunks", None, "the speed override is 0: none were asked for")
+    else:
+        yield from stream(seen, f"delta/{name}", RATE_SHARE * least_hz)
     chunks = [each for each in of_key(seen.samples, f"delta/{name}") if each.record]
     if spec is not None and chunks:
         yield from _chunks(name, chunks, spec, tasks, profile)
