@@ -55,7 +55,12 @@ def run_model(
     more = [line for line in extra.read_text().split("\n") if line] if extra.is_file() else []
     command = environment_command(find_model(name), [*TOOLS, *more, *added])
     if name == "lerobot":  # its arm and data sets, too
-        for package in ("vla-zenoh-lerobot", "vla-zenoh-dataset", "lerobot_robot_vla_zenoh"):
+        for package in (
+            "vla-zenoh-lerobot",
+            "vla-zenoh-dataset",
+            "vla-zenoh-benchmarks",
+            "lerobot_robot_vla_zenoh",
+        ):
             command += how_to_repeat(package)
     made = subprocess.run(
         [*command, "python", "-c", ""], env=environ, capture_output=True, text=True, check=False
