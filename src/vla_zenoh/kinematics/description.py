@@ -149,7 +149,8 @@ class Description:
             for name, joint in self.joints.items()
             if name in joints
             or (
-                joint.mimic is not None
+                joint.moves
+                and joint.mimic is not None
                 and joint.mimic.joint in self.joints
                 and self.follows(name).joint in joints
             )

@@ -100,7 +100,8 @@ class Kinematics:
             for name, joint in described.joints.items()
             if joint.moves and name not in arm_joints and name not in followers
         ]
-        self.locked_position = _locked(self.full_model, described, {**opened, **passive})
+        self._stand = {**opened, **passive}
+        self.locked_position = _locked(self.full_model, described, self._stand)
         self.model: Any = pin.buildReducedModel(
             self.full_model, self.locked_joints, self.locked_position
         )
@@ -138,6 +139,10 @@ class Kinematics:
     def joint_id(self, name: str) -> int:
         """Index of a joint in `full_model`."""
         return self.full_model.getJointId(self.described.model_name(name))
+
+    def stands_at(self, name: str) -> float:
+        """Where a joint is assumed to stand that is not commanded, m or rad."""
+        return _position(self.described, name, self._stand)
 
     def unit(self, index: int) -> str:
         """Of the positions of joint `index`: rad, or m where it slides."""

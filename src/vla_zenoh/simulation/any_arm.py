@@ -16,7 +16,7 @@ import numpy as np
 
 from vla_zenoh.errors import ResourceError
 from vla_zenoh.kinematics.collision import collision_shapes
-from vla_zenoh.kinematics.description import Description
+from vla_zenoh.kinematics.description import DescribedJoint, Description
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.types import FloatArray
 
@@ -44,13 +44,15 @@ def arm_spec(kinematics: Kinematics, fingers: Sequence[str]) -> mujoco.MjSpec:
             "which the description lets follow a joint of the arm (mimic)"
         )
     hand = described.led_by(fingers)
-    spec = mujoco.MjSpec.from_string(_bare(described, {*kinematics.arm_joints, *hand}))
+    moving = {*kinematics.arm_joints, *hand}
+    spec = mujoco.MjSpec.from_string(_bare(described, moving))
     spec.compiler.fusestatic = False  # links keep their names and frames
     spec.compiler.balanceinertia = True
     spec.compiler.boundmass = LEAST_MASS_KG
     spec.compiler.boundinertia = LEAST_INERTIA_KG_M2
-    for name, position in kinematics.locked_rad.items():
-        _fix(spec, described, name, position)
+    for name, joint in described.joints.items():
+        if joint.moves and name not in moving:
+            _fix(spec, joint, kinematics.stands_at(name))
     base = kinematics.base_placement.inverse()
     spec.bodies[1].pos = base.translation
     spec.bodies[1].quat = _quat_wxyz(base.rotation)
@@ -74,8 +76,10 @@ def _bare(described: Description, moving: Collection[str]) -> str:
     found = ElementTree.parse(described.path).getroot()
     bare = ElementTree.Element("robot", name="arm")
     for link in found.findall("link"):
-        made = ElementTree.SubElement(bare, "link", name=_link(link.attrib["name"]))
-        made.extend(link.findall("inertial"))
+        name = link.attrib["name"]
+        made = ElementTree.SubElement(bare, "link", name=_link(name))
+        if any(joint.name in moving for joint in described.chain(described.root, name)):
+            made.extend(each for each in link.findall("inertial") if _is_possible(each))
     for joint in found.findall("joint"):
         name = joint.attrib["name"]
         kind = joint.attrib["type"] if name in moving else "fixed"
@@ -88,13 +92,23 @@ def _bare(described: Description, moving: Collection[str]) -> str:
     return ElementTree.tostring(bare, encoding="unicode")
 
 
+def _is_possible(inertial: ElementTree.Element) -> bool:
+    """Whether a body can have this inertia; without one MuJoCo takes that of the shapes."""
+    found = inertial.find("inertia")
+    if found is None:
+        return False
+    xx, xy, xz, yy, yz, zz = (
+        float(found.get(name, "0")) for name in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+    )
+    return bool(np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])[0] > 0)
+
+
 def _link(name: str) -> str:
     return f"{MUJOCO_WORLD}_link" if name == MUJOCO_WORLD else name
 
 
-def _fix(spec: mujoco.MjSpec, described: Description, name: str, position: float) -> None:
+def _fix(spec: mujoco.MjSpec, joint: DescribedJoint, position: float) -> None:
     """Let a joint that does not move stand at `position`, m or rad."""
-    joint = described.joints[name]
     body = spec.body(_link(joint.child))
     axis = np.array(joint.axis)
     quat_wxyz = np.array(body.quat)

@@ -15,7 +15,7 @@ from vla_zenoh.control.preflight import Passing, PeerSnapshot, reasons_of_part, 
 from vla_zenoh.keys import LOADING, NOTHING_YET, OPENING
 from vla_zenoh.lab.check.fit import check_spec
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec
-from vla_zenoh.profile import load_profile
+from vla_zenoh.profile import load_profile, override
 from vla_zenoh.types import GripperState, Header, PoseState, Stamped
 
 
@@ -38,6 +38,28 @@ class Ready:
                 self.profile, self.worker, self.prompt, peers, self.chunk, now_ns, self.rate_hz
             ),
         ]
+
+
+GUESSED = ("robot.home_rad", "limits.joint.jerk_rad_s3")
+
+
+def test_a_real_arm_is_not_activated_while_a_guess_is_unconfirmed() -> None:
+    ready = Ready()
+    real = override(load_profile("ur5e_rtde"), {"unconfirmed": GUESSED})
+    reasons = reasons_of_part(real, ready.peers, ready.pose, ready.gripper, ready.now_ns)
+    assert (
+        "guessed and not confirmed: robot.home_rad, limits.joint.jerk_rad_s3; look at each in the "
+        "profile, correct it, and delete it from unconfirmed"
+    ) in reasons
+    confirmed = override(real, {"unconfirmed": ()})
+    left = reasons_of_part(confirmed, ready.peers, ready.pose, ready.gripper, ready.now_ns)
+    assert left == reasons[1:]
+
+
+def test_a_simulated_arm_is_activated_with_guesses() -> None:
+    ready = Ready()
+    ready.profile = override(ready.profile, {"unconfirmed": GUESSED})
+    assert ready.reasons() == []
 
 
 def without(peers: PeerSnapshot, *nodes: str) -> PeerSnapshot:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from descriptions import SEVEN, TOOL, Row, arm, urdf
+from described_arms import SEVEN, TOOL, Row, arm, urdf
 
 from vla_zenoh.kinematics.collision import CollisionModel
 from vla_zenoh.kinematics.kinematics import Kinematics

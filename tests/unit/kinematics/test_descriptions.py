@@ -3,183 +3,36 @@
 from __future__ import annotations
 
 import gzip
-from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 import pytest
-from descriptions import SEVEN, SIX, TOOL, Row, X, Y, Z, arm, tcp_in_base, urdf
+from described_arms import (
+    JOINTS_6,
+    SIX,
+    SLIDE,
+    TAKEN,
+    TOOL,
+    Row,
+    Y,
+    arm,
+    finger,
+    tcp_in_base,
+    urdf,
+)
 
 from vla_zenoh.errors import CodecError, ProfileError
 from vla_zenoh.kinematics.description import Description
 from vla_zenoh.kinematics.fingers import Fingers
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.lab.profile.check import check_profile
-from vla_zenoh.profile import GripperProfile, JointEnds
+from vla_zenoh.profile import GripperProfile
 from vla_zenoh.resources import ROBOT_DATA_PREFIX, robot_urdf
 from vla_zenoh.robots.joint_reading import JointReading
 from vla_zenoh.types.records import Joints
 
 EXACT = 1e-9
-JOINTS_6 = tuple(f"j{n}" for n in range(1, 7))
-JOINTS_7 = tuple(f"j{n}" for n in range(1, 8))
-SLIDE = Row("lift", axis=Z, kind="prismatic", ends=(0.0, 0.4), velocity=0.1)
-
-
-def finger(name: str, low: float, high: float, **more: object) -> Row:
-    """A finger that slides, at the link of joint 6."""
-    return Row(name, axis=Y, kind="prismatic", parent="j6_link", ends=(low, high), **more)  # type: ignore[arg-type]
-
-
-NOTHING: Mapping[str, float] = MappingProxyType({})
-
-
-class Taken(NamedTuple):
-    """A description that is taken, and what it means.
-
-    Args:
-        rows: its joints.
-        joints: that are commanded.
-        locked: of joints between base and TCP.
-        fingers: of the hand.
-        signs: of these.
-        base: frame of the poses.
-        ends: of the fingers, by the profile.
-    """
-
-    rows: list[Row]
-    joints: tuple[str, ...] = JOINTS_6
-    locked: Mapping[str, float] = NOTHING
-    fingers: tuple[str, ...] = ()
-    signs: tuple[float, ...] = ()
-    base: str = "base"
-    ends: JointEnds | None = None
-
-
-TAKEN: dict[str, Taken] = {
-    "six joints": Taken([*arm(SIX), TOOL]),
-    "seven joints": Taken([*arm(SEVEN), TOOL], JOINTS_7),
-    "on a pedestal": Taken(
-        [Row("mount", at_m=(0.3, 0.1, 0.9), kind="fixed", child="foot"), *arm(SIX), TOOL],
-        base="foot",
-    ),
-    "joints and links of one name": Taken(
-        [row._replace(child=row.name) for row in arm(SIX)] + [TOOL]
-    ),
-    "a joint with the name of another link": Taken(
-        [row._replace(child=f"j{n % 6 + 1}") for n, row in enumerate(arm(SIX), 1)] + [TOOL]
-    ),
-    "a joint with the name of the world": Taken(
-        [Row("universe"), *arm(SIX)[1:], TOOL], ("universe", *JOINTS_6[1:])
-    ),
-    "a torso that lifts": Taken([SLIDE, *arm(SIX), TOOL], locked={"lift": 0.25}),
-    "a torso that turns": Taken(
-        [Row("waist", at_m=(0.1, 0.0, 0.8)), *arm(SEVEN), TOOL], JOINTS_7, {"waist": -0.3}
-    ),
-    "a torso without limits": Taken(
-        [Row("waist", kind="continuous", limit=""), *arm(SIX), TOOL], locked={"waist": 2.0}
-    ),
-    "a wrist that is locked": Taken(
-        [*arm(SEVEN), TOOL], ("j1", "j2", "j3", "j4", "j6", "j7"), {"j5": 0.4}
-    ),
-    "a joint that keeps the hand level": Taken(
-        [*arm("zyyyx", j4=Row("j4", axis=Y, mimic=("j3", -1.0, 0.2))), TOOL],
-        ("j1", "j2", "j3", "j5"),
-    ),
-    "a joint that follows one that follows": Taken(
-        [
-            *arm(
-                SIX,
-                j3=Row("j3", axis=Y, mimic=("j2", 0.5, 0.1)),
-                j5=Row("j5", axis=Y, mimic=("j3", -2.0, 0.0)),
-            ),
-            TOOL,
-        ],
-        ("j1", "j2", "j4", "j6"),
-    ),
-    "a joint that follows a locked one": Taken(
-        [SLIDE, Row("lift_2", kind="prismatic", mimic=("lift", 1.0, 0.0)), *arm(SIX), TOOL],
-        locked={"lift": 0.1},
-    ),
-    "an arm on rails": Taken(
-        [Row("rail", axis=X, kind="prismatic", ends=(-0.5, 0.5)), *arm("yzy"), TOOL],
-        ("rail", "j1", "j2", "j3"),
-    ),
-    "a SCARA": Taken(
-        [*arm("zz"), Row("j3", axis=Z, kind="prismatic", ends=(-0.2, 0.0)), Row("j4"), TOOL],
-        ("j1", "j2", "j3", "j4"),
-    ),
-    "two arms": Taken(
-        [
-            *arm(SIX),
-            TOOL,
-            Row("l1", parent="base", at_m=(0.0, 0.4, 0.2)),
-            Row("l2", axis=Y),
-            Row("l3", axis=Y),
-        ]
-    ),
-    "wheels": Taken(
-        [*arm(SIX), TOOL, Row("wheel", parent="base", axis=Y, kind="continuous", limit="")]
-    ),
-    "a head that follows nothing known": Taken(
-        [*arm(SIX), TOOL, Row("neck", parent="base", mimic=("chin", 1.0, 0.0))]
-    ),
-    "axes that point backwards": Taken(
-        [*arm(SIX, j2=Row("j2", axis=(0.0, -1.0, 0.0)), j5=Row("j5", axis=(0.0, -1.0, 0.0))), TOOL]
-    ),
-    "an axis that is askew": Taken([*arm(SIX, j4=Row("j4", axis=(0.6, 0.0, 0.8))), TOOL]),
-    "joints listed in another order": Taken([*arm(SIX), TOOL], tuple(reversed(JOINTS_6))),
-    "links without shapes on the way": Taken(
-        [*arm(SIX), Row("flange", at_m=(0.0, 0.0, 0.0), kind="fixed"), TOOL]
-    ),
-    "fingers that slide alike": Taken(
-        [*arm(SIX), TOOL, finger("left", 0.0, 0.04), finger("right", 0.0, 0.04)],
-        fingers=("left", "right"),
-        signs=(1.0, 1.0),
-    ),
-    "fingers of opposite sign": Taken(
-        [*arm(SIX), TOOL, finger("left", 0.0, 0.035), finger("right", -0.035, 0.0)],
-        fingers=("left", "right"),
-        signs=(1.0, -1.0),
-    ),
-    "one finger of negative range": Taken(
-        [*arm(SIX), TOOL, finger("left", -0.044, 0.0)], fingers=("left",), signs=(-1.0,)
-    ),
-    "a finger that mimics the other, mirrored": Taken(
-        [
-            *arm(SIX),
-            TOOL,
-            finger("left", 0.021, 0.057),
-            finger("right", -0.057, -0.021, mimic=("left", -1.0, 0.0)),
-        ],
-        fingers=("left", "right"),
-        signs=(1.0, -1.0),
-        ends=JointEnds(0.057, 0.021, "m"),
-    ),
-    "a finger that mimics one that is not listed": Taken(
-        [
-            *arm(SIX),
-            TOOL,
-            finger("left", 0.0, 0.04),
-            finger("right", 0.0, 0.04, mimic=("left", 1.0, 0.0)),
-        ],
-        fingers=("left",),
-        signs=(1.0,),
-    ),
-    "knuckles that turn against each other": Taken(
-        [
-            *arm(SIX),
-            TOOL,
-            Row("left", axis=X, parent="j6_link", ends=(0.0, 0.8)),
-            Row("right", axis=X, parent="j6_link", ends=(-0.8, 0.0), mimic=("left", -1.0, 0.0)),
-        ],
-        fingers=("left", "right"),
-        signs=(1.0, -1.0),
-        ends=JointEnds(0.0, 0.8, "rad"),
-    ),
-}
 
 
 @pytest.mark.parametrize("name", TAKEN)

@@ -134,6 +134,13 @@ def posture_of(kinematics: Kinematics, table_z_m: float | None, answers: Answers
         home = answers.numbers("home", found.home_rad, "robot.home_rad", what, (size,))
         if home != found.home_rad:
             found = posture(kinematics, reach, home)
+    if found.may_touch:
+        pairs = "; ".join(" and ".join(pair) for pair in found.may_touch)
+        what = f"{pairs}: their shapes overlap almost wherever the arm is"
+        answers.guesses.append(Guess("limits.reach.may_touch", what))
+    if not found.free:
+        what = "no home was found that is away from singularities, the arm itself and the table"
+        answers.guesses.append(Guess("robot.home_rad", what))
     box = [edge for span in found.workspace_m for edge in span]
     what = "box of the TCP, m: what the arm reaches"
     x0, x1, y0, y1, z0, z1 = answers.numbers("workspace", box, "limits.workspace", what, (6,))

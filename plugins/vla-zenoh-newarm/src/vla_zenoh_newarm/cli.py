@@ -13,7 +13,7 @@ import typer
 
 from vla_zenoh.cli.options import JsonOption, model_options, options
 from vla_zenoh.cli.output import console, errors, fail, styled
-from vla_zenoh.errors import OutputError
+from vla_zenoh.errors import OutputError, VlaZenohError
 from vla_zenoh.lab.cli.output import print_json
 from vla_zenoh.lab.cli.output_path import ForceOption, output_file
 from vla_zenoh.lab.profile.check import check_profile
@@ -87,19 +87,29 @@ def new(
     a real one is not activated before they are gone.
     """
     source = robot_urdf(description)
-    name = re.sub(r"[^a-z0-9_]+", "_", source.name.partition(".")[0].lower()).strip("_") or "arm"
+    name = _name(output or source)
     file = output or Path(f"{name}.yaml")
     copy = file.with_name(f"{file.stem}_mended.urdf")
     with output_file(file, force=force, inputs=[source]) as part:
         if copy.exists() and not force:
             raise OutputError(f"{copy} exists; give another --output, or --force to replace it")
         answers = Answers(vars(given), ask=sys.stdin.isatty() and not yes)
-        arm = found_arm(source, copy, model_options(settings or []), answers)
+        try:
+            arm = found_arm(source, copy, model_options(settings or []), answers)
+        except VlaZenohError:
+            copy.unlink(missing_ok=True)
+            raise
         named = description if arm.file == source and _is_named(description) else ""
         path = named or os.path.relpath(arm.file.resolve(), file.resolve().parent)
-        text = profile_text(file.stem if output else name, description, path, arm)
+        text = profile_text(name, description, path, arm)
         part.write_text(text, "utf-8")
     _report(file, arm, as_json)
+
+
+def _name(file: Path) -> str:
+    """A name for a robot after its file."""
+    words = re.sub(r"[^a-z0-9_]+", "_", file.name.partition(".")[0].lower())
+    return words.strip("_") or "arm"
 
 
 def _is_named(description: str) -> bool:

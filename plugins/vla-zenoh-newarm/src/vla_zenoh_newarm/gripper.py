@@ -69,7 +69,7 @@ def _by_ends(described: Description, joints: Sequence[DescribedJoint]) -> Grippe
     lower, upper = tips.apart_m(first.lower), tips.apart_m(first.upper)
     opened, shut = (first.upper, first.lower) if upper >= lower else (first.lower, first.upper)
     low_m, high_m = WIDTHS_M
-    width_m = min(max(abs(upper - lower), low_m), high_m)
+    width_m = min(max(tips.width_m(opened, shut), low_m), high_m)
     values = {
         "max_width_m": round(width_m, 3),
         f"joint_open_{first.unit}": round(opened, 4),
@@ -96,21 +96,19 @@ class _Tips:
         self._described, self._joints = described, joints
         self._model: Any = pin.buildModelFromXML(described.text({}))
         self._data: Any = self._model.createData()
-        frames = self._model.frames
         moving = {self._id(name) for name in described.led_by(joints)}
         points: dict[int, list[FloatArray]] = {}
         for shape in collision_shapes(self._model, described.path).geometryObjects:
             if shape.parentJoint in moving:
                 middle = shape.placement * np.array(_middle(shape))
                 points.setdefault(shape.parentJoint, []).append(middle)
-        del frames
         self._tips = {
             joint: max(found, key=lambda point: float(np.linalg.norm(point)))
             for joint, found in points.items()
         }
 
     def apart_m(self, position: float) -> float:
-        """How far the two furthest tips are from each other, or the only one from its shut place.
+        """How far the two furthest tips are from each other; of a single one how far it turned.
 
         Args:
             position: of the first joint, m or rad.
@@ -125,8 +123,15 @@ class _Tips:
         pin.forwardKinematics(self._model, self._data, configuration)
         tips = [self._data.oMi[joint] * tip for joint, tip in self._tips.items()]
         if len(tips) < 2:
-            return abs(position) * (float(np.linalg.norm(next(iter(self._tips.values()), 0.1))))
+            return abs(position)
         return max(float(np.linalg.norm(a - b)) for a in tips for b in tips)
+
+    def width_m(self, opened: float, shut: float) -> float:
+        """Opening between two positions of the first joint."""
+        if len(self._tips) > 1:
+            return self.apart_m(opened) - self.apart_m(shut)
+        length_m = max((float(np.linalg.norm(tip)) for tip in self._tips.values()), default=0.0)
+        return abs(opened - shut) * length_m
 
     def _id(self, name: str) -> int:
         return self._model.getJointId(self._described.model_name(name))

@@ -10,8 +10,10 @@ import math
 import tempfile
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 
+import coal
 import numpy as np
 
 from vla_zenoh.errors import ProfileError, in_words
@@ -62,10 +64,11 @@ class Mended:
             return Description(path)
 
     def give_ends(self, joints: Collection[str]) -> None:
-        """Give those of `joints` that turn endlessly ends."""
-        endless = [name for name in _give_ends(self._robot) if name in joints]
+        """Give those of `joints` that turn endlessly ends, and a velocity."""
+        endless = list(_give_ends(self._robot, joints))
         if endless:
             self.changes.append(f"{', '.join(endless)}: endless, here from -pi to pi")
+            self.guesses += _give_velocities(self._robot)
 
     def save(self, copy: Path) -> Path:
         """The description to use: the given file, or where something was changed, a copy."""
@@ -111,10 +114,10 @@ def _expanded(source: Path, arguments: Mapping[str, str]) -> str | None:
 
 
 # -- joints ---------------------------------------------------------------------------------------
-def _give_ends(robot: ElementTree.Element) -> Iterator[str]:
-    """Names of the joints that turned endlessly."""
+def _give_ends(robot: ElementTree.Element, joints: Collection[str]) -> Iterator[str]:
+    """Names of those of `joints` that turned endlessly."""
     for joint in robot.findall("joint"):
-        if joint.get("type") != "continuous":
+        if joint.get("type") != "continuous" or joint.get("name") not in joints:
             continue
         joint.set("type", "revolute")
         limit = _limit(joint)
@@ -175,12 +178,14 @@ def _give_shapes(robot: ElementTree.Element, source: Path) -> Iterator[str]:
             for collision in link.findall("collision"):
                 link.remove(collision)
             ends = list(_ends(robot, str(link.get("name"))))
+            if link not in bare and not ends:
+                ends = [np.zeros(3)]
             link.extend(_plain_shape(end) for end in ends)
             missing += [str(link.get("name"))] if ends else []
     if missing:
         yield (
             f"shapes of {', '.join(missing)}: cylinders from joint to joint, since their meshes "
-            "were not found"
+            "cannot be read"
         )
 
 
@@ -212,7 +217,7 @@ def _plain_shape(end: FloatArray) -> ElementTree.Element:
 
 
 def _mesh(name: str, source: Path) -> Path | None:
-    """The file of a mesh, which is looked for as Pinocchio does."""
+    """The file of a mesh, looked for as Pinocchio does; None: there is none that can be read."""
     if Path(name).suffix.lower() not in MESHES:
         return None
     kind, _, rest = name.rpartition("://")
@@ -221,8 +226,17 @@ def _mesh(name: str, source: Path) -> Path | None:
         folders, rest = [Path("/")], rest.lstrip("/")
     for folder in folders:
         if (found := folder / rest).is_file():
-            return found
+            return found if _is_readable(found) else None
     return None
+
+
+@cache
+def _is_readable(file: Path) -> bool:
+    try:
+        coal.MeshLoader().load(str(file), np.ones(3))
+    except (RuntimeError, ValueError):
+        return False
+    return True
 
 
 def _name_meshes(robot: ElementTree.Element, source: Path) -> None:

@@ -13,11 +13,13 @@ from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import POSE_JOINTS, ReachLimits
 from vla_zenoh.types import FloatArray
 
-SAMPLES = 3000
+SAMPLES = 1000
 BEST = 150
 """Samples of which distances are computed, the best first."""
 INNER = 0.75
 """Part of each joint's range, about its middle, in which a home lies."""
+OVERLAPS, OVERLAP_SHARE = 4, 0.9
+"""Pairs of links that may touch, at most, less one; the share of samples in which they overlap."""
 WAY_M = 0.08
 """A home has this way up and down."""
 ABOVE_TABLE = 0.2
@@ -42,12 +44,14 @@ class Posture(NamedTuple):
         workspace_m: x, y and z.
         reach_m: of the TCP from the base, horizontally.
         free: the arm at home is near nothing; else `home_rad` is the best there is.
+        may_touch: links whose shapes overlap almost wherever the arm is.
     """
 
     home_rad: tuple[float, ...]
     workspace_m: tuple[Span, Span, Span]
     reach_m: float
     free: bool
+    may_touch: tuple[tuple[str, str], ...] = ()
 
 
 def posture(kinematics: Kinematics, reach: ReachLimits, home_rad: Sequence[float]) -> Posture:
@@ -64,12 +68,12 @@ def posture(kinematics: Kinematics, reach: ReachLimits, home_rad: Sequence[float
     places_m = np.array([kinematics.forward(middle + half * each).position_m for each in shares])
     table_m = reach.table_z_m if reach.table_z_m is not None else float(places_m[:, 2].min())
     reach_m = float(np.quantile(np.linalg.norm(places_m[:, :2], axis=1), REACH_SHARE))
-    free = True
+    free, touching = True, ()
     if home_rad:
         home = np.array(home_rad, float)
     else:
         inner = middle + INNER * half * shares
-        home, free = _home(kinematics, reach, inner, table_m, reach_m)
+        home, free, touching = _home(kinematics, reach, inner, table_m, reach_m)
     at_m = kinematics.forward(home).position_m
     edges = np.quantile(places_m, (1 - REACH_SHARE, REACH_SHARE), axis=0)
     lower = np.minimum(np.floor(edges[0] * 20) / 20, at_m - MARGIN_M)
@@ -77,7 +81,7 @@ def posture(kinematics: Kinematics, reach: ReachLimits, home_rad: Sequence[float
     if reach.table_z_m is not None:
         lower[2] = min(max(lower[2], table_m + ABOVE_M), float(at_m[2]) - ABOVE_M)
     x, y, z = zip(np.round(lower, 3).tolist(), np.round(upper, 3).tolist(), strict=True)
-    return Posture(tuple(home.tolist()), (x, y, z), reach_m, free)
+    return Posture(tuple(home.tolist()), (x, y, z), reach_m, free, touching)
 
 
 def _home(
@@ -86,17 +90,37 @@ def _home(
     samples_rad: FloatArray,
     table_m: float,
     reach_m: float,
-) -> tuple[FloatArray, bool]:
-    """The best of the samples that is near nothing, and whether there is one."""
+) -> tuple[FloatArray, bool, tuple[tuple[str, str], ...]]:
+    """The best of the samples that is near nothing; whether there is one; links that may touch."""
     scores = np.array([_score(kinematics, each, table_m, reach_m) for each in samples_rad])
-    order = np.argsort(-scores)[:BEST]
-    found = samples_rad[order[0]]
-    barriers = Barriers(kinematics, reach, found)
-    for index in order:
-        home = np.round(samples_rad[index], 2)
-        if _is_free(kinematics, barriers, home):
-            return home, True
-    return np.round(found, 2), False
+    homes = np.round(samples_rad[np.argsort(-scores)[:BEST]], 2)
+    touching: tuple[tuple[str, str], ...] = ()
+    for _ in range(OVERLAPS):
+        allowed = reach.model_copy(update={"may_touch": touching})
+        barriers = Barriers(kinematics, allowed, homes[0])
+        for home in homes:
+            if _is_free(kinematics, barriers, home):
+                return home, True, touching
+        overlap = _overlap(kinematics, barriers, homes)
+        if overlap is None:
+            break
+        touching = (*touching, overlap)
+    return homes[0], False, ()
+
+
+def _overlap(
+    kinematics: Kinematics, barriers: Barriers, homes: FloatArray
+) -> tuple[str, str] | None:
+    """The two links whose shapes overlap at almost all of these homes; None: there are none."""
+    left = [barriers.at(home, kinematics.jacobian(home))[1:] for home in homes]
+    shares = np.mean(np.array(left) < 0.0, axis=0)
+    for index in np.argsort(-shares):
+        pair = barriers.collisions.pairs[index]
+        if shares[index] < OVERLAP_SHARE:
+            return None
+        if pair.limit == "self_collision":
+            return pair.first, pair.second
+    return None
 
 
 def _score(kinematics: Kinematics, joints_rad: FloatArray, table_m: float, reach_m: float) -> float:

@@ -77,7 +77,9 @@ def profile_text(name: str, source: str, description: str, arm: Arm) -> str:
         f"    velocity_rad_s: {_row(motion.velocity)}",
         f"    acceleration_rad_s2: {_row(motion.acceleration)}{mark(acceleration)}",
         f"    jerk_rad_s3: {_row(motion.jerk)}{mark(jerk)}",
-        f"  reach: {{table_z_m: {table}}}{mark('limits.reach.table_z_m')}",
+        "  reach:",
+        f"    table_z_m: {table}{mark('limits.reach.table_z_m')}",
+        *_may_touch(home.may_touch),
         "",
         "cameras: # of the scene; a real arm has others",
         '  front: {source: "sim:front"}',
@@ -97,6 +99,13 @@ def profile_text(name: str, source: str, description: str, arm: Arm) -> str:
             lines += [f"  # {each}" for each in what]
             lines += [f"  - {place}"]
     return "\n".join(lines) + "\n"
+
+
+def _may_touch(pairs: Sequence[tuple[str, str]]) -> list[str]:
+    if not pairs:
+        return []
+    rows = [f"      - [{_text(first)}, {_text(second)}]" for first, second in pairs]
+    return ["    may_touch: # a guess", *rows]
 
 
 def _row(values: Sequence[float]) -> str:

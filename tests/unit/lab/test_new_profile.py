@@ -1,0 +1,241 @@
+"""`profile new`: what is found in a description, what is mended and guessed, who answers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import combinations
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from described_arms import SEVEN, SIX, TOOL, Row, X, Y, arm, finger, urdf
+from vla_zenoh_newarm.answers import Answers
+from vla_zenoh_newarm.gripper import gripper
+from vla_zenoh_newarm.mended import Mended
+from vla_zenoh_newarm.structure import structure
+
+from vla_zenoh.errors import ProfileError
+from vla_zenoh.kinematics.description import Description
+
+JOINTS_6 = tuple(f"j{n}" for n in range(1, 7))
+OPTIONS = ("base", "tcp", "home", "workspace", "table", "acceleration", "jerk", "gripper")
+
+
+class Found(NamedTuple):
+    """A description, and what is found in it.
+
+    Args:
+        rows: its joints.
+        arm: joints that are commanded.
+        tcp: link that is controlled.
+        base: link of the poses.
+        fingers: joints of the hand.
+        values: of its gripper.
+    """
+
+    rows: list[Row]
+    arm: tuple[str, ...] = JOINTS_6
+    tcp: str = "tcp"
+    base: str = "base"
+    fingers: tuple[str, ...] = ()
+    values: Mapping[str, float] = {}
+
+
+LEFT, RIGHT = finger("left", 0.0, 0.04), finger("right", 0.0, 0.04)
+MIRRORED = finger("right", -0.04, 0.0, mimic=("left", -1.0, 0.0))
+JAW = Row("jaw", axis=X, parent="j6_link", ends=(-0.2, 1.2), at_m=(0.0, 0.0, 0.02))
+TIP = Row("jaw_tip", parent="jaw_link", kind="fixed", at_m=(0.0, 0.08, 0.0))
+FOUND: dict[str, Found] = {
+    "six joints and a tool": Found([*arm(SIX), TOOL]),
+    "no link for the TCP": Found(arm(SIX), tcp="j6_link"),
+    "a head beside the arm": Found([*arm(SIX), TOOL, Row("neck", parent="base"), Row("nod")]),
+    "a torso under seven joints": Found(
+        [Row("lift", kind="prismatic", ends=(0.0, 0.3)), *arm(SEVEN), TOOL],
+        arm=tuple(f"j{n}" for n in range(1, 8)),
+        base="lift_link",
+    ),
+    "wheels": Found([*arm(SIX), TOOL, Row("wheel", parent="base", kind="continuous", limit="")]),
+    "fingers that slide": Found(
+        [*arm(SIX), TOOL, LEFT, RIGHT],
+        fingers=("left", "right"),
+        values={"max_width_m": 0.08},
+    ),
+    "a finger that follows": Found(
+        [*arm(SIX), TOOL, LEFT, MIRRORED],
+        fingers=("left", "right"),
+        values={"max_width_m": 0.08},
+    ),
+    "a jaw that turns": Found(
+        [*arm(SIX), TOOL, JAW, TIP],
+        fingers=("jaw",),
+        values={"max_width_m": 0.112, "joint_open_rad": 1.2, "joint_shut_rad": -0.2},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FOUND)
+def test_arm_hand_and_tcp_are_found(tmp_path: Path, name: str) -> None:
+    case = FOUND[name]
+    path = tmp_path / "arm.urdf"
+    path.write_text(urdf(case.rows))
+    found = structure(Description(path), None, None)
+    assert (found.arm, found.tcp, found.base) == (case.arm, case.tcp, case.base)
+    hand = gripper(Description(path), found.fingers)
+    assert hand.joints == case.fingers
+    assert dict(hand.values) == pytest.approx(dict(case.values), abs=2e-3)
+
+
+def test_of_two_arms_one_is_taken_and_the_other_named(tmp_path: Path) -> None:
+    path = tmp_path / "arms.urdf"
+    other = [row._replace(name=f"o{row.name}", parent="") for row in arm(SIX)]
+    other[0] = other[0]._replace(parent="base", at_m=(0.0, 0.5, 0.2))
+    path.write_text(urdf([*arm(SIX), TOOL, *other]))
+    found = structure(Description(path), None, None)
+    assert (found.tcp, found.other_tcps) == ("tcp", ("oj6_link",))
+    assert structure(Description(path), None, "oj6_link").arm == tuple(
+        f"oj{n}" for n in range(1, 7)
+    )
+
+
+def test_a_hand_of_many_joints_is_left_still_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "hand.urdf"
+    many = [Row(f"finger{n}", axis=X, parent="j6_link") for n in range(4)]
+    path.write_text(urdf([*arm(SIX), TOOL, *many]))
+    found = structure(Description(path), None, None)
+    hand = gripper(Description(path), found.fingers)
+    assert hand.joints == ()
+    assert "finger0, finger1, finger2, finger3" in hand.why
+
+
+# -- what is mended -------------------------------------------------------------------------------
+MESH = '<mesh filename="package://away/link.stl"/>'
+BALL = '<sphere radius="0.02"/>'
+
+
+def mended(folder: Path, text: str) -> tuple[Description, Mended]:
+    """The description that is saved for this one, and how it was mended."""
+    source = folder / "arm.urdf"
+    source.write_text(text)
+    made = Mended(source, {})
+    made.described()
+    made.give_ends(JOINTS_6)
+    return Description(made.save(folder / "copy.urdf")), made
+
+
+def test_what_lacks_nothing_is_used_as_it_is(tmp_path: Path) -> None:
+    found, made = mended(tmp_path, urdf([*arm(SIX), TOOL]))
+    assert found.path.name == "arm.urdf"
+    assert (made.changes, made.guesses) == ([], [])
+    assert not (tmp_path / "copy.urdf").exists()
+
+
+def test_an_endless_joint_of_the_arm_gets_ends_and_a_wheel_does_not(tmp_path: Path) -> None:
+    endless = Row("j6", kind="continuous", limit='<limit effort="5" velocity="2"/>')
+    wheel = Row("wheel", parent="base", kind="continuous", limit="")
+    found, made = mended(tmp_path, urdf([*arm(SIX, j6=endless), TOOL, wheel]))
+    assert (found.joints["j6"].lower, found.joints["j6"].upper) == pytest.approx((-3.1416, 3.1416))
+    assert "j6: endless" in made.changes[0]
+    assert "wheel" not in made.changes[0]
+
+
+@pytest.mark.parametrize("limit", ["", '<limit lower="-2" upper="2" effort="0" velocity="0"/>'])
+def test_a_joint_without_a_velocity_gets_one_as_a_guess(tmp_path: Path, limit: str) -> None:
+    found, made = mended(tmp_path, urdf([*arm(SIX, j2=Row("j2", axis=Y, limit=limit)), TOOL]))
+    assert found.joints["j2"].velocity == 1.0
+    assert "velocity of j2: 1 rad/s" in made.guesses[0]
+
+
+def test_a_link_whose_mesh_is_not_there_gets_a_plain_shape_as_a_guess(tmp_path: Path) -> None:
+    text = urdf([*arm(SIX), TOOL]).replace(BALL, MESH, 3)
+    found, made = mended(tmp_path, text)
+    assert "shapes of base, j1_link, j2_link" in made.guesses[0]
+    assert "away" not in found.path.read_text()
+
+
+def test_a_link_whose_mesh_cannot_be_read_gets_a_plain_shape_too(tmp_path: Path) -> None:
+    (tmp_path / "link.stl").write_bytes(b"solid")
+    text = urdf([*arm(SIX), TOOL]).replace(BALL, '<mesh filename="link.stl"/>', 1)
+    _, made = mended(tmp_path, text)
+    assert "shapes of base" in made.guesses[0]
+
+
+def test_a_description_without_any_shapes_gets_some(tmp_path: Path) -> None:
+    found, made = mended(tmp_path, urdf([*arm(SIX), TOOL], shapes=False))
+    assert "shapes of j1_link" in made.guesses[0]
+    assert found.path.read_text().count("<collision>") >= len(JOINTS_6) - 1
+
+
+def test_a_mesh_is_found_wherever_the_copy_is(tmp_path: Path) -> None:
+    package = tmp_path / "away"
+    package.mkdir()
+    corners = ("0 0 0", "1 0 0", "0 1 0", "0 0 1")
+    facets = [
+        f"facet normal 0 0 1\nouter loop\n{''.join(f'vertex {c}{chr(10)}' for c in each)}endloop\n"
+        "endfacet\n"
+        for each in combinations(corners, 3)
+    ]
+    (package / "link.stl").write_text(f"solid link\n{''.join(facets)}endsolid link\n")
+    endless = Row("j6", kind="continuous", limit="")
+    text = urdf([*arm(SIX, j6=endless), TOOL]).replace(BALL, MESH, 1)
+    found, _ = mended(tmp_path, text)
+    assert str(package / "link.stl") in found.path.read_text()
+
+
+def test_a_xacro_is_expanded(tmp_path: Path) -> None:
+    source = tmp_path / "arm.urdf.xacro"
+    space = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'
+    argument = '<xacro:arg name="high" default="0.1"/>'
+    text = urdf([*arm(SIX), TOOL]).replace('name="made">', f'name="made" {space}>{argument}', 1)
+    source.write_text(text.replace('xyz="0.0 0.0 0.1"', 'xyz="0 0 $(arg high)"'))
+    made = Mended(source, {"high": "0.3"})
+    assert made.described().joints["tool"].offset_m == (0.0, 0.0, 0.3)
+    assert "expanded" in made.changes[0]
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("<mujoco/>", "is MJCF, the format of MuJoCo: give the maker's URDF"),
+        ("robot", "is no XML"),
+        ('<robot name="a"><link name="a"/></robot>', "has no joint that moves"),
+        (
+            '<robot name="a"><link name="a"/><joint name="j" type="fixed"><parent link="a"/>'
+            '<child link="${b}"/></joint></robot>',
+            "is a xacro and cannot be expanded",
+        ),
+    ],
+)
+def test_what_is_no_arm_is_refused_by_name(tmp_path: Path, text: str, says: str) -> None:
+    source = tmp_path / "arm.urdf"
+    source.write_text(text)
+    with pytest.raises(ProfileError, match=says.replace("(", r"\(")):
+        structure(Mended(source, {}).described(), None, None)
+
+
+# -- who answers ----------------------------------------------------------------------------------
+def answers(**given: str) -> Answers:
+    return Answers({name: given.get(name) for name in OPTIONS}, ask=False)
+
+
+def test_what_is_answered_is_no_guess_and_the_rest_is() -> None:
+    person = answers(jerk="60,61")
+    assert person.numbers("jerk", (1.0,), "limits.joint.jerk_rad_s3", "", (1, 2)) == (60.0, 61.0)
+    assert person.numbers("home", (1.0, 0.5), "robot.home_rad", "", (2,)) == (1.0, 0.5)
+    assert [guess.place for guess in person.guesses] == ["robot.home_rad"]
+
+
+@pytest.mark.parametrize("text", ["60,61,62", "fast", "", "none"])
+def test_an_answer_that_does_not_fit_is_refused_by_its_option(text: str) -> None:
+    with pytest.raises(ProfileError, match=r"--jerk .*give 1 or 2 number"):
+        answers(jerk=text).numbers("jerk", (1.0,), "limits.joint.jerk_rad_s3", "", (1, 2))
+
+
+def test_enter_keeps_a_guess_unconfirmed_and_another_answer_confirms(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    said = iter(["1", "2"])
+    monkeypatch.setattr("typer.prompt", lambda *_, **__: next(said))
+    person = Answers(dict.fromkeys(OPTIONS), ask=True)
+    assert person.numbers("table", (1.0,), "limits.reach.table_z_m", "", (1,)) == (1.0,)
+    assert person.numbers("jerk", (1.0,), "limits.joint.jerk_rad_s3", "", (1,)) == (2.0,)
+    assert [guess.place for guess in person.guesses] == ["limits.reach.table_z_m"]
