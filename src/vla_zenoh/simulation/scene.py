@@ -118,12 +118,29 @@ def build_model(
     except (ValueError, mujoco.FatalError) as error:
         described = " and ".join(dict.fromkeys(robot.description for robot in robots))
         raise ResourceError(f"MuJoCo rejects scene {path} with {described}: {error}") from error
+    for robot in robots:
+        if robot.robot is not None:
+            _let_through(model, robot, robot.robot.home_rad)
     # Two groups for ray casting.
     moving = model.body_weldid[model.geom_bodyid] != 0
     visible = model.geom_group < HIDDEN_GROUP
     model.geom_group[visible & moving] = MOVING_GROUP
     model.geom_group[visible & ~moving] = STATIC_GROUP
     return model
+
+
+def _let_through(model: mujoco.MjModel, robot: RobotModel, home_rad: Sequence[float]) -> None:
+    """Let shapes of the arm that are inside the table at home, as a shoulder's, touch nothing."""
+    data, prefix = mujoco.MjData(model), prefix_of(robot)
+    for name, position in zip(robot.arm_joints, home_rad, strict=True):
+        data.joint(prefix + name).qpos[0] = position
+    mujoco.mj_forward(model, data)
+    moves = model.body_weldid[model.geom_bodyid] != 0
+    bodies = [model.body(int(body)).name for body in model.geom_bodyid]
+    own = np.array([name.startswith(prefix) for name in bodies]) & moves
+    for pair in data.contact.geom[data.contact.dist < 0]:
+        if not moves[pair].all():
+            model.geom_contype[pair[own[pair]]] = 0
 
 
 def _robot_spec(robot: RobotModel, joint_friction_nm: float) -> mujoco.MjSpec:
