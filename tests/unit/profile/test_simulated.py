@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-from vla_zenoh.lab.profile.check import check_profile
 from vla_zenoh.profile import load_profile, read_profile, simulated, to_yaml
 from vla_zenoh.resources import names
 
@@ -34,9 +33,3 @@ def test_a_real_robot_is_simulated_with_what_its_profile_says_else(name: str) ->
 def test_a_simulated_robot_stays_as_it_is() -> None:
     profile = load_profile("panda_sim")
     assert simulated(profile) is profile
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", ["so101_lerobot", "ur5e_rtde"])
-def test_the_check_with_sim_builds_the_simulated_robot(name: str) -> None:
-    assert check_profile(name, sim=True).errors == []
