@@ -181,10 +181,13 @@ OF_ONE_SCENE = {"scripted_pair", "scripted_pick"}
 OF_BENCHMARKS = {"libero_privileged", "metaworld_expert", "ogbench_expert", "so101_expert"}
 """They act on what a benchmark knows, which no observation of a check has."""
 
+OF_A_CLIENT = {"physicalai_client"}
+"""It has no answer without one: tests/unit/policy/test_physicalai_client.py."""
+
 
 def test_every_shipped_worker_is_checked() -> None:
     here = {"brick", "replay", "scripted", *ADAPTERS}
-    elsewhere = IN_ENVIRONMENTS_OF_THEIR_OWN | OF_ONE_SCENE | OF_BENCHMARKS
+    elsewhere = IN_ENVIRONMENTS_OF_THEIR_OWN | OF_ONE_SCENE | OF_BENCHMARKS | OF_A_CLIENT
     assert here | elsewhere == set(resources.names("models"))
 
 

@@ -32,9 +32,10 @@ ELSEWHERE = {
     "openvla",
     "openvla_rest",
     "origami",
+    "physicalai_client",
     "xpolicylab",
 }
-"""They need weights, or a server: tested with those, by themselves."""
+"""They need weights, a server or a client: tested with those, by themselves."""
 EXPERTS = {"libero_privileged", "metaworld_expert", "ogbench_expert", "so101_expert"}
 """They need their benchmark and its state."""
 HERE = [name for name in MODELS if name not in ELSEWHERE | EXPERTS]

@@ -1,0 +1,63 @@
+"""Tests against others' packages that put robots on Zenoh, each in an environment of its own.
+
+    .venv/bin/python scripts/test_rivals.py [PYTEST OPTIONS]
+
+uv makes the environments in ``.tools/rivals``, once. Of physicalai only what its robots' transport
+imports is installed: the rest is its inference, half a gigabyte.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import sysconfig
+from pathlib import Path
+
+from bootstrap import TOOLS, uv_environment
+
+ROOT = Path(__file__).resolve().parent.parent
+PHYSICALAI = "PHYSICALAI_PYTHON"
+"""Environment variable with the Python that has physicalai."""
+ALONE = ("physicalai==0.3.0",)
+NEEDED = (
+    "eclipse-zenoh==1.9.0",
+    "iceoryx2==0.9.0",
+    "jsonargparse[signatures]==4.53.0",
+    "loguru==0.7.3",
+    "msgpack==1.2.1",
+    "numpy==2.4.6",
+    "pydantic==2.14.4",
+    "pyyaml==6.0.4",
+)
+
+
+def environment(uv: str, environ: dict[str, str]) -> str:
+    """Make the environment of physicalai unless it is there; its Python."""
+    folder = TOOLS / "rivals" / "physicalai"
+    python, ready = folder / "bin" / "python", folder / "ready"
+    told = "\n".join((*ALONE, *NEEDED))
+    if not ready.is_file() or ready.read_text() != told:
+        install = [uv, "--quiet", "pip", "install", "--python", str(python)]
+        for command in (
+            [uv, "--quiet", "venv", "--clear", "--python", sys.executable, str(folder)],
+            [*install, "--no-deps", *ALONE],
+            [*install, *NEEDED],
+        ):
+            subprocess.run(command, env=environ, check=True)
+        ready.write_text(told)
+    return str(python)
+
+
+def main() -> int:
+    """Make the environments and run the tests; the exit status."""
+    environ = uv_environment(os.environ)
+    uv = str(Path(sysconfig.get_path("scripts")) / "uv")
+    if PHYSICALAI not in environ:
+        environ[PHYSICALAI] = environment(uv, environ)
+    command = [sys.executable, "-m", "pytest", "-m", "rivals", "tests/rivals", *sys.argv[1:]]
+    return subprocess.run(command, cwd=ROOT, env=environ, check=False).returncode
+
+
+if __name__ == "__main__":
+    sys.exit(main())
