@@ -511,6 +511,22 @@ def test_joints_that_are_published_in_another_order_are_exported_as_a_policy_is_
     np.testing.assert_allclose(found, [[*values.values()]] * len(found), atol=STATE_ATOL)
 
 
+def test_joints_that_a_model_names_in_another_order_are_exported_as_a_policy_is_asked_for_them(
+    tmp_path: Path,
+) -> None:
+    names = tuple(load_profile("panda_sim").robot.arm_joints)
+    found = []
+    for order in (names, names[::-1]):
+        of = spec(space="joint", joints=order, kind="absolute", gripper="open_fraction")
+        run = make_run(tmp_path / f"{order[0]}.mcap", of=of, prompts=PROMPTS[:1])
+        (episode,) = episodes_of(load_run(run))
+        assert episode.spec.action.joints == names
+        found.append(np.array([frame.action for frame in episode.frames]))
+    one, other = found
+    np.testing.assert_array_equal(one[:, : len(names)], other[:, len(names) - 1 :: -1])
+    np.testing.assert_array_equal(one[:, -1], other[:, -1])
+
+
 def test_a_home_that_was_changed_between_runs_does_not_change_the_signs_of_rotations(
     tmp_path: Path,
 ) -> None:

@@ -158,7 +158,7 @@ def _episode(
     run: Run, whose: str, led: list[Span], carried_out: list[RecordedSample], people: set[str]
 ) -> RecordedEpisode:
     own = [chunk for span in led if span[2] == whose for chunk in _within(span, carried_out)]
-    spec, own = _one_by_one(_spec_of(run, own), own)
+    spec, own = _one_by_one(*_in_order_of_profile(run, _spec_of(run, own), own))
     mixed = any(worker != whose for _, _, worker in led)
     motion = commanded_motion(run, spec.action) if mixed else None
     parts = [(span, _within(span, own)) for span in led]
@@ -197,6 +197,33 @@ def _spec_of(run: Run, chunks: list[RecordedSample]) -> ModelSpec:
             "one activation"
         )
     return specs[0]
+
+
+def _in_order_of_profile(
+    run: Run, spec: ModelSpec, chunks: list[RecordedSample]
+) -> tuple[ModelSpec, list[RecordedSample]]:
+    """Columns of joints in the order of the profile, in which a policy is told its state.
+
+    A model may name its joints in another order; a policy that is trained on the data is asked for
+    them in this one.
+    """
+    order, parts = np.arange(spec.action.dimension), {}
+    for part in spec.parts:
+        own = parts[part] = spec.action.of(part)
+        joints = tuple(run.of_part(part).profile.robot.arm_joints) if own.joints else ()
+        if set(joints) != set(own.joints):  # never of a command node, which rejects such a spec
+            continue
+        begin = spec.action.columns(part).start
+        order[begin : begin + len(joints)] = [begin + own.joints.index(name) for name in joints]
+        parts[part] = own.model_copy(update={"joints": joints})
+    action = ActionSpec.of_parts(parts) if spec.action.parts else parts[""]
+    if action == spec.action:
+        return spec, chunks
+    out = [
+        chunk._replace(record=replace(chunk.record, steps=chunk.record.steps[:, order]))
+        for chunk in chunks
+    ]
+    return spec.model_copy(update={"action": action}), out
 
 
 def _one_by_one(
