@@ -36,7 +36,7 @@ from vla_zenoh_benchmarks.lockstep.loop import Lockstep
 from vla_zenoh_benchmarks.lockstep.worker import Delays
 
 from benchmarks.lockstep_arm import LOOK_S, activated, in_processes
-from vla_zenoh.control.limits import joint_motion_limits, workspace_corners
+from vla_zenoh.control.limits import chain_motion_limits, workspace_corners
 from vla_zenoh.control.reachability import Barriers, ReachabilityFilter
 from vla_zenoh.kinematics.kinematics import Kinematics, pose_error, smallest_singular_value
 from vla_zenoh.kinematics.so3 import quat_from_rotation
@@ -198,7 +198,7 @@ def random_track(arm: Arm, seed: int, duration_s: float, spread_rad: float) -> T
 def is_free(arm: Arm, track: Track) -> bool:
     """Whether no bound is near."""
     moment_s = track.duration_s / (len(track.rows_rad) - 1)
-    bounds = joint_motion_limits(arm.profile, arm.kinematics)
+    bounds = chain_motion_limits(arm.profile, arm.kinematics)
     rates = np.diff(track.rows_rad, axis=0) / moment_s
     if (np.abs(rates) > SHARE * bounds.velocity_rad_s).any():
         return False

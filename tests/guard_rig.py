@@ -19,13 +19,12 @@ from ruckig import (
     Trajectory,
 )
 
-from vla_zenoh.control.limits import JointMotionLimits, motion_limits
+from vla_zenoh.control.limits import JointMotionLimits, joint_motion_limits, motion_limits
 from vla_zenoh.control.smoothing import Motion, Smoother
 from vla_zenoh.guard.reference_governor import BRAKE_MARGIN
 from vla_zenoh.guard.stream_guard import (
     JointGuard,
     PoseGuard,
-    joint_motion_limits,
     pose_brake_limits,
 )
 from vla_zenoh.kinematics.so3 import Pose, exp3, log3, quat_from_rotation

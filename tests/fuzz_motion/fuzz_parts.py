@@ -129,7 +129,7 @@ def least_m(kind: str, seed: int, ticks: int) -> tuple[float, int]:
     for _ in range(ticks):
         at = pair.tick()
         least = min(least, apart_m(*at))
-        held += pair.commander.parts[0].motion.held
+        held += pair.commander.parts[0].motion.must_pause
     return float(least), held
 
 

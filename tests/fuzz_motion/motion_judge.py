@@ -12,9 +12,8 @@ from motion_case import Case
 from motion_rig import HAS_SPEED, Tick, Trace
 from numpy.typing import NDArray
 
-from vla_zenoh.control.limits import ROTATION_BOX, motion_limits
+from vla_zenoh.control.limits import ROTATION_BOX, joint_motion_limits, motion_limits
 from vla_zenoh.guard.reference_governor import BRAKE_MARGIN
-from vla_zenoh.guard.stream_guard import joint_motion_limits
 
 Array = NDArray[np.float64]
 

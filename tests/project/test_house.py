@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -40,7 +41,7 @@ def test_constants_are_names_in_capitals_and_conditions_on_the_space_are_counted
     code = "SLOW, FAST = 1, 2\nBOTH: int = 3\nother = 4\n"
     code += "if action.space == 'joint':\n    pass\nwhile other:\n    pass\n"
     path.write_text(code, "utf-8")
-    assert house.constants_in(path) == 3
+    assert house.constants_in(path) == ["SLOW", "FAST", "BOTH"]
     assert house.branches_on_space(path) == 1
 
 
@@ -52,6 +53,13 @@ def test_modules_that_cannot_be_imported_are_left_out_and_it_says_what_to_do(
     told = capsys.readouterr().err
     assert "a_library_that_is_not_there" in told
     assert "`make setup`" in told
+
+
+def test_a_constant_of_the_control_or_the_guard_means_the_same_in_all_their_files() -> None:
+    folders = [ROOT / "src/vla_zenoh" / name for name in ("control", "guard")]
+    paths = [path for folder in folders for path in folder.glob("*.py")]
+    names = Counter(name for path in paths for name in house.constants_in(path))
+    assert [name for name, files in names.items() if files > 1] == []
 
 
 def test_no_two_public_classes_have_one_name() -> None:

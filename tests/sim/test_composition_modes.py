@@ -145,7 +145,7 @@ def test_a_joint_limit_stops_a_turn_without_drift_and_the_way_back_is_free(horiz
 
 def test_joints_carry_out_fifty_steps_and_turns_exactly() -> None:
     loop = begin(changed(command="joint"), 10.0)
-    assert loop.guard.mode == "joint"
+    assert loop.guard.kind == "joint"
     moved_m, turned_rad = carry_out(loop, "go up", 50)
     np.testing.assert_allclose(moved_m, [0, 0, 0.5], atol=REACHED_M)
     np.testing.assert_allclose(turned_rad, np.zeros(3), atol=DRIFT_RAD)

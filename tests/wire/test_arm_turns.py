@@ -20,9 +20,9 @@ from vla_zenoh.bus import buffers as slots
 from vla_zenoh.bus.clock import Tick
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec import message, records
+from vla_zenoh.control.limits import joint_motion_limits
 from vla_zenoh.errors import NodeError
 from vla_zenoh.guard.reference_governor import BRAKE_MARGIN
-from vla_zenoh.guard.stream_guard import joint_motion_limits
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.robots import python_driver
 from vla_zenoh.robots.node import FAILURES, LEAST_S, RobotNode

@@ -131,16 +131,16 @@ def covered_step(
     rate = np.zeros(6) if state is None else state.rate
     if turns(spec, step):
         turn = asked.rotation @ before.rotation.T
-        held = orthonormal(turn @ before.rotation)
+        aim = orthonormal(turn @ before.rotation)
     else:
-        held = before.rotation if state is None else state.held
-    error = log3(held @ before.rotation.T)
+        aim = before.rotation if state is None else state.aim
+    error = log3(aim @ before.rotation.T)
     angle = norm3(error)
     if angle > 0.0:
         error = math.sin(angle) / angle * error
     way = np.concatenate([asked.position_m - before.position_m, error])
     moved, reached = _motion(spec.controller, rate, way, spec.dt_s)
-    return _after(before, moved), Response(spec.controller, reached, held, rate, way)
+    return _after(before, moved), Response(spec.controller, reached, aim, rate, way)
 
 
 def chunk_poses(spec: ActionSpec, steps: Steps, start: Pose) -> list[Pose]:
@@ -242,14 +242,14 @@ class Response:
     Args:
         controller: its gains.
         rate: (6,) of the arm, m/s and rad/s in base axes.
-        held: (3, 3) orientation goal.
+        aim: (3, 3) orientation goal.
         start_rate: (6,) of the arm when the step began.
         way: (6,) from there to the controller's goal, m and rad.
     """
 
     controller: ControllerSpec
     rate: FloatArray
-    held: FloatArray
+    aim: FloatArray
     start_rate: FloatArray
     way: FloatArray
 

@@ -24,7 +24,7 @@ A motion is planned with the first of the last three that takes no detour, each 
 executed: a detour within the limits is better than no plan.
 
 A plan with shares s, s^2, s^3 of the box is the same motion in 1/s of the time. Ruckig, which
-rounds absolute values, is given it in a time of its own, at a `pace` of s.
+rounds absolute values, is given it in a time of its own, at a `time_scale` of s.
 
 Ruckig: Berscheid and Kroeger, "Jerk-limited real-time trajectory generation with arbitrary target
 states", RSS 2021.
@@ -54,11 +54,11 @@ REST_VELOCITY = 1e-6
 REST_OFFSET = 1e-6
 """m and rad: nearer to the target counts as reached. Ruckig may end some 1e-9 off."""
 
-QUIET = (1e-8, 1e-8, 1e-6)
+SOLVER_NOISE = (1e-8, 1e-8, 1e-6)
 """m or rad, per s, per s^2: smaller values are noise and set to zero. The first two are the
 precision of Ruckig's solver; such an acceleration changes a velocity by less in a tick. Of a motion
 that is slower by a factor, the last two are smaller by it and its square: see
-`AxisSmoother._pace_of`."""
+`AxisSmoother._time_scale_of`."""
 OVERSHOOT = 1e-6
 """m and rad: rounding by which a plan may leave the range between start, target and stop."""
 
@@ -66,7 +66,7 @@ ASIDE = 2e-7
 """m and rad: a target nearer to the line of the motion is on it; goals are float32, 30 nm off."""
 BESIDE = 0.01
 """Part of the limits for motion beside the line."""
-_ASIDE = np.array([[ASIDE], *([quiet] for quiet in QUIET[1:])])
+_ASIDE = np.array([[ASIDE], *([quiet] for quiet in SOLVER_NOISE[1:])])
 """(3, 1) the same of displacement, velocity and acceleration."""
 TINY, MOST = 1e-12, 1e9
 """Ruckig takes no limit of zero and none that is infinite."""
@@ -89,13 +89,16 @@ class AxisPlan:
         start: (n,) its start.
         basis: (n, k).
         path: of the k coordinates, which start at zero.
-        pace: time of the path per second.
+        time_scale: time of the path per second.
     """
 
-    def __init__(self, start: FloatArray, basis: FloatArray, path: Trajectory, pace: float) -> None:
-        self._start, self._basis, self._path, self._pace = start, basis, path, pace
-        self._paced, self._paced_twice = pace * basis, pace * pace * basis
-        self.duration_s: float = path.duration / pace
+    def __init__(
+        self, start: FloatArray, basis: FloatArray, path: Trajectory, time_scale: float
+    ) -> None:
+        self._start, self._basis, self._path, self._time_scale = start, basis, path, time_scale
+        self._rates_basis = time_scale * basis
+        self._changes_basis = time_scale * time_scale * basis
+        self.duration_s: float = path.duration / time_scale
         self.end = start + basis @ path.at_time(path.duration)[0]
         """(n,) its end."""
 
@@ -110,11 +113,11 @@ class AxisPlan:
         if time_s >= self.duration_s:
             zeros = np.zeros(len(self.end))
             return AxisState(self.end, zeros, zeros)
-        position, velocity, acceleration = self._path.at_time(time_s * self._pace)
+        position, velocity, acceleration = self._path.at_time(time_s * self._time_scale)
         return AxisState(
             self._start + self._basis.dot(position),
-            self._paced.dot(velocity),
-            self._paced_twice.dot(acceleration),
+            self._rates_basis.dot(velocity),
+            self._changes_basis.dot(acceleration),
         )
 
 
@@ -148,7 +151,7 @@ class AxisSmoother:
         self._plan: AxisPlan | None = None
         self._elapsed_s = 0.0
         self._jerk, self._sign = zeros, zeros
-        self._pace = 1.0
+        self._time_scale = 1.0
         self._again: tuple[Shares, bool] | None = None
         self._too_fast = zeros > 0.0
         self.braking = False
@@ -175,7 +178,7 @@ class AxisSmoother:
         self.braking, self._target = False, target
         limits, unreversed = self._limits(shares)
         way = target - self.state.position
-        way[np.abs(way) < QUIET[0]] = 0.0
+        way[np.abs(way) < SOLVER_NOISE[0]] = 0.0
         plan, enough = self._towards(way, limits, unreversed, all_to_stop)
         self._begin(plan)
         self._too_fast = self._slows() & (np.abs(self.state.velocity) > limits[0])
@@ -183,14 +186,18 @@ class AxisSmoother:
         self._again = (shares, all_to_stop) if again else None
         return enough
 
-    def brake(self, shares: Shares | None = None) -> None:
-        """Come to rest as fast as the limits allow, each axis by itself.
+    def brake(self) -> None:
+        """Come to rest as fast as the limits allow, each axis by itself."""
+        self._brake(None)
 
-        Args:
-            shares: of the limits; all axes then stop together, because the shares hold for the
-                present direction. More jerk is used if the arm would otherwise exceed the velocity
-                limit. Ignored while it brakes already.
+    def brake_together(self, shares: Shares = FULL) -> None:
+        """Come to rest with all axes together, as `shares` of the limits hold for one direction.
+
+        More jerk is used if the arm would otherwise exceed the velocity limit.
         """
+        self._brake(shares)
+
+    def _brake(self, shares: Shares | None) -> None:
         if self.braking:
             return
         self._settle(FULL)
@@ -239,7 +246,7 @@ class AxisSmoother:
                 path = self._calculated(ask)
                 if path is None:
                     continue
-                found = AxisPlan(self.state.position, basis, path, self._pace_of(most))
+                found = AxisPlan(self.state.position, basis, path, self._time_scale_of(most))
                 stop = basis, may_take, parts
                 if not (self._overshoots(path, along, stop) or self._leaves(found)):
                     if most is not limits:
@@ -254,7 +261,7 @@ class AxisSmoother:
 
     def _coordinates(self, way: FloatArray, limits: FloatArray) -> tuple[FloatArray, list[float]]:
         """Basis (n, k) with the fewest directions for a motion by `way`, and their limit shares."""
-        whole = line_of(way, *self.state[1:], self._pace)
+        whole = line_of(way, *self.state[1:], self._time_scale)
         if whole is not None:
             return whole[:, None], [1.0]
         columns: list[FloatArray] = []
@@ -276,7 +283,7 @@ class AxisSmoother:
         size = len(way)
         each = np.eye(size), [1.0] * size
         motion = np.array([self.state.velocity[axes], self.state.acceleration[axes]])
-        line = line_of(way, motion[0], motion[1], self._pace)
+        line = line_of(way, motion[0], motion[1], self._time_scale)
         if line is not None:
             return (line[:, None], [1.0]) if line.any() else (np.zeros((size, 0)), [])
         length = float(np.linalg.norm(way))
@@ -328,7 +335,7 @@ class AxisSmoother:
             ask.synchronization = synchronization
             path = self._calculated(ask)
             if path is not None:
-                return AxisPlan(self.state.position, basis, path, self._pace_of(limits))
+                return AxisPlan(self.state.position, basis, path, self._time_scale_of(limits))
         return None
 
     def _input(
@@ -340,7 +347,7 @@ class AxisSmoother:
         With all of its acceleration it would have to reverse before that has ended.
         """
         _, velocity, acceleration = self.state
-        paces = self._pace_of(limits) ** np.array([1.0, 2.0, 3.0])
+        paces = self._time_scale_of(limits) ** np.array([1.0, 2.0, 3.0])
         with np.errstate(divide="ignore"):
             along = (limits[:, :, None] / np.abs(basis)).min(axis=1) * np.array(parts)
             # On a line the axis that needs most jerk decides: the others have to stay with it.
@@ -350,8 +357,8 @@ class AxisSmoother:
         along[2] = jerk * parts
         along /= paces[:, None]
         velocity, acceleration = velocity @ basis / paces[0], acceleration @ basis / paces[1]
-        velocity[np.abs(velocity) < QUIET[1]] = 0.0
-        acceleration[np.abs(acceleration) < QUIET[2]] = 0.0
+        velocity[np.abs(velocity) < SOLVER_NOISE[1]] = 0.0
+        acceleration[np.abs(acceleration) < SOLVER_NOISE[2]] = 0.0
         # Slowing down, and slow enough once that ends: braking harder would reverse the motion.
         speed = np.abs(velocity)
         slows = velocity * acceleration < 0
@@ -378,7 +385,7 @@ class AxisSmoother:
             return None
         return path if done else None
 
-    def _pace_of(self, limits: FloatArray) -> float:
+    def _time_scale_of(self, limits: FloatArray) -> float:
         """Time for Ruckig per second: it rounds absolute values, and motions may be slow."""
         return float((limits[2] / self.box[2]).max() ** (1 / 3))
 
@@ -393,7 +400,7 @@ class AxisSmoother:
         _, velocity, acceleration = self.state
         speed = np.abs(velocity)
         slows = velocity * acceleration < 0
-        least = REST_VELOCITY * self._pace
+        least = REST_VELOCITY * self._time_scale
         room = np.maximum(np.where(slows, speed, self.box[0] - speed), least)
         needed = np.minimum(acceleration**2 / (2 * room) / self.box[2], 1.0)
         kept = np.where(acceleration * self._sign > 0.0, self._jerk, 0.0)
@@ -408,18 +415,18 @@ class AxisSmoother:
     def _slows(self) -> NDArray[np.bool_]:
         """(n,) which axes slow down, by more than rounding noise."""
         _, velocity, acceleration = self.state
-        noise = QUIET[2] * self._pace**2
+        noise = SOLVER_NOISE[2] * self._time_scale**2
         return (velocity * acceleration < 0) & (np.abs(acceleration) > noise)
 
     # -- moving -------------------------------------------------------------------------------
-    def advance(self, pace: float) -> bool:
-        """Advance the state by `pace` of a tick; whether it moves."""
+    def advance(self, part: float) -> bool:
+        """Advance the state by `part` of a tick; whether it moves."""
         if self._again is not None and not (self._slows() & self._too_fast).any():
             # They were too fast for their shares, and may go as fast again by the plan there is.
             self._move_again(*self._again)
         if self._plan is None:
             return False
-        self._elapsed_s += pace * self._dt_s
+        self._elapsed_s += part * self._dt_s
         self.state = self._plan.at(self._elapsed_s)
         if self._elapsed_s >= self._plan.duration_s:
             self._plan = None
@@ -458,11 +465,11 @@ class AxisSmoother:
 
     def _settle(self, shares: Shares) -> None:
         """Set noise to zero, before a motion with these shares is planned."""
-        self._pace = shares.jerk ** (1 / 3)
+        self._time_scale = shares.jerk ** (1 / 3)
         position, velocity, acceleration = self.state
         velocity, acceleration = velocity.copy(), acceleration.copy()
-        velocity[np.abs(velocity) < QUIET[1] * self._pace] = 0.0
-        acceleration[np.abs(acceleration) < QUIET[2] * self._pace**2] = 0.0
+        velocity[np.abs(velocity) < SOLVER_NOISE[1] * self._time_scale] = 0.0
+        acceleration[np.abs(acceleration) < SOLVER_NOISE[2] * self._time_scale**2] = 0.0
         self.state = AxisState(position, velocity, acceleration)
 
 
@@ -472,14 +479,14 @@ def _across(along: FloatArray) -> FloatArray:
 
 
 def line_of(
-    way: FloatArray, velocity: FloatArray, acceleration: FloatArray, pace: float
+    way: FloatArray, velocity: FloatArray, acceleration: FloatArray, time_scale: float
 ) -> FloatArray | None:
     """Direction of a motion on a straight line through its target, None if it is on none.
 
     That of the displacement if there is one; the motion's own if the target is about to be passed
     and so near that the displacement is rounding. Zero without displacement and motion.
     """
-    motion = np.stack([way, velocity / pace, acceleration / pace**2])
+    motion = np.stack([way, velocity / time_scale, acceleration / time_scale**2])
     lengths = np.sqrt((motion * motion).sum(axis=1))
     if not lengths.any():
         return way

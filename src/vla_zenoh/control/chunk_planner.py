@@ -27,7 +27,7 @@ from vla_zenoh.control.commander_io import StateHistory
 from vla_zenoh.control.joint_space import JointBounds
 from vla_zenoh.control.limits import (
     APPROACH,
-    LEAST,
+    LEAST_TO_GOAL,
     BoundedStep,
     LimitHit,
     Slowdown,
@@ -487,7 +487,7 @@ class ChunkPlanner:
             plan.announced = True
             plan.add_hits([LimitHit(APPROACH, far, step, where=unit)])
         needed_s = max(far_m / limits.approach_m_s, far_rad / limits.approach_rad_s)
-        share = min(max(full_s / needed_s, LEAST), 1.0)
+        share = min(max(full_s / needed_s, LEAST_TO_GOAL), 1.0)
         has_ns = plan.dt_ns if plan.bounded or plan.first_step_ns < 0 else plan.first_step_ns
         part = min(has_ns / 1e9 / needed_s, 1 / steps)
         return part, Slowdown(APPROACH, share, far, step, "", BEHIND_S)

@@ -199,7 +199,7 @@ class CommandedPart:
             measured_rad=self.measured_rad,
             commanded=motion.commanded,
             commanded_rad=motion.joints_rad,
-            in_joints=motion.joints_asked,
+            joints_asked=motion.joints_asked,
             published=published,
             stuck=motion.stuck,
         )
@@ -220,14 +220,14 @@ class CommandedPart:
             reasons += reasons_by_joints(
                 self.profile, worker, spec, chunk.record, bounds, self.joint
             )
-        if self.reach is None and self._in_joints(spec):
+        if self.reach is None and self._asks_joints(spec):
             reasons.append(
                 f"worker {worker!r} acts in joints, which needs the robot's kinematics: set "
                 "robot.description, robot.tcp_frame and robot.arm_joints in the profile"
             )
         return [self.says(why) for why in reasons]
 
-    def _in_joints(self, spec: ModelSpec) -> bool:
+    def _asks_joints(self, spec: ModelSpec) -> bool:
         try:
             return spec.action.of(self.name).space == "joint"
         except SpecError:
@@ -251,7 +251,7 @@ class CommandedPart:
             joint,
             now_ns,
             blocked=blocked,
-            in_joints=self._in_joints(lease.spec),
+            joints_asked=self._asks_joints(lease.spec),
         )
         if self.reach is None or self.measured_rad is None:
             return events

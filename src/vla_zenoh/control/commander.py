@@ -523,11 +523,11 @@ class Commander:
         moves = self.state is State.ACTIVE or self.retreating
         ahead_s = ticks / self.profile.timing.command_hz
         slowdown, hit = spacing.look(now_ns, ahead_s, moves=moves)
-        if hit is not None and not self._motion.held:
+        if hit is not None and not self._motion.must_pause:
             what, why = hit.name, f"stand{hit.at}"
             self._out.events.append(make_event("warning", "limit", what, why, hit.value, hit.limit))
         for part in self.parts:
-            part.motion.pace.part_slowdown, part.motion.held = slowdown, hit is not None
+            part.motion.pace.part_slowdown, part.motion.must_pause = slowdown, hit is not None
 
 
 def _latched(gripper: Stamped[GripperState] | None) -> bool:

@@ -50,7 +50,7 @@ LONGEST_S = 0.1
 """Longest time between two states that the filters integrate."""
 FROZEN_M = 0.05
 """A wrench that stays the same to the last bit while the TCP moves this far is not measured."""
-QUIET = 0.2
+UNTOUCHED = 0.2
 """Part of ``slow`` below which the arm is not in contact."""
 
 STEP_M = 0.005
@@ -66,7 +66,7 @@ SPARE_NS = 4_000_000_000
 """Time that a retreat may take beyond that of its path."""
 SPACE_M = 0.002
 """Distance between the poses of a trail."""
-PLACES = 60
+TRAIL_POSES = 60
 """Of a trail: 0.12 m, so that a detour of up to this is left out."""
 RAD_AS_M = 0.05
 """A rotation by 1 rad counts as this distance."""
@@ -280,7 +280,7 @@ class Contact(Monitor):
     @property
     def quiet(self) -> bool:
         """No contact, as far as the robot measures it."""
-        return all(load.value <= QUIET * load.slow for load in self._measured)
+        return all(load.value <= UNTOUCHED * load.slow for load in self._measured)
 
     def overload(self) -> Load | None:
         """The load above its stop limit, None without one."""
@@ -334,7 +334,7 @@ class CommandTrail:
                 return
         self._poses.append(pose)
         self._places.append(place)
-        del self._poses[:-PLACES], self._places[:-PLACES]
+        del self._poses[:-TRAIL_POSES], self._places[:-TRAIL_POSES]
 
     def clear(self) -> None:
         """Drop all poses."""

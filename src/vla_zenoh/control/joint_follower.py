@@ -53,7 +53,7 @@ BACK_SHARE = 0.7
 """Part of the acceleration used towards a far target, whose path is curved in joint space."""
 NEAR_END_RAD = 0.1
 """A joint further from the end of its range is not reported as held by it."""
-HALVINGS = 8
+ACCELERATION_HALVINGS = 8
 """Of the search for an acceleration: to 1/256 of the range allowed."""
 NEAR_SHARE, FAR_SHARE = 0.7, 0.1
 """Part of the joints' acceleration and jerk available for a distance constraint: they follow the
@@ -64,9 +64,9 @@ BACK_JERK = 0.4
 """Rate of the correction in units of jerk over acceleration, at most one per tick."""
 ROUNDING_RAD_S = 1e-9
 """A smaller excess of a velocity is rounding; smaller divisors would be noise."""
-NEAR_M = 0.08
+CONSTRAINED_M = 0.08
 """A pair further from its stop than this is no constraint until the next update."""
-PEEK_RAD = 1e-3
+SINGULARITY_PEEK_RAD = 1e-3
 """Joint displacement for the rate of the singular value."""
 
 
@@ -118,7 +118,7 @@ class DistanceConstraints:
             return
         collisions, stop_m = self._barriers.collisions, self._barriers.stop[1:]
         distances_m = collisions.distances(joints_rad)
-        self._near = near = np.flatnonzero(distances_m < stop_m + NEAR_M)
+        self._near = near = np.flatnonzero(distances_m < stop_m + CONSTRAINED_M)
         self._at_rad = joints_rad
         self._rows = -collisions.gradients(joints_rad, near.tolist())
         self._left_m = (distances_m - stop_m)[near]
@@ -354,11 +354,11 @@ class JointFollower:
         fastest = float(np.abs(wanted).max())
         if singular_value > WATCHED * DAMPED_BELOW or fastest == 0.0:
             return 1.0
-        ahead = joints + wanted * (PEEK_RAD / fastest)
+        ahead = joints + wanted * (SINGULARITY_PEEK_RAD / fastest)
         after = smallest_singular_value(self.kinematics.jacobian(ahead))
         # At the speed within the limits, or the rate would be that of an impossible velocity.
         share = 1.0 / max(1.0, float(np.max(np.abs(wanted) / self.velocity_rad_s)))
-        fall_1_s = (singular_value - after) / PEEK_RAD * fastest * share
+        fall_1_s = (singular_value - after) / SINGULARITY_PEEK_RAD * fastest * share
         allowed = SINGULARITY_1_S * max(singular_value - self._singularity_stop, 0.0)
         return share * allowed / fall_1_s if fall_1_s > allowed else 1.0
 
@@ -431,7 +431,7 @@ def _towards_end(
     if fits(greatest):
         return greatest
     low, high = least, greatest
-    for _ in range(HALVINGS):
+    for _ in range(ACCELERATION_HALVINGS):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if fits(middle) else (low, middle)
     return low

@@ -21,14 +21,14 @@ from vla_zenoh.control.actions import step_joints
 from vla_zenoh.control.axis_smoothing import AxisSmoother, line_of
 from vla_zenoh.control.limits import (
     FULL,
-    HELD_LEAD_RAD,
-    LEAST,
+    LEAST_TO_GOAL,
+    PAUSE_LEAD_RAD,
     BoundedStep,
     LimitHit,
     Shares,
+    chain_motion_limits,
     into_workspace,
     joint_margins,
-    joint_motion_limits,
     motion_limits,
     stop_way,
     workspace_corners,
@@ -37,20 +37,20 @@ from vla_zenoh.control.plan_timeline import Goal, joint_goal
 from vla_zenoh.control.policy_check import ROUNDING, Rejection
 from vla_zenoh.control.reachability import Barriers, Floors
 from vla_zenoh.control.smoothing import Motion
-from vla_zenoh.control.states import Mode
+from vla_zenoh.control.states import MotionMode
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import Pose, norm3
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.profile import REJECT_FACTOR, Profile
 from vla_zenoh.types import Cause, FloatArray, JointCommand
 
-HALVINGS = 7
+STEP_HALVINGS = 7
 """Of the search for the feasible part of a step: to 1/128 of it."""
 INSIDE_M = 0.002
 """A step ends this far inside the box, so that the curve to its end stays in it."""
 CORRECTIONS = 4
 """Newton steps that bring a TCP back into the box."""
-PLACES = np.array([0.25, 0.5, 0.75, 1.0])
+CHECKED_PLACES = np.array([0.25, 0.5, 0.75, 1.0])
 """Places of a motion at which it is checked."""
 PARTS = (1.0, 0.5, 0.25, 0.125)
 """Shares of the displacement to a goal in the box that are tried, longest on the leash first."""
@@ -64,13 +64,13 @@ NEARER_M = 5e-4
 """m by which a motion may come nearer than a stop: goals are bounded step by step."""
 CHECK_TICKS = 4
 """Between two checks of distances, which cost too much for every tick; they look as far ahead."""
-ROOM = np.array([[0.95], [0.8], [0.8]])
+TCP_ROOM = np.array([[0.95], [0.8], [0.8]])
 """Parts of the TCP's velocity, acceleration and jerk that a straight motion is planned with."""
 BEND = 0.5
 """Part of the acceleration that a curve may take, of the TCP or in joint space."""
-NOTHING = 1e-9
+NO_WAY = 1e-9
 """A shorter displacement has no direction."""
-PEEK_RAD = 1e-4
+CURVE_PEEK_RAD = 1e-4
 """Displacement for the rate of the Jacobian: shorter is rounding, longer is curved."""
 
 
@@ -80,7 +80,7 @@ class JointBounds:
     def __init__(self, profile: Profile, kinematics: Kinematics, barriers: Barriers) -> None:
         self.limits, self.kinematics, self.barriers = profile.limits, kinematics, barriers
         self._floors = Floors(barriers)
-        self.motion = joint_motion_limits(profile, kinematics)
+        self.motion = chain_motion_limits(profile, kinematics)
         self._tcp_rates: FloatArray | None = None
         if profile.robot.command == "pose":
             self._tcp_rates = motion_limits(profile.limits).box[0]
@@ -155,7 +155,7 @@ class JointBounds:
         after, found = self._try(start_rad, target_rad, floor)
         if found is not None:
             low, high, whole, after = 0.0, 1.0, target_rad, before
-            for _ in range(HALVINGS):
+            for _ in range(STEP_HALVINGS):
                 middle = 0.5 * (low + high)
                 part_rad = start_rad + middle * (whole - start_rad)
                 yield
@@ -219,7 +219,7 @@ class JointBounds:
     def _box_hit(self, start_rad: FloatArray, end_rad: FloatArray) -> LimitHit | None:
         """The face of the box that the straight motion between two joints would cross."""
         start_m = self.kinematics.forward(start_rad).position_m
-        return self.face_hit(start_m, start_rad + PLACES[:, None] * (end_rad - start_rad))
+        return self.face_hit(start_m, start_rad + CHECKED_PLACES[:, None] * (end_rad - start_rad))
 
     def face_hit(self, start_m: FloatArray, places_rad: Iterable[FloatArray]) -> LimitHit | None:
         """The face of the box that a TCP at `start_m` crosses at any of these joints (n,)."""
@@ -257,14 +257,14 @@ class JointPath(AxisSmoother):
         self._ticks = 0
         self._hits: list[LimitHit] = []
         self._asked: tuple[Goal, Shares, bool]
-        self._held = False
+        self._before_bound = False
         """It braked before a bound, on the way to what was asked for last."""
         home_rad = self.kinematics.ordered(profile.robot.arm_joints, profile.robot.home_rad)
         super().__init__(home_rad, 1.0 / profile.timing.command_hz, np.array(bounds.motion))
 
     def stand(self, position: FloatArray) -> None:
         super().stand(position)
-        self._held = False
+        self._before_bound = False
         self._follow()
 
     def leash(self, goal: Goal, ahead_s: float) -> tuple[Goal, list[LimitHit]]:
@@ -300,7 +300,7 @@ class JointPath(AxisSmoother):
     def near(self, goal: Goal) -> Goal:
         """`goal`, or one so near that the arm can retreat from there."""
         way_rad = self.way_to(goal)
-        share = HELD_LEAD_RAD / max(float(np.abs(way_rad).max()), HELD_LEAD_RAD)
+        share = PAUSE_LEAD_RAD / max(float(np.abs(way_rad).max()), PAUSE_LEAD_RAD)
         if share >= 1.0:
             return goal
         nearer_rad = self.state.position + share * way_rad
@@ -317,44 +317,44 @@ class JointPath(AxisSmoother):
 
     def go_to(self, goal: Goal, shares: Shares = FULL, *, all_to_stop: bool = False) -> bool:
         """Move to the joints of `goal`, or as near as the bounds allow; see `move_to`."""
-        self._asked, self._held = (goal, shares, all_to_stop), False
+        self._asked, self._before_bound = (goal, shares, all_to_stop), False
         here_rad, end_rad = self.state.position, goal.known_rad
         hit = self._bounds.ahead_hit(here_rad, end_rad)
         if hit is not None:
             self._hits.append(hit)
             way_rad, low, high = end_rad - here_rad, 0.0, 1.0
-            for _ in range(HALVINGS):
+            for _ in range(STEP_HALVINGS):
                 middle = 0.5 * (low + high)
                 found = self._bounds.ahead_hit(here_rad, here_rad + middle * way_rad)
                 low, high = (low, middle) if found else (middle, high)
             end_rad = here_rad + low * way_rad
         return self.move_to(end_rad, shares, all_to_stop=all_to_stop)
 
-    def tick(self, pace: float = 1.0) -> Motion:
-        """Advance by `pace` of a tick; brakes where the motion would come too near to a bound."""
+    def tick(self, part: float = 1.0) -> Motion:
+        """Advance by `part` of a tick; brakes where the motion would come too near to a bound."""
         self._ticks += 1
-        if self._held and self.at_rest:
+        if self._before_bound and self.at_rest:
             self._go_on()
         if self._ticks % CHECK_TICKS == 0 and not self.braking and not self.at_rest:
             here_rad = self.state.position
             stop_rad = here_rad + stop_way(*self.state[1:], self.box, CHECK_TICKS * self._dt_s)
             self._brake_at(self._bounds.distance_hit(here_rad, stop_rad))
         before = self.state
-        moves = self.advance(pace)
-        if moves and not self.braking and not self._stops_inside(pace):
+        moves = self.advance(part)
+        if moves and not self.braking and not self._stops_inside(part):
             hit = self._stop_hit()
             if hit is not None:
                 self.state = before  # a stop from there was found to end inside
                 self._brake_at(hit)
-                self.advance(pace)
+                self.advance(part)
         if moves:
             self._follow()
         return self.motion
 
-    def brake(self, shares: Shares | None = FULL) -> None:
-        """Come to rest as `tick` has checked it, whatever the shares."""
-        self._held = False
-        super().brake(FULL if self._is_straight() else None)
+    def brake(self) -> None:
+        """Come to rest as `tick` has checked it."""
+        self._before_bound = False
+        self._brake(FULL if self._is_straight() else None)
 
     def _is_straight(self) -> bool:
         """The joints move in proportion, so that a stop can end on their straight line.
@@ -367,12 +367,12 @@ class JointPath(AxisSmoother):
         if hit is not None:
             self._hits.append(hit)
             self.brake()
-            self._held = True
+            self._before_bound = True
 
     def _go_on(self) -> None:
         """Continue after a brake before a bound, if the straight way to the goal is free."""
         goal, shares, all_to_stop = self._asked
-        self._held = False
+        self._before_bound = False
         if self._bounds.ahead_hit(self.state.position, goal.known_rad) is None:
             self.go_to(goal, shares, all_to_stop=all_to_stop)
 
@@ -388,12 +388,12 @@ class JointPath(AxisSmoother):
         stop_rad = [stop.at(float(time_s)).position for time_s in times_s]
         return self._bounds.face_hit(self.motion.pose.position_m, stop_rad)
 
-    def _stops_inside(self, pace: float) -> bool:
+    def _stops_inside(self, part: float) -> bool:
         """Whether the TCP is too far from every face of the box for a stop to cross one."""
         low, high = workspace_corners(self._bounds.limits)
         place = self.motion.pose.position_m
         room_m = float(np.minimum(place - low, high - place).min())
-        way = np.abs(stop_way(*self.state[1:], self.box, pace * self._dt_s))
+        way = np.abs(stop_way(*self.state[1:], self.box, part * self._dt_s))
         # The TCP is further from an axis by at most its own way.
         return float(way @ self._levers) * math.exp(float(way.sum())) < room_m
 
@@ -415,7 +415,7 @@ class JointPath(AxisSmoother):
         change = jacobian @ acceleration
         fastest = float(np.abs(velocity).max())
         if fastest > 0.0:
-            peek_s = PEEK_RAD / fastest
+            peek_s = CURVE_PEEK_RAD / fastest
             ahead, behind = (
                 self.kinematics.jacobian(joints_rad + sign * peek_s * velocity)
                 for sign in (1.0, -1.0)
@@ -439,13 +439,17 @@ class JointPath(AxisSmoother):
         """(n,) joints commanded."""
         return self.state.position
 
-    def step(self, mode: Mode) -> None:
+    def step(self, mode: MotionMode) -> None:
         """Advance by one tick."""
         self.tick()
 
-    def stop(self, shares: Shares | None) -> None:
-        """Come to rest, as `brake`."""
-        self.brake(shares)
+    def stop(self) -> None:
+        """Come to rest."""
+        self.brake()
+
+    def pause(self) -> None:
+        """Come to rest, to go on from there."""
+        self.brake()
 
     def way_to(self, goal: Goal) -> FloatArray:
         """(n,) from the commanded joints to those of `goal`."""
@@ -463,7 +467,7 @@ class JointPath(AxisSmoother):
         bends = 2 * np.abs(np.diff(ways, axis=0)).max(axis=0)
         now = float(np.linalg.norm(self.state.velocity))
         return followed_shares(
-            way_rad, self.box, now, np.abs(ways).max(axis=0), bends, ROOM * self._tcp_box, BEND
+            way_rad, self.box, now, np.abs(ways).max(axis=0), bends, TCP_ROOM * self._tcp_box, BEND
         )
 
     def command(self, state: str, cause: Cause | None, goal: Goal | None) -> JointCommand:
@@ -487,16 +491,16 @@ def followed_shares(
     `limits` (3, m), and the curvature may take the part `bend` of its acceleration.
     """
     length = float(np.linalg.norm(ways))
-    if length < NOTHING:
+    if length < NO_WAY:
         return FULL
     # All axes move together, as fast as the slowest one.
-    rates = (box / np.maximum(np.abs(ways), NOTHING)).min(axis=1)
+    rates = (box / np.maximum(np.abs(ways), NO_WAY)).min(axis=1)
     now = speed / length
-    bends = np.maximum(bends, NOTHING)
-    needed = np.maximum(rates[:, None] * other_ways, NOTHING)
+    bends = np.maximum(bends, NO_WAY)
+    needed = np.maximum(rates[:, None] * other_ways, NO_WAY)
     velocity, _, jerk = (limits / needed).min(axis=1)
     fastest = min(rates[0] * velocity, float(np.min(np.sqrt(bend * limits[1] / bends))))
     reached = min(fastest, (now * now + rates[1]) ** 0.5)
     left = np.maximum(limits[1] - bends * reached * reached, (1 - bend) * limits[1])
-    parts = np.clip([fastest / rates[0], (left / needed[1]).min(), jerk], LEAST, 1.0)
+    parts = np.clip([fastest / rates[0], (left / needed[1]).min(), jerk], LEAST_TO_GOAL, 1.0)
     return Shares(*(float(part) for part in parts))

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from vla_zenoh.kinematics.so3 import Pose, exp3, log3, norm3, orthonormal, pose_distance
-from vla_zenoh.profile import REJECT_FACTOR, Limits, Profile, ReachLimits
+from vla_zenoh.profile import Limits, Profile, ReachLimits
 from vla_zenoh.types import FloatArray
 
 if TYPE_CHECKING:
@@ -25,16 +25,16 @@ ROTATION_BOX = 0.55
 terms of a moving chart (5 %) stay below the limit in any direction."""
 APPROACH = "approach"
 """Name of the slowdown towards a target that is further away than a step."""
-SLOWEST = 0.1
+LEAST_NEAR_STOP = 0.1
 """Least share of the speed close to a stop: the arm has to be able to work there."""
-HELD_LEAD_M, HELD_LEAD_RAD = 0.01, 0.02
+PAUSE_LEAD_M, PAUSE_LEAD_RAD = 0.01, 0.02
 """The goal of an arm that another part holds up leads it by this much at most."""
 SPEED_STEPS = 20
 """Number of speed shares of what is measured: each change of the share plans the motion again."""
 BEGIN_M, BEGIN_RAD, BEGIN_JOINT_RAD = 0.002, 0.01, 0.004
 """A command stream begins this near to where the robot holds the arm, or its guard rejects it: what
 it begins with is one step of the controller's set-point."""
-LEAST = 0.02
+LEAST_TO_GOAL = 0.02
 """Least share where the joints are too slow, or a far target is approached."""
 
 
@@ -81,13 +81,18 @@ class JointMotionLimits(NamedTuple):
     jerk_rad_s3: FloatArray
 
 
-def joint_motion_limits(profile: Profile, kinematics: Kinematics) -> JointMotionLimits:
-    """Those of a profile in chain order; its velocities bound the shares of the URDF's."""
-    robot = profile.robot
-    # The joints of the kinematics are in chain order, the profile's in its own.
+def joint_motion_limits(profile: Profile, margin: float = 1.0) -> JointMotionLimits:
+    """`margin` times the limits of `profile`, in the order of ``robot.arm_joints``."""
+    limits, joints = profile.limits.joint, len(profile.robot.arm_joints)
+    names = ("velocity_rad_s", "acceleration_rad_s2", "jerk_rad_s3")
+    return JointMotionLimits(*(margin * np.array(limits.of(name, joints)) for name in names))
+
+
+def chain_motion_limits(profile: Profile, kinematics: Kinematics) -> JointMotionLimits:
+    """The same in chain order; the velocities bound the shares of the URDF's."""
     velocity, acceleration, jerk = (
-        kinematics.ordered(robot.arm_joints, profile.limits.joint.of(name, kinematics.size))
-        for name in ("velocity_rad_s", "acceleration_rad_s2", "jerk_rad_s3")
+        kinematics.ordered(profile.robot.arm_joints, values)
+        for values in joint_motion_limits(profile)
     )
     share = float(np.min(velocity / kinematics.velocity_rad_s))
     return JointMotionLimits(
@@ -126,7 +131,6 @@ class LimitHit(NamedTuple):
             ``self_collision``, ``table_distance``, ``keep_out``.
         value: the value asked for.
         limit: the value allowed.
-        fatal: too far beyond the limit to be shortened.
         where: the joint, the two links, the link over the table, or link and keep-out; empty for
             the whole arm.
     """
@@ -134,7 +138,6 @@ class LimitHit(NamedTuple):
     name: str
     value: float
     limit: float
-    fatal: bool = False
     where: str = ""
 
     @property
@@ -147,7 +150,7 @@ def bound_step(limits: Limits, before: Pose, asked: Pose) -> tuple[Pose, list[Li
     """Shorten the step from `before` to `asked` to its limits and the workspace.
 
     Returns:
-        the bounded pose, and the limits that acted; after a fatal hit the pose must not be used.
+        the bounded pose, and the limits that acted.
     """
     way_m = asked.position_m - before.position_m
     turn = log3(asked.rotation @ before.rotation.T)
@@ -167,14 +170,13 @@ def _bound_norm(name: str, vector: FloatArray, limit: float) -> tuple[FloatArray
     if norm <= limit * (1 + 1e-6):  # float32 steps of exactly the limit are within it
         return vector, []
     if not math.isfinite(norm):  # a product of numbers that were finite each
-        return np.zeros(3), [LimitHit(name, math.inf, limit, fatal=True)]
-    return vector * (limit / norm), [LimitHit(name, norm, limit, norm > REJECT_FACTOR * limit)]
+        return np.zeros(3), [LimitHit(name, math.inf, limit)]
+    return vector * (limit / norm), [LimitHit(name, norm, limit)]
 
 
 def workspace_corners(limits: Limits) -> tuple[FloatArray, FloatArray]:
     """Lower and upper corner (3,) m of the workspace box."""
-    box = limits.workspace
-    low, high = np.array([box.x_m, box.y_m, box.z_m]).T
+    low, high = np.array(limits.workspace.corners_m)
     return low, high
 
 
@@ -185,9 +187,8 @@ def into_workspace(
 
     A step that starts at `before_m`, outside the box, may lead back or stay, but no further out.
     """
-    box = limits.workspace
     x, y, z = position_m.tolist()
-    (x_low, x_high), (y_low, y_high), (z_low, z_high) = box.x_m, box.y_m, box.z_m
+    (x_low, y_low, z_low), (x_high, y_high, z_high) = limits.workspace.corners_m
     if before_m is not None:
         x0, y0, z0 = before_m.tolist()
         x_low, y_low, z_low = min(x_low, x0), min(y_low, y0), min(z_low, z0)
@@ -247,7 +248,7 @@ class Slowdown(NamedTuple):
         return f" at {self.where}" if self.where else ""
 
 
-def in_steps(share: float, least: float = SLOWEST) -> float:
+def in_steps(share: float, least: float = LEAST_NEAR_STOP) -> float:
     """A share of the speed, rounded up to one of `SPEED_STEPS`; not below `least`."""
     return max(math.ceil(share * SPEED_STEPS) / SPEED_STEPS, least)
 

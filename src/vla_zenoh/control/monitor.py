@@ -30,7 +30,7 @@ class PartSnapshot(NamedTuple):
         measured_rad: (n,) measured joints; None: no kinematics, or no joints of this arm.
         commanded: the TCP pose streamed last; None: nothing is streamed.
         commanded_rad: (n,) joints streamed last; None: poses are.
-        in_joints: the goals are joints, so singularities do not matter.
+        joints_asked: the goals are joints, so singularities do not matter.
         published: what is streamed reaches the robot.
         stuck: why the motion cannot reach its goal; empty while it can.
     """
@@ -45,7 +45,7 @@ class PartSnapshot(NamedTuple):
     measured_rad: FloatArray | None
     commanded: Pose | None
     commanded_rad: FloatArray | None
-    in_joints: bool
+    joints_asked: bool
     published: bool
     stuck: str
 

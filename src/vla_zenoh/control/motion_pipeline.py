@@ -11,7 +11,7 @@ from vla_zenoh.control.chunk_planner import LOOK_AHEAD, ChunkPlanner
 from vla_zenoh.control.commander_io import limit_events, make_event
 from vla_zenoh.control.contact import Contact, Retreat
 from vla_zenoh.control.joint_space import JointPath
-from vla_zenoh.control.limits import BEGIN_JOINT_RAD, FULL, LimitHit, Shares, into_workspace
+from vla_zenoh.control.limits import BEGIN_JOINT_RAD, LimitHit, Shares, into_workspace
 from vla_zenoh.control.plan_timeline import (
     Goal,
     GoalTimeline,
@@ -24,7 +24,7 @@ from vla_zenoh.control.pose_to_joint import FollowedPath, PoseToJoint
 from vla_zenoh.control.preflight import LINGER_NS, Settling, follows, held_joints
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.smoothing import PosePath
-from vla_zenoh.control.states import OBEYING, Mode, State
+from vla_zenoh.control.states import OBEYING, MotionMode, State
 from vla_zenoh.control.step_timing import GoalPace, Mover, TimedGoal
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.kinematics.so3 import Pose, held_pose, interpolate, pose_distance, pose_of
@@ -76,13 +76,13 @@ class MotionPipeline:
             self._poses = FollowedPath(profile, self._joints)
         self._mover: Mover = self._poses
         """What moves the arm: `_poses` or `_path`."""
-        self.mode = Mode.BRAKE
+        self.mode = MotionMode.BRAKE
         """Of the last tick."""
         self.timeline: GoalTimeline | None = None
         self.goal: Goal | None = None
         self.streaming = False
         self.pace = GoalPace()
-        self.held = False
+        self.must_pause = False
         """Another part is too near: the arm has to pause."""
         self.contact = Contact(profile.limits.contact)
         self.retreat = Retreat(profile.limits, self.contact)
@@ -94,7 +94,7 @@ class MotionPipeline:
 
     # -- state --------------------------------------------------------------------------------
     @property
-    def in_joints(self) -> bool:
+    def moves_in_joints(self) -> bool:
         """The arm moves in joints."""
         return isinstance(self._mover, JointPath)
 
@@ -155,7 +155,7 @@ class MotionPipeline:
         now_ns: int,
         *,
         blocked: bool,
-        in_joints: bool = False,
+        joints_asked: bool = False,
     ) -> list[Event]:
         """Start at the set-point of the robot's controller, so that nothing jumps.
 
@@ -165,7 +165,7 @@ class MotionPipeline:
             joint: newest joints.
             now_ns: time of this tick.
             blocked: the arm is far from its controller's set-point.
-            in_joints: the actions are joints.
+            joints_asked: the actions are joints.
 
         Returns:
             what is dropped of a chunk, while the brake of the last activation continues.
@@ -190,7 +190,7 @@ class MotionPipeline:
             if standing and not (self.streaming and apart_rad <= BEGIN_JOINT_RAD):
                 self._joints.restart(held_rad)
             self._joints.keep_elbow()
-        if in_joints and standing:
+        if joints_asked and standing:
             self._enter(joints=True)
         # The goal of a blocked arm is where it is. Otherwise a brake continues, and the goal is
         # where it ends.
@@ -211,7 +211,7 @@ class MotionPipeline:
     def _enter(self, *, joints: bool) -> None:
         """Act in joints or in poses from now on; only while the arm stands."""
         path, poses, follower = self._path, self._poses, self._joints
-        if joints is self.in_joints or path is None or follower is None:
+        if joints is self.moves_in_joints or path is None or follower is None:
             return
         self.goal = None
         if joints:
@@ -308,22 +308,22 @@ class MotionPipeline:
         events = limit_events(found) if found else []
         goal = self._aggregator.goal(plans, now_ns)
         joints = isinstance(goal, JointGoal) and self._path is not None
-        if joints is not self.in_joints and self.at_rest:
+        if joints is not self.moves_in_joints and self.at_rest:
             self._enter(joints=joints)
         self._back = None
-        if joints is not self.in_joints:
-            self.mode = Mode.CHANGE
-        elif self.held or self.pace.override == 0.0:
-            self.mode = Mode.PAUSE
+        if joints is not self.moves_in_joints:
+            self.mode = MotionMode.CHANGE
+        elif self.must_pause or self.pace.override == 0.0:
+            self.mode = MotionMode.PAUSE
         else:
-            self.mode = Mode.FOLLOW
+            self.mode = MotionMode.FOLLOW
         mover = self._mover
-        if self.held and self.mode is Mode.PAUSE:
+        if self.must_pause and self.mode is MotionMode.PAUSE:
             near = mover.near(goal)  # so that the arm can retreat
             if near is not goal:
                 self._shorten(plans, goal, near, now_ns)
-        if self.mode is not Mode.FOLLOW:
-            mover.stop(FULL)  # on the path, to continue from there later
+        if self.mode is not MotionMode.FOLLOW:
+            mover.pause()
             self.goal = None
             return events
         # The leash starts where the arm is in this tick: it may be moving away from the last goal.
@@ -360,16 +360,16 @@ class MotionPipeline:
     def _retreat_or_brake(
         self, mover: Mover, timeline: GoalTimeline, state: State, now_ns: int
     ) -> list[Event]:
-        if state is not State.INACTIVE or self.held:
+        if state is not State.INACTIVE or self.must_pause:
             self.retreat.end()
         back, event = self.retreat.step(mover.motion.pose, now_ns, at_rest=self.at_rest)
         if back is not None and isinstance(mover, JointPath):
             self._enter(joints=False)
             mover = self._poses
         dropped: list[Event] = []
-        self.mode = Mode.BRAKE if back is None else Mode.RETREAT
+        self.mode = MotionMode.BRAKE if back is None else MotionMode.RETREAT
         if back is None:
-            mover.stop(None)
+            mover.stop()
             self.goal = None
             if timeline.plan.cause is not None and mover.at_rest:
                 # So that nothing pulls the arm further.

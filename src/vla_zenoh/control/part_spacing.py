@@ -30,7 +30,7 @@ from vla_zenoh.types import FloatArray
 
 NAME = "part_distance"
 """Of the limit."""
-FAR_M = 0.25
+SPACED_M = 0.25
 """Arms this much further apart than they may come are looked at now and then."""
 FAR_TICKS = 4
 NOISE_M = 2e-5
@@ -38,7 +38,7 @@ NOISE_M = 2e-5
 SPARE_M = 5e-3
 """Arms that brake end this much before the stop: joints that begin to lag in a brake end elsewhere
 than their pose would. 3.4 mm were found in 2.5 million ticks of ``fuzz_parts.py``."""
-SLOWEST = 0.05
+LEAST_NEAR_PART = 0.05
 """Least share of the speed near the stop: the arms are held there, and have to come away again."""
 STANDS_RAD = 2e-3
 """Arms whose joints go on by less than this stand."""
@@ -60,7 +60,7 @@ class PartSpacing:
         self.place()
         self._stop_m = max(limit.part_stop_m for limit in limits)
         self._slow_m = max(limit.part_slow_m for limit in limits)
-        self._within_m = max(self._slow_m, self._stop_m) + FAR_M
+        self._within_m = max(self._slow_m, self._stop_m) + SPACED_M
         self.nearest = Nearest(self._within_m)
         """Distance of the commanded joints when last computed."""
         self._skip = 0
@@ -130,7 +130,7 @@ class PartSpacing:
         if not self._slower:
             return None
         left = max(near.distance_m - self._stop_m, 0.0) / (self._slow_m - self._stop_m)
-        share = in_steps(math.sqrt(left), SLOWEST)
+        share = in_steps(math.sqrt(left), LEAST_NEAR_PART)
         return Slowdown(NAME, share, near.distance_m, self._slow_m, str(near))
 
     def _may_go_on(self, at: Sequence[FloatArray], now_ns: int, floor_m: float) -> bool:

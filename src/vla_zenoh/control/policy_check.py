@@ -61,7 +61,7 @@ RATE_TOLERANCE = 0.1
 """Share by which chunks per second may differ from the steps that a model counts."""
 
 
-def pace(spec: ModelSpec, rate_hz: float) -> str:
+def wrong_rate(spec: ModelSpec, rate_hz: float) -> str:
     """Why a model that counts inferences as steps cannot be asked at `rate_hz`; empty: it can."""
     step_hz = 1.0 / spec.action.dt_s
     if not spec.every_step or abs(rate_hz - step_hz) <= RATE_TOLERANCE * step_hz:
@@ -497,14 +497,14 @@ def validate_steps(
 
 def _validate_targets(positions_m: FloatArray, limits: Limits) -> Rejection | None:
     """Why absolute targets (n, 3) are too far outside the workspace box to be intended."""
-    box, most_m = limits.workspace, REJECT_FACTOR * limits.step_m
+    most_m = REJECT_FACTOR * limits.step_m
     away_m = np.linalg.norm(positions_m - np.clip(positions_m, *workspace_corners(limits)), axis=1)
     for index in (away_m > most_m).nonzero()[0]:
         at = ", ".join(f"{value:.4g}" for value in positions_m[index])
         why = (
-            f"a target at ({at}) m, {away_m[index]:.4g} m outside the workspace x {box.x_m} "
-            f"y {box.y_m} z {box.z_m}: are its numbers metres (position_scale_m), and is it in "
-            "the base frame?"
+            f"a target at ({at}) m, {away_m[index]:.4g} m outside the workspace "
+            f"{limits.workspace}: are its numbers metres (position_scale_m), and is it in the base "
+            "frame?"
         )
         return Rejection("workspace", why, float(away_m[index]), most_m)
     return None

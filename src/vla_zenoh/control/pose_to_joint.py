@@ -2,9 +2,9 @@
 
 The pose stream has its limits, and joints have theirs. Those of the joints act in three places: the
 motion to a goal is planned with the shares of the pose's limits that the joints can follow
-(`PoseToJoint.shares`); where they lag behind nevertheless, the pose waits for them (`pace`), up to
-`STUCK_S`; and if they lag when the arm brakes, the joints stop within their own limits and the pose
-follows them. An arm that stops does not make up for its lag.
+(`PoseToJoint.shares`); where they lag behind nevertheless, the pose waits for them (`time_rate`),
+up to `STUCK_S`; and if they lag when the arm brakes, the joints stop within their own limits and
+the pose follows them. An arm that stops does not make up for its lag.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from vla_zenoh.control.limits import (
     FULL,
     Shares,
     between,
+    chain_motion_limits,
     into_workspace,
     joint_margins,
-    joint_motion_limits,
     stop_way,
 )
 from vla_zenoh.control.plan_timeline import Goal
 from vla_zenoh.control.reachability import Barriers
 from vla_zenoh.control.smoothing import Motion, PosePath, Smoother
-from vla_zenoh.control.states import STOPPING, Mode
+from vla_zenoh.control.states import STOPPING, MotionMode
 from vla_zenoh.kinematics.kinematics import Kinematics, pose_error
 from vla_zenoh.kinematics.so3 import Pose, exp3, log3, pose_distance
 from vla_zenoh.profile import Profile
@@ -47,26 +47,26 @@ LONGEST_RAD = POSTURE_RAD_S / POSTURE_1_S
 """A posture further away pulls no faster."""
 PULL_JERK = 1.4
 """Greatest jerk of that when it reverses, in speeds times `PULL_1_S` squared."""
-NEAR_M, NEAR_RAD = 0.002, 0.01
+LAG_M, LAG_RAD = 0.002, 0.01
 """Joints nearer to the pose than this follow it."""
 FAR = 5.0
 """At this multiple of that distance the pose waits for them."""
-SLOWEST = 1e-3
+LEAST_SPEED = 1e-3
 """Least share of the speed: a pose that stands cannot be planned with."""
-ROOM = (0.95, 0.9, 0.9)
+JOINT_ROOM = (0.95, 0.9, 0.9)
 """Parts of the joints' velocity, acceleration and jerk used for planning: the path is curved in
 joint space, and the elbow moves as well."""
-PLACES = 3
+PATH_PLACES = 3
 """Places of a path at which the joints are computed."""
 BRAKE_BEND = 0.15
 """`BEND` of a brake, whose curvature effect falls with its speed."""
 BRAKE_S = 0.1
 """A brake covers about the distance that the arm moves in this time."""
 CREEPING, STUCK_S = 0.05, 0.5
-"""A pose that advances at less than this pace for this long will not be reached."""
+"""A pose that advances at less than this rate for this long will not be reached."""
 OUTSIDE_M = 1e-3
 """An arm further outside the box than this started there, and is moved inside."""
-DAMPING = 1e-5 * np.eye(6)
+LENGTH_DAMPING = 1e-5 * np.eye(6)
 """Of the inverse for lengths alone: at a singularity they are large, and finite."""
 LAGS = 0.5
 """Joints that lag by this much, see `PoseToJoint._lag`, may stop by themselves."""
@@ -87,7 +87,7 @@ class PoseToJoint:
     ) -> None:
         robot, limits = profile.robot, profile.limits
         self._kinematics = kinematics
-        self.limits = joint_motion_limits(profile, kinematics)
+        self.limits = chain_motion_limits(profile, kinematics)
         velocity, acceleration, jerk = self.limits
         share = float(np.min(velocity / kinematics.velocity_rad_s))
         home_rad = kinematics.ordered(robot.arm_joints, robot.home_rad)
@@ -108,7 +108,7 @@ class PoseToJoint:
         self._pull_1_s = min(PULL_1_S, most**0.5)
         self._dt_s = 1.0 / profile.timing.command_hz
         self._names = kinematics.arm_joints
-        self._held: set[str] = set()
+        self._held_by: set[str] = set()
         self.restart(home_rad)
 
     def restart(self, joints_rad: FloatArray) -> None:
@@ -117,7 +117,7 @@ class PoseToJoint:
         self._pull = self._pull_rate_1_s = 0.0
         self._stopping, self._ticks = False, 0
         self.keep_elbow()
-        self.pace = 1.0
+        self.time_rate = 1.0
         """Rate of the pose's time, 0 to 1."""
 
     def keep_elbow(self) -> None:
@@ -135,7 +135,7 @@ class PoseToJoint:
         turn = log3(rotation.T @ goal.rotation)
         ways = np.concatenate([goal.position_m - position_m, turn])
         joint_ways, bends = self._ways(np.concatenate([ways[:3], rotation @ turn]))
-        limits = np.array(ROOM)[:, None] * np.array(self.limits)
+        limits = np.array(JOINT_ROOM)[:, None] * np.array(self.limits)
         speed = float(np.linalg.norm(twist))
         return followed_shares(ways, box, speed, joint_ways, bends, limits, bend)
 
@@ -146,10 +146,10 @@ class PoseToJoint:
         """
         found: list[FloatArray] = []
         joints = self._now.position_rad
-        for _ in range(PLACES):
+        for _ in range(PATH_PLACES):
             found.append(_joint_way(self._kinematics.jacobian(joints), way))
-            joints = joints + found[-1] / (PLACES - 1)
-        bends = np.abs(np.diff(found, axis=0)).max(axis=0) * (PLACES - 1)
+            joints = joints + found[-1] / (PATH_PLACES - 1)
+        bends = np.abs(np.diff(found, axis=0)).max(axis=0) * (PATH_PLACES - 1)
         return np.abs(found).max(axis=0), bends
 
     def brake(self, smoother: Smoother) -> None:
@@ -159,7 +159,7 @@ class PoseToJoint:
         (position_m, rotation), twist, _ = smoother.motion
         way = BRAKE_S * twist
         ahead = Pose(position_m + way[:3], exp3(way[3:]) @ rotation)
-        smoother.brake(self.shares(smoother.motion, ahead, smoother.box, bend=BRAKE_BEND))
+        smoother.brake_together(self.shares(smoother.motion, ahead, smoother.box, bend=BRAKE_BEND))
 
     def stopping_rad(self, smoother: Smoother, ahead_s: float) -> list[FloatArray]:
         """(n,) each, joints on the way to rest and at rest, were the arm to brake in `ahead_s`.
@@ -171,7 +171,7 @@ class PoseToJoint:
             return [joints]
         ahead = copy(smoother)
         if not ahead.braking:
-            ahead.tick(self.pace * ahead_s / self._dt_s)
+            ahead.tick(self.time_rate * ahead_s / self._dt_s)
             self.brake(ahead)
         rest = ahead.resting_pose()
         jacobian, velocity = self._kinematics.jacobian(joints), self._now.velocity_rad_s
@@ -197,28 +197,28 @@ class PoseToJoint:
             self._constraints.update(self._now.position_rad)
         self._ticks += 1
         # Held joints approach a standing pose for as long as it takes.
-        lags = lag > 1.0 or (bool(self._held) and smoother.at_rest)
+        lags = lag > 1.0 or (bool(self._held_by) and smoother.at_rest)
         self._stopping = braking and (self._stopping or lags)
         if self._stopping:
             self._stop(smoother)
             return
-        self.pace = min(max((FAR - lag) / (FAR - 1.0), SLOWEST), 1.0)
-        waiting = self.pace < CREEPING
+        self.time_rate = min(max((FAR - lag) / (FAR - 1.0), LEAST_SPEED), 1.0)
+        waiting = self.time_rate < CREEPING
         self._waiting_s = self._waiting_s + self._dt_s if waiting else 0.0
-        motion = smoother.tick(self.pace)
+        motion = smoother.tick(self.time_rate)
         self._follower.posture_rad = self._pulled_to(1.0 if elbow and not braking else 0.0)
-        twist = self.pace * motion.twist
+        twist = self.time_rate * motion.twist
         pose = self._inside(here, motion.pose)
         self._now, hits = self._follower.step(self._now, pose, twist, self._dt_s)
         found = {f"{hit.name} {hit.where}".strip() for hit in hits}
-        self._held = found | (self._held if waiting else set())
+        self._held_by = found | (self._held_by if waiting else set())
 
     @property
     def stuck(self) -> str:
         """Why the joints will never reach the pose, empty while they follow."""
         if self._waiting_s < STUCK_S:
             return ""
-        held = sorted(self._held)
+        held = sorted(self._held_by)
         return (
             f"the joints cannot follow the pose: it has waited for them for {STUCK_S:g} s; "
             f"they are held by {', '.join(held) or 'nothing, so the arm cannot reach this pose'}"
@@ -232,9 +232,9 @@ class PoseToJoint:
         return Pose(inside_m, pose.rotation)
 
     def _lag(self, here: Pose, pose: Pose) -> float:
-        """Distance of the TCP from `pose`, in units of `NEAR_M` and `NEAR_RAD`."""
+        """Distance of the TCP from `pose`, in units of `LAG_M` and `LAG_RAD`."""
         apart_m, apart_rad = pose_distance(here, self._inside(here, pose))
-        return max(apart_m / NEAR_M, apart_rad / NEAR_RAD)
+        return max(apart_m / LAG_M, apart_rad / LAG_RAD)
 
     def _stop(self, smoother: Smoother) -> None:
         """Stop the joints within their limits; the pose follows them."""
@@ -298,11 +298,14 @@ class FollowedPath(PosePath):
     def stopping_rad(self, ahead_s: float) -> list[FloatArray]:
         return self.joints.stopping_rad(self, ahead_s)
 
-    def step(self, mode: Mode) -> None:
-        self.joints.tick(self, braking=mode in STOPPING, elbow=mode is Mode.FOLLOW)
+    def step(self, mode: MotionMode) -> None:
+        self.joints.tick(self, braking=mode in STOPPING, elbow=mode is MotionMode.FOLLOW)
 
-    def stop(self, shares: Shares | None) -> None:
+    def stop(self) -> None:
         """Come to rest as fast as the joints can."""
+        self.joints.brake(self)
+
+    def pause(self) -> None:
         self.joints.brake(self)
 
     def command(self, state: str, cause: Cause | None, goal: Goal | None) -> JointCommand:
@@ -319,4 +322,4 @@ class FollowedPath(PosePath):
 
 def _joint_way(jacobian: FloatArray, way: FloatArray) -> FloatArray:
     """The least joint displacement (n,) that moves the TCP by `way` (6,)."""
-    return jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + DAMPING, way)
+    return jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + LENGTH_DAMPING, way)

@@ -143,7 +143,7 @@ def reasons_of_worker(
             f"worker {worker!r} {why}" if name == "camera" else f"worker {worker!r}: {name}: {why}"
             for _, name, why in policy_check.spec_errors(profile, spec)
         ]
-        if why := policy_check.pace(spec, rate_hz):
+        if why := policy_check.wrong_rate(spec, rate_hz):
             reasons.append(f"worker {worker!r}: {why}")
         reasons += _chunk(profile, worker, spec, peers, chunk, now_ns, rate_hz)
         reasons += _cameras(profile, spec, peers)
@@ -273,11 +273,10 @@ def _robot(
         )
     _, outside_m = into_workspace(profile.limits, pose.record.position_m)
     if outside_m > profile.limits.step_m:
-        box = profile.limits.workspace
         at = ", ".join(f"{value:.3f}" for value in pose.record.position_m)
         reasons.append(
             f"the TCP at ({at}) m is {outside_m:.3f} m outside the workspace "
-            f"x {box.x_m} y {box.y_m} z {box.z_m}; move it inside"
+            f"{profile.limits.workspace}; move it inside"
         )
     return reasons
 

@@ -17,7 +17,7 @@ posture put it, as with a Cartesian controller, unless joints are commanded.
 Inside its zone ``slow - stop`` a barrier that shrinks limits the speed of the TCP to a share of the
 profile's::
 
-    share = sqrt(h / (slow - stop)), at least SLOWEST
+    share = sqrt(h / (slow - stop)), at least LEAST_NEAR_STOP
 
 the speed that a constant deceleration can stop within the distance left, if it can stop full speed
 within the zone. A step for which only the joints are too slow is kept with a slowdown, see
@@ -34,8 +34,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vla_zenoh.control.limits import (
-    LEAST,
-    SLOWEST,
+    LEAST_NEAR_STOP,
+    LEAST_TO_GOAL,
     BoundedStep,
     LimitHit,
     Slowdown,
@@ -66,7 +66,7 @@ NOISE = 2e-6
 """m, and singular value: difference of distances and solver between two equal poses."""
 SHRINKING = 1e-6
 """A barrier that changes by less counts as constant."""
-HALVINGS = 4
+REACH_HALVINGS = 4
 """Tries for a part that is feasible, the first a guess; then nothing of the step is left."""
 REFINEMENTS = 4
 """Halvings of what is between the feasible part and the next: to 1/16 of it."""
@@ -197,7 +197,7 @@ class Barriers:
         index = int(left.argmin())
         if left[index] >= 1.0:
             return None
-        share = max(float(np.sqrt(left[index])), SLOWEST)
+        share = max(float(np.sqrt(left[index])), LEAST_NEAR_STOP)
         value, slow = float(after[index] + self.stop[index]), float(self.slow[index])
         return Slowdown(self.names[index], share, value, slow, self.where(index))
 
@@ -391,7 +391,7 @@ class ReachabilityFilter:
             return self._settle(start, end, asked, hits, dt_s)
         best, low, high = here, 0.0, 1.0
         fraction = self._guess(start, end, hits)
-        for _ in range(HALVINGS):
+        for _ in range(REACH_HALVINGS):
             if fraction < SMALLEST_FRACTION:
                 break
             yield
@@ -425,7 +425,7 @@ class ReachabilityFilter:
         if end is here or here.error > 0 or here.barriers.min() <= 0:
             return 0.5
         if hits[0].name == "joint_velocity":
-            return GUESS_SHORT * hits[0].limit / (SLOWEST * hits[0].value)
+            return GUESS_SHORT * hits[0].limit / (LEAST_NEAR_STOP * hits[0].value)
         room = here.barriers - start.floor
         fall = np.maximum(here.barriers - end.barriers, 1e-12)
         return GUESS_SHORT * min(1.0, float((room / fall).min()))
@@ -455,7 +455,7 @@ class ReachabilityFilter:
         leaving = here.barriers[0] < 0 and end.barriers[0] > here.barriers[0]
         if not hits and not leaving:
             late = self._late(here, end, dt_s)
-            if late is not None and late.value > late.limit / SLOWEST:
+            if late is not None and late.value > late.limit / LEAST_NEAR_STOP:
                 hits = [LimitHit(late.name, late.value, late.limit, where=late.where)]
         return end, hits
 
@@ -488,7 +488,7 @@ class ReachabilityFilter:
         limit = float(self._velocity_rad_s[joint])
         return Slowdown(
             "joint_velocity",
-            max(full_s / needed_s, LEAST),
+            max(full_s / needed_s, LEAST_TO_GOAL),
             limit * needed_s / time_s,
             limit,
             self.kinematics.arm_joints[joint],

@@ -16,8 +16,8 @@ import numpy as np
 from vla_zenoh.control.axis_smoothing import OVERSHOOT, AxisPlan, AxisSmoother, AxisState
 from vla_zenoh.control.limits import (
     FULL,
-    HELD_LEAD_M,
-    HELD_LEAD_RAD,
+    PAUSE_LEAD_M,
+    PAUSE_LEAD_RAD,
     LimitHit,
     MotionLimits,
     Shares,
@@ -27,7 +27,7 @@ from vla_zenoh.control.limits import (
     workspace_corners,
 )
 from vla_zenoh.control.plan_timeline import Goal
-from vla_zenoh.control.states import Mode
+from vla_zenoh.control.states import MotionMode
 from vla_zenoh.kinematics.so3 import (
     Pose,
     exp3,
@@ -122,14 +122,14 @@ class Smoother(AxisSmoother):
         self.brake()
 
     # -- moving -------------------------------------------------------------------------------
-    def tick(self, pace: float = 1.0) -> Motion:
+    def tick(self, part: float = 1.0) -> Motion:
         """Advance by one tick.
 
         Args:
-            pace: part of the tick by which the motion advances, for a slow follower. Twist and
-                acceleration are those at full pace.
+            part: of the tick, by which the motion advances, for a slow follower. Twist and
+                acceleration are those of a whole tick.
         """
-        if not self.advance(pace):
+        if not self.advance(part):
             return self.motion
         position, velocity, acceleration = self.state
         rotation = self._anchor @ exp3(position[3:])
@@ -202,13 +202,17 @@ class PosePath(Smoother):
         """(n,) each, commanded joints on the way to rest and at rest, from a brake in `ahead_s`."""
         return []
 
-    def step(self, mode: Mode) -> None:
+    def step(self, mode: MotionMode) -> None:
         """Advance by one tick."""
         self.tick()
 
-    def stop(self, shares: Shares | None) -> None:
-        """Come to rest, as `AxisSmoother.brake`."""
-        self.brake(shares)
+    def stop(self) -> None:
+        """Come to rest as soon as possible."""
+        self.brake()
+
+    def pause(self) -> None:
+        """Come to rest on the path, to go on from there."""
+        self.brake_together()
 
     def taken_hits(self) -> list[LimitHit]:
         """Limits that acted on the motion since the last call."""
@@ -252,7 +256,7 @@ class PosePath(Smoother):
         """`goal`, or one so near that the arm can retreat from there."""
         here = self.motion.pose
         apart_m, apart_rad = pose_distance(here, goal.pose)
-        share = 1 / max(apart_m / HELD_LEAD_M, apart_rad / HELD_LEAD_RAD, 1.0)
+        share = 1 / max(apart_m / PAUSE_LEAD_M, apart_rad / PAUSE_LEAD_RAD, 1.0)
         if share >= 1.0:
             return goal
         nearer = interpolate(here, goal.pose, share)

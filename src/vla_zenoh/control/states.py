@@ -57,7 +57,7 @@ TABLE: dict[tuple[State, Trigger], State] = {
 """All transitions of the command node."""
 
 
-class Mode(StrEnum):
+class MotionMode(StrEnum):
     """What the motion of a part does in a tick: one of `MODES` of the node's state."""
 
     FOLLOW = "follow"  # moves to the goal in force
@@ -67,15 +67,15 @@ class Mode(StrEnum):
     BRAKE = "brake"  # comes to rest and stays there
 
 
-MODES: dict[State, frozenset[Mode]] = {
-    State.ACTIVE: frozenset({Mode.FOLLOW, Mode.PAUSE, Mode.CHANGE}),
-    State.HOLDING: frozenset({Mode.BRAKE}),
-    State.INACTIVE: frozenset({Mode.RETREAT, Mode.BRAKE}),
-    State.STOPPED: frozenset({Mode.BRAKE}),
-    State.FAULT: frozenset({Mode.BRAKE}),
+MODES: dict[State, frozenset[MotionMode]] = {
+    State.ACTIVE: frozenset({MotionMode.FOLLOW, MotionMode.PAUSE, MotionMode.CHANGE}),
+    State.HOLDING: frozenset({MotionMode.BRAKE}),
+    State.INACTIVE: frozenset({MotionMode.RETREAT, MotionMode.BRAKE}),
+    State.STOPPED: frozenset({MotionMode.BRAKE}),
+    State.FAULT: frozenset({MotionMode.BRAKE}),
 }
 """Modes of motion in each state of the command node."""
-STOPPING = frozenset({Mode.PAUSE, Mode.CHANGE, Mode.BRAKE})
+STOPPING = frozenset({MotionMode.PAUSE, MotionMode.CHANGE, MotionMode.BRAKE})
 """Modes in which the arm comes to rest."""
 OBEYING = frozenset({State.ACTIVE, State.HOLDING})
 """States in which chunks of the leased worker are executed."""

@@ -31,7 +31,7 @@ from vla_zenoh.control.commander_io import make_event
 from vla_zenoh.control.joint_space import JointPath
 from vla_zenoh.control.limits import APPROACH, FULL, Shares, Slowdown, slowest
 from vla_zenoh.control.plan_timeline import Goal, Plan
-from vla_zenoh.control.pose_to_joint import SLOWEST
+from vla_zenoh.control.pose_to_joint import LEAST_SPEED
 from vla_zenoh.control.smoothing import PosePath
 from vla_zenoh.types import Event, FloatArray
 
@@ -86,7 +86,7 @@ class Arrivals:
 
 
 class StepTiming:
-    """The speed to each goal of an arm that stands at first.
+    """The speed to each goal, for plans since the arm stood; see the module.
 
     Args:
         box: (3, 6) velocity, acceleration and jerk limits of every axis.
@@ -147,7 +147,7 @@ class StepTiming:
         if MOVING * share < now:
             share = now + CHANGE * (share - now)
         share = max(share, least)
-        return min(max(share, SLOWEST), 1.0)
+        return min(max(share, LEAST_SPEED), 1.0)
 
     def _take(self, plan: Plan, plan_ns: int, asked_period_s: float) -> None:
         next_ns, late_by_ns = self._arrivals.arrived(plan_ns, asked_period_s * 1e9)

@@ -191,7 +191,7 @@ class JointMonitor(Monitor):
         if part.measured_rad is None or part.commanded is None:
             return None
         hit = self.update(
-            part.measured_rad, part.commanded_rad, part.now_ns, in_joints=part.in_joints
+            part.measured_rad, part.commanded_rad, part.now_ns, joints_asked=part.joints_asked
         )
         return None if hit is None else too_near(hit)
 
@@ -201,7 +201,7 @@ class JointMonitor(Monitor):
         commanded_rad: FloatArray | None,
         now_ns: int,
         *,
-        in_joints: bool = False,
+        joints_asked: bool = False,
     ) -> LimitHit | None:
         """Check the bounds and the elbow in turn, one of them every half `PERIOD_NS`.
 
@@ -209,7 +209,7 @@ class JointMonitor(Monitor):
             measured_rad: (n,) in chain order.
             commanded_rad: (n,) joint commands; None: poses are commanded.
             now_ns: time of this tick.
-            in_joints: joints are commanded; then singularities do not matter.
+            joints_asked: the goals are joints; then singularities do not matter.
 
         Returns:
             the bound for which the arm has to brake, None without one.
@@ -219,10 +219,10 @@ class JointMonitor(Monitor):
         self._next_ns = now_ns + PERIOD_NS // 2
         self._elbow_next = not self._elbow_next
         if self._elbow_next:
-            return self._bounds(measured_rad, in_joints=in_joints)
+            return self._bounds(measured_rad, joints_asked=joints_asked)
         return self._elbow(measured_rad, commanded_rad)
 
-    def _bounds(self, measured_rad: FloatArray, *, in_joints: bool) -> LimitHit | None:
+    def _bounds(self, measured_rad: FloatArray, *, joints_asked: bool) -> LimitHit | None:
         kinematics, barriers = self._reach.kinematics, self._reach.barriers
         ends = np.minimum(measured_rad - kinematics.lower_rad, kinematics.upper_rad - measured_rad)
         left = barriers.at(measured_rad, kinematics.jacobian(measured_rad))
@@ -230,7 +230,9 @@ class JointMonitor(Monitor):
         before = left if self._edge is None else self._edge
         self._edge = np.minimum(np.maximum(before, left), left + self._band)
         nearer = self._edge < before
-        nearer[len(ends)] &= not in_joints  # the singular value comes first after the joints' ends
+        nearer[
+            len(ends)
+        ] &= not joints_asked  # the singular value comes first after the joints' ends
         past = np.where(nearer, left + self._past, 1.0)
         worst = int(np.argmin(past))
         if past[worst] < 0:

@@ -7,7 +7,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from vla_zenoh.control.limits import ROTATION_BOX
+from vla_zenoh.control.limits import ROTATION_BOX, joint_motion_limits
 from vla_zenoh.control.states import OBEYING
 from vla_zenoh.errors import CodecError
 from vla_zenoh.guard.reference_governor import BRAKE_MARGIN
@@ -15,7 +15,6 @@ from vla_zenoh.guard.stream_guard import (
     ACCELERATE_S,
     JointGuard,
     PoseGuard,
-    joint_motion_limits,
     pose_brake_limits,
 )
 from vla_zenoh.kinematics.so3 import Pose, pose_distance
@@ -33,7 +32,7 @@ UNHEEDED_NS = 200_000_000
 """The arm reports this for this long after the last such rejection."""
 ACTIVE_STATES = frozenset(state.value for state in OBEYING)
 """States in which a command node drives the arm; in any other it brakes or stands."""
-SETTLE_NS = 500_000_000
+ARM_SETTLES_NS = 500_000_000
 """After the last command the arm comes to rest within this time."""
 MOVED_M, MOVED_RAD = 0.005, 0.02
 """An arm at rest that moves further than this, TCP or any joint, is moved by something else; its
@@ -45,7 +44,7 @@ waited on a stuck link or in a suspended process."""
 MAX_SOURCES = 64
 """Sources whose last sequence number is remembered; each start of a command node is one."""
 
-Mode = Literal["pose", "joint"]
+CommandKind = Literal["pose", "joint"]
 
 
 class Measured(NamedTuple):
@@ -55,9 +54,9 @@ class Measured(NamedTuple):
     position_rad: FloatArray
     velocity_rad_s: FloatArray
 
-    def at(self, mode: Mode) -> Any:
+    def at(self, kind: CommandKind) -> Any:
         """The pose or the joint positions."""
-        return self.pose if mode == "pose" else self.position_rad
+        return self.pose if kind == "pose" else self.position_rad
 
 
 class ArmGuard:
@@ -82,7 +81,7 @@ class ArmGuard:
     ) -> None:
         robot, timeout_s, here = profile.robot, profile.timing.command_timeout_s, measure()
         brake = joint_motion_limits(profile, BRAKE_MARGIN)
-        self._guards: dict[Mode, PoseGuard | JointGuard] = {
+        self._guards: dict[CommandKind, PoseGuard | JointGuard] = {
             "pose": PoseGuard(here.pose, dt_s, timeout_s, pose_brake_limits(profile)),
             "joint": JointGuard(
                 robot.arm_joints, here.position_rad, dt_s, timeout_s, brake, joint_range_rad
@@ -91,11 +90,11 @@ class ArmGuard:
         self._measure = measure
         self._writer = self._state = ""
         self._unheeded_until_ns = self._now_ns = 0
-        self.mode: Mode = robot.command
+        self.kind: CommandKind = robot.command
 
     @property
     def _active(self) -> PoseGuard | JointGuard:
-        return self._guards[self.mode]
+        return self._guards[self.kind]
 
     @property
     def following(self) -> bool:
@@ -152,28 +151,28 @@ class ArmGuard:
         ``other_mode`` (the other stream is followed), ``moving`` (the arm moves, so its control law
         cannot be exchanged), or what `StreamGuard.offer` returns.
         """
-        mode: Mode = "joint" if isinstance(command.record, JointCommand) else "pose"
+        kind: CommandKind = "joint" if isinstance(command.record, JointCommand) else "pose"
         state = command.record.state
         if not (self.following or self.braking or state in ACTIVE_STATES):
             # The end of a stream to a robot node that was restarted, or that had been silent.
             return "inactive"
-        reason = self._change(mode) or self._guards[mode].offer(command, now_ns)
+        reason = self._change(kind) or self._guards[kind].offer(command, now_ns)
         if reason is None:
-            self.mode, self._writer, self._state = mode, command.header.source, state
+            self.kind, self._writer, self._state = kind, command.header.source, state
         elif reason in UNHEEDED and state in ACTIVE_STATES and not (self.following or self.braking):
             self._unheeded_until_ns = now_ns + UNHEEDED_NS
         return reason
 
-    def _change(self, mode: Mode) -> str | None:
-        """Prepare the guard of `mode` for a stream, or the reason against a change."""
-        if mode == self.mode:
+    def _change(self, kind: CommandKind) -> str | None:
+        """Prepare the guard of `kind` for a stream, or the reason against a change."""
+        if kind == self.kind:
             return None
         if self.following or self.braking:
             return "other_mode"
         measured = self._measure()
         if float(np.abs(measured.velocity_rad_s).max()) > STANDING_RAD_S:
             return "moving"
-        self._guards[mode].anchor(measured.at(mode))
+        self._guards[kind].anchor(measured.at(kind))
         return None
 
     def tick(self, now_ns: int, dt_s: float | None = None) -> PoseReference | JointReference:
@@ -188,8 +187,8 @@ class ArmGuard:
         Commands received before are still replays.
         """
         measured = self._measure()
-        for mode, guard in self._guards.items():
-            guard.anchor(measured.at(mode))
+        for kind, guard in self._guards.items():
+            guard.anchor(measured.at(kind))
 
     def hold(self) -> None:
         """Follow no stream and hold the reference: the arm stopped there by itself."""
@@ -202,8 +201,8 @@ class ArmGuard:
     def reset(self) -> None:
         """Follow no stream, forget the last, and hold the measured place: the robot was reset."""
         measured = self._measure()
-        for mode, guard in self._guards.items():
-            guard.reset(measured.at(mode))
+        for kind, guard in self._guards.items():
+            guard.reset(measured.at(kind))
 
 
 class HeldReference:
@@ -231,7 +230,7 @@ class HeldReference:
 
     def update(self, measured: Measured, now_ns: int) -> bool:
         """Whether `held` is still true; call it while nothing is sent."""
-        if self._sent_ns is None or now_ns - self._sent_ns < SETTLE_NS:
+        if self._sent_ns is None or now_ns - self._sent_ns < ARM_SETTLES_NS:
             return self.held
         if self._settled is None:
             self._settled = measured

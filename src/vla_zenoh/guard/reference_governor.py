@@ -48,13 +48,13 @@ LONG_S = 0.6
 commanded path then goes on without jerk, and the difference gets all of it."""
 UNIT_S = 0.1
 """Unit of the numbers given to Ruckig, which takes everything below 1e-8 for zero."""
-NOTHING = 1e-7
+NOISE_UNITS = 1e-7
 """In these units. Ruckig would answer noise with full jerk."""
 LEAST_JERK = 1e-3
 """Least share of the jerk for planning."""
-SLACK, LEAST = 0.1, 0.25
+SLACK, LEAST_LEFT = 0.1, 0.25
 """Shares of the stream's limits. The difference is replanned when the commanded path takes `SLACK`
-more of them; it always has `LEAST`."""
+more of them; it always has `LEAST_LEFT`."""
 REVERSAL = 0.15
 """Share of the jerk that the difference leaves unused. Where the commanded path's jerk reverses
 within a tick, a third-order finite difference weighs its parts unevenly: by up to 1/8 of the jerk
@@ -371,7 +371,7 @@ class ReferenceGovernor(Generic[Reference]):
         left[2] -= REVERSAL
         # The commanded path may begin to accelerate: the difference has less jerk, and gives way.
         left[1] -= (1.0 - GIVES_WAY) * np.maximum(1.0 - taken[1], 0.0)
-        left = np.maximum(left, LEAST)
+        left = np.maximum(left, LEAST_LEFT)
         velocity, acceleration, jerk = left * self._own * self._axis
         cramped = _jerk(way, LONG_S) > (BRAKE_MARGIN - ORDINARY) * self._own[2] * self._axis
         self._cramped = cramped if cramped.any() else None
@@ -386,7 +386,7 @@ class ReferenceGovernor(Generic[Reference]):
         length = self._length = jerk * UNIT_S**3
         units = np.array([length, length / UNIT_S, length / UNIT_S**2])
         start = np.array(way) / units
-        start[:, (np.abs(start) < NOTHING).all(axis=0)] = 0.0
+        start[:, (np.abs(start) < NOISE_UNITS).all(axis=0)] = 0.0
         self._planned, self._time_s = False, 0.0
         if not start.any():
             self._way = self._cramped = None

@@ -451,10 +451,3 @@ def pose_brake_limits(profile: Profile) -> MotionLimits:
     """`BRAKE_MARGIN` times the limits of a profile's pose stream."""
     limits = BRAKE_MARGIN * np.array(motion_limits(profile.limits))
     return MotionLimits(*map(tuple, limits.tolist()))
-
-
-def joint_motion_limits(profile: Profile, margin: float = 1.0) -> JointMotionLimits:
-    """`margin` times the limits of `profile`, in the order of ``robot.arm_joints``."""
-    limits, joints = profile.limits.joint, len(profile.robot.arm_joints)
-    names = ("velocity_rad_s", "acceleration_rad_s2", "jerk_rad_s3")
-    return JointMotionLimits(*(margin * np.array(limits.of(name, joints)) for name in names))

@@ -86,6 +86,15 @@ class Workspace(Section):
     y_m: Reach = (-0.45, 0.45)
     z_m: Reach = (0.012, 0.9)
 
+    @property
+    def corners_m(self) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+        """Lower and upper corner."""
+        (x, to_x), (y, to_y), (z, to_z) = self.x_m, self.y_m, self.z_m
+        return (x, y, z), (to_x, to_y, to_z)
+
+    def __str__(self) -> str:
+        return f"x {self.x_m} y {self.y_m} z {self.z_m}"
+
 
 class TranslationLimits(Section):
     """Limits per axis of the base frame."""

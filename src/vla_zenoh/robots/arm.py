@@ -14,8 +14,8 @@ from vla_zenoh.codec.records import SMALL_BYTES
 from vla_zenoh.control.preflight import STOP_LATCHED
 from vla_zenoh.errors import CodecError
 from vla_zenoh.guard.arm_guard import (
+    ARM_SETTLES_NS,
     OLDEST_NS,
-    SETTLE_NS,
     ArmGuard,
     GripperGuard,
     HeldReference,
@@ -139,7 +139,7 @@ class Arm:
 
     def _hold_after_stall(self, mono_ns: int, stall_s: float) -> None:
         """Hold the robot at its last set-point; motion resumes from there, at rest."""
-        brief = stall_s * 1e9 <= SETTLE_NS
+        brief = stall_s * 1e9 <= ARM_SETTLES_NS
         if not brief:
             self._hold.invalidate()  # the arm may have been moved by other means meanwhile
         if self.guard.moving:
@@ -309,7 +309,7 @@ class Arm:
             "fault": self._driver.fault,
             STOP_LATCHED: "emergency stop; latched until a reset",
             "silent": self._driver.silent_why,
-            "braking": f"no command/{self.guard.mode} for {timeout_s:g} s while the arm moved",
+            "braking": f"no command/{self.guard.kind} for {timeout_s:g} s while the arm moved",
             "unheeded": "command stream rejected: its first set-point does not match the arm's "
             "current pose, or its beginning was lost",
         }.get(state, "")

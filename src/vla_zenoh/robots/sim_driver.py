@@ -280,7 +280,7 @@ class SimDriver(RobotDriver):
         self.report.counters["sim.torque_saturated"] = self.world.saturated
         detail: dict[str, Any] = {
             "scene": self.profile.sim.scene,
-            "command": self._first.guard.mode,
+            "command": self._first.guard.kind,
         }
         if self._pace is not None:
             detail["real_time_factor"] = round(self._pace.factor, 3)

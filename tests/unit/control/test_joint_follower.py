@@ -8,11 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vla_zenoh.control.joint_follower import JointFollower
-from vla_zenoh.control.limits import into_workspace, motion_limits
-from vla_zenoh.control.pose_to_joint import FAR, NEAR_M, NEAR_RAD, PoseToJoint
+from vla_zenoh.control.limits import into_workspace, joint_motion_limits, motion_limits
+from vla_zenoh.control.pose_to_joint import FAR, LAG_M, LAG_RAD, PoseToJoint
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.smoothing import Smoother
-from vla_zenoh.guard.stream_guard import joint_motion_limits
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.kinematics.so3 import Pose, exp3, pose_distance
 from vla_zenoh.profile import Profile, load_profile, override
@@ -23,7 +22,7 @@ KINEMATICS = make_kinematics(BASE)
 HOME_RAD = KINEMATICS.ordered(BASE.robot.arm_joints, BASE.robot.home_rad)
 TICK_S = 1 / BASE.timing.command_hz
 STEP_TICKS = 25
-MOST_LAG_M, MOST_LAG_RAD = 1.25 * FAR * NEAR_M, 1.25 * FAR * NEAR_RAD
+MOST_LAG_M, MOST_LAG_RAD = 1.25 * FAR * LAG_M, 1.25 * FAR * LAG_RAD
 STRAIGHT_M = 0.001
 RTOL = 1e-6
 # Straight on, and not quite as fast as each joint could by itself.
@@ -118,7 +117,7 @@ def test_joints_are_never_far_from_the_pose_and_stop_when_told_whatever_they_can
     assert arm.stop_s() <= allowed_s
     assert arm.stage.at_rest
     assert arm.smoother.at_rest
-    assert arm.lag()[0] <= NEAR_M
+    assert arm.lag()[0] <= LAG_M
 
 
 @pytest.mark.parametrize("speed_m_s", [0.1, 0.2, 0.3, 0.4])

@@ -228,9 +228,9 @@ def test_a_standing_arm_near_a_singularity_approaches_none_when_its_goals_become
     shadow = ReachabilityFilter(PROFILE, KINEMATICS)
     shadow.reset(singular_rad)
     monitor, now_ns = JointMonitor(PROFILE, shadow), 0
-    for in_joints in [True] * 40 + [False] * 40:
+    for joints_asked in [True] * 40 + [False] * 40:
         now_ns += TICK_NS
-        assert monitor.update(singular_rad, singular_rad, now_ns, in_joints=in_joints) is None
+        assert monitor.update(singular_rad, singular_rad, now_ns, joints_asked=joints_asked) is None
         assert monitor.slowdown is None
 
 

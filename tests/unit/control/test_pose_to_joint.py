@@ -7,13 +7,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vla_zenoh.control.chunk_planner import ChunkPlanner
-from vla_zenoh.control.limits import motion_limits
+from vla_zenoh.control.limits import joint_motion_limits, motion_limits
 from vla_zenoh.control.motion_pipeline import MotionPipeline
 from vla_zenoh.control.pose_to_joint import PoseToJoint
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.smoothing import Smoother
 from vla_zenoh.control.states import State
-from vla_zenoh.guard.stream_guard import joint_motion_limits
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.kinematics.so3 import Pose, exp3, quat_from_rotation
 from vla_zenoh.profile import load_profile, override

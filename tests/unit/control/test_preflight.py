@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from command_rig import MS, START_NS, WORKER, Rig, model_spec
 
-from vla_zenoh.control.policy_check import pace
+from vla_zenoh.control.policy_check import wrong_rate
 from vla_zenoh.control.preflight import Passing, PeerSnapshot, reasons_of_part, reasons_of_worker
 from vla_zenoh.keys import LOADING, NOTHING_YET, OPENING
 from vla_zenoh.lab.check.fit import check_spec
@@ -287,7 +287,7 @@ def test_a_model_that_counts_its_inferences_is_asked_once_a_step(
     spec = ModelSpec(
         name="act", action=ActionSpec(horizon=1, dt_s=dt_s, gripper="none"), every_step=every_step
     )
-    profile, reason = load_profile("panda_sim"), pace(spec, rate_hz)
+    profile, reason = load_profile("panda_sim"), wrong_rate(spec, rate_hz)
     assert bool(reason) == rejected
     found = check_spec(profile, spec, worker="scripted", rate_hz=rate_hz)
     assert [each.why for each in found if each.name == "rate"] == ([reason] if rejected else [])

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from panda_arm import HOME_RAD, moved, panda, tool_down_at
 from pydantic import ValidationError
 
-from vla_zenoh.control.limits import SLOWEST, BoundedStep, LimitHit
+from vla_zenoh.control.limits import LEAST_NEAR_STOP, BoundedStep, LimitHit
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.errors import ProfileError, RecordError
 from vla_zenoh.kinematics.collision import HELD, TABLE
@@ -589,7 +589,7 @@ def test_the_nearer_a_bound_the_slower_the_arm(
     assert shares[0] == 1.0
     approach = shares[len(shares) - shares[::-1].index(1.0) :]
     assert approach == sorted(approach, reverse=True)
-    assert SLOWEST <= approach[-1] < 0.9
+    assert LEAST_NEAR_STOP <= approach[-1] < 0.9
 
 
 def test_away_from_a_bound_the_arm_has_its_full_speed() -> None:

@@ -42,7 +42,7 @@ def smoother() -> Smoother:
 
 def ordered(motion: Smoother, order: tuple[np.ndarray, np.ndarray] | Shares | None) -> None:
     if order is None or isinstance(order, Shares):
-        motion.brake(order)
+        motion.brake_together(order)
         return
     here = motion.motion.pose
     parts = SLOWEST + (1 - SLOWEST) * np.abs(order[0]) / REACH_M
@@ -144,7 +144,7 @@ def test_a_brake_that_has_little_jerk_gets_no_faster_first(jerk: float) -> None:
     for _ in range(34):
         motion.tick()
     assert motion.motion.acceleration[0] > 0
-    motion.brake(Shares(jerk=jerk))
+    motion.brake_together(Shares(jerk=jerk))
     foretold = motion.resting_pose()
     while not motion.at_rest:
         before = motion.motion

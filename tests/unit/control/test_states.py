@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 from command_rig import Rig
 
-from vla_zenoh.control.states import MODES, OBEYING, TABLE, Mode, State, Trigger
+from vla_zenoh.control.states import MODES, OBEYING, TABLE, MotionMode, State, Trigger
 
 # Written down once more, so that an edge cannot come or go unnoticed.
 EDGES = [
@@ -57,9 +57,9 @@ def test_chunks_are_obeyed_after_an_activation_only(state: State) -> None:
 
 def test_the_motion_follows_goals_while_active_only_and_retreats_while_inactive_only() -> None:
     assert set(MODES) == set(State)
-    assert [state for state in State if Mode.FOLLOW in MODES[state]] == [State.ACTIVE]
-    assert [state for state in State if Mode.RETREAT in MODES[state]] == [State.INACTIVE]
-    assert all(Mode.BRAKE in MODES[state] for state in State if state is not State.ACTIVE)
+    assert [state for state in State if MotionMode.FOLLOW in MODES[state]] == [State.ACTIVE]
+    assert [state for state in State if MotionMode.RETREAT in MODES[state]] == [State.INACTIVE]
+    assert all(MotionMode.BRAKE in MODES[state] for state in State if state is not State.ACTIVE)
 
 
 def test_the_motion_pauses_at_speed_0_goes_on_and_brakes_when_it_is_deactivated() -> None:
@@ -67,13 +67,13 @@ def test_the_motion_pauses_at_speed_0_goes_on_and_brakes_when_it_is_deactivated(
     rig.activate()
     rig.send([[0.02, 0, 0, 0, 0, 0, 0]] * 8)
     motion = rig.commander.parts[0].motion
-    assert motion.mode is Mode.FOLLOW
+    assert motion.mode is MotionMode.FOLLOW
     rig.put("speed", 0.0)
-    assert motion.mode is Mode.PAUSE
+    assert motion.mode is MotionMode.PAUSE
     rig.put("speed", 100.0)
-    assert motion.mode is Mode.FOLLOW
+    assert motion.mode is MotionMode.FOLLOW
     rig.put("active", False)
-    assert motion.mode is Mode.BRAKE
+    assert motion.mode is MotionMode.BRAKE
 
 
 def set_faults(rig: Rig, faults: tuple[str, ...]) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vla_zenoh.guard.arm_guard import STANDING_RAD_S, UNHEEDED_NS, ArmGuard, Measured, Mode
+from vla_zenoh.guard.arm_guard import STANDING_RAD_S, UNHEEDED_NS, ArmGuard, CommandKind, Measured
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import Header, JointCommand, PoseCommand, Stamped
@@ -25,11 +25,11 @@ UNIT = np.array([0.0, 0.0, 0.0, 1.0])
 class Side:
     """An arm that stands where it is told, its guard, and a clock."""
 
-    def __init__(self, mode: Mode = "pose") -> None:
+    def __init__(self, mode: CommandKind = "pose") -> None:
         self.measured = Measured(Pose(np.array([0.43, 0.0, 0.3]), np.eye(3)), HOME_RAD, np.zeros(7))
         ends = HOME_RAD - 1, HOME_RAD + 1
         self.guard = ArmGuard(PROFILE, lambda: self.measured, ends, 1e-3)
-        self.guard.mode = mode
+        self.guard.kind = mode
         self.now_ns, self.seq = START_NS, 0
 
     def stamped(self, record: Any, source: str) -> Stamped[Any]:
@@ -58,7 +58,7 @@ class Side:
 
 @pytest.mark.parametrize(("mode", "kind"), [("pose", PoseReference), ("joint", JointReference)])
 def test_it_holds_the_arm_by_what_the_profile_says_until_somebody_commands(
-    mode: Mode, kind: type
+    mode: CommandKind, kind: type
 ) -> None:
     assert isinstance(Side(mode).tick(), kind)
 
@@ -68,7 +68,7 @@ def test_while_poses_are_followed_joints_are_refused_and_change_nothing() -> Non
     assert side.pose(0.0004, 0.02) is None
     before = side.tick()
     assert side.joint() == "other_mode"
-    assert side.guard.mode == "pose"
+    assert side.guard.kind == "pose"
     np.testing.assert_array_equal(side.guard.reference[0], before[0])
 
 
@@ -123,7 +123,7 @@ def test_an_arm_that_still_swings_is_not_handed_over() -> None:
     swinging[4] = -1.5 * STANDING_RAD_S
     side.measured = side.measured._replace(velocity_rad_s=swinging)
     assert side.joint() == "moving"
-    assert side.guard.mode == "pose"
+    assert side.guard.kind == "pose"
     side.measured = side.measured._replace(velocity_rad_s=0.5 * swinging)
     assert side.joint() is None
 
@@ -163,11 +163,13 @@ def test_what_was_heard_before_a_change_is_not_new_after_it() -> None:
     assert side.pose() is None
     side.tick(SILENT_MS)
     assert side.guard.offer(old, side.now_ns) == "replayed"
-    assert side.guard.mode == "pose"
+    assert side.guard.kind == "pose"
 
 
 @pytest.mark.parametrize("mode", ["pose", "joint"])
-def test_an_arm_that_somebody_else_moved_stands_there_and_knows_who_spoke(mode: Mode) -> None:
+def test_an_arm_that_somebody_else_moved_stands_there_and_knows_who_spoke(
+    mode: CommandKind,
+) -> None:
     side = Side(mode)
     offer = side.guard.offer
     at, still = side.measured.pose.position_m, np.zeros(6)
@@ -184,14 +186,14 @@ def test_an_arm_that_somebody_else_moved_stands_there_and_knows_who_spoke(mode: 
 
 
 @pytest.mark.parametrize("mode", ["pose", "joint"])
-def test_a_restart_stands_where_the_robot_was_put(mode: Mode) -> None:
+def test_a_restart_stands_where_the_robot_was_put(mode: CommandKind) -> None:
     side = Side(mode)
     assert (side.pose if mode == "pose" else side.joint)() is None
     elsewhere = Pose(np.array([0.3, 0.0, 0.5]), np.eye(3))
     side.measured = Measured(elsewhere, HOME_RAD + 0.2, np.zeros(7))
     side.guard.reset()
     assert not side.guard.following
-    assert side.guard.mode == mode
+    assert side.guard.kind == mode
     where = elsewhere.position_m if mode == "pose" else HOME_RAD + 0.2
     np.testing.assert_array_equal(side.tick()[0], where)
 
@@ -206,7 +208,7 @@ def test_a_restart_stands_where_the_robot_was_put(mode: Mode) -> None:
     ],
 )
 def test_a_stream_whose_beginning_was_lost_is_said_to_be_unheeded_until_it_ends(
-    mode: Mode, by: float, speed: float, reason: str
+    mode: CommandKind, by: float, speed: float, reason: str
 ) -> None:
     side = Side(mode)
     for _ in range(20):

@@ -10,10 +10,11 @@ from guard_rig import stop_from
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from vla_zenoh.control.limits import joint_motion_limits
 from vla_zenoh.control.smoothing import Motion, Smoother
 from vla_zenoh.guard.arm_guard import max_braking_time_s
 from vla_zenoh.guard.reference_governor import BRAKE_MARGIN
-from vla_zenoh.guard.stream_guard import joint_motion_limits, pose_brake_limits
+from vla_zenoh.guard.stream_guard import pose_brake_limits
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh.types import JointReference

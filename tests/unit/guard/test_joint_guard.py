@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 from guard_rig import stop_from
 
-from vla_zenoh.control.limits import BEGIN_JOINT_RAD, JointMotionLimits
+from vla_zenoh.control.limits import BEGIN_JOINT_RAD, JointMotionLimits, joint_motion_limits
 from vla_zenoh.guard.reference_governor import BRAKE_MARGIN
 from vla_zenoh.guard.stream_guard import (
     BEGIN_RAD_S,
     JUMP_JOINT_RAD,
     JointGuard,
-    joint_motion_limits,
 )
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import FloatArray, Header, JointCommand, JointReference, Stamped

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from panda_arm import ARM_JOINTS, HOME_RAD, panda
 
 from vla_zenoh.errors import CodecError
-from vla_zenoh.guard.arm_guard import MOVED_M, MOVED_RAD, SETTLE_NS, HeldReference, Measured
+from vla_zenoh.guard.arm_guard import ARM_SETTLES_NS, MOVED_M, MOVED_RAD, HeldReference, Measured
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.profile import load_profile
 from vla_zenoh.robots.joint_reading import (
@@ -381,18 +381,18 @@ def test_what_was_sent_last_counts_until_somebody_moves_the_arm() -> None:
     hold = HeldReference()
     assert not hold.update(at(0), 0)
     hold.on_sent(0)
-    assert hold.update(at(0.5), SETTLE_NS // 2), "it still settles"
-    assert hold.update(at(0.1), SETTLE_NS)
-    assert hold.update(at(0.1 + 0.9 * MOVED_M), 2 * SETTLE_NS)
-    assert not hold.update(at(0.1 + 1.1 * MOVED_M), 3 * SETTLE_NS)
+    assert hold.update(at(0.5), ARM_SETTLES_NS // 2), "it still settles"
+    assert hold.update(at(0.1), ARM_SETTLES_NS)
+    assert hold.update(at(0.1 + 0.9 * MOVED_M), 2 * ARM_SETTLES_NS)
+    assert not hold.update(at(0.1 + 1.1 * MOVED_M), 3 * ARM_SETTLES_NS)
     assert not hold.held
-    hold.on_sent(4 * SETTLE_NS)
+    hold.on_sent(4 * ARM_SETTLES_NS)
     assert hold.held
 
 
 def test_an_elbow_that_somebody_moved_while_the_tcp_stayed_is_not_held_any_more() -> None:
     hold = HeldReference()
     hold.on_sent(0)
-    assert hold.update(at(0.1), SETTLE_NS)
-    assert hold.update(at(0.1, 0.9 * MOVED_RAD), 2 * SETTLE_NS)
-    assert not hold.update(at(0.1, 1.1 * MOVED_RAD), 3 * SETTLE_NS)
+    assert hold.update(at(0.1), ARM_SETTLES_NS)
+    assert hold.update(at(0.1, 0.9 * MOVED_RAD), 2 * ARM_SETTLES_NS)
+    assert not hold.update(at(0.1, 1.1 * MOVED_RAD), 3 * ARM_SETTLES_NS)

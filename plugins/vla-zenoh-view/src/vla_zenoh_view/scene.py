@@ -10,6 +10,7 @@ import pinocchio as pin
 import rerun as rr
 
 from vla_zenoh.control.actions import Steps, chunk_poses
+from vla_zenoh.control.limits import workspace_corners
 from vla_zenoh.control.plan_timeline import Goal, Plan
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.policy import ActionSpec
@@ -110,8 +111,7 @@ class Scene:
     def _begin(self, profile: Profile) -> None:
         log = self._stream.log
         log(paths.WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        space = profile.limits.workspace
-        low, high = np.array([space.x_m, space.y_m, space.z_m]).T
+        low, high = workspace_corners(profile.limits)
         self._reach = low - REACH_M, high + REACH_M
         box = rr.Boxes3D(mins=[low], sizes=[high - low], colors=[(120, 130, 150, 70)], radii=0.001)
         log(f"{self._root}/workspace", box, static=True)

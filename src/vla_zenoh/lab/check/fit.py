@@ -17,8 +17,8 @@ from vla_zenoh.control.policy_check import (
     few_joints,
     largest_step,
     outside_workspace_m,
-    pace,
     spec_errors,
+    wrong_rate,
 )
 from vla_zenoh.kinematics.so3 import Pose, pose_distance
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec
@@ -95,7 +95,7 @@ def _timing(profile: Profile, spec: ModelSpec, rate_hz: float) -> Iterator[Findi
             f"a chunk lasts {chunk_s:g} s and one is asked for every {1 / rate_hz:g} s: the arm "
             "waits in between",
         )
-    if why := pace(spec, rate_hz):
+    if why := wrong_rate(spec, rate_hz):
         yield error("rate", why)
     oldest_s = profile.timing.max_observation_age_s
     if spec.observation.max_age_s > oldest_s:
@@ -154,11 +154,10 @@ def _targets(spec: ActionSpec, steps: Steps, limits: Limits) -> Iterator[Finding
     longest_m, _ = largest_step(spec, steps)
     outside_m = float(outside_workspace_m(spec, steps, limits).max())
     if longest_m <= REACH_M and outside_m > limits.step_m:
-        box = limits.workspace
         yield warning(
             "workspace",
-            f"a pose {outside_m:.3f} m outside the workspace x {box.x_m} y {box.y_m} "
-            f"z {box.z_m}: is it in the base frame?",
+            f"a pose {outside_m:.3f} m outside the workspace {limits.workspace}: is it in "
+            "the base frame?",
         )
 
 
