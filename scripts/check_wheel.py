@@ -53,6 +53,7 @@ WITH_PLUGINS = [
     ["web", "--help"],
     ["node", "rolling", "--help"],
     ["nights", "--help"],
+    ["trial", "--help"],
     ["conform", "robot", "--help"],
     ["teleop", "--help"],
     ["dataset", "export", "--help"],

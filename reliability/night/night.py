@@ -29,10 +29,10 @@ import contextlib
 
 from chain import write_profile
 from vla_zenoh_nights.trial import UnattendedTrial
+from vla_zenoh_trial.folder import TrialFolder
 
 from vla_zenoh.lab.recording.reader import open_recording
-from vla_zenoh.lab.trial.folder import TrialFolder
-from vla_zenoh.lab.trial.verdict import verdict_in
+from vla_zenoh.lab.recording.verdict import verdict_in
 
 MODELS = """\
 workers: [scripted, twin]

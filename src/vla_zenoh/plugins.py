@@ -161,10 +161,16 @@ PACKAGES: Mapping[str, str] = {
     "save": "vla-zenoh-rolling",
     "serve.mcp": "vla-zenoh-mcp",
     "teleop": "vla-zenoh-teleop",
+    "trial": "vla-zenoh-trial",
     "view": "vla-zenoh-view",
     "web": "vla-zenoh-web",
 }
 """Command of a package in ``plugins/`` -> that package, for a computer that lacks it."""
+NEEDED: Mapping[str, str] = {
+    "vla-zenoh-figures": "vla-zenoh-benchmarks",
+    "vla-zenoh-nights": "vla-zenoh-trial",
+}
+"""Package in ``plugins/`` -> another one that it needs."""
 
 
 def installed(group: Group[Any]) -> Mapping[str, EntryPoint]:
@@ -195,10 +201,8 @@ def lacking(command: str) -> str:
         return ""
     package = PACKAGES[command]
     words = command.replace(".", " ")
-    return (
-        f"`vla-zenoh {words}` needs the package {package}; "
-        f"install it with: {how_to_install(package=package)}"
-    )
+    install = how_to_install(package=package, needed=NEEDED.get(package, ""))
+    return f"`vla-zenoh {words}` needs the package {package}; install it with: {install}"
 
 
 def load(group: Group[Declaration], name: str) -> Declaration:

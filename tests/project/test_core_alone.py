@@ -78,7 +78,9 @@ def test_a_command_of_a_package_that_is_missing_says_how_to_install_it(
     assert done.returncode == 1
     package = plugins.PACKAGES[command]
     assert f"needs the package {package}; install it with: pip install" in done.stderr
-    assert f". './plugins/{package}' in a checkout" in done.stderr
+    folders = [needed, package] if (needed := plugins.NEEDED.get(package)) else [package]
+    paths = " ".join(f"'./plugins/{each}'" for each in folders)
+    assert f" . {paths} in a checkout" in done.stderr
 
 
 @pytest.mark.realtime

@@ -249,10 +249,25 @@ def edit_commands(folder: Path, entries: str) -> None:
     install(project)
 
 
+PROJECTS = [
+    tomllib.loads(file.read_text("utf-8"))["project"]
+    for file in (Path(__file__).parents[2] / "plugins").glob("*/pyproject.toml")
+]
+
+
+def test_a_package_that_needs_another_is_installed_with_it() -> None:
+    names = {project["name"] for project in PROJECTS}
+    needed = {
+        project["name"]: names.intersection(project["dependencies"])
+        for project in PROJECTS
+        if names.intersection(project["dependencies"])
+    }
+    assert needed == {name: {other} for name, other in plugins.NEEDED.items()}
+
+
 def test_the_package_of_every_command_in_plugins_is_known() -> None:
     declared = {}
-    for file in (Path(__file__).parents[2] / "plugins").glob("*/pyproject.toml"):
-        project = tomllib.loads(file.read_text("utf-8"))["project"]
+    for project in PROJECTS:
         commands = project.get("entry-points", {}).get(plugins.COMMANDS.name, {})
         declared |= dict.fromkeys(commands, project["name"])
     assert declared == plugins.PACKAGES

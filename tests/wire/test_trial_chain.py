@@ -21,9 +21,9 @@ from camera_rig import until
 from chain import READY_PATIENCE_S, Chain, running_chain
 from vla_zenoh_dataset.episodes import episodes_of
 from vla_zenoh_dataset.success import succeeded
+from vla_zenoh_trial.folder import TrialFolder
 
 from vla_zenoh.lab.recording.run import load_run
-from vla_zenoh.lab.trial.folder import TrialFolder
 
 pytestmark = pytest.mark.slow
 

@@ -27,7 +27,7 @@ from web_rig import (
 )
 
 from vla_zenoh.lab.recording.reader import open_recording
-from vla_zenoh.lab.trial.verdict import verdict_in
+from vla_zenoh.lab.recording.verdict import verdict_in
 
 pytestmark = pytest.mark.long
 

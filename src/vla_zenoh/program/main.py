@@ -138,7 +138,7 @@ COMMANDS: Panels = {
         ),
         "inspect": "lab.cli.inspect:inspect",
         "net": "lab.cli.net:net",
-        "trial": "lab.cli.trial:trial",
+        "trial": OF_A_PACKAGE,
         "nights": OF_A_PACKAGE,
     },
 }

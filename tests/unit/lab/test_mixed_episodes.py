@@ -28,7 +28,7 @@ from vla_zenoh_dataset.lerobot import export
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.policy_servers.state_vector import read_parts
 from vla_zenoh.lab.recording.run import load_run
-from vla_zenoh.lab.trial.verdict import FACT
+from vla_zenoh.lab.recording.verdict import FACT
 from vla_zenoh.policy import ControllerSpec
 from vla_zenoh.profile import load_profile
 

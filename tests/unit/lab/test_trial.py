@@ -12,15 +12,16 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from vla_zenoh_trial.episode_fsm import DONE_S, EpisodeFsm, Phase
+from vla_zenoh_trial.folder import PLAN, TRIALS, TrialFolder
+from vla_zenoh_trial.plan import HIDDEN, DueEpisode, TrialPlan
+from vla_zenoh_trial.score import score
+from vla_zenoh_trial.verdict import EpisodeVerdict, read_verdict
 
 from vla_zenoh.errors import RecordError, RecordingError
 from vla_zenoh.lab.episode import EpisodeView
+from vla_zenoh.lab.recording.verdict import Verdict, verdict_in
 from vla_zenoh.lab.statistics import Paired
-from vla_zenoh.lab.trial.episode_fsm import DONE_S, EpisodeFsm, Phase
-from vla_zenoh.lab.trial.folder import PLAN, TRIALS, TrialFolder
-from vla_zenoh.lab.trial.plan import HIDDEN, DueEpisode, TrialPlan
-from vla_zenoh.lab.trial.score import score
-from vla_zenoh.lab.trial.verdict import EpisodeVerdict, Verdict, read_verdict, verdict_in
 
 SECONDS = 20.0
 FIRST_SHARE = 0.1

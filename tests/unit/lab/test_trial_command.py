@@ -13,15 +13,15 @@ import pytest
 import typer
 from click.testing import Result
 from typer.testing import CliRunner
+from vla_zenoh_trial.cli import trial
+from vla_zenoh_trial.episode_fsm import EpisodeFsm
+from vla_zenoh_trial.folder import TrialFolder
+from vla_zenoh_trial.person import Lines, TrialPerson
+from vla_zenoh_trial.plan import DueEpisode, TrialPlan
+from vla_zenoh_trial.verdict import End, EpisodeVerdict
 
 from vla_zenoh.errors import NodeError
-from vla_zenoh.lab.cli.trial import trial
-from vla_zenoh.lab.cli.trial_person import Lines, TrialPerson
 from vla_zenoh.lab.episode import EpisodeView, Interrupted
-from vla_zenoh.lab.trial.episode_fsm import EpisodeFsm
-from vla_zenoh.lab.trial.folder import TrialFolder
-from vla_zenoh.lab.trial.plan import DueEpisode, TrialPlan
-from vla_zenoh.lab.trial.verdict import End, EpisodeVerdict
 
 PLAN = TrialPlan("panda", ("ann", "bob"), "wave", ("left", "right"), 20.0, 7, True)
 SOON_S = 0.05

@@ -12,9 +12,10 @@ from dataset_rig import PROMPTS, write_run
 from typed import typed
 from vla_zenoh_dataset.episodes import episodes_of
 from vla_zenoh_dataset.success import succeeded
+from vla_zenoh_trial.verdict import EpisodeVerdict
 
 from vla_zenoh.lab.recording.run import load_run
-from vla_zenoh.lab.trial.verdict import FACT, EpisodeVerdict, Verdict
+from vla_zenoh.lab.recording.verdict import FACT, Verdict
 
 
 def fact(verdict: Verdict, worker: str = "teacher") -> dict[str, object]:

@@ -25,11 +25,11 @@ from vla_zenoh_nights.plan import (
 )
 from vla_zenoh_nights.runner import Webhook
 from vla_zenoh_nights.trial import JOURNAL, PAGE, UnattendedTrial, write_page
+from vla_zenoh_trial.folder import TrialFolder
+from vla_zenoh_trial.verdict import EpisodeVerdict
 
 from vla_zenoh.codec.image import encode_jpeg
 from vla_zenoh.errors import NodeError, OutputError, RecordError
-from vla_zenoh.lab.trial.folder import TrialFolder
-from vla_zenoh.lab.trial.verdict import EpisodeVerdict
 from vla_zenoh.types import Image
 
 PLAN: dict[str, Any] = {

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from vla_zenoh.errors import RecordError
 from vla_zenoh.lab.recording.run import newest
+from vla_zenoh.lab.recording.verdict import Verdict, verdict_in
 from vla_zenoh.lab.tasks.judge import SETTLED_S, judge_of
 from vla_zenoh.lab.tasks.order import parse_prompt
-from vla_zenoh.lab.trial.verdict import Verdict, verdict_in
 from vla_zenoh_dataset.episodes import RecordedEpisode
 
 AFTER_NS = int(1.2 * SETTLED_S * 1e9)

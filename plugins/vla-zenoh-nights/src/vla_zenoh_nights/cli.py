@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from vla_zenoh_trial.cli import mapping_of, show_score
+from vla_zenoh_trial.folder import TrialFolder
 
 from vla_zenoh.cli.options import JsonOption, options
 from vla_zenoh.cli.output import console, errors
@@ -14,9 +16,7 @@ from vla_zenoh.cli.plain import warn
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.lab.cli.output import print_json
 from vla_zenoh.lab.cli.output_path import check_folder
-from vla_zenoh.lab.cli.trial import mapping_of, show_score
 from vla_zenoh.lab.episode import Interrupted
-from vla_zenoh.lab.trial.folder import TrialFolder
 from vla_zenoh.runtime.process import stop_on_signals
 from vla_zenoh_nights.plan import read_plan
 from vla_zenoh_nights.runner import run_unattended

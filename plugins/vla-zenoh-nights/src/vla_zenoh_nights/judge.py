@@ -46,7 +46,7 @@ class JudgedEpisode:
     """What a judge sees of an episode.
 
     Args:
-        end: ``policy`` or ``time``, as in `vla_zenoh.lab.trial.verdict`.
+        end: ``policy`` or ``time``, as in `vla_zenoh_trial.verdict`.
         frames: oldest first, about one each second; the last is from after the brake.
         states: oldest first, about 20 each second.
     """

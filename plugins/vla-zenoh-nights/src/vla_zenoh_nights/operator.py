@@ -9,6 +9,9 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
+from vla_zenoh_trial.episode_fsm import EpisodeFsm, Phase
+from vla_zenoh_trial.folder import TrialFolder
+from vla_zenoh_trial.plan import TrialPlan
 
 from vla_zenoh.client.client import Client
 from vla_zenoh.client.primitives import ask
@@ -18,9 +21,6 @@ from vla_zenoh.lab.durable import write_whole, writing
 from vla_zenoh.lab.episode import EpisodeRunner
 from vla_zenoh.lab.newest_records import NewestRecords, StreamSlot
 from vla_zenoh.lab.tasks.judge import TaskJudge
-from vla_zenoh.lab.trial.episode_fsm import EpisodeFsm, Phase
-from vla_zenoh.lab.trial.folder import TrialFolder
-from vla_zenoh.lab.trial.plan import TrialPlan
 from vla_zenoh.lab.video import decoded_at_height
 from vla_zenoh.types import GripperState, Image, ObjectPoses, PoseState
 from vla_zenoh_nights.judge import Frame, Judge, JudgedEpisode, StateSample

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from vla_zenoh_trial.plan import TrialPlan
+from vla_zenoh_trial.verdict import EpisodeVerdict
 
 from vla_zenoh.errors import ProfileError, RecordError
 from vla_zenoh.lab.tasks.order import Order
-from vla_zenoh.lab.trial.plan import TrialPlan
-from vla_zenoh.lab.trial.verdict import EpisodeVerdict
 from vla_zenoh.profile.load import read_yaml
 
 CONTACT_WORDS = ("contact", "does not follow", "too near to a bound")

@@ -11,10 +11,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from vla_zenoh_trial.runner import TrialRunner
+
 from vla_zenoh.client.client import Client
 from vla_zenoh.errors import NodeError, OutputError, RecordingError, SessionError
 from vla_zenoh.lab.episode import Interrupted
-from vla_zenoh.lab.trial.runner import TrialRunner
 from vla_zenoh_nights.judge import Judge, make_judge, post_json
 from vla_zenoh_nights.operator import TrialStopped, UnattendedOperator
 from vla_zenoh_nights.trial import UnattendedTrial, write_page

@@ -9,12 +9,13 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from vla_zenoh_trial.folder import TrialFolder
+from vla_zenoh_trial.plan import TrialPlan
+from vla_zenoh_trial.score import TrialScore, score
+from vla_zenoh_trial.verdict import END_WORDS, EpisodeVerdict
+
 from vla_zenoh.errors import OutputError
 from vla_zenoh.lab.durable import append_lines, page_template, whole_lines, write_whole, writing
-from vla_zenoh.lab.trial.folder import TrialFolder
-from vla_zenoh.lab.trial.plan import TrialPlan
-from vla_zenoh.lab.trial.score import TrialScore, score
-from vla_zenoh.lab.trial.verdict import END_WORDS, EpisodeVerdict
 from vla_zenoh_nights.operator import strip_path
 from vla_zenoh_nights.plan import UnattendedPlan, UnattendedTask, checked_plan
 

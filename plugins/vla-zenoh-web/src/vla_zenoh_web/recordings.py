@@ -13,7 +13,7 @@ import zenoh
 from vla_zenoh.errors import NodeError, RecordingError
 from vla_zenoh.lab.cli.output_path import RUNS, output_file
 from vla_zenoh.lab.recording.recorder import Recorder
-from vla_zenoh.lab.trial.verdict import FACT
+from vla_zenoh.lab.recording.verdict import FACT
 from vla_zenoh.profile import Profile
 
 

@@ -17,10 +17,10 @@ from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.cli.output import print_json
 from vla_zenoh.lab.cli.output_path import check_folder
-from vla_zenoh.lab.trial.folder import TrialFolder
-from vla_zenoh.lab.trial.plan import TrialPlan
-from vla_zenoh.lab.trial.score import TrialScore, score
-from vla_zenoh.lab.trial.verdict import EpisodeVerdict
+from vla_zenoh_trial.folder import TrialFolder
+from vla_zenoh_trial.plan import TrialPlan
+from vla_zenoh_trial.score import TrialScore, score
+from vla_zenoh_trial.verdict import EpisodeVerdict
 
 
 @dataclass(frozen=True)
@@ -143,10 +143,10 @@ def _run(
     target: RobotTarget,
     yes_setup: bool,
 ) -> list[EpisodeVerdict]:
-    from vla_zenoh.lab.cli.trial_person import TrialPerson
     from vla_zenoh.lab.episode import Interrupted
-    from vla_zenoh.lab.trial.runner import TrialRunner
     from vla_zenoh.runtime.process import stop_on_signals
+    from vla_zenoh_trial.person import TrialPerson
+    from vla_zenoh_trial.runner import TrialRunner
 
     stop = stop_on_signals()
     # Neither a terminal that is closed nor Ctrl-Z may leave a moving arm behind.

@@ -20,9 +20,9 @@ from rich.text import Text
 from vla_zenoh.cli.output import errors, printable
 from vla_zenoh.errors import NodeError
 from vla_zenoh.lab.episode import Interrupted
-from vla_zenoh.lab.trial.episode_fsm import EpisodeFsm, Phase
-from vla_zenoh.lab.trial.plan import TrialPlan
-from vla_zenoh.lab.trial.verdict import END_WORDS
+from vla_zenoh_trial.episode_fsm import EpisodeFsm, Phase
+from vla_zenoh_trial.plan import TrialPlan
+from vla_zenoh_trial.verdict import END_WORDS
 
 WAIT_S = 0.1
 REFRESH_S = 0.2

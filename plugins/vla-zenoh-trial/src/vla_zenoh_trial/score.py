@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from statistics import median
 
 from vla_zenoh.lab.statistics import Paired, paired, wilson_95
-from vla_zenoh.lab.trial.plan import TrialPlan
-from vla_zenoh.lab.trial.verdict import INTERVENTIONS, EpisodeVerdict
+from vla_zenoh_trial.plan import TrialPlan
+from vla_zenoh_trial.verdict import INTERVENTIONS, EpisodeVerdict
 
 
 @dataclass(frozen=True, slots=True)

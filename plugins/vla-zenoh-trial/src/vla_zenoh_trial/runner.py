@@ -16,11 +16,12 @@ from vla_zenoh.keys import worker_node
 from vla_zenoh.lab.episode import EpisodeRunner, EpisodeView, Interrupted
 from vla_zenoh.lab.newest_records import NewestRecords
 from vla_zenoh.lab.recording.recorder import Recorder
-from vla_zenoh.lab.trial.episode_fsm import EpisodeFsm, Phase
-from vla_zenoh.lab.trial.folder import TrialFolder
-from vla_zenoh.lab.trial.plan import DueEpisode, TrialPlan
-from vla_zenoh.lab.trial.verdict import FACT, End, EpisodeVerdict
+from vla_zenoh.lab.recording.verdict import FACT
 from vla_zenoh.types import PoseState
+from vla_zenoh_trial.episode_fsm import EpisodeFsm, Phase
+from vla_zenoh_trial.folder import TrialFolder
+from vla_zenoh_trial.plan import DueEpisode, TrialPlan
+from vla_zenoh_trial.verdict import End, EpisodeVerdict
 
 POLL_S = 0.05
 REST_PATIENCE_S = 5.0

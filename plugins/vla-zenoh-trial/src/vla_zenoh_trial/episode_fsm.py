@@ -13,8 +13,9 @@ from __future__ import annotations
 from enum import StrEnum
 
 from vla_zenoh.lab.episode import EpisodeLimit, EpisodeView
-from vla_zenoh.lab.trial.plan import DueEpisode
-from vla_zenoh.lab.trial.verdict import End, EpisodeVerdict, Verdict, read_verdict
+from vla_zenoh.lab.recording.verdict import Verdict
+from vla_zenoh_trial.plan import DueEpisode
+from vla_zenoh_trial.verdict import End, EpisodeVerdict, read_verdict
 
 DONE_S = 0.5
 """The episode ends when the policy has been done, and the arm at rest, for this long."""

@@ -21,8 +21,8 @@ from pydantic import TypeAdapter, ValidationError
 
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.durable import append_lines, lock_folder, whole_lines, write_whole, writing
-from vla_zenoh.lab.trial.plan import TrialPlan
-from vla_zenoh.lab.trial.verdict import EpisodeVerdict
+from vla_zenoh_trial.plan import TrialPlan
+from vla_zenoh_trial.verdict import EpisodeVerdict
 
 EPISODES, SECONDS = 20, 60.0
 """Of a plan that does not say them."""

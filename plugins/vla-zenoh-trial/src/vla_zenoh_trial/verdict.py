@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Literal
 
-Verdict = Literal["success", "failure", "void"]
-"""A void episode does not count, and is repeated."""
+from vla_zenoh.lab.recording.verdict import Verdict
+
 End = Literal[
     "person", "policy", "time", "lost", "stopped", "taken", "recording", "refused", "broken_off"
 ]
-FACT = "trial"
-"""Name of the verdict in the metadata at the end of a recording."""
 END_WORDS: dict[End, str] = {
     "person": "ended by you",
     "policy": "the policy reported that it is done",
@@ -68,15 +65,3 @@ def read_verdict(line: str) -> tuple[Verdict, str] | None:
     word, _, note = line.strip().partition(" ")
     verdict = _VERDICTS.get(word.lower())
     return None if verdict is None else (verdict, note.strip())
-
-
-def verdict_in(metadata: Mapping[str, Any] | None, worker: str) -> Verdict | None:
-    """The verdict on `worker` in the metadata at the end of a recording; None: there is none.
-
-    Args:
-        metadata: None: the recording was cut off.
-    """
-    fact = (metadata or {}).get(FACT)
-    if not isinstance(fact, Mapping) or fact.get("worker") != worker:
-        return None
-    return next((each for each in get_args(Verdict) if each == fact.get("verdict")), None)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from vla_zenoh.errors import RecordError
-from vla_zenoh.lab.trial.verdict import EpisodeVerdict
+from vla_zenoh_trial.verdict import EpisodeVerdict
 
 MAX_SETUPS = 10_000
 HIDDEN = "[worker]"
