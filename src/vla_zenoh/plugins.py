@@ -160,6 +160,7 @@ PACKAGES: Mapping[str, str] = {
     "profile.new": "vla-zenoh-newarm",
     "save": "vla-zenoh-rolling",
     "serve.mcp": "vla-zenoh-mcp",
+    "serve.policy": "vla-zenoh-serve",
     "teleop": "vla-zenoh-teleop",
     "trial": "vla-zenoh-trial",
     "view": "vla-zenoh-view",

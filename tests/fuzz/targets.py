@@ -22,6 +22,7 @@ import numpy as np
 import typer
 from model_wires import groot, lerobot_server, npy, openpi, openvla_rest, origami, xpolicylab
 from vla_zenoh_mcp import protocol
+from vla_zenoh_serve import openpi_server
 
 from vla_zenoh.cli import status_table as cli_status
 from vla_zenoh.cli.options import model_options
@@ -42,7 +43,6 @@ from vla_zenoh.lab.inference_views import InferenceView
 from vla_zenoh.lab.policy_servers import message as arrays
 from vla_zenoh.lab.recording.record_types import RECORDS, record_from_json, record_to_json
 from vla_zenoh.lab.recording.run import load_run
-from vla_zenoh.lab.serve import openpi_server
 from vla_zenoh.lab.tasks.order import parse_prompt
 from vla_zenoh.policy import ActionSpec, ModelSpec, ObservationSpec
 from vla_zenoh.policy.loader import find_model, make_policy

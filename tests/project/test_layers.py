@@ -49,8 +49,6 @@ ALLOWED = {
     "runtime": IO - NODE,
     "nodes": IO - NODE,
     "lab/policy_servers/adapter.py": frozenset({"time"}),
-    "lab/serve/openpi_server.py": frozenset({"time"}),
-    "lab/serve/policy_server.py": IO - NODE,
     "robots": IO - NODE,
     "simulation": frozenset({"mujoco"}),
     "cli": IO - {"torch", "mujoco", "asyncio"},

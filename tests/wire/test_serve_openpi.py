@@ -19,12 +19,12 @@ import pytest
 from camera_rig import until
 from model_wires import openpi
 from peer_rig import OPENPI_CLIENT, free_port, python_with
+from vla_zenoh_serve.served_policy import make_served_policy
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from vla_zenoh.errors import PeerError, SpecError
 from vla_zenoh.lab.check.examples import example_observation
-from vla_zenoh.lab.serve.served_policy import make_served_policy
 from vla_zenoh.policy import Observation, Policy
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import load_profile

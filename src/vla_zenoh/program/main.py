@@ -88,7 +88,7 @@ COMMANDS: Panels = {
         "web": OF_A_PACKAGE,
         "serve": CommandGroup(
             "Offer a model to clients of other frameworks.",
-            {"policy": "lab.cli.serve:serve", "mcp": OF_A_PACKAGE},
+            dict.fromkeys(("policy", "mcp"), OF_A_PACKAGE),
         ),
     },
     "Watch and record": {

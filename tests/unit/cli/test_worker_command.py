@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 import typer
 from typer.testing import CliRunner
+from vla_zenoh_serve.cli import serve
 
 from vla_zenoh.cli.nodes import worker
 from vla_zenoh.lab.cli.check import check
-from vla_zenoh.lab.cli.serve import serve
 from vla_zenoh.profile import load_profile
 from vla_zenoh.runtime.launch import node_commands
 from vla_zenoh.security.roles import identities

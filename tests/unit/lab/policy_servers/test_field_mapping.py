@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from model_wires import groot, openpi, openvla_rest, origami
+from vla_zenoh_serve import openpi_server
 
 from vla_zenoh.errors import PeerError, SpecError
 from vla_zenoh.kinematics.so3 import exp3, quat_from_rotation
@@ -22,7 +23,6 @@ from vla_zenoh.lab.policy_servers.field_mapping import (
     read_field_mapping,
 )
 from vla_zenoh.lab.policy_servers.presets import Presets
-from vla_zenoh.lab.serve import openpi_server
 from vla_zenoh.policy import Observation
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import GripperState, JointState, PoseState

@@ -21,12 +21,13 @@ from vla_zenoh.cli.options import (
 from vla_zenoh.cli.output import console
 from vla_zenoh.lab.cli.loopback import require_loopback
 from vla_zenoh.lab.policy_servers.state_vector import home_reference
-from vla_zenoh.lab.serve import openpi_server
-from vla_zenoh.lab.serve.served_policy import make_served_policy
+from vla_zenoh.plugins import how_to_repeat
 from vla_zenoh.policy.loader import make_policy
 from vla_zenoh.policy.meaning import IDENTITY
 from vla_zenoh.runtime.environments import run_in_own_environment
 from vla_zenoh.runtime.process import stop_on_signals
+from vla_zenoh_serve import openpi_server
+from vla_zenoh_serve.served_policy import make_served_policy
 
 
 @options
@@ -70,8 +71,9 @@ def serve(
             f"type on the other computer `ssh -L {port}:127.0.0.1:{port} THIS_COMPUTER`",
         )
     robot, chosen = loaded.robot, model.choose(loaded, worker)
-    run_in_own_environment(chosen.model, model.python, extra="serve")
-    from vla_zenoh.lab.serve.policy_server import PolicyServer
+    ours = how_to_repeat("vla-zenoh-serve")
+    run_in_own_environment(chosen.model, model.python, extra="control", packages=ours)
+    from vla_zenoh_serve.policy_server import PolicyServer
 
     policy = make_policy(chosen.model, chosen.options, profile=profile)
     offer = make_served_policy(

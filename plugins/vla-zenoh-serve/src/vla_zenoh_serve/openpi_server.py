@@ -15,10 +15,10 @@ import numpy as np
 
 from vla_zenoh.errors import CodecError, PeerError, SpecError, in_words
 from vla_zenoh.lab.policy_servers import message
-from vla_zenoh.lab.serve.served_policy import ServedPolicy
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.policy.inference import Committed
 from vla_zenoh.types import shown
+from vla_zenoh_serve.served_policy import ServedPolicy
 
 PORT = 8000
 HEALTH_PATH = "/healthz"

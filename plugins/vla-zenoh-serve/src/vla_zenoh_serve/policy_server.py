@@ -9,16 +9,12 @@ import hmac
 import threading
 from http import HTTPStatus
 
-from vla_zenoh.errors import MissingExtraError
-from vla_zenoh.lab.serve.openpi_server import HEALTH_PATH, MAX_BYTES, OpenPiConversation
-from vla_zenoh.lab.serve.served_policy import ServedPolicy
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request, Response
+from websockets.sync.server import Server, ServerConnection, serve
 
-try:
-    from websockets.exceptions import ConnectionClosed
-    from websockets.http11 import Request, Response
-    from websockets.sync.server import Server, ServerConnection, serve
-except ImportError as error:
-    raise MissingExtraError(error.name or "websockets", "serve") from error
+from vla_zenoh_serve.openpi_server import HEALTH_PATH, MAX_BYTES, OpenPiConversation
+from vla_zenoh_serve.served_policy import ServedPolicy
 
 INTERNAL_ERROR, TRY_AGAIN_LATER = 1011, 1013
 
