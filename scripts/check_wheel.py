@@ -55,6 +55,7 @@ WITH_PLUGINS = [
     ["nights", "--help"],
     ["trial", "--help"],
     ["conform", "robot", "--help"],
+    ["secure", "show", "--help"],
     ["serve", "policy", "--help"],
     ["teleop", "--help"],
     ["dataset", "export", "--help"],

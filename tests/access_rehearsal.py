@@ -21,10 +21,10 @@ from access_check import (
     probes,
     token_selectors,
 )
+from vla_zenoh_secure.lab_certificates import LabCertificates
 
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.keys import Keys
-from vla_zenoh.lab.certificates.lab_certificates import LabCertificates
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.schema import SecurityProfile
 from vla_zenoh.security.roles import EVERY_MESSAGE, Act, Identity, Role, access_control

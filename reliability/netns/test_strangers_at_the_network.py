@@ -18,9 +18,9 @@ import pytest
 from netns.attack import MARK, MOTION, RATE
 from netns.lab import needs_namespaces
 from netns.site import HERE, Site, secured_site
+from vla_zenoh_secure.lab_certificates import LabCertificates
 
 from vla_zenoh.bus.session import session_config
-from vla_zenoh.lab.certificates.lab_certificates import LabCertificates
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.security.roles import Identity, Role
 

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from vla_zenoh.lab.cli.secure import secure_app
 from vla_zenoh.program.main import app
 
 TEXT = (Path(__file__).parents[2] / "docs" / "how-to" / "ros2.md").read_text("utf-8")
@@ -24,7 +23,7 @@ def bridge_file(folder: Path, plain: str, *more: str) -> str:
     """Made by the words of the page, below `folder`."""
     (folder / "lab.yaml").write_text(plain)
     init = ["init", "--profile", "./lab.yaml", "--at", "robot=10.0.0.2"]
-    done = RUNNER.invoke(secure_app, [*init, "--folder", str(folder / "certificates")])
+    done = RUNNER.invoke(app, ["secure", *init, "--folder", str(folder / "certificates")])
     assert done.exit_code == 0, done.output
     words = ["bridge-config", "--profile", "./lab_secure.yaml", *more]
     done = RUNNER.invoke(app, ["profile", *words])

@@ -13,12 +13,12 @@ import pytest
 import zenoh
 from camera_rig import free_endpoint, until
 from typer.testing import CliRunner
+from vla_zenoh_secure.lab_certificates import LabCertificates
+from vla_zenoh_secure.secure_profile import profile_text, serving_addresses
 
 from vla_zenoh.bus.buffers import CallbackRing
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import SecurityError
-from vla_zenoh.lab.certificates.lab_certificates import LabCertificates
-from vla_zenoh.lab.certificates.secure_profile import profile_text, serving_addresses
 from vla_zenoh.profile import load_profile
 from vla_zenoh.program.main import app
 from vla_zenoh.runtime.router import router_config, run_router

@@ -26,9 +26,9 @@ from vla_zenoh_rolling.settings_log import entries_of
 
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.keys import Keys
-from vla_zenoh.lab.cli.secure import secure_app
 from vla_zenoh.lab.recording.reader import open_recording
 from vla_zenoh.profile import load_profile
+from vla_zenoh.program.main import app
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(180)]
 
@@ -56,7 +56,7 @@ class Lab:
 
 
 def secure(*words: str) -> None:
-    done = CliRunner().invoke(secure_app, list(words))
+    done = CliRunner().invoke(app, ["secure", *words])
     assert done.exit_code == 0, done.output
 
 

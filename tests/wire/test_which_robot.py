@@ -18,10 +18,10 @@ from pathlib import Path
 import pytest
 from camera_rig import free_endpoint, until
 from typer.testing import CliRunner, Result
+from vla_zenoh_secure.lab_certificates import LabCertificates
 
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.client.client import Client
-from vla_zenoh.lab.certificates.lab_certificates import LabCertificates
 from vla_zenoh.nodes.command.node import CommandNode
 from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh.program.main import app

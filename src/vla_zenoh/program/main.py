@@ -122,7 +122,11 @@ COMMANDS: Panels = {
             "Compare a robot with its profile.", {"check": "lab.cli.doctor:robot_check"}
         ),
         "camera": CommandGroup("Cameras of this computer.", {"list": "lab.cli.camera:camera_list"}),
-        "secure": "lab.cli.secure:secure_app",
+        "secure": CommandGroup(
+            "Certificates for a lab, so that only its hosts connect, with the rights of their "
+            "roles.",
+            dict.fromkeys(("init", "add", "here", "show"), OF_A_PACKAGE),
+        ),
         "dataset": CommandGroup(
             "Turn recorded runs into training data.",
             dict.fromkeys(("export", "stats"), OF_A_PACKAGE),

@@ -1,17 +1,21 @@
 """Reads and checks the certificates of a computer.
 
 Needs the library ``cryptography``; nodes that only use their certificates do without it, see
-`store`. `vla_zenoh.lab.certificates` makes them.
+`store`. The package vla-zenoh-secure makes them.
 """
 
 from __future__ import annotations
 
 import datetime as dt
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 from vla_zenoh.errors import MissingExtraError, SecurityError, counted
+from vla_zenoh.profile import Profile
+from vla_zenoh.security.bridge import bridges
+from vla_zenoh.security.roles import identities
 from vla_zenoh.security.store import AUTHORITY, Store, open_to_others
 
 try:
@@ -160,3 +164,22 @@ def read_file(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise SecurityError(f"{path} cannot be read: {error.strerror}") from error
+
+
+def unused_certificates(profile: Profile, entries: Iterable[Entry]) -> dict[Path, str]:
+    """Certificates whose traffic the router drops: file -> what to do.
+
+    There are some after a role was reduced or a node was removed from the profile.
+    """
+    security = profile.session.security
+    people = security.people if security is not None else {}
+    known = {one.common_name for one in (*identities(profile), *bridges(profile))}
+    out: dict[Path, str] = {}
+    for entry in entries:
+        if entry.host and f"{entry.node}@{entry.host}" not in known:
+            role = people.get(entry.host)
+            given = f", where people at {entry.host} are {role}" if role is not None else ""
+            out[entry.path] = (
+                f"is not known to profile {profile.name}{given}: delete it here and on {entry.host}"
+            )
+    return out

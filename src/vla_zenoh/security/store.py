@@ -8,7 +8,7 @@
     FOLDER/.this_host             name of the HOST that this computer is; not copied
 
 Private keys are readable by their owner only. `certificates` checks, and
-`vla_zenoh.lab.certificates` makes them.
+The package vla-zenoh-secure makes them.
 """
 
 from __future__ import annotations

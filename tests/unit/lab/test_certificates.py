@@ -11,14 +11,15 @@ import pytest
 from cryptography import x509
 from cryptography.x509.oid import ExtendedKeyUsageOID
 from typer.testing import CliRunner
+from vla_zenoh_secure import authority as ca
+from vla_zenoh_secure.lab_certificates import LabCertificates
+from vla_zenoh_secure.secure_profile import moved_hosts, profile_text, with_operator
 
 from vla_zenoh.errors import SecurityError
-from vla_zenoh.lab.certificates import authority as ca
-from vla_zenoh.lab.certificates.lab_certificates import LabCertificates, unused_certificates
-from vla_zenoh.lab.certificates.secure_profile import moved_hosts, profile_text, with_operator
-from vla_zenoh.lab.cli.secure import secure_app
 from vla_zenoh.profile import load_profile, override
+from vla_zenoh.program.main import app
 from vla_zenoh.security import certificates
+from vla_zenoh.security.certificates import unused_certificates
 from vla_zenoh.security.roles import Identity, Role, operator_identities
 
 NOW = dt.datetime(2026, 3, 1, 12, tzinfo=dt.UTC)
@@ -288,7 +289,7 @@ def test_a_profile_that_cannot_be_secured_leaves_nothing_behind(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / "keys"
-    done = runner.invoke(secure_app, ["init", "-p", "panda_ros2", "--folder", str(folder)])
+    done = runner.invoke(app, ["secure", "init", "-p", "panda_ros2", "--folder", str(folder)])
     assert done.exit_code == 1
     assert "ros2.connect: is missing: in a secured lab the bridge" in str(done.exception)
     assert list(tmp_path.iterdir()) == []
@@ -298,7 +299,7 @@ def test_a_lab_is_secured_by_one_command(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / "keys"
     init = ["init", "--profile", "panda_sim_two_hosts", "--folder", str(folder)]
-    done = runner.invoke(secure_app, [*init, "--at", "robot=10.0.0.2"])
+    done = runner.invoke(app, ["secure", *init, "--at", "robot=10.0.0.2"])
     assert done.exit_code == 0, done.output
     secured = "panda_sim_two_hosts_secure.yaml"
     assert load_profile(secured).session.listen == ("tls/10.0.0.2:7447",)
@@ -316,18 +317,18 @@ def test_a_lab_is_secured_by_one_command(tmp_path: Path, monkeypatch: pytest.Mon
         f"  scp {secured} gpu:",
     ]
     assert f"There: vla-zenoh up ./{secured} --host NAME" in lines
-    again = runner.invoke(secure_app, init)
+    again = runner.invoke(app, ["secure", *init])
     assert again.exit_code == 1
 
     add = ["add", "desk", "--role", "operator", "--profile", secured]
-    done = runner.invoke(secure_app, add)
+    done = runner.invoke(app, ["secure", *add])
     assert done.exit_code == 0, done.output
     assert f"  scp -rp {folder}/desk desk:{folder}/" in done.output.splitlines()
     assert f"To watch, there: vla-zenoh status --profile ./{secured}" in done.output
     assert " up " not in done.output
     assert (folder / "desk" / "operator.pem").exists()
 
-    done = runner.invoke(secure_app, ["show", "--profile", secured, "--json"])
+    done = runner.invoke(app, ["secure", "show", "--profile", secured, "--json"])
     assert done.exit_code == 0, done.output
     shown = json.loads(done.stdout)
     assert {(one["host"], one["node"]) for one in shown} >= {
@@ -341,5 +342,5 @@ def test_a_lab_is_secured_by_one_command(tmp_path: Path, monkeypatch: pytest.Mon
     assert all(one["faults"] == [] and one["days_left"] >= 364 for one in shown)
 
     (folder / "desk" / "operator.key").chmod(0o644)
-    done = runner.invoke(secure_app, ["show", "--profile", secured])
+    done = runner.invoke(app, ["secure", "show", "--profile", secured])
     assert done.exit_code == 1

@@ -12,16 +12,15 @@ import yaml
 import zenoh
 from access_check import Passage, allows, passages
 from typer.testing import CliRunner
+from vla_zenoh_secure.lab_certificates import LabCertificates
 
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.lab.certificates.bridge import bridge_locks, bridges
-from vla_zenoh.lab.certificates.lab_certificates import LabCertificates
-from vla_zenoh.lab.cli.secure import secure_app
 from vla_zenoh.lab.profile.ros2_bridge import bridge_command, bridge_config, bridge_text
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.program.main import app
 from vla_zenoh.ros2.keys import Ros2Dds
 from vla_zenoh.security import certificates
+from vla_zenoh.security.bridge import bridge_locks, bridges
 from vla_zenoh.security.roles import Act, Role
 
 RUNNER = CliRunner()
@@ -55,7 +54,7 @@ def secured(folder: Path, more: str) -> Path:
     file = folder / "secured.yaml"
     words = ["--profile", str(folder / "plain.yaml"), "--output", str(file)]
     words += ["--folder", str(folder / "certificates"), "--at", "robot=10.0.0.2"]
-    done = RUNNER.invoke(secure_app, ["init", *words])
+    done = RUNNER.invoke(app, ["secure", "init", *words])
     assert done.exit_code == 0, done.output
     return file
 
@@ -270,7 +269,7 @@ def test_a_renewed_host_has_a_new_certificate_for_its_bridge(tmp_path: Path) -> 
     file = secured(tmp_path, f"ros2: {{connect: [tcp/10.0.0.5:7450]}}\n{HOSTS}")
     pem = tmp_path / "certificates" / "robot" / "bridge.pem"
     before = pem.read_bytes()
-    done = RUNNER.invoke(secure_app, ["add", "robot", "--profile", str(file), "--renew"])
+    done = RUNNER.invoke(app, ["secure", "add", "robot", "--profile", str(file), "--renew"])
     assert done.exit_code == 0, done.output
     assert pem.read_bytes() != before
     entries = LabCertificates(tmp_path / "certificates").entries(dt.datetime.now(dt.UTC), "robot")

@@ -8,10 +8,10 @@ import threading
 from pathlib import Path
 
 import pytest
+from vla_zenoh_secure.lab_certificates import LabCertificates
 
 from vla_zenoh.cli import status_table
 from vla_zenoh.cli.output import Screen
-from vla_zenoh.lab.certificates.lab_certificates import LabCertificates
 from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh.profile.schema import SecurityProfile
 from vla_zenoh.runtime import launch

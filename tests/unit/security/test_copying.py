@@ -12,9 +12,10 @@ from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
+from vla_zenoh_secure.cli import is_own
 
-from vla_zenoh.lab.cli.secure import is_own, secure_app
 from vla_zenoh.profile import Profile, load_profile
+from vla_zenoh.program.main import app
 from vla_zenoh.security.store import THIS_HOST, Store, operator_hosts
 
 PATIENCE_S = 30.0
@@ -60,7 +61,7 @@ class World:
         return self.homes / host
 
     def secure(self, *words: str) -> str:
-        done = CliRunner().invoke(secure_app, list(words))
+        done = CliRunner().invoke(app, ["secure", *words])
         assert done.exit_code == 0, done.output + repr(done.exception)
         return done.output
 
@@ -197,11 +198,11 @@ def test_where_it_is_not_known_people_drive_all_the_same_until_it_is_said(world:
 
 def test_only_a_host_whose_certificates_are_here_can_be_this_computer(world: World) -> None:
     runner = CliRunner()
-    done = runner.invoke(secure_app, ["init", "-p", "panda_sim_two_hosts", "--host", "desk"])
+    done = runner.invoke(app, ["secure", "init", "-p", "panda_sim_two_hosts", "--host", "desk"])
     assert done.exit_code == 2
     assert not list(world.here.iterdir())
     world.secure("init", "-p", "panda_sim_two_hosts")
-    done = runner.invoke(secure_app, ["here", "desk", "-p", "panda_sim_two_hosts_secure.yaml"])
+    done = runner.invoke(app, ["secure", "here", "desk", "-p", "panda_sim_two_hosts_secure.yaml"])
     assert done.exit_code == 1
 
 

@@ -6,8 +6,8 @@ import datetime as dt
 from pathlib import Path
 
 import pytest
+from vla_zenoh_secure.lab_certificates import LabCertificates
 
-from vla_zenoh.lab.certificates.lab_certificates import LabCertificates
 from vla_zenoh.profile import Profile, load_profile, override
 from vla_zenoh.security.roles import Identity, Role, identities_of, operator_identities
 from vla_zenoh.security.store import local_role, operator_hosts

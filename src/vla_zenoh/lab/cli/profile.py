@@ -67,7 +67,7 @@ def bridge_config(
 
 def _locks(profile: Profile, given: Path | None) -> tuple[dict[str, object], str]:
     """The bridge's sections for certificates and access, and how to copy the certificates."""
-    from vla_zenoh.lab.certificates.bridge import NODE, bridge_locks, bridges
+    from vla_zenoh.security.bridge import NODE, bridge_locks, bridges
     from vla_zenoh.security.store import Store
 
     assert profile.session.security is not None

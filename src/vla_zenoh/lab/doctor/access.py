@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import MissingExtraError, SecurityError, VlaZenohError
-from vla_zenoh.lab.certificates.bridge import NODE as BRIDGE
 from vla_zenoh.lab.doctor.needs import HostFinding, judged
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.schema import is_loopback
+from vla_zenoh.security.bridge import NODE as BRIDGE
 
 if TYPE_CHECKING:
     from vla_zenoh.security.certificates import Entry
@@ -30,8 +30,7 @@ def access(profile: Profile) -> Iterator[HostFinding]:
         yield _without(profile)
         return
     try:
-        from vla_zenoh.lab.certificates.lab_certificates import unused_certificates
-        from vla_zenoh.security.certificates import CheckedStore
+        from vla_zenoh.security.certificates import CheckedStore, unused_certificates
 
         store = CheckedStore(security.folder)
         host = store.this_host(security.host)

@@ -7,14 +7,12 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from vla_zenoh.errors import SecurityError
-from vla_zenoh.lab.certificates import authority as ca
-from vla_zenoh.lab.certificates.authority import KeyPair
-from vla_zenoh.lab.certificates.bridge import bridges
 from vla_zenoh.lab.durable import write_whole, writing
-from vla_zenoh.profile import Profile
-from vla_zenoh.security.certificates import CheckedStore, Entry, read, read_file
-from vla_zenoh.security.roles import Identity, Role, identities
+from vla_zenoh.security.certificates import CheckedStore, read, read_file
+from vla_zenoh.security.roles import Identity, Role
 from vla_zenoh.security.store import AUTHORITY, THIS_HOST, Files, open_to_others
+from vla_zenoh_secure import authority as ca
+from vla_zenoh_secure.authority import KeyPair
 
 KEY_MODE = 0o600
 FOLDER_MODE = 0o700
@@ -118,22 +116,3 @@ def _write(path: Path, content: bytes, mode: int) -> None:
     with writing(path, SecurityError):
         write_whole(path, content, mode)
         path.chmod(mode)  # whatever the umask
-
-
-def unused_certificates(profile: Profile, entries: Iterable[Entry]) -> dict[Path, str]:
-    """Certificates whose traffic the router drops: file -> what to do.
-
-    There are some after a role was reduced or a node was removed from the profile.
-    """
-    security = profile.session.security
-    people = security.people if security is not None else {}
-    known = {one.common_name for one in (*identities(profile), *bridges(profile))}
-    out: dict[Path, str] = {}
-    for entry in entries:
-        if entry.host and f"{entry.node}@{entry.host}" not in known:
-            role = people.get(entry.host)
-            given = f", where people at {entry.host} are {role}" if role is not None else ""
-            out[entry.path] = (
-                f"is not known to profile {profile.name}{given}: delete it here and on {entry.host}"
-            )
-    return out

@@ -29,24 +29,24 @@ from vla_zenoh.cli.output import console, fail, new_table, styled
 from vla_zenoh.cli.plain import warn
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import SecurityError, VlaZenohError
-from vla_zenoh.lab.certificates.authority import AUTHORITY_DAYS, CERTIFICATE_DAYS
-from vla_zenoh.lab.certificates.bridge import bridges
-from vla_zenoh.lab.certificates.lab_certificates import LabCertificates, unused_certificates
-from vla_zenoh.lab.certificates.secure_profile import (
-    moved_hosts,
-    profile_text,
-    serving_addresses,
-    with_operator,
-)
 from vla_zenoh.lab.cli.output import print_json
 from vla_zenoh.lab.cli.output_path import ForceOption, output_file
 from vla_zenoh.profile import Profile, load_profile, profile_file
 from vla_zenoh.profile.load import followed, paths_in
 from vla_zenoh.profile.schema import DEFAULT_FOLDER, SecurityProfile
 from vla_zenoh.resources import is_path, shipped
-from vla_zenoh.security.certificates import Entry
+from vla_zenoh.security.bridge import bridges
+from vla_zenoh.security.certificates import Entry, unused_certificates
 from vla_zenoh.security.roles import PEOPLE, Role, identities, identities_of, operator_identities
 from vla_zenoh.security.store import Store
+from vla_zenoh_secure.authority import AUTHORITY_DAYS, CERTIFICATE_DAYS
+from vla_zenoh_secure.lab_certificates import LabCertificates
+from vla_zenoh_secure.secure_profile import (
+    moved_hosts,
+    profile_text,
+    serving_addresses,
+    with_operator,
+)
 
 
 def is_own(address: str) -> bool:
@@ -144,11 +144,6 @@ def certificate_row(entry: Entry, now: dt.datetime) -> dict[str, object]:
     }
 
 
-secure_app = typer.Typer(
-    help="Certificates for a lab, so that only its hosts connect, with the rights of their roles.",
-    no_args_is_help=True,
-)
-
 FolderOption = Annotated[
     str | None,
     typer.Option(
@@ -166,7 +161,6 @@ AddressOption = Annotated[
 DaysOption = Annotated[int, typer.Option("--days", min=1, max=AUTHORITY_DAYS, help="Validity.")]
 
 
-@secure_app.command("init")
 def init(
     profile: ProfileOption = DEFAULT_PROFILE,
     output: Annotated[
@@ -240,7 +234,6 @@ def init(
         )
 
 
-@secure_app.command("add")
 def add(
     host: Annotated[
         str, typer.Argument(parser=node_name, help="Host of the profile, or another computer.")
@@ -306,7 +299,6 @@ def add(
         out.print(f"{host} is now in {file}: restart the router of {where}", soft_wrap=True)
 
 
-@secure_app.command("here")
 def here(
     host: Annotated[str, typer.Argument(help="Host whose certificates are here.")],
     profile: ProfileOption = DEFAULT_PROFILE,
@@ -323,7 +315,6 @@ def here(
     )
 
 
-@secure_app.command("show")
 def show(
     profile: ProfileOption = DEFAULT_PROFILE,
     folder: FolderOption = None,
