@@ -203,7 +203,8 @@ class Scene:
     def objects(self, objects: ObjectPoses) -> None:
         """Draw the simulator's objects; those that are parked away from the robot are left out."""
         low, high = self._reach
-        near = ((objects.position_m >= low) & (objects.position_m <= high)).all(axis=1)
+        within = (objects.position_m >= low) & (objects.position_m <= high)
+        near = np.asarray(within.all(axis=1))
         names = [name for name, shown in zip(objects.names, near, strict=True) if shown]
         colours = [OBJECT_COLOURS.get(name.split("_")[0], OTHER_OBJECT) for name in names]
         points = rr.Points3D(
