@@ -258,8 +258,9 @@ class JointFollower:
         if self.constraints is None:
             return reached, hits
         rows, left_m = self.constraints.at(now.position_rad, here.position_m, jacobian)
+        # A row of zeros, of what no joint moves, divides by rounding and not by zero.
         most, jerk = (
-            FAR_SHARE * (np.abs(rows) @ limit)
+            np.maximum(FAR_SHARE * (np.abs(rows) @ limit), ROUNDING_RAD_S)
             for limit in (self.acceleration_rad_s2, self.jerk_rad_s3)
         )
         # A conservative test first, for all constraints at once.

@@ -59,12 +59,14 @@ def arm_spec(kinematics: Kinematics, fingers: Sequence[str]) -> mujoco.MjSpec:
     _add_shapes(spec, kinematics)
     for name in set(hand) - set(fingers):
         leader, multiplier, offset = described.follows(name)
+        line = np.zeros(mujoco.mjNEQDATA)
+        line[:2] = offset, multiplier
         spec.add_equality(
             type=mujoco.mjtEq.mjEQ_JOINT,
             objtype=mujoco.mjtObj.mjOBJ_JOINT,
             name1=name,
             name2=leader,
-            data=[offset, multiplier, *[0.0] * 9],
+            data=line,
         )
     for index, name in enumerate(kinematics.arm_joints):
         spec.joint(name).range = kinematics.lower_rad[index], kinematics.upper_rad[index]

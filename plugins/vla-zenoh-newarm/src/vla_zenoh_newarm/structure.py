@@ -126,12 +126,14 @@ class _Tree:
     def _is_finger(self, joint: DescribedJoint) -> bool:
         if self.depth(joint) > FINGER_JOINTS:
             return False
+        is_last = not any(self.is_own(each) for each in self.below(joint.child))
         if not self.is_own(joint):
-            return not any(self.is_own(each) for each in self.below(joint.child))
+            return is_last
         if FINGER.search(joint.name):
             return True
         mimicked = [each.mimic.joint for each in self._described.joints.values() if each.mimic]
-        return joint.name in mimicked or self._in_a_hand(joint)
+        # What others follow and more joints come after is a linkage of the arm.
+        return (joint.name in mimicked and is_last) or self._in_a_hand(joint)
 
     def _in_a_hand(self, joint: DescribedJoint) -> bool:
         """Whether it begins one of several short branches of one body, after a real arm."""

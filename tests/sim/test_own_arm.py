@@ -1,0 +1,93 @@
+"""Any arm: a profile made of its description, and its simulated twin that moves by prompt."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from described_arms import TAKEN, urdf
+from typer.testing import CliRunner
+from vla_zenoh_benchmarks.lockstep.loop import Lockstep
+
+from vla_zenoh.control.reachability import ReachabilityFilter
+from vla_zenoh.policy.loader import find_model, make_policy
+from vla_zenoh.profile import Profile, load_profile, override
+from vla_zenoh.program.main import app
+from vla_zenoh.simulation.world import World, build_world
+
+STEPS = 2
+WAY_M = STEPS * 0.01
+EXACT_M = 5e-4
+SECONDS = 1.4
+"""For the steps at 5 Hz, and to stand again."""
+FOLLOWS = "which the description lets follow a joint of the arm (mimic)"
+
+
+def new(folder: Path, text: str, *words: str) -> tuple[int, str, Path]:
+    """Exit code and output of `profile new`, and the profile."""
+    (folder / "arm.urdf").write_text(text)
+    file = folder / "made.yaml"
+    given = ["profile", "new", str(folder / "arm.urdf"), "--output", str(file), "--yes", *words]
+    done = CliRunner().invoke(app, given)
+    return done.exit_code, done.output, file
+
+
+def loop_of(profile: Profile) -> tuple[Lockstep, World]:
+    # Slow nodes: only where the arm ends up matters.
+    slow = override(profile, {"timing": {"command_hz": 50, "state_hz": 50}})
+    world = build_world(slow)
+    reach = ReachabilityFilter(slow)
+    loop = Lockstep(slow, world, make_policy(find_model("scripted")), reach=reach)
+    return loop, world
+
+
+def moved_m(profile: Profile) -> tuple[str, list[float]]:
+    """Why the arm is not activated, or how far up it goes by two prompts."""
+    loop, world = loop_of(profile)
+    ways_m: list[float] = []
+    for motion in ("go up", "go down"):
+        start_m = world.tcp()[0]
+        loop.put("prompt", f"HARD: {motion} x{STEPS}")
+        loop.run(0.2)
+        if why := loop.activate(1.0, 0.2):
+            return why, ways_m
+        loop.run(SECONDS)
+        end_m = world.tcp()[0]
+        assert np.abs(end_m - start_m)[:2].max() < EXACT_M
+        ways_m.append(float(end_m[2] - start_m[2]))
+    return "", ways_m
+
+
+REFUSED = {
+    "a joint that keeps the hand level",
+    "a joint that follows one that follows",
+    "a joint that follows a locked one",
+}
+"""A joint follows another one between base and TCP."""
+NO_WAY_UP = {"an arm on rails", "a SCARA", "one finger of negative range"}
+"""Not every step up can be made from the home that is found, or there is none."""
+MOVED = sorted(TAKEN.keys() - REFUSED - NO_WAY_UP)
+AT_ONCE = {"six joints", "a torso that lifts", "knuckles that turn against each other"}
+"""The others take as long, and are tried by ``make test-long``."""
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=() if name in AT_ONCE else pytest.mark.long) for name in MOVED],
+)
+def test_a_made_profile_moves_its_simulated_arm(tmp_path: Path, name: str) -> None:
+    code, output, file = new(tmp_path, urdf(TAKEN[name].rows))
+    assert code == 0, output
+    why, ways_m = moved_m(load_profile(str(file)))
+    assert why == ""
+    assert ways_m == pytest.approx([WAY_M, -WAY_M], abs=EXACT_M)
+
+
+@pytest.mark.parametrize("name", sorted(REFUSED))
+def test_a_joint_that_follows_one_of_the_arm_is_refused_by_name(tmp_path: Path, name: str) -> None:
+    code, output, _ = new(tmp_path, urdf(TAKEN[name].rows))
+    assert code == 1
+    said = " ".join(output.split())
+    assert "the simulator" in said
+    assert FOLLOWS in said
