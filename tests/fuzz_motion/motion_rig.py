@@ -270,7 +270,7 @@ class Rig:
             if max(left) > LEFT and all(event.what != "dropped" for event in out.events):
                 self.trace.broken.append((at, "part of a chunk lost in silence", max(left), "m"))
         early_s = self.case.profile.timing.max_open_loop_s - (self._now_ns - self._chunk_ns) / 1e9
-        if (state, now) == ("active", "holding") and early_s > 0 and not motion.at_rest:
+        if (state, now) == ("active", "holding") and early_s > 0 and not motion.arrived:
             self.trace.broken.append((at, "holds on its way to the last step", early_s, "s"))
         lie = self._lie
         if lie is None or now not in OBEYING:
