@@ -20,6 +20,7 @@ from vla_zenoh.types import Header, Task
 pytestmark = pytest.mark.long
 
 CAMERAS = ("front", "wrist")
+STEP_S = 0.5
 BLANK = np.zeros((480, 640, 3), np.uint8)
 
 
@@ -31,11 +32,11 @@ class Look:
         observation=ObservationSpec(
             cameras=tuple(CameraSpec(camera=name) for name in CAMERAS), state=()
         ),
-        action=ActionSpec(horizon=1, dt_s=0.1, rotation="rpy", gripper="none"),
+        action=ActionSpec(horizon=2, dt_s=STEP_S, rotation="rpy", gripper="none"),
     )
 
     def infer(self, _: object) -> ActionSteps:
-        return ActionSteps(np.zeros((1, 6)))
+        return ActionSteps(np.zeros((2, 6)))
 
 
 class Cameras:
@@ -48,7 +49,11 @@ class Cameras:
             profile, session, Look(), "look", images="raw", host=None, changed=self.changed
         )
         self._keys, self._session, self._seq = profile.keys, session, 0
-        self._put(self._keys.task, records.encode(Task(1, True, "look", "look", 10.0)), "command#1")
+        self.set_speed(100.0)
+
+    def set_speed(self, percent: float) -> None:
+        task = Task(1, True, "look", "look", 10.0, percent)
+        self._put(self._keys.task, records.encode(task), "command#1")
 
     def show(self, camera: str) -> None:
         self._put(self._keys.camera_raw(camera), BLANK.tobytes(), "camera#1")
@@ -116,3 +121,22 @@ def test_an_image_that_was_looked_at_but_not_used_waits_for_the_others(cameras: 
     until("both images", lambda: worker.has_images)
     seen = worker.observe()
     assert seen is not None, worker.complaint
+
+
+def test_a_speed_override_of_which_only_its_end_is_left_between_two_looks_still_counts(
+    cameras: Cameras,
+) -> None:
+    worker = cameras.worker
+    for camera in CAMERAS:
+        cameras.show(camera)
+    until("both images", lambda: worker.has_images)
+    answer(worker)
+    cameras.set_speed(0.0)
+    time.sleep(1.1 * STEP_S)
+    cameras.set_speed(100.0)
+    for camera in CAMERAS:
+        cameras.show(camera)
+    until("both images", lambda: worker.has_images)
+    observation = until("an observation", worker.observe)
+    committed = worker.prefix.committed(observation)
+    assert committed is not None, "the arm stood, so its first step is not over"

@@ -8,9 +8,9 @@ import numpy as np
 
 from vla_zenoh.control.limits import LimitHit, Slowdown, in_steps, joint_margins, slowest
 from vla_zenoh.control.monitor import Brake, Monitor, PartSnapshot, too_near
-from vla_zenoh.control.plan_timeline import FOREVER_NS
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.keys import NO_DEADMAN_TOKEN, worker_node
+from vla_zenoh.policy.plan_clock import FOREVER_NS
 from vla_zenoh.profile import Profile, Timing
 from vla_zenoh.types import FloatArray, Task
 

@@ -26,6 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vla_zenoh.errors import SpecError
 from vla_zenoh.policy.meaning import RotationForm, toward, unturned
+from vla_zenoh.policy.plan_clock import PlanClock
 from vla_zenoh.policy.spec import ActionSpec, ModelSpec
 from vla_zenoh.types import (
     ActionChunk,
@@ -253,11 +254,15 @@ class Committed:
 class ChunkPrefix:
     """Calls a model with the prefix of its next chunk, from its last chunk and its latency.
 
+    Args:
+        max_age_s: `max_observation_age_s` of the profile: after a pause (speed override 0) the
+            command node drops what an older observation asked for.
+
     Raises:
         SpecError: it takes the prefix, and its steps are relative to the start of their chunk.
     """
 
-    def __init__(self, policy: Policy) -> None:
+    def __init__(self, policy: Policy, max_age_s: float = math.inf) -> None:
         self._policy, self._action = policy, policy.spec.action
         self._takes = bool(getattr(policy, "takes_committed", False))
         if self._takes and self._action.relative_to == "start":
@@ -266,8 +271,20 @@ class ChunkPrefix:
                 "takes them cannot answer relative_to: start; let it answer relative_to: previous, "
                 "or absolute poses"
             )
+        self._max_age_s = max_age_s
+        self._clock: PlanClock | None = None
+        self._resumed_ns = 0
         self._latencies_s: deque[float] = deque(maxlen=REMEMBERED_LATENCIES)
         self._last: tuple[int, int, NDArray[np.float32]] | None = None
+
+    def set_override(self, override: float, stamp_ns: int) -> None:
+        """The speed override, 0 to 1, in force from `stamp_ns` on, wall clock; oldest first."""
+        if self._clock is None:
+            self._clock = PlanClock(override, stamp_ns)
+        if override != self._clock.override:
+            if not self._clock.override:
+                self._resumed_ns = stamp_ns
+            self._clock.set(override, stamp_ns)
 
     def infer(self, observation: Observation) -> ActionSteps:
         """Infer, with the committed steps if the model takes them."""
@@ -301,8 +318,11 @@ class ChunkPrefix:
         if self._last is None or self._last[0] != observation.task.episode:
             return None
         _, stamp_ns, steps = self._last
+        if (self._resumed_ns - stamp_ns) / 1e9 > self._max_age_s:
+            return None
         # The command node starts the first step at once; see control/plan_timeline.py.
-        passed_s = observation.task.speed * (observation.stamp_wall_ns - stamp_ns) / 1e9
+        clock = self._clock or PlanClock(observation.task.speed)
+        passed_s = (clock.at(observation.stamp_wall_ns) - clock.at(stamp_ns)) / 1e9
         had = max(passed_s / self._action.dt_s, 1.0)
         try:
             left = rest_of(self._action, steps, had)
@@ -310,7 +330,7 @@ class ChunkPrefix:
             return None
         if not len(left):
             return None
-        late = observation.task.speed * max(self._latencies_s) / self._action.dt_s
+        late = clock.override * max(self._latencies_s) / self._action.dt_s
         return Committed(left, min(math.ceil(late - ALIGNED), len(left)))
 
 

@@ -8,8 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vla_zenoh.control.limits import into_workspace
-from vla_zenoh.control.plan_timeline import HISTORY_NS, Goal, GoalTimeline, Plan
+from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan
 from vla_zenoh.kinematics.so3 import Pose, angle_between, exp3
+from vla_zenoh.policy.plan_clock import HISTORY_NS
 from vla_zenoh.profile import Limits
 
 MS = 1_000_000

@@ -10,10 +10,15 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from vla_zenoh_dataset.episodes import StepClock
 
+from vla_zenoh.control.plan_timeline import Goal, GoalTimeline, Plan
+from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.lab.check.examples import example_observation
+from vla_zenoh.lab.recording.run import RecordedSample
 from vla_zenoh.policy import ActionSpec, ActionSteps, ModelSpec, Observation
 from vla_zenoh.policy.inference import ChunkPrefix, Committed, rest_of
+from vla_zenoh.types import Header, Task
 
 ATOL = 1e-6  # steps travel as float32
 MS = 1_000_000
@@ -145,3 +150,102 @@ def test_quaternions_stay_unit_whatever_their_sign() -> None:
     left = rest_of(spec, steps, 1.5)
     assert np.linalg.norm(left[:, 3:7], axis=1) == pytest.approx(1.0)
     assert abs(left[0, 3]) == pytest.approx(1.0)
+
+
+Overrides = tuple[tuple[float, float], ...]
+"""(Time in ms, share) of the speed override, oldest first."""
+
+
+def told_under(overrides: Overrides, at_ms: float, *, max_age_s: float = 60.0) -> Committed | None:
+    """What a model is told at a time of the chunk that it answered to the observation at 0 ms."""
+    model = Model()
+    prefix = ChunkPrefix(model, max_age_s)
+    prefix.set_override(overrides[0][1], seen(overrides[0][0]).stamp_wall_ns)
+    prefix.published(seen(0), ramp(), seen(100).stamp_wall_ns, obeyed=True)
+    for time_ms, share in overrides[1:]:
+        prefix.set_override(share, seen(time_ms).stamp_wall_ns)
+    task = replace(seen(at_ms).task, speed_percent=100.0 * overrides[-1][1])
+    prefix.infer(replace(seen(at_ms), task=task))
+    return model.told
+
+
+@pytest.mark.parametrize(
+    ("overrides", "had"),
+    [
+        (((-1000, 1.0), (300, 0.1)), 3),
+        (((-1000, 0.5), (200, 1.0)), 2),
+        (((-1000, 1.0), (100, 0.0), (200, 1.0)), 2),
+        (((-1000, 1.0), (100, 0.5), (301, 1.0), (301, 0.0)), 2),
+    ],
+)
+def test_steps_are_counted_at_the_speed_override_of_their_time_not_at_the_present_one(
+    overrides: Overrides, had: int
+) -> None:
+    committed = told_under(overrides, 301)
+    assert committed is not None
+    np.testing.assert_allclose(committed.steps[0], ramp()[had], atol=2e-4)
+    assert len(committed.steps) in (8 - had, 7 - had)
+
+
+def test_the_latency_to_come_is_counted_at_the_present_speed_override() -> None:
+    slow, fast = told_under(((-1000, 1.0), (300, 0.1)), 301), told_under(((-1000, 1.0),), 301)
+    assert slow is not None
+    assert fast is not None
+    assert slow.frozen == fast.frozen == 1
+    very_late = Model()
+    prefix = ChunkPrefix(very_late, 60.0)
+    prefix.set_override(1.0, seen(-1).stamp_wall_ns)
+    prefix.published(seen(0), ramp(), seen(400).stamp_wall_ns, obeyed=True)
+    prefix.set_override(0.5, seen(200).stamp_wall_ns)
+    prefix.infer(seen(200))
+    assert very_late.told.frozen == 2
+
+
+def test_after_a_pause_what_the_command_node_dropped_is_not_committed() -> None:
+    paused = ((-1000, 1.0), (150, 0.0), (1150, 1.0))
+    kept = told_under(paused, 1160, max_age_s=1.2)
+    assert kept is not None
+    np.testing.assert_allclose(kept.steps[0], ramp()[1] * 0.4 + ramp()[2] * 0.6, atol=1e-2)
+    assert told_under(paused, 1160, max_age_s=1.0) is None
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(1, 400), st.sampled_from((0.0, 0.1, 0.35, 0.5, 1.0))), max_size=5
+    ),
+    st.sampled_from((0.25, 0.5, 1.0)),
+    st.integers(1, 1500),
+)
+def test_worker_command_node_and_data_set_count_the_same_steps(
+    changes: list[tuple[int, float]], first: float, at_ms: int
+) -> None:
+    times = np.cumsum([after for after, _ in changes])
+    later = [(float(at), share) for at, (_, share) in zip(times, changes, strict=True)]
+    overrides = ((-1000.0, first), *(one for one in later if one[0] < at_ms))
+    zero_ns = seen(0).stamp_wall_ns
+    poses = [Pose(np.array([0.001 * (k + 1), 0.0, 0.0]), np.eye(3)) for k in range(8)]
+    timeline = GoalTimeline(Goal(poses[0], 0.0), zero_ns - 1000 * MS)
+    timeline.clock.set(first, zero_ns - 1000 * MS)
+    timeline.add(Plan(zero_ns, zero_ns, 100 * MS, [Goal(pose, 0.0) for pose in poses]), zero_ns)
+    task = replace(seen(0).task, speed_percent=100.0 * first)
+    tasks = [recorded(task, -1000.0)]
+    for time_ms, share in overrides[1:]:
+        timeline.clock.set(share, zero_ns + round(time_ms * MS))
+        tasks.append(recorded(replace(task, speed_percent=100.0 * share), time_ms))
+    end_ns = zero_ns + at_ms * MS
+    executed = timeline.plan.steps_until(end_ns)
+    exported = StepClock(tasks, zero_ns, end_ns, 0.1).steps(end_ns)
+    assert min(max(exported, 1.0), 8.0) == pytest.approx(executed, abs=1e-4)
+    committed = told_under(overrides, at_ms)
+    if committed is None:
+        assert executed > 7.0 - 1e-3
+        return
+    left = rest_of(DELTA, ramp(), executed)
+    assert abs(len(left) - len(committed.steps)) <= 1
+    shared = min(len(left), len(committed.steps))
+    np.testing.assert_allclose(committed.steps[:shared, 0], left[:shared, 0], atol=2e-6)
+
+
+def recorded(task: Task, time_ms: float) -> RecordedSample:
+    stamp_ns = seen(time_ms).stamp_wall_ns
+    return RecordedSample(Header(stamp_ns, 0, "command#1"), task, stamp_ns, "task")

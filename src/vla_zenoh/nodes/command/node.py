@@ -188,7 +188,7 @@ class CommandNode:
         out = self.commander.step(inputs, now_ns, min(tick.periods, limit))
         self._command(out, now_ns)
         self._status.add_tick(now_ns, tick.stall_s, time.perf_counter() - began)
-        self._report(out)
+        self._report(out, now_ns)
         if any(event.kind == "transition" for event in out.events):
             latched = self.commander.state in (State.STOPPED, State.FAULT)
             self._latch.set(self.commander.why if latched else None)
@@ -224,7 +224,7 @@ class CommandNode:
             if commands.gripper is not None:
                 gripper.publish(commands.gripper)
 
-    def _report(self, out: Outputs) -> None:
+    def _report(self, out: Outputs, now_ns: int) -> None:
         for rejection in out.rejections:
             kind = "skipped" if rejection.quiet else "refused"
             self.node.counters[f"{kind}.{rejection.reason}"] += 1
@@ -235,7 +235,8 @@ class CommandNode:
         due = time.monotonic() - self._last_task >= TASK_PERIOD_S
         if out.task_changed or due:
             self._last_task = time.monotonic()
-            self._task_out.publish(self.commander.task)
+            # Plan time runs at its speed override from this tick on.
+            self._task_out.publish(self.commander.task, stamp_wall_ns=now_ns)
 
 
 class CommandStatus:

@@ -12,7 +12,6 @@ import zenoh
 
 from vla_zenoh.bus.buffers import (
     CallbackRing,
-    LatestSample,
     ReceivedSample,
     Wake,
     ZenohRing,
@@ -49,7 +48,7 @@ FRESH_PATIENCE_S = 0.05
 FRESH_TOLERANCE_S = 0.005
 STREAM_PATIENCE_S = 0.5
 """After this silence of a stream's writer another one is accepted."""
-MAX_QUEUE, STATES = 96, 256
+MAX_QUEUE, STATES, TASKS = 96, 256, 64
 PATIENCE_S, PERIODS = 1.0, 3
 """Without images on the preferred stream for this long, and for this many periods of a slow camera,
 a worker subscribes to the common one as well."""
@@ -77,14 +76,15 @@ class RobotSession:
         self.robot = profile.robot.name
         node = self.node = Node(worker_node(name), profile, session, host=host)
         self.policy, self.name, self.spec = policy, name, policy.spec
-        self.prefix = ChunkPrefix(policy)
+        self.prefix = ChunkPrefix(policy, profile.timing.max_observation_age_s)
         keys = node.keys
         self._chunks = node.declare_publisher(keys.delta(name), Kind.ORDER)
         self._specs = node.declare_publisher(keys.spec(name), Kind.TELEMETRY)
         node.serve(
             keys.spec(name), lambda query: query.reply(keys.spec(name), records.encode(self.spec))
         )
-        self._tasks = Stream(node, keys.task, Task, LatestSample(SMALL_BYTES), TASK_PATIENCE_S)
+        tasks = CallbackRing(TASKS, SMALL_BYTES)
+        self._tasks = Stream(node, keys.task, Task, tasks, TASK_PATIENCE_S)
         streams = self._streams = Streams.of(self.spec.observation, self.spec.parts)
         history_s, jpeg = self.spec.observation.history_span_s, images == "jpeg"
         camera_stream = partial(CameraStream, node, history_s=history_s, changed=changed)
@@ -131,9 +131,11 @@ class RobotSession:
 
     def poll(self) -> None:
         """Decode what was received since the last call."""
-        task = self._tasks.newest()
-        if task is not None:
-            self._set_task(task)
+        tasks = list(filter(None, map(self._tasks.decode, self._tasks.buffer.drain())))
+        for task in tasks:  # all of them: each may have changed the speed override
+            self.prefix.set_override(task.record.speed, task.header.stamp_wall_ns)
+        if tasks:
+            self._set_task(tasks[-1])
         for camera in self._cameras:
             camera.poll()
         self.poll_states()

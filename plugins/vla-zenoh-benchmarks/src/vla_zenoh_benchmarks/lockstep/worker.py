@@ -101,9 +101,9 @@ class LockstepWorker:
         self.name = name
         self.source = worker_node(name)
         self.policy, self.spec = policy, policy.spec
-        self._continuation = ChunkPrefix(policy)
         self.task: Task | None = None
         self._patience_s = profile.timing.max_observation_age_s
+        self._continuation = ChunkPrefix(policy, self._patience_s)
         self._delays, self._jitter = delays, jitter
         self._streams = Streams.of(self.spec.observation, self.spec.parts)
         self._frozen = FrozenImages.of(profile.cameras)
@@ -118,6 +118,7 @@ class LockstepWorker:
 
     def take_task(self, task: Stamped[Task]) -> None:
         known, self.task = self.task, task.record
+        self._continuation.set_override(task.record.speed, task.header.stamp_wall_ns)
         if known is not None and known.requested_hz != self.task.requested_hz:
             self._due_ns = min(self._due_ns, self._asked_ns)
         if known is None or known.episode != self.task.episode:

@@ -1,0 +1,46 @@
+"""Plan time: wall time at the speed override.
+
+The command node counts the steps of a chunk in it, and so does whoever tells what was executed.
+"""
+
+from __future__ import annotations
+
+HISTORY_NS = 15_000_000_000
+"""Observations are rejected long before they are this old."""
+FOREVER_NS = 1 << 62
+"""A time that does not come."""
+
+
+class PlanClock:
+    """Plan time as a function of wall time (both ns): its rate is the speed override.
+
+    At the beginning, `now_ns`, plan time is wall time.
+    """
+
+    def __init__(self, override: float = 1.0, now_ns: int = 0) -> None:
+        self._marks: list[tuple[int, int, float]] = [(now_ns, now_ns, override)]
+
+    @property
+    def override(self) -> float:
+        """Plan seconds per wall second, 0 to 1."""
+        return self._marks[-1][2]
+
+    def set(self, override: float, now_ns: int) -> None:
+        """Set the rate of plan time from `now_ns` on."""
+        self._marks.append((now_ns, self.at(now_ns), override))
+        while len(self._marks) > 1 and self._marks[1][0] < now_ns - HISTORY_NS:
+            del self._marks[0]
+
+    def at(self, wall_ns: int) -> int:
+        """Plan time at a wall time: of the last seconds, or later at the present override."""
+        before = (mark for mark in reversed(self._marks) if mark[0] <= wall_ns)
+        since_ns, plan_ns, override = next(before, self._marks[0])
+        passed_ns = wall_ns - since_ns
+        return plan_ns + (passed_ns if override == 1.0 else round(override * passed_ns))
+
+    def wall_at(self, plan_ns: int) -> int:
+        """Wall time at which plan time will be `plan_ns`; `FOREVER_NS` at override 0."""
+        since_ns, base_ns, override = self._marks[-1]
+        if override <= 0.0:
+            return FOREVER_NS
+        return since_ns + round((plan_ns - base_ns) / override)
