@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -83,6 +84,7 @@ def write_run(
     cameras: Sequence[str] = ("front",),
     profile_yaml: str = PROFILE,
     ended: Mapping[str, Any] | None = None,
+    set_back: tuple[str, float, float] | None = None,
 ) -> Path:
     """One activation of 2 s for each prompt, half a second of rest after each.
 
@@ -97,6 +99,7 @@ def write_run(
         cameras: those that were recorded.
         profile_yaml: the profile in force.
         ended: what stands at its end beside what was dropped.
+        set_back: key (empty: all) whose writer's clock is set back, after how many ms, by how many.
     """
     said = of or spec()
     samples: list[Sample] = []
@@ -147,9 +150,20 @@ def write_run(
         path, KEYS, profile_yaml=profile_yaml, base_frame="base", began_ns=ZERO_NS
     )
     for sample in sorted(samples, key=lambda each: each.received_ns):
-        out.write(sample)
+        out.write(sample if set_back is None else stamped_back(sample, *set_back))
     out.finish({"dropped": {}, **(ended or {})})
     return path
+
+
+def stamped_back(sample: Sample, key: str, after_ms: float, by_ms: float) -> Sample:
+    """A sample as stamped by a clock that was set back."""
+    header = sample.header
+    if header is None or key not in ("", KEYS.short(sample.key)):
+        return sample
+    if header.stamp_wall_ns < ZERO_NS + after_ms * MS:
+        return sample
+    stamp_ns = header.stamp_wall_ns - round(by_ms * MS)
+    return replace(sample, header=Header(stamp_ns, header.seq, header.source))
 
 
 TELEOP_STEP_M, TELEOP_DT_S = 0.002, 0.05

@@ -18,6 +18,7 @@ from dataset_rig import (
     DT_S,
     HEIGHT,
     HORIZON,
+    PROFILE,
     PROMPTS,
     WIDTH,
     ZERO_NS,
@@ -546,3 +547,72 @@ def test_a_home_that_was_changed_between_runs_does_not_change_the_signs_of_rotat
     assert signs[0] != signs[1]
     export(tmp_path / "out", episodes, [], read_parts("quat_xyzw"))
     assert len(np.unique(states(tmp_path / "out").round(6), axis=0)) == 1
+
+
+STREAMS = (
+    *("task", "state/pose", "state/gripper", "command/pose", "delta/teacher"),
+    "camera/front/jpeg",
+)
+
+
+@pytest.mark.parametrize(
+    ("key", "by_ms"),
+    [
+        *((key, 2000.0) for key in (*STREAMS, "camera/front/jpeg")),
+        ("state/pose", 60.0),
+        ("", 3.6e6),
+    ],
+)
+def test_a_clock_that_was_set_back_is_named_and_no_data_set_is_made_of_it(
+    key: str, by_ms: float, tmp_path: Path
+) -> None:
+    run = load_run(make_run(tmp_path / "back.mcap", set_back=(key, 1500, by_ms)))
+    (first, *_) = (each for each in run.problems if "go back" in each)
+    assert f"by {by_ms / 1e3:.3f} s" in first
+    assert first.startswith(("1.5 s", "1.6 s", "1.7 s"))
+    with pytest.raises(RecordingError, match=r"back\.mcap: 1\.\d s after its beginning the stamps"):
+        episodes_of(run)
+
+
+@pytest.mark.parametrize("by_ms", [0.0, 5.0])
+def test_stamps_that_go_back_by_little_are_put_in_order(by_ms: float, tmp_path: Path) -> None:
+    run = load_run(make_run(tmp_path / "run.mcap", set_back=("state/pose", 1500, by_ms + 12)))
+    stamps = [entry.header.stamp_wall_ns for entry in run.poses]
+    assert stamps == sorted(stamps)
+    assert not run.problems
+    assert len(episodes_of(run)) == len(PROMPTS)
+
+
+WIDER = PROFILE.replace("max_width_m: 0.08", "max_width_m: 0.1")
+
+
+@pytest.mark.parametrize(
+    ("action", "state", "refused"),
+    [
+        ({"gripper": "open_fraction"}, "position", True),
+        ({"gripper": "absolute_m"}, "position+gripper_open", True),
+        ({"gripper": "none"}, "position+gripper_closed", True),
+        ({"gripper": "absolute_m"}, "position+gripper_m", False),
+        ({"gripper": "binary"}, "position", False),
+        ({"gripper": "none"}, "position", False),
+    ],
+)
+def test_a_share_of_two_widths_is_refused_and_metres_are_not(
+    action: dict[str, str], state: str, refused: bool, tmp_path: Path
+) -> None:
+    said = spec(**action)
+    assert WIDER != PROFILE
+    runs = [
+        load_run(make_run(tmp_path / f"{name}.mcap", of=said, profile_yaml=text))
+        for name, text in (("one", PROFILE), ("two", WIDER))
+    ]
+    episodes = [episode for run in runs for episode in episodes_of(run)]
+    out = tmp_path / "out"
+    if not refused:
+        assert export(out, episodes, [], read_parts(state)).episodes == len(episodes)
+        return
+    with pytest.raises(
+        RecordingError, match=r"one\.mcap and .*two\.mcap have different.*0\.08 and 0\.1"
+    ):
+        export(out, episodes, [], read_parts(state))
+    assert not out.exists()

@@ -100,9 +100,15 @@ def episodes_of(run: Run, worker: str | None = None) -> list[RecordedEpisode]:
         worker: only episodes of this worker; of a person's, only what the person led.
 
     Raises:
-        RecordingError: a chunk's spec is not in the recording, or a person's motion cannot be told
-            in the numbers of the model's spec.
+        RecordingError: a chunk's spec is not in the recording, a person's motion cannot be told in
+            the numbers of the model's spec, or a clock was set back.
     """
+    if run.clock_steps:
+        raise RecordingError(
+            f"{run.path}: {run.clock_steps[0]}. Which state belongs to which action is unknown; "
+            "leave this recording out, and synchronise the clocks (`vla-zenoh doctor`) before the "
+            "next one"
+        )
     done = {
         (cause.worker, cause.chunk_seq, cause.observation_stamp_ns)
         for cause, _ in run.first_commands()

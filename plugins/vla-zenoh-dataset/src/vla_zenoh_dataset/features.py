@@ -258,6 +258,34 @@ def numbers_of(episode: RecordedEpisode, parts: Sequence[str]) -> dict[str, Stat
     return out
 
 
+def check_gripper_widths(episodes: Sequence[RecordedEpisode], names: Sequence[str]) -> None:
+    """A share of an open gripper is the same width in all recordings.
+
+    Args:
+        names: of the parts of the state.
+
+    Raises:
+        RecordingError: their profiles have different widths.
+    """
+    shares = {"gripper_open", "gripper_closed"} & {*names}
+    for part in episodes[0].spec.parts:
+        action = episodes[0].spec.action.of(part)
+        by_width = action.gripper == "absolute_m" and in_lerobots_numbers(action)
+        if not (shares or by_width or action.gripper == "open_fraction"):
+            continue
+        runs = {str(each.run.path): each.run.of_part(part) for each in episodes}
+        widths = {name: run.profile.robot.gripper.max_width_m for name, run in runs.items()}
+        first, *others = widths
+        other = next((name for name in others if widths[name] != widths[first]), None)
+        if other is not None:
+            raise RecordingError(
+                f"{first} and {other} have different grippers: gripper.max_width_m is "
+                f"{widths[first]:g} and {widths[other]:g} m in their profiles, and a share of it "
+                "would mean two widths in one data set; export the recordings of each gripper by "
+                "themselves"
+            )
+
+
 def _states(episode: RecordedEpisode, run: Run, numbers: StateNumbers) -> NDArray[np.float32]:
     streams: dict[str, Any] = {"joint": run.joints, "pose": run.poses, "gripper": run.grippers}
     wanted = {part: streams[STREAM_OF.get(part, part)] for part in parts_of(numbers.names)}

@@ -30,6 +30,7 @@ from vla_zenoh_dataset.features import (
     STATE,
     action_names,
     actions_of,
+    check_gripper_widths,
     joined,
     names_of_state,
     numbers_of,
@@ -84,7 +85,7 @@ def export(
 
     Raises:
         RecordingError: the folder is not empty; there are no episodes; their actions differ in
-            meaning; a part of them was not recorded.
+            meaning, or their grippers in width; a part of them was not recorded.
     """
     if not episodes:
         raise RecordingError("the recordings hold no episode: no chunk was executed in them")
@@ -93,6 +94,7 @@ def export(
         raise RecordingError(
             f"the actions of the workers {whose} do not mean the same; choose one with --worker"
         )
+    check_gripper_widths(episodes, parts)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise RecordingError(f"{folder} is there already; give --output a new folder")
     return _Dataset(folder, episodes, cameras, parts, depth).write(progress)
