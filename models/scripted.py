@@ -27,7 +27,6 @@ from itertools import pairwise
 import numpy as np
 
 from vla_zenoh.lab.demo.scripted_motions import parse_scripted
-from vla_zenoh.lab.policy_servers.model_options import number, whole_number
 from vla_zenoh.policy import (
     ActionSpec,
     ActionSteps,
@@ -36,6 +35,7 @@ from vla_zenoh.policy import (
     Observation,
     ObservationSpec,
 )
+from vla_zenoh.policy.options import number, whole_number
 
 ROUNDING = 1e-6
 """A smaller part of a step counts as none."""

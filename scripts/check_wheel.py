@@ -62,6 +62,10 @@ WITH_PLUGINS = [
 ]
 
 
+OF_PLUGINS = ("msgpack",)
+"""What those commands import of what their packages require: all of it would be large."""
+
+
 def run(*command: object, cwd: Path = ROOT, attempts: int = 1) -> None:
     """Runs a command and shows it; ends the program when all attempts fail."""
     words = [str(word) for word in command]
@@ -110,7 +114,7 @@ def try_out(archive: Path, extra: str, plugins: Sequence[Path] = ()) -> None:
         if not any((work / "runs").rglob("*")):
             sys.exit("build: the demo left nothing in the folder named with --output")
         if plugins:
-            run(UV, "--quiet", "pip", "install", *target, "--no-deps", *plugins)
+            run(UV, "--quiet", "pip", "install", *target, "--no-deps", *plugins, *OF_PLUGINS)
         for trial in WITH_PLUGINS if plugins else ():
             run(folder / "venv" / "bin" / "vla-zenoh", *trial, cwd=work)
 

@@ -25,7 +25,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.errors import WorkerError, in_words
-from vla_zenoh.lab.policy_servers.model_options import one_of
 from vla_zenoh.policy import (
     ActionSpec,
     ActionSteps,
@@ -35,6 +34,7 @@ from vla_zenoh.policy import (
     ObservationSpec,
 )
 from vla_zenoh.policy.inference import Committed
+from vla_zenoh.policy.options import one_of
 from vla_zenoh.types import PoseState
 
 FloatArray = NDArray[np.float64]

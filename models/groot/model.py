@@ -1,6 +1,12 @@
 # /// script
 # requires-python = ">=3.11"
-# dependencies = ["example-robot-data>=6", "numpy", "pin>=4", "pyzmq>=26"]
+# dependencies = [
+#     "example-robot-data>=6",
+#     "numpy",
+#     "pin>=4",
+#     "pyzmq>=26",
+#     "vla-zenoh-policy-servers",
+# ]
 # ///
 """Queries a GR00T policy server (N1.5, N1.6 and later) over ZeroMQ.
 
@@ -14,10 +20,10 @@ from typing import Any, cast, get_args
 
 import zmq
 from vla_zenoh_model_groot import wire
+from vla_zenoh_policy_servers.adapter import Adapter, address
 
 from vla_zenoh.errors import PeerError, SpecError
-from vla_zenoh.lab.policy_servers.adapter import Adapter
-from vla_zenoh.lab.policy_servers.model_options import address, one_of
+from vla_zenoh.policy.options import one_of
 
 
 class Groot(Adapter):
@@ -30,7 +36,8 @@ class Groot(Adapter):
         timeout_s: for connecting, and for each answer.
         api_token: if the server requires one.
         profile: of the robot: its gripper and, if answers are joints, its arm.
-        layout: see lab/policy_servers/field_mapping.py. Images are video.NAME, states state.NAME.
+        layout: see vla_zenoh_policy_servers.field_mapping. Images are video.NAME, states
+            state.NAME.
     """
 
     name, presets, joints = "groot", wire.PRESETS, True

@@ -24,11 +24,11 @@ from typing import Any, Literal
 
 import numpy as np
 from vla_zenoh_model_groot import npy
+from vla_zenoh_policy_servers import message
+from vla_zenoh_policy_servers.field_mapping import FieldMapping
+from vla_zenoh_policy_servers.presets import BRIDGE, OPENS_AT_1, OSC, Presets
 
 from vla_zenoh.errors import CodecError, PeerError
-from vla_zenoh.lab.policy_servers import message
-from vla_zenoh.lab.policy_servers.field_mapping import FieldMapping
-from vla_zenoh.lab.policy_servers.presets import BRIDGE, OPENS_AT_1, OSC, Presets
 from vla_zenoh.types import shown
 
 Version = Literal["n1.5", "n1.6"]

@@ -7,9 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from vla_zenoh_policy_servers.presets import LEROBOT, LEROBOT_STATE
+
 from vla_zenoh.errors import WorkerError
-from vla_zenoh.lab.policy_servers.model_options import read_json
-from vla_zenoh.lab.policy_servers.presets import LEROBOT, LEROBOT_STATE
+from vla_zenoh.policy.options import read_json
 
 TRAINING, INFO, OURS = "train_config.json", "meta/info.json", "meta/vla_zenoh.json"
 PLUGIN = "vla_zenoh"

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from vla_zenoh.errors import VlaZenohError, WorkerError
-from vla_zenoh.lab.policy_servers.model_options import checkpoint_folder, refuse_dead_link
+from vla_zenoh.policy.options import checkpoint_folder, refuse_dead_link
 
 CONFIG, MODEL = "config.json", "pretrained_model"
 """Config of a policy, and its folder in a checkpoint of a training."""

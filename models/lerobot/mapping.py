@@ -6,14 +6,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from vla_zenoh_policy_servers.field_mapping import FieldSource, read_map, read_size
+from vla_zenoh_policy_servers.state_vector import read_state
+
 from vla_zenoh.errors import SpecError, WorkerError
-from vla_zenoh.lab.policy_servers.field_mapping import FieldSource, read_map, read_size
-from vla_zenoh.lab.policy_servers.model_options import (
+from vla_zenoh.policy.options import (
     one_of,
     read_json,
     whole_number,
 )
-from vla_zenoh.lab.policy_servers.state_vector import read_state
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 ADAPTER = "adapter_config.json"
@@ -160,7 +161,7 @@ def state_parts(
     told: str,
     joints: Sequence[int],
 ) -> tuple[str, ...]:
-    """Parts that make ``observation.state``, in order, see `lab.policy_servers.state_vector`.
+    """Parts that make ``observation.state``, in order, see `vla_zenoh_policy_servers.state_vector`.
 
     Args:
         folder: of the policy.

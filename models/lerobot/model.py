@@ -6,6 +6,7 @@
 #     "numpy>=1.26",
 #     "pin>=4",
 #     "safetensors==0.8.0",
+#     "vla-zenoh-policy-servers",
 # ]
 # ///
 """Any policy that LeRobot saved (ACT, SmolVLA, pi0, ...), run by LeRobot itself.
@@ -49,11 +50,10 @@ from vla_zenoh_model_lerobot.mapping import (
     takes_prefix,
 )
 from vla_zenoh_model_lerobot.normalisation import IDENTITY, Scaled, check_statistics
+from vla_zenoh_policy_servers.action_semantics import ActionSemantics, read_action_semantics
+from vla_zenoh_policy_servers.state_vector import StateNumbers, parts_of, state_numbers
 
 from vla_zenoh.errors import SpecError, WorkerError, in_words
-from vla_zenoh.lab.policy_servers.action_semantics import ActionSemantics, read_action_semantics
-from vla_zenoh.lab.policy_servers.model_options import checkpoint_folder, one_of
-from vla_zenoh.lab.policy_servers.state_vector import StateNumbers, parts_of, state_numbers
 from vla_zenoh.policy import (
     ActionSpec,
     ActionSteps,
@@ -64,6 +64,7 @@ from vla_zenoh.policy import (
     Resize,
 )
 from vla_zenoh.policy.inference import Committed
+from vla_zenoh.policy.options import checkpoint_folder, one_of
 from vla_zenoh.profile import load_profile
 
 
@@ -73,7 +74,7 @@ class LeRobot:
     Args:
         checkpoint: directory with ``config.json``, ``model.safetensors`` and the two pipelines.
         state: what the numbers of ``observation.state`` are, in order, see
-            lab/policy_servers/state_vector.py.
+            vla_zenoh_policy_servers.state_vector.
         map: ``feature=camera:NAME`` if the names differ, separated by commas; ``feature=`` leaves
             an image out. Others are from the camera named like their last part.
         size: of the images, WIDTHxHEIGHT; empty: as the camera gives them; ``auto``: that of the
@@ -87,8 +88,8 @@ class LeRobot:
             training names, if it is there.
         rtc: ``on``: a pi0, pi0.5 or SmolVLA continues the steps in execution, by LeRobot's own
             real-time chunking with the weights of the paper.
-        meaning: of the actions, see lab/policy_servers/action_semantics.py. `horizon` defaults to
-            the number of steps that the policy was made to execute.
+        meaning: of the actions, see vla_zenoh_policy_servers.action_semantics. `horizon` defaults
+            to the number of steps that the policy was made to execute.
     """
 
     def __init__(

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.errors import WorkerError
-from vla_zenoh.lab.policy_servers.model_options import read_json
+from vla_zenoh.policy.options import read_json
 
 IDENTITY = "IDENTITY"
 FIGURES: Mapping[str, tuple[str, str]] = {

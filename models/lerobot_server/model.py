@@ -1,6 +1,12 @@
 # /// script
 # requires-python = ">=3.11"
-# dependencies = ["example-robot-data>=6", "grpcio>=1.70", "numpy", "pin>=4"]
+# dependencies = [
+#     "example-robot-data>=6",
+#     "grpcio>=1.70",
+#     "numpy",
+#     "pin>=4",
+#     "vla-zenoh-policy-servers",
+# ]
 # ///
 """Queries lerobot's policy server (``lerobot.async_inference.policy_server``) over gRPC.
 
@@ -14,10 +20,10 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from vla_zenoh_model_lerobot_server import wire
+from vla_zenoh_policy_servers.adapter import Adapter, address
 
 from vla_zenoh.errors import PeerError, SpecError
-from vla_zenoh.lab.policy_servers.adapter import Adapter
-from vla_zenoh.lab.policy_servers.model_options import address, number, one_of
+from vla_zenoh.policy.options import number, one_of
 from vla_zenoh.profile import load_profile
 
 if TYPE_CHECKING:
@@ -38,8 +44,8 @@ class LeRobotServer(Adapter):
         load_s: how long the server may load.
         timeout_s: for connecting, and for each answer.
         profile: of the robot: its gripper and, if answers are joints, its arm.
-        layout: see lab/policy_servers/field_mapping.py. An image is observation.images.NAME, the
-            state observation.state, the prompt task; size none: as the camera gives it.
+        layout: see vla_zenoh_policy_servers.field_mapping. An image is observation.images.NAME,
+            the state observation.state, the prompt task; size none: as the camera gives it.
     """
 
     name, presets, joints = "lerobot_server", wire.PRESETS, True

@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 from vla_zenoh_model_lerobot_server import pickles
 from vla_zenoh_model_lerobot_server.pickles import Instance
+from vla_zenoh_policy_servers import message
+from vla_zenoh_policy_servers.field_mapping import FieldMapping
+from vla_zenoh_policy_servers.presets import OSC, STATE8, Presets
+from vla_zenoh_policy_servers.state_vector import size_of
 
 from vla_zenoh.errors import PeerError, SpecError
-from vla_zenoh.lab.policy_servers import message
-from vla_zenoh.lab.policy_servers.field_mapping import FieldMapping
-from vla_zenoh.lab.policy_servers.presets import OSC, STATE8, Presets
-from vla_zenoh.lab.policy_servers.state_vector import size_of
 from vla_zenoh.types import shown
 
 PORT = 8080

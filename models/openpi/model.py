@@ -1,6 +1,12 @@
 # /// script
 # requires-python = ">=3.11"
-# dependencies = ["example-robot-data>=6", "numpy", "pin>=4", "websockets>=15"]
+# dependencies = [
+#     "example-robot-data>=6",
+#     "numpy",
+#     "pin>=4",
+#     "vla-zenoh-policy-servers",
+#     "websockets>=15",
+# ]
 # ///
 """Queries a policy server with openpi's protocol.
 
@@ -14,12 +20,12 @@ from typing import Any
 
 import numpy as np
 from vla_zenoh_model_openpi import wire
+from vla_zenoh_policy_servers.adapter import Adapter, address
+from vla_zenoh_policy_servers.websocket_client import WebSocketClient
 
-from vla_zenoh.lab.policy_servers.adapter import Adapter
-from vla_zenoh.lab.policy_servers.model_options import address, one_of
-from vla_zenoh.lab.policy_servers.websocket_client import WebSocketClient
 from vla_zenoh.policy import ActionSteps, Observation
 from vla_zenoh.policy.inference import Committed
+from vla_zenoh.policy.options import one_of
 
 
 class OpenPi(Adapter):
@@ -32,7 +38,7 @@ class OpenPi(Adapter):
         dialect: openpi, vllm (knows resets and sessions), auto: by the path of the URL.
         api_key: sent as ``Authorization: Api-Key``.
         profile: of the robot: its gripper and, if answers are joints, its arm.
-        layout: see lab/policy_servers/field_mapping.py.
+        layout: see vla_zenoh_policy_servers.field_mapping.
     """
 
     name, presets, joints = "openpi", wire.PRESETS, True

@@ -13,10 +13,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from vla_zenoh_policy_servers import message
+from vla_zenoh_policy_servers.field_mapping import FieldMapping
+from vla_zenoh_policy_servers.presets import ADDED, OSC, STATE8, Presets
+
 from vla_zenoh.errors import CodecError, PeerError
-from vla_zenoh.lab.policy_servers import message
-from vla_zenoh.lab.policy_servers.field_mapping import FieldMapping
-from vla_zenoh.lab.policy_servers.presets import ADDED, OSC, STATE8, Presets
 from vla_zenoh.types import shown
 
 PORT = 8000

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from vla_zenoh.errors import WorkerError
-from vla_zenoh.lab.policy_servers.model_options import read_json
+from vla_zenoh.policy.options import read_json
 
 CONFIG, STATISTICS = "config.json", "dataset_statistics.json"
 TOKENIZER, ADAPTER_CONFIG = "tokenizer.json", "adapter_config.json"

@@ -11,7 +11,7 @@ from torch import Tensor
 from vla_zenoh_model_openvla.checkpoint import ADAPTER_CONFIG, tensors
 
 from vla_zenoh.errors import WorkerError
-from vla_zenoh.lab.policy_servers.model_options import read_json
+from vla_zenoh.policy.options import read_json
 
 WEIGHTS = "adapter_model.safetensors"
 PREFIX = "base_model.model."

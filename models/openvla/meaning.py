@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 from vla_zenoh_model_openvla.statistics import AXES, Range
+from vla_zenoh_policy_servers.action_semantics import ActionSemantics, read_action_semantics
+from vla_zenoh_policy_servers.presets import ADDED, OSC
 
 from vla_zenoh.errors import WorkerError
-from vla_zenoh.lab.policy_servers.action_semantics import ActionSemantics, read_action_semantics
-from vla_zenoh.lab.policy_servers.presets import ADDED, OSC
 
 USUAL: Mapping[str, str] = {
     "action": "delta",
@@ -34,7 +34,7 @@ def data_meaning(told: Mapping[str, str], key: str, trained: Range, chunk: int) 
     """Meaning of the numbers of the data set `key`, as set and as known.
 
     Args:
-        told: options of the user, see `vla_zenoh.lab.policy_servers.action_semantics`.
+        told: options of the user, see `vla_zenoh_policy_servers.action_semantics`.
         key: of the data set.
         trained: range of its actions.
         chunk: steps in an answer of the model.

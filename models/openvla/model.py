@@ -13,6 +13,7 @@
 #     "torch==2.11.0",
 #     "torchvision==0.26.0",
 #     "transformers==5.23.0",
+#     "vla-zenoh-policy-servers",
 # ]
 # ///
 """OpenVLA (Kim et al., CoRL 2024) from a directory of weights, as published or fine-tuned.
@@ -36,16 +37,16 @@ from vla_zenoh_model_openvla.meaning import data_meaning
 from vla_zenoh_model_openvla.picture import trained_form
 from vla_zenoh_model_openvla.statistics import AXES, Range, choose, read_range
 from vla_zenoh_model_openvla.tokens import PROMPTS, ActionBins, prompt_text, prompt_tokens
-
-from vla_zenoh.errors import SpecError, WorkerError, in_words
-from vla_zenoh.lab.policy_servers.model_options import checkpoint_folder, one_of
-from vla_zenoh.lab.policy_servers.state_vector import (
+from vla_zenoh_policy_servers.state_vector import (
     StateNumbers,
     parts_of,
     read_state,
     state_numbers,
 )
+
+from vla_zenoh.errors import SpecError, WorkerError, in_words
 from vla_zenoh.policy import ActionSteps, CameraSpec, ModelSpec, Observation, ObservationSpec
+from vla_zenoh.policy.options import checkpoint_folder, one_of
 from vla_zenoh.profile import load_profile
 
 Device = str
@@ -73,10 +74,10 @@ class OpenVLA:
         dtype: of weights; ``auto``: bfloat16 on a GPU, else float32.
         quantise: ``int8`` or ``nf4``: Llama's layers in less memory.
         chunk: OFT: steps of a chunk; known for LIBERO and Bridge.
-        state: OFT: what the numbers of the robot's state are, see lab/policy_servers.
+        state: OFT: what the numbers of the robot's state are, see vla_zenoh_policy_servers.
         profile: of the robot; OFT: its gripper and arm, for the state.
         meaning: of the numbers in the units of the data, known for some data sets, see
-            vla_zenoh/lab/policy_servers/action_semantics.py. `horizon` defaults to the whole chunk.
+            vla_zenoh_policy_servers.action_semantics. `horizon` defaults to the whole chunk.
     """
 
     def __init__(

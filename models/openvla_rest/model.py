@@ -1,6 +1,6 @@
 # /// script
 # requires-python = ">=3.11"
-# dependencies = ["example-robot-data>=6", "numpy", "pin>=4"]
+# dependencies = ["example-robot-data>=6", "numpy", "pin>=4", "vla-zenoh-policy-servers"]
 # ///
 """Queries the REST server of OpenVLA or OpenVLA-OFT: ``POST /act``.
 
@@ -16,9 +16,9 @@ from contextlib import suppress
 from typing import Any
 
 from vla_zenoh_model_openvla_rest import wire
+from vla_zenoh_policy_servers.adapter import Adapter, address
 
-from vla_zenoh.lab.policy_servers.adapter import Adapter
-from vla_zenoh.lab.policy_servers.model_options import address, yes_no
+from vla_zenoh.policy.options import yes_no
 
 
 class OpenVlaRest(Adapter):
@@ -31,7 +31,7 @@ class OpenVlaRest(Adapter):
         encoded: yes: JSON within JSON, for servers without json_numpy on the wire.
         timeout_s: for each request.
         profile: of the robot, for its gripper.
-        layout: see lab/policy_servers/field_mapping.py.
+        layout: see vla_zenoh_policy_servers.field_mapping.
     """
 
     name, presets = "openvla_rest", wire.PRESETS

@@ -17,9 +17,9 @@ from collections.abc import Mapping
 from typing import Any, NoReturn
 
 import numpy as np
+from vla_zenoh_policy_servers.presets import BRIDGE, OPENS_AT_1, OSC, STATE8, Presets
 
 from vla_zenoh.errors import PeerError
-from vla_zenoh.lab.policy_servers.presets import BRIDGE, OPENS_AT_1, OSC, STATE8, Presets
 from vla_zenoh.types import shown
 
 PORT = 8000

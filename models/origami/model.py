@@ -1,6 +1,12 @@
 # /// script
 # requires-python = ">=3.11"
-# dependencies = ["eclipse-zenoh>=1.9,<2", "example-robot-data>=6", "numpy", "pin>=4"]
+# dependencies = [
+#     "eclipse-zenoh>=1.9,<2",
+#     "example-robot-data>=6",
+#     "numpy",
+#     "pin>=4",
+#     "vla-zenoh-policy-servers",
+# ]
 # ///
 """Queries a policy by origami-zenoh-v1: Zenoh queries through the router of the policy.
 
@@ -16,10 +22,10 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 from vla_zenoh_model_origami import wire
+from vla_zenoh_policy_servers.adapter import Adapter
+from vla_zenoh_policy_servers.message import MAX_PAYLOAD_BYTES
 
 from vla_zenoh.errors import CodecError, PeerError, SpecError
-from vla_zenoh.lab.policy_servers.adapter import Adapter
-from vla_zenoh.lab.policy_servers.message import MAX_PAYLOAD_BYTES
 
 if TYPE_CHECKING:
     import zenoh
@@ -34,7 +40,7 @@ class Origami(Adapter):
         preset: north_right; see wire.py.
         timeout_s: for each answer.
         profile: of the robot, for its arm and gripper.
-        layout: see lab/policy_servers/field_mapping.py.
+        layout: see vla_zenoh_policy_servers.field_mapping.
     """
 
     name, presets, joints = "origami", wire.PRESETS, True

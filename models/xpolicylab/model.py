@@ -1,6 +1,12 @@
 # /// script
 # requires-python = ">=3.11"
-# dependencies = ["example-robot-data>=6", "numpy", "pin>=4", "websockets>=15"]
+# dependencies = [
+#     "example-robot-data>=6",
+#     "numpy",
+#     "pin>=4",
+#     "vla-zenoh-policy-servers",
+#     "websockets>=15",
+# ]
 # ///
 """Queries a policy served by XPolicyLab (pi0.5, GR00T, RDT, SmolVLA and others) over WebSocket.
 
@@ -16,11 +22,9 @@ from dataclasses import replace
 from typing import Any
 
 from vla_zenoh_model_xpolicylab import wire
-
-from vla_zenoh.lab.policy_servers.adapter import Adapter
-from vla_zenoh.lab.policy_servers.field_mapping import NONE
-from vla_zenoh.lab.policy_servers.model_options import address
-from vla_zenoh.lab.policy_servers.websocket_client import WebSocketClient
+from vla_zenoh_policy_servers.adapter import Adapter, address
+from vla_zenoh_policy_servers.field_mapping import NONE
+from vla_zenoh_policy_servers.websocket_client import WebSocketClient
 
 
 class XPolicyLab(Adapter):
@@ -32,7 +36,7 @@ class XPolicyLab(Adapter):
         case: action case for the server to prepare; empty: none.
         timeout_s: for connecting, and for each answer.
         profile: of the robot: its gripper and, if answers are joints, its arm.
-        layout: see lab/policy_servers/field_mapping.py. A name a/b/c is nested: c in b in a.
+        layout: see vla_zenoh_policy_servers.field_mapping. A name a/b/c is nested: c in b in a.
     """
 
     name, presets, joints = "xpolicylab", wire.PRESETS, True

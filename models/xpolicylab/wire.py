@@ -27,11 +27,11 @@ from datetime import UTC, datetime
 from typing import Any, Literal
 
 import numpy as np
+from vla_zenoh_policy_servers import message
+from vla_zenoh_policy_servers.field_mapping import FieldMapping
+from vla_zenoh_policy_servers.presets import Presets
 
 from vla_zenoh.errors import CodecError, PeerError, SpecError
-from vla_zenoh.lab.policy_servers import message
-from vla_zenoh.lab.policy_servers.field_mapping import FieldMapping
-from vla_zenoh.lab.policy_servers.presets import Presets
 from vla_zenoh.types import shown
 
 PORT = 19000

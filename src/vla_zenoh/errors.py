@@ -62,16 +62,16 @@ class ResourceError(VlaZenohError, FileNotFoundError):
         return str(self.args[0]) if self.args else ""
 
 
-def how_to_install(extra: str = "", package: str = "", needed: str = "") -> str:
+def how_to_install(extra: str = "", package: str = "", needed: Iterable[str] = ()) -> str:
     """Command that installs this package, with an extra; or a `package` of its ``plugins/``.
 
-    `needed` is another of them, without which the package does not work.
+    `needed` are others of them, without which the package does not work.
 
     Never by name alone: the package is on no index, and anyone could register the name there.
     """
     extras = f"[{extra}]" if extra else ""
     this = f"'.{extras}'" if extra and not package else "."
-    folders = [f"'./plugins/{needed}'"] if needed else []
+    folders = [f"'./plugins/{other}'" for other in needed]
     folders += [f"'./plugins/{package}{extras}'"] if package else []
     what = " ".join((this, *folders))
     return f"pip install -c constraints.txt {what} in a checkout of vla-zenoh"

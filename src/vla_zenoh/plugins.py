@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib.metadata import EntryPoint, distribution, entry_points
+from importlib.metadata import EntryPoint, PackageNotFoundError, distribution, entry_points
 from pathlib import Path
 from types import FunctionType
 from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
@@ -171,11 +171,17 @@ PACKAGES: Mapping[str, str] = {
     "web": "vla-zenoh-web",
 }
 """Command of a package in ``plugins/`` -> that package, for a computer that lacks it."""
-NEEDED: Mapping[str, str] = {
-    "vla-zenoh-figures": "vla-zenoh-benchmarks",
-    "vla-zenoh-nights": "vla-zenoh-trial",
+NEEDED: Mapping[str, tuple[str, ...]] = {
+    "lerobot_robot_vla_zenoh": ("vla-zenoh-policy-servers",),
+    "vla-zenoh-dataset": ("vla-zenoh-policy-servers",),
+    "vla-zenoh-figures": ("vla-zenoh-benchmarks",),
+    "vla-zenoh-nights": ("vla-zenoh-trial",),
+    "vla-zenoh-serve": ("vla-zenoh-policy-servers",),
 }
-"""Package in ``plugins/`` -> another one that it needs."""
+"""Package in ``plugins/`` -> others that it needs."""
+OURS = "vla-zenoh-"
+"""A requirement in the header of a model that begins with it is a package in ``plugins/``: they are
+on no index."""
 
 
 def installed(group: Group[Any]) -> Mapping[str, EntryPoint]:
@@ -204,10 +210,28 @@ def lacking(command: str) -> str:
     """
     if command in installed(COMMANDS):
         return ""
-    package = PACKAGES[command]
     words = command.replace(".", " ")
-    install = how_to_install(package=package, needed=NEEDED.get(package, ""))
-    return f"`vla-zenoh {words}` needs the package {package}; install it with: {install}"
+    return f"`vla-zenoh {words}` {lacking_package([PACKAGES[command]])}"
+
+
+def installing(package: str) -> str:
+    """Command that installs a package of ``plugins/``, and those that it needs."""
+    return how_to_install(package=package, needed=needed_by(package))
+
+
+def needed_by(package: str) -> tuple[str, ...]:
+    """Packages of ``plugins/`` that one of them needs, each after those that it needs itself."""
+    found: dict[str, None] = {}
+    for other in NEEDED.get(package, ()):
+        found |= dict.fromkeys((*needed_by(other), other))
+    return tuple(found)
+
+
+def lacking_package(requirements: Iterable[str]) -> str:
+    """What must be installed for the first of `requirements` that is a package of ``plugins/``, as
+    text; empty: none is."""
+    ours = [each for each in requirements if each.startswith(OURS)]
+    return f"needs the package {ours[0]}; install it with: {installing(ours[0])}" if ours else ""
 
 
 def load(group: Group[Declaration], name: str) -> Declaration:
@@ -293,8 +317,22 @@ def file_here(name: str) -> Path | None:
 
 
 def how_to_repeat(package: str) -> list[str]:
-    """Options of ``uv run`` that put an installed package into another environment."""
-    found = distribution(package)
+    """Options of ``uv run`` that put an installed package, and those of ``plugins/`` that it needs,
+    into another environment.
+
+    Raises:
+        PluginError: one of them is not installed.
+    """
+    return [word for each in (*needed_by(package), package) for word in _repeated(each)]
+
+
+def _repeated(package: str) -> list[str]:
+    try:
+        found = distribution(package)
+    except PackageNotFoundError as error:
+        raise PluginError(
+            f"the package {package} is not installed; install it with: {installing(package)}"
+        ) from error
     origin = json.loads(found.read_text("direct_url.json") or "{}")
     url = str(origin.get("url", ""))
     if origin.get("dir_info", {}).get("editable"):

@@ -40,6 +40,7 @@ EXPERTS = {"libero_privileged", "metaworld_expert", "ogbench_expert", "so101_exp
 """They need their benchmark and its state."""
 HERE = [name for name in MODELS if name not in ELSEWHERE | EXPERTS]
 HEAVY = ("torch", "tensorflow", "jax", "zenoh", "mujoco")
+SHARED = "vla-zenoh-policy-servers"
 PROMPTS = {"scripted": "HARD: go up"}
 PROFILES = {"scripted_pair": "two_pandas_sim", "scripted_pick": "so101_sim"}
 """Of workers that act for one robot."""
@@ -93,7 +94,14 @@ def test_its_header_says_what_it_needs(name: str) -> None:
     model = find_model(name)
     assert model.dependencies, "a PEP 723 header with its dependencies is missing"
     assert model.requires_python
-    assert not any(need.startswith("vla-zenoh") for need in model.dependencies)
+    ours = {need for need in model.dependencies if need.startswith("vla-zenoh")}
+    assert ours == ({SHARED} if SHARED.replace("-", "_") in sources(model.path) else set())
+
+
+def sources(path: Path) -> str:
+    """Text of the file of a model and of those beside it."""
+    files = path.parent.rglob("*.py") if path.name == "model.py" else [path]
+    return "".join(file.read_text("utf-8") for file in files)
 
 
 @pytest.fixture(scope="module")

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from vla_zenoh_policy_servers.action_semantics import read_action_semantics
 from vla_zenoh_serve import openpi_server
 from vla_zenoh_serve.policy_server import PolicyServer
 from vla_zenoh_serve.served_policy import make_served_policy
 
 from vla_zenoh.errors import PeerError
 from vla_zenoh.lab.check.examples import example_observation
-from vla_zenoh.lab.policy_servers.action_semantics import read_action_semantics
 from vla_zenoh.policy import (
     ActionSpec,
     ActionSteps,

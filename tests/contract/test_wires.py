@@ -25,10 +25,10 @@ from model_wires import (
     pickles,
     xpolicylab,
 )
+from vla_zenoh_policy_servers.field_mapping import read_field_mapping
 from vla_zenoh_serve import openpi_server
 
 from vla_zenoh.errors import PeerError
-from vla_zenoh.lab.policy_servers.field_mapping import read_field_mapping
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.profile import load_profile
 

@@ -22,6 +22,7 @@ import numpy as np
 import typer
 from model_wires import groot, lerobot_server, npy, openpi, openvla_rest, origami, xpolicylab
 from vla_zenoh_mcp import protocol
+from vla_zenoh_policy_servers import message as arrays
 from vla_zenoh_serve import openpi_server
 
 from vla_zenoh.cli import status_table as cli_status
@@ -40,7 +41,6 @@ from vla_zenoh.lab.cli.output import plain_types
 from vla_zenoh.lab.demo.scripted_motions import parse_scripted
 from vla_zenoh.lab.evaluation.mcap_file import evaluate_loaded
 from vla_zenoh.lab.inference_views import InferenceView
-from vla_zenoh.lab.policy_servers import message as arrays
 from vla_zenoh.lab.recording.record_types import RECORDS, record_from_json, record_to_json
 from vla_zenoh.lab.recording.run import load_run
 from vla_zenoh.lab.tasks.order import parse_prompt

@@ -69,6 +69,28 @@ def test_its_commands_are_listed_and_those_of_plug_ins_are_not(alone: dict[str, 
     assert "  rolling " not in done.stdout
 
 
+SHARED = "the package vla-zenoh-policy-servers"
+INSTALL = "install it with: pip install -c constraints.txt . './plugins/vla-zenoh-policy-servers'"
+
+
+def test_a_model_whose_header_names_a_package_that_is_missing_says_how_to_install_it(
+    alone: dict[str, str],
+) -> None:
+    done = run(alone, "worker", "openpi")
+    assert done.returncode == 1
+    assert f"{SHARED} is not installed; {INSTALL}" in done.stderr
+    prepared = {**alone, plugins.OWN_ENVIRONMENT_VARIABLE: f"openpi={ROOT}/models/openpi/model.py"}
+    done = run(prepared, "worker", "openpi")
+    assert "its environment lacks vla-zenoh-policy-servers" in done.stderr
+    assert f"needs {SHARED}; {INSTALL}" in done.stderr
+
+
+def test_the_models_of_the_demo_need_no_package(alone: dict[str, str]) -> None:
+    for name in ("scripted", "brick"):
+        done = run(alone, "check", name)
+        assert done.returncode == 0, done.stderr
+
+
 @pytest.mark.parametrize("command", plugins.PACKAGES)
 @pytest.mark.parametrize("after", [(), ("--help",), ("a-word", "--an-option=1")], ids=str)
 def test_a_command_of_a_package_that_is_missing_says_how_to_install_it(
@@ -78,7 +100,7 @@ def test_a_command_of_a_package_that_is_missing_says_how_to_install_it(
     assert done.returncode == 1
     package = plugins.PACKAGES[command]
     assert f"needs the package {package}; install it with: pip install" in done.stderr
-    folders = [needed, package] if (needed := plugins.NEEDED.get(package)) else [package]
+    folders = [*plugins.needed_by(package), package]
     paths = " ".join(f"'./plugins/{each}'" for each in folders)
     assert f" . {paths} in a checkout" in done.stderr
 

@@ -20,12 +20,12 @@ import pytest
 from camera_rig import until
 from model_wires import groot, openpi, openvla_rest, origami
 from vla_zenoh_benchmarks.lockstep.loop import Lockstep
+from vla_zenoh_policy_servers.action_semantics import ACTION_OPTIONS, read_action_semantics
+from vla_zenoh_policy_servers.field_mapping import DEFAULTS, read_map
+from vla_zenoh_policy_servers.state_vector import COORDINATES, PARTS, read_parts
 
 from vla_zenoh.errors import PeerError
 from vla_zenoh.lab.check.examples import example_observation
-from vla_zenoh.lab.policy_servers.action_semantics import ACTION_OPTIONS, read_action_semantics
-from vla_zenoh.lab.policy_servers.field_mapping import DEFAULTS, read_map
-from vla_zenoh.lab.policy_servers.state_vector import COORDINATES, PARTS, read_parts
 from vla_zenoh.policy import ActionSpec, CameraSpec, Observation, ObservationSpec
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import load_profile

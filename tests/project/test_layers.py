@@ -48,7 +48,6 @@ ALLOWED = {
     "client": IO - NODE,
     "runtime": IO - NODE,
     "nodes": IO - NODE,
-    "lab/policy_servers/adapter.py": frozenset({"time"}),
     "robots": IO - NODE,
     "simulation": frozenset({"mujoco"}),
     "cli": IO - {"torch", "mujoco", "asyncio"},
@@ -229,7 +228,7 @@ def test_doctor_starts_where_opencv_does_not_load() -> None:
 
 
 def test_importing_what_adapters_share_loads_nothing_that_their_environments_lack() -> None:
-    loaded = loaded_after("vla_zenoh.lab.policy_servers.adapter")
+    loaded = loaded_after("vla_zenoh_policy_servers.adapter")
     assert loaded.isdisjoint({*HEAVY, *OPTIONAL, "cv2", "rosbags"})
 
 

@@ -16,9 +16,9 @@ from model_wires import groot, lerobot_server, openpi, openvla_rest, xpolicylab
 from motions import make_world
 from vla_zenoh_benchmarks.lockstep.loop import Lockstep
 from vla_zenoh_benchmarks.lockstep.worker import Delays
+from vla_zenoh_policy_servers.field_mapping import FieldMapping, read_field_mapping
 
 from vla_zenoh.control.reachability import ReachabilityFilter
-from vla_zenoh.lab.policy_servers.field_mapping import FieldMapping, read_field_mapping
 from vla_zenoh.policy import ActionSteps, Observation
 from vla_zenoh.policy.inference import Committed
 from vla_zenoh.policy.meaning import unturned

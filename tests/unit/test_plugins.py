@@ -262,7 +262,7 @@ def test_a_package_that_needs_another_is_installed_with_it() -> None:
         for project in PROJECTS
         if names.intersection(project["dependencies"])
     }
-    assert needed == {name: {other} for name, other in plugins.NEEDED.items()}
+    assert needed == {name: set(others) for name, others in plugins.NEEDED.items()}
 
 
 def test_the_package_of_every_command_in_plugins_is_known() -> None:

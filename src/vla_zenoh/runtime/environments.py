@@ -17,7 +17,13 @@ from pathlib import Path
 
 from vla_zenoh import __version__
 from vla_zenoh.errors import WorkerError, how_to_install
-from vla_zenoh.plugins import OWN_ENVIRONMENT_VARIABLE, in_own_environment
+from vla_zenoh.plugins import (
+    OURS,
+    OWN_ENVIRONMENT_VARIABLE,
+    how_to_repeat,
+    in_own_environment,
+    lacking_package,
+)
 from vla_zenoh.policy.loader import ModelFile
 from vla_zenoh.runtime.process import die_with_parent
 
@@ -39,14 +45,14 @@ def run_in_own_environment(
 
     Raises:
         WorkerError: another environment is needed and cannot be made.
+        PluginError: it has a package of ``plugins/`` that is not installed here.
     """
     die_with_parent()  # before the model is constructed, which may take long or hang
     missing = model.missing()
     if in_own_environment():
         if missing:
-            raise WorkerError(
-                f"{model.path}: its environment lacks {', '.join(missing)}; is the header right?"
-            )
+            advice = lacking_package(missing) or "is the header right?"
+            raise WorkerError(f"{model.path}: its environment lacks {', '.join(missing)}; {advice}")
         return
     if python is None and not missing:
         return
@@ -90,7 +96,12 @@ def environment_command(
 
     Raises:
         WorkerError: there is no uv.
+        PluginError: the header names a package of ``plugins/`` that is not installed here.
     """
+    brought: list[str] = []
+    for requirement in (*model.dependencies, *more):
+        ours = requirement.startswith(OURS)
+        brought += how_to_repeat(requirement) if ours else ["--with", requirement]
     beside = Path(sysconfig.get_path("scripts")) / "uv"
     uv = str(beside) if beside.is_file() else shutil.which("uv")
     if uv is None:
@@ -104,8 +115,7 @@ def environment_command(
         command.append("--quiet")
     if model.requires_python:
         command += ["--python", model.requires_python]
-    for requirement in (*model.dependencies, *more):
-        command += ["--with", requirement]
+    command += brought
     # The package that is running now: the checkout, else the same version.
     extras = f"[{extra}]" if extra else ""
     checkout = Path(__file__).resolve().parents[3]

@@ -29,9 +29,9 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from pair_recording_rig import WIDTH_M, write_pair_run
 from vla_zenoh_dataset.episodes import episodes_of
 from vla_zenoh_dataset.lerobot import export
+from vla_zenoh_policy_servers.presets import LEROBOT_STATE
+from vla_zenoh_policy_servers.state_vector import read_parts
 
-from vla_zenoh.lab.policy_servers.presets import LEROBOT_STATE
-from vla_zenoh.lab.policy_servers.state_vector import read_parts
 from vla_zenoh.lab.recording.run import load_run
 
 pytestmark = pytest.mark.models

@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 from typed import typed
 from typer.main import get_command
+from vla_zenoh_policy_servers.adapter import address as address_option
 
 from vla_zenoh.errors import ProfileError, SpecError
-from vla_zenoh.lab.policy_servers.model_options import address as address_option
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.profile.schema import network_address
 from vla_zenoh.program.main import app

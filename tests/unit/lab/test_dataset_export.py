@@ -40,9 +40,9 @@ from vla_zenoh_dataset.features import (
 )
 from vla_zenoh_dataset.lerobot import export
 from vla_zenoh_dataset.openvla import openvla_statistics
+from vla_zenoh_policy_servers.state_vector import read_parts
 
 from vla_zenoh.errors import RecordingError
-from vla_zenoh.lab.policy_servers.state_vector import read_parts
 from vla_zenoh.lab.recording.run import Run, load_run
 from vla_zenoh.policy import ActionSpec, standing_step
 from vla_zenoh.profile import load_profile

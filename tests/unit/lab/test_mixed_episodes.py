@@ -24,9 +24,9 @@ from dataset_rig import (
 from typed import typed
 from vla_zenoh_dataset.episodes import RecordedEpisode, Span, episodes_of, together
 from vla_zenoh_dataset.lerobot import export
+from vla_zenoh_policy_servers.state_vector import read_parts
 
 from vla_zenoh.errors import RecordingError
-from vla_zenoh.lab.policy_servers.state_vector import read_parts
 from vla_zenoh.lab.recording.run import load_run
 from vla_zenoh.lab.recording.verdict import FACT
 from vla_zenoh.policy import ControllerSpec

@@ -14,9 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from random_records import refusal, same
+from vla_zenoh_policy_servers import message
 
 from vla_zenoh.errors import CodecError
-from vla_zenoh.lab.policy_servers import message
 
 MEMORY_LIMIT_BYTES = 3 * 1024**3  # of address space, most of it the libraries' own
 MAX_GROWTH_MIB = 400  # the payload and what decoding it takes
@@ -212,7 +212,7 @@ def test_forged_lengths_take_no_memory() -> None:
     # Each level claims as many entries as the payload has bytes: half a gigabyte a level.
     script = f"""
         import resource
-        from vla_zenoh.lab.policy_servers import message
+        from vla_zenoh_policy_servers import message
         from vla_zenoh.errors import CodecError
         resource.setrlimit(resource.RLIMIT_AS, ({MEMORY_LIMIT_BYTES}, {MEMORY_LIMIT_BYTES}))
         size = 60 * 1024 * 1024

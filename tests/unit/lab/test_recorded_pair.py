@@ -22,9 +22,9 @@ from vla_zenoh_dataset.episodes import episodes_of
 from vla_zenoh_dataset.features import action_names, names_of_state, numbers_of, usual_state
 from vla_zenoh_dataset.lerobot import export
 from vla_zenoh_dataset.openvla import openvla_statistics
+from vla_zenoh_policy_servers.state_vector import read_parts
 
 from vla_zenoh.lab.evaluation.evaluate import combined, evaluate
-from vla_zenoh.lab.policy_servers.state_vector import read_parts
 from vla_zenoh.lab.recording.run import load_run
 from vla_zenoh.policy import standing_step
 

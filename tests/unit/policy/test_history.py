@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from vla_zenoh_policy_servers.state_vector import StateNumbers, read_parts
 
-from vla_zenoh.lab.policy_servers.state_vector import StateNumbers, read_parts
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec, Observation, ObservationSpec
 from vla_zenoh.policy.observation import MAX_PICTURES, NotReady, Streams, assemble
 from vla_zenoh.types import Header, Image, JointState, PoseState, Stamped, Task

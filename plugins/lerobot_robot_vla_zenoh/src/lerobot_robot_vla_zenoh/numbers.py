@@ -7,13 +7,13 @@ from collections.abc import Mapping
 import numpy as np
 from lerobot.utils.errors import DeviceNotConnectedError
 from numpy.typing import NDArray
+from vla_zenoh_policy_servers.action_semantics import read_action_semantics
+from vla_zenoh_policy_servers.presets import LEROBOT, LEROBOT_STATE
+from vla_zenoh_policy_servers.state_vector import read_parts, state_numbers
 
 from vla_zenoh import RemoteRobot
 from vla_zenoh.errors import ProfileError, VlaZenohError
 from vla_zenoh.kinematics.kinematics import make_kinematics
-from vla_zenoh.lab.policy_servers.action_semantics import read_action_semantics
-from vla_zenoh.lab.policy_servers.presets import LEROBOT, LEROBOT_STATE
-from vla_zenoh.lab.policy_servers.state_vector import read_parts, state_numbers
 from vla_zenoh.policy import Observation
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray, Task

@@ -61,7 +61,8 @@ def export(
     Where a person took the arm from a model and gave it back that is one episode of the model; the
     column `intervention` says which frames the person led.
     """
-    from vla_zenoh.lab.policy_servers.state_vector import read_parts
+    from vla_zenoh_policy_servers.state_vector import read_parts
+
     from vla_zenoh.lab.recording.run import load_run
     from vla_zenoh_dataset.episodes import episodes_of
     from vla_zenoh_dataset.features import usual_state

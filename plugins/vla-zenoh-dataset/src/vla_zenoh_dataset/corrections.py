@@ -11,10 +11,10 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
+from vla_zenoh_policy_servers.state_vector import home_reference
 
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.kinematics.so3 import Pose, pose_of, quat_from_rotation, rotation_from_quat
-from vla_zenoh.lab.policy_servers.state_vector import home_reference
 from vla_zenoh.lab.recording.run import Run, newest
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.policy.meaning import IDENTITY

@@ -14,15 +14,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
-from vla_zenoh.errors import RecordingError, SpecError
-from vla_zenoh.lab.policy_servers.action_semantics import (
+from vla_zenoh_policy_servers.action_semantics import (
     NO_CONTROLLER,
     ActionSemantics,
     read_action_semantics,
 )
-from vla_zenoh.lab.policy_servers.presets import LEROBOT, LEROBOT_STATE
-from vla_zenoh.lab.policy_servers.state_vector import StateNumbers, parts_of, state_numbers
+from vla_zenoh_policy_servers.presets import LEROBOT, LEROBOT_STATE
+from vla_zenoh_policy_servers.state_vector import StateNumbers, parts_of, state_numbers
+
+from vla_zenoh.errors import RecordingError, SpecError
 from vla_zenoh.lab.recording.run import Run, nearest
 from vla_zenoh.policy import ActionSpec, Observation
 from vla_zenoh.policy.meaning import ROTATION_FORMS

@@ -79,7 +79,7 @@ def export(
 
     Args:
         folder: must not exist, or be empty.
-        parts: of the state, see `vla_zenoh.lab.policy_servers.state_vector`.
+        parts: of the state, see `vla_zenoh_policy_servers.state_vector`.
         progress: called with what is being written.
         depth: cameras whose depth images to export.
 

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from vla_zenoh.errors import CodecError, PeerError, WorkerError
-from vla_zenoh.lab.policy_servers.model_options import number, one_of, yes_no
 from vla_zenoh.policy import ActionSpec, ActionSteps, ModelSpec, Observation, ObservationSpec
+from vla_zenoh.policy.options import number, one_of, yes_no
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import FloatArray
 from vla_zenoh_physicalai import wire

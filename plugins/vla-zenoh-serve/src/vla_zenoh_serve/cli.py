@@ -8,6 +8,7 @@ import threading
 from typing import Annotated
 
 import typer
+from vla_zenoh_policy_servers.state_vector import home_reference
 
 from vla_zenoh.cli.options import (
     DEFAULT_PROFILE,
@@ -20,7 +21,6 @@ from vla_zenoh.cli.options import (
 )
 from vla_zenoh.cli.output import console
 from vla_zenoh.lab.cli.loopback import require_loopback
-from vla_zenoh.lab.policy_servers.state_vector import home_reference
 from vla_zenoh.plugins import how_to_repeat
 from vla_zenoh.policy.loader import make_policy
 from vla_zenoh.policy.meaning import IDENTITY

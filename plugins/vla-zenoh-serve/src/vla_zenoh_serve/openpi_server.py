@@ -12,9 +12,9 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
+from vla_zenoh_policy_servers import message
 
 from vla_zenoh.errors import CodecError, PeerError, SpecError, in_words
-from vla_zenoh.lab.policy_servers import message
 from vla_zenoh.policy import ActionSpec
 from vla_zenoh.policy.inference import Committed
 from vla_zenoh.types import shown

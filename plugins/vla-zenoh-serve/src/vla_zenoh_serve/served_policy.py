@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-from vla_zenoh.errors import PeerError, RecordError, SpecError
-from vla_zenoh.lab.policy_servers.field_mapping import FieldSource, read_map
-from vla_zenoh.lab.policy_servers.state_vector import (
+from vla_zenoh_policy_servers.field_mapping import FieldSource, read_map
+from vla_zenoh_policy_servers.state_vector import (
     ROTATIONS,
     StateNumbers,
     parts_of,
     read_parts,
 )
+
+from vla_zenoh.errors import PeerError, RecordError, SpecError
 from vla_zenoh.policy import ActionSteps, ModelSpec, Observation, Policy, check_steps, reset_of
 from vla_zenoh.policy.inference import Committed
 from vla_zenoh.policy.meaning import IDENTITY

@@ -11,7 +11,6 @@ import numpy as np
 
 from vla_zenoh.errors import ResourceError, SpecError, WorkerError
 from vla_zenoh.lab.episode import EpisodeLimit
-from vla_zenoh.lab.policy_servers.model_options import shown
 from vla_zenoh.lab.statistics import wilson_95
 from vla_zenoh.lab.tasks.episode import TaskEpisode, draw_episode, draw_stay
 from vla_zenoh.lab.tasks.judge import LIMIT_S, judge_of
@@ -25,6 +24,7 @@ from vla_zenoh.lab.tasks.order import (
     is_nonsense,
     parse_prompt,
 )
+from vla_zenoh.policy.options import shown
 from vla_zenoh.types import FloatArray, ObjectPoses
 
 SCENE = "bricks"

@@ -21,7 +21,6 @@ MODULES: Mapping[Role, Mapping[str, str]] = {
     # role: {module: distribution that brings it}
     "base": {
         "zenoh": "eclipse-zenoh",
-        "msgpack": "msgpack",
         "msgspec": "msgspec",
         "numpy": "numpy",
         "cv2": "opencv-python-headless",

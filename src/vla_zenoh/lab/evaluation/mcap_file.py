@@ -23,10 +23,10 @@ from vla_zenoh.lab.evaluation.segments import (
     segment,
     turned_rad,
 )
-from vla_zenoh.lab.policy_servers.model_options import shown
 from vla_zenoh.lab.recording.film import Film, write_film
 from vla_zenoh.lab.recording.run import RecordedSample, Run
 from vla_zenoh.lab.recording.verdict import FACT
+from vla_zenoh.policy.options import shown
 from vla_zenoh.profile import Profile, read_profile
 from vla_zenoh.types import LATENCY_STAGES, Cause, FloatArray, JointCommand, NodeStatus, PoseCommand
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 from model_wires import openpi
+from vla_zenoh_policy_servers.adapter import FIRST_S, LONGEST_S, Adapter
 
 from vla_zenoh.errors import PeerError, SpecError
 from vla_zenoh.lab.check.examples import example_observation
-from vla_zenoh.lab.policy_servers.adapter import FIRST_S, LONGEST_S, Adapter
 
 STEP = [[0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]]
 SOON_S = 0.05

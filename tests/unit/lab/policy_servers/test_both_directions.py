@@ -11,19 +11,19 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from vla_zenoh.errors import SpecError
-from vla_zenoh.kinematics.kinematics import home_orientation
-from vla_zenoh.kinematics.so3 import exp3, quat_from_rotation, rotation_from_quat
-from vla_zenoh.lab.check.examples import example_observation
-from vla_zenoh.lab.policy_servers.action_semantics import ActionSemantics, read_action_semantics
-from vla_zenoh.lab.policy_servers.state_vector import (
+from vla_zenoh_policy_servers.action_semantics import ActionSemantics, read_action_semantics
+from vla_zenoh_policy_servers.state_vector import (
     CUT,
     ROTATIONS,
     home_reference,
     read_parts,
     state_numbers,
 )
+
+from vla_zenoh.errors import SpecError
+from vla_zenoh.kinematics.kinematics import home_orientation
+from vla_zenoh.kinematics.so3 import exp3, quat_from_rotation, rotation_from_quat
+from vla_zenoh.lab.check.examples import example_observation
 from vla_zenoh.policy import ActionSpec, ModelSpec, Observation, ObservationSpec
 from vla_zenoh.policy.meaning import ROTATION_FORMS
 from vla_zenoh.profile import load_profile

@@ -8,21 +8,21 @@ from typing import Any
 import numpy as np
 import pytest
 from model_wires import groot, openpi, openvla_rest, origami
-from vla_zenoh_serve import openpi_server
-
-from vla_zenoh.errors import PeerError, SpecError
-from vla_zenoh.kinematics.so3 import exp3, quat_from_rotation
-from vla_zenoh.lab.check.examples import example_observation
-from vla_zenoh.lab.policy_servers import action_semantics as meaning
-from vla_zenoh.lab.policy_servers import field_mapping
-from vla_zenoh.lab.policy_servers.adapter import FIRST_S, LONGEST_S, Backoff
-from vla_zenoh.lab.policy_servers.field_mapping import (
+from vla_zenoh_policy_servers import action_semantics as meaning
+from vla_zenoh_policy_servers import field_mapping
+from vla_zenoh_policy_servers.adapter import FIRST_S, LONGEST_S, Backoff
+from vla_zenoh_policy_servers.field_mapping import (
     DEFAULTS,
     FieldMapping,
     read_columns,
     read_field_mapping,
 )
-from vla_zenoh.lab.policy_servers.presets import Presets
+from vla_zenoh_policy_servers.presets import Presets
+from vla_zenoh_serve import openpi_server
+
+from vla_zenoh.errors import PeerError, SpecError
+from vla_zenoh.kinematics.so3 import exp3, quat_from_rotation
+from vla_zenoh.lab.check.examples import example_observation
 from vla_zenoh.policy import Observation
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import GripperState, JointState, PoseState

@@ -11,13 +11,13 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from vla_zenoh_policy_servers import state_vector
+from vla_zenoh_policy_servers.action_semantics import METRIC, StateUnits
+from vla_zenoh_policy_servers.state_vector import StateNumbers
 
 from vla_zenoh.errors import SpecError
 from vla_zenoh.kinematics.so3 import exp3, quat_from_rotation
 from vla_zenoh.lab.check.examples import example_observation
-from vla_zenoh.lab.policy_servers import state_vector
-from vla_zenoh.lab.policy_servers.action_semantics import METRIC, StateUnits
-from vla_zenoh.lab.policy_servers.state_vector import StateNumbers
 from vla_zenoh.policy import ActionSpec, ModelSpec, Observation, ObservationSpec
 from vla_zenoh.types import GripperState, JointState, PoseState
 

@@ -11,7 +11,7 @@ known robot, each of which can be overridden; the preset ``none`` is empty::
     keys       names in the answer, concatenated column-wise (groot: x,y,z,...)
     columns    which of its columns, as 0:7 or 0,1,2,6
 
-For the meaning of the numbers see `vla_zenoh.lab.policy_servers.action_semantics`.
+For the meaning of the numbers see `vla_zenoh_policy_servers.action_semantics`.
 """
 
 from __future__ import annotations
@@ -25,18 +25,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.errors import PeerError, SpecError
-from vla_zenoh.lab.policy_servers.action_semantics import (
-    ACTION_OPTIONS,
-    ActionSemantics,
-    as_spec_error,
-    read_action_semantics,
-)
-from vla_zenoh.lab.policy_servers.state_vector import (
-    StateNumbers,
-    parts_of,
-    read_parts,
-    state_numbers,
-)
 from vla_zenoh.policy import (
     ActionSteps,
     CameraSpec,
@@ -47,6 +35,18 @@ from vla_zenoh.policy import (
 )
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import shown
+from vla_zenoh_policy_servers.action_semantics import (
+    ACTION_OPTIONS,
+    ActionSemantics,
+    as_spec_error,
+    read_action_semantics,
+)
+from vla_zenoh_policy_servers.state_vector import (
+    StateNumbers,
+    parts_of,
+    read_parts,
+    state_numbers,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ class FieldSource:
 
     Args:
         camera: image of this camera, or empty.
-        parts: of the robot state, see `vla_zenoh.lab.policy_servers.state_vector`.
+        parts: of the robot state, see `vla_zenoh_policy_servers.state_vector`.
         blank: height and width of a black image.
     """
 

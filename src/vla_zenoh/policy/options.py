@@ -7,10 +7,8 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
-from urllib.parse import SplitResult, urlsplit
 
 from vla_zenoh.errors import SpecError, WorkerError
-from vla_zenoh.profile.schema import reachable_address
 
 SECRET = "api_"
 """Prefix of the names of options that must not be shown (`api_key`)."""
@@ -67,24 +65,6 @@ def whole_number(name: str, text: str, *, least: int = 0) -> int:
     if value != int(value):
         raise SpecError(f"{name} is {text!r}, wanted a whole number")
     return int(value)
-
-
-def address(text: str, *schemes: str) -> SplitResult:
-    """The option `url`; without a scheme the first of `schemes` is meant.
-
-    Raises:
-        SpecError: another scheme, or no host of this name can be.
-    """
-    wanted = " or ".join(f"{scheme}://HOST:PORT" for scheme in schemes)
-    try:
-        parts = urlsplit(text if "://" in text else f"{schemes[0]}://{text}")
-        fits = parts.scheme in schemes and parts.port != 0
-        reachable_address(parts.hostname or "")
-    except ValueError as error:
-        raise SpecError(f"url is {text!r}, wanted {wanted}: {error}") from error
-    if not fits:
-        raise SpecError(f"url is {text!r}, wanted {wanted}")
-    return parts
 
 
 def checkpoint_folder(text: str) -> Path:

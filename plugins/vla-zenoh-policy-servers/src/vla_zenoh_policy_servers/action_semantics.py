@@ -2,7 +2,7 @@
 
 The same options serve policy servers, LeRobot checkpoints and OpenVLA checkpoints, in both
 directions: they say what its answers mean, how the steps in execution are told to it, and in which
-units it wants the state (`vla_zenoh.lab.policy_servers.state_vector`)::
+units it wants the state (`vla_zenoh_policy_servers.state_vector`)::
 
     action     delta, absolute, velocity (of the TCP); joint_delta, joint_position, joint_velocity
     frame      base, tcp: axes of a delta or velocity
@@ -47,9 +47,9 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from vla_zenoh.errors import SpecError, describe_faults
-from vla_zenoh.lab.policy_servers.model_options import number, one_of, whole_number
 from vla_zenoh.policy import ActionSpec, Anchor, ControllerSpec, Frame, GripperSemantics, RelativeTo
 from vla_zenoh.policy.meaning import ROTATION_FORMS, SHARE, GripperScale
+from vla_zenoh.policy.options import number, one_of, whole_number
 
 Action = Literal["delta", "absolute", "velocity", "joint_delta", "joint_position", "joint_velocity"]
 _JOINT_KINDS: Mapping[str, str] = {

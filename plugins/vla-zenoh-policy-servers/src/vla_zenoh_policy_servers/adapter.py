@@ -11,17 +11,37 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
+from urllib.parse import SplitResult, urlsplit
 
 from vla_zenoh.errors import PeerError, SpecError
-from vla_zenoh.lab.policy_servers.field_mapping import read_field_mapping
-from vla_zenoh.lab.policy_servers.model_options import number
-from vla_zenoh.lab.policy_servers.presets import Presets
 from vla_zenoh.policy import ActionSteps, ModelSpec, Observation
+from vla_zenoh.policy.options import number
 from vla_zenoh.profile import load_profile
+from vla_zenoh.profile.schema import reachable_address
+from vla_zenoh_policy_servers.field_mapping import read_field_mapping
+from vla_zenoh_policy_servers.presets import Presets
 
 FIRST_S = 0.25
 LONGEST_S = 2.0
 """The robot holds meanwhile: retry soon, but not in a tight loop."""
+
+
+def address(text: str, *schemes: str) -> SplitResult:
+    """The option `url`; without a scheme the first of `schemes` is meant.
+
+    Raises:
+        SpecError: another scheme, or no host of this name can be.
+    """
+    wanted = " or ".join(f"{scheme}://HOST:PORT" for scheme in schemes)
+    try:
+        parts = urlsplit(text if "://" in text else f"{schemes[0]}://{text}")
+        fits = parts.scheme in schemes and parts.port != 0
+        reachable_address(parts.hostname or "")
+    except ValueError as error:
+        raise SpecError(f"url is {text!r}, wanted {wanted}: {error}") from error
+    if not fits:
+        raise SpecError(f"url is {text!r}, wanted {wanted}")
+    return parts
 
 
 class Backoff:
@@ -57,7 +77,7 @@ class Adapter(ABC):
     Args:
         where: the server, for messages.
         preset: one of `presets`, or ``none``.
-        mapping: options that override it, see `vla_zenoh.lab.policy_servers.field_mapping`.
+        mapping: options that override it, see `vla_zenoh_policy_servers.field_mapping`.
         timeout_s: for connecting, and for each answer.
         profile: of the robot: its gripper and, if answers are joints, its arm.
         normalisation: for the spec.

@@ -29,8 +29,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.errors import MissingExtraError, SpecError
-from vla_zenoh.lab.policy_servers.action_semantics import HOME, METRIC, SCALED, StateUnits
-from vla_zenoh.lab.policy_servers.model_options import number
 from vla_zenoh.policy import Observation, StatePart
 from vla_zenoh.policy.meaning import (
     CLEAR,
@@ -40,8 +38,10 @@ from vla_zenoh.policy.meaning import (
     SHARE,
     GripperScale,
 )
+from vla_zenoh.policy.options import number
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray, JointState
+from vla_zenoh_policy_servers.action_semantics import HOME, METRIC, SCALED, StateUnits
 
 ROTATIONS = tuple(name for name in ROTATION_FORMS if name != "quaternion")
 CUT = ("rpy", "rotvec", "quat_xyzw", "quat_wxyz")
