@@ -47,6 +47,7 @@ WITH_PLUGINS = [
     ["bench", "sim", "--help"],
     ["bench", "task", "--help"],
     ["compare", "--help"],
+    ["do", "home", "--help"],
     ["figure", "motion", "--help"],
     ["profile", "check", "fr3", "ur5e_rtde"],
     ["view", "--help"],

@@ -105,6 +105,17 @@ def test_a_command_of_a_package_that_is_missing_says_how_to_install_it(
     assert f" . {paths} in a checkout" in done.stderr
 
 
+def test_up_says_at_its_start_that_a_node_of_its_host_needs_a_package(
+    alone: dict[str, str], tmp_path: Path
+) -> None:
+    profile = tmp_path / "lab.yaml"
+    nodes = "[router, sim, camera, command, worker, primitives]"
+    profile.write_text(f"extends: panda_sim\nhosts: {{here: {{nodes: {nodes}}}}}\n", "utf-8")
+    done = run(alone, "up", str(profile), "--dry-run")
+    assert done.returncode == 1
+    assert "hosts.here.nodes has primitives: `vla-zenoh node primitives` needs" in done.stderr
+
+
 @pytest.mark.realtime
 def test_up_runs_without_a_rolling_record_and_names_its_package(
     alone: dict[str, str], tmp_path: Path

@@ -63,7 +63,6 @@ ALLOWED = {
             "lab/episode.py",
             "lab/inference_views.py",
             "lab/newest_records.py",
-            "lab/primitives/node.py",
             "lab/recording/recorder.py",
             "lab/recording/replay.py",
             "lab/recording/sample_queue.py",

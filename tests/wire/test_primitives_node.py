@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 import zenoh
 from camera_rig import free_endpoint, until
+from vla_zenoh_primitives.endings import Arrival
+from vla_zenoh_primitives.node import PrimitivesNode
 
 from vla_zenoh.bus.buffers import CallbackRing
 from vla_zenoh.bus.node import Node
@@ -23,8 +25,6 @@ from vla_zenoh.client.primitives import ask
 from vla_zenoh.errors import NodeError
 from vla_zenoh.keys import PRIMITIVES, Kind, worker_node
 from vla_zenoh.kinematics.so3 import Pose
-from vla_zenoh.lab.primitives.endings import Arrival
-from vla_zenoh.lab.primitives.node import PrimitivesNode
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.types import GripperState, JointState, PoseState, Task
 

@@ -62,7 +62,7 @@ COMMANDS: Panels = {
                 "arm": "cli.nodes:arm",
                 "camera": "cli.nodes:camera",
                 "command": "cli.nodes:command",
-                "primitives": "lab.cli.primitives:node",
+                "primitives": OF_A_PACKAGE,
                 "rolling": OF_A_PACKAGE,
             },
         ),
@@ -78,12 +78,7 @@ COMMANDS: Panels = {
         "reset": "cli.drive:reset",
         "do": CommandGroup(
             "Guarded motions: go to a pose, home, grip, run a model until a condition holds.",
-            {
-                "move-to": "lab.cli.primitives:move_to",
-                "home": "lab.cli.primitives:home",
-                "grip": "lab.cli.primitives:grip",
-                "run": "lab.cli.primitives:run",
-            },
+            dict.fromkeys(("move-to", "home", "grip", "run"), OF_A_PACKAGE),
         ),
         "web": OF_A_PACKAGE,
         "serve": CommandGroup(

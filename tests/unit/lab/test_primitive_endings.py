@@ -7,10 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-from vla_zenoh.client.messages import Until
-from vla_zenoh.kinematics.so3 import Pose
-from vla_zenoh.lab.primitives.endings import (
+from vla_zenoh_primitives.endings import (
     GRIPPED_S,
     SETTLED_S,
     STUCK_S,
@@ -20,6 +17,9 @@ from vla_zenoh.lab.primitives.endings import (
     RunEnding,
     Sight,
 )
+
+from vla_zenoh.client.messages import Until
+from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.types import GripperState, PoseState
 
 PERIOD_S = 0.01

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from panda_arm import HOME_RAD
+from vla_zenoh_primitives.target_check import TargetCheck
 
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.kinematics.so3 import Pose, exp3
-from vla_zenoh.lab.primitives.target_check import TargetCheck
 from vla_zenoh.profile import load_profile, override
 
 PROFILE = load_profile("panda_sim")

@@ -34,13 +34,13 @@ from vla_zenoh.control.states import DEACTIVATED
 from vla_zenoh.errors import CodecError, NodeError, SessionError, VlaZenohError
 from vla_zenoh.keys import PRIMITIVES, last_chunk, worker_node
 from vla_zenoh.kinematics.so3 import Pose, pose_of, rotation_from_quat
-from vla_zenoh.lab.primitives.endings import NEAR_RAD, Arrival, Ending, Gripped, RunEnding, Sight
-from vla_zenoh.lab.primitives.policy import CHUNK_HZ, Target, TargetPolicy
-from vla_zenoh.lab.primitives.target_check import TargetCheck
 from vla_zenoh.nodes.worker.node import InferenceDebugPublisher
 from vla_zenoh.nodes.worker.robot_session import RobotSession
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray, HeldBox
+from vla_zenoh_primitives.endings import NEAR_RAD, Arrival, Ending, Gripped, RunEnding, Sight
+from vla_zenoh_primitives.policy import CHUNK_HZ, Target, TargetPolicy
+from vla_zenoh_primitives.target_check import TargetCheck
 
 POLL_S = 0.01
 SPEC_LEAD_S = 0.1

@@ -28,7 +28,7 @@ CONDITIONS = "gripper=closed|open, inside=X,Y,Z:X,Y,Z (m), force=N, still=S, don
 @options
 def node(node: NodeOptions) -> None:
     """Answer queries for guarded motions: `vla-zenoh do`, scripts and agents."""
-    from vla_zenoh.lab.primitives.node import PrimitivesNode
+    from vla_zenoh_primitives.node import PrimitivesNode
 
     profile = node.load()
     run_node(
