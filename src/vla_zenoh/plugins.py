@@ -76,6 +76,24 @@ class RobotPlugin:
     check_robot: Callable[[Any, Any], Iterable[Any]] | None = None
 
 
+class FoundCamera(NamedTuple):
+    """A camera of this computer.
+
+    Args:
+        source: how to write it in a profile, so that it is the same camera after a restart.
+        name: as its maker or driver calls it.
+        device: where it is plugged in; empty: not known.
+    """
+
+    source: str
+    name: str
+    device: str
+
+
+def _no_cameras() -> Iterable[FoundCamera]:
+    return ()
+
+
 @dataclass(frozen=True, kw_only=True)
 class CameraPlugin:
     """What the ``source`` of a camera may begin with. Group ``vla_zenoh.cameras``.
@@ -92,6 +110,9 @@ class CameraPlugin:
         has_depth: it measures depth.
         has_locks: its exposure and white balance can be fixed.
         same_moving_s: how long an image may repeat while the arm moves, s; 0: indefinitely.
+        connected: cameras of this computer, for `vla-zenoh camera list`; a `MissingExtraError`
+            where the library that knows them is not installed.
+        maker: a word in the names of its cameras. Where it can list them, other sources do not.
     """
 
     written: str
@@ -103,6 +124,8 @@ class CameraPlugin:
     has_depth: bool = False
     has_locks: bool = False
     same_moving_s: float = 1.0
+    connected: Callable[[], Iterable[FoundCamera]] = _no_cameras
+    maker: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from vla_zenoh_realsense.source import WINDOW_S, DeviceClock
 
 from vla_zenoh.errors import NodeError, ProfileError
 from vla_zenoh.nodes.camera.geometry import Geometry, Intrinsics, read_intrinsics
-from vla_zenoh.nodes.camera.realsense import WINDOW_S, DeviceClock
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.profile.schema import CameraProfile, Crop
 

@@ -16,7 +16,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from wrong_profiles import CAMERA_SOURCES
 
-from vla_zenoh.errors import NodeError, PluginError
+from vla_zenoh.errors import MissingExtraError, NodeError, PluginError
+from vla_zenoh.lab.cli.camera import connected_cameras
 from vla_zenoh.lab.profile.check import check_profile
 from vla_zenoh.nodes.camera.camera_publisher import EARLY, LATE, RateLimiter, to_rgb
 from vla_zenoh.nodes.camera.geometry import resize
@@ -31,6 +32,7 @@ from vla_zenoh.nodes.camera.opencv_sources import (
     why_not,
 )
 from vla_zenoh.nodes.camera.source import without_password
+from vla_zenoh.plugins import CameraPlugin, FoundCamera
 from vla_zenoh.profile import load_profile
 from vla_zenoh.profile.schema import CameraProfile
 
@@ -355,3 +357,22 @@ for source in ("file:{tmp_path}/a.mp4", "file:{tmp_path}/a.png", "v4l2:{tmp_path
         [sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=60
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+# -- which are connected --------------------------------------------------------------------------
+def lists(*names: str, maker: str = "") -> CameraPlugin:
+    cameras = [FoundCamera(f"{maker or 'v4l2'}:{name}", name, "usb") for name in names]
+    return CameraPlugin(written="", connected=lambda: cameras, maker=maker)
+
+
+def has_no_library() -> list[FoundCamera]:
+    raise MissingExtraError("acme_sdk", "sdk", package="acme-cameras")
+
+
+def test_a_camera_of_a_maker_is_listed_once_by_its_own_library_where_that_is_installed() -> None:
+    both = [lists("Acme One", maker="Acme"), lists("Acme One", "Webcam")]
+    listed = ["Acme:Acme One", "v4l2:Webcam"]
+    assert [one.source for one in connected_cameras(both)] == listed
+    assert [one.source for one in connected_cameras(reversed(both))] == listed[::-1]
+    without = [CameraPlugin(written="", connected=has_no_library, maker="Acme"), both[1]]
+    assert [one.source for one in connected_cameras(without)] == ["v4l2:Acme One", "v4l2:Webcam"]

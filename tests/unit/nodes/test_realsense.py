@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from camera_rig import Rig, await_match, camera_rig, until
 from depth_rig import Looker, looking
+from vla_zenoh_realsense.source import RealsenseSource
 
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.codec.image import decode_depth
@@ -23,7 +24,6 @@ from vla_zenoh.errors import NodeError
 from vla_zenoh.lab.recording.reader import open_recording
 from vla_zenoh.lab.recording.recorder import Recorder
 from vla_zenoh.lab.recording.run import depths
-from vla_zenoh.nodes.camera.realsense import RealsenseSource
 from vla_zenoh.profile.schema import CameraProfile, Crop
 
 rs = pytest.importorskip("pyrealsense2", exc_type=ImportError)

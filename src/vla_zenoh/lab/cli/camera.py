@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import threading
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,13 +17,11 @@ from vla_zenoh.errors import MissingExtraError, VlaZenohError, in_words
 from vla_zenoh.lab.cli.output import print_json, progress
 from vla_zenoh.lab.cli.output_path import ForceOption, if_wanted, output_folder
 from vla_zenoh.nodes.camera.node import make_source
-from vla_zenoh.nodes.camera.realsense import connected, sdk
-from vla_zenoh.nodes.camera.v4l2_devices import list_devices
+from vla_zenoh.plugins import CAMERAS, CameraPlugin, FoundCamera, load_all
 from vla_zenoh.profile.schema import CameraProfile
 
 WARM_UP = 15
 """Images until exposure has settled."""
-MAKER = "RealSense"
 
 
 @options
@@ -39,7 +38,7 @@ def camera_list(
     one after a restart. With --output each is opened: stop the nodes that use them first.
     """
     with if_wanted(output_folder, output, force=force) as folder:
-        found = _cameras()
+        found = [each._asdict() for each in connected_cameras(load_all(CAMERAS).values())]
         if folder is not None:
             for row in found:
                 with progress(f"a picture of {row['source']}"):
@@ -57,32 +56,21 @@ def camera_list(
     console().print(table)
 
 
-def _cameras() -> list[dict[str, Any]]:
-    """RealSense cameras are listed by their own library, which gives them depth, if it is here."""
-    try:
-        found = _realsense()
-    except MissingExtraError:
-        return _v4l2()
-    return found + [row for row in _v4l2() if MAKER not in row["name"]]
-
-
-def _v4l2() -> list[dict[str, Any]]:
+def connected_cameras(sources: Iterable[CameraPlugin]) -> list[FoundCamera]:
+    """Cameras of every source that can list them; those of a maker by its own library, if here."""
+    found: list[tuple[str, FoundCamera]] = []
+    makers: set[str] = set()
+    for source in sources:
+        try:
+            found += [(source.maker, camera) for camera in source.connected()]
+        except MissingExtraError:
+            continue
+        if source.maker:
+            makers.add(source.maker)
     return [
-        {"source": one.source, "name": one.name, "device": str(one.path)} for one in list_devices()
-    ]
-
-
-def _realsense() -> list[dict[str, Any]]:
-    info = sdk().camera_info
-    return [
-        {
-            "source": f"realsense:{one.get_info(info.serial_number)}",
-            "name": one.get_info(info.name),
-            "device": one.get_info(info.usb_type_descriptor)
-            if one.supports(info.usb_type_descriptor)
-            else "",
-        }
-        for one in connected()
+        camera
+        for maker, camera in found
+        if maker or not any(other in camera.name for other in makers)
     ]
 
 

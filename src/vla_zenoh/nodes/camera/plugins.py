@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
-from vla_zenoh.plugins import CameraPlugin
+from vla_zenoh.plugins import CameraPlugin, FoundCamera
 from vla_zenoh.profile.schema import CameraProfile, reachable_address
 
 if TYPE_CHECKING:
@@ -20,6 +20,12 @@ def _v4l2(device: str, profile: CameraProfile) -> Source:
     from vla_zenoh.nodes.camera.opencv_sources import V4l2Source
 
     return V4l2Source(device, profile)
+
+
+def _v4l2_connected() -> list[FoundCamera]:
+    from vla_zenoh.nodes.camera.v4l2_devices import list_devices
+
+    return [FoundCamera(one.source, one.name, str(one.path)) for one in list_devices()]
 
 
 def _rtsp(place: str, profile: CameraProfile) -> Source:
@@ -47,24 +53,12 @@ def _file(path: str, profile: CameraProfile) -> Source:
     return FileSource(path, profile.rate_hz)
 
 
-def _realsense(serial: str, profile: CameraProfile) -> Source:
-    from vla_zenoh.nodes.camera.realsense import RealsenseSource
-
-    return RealsenseSource(serial, profile)
-
-
 # Drawn by the camera node from the simulator's scene, and served by the node ros2.
 SIM = CameraPlugin(written="sim:CAMERA", has_depth=True)
 ROS2 = CameraPlugin(written="ros2:TOPIC", has_depth=True, same_moving_s=2.0)
 
-V4L2 = CameraPlugin(written="v4l2:DEVICE", make=_v4l2, has_lens=True, has_locks=True)
-REALSENSE = CameraPlugin(
-    written="realsense:SERIAL",
-    make=_realsense,
-    has_lens=True,
-    has_intrinsics=True,
-    has_depth=True,
-    has_locks=True,
+V4L2 = CameraPlugin(
+    written="v4l2:DEVICE", make=_v4l2, has_lens=True, has_locks=True, connected=_v4l2_connected
 )
 RTSP = CameraPlugin(
     written="rtsp://HOST/PATH", make=_rtsp, check=_rtsp_fault, has_lens=True, same_moving_s=5.0

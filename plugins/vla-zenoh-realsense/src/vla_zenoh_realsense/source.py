@@ -1,6 +1,6 @@
 """Intel RealSense cameras by their serial number: colour, and depth in the same view.
 
-Through ``pyrealsense2`` (extra ``realsense``). Depth is aligned to colour, so both have the
+Through ``pyrealsense2`` (extra ``sdk``). Depth is aligned to colour, so both have the
 intrinsics of colour and the same pixels.
 """
 
@@ -38,7 +38,9 @@ def sdk() -> Any:
     try:
         return import_module("pyrealsense2")
     except ImportError as error:
-        raise MissingExtraError(f"pyrealsense2 ({error})", "realsense") from error
+        raise MissingExtraError(
+            f"pyrealsense2 ({error})", "sdk", package="vla-zenoh-realsense"
+        ) from error
 
 
 def connected(context: Any = None) -> list[Any]:
