@@ -188,13 +188,21 @@ def import_model(model: ModelFile) -> ModuleType:
         found.loader.exec_module(module)
     except (Exception, SystemExit) as error:
         del sys.modules[name]
-        hint = (
-            "; name what brings it in the header of the file (PEP 723), or install it here"
-            if isinstance(error, ModuleNotFoundError)
-            else ""
-        )
+        hint = _of_missing(error, model.path) if isinstance(error, ModuleNotFoundError) else ""
         raise WorkerError(f"{model.path} cannot be imported: {in_words(error)}{hint}") from error
     return module
+
+
+def _of_missing(error: ModuleNotFoundError, path: Path) -> str:
+    """What to do about a module that the file at `path` does not find."""
+    module = (error.name or "").partition(".")[0]
+    beside = path.parent / module
+    if module and (beside.is_dir() or beside.with_suffix(".py").is_file()):
+        return (
+            f"; it lies beside the file, where Python does not look: set PYTHONPATH={path.parent}, "
+            "or put both into a package and install that"
+        )
+    return "; name what brings it in the header of the file (PEP 723), or install it here"
 
 
 # -- making what a file holds ---------------------------------------------------------------------

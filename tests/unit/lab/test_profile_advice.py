@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from vla_zenoh import resources
-from vla_zenoh.lab.profile.check import advice
+from vla_zenoh.lab.profile.check import advice, check_profile
 from vla_zenoh.lab.profile.robot_check import barriers_advice
 from vla_zenoh.profile import load_profile, override
 
@@ -98,3 +98,33 @@ def test_a_link_and_a_tool_without_a_collision_shape_are_named(tmp_path: Path) -
 
 def test_the_shipped_arms_have_shapes_up_to_their_tool() -> None:
     assert list(barriers_advice(SIM)) == []
+
+
+EXAMPLES = Path(__file__).parents[3] / "examples"
+
+
+def test_a_robot_that_is_a_program_of_its_own_is_not_imported_as_a_driver() -> None:
+    report = check_profile(str(EXAMPLES / "wire" / "robot.yaml"))
+    assert not report.errors
+    (said,) = report.advice
+    assert said.startswith("hosts: none runs the node arm")
+    assert "the program that is the robot" in said
+
+
+@pytest.mark.parametrize("runs_here", [True, False])
+def test_the_file_of_an_arm_is_checked_where_a_host_runs_it(
+    runs_here: bool, tmp_path: Path
+) -> None:
+    (tmp_path / "helper.py").write_text("NUMBER = 7\n")
+    (tmp_path / "driver.py").write_text("import helper\n")
+    host = "here" if runs_here else "there"
+    hosts = f"hosts: {{{host}: {{nodes: [router, arm, command]}}, other: {{nodes: [worker]}}}}"
+    robot = "extends: panda_sim\nrobot: {driver: arm, command: joint}\narm: {file: driver.py}"
+    path = tmp_path / "robot.yaml"
+    path.write_text(f"{robot}\ncameras: {{front: null, wrist: null}}\n{hosts}\n")
+    report = check_profile(str(path), "here" if runs_here else "other")
+    (said,) = (each for each in (*report.errors, *report.advice) if "helper" in each)
+    assert (said in report.errors) is runs_here
+    assert "it lies beside the file" in said
+    assert f"PYTHONPATH={tmp_path}" in said
+    assert "PEP 723" not in said

@@ -78,9 +78,12 @@ def check_profile(
         part = profile.hosts[host]
         here = {*part.nodes, *profile.workers_of(part)}
         found += [*_cameras(profile, part), *_router(profile, host), *_certificates(profile, host)]
+    ours = {kind for part in profile.hosts.values() for kind in part.nodes}
     errors: list[str] = []
     hints = advice(profile)
     for place, why, node, other in found:
+        if node == "arm" and node not in ours:  # another program is the robot
+            continue
         if not node or node in here:
             fault = (place, why, (other,)) if other else (place, why)
             errors.append(located_fault(fault, lines))
@@ -234,7 +237,10 @@ def _placement(profile: Profile) -> Iterator[str]:
         yield "hosts: none runs the simulator, and robot.driver is sim"
     for node in ("ros2", "arm"):
         if node not in running and profile.robot.node == node:
-            yield f"hosts: none runs the node {node}, and robot.driver is {profile.robot.driver}"
+            yield (
+                f"hosts: none runs the node {node}, and robot.driver is {profile.robot.driver}; "
+                "start it, or the program that is the robot, by hand"
+            )
     for what, known, used in (
         (
             "cameras",
