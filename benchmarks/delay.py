@@ -16,13 +16,13 @@ from statistics import median
 from typing import Annotated, Any, NamedTuple
 
 import typer
+from vla_zenoh_benchmarks.statistics import mcnemar_exact, wilson_95
 from vla_zenoh_benchmarks.task_lockstep import run_in_lockstep
 
 from vla_zenoh.cli.options import effective_profile
 from vla_zenoh.cli.output import console, new_table
 from vla_zenoh.errors import MissingExtraError
-from vla_zenoh.lab.bench.task import TaskPlan, TaskRequest
-from vla_zenoh.lab.statistics import mcnemar_exact, wilson_95
+from vla_zenoh.lab.tasks.task import TaskPlan, TaskRequest
 from vla_zenoh.profile import Profile, override
 from vla_zenoh.runtime.process import stop_on_signals
 

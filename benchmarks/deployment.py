@@ -7,8 +7,7 @@ from typing import Annotated
 
 import typer
 from vla_zenoh_benchmarks.paired_tasks import Comparison, compare, read_run
-
-from vla_zenoh.lab.statistics import wilson_95
+from vla_zenoh_benchmarks.statistics import wilson_95
 
 LABELS = {"live": "the arm stands meanwhile", "command": "through the command node"}
 COLOURS = {"live": "#1a7f8e", "command": "#d1603d"}

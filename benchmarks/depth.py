@@ -11,12 +11,12 @@ import numpy as np
 import typer
 import zenoh
 from numpy.typing import NDArray
+from vla_zenoh_benchmarks.result_file import ResultOptions, write_json
 
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.cli.options import options
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import decode_depth, encode_depth
-from vla_zenoh.lab.cli.bench_file import ResultOptions, write_json
 from vla_zenoh.lab.cli.loopback import free_port
 from vla_zenoh.nodes.camera.node import CameraNode
 from vla_zenoh.profile import SessionProfile, load_profile

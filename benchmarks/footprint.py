@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from vla_zenoh_benchmarks.result_file import ResultOptions, write_json
 
 from benchmarks.chain.process import free_port
 from vla_zenoh.bus.buffers import CallbackRing, bytes_of
@@ -26,7 +27,6 @@ from vla_zenoh.cli.options import options
 from vla_zenoh.client.client import Client
 from vla_zenoh.codec import records
 from vla_zenoh.errors import NodeError, SessionError
-from vla_zenoh.lab.cli.bench_file import ResultOptions, write_json
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.types import PoseCommand
 

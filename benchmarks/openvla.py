@@ -8,10 +8,10 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 from rich.text import Text
+from vla_zenoh_benchmarks.result_file import ResultOptions, write_json
 
 from vla_zenoh.cli.options import model_options, options
 from vla_zenoh.errors import WorkerError
-from vla_zenoh.lab.cli.bench_file import ResultOptions, write_json
 from vla_zenoh.policy.loader import find_model, import_model, make_policy, module_name
 from vla_zenoh.policy.options import one_of
 from vla_zenoh.runtime.environments import run_in_own_environment

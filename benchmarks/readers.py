@@ -15,13 +15,13 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from vla_zenoh_benchmarks.result_file import ResultOptions, write_json
 
 from benchmarks.chain.our_chain import CAMERAS, Chain
 from benchmarks.picture import noisy_picture
 from vla_zenoh.bus.buffers import CallbackRing
 from vla_zenoh.bus.clock import FixedRate
 from vla_zenoh.cli.options import options
-from vla_zenoh.lab.cli.bench_file import ResultOptions, write_json
 from vla_zenoh.runtime.process import PARENT_VARIABLE
 from vla_zenoh.types import ActionChunk
 

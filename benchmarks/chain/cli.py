@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Annotated
 
 import typer
+from vla_zenoh_benchmarks.result_file import ResultOptions, write_json
 
 from vla_zenoh.cli.options import options
-from vla_zenoh.lab.cli.bench_file import ResultOptions, write_json
 from vla_zenoh.lab.cli.output import progress_bars
 
 

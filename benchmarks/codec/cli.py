@@ -7,8 +7,9 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from vla_zenoh_benchmarks.result_file import ResultOptions, write_json
+
 from vla_zenoh.cli.options import options
-from vla_zenoh.lab.cli.bench_file import ResultOptions, write_json
 
 BUDGET_S = 0.3
 """Time for one figure, at most `MAX_TURNS` turns."""

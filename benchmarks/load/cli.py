@@ -7,10 +7,10 @@ from typing import Annotated, Any
 import typer
 from rich.box import SIMPLE
 from rich.table import Table
+from vla_zenoh_benchmarks.result_file import ResultOptions, kept_rows
 
 from vla_zenoh.cli.options import DEFAULT_PROFILE, effective_profile, options
 from vla_zenoh.cli.output import errors
-from vla_zenoh.lab.cli.bench_file import ResultOptions, kept_rows
 from vla_zenoh.lab.cli.options import number_list
 
 MOST = 64

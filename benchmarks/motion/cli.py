@@ -11,14 +11,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.progress import TaskID
+from vla_zenoh_benchmarks.result_file import write_json
 
 from benchmarks.motion.protocol import PROTOCOL, STEPS, Conditions, MotionCase
 from vla_zenoh.cli.options import DEFAULT_PROFILE, JsonOption, effective_profile, options
 from vla_zenoh.cli.output import console
-from vla_zenoh.lab.cli.bench_file import running_nodes, write_json
 from vla_zenoh.lab.cli.options import SimulatedProfileOption, number_list
 from vla_zenoh.lab.cli.output import print_json, progress_bars
 from vla_zenoh.lab.cli.output_path import ForceOption, if_wanted, output_folder
+from vla_zenoh.lab.cli.running_nodes import running_nodes
 from vla_zenoh.profile import Profile
 
 if TYPE_CHECKING:

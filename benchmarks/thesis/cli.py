@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from vla_zenoh_benchmarks.result_file import ResultOptions, write_json
 
 from benchmarks.thesis.csv_file import evaluate_csv
 from benchmarks.thesis.published import thesis_table
 from vla_zenoh.cli.options import options
 from vla_zenoh.cli.output import errors, new_table
-from vla_zenoh.lab.cli.bench_file import ResultOptions, write_json
 from vla_zenoh.lab.evaluation import tables
 from vla_zenoh.lab.evaluation.evaluate import combined
 

@@ -205,6 +205,7 @@ NEEDED: Mapping[str, tuple[str, ...]] = {
     "vla-zenoh-figures": ("vla-zenoh-benchmarks",),
     "vla-zenoh-nights": ("vla-zenoh-trial",),
     "vla-zenoh-serve": ("vla-zenoh-policy-servers",),
+    "vla-zenoh-trial": ("vla-zenoh-benchmarks",),
 }
 """Package in ``plugins/`` -> others that it needs."""
 OURS = "vla-zenoh-"

@@ -57,7 +57,6 @@ ALLOWED = {
     # What of the lab listens to a robot, drives it or starts processes.
     **dict.fromkeys(
         (
-            "lab/bench/task_runner.py",
             "lab/check/model_runner.py",
             "lab/doctor/access.py",
             "lab/episode.py",
@@ -66,6 +65,7 @@ ALLOWED = {
             "lab/recording/recorder.py",
             "lab/recording/replay.py",
             "lab/recording/sample_queue.py",
+            "lab/tasks/task_runner.py",
         ),
         IO - NODE,
     ),
@@ -149,7 +149,7 @@ def test_no_module_of_the_core_imports_the_lab_at_any_time(path: Path) -> None:
     "source",
     [
         "from vla_zenoh.lab.doctor import HostFinding",
-        "def f():\n    import vla_zenoh.lab.bench",
+        "def f():\n    import vla_zenoh.lab.tasks",
         "TABLE = {'check': 'lab.cli.check:check'}",
         "import_module('vla_zenoh.lab.check')",
     ],

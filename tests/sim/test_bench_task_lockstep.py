@@ -11,7 +11,7 @@ from vla_zenoh_benchmarks.cli_task import _with_bricks
 from vla_zenoh_benchmarks.task_lockstep import run_in_lockstep
 
 from vla_zenoh.errors import NodeError
-from vla_zenoh.lab.bench.task import BASELINES, TaskOutcome, TaskPlan
+from vla_zenoh.lab.tasks.task import BASELINES, TaskOutcome, TaskPlan
 from vla_zenoh.profile import load_profile, override
 
 SEED = 1_000_000

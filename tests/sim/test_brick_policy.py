@@ -20,11 +20,11 @@ from vla_zenoh_benchmarks.lockstep.loop import Lockstep
 
 from vla_zenoh import resources
 from vla_zenoh.errors import WorkerError
-from vla_zenoh.lab.bench.task import DemoPlan, order_of
 from vla_zenoh.lab.check.examples import example_observation
 from vla_zenoh.lab.tasks.episode import TaskEpisode, draw_episode
 from vla_zenoh.lab.tasks.judge import TaskJudge, Verdict
 from vla_zenoh.lab.tasks.order import HELD_OUT, NONSENSE, TRAINING, Order, brick, phrase
+from vla_zenoh.lab.tasks.task import DemoPlan, order_of
 from vla_zenoh.policy import ActionSteps, Policy, check_steps
 from vla_zenoh.policy.inference import Committed
 from vla_zenoh.policy.loader import find_model, import_model, make_policy

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from vla_zenoh_benchmarks.task_lockstep import run_in_lockstep
 
-from vla_zenoh.lab.bench.task import DemoPlan
+from vla_zenoh.lab.tasks.task import DemoPlan
 from vla_zenoh.policy import Policy
 from vla_zenoh.policy.loader import find_model, import_model, make_policy
 from vla_zenoh.profile import load_profile

@@ -29,9 +29,9 @@ from generate import labelled
 from states import Situation
 from vla_zenoh_benchmarks.lockstep.loop import Lockstep
 from vla_zenoh_benchmarks.lockstep.worker import Delays
+from vla_zenoh_benchmarks.statistics import wilson_95
 from worker import HORIZON, Brick, Hand, Waypoints
 
-from vla_zenoh.lab.statistics import wilson_95
 from vla_zenoh.lab.tasks.episode import TaskEpisode, draw_episode, draw_stay
 from vla_zenoh.lab.tasks.judge import LIMIT_S, TaskJudge, Verdict
 from vla_zenoh.lab.tasks.order import COLOURS, FAMILIES, Order, brick

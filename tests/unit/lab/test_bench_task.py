@@ -17,23 +17,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 from vla_zenoh_benchmarks.cli_task import _named, _varied, _with_bricks, task
+from vla_zenoh_benchmarks.statistics import wilson_95
+from vla_zenoh_benchmarks.task_score import TaskScore, failure_sheet
 
 from vla_zenoh.codec.image import decode_jpeg, encode_jpeg
 from vla_zenoh.errors import NodeError
-from vla_zenoh.lab.bench.task import BASELINES, TaskOutcome, TaskPlan, TaskRequest, TaskScore
-from vla_zenoh.lab.bench.task_sheet import (
+from vla_zenoh.lab.cli.running_nodes import LAST_LINES, up_with_last_lines
+from vla_zenoh.lab.tasks.episode import TaskEpisode
+from vla_zenoh.lab.tasks.judge import Verdict
+from vla_zenoh.lab.tasks.order import COLOURS, FAMILIES, Order, brick
+from vla_zenoh.lab.tasks.task import BASELINES, TaskOutcome, TaskPlan, TaskRequest
+from vla_zenoh.lab.tasks.task_sheet import (
     FRAME_HEIGHT,
     FRAME_WIDTH,
     GAP,
     TITLE_HEIGHT,
-    failure_sheet,
     sheet,
 )
-from vla_zenoh.lab.cli.bench_file import LAST_LINES, up_with_last_lines
-from vla_zenoh.lab.statistics import wilson_95
-from vla_zenoh.lab.tasks.episode import TaskEpisode
-from vla_zenoh.lab.tasks.judge import Verdict
-from vla_zenoh.lab.tasks.order import COLOURS, FAMILIES, Order, brick
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import Image, ObjectPoses
 

@@ -15,11 +15,12 @@ from typer.testing import CliRunner
 from vla_zenoh_benchmarks.cli_compare import B_IS_WORSE
 from vla_zenoh_benchmarks.cli_compare import compare as command
 from vla_zenoh_benchmarks.paired_tasks import CONDITIONS, TaskResultFile, compare, read_run
+from vla_zenoh_benchmarks.task_score import TaskScore
 
 from vla_zenoh.errors import RecordError, ResourceError
-from vla_zenoh.lab.bench.task import TaskOutcome, TaskPlan, TaskScore
 from vla_zenoh.lab.tasks.episode import TaskEpisode
 from vla_zenoh.lab.tasks.order import Order
+from vla_zenoh.lab.tasks.task import TaskOutcome, TaskPlan
 
 SEED = 1_000_000
 FAMILIES = ("put", "stack", "push")

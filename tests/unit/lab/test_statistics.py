@@ -8,8 +8,7 @@ import math
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from vla_zenoh.lab.statistics import ALPHA, LEAST_DIFFERING, Paired, mcnemar_exact, paired
+from vla_zenoh_benchmarks.statistics import ALPHA, LEAST_DIFFERING, Paired, mcnemar_exact, paired
 
 ATOL = 1e-12
 COVERED_AT_LEAST = 0.93

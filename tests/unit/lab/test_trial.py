@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from vla_zenoh_benchmarks.statistics import Paired
 from vla_zenoh_trial.episode_fsm import DONE_S, EpisodeFsm, Phase
 from vla_zenoh_trial.folder import PLAN, TRIALS, TrialFolder
 from vla_zenoh_trial.plan import HIDDEN, DueEpisode, TrialPlan
@@ -21,7 +22,6 @@ from vla_zenoh_trial.verdict import EpisodeVerdict, read_verdict
 from vla_zenoh.errors import RecordError, RecordingError
 from vla_zenoh.lab.episode import EpisodeView
 from vla_zenoh.lab.recording.verdict import Verdict, verdict_in
-from vla_zenoh.lab.statistics import Paired
 
 SECONDS = 20.0
 FIRST_SHARE = 0.1

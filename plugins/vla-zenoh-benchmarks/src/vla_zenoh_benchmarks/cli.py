@@ -17,14 +17,15 @@ from vla_zenoh import __version__
 from vla_zenoh.cli.options import MAX_INDEX, JsonOption, ModelOptions, model_options, options
 from vla_zenoh.cli.output import console, errors, new_table
 from vla_zenoh.errors import ResourceError
-from vla_zenoh.lab.cli.bench_file import counts, rate_cells, shown_camera, write_json
 from vla_zenoh.lab.cli.output import print_json, progress_bars
 from vla_zenoh.lab.cli.output_path import check_folder
+from vla_zenoh.lab.tasks.task import shown_camera
 from vla_zenoh_benchmarks.contract import BenchmarkTask
 from vla_zenoh_benchmarks.episode import EpisodeConditions, EpisodeOutcome, EpisodeRequest, Mode
 from vla_zenoh_benchmarks.journal import PLAN, RunJournal, actions_file, read_episodes, read_json
 from vla_zenoh_benchmarks.process import BenchmarkProcess, BenchmarkSetting
 from vla_zenoh_benchmarks.result import summary, write_page, write_videos
+from vla_zenoh_benchmarks.result_file import counts, rate_cells, write_json
 from vla_zenoh_benchmarks.run import BenchmarkStage, Does, LocalRun, run_at_places
 
 REPLAY = "replay"

@@ -9,8 +9,8 @@ from rich.progress import track
 
 from vla_zenoh.cli.options import DEFAULT_PROFILE, effective_profile, options
 from vla_zenoh.cli.output import errors, new_table
-from vla_zenoh.lab.cli.bench_file import ResultOptions, kept_rows
 from vla_zenoh.lab.cli.options import SimulatedProfileOption, number_list
+from vla_zenoh_benchmarks.result_file import ResultOptions, kept_rows
 
 SHARES = ("p50", "p95", "p99", "max")
 

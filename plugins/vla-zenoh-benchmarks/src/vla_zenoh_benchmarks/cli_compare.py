@@ -12,7 +12,6 @@ from vla_zenoh.cli.options import JsonOption
 from vla_zenoh.cli.output import console, fail, new_table
 from vla_zenoh.errors import ResourceError
 from vla_zenoh.lab.cli.output import print_json, progress
-from vla_zenoh.lab.statistics import ALPHA
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.types import ActionChunk
 from vla_zenoh_benchmarks.disagreement import (
@@ -24,6 +23,7 @@ from vla_zenoh_benchmarks.disagreement import (
 )
 from vla_zenoh_benchmarks.paired_tasks import CONDITIONS, Comparison, figures, read_run
 from vla_zenoh_benchmarks.paired_tasks import compare as compare_runs
+from vla_zenoh_benchmarks.statistics import ALPHA
 
 B_IS_WORSE = 3
 """Exit code; 1 and 2 are those of every command for errors."""

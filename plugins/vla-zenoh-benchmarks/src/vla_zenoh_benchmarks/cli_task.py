@@ -22,16 +22,18 @@ from vla_zenoh.cli.options import (
     options,
 )
 from vla_zenoh.cli.output import console, new_table
-from vla_zenoh.lab.bench.task import BASELINES, SCENE, TaskOutcome, TaskPlan, TaskScore
-from vla_zenoh.lab.cli.bench_file import counts, rate_cells, running_nodes, shown_camera, write_json
 from vla_zenoh.lab.cli.options import SimulatedProfileOption
 from vla_zenoh.lab.cli.output import print_json, progress_bars
 from vla_zenoh.lab.cli.output_path import ForceOption, if_wanted, output_folder, require_free_folder
+from vla_zenoh.lab.cli.running_nodes import running_nodes
 from vla_zenoh.lab.tasks.judge import LIMIT_S
 from vla_zenoh.lab.tasks.order import FAMILIES, LIFT
+from vla_zenoh.lab.tasks.task import BASELINES, SCENE, TaskOutcome, TaskPlan, shown_camera
 from vla_zenoh.policy.loader import find_model
 from vla_zenoh.profile import Profile, override
 from vla_zenoh.resources import is_path
+from vla_zenoh_benchmarks.result_file import counts, rate_cells, write_json
+from vla_zenoh_benchmarks.task_score import TaskScore, failure_sheet
 
 Latencies = dict[str, tuple[float, float]]
 VARIATIONS = ("lights", "table", "camera", "distractors")
@@ -133,7 +135,6 @@ def task(
     A task is to put a brick in the box, stack it on another one, or push it. The verdict is by the
     true poses of the objects.
     """
-    from vla_zenoh.lab.bench.task_sheet import failure_sheet
     from vla_zenoh.lab.episode import Interrupted
     from vla_zenoh.plugins import how_to_repeat
     from vla_zenoh.runtime.environments import run_in_own_environment
@@ -237,8 +238,8 @@ def _real_time(
     stop: threading.Event,
     camera: str | None,
 ) -> Iterator[tuple[TaskOutcome, Latencies]]:
-    from vla_zenoh.lab.bench.task_runner import TaskRunner
     from vla_zenoh.lab.cli.loopback import own_address
+    from vla_zenoh.lab.tasks.task_runner import TaskRunner
     from vla_zenoh.runtime.process import die_with_parent
 
     die_with_parent()

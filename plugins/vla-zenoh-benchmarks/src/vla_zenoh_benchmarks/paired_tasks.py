@@ -14,7 +14,7 @@ from typing import Any
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
 
 from vla_zenoh.errors import RecordError, describe_fault
-from vla_zenoh.lab.statistics import ALPHA, Paired, paired
+from vla_zenoh_benchmarks.statistics import ALPHA, Paired, paired
 
 """Significance level, as in the intervals at 95 %."""
 CONDITIONS = (

@@ -12,11 +12,11 @@ import numpy as np
 
 from vla_zenoh.codec.image import decode_jpeg
 from vla_zenoh.lab.durable import page_template
-from vla_zenoh.lab.statistics import wilson_95
 from vla_zenoh.lab.video import VideoWriter
 from vla_zenoh_benchmarks.episode import EpisodeOutcome, EpisodeRequest
 from vla_zenoh_benchmarks.journal import actions_file
 from vla_zenoh_benchmarks.process import FRAME_HZ, BenchmarkProcess
+from vla_zenoh_benchmarks.statistics import wilson_95
 
 TEMPLATE = "page.html.j2"
 VIDEOS = "failures"

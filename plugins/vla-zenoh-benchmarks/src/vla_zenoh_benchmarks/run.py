@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from vla_zenoh.errors import MissingExtraError, NodeError
-from vla_zenoh.lab.cli.bench_file import running_nodes
 from vla_zenoh.lab.cli.loopback import free_port
+from vla_zenoh.lab.cli.running_nodes import running_nodes
 from vla_zenoh.profile import load_profile, override, to_yaml
 from vla_zenoh.profile.profile import Profile
 from vla_zenoh_benchmarks.episode import EpisodeOutcome, EpisodeRequest

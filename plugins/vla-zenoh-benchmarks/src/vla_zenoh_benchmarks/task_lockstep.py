@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from vla_zenoh.codec.image import encode_jpeg
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.errors import NodeError, VlaZenohError, WorkerError, in_words
-from vla_zenoh.lab.bench.task import (
+from vla_zenoh.lab.tasks.task import (
     ARM_LOST,
     SceneSnapshot,
     TaskOutcome,

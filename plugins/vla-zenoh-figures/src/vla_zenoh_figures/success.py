@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from vla_zenoh_benchmarks.paired_tasks import PairedOutcome, TaskResultFile
+from vla_zenoh_benchmarks.statistics import wilson_95
 
-from vla_zenoh.lab.statistics import wilson_95
 from vla_zenoh_figures.style import Drawn, FigureError, look, panels, styled
 
 ROW_IN, APART = 0.24, 0.18

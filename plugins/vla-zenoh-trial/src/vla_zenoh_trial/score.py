@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import median
 
-from vla_zenoh.lab.statistics import Paired, paired, wilson_95
+from vla_zenoh_benchmarks.statistics import Paired, paired, wilson_95
+
 from vla_zenoh_trial.plan import TrialPlan
 from vla_zenoh_trial.verdict import INTERVENTIONS, EpisodeVerdict
 

@@ -42,8 +42,8 @@ def demo(
 
         run_demo(prompt, steps, given.profile or DEFAULT_PROFILE, given)
         return
-    from vla_zenoh.lab.bench.task import FIRST_SEED
     from vla_zenoh.lab.cli.demo_tasks import run_task_demo
+    from vla_zenoh.lab.tasks.task import FIRST_SEED
 
     prompts, first_seed = [prompt] if prompt else [], FIRST_SEED if seed is None else seed
     run_task_demo(prompts, first_seed, given.profile or TASK_PROFILE, given)

@@ -19,12 +19,12 @@ from rich.progress import Progress
 from vla_zenoh.cli.options import effective_profile
 from vla_zenoh.cli.output import console, errors
 from vla_zenoh.client.client import Client
-from vla_zenoh.lab.cli.bench_file import running_nodes
 from vla_zenoh.lab.cli.demo_capacity import measure_capacity, small
 from vla_zenoh.lab.cli.loopback import own_address
 from vla_zenoh.lab.cli.options import DemoOptions
 from vla_zenoh.lab.cli.output import progress_bars
 from vla_zenoh.lab.cli.output_path import RUNS, output_folder
+from vla_zenoh.lab.cli.running_nodes import running_nodes
 from vla_zenoh.lab.episode import Interrupted
 from vla_zenoh.lab.evaluation.mcap_file import evaluate_parts
 from vla_zenoh.lab.evaluation.report import page

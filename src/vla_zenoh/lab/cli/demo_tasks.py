@@ -10,16 +10,15 @@ from rich.text import Text
 
 from vla_zenoh.cli.output import console, new_table, styled
 from vla_zenoh.errors import ResourceError, nearest
-from vla_zenoh.lab.bench.task import SCENE, DemoPlan, TaskOutcome, is_judged, order_of
-from vla_zenoh.lab.bench.task_runner import TaskRunner
-from vla_zenoh.lab.bench.task_sheet import sheet
-from vla_zenoh.lab.cli.bench_file import shown_camera
 from vla_zenoh.lab.cli.demo_stage import Stage, latencies, open_stage, print_end
 from vla_zenoh.lab.cli.options import DemoOptions
 from vla_zenoh.lab.cli.output import print_json
 from vla_zenoh.lab.evaluation.result import TASKS
 from vla_zenoh.lab.tasks.judge import FAILURES, LIMIT_S
 from vla_zenoh.lab.tasks.order import COLOURS, DIRECTIONS, PUSH, PUT, STACK, Order, phrase
+from vla_zenoh.lab.tasks.task import SCENE, DemoPlan, TaskOutcome, is_judged, order_of, shown_camera
+from vla_zenoh.lab.tasks.task_runner import TaskRunner
+from vla_zenoh.lab.tasks.task_sheet import sheet
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.sanitize import one_line, printable
 

@@ -1,15 +1,13 @@
-"""The result of a benchmark as JSON, and the log lines of its nodes."""
+"""Where the result of a benchmark goes: tables, or JSON in a file."""
 
 from __future__ import annotations
 
 import json
-import os
-from collections import deque
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from rich.console import RenderableType
@@ -18,12 +16,7 @@ from vla_zenoh.cli.options import JsonOption
 from vla_zenoh.cli.output import console, errors
 from vla_zenoh.lab.cli.output import print_json
 from vla_zenoh.lab.cli.output_path import ForceOption, if_wanted, output_file
-
-if TYPE_CHECKING:
-    from vla_zenoh.profile import Profile
-    from vla_zenoh.runtime.launch import Host
-
-LAST_LINES = 20
+from vla_zenoh.lab.cli.running_nodes import LAST_LINES
 
 
 @dataclass(frozen=True)
@@ -67,11 +60,6 @@ def counts(of: Mapping[str, int]) -> str:
     return ", ".join(f"{name} {count}" for name, count in of.items())
 
 
-def shown_camera(cameras: Collection[str]) -> str | None:
-    """The camera whose images show a task; None: there is none."""
-    return "front" if "front" in cameras else next(iter(cameras), None)
-
-
 class Rows(list[dict[str, Any]]):
     """Result rows, and the log lines of the nodes."""
 
@@ -104,53 +92,3 @@ def kept_rows(options: ResultOptions) -> Iterator[Rows]:
         finally:
             if rows:
                 write_json(file, rows)
-
-
-@contextmanager
-def up_with_last_lines(host: Host, lines: Collection[str]) -> Iterator[Host]:
-    """`host`, up; a failure of the block shows the last log lines.
-
-    Args:
-        lines: log lines of its nodes, growing.
-    """
-    from vla_zenoh.lab.episode import Interrupted
-
-    failed_at: list[str] = []
-    try:
-        with host as running:
-            try:
-                yield running
-            except Exception:  # whatever it is, it goes on
-                failed_at += lines  # before the nodes end
-                raise
-    except Interrupted:
-        raise
-    except Exception:
-        last = (failed_at or [*lines])[-LAST_LINES:]
-        errors().print("\n".join(last), style="dim", soft_wrap=True)
-        raise
-
-
-@contextmanager
-def running_nodes(
-    profile: Profile, log_file: Path | None = None, **settings: Any
-) -> Iterator[Host]:
-    """All nodes of a simulated robot; a failure of the block shows the last log lines.
-
-    Args:
-        log_file: for their log; None: it is not kept.
-        settings: see `Host`.
-    """
-    from vla_zenoh.runtime.launch import Host
-
-    last: deque[str] = deque(maxlen=LAST_LINES)
-    with (log_file or Path(os.devnull)).open("w", encoding="utf-8") as log:
-
-        def write(node: str, line: str) -> None:
-            last.append(f"{node:>16} | {line}")
-            log.write(f"{last[-1]}\n")
-            log.flush()
-
-        host = Host(profile, None, log=write, tell=write, own_router=True, **settings)
-        with up_with_last_lines(host, last) as running:
-            yield running

@@ -1,17 +1,13 @@
-"""The task benchmark: plan, one episode in real time or in lockstep, and score. Pure."""
+"""Tasks by prompt: a plan of them, and one episode in real time or in lockstep. Pure."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, NamedTuple, Protocol
 
-import numpy as np
-
 from vla_zenoh.errors import ResourceError, SpecError, WorkerError
 from vla_zenoh.lab.episode import EpisodeLimit
-from vla_zenoh.lab.statistics import wilson_95
 from vla_zenoh.lab.tasks.episode import TaskEpisode, draw_episode, draw_stay
 from vla_zenoh.lab.tasks.judge import LIMIT_S, judge_of
 from vla_zenoh.lab.tasks.order import (
@@ -24,13 +20,11 @@ from vla_zenoh.lab.tasks.order import (
     is_nonsense,
     parse_prompt,
 )
-from vla_zenoh.policy.options import shown
 from vla_zenoh.types import FloatArray, ObjectPoses
 
 SCENE = "bricks"
 """The scene of the tasks."""
 STAY = "stay"
-PLANNED = ("seed", "held_out", "prompt", "delay_ms", "rate_hz", "limit_s")
 NOT_OBEYED, ARM_LOST, NO_STATE = "not_obeyed", "arm_lost", "no_state"
 CHAIN_FAILURES: Mapping[str, str] = {
     NOT_OBEYED: "activation was rejected to the end",
@@ -146,64 +140,9 @@ class TaskOutcome:
         }
 
 
-@dataclass(slots=True)
-class TaskScore:
-    """Outcomes of a plan, and their figures.
-
-    Args:
-        mode: ``real_time`` or ``lockstep``.
-        latency_ms: stage -> ``[p50, p95]``.
-    """
-
-    plan: TaskPlan
-    mode: str
-    profile: str
-    vary: Sequence[str] = ()
-    ended: list[TaskOutcome] = field(default_factory=list)
-    latency_ms: dict[str, tuple[float, float]] = field(default_factory=dict)
-    wall_s: float = 0.0
-    options: Mapping[str, str] = field(default_factory=dict)
-
-    def to_dict(self) -> dict[str, Any]:
-        plan = self.plan
-        families = sorted({each.episode.order.family for each in self.ended})
-        return {
-            "model": plan.model,
-            "options": shown(self.options),
-            "mode": self.mode,
-            "profile": self.profile,
-            "scene": SCENE,
-            "family": plan.family or "all",
-            "vary": list(self.vary),
-            **{name: getattr(plan, name) for name in PLANNED},
-            **_figures(self.ended),
-            "by_family": {
-                family: _figures([e for e in self.ended if e.episode.order.family == family])
-                for family in families
-            },
-            "latency_ms": {name: list(pair) for name, pair in self.latency_ms.items()},
-            "wall_s": round(self.wall_s, 1),
-            "all": [each.to_dict() for each in self.ended],
-        }
-
-
-def _figures(ended: Sequence[TaskOutcome]) -> dict[str, Any]:
-    successes = sum(each.success for each in ended)
-    times_s = [each.time_s for each in ended if each.success]
-    kinds = Counter(each.failure for each in ended if not each.success)
-    return {
-        "success_rate": successes / len(ended) if ended else None,
-        "successes": successes,
-        "episodes": len(ended),
-        "wilson_95": list(wilson_95(successes, len(ended))),
-        "failures": dict(kinds.most_common()),
-        "time_to_success_s": {
-            "p50": float(np.median(times_s)),
-            "p95": float(np.percentile(times_s, 95)),
-        }
-        if times_s
-        else None,
-    }
+def shown_camera(cameras: Collection[str]) -> str | None:
+    """The camera whose images show a task; None: there is none."""
+    return "front" if "front" in cameras else next(iter(cameras), None)
 
 
 FIRST_SEED = 1

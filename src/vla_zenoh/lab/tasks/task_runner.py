@@ -9,7 +9,9 @@ from collections.abc import Iterator
 from vla_zenoh.control.states import DEACTIVATED
 from vla_zenoh.errors import NodeError, SessionError
 from vla_zenoh.keys import worker_node
-from vla_zenoh.lab.bench.task import (
+from vla_zenoh.lab.episode import COMMAND, EpisodeRunner
+from vla_zenoh.lab.newest_records import NewestRecords, StreamSlot
+from vla_zenoh.lab.tasks.task import (
     ARM_LOST,
     NO_STATE,
     SceneSnapshot,
@@ -17,8 +19,6 @@ from vla_zenoh.lab.bench.task import (
     TaskPlan,
     run_task,
 )
-from vla_zenoh.lab.episode import COMMAND, EpisodeRunner
-from vla_zenoh.lab.newest_records import NewestRecords, StreamSlot
 from vla_zenoh.runtime.launch import Host
 from vla_zenoh.types import GripperState, ObjectPoses, PoseState
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.codec.image import decode_jpeg, encode_jpeg
-from vla_zenoh.lab.bench.task import STAY, TaskOutcome, is_judged
+from vla_zenoh.lab.tasks.task import STAY, TaskOutcome, is_judged
 from vla_zenoh.types import Image
 
 FRAME_WIDTH, FRAME_HEIGHT, TITLE_HEIGHT, GAP = 560, 420, 56, 8
@@ -22,11 +22,6 @@ GREEN, RED, GREY, INK = (24, 140, 60), (200, 30, 30), (110, 110, 110), (25, 30, 
 PAPER, EMPTY = 255, 235
 
 Picture = NDArray[np.uint8]
-
-
-def failure_sheet(ended: Sequence[TaskOutcome]) -> bytes | None:
-    """A JPEG of the first failures with pictures; None: there are none."""
-    return sheet([each for each in ended if not each.success])
 
 
 def sheet(ended: Sequence[TaskOutcome]) -> bytes | None:

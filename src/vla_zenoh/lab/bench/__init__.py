@@ -1,1 +1,0 @@
-"""Measures the chain and judges models by task."""
