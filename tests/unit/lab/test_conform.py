@@ -13,13 +13,15 @@ from vla_zenoh_conform.rules import RuleFinding, Seen, Trial
 from vla_zenoh_conform.samples import Arrived, Raw, arrived
 
 from vla_zenoh.codec import message, records
+from vla_zenoh.codec.image import encode_jpeg
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.policy import ActionSpec, ModelSpec
-from vla_zenoh.profile import load_profile
+from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.types import (
     ActionChunk,
     ClockReply,
+    Depth,
     GripperState,
     Header,
     Image,
@@ -46,6 +48,11 @@ def broken(findings: Iterable[RuleFinding]) -> set[str]:
 def with_header(sample: Arrived, **changes: Any) -> Arrived:
     assert sample.header is not None
     return replace(sample, header=replace(sample.header, **changes))
+
+
+def replace_camera(profile: Profile, **changes: Any) -> Profile:
+    front = profile.cameras["front"].model_copy(update=changes)
+    return profile.model_copy(update={"cameras": {**profile.cameras, "front": front}})
 
 
 def number(sample: Arrived) -> int:
@@ -319,26 +326,101 @@ def test_at_a_lower_speed_override_a_worker_may_send_as_few_chunks_as_are_asked_
 
 
 # -- camera -----------------------------------------------------------------------------------
-@pytest.mark.parametrize(
-    ("width", "rate_hz", "changing", "wanted"),
-    [
-        (640, 30, True, set()),
-        (320, 30, True, {"size"}),
-        (640, 10, True, {"camera/front/raw: rate"}),
-        (640, 30, False, {"images change"}),
-    ],
-)
-def test_a_camera_breaks_the_rules_that_it_breaks_and_no_other(
-    width: int, rate_hz: int, changing: bool, wanted: set[str]
-) -> None:
-    samples = []
-    for seq in range(rate_hz):
-        image = Image(np.full((480, width, 3), seq if changing else 7, np.uint8))
-        stamp_ns = AT_NS + seq * 10**9 // rate_hz
-        header = Header(stamp_ns, seq, "camera#1")
-        samples.append(Arrived("camera/front/raw", stamp_ns, header, image))
+CAMERA = replace_camera(load_profile("panda_sim"), depth_unit_m=0.001, jpeg_width=320)
+RAW, JPEG, DEPTH = (f"camera/front/{kind}" for kind in ("raw", "jpeg", "depth"))
+IMAGES = 30
+
+
+def image_of(key: str, shade: int) -> Image | Depth:
+    if key == DEPTH:
+        return Depth(np.full((480, 640), shade, np.uint16), 0.001)
+    size = (480, 640, 3) if key == RAW else (240, 320, 3)
+    return Image(np.full(size, shade, np.uint8))
+
+
+def camera_samples() -> Iterator[Arrived]:
+    for seq in range(IMAGES):
+        stamp_ns = AT_NS + seq * 10**9 // IMAGES
+        for key in (RAW, JPEG, DEPTH):
+            header = Header(stamp_ns, seq, "camera#1")
+            yield Arrived(key, stamp_ns + MS, header, image_of(key, seq))
+
+
+def frozen_but(changing: set[int]) -> Change:
+    """Its images change at these numbers only."""
+
+    def change(sample: Arrived) -> Arrived:
+        shade = max((at for at in changing if at <= number(sample)), default=100)
+        return replace(sample, record=image_of(sample.key, shade))
+
+    return change
+
+
+def change_of(*keys: str) -> set[str]:
+    return {f"{key}: images change" for key in keys}
+
+
+CAMERAS: dict[str, tuple[Change, set[str]]] = {
+    "as it should be": (same, set()),
+    "a third of the rate": (
+        of(RAW)(lambda s: s if number(s) % 3 == 0 else None),
+        {f"{RAW}: rate"},
+    ),
+    "no JPEG": (lambda s: None if s.key == JPEG else s, {f"{JPEG}: rate"}),
+    "no depth, which the profile declares": (
+        *(lambda s: None if s.key == DEPTH else s,),
+        {f"{DEPTH}: rate"},
+    ),
+    "a JPEG that is no image": (
+        of(JPEG)(lambda s: replace(s, record=None, why="truncated: no end")),
+        {f"{JPEG}: records"},
+    ),
+    "a JPEG as wide as the raw image": (
+        of(JPEG)(lambda s: replace(s, record=image_of(RAW, number(s)))),
+        {f"{JPEG}: size"},
+    ),
+    "raw images of half the size": (
+        of(RAW)(lambda s: replace(s, record=image_of(JPEG, number(s)))),
+        {f"{RAW}: size"},
+    ),
+    "another unit": (
+        of(DEPTH)(lambda s: replace(s, record=Depth(s.record.counts, 0.01))),
+        {f"{DEPTH}: unit"},
+    ),
+    "all images are the same": (of(RAW)(frozen_but(set())), change_of(RAW)),
+    "all but one repeat": (of(RAW)(frozen_but({9})), change_of(RAW)),
+    "all but one repeat, in every stream": (frozen_but({20}), change_of(RAW, JPEG, DEPTH)),
+    "every second one repeats": (of(JPEG)(frozen_but(set(range(0, 30, 2)))), change_of(JPEG)),
+    "one repeats": (of(JPEG)(frozen_but(set(range(30)) - {7})), set()),
+}
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_a_camera_breaks_the_rules_that_it_breaks_and_no_other(name: str) -> None:
+    change, wanted = CAMERAS[name]
+    samples = [found for sample in camera_samples() if (found := change(sample)) is not None]
     seen = Seen("camera", samples, 1.0, clocks=[CLOCK])
-    assert broken(rules.camera(seen, "front", PROFILE)) == wanted
+    assert broken(rules.camera(seen, "front", CAMERA)) == wanted
+
+
+def test_a_camera_without_depth_in_the_profile_is_not_asked_for_it() -> None:
+    samples = [sample for sample in camera_samples() if sample.key != DEPTH]
+    profile = replace_camera(CAMERA, depth_unit_m=None)
+    seen = Seen("camera", samples, 1.0, clocks=[CLOCK])
+    assert not broken(rules.camera(seen, "front", profile))
+
+
+@pytest.mark.parametrize(
+    ("key", "encoding"),
+    [(RAW, "image/jpeg"), (JPEG, "zenoh/bytes;rgb8;480x640"), (DEPTH, "image/jpeg"), (JPEG, "")],
+)
+def test_an_image_of_another_encoding_than_its_key_says_is_named(key: str, encoding: str) -> None:
+    header = records.encode_header(Header(AT_NS, 1, "camera#1"))
+    found = arrived(
+        Raw(key, encode_jpeg(Image(np.zeros((4, 4, 3), np.uint8))), header, encoding, 1)
+    )
+    assert found.record is None
+    assert "encoding" in found.why
 
 
 def test_bytes_that_are_no_record_are_named() -> None:

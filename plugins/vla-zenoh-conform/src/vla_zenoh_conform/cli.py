@@ -93,14 +93,16 @@ def camera(
 ) -> None:
     """Say line by line what a camera node does right and wrong on the wire.
 
-    Exit status 1: something is wrong.
+    It takes its raw images, its JPEG images and, where the profile declares it, its depth. Exit
+    status 1: something is wrong.
     """
     with target.client() as client:
         keys, cameras = client.keys, client.profile.cameras
         if name not in cameras:
             raise NodeError(f"no camera {name!r} in the profile; known: {', '.join(cameras)}")
         with progress(f"listening for {seconds:g} s"):
-            seen = look(client.session, keys, node, [keys.camera_raw(name)], seconds)
+            wanted = rules.camera_keys(name, cameras[name])
+            seen = look(client.session, keys, node, wanted, seconds)
     _report(rules.camera(seen, name, client.profile), as_json=as_json)
 
 

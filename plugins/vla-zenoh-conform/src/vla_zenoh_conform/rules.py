@@ -14,7 +14,8 @@ from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import Pose, pose_distance, rotation_from_quat
 from vla_zenoh.policy import ModelSpec, check_steps
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import ActionChunk, ClockReply, JointState, PoseState, Task
+from vla_zenoh.profile.schema import CameraProfile
+from vla_zenoh.types import ActionChunk, ClockReply, Depth, JointState, PoseState, Task
 from vla_zenoh_conform.samples import Arrived, of_key
 
 LEAST_STATE_HZ = 20.0
@@ -33,6 +34,8 @@ STOPPED_S = 1.0
 """From a stop, or the end of the robot's patience with silence, until the arm stands."""
 STOPPED_SHARE = 0.25
 """Of the way, while the arm brakes from the speed it has in the middle of it."""
+REPEATED_SHARE = 0.2
+"""Of a camera's images may be as the one before: every sensor has noise."""
 ROBOT_KEYS = ("state/joint", "state/pose", "state/gripper")
 
 
@@ -345,19 +348,51 @@ def _steps(chunks: Sequence[ActionChunk], spec: ModelSpec, profile: Profile) -> 
 
 
 # -- camera -----------------------------------------------------------------------------------
+def camera_keys(name: str, wanted: CameraProfile) -> list[str]:
+    """The keys of a camera, below the robot."""
+    kinds = ["raw", "jpeg"] if wanted.depth_unit_m is None else ["raw", "jpeg", "depth"]
+    return [f"camera/{name}/{kind}" for kind in kinds]
+
+
 def camera(seen: Seen, name: str, profile: Profile) -> Iterator[RuleFinding]:
     """All rules of a camera's node."""
     yield from presence(seen)
-    key, wanted = f"camera/{name}/raw", profile.cameras[name]
-    yield from stream(seen, key, RATE_SHARE * wanted.rate_hz)
-    images = [each.record for each in of_key(seen.samples, key) if each.record is not None]
-    sizes = {image.rgb.shape[:2] for image in images}
-    if not sizes:
+    wanted = profile.cameras[name]
+    width, height = wanted.width, wanted.height
+    raw, jpeg, *depth = camera_keys(name, wanted)
+    yield from _images(seen, raw, wanted.rate_hz, (height, width))
+    scale = min(1.0, (wanted.jpeg_width or width) / width)
+    size = round(height * scale), round(width * scale)
+    rate_hz = min(wanted.rate_hz, wanted.jpeg_rate_hz or wanted.rate_hz)
+    yield from _images(seen, jpeg, rate_hz, size)
+    for key in depth:
+        yield from _images(seen, key, wanted.rate_hz, (height, width))
+        units_m = {image.unit_m for image in _records(seen, key)}
+        if units_m:
+            shown_m = ", ".join(f"{unit_m:g}" for unit_m in sorted(units_m))
+            text = f"{shown_m} m a count, of the profile {wanted.depth_unit_m:g}"
+            yield RuleFinding(f"{key}: unit", units_m == {wanted.depth_unit_m}, text)
+
+
+def _images(seen: Seen, key: str, rate_hz: float, wanted: tuple[int, int]) -> Iterator[RuleFinding]:
+    yield from stream(seen, key, RATE_SHARE * rate_hz)
+    pixels = [
+        image.counts if isinstance(image, Depth) else image.rgb for image in _records(seen, key)
+    ]
+    if not pixels:
         return
-    right = sizes == {(wanted.height, wanted.width)}
+    sizes = {each.shape[:2] for each in pixels}
     shown = ", ".join(f"{width}x{height}" for height, width in sorted(sizes))
-    text = f"{shown}, of the profile {wanted.width}x{wanted.height}"
-    yield RuleFinding("size", right, text)
-    same = sum(np.array_equal(before.rgb, after.rgb) for before, after in pairwise(images))
-    text = f"{same} of {len(images)} repeat the one before"
-    yield RuleFinding("images change", same < len(images) - 1, text)
+    text = f"{shown}, of the profile {wanted[1]}x{wanted[0]}"
+    yield RuleFinding(f"{key}: size", sizes == {wanted}, text)
+    if len(pixels) == 1:
+        return
+    same = sum(np.array_equal(before, after) for before, after in pairwise(pixels))
+    text = f"{same} of {len(pixels)} repeat the one before"
+    hint = "" if same == 0 else "; a simulator's do where nothing moves"
+    right = same <= REPEATED_SHARE * len(pixels)
+    yield RuleFinding(f"{key}: images change", right, text + hint)
+
+
+def _records(seen: Seen, key: str) -> list[Any]:
+    return [each.record for each in of_key(seen.samples, key) if each.record is not None]

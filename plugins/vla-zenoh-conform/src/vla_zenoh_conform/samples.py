@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from vla_zenoh.codec import records
-from vla_zenoh.codec.image import decode_jpeg, decode_raw
+from vla_zenoh.codec.image import decode_depth, decode_jpeg, decode_raw
 from vla_zenoh.errors import CodecError
 from vla_zenoh.lab.recording.record_types import record_of
-from vla_zenoh.types import Header
+from vla_zenoh.types import Header, shown
+
+IMAGES: Mapping[str, tuple[str, Callable[[bytes, str], Any]]] = {
+    "raw": ("zenoh/bytes", decode_raw),
+    "jpeg": ("image/jpeg", lambda payload, schema: decode_jpeg(payload)),
+    "depth": ("image/png", decode_depth),
+}
+"""End of a camera's key -> encoding, and decoder of payload and the encoding's schema."""
 
 
 class Raw(NamedTuple):
@@ -57,9 +64,11 @@ def _record(raw: Raw, unknown: list[str]) -> Any:
     kind = record_of(raw.key)
     if kind is not None:
         return records.decode(kind, raw.payload, unknown)
-    if raw.encoding.startswith("image/jpeg"):
-        return decode_jpeg(raw.payload)
-    return decode_raw(raw.payload, raw.encoding.partition(";")[2])
+    encoding, _, schema = raw.encoding.partition(";")
+    wanted, decode = IMAGES[raw.key.rpartition("/")[2]]
+    if encoding != wanted:
+        raise CodecError("malformed", f"encoding {shown(raw.encoding)}, wanted: {wanted}")
+    return decode(raw.payload, schema)
 
 
 def of_key(samples: Iterable[Arrived], key: str) -> list[Arrived]:
