@@ -12,7 +12,7 @@ BIN := .venv/bin
 COMMA := ,
 READY := .venv/.ready-$(subst $(COMMA),-,$(EXTRAS))
 DEMO_READY := .venv/.ready-$(subst $(COMMA),-,$(DEMO_EXTRAS))
-SUITE := not slow and not models and not ros2 and not rclpy and not franka and not rivals
+SUITE := not slow and not models and not ros2 and not rclpy and not franka and not rivals and not clients
 WHICH := not long
 # Real arms brake when their computer stands still for a tenth of a second, and so do those of the tests: one that
 # fails in real time is tried twice more, and told in the summary.
@@ -23,7 +23,7 @@ AT_THE_END := --last-failed --last-failed-no-failures none --reruns 0 -r fEs
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-long slow fuzz fuzz-motion soak test-ros2 test-franka test-rivals test-realsense test-models check format bench bench-faults bench-ros2 bench-rclpy build docs ros2-bridge ros2-environment clean
+.PHONY: help setup demo test test-long slow fuzz fuzz-motion soak test-ros2 test-franka test-rivals test-clients test-realsense test-models check format bench bench-faults bench-ros2 bench-rclpy build docs ros2-bridge ros2-environment clean
 
 help: ## Show this list
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z0-9-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
@@ -57,7 +57,7 @@ test-long: $(READY) ## Run those that take longer, too, and the files of many wh
 	@$(MAKE) --no-print-directory test WHICH=long
 
 slow: $(READY) ## Run the tests that take long, too, and search for new examples
-	HYPOTHESIS_PROFILE=searching $(BIN)/python -m pytest -m "not models and not franka and not rclpy and not rivals" $(ARGS)
+	HYPOTHESIS_PROFILE=searching $(BIN)/python -m pytest -m "not models and not franka and not rclpy and not rivals and not clients" $(ARGS)
 
 fuzz: $(READY) ## Feed every reader of foreign bytes with nonsense; SECONDS=600 for longer
 	$(BIN)/python tests/fuzz/fuzz.py --seconds $(SECONDS) $(ARGS)
@@ -82,6 +82,11 @@ test-franka: $(READY) ## Run the tests of the driver franka against franka-sim, 
 
 test-rivals: $(READY) ## Run the tests against robots' packages of others on Zenoh, each in an environment of its own
 	$(BIN)/python scripts/test_rivals.py $(AGAIN) $(ARGS)
+
+test-clients: $(READY) ## Build the clients of the wire in Rust and run their tests; needs cargo
+	cargo test --release --manifest-path examples/wire/rust/Cargo.toml
+	cargo build --release --manifest-path examples/wire/rust/Cargo.toml
+	$(BIN)/python -m pytest $(AGAIN) -m clients tests/wire $(ARGS)
 
 test-realsense: $(READY) ## Run the tests of RealSense cameras with the SDK's software device
 	$(BIN)/uv pip install --quiet --no-deps --target .venv/realsense pyrealsense2

@@ -15,6 +15,7 @@ import zenoh
 SCHEMA = 2
 OLDEST_NS = 1_000_000_000
 MSGPACK = zenoh.Encoding("application/msgpack")
+IMAGES = {"congestion_control": zenoh.CongestionControl.DROP, "priority": zenoh.Priority.DATA_LOW}
 STATE = {
     "congestion_control": zenoh.CongestionControl.DROP,
     "priority": zenoh.Priority.INTERACTIVE_HIGH,
@@ -70,6 +71,17 @@ class Node:
 
     def publish(self, key: str, record: dict, quality: dict, stamp_ns: int = 0) -> None:
         """Put a record with its header."""
+        self.put(key, zenoh.ZBytes(msgpack.packb(record)), MSGPACK, quality, stamp_ns)
+
+    def put(
+        self,
+        key: str,
+        payload: zenoh.ZBytes | bytes,
+        encoding: zenoh.Encoding,
+        quality: dict,
+        stamp_ns: int = 0,
+    ) -> None:
+        """Put bytes with their header."""
         header = {
             "schema": SCHEMA,
             "stamp_wall_ns": stamp_ns or time.time_ns(),
@@ -79,9 +91,9 @@ class Node:
         self._next_seq[key] += 1
         self.session.put(
             f"{self.robot}/{key}",
-            msgpack.packb(record),
+            payload,
             attachment=msgpack.packb(header),
-            encoding=MSGPACK,
+            encoding=encoding,
             **quality,
         )
 
