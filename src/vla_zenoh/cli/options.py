@@ -29,6 +29,14 @@ MAX_INDEX = 2**31 - 1
 DEFAULT_PROFILE = "panda_sim"
 PROFILE_VARIABLE = "VLA_ZENOH_PROFILE"
 
+
+def endpoint(text: str) -> str:
+    """Parse an endpoint of Zenoh, as tcp/10.0.0.2:7447, or raise a `ValueError`."""
+    from vla_zenoh.profile.schema import endpoint
+
+    return endpoint(text)
+
+
 ProfileOption = Annotated[
     str, typer.Option("--profile", "-p", envvar=PROFILE_VARIABLE, help="Name or path of a profile.")
 ]
@@ -38,6 +46,7 @@ ConnectOption = Annotated[
         "--connect",
         "-e",
         envvar="VLA_ZENOH_CONNECT",
+        parser=endpoint,
         help="Router to connect to, as tcp/HOST:PORT; repeatable.",
     ),
 ]
@@ -47,6 +56,7 @@ ListenOption = Annotated[
         "--listen",
         "-l",
         envvar="VLA_ZENOH_LISTEN",
+        parser=endpoint,
         help="Where the router listens, as tcp/HOST:PORT; repeatable.",
     ),
 ]

@@ -43,7 +43,8 @@ _NAME = re.compile(r"[A-Za-z0-9_](?:[A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?")
 """The same with underscores, which names of containers have, and no certificate."""
 
 
-def _endpoint(value: str) -> str:
+def endpoint(value: str) -> str:
+    """`value` if it is an endpoint of Zenoh, or a `ValueError`."""
     protocol, slash, _ = value.partition("/")
     known = (*IP_PROTOCOLS, *FILE_PROTOCOLS)
     if not slash:
@@ -63,6 +64,8 @@ def _endpoint(value: str) -> str:
     host = match["host"]
     if host.rpartition(".")[2].isdigit() and not _is_ipv4(host):
         raise ValueError(f"{value!r}: {host} is no IPv4 address: it has four numbers up to 255")
+    if host.startswith("[") and not _is_ipv6(host[1:-1]):
+        raise ValueError(f"{value!r}: {host} is no IPv6 address")
     if not host.startswith("[") and not all(map(_NAME.fullmatch, host.split("."))):
         raise ValueError(f"{value!r}: {host} is no host name")
     if int(match["port"]) > 65535:
@@ -73,6 +76,14 @@ def _endpoint(value: str) -> str:
 def _is_ipv4(host: str) -> bool:
     try:
         ipaddress.IPv4Address(host)
+    except ValueError:
+        return False
+    return True
+
+
+def _is_ipv6(host: str) -> bool:
+    try:
+        ipaddress.IPv6Address(host)
     except ValueError:
         return False
     return True
@@ -109,7 +120,7 @@ def reachable_address(text: str) -> str:
 
 Address = Annotated[str, AfterValidator(reachable_address)]
 """Of a device or server that a profile names."""
-Endpoint = Annotated[str, Field(max_length=512), AfterValidator(_endpoint)]
+Endpoint = Annotated[str, Field(max_length=512), AfterValidator(endpoint)]
 Endpoints = Annotated[tuple[Endpoint, ...], Field(strict=False, max_length=16), Distinct]
 
 

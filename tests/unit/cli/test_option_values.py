@@ -48,8 +48,59 @@ def test_names_and_addresses_have_parsers() -> None:
     """Options by whose name one sees that they are names in keys, or addresses."""
     for each in ALL:
         parameter, information = each.values[0], each.values[0].type_descriptor.parameter_info
-        if {"--name", "--bind", "--address"} & set(parameter.opts):
+        if ADDRESSED & set(parameter.opts):
             assert information.parser is not None, each.id
+
+
+ADDRESSED = {"--name", "--bind", "--address", "--connect", "--listen", "--ray", "--endpoint"}
+ENDPOINTS = ["127.0.0.1:7447", "127.0.0.1:99999", "10.0.0.300:1", "a b:1", " ", "läb:7447"]
+ENDPOINTS += ["a:1;x", "[::::]:1", "[::1]", "-a:1", "a..b:1", "127.0.0.1", "a:1:2", "lab_pc"]
+ENDPOINTS += ["a\nb:7", "a:-1"]
+GOOD = ENDPOINTS[0]
+ROUTED = [each for each in ALL if {"--connect", "--listen", "--ray"} & set(each.values[0].opts)]
+
+
+@pytest.mark.parametrize("parameter", ROUTED)
+def test_every_endpoint_is_checked_where_it_is_given(
+    parameter: Any,
+) -> None:
+    """With a parser, so before the command begins; nothing is started for any of them."""
+    ray = "--ray" in parameter.opts
+    parse = parameter.type_descriptor.parameter_info.parser
+    for text in ENDPOINTS:
+        given = text if ray else f"tcp/{text}"
+        if text == GOOD:
+            assert parse(given) == given
+            continue
+        with pytest.raises(ValueError, match=r"HOST:PORT|IPv|host name|port is at most|endpoint"):
+            parse(given)
+    with pytest.raises(ValueError, match=r"HOST:PORT|protocol"):
+        parse("nosuch/127.0.0.1:7447")
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["net --connect", "bench sim pusht --worker scripted --ray", "bench sim pusht --connect"]
+    + ["up panda_sim --listen", "stop --connect", "node router --listen"],
+)
+def test_the_message_names_the_option_and_comes_at_once(
+    line: str, capsys: pytest.CaptureFixture[str], monkeypatch: Any
+) -> None:
+    monkeypatch.setenv("COLUMNS", "300")
+    done = typed(capsys, *line.split(), "tcp/10.0.0.300:7447")
+    assert done.code == USAGE
+    assert line.split()[-1] in done.said
+    assert "10.0.0.300" in done.said
+
+
+def test_an_endpoint_of_the_environment_is_checked_as_well(
+    capsys: pytest.CaptureFixture[str], monkeypatch: Any
+) -> None:
+    monkeypatch.setenv("COLUMNS", "300")
+    monkeypatch.setenv("VLA_ZENOH_CONNECT", "tcp/10.0.0.300:7447")
+    done = typed(capsys, "net")
+    assert done.code == USAGE
+    assert "10.0.0.300 is no IPv4 address" in done.said
 
 
 ADDRESSES = ["127.0.0.1:7552", "10.0.0.300", "lab_pc", "tcp/10.0.0.3", "a b", "", "0.0.0.0", "::"]
@@ -115,8 +166,8 @@ LINES = [
     ("web --name lab:80", USAGE, "'lab:80' is no address"),
     ("view --serve --bind nosuch:5", USAGE, "'nosuch:5' is no address"),
     ("serve policy --worker scripted --host 10.0.0.300", USAGE, "is no address"),
-    ("profile bridge-config -e tcp/a..b:7447", FAILED, "a..b is no host name"),
-    ("up panda_sim --listen tcp/10.0.0.300:7447", FAILED, "10.0.0.300 is no IPv4 address"),
+    ("profile bridge-config -e tcp/a..b:7447", USAGE, "a..b is no host name"),
+    ("up panda_sim --listen tcp/10.0.0.300:7447", USAGE, "10.0.0.300 is no IPv4 address"),
     (f"status --host nosuch {TALKING}", FAILED, "has no host 'nosuch'"),
     (f"stop --host a/b {TALKING}", FAILED, "has no host 'a/b'"),
     (f"worker scripted --name a/b {TALKING}", USAGE, "cannot be part of a key"),

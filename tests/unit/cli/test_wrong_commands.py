@@ -51,8 +51,8 @@ WRONG: list[tuple[str, int, str]] = [
         "error: no profile called 'nosuch'. Known: fr3, panda_bricks, panda_fci, panda_ros2, pan",
     ),
     ("up ./absent.yaml", FAILED, "error: there is no file or folder './absent.yaml'"),
-    ("up --listen x", FAILED, "session.listen.0: 'x' is not an endpoint: write tcp/HOST:PORT"),
-    ("up --connect tpc/a:1", FAILED, "unknown protocol; did you mean 'tcp'? Known: tcp, udp, tls"),
+    ("up --listen x", USAGE, "'x' is not an endpoint: write tcp/HOST:PORT"),
+    ("up --connect tpc/a:1", USAGE, "unknown protocol; did you mean 'tcp'? Known: tcp, udp, tls"),
     (
         "up --listen tcp/10.0.0.2:7447",
         FAILED,

@@ -14,7 +14,14 @@ import typer
 from rich.progress import TimeRemainingColumn
 
 from vla_zenoh import __version__
-from vla_zenoh.cli.options import MAX_INDEX, JsonOption, ModelOptions, model_options, options
+from vla_zenoh.cli.options import (
+    MAX_INDEX,
+    JsonOption,
+    ModelOptions,
+    endpoint,
+    model_options,
+    options,
+)
 from vla_zenoh.cli.output import console, errors, new_table
 from vla_zenoh.errors import ResourceError
 from vla_zenoh.lab.cli.output import print_json, progress_bars
@@ -96,6 +103,20 @@ class BenchmarkEpisodes:
         ]
 
 
+def ray_address(text: str) -> str:
+    """Parse the address of a Ray cluster, as ``ray start`` tells it, or raise a `ValueError`."""
+    if text == "auto":
+        return text
+    try:
+        endpoint(f"tcp/{text.removeprefix('ray://')}")
+    except ValueError as error:
+        raise ValueError(
+            f"{text!r} is no address of a Ray cluster: write HOST:PORT, as 10.0.0.2:6379, "
+            "ray://HOST:PORT or auto"
+        ) from error
+    return text
+
+
 @dataclass(frozen=True)
 class BenchmarkPlace:
     """Options for where it runs."""
@@ -105,14 +126,20 @@ class BenchmarkPlace:
     ] = 1
     ray: Annotated[
         str | None,
-        typer.Option("--ray", help="Address of a Ray cluster that runs them, each with a worker."),
+        typer.Option(
+            "--ray",
+            parser=ray_address,
+            help="Address of a Ray cluster that runs them, each with a worker.",
+        ),
     ] = None
     connect: Annotated[
-        str,
+        str | None,
         typer.Option(
-            "--connect", help="Router of a worker that runs already, serving robots sim0, sim1, ..."
+            "--connect",
+            parser=endpoint,
+            help="Router of a worker that runs already, serving robots sim0, sim1, ...",
         ),
-    ] = ""
+    ] = None
     benchmark_python: Annotated[
         str | None,
         typer.Option("--benchmark-python", help="Interpreter of the benchmark's environment."),
@@ -186,7 +213,7 @@ def sim(
         str(chosen.model.path) if chosen else "",
         model.python,
         place.benchmark_python,
-        place.connect,
+        place.connect or "",
     )
     teller = BenchmarkProcess(setting, "", place.benchmark_python)
     try:
