@@ -206,6 +206,7 @@ NEEDED: Mapping[str, tuple[str, ...]] = {
     "vla-zenoh-nights": ("vla-zenoh-trial",),
     "vla-zenoh-serve": ("vla-zenoh-policy-servers",),
     "vla-zenoh-trial": ("vla-zenoh-benchmarks",),
+    "vla-zenoh-web": ("vla-zenoh-teleop",),
 }
 """Package in ``plugins/`` -> others that it needs."""
 OURS = "vla-zenoh-"

@@ -25,9 +25,9 @@ from pair_rig import (
 )
 from vla_zenoh_benchmarks.lockstep.loop import Lockstep
 from vla_zenoh_benchmarks.lockstep.worker import Message
+from vla_zenoh_teleop.policy import OperatorInput, TeleopPolicy
 
 from vla_zenoh.codec import records
-from vla_zenoh.lab.teleop.policy import OperatorInput, TeleopPolicy
 from vla_zenoh.types import GripperState, JointCommand, JointState, PoseState
 
 pytestmark = pytest.mark.long

@@ -23,8 +23,8 @@ from arm_rig import (
 from vla_zenoh_benchmarks.lockstep.loop import Lockstep
 from vla_zenoh_benchmarks.lockstep.worker import Message
 from vla_zenoh_teleop.leader import LeaderPolicy, LeaderState
+from vla_zenoh_teleop.policy import AXES, OperatorInput, TeleopPolicy
 
-from vla_zenoh.lab.teleop.policy import AXES, OperatorInput, TeleopPolicy
 from vla_zenoh.policy import Policy
 from vla_zenoh.types import (
     ActionChunk,

@@ -428,6 +428,10 @@ class PartAction(_Spec):
 ActionSpec.model_rebuild()
 
 
+PERSON = "teleop"
+"""Name in the spec of every worker that is a person; what it leads is an intervention."""
+
+
 class ModelSpec(_Spec):
     """Everything a command node must know about a model before it executes its chunks.
 

@@ -122,6 +122,11 @@ class GripperState(Record):
     mode: Name = "ready"
     faults: Annotated[tuple[_LongText, ...], Meta(max_length=MAX_ENTRIES)] = ()
 
+    @property
+    def kept_width_m(self) -> float:
+        """The width (m) to command so that nothing changes: shut, where an object is held."""
+        return 0.0 if self.holding else max(self.width_m, 0.0)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PrivilegedState(Record):

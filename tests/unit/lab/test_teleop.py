@@ -23,14 +23,7 @@ from vla_zenoh_teleop.keyboard import (
     KeystrokeParser,
 )
 from vla_zenoh_teleop.leader import LeaderArm, LeaderPolicy, LeaderState
-from vla_zenoh_teleop.sticks import Button, Gamepad, SpaceMouse
-
-from vla_zenoh.control.actions import step_pose, step_width
-from vla_zenoh.errors import NodeError, PeerError
-from vla_zenoh.kinematics.kinematics import make_kinematics
-from vla_zenoh.kinematics.so3 import Pose, quat_from_rotation, rotation_from_quat
-from vla_zenoh.lab.check.examples import example_observation
-from vla_zenoh.lab.teleop.policy import (
+from vla_zenoh_teleop.policy import (
     DEAD_ZONE,
     DT_S,
     HORIZON,
@@ -41,6 +34,13 @@ from vla_zenoh.lab.teleop.policy import (
     combined,
     without_dead_zone,
 )
+from vla_zenoh_teleop.sticks import Button, Gamepad, SpaceMouse
+
+from vla_zenoh.control.actions import step_pose, step_width
+from vla_zenoh.errors import NodeError, PeerError
+from vla_zenoh.kinematics.kinematics import make_kinematics
+from vla_zenoh.kinematics.so3 import Pose, quat_from_rotation, rotation_from_quat
+from vla_zenoh.lab.check.examples import example_observation
 from vla_zenoh.policy import Observation, check_steps
 from vla_zenoh.profile import load_profile, override
 from vla_zenoh.types import GripperState, JointState, PoseState

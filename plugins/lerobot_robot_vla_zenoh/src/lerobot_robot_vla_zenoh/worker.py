@@ -9,7 +9,6 @@ import numpy as np
 import zenoh
 
 from vla_zenoh.bus.buffers import Wake
-from vla_zenoh.lab.teleop.policy import kept_width_m
 from vla_zenoh.nodes.worker.robot_session import RobotSession
 from vla_zenoh.policy import ActionSpec, ActionSteps, ModelSpec, Observation, ObservationSpec
 from vla_zenoh.profile import Profile
@@ -66,7 +65,7 @@ class LoopWorker:
             assert joint is not None
             assert gripper is not None
             measured = dict(zip(joint.names, joint.position_rad, strict=True))
-            opening = kept_width_m(gripper) / self._max_width_m
+            opening = gripper.kept_width_m / self._max_width_m
             self._goal = np.array([*(measured[name] for name in self._joints), min(opening, 1.0)])
         return ActionSteps(self._goal)
 

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from vla_zenoh.control.actions import as_deltas
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.recording.run import RecordedSample, Run, Span, is_within, newest
-from vla_zenoh.lab.teleop.policy import PERSON
 from vla_zenoh.policy import ActionSpec, ModelSpec, standing_step
+from vla_zenoh.policy.spec import PERSON
 from vla_zenoh_dataset.corrections import commanded_motion
 from vla_zenoh_dataset.label import EpisodeLabel
 

@@ -11,7 +11,7 @@ import re
 from enum import Enum
 from typing import NamedTuple
 
-from vla_zenoh.lab.teleop.policy import AXES, OperatorInput, clipped_twist
+from vla_zenoh_teleop.policy import AXES, OperatorInput, clipped_twist
 
 BEGIN = b"\x1b[>11u\x1b[?u\x1b[?1004h"
 """Report releases (1 + 2 + 8), confirm that, and report when the window loses the focus."""

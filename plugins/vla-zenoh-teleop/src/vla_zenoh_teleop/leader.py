@@ -21,12 +21,13 @@ import numpy as np
 from vla_zenoh.errors import NodeError, PeerError, in_words
 from vla_zenoh.kinematics.kinematics import make_kinematics
 from vla_zenoh.kinematics.so3 import orthonormal, pose_of, quat_from_rotation
-from vla_zenoh.lab.teleop.policy import COVER_S, DT_S, HORIZON, PERSON, kept_width_m
 from vla_zenoh.policy import ActionSpec, ActionSteps, ModelSpec, Observation, ObservationSpec
 from vla_zenoh.policy.loader import make_robot
+from vla_zenoh.policy.spec import PERSON
 from vla_zenoh.profile import Profile
 from vla_zenoh.robot import numbers
 from vla_zenoh.types import FloatArray
+from vla_zenoh_teleop.policy import COVER_S, DT_S, HORIZON
 
 READ_S = 0.01
 KEPT_S = 2.0
@@ -155,7 +156,7 @@ class LeaderPolicy:
         if not (leads and self._leads):
             # What the leader did before is not meant.
             self._follow.begin(observation, path[-1].position_rad)
-            self._width_m, self._leader_width_m = kept_width_m(gripper), path[-1].width_m
+            self._width_m, self._leader_width_m = gripper.kept_width_m, path[-1].width_m
             path = path[-1:]
         self._leads = leads
         times_s = self._now_s() - period_s + DT_S * np.arange(1, count + 1)

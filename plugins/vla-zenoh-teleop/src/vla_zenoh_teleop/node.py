@@ -17,7 +17,6 @@ import zenoh
 from vla_zenoh.client.client import Client, StopOutcome
 from vla_zenoh.errors import NodeError, PeerError
 from vla_zenoh.keys import CRASHED, STARTING
-from vla_zenoh.lab.teleop.policy import OperatorInput, TeleopPolicy, combined
 from vla_zenoh.nodes.worker.node import WorkerNode
 from vla_zenoh.policy import Frame
 from vla_zenoh.profile import Profile
@@ -35,6 +34,7 @@ from vla_zenoh_teleop.keyboard import (
     KeystrokeParser,
 )
 from vla_zenoh_teleop.leader import LeaderArm, LeaderPolicy
+from vla_zenoh_teleop.policy import OperatorInput, TeleopPolicy, combined
 from vla_zenoh_teleop.sticks import Gamepad, SpaceMouse
 
 SHOW_PERIOD_S = 0.2

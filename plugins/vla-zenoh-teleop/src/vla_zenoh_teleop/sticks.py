@@ -6,7 +6,7 @@ import os
 from typing import Any
 
 from vla_zenoh.errors import NodeError, PeerError, in_words
-from vla_zenoh.lab.teleop.policy import OperatorInput, clipped_twist, without_dead_zone
+from vla_zenoh_teleop.policy import OperatorInput, clipped_twist, without_dead_zone
 
 MAX_READS = 64
 """A SpaceMouse sends states faster than they are read: only the newest counts."""

@@ -6,12 +6,12 @@ import threading
 from collections.abc import Callable
 
 import zenoh
+from vla_zenoh_teleop.policy import OperatorInput, TeleopPolicy, speeds_of
 
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.client.client import Client
 from vla_zenoh.errors import NodeError
 from vla_zenoh.keys import worker_node
-from vla_zenoh.lab.teleop.policy import OperatorInput, TeleopPolicy, speeds_of
 from vla_zenoh.nodes.worker.node import WorkerNode
 from vla_zenoh.policy import Frame
 from vla_zenoh.profile import Profile

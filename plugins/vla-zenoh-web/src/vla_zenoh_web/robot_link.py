@@ -10,6 +10,7 @@ from dataclasses import asdict
 from typing import Any
 
 import zenoh
+from vla_zenoh_teleop.policy import OperatorInput
 
 from vla_zenoh.bus.buffers import ReceivedSample, ZenohRing, bytes_of
 from vla_zenoh.cli.node_rows import NodeRow, acting_limits, mode_of, node_rows
@@ -19,7 +20,6 @@ from vla_zenoh.codec import records
 from vla_zenoh.codec.settings import decode_held
 from vla_zenoh.errors import CodecError, RecordError, SessionError, VlaZenohError
 from vla_zenoh.keys import ENDED, PRIMITIVES, ROLLING, last_chunk, worker_node
-from vla_zenoh.lab.teleop.policy import OperatorInput
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import ActionChunk, Event, NodeStatus, Task

@@ -22,10 +22,10 @@ from starlette.requests import Request as HttpRequest
 from starlette.responses import Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
+from vla_zenoh_teleop.policy import OperatorInput
 
 from vla_zenoh.errors import CodecError, VlaZenohError
 from vla_zenoh.lab.rate_limit import RateLimit
-from vla_zenoh.lab.teleop.policy import OperatorInput
 from vla_zenoh_web import metrics, requests
 from vla_zenoh_web.access import People, Person, host_is_ours, origin_is_ours, with_headers
 from vla_zenoh_web.arm import surroundings

@@ -9,11 +9,10 @@ from typing import NamedTuple
 import numpy as np
 
 from vla_zenoh.policy import ActionSpec, ActionSteps, Frame, ModelSpec, Observation, ObservationSpec
+from vla_zenoh.policy.spec import PERSON
 from vla_zenoh.profile import Profile
-from vla_zenoh.types import FloatArray, GripperState
+from vla_zenoh.types import FloatArray
 
-PERSON = "teleop"
-"""Name in the spec of every worker that is a person; what it leads is an intervention."""
 DT_S = 0.05
 HORIZON = 20
 """Steps at most: below one chunk per second the arm holds between chunks."""
@@ -175,7 +174,7 @@ class TeleopPolicy:
         gripper = observation.parts[part].gripper if part else observation.gripper
         assert gripper is not None
         opening, most_m = wanted.opening if active else 0.0, self._max_width_m[part]
-        width_m = self._width_m.get(part, kept_width_m(gripper))
+        width_m = self._width_m.get(part, gripper.kept_width_m)
         if active and toggled:
             width_m = 0.0 if width_m > most_m / 2 else most_m
         period_s = 1 / observation.rate_hz
@@ -214,8 +213,3 @@ def _at_most_unit(direction: Sequence[float]) -> FloatArray:
     """`direction`, no longer than 1: two keys at once are not faster than one."""
     vector = np.array(direction)
     return vector / max(float(np.linalg.norm(vector)), 1.0)
-
-
-def kept_width_m(gripper: GripperState) -> float:
-    """The width (m) that changes nothing: of a gripper that holds an object, shut."""
-    return 0.0 if gripper.holding else max(gripper.width_m, 0.0)
