@@ -203,6 +203,7 @@ NEEDED: Mapping[str, tuple[str, ...]] = {
     "lerobot_robot_vla_zenoh": ("vla-zenoh-policy-servers",),
     "vla-zenoh-dataset": ("vla-zenoh-policy-servers",),
     "vla-zenoh-figures": ("vla-zenoh-benchmarks",),
+    "vla-zenoh-mcp": ("vla-zenoh-primitives",),
     "vla-zenoh-nights": ("vla-zenoh-trial",),
     "vla-zenoh-serve": ("vla-zenoh-policy-servers",),
     "vla-zenoh-trial": ("vla-zenoh-benchmarks",),

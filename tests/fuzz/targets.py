@@ -23,13 +23,13 @@ import typer
 from model_wires import groot, lerobot_server, npy, openpi, openvla_rest, origami, xpolicylab
 from vla_zenoh_mcp import protocol
 from vla_zenoh_policy_servers import message as arrays
+from vla_zenoh_primitives.requests import decode_request
 from vla_zenoh_serve import openpi_server
 
 from vla_zenoh.cli import status_table as cli_status
 from vla_zenoh.cli.options import model_options
 from vla_zenoh.cli.output import Screen
 from vla_zenoh.client import messages
-from vla_zenoh.client.messages import decode_request
 from vla_zenoh.codec import image, message, records, settings
 from vla_zenoh.errors import CodecError, PeerError, ProfileError, SpecError, VlaZenohError
 from vla_zenoh.keys import Keys

@@ -17,7 +17,7 @@ import pytest
 from camera_rig import until
 from chain import LONG_PATIENCE_S, Chain, command_line, running_chain
 
-from vla_zenoh.client.messages import Answer, decode_answer
+from vla_zenoh.client.answer import Answer, decode_answer
 from vla_zenoh.client.primitives import PrimitiveError, ask
 from vla_zenoh.client.remote_robot import RemoteRobot, connect
 from vla_zenoh.keys import PRIMITIVES, worker_node

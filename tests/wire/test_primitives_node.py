@@ -19,8 +19,8 @@ from vla_zenoh_primitives.node import PrimitivesNode
 from vla_zenoh.bus.buffers import CallbackRing
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import open_session
+from vla_zenoh.client.answer import Answer
 from vla_zenoh.client.client import Client
-from vla_zenoh.client.messages import Answer
 from vla_zenoh.client.primitives import ask
 from vla_zenoh.errors import NodeError
 from vla_zenoh.keys import PRIMITIVES, Kind, worker_node

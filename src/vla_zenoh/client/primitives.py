@@ -12,13 +12,8 @@ from typing import Any
 import zenoh
 
 from vla_zenoh.bus.buffers import bytes_of
+from vla_zenoh.client.answer import DEFAULT_TIMEOUT_S, MAX_ANSWER_BYTES, Answer, decode_answer
 from vla_zenoh.client.client import Client
-from vla_zenoh.client.messages import (
-    DEFAULT_TIMEOUT_S,
-    MAX_ANSWER_BYTES,
-    Answer,
-    decode_answer,
-)
 from vla_zenoh.errors import SessionError
 
 MARGIN_S = 20.0
@@ -55,7 +50,7 @@ def ask(
     The arm moves only while this waits: if the process ends, or the block is left, it brakes.
 
     Args:
-        primitive: one of `vla_zenoh.client.messages.REQUESTS`.
+        primitive: one of `vla_zenoh_primitives.requests.REQUESTS`.
         fields: of the request, without its holder.
         who: begins the name by which this client holds the arm.
         cancelled: polled; once it returns true, the deadman is released and the arm brakes.

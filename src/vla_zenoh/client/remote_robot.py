@@ -12,8 +12,8 @@ import zenoh
 
 from vla_zenoh.bus.buffers import LatestSample, ReceivedSample, bytes_of, header_of
 from vla_zenoh.bus.clock import Clock
+from vla_zenoh.client.answer import DEFAULT_TIMEOUT_S, Answer
 from vla_zenoh.client.client import ANSWER_S, START_PATIENCE_S, Client, open_patiently
-from vla_zenoh.client.messages import DEFAULT_TIMEOUT_S, Answer
 from vla_zenoh.client.primitives import PrimitiveError, ask
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import MAX_IMAGE_BYTES, decode_jpeg, decode_raw
@@ -140,7 +140,7 @@ class RemoteRobot(Client):
 
         Args:
             worker: the worker that moves it.
-            until: conditions, `vla_zenoh.client.messages.Until`: ``{"gripper": "closed"}``.
+            until: conditions, `vla_zenoh_primitives.requests.Until`: ``{"gripper": "closed"}``.
             prompt: for the worker; None: the present one.
             timeout_s: then the arm is braked.
 

@@ -17,8 +17,8 @@ from vla_zenoh_primitives.endings import (
     RunEnding,
     Sight,
 )
+from vla_zenoh_primitives.requests import Until
 
-from vla_zenoh.client.messages import Until
 from vla_zenoh.kinematics.so3 import Pose
 from vla_zenoh.types import GripperState, PoseState
 

@@ -11,7 +11,8 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from vla_zenoh.client.messages import REQUESTS
+from vla_zenoh_primitives.requests import REQUESTS
+
 from vla_zenoh.errors import CodecError
 
 VERSIONS = ("2024-11-05", "2025-03-26", "2025-06-18", "2025-11-25")

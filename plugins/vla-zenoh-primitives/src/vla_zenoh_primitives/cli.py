@@ -11,13 +11,14 @@ import typer
 from vla_zenoh.cli.options import AnswerOption, NodeOptions, node_name, not_empty, options
 from vla_zenoh.cli.plain import fail, say
 from vla_zenoh.cli.target import RobotTarget
-from vla_zenoh.client.messages import DEFAULT_TIMEOUT_S, FURTHEST_M, FURTHEST_RAD, Answer
+from vla_zenoh.client.answer import DEFAULT_TIMEOUT_S, Answer
 from vla_zenoh.client.primitives import ask
 from vla_zenoh.codec.settings import MAX_HELD_M, MIN_HELD_M
 from vla_zenoh.errors import SessionError
 from vla_zenoh.keys import PRIMITIVES, worker_node
 from vla_zenoh.lab.cli.options import number_list
 from vla_zenoh.runtime.process import run_node
+from vla_zenoh_primitives.requests import FURTHEST_M, FURTHEST_RAD
 
 TimeoutOption = Annotated[
     float, typer.Option("--timeout", min=0.1, max=3600, help="Seconds until the arm is braked.")

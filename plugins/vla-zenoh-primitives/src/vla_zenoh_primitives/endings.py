@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vla_zenoh.client.messages import Until
 from vla_zenoh.kinematics.so3 import Pose, pose_distance, pose_of
 from vla_zenoh.types import FloatArray, GripperState, PoseState
+from vla_zenoh_primitives.requests import Until
 
 NEAR_M, NEAR_RAD = 1e-3, 2e-3
 """Tolerances of the measured state for a reached target."""

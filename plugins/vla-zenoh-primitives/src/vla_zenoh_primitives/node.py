@@ -18,16 +18,7 @@ import numpy as np
 import zenoh
 
 from vla_zenoh.bus.buffers import Wake, bytes_of
-from vla_zenoh.client.messages import (
-    MAX_REQUEST_BYTES,
-    Answer,
-    Grip,
-    Home,
-    MoveTo,
-    PrimitiveRequest,
-    RunModel,
-    decode_request,
-)
+from vla_zenoh.client.answer import Answer
 from vla_zenoh.client.remote_robot import TIMEOUT_S, RemoteRobot
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.states import DEACTIVATED
@@ -40,6 +31,15 @@ from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray, HeldBox
 from vla_zenoh_primitives.endings import NEAR_RAD, Arrival, Ending, Gripped, RunEnding, Sight
 from vla_zenoh_primitives.policy import CHUNK_HZ, Target, TargetPolicy
+from vla_zenoh_primitives.requests import (
+    MAX_REQUEST_BYTES,
+    Grip,
+    Home,
+    MoveTo,
+    PrimitiveRequest,
+    RunModel,
+    decode_request,
+)
 from vla_zenoh_primitives.target_check import TargetCheck
 
 POLL_S = 0.01
@@ -67,7 +67,7 @@ class _Asked(NamedTuple):
 
 
 class PrimitivesNode:
-    """Answers on `Keys.primitive`, see `vla_zenoh.client.messages`.
+    """Answers on `Keys.primitive`, see `vla_zenoh_primitives.requests`.
 
     Args:
         session: with the rights of a worker and of an operator.

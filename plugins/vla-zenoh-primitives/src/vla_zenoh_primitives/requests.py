@@ -1,14 +1,12 @@
-"""Requests for guarded primitives and their answers: JSON, for clients in any language.
+"""Requests for guarded primitives: JSON, of clients in any language.
 
 An invalid request is answered with what is wrong with which field.
 """
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping
 from typing import Annotated, Literal
 
 from pydantic import (
@@ -16,19 +14,18 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
-    TypeAdapter,
     ValidationError,
     model_validator,
 )
 
+from vla_zenoh.client.answer import DEFAULT_TIMEOUT_S
 from vla_zenoh.codec.settings import MAX_HELD_M, MIN_HELD_M
 from vla_zenoh.errors import CodecError, ProfileError, describe_faults, nearest
 from vla_zenoh.keys import key_chunk
 from vla_zenoh.policy.spec import MAX_JOINTS
 from vla_zenoh.types import MAX_TEXT
 
-MAX_REQUEST_BYTES, MAX_ANSWER_BYTES = 16 * 1024, 64 * 1024
-DEFAULT_TIMEOUT_S = 30.0
+MAX_REQUEST_BYTES = 16 * 1024
 FURTHEST_M = 5.0
 FURTHEST_RAD = 4 * math.pi
 UNIT_TOLERANCE = 0.01
@@ -222,58 +219,3 @@ def decode_request(primitive: str, payload: bytes) -> PrimitiveRequest:
         reason = "malformed" if error.errors()[0]["type"] == "json_invalid" else "invalid"
         why = describe_faults(error, "request", most=4)
         raise CodecError(reason, f"request {primitive}: {why}"[:MAX_TEXT]) from error
-
-
-@dataclass(frozen=True)
-class Answer:
-    """How a primitive ended, and where the arm stands.
-
-    Args:
-        ok: the request was fulfilled.
-        reason: short stable name: ``reached``; of a run the name of the condition; otherwise
-            ``timeout``, ``bound`` (a limit stopped the motion), ``stopped``, ``fault``,
-            ``deactivated``, ``ended`` (by the command node; `why` has details), or, before anything
-            moved, ``busy``, ``rejected``, ``invalid``.
-        why: a sentence; empty if there is nothing to add.
-        took_s: duration.
-        position_m: of the TCP in the base frame; None if unknown.
-        quat_xyzw: of the TCP.
-        joints_rad: name -> position.
-        width_m: of the gripper.
-        holding: it holds an object.
-        off_m: distance from the target of a motion.
-        off_rad: angle to it; of a motion of joints that are commanded the largest of theirs.
-    """
-
-    ok: bool
-    reason: str
-    why: str = ""
-    took_s: float = 0.0
-    position_m: Sequence[float] | None = None
-    quat_xyzw: Sequence[float] | None = None
-    joints_rad: Mapping[str, float] = field(default_factory=dict)
-    width_m: float | None = None
-    holding: bool = False
-    off_m: float | None = None
-    off_rad: float | None = None
-
-    def encode(self) -> bytes:
-        """The answer as JSON."""
-        return json.dumps(asdict(self)).encode()
-
-
-_ANSWER = TypeAdapter(Answer)
-
-
-def decode_answer(payload: bytes) -> Answer:
-    """Read an answer.
-
-    Raises:
-        CodecError: not an answer.
-    """
-    if len(payload) > MAX_ANSWER_BYTES:
-        raise CodecError("oversize", f"{len(payload)} bytes, at most {MAX_ANSWER_BYTES} are read")
-    try:
-        return _ANSWER.validate_json(payload)
-    except ValidationError as error:
-        raise CodecError("malformed", describe_faults(error, "answer", most=4)) from error
