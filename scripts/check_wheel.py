@@ -56,6 +56,7 @@ WITH_PLUGINS = [
     ["nights", "--help"],
     ["trial", "--help"],
     ["conform", "robot", "--help"],
+    ["replay", "--help"],
     ["secure", "show", "--help"],
     ["serve", "policy", "--help"],
     ["teleop", "--help"],

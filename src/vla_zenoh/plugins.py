@@ -186,6 +186,7 @@ PACKAGES: Mapping[str, str] = {
     "node.primitives": "vla-zenoh-primitives",
     "node.rolling": "vla-zenoh-rolling",
     "profile.new": "vla-zenoh-newarm",
+    "replay": "vla-zenoh-replay",
     "save": "vla-zenoh-rolling",
     "secure.add": "vla-zenoh-secure",
     "secure.here": "vla-zenoh-secure",

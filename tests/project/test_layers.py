@@ -63,7 +63,6 @@ ALLOWED = {
             "lab/inference_views.py",
             "lab/newest_records.py",
             "lab/recording/recorder.py",
-            "lab/recording/replay.py",
             "lab/recording/sample_queue.py",
             "lab/tasks/task_runner.py",
         ),

@@ -21,6 +21,7 @@ from camera_rig import until
 from chain import LONG_PATIENCE_S, READY_PATIENCE_S, Chain, command_line
 from recording_rig import assert_same, ghost_of, recording
 from rosbags.rosbag2 import Reader
+from vla_zenoh_replay.replay import CAMERAS, Replay
 
 from vla_zenoh.bus.node import Publisher
 from vla_zenoh.codec import records
@@ -29,7 +30,6 @@ from vla_zenoh.keys import Keys, Kind
 from vla_zenoh.lab.evaluation.mcap_file import evaluate_loaded
 from vla_zenoh.lab.recording.reader import open_recording
 from vla_zenoh.lab.recording.recorder import Recorder
-from vla_zenoh.lab.recording.replay import CAMERAS, Replay
 from vla_zenoh.lab.recording.run import Run, load_run, pictures
 from vla_zenoh.types import Event, NodeStatus
 

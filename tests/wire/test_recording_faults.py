@@ -10,13 +10,13 @@ from typing import Any
 import pytest
 import zenoh
 from camera_rig import free_endpoint, until
+from vla_zenoh_replay.replay import Replay, ReplayResult
 from vla_zenoh_web.recordings import Recordings
 
 from vla_zenoh.bus.session import alive_nodes, open_session
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.recording.reader import open_recording
 from vla_zenoh.lab.recording.recorder import Recorder
-from vla_zenoh.lab.recording.replay import Replay, ReplayResult
 from vla_zenoh.lab.recording.sample import TEXT, Sample
 from vla_zenoh.lab.recording.writer import CrashSafeFile, RecordingWriter
 from vla_zenoh.profile import Profile, load_profile, override

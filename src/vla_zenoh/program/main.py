@@ -91,7 +91,7 @@ COMMANDS: Panels = {
         "view": OF_A_PACKAGE,
         "record": "lab.cli.record:record",
         "save": OF_A_PACKAGE,
-        "replay": "lab.cli.replay:replay",
+        "replay": OF_A_PACKAGE,
         "eval": "lab.cli.evaluate:evaluation",
         "keys": "lab.cli.keys:keys",
         "echo": "lab.cli.keys:echo",

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from typer.testing import CliRunner
+from vla_zenoh_replay.replay import Restamper
 
 from vla_zenoh.codec import records
 from vla_zenoh.codec.image import encode_jpeg
@@ -24,7 +25,6 @@ from vla_zenoh.lab.evaluation.result import TASKS, PlotTrace
 from vla_zenoh.lab.evaluation.timelines import unbroken
 from vla_zenoh.lab.recording.film import Film, write_film
 from vla_zenoh.lab.recording.reader import open_recording
-from vla_zenoh.lab.recording.replay import Restamper
 from vla_zenoh.lab.recording.run import load_run
 from vla_zenoh.lab.recording.sample import JPEG, MSGPACK, TEXT, Sample
 from vla_zenoh.lab.recording.writer import RecordingWriter

@@ -39,7 +39,7 @@ def replay(
     where a robot is alive on these keys, unless only images are replayed.
     """
     from vla_zenoh.lab.recording.reader import open_recording
-    from vla_zenoh.lab.recording.replay import Replay, ReplayResult, parse_groups
+    from vla_zenoh_replay.replay import Replay, ReplayResult, parse_groups
 
     groups = parse_groups(only or ())
     run_file = open_recording(file)
