@@ -34,7 +34,8 @@ FIRST_WORD_S, LEAST_WAIT_S = 0.8, 0.3
 imports alone take longer, `cli.silence` has said it."""
 GIVE_UP_S = 10.0
 """It tries, and watches the arm, for so long."""
-AGAIN_S, RETRY_S, POLL_S = 0.5, 0.2, 0.05
+AGAIN_S, RETRY_S, POLL_S, ENDS_S = 0.5, 0.2, 0.05, 0.5
+INTERRUPTED = 130
 SILENT_S, APPEAR_S = 2.0, 1.5
 LEAVING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
 
@@ -50,7 +51,8 @@ class StopAttempt:
         self.clients: list[StopClient] = []
         self.why = "the router does not answer"
         self.over = threading.Event()
-        threading.Thread(target=self._run, name="stop", daemon=True).start()
+        self._thread = threading.Thread(target=self._run, name="stop", daemon=True)
+        self._thread.start()
 
     def _run(self) -> None:
         while not self.over.is_set():
@@ -88,6 +90,18 @@ class StopAttempt:
         client.stop()
         self.clients.append(client)
 
+    def end(self, status: int) -> None:
+        """End the thread, or the program with `status` where a router that hangs keeps it.
+
+        Python would end such a thread within Zenoh, which aborts the program.
+        """
+        self.over.set()
+        self._thread.join(ENDS_S)
+        if self._thread.is_alive():
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(status)
+
     def progress(self) -> dict[str, StopProgress]:
         """Progress of each robot; with ``--all`` the profile's own only if it is there."""
         found = {client.keys.robot: client.stop_progress() for client in self.clients}
@@ -102,13 +116,13 @@ class StopAttempt:
 
 def stop_and_watch(target: RobotTarget, *, every: bool, as_json: bool) -> None:
     """Stop, say what became of it, and exit with the status of the worst outcome."""
-    attempt = StopAttempt(target, target.load_for_stop(), every=every)
+    attempt, status = StopAttempt(target, target.load_for_stop(), every=every), INTERRUPTED
     try:
-        outcome = _watch(attempt, every=every, as_json=as_json)
+        status = EXIT_STATUS[_watch(attempt, every=every, as_json=as_json)]
     finally:
-        attempt.over.set()
-    if outcome is not StopOutcome.CONFIRMED:
-        raise SystemExit(EXIT_STATUS[outcome])
+        attempt.end(status)
+    if status:
+        raise SystemExit(status)
 
 
 def _watch(attempt: StopAttempt, *, every: bool, as_json: bool) -> StopOutcome:
@@ -170,12 +184,23 @@ def _warn_of_others(attempt: StopAttempt) -> None:
 # -- stop --wait-key: a standby emergency stop for a person beside the arm ------------------------
 def stop_by_key(target: RobotTarget, *, every: bool) -> None:
     """Stop the robot at every key, and when the person leaves; the session stays open meanwhile."""
+    attempts, status = list[StopAttempt](), INTERRUPTED
+    try:
+        _watch_keys(target, attempts, every=every)
+        status = 0
+    finally:
+        for attempt in attempts:
+            attempt.end(status)
+
+
+def _watch_keys(target: RobotTarget, attempts: list[StopAttempt], *, every: bool) -> None:
     with target.client(stop=True) as client, _keys() as pressed:
         connected = True
 
         def stop() -> None:
             client.stop()
             attempt = StopAttempt(target, client.profile, every=every)
+            attempts.append(attempt)
             try:
                 _watch(attempt, every=every, as_json=False)
             finally:

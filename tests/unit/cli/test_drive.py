@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import os
 import resource
+import socket
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache
 from typing import Any, cast
 
@@ -132,10 +133,21 @@ def test_output_that_is_read_no_further_is_no_traceback(line: str, unbuffered: s
     assert (done.returncode, done.stderr) == (1, "")
 
 
+@pytest.fixture
+def hung_router() -> Iterator[str]:
+    """Endpoint of something that accepts connections and says nothing."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        yield f"tcp/127.0.0.1:{server.getsockname()[1]}"
+
+
 @pytest.mark.realtime
+@pytest.mark.parametrize("hangs", [False, True])
 @pytest.mark.parametrize("form", [[], ["--json"]])
-def test_a_stop_without_a_router_says_at_once_that_nobody_confirmed_it(form: list[str]) -> None:
-    words = [sys.executable, "-m", "vla_zenoh", "stop", *form, *NOWHERE]
+def test_a_stop_without_a_router_says_at_once_that_nobody_confirmed_it(
+    form: list[str], hangs: bool, hung_router: str
+) -> None:
+    where = ("--connect", hung_router) if hangs else NOWHERE
+    words = [sys.executable, "-m", "vla_zenoh", "stop", *form, *where]
     began_s = time.monotonic()
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
