@@ -169,6 +169,8 @@ PACKAGES: Mapping[str, str] = {
     "bench.command": "vla-zenoh-benchmarks",
     "bench.sim": "vla-zenoh-benchmarks",
     "bench.task": "vla-zenoh-benchmarks",
+    "camera.board": "vla-zenoh-calibrate",
+    "camera.calibrate": "vla-zenoh-calibrate",
     "compare": "vla-zenoh-benchmarks",
     "conform.camera": "vla-zenoh-conform",
     "conform.robot": "vla-zenoh-conform",

@@ -116,7 +116,13 @@ COMMANDS: Panels = {
         "robot": CommandGroup(
             "Compare a robot with its profile.", {"check": "lab.cli.doctor:robot_check"}
         ),
-        "camera": CommandGroup("Cameras of this computer.", {"list": "lab.cli.camera:camera_list"}),
+        "camera": CommandGroup(
+            "List the cameras of this computer, and calibrate them.",
+            {
+                "list": "lab.cli.camera:camera_list",
+                **dict.fromkeys(("board", "calibrate"), OF_A_PACKAGE),
+            },
+        ),
         "secure": CommandGroup(
             "Certificates for a lab, so that only its hosts connect, with the rights of their "
             "roles.",

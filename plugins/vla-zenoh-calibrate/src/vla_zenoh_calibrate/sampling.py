@@ -90,6 +90,12 @@ class Sampler:
     def views(self) -> list[View]:
         return [one.view for one in self.taken]
 
+    def newest_pose(self) -> FloatArray:
+        """The newest measured pose (4, 4) of the arm; `CalibrationError`: none came."""
+        if not self._states:
+            raise CalibrationError("no state of the arm came; `vla-zenoh status` shows its node")
+        return self._states[-1].pose
+
     def add_state(self, stamp_ns: int, pose: FloatArray, received_ns: int) -> None:
         """A measured pose (4, 4) of the arm's last link in its base.
 
