@@ -53,6 +53,7 @@ WITH_PLUGINS = [
     ["view", "--help"],
     ["web", "--help"],
     ["node", "rolling", "--help"],
+    ["node", "ros2", "--help"],
     ["nights", "--help"],
     ["trial", "--help"],
     ["conform", "robot", "--help"],

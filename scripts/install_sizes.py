@@ -20,7 +20,7 @@ ROWS = {
     "drive, watch, cameras, own models": ("",),
     "model host, shipped policy": ("brick,secure",),
     "robot host": ("control,record,secure",),
-    "robot host, ROS 2": ("record,ros2,secure",),
+    "robot host, ROS 2": ("record,secure", "vla-zenoh-ros2"),
     "simulator and everything in the tutorial": ("all",),
     "the same with the viewer": ("all", "vla-zenoh-view"),
 }

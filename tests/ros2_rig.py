@@ -12,6 +12,7 @@ from typing import Any
 import zenoh
 from camera_rig import PATIENCE_S, free_endpoint, until
 from ros2_peer import KinematicPanda, Ros2Peer
+from vla_zenoh_ros2.driver import Ros2Driver
 
 from vla_zenoh.bus.clock import Clock
 from vla_zenoh.bus.node import Publisher
@@ -20,7 +21,6 @@ from vla_zenoh.codec import records
 from vla_zenoh.keys import Kind
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.robots.node import RobotNode
-from vla_zenoh.robots.ros2.driver import Ros2Driver
 from vla_zenoh.types import Event, GripperState, Header, JointState, NodeStatus, PoseState
 
 CAMERA = "/camera/realsense2_camera/color/image_raw"

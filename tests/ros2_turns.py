@@ -16,6 +16,7 @@ from camera_rig import routed_session
 from panda_arm import ARM_JOINTS, HOME_RAD, panda
 from ros2_peer import FINGERS, GOAL, Ros2Peer
 from ros2_rig import write_profile
+from vla_zenoh_ros2.driver import Ros2Driver
 
 from vla_zenoh.bus import buffers as slots
 from vla_zenoh.bus.node import Node
@@ -24,7 +25,6 @@ from vla_zenoh.kinematics.so3 import quat_from_rotation
 from vla_zenoh.profile import load_profile
 from vla_zenoh.robots.arm import Arm
 from vla_zenoh.robots.node import RobotNode
-from vla_zenoh.robots.ros2.driver import Ros2Driver
 from vla_zenoh.types import (
     Event,
     FloatArray,

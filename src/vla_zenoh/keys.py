@@ -1,5 +1,5 @@
 """Every key expression of ours, with its payload. The only file with key text; keys of ROS 2 are
-in ``ros2/keys.py``.
+in `vla_zenoh_ros2.keys`.
 
 A key is ``{root}/{robot}/...``: `Keys` makes the keys of one robot, `Kind` chooses the quality of
 service. `KEY_PATHS` is the whole wire protocol. A robot of several parts has states and commands of

@@ -24,12 +24,16 @@ from model_wires import groot, lerobot_server, npy, openpi, openvla_rest, origam
 from vla_zenoh_mcp import protocol
 from vla_zenoh_policy_servers import message as arrays
 from vla_zenoh_primitives.requests import decode_request
+from vla_zenoh_ros2 import readers
+from vla_zenoh_ros2.bridge_view import read_view
+from vla_zenoh_ros2.keys import Attachment
+from vla_zenoh_ros2.pictures import COMPRESSED_IMAGE, IMAGE
 from vla_zenoh_serve import openpi_server
 
 from vla_zenoh.cli import status_table as cli_status
 from vla_zenoh.cli.options import model_options
 from vla_zenoh.cli.output import Screen
-from vla_zenoh.client import messages
+from vla_zenoh.client.answer import Answer, decode_answer
 from vla_zenoh.codec import image, message, records, settings
 from vla_zenoh.errors import CodecError, PeerError, ProfileError, SpecError, VlaZenohError
 from vla_zenoh.keys import Keys
@@ -47,11 +51,7 @@ from vla_zenoh.lab.tasks.order import parse_prompt
 from vla_zenoh.policy import ActionSpec, ModelSpec, ObservationSpec
 from vla_zenoh.policy.loader import find_model, make_policy
 from vla_zenoh.profile import load_profile
-from vla_zenoh.ros2 import readers
-from vla_zenoh.ros2.bridge_view import read_view
-from vla_zenoh.ros2.keys import Attachment
 from vla_zenoh.ros2.messages import Messages, parse
-from vla_zenoh.ros2.pictures import COMPRESSED_IMAGE, IMAGE
 from vla_zenoh.types import ClockReply, Depth, Event, Header, InferenceDebug, NodeStatus
 
 OF_TORCH = Path(__file__).parents[1] / "contract" / "lerobot_actions.pickle"
@@ -387,9 +387,9 @@ def _targets() -> Iterator[Target]:
         )
     yield Target(
         "primitive-answer",
-        messages.decode_answer,
+        decode_answer,
         codec,
-        lambda: [messages.Answer(True, "reached", position_m=(0.1, 0.2, 0.3)).encode()],
+        lambda: [Answer(True, "reached", position_m=(0.1, 0.2, 0.3)).encode()],
     )
     yield Target("prompt", _prompt, codec, lambda: [b"HARD: go up x3", b"put the red brick down"])
     yield Target("depth", _depth, codec, _depths)

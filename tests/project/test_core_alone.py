@@ -50,7 +50,7 @@ def test_a_robot_of_a_plug_in_is_named_with_what_is_installed(alone: dict[str, s
     done = run(alone, "profile", "check", "fr3")
     assert done.returncode == 1
     assert "robot.driver: no robot driver 'franka' is installed" in done.stderr
-    assert "Installed: arm, ros2, sim." in done.stderr
+    assert "Installed: arm, sim." in done.stderr
     assert run(alone, "profile", "show", "fr3").returncode == 0
 
 
@@ -58,7 +58,7 @@ def test_the_doctor_needs_no_extra_and_lists_the_plug_ins(alone: dict[str, str])
     done = run(alone, "doctor", "--json")
     assert "cryptography" not in done.stderr
     found = {each["name"]: each["found"] for each in json.loads(done.stdout)}
-    assert found["plug-ins: robot drivers"] == "arm, ros2, sim"
+    assert found["plug-ins: robot drivers"] == "arm, sim"
     assert found["plug-ins: benchmarks"] == "none"
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from typer.testing import CliRunner
+from vla_zenoh_ros2.writers import position
 from wrong_profiles import CAMERA_SOURCES, DRIVERS
 
 from vla_zenoh.control.reachability import ReachabilityFilter
@@ -20,7 +21,6 @@ from vla_zenoh.policy.loader import make_robot
 from vla_zenoh.profile import load_profile
 from vla_zenoh.program.main import app
 from vla_zenoh.resources import robot_urdf
-from vla_zenoh.ros2.writers import position
 from vla_zenoh.types import JointCommand
 
 TEXT_FILE = Path(__file__).parents[2] / "docs" / "how-to" / "robots.md"

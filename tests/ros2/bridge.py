@@ -9,8 +9,8 @@ from pathlib import Path
 from types import ModuleType
 
 from ros_node import LOOPBACK_XML
+from vla_zenoh_ros2.bridge_config import bridge_config, bridge_text
 
-from vla_zenoh.lab.profile.ros2_bridge import bridge_config, bridge_text
 from vla_zenoh.profile import load_profile
 
 ROOT = Path(__file__).resolve().parents[2]

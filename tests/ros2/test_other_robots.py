@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from vla_zenoh_ros2.bridge_config import endpoints
 
 from vla_zenoh.errors import SessionError
-from vla_zenoh.lab.profile.ros2_bridge import endpoints
 
 ros = pytest.importorskip("ros_messages", exc_type=ImportError)
 

@@ -22,8 +22,7 @@ import pytest
 import zenoh
 from camera_rig import free_endpoint
 from chain import running_chain
-
-from vla_zenoh.ros2.keys import Endpoint, EntityRole, Ros2Dds
+from vla_zenoh_ros2.keys import Endpoint, EntityRole, Ros2Dds
 
 if TYPE_CHECKING:
     from rig import Lab

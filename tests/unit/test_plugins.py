@@ -21,7 +21,7 @@ from vla_zenoh import plugins, resources
 from vla_zenoh.errors import NodeError, PluginError, ProfileError
 from vla_zenoh.lab.check.examination import Examination
 from vla_zenoh.lab.check.model_runner import ModelRunner
-from vla_zenoh.lab.doctor.plugins import installed_plugins, robot_driver
+from vla_zenoh.lab.doctor.plugins import installed_plugins, robot_drivers
 from vla_zenoh.lab.profile.check import check_profile
 from vla_zenoh.nodes.camera.node import make_source
 from vla_zenoh.policy.loader import find_model, make_policy
@@ -141,7 +141,7 @@ def test_a_profile_with_it_is_the_same_once_written_and_read(folder: Path) -> No
 def test_its_profile_passes_the_check_and_the_doctor_asks_it(folder: Path) -> None:
     report = check_profile(str(folder / "acme.yaml"))
     assert report.errors == []
-    (finding,) = robot_driver(load_profile(str(folder / "acme.yaml")), None)
+    (finding,) = robot_drivers(load_profile(str(folder / "acme.yaml")), None)
     assert finding.found == "controller at 10.0.0.7"
 
 

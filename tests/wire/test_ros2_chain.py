@@ -16,10 +16,10 @@ import pytest
 from chain import Chain, running_chain
 from ros2_peer import KinematicPanda, Ros2Peer
 from ros2_rig import CAMERA, HEIGHT, WIDTH, write_profile
+from vla_zenoh_ros2.keys import BOOL, EMPTY, TEXT
 
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.profile import load_profile
-from vla_zenoh.ros2.keys import BOOL, EMPTY, TEXT
 
 pytestmark = pytest.mark.slow
 

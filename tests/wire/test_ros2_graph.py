@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 from camera_rig import until
 from ros2_rig import write_profile
+from vla_zenoh_ros2.bridge_config import endpoints
+from vla_zenoh_ros2.driver import Ros2Driver
 
 from vla_zenoh.bus.session import open_session
-from vla_zenoh.lab.profile.ros2_bridge import endpoints
 from vla_zenoh.profile import load_profile
 from vla_zenoh.robots.node import RobotNode
-from vla_zenoh.robots.ros2.driver import Ros2Driver
 
 SLASH = "§"
 PLAIN = ""

@@ -8,11 +8,11 @@ import pytest
 import zenoh
 from camera_rig import until
 from ros2_rig import write_profile
+from vla_zenoh_ros2.bridge_view import BridgeView
+from vla_zenoh_ros2.middleware import Bridges
 
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.profile import load_profile
-from vla_zenoh.robots.ros2.middleware import Bridges
-from vla_zenoh.ros2.bridge_view import BridgeView
 
 WRITER = "@/b1/ros2/dds/010f00/writer/010f0001/rt"
 

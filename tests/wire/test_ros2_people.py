@@ -17,6 +17,11 @@ import zenoh
 from camera_rig import await_match, until
 from ros2_peer import Ros2Peer
 from ros2_rig import write_profile
+from vla_zenoh_ros2 import operator_topics
+from vla_zenoh_ros2.keys import BOOL, EMPTY, OPERATIONS, TEXT
+from vla_zenoh_ros2.middleware import Bridges
+from vla_zenoh_ros2.operator_topics import OperatorTopics
+from vla_zenoh_ros2.ros_graph import RosGraph
 
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import open_session
@@ -24,11 +29,6 @@ from vla_zenoh.client.client import Client
 from vla_zenoh.codec import records
 from vla_zenoh.keys import Keys
 from vla_zenoh.profile import load_profile
-from vla_zenoh.robots.ros2 import operator_topics
-from vla_zenoh.robots.ros2.middleware import Bridges
-from vla_zenoh.robots.ros2.operator_topics import OperatorTopics
-from vla_zenoh.robots.ros2.ros_graph import RosGraph
-from vla_zenoh.ros2.keys import BOOL, EMPTY, OPERATIONS, TEXT
 from vla_zenoh.ros2.messages import Messages
 from vla_zenoh.types import Header, Task
 

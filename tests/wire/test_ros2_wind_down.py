@@ -10,10 +10,10 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from ros2_turns import SPEED_M_S, TICK_S, Turns, ros2_turns
+from vla_zenoh_ros2.arm import Ros2Arm
 
 from vla_zenoh.bus.clock import Tick
 from vla_zenoh.robots.node import FAILURES, LEAST_S
-from vla_zenoh.robots.ros2.arm import Ros2Arm
 
 MOVING = 60
 """Turns after which the arm is in full motion."""

@@ -1,4 +1,4 @@
-"""vla-zenoh worker, and node: router, sim, ros2, arm, camera, command: one node until Ctrl-C."""
+"""vla-zenoh worker, and node: router, sim, arm, camera, command: one node until Ctrl-C."""
 
 from __future__ import annotations
 
@@ -76,9 +76,10 @@ def latch_file(profile: Profile, node: str) -> Path:
     return default_log_folder() / f"stopped-{profile.robot.name}-{node}"
 
 
-def _run_robot(
+def run_robot(
     node: NodeOptions, identity: str, make_driver: Callable[[Profile], RobotDriver]
 ) -> None:
+    """Run the robot node of a driver, whose certificate is of `identity`."""
     from vla_zenoh.robots.node import RobotNode
 
     profile = node.load()
@@ -101,15 +102,7 @@ def sim(
     """Run the simulated robot: receives commands, publishes its state."""
     from vla_zenoh.robots.sim_driver import SimDriver
 
-    _run_robot(node, "sim", lambda profile: SimDriver(profile, lockstep=lockstep))
-
-
-@options
-def ros2(node: NodeOptions) -> None:
-    """Drive a ROS 2 robot and serve its cameras, through a bridge or rmw_zenoh."""
-    from vla_zenoh.robots.ros2.driver import Ros2Driver
-
-    _run_robot(node, "ros2", Ros2Driver)
+    run_robot(node, "sim", lambda profile: SimDriver(profile, lockstep=lockstep))
 
 
 @options
@@ -130,7 +123,7 @@ def arm(node: NodeOptions) -> None:
         script = find_model(str(path))
         run_in_own_environment(script, None, extra="control", packages=packages)
 
-    _run_robot(node, "arm", PythonDriver)
+    run_robot(node, "arm", PythonDriver)
 
 
 @options

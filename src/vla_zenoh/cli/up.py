@@ -35,7 +35,7 @@ from vla_zenoh.cli.options import (
 from vla_zenoh.cli.output import console, errors, fail, styled
 from vla_zenoh.cli.target import RobotTarget
 from vla_zenoh.errors import NodeError
-from vla_zenoh.keys import PRIMITIVES, ROLLING
+from vla_zenoh.keys import ROLLING
 from vla_zenoh.resources import is_path, profile_file
 from vla_zenoh.runtime.process import DETAIL, FATAL, die_with_parent, stop_on_signals
 from vla_zenoh.runtime.supervisor import repeated
@@ -85,8 +85,9 @@ def up(
 
         loaded = effective_profile(profile, connect, listen, sim=sim)
         name, part = choose_host(loaded, host)
-        if PRIMITIVES in part.nodes and (why := plugins.lacking(f"node.{PRIMITIVES}")):
-            raise NodeError(f"hosts.{name}.nodes has {PRIMITIVES}: {why}")
+        for kind in part.nodes:
+            if f"node.{kind}" in plugins.PACKAGES and (why := plugins.lacking(f"node.{kind}")):
+                raise NodeError(f"hosts.{name}.nodes has {kind}: {why}")
         lock_host(loaded, name).close()  # says at once that it runs already; `Host` takes it again
         reject_wrong(profile, check)
     logs = log_dir or default_log_folder()

@@ -262,6 +262,12 @@ class Profile(Section):
             return ()
         return self.workers if host.workers is None else host.workers
 
+    @property
+    def robot_nodes(self) -> dict[str, str]:
+        """Robot driver -> kind of its node; ``ros2``, too, where it serves what another moves."""
+        found = {self.robot.driver: self.robot.node}
+        return found if self.ros2 is None else {**found, "ros2": "ros2"}
+
     def node_name(self, host: str, kind: str) -> str:
         """Name on the bus of the node of this kind on `host`; unique if several hosts run one."""
         if kind == PRIMITIVES:  # its chunks are those of a worker

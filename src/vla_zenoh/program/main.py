@@ -58,7 +58,7 @@ COMMANDS: Panels = {
             {
                 "router": "cli.nodes:router",
                 "sim": "cli.nodes:sim",
-                "ros2": "cli.nodes:ros2",
+                "ros2": OF_A_PACKAGE,
                 "arm": "cli.nodes:arm",
                 "camera": "cli.nodes:camera",
                 "command": "cli.nodes:command",
@@ -106,7 +106,7 @@ COMMANDS: Panels = {
         "profile": CommandGroup(
             "List, show, check and make profiles.",
             {
-                "bridge-config": "lab.cli.profile:bridge_config",
+                "bridge-config": OF_A_PACKAGE,
                 "list": "lab.cli.profile:list_profiles",
                 "show": "lab.cli.profile:show",
                 "check": "lab.cli.profile:check",

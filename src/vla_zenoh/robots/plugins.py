@@ -1,4 +1,4 @@
-"""Declarations of the robot drivers ``sim``, ``ros2`` and ``arm``; see `vla_zenoh.plugins`."""
+"""Declarations of the robot drivers ``sim`` and ``arm``; see `vla_zenoh.plugins`."""
 
 from __future__ import annotations
 
@@ -64,5 +64,4 @@ def _check(profile: Profile, options: ArmOptions) -> Iterator[Fault]:
 
 
 SIM = RobotPlugin()
-ROS2 = RobotPlugin()
 ARM = RobotPlugin(make=_make, options=ArmOptions, paths=("file",), script=_script, check=_check)

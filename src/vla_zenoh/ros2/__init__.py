@@ -1,1 +1,1 @@
-"""ROS 2 without ROS: messages, type hashes, names and keys of both transports."""
+"""ROS 2 without ROS: the messages of its distributions, with their type hashes and CDR."""

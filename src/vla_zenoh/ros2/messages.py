@@ -21,7 +21,6 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
 from vla_zenoh.errors import CodecError, ProfileError, nearest
-from vla_zenoh.ros2.keys import split_type
 
 STORES = {
     "humble": Stores.ROS2_HUMBLE,
@@ -32,6 +31,7 @@ STORES = {
 }
 """Distribution -> rosbags' definitions of it."""
 
+_TYPE = re.compile(r"([a-z][a-z0-9_]*)/(msg|srv|action)/([A-Za-z][A-Za-z0-9_]*)")
 NO_HASH = "TypeHashNotSupported"
 """In place of a hash where the distribution has none (Humble)."""
 MAX_MESSAGE_BYTES = 4 * 1024 * 1024
@@ -47,6 +47,17 @@ _PARTS = {"srv": ("_Request", "_Response"), "action": ("_Goal", "_Result", "_Fee
 
 Definitions = dict[str, Any]
 """Type -> (constants, fields), as rosbags keeps them."""
+
+
+def split_type(kind: str) -> tuple[str, str, str]:
+    """``package/msg/Name`` in its three parts; a `ProfileError` if it is no such name."""
+    match = _TYPE.fullmatch(kind)
+    if match is None:
+        raise ProfileError(
+            f"{kind[:80]!r} is not a ROS type: write package/msg/Name, package/srv/Name or "
+            "package/action/Name"
+        )
+    return match[1], match[2], match[3]
 
 
 class Messages:

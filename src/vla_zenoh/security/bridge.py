@@ -11,12 +11,13 @@ from typing import Any
 
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.schema import TRUSTED_PROTOCOLS, host_of, is_loopback
-from vla_zenoh.ros2.bridge_view import ALL_VIEW_KEYS
 from vla_zenoh.security.roles import EVERY_MESSAGE, IN, OUT, Identity, Role, rule
 from vla_zenoh.security.store import AUTHORITY
 
 NODE, USER = "bridge", "ros2"
 """Its name in its certificate, and the one node that it serves."""
+ALL_VIEW_KEYS = "@/*/ros2/**"
+"""What bridges say of DDS."""
 KEYS = ("**", "**/@adv/**", "@/*/@ros2_lv/**", ALL_VIEW_KEYS)
 """Topics and services, what late listeners ask for, what bridges tell each other, and what they say
 of DDS. A star stands for no name that begins with an @."""

@@ -304,7 +304,7 @@ def test_a_host_needs_what_its_nodes_need() -> None:
     assert gpu.roles == {"base"}
     assert not gpu.is_router
     assert needs_of(profile).roles == {"base", "control", "sim"}
-    assert needs_of(load_profile("panda_ros2")).roles == {"base", "control", "ros2"}
+    assert needs_of(load_profile("panda_ros2")).roles == {"base", "control"}
 
 
 def test_usb_cameras_of_a_profile_are_needed_on_the_host_that_has_them() -> None:

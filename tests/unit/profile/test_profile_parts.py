@@ -6,10 +6,10 @@ import re
 from typing import Any
 
 import pytest
+from vla_zenoh_ros2.bridge_config import endpoints
 
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.keys import Keys
-from vla_zenoh.lab.profile.ros2_bridge import endpoints
 from vla_zenoh.profile import Profile, load_profile, override, read_profile, to_yaml
 
 PAIR = load_profile("two_pandas_sim")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 
-from vla_zenoh.ros2.bridge_view import (
+from vla_zenoh_ros2.bridge_view import (
     any_active,
     any_transient_local,
     endpoints_key,

@@ -5,9 +5,7 @@ from __future__ import annotations
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from vla_zenoh.errors import CodecError, ProfileError
-from vla_zenoh.ros2.keys import (
+from vla_zenoh_ros2.keys import (
     COMMAND,
     DEFAULT,
     GID_BYTES,
@@ -21,6 +19,8 @@ from vla_zenoh.ros2.keys import (
     gid_of,
     parts_of,
 )
+
+from vla_zenoh.errors import CodecError, ProfileError
 
 HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 ZID = "f9980ee0495eaafb3e38f0d19e2eae12"

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from panda_arm import ARM_JOINTS, HOME_RAD, panda
+from vla_zenoh_ros2.gripper import ActionGoal, GoalSequencer
 
 from vla_zenoh.errors import CodecError
 from vla_zenoh.guard.arm_guard import ARM_SETTLES_NS, MOVED_M, MOVED_RAD, HeldReference, Measured
@@ -23,7 +24,6 @@ from vla_zenoh.robots.joint_reading import (
     SimulatedClock,
     StampFilter,
 )
-from vla_zenoh.robots.ros2.gripper import ActionGoal, GoalSequencer
 from vla_zenoh.types import GripperCommand
 from vla_zenoh.types.records import Joints
 

@@ -6,11 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-from vla_zenoh.errors import CodecError
-from vla_zenoh.kinematics.so3 import rotation_from_rpy
-from vla_zenoh.ros2.messages import Messages
-from vla_zenoh.ros2.transforms import (
+from vla_zenoh_ros2.transforms import (
     MAX_FRAMES,
     TF_MESSAGE,
     Edge,
@@ -21,6 +17,10 @@ from vla_zenoh.ros2.transforms import (
     read_transforms,
     tf_message,
 )
+
+from vla_zenoh.errors import CodecError
+from vla_zenoh.kinematics.so3 import rotation_from_rpy
+from vla_zenoh.ros2.messages import Messages
 
 M = Messages("jazzy")
 QUARTER = rotation_from_rpy(np.array([0.0, 0.0, np.pi / 2]))

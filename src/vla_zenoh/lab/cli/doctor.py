@@ -24,8 +24,7 @@ from vla_zenoh.errors import SecurityError, SessionError
 from vla_zenoh.lab.cli.output import print_json, progress
 from vla_zenoh.lab.doctor import HostFinding, Needs, examine, needs_of
 from vla_zenoh.lab.doctor.access import access
-from vla_zenoh.lab.doctor.plugins import installed_plugins, robot_driver
-from vla_zenoh.lab.doctor.ros2 import ros2_bridge
+from vla_zenoh.lab.doctor.plugins import installed_plugins, robot_drivers
 from vla_zenoh.lab.doctor.software import robot
 from vla_zenoh.profile import SessionProfile
 
@@ -100,8 +99,7 @@ def doctor(
         findings += installed_plugins()
         if loaded is not None:
             findings += robot(loaded, host)
-            findings += ros2_bridge(loaded, host)
-            findings += robot_driver(loaded, host)
+            findings += robot_drivers(loaded, host)
             findings += access(loaded)
     report(findings, as_json=as_json)
 

@@ -1,4 +1,4 @@
-"""vla-zenoh profile: list, show and check profiles; configure the bridge for one."""
+"""vla-zenoh profile: list, show and check profiles."""
 
 from __future__ import annotations
 
@@ -13,76 +13,14 @@ from vla_zenoh.cli.options import (
     HostOption,
     JsonOption,
     ListenOption,
-    NodeOptions,
     SimOption,
-    options,
 )
 from vla_zenoh.cli.output import console, errors, fail, new_table, styled
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.lab.cli.output import print_json
 from vla_zenoh.lab.profile.check import check_profile
-from vla_zenoh.profile import Profile, load_profile, profile_file, to_yaml
+from vla_zenoh.profile import load_profile, profile_file, to_yaml
 from vla_zenoh.resources import names, shipped
-
-FILE = "bridge.json5"
-
-
-@options
-def bridge_config(
-    node: NodeOptions,
-    beside: Annotated[
-        bool,
-        typer.Option(
-            "--beside", help="The bridge is a client of our router; default: a router itself."
-        ),
-    ] = False,
-    certificates: Annotated[
-        Path | None,
-        typer.Option(
-            "--certificates",
-            help="Folder on the bridge's computer with ca.pem, bridge.pem and bridge.key, for a "
-            "bridge reached by TLS; default: that of the host which runs the node ros2.",
-        ),
-    ] = None,
-) -> None:
-    """Print the configuration of zenoh-bridge-ros2dds that lets through what a profile uses.
-
-    Redirect stdout into a file; stderr says how to start the bridge with it.
-    """
-    from vla_zenoh.lab.profile import ros2_bridge as bridge
-
-    profile = node.load()
-    start = bridge.bridge_command(profile, FILE)
-    locks, notes = None, [f"Start the bridge with, on the robot's computer:\n  {start}"]
-    if bridge.is_locked(profile):
-        locks, note = _locks(profile, certificates)
-        notes.append(note)
-    elif certificates is not None:
-        raise typer.BadParameter("--certificates is for a bridge that is reached by tls/")
-    text = bridge.bridge_text(profile, bridge.bridge_config(profile, locks, beside=beside))
-    print(text, end="")
-    for note in notes:
-        errors().print(note, soft_wrap=True)
-
-
-def _locks(profile: Profile, given: Path | None) -> tuple[dict[str, object], str]:
-    """The bridge's sections for certificates and access, and how to copy the certificates."""
-    from vla_zenoh.security.bridge import NODE, bridge_locks, bridges
-    from vla_zenoh.security.store import Store
-
-    assert profile.session.security is not None
-    store, hosts = Store(profile.session.security.folder), [b.host for b in bridges(profile)]
-    if len(hosts) != 1:
-        raise typer.BadParameter("no host of this profile runs the node ros2")
-    source = store.folder / hosts[0]
-    folder = (given or source).expanduser()
-    if not folder.is_absolute():
-        raise typer.BadParameter("--certificates wants an absolute path, from / or ~")
-    names = " ".join(str(source / name) for name in ("ca.pem", f"{NODE}.pem", f"{NODE}.key"))
-    return bridge_locks(profile, folder), (
-        f"It accepts only node ros2@{hosts[0]}, by certificate. If it is another computer:\n"
-        f"  ssh ROBOT mkdir -p -m 700 {folder}\n  scp -p {names} ROBOT:{folder}/"
-    )
 
 
 def list_profiles(as_json: JsonOption = False) -> None:

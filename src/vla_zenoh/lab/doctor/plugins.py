@@ -21,17 +21,22 @@ def installed_plugins() -> Iterator[HostFinding]:
             yield HostFinding(name, "warn", why, "mend or uninstall that package")
 
 
-def robot_driver(profile: Profile, host: str | None) -> Iterator[HostFinding]:
-    """What the robot driver of a profile needs of this computer, if it runs there."""
-    if profile.robot.node not in nodes_on(profile, host):
-        return
+def robot_drivers(profile: Profile, host: str | None) -> Iterator[HostFinding]:
+    """What the robot drivers of a profile need of this computer, where they run there."""
+    here = nodes_on(profile, host)
+    for name, node in profile.robot_nodes.items():
+        if node in here:
+            yield from _robot_driver(profile, name)
+
+
+def _robot_driver(profile: Profile, name: str) -> Iterator[HostFinding]:
     try:
-        robot = plugins.load(plugins.ROBOTS, profile.robot.driver)
+        robot = plugins.load(plugins.ROBOTS, name)
     except PluginError as error:
         yield HostFinding("robot driver", "fail", str(error))
         return
     try:
         yield from robot.check_host(profile, profile.driver_options)
     except Exception as error:
-        why = f"the check of {profile.robot.driver} itself failed: {in_words(error)}"
+        why = f"the check of {name} itself failed: {in_words(error)}"
         yield HostFinding("robot driver", "warn", why)

@@ -29,13 +29,11 @@ MODULES: Mapping[Role, Mapping[str, str]] = {
     },
     "control": {"pinocchio": "pin", "ruckig": "ruckig"},
     "sim": {"mujoco": "mujoco-core", "av": "av"},
-    "ros2": {"rosbags": "rosbags"},
 }
 PURPOSE: Mapping[Role, str] = {
     "base": "cameras and workers",
     "control": "command node",
     "sim": "simulator",
-    "ros2": "node ros2",
 }
 VERSIONS: Mapping[str, tuple[tuple[int, ...], tuple[int, ...] | None]] = {
     # distribution: oldest that works, first that is not known to work

@@ -20,10 +20,9 @@ from vla_zenoh.lab.profile.robot_check import (
     arm,
     barriers_advice,
     braking_advice,
-    driver,
+    drivers,
     joints_advice,
     mounts,
-    ros2,
     simulator,
 )
 from vla_zenoh.policy.loader import find_worker, make_policy
@@ -71,7 +70,7 @@ def check_profile(
         known = ", ".join(profile.hosts)
         where = located(("hosts",), f"has no {host!r}{nearest(host, profile.hosts)}", lines)
         return ProfileReport([f"{where} It has: {known}"], [])
-    found = [*arm(profile), *mounts(profile), *simulator(profile), *driver(profile), *ros2(profile)]
+    found = [*arm(profile), *mounts(profile), *simulator(profile), *drivers(profile)]
     found += _workers(profile, name)
     here: set[str] = set()  # nodes and workers of this computer, as far as its host is known
     if host is not None:

@@ -247,31 +247,17 @@ def _not_simulated(profile: Profile, error: VlaZenohError) -> Iterator[ProfileFa
     )
 
 
-def driver(profile: Profile) -> Iterator[ProfileFault]:
-    """What the plug-in of the robot driver finds."""
-    try:
-        robot = plugins.load(plugins.ROBOTS, profile.robot.driver)
-    except PluginError as error:
-        yield ProfileFault(("robot", "driver"), str(error), profile.robot.node)
-        return
-    name, options = profile.robot.driver, profile.driver_options
-    for place, why, *_ in plugins.faults_of(name, robot.check, profile, options):
-        yield ProfileFault(place, why, profile.robot.node)
-
-
-def ros2(profile: Profile) -> Iterator[ProfileFault]:
-    """Messages of the node ros2."""
-    if profile.ros2 is None:
-        return
-    try:
-        from vla_zenoh.robots.ros2.driver import Ros2Driver
-
-        Ros2Driver(profile)
-    except ImportError as error:
-        why = str(MissingExtraError(str(error.name), "ros2"))
-        yield ProfileFault(("ros2",), why, "ros2")
-    except ProfileError as error:
-        yield ProfileFault(("ros2",), str(error), "ros2" if "cannot be read" in str(error) else "")
+def drivers(profile: Profile) -> Iterator[ProfileFault]:
+    """What the plug-ins of the robot driver and of the node ``ros2`` find."""
+    for name, node in profile.robot_nodes.items():
+        try:
+            robot = plugins.load(plugins.ROBOTS, name)
+        except PluginError as error:
+            place = ("robot", "driver") if name == profile.robot.driver else ("ros2",)
+            yield ProfileFault(place, str(error), node)
+            continue
+        for place, why, *_ in plugins.faults_of(name, robot.check, profile, profile.driver_options):
+            yield ProfileFault(place, why, node)
 
 
 def mounts(profile: Profile) -> Iterator[ProfileFault]:

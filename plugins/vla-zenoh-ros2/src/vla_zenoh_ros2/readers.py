@@ -13,9 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_zenoh.errors import CodecError
-from vla_zenoh.ros2.keys import BOOL, TEXT
 from vla_zenoh.ros2.messages import MAX_MESSAGE_BYTES, MAX_PICTURE_BYTES, SECOND_NS, Messages
-from vla_zenoh.ros2.pictures import (
+from vla_zenoh.types import MAX_NAMES, FloatArray
+from vla_zenoh.types.records import Joints
+from vla_zenoh_ros2.keys import BOOL, TEXT
+from vla_zenoh_ros2.pictures import (
     COMPRESSED_IMAGE,
     IMAGE,
     read_compressed_depth_m,
@@ -23,9 +25,7 @@ from vla_zenoh.ros2.pictures import (
     read_depth_m,
     read_rgb,
 )
-from vla_zenoh.ros2.writers import GRASP, GRIPPER_COMMAND, PARALLEL_COMMAND
-from vla_zenoh.types import MAX_NAMES, FloatArray
-from vla_zenoh.types.records import Joints
+from vla_zenoh_ros2.writers import GRASP, GRIPPER_COMMAND, PARALLEL_COMMAND
 
 JOINT_STATE, WRENCH = "sensor_msgs/msg/JointState", "geometry_msgs/msg/WrenchStamped"
 SUCCEEDED = 4

@@ -23,9 +23,8 @@ from vla_zenoh.client.client import Client
 from vla_zenoh.codec import settings
 from vla_zenoh.errors import CodecError, SessionError
 from vla_zenoh.profile import Profile
-from vla_zenoh.robots.ros2.middleware import Bridges
-from vla_zenoh.robots.ros2.ros_graph import Request, RosGraph
-from vla_zenoh.ros2.keys import (
+from vla_zenoh.ros2.messages import Messages
+from vla_zenoh_ros2.keys import (
     ACTIVE,
     ANSWER_TOPIC,
     LATCHED,
@@ -40,9 +39,10 @@ from vla_zenoh.ros2.keys import (
     TEXT,
     Operation,
 )
-from vla_zenoh.ros2.messages import Messages
-from vla_zenoh.ros2.readers import Wanted, read, read_request
-from vla_zenoh.ros2.writers import DIAGNOSTICS, Stamp, diagnostics, log
+from vla_zenoh_ros2.middleware import Bridges
+from vla_zenoh_ros2.readers import Wanted, read, read_request
+from vla_zenoh_ros2.ros_graph import Request, RosGraph
+from vla_zenoh_ros2.writers import DIAGNOSTICS, Stamp, diagnostics, log
 
 STATUS_PERIOD_S = 1.0
 POLL_S = 0.05

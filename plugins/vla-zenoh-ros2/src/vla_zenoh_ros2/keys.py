@@ -7,7 +7,6 @@ by which bridges tell each other what to route. ``rmw_zenoh``: those of robots t
 
 from __future__ import annotations
 
-import re
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,25 +14,14 @@ from enum import Enum
 from hashlib import blake2b
 from typing import NamedTuple
 
-from vla_zenoh.errors import CodecError, ProfileError
+from vla_zenoh.errors import CodecError
+from vla_zenoh.ros2.messages import split_type
 
-_TYPE = re.compile(r"([a-z][a-z0-9_]*)/(msg|srv|action)/([A-Za-z][A-Za-z0-9_]*)")
 CANCEL_GOAL = "action_msgs/srv/CancelGoal"
 _SLASH_OF_BRIDGES = "§"
 _SLASH_OF_RMW = "%"
 GID_BYTES = 16
 _ATTACHMENT = struct.Struct(f"<qqB{GID_BYTES}s")
-
-
-def split_type(kind: str) -> tuple[str, str, str]:
-    """``package/msg/Name`` in its three parts; a `ProfileError` if it is no such name."""
-    match = _TYPE.fullmatch(kind)
-    if match is None:
-        raise ProfileError(
-            f"{kind[:80]!r} is not a ROS type: write package/msg/Name, package/srv/Name or "
-            "package/action/Name"
-        )
-    return match[1], match[2], match[3]
 
 
 def dds_type(kind: str) -> str:

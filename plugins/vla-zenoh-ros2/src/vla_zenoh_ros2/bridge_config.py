@@ -12,7 +12,7 @@ from vla_zenoh.errors import ProfileError
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.robot import GRIPPER_ACTIONS, Ros2Gripper, Ros2Profile
 from vla_zenoh.profile.schema import TRUSTED_PROTOCOLS, endpoint_faults, host_of, is_loopback
-from vla_zenoh.ros2.keys import (
+from vla_zenoh_ros2.keys import (
     ANSWER_TOPIC,
     LOG,
     OPERATIONS,
@@ -22,9 +22,9 @@ from vla_zenoh.ros2.keys import (
     Endpoint,
     EntityRole,
 )
-from vla_zenoh.ros2.readers import JOINT_STATE, WRENCH
-from vla_zenoh.ros2.transforms import TF, TF_MESSAGE, TF_STATIC
-from vla_zenoh.ros2.writers import DIAGNOSTICS, GRASP
+from vla_zenoh_ros2.readers import JOINT_STATE, WRENCH
+from vla_zenoh_ros2.transforms import TF, TF_MESSAGE, TF_STATIC
+from vla_zenoh_ros2.writers import DIAGNOSTICS, GRASP
 
 PROGRAM = "zenoh-bridge-ros2dds"
 ALLOWED_AS = {

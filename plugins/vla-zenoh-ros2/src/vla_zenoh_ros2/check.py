@@ -6,17 +6,17 @@ from collections.abc import Iterator
 
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.errors import SecurityError, SessionError
-from vla_zenoh.lab.doctor.needs import HostFinding, nodes_on
+from vla_zenoh.lab.doctor.needs import HostFinding
 from vla_zenoh.profile import Profile
-from vla_zenoh.robots.ros2.middleware import Bridges, bridge_session
+from vla_zenoh_ros2.middleware import Bridges, bridge_session
 
 NAME = "ROS 2 bridge"
 
 
-def ros2_bridge(profile: Profile, host: str | None = None) -> Iterator[HostFinding]:
-    """Findings of the host that runs the node ``ros2`` with a bridge; none for others."""
+def ros2_bridge(profile: Profile) -> Iterator[HostFinding]:
+    """Findings of the host that runs the node ``ros2``, where a bridge is used."""
     ros2 = profile.ros2
-    if ros2 is None or ros2.bridge != "ros2dds" or "ros2" not in nodes_on(profile, host):
+    if ros2 is None or ros2.bridge != "ros2dds":
         return
     start = "vla-zenoh profile bridge-config: makes its settings, and prints how to start it"
     try:

@@ -15,7 +15,8 @@ from vla_zenoh.errors import CodecError
 from vla_zenoh.profile import Profile, SessionProfile
 from vla_zenoh.profile.robot import GRIPPER_ACTIONS, Ros2Gripper
 from vla_zenoh.profile.schema import TRUSTED_PROTOCOLS
-from vla_zenoh.ros2.bridge_view import (
+from vla_zenoh.types import Event
+from vla_zenoh_ros2.bridge_view import (
     MAX_REPLY_BYTES,
     SERVES,
     VIEW_KEYS,
@@ -27,7 +28,6 @@ from vla_zenoh.ros2.bridge_view import (
     route_key,
     vendors,
 )
-from vla_zenoh.types import Event
 
 ASK_S = 1.0
 """Timeout of a query."""

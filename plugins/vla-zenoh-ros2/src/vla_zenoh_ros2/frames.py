@@ -21,12 +21,15 @@ from vla_zenoh.kinematics.kinematics import Kinematics, make_kinematics
 from vla_zenoh.kinematics.so3 import quat_from_rotation, rotation_from_rpy
 from vla_zenoh.profile import Profile
 from vla_zenoh.profile.schema import CameraMount
-from vla_zenoh.robots.ros2.arm import Ros2Arm
-from vla_zenoh.robots.ros2.camera import Camera
-from vla_zenoh.robots.ros2.ros_graph import RosGraph
-from vla_zenoh.ros2.keys import LATCHED, SENSOR, Qos
 from vla_zenoh.ros2.messages import MAX_MESSAGE_BYTES, Messages
-from vla_zenoh.ros2.transforms import (
+from vla_zenoh.sanitize import one_line
+from vla_zenoh.types import Event, FloatArray
+from vla_zenoh.types.records import JointReference, PoseReference
+from vla_zenoh_ros2.arm import Ros2Arm
+from vla_zenoh_ros2.camera import Camera
+from vla_zenoh_ros2.keys import LATCHED, SENSOR, Qos
+from vla_zenoh_ros2.ros_graph import RosGraph
+from vla_zenoh_ros2.transforms import (
     TF,
     TF_MESSAGE,
     TF_STATIC,
@@ -38,9 +41,6 @@ from vla_zenoh.ros2.transforms import (
     read_transforms,
     tf_message,
 )
-from vla_zenoh.sanitize import one_line
-from vla_zenoh.types import Event, FloatArray
-from vla_zenoh.types.records import JointReference, PoseReference
 
 PERIOD_S, STATIC_PERIOD_S = 1 / 30, 1.0
 LISTEN_S = 3.0

@@ -20,7 +20,6 @@ SERVES = "Cyclone DDS"
 CONFIGS, PARTICIPANTS = "@/*/ros2/config", "@/*/ros2/dds/*"
 VIEW_KEYS = (CONFIGS, PARTICIPANTS)
 """Key expressions of the queries for a `BridgeView`."""
-ALL_VIEW_KEYS = "@/*/ros2/**"
 MAX_REPLY_BYTES = 256 * 1024
 Replies = Iterable[tuple[str, bytes]]
 """Key and JSON of every reply."""

@@ -15,11 +15,11 @@ from vla_zenoh.nodes.camera.geometry import Pixels, resize
 from vla_zenoh.nodes.camera.source import LOOK_S, STALL_S
 from vla_zenoh.profile.robot import Ros2Camera
 from vla_zenoh.robots.joint_reading import SimulatedClock, StampFilter, wall_stamp_ns
-from vla_zenoh.robots.ros2.ros_graph import RosGraph
-from vla_zenoh.ros2.keys import SENSOR
 from vla_zenoh.ros2.messages import MAX_PICTURE_BYTES, Messages
-from vla_zenoh.ros2.readers import RosDepth, RosImage, read, read_depth
 from vla_zenoh.types import Event
+from vla_zenoh_ros2.keys import SENSOR
+from vla_zenoh_ros2.readers import RosDepth, RosImage, read, read_depth
+from vla_zenoh_ros2.ros_graph import RosGraph
 
 CAMERA_WAIT_S, CAMERA_SAME_S = 0.1, 2.0
 """A sensor has noise; a driver that repeats an image for less than the second is tolerated."""

@@ -1,1 +1,0 @@
-"""Driver of ROS 2 robots."""
