@@ -19,6 +19,7 @@ import numpy as np
 import pinocchio as pin
 
 from vla_zenoh.errors import ProfileError, ResourceError, nearest
+from vla_zenoh.kinematics.description import Description
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import rotation_from_rpy
 from vla_zenoh.profile import KeepOut, PartBase
@@ -301,19 +302,20 @@ def collision_shapes(model: Any, urdf: Path) -> Any:
     Raises:
         ResourceError: they cannot be loaded, or there are none.
     """
+    # package://name/... is looked for beside the URDF and in every folder above it.
+    folders = urdf.resolve().parents
     try:
         geometry = pin.buildGeomFromUrdf(
             model,
             str(urdf),
             pin.GeometryType.COLLISION,
-            # package://name/... is looked for beside the URDF and in every folder above it.
-            package_dirs=[str(folder) for folder in urdf.resolve().parents],
+            package_dirs=[str(folder) for folder in folders],
         )
     except (ValueError, RuntimeError) as error:
         raise ResourceError(
             f"the collision shapes of {urdf.name} cannot be loaded: "
-            f"{' '.join(str(error).split())}. package://NAME/... is looked for as NAME/... "
-            "beside the URDF and in every folder above it"
+            f"{_bad_mesh(Description(urdf), folders)}. package://NAME/... is looked for as "
+            "NAME/... beside the URDF and in every folder above it"
         ) from error
     if geometry.ngeoms == 0:
         raise ResourceError(f"{urdf.name} has no collision shapes; give it some, or do without")
@@ -505,3 +507,21 @@ class PlacedArm:
             if distance_m < found.distance_m:
                 found = Nearest(distance_m, self._names[i], other._names[j])
         return found
+
+
+def _bad_mesh(description: Description, folders: Sequence[Path]) -> str:
+    """Which collision mesh cannot be loaded, and why."""
+    for link, name in description.meshes:
+        whose = f"link {link!r} has the mesh {name!r}, which"
+        scheme, colon, rest = name.partition("://")
+        if colon and scheme not in ("package", "file"):
+            return f"{whose} is no file: give its path, or package://NAME/..."
+        places = [Path(rest)] if scheme == "file" else [each / (rest or name) for each in folders]
+        found = next((place for place in places if place.exists()), None)
+        if found is None:
+            return f"{whose} is not there"
+        try:
+            coal.MeshLoader().load(str(found), np.ones(3))
+        except (ValueError, RuntimeError):
+            return f"{whose} is no mesh that can be read (STL, DAE, OBJ)"
+    return "one of its meshes cannot be read"

@@ -27,6 +27,11 @@ SHAPES: Mapping[str, Mapping[str, int]] = {
     "mesh": {},
 }
 """Collision shapes, with how many numbers above 0 each attribute has."""
+NUMBERS = frozenset({"xyz", "rpy", "size", "radius", "length", "scale", "damping", "friction"})
+"""Attributes of links and joints that hold numbers and nothing else; of inertia all are, of mass
+its value."""
+MOST_RPY_RAD, MOST_XYZ_M = 10.0, 1e6
+"""Larger angles are degrees, and larger numbers no place on this planet."""
 PLACE = ("robot", "description")
 COMPRESSED = (b"\x1f\x8b", b"PK\x03\x04", b"BZh", b"\xfd7zXZ")
 """How files of gzip, zip, bzip2 and xz begin."""
@@ -105,8 +110,10 @@ class Description:
         root = self._root()
         self.links = tuple(self._named(link, "link") for link in root.findall("link"))
         for link in root.findall("link"):
+            whose = f"link {link.attrib['name']!r}"
+            self._check_numbers(link, whose)
             for collision in link.findall("collision"):
-                self._check_shape(collision, f"link {link.attrib['name']!r}")
+                self._check_shape(collision, whose)
         found = [self._joint(joint) for joint in root.findall("joint")]
         self._check_names(found)
         self.joints: Mapping[str, DescribedJoint] = {joint.name: joint for joint in found}
@@ -181,6 +188,15 @@ class Description:
         return ElementTree.tostring(root, encoding="unicode")
 
     @property
+    def meshes(self) -> list[tuple[str, str]]:
+        """Link and file of each collision mesh."""
+        return [
+            (link.attrib["name"], mesh.attrib["filename"])
+            for link in self._root().findall("link")
+            for mesh in link.findall("collision/geometry/mesh")
+        ]
+
+    @property
     def shapeless(self) -> list[str]:
         """Links that can be seen, and have no collision shape."""
         return [
@@ -245,6 +261,7 @@ class Description:
                 raise self._error(f"has joint {name!r} without <{end} link=...>")
             ends.append(str(link.get("link")))
         whose, origin = f"joint {name!r}", element.find("origin")
+        self._check_numbers(element, whose)
         x, y, z = self._vector(origin, "xyz", whose)
         self._vector(origin, "rpy", whose)
         axis = (1.0, 0.0, 0.0)
@@ -281,6 +298,25 @@ class Description:
             if min(sizes) <= 0:
                 given = shape.get(attribute)
                 raise self._error(f"has {whose} with {attribute} {given!r}: give metres above 0")
+
+    def _check_numbers(self, part: ElementTree.Element, whose: str) -> None:
+        """Numbers of a link or joint that nothing here needs, and Pinocchio's reader does."""
+        for element in part.iter():
+            for attribute, text in element.attrib.items():
+                mass = element.tag == "mass" and attribute == "value"
+                if not (mass or element.tag == "inertia" or attribute in NUMBERS):
+                    continue
+                what = element.tag if mass else attribute
+                values = [self._number(each, what, whose) for each in text.split()]
+                largest = max(map(abs, values), default=0.0)
+                if attribute == "rpy" and largest > MOST_RPY_RAD:
+                    raise self._error(
+                        f"has {whose} with rpy {text[:40]!r}: a URDF is in rad, are these degrees?"
+                    )
+                if attribute == "xyz" and largest > MOST_XYZ_M:
+                    raise self._error(
+                        f"has {whose} with xyz {text[:40]!r}: a URDF is in metres, and that is far"
+                    )
 
     def _vector(
         self, element: ElementTree.Element | None, attribute: str, whose: str

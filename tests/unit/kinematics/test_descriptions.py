@@ -121,6 +121,7 @@ BALL = '<sphere radius="0.02"/>'
 NO_EFFORT = '<limit lower="-1" upper="1" velocity="2"/>'
 DEGREES = [row._replace(ends=(-170.0, 170.0), velocity=150.0) for row in arm(SIX)]
 MILLIMETRES = [row._replace(at_m=(0.0, 0.0, 200.0)) for row in arm(SIX)]
+INERTIA = '<mass value="1"/><inertia ixx="1" iyy="1,0" izz="1" ixy="0" ixz="0" iyz="0"/>'
 HOOK = Row("hook", parent="j6_link", child="j2_link", kind="fixed")
 REFUSED: dict[str, Refused] = {
     "an empty file": Refused("", ("is empty",)),
@@ -259,6 +260,37 @@ REFUSED: dict[str, Refused] = {
         WHOLE.replace(BALL, "<mesh/>", 1), ("link 'base' with a collision mesh without a filename",)
     ),
     "an empty shape": Refused(WHOLE.replace(BALL, "", 1), ("link 'base'", "that is nothing")),
+    "a mass that is none": Refused(
+        WHOLE.replace("<collision>", '<inertial><mass value="nan"/></inertial><collision>', 1),
+        ("link 'base' with mass 'nan': no number",),
+    ),
+    "an inertia that is none": Refused(
+        WHOLE.replace("<collision>", f"<inertial>{INERTIA}</inertial><collision>", 1),
+        ("link 'base' with iyy '1,0': no number",),
+    ),
+    "a place to look at that is none": Refused(
+        WHOLE.replace("<collision>", '<visual><origin xyz="0 0 x"/></visual><collision>', 1),
+        ("link 'base' with xyz 'x': no number",),
+    ),
+    "a turn in degrees": Refused(
+        WHOLE.replace('xyz="0.0 0.0 0.2"', 'xyz="0 0 0.2" rpy="0 90 0"', 1),
+        ("joint 'j1' with rpy '0 90 0'", "are these degrees?"),
+    ),
+    "a joint at the end of the world": Refused(
+        WHOLE.replace('xyz="0.0 0.0 0.2"', 'xyz="0 0 1e300"', 1), ("xyz '0 0 1e300'", "metres")
+    ),
+    "a mesh of the network": Refused(
+        WHOLE.replace(BALL, '<mesh filename="http://robots.org/a.stl"/>', 1),
+        ("link 'base' has the mesh 'http://robots.org/a.stl', which is no file",),
+    ),
+    "a mesh that is not there": Refused(
+        WHOLE.replace(BALL, '<mesh filename="package://made/a.stl"/>', 1),
+        ("link 'base' has the mesh 'package://made/a.stl', which is not there", "beside the URDF"),
+    ),
+    "a mesh that is none": Refused(
+        WHOLE.replace(BALL, '<mesh filename="package://my_arm.py"/>', 1),
+        ("link 'base' has the mesh 'package://my_arm.py', which is no mesh that can be read",),
+    ),
     "a finger that is shut nowhere": Refused(
         urdf([*arm(SIX), TOOL, finger("left", -0.03, 0.05)]),
         ("'left'", "joint_open_m"),
@@ -412,3 +444,11 @@ def test_descriptions_of_a_public_collection_are_read() -> None:
         except ProfileError as error:
             refused.append(str(error))
     assert refused == ["ur3.urdf has no links"]
+
+
+def test_joints_that_all_turn_about_one_axis_are_told(tmp_path: Path) -> None:
+    parallel = [row._replace(axis=(0.0, 0.0, 1.0)) for row in arm(SIX)]
+    for rows, told in ((parallel, True), (arm(SIX), False)):
+        errors, advice = checked(tmp_path, urdf([*rows, TOOL]))
+        assert errors == ""
+        assert ("of six directions only, whatever their positions" in advice) is told

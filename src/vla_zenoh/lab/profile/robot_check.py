@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from vla_zenoh import plugins, resources
 from vla_zenoh.errors import (
@@ -19,10 +19,15 @@ from vla_zenoh.errors import (
 from vla_zenoh.profile import POSE_JOINTS, Profile
 from vla_zenoh.profile.section import Place
 
+if TYPE_CHECKING:
+    from vla_zenoh.kinematics.kinematics import Kinematics
+
 TOOL_M = 0.06
 """A TCP further from all shapes has a tool without one; between open fingers it is nearer."""
 WIDTHS = 1.5
 """Factor between the widths of a description and a profile: one finger of two is twice as much."""
+POSTURES = 8
+"""At which the axes of an arm are looked at."""
 LONG_BRAKE_S = 2.5
 """`up` ends a robot's node 2.8 s after Ctrl-C, less the time until the node gets the signal.
 See `STOP_ORDER` in `vla_zenoh.runtime.supervisor`."""
@@ -160,6 +165,7 @@ def joints_advice(profile: Profile) -> Iterator[str]:
         )
     joints = len(profile.robot.arm_joints)
     if joints >= POSE_JOINTS:
+        yield from _axes_advice(kinematics)
         return
     axes = ", ".join(immovable_axes(kinematics.jacobian(home_rad))) or "none"
     yield (
@@ -168,6 +174,24 @@ def joints_advice(profile: Profile) -> Iterator[str]:
         "shortened to nothing, activation is rejected while its newest chunk asks for one, and "
         "models with absolute poses or joint positions are rejected altogether"
     )
+
+
+def _axes_advice(kinematics: Kinematics) -> Iterator[str]:
+    """Advice where enough joints cannot turn or move the TCP in every direction anywhere."""
+    import numpy as np
+
+    random = np.random.default_rng(1)
+    span_rad = kinematics.upper_rad - kinematics.lower_rad
+    shares = random.random((POSTURES, kinematics.size))
+    most = max(
+        np.linalg.matrix_rank(kinematics.jacobian(kinematics.lower_rad + share * span_rad), 1e-6)
+        for share in shares
+    )
+    if most < POSE_JOINTS:
+        yield (
+            f"robot.arm_joints: {kinematics.size} joints move the TCP in {most} of six directions "
+            "only, whatever their positions: are the axes of the description right?"
+        )
 
 
 def _fingers_advice(profile: Profile, described_m: float) -> Iterator[str]:
