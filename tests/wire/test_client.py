@@ -13,6 +13,7 @@ import zenoh
 from camera_rig import PATIENCE_S, await_match, free_endpoint, until
 from vla_zenoh_web.robot_link import RobotLink
 
+from vla_zenoh import keys
 from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.cli.drive import _reaches
@@ -74,6 +75,25 @@ def test_names_of_strangers_neither_fill_a_client_nor_hide_a_node(profile: Profi
         assert client.snapshot()["sim"][2] is False
         for token in tokens:
             token.undeclare()
+
+
+@pytest.mark.parametrize(("theirs", "who"), [(-1, "the sender"), (1, "this side")])
+def test_a_person_with_another_version_is_told_which_side_to_update(
+    profile: Profile, monkeypatch: pytest.MonkeyPatch, theirs: int, who: str
+) -> None:
+    with open_session(profile.session) as here, open_session(profile.session) as there:
+        client = Client(profile, here).subscribe()
+        token = there.liveliness().declare_token(profile.keys.alive("command"))
+        until("the node is there", lambda: "command" in client.alive)
+        with monkeypatch.context() as patch:
+            patch.setattr(keys, "SCHEMA", keys.SCHEMA + theirs)
+            header = records.encode_header(Header(1, 2, "command#1"))
+        status = records.encode(NodeStatus("command", "inactive", "h", 1, 2))
+        there.put(profile.keys.status("command"), status, attachment=header)
+        until("its status has come", lambda: client.other_version)
+        with pytest.raises(SessionError, match=f"status/command: schema .* on {who}"):
+            client.set_prompt("hold", 0.2)
+        token.undeclare()
 
 
 @pytest.mark.slow

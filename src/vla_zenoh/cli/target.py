@@ -141,6 +141,8 @@ class RobotTarget:
 
     def no_node(self, client: Client, *command: str, kind: str = "node") -> str:
         """Message that this robot has no such node, with `command` for the other robots."""
+        if client.other_version:
+            return f"no {kind} of {self.named(client)} can be read: {client.other_version}"
         others = [f"{name} (`{self.typed(*command, robot=name)}`)" for name in self.others(client)]
         there = f"Alive on this router: {', '.join(others)}"
         none = "No other robot is visible on this router; `vla-zenoh up` starts one"

@@ -252,6 +252,8 @@ class StopClient(NodeRegistry):
         self._subscriptions: list[Any] = []
         self._stop_s = 0.0
         self._standstill: list[Standstill] = []
+        self.other_version = ""
+        """Which side is to be updated, where nodes write another version of the wire."""
 
     def subscribe(self) -> Self:
         """Subscribe to statuses and liveliness; returns the client."""
@@ -269,13 +271,14 @@ class StopClient(NodeRegistry):
             key, zenoh.handlers.Callback(callback, indirect=False)
         )
 
-    @staticmethod
     def _decode(
-        kind: type[Value], sample: zenoh.Sample, limit: int = records.SMALL_BYTES
+        self, kind: type[Value], sample: zenoh.Sample, limit: int = records.SMALL_BYTES
     ) -> tuple[Header, Value] | None:
         try:
             return header_of(sample), records.decode(kind, bytes_of(sample.payload, limit))
-        except CodecError:
+        except CodecError as error:
+            if error.reason == "schema":
+                self.other_version = f"{self.keys.short(str(sample.key_expr))}: {error}"
             return None  # the nodes count and report it
 
     def _on_status(self, sample: zenoh.Sample) -> None:
@@ -687,7 +690,8 @@ class Client(StopClient):
                 f"{what}: no command node of robot {self.keys.robot!r} is running{starts}"
             )
         status = self.status("command")
-        state = f"its state is {status.state}" if status else "it has not reported its state yet"
+        unread = self.other_version or "it has not reported its state yet"
+        state = f"its state is {status.state}" if status else unread
         silent = StartingError if self._cold else SessionError
         raise silent(
             f"{what}: the command node of robot {self.keys.robot!r} is alive, but did not accept "
