@@ -616,3 +616,49 @@ def test_a_share_of_two_widths_is_refused_and_metres_are_not(
     ):
         export(out, episodes, [], read_parts(state))
     assert not out.exists()
+
+
+def read_back(path: Path) -> tuple[Any, list[str]]:
+    """What counts of a recording, and what is said of it."""
+    try:
+        run = load_run(path)
+    except RecordingError as error:
+        return None, [str(error)]
+    streams = (run.tasks, run.poses, run.grippers, run.chunks, run.commands)
+    counted = [[(one.header.stamp_wall_ns, one.key) for one in stream] for stream in streams]
+    try:
+        frames = [frame.action.tobytes() for each in episodes_of(run) for frame in each.frames]
+        profile = run.profile.robot.gripper.max_width_m
+    except RecordingError as error:
+        return None, [*run.problems, str(error)]
+    return (counted, frames, profile, dict(run.picture_counts)), run.problems
+
+
+@pytest.mark.parametrize("begin", range(20))
+def test_a_byte_that_flipped_anywhere_changes_nothing_or_is_named(
+    begin: int, run_file: Path, tmp_path: Path
+) -> None:
+    """Positions all over the file, most of them where its index and facts are."""
+    data, path = run_file.read_bytes(), tmp_path / "flipped.mcap"
+    whole, _ = read_back(run_file)
+    facts = [*range(1200), *range(len(data) - 6000, len(data))]
+    random = np.random.default_rng(begin)
+    for at in [*random.choice(facts, 6), *random.integers(0, len(data), 3)]:
+        flipped = bytearray(data)
+        flipped[at] ^= 1 << int(random.integers(8))
+        path.write_bytes(flipped)
+        found, problems = read_back(path)
+        assert found == whole or problems, at
+        for said in problems:
+            assert "codec" not in said
+            assert "buffer" not in said
+
+
+@pytest.mark.parametrize("tenth", range(1, 10))
+def test_a_recording_that_was_cut_off_anywhere_is_read_so_far_and_named(
+    tenth: int, run_file: Path, tmp_path: Path
+) -> None:
+    path, data = tmp_path / "cut.mcap", run_file.read_bytes()
+    path.write_bytes(data[: len(data) * tenth // 10])
+    _, problems = read_back(path)
+    assert any("it ends within a record); read up to there" in each for each in problems)

@@ -9,21 +9,24 @@ recording, its segments one after the other.
 from __future__ import annotations
 
 import json
+import os
 import struct
+import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from heapq import heappop, heappush
 from itertools import count
 from pathlib import Path
 from typing import IO, Any, TypeVar
 
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
+from mcap.exceptions import EndOfFile, McapError, RecordLengthLimitExceeded
 from mcap.reader import SeekingReader
 from mcap.records import (
     Attachment,
+    AttachmentIndex,
     Channel,
     Chunk,
     ChunkIndex,
@@ -53,12 +56,14 @@ SEGMENTS = "segment-*.mcap"
 _KINDS = {kind.__name__: kind for kind in RECORDS}
 _SCHEMAS = (ros2_messages.TEXT, ros2_messages.IMAGE, ros2_messages.JPEG_IMAGE)
 _BROKEN = (
+    OSError,  # an offset that is no place in a file
     *(McapError, CRCValidationError, ZstdError, struct.error),
     *(ValueError, EOFError, KeyError, OverflowError, UnicodeDecodeError, MemoryError),
     *(RuntimeError, IndexError),
 )
 """What MCAP, zstd and lz4 raise for bytes that are none of theirs."""
-OPCODE_AND_LENGTH = 1 + 8
+OPCODE_AND_LENGTH, MAGIC_SIZE = 1 + 8, 8
+FOOTER_SIZE = OPCODE_AND_LENGTH + 8 + 8 + 4
 
 Read = TypeVar("Read", bound=McapRecord)
 
@@ -210,15 +215,27 @@ def _facts(file: IO[bytes], damage: Callable[[str], None]) -> Iterator[Any]:
                 yield _at(file, index.offset, Metadata)
             for index in summary.attachment_indexes:
                 if index.name == PROFILE_FILE:
-                    yield _at(file, index.offset, Attachment)
+                    found = _at(file, index.offset, Attachment)
+                    yield found if _has_right_checksum(file, index) else replace(found, data=b"")
     file.seek(0)
     yield from _whole(file, damage)
+
+
+def _has_right_checksum(file: IO[bytes], index: AttachmentIndex) -> bool:
+    """Of an attachment; a writer may leave it out, as 0."""
+    file.seek(index.offset + OPCODE_AND_LENGTH)
+    data = file.read(index.length - OPCODE_AND_LENGTH)
+    wanted = int.from_bytes(data[-4:], "little")
+    return not wanted or zlib.crc32(data[:-4]) == wanted
 
 
 def _summary(file: IO[bytes]) -> Summary | None:
     """The index at the end of a file; None if there is none, or it is incomplete."""
     file.seek(0)
     try:
+        if not _is_summary_whole(file):
+            return None
+        file.seek(0)
         found = SeekingReader(file, record_size_limit=MAX_RECORD_BYTES).get_summary()
     except _BROKEN:
         return None
@@ -227,6 +244,19 @@ def _summary(file: IO[bytes]) -> Summary | None:
     in_chunks = found.chunk_indexes or not found.statistics.message_count
     whole = len(found.chunk_indexes) == found.statistics.chunk_count
     return found if in_chunks and whole else None
+
+
+def _is_summary_whole(file: IO[bytes]) -> bool:
+    """Whether the checksum of the index is right; a writer may leave it out, as 0."""
+    end = file.seek(-(FOOTER_SIZE + MAGIC_SIZE), os.SEEK_END)
+    footer = file.read(FOOTER_SIZE)
+    begin, _, wanted = struct.unpack("<QQI", footer[OPCODE_AND_LENGTH:])
+    if not wanted or not begin:
+        return True
+    if begin > end:
+        raise McapError("its index begins after its end")
+    file.seek(begin)
+    return zlib.crc32(file.read(end - begin) + footer[:-4]) == wanted
 
 
 def _at(file: IO[bytes], offset: int, kind: type[Read]) -> Read:
@@ -295,11 +325,24 @@ def _whole(file: IO[bytes], damage: Callable[[str], None]) -> Iterator[Any]:
             return
         except _BROKEN as error:
             damage(
-                f"cut off or damaged after {file.tell():,} bytes "
-                f"({type(error).__name__}{f': {error}' if str(error) else ''}); read up to there"
+                f"cut off or damaged after {file.tell():,} bytes ({_cause(error)}); read up to "
+                "there"
             )
             return
         yield record
+
+
+def _cause(error: Exception) -> str:
+    """What is wrong with bytes, not in the words of a library."""
+    if isinstance(error, UnicodeDecodeError):
+        return "a text that is no UTF-8"
+    if isinstance(error, CRCValidationError):
+        return "a checksum is wrong"
+    if isinstance(error, (struct.error, EOFError, EndOfFile)):
+        return "it ends within a record"
+    if isinstance(error, RecordLengthLimitExceeded):
+        return "a record is too long"
+    return "a record is none"
 
 
 def segments_of(path: Path) -> list[Path]:
