@@ -45,9 +45,9 @@ from vla_zenoh_policy_servers.state_vector import read_parts
 from vla_zenoh.errors import RecordingError
 from vla_zenoh.lab.recording.run import Run, load_run
 from vla_zenoh.policy import ActionSpec, standing_step
-from vla_zenoh.profile import load_profile
+from vla_zenoh.profile import load_profile, override
 from vla_zenoh.profile.load import to_yaml
-from vla_zenoh.types import JointState
+from vla_zenoh.types import JointState, NodeStatus
 
 FPS, USED = 10, 2
 """Steps of a chunk until the next one takes over."""
@@ -189,6 +189,24 @@ def test_info_names_and_types_what_the_spec_declares(dataset: Path) -> None:
         "qz",
         "qw",
     ]
+
+
+def test_where_a_camera_was_and_its_lens_are_written_of_each_episode(tmp_path: Path) -> None:
+    mount = {
+        "frame": "front_optical_frame",
+        "link": "panda_link0",
+        "position_m": [1.0, 0.0, 0.5],
+        "rpy_rad": [-1.9, 0.0, 1.6],
+    }
+    changed = override(load_profile("panda_sim"), {"cameras": {"front": {"mount": mount}}})
+    run = load_run(make_run(tmp_path / "run.mcap", profile_yaml=to_yaml(changed)))
+    lens = {"fx_px": 500.0, "fy_px": 500.0, "cx_px": 320.0, "cy_px": 240.0}
+    said = {"cameras": {"front": {"intrinsics": lens}}}
+    run.statuses["camera"] = NodeStatus("camera", "ok", "host", 1, 2, detail=said)
+    export(tmp_path / "out", episodes_of(run), ["front"], PARTS)
+    ours = json.loads((tmp_path / "out/meta/vla_zenoh.json").read_text())
+    for episode in ours["episodes"]:
+        assert episode["cameras"] == {"front": {"mount": mount, "intrinsics": lens}}
 
 
 def test_openvla_statistics_are_those_of_the_actions(dataset: Path) -> None:

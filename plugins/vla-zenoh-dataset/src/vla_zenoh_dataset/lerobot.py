@@ -21,6 +21,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from vla_zenoh.errors import RecordingError
+from vla_zenoh.lab.recording.run import Run
 from vla_zenoh.lab.video import CODEC, PIXEL_FORMAT
 from vla_zenoh_dataset.episodes import RecordedEpisode, fps_of
 from vla_zenoh_dataset.features import (
@@ -315,6 +316,7 @@ class _Dataset:
                     "success": episode.success,
                     "label": episode.label.value,
                     "led": [dict(zip(LED, span, strict=True)) for span in episode.led],
+                    "cameras": {name: _camera_of(episode.run, name) for name in self._cameras},
                 }
                 for episode in self._episodes
             ],
@@ -360,3 +362,16 @@ class _Dataset:
             dtype = {INTERVENTION: "bool", "timestamp": "float32"}.get(name, "int64")
             out[name] = {"dtype": dtype, "shape": [1], "names": None}
         return out
+
+
+def _camera_of(run: Run, name: str) -> dict[str, Any]:
+    """Mount of a camera by the recorded profile, and its lens by its node; None: unknown."""
+    camera = run.profile.cameras.get(name)
+    mount = None if camera is None else camera.mount
+    found = None
+    for status in run.statuses.values():
+        cameras = status.detail.get("cameras")
+        about = cameras.get(name) if isinstance(cameras, Mapping) else None
+        if isinstance(about, Mapping):
+            found = about.get("intrinsics", found)
+    return {"mount": None if mount is None else mount.model_dump(mode="json"), "intrinsics": found}
