@@ -1,15 +1,22 @@
-"""A simulated Panda with a ChArUco board on the table or in its hand, for tests of calibrations."""
+"""A simulated Panda with a ChArUco board on the table or in its hand, for tests of calibrations.
+
+``PYTHONPATH=tests python tests/calibrate_rig.py FILE.jpg`` makes the picture of the how-to page.
+"""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import cv2
 import mujoco
 import numpy as np
 from vla_zenoh_calibrate.board import Board
-from vla_zenoh_calibrate.hand_eye import Eye
+from vla_zenoh_calibrate.hand_eye import EYES, Eye, calibrate_hand_eye
+from vla_zenoh_calibrate.lens import calibrate_lens
+from vla_zenoh_calibrate.picture import arm_frames, with_frames
 from vla_zenoh_calibrate.sampling import Sampler
 from vla_zenoh_calibrate.tour import tour
 from vla_zenoh_calibrate.view import inverse, placed
@@ -171,3 +178,26 @@ class Rig:
             noise = random.normal(0, 2.0, image.shape)
             sampler.add_image(stamp_ns, (image + noise).clip(0, 255).astype(np.uint8), stamp_ns)
             sampler.settle()
+
+
+def main() -> None:
+    """Write the picture of docs/how-to/calibrate-a-camera.md: both arrangements side by side."""
+    sides = []
+    for eye in EYES:
+        with TemporaryDirectory() as folder, Rig(Path(folder), eye) as rig:
+            sampler = Sampler(BOARD, with_arm=True)
+            rig.fill(sampler, 30 if eye == "in-hand" else 45)
+            lens = calibrate_lens(BOARD, sampler.views, (WIDTH, HEIGHT))
+            place = calibrate_hand_eye(
+                BOARD, sampler.views, lens.intrinsics, eye, information=lens.information
+            )
+        best = max(sampler.taken, key=lambda one: (len(one.view.ids), np.ptp(one.view.pixels)))
+        assert best.view.arm is not None
+        frames = arm_frames(place, best.view.arm)
+        sides.append(with_frames(best.image, place.lens, frames))
+    drawn = cv2.cvtColor(np.hstack(sides), cv2.COLOR_RGB2BGR)
+    cv2.imwrite(sys.argv[1], cv2.resize(drawn, None, fx=0.8, fy=0.8, interpolation=cv2.INTER_AREA))
+
+
+if __name__ == "__main__":
+    main()

@@ -31,15 +31,14 @@ from vla_zenoh.profile import CameraProfile, Profile, read_profile
 from vla_zenoh_calibrate.arm import Arm
 from vla_zenoh_calibrate.board import DICTIONARIES, Board
 from vla_zenoh_calibrate.errors import CalibrationError
-from vla_zenoh_calibrate.hand_eye import EYES, Eye, HandEye, calibrate_hand_eye
+from vla_zenoh_calibrate.hand_eye import EYES, Eye, calibrate_hand_eye
 from vla_zenoh_calibrate.lens import board_pose, calibrate_lens
-from vla_zenoh_calibrate.picture import with_frames
+from vla_zenoh_calibrate.picture import arm_frames, with_frames
 from vla_zenoh_calibrate.profile_edit import backup, write_profile
 from vla_zenoh_calibrate.result import Calibration, mount_of, write_files
 from vla_zenoh_calibrate.sampling import Sampler, Taken
 from vla_zenoh_calibrate.streams import Live, read_recording, recordings_of
 from vla_zenoh_calibrate.tour import read_joints, tour
-from vla_zenoh_calibrate.view import inverse
 
 SAME_ASPECT = 0.01
 DWELL_S, MOVE_S = 1.5, 30.0
@@ -396,20 +395,11 @@ class _Session:
         frames = {"board": board_pose(self._board, view, found.lens)}
         place = found.place
         if place is not None and view.arm is not None:
-            frames |= _arm_frames(place, view.arm)
+            frames |= arm_frames(place, view.arm)
             held = frames["tcp" if place.eye == "in-hand" else "base"]
             if self._arm is not None and self._link not in (self._arm.tcp, self._arm.base):
                 frames[self._link] = held @ self._arm.link(self._link, place.eye)
         return with_frames(best.image, found.lens, frames)
-
-
-def _arm_frames(place: HandEye, arm: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
-    """Base and TCP in the camera, and the board where the arm's pose puts it."""
-    eye = inverse(place.camera)
-    if place.eye == "in-hand":
-        base = eye @ inverse(arm)
-        return {"base": base, "tcp": eye, "board": base @ place.board}
-    return {"base": eye, "tcp": eye @ arm, "board": eye @ arm @ place.board}
 
 
 def _require_whole_images(name: str, camera: CameraProfile) -> None:

@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 
 from vla_zenoh.nodes.camera.geometry import Intrinsics
 from vla_zenoh.types import FloatArray
+from vla_zenoh_calibrate.hand_eye import HandEye
 from vla_zenoh_calibrate.lens import distortion_of
+from vla_zenoh_calibrate.view import inverse
 
 AXES = ((230, 60, 50), (60, 190, 70), (60, 110, 240))
 """Red, green and blue of x, y and z, RGB."""
@@ -47,3 +49,12 @@ def with_frames(
                 drawn, name, at, cv2.FONT_HERSHEY_SIMPLEX, scale, colour, thick, cv2.LINE_AA
             )
     return drawn
+
+
+def arm_frames(place: HandEye, arm: FloatArray) -> dict[str, FloatArray]:
+    """Base and TCP in the camera, and the board where the arm's pose (4, 4) puts it."""
+    eye = inverse(place.camera)
+    if place.eye == "in-hand":
+        base = eye @ inverse(arm)
+        return {"base": base, "tcp": eye, "board": base @ place.board}
+    return {"base": eye, "tcp": eye @ arm, "board": eye @ arm @ place.board}
