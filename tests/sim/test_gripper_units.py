@@ -167,12 +167,15 @@ def test_every_preset_with_a_gripper_is_tried() -> None:
     assert set(PRESETS) == every
 
 
+@pytest.mark.parametrize(
+    "seconds", [2.0, pytest.param(60.0, marks=[pytest.mark.slow, pytest.mark.timeout(1800)])]
+)
 @pytest.mark.parametrize("name", PRESETS)
-def test_a_policy_of_every_preset_holds_a_brick(name: str) -> None:
+def test_a_policy_of_every_preset_holds_a_brick(name: str, seconds: float) -> None:
     presets, options, shut = PRESETS[name]
     mapping = read_field_mapping("x", presets, name.split()[1], options, profile=PANDA)
     world, policy = make_world(), Keeps(mapping, shut)
     was_m = hold(world, np.zeros(3), PANDA)
-    run(PANDA, world, policy, 2.0)
+    run(PANDA, world, policy, seconds)
     held(world, was_m)
     np.testing.assert_allclose(policy.told, shut, atol=1e-3)

@@ -672,6 +672,17 @@ def test_a_byte_that_flipped_anywhere_changes_nothing_or_is_named(
             assert "buffer" not in said
 
 
+@pytest.mark.parametrize("name", [b"panda", b"vla"])
+def test_a_damaged_name_of_the_robot_is_named(name: bytes, run_file: Path, tmp_path: Path) -> None:
+    data, path = run_file.read_bytes(), tmp_path / "flipped.mcap"
+    what = {b"panda": b"robot", b"vla": b"root"}[name]
+    field = b"".join(len(each).to_bytes(4, "little") + each for each in (what, name))
+    assert data.count(field) == 1
+    path.write_bytes(data.replace(field, field[:-1] + b"q"))
+    _, problems = read_back(path)
+    assert "holds nothing of that robot, but vla/panda/" in problems[0]
+
+
 @pytest.mark.parametrize("tenth", range(1, 10))
 def test_a_recording_that_was_cut_off_anywhere_is_read_so_far_and_named(
     tenth: int, run_file: Path, tmp_path: Path

@@ -14,12 +14,12 @@ from vla_zenoh import plugins
 from vla_zenoh.bus.host import own_boot_id
 from vla_zenoh.client.client import Client
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.keys import NODE_KINDS, ROLLING
+from vla_zenoh.keys import LOADING, NODE_KINDS, OPENING, ROLLING, STARTING
 from vla_zenoh.profile import Profile, load_profile
 from vla_zenoh.profile.robot import RobotProfile
 from vla_zenoh.profile.schema import NodeKind
 from vla_zenoh.program.main import COMMANDS, CommandGroup
-from vla_zenoh.runtime.launch import Host, node_commands
+from vla_zenoh.runtime.launch import Host, node_commands, still_starting
 from vla_zenoh.runtime.supervisor import STOP_ORDER
 from vla_zenoh.types import NodeStatus
 
@@ -165,3 +165,24 @@ def test_so_does_one_on_another_computer_where_the_numbers_of_processes_meet(
 def test_a_router_that_says_nothing_takes_part(child: tuple[subprocess.Popen[Any], int]) -> None:
     process, _ = child
     assert brakes(process, "robot")
+
+
+@pytest.mark.parametrize(
+    ("state", "detail", "said"),
+    [
+        ("streaming", {"cameras": {"front": {"why": OPENING}}}, ["camera 'front': " + OPENING]),
+        (
+            "streaming",
+            {"cameras": {"front": {"why": f"{OPENING}: no scene yet"}, "wrist": {"why": ""}}},
+            [f"camera 'front': {OPENING}: no scene yet"],
+        ),
+        ("streaming", {"cameras": {"front": {"why": "there is no file a.mp4"}}}, []),
+        (STARTING, {"complaint": LOADING}, [f"node: {LOADING}"]),
+        (STARTING, {}, ["node: it has not reported yet"]),
+        ("inactive", {}, []),
+    ],
+)
+def test_up_is_not_ready_while_a_camera_is_being_opened_or_a_model_loads(
+    state: str, detail: dict[str, Any], said: list[str]
+) -> None:
+    assert still_starting(NodeStatus("node", state, "here", 1, 1, detail=detail)) == said

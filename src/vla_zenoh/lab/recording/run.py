@@ -34,7 +34,7 @@ from vla_zenoh.types import (
     Task,
 )
 
-MAX_PROBLEMS = 20
+MAX_PROBLEMS, SHOWN_KEYS = 20, 3
 CLOCK_STEP_NS = 20_000_000
 """Stamps of one key that go back by less are of writers whose clocks differ a little."""
 _read_profile = lru_cache(maxsize=4)(partial(read_profile, where="the recorded profile"))
@@ -237,8 +237,14 @@ def load_run(path: Path) -> Run:
         ObjectPoses: run.objects,
         InferenceDebug: run.seen,
     }
-    newest_of = dict[str, tuple[Header, int]]()
-    for entry in file.entries(_of_interest(keys)):
+    newest_of, is_wanted, others = dict[str, tuple[Header, int]](), _of_interest(keys), set[str]()
+
+    def wanted(key: str) -> bool:
+        if not key.startswith(f"{keys.root}/{keys.robot}/"):
+            others.add(key)
+        return is_wanted(key)
+
+    for entry in file.entries(wanted):
         run.began_ns = run.began_ns or entry.received_ns
         run.ended_ns = max(run.ended_ns, entry.received_ns)
         if entry.header is not None:
@@ -275,6 +281,11 @@ def load_run(path: Path) -> Run:
             run.statuses[node] = record
     if file.damage:
         run.problems.append(f"{path.name} is {file.damage}")
+    if others and not run.began_ns:
+        run.problems.append(
+            f"it says that it is of {keys.root}/{keys.robot}, and holds nothing of that robot, but "
+            f"{', '.join(sorted(others)[:SHOWN_KEYS])}: is it damaged?"
+        )
     for each in lists.values():
         each.sort(key=lambda received: received.header.stamp_wall_ns)
     run.problems += run.clock_steps[:MAX_PROBLEMS]
