@@ -22,7 +22,7 @@ from vla_zenoh_calibrate.tour import tour
 from vla_zenoh_calibrate.view import inverse, placed
 
 from vla_zenoh.kinematics.kinematics import InverseKinematics, make_kinematics
-from vla_zenoh.kinematics.so3 import Pose, exp3
+from vla_zenoh.kinematics.so3 import Pose, exp3, log3
 from vla_zenoh.nodes.camera.geometry import Intrinsics
 from vla_zenoh.profile import load_profile
 from vla_zenoh.simulation.backend import EGL, Backend
@@ -181,16 +181,22 @@ class Rig:
 
 
 def main() -> None:
-    """Write the picture of docs/how-to/calibrate-a-camera.md: both arrangements side by side."""
+    """Write the picture of docs/how-to/calibrate-a-camera.md, and print the errors it tells."""
     sides = []
     for eye in EYES:
         with TemporaryDirectory() as folder, Rig(Path(folder), eye) as rig:
             sampler = Sampler(BOARD, with_arm=True)
             rig.fill(sampler, 30 if eye == "in-hand" else 45)
-            lens = calibrate_lens(BOARD, sampler.views, (WIDTH, HEIGHT))
-            place = calibrate_hand_eye(
-                BOARD, sampler.views, lens.intrinsics, eye, information=lens.information
-            )
+            truth, known = rig.truth, rig.lens
+        lens = calibrate_lens(BOARD, sampler.views, (WIDTH, HEIGHT))
+        place = calibrate_hand_eye(
+            BOARD, sampler.views, lens.intrinsics, eye, information=lens.information
+        )
+        exact = calibrate_hand_eye(BOARD, sampler.views, known, eye)
+        for name, found in (("lens calibrated", place), ("lens known", exact)):
+            apart = inverse(truth) @ found.camera
+            off_m, off_rad = np.linalg.norm(apart[:3, 3]), np.linalg.norm(log3(apart[:3, :3]))
+            print(f"{eye}, {name}: {off_m * 1e3:.2f} mm, {off_rad * 1e3:.2f} mrad")
         best = max(sampler.taken, key=lambda one: (len(one.view.ids), np.ptp(one.view.pixels)))
         assert best.view.arm is not None
         frames = arm_frames(place, best.view.arm)

@@ -5,11 +5,14 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 from calibrate_rig import BOARD
 from camera_rig import await_match, free_endpoint
+from chain import LONG_PATIENCE_S, running_chain
+from typer.testing import CliRunner
 from vla_zenoh_calibrate.arm import Arm
 from vla_zenoh_calibrate.errors import CalibrationError
 from vla_zenoh_calibrate.sampling import Sampler
@@ -19,10 +22,13 @@ from vla_zenoh.bus.node import Node
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.client.client import Client
 from vla_zenoh.codec import records
+from vla_zenoh.keys import PRIMITIVES, worker_node
 from vla_zenoh.profile import Profile, load_profile, override
+from vla_zenoh.program.main import app
 from vla_zenoh.types import Header, JointState
 
 WIDTH, HEIGHT = 640, 480
+HOSTS = "hosts: {here: {nodes: [router, sim, camera, command, worker, primitives]}}\n"
 STANDS_S = 1.6
 LENS = {"fx_px": 500.0, "fy_px": 501.0, "cx_px": 320.0, "cy_px": 240.0}
 
@@ -99,3 +105,22 @@ def test_a_camera_that_is_silent_is_named(
         live = Live(client, Sampler(BOARD, with_arm=False), "front", None, print)
         with pytest.raises(CalibrationError, match=r"camera/front/raw for 0\.3 s"):
             live.pump(2.0)
+
+
+@pytest.mark.long
+def test_a_tour_moves_the_arm_only_when_a_person_says_yes(tmp_path: Path) -> None:
+    with running_chain(tmp_path, more=HOSTS, patience_s=LONG_PATIENCE_S) as chain:
+        chain.until("it answers", lambda: worker_node(PRIMITIVES) in chain.client.alive, 40)
+        chain.settle()
+        began = chain.measured().position_m
+        words = ["camera", "calibrate", "front", "-p", str(chain.profile_file), "--eye", "in-hand"]
+        words += ["--tour", "--views", "6", "-o", str(tmp_path / "out")]
+        declined = CliRunner().invoke(app, words, input="n\n")
+        assert declined.exit_code == 1
+        assert "move it to 6 poses" in declined.output
+        assert np.linalg.norm(chain.measured().position_m - began) < 2e-3
+        agreed = CliRunner().invoke(app, words, input="y\n")
+        # There is no board in this scene, so that the tour ends without a view.
+        assert "no view was taken" in str(agreed.exception) + agreed.output
+        assert np.linalg.norm(chain.measured().position_m - began) > 0.01
+        assert not chain.moves()

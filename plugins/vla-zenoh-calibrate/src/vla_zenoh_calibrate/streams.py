@@ -121,7 +121,7 @@ class Live:
         client.watch(self._image_key, self._images)
         if arm is not None:
             client.watch(arm.key, self._states)
-        self._heard_s = time.monotonic()
+        self._silent_since_s = self._left_s = time.monotonic()
         self._last_why = ""
 
     @property
@@ -140,19 +140,22 @@ class Live:
         Raises:
             CalibrationError: nothing comes, or clocks differ.
         """
-        until_s = time.monotonic() + seconds
+        began_s = time.monotonic()
+        until_s = began_s + seconds
+        # What waited for a move of the arm, or for a person, has not listened.
+        self._silent_since_s += began_s - self._left_s
         out: list[Taken | Refused] = []
         while time.monotonic() < until_s:
             self._take_states()
             sample = self._images.pop()
             if sample is not None:
-                self._heard_s = time.monotonic()
+                self._silent_since_s = time.monotonic()
                 if images:
                     payload = bytes_of(sample.sample.payload, MAX_IMAGE_BYTES)
                     image = _decoded(payload, str(sample.sample.encoding))
                     stamp_ns = header_of(sample.sample).stamp_wall_ns
                     self._sampler.add_image(stamp_ns, image.rgb, sample.mono_ns)
-            elif time.monotonic() - self._heard_s > SILENT_S:
+            elif time.monotonic() - self._silent_since_s > SILENT_S:
                 raise CalibrationError(
                     f"no image on {self._image_key} for {SILENT_S:g} s; `vla-zenoh status` shows "
                     "the camera's node"
@@ -162,6 +165,7 @@ class Live:
             self._tell_why(found)
             out += found
             time.sleep(PAUSE_S)
+        self._left_s = time.monotonic()
         return out
 
     def _take_states(self) -> None:
