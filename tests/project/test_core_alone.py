@@ -46,12 +46,15 @@ def test_the_simulator_needs_no_plug_in(alone: dict[str, str]) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_a_robot_of_a_plug_in_is_named_with_what_is_installed(alone: dict[str, str]) -> None:
-    done = run(alone, "profile", "check", "fr3")
+@pytest.mark.parametrize(("profile", "driver"), [("fr3", "franka"), ("panda_ros2", "ros2")])
+def test_a_robot_of_a_plug_in_is_named_with_what_is_installed(
+    alone: dict[str, str], profile: str, driver: str
+) -> None:
+    done = run(alone, "profile", "check", profile)
     assert done.returncode == 1
-    assert "robot.driver: no robot driver 'franka' is installed" in done.stderr
+    assert f"robot.driver: no robot driver '{driver}' is installed" in done.stderr
     assert "Installed: arm, sim." in done.stderr
-    assert run(alone, "profile", "show", "fr3").returncode == 0
+    assert run(alone, "profile", "show", profile).returncode == 0
 
 
 def test_the_doctor_needs_no_extra_and_lists_the_plug_ins(alone: dict[str, str]) -> None:
