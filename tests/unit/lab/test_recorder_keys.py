@@ -8,7 +8,7 @@ import pytest
 
 from vla_zenoh.bus.session import covers
 from vla_zenoh.keys import Keys
-from vla_zenoh.lab.recording.record_types import RecordTypes
+from vla_zenoh.lab.recording.record_types import record_of
 from vla_zenoh.lab.recording.recorder import recorded_keys
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import JointCommand, PoseState
@@ -44,15 +44,14 @@ def test_without_keys_everything_is_recorded_once_and_raw_pictures_by_their_swit
 def test_states_and_commands_of_every_part_are_recorded_once_as_their_records(raw: bool) -> None:
     pair = load_profile("two_pandas_sim")
     expressions = recorded_keys(pair.keys_of_all_parts, raw=raw)
-    types = RecordTypes(pair.keys)
     for part, kind in product(pair.part_names, (PoseState, JointCommand)):
         keys = pair.keys.of_part(part)
         key = keys.state_pose if kind is PoseState else keys.command_joint
         assert heard(expressions, key) == 1
-        assert types.of(key) is kind
+        assert record_of(pair.keys.short(key)) is kind
     assert heard(expressions, pair.keys.camera_jpeg("top")) == 1
     assert heard(expressions, pair.keys.camera_raw("top")) == int(raw)
-    assert types.of(pair.keys.camera_jpeg("state")) is None
+    assert record_of(pair.keys.short(pair.keys.camera_jpeg("state"))) is None
 
 
 def test_keys_are_in_place_of_everything_and_raw_pictures_come_to_them() -> None:

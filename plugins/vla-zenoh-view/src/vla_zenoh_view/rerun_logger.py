@@ -14,7 +14,7 @@ from vla_zenoh.errors import CodecError, RecordError, SpecError
 from vla_zenoh.keys import Keys, last_chunk
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import Pose, pose_of, rotation_from_quat
-from vla_zenoh.lab.recording.record_types import RecordTypes, group_of, part_of
+from vla_zenoh.lab.recording.record_types import group_of, part_of, record_of
 from vla_zenoh.lab.recording.sample import DEPTH, JPEG, Sample
 from vla_zenoh.policy import ModelSpec
 from vla_zenoh.profile import Profile, to_yaml
@@ -83,7 +83,6 @@ class RerunLogger:
     ) -> None:
         self._stream, self._live = stream, live
         self.keys = keys or profile.keys
-        self._types = RecordTypes(self.keys)
         self._command_status = self.keys.status(COMMAND_NODE)
         stream.set_log_time_enabled(False)
         stream.set_log_tick_enabled(False)
@@ -126,7 +125,7 @@ class RerunLogger:
     # -- in -----------------------------------------------------------------------------------
     def log(self, sample: Sample) -> None:
         """Log what a sample shows; whatever it holds, nothing is raised."""
-        group, kind = group_of(self.keys, sample.key), self._types.of(sample.key)
+        group, kind = group_of(self.keys, sample.key), record_of(self.keys.short(sample.key))
         if not group or kind is SceneState:
             return
         stamp_ns = self._stamp_ns(sample)

@@ -74,17 +74,6 @@ def group_of(keys: Keys, key: str) -> str:
     return own.split("/")[0] if keys.short(key) != key else ""
 
 
-class RecordTypes:
-    """Record types of the keys of one robot."""
-
-    def __init__(self, keys: Keys) -> None:
-        self._keys = keys
-
-    def of(self, key: str) -> type | None:
-        """The record type of a whole key, as `record_of`."""
-        return record_of(self._keys.short(key))
-
-
 PAYLOAD, ATTACHMENT = "_payload", "_attachment"
 
 
