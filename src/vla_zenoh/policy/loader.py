@@ -150,7 +150,7 @@ def _read_header(path: Path) -> Mapping[str, Any]:
     try:
         blocks = _HEADER.findall(path.read_text("utf-8-sig"))
     except (OSError, UnicodeDecodeError) as error:
-        raise WorkerError(f"{path} cannot be read: {error}") from error
+        raise WorkerError(f"{path} cannot be read: {in_words(error)}") from error
     if not blocks:
         return {}
     if len(blocks) > 1:
@@ -259,7 +259,7 @@ def find_robot_maker(path: Path) -> Maker:
         WorkerError: there is no such file, or as `find_maker`.
     """
     if not path.is_file():
-        raise WorkerError(f"{path} is not a file; arm.file of the profile names it")
+        raise WorkerError(f"{path} is not a file: give a Python file with a class of a robot")
     return find_maker(ModelFile(path.stem, path), "ROBOT", "move")
 
 

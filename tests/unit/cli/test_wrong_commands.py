@@ -207,3 +207,28 @@ def test_a_demo_is_refused_a_prompt_that_it_cannot_judge_and_lists_those_it_can(
     assert "push the red brick" in done.said
     assert done.stdout == ""
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "dataset stats .",
+        "nights nosuch.yaml -o t",
+        "web --people nosuch.yaml",
+        "eval nosuch.mcap",
+        "compare nosuch other",
+        "teleop --leader nosuch.py",
+        "figure success nosuch -o a.pdf",
+        "trial --prompt x --workers a --setups nosuch.txt -o t",
+        "profile new nosuch.urdf",
+        "replay nosuch.mcap",
+    ],
+)
+def test_a_file_that_is_not_there_is_named_without_numbers_of_the_system(
+    capsys: pytest.CaptureFixture[str], line: str
+) -> None:
+    done = typed(capsys, *line.split())
+    assert done.code in (USAGE, FAILED)
+    assert "Errno" not in done.said
+    assert "arm.file" not in done.said
+    assert any(word in done.said for word in ("nosuch", "meta/info.json"))

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from vla_zenoh.errors import OutputError, RecordError
+from vla_zenoh.errors import OutputError, RecordError, in_words
 from vla_zenoh.lab.durable import append_lines, whole_lines
 from vla_zenoh_benchmarks.episode import EpisodeOutcome, EpisodeRequest
 
@@ -79,7 +79,7 @@ def read_json(file: Path) -> Any:
     try:
         return json.loads(file.read_bytes())
     except (OSError, ValueError) as error:
-        raise RecordError(f"{file} cannot be read: {error}") from error
+        raise RecordError(f"{file} cannot be read: {in_words(error)}") from error
 
 
 def _require_same(folder: Path, old: Mapping[str, Any], new: Mapping[str, Any]) -> None:

@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from vla_zenoh.errors import RecordingError
+from vla_zenoh.errors import RecordingError, in_words
 from vla_zenoh_dataset.features import ACTION, STATE, of_numbers
 from vla_zenoh_dataset.lerobot import INFO
 
@@ -54,7 +54,9 @@ def read_numbers(folder: Path) -> tuple[dict[str, Any], dict[str, NDArray[np.flo
         table = pa.concat_tables(tables)
         columns = {name: np.array(table[name].to_pylist(), np.float32) for name in names}
     except (OSError, ValueError, TypeError, KeyError, pa.ArrowException) as error:
-        raise RecordingError(f"{folder} is no LeRobot dataset that can be read: {error}") from error
+        raise RecordingError(
+            f"{folder} is no LeRobot dataset that can be read: {in_words(error)}"
+        ) from error
     if ACTION not in columns or not len(columns[ACTION]):
         raise RecordingError(f"{folder} holds no actions")
     return info, columns

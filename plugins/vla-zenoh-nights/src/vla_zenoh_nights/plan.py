@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from vla_zenoh_trial.plan import TrialPlan
 from vla_zenoh_trial.verdict import EpisodeVerdict
 
-from vla_zenoh.errors import ProfileError, RecordError
+from vla_zenoh.errors import ProfileError, RecordError, in_words
 from vla_zenoh.lab.tasks.order import Order
 from vla_zenoh.profile.load import read_yaml
 
@@ -185,7 +185,7 @@ def read_plan(path: Path) -> UnattendedPlan:
     try:
         data, _ = read_yaml(path.read_bytes(), str(path))
     except (OSError, ProfileError) as error:
-        raise RecordError(f"{path}: {error}") from error
+        raise RecordError(in_words(error)) from error
     return checked_plan(data, str(path))
 
 

@@ -14,7 +14,7 @@ from vla_zenoh.cli.options import MAX_INDEX, MAX_SECONDS, JsonOption, options
 from vla_zenoh.cli.output import console, errors, fail, new_table
 from vla_zenoh.cli.plain import warn
 from vla_zenoh.cli.target import RobotTarget
-from vla_zenoh.errors import RecordingError
+from vla_zenoh.errors import RecordingError, in_words
 from vla_zenoh.lab.cli.output import print_json
 from vla_zenoh.lab.cli.output_path import check_folder
 from vla_zenoh_trial.folder import TrialFolder
@@ -120,7 +120,7 @@ def _setups(episodes: int | None, file: Path | None) -> tuple[str, ...] | None:
     try:
         lines = [line.strip() for line in file.read_text("utf-8").splitlines()]
     except (OSError, UnicodeError) as error:
-        fail(f"{file} cannot be read: {error}")
+        fail(f"--setups cannot be read: {in_words(error)}")
     return tuple(line for line in lines if line)
 
 

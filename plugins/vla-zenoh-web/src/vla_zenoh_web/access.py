@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from vla_zenoh.errors import ProfileError, SecurityError
+from vla_zenoh.errors import ProfileError, SecurityError, in_words
 from vla_zenoh.keys import key_chunk
 from vla_zenoh.profile.load import read_yaml
 from vla_zenoh.security.store import open_to_others
@@ -73,7 +73,7 @@ def read_people(path: Path) -> list[Person]:
             raise SecurityError(fault)
         data, _ = read_yaml(path.read_bytes(), str(path))
     except (OSError, ProfileError) as error:
-        raise SecurityError(f"--people {path}: {error}") from error
+        raise SecurityError(f"--people: {in_words(error)}") from error
     people: list[Person] = []
     for name, entry in data.items():
         fields = entry if isinstance(entry, dict) else {}
