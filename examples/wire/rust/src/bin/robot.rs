@@ -30,7 +30,7 @@ const JOINTS: [&str; 7] = [
     "panda_joint7",
 ];
 const HOME_RAD: [f64; 7] =
-    [0.0, -0.0439564754, 0.0, -2.6269994397, 0.0, 2.5830429643, 0.7853981634];
+    [0.0, -0.0439564754, 0.0, -2.6269994397, 0.0, 2.5830429643, std::f64::consts::FRAC_PI_4];
 const MAX_WIDTH_M: f64 = 0.08;
 const PERIOD: Duration = Duration::from_millis(1);
 const BRAKE_RAD_S2: f64 = 4.0;

@@ -130,7 +130,7 @@ fn main() -> Result<(), AnyError> {
     let spec_hash = hash(&spec);
     let (mut told, mut model, mut episode): (Option<Instant>, _, _) = (None, None, None);
     loop {
-        if told.map_or(true, |at| at.elapsed() >= SPEC_PERIOD) {
+        if told.is_none_or(|at| at.elapsed() >= SPEC_PERIOD) {
             told = Some(Instant::now());
             node.publish(&key, &spec, NEWS, now_ns())?;
         }
