@@ -26,7 +26,7 @@ from wire_rig import (
     running,
 )
 
-from benchmarks.motion.protocol import PREPARATION_HZ, PROTOCOL, STEPS
+from benchmarks.motion.protocol import PREPARATION_HZ, PROTOCOL, STEPS, MotionCase
 from benchmarks.motion.runner import MotionRunner
 from benchmarks.motion.segments import make_segment
 from vla_zenoh.codec import records
@@ -111,27 +111,23 @@ def test_the_rust_robot_killed_in_motion_is_back_and_is_driven_on(chain: Chain) 
         moves_exactly_stops_and_is_reset(chain)
 
 
-@pytest.mark.timeout(600)
-def test_the_rust_robot_does_the_motions_of_the_bench_exactly(chain: Chain) -> None:
+@pytest.mark.parametrize("case", PROTOCOL, ids=lambda case: case.name)
+def test_the_rust_robot_does_a_motion_of_the_bench_exactly(chain: Chain, case: MotionCase) -> None:
     run = MotionRunner(chain.client, Flag())
-    wrong = []
-    for case in PROTOCOL:
-        # Each begins at home, where a robot that is started again stands.
-        with running(robot_of(chain.profile)):
-            time.sleep(LONG_PATIENCE_S["state"])  # until then the one before is the writer
-            run.begin(PREPARATION_HZ)
-            if case.preparation:
-                prepared = run.run_segment(make_segment(case.preparation, 1), PREPARATION_HZ)
-                assert not prepared.faults(), chain.story()
-            found = run.run_segment(case.segment, PREPARATION_HZ)
-            chain.client.deactivate()
-        off_m = max(abs(found.reached_m - found.asked_m), found.drift_mm / 1e3)
-        off_rad = max(abs(found.reached_rad - found.asked_rad), found.drift_rad)
-        print(f"{case.name}: {1e3 * off_m:.4f} mm, {1e3 * off_rad:.4f} mrad")
-        wrong += found.faults()
-        if off_m > EXACT_M or off_rad > EXACT_RAD or found.steps_done != STEPS:
-            wrong.append(f"{case.name}: {off_m} m, {off_rad} rad, {found.steps_done} steps")
-    assert not wrong, chain.story()
+    with running(robot_of(chain.profile)):
+        run.begin(PREPARATION_HZ)
+        if case.preparation:
+            prepared = run.run_segment(make_segment(case.preparation, 1), PREPARATION_HZ)
+            assert not prepared.faults(), chain.story()
+        found = run.run_segment(case.segment, PREPARATION_HZ)
+        chain.client.deactivate()
+    off_m = max(abs(found.reached_m - found.asked_m), found.drift_mm / 1e3)
+    off_rad = max(abs(found.reached_rad - found.asked_rad), found.drift_rad)
+    print(f"{case.name}: {1e3 * off_m:.4f} mm, {1e3 * off_rad:.4f} mrad")
+    assert not found.faults(), chain.story()
+    assert off_m < EXACT_M
+    assert off_rad < EXACT_RAD
+    assert found.steps_done == STEPS
 
 
 def test_conform_finds_nothing_wrong_with_the_rust_robot(tmp_path: Path) -> None:
