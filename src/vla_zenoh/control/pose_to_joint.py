@@ -39,8 +39,9 @@ from vla_zenoh.kinematics.so3 import Pose, exp3, log3, pose_distance
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import Cause, FloatArray, JointCommand
 
-REST_RAD_S = 1e-5
-"""Slower joints stand: an elbow approaches its posture for ever."""
+REST_RAD_S = 1e-3
+"""Slower joints stand: an elbow approaches its posture for ever, and is within `REST_RAD_S` /
+`POSTURE_1_S` of it then. No controller feels a step of this size in its reference's velocity."""
 PULL_1_S = 25.0
 """Rate at which the pull to the posture rises and falls, as a critically damped spring."""
 LONGEST_RAD = POSTURE_RAD_S / POSTURE_1_S

@@ -279,6 +279,24 @@ def test_an_elbow_on_its_way_to_its_posture_does_not_put_off_the_watchdog(postur
     assert "within the watchdog" in arm.commander.why
 
 
+def test_an_arm_whose_elbow_creeps_to_its_posture_is_at_rest_within_seconds() -> None:
+    robot = {"command": "joint", "posture": "home"}
+    arm = Arm(override(load_profile("panda_sim"), {"robot": robot}))
+    arm.at_rad = arm.at_rad + np.array([0.3, 0.0, -0.3, 0.0, 0.3, 0.0, 0.0])
+    arm.stand_at(arm.reach.kinematics, arm.at_rad)
+    arm.activate()
+    begun_ns = arm.now_ns
+    arm.run(0.5)
+    assert not arm.commander.at_rest
+    while not arm.commander.at_rest:
+        arm.send([[0.0] * 7])
+        arm.run(0.2)
+    assert (arm.now_ns - begun_ns) / 1e9 < 9.0
+    stood_rad = arm.at_rad
+    arm.run(3.0)
+    assert np.abs(arm.at_rad - stood_rad).max() < 2e-3
+
+
 # -- profiles -----------------------------------------------------------------------------------
 LEAST_LIMITS: dict[str, dict[str, float]] = {
     "translation": {"velocity_m_s": 1e-3, "acceleration_m_s2": 1e-2, "jerk_m_s3": 0.1},
