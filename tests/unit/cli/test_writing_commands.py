@@ -32,6 +32,9 @@ READ = {
     "bench sim replay",
     "trial setups",
     "nights plan_file",
+    "camera calibrate recording",
+    "camera calibrate lens",
+    "camera calibrate tour_file",
     "teleop leader",
     "web people",
     "web certificate",
@@ -42,6 +45,8 @@ READ = {
 """Files and folders that commands read."""
 LOGS = {"up log_dir", "node rolling folder"}
 """Folders of files that are appended to, and turned over."""
+EDITED = {"camera calibrate write"}
+"""A profile in which keys are set; a backup is kept: `tests/unit/lab/test_calibrate_command.py`."""
 CERTIFICATES = {"secure init folder", "secure here folder", "secure show folder"}
 """Folders whose files only ``secure add --renew`` replaces; see `tests/unit/security`."""
 NAMED = ("file", "folder", "out", "save", "into", "directory")
@@ -80,6 +85,8 @@ WRITERS = {
     "bench task": Writer("bench task --model hold", "out"),
     "bench sim": Writer("bench sim metaworld --worker scripted", "out"),
     "camera list": Writer("camera list", "out"),
+    "camera board": Writer("camera board", "out.pdf"),
+    "camera calibrate": Writer("camera calibrate front --recording RUN", "out"),
     "trial": Writer("trial --workers a --prompt go", "out"),
     "nights": Writer("nights plan.yaml", "out"),
     "inspect": Writer("inspect", "out"),
@@ -166,7 +173,7 @@ def test_every_path_of_a_command_is_read_or_is_its_output() -> None:
         for each in command.params:
             path = "Path" in str(each.type_descriptor.annotation) or each.name in NAMED
             if path and "--output" not in each.opts:
-                assert f"{name} {each.name}" in READ | CERTIFICATES | LOGS, (
+                assert f"{name} {each.name}" in READ | EDITED | CERTIFICATES | LOGS, (
                     "outputs are called --output"
                 )
 

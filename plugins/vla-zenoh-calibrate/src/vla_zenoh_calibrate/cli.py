@@ -7,7 +7,7 @@ import select
 import sys
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -53,9 +53,14 @@ class BoardOptions:
         str, typer.Option("--squares", help="Squares of the board, COLUMNSxROWS.")
     ] = "9x6"
     square_m: Annotated[
-        float, typer.Option("--square-m", help="Side of a square, measured after printing, m.")
+        float,
+        typer.Option(
+            "--square-m", help="Side of a square, measured after printing, m.", min=0.001, max=1
+        ),
     ] = 0.03
-    marker_m: Annotated[float, typer.Option("--marker-m", help="Side of a marker, m.")] = 0.022
+    marker_m: Annotated[
+        float, typer.Option("--marker-m", help="Side of a marker, m.", min=0.001, max=1)
+    ] = 0.022
     dictionary: Annotated[
         str, typer.Option("--dictionary", help=f"Of the markers: {', '.join(DICTIONARIES)}.")
     ] = "5X5_100"
@@ -76,6 +81,7 @@ def board(
     ] = Path("board.pdf"),
     dpi: Annotated[int, typer.Option("--dpi", help="Of a .png.", min=72, max=1200)] = 300,
     force: ForceOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Write a ChArUco board to print at true size.
 
@@ -87,6 +93,10 @@ def board(
         raise typer.BadParameter(f"--output {output}: wants .pdf or .png")
     with output_file(output, force=force) as file:
         file.write_bytes(made.pdf() if output.suffix == ".pdf" else made.png(dpi))
+    if as_json:
+        size = dict(zip(("width_m", "height_m"), made.size_m, strict=True))
+        print_json({"file": str(output), **asdict(made), **size})
+        return
     width, height = (side * 1e3 for side in made.size_m)
     say(f"{output}: {made.written}; {width:g} x {height:g} mm without margin")
     say(
