@@ -325,7 +325,9 @@ class Brick:
         if self._asked is None:
             return here
         stamp_ns, goals = self._asked
-        steps = (observation.stamp_wall_ns - stamp_ns) / (DT_S * 1e9)
+        # At a speed override steps take longer, see "Speed override" in docs/design.md.
+        passed_s = observation.task.speed * (observation.stamp_wall_ns - stamp_ns) / 1e9
+        steps = passed_s / DT_S
         done = min(max(steps, 1.0), float(HORIZON))
         row = min(int(done), HORIZON - 1)
         share = done - row if done < HORIZON else 1.0

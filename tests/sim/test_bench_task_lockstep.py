@@ -127,3 +127,12 @@ def test_a_worker_that_refuses_the_prompt_is_not_obeyed_and_its_reason_is_told()
 @pytest.mark.parametrize("model", BASELINES)
 def test_baselines_reach_nothing(model: str) -> None:
     assert not any(end.success for end in outcomes(TaskPlan(model, 12, SEED)))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("speed_percent", [30, 60])
+def test_the_shipped_policy_pushes_a_brick_at_a_lower_speed_override(speed_percent: float) -> None:
+    profile = override(load_profile("panda_bricks"), {"task": {"speed_percent": speed_percent}})
+    plan = TaskPlan("brick", 1, SEED, family="push", limit_s=20.0)
+    ((done, _),) = run_in_lockstep(profile, plan, {}, "front", threading.Event(), 1)
+    assert done.success, done.failure
