@@ -92,10 +92,6 @@ class SingleWriterFilter:
             return "foreign"
         return "replayed" if header.seq <= self._last_seq.get(header.source, -1) else None
 
-    def is_next(self, header: Header) -> bool:
-        """Whether a sample is of the writer, and newer than all that were accepted."""
-        return header.source == self.writer and header.seq > self._last_seq.get(header.source, -1)
-
     def check(self, header: Header, now_ns: int = 0, writer: str = "") -> None:
         """Raise a `CodecError` for a sample that is to be rejected, see `objection`."""
         reason = self.objection(header, now_ns, writer)

@@ -23,18 +23,15 @@ def stream() -> SingleWriterFilter:
 
 
 def test_the_next_sample_of_the_writer_is_new_and_no_other(stream: SingleWriterFilter) -> None:
-    assert stream.is_next(header(10))
-    assert not stream.is_next(header(9))
-    assert not stream.is_next(header(3))
-    assert not stream.is_next(header(10, "stranger#1"))
+    now_ns = 100 * MS
+    assert stream.objection(header(10), now_ns) is None
+    assert stream.objection(header(9), now_ns) == "replayed"
+    assert stream.objection(header(3), now_ns) == "replayed"
+    assert stream.objection(header(10, "stranger#1"), now_ns) == "foreign"
 
 
-def test_after_a_silence_a_repetition_is_still_not_new(stream: SingleWriterFilter) -> None:
+def test_a_silent_writer_is_forgotten(stream: SingleWriterFilter) -> None:
     later_ns = round(10 * SILENCE_S * 1e9)
-    assert stream.objection(header(3), later_ns) is None, "a silent writer is forgotten"
-    assert not stream.is_next(header(3))
-    assert stream.is_next(header(11))
-
-
-def test_before_anything_was_accepted_nothing_is_new() -> None:
-    assert not SingleWriterFilter(SILENCE_S).is_next(header(0))
+    assert stream.objection(header(3), later_ns) is None
+    assert stream.objection(header(11), later_ns) is None
+    assert stream.objection(header(0, "stranger#1"), later_ns) is None
