@@ -357,7 +357,7 @@ def _corners(shape: Any) -> FloatArray:
     turn = np.arange(sides) * 2 * np.pi / sides
     around = np.stack([np.cos(turn), np.sin(turn)], axis=1) / np.cos(np.pi / sides)
     if isinstance(geometry, coal.BVHModelBase):
-        points = np.array(geometry.vertices()) * shape.meshScale
+        points = np.array(geometry.vertices())
     elif isinstance(geometry, coal.Box):
         points = np.array(list(itertools.product((-1.0, 1.0), repeat=3))) * geometry.halfSide
     elif isinstance(geometry, coal.Cylinder):

@@ -145,7 +145,7 @@ def _set_shape(spec: mujoco.MjSpec, geom: Any, shape: Any, name: str) -> None:
         geom.type = mujoco.mjtGeom.mjGEOM_CYLINDER
         geom.size = [solid.radius, solid.halfLength, 0.0]
     elif isinstance(solid, coal.BVHModelBase):
-        vertices = np.array(solid.vertices()) * shape.meshScale
+        vertices = np.array(solid.vertices())
         spec.add_mesh(name=name, uservert=vertices.ravel())
         geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, name
     else:

@@ -1,7 +1,9 @@
-"""Which pairs of an arm are checked: all that can touch, however rarely the samples see it."""
+"""Which pairs of an arm are checked: all that can touch, however rarely the samples see it; and how
+large what is checked is."""
 
 from __future__ import annotations
 
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +12,7 @@ from described_arms import SEVEN, TOOL, Row, arm, urdf
 
 from vla_zenoh.kinematics.collision import CollisionModel
 from vla_zenoh.kinematics.kinematics import Kinematics
+from vla_zenoh.profile import KeepOut
 
 NEAR_M = 0.05
 JOINTS = tuple(f"j{n}" for n in range(1, 8))
@@ -32,3 +35,36 @@ def test_what_only_few_configurations_touch_is_checked(tmp_path: Path, seed: int
     pairs = CollisionModel(Kinematics(path, "tcp", JOINTS), near_m=NEAR_M).pairs
     for number in range(4):
         assert any({pair.first, pair.second} == {"tcp", f"to_{number}_link"} for pair in pairs)
+
+
+CORNERS = ((0, 0, 0), (100, 0, 0), (0, 20, 0), (0, 0, 20))
+"""Of a mesh, in the unit of its file."""
+
+
+@pytest.mark.parametrize(
+    ("scale", "tip_m"),
+    [("0.001 0.001 0.001", (0.1, 0.0, 0.0)), ("-0.002 0.001 0.001", (-0.2, 0.0, 0.0))],
+    ids=["millimetres", "a mirror image"],
+)
+def test_a_mesh_is_as_large_as_its_scale_says(
+    tmp_path: Path, scale: str, tip_m: tuple[float, float, float]
+) -> None:
+    """The hull of the first link reaches the tip of its mesh: a keep-out there is touched."""
+    facets = [
+        f"facet normal 0 0 1 outer loop vertex {' vertex '.join(' '.join(map(str, c)) for c in f)} "
+        "endloop endfacet "
+        for f in combinations(CORNERS, 3)
+    ]
+    (tmp_path / "link.stl").write_text(f"solid link\n{''.join(facets)}\nendsolid link\n")
+    mesh, ball = f'<mesh filename="link.stl" scale="{scale}"/>', '<sphere radius="0.02"/>'
+    before, _, after = urdf([*arm(SEVEN), TOOL]).partition(f'<link name="{arm(SEVEN)[0].link}">')
+    path = tmp_path / "arm.urdf"
+    path.write_text(f'{before}<link name="{arm(SEVEN)[0].link}">{after.replace(ball, mesh, 1)}')
+    kinematics = Kinematics(path, "tcp", JOINTS)
+    centre_m = np.array(arm(SEVEN)[0].at_m) + tip_m
+    point = KeepOut(centre_m=tuple(centre_m.tolist()), radius_m=0.001)
+    collisions = CollisionModel(kinematics, near_m=NEAR_M, keep_out={"point": point})
+    distances_m = collisions.distances(np.zeros(kinematics.size))
+    first = [pair.first == arm(SEVEN)[0].link for pair in collisions.pairs]
+    apart = [pair.second == "point" for pair in collisions.pairs]
+    assert distances_m[np.logical_and(first, apart)] == pytest.approx(-0.001, abs=0.001)
