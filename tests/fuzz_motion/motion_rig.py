@@ -229,9 +229,9 @@ class Rig:
         if inputs.chunks and at % 2:  # as the command node does with one that comes between ticks
             early, inputs = inputs, Inputs(inputs.settings, peers=inputs.peers)
             self.commander.prepare(replace(early, settings=(), peers=None), self._now_ns)
-        plan_before = self._plan()
+        plan_before, arrived = self._plan(), self.commander.parts[0].motion.arrived
         out = self.commander.step(inputs, self._now_ns, periods)
-        self._check(at, plan_before, before, out)
+        self._check(at, plan_before, before, out, arrived=arrived)
         state = self.commander.state.value
         for event in out.events:
             if event.what.endswith("->fault") and not event.why.startswith("the robot reports"):
@@ -258,9 +258,13 @@ class Rig:
         timeline = self.commander.parts[0].motion.timeline
         return None if timeline is None else timeline.plan
 
-    def _check(self, at: int, before: Any, state: str, out: Outputs) -> None:
-        """Nothing of a chunk is lost in silence, and no lie is believed for long."""
-        motion, now = self.commander.parts[0].motion, self.commander.state.value
+    def _check(self, at: int, before: Any, state: str, out: Outputs, *, arrived: bool) -> None:
+        """Nothing of a chunk is lost in silence, and no lie is believed for long.
+
+        A hold is judged by whether the arm had `arrived` before the tick: the brake of the hold is
+        a motion of its own, which ends the creep of an elbow to its posture.
+        """
+        now = self.commander.state.value
         if out.accepted is not None:
             self._chunk_ns = self._now_ns
         plan = self._plan()
@@ -270,7 +274,7 @@ class Rig:
             if max(left) > LEFT and all(event.what != "dropped" for event in out.events):
                 self.trace.broken.append((at, "part of a chunk lost in silence", max(left), "m"))
         early_s = self.case.profile.timing.max_open_loop_s - (self._now_ns - self._chunk_ns) / 1e9
-        if (state, now) == ("active", "holding") and early_s > 0 and not motion.arrived:
+        if (state, now) == ("active", "holding") and early_s > 0 and not arrived:
             self.trace.broken.append((at, "holds on its way to the last step", early_s, "s"))
         lie = self._lie
         if lie is None or now not in OBEYING:
