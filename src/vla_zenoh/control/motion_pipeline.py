@@ -410,7 +410,8 @@ class MotionPipeline:
             return state in OBEYING or self.streaming
         if self._rest_since_ns is None:
             self._rest_since_ns = now_ns
-        return self.streaming and now_ns - self._rest_since_ns < LINGER_NS
+        # A clock that was set back ends it, too.
+        return self.streaming and 0 <= now_ns - self._rest_since_ns < LINGER_NS
 
 
 def _dropped(plan: Plan, rest: Goal) -> list[Event]:

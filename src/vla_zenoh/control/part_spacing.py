@@ -169,13 +169,14 @@ class PartSpacing:
 
     def monitor(self, now_ns: int) -> LimitHit | None:
         """Check the measured joints of all parts, every `PERIOD_NS`; returns why to brake."""
-        if now_ns < self._monitor_ns:
+        late_ns = now_ns - self._monitor_ns
+        if -PERIOD_NS <= late_ns < 0:
             return None
         found = [part.measured_rad for part in self._parts]
         measured_rad = [joints_rad for joints_rad in found if joints_rad is not None]
         if len(measured_rad) < len(found):
             return None
-        begins = now_ns - self._monitor_ns > 2 * PERIOD_NS
+        begins = not 0 <= late_ns <= 2 * PERIOD_NS  # the arms did not move, or a clock was set
         self._monitor_ns, within_m = now_ns + PERIOD_NS, self._stop_m - PAST
         near = self._nearest(measured_rad, within_m)
         before_m = near.distance_m if begins else self._edge_m

@@ -36,6 +36,8 @@ NEIGHBOURS_M = 0.03
 """Links that are never further apart are neighbours: they touch at a joint."""
 CONSTANT_M = 1e-3
 """A distance that varies by less over the joint space depends on no joint."""
+THINNEST_M = 1e-5
+"""A flatter hull ends the process: Qhull finds no first simplex, and Coal does not ask it."""
 TABLE = "table"
 HELD = "the held object"
 FLAT = 1e-6
@@ -330,8 +332,14 @@ def _one_hull_a_link(kinematics: Kinematics) -> Any:
         corners.setdefault(full.frames[shape.parentFrame].name, []).append(_corners(shape))
     hulls = pin.GeometryModel()
     for link, found in corners.items():
+        all_m = np.concatenate(found)
+        if _thickness_m(all_m) < THINNEST_M:
+            raise ResourceError(
+                f"link {link!r} of {kinematics.urdf.name} has a flat collision shape: give it a "
+                "thickness, or a box in its place"
+            )
         points = coal.StdVec_Vec3s()
-        points.extend([corner.copy() for corner in np.concatenate(found)])
+        points.extend([corner.copy() for corner in all_m])
         hull = coal.Convex.convexHull(points, True, "Qt")
         frame = full.getFrameId(link, pin.FrameType.BODY)
         parent = full.frames[frame].parentJoint
@@ -340,6 +348,13 @@ def _one_hull_a_link(kinematics: Kinematics) -> Any:
         full, hulls, kinematics.locked_joints, kinematics.locked_position
     )
     return reduced
+
+
+def _thickness_m(points_m: FloatArray) -> float:
+    """Of the slab that holds points (m, 3), about across the direction in which they vary least."""
+    apart_m = points_m - points_m.mean(axis=0)
+    across = np.linalg.eigh(apart_m.T @ apart_m)[1][:, 0]
+    return float(np.ptp(apart_m @ across))
 
 
 def _distance_m(shape: Any, place: Any) -> float:

@@ -293,6 +293,9 @@ class Description:
         shape = shapes[0]
         if shape.tag == "mesh" and not shape.get("filename"):
             raise self._error(f"has {whose} with a collision mesh without a filename")
+        if shape.tag == "mesh" and not all(self._vector(shape, "scale", whose, "1 1 1")):
+            given = shape.get("scale")
+            raise self._error(f"has {whose} with scale {given!r}: give three numbers other than 0")
         for attribute, count in SHAPES[shape.tag].items():
             sizes = self._numbers(shape.get(attribute, ""), attribute, whose, count)
             if min(sizes) <= 0:
@@ -319,9 +322,13 @@ class Description:
                     )
 
     def _vector(
-        self, element: ElementTree.Element | None, attribute: str, whose: str
+        self,
+        element: ElementTree.Element | None,
+        attribute: str,
+        whose: str,
+        without: str = "0 0 0",
     ) -> tuple[float, float, float]:
-        text = "0 0 0" if element is None else element.get(attribute, "0 0 0")
+        text = without if element is None else element.get(attribute, without)
         x, y, z = self._numbers(text, attribute, whose, 3)
         return x, y, z
 

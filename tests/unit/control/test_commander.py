@@ -412,6 +412,16 @@ def test_the_stream_ends_a_while_after_the_arm_stands() -> None:
     assert not rig.commander.streaming
 
 
+def test_the_stream_of_an_arm_at_rest_ends_though_the_clock_was_set_back() -> None:
+    rig = Rig()
+    rig.activate()
+    rig.put("active", False)
+    assert rig.commander.streaming
+    rig.now_ns -= 3600 * 10**9
+    rig.run(2 * LINGER_NS / 1e9)
+    assert not rig.commander.streaming
+
+
 def robot_away_from_its_last_command(rig: Rig, away_m: float) -> Stamped[PoseState]:
     """A state of a robot whose controller's set-point is this far above the stream's."""
     pose = Rig.pose_state(rig)

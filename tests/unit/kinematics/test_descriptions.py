@@ -259,6 +259,18 @@ REFUSED: dict[str, Refused] = {
     "a mesh without a file": Refused(
         WHOLE.replace(BALL, "<mesh/>", 1), ("link 'base' with a collision mesh without a filename",)
     ),
+    "a mesh with a scale of one number": Refused(
+        WHOLE.replace(BALL, '<mesh filename="a.stl" scale="0.001"/>', 1),
+        ("link 'base' with scale '0.001': give three numbers",),
+    ),
+    "a mesh of no size": Refused(
+        WHOLE.replace(BALL, '<mesh filename="a.stl" scale="1 1 0"/>', 1),
+        ("link 'base' with scale '1 1 0': give three numbers other than 0",),
+    ),
+    "a shape as thin as nothing": Refused(
+        WHOLE.replace(BALL, '<box size="0.1 0.1 1e-9"/>', 1),
+        ("link 'base' of arm.urdf has a flat collision shape",),
+    ),
     "an empty shape": Refused(WHOLE.replace(BALL, "", 1), ("link 'base'", "that is nothing")),
     "a mass that is none": Refused(
         WHOLE.replace("<collision>", '<inertial><mass value="nan"/></inertial><collision>', 1),

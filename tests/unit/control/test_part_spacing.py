@@ -1,0 +1,79 @@
+"""Measured arms that come too near to each other brake, whatever happens to the clock."""
+
+from __future__ import annotations
+
+from functools import cache
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from vla_zenoh.control.part_spacing import PartSpacing
+from vla_zenoh.control.reachability import ReachabilityFilter
+from vla_zenoh.control.watchdog import PERIOD_NS
+from vla_zenoh.profile import Profile, load_profile
+from vla_zenoh.types import FloatArray
+
+NOON_NS = 1_700_000_000_000_000_000
+HOUR_NS = 3_600_000_000_000
+LEAN = np.array([0.0, 0.5, 0.0, 0.5, 0.0, 0.0, 0.0])
+"""From home towards the other arm."""
+AT_STOP, STEP = 1.55, 0.01
+"""Multiples of that: where the arms are at their stop, and how they come nearer."""
+
+
+@cache
+def pair() -> Profile:
+    return load_profile("two_pandas_sim")
+
+
+@cache
+def reach() -> ReachabilityFilter:
+    return ReachabilityFilter(pair().of_part("left"))
+
+
+def leaning(share: float) -> FloatArray:
+    return np.array(pair().robot.home_rad) + share * LEAN
+
+
+class Arms:
+    """Two arms that are measured where a test says."""
+
+    def __init__(self) -> None:
+        self.parts: list[Any] = [
+            SimpleNamespace(name=name, profile=pair().of_part(name), reach=reach())
+            for name in pair().part_names
+        ]
+        self.spacing = PartSpacing(pair(), cast("Any", self.parts))
+
+    def come_nearer(self, since_ns: int) -> list[str]:
+        """The limits found on the way from the stop to each other."""
+        found: list[str] = []
+        for number in range(8):
+            for part in self.parts:
+                part.measured_rad = leaning(AT_STOP + STEP * number)
+            hit = self.spacing.monitor(since_ns + number * PERIOD_NS)
+            found += [] if hit is None else [hit.name]
+        return found
+
+
+@pytest.mark.parametrize("set_by_ns", [0, HOUR_NS, -HOUR_NS], ids=["kept", "forward", "back"])
+def test_measured_arms_that_come_too_near_are_found_though_the_clock_was_set(
+    set_by_ns: int,
+) -> None:
+    arms = Arms()
+    assert arms.come_nearer(NOON_NS)
+    assert arms.come_nearer(NOON_NS + 10**9 + set_by_ns)
+
+
+def test_measured_arms_are_looked_at_once_a_period() -> None:
+    arms = Arms()
+    looks: list[int] = []
+    nearest = arms.spacing._nearest
+    arms.spacing._nearest = lambda *given: (looks.append(1), nearest(*given))[1]  # type: ignore[method-assign]
+    for part in arms.parts:
+        part.measured_rad = leaning(1.0)
+    for late_ns in range(0, 10 * PERIOD_NS, PERIOD_NS // 10):
+        arms.spacing.monitor(NOON_NS + late_ns)
+    assert len(looks) == 10
