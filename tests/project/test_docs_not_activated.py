@@ -28,12 +28,11 @@ REASONS = {
         *("unsettled", "why_not_ready", "state_lost"),
     },
     "control/commanded_part.py": {"reasons_by_worker"},
-    "control/state_monitor.py": {"reasons"},
     "control/watchdog.py": {"reasons_against"},
-    "control/contact.py": {"missing", "reasons"},
+    "control/contact.py": {"missing"},
     "control/commander.py": {"_activate", "_preflight", "_ended_before"},
 }
-"""File -> functions that give reasons against an activation."""
+"""File -> functions that give reasons against an activation, beside ``reasons`` of a monitor."""
 LEAST_WORDS, LEAST_PREFIX = 4, 20
 GAP = "..."
 
@@ -59,8 +58,22 @@ def sentences(file: str, functions: set[str]) -> Iterator[str]:
                 yield node.value
 
 
+def monitor_files() -> list[str]:
+    """Files of control/ with a monitor, whose ``reasons`` count wherever it is."""
+    return [
+        str(path.relative_to(SOURCE))
+        for path in sorted((SOURCE / "control").glob("*.py"))
+        if re.search(r"^class \w+\(Monitor\):", path.read_text(), re.M)
+    ]
+
+
 def all_sentences() -> set[str]:
-    return {text for file, names in REASONS.items() for text in sentences(file, names)}
+    given = {text for file, names in REASONS.items() for text in sentences(file, names)}
+    return given | {text for file in monitor_files() for text in sentences(file, {"reasons"})}
+
+
+def test_the_reasons_of_every_monitor_are_among_them() -> None:
+    assert {"control/state_monitor.py", "control/contact.py"} <= {*monitor_files()}
 
 
 def reasons() -> list[str]:

@@ -14,6 +14,7 @@ import pytest
 import vla_zenoh
 
 PACKAGE = Path(vla_zenoh.__file__).parent
+ROOT = Path(__file__).parents[2]
 
 ORDER = (
     # A folder, or a module beside them, imports those of the lines above and of its own line.
@@ -98,6 +99,18 @@ def offences(source: str, forbidden: frozenset[str]) -> list[str]:
         for name in imported_names(source)
         if any(name == banned or name.startswith(f"{banned}.") for banned in forbidden)
     )
+
+
+def test_where_the_tcp_may_be_is_read_in_one_place() -> None:
+    """A further limit narrows `Limits.tcp_box`: who reads the workspace itself would miss it."""
+    readers = {
+        path.name
+        for path in (*PACKAGE.rglob("*.py"), *(ROOT / "plugins").rglob("*.py"))
+        if "limits.workspace" in (source := path.read_text())
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.Attribute) and ast.unparse(node).endswith("limits.workspace")
+    }
+    assert readers == set()
 
 
 OF_THE_PACKAGE = ("vla_zenoh.__version__", "vla_zenoh.lazy_names")

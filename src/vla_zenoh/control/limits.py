@@ -176,7 +176,7 @@ def _bound_norm(name: str, vector: FloatArray, limit: float) -> tuple[FloatArray
 
 def workspace_corners(limits: Limits) -> tuple[FloatArray, FloatArray]:
     """Lower and upper corner (3,) m of the workspace box."""
-    low, high = np.array(limits.workspace.corners_m)
+    low, high = np.array(limits.tcp_box.corners_m)
     return low, high
 
 
@@ -188,7 +188,7 @@ def into_workspace(
     A step that starts at `before_m`, outside the box, may lead back or stay, but no further out.
     """
     x, y, z = position_m.tolist()
-    (x_low, y_low, z_low), (x_high, y_high, z_high) = limits.workspace.corners_m
+    (x_low, y_low, z_low), (x_high, y_high, z_high) = limits.tcp_box.corners_m
     if before_m is not None:
         x0, y0, z0 = before_m.tolist()
         x_low, y_low, z_low = min(x_low, x0), min(y_low, y0), min(z_low, z0)

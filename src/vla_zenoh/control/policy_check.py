@@ -503,7 +503,7 @@ def _validate_targets(positions_m: FloatArray, limits: Limits) -> Rejection | No
         at = ", ".join(f"{value:.4g}" for value in positions_m[index])
         why = (
             f"a target at ({at}) m, {away_m[index]:.4g} m outside the workspace "
-            f"{limits.workspace}: are its numbers metres (position_scale_m), and is it in the base "
+            f"{limits.tcp_box}: are its numbers metres (position_scale_m), and is it in the base "
             "frame?"
         )
         return Rejection("workspace", why, float(away_m[index]), most_m)

@@ -276,7 +276,7 @@ def _robot(
         at = ", ".join(f"{value:.3f}" for value in pose.record.position_m)
         reasons.append(
             f"the TCP at ({at}) m is {outside_m:.3f} m outside the workspace "
-            f"{profile.limits.workspace}; move it inside"
+            f"{profile.limits.tcp_box}; move it inside"
         )
     return reasons
 

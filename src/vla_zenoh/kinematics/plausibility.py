@@ -97,7 +97,7 @@ def _out_of_reach(kinematics: Kinematics, limits: Limits, length_m: float) -> It
     """Whether the workspace lies where no joint position takes the TCP."""
     first = kinematics.model.jointPlacements[1]
     foot_m = kinematics.base_placement.actInv(first).translation
-    nearest_m = np.clip(foot_m, *limits.workspace.corners_m)
+    nearest_m = np.clip(foot_m, *limits.tcp_box.corners_m)
     away_m = float(np.linalg.norm(nearest_m - foot_m))
     reach_m = length_m + _slides_m(kinematics)
     if away_m > reach_m:

@@ -273,6 +273,15 @@ class Limits(Section):
     tracking_rad: float = Field(default=0.3, gt=0, le=1.0)
     elbow_rad: float = Field(default=0.35, gt=0, le=1.5)
 
+    @property
+    def tcp_box(self) -> Workspace:
+        """Where the TCP may be, by all limits on its place.
+
+        What makes goals, bounds, judges or shows them reads this and not `workspace`, so a further
+        limit has one place: here it narrows the box.
+        """
+        return self.workspace
+
     def contradictions(self) -> Iterator[Fault]:
         for step, lead in (("step_m", "lead_m"), ("step_rad", "lead_rad")):
             value, limit = getattr(self, step), getattr(self, lead)

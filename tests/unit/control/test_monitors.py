@@ -9,15 +9,19 @@ import numpy as np
 import pytest
 from command_rig import DOWN, START_M, START_NS, Rig, profile, reach_of
 
+from vla_zenoh.control.commanded_part import CommandedPart
 from vla_zenoh.control.contact import Contact
+from vla_zenoh.control.monitor import Monitor
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.kinematics.so3 import Pose, quat_from_rotation, rotation_from_quat
-from vla_zenoh.profile import ContactLimits, Profile, load_profile, override
+from vla_zenoh.profile import ContactLimits, Limits, Profile, load_profile, override
+from vla_zenoh.profile.limits import Workspace
 from vla_zenoh.types import FloatArray, Header, JointState, PoseState, Stamped
 
 MS = 1_000_000
 STOP_N, MOST_N = 40.0, 44.0
 JUMPS_M = (0.05, 0.055, 0.065)
+DOWN_M, AT_EDGE_M = 0.05, 1e-3
 
 
 class Arm(Rig):
@@ -77,6 +81,14 @@ class Arm(Rig):
             self.send([[0, 0, -step_m, 0, 0, 0, 0]] * 8)
             self.run(0.1)
         assert self.state == "active", self.commander.why
+
+
+def test_an_arm_is_asked_by_every_monitor_there_is() -> None:
+    of = profile()
+    part = CommandedPart(of, reach_of(of))
+    assert {type(monitor) for monitor in part.monitors} == {
+        kind for kind in Monitor.__subclasses__() if kind.__module__.startswith("vla_zenoh.")
+    }
 
 
 # -- forces ------------------------------------------------------------------------------------
@@ -180,6 +192,34 @@ def test_a_retreat_stops_before_a_bound_as_any_other_motion_does() -> None:
     bounded, hits = motion._within_reach(here, into)
     assert {hit.name for hit in hits} == {"table_distance"}
     assert bounded.position_m[2] > table_z_m
+
+
+class RaisedLimits(Limits):
+    """Limits with one more on the height of the TCP."""
+
+    least_m: float = 0.0
+
+    @property
+    def tcp_box(self) -> Workspace:
+        return self.workspace.model_copy(update={"z_m": (self.least_m, self.workspace.z_m[1])})
+
+
+@pytest.mark.parametrize("command", ["pose", "joint"])
+def test_a_further_limit_on_the_height_of_the_tcp_holds_for_everything_that_makes_goals(
+    command: str,
+) -> None:
+    of = profile(robot={"command": command})
+    least_m = float(Arm(of).position_m[2]) - DOWN_M
+    limits = RaisedLimits.model_construct(**dict(of.limits), least_m=least_m)
+    arm = Arm(of.model_copy(update={"limits": limits}))
+    arm.activate()
+    for _ in range(12):
+        arm.send([[0, 0, -0.02, 0, 0, 0, 0]] * 8)
+        arm.run(0.2)
+        assert arm.position_m[2] > least_m - AT_EDGE_M
+    assert arm.state == "active", arm.commander.why
+    assert arm.position_m[2] < least_m + AT_EDGE_M
+    assert "workspace" in {event.what for event in arm.events}
 
 
 # -- each stream has its own age ----------------------------------------------------------------

@@ -150,7 +150,7 @@ class McpServer:
             raise SessionError(
                 f"{error}; the command node is {state}{why and f': {why}'}"
             ) from None
-        box = robot.profile.limits.workspace
+        box = robot.profile.limits.tcp_box
         worker = worker_node("")
         fields = {
             "robot": robot.profile.robot.name,

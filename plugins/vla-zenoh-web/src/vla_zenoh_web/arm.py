@@ -41,7 +41,7 @@ def surroundings(profile: Profile) -> dict[str, dict[str, Any]]:
 def _around(profile: Profile, name: str) -> dict[str, Any]:
     base = profile.parts[name].base if name else PartBase()
     limits = profile.of_part(name).limits
-    space, reach = limits.workspace, limits.reach
+    space, reach = limits.tcp_box, limits.reach
     return {
         "base": [*base.position_m, base.yaw_rad],
         "workspace": [list(space.x_m), list(space.y_m), list(space.z_m)],

@@ -156,7 +156,7 @@ def _targets(spec: ActionSpec, steps: Steps, limits: Limits) -> Iterator[Finding
     if longest_m <= REACH_M and outside_m > limits.step_m:
         yield warning(
             "workspace",
-            f"a pose {outside_m:.3f} m outside the workspace {limits.workspace}: is it in "
+            f"a pose {outside_m:.3f} m outside the workspace {limits.tcp_box}: is it in "
             "the base frame?",
         )
 

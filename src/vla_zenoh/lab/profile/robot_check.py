@@ -88,7 +88,7 @@ def arm(profile: Profile) -> Iterator[ProfileFault]:
     _, outside_m = into_workspace(profile.limits, at_m)
     if profile.robot.driver == "sim" and outside_m > profile.limits.step_m:
         where = ", ".join(f"{value:.3f}" for value in at_m)
-        box = profile.limits.workspace
+        box = profile.limits.tcp_box
         yield ProfileFault(
             ("robot", "home_rad"),
             f"puts the TCP at ({where}) m, {outside_m:.3f} m outside "
