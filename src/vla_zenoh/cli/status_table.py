@@ -217,9 +217,9 @@ def _message(row: NodeRow, found: NodeStatus, mode: str) -> str:
         return _cell([*short, str(detail.get("why", "")), task], MAX_WORDS)
     if short:
         return _cell(short, MAX_WORDS)
-    if bad := _bad_cameras(_fields(detail.get("cameras"))):
-        return _cell(bad, MAX_WORDS)
-    told = (detail.get(name) for name in ("complaint", "fault", "busy", "slow", "renderer"))
+    if wrong := complaints(detail):
+        return _cell(wrong, MAX_WORDS)
+    told = (detail.get(name) for name in ("busy", "slow", "renderer"))
     text = str(next(filter(None, told), ""))
     if not text and "obeyed" in detail:
         return f"{mode}: in control" if detail["obeyed"] else "shadow mode"
@@ -230,6 +230,12 @@ def _message(row: NodeRow, found: NodeStatus, mode: str) -> str:
     if not text and (seen := _fields(detail.get("middleware"))):
         text = f"robot's ROS 2: {', '.join(map(str, seen))}"
     return one_line(text or (unknown if isinstance(unknown, str) else ""), MAX_WORDS)
+
+
+def complaints(detail: Mapping[str, Any]) -> list[str]:
+    """What a node says is wrong with it, by the `detail` of its status."""
+    own = (detail.get(name) for name in ("complaint", "fault"))
+    return [*_bad_cameras(_fields(detail.get("cameras"))), *map(str, filter(None, own))]
 
 
 def _bad_cameras(cameras: Mapping[str, Any]) -> list[str]:

@@ -26,6 +26,7 @@ from vla_zenoh.types import (
     Header,
     Image,
     JointState,
+    NodeStatus,
     PoseState,
     Task,
 )
@@ -408,6 +409,16 @@ def test_a_camera_without_depth_in_the_profile_is_not_asked_for_it() -> None:
     profile = replace_camera(CAMERA, depth_unit_m=None)
     seen = Seen("camera", samples, 1.0, clocks=[CLOCK])
     assert not broken(rules.camera(seen, "front", profile))
+
+
+def test_a_camera_without_images_is_quoted_with_what_its_status_says() -> None:
+    why = "an image of type int64 cannot be shown"
+    detail = {"cameras": {"front": {"why": why}}}
+    status = NodeStatus("camera", "degraded", "here", 1, AT_NS, {}, {}, {}, {}, detail)
+    said = Arrived("status/camera", AT_NS, Header(AT_NS, 0, "camera#1"), status)
+    found = list(rules.camera(Seen("camera", [said], 1.0, clocks=[CLOCK]), "front", CAMERA))
+    assert broken(found) == {f"{key}: rate" for key in (RAW, JPEG, DEPTH)}
+    assert all(why in each.text for each in found if each.right is False)
 
 
 @pytest.mark.parametrize(

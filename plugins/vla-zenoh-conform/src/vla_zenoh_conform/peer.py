@@ -95,7 +95,7 @@ def look(
     session: zenoh.Session, keys: Keys, node: str, wanted: Sequence[str], seconds: float
 ) -> Seen:
     """Listen to a peer for some seconds, and ask it what it answers."""
-    with recording(session, keys, wanted) as kept:
+    with recording(session, keys, [*wanted, keys.status(node)]) as kept:
         began_s = time.monotonic()
         alive = node in alive_nodes(session, keys, node)
         clocks = [found for _ in range(ASKS) if (found := _clock(session, keys.clock(node)))]

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from vla_zenoh.cli.status_table import complaints
 from vla_zenoh.errors import SpecError
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.kinematics.so3 import Pose, pose_distance, rotation_from_quat
@@ -106,7 +107,8 @@ def stream(seen: Seen, key: str, least_hz: float) -> Iterator[RuleFinding]:
     """Records, writer, order, stamps and rate of one key."""
     samples = of_key(seen.samples, key)
     if not samples:
-        yield RuleFinding(f"{key}: rate", False, f"nothing in {seen.seconds:.0f} s")
+        text = "; ".join([f"nothing in {seen.seconds:.0f} s", *_own_words(seen)])
+        yield RuleFinding(f"{key}: rate", False, text)
         return
     bad = [sample.why for sample in samples if sample.why]
     text = f"{len(bad)} of {len(samples)}: {bad[0]}" if bad else f"{len(samples)} valid"
@@ -120,6 +122,13 @@ def stream(seen: Seen, key: str, least_hz: float) -> Iterator[RuleFinding]:
     hz = len(samples) / seen.seconds
     text = f"{hz:.1f} Hz, at least {least_hz:g} are wanted"
     yield RuleFinding(f"{key}: rate", hz >= least_hz, text)
+
+
+def _own_words(seen: Seen) -> Iterator[str]:
+    """What the node itself says is wrong, by its newest status."""
+    said = [each.record for each in of_key(seen.samples, f"status/{seen.node}") if each.record]
+    for why in complaints(said[-1].detail) if said else ():
+        yield f"its status says: {why}"
 
 
 def _headers(seen: Seen, key: str, samples: Sequence[Arrived]) -> Iterator[RuleFinding]:
