@@ -314,7 +314,10 @@ def beyond_joints(
     spec, steps = as_deltas(spec, steps)
     asked = np.zeros(6)
     asked[:3] = steps[:, :3].sum(axis=0) * spec.position_scale_m
-    asked[3:] = steps[:, 3:6].sum(axis=0) * (2.0 if spec.rotation == "quaternion" else 1.0)
+    turns = steps[:, 3:6]
+    if spec.rotation == "quaternion":  # of small turns, with either sign
+        turns = np.copysign(2.0, steps[:, 6:7]) * turns
+    asked[3:] = turns.sum(axis=0)
     if spec.frame == "tcp":
         asked = np.concatenate([rotation @ asked[:3], rotation @ asked[3:]])
     if _lost(jacobian, asked) <= LOST_SHARE * float(np.linalg.norm(_WEIGHTS * asked)):

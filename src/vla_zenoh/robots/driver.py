@@ -8,10 +8,13 @@ from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+
 from vla_zenoh.bus.clock import FixedRate, Tick
 from vla_zenoh.errors import NodeError
 from vla_zenoh.guard.arm_guard import Measured
 from vla_zenoh.kinematics.so3 import Pose, quat_from_rotation
+from vla_zenoh.policy.meaning import toward
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import (
     FloatArray,
@@ -172,13 +175,23 @@ class RobotDriver(ABC):
         names = self.profile.robot.arm_joints
         return self.kinematics.forward(self.kinematics.ordered(names, position_rad))
 
+    @cached_property
+    def home_quat(self) -> tuple[float, float, float, float]:
+        """Orientation of the TCP at home, x, y, z, w."""
+        from vla_zenoh.kinematics.kinematics import home_orientation
 
-def command_of(
-    reference: PoseReference | JointReference, joints: tuple[str, ...]
-) -> PoseCommand | JointCommand:
-    """A reference as a command record; `joints` are the names of the arm's joints."""
-    if isinstance(reference, JointReference):
-        return JointCommand(joints, *reference, STREAMING)
-    position_m, rotation, twist, acceleration = reference
-    quat_xyzw = quat_from_rotation(rotation)
-    return PoseCommand(position_m, quat_xyzw, twist, acceleration, position_m, quat_xyzw, STREAMING)
+        return home_orientation(self.profile, self.kinematics)
+
+    def command_of(self, reference: PoseReference | JointReference) -> PoseCommand | JointCommand:
+        """A reference as a command record.
+
+        Of the two signs of its quaternion it has that nearer to the home orientation, as measured
+        poses have: of a tool that points down w is about zero, and its sign is that of rounding.
+        """
+        if isinstance(reference, JointReference):
+            return JointCommand(self.profile.robot.arm_joints, *reference, STREAMING)
+        position_m, rotation, twist, acceleration = reference
+        quat_xyzw = np.array(toward(quat_from_rotation(rotation), self.home_quat))
+        return PoseCommand(
+            position_m, quat_xyzw, twist, acceleration, position_m, quat_xyzw, STREAMING
+        )

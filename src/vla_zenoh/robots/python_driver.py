@@ -16,7 +16,7 @@ from vla_zenoh.errors import NodeError, ProfileError, VlaZenohError, in_words
 from vla_zenoh.policy.loader import IS_ROBOT, is_robot
 from vla_zenoh.profile import Profile
 from vla_zenoh.robot import Reading, Robot, numbers
-from vla_zenoh.robots.driver import DriverStatus, Measurement, RobotDriver, command_of
+from vla_zenoh.robots.driver import DriverStatus, Measurement, RobotDriver
 from vla_zenoh.robots.joint_reading import JointReading
 from vla_zenoh.sanitize import one_line
 from vla_zenoh.types import Event, FloatArray, GripperCommand, GripperState
@@ -129,7 +129,7 @@ class PythonDriver(RobotDriver):
             self.report.emit(Event("warning", "notice", "object_lost", why))
 
     def move(self, reference: PoseReference | JointReference, now_ns: int) -> None:
-        self._call("move", command_of(reference, self.profile.robot.arm_joints))
+        self._call("move", self.command_of(reference))
         self.report.counters["arm.commands_given"] += 1
 
     def grip(self, command: GripperCommand, now_ns: int) -> None:

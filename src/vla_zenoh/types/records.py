@@ -328,7 +328,8 @@ class PoseCommand(Record):
     """Where the TCP has to be now, in the base frame, with feed-forward.
 
     Args:
-        position_m, quat_xyzw: (3,), (4,) unit.
+        position_m, quat_xyzw: (3,), (4,) unit. A robot class gets that of the quaternion's two
+            signs which is nearer to the home orientation; on the wire it may be either.
         twist, acceleration: (6,) m/s and rad/s, m/s^2 and rad/s^2.
         goal_position_m, goal_quat_xyzw: where the smoothed motion is heading.
         state: the command node's state.

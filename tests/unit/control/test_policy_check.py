@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
@@ -64,6 +66,14 @@ def test_a_chunk_that_asks_five_joints_for_the_sixth_axis_is_named_with_its_amou
     steps = np.zeros((2, 6), np.float32)
     steps[:, 5] = 0.05
     assert beyond_joints(deltas(), steps, jacobian_without(5), np.eye(3)) == ["yaw (+0.1 rad)"]
+
+
+@pytest.mark.parametrize("signs", [(1, 1), (-1, -1), (1, -1)])
+def test_either_sign_of_a_quaternion_asks_for_the_same_turn(signs: tuple[int, int]) -> None:
+    spec = ActionSpec(rotation="quaternion", gripper="none", horizon=2, dt_s=0.1)
+    turn = np.array([0.0, 0.0, math.sin(0.05), math.cos(0.05)])
+    steps = np.array([[0.0, 0.0, 0.0, *(sign * turn)] for sign in signs], np.float32)
+    assert beyond_joints(spec, steps, jacobian_without(5), np.eye(3)) == ["yaw (+0.2 rad)"]
 
 
 def test_a_delta_in_the_frame_of_the_tcp_is_judged_in_base_axes() -> None:

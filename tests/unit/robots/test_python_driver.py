@@ -10,9 +10,11 @@ import pytest
 from driver_report import Report
 
 from vla_zenoh.errors import NodeError
+from vla_zenoh.kinematics.so3 import exp3
 from vla_zenoh.profile import load_profile
 from vla_zenoh.robots.python_driver import FAULT_NS, PythonDriver
 from vla_zenoh.types import Event, GripperCommand, JointCommand, JointReference
+from vla_zenoh.types.records import PoseReference
 
 ARM = """
 from vla_zenoh.robot import Reading
@@ -103,6 +105,16 @@ def test_a_set_point_reaches_the_arm_as_a_command(rig: Rig) -> None:
     assert isinstance(command, JointCommand)
     np.testing.assert_array_equal(command.velocity_rad_s, rad / 2)
     assert rig.report.counters["arm.commands_given"] == 1
+
+
+def test_the_quaternions_of_a_tool_that_points_down_keep_their_sign(rig: Rig) -> None:
+    """Its w is about zero; a robot that interpolates from one to the next must not go around."""
+    down = np.diag([1.0, -1.0, -1.0])
+    for turn in ([0, 0, 0], [1e-3, 0, 0.5], [-1e-3, 0, 1.0], [1e-3, 0, 1.5], [-1e-9, 0, 2.0]):
+        rotation = exp3(np.array(turn)) @ down
+        rig.driver.move(PoseReference(np.zeros(3), rotation, np.zeros(6), np.zeros(6)), 0)
+    quats = np.array([command.quat_xyzw for command in rig.calls])
+    assert ((quats[1:] * quats[:-1]).sum(axis=1) > 0.9).all()
 
 
 def test_an_invalid_reading_is_rejected_and_its_fault_counts(rig: Rig) -> None:

@@ -17,7 +17,7 @@ from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.nodes.camera.source import STALL_S
 from vla_zenoh.profile import Profile
 from vla_zenoh.robots.arm import Arm
-from vla_zenoh.robots.driver import DriverStatus, Measurement, RobotDriver, command_of
+from vla_zenoh.robots.driver import DriverStatus, Measurement, RobotDriver
 from vla_zenoh.robots.joint_reading import JointReading, RobotClock, SimulatedClock, wall_stamp_ns
 from vla_zenoh.ros2.messages import Messages
 from vla_zenoh.types import Event, FloatArray, GripperCommand, GripperState, JointState
@@ -144,7 +144,7 @@ class Ros2Arm(RobotDriver):
 
     def move(self, reference: PoseReference | JointReference, now_ns: int) -> None:
         """Publish a set-point."""
-        command = command_of(reference, self.profile.robot.arm_joints)
+        command = self.command_of(reference)
         stamp_ns = now_ns if self.sim_clock is None else self.sim_clock.newest_ns
         message = self._write(command, Stamp(stamp_ns, self._frame))
         self._writer.publish(self._messages.encode(message))
