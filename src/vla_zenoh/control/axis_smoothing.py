@@ -347,7 +347,7 @@ class AxisSmoother:
         With all of its acceleration it would have to reverse before that has ended.
         """
         _, velocity, acceleration = self.state
-        paces = self._time_scale_of(limits) ** np.array([1.0, 2.0, 3.0])
+        scales = self._time_scale_of(limits) ** np.array([1.0, 2.0, 3.0])
         with np.errstate(divide="ignore"):
             along = (limits[:, :, None] / np.abs(basis)).min(axis=1) * np.array(parts)
             # On a line the axis that needs most jerk decides: the others have to stay with it.
@@ -355,8 +355,8 @@ class AxisSmoother:
             jerk = (self.box[2][:, None] / np.abs(basis)).min(axis=0)
             jerk *= np.maximum(most.max(axis=0), TINY)
         along[2] = jerk * parts
-        along /= paces[:, None]
-        velocity, acceleration = velocity @ basis / paces[0], acceleration @ basis / paces[1]
+        along /= scales[:, None]
+        velocity, acceleration = velocity @ basis / scales[0], acceleration @ basis / scales[1]
         velocity[np.abs(velocity) < SOLVER_NOISE[1]] = 0.0
         acceleration[np.abs(acceleration) < SOLVER_NOISE[2]] = 0.0
         # Slowing down, and slow enough once that ends: braking harder would reverse the motion.

@@ -264,7 +264,7 @@ class CommandedPart:
     def commands(self, state: State, now_ns: int) -> MotionCommands:
         """The set-points of robot and gripper, while streaming."""
         arm, motion, width = self.motion.command(state), self.motion, None
-        if arm is not None and state is State.ACTIVE and motion.pace.override > 0.0:
+        if arm is not None and state is State.ACTIVE and motion.scaling.override > 0.0:
             if motion.goal is not None:
                 self.gripper.request(motion.goal.width_m)
             width = self.gripper.step(now_ns, self.gripper_state)
@@ -281,7 +281,7 @@ class CommandedPart:
         events = [] if news is None else [news]
         found = (monitor.check(part) for monitor in self.monitors)
         brake = next((brake for brake in found if brake is not None), None)
-        self.motion.pace.monitored = slowest(*(monitor.slowdown for monitor in self.monitors))
+        self.motion.scaling.monitored = slowest(*(monitor.slowdown for monitor in self.monitors))
         if brake is None:
             return None, events
         if brake.event is not None:

@@ -527,7 +527,7 @@ class Commander:
             what, why = hit.name, f"stand{hit.at}"
             self._out.events.append(make_event("warning", "limit", what, why, hit.value, hit.limit))
         for part in self.parts:
-            part.motion.pace.part_slowdown, part.motion.must_pause = slowdown, hit is not None
+            part.motion.scaling.part_slowdown, part.motion.must_pause = slowdown, hit is not None
 
 
 def _latched(gripper: Stamped[GripperState] | None) -> bool:

@@ -25,7 +25,7 @@ from vla_zenoh.control.preflight import LINGER_NS, Settling, follows, held_joint
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.smoothing import PosePath
 from vla_zenoh.control.states import OBEYING, MotionMode, State
-from vla_zenoh.control.step_timing import GoalPace, Mover, TimedGoal
+from vla_zenoh.control.step_timing import Mover, SpeedScaling, TimedGoal
 from vla_zenoh.errors import ProfileError
 from vla_zenoh.kinematics.so3 import Pose, held_pose, interpolate, pose_distance, pose_of
 from vla_zenoh.profile import Profile
@@ -81,7 +81,7 @@ class MotionPipeline:
         self.timeline: GoalTimeline | None = None
         self.goal: Goal | None = None
         self.streaming = False
-        self.pace = GoalPace()
+        self.scaling = SpeedScaling()
         self.must_pause = False
         """Another part is too near: the arm has to pause."""
         self.contact = Contact(profile.limits.contact)
@@ -170,7 +170,7 @@ class MotionPipeline:
         Returns:
             what is dropped of a chunk, while the brake of the last activation continues.
         """
-        self.pace.begin()
+        self.scaling.begin()
         self.retreat.end()
         measured_rad: FloatArray | None = None
         if self._reach is not None and joint is not None:
@@ -199,7 +199,7 @@ class MotionPipeline:
             goal = Goal(self._within_reach(self._mover.motion.pose, actual)[0], width_m)
         elif blocked and self._path is not None and measured_rad is not None:
             goal = joint_goal(self._path.kinematics, measured_rad, width_m)
-        self.pace.stand()
+        self.scaling.stand()
         self.goal = None if blocked else goal
         if self.timeline is None:
             self.timeline = GoalTimeline(goal, now_ns)
@@ -220,7 +220,7 @@ class MotionPipeline:
             poses.reset(path.motion.pose)
             follower.restart(path.state.position)
         self._mover = path if joints else poses
-        self.pace.stand()
+        self.scaling.stand()
 
     def measure(self, measured: PoseState, joint: JointState | None, received_ns: int) -> None:
         """Track whether the robot still moves while the stream stands."""
@@ -251,9 +251,9 @@ class MotionPipeline:
         """
         if self.timeline is None:
             return True, []
-        if task.speed != self.pace.override or task.speed != self.timeline.clock.override:
+        if task.speed != self.scaling.override or task.speed != self.timeline.clock.override:
             # Plan time passes at the override, and the motion to the goal is planned again.
-            self.pace.override, self.pace.slowing = task.speed, task.speed > 0.0
+            self.scaling.override, self.scaling.slowing = task.speed, task.speed > 0.0
             self.timeline.clock.set(task.speed, now_ns)
             self.goal = None
         failures = self.failures
@@ -297,7 +297,7 @@ class MotionPipeline:
         plan = timeline.plan
         rest = mover.resting_goal(mover.motion.pose, timeline.at(now_ns).width_m)
         timeline.hold(rest, now_ns)
-        self.pace.stand()
+        self.scaling.stand()
         return _dropped(plan, rest)
 
     def _follow(
@@ -313,7 +313,7 @@ class MotionPipeline:
         self._back = None
         if joints is not self.moves_in_joints:
             self.mode = MotionMode.CHANGE
-        elif self.must_pause or self.pace.override == 0.0:
+        elif self.must_pause or self.scaling.override == 0.0:
             self.mode = MotionMode.PAUSE
         else:
             self.mode = MotionMode.FOLLOW
@@ -328,15 +328,15 @@ class MotionPipeline:
             return events
         # The leash starts where the arm is in this tick: it may be moving away from the last goal.
         short, hits = mover.leash(goal, ticks * self._dt_s)
-        slower = self.pace.slowest(goal)
-        if goal is not self.goal or hits or self.pace.changes(mover, slower):
+        slower = self.scaling.slowest(goal)
+        if goal is not self.goal or hits or self.scaling.changes(mover, slower):
             if hits:
                 if goal is not self.goal:
                     name, value, limit = hits[0][:3]
                     events.append(make_event("warning", "limit", name, "leash", value, limit))
                 goal = self._shorten(plans, goal, short, now_ns)
             timed = TimedGoal(goal, timeline.plan, task.rate_hz, overdue_ns, now_ns)
-            events += self.pace.set_out(mover, timed, slower)
+            events += self.scaling.go_to(mover, timed, slower)
             self.goal = goal
         events += limit_events(self._planner.bound_due(plans, now_ns, LOOK_AHEAD))
         return events

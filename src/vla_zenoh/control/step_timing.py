@@ -191,8 +191,12 @@ class TimedGoal(NamedTuple):
     now_ns: int
 
 
-class GoalPace:
-    """The motion to each goal, as fast as steps, slowdowns and the speed override allow."""
+class SpeedScaling:
+    """Speed scaling: the share of its limits with which the arm moves to each goal.
+
+    The least of what the time of the step asks for, of what slows the arm down and of what joints
+    can follow, times the speed override.
+    """
 
     def __init__(self) -> None:
         self.override = 1.0
@@ -218,8 +222,8 @@ class GoalPace:
         self._timings.clear()
 
     @property
-    def speed(self) -> float:
-        """Share of the speed limits, without the override."""
+    def share(self) -> float:
+        """Share of the speed limits that slowdowns leave, without the override."""
         return 1.0 if self.slower is None else self.slower.share
 
     def slowest(self, goal: Goal) -> Slowdown | None:
@@ -230,9 +234,9 @@ class GoalPace:
         """Whether the motion in progress must be planned again, with `slower` from now on."""
         if self.slowing and _within(mover, self.override):
             return True
-        return (1.0 if slower is None else slower.share) != self.speed
+        return (1.0 if slower is None else slower.share) != self.share
 
-    def set_out(self, mover: Mover, timed: TimedGoal, slower: Slowdown | None) -> list[Event]:
+    def go_to(self, mover: Mover, timed: TimedGoal, slower: Slowdown | None) -> list[Event]:
         """Carry out a goal; reports each reason for being `slower` once per activation."""
         self.slower, events = slower, list[Event]()
         if slower is not None and slower.name not in (APPROACH, *self._slowed_by):
@@ -240,7 +244,7 @@ class GoalPace:
             name, _, value, limit, *_ = slower
             events.append(make_event("info", "limit", name, f"slower{slower.at}", value, limit))
         goal, plan, rate_hz, overdue_ns, now_ns = timed
-        override, speed = self.override, self.speed * self.override
+        override, speed = self.override, self.share * self.override
         if not plan.soonest:
             timing = self._timings.setdefault(mover, StepTiming(mover.box))
             way, (velocity, _) = mover.way_to(goal), mover.axis_rates()

@@ -56,7 +56,7 @@ class CollisionPair(NamedTuple):
         first: a link, or the held object.
         second: another link, ``table``, or the name of a keep-out.
         limit: ``self_collision``, ``table_distance`` or ``keep_out``.
-        is_hand: `first` moves with the last joint of the arm.
+        is_hand: `first` moves with the TCP.
     """
 
     first: str
@@ -100,6 +100,7 @@ class CollisionModel:
         may_touch: Iterable[tuple[str, str]] = (),
     ) -> None:
         self._model, self._data = kinematics.model, kinematics.model.createData()
+        self._hand_joint: int = self._model.frames[kinematics.tcp].parentJoint
         self.held: HeldBox | None = None
         """What the gripper holds, see `hold`."""
         self._held_pairs: list[tuple[int, int]] = []
@@ -222,7 +223,7 @@ class CollisionModel:
         limit = "self_collision"
         if other.parentJoint == 0 and second >= self._links:
             limit = "table_distance" if other.name == TABLE else "keep_out"
-        is_hand = link.parentJoint == self._model.njoints - 1
+        is_hand = link.parentJoint == self._hand_joint
         return CollisionPair(link.name, other.name, limit, is_hand)
 
     def _add_held(self, kinematics: Kinematics) -> list[tuple[int, int]]:
@@ -230,8 +231,7 @@ class CollisionModel:
 
         Those of the last two joints may touch what the gripper holds.
         """
-        frame = kinematics.model.frames[kinematics.tcp]
-        joint, self._tcp = frame.parentJoint, frame.placement
+        joint, self._tcp = self._hand_joint, self._model.frames[kinematics.tcp].placement
         wrist = (joint, self._model.parents[joint] or joint)
         shapes = self._geometry.geometryObjects
         others = [index for index in range(len(shapes)) if shapes[index].parentJoint not in wrist]

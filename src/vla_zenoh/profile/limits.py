@@ -105,7 +105,7 @@ class TranslationLimits(Section):
 
 
 class RotationLimits(Section):
-    """Limits per axis of the rotation vector."""
+    """Limits of the TCP's rotation, by its norm: about any axis."""
 
     velocity_rad_s: float = Field(default=1.5, ge=1e-3, le=2.5)
     acceleration_rad_s2: float = Field(default=6.0, ge=1e-2, le=25)

@@ -180,7 +180,7 @@ def test_the_measured_arm_ends_the_activation_with_an_event_that_names_joint_val
         joints_rad = joints_rad - 0.001 * JOINT["panda_joint4"]
         arm.stand_at(KINEMATICS, joints_rad)
         arm.tick()
-        slowest = min(slowest, arm.commander.parts[0].motion.pace.speed)
+        slowest = min(slowest, arm.commander.parts[0].motion.scaling.share)
         if arm.state != "active":
             break
     assert arm.state == "inactive"

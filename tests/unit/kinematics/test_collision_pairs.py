@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from described_arms import SEVEN, TOOL, Row, arm, urdf
+from described_arms import SEVEN, TOOL, Row, Y, arm, urdf
 
-from vla_zenoh.kinematics.collision import CollisionModel
+from vla_zenoh.kinematics.collision import HELD, CollisionModel
 from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.profile import KeepOut
 
@@ -35,6 +35,16 @@ def test_what_only_few_configurations_touch_is_checked(tmp_path: Path, seed: int
     pairs = CollisionModel(Kinematics(path, "tcp", JOINTS), near_m=NEAR_M).pairs
     for number in range(4):
         assert any({pair.first, pair.second} == {"tcp", f"to_{number}_link"} for pair in pairs)
+
+
+def test_the_hand_is_what_moves_with_the_tcp_whichever_joint_comes_last(tmp_path: Path) -> None:
+    """A rod that keeps a linkage parallel is a joint of its own, and no hand to the table."""
+    rod = Row("rod", axis=Y, parent="j2_link", mimic=("j3", -1.0, 0.0))
+    path = tmp_path / "arm.urdf"
+    path.write_text(urdf([*arm(SEVEN), TOOL, rod]))
+    collisions = CollisionModel(Kinematics(path, "tcp", JOINTS), near_m=1.0, table_z_m=-0.05)
+    hand = {pair.first for pair in collisions.pairs if pair.is_hand}
+    assert hand == {"j7_link", "tcp", HELD}
 
 
 CORNERS = ((0, 0, 0), (100, 0, 0), (0, 20, 0), (0, 0, 20))

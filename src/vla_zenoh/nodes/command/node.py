@@ -319,7 +319,7 @@ class CommandStatus:
                 "held_by": commander.deadman.name if task.active else "",
                 "at_rest": commander.at_rest,
                 "streaming": commander.streaming,
-                "speed_share": round(min(part.motion.pace.speed for part in commander.parts), 3),
+                "speed_share": round(min(part.motion.scaling.share for part in commander.parts), 3),
                 "tracking_mm": _most(part.tracking.apart_m for part in commander.parts),
                 "tracking_mrad": _most(part.tracking.apart_rad for part in commander.parts),
                 "elbow_mrad": _most(part.elbow_rad for part in commander.parts),
@@ -344,7 +344,7 @@ class CommandStatus:
         self._limits = {name: hit for name, hit in self._limits.items() if hit[1] > oldest_s}
         acting = {name: why for name, (why, _) in self._limits.items()}
         for part in self._commander.parts:
-            slower = part.motion.pace.slower if part.motion.streaming else None
+            slower = part.motion.scaling.slower if part.motion.streaming else None
             if slower is not None:
                 acting[slower.name] = part.says(f"{slower.share:.0%} of the speed{slower.at}")
         return [f"{name}: {why}"[:MAX_LIMIT] for name, why in sorted(acting.items())]
