@@ -184,7 +184,7 @@ class FrankaArm:
             state.dq,
             state.tau_ext_hat_filtered,
             **({} if self._hand is None else self._hand.state()._asdict()),
-            wrench=state.O_F_ext_hat_K,
+            wrench=external_wrench(state.O_F_ext_hat_K),
             fault=self._fault(mode),
             mode="" if mode in READY | STOPPED else mode,
             measured_ns=self._measured_ns,
@@ -332,6 +332,16 @@ def at_rest(command: Command) -> Command:
         still = np.zeros_like(command.velocity_rad_s)
         return replace(command, velocity_rad_s=still, acceleration_rad_s2=still)
     return replace(command, twist=np.zeros(6), acceleration=np.zeros(6))
+
+
+def external_wrench(reported: Any) -> FloatArray | None:
+    """(6,) N and Nm that the surroundings exert on the arm; None: the robot does not know them.
+
+    It reports what the robot exerts on the surroundings, and zeros near a singularity (`RobotState`
+    in the documentation of libfranka): a force limit that took these for no force would be none.
+    """
+    wrench = -np.array(reported, dtype=np.float64)
+    return wrench if wrench.any() else None
 
 
 def _in_time(make: Callable[[], Any], what: str) -> Any:
