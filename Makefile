@@ -23,7 +23,7 @@ AT_THE_END := --last-failed --last-failed-no-failures none --reruns 0 -r fEs
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-long slow fuzz fuzz-motion soak test-ros2 test-franka test-rivals test-clients test-realsense test-models check format bench bench-faults bench-ros2 bench-rclpy build docs ros2-bridge ros2-environment clean
+.PHONY: help setup demo test test-long slow fuzz fuzz-motion mutants soak test-ros2 test-franka test-rivals test-clients test-realsense test-models check format bench bench-faults bench-ros2 bench-rclpy build docs ros2-bridge ros2-environment clean
 
 help: ## Show this list
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z0-9-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
@@ -64,6 +64,9 @@ fuzz: $(READY) ## Feed every reader of foreign bytes with nonsense; SECONDS=600 
 
 fuzz-motion: $(READY) ## Fuzz command node and guard with a perfect arm; MINUTES=10 for less
 	PYTHONPATH=tests $(BIN)/python tests/fuzz_motion/fuzz_motion.py --minutes $(MINUTES) $(ARGS)
+
+mutants: $(READY) ## Put 200 small faults into the core, one at a time, and tell which no test notices
+	$(BIN)/python tests/mutants/mutants.py $(ARGS)
 
 soak: $(READY) ## Run the whole chain with random faults; MINUTES=3 for a short one
 	$(BIN)/python reliability/soak/soak.py --minutes $(MINUTES) $(ARGS)
