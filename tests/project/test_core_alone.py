@@ -94,18 +94,46 @@ def test_the_models_of_the_demo_need_no_package(alone: dict[str, str]) -> None:
         assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize("command", plugins.PACKAGES)
-@pytest.mark.parametrize("after", [(), ("--help",), ("a-word", "--an-option=1")], ids=str)
+MANY = """
+import contextlib, io, json, sys
+from vla_zenoh.program.entry import main
+
+told = []
+for words in json.load(sys.stdin):
+    sys.argv, said, code = ["vla-zenoh", *words], io.StringIO(), 0
+    with contextlib.redirect_stderr(said):
+        try:
+            main()
+        except SystemExit as end:
+            code = end.code
+    told.append((code, said.getvalue()))
+json.dump(told, sys.stdout)
+"""
+AFTER = ((), ("--help",), ("a-word", "--an-option=1"))
+
+
 def test_a_command_of_a_package_that_is_missing_says_how_to_install_it(
-    alone: dict[str, str], command: str, after: tuple[str, ...]
+    alone: dict[str, str],
 ) -> None:
-    done = run(alone, *command.split("."), *after)
-    assert done.returncode == 1
-    package = plugins.PACKAGES[command]
-    assert f"needs the package {package}; install it with: pip install" in done.stderr
-    folders = [*plugins.needed_by(package), package]
-    paths = " ".join(f"'./plugins/{each}'" for each in folders)
-    assert f" . {paths} in a checkout" in done.stderr
+    """One process runs them all: each would spend its time on the same imports."""
+    asked = [(command, after) for command in plugins.PACKAGES for after in AFTER]
+    words = [(*command.split("."), *after) for command, after in asked]
+    done = subprocess.run(
+        [sys.executable, "-S", "-c", MANY],
+        env=alone,
+        input=json.dumps(words),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    for (command, after), (code, said) in zip(asked, json.loads(done.stdout), strict=True):
+        assert code == 1, (command, after, said)
+        package = plugins.PACKAGES[command]
+        assert f"needs the package {package}; install it with: pip install" in said, after
+        folders = [*plugins.needed_by(package), package]
+        paths = " ".join(f"'./plugins/{each}'" for each in folders)
+        assert f" . {paths} in a checkout" in said, (command, after)
 
 
 def test_up_says_at_its_start_that_a_node_of_its_host_needs_a_package(
