@@ -81,7 +81,12 @@ def session_config(
             "exit_on_failure": not routes,
             "retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
         },
-        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        # Nothing is scouted for, so a router waits for no answers before it opens.
+        "scouting": {
+            "delay": 0,
+            "multicast": {"enabled": False},
+            "gossip": {"enabled": False},
+        },
         "transport": {
             "shared_memory": {
                 "enabled": profile.shared_memory and not obstacle(),
