@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -67,6 +68,7 @@ def monitor_files() -> list[str]:
     ]
 
 
+@cache
 def all_sentences() -> set[str]:
     given = {text for file, names in REASONS.items() for text in sentences(file, names)}
     return given | {text for file in monitor_files() for text in sentences(file, {"reasons"})}
@@ -106,6 +108,7 @@ def test_an_entry_is_a_reason_that_the_code_gives(entry: str) -> None:
     assert any(stands_for(entry, each) for each in said), f"no code says: {entry}"
 
 
+@cache
 def findings() -> set[str]:
     """Names of the errors that a spec or a chunk can have."""
     tree = ast.parse((SOURCE / "control" / "policy_check.py").read_text())

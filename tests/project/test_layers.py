@@ -7,6 +7,7 @@ import json
 import re
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -83,6 +84,7 @@ def allowed(path: Path) -> frozenset[str]:
     return next((ALLOWED[str(step)] for step in steps if str(step) in ALLOWED), frozenset())
 
 
+@cache
 def imported_names(source: str) -> set[str]:
     names: set[str] = set()
     for node in ast.walk(ast.parse(source)):

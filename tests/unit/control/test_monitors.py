@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from typing import Any
 
@@ -99,15 +100,16 @@ def pressed(force_n: FloatArray, at_ns: int) -> Stamped[PoseState]:
 
 
 @pytest.mark.parametrize("rate_n_s", [0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0])
-@pytest.mark.parametrize("offset_n", [0.0, 5.0, 14.0])
-@pytest.mark.parametrize("degrees", [0, 60, 90, 180])
+@pytest.mark.parametrize(
+    ("offset_n", "degrees"), [(0.0, 0), *itertools.product((5.0, 14.0), (0, 60, 90, 180))]
+)
 def test_the_arm_brakes_at_its_force_however_slowly_it_rises_and_whatever_was_there_before(
     rate_n_s: float, offset_n: float, degrees: float
 ) -> None:
     contact = Contact(ContactLimits(force_stop_n=STOP_N))
     angle = np.radians(degrees)
     offset = offset_n * np.array([np.cos(angle), np.sin(angle), 0.0])
-    step_ns = 4 * MS if rate_n_s >= 1.0 else 40 * MS
+    step_ns = 4 * MS if rate_n_s > 3.0 else 40 * MS
     now_ns = START_NS
     for _ in range(100):
         contact.update_pose(pressed(offset, now_ns))
