@@ -7,8 +7,10 @@ import subprocess
 import sys
 from typing import Any
 
+import pytest
 from camera_rig import free_endpoint
 from chain import LONG_PATIENCE_S, Chain, command_line
+from typed import Typed, typed
 
 from vla_zenoh.bus.session import open_session
 from vla_zenoh.profile import load_profile, override
@@ -21,69 +23,83 @@ CONTROL_HZ = 500
 """How often the simulated robot computes control, where the computer keeps up."""
 
 
-def run(chain: Chain, *words: str) -> subprocess.CompletedProcess[str]:
-    done = command_line(*words, profile=chain.profile_file)
-    assert "Traceback" not in done.stderr
-    return done
+class Person:
+    """Whoever types commands: in this process, as each of its own would load everything anew."""
+
+    def __init__(self, capsys: pytest.CaptureFixture[str]) -> None:
+        self._capsys = capsys
+
+    def run(self, *words: str) -> Typed:
+        return typed(self._capsys, *words)
+
+    def ok(self, *words: str) -> str:
+        """What it prints; asked again where a busy computer took longer than the program waits."""
+        for _ in range(1 + AGAIN):
+            done = self.run(*words)
+            if "did not accept this within" not in done.stderr:
+                break
+        assert done.code == 0, done.stderr
+        return done.stdout
+
+    def json(self, *words: str) -> Any:
+        return json.loads(self.ok(*words))
 
 
-def ok(chain: Chain, *words: str) -> str:
-    """What it prints; asked again where a busy computer took longer than the program waits."""
-    for _ in range(1 + AGAIN):
-        done = run(chain, *words)
-        if "did not accept this within" not in done.stderr:
-            break
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+@pytest.fixture
+def person(
+    chain: Chain, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> Person:
+    monkeypatch.setenv("VLA_ZENOH_PROFILE", str(chain.profile_file))
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setenv("TERM", "dumb")
+    return Person(capsys)
 
 
-def json_of(chain: Chain, *words: str) -> Any:
-    return json.loads(ok(chain, *words))
-
-
-def test_a_session_from_prompt_to_reset(chain: Chain) -> None:
+def test_a_session_from_prompt_to_reset(chain: Chain, person: Person) -> None:
     chain.activate_when_ready()  # once, so that nothing is missing any more
     chain.settle()
-    assert "prompt: 'HARD: go up' (worker scripted, 10 Hz)" in ok(chain, "prompt", "HARD: go up")
-    assert "rate: 5 Hz" in ok(chain, "rate", "5")
-    assert "speed: 100 % of the planned speed" in ok(chain, "speed")
-    assert "speed: 30 % of the planned speed" in ok(chain, "speed", "30 %")
-    assert "speed 30 %" in ok(chain, "status", "--once")
-    assert "speed: 80 % of the planned speed" in ok(chain, "speed", "80")
-    assert "'fast' is not a percentage" in run(chain, "speed", "fast").stderr
-    ok(chain, "speed", "100")
+    assert "prompt: 'HARD: go up' (worker scripted, 10 Hz)" in person.ok("prompt", "HARD: go up")
+    assert "rate: 5 Hz" in person.ok("rate", "5")
+    assert "speed: 100 % of the planned speed" in person.ok("speed")
+    assert "speed: 30 % of the planned speed" in person.ok("speed", "30 %")
+    assert "speed 30 %" in person.ok("status", "--once")
+    assert "speed: 80 % of the planned speed" in person.ok("speed", "80")
+    assert "'fast' is not a percentage" in person.run("speed", "fast").stderr
+    person.ok("speed", "100")
 
-    refused = run(chain, "use", "scripter")
-    assert refused.returncode == REFUSED
+    refused = person.run("use", "scripter")
+    assert refused.code == REFUSED
     assert "worker 'scripter' is not alive; did you mean 'scripted'?" in refused.stderr
     assert "Alive are: scripted" in refused.stderr
     chain.client.set_worker("nobody")
-    refused = run(chain, "activate")
-    assert refused.returncode == REFUSED
+    refused = person.run("activate")
+    assert refused.code == REFUSED
     assert "activate rejected:" in refused.stderr
     assert "- worker 'nobody' is not alive; alive are: scripted" in refused.stderr
-    ok(chain, "use", "scripted")
+    person.ok("use", "scripted")
 
-    assert "SIM | active: worker scripted, prompt 'HARD: go up', 5 Hz" in ok(chain, "activate")
+    assert "SIM | active: worker scripted, prompt 'HARD: go up', 5 Hz" in person.ok("activate")
     chain.until("it moves", chain.moves)
-    assert "inactive, the arm stands: robot panda" in ok(chain, "deactivate")
+    assert "inactive, the arm stands: robot panda" in person.ok("deactivate")
     assert not chain.moves()
 
     named = f"robot panda (profile {chain.profile_file})"
     how = f"`vla-zenoh reset --profile {chain.profile_file}` clears it"
-    said = ok(chain, "stop")
+    stop = command_line("stop", profile=chain.profile_file)  # sets the priority of its process
+    assert stop.returncode == 0, stop.stderr
+    said = stop.stdout
     assert f"CONFIRMED: {named} is stopped and stands, by " in said
     assert how in said
-    refused = run(chain, "activate")
-    assert refused.returncode == REFUSED
+    refused = person.run("activate")
+    assert refused.code == REFUSED
     assert (
         "the state is stopped (emergency stop); clear it with `vla-zenoh reset`" in refused.stderr
     )
-    assert "reset; inactive" in ok(chain, "reset")
+    assert "reset; inactive" in person.ok("reset")
 
 
-def test_status_as_json_tells_of_every_node(chain: Chain) -> None:
-    told = json_of(chain, "status", "--json")
+def test_status_as_json_tells_of_every_node(chain: Chain, person: Person) -> None:
+    told = person.json("status", "--json")
     assert (told["robot"], told["mode"]) == ("panda", "sim")
     assert (told["limits"], told["hosts_down"]) == ([], {})
     found = told["nodes"]
@@ -101,14 +117,14 @@ def test_status_as_json_tells_of_every_node(chain: Chain) -> None:
     assert found["sim"]["detail"]["lockstep"] is False
 
 
-def test_status_for_people_names_every_node(chain: Chain) -> None:
-    out = ok(chain, "status", "--once")
+def test_status_for_people_names_every_node(person: Person) -> None:
+    out = person.ok("status", "--once")
     for word in ("router", "sim", "camera", "command", "worker-scripted", "inactive", "inferring"):
         assert word in out
 
 
-def test_keys_as_json_say_type_writer_and_rate(chain: Chain) -> None:
-    found = {entry["key"]: entry for entry in json_of(chain, "keys", "--json")}
+def test_keys_as_json_say_type_writer_and_rate(chain: Chain, person: Person) -> None:
+    found = {entry["key"]: entry for entry in person.json("keys", "--json")}
     pose = found["vla/panda/state/pose"]
     assert pose["type"] == "application/msgpack"
     assert pose["writer"].startswith("sim#")
@@ -119,20 +135,20 @@ def test_keys_as_json_say_type_writer_and_rate(chain: Chain) -> None:
     assert found["vla/panda/camera/front/jpeg"]["type"].startswith("image/jpeg")
 
 
-def test_echo_decodes_what_is_written(chain: Chain) -> None:
-    lines = ok(chain, "echo", "state/pose", "-n", "3", "--json").splitlines()
+def test_echo_decodes_what_is_written(person: Person) -> None:
+    lines = person.ok("echo", "state/pose", "-n", "3", "--json").splitlines()
     assert len(lines) == 3
     first, *_, last = (json.loads(line) for line in lines)
     assert first["key"] == "vla/panda/state/pose"
     assert first["header"]["source"].startswith("sim#")
     assert last["header"]["seq"] > first["header"]["seq"]
     assert len(first["value"]["position_m"]) == 3
-    assert "'worker': 'scripted'" in ok(chain, "echo", "task", "-n", "1")
+    assert "'worker': 'scripted'" in person.ok("echo", "task", "-n", "1")
 
 
-def test_echo_of_a_silent_key_fails(chain: Chain) -> None:
-    done = run(chain, "echo", "no/such/key", "--seconds", "0.3")
-    assert done.returncode == REFUSED
+def test_echo_of_a_silent_key_fails(person: Person) -> None:
+    done = person.run("echo", "no/such/key", "--seconds", "0.3")
+    assert done.code == REFUSED
     assert "nothing was published on vla/panda/no/such/key" in done.stderr
 
 
@@ -152,8 +168,8 @@ def test_echo_names_the_key_that_was_meant_and_ends_with_the_router() -> None:
     assert echo.returncode == REFUSED
 
 
-def test_without_a_router_a_command_says_where_it_looked_and_what_to_do(chain: Chain) -> None:
-    done = run(chain, "status", "--once", "--connect", "tcp/127.0.0.1:9")
-    assert done.returncode == REFUSED
+def test_without_a_router_a_command_says_where_it_looked_and_what_to_do(person: Person) -> None:
+    done = person.run("status", "--once", "--connect", "tcp/127.0.0.1:9")
+    assert done.code == REFUSED
     assert "no Zenoh router answers at tcp/127.0.0.1:9" in done.stderr
     assert "vla-zenoh up" in done.stderr

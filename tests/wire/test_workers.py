@@ -169,25 +169,6 @@ def test_a_worker_that_is_not_there_is_refused_in_motion_and_the_arm_goes_on(
     assert chain.state() == "active"
 
 
-@pytest.mark.parametrize(
-    ("text", "why"),
-    [
-        ("import no_such_module_at_all\n", "No module named 'no_such_module_at_all'"),
-        ("class Model:\n    spec = 1\n    def infer(self, o): ...\n", "needs a property `spec`"),
-    ],
-)
-def test_a_file_that_is_no_model_is_refused_with_its_reason(
-    chain: Chain, tmp_path: Path, text: str, why: str
-) -> None:
-    model = tmp_path / "bad.py"
-    model.write_text(text)
-    with worker(chain, str(model)) as process:
-        out, _ = process.communicate(timeout=30)
-    assert process.returncode == 1
-    assert why in out
-    assert "Traceback" not in out
-
-
 def test_what_a_model_sees_is_shown_with_its_prompt_raw_output_and_steps(
     chain: Chain, tmp_path: Path
 ) -> None:

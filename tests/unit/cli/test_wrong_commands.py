@@ -196,6 +196,22 @@ def test_without_a_router_it_is_said_where_one_was_looked_for(
     assert "no Zenoh router answers at tcp/127.0.0.1:9. Start one with `vla-zenoh" in done.said
 
 
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("import no_such_module_at_all\n", "No module named 'no_such_module_at_all'"),
+        ("class Model:\n    spec = 1\n    def infer(self, o): ...\n", "needs a property `spec`"),
+    ],
+)
+def test_a_file_that_is_no_model_is_refused_with_its_reason(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, text: str, why: str
+) -> None:
+    (tmp_path / "bad.py").write_text(text)
+    done = typed(capsys, "worker", "./bad.py", *NOWHERE)
+    assert done.code == FAILED
+    assert why in done.said
+
+
 def test_a_demo_is_refused_a_prompt_that_it_cannot_judge_and_lists_those_it_can(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
