@@ -252,6 +252,9 @@ def hang_in_motion(chain: Chain, node: str, seconds: float) -> int:
     return at_ns
 
 
+# A watchdog that runs out and a worker that is gone are in tests/unit/control/test_commander.py;
+# here it hangs for two leases and a half.
+@pytest.mark.long
 def test_a_hung_worker_lets_the_arm_hold_and_then_lose_it(chain: Chain) -> None:
     lease_s = chain.profile.session.lease_ms / 1e3
     at_ns = hang_in_motion(chain, "worker-scripted", 2.5 * lease_s)
