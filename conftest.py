@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,9 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))
 
 IN_REAL_TIME = {"wire", "fault", "netns", "ros2"}
 """Folders of tests that begin processes and wait for them: one file at a time on two cores."""
+KEEPS = "wire"
+"""Folder whose files hand a robot on to each other; those that kill its nodes begin with a new
+one."""
 LEFT_OUT = {**dict.fromkeys(IN_REAL_TIME, "realtime"), "franka": "franka", "models": "models"}
 """Folder -> mark of everything in it."""
 
@@ -48,9 +52,14 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 @pytest.hookimpl(tryfirst=True)  # before -m chooses
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    robots_s: dict[Path, float] = {}
     for item in items:
         if item.path.relative_to(ROOT).parts[1] in IN_REAL_TIME:
             item.add_marker(pytest.mark.realtime)
+        if _is_lent_a_robot(item):
+            robots_s[item.path] = _patience_s(item)["command"]
+    # Files that can go on with the same robot follow each other.
+    items.sort(key=lambda item: robots_s.get(item.path, 0.0))
 
 
 @pytest.hookimpl(tryfirst=True)  # before the fixtures are made
@@ -63,6 +72,53 @@ def pytest_runtest_setup(item: pytest.Function) -> None:
         for fixture in fixtures:
             if fixture.scope == "module":
                 fixture.finish(request)
+    ROBOT.close()
+
+
+@pytest.hookimpl(trylast=True)  # after the fixtures of a file have ended
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
+    if nextitem is None or not (nextitem.path == item.path or _is_lent_a_robot(nextitem)):
+        ROBOT.close()
+
+
+def pytest_sessionfinish() -> None:
+    ROBOT.close()
+
+
+class KeptRobot:
+    """A robot that goes from file to file: five processes take ten seconds to be ready."""
+
+    def __init__(self) -> None:
+        self._patience_s: Mapping[str, float] = {}
+        self._running = ExitStack()
+        self._chain: Chain | None = None
+
+    def get(self, folder: Path, patience_s: Mapping[str, float]) -> Chain:
+        """The one that runs, if it is as patient; else a new one."""
+        if self._chain is None or patience_s != self._patience_s:
+            self.close()
+            chain = self._running.enter_context(running_chain(folder, patience_s=patience_s))
+            chain.activate_when_ready()
+            self._chain, self._patience_s = chain, patience_s
+        return self._chain
+
+    def close(self) -> None:
+        self._chain = None
+        self._running.close()
+
+
+ROBOT = KeptRobot()
+
+
+def _is_lent_a_robot(item: pytest.Item) -> bool:
+    """Whether it takes the robot of this file, and its folder hands that on."""
+    fixtures: Any = getattr(item, "_fixtureinfo", None)
+    chains = fixtures.name2fixturedefs.get("shared_chain", ()) if fixtures else ()
+    return len(chains) == 1 and item.path.parent.name == KEEPS
+
+
+def _patience_s(of: Any) -> Mapping[str, float]:
+    return getattr(of.module, "ROBOT_PATIENCE_S", CHAIN_PATIENCE_S)
 
 
 @pytest.fixture(scope="module")
@@ -70,10 +126,10 @@ def shared_chain(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Chain]:
     """One robot for all tests of a file; take `chain` instead, which begins in order."""
-    patience_s = getattr(request.module, "ROBOT_PATIENCE_S", CHAIN_PATIENCE_S)
-    with running_chain(tmp_path_factory.mktemp("chain"), patience_s=patience_s) as chain:
-        chain.activate_when_ready()
-        yield chain
+    failed = request.session.testsfailed
+    yield ROBOT.get(tmp_path_factory.mktemp("chain"), _patience_s(request))
+    if request.path.parent.name != KEEPS or request.session.testsfailed > failed:
+        ROBOT.close()
 
 
 @pytest.fixture

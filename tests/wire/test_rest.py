@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -19,13 +18,6 @@ UNKNOWN = "a prompt that the scripted model does not know"
 SLOW, FAST = 1.2, 0.5
 """Shares of a rate: the most at rest, and the least that a busy computer reaches."""
 SAME_M = 1e-4
-
-
-@pytest.fixture(scope="module")
-def chain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chain]:
-    folder: Path = tmp_path_factory.mktemp("rest")
-    with running_chain(folder) as chain:
-        yield chain
 
 
 def commands_hz(chain: Chain) -> float:
