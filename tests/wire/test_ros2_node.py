@@ -42,6 +42,10 @@ GOAL = "multi_mode_control_msgs/msg/CartesianImpedanceGoal"
 BRIDGES = ("ros2dds", "rmw_zenoh")
 
 
+whatever_the_bridge = pytest.mark.parametrize("shared_rig", BRIDGES[:1], indirect=True)
+"""Of a test about what the node makes of messages, however they came."""
+
+
 @pytest.fixture(scope="module", params=BRIDGES)
 def shared_rig(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
@@ -82,6 +86,7 @@ def test_joint_states_become_our_states_with_the_robots_own_stamps(rig: Ros2Rig)
     assert {(h.stamp_wall_ns, h.seq) for h in heard[JointState][:-1]} <= poses
 
 
+@whatever_the_bridge
 @pytest.mark.parametrize(
     ("field", "index", "value", "reason"),
     [
@@ -104,6 +109,7 @@ def test_what_is_not_finite_is_refused_and_no_state_comes_of_it(
     assert len(rig.states[PoseState]) == since
 
 
+@whatever_the_bridge
 def test_a_robot_that_repeats_itself_is_frozen(rig: Ros2Rig) -> None:
     before = rig.counted("refused.frozen")
     rig.robot.frozen = True
@@ -111,6 +117,7 @@ def test_a_robot_that_repeats_itself_is_frozen(rig: Ros2Rig) -> None:
     rig.wait("the node says so", lambda: rig.statuses[-1].state == "silent")
 
 
+@whatever_the_bridge
 def test_a_robot_that_falls_silent_and_comes_back_is_told(rig: Ros2Rig) -> None:
     rig.wait("it runs", lambda: rig.statuses[-1].state == "running")
     rig.events.clear()
@@ -178,6 +185,7 @@ def image(rig: Ros2Rig, stamp_ns: int, encoding: str = "bgr8", value: int = 7) -
     )
 
 
+@whatever_the_bridge
 def test_a_camera_that_shows_one_picture_again_and_again_is_said_to_be_bad(rig: Ros2Rig) -> None:
     dice = np.random.default_rng(2)
     pool = [dice.integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8).ravel() for _ in range(5)]
@@ -314,6 +322,7 @@ class Commander:
         self._thread.join()
 
 
+@whatever_the_bridge
 def test_a_stream_that_falls_silent_is_braked_and_then_nothing_more_is_sent(rig: Ros2Rig) -> None:
     goals = rig.robot.goals
     rig.events.clear()
@@ -338,6 +347,7 @@ def test_a_stream_that_falls_silent_is_braked_and_then_nothing_more_is_sent(rig:
     assert rig.detail("held")
 
 
+@whatever_the_bridge
 def test_a_stream_that_begins_elsewhere_is_refused(rig: Ros2Rig) -> None:
     sent, before = len(rig.robot.goals), rig.counted("refused.pose_jump")
     with Commander(rig):

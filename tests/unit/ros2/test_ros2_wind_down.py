@@ -22,8 +22,6 @@ JERKED_M = 1e-4
 """Two steps differ by less: a tick of twice the acceleration of `limits.translation`."""
 STALL_S = 0.4
 """Longer than timing.command_timeout_s of the rig's profile, which is 0.3 s."""
-SLOW_S = 0.2
-"""Between two turns of a loop that is late: by less than that."""
 GENTLE = "limits: {translation: {jerk_m_s3: 0.3}}\n"
 """From 0.2 m/s the robot's own stop takes 1.15 s."""
 GENTLE_RAMP_S = 2.0
@@ -143,15 +141,3 @@ def test_a_brake_that_takes_long_is_brought_to_its_end(loop: Loop) -> None:
     loop.run()
     braked(loop.turns)
     assert (loop.turn - moving) * TICK_S > LEAST_S
-
-
-def test_a_loop_that_is_too_slow_to_brake_ends_in_time_and_says_so(loop: Loop) -> None:
-    def slow() -> None:
-        loop.stop.set()
-        loop.period_s = SLOW_S
-
-    loop.script[MOVING] = slow
-    loop.run()
-    assert loop.turns.arm.guard.moving
-    (event,) = loop.turns.told("not_braked")
-    assert "the loop was late too often" in event.why
