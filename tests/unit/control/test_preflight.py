@@ -10,13 +10,24 @@ import numpy as np
 import pytest
 from command_rig import MS, START_NS, WORKER, Rig, model_spec
 
+from vla_zenoh.control.limits import BEGIN_M
 from vla_zenoh.control.policy_check import wrong_rate
-from vla_zenoh.control.preflight import Passing, PeerSnapshot, reasons_of_part, reasons_of_worker
+from vla_zenoh.control.preflight import (
+    SETTLED,
+    SETTLED_NS,
+    Passing,
+    PeerSnapshot,
+    Settling,
+    reasons_of_part,
+    reasons_of_worker,
+)
 from vla_zenoh.keys import LOADING, NOTHING_YET, OPENING
+from vla_zenoh.kinematics.kinematics import make_kinematics
+from vla_zenoh.kinematics.so3 import pose_of
 from vla_zenoh.lab.check.fit import check_spec
 from vla_zenoh.policy import ActionSpec, CameraSpec, ModelSpec
 from vla_zenoh.profile import load_profile, override
-from vla_zenoh.types import GripperState, Header, PoseState, Stamped
+from vla_zenoh.types import GripperState, Header, JointState, PoseState, Stamped
 
 
 class Ready:
@@ -375,3 +386,68 @@ def test_what_fails_does_not_pass_by_itself(change: Callable[[Ready], None]) -> 
     ready = Ready()
     change(ready)
     assert [why for why in ready.reasons() if not isinstance(why, Passing)]
+
+
+class Settles:
+    """An arm whose stream stands, measured every 20 ms."""
+
+    def __init__(self) -> None:
+        self.settling = Settling(None)
+        self.now_ns = START_NS
+        self.state = replace(
+            Ready().pose.record, reference_position_m=None, reference_quat_xyzw=None
+        )
+
+    def reasons(self, behind_m: float) -> list[str]:
+        """Why it is not activated where it is so far behind its last command."""
+        here_m = self.state.position_m - [behind_m, 0.0, 0.0]
+        self.now_ns += 20 * MS
+        self.settling.measure(replace(self.state, position_m=here_m), None, self.now_ns)
+        return self.settling.unsettled(pose_of(self.state), None)
+
+    def stand_ms(self, behind_m: float) -> int:
+        """How long it stands until it is activated."""
+        begin_ns = self.now_ns + 20 * MS
+        while self.reasons(behind_m):
+            assert self.now_ns < begin_ns + 10 * SETTLED_NS
+        return (self.now_ns - begin_ns) // MS
+
+
+def test_an_arm_that_still_moves_to_its_last_command_is_not_activated() -> None:
+    arm = Settles()
+    assert arm.settling.unsettled(pose_of(arm.state), None) == []
+    for behind_m in np.arange(3 * BEGIN_M, BEGIN_M + SETTLED, -1.1 * SETTLED):
+        (why,) = arm.reasons(behind_m)
+        assert why.startswith(f"the robot is still {behind_m:.3f} m and 0.000 rad from its last")
+    assert arm.reasons(0.9 * BEGIN_M) == []
+
+
+def test_an_arm_that_stands_elsewhere_is_activated_there_after_a_while() -> None:
+    arm = Settles()
+    assert arm.reasons(2 * BEGIN_M)
+    # It creeps, by less at a time than counts as motion.
+    creeping = [arm.reasons(2 * BEGIN_M - step * 0.6 * SETTLED) for step in range(7)]
+    assert all(creeping)
+    assert arm.stand_ms(3 * BEGIN_M) == SETTLED_NS // MS + 20
+
+
+def test_how_long_an_arm_stood_before_a_stream_moved_does_not_count() -> None:
+    arm = Settles()
+    arm.stand_ms(2 * BEGIN_M)
+    arm.settling.restart()
+    assert arm.stand_ms(2 * BEGIN_M) == SETTLED_NS // MS + 20
+
+
+def test_an_arm_whose_elbow_still_moves_is_not_activated_though_its_tcp_stands() -> None:
+    profile = load_profile("fr3")
+    kinematics = make_kinematics(profile)
+    pose = replace(Ready().pose.record, reference_position_m=None, reference_quat_xyzw=None)
+    settling, zero = Settling(kinematics), np.zeros(kinematics.size)
+    commanded_rad = np.array(profile.robot.home_rad)
+    for step, way_rad in enumerate([0.3, 0.2, 0.1]):
+        there_rad = commanded_rad + way_rad
+        joint = JointState(kinematics.arm_joints, there_rad, zero, zero)
+        settling.measure(pose, joint, START_NS + 200 * step * MS)
+        (why,) = settling.unsettled(pose_of(pose), commanded_rad)
+        assert f"0.000 rad from its last command, its joints {way_rad:.3f} rad" in why
+    assert settling.unsettled(pose_of(pose), there_rad) == []
