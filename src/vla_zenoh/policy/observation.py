@@ -24,7 +24,7 @@ from vla_zenoh.policy import (
     ObservationSpec,
     StatePart,
 )
-from vla_zenoh.policy.spec import STREAM_OF
+from vla_zenoh.policy.spec import FIELD_OF, STREAM_OF
 from vla_zenoh.types import (
     Depth,
     GripperState,
@@ -269,7 +269,7 @@ def _observation(
         for what in wanted.state:
             if STREAM_OF.get(what, what) != kind:
                 continue
-            name = "effort_nm" if what == "effort" else what
+            name = FIELD_OF.get(what, what)
             value = entry.record if what == kind else getattr(entry.record, name)
             if value is None:
                 where = _STATE.format(stream)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import subprocess
 import sys
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -23,8 +24,11 @@ from vla_zenoh.policy import (
     ModelSpec,
     Observation,
     ObservationSpec,
+    StatePart,
     check_steps,
 )
+from vla_zenoh.policy.observation import STATE_KINDS
+from vla_zenoh.policy.spec import FIELD_OF, STREAM_OF
 
 SPEC = ModelSpec(
     name="openvla",
@@ -298,8 +302,19 @@ def test_steps_that_break_the_contract_are_refused(steps: Any, said: str) -> Non
 
 
 # -- example ----------------------------------------------------------------------------------
-STATE_PARTS = ("joint", "pose", "gripper", "privileged", "wrench", "effort")
-FIELDS = {"effort": "effort_nm"}
+STATE_PARTS: tuple[StatePart, ...] = get_args(StatePart)
+
+
+@pytest.mark.parametrize("part", STATE_PARTS)
+def test_a_part_of_the_state_is_in_an_observation_in_a_record_and_among_what_is_tried(
+    part: StatePart,
+) -> None:
+    field = FIELD_OF.get(part, part)
+    assert field in {each.name for each in dataclasses.fields(Observation)}
+    record = STATE_KINDS[STREAM_OF.get(part, part)]
+    assert part in STATE_KINDS or field in {each.name for each in dataclasses.fields(record)}
+    spec = SPEC.model_copy(update={"observation": ObservationSpec(state=(part,))})
+    assert getattr(example_observation(spec), field) is not None
 
 
 def holds(spec: ModelSpec, observation: Observation) -> bool:
@@ -311,7 +326,7 @@ def holds(spec: ModelSpec, observation: Observation) -> bool:
             and observation.images[c.camera].dtype == np.uint8
             for c in wanted.cameras
         )
-        and {p for p in STATE_PARTS if getattr(observation, FIELDS.get(p, p)) is not None}
+        and {p for p in STATE_PARTS if getattr(observation, FIELD_OF.get(p, p)) is not None}
         == set(wanted.state)
     )
 

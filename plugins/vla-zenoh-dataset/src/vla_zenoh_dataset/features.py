@@ -20,13 +20,18 @@ from vla_zenoh_policy_servers.action_semantics import (
     read_action_semantics,
 )
 from vla_zenoh_policy_servers.presets import LEROBOT, LEROBOT_STATE
-from vla_zenoh_policy_servers.state_vector import StateNumbers, parts_of, state_numbers
+from vla_zenoh_policy_servers.state_vector import (
+    PARTS,
+    StateNumbers,
+    parts_of,
+    state_numbers,
+)
 
 from vla_zenoh.errors import RecordingError, SpecError
 from vla_zenoh.lab.recording.run import Run, nearest
 from vla_zenoh.policy import ActionSpec, Observation
 from vla_zenoh.policy.meaning import ROTATION_FORMS
-from vla_zenoh.policy.spec import STREAM_OF
+from vla_zenoh.policy.spec import FIELD_OF, STREAM_OF
 from vla_zenoh.types import Task
 from vla_zenoh_dataset.episodes import RecordedEpisode
 
@@ -150,8 +155,9 @@ def state_names(
     parts: Sequence[str], joints: Sequence[str], spec: ActionSpec | None = None
 ) -> list[str]:
     """Names of the numbers of a state; `spec`: of the actions that it goes with."""
-    own = {"joint": [*joints], "joint_deg": [f"{name}_deg" for name in joints]}
-    own["effort"] = [f"{name}_effort" for name in joints]
+    per_joint = [part for part, (_, count) in PARTS.items() if count is None]
+    own = {part: [f"{name}_{part}" for name in joints] for part in per_joint}
+    own |= {"joint": [*joints], "joint_deg": [f"{name}_deg" for name in joints]}
     if spec is not None and in_lerobots_numbers(spec):
         own["joint"] = [f"{name}.pos" for name in joints]
         if spec.gripper != "none":
@@ -300,7 +306,7 @@ def _states(episode: RecordedEpisode, run: Run, numbers: StateNumbers) -> NDArra
                 raise RecordingError(
                     f"{run.path}: no {place}state/{part} within {NEAR_NS / 1e6:g} ms of a frame"
                 )
-            name = {"effort": "effort_nm"}.get(part, part)
+            name = FIELD_OF.get(part, part)
             found[name] = near.record if part in streams else getattr(near.record, name)
             if found[name] is None:
                 raise RecordingError(f"{run.path}: its robot did not measure {part}")

@@ -39,6 +39,7 @@ from vla_zenoh.policy.meaning import (
     GripperScale,
 )
 from vla_zenoh.policy.options import number
+from vla_zenoh.policy.spec import FIELD_OF
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import FloatArray, JointState
 from vla_zenoh_policy_servers.action_semantics import HOME, METRIC, SCALED, StateUnits
@@ -46,7 +47,6 @@ from vla_zenoh_policy_servers.action_semantics import HOME, METRIC, SCALED, Stat
 ROTATIONS = tuple(name for name in ROTATION_FORMS if name != "quaternion")
 CUT = ("rpy", "rotvec", "quat_xyzw", "quat_wxyz")
 """Forms in which a rotation has several numbers, so that a reference chooses."""
-JOINTS = ("joint", "joint_deg")
 COORDINATES: Mapping[str, tuple[str, ...]] = {
     "position": ("x", "y", "z"),
     **{name: ROTATION_FORMS[name].names for name in SCALED},
@@ -166,10 +166,10 @@ class StateNumbers:
         for name in self.names:
             whole, index = _WHOLE.get(name, (name, None))
             part = PARTS[name][0]
-            measured = None if part is None else getattr(observation, _FIELDS.get(part, part))
+            measured = None if part is None else getattr(observation, FIELD_OF.get(part, part))
             if part is not None and measured is None:
                 raise SpecError(f"the observation has no {part}, of which {name!r} is a part")
-            if name in JOINTS or name == "effort":
+            if PARTS[name][1] is None:
                 measured = self._ordered(observation, measured)
             values = self._encoded(whole, measured)
             out += values if index is None else [values[index]]
@@ -261,10 +261,6 @@ class StateNumbers:
         if gripper == "gripper_m":
             return GripperScale(0.0, self.max_width_m)
         return GripperScale(1.0, 0.0) if gripper == "gripper_closed" else self.units.gripper
-
-
-_FIELDS = {"effort": "effort_nm"}
-"""Fields of an observation that are not called as their part."""
 
 
 def state_numbers(

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from vla_zenoh.policy import CameraSpec, DepthSpec, ModelSpec, Observation
 from vla_zenoh.policy.observation import prepare_depth, prepare_image
+from vla_zenoh.policy.spec import FIELD_OF
 from vla_zenoh.profile import Profile
 from vla_zenoh.types import Depth, GripperState, Image, JointState, PoseState, PrivilegedState, Task
 
@@ -183,7 +184,7 @@ class ExampleMaker:
             "effort": joint.effort_nm,
         }
         asked = [name for name in self.spec.observation.state if name in state]
-        return {"effort_nm" if name == "effort" else name: state[name] for name in asked}
+        return {FIELD_OF.get(name, name): state[name] for name in asked}
 
     def _joint(self, part: str) -> JointState:
         # Those that the model moves, or seven made up.
