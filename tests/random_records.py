@@ -206,7 +206,11 @@ def action_specs(draw: st.DrawFn) -> ActionSpec:
 
 
 model_specs = st.builds(
-    ModelSpec, name=texts.filter(bool), observation=observation_specs, action=action_specs()
+    ModelSpec,
+    name=texts.filter(bool),
+    observation=observation_specs,
+    action=action_specs(),
+    every_step=st.booleans(),
 )
 
 RECORDS: dict[type, st.SearchStrategy[Any]] = {
@@ -226,7 +230,10 @@ RECORDS: dict[type, st.SearchStrategy[Any]] = {
     GripperCommand: st.builds(
         GripperCommand, st.floats(0, 1), st.floats(1e-4, 10), st.floats(0, 1000)
     ),
-    Task: st.builds(Task, counts, st.booleans(), texts, texts, st.floats(0.01, 1000)),
+    Task: st.builds(
+        *(Task, counts, st.booleans(), texts, texts, st.floats(0.01, 1000)),
+        speed_percent=st.floats(0, 100),
+    ),
     NodeStatus: statuses,
     Event: st.builds(
         Event,
@@ -239,7 +246,9 @@ RECORDS: dict[type, st.SearchStrategy[Any]] = {
         st.integers(1, 2**63 - 1),
     ),
     PrivilegedState: st.builds(PrivilegedState, maps(st.integers(0, 40).flatmap(vectors))),
-    SceneState: st.builds(SceneState, texts, st.integers(0, 40).flatmap(vectors)),
+    SceneState: st.builds(
+        SceneState, texts, st.integers(0, 40).flatmap(vectors), st.none() | counts
+    ),
     ObjectPoses: object_poses(),
     ModelSpec: model_specs,
     InferenceDebug: st.builds(

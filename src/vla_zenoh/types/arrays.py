@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Annotated, Any
+from functools import cache
+from typing import Annotated, Any, get_args, get_type_hints
 
 import numpy as np
 from msgspec import Meta
@@ -96,13 +97,20 @@ Vectors = Annotated[
 ]
 
 
-def check_lengths(record: Any, *names: str) -> None:
-    """Raise a `RecordError` unless arrays have one entry for each of the record's `names`, which
-    differ."""
+@cache
+def _per_joint(kind: type[Any]) -> tuple[str, ...]:
+    """The fields of a record that are `PerJoint`, or None in its place."""
+    hints = get_type_hints(kind, include_extras=True)
+    return tuple(name for name, hint in hints.items() if PerJoint in (hint, *get_args(hint)))
+
+
+def check_per_joint(record: Any) -> None:
+    """Raise a `RecordError` unless each field that is `PerJoint` has one entry for each of the
+    record's `names`, which differ."""
     joints = record.names
     if not joints or len(set(joints)) != len(joints):
         raise RecordError(f"names is {joints}, allowed: at least one name, none of them twice")
-    for name in names:
+    for name in _per_joint(type(record)):
         value = getattr(record, name)
         if value is not None and len(value) != len(joints):
             raise RecordError(

@@ -23,7 +23,7 @@ from vla_zenoh.types.arrays import (
     Vector3,
     Vector6,
     Vectors,
-    check_lengths,
+    check_per_joint,
 )
 from vla_zenoh.types.form import (
     MAX_ENTRIES,
@@ -77,7 +77,7 @@ class JointState(Record):
     reference_rad: PerJoint | None = None
 
     def _check(self) -> None:
-        check_lengths(self, "position_rad", "velocity_rad_s", "effort_nm", "reference_rad")
+        check_per_joint(self)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -367,7 +367,7 @@ class JointCommand(Record):
     cause: Cause | None = None
 
     def _check(self) -> None:
-        check_lengths(self, "position_rad", "velocity_rad_s", "acceleration_rad_s2")
+        check_per_joint(self)
 
 
 @dataclass(frozen=True, slots=True)

@@ -90,6 +90,22 @@ def test_every_kind_of_record_is_tested_here() -> None:
 
 
 @by_kind
+def test_every_field_of_a_record_is_drawn_at_random(kind: type) -> None:
+    names = kind.model_fields if kind is ModelSpec else [f.name for f in dataclasses.fields(kind)]
+    values: dict[str, set[str]] = {name: set() for name in names}
+
+    @given(RECORDS[kind])
+    @settings(NOTHING_TAKEN, derandomize=True, database=None)
+    def draw(record: Any) -> None:
+        for name, known in values.items():
+            known.add(repr(getattr(record, name)))
+
+    draw()
+    same = [name for name, known in values.items() if len(known) == 1]
+    assert not same, f"tests/random_records.py draws no {', '.join(same)} for {kind.__name__}"
+
+
+@by_kind
 @given(data=st.data())
 @NOTHING_TAKEN
 def test_a_record_comes_back_as_it_was(kind: type, data: st.DataObject) -> None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from driver_report import Report
 from vla_zenoh.errors import NodeError
 from vla_zenoh.kinematics.so3 import exp3
 from vla_zenoh.profile import load_profile
+from vla_zenoh.robot import Reading
 from vla_zenoh.robots.python_driver import FAULT_NS, PythonDriver
 from vla_zenoh.types import Event, GripperCommand, JointCommand, JointReference
 from vla_zenoh.types.records import PoseReference
@@ -58,6 +60,17 @@ hosts: {here: {nodes: [router, arm, command, worker]}}
 MS_NS = 1_000_000
 
 
+class WatchedReading(Reading):
+    """A reading that knows which of its fields were asked for."""
+
+    __slots__ = ()
+    asked: ClassVar[set[str]] = set()
+
+    def __getattribute__(self, name: str) -> Any:
+        WatchedReading.asked.add(name)
+        return super().__getattribute__(name)
+
+
 class Rig:
     """A driver, its arm, and what it reported."""
 
@@ -96,6 +109,14 @@ def test_a_reading_becomes_a_measurement(rig: Rig) -> None:
     assert measurement.joints.names == rig.driver.profile.robot.arm_joints
     np.testing.assert_allclose(measurement.pose.wrench[:3], [1, 2, 3])
     assert measurement.gripper.width_m == 0.03
+
+
+def test_no_field_of_a_reading_is_left_unread(rig: Rig) -> None:
+    home_rad = rig.driver.profile.robot.home_rad
+    rig.driver.robot.read = lambda: WatchedReading(home_rad)
+    WatchedReading.asked.clear()
+    assert rig.driver.read(rig.now_ns) is not None
+    assert {field.name for field in fields(Reading)} <= WatchedReading.asked
 
 
 def test_a_set_point_reaches_the_arm_as_a_command(rig: Rig) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from vla_zenoh.profile import load_profile
 from vla_zenoh.robot import Reading
 from vla_zenoh.robots.joint_reading import JointReading
 from vla_zenoh.robots.python_driver import FAULT_NS, MAX_WORDS, Fault, measurement_of
+from vla_zenoh.types import JointState
 
 PROFILE = load_profile("panda_sim")
 KINEMATICS = make_kinematics(PROFILE)
@@ -29,6 +30,17 @@ def test_a_reading_that_holds_becomes_our_records() -> None:
     np.testing.assert_array_equal(taken.pose.wrench, np.arange(6.0))
     assert (taken.gripper.width_m, taken.gripper.moving, taken.gripper.holding) == (0.05, True, 0)
     assert taken.stamp_ns == STAMP_NS
+
+
+PER_JOINT = [each.name for each in fields(JointState) if each.name in Reading.__annotations__]
+
+
+@pytest.mark.parametrize("name", PER_JOINT)
+def test_what_a_reading_says_of_each_joint_is_in_the_joint_state(name: str) -> None:
+    said = HOME_RAD + 0.01 * np.arange(1, 8)
+    reading = replace(GOOD, **{name: said})
+    taken = measurement_of(reading, STAMP_NS, ASKED_M, JointReading(PROFILE, KINEMATICS))
+    np.testing.assert_array_equal(getattr(taken.joints, name), said)
 
 
 def test_an_arm_that_does_not_say_its_width_is_believed_to_be_where_it_was_asked_to_be() -> None:
