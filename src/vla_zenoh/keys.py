@@ -163,7 +163,7 @@ class Keys:
     task = _Key(
         "task", "`Task`: the settings as the command node agreed to them; workers follow it."
     )
-    delta = _KeyOf("delta/{worker}", "`ActionChunk` of one worker: the delta key.")
+    delta = _KeyOf("delta/{worker}", "`ActionChunk` of one worker, whatever its steps mean.")
     spec = _KeyOf("spec/{worker}", "The worker's `ModelSpec`, once a second and on request.")
     seen = _KeyOf(
         "seen/{worker}/{camera}",

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 import vla_zenoh
+from vla_zenoh import control
 
 PACKAGE = Path(vla_zenoh.__file__).parent
 ROOT = Path(__file__).parents[2]
@@ -113,6 +114,13 @@ def test_where_the_tcp_may_be_is_read_in_one_place() -> None:
         if isinstance(node, ast.Attribute) and ast.unparse(node).endswith("limits.workspace")
     }
     assert readers == set()
+
+
+def test_the_map_of_control_has_every_module_once() -> None:
+    shown = re.findall(r"^ *(\w+)  +\w", str(control.__doc__), re.M)
+    assert sorted(shown) == sorted(
+        path.stem for path in (PACKAGE / "control").glob("*.py") if path.stem != "__init__"
+    )
 
 
 OF_THE_PACKAGE = ("vla_zenoh.__version__", "vla_zenoh.lazy_names")

@@ -1,9 +1,10 @@
 """Monitors of an arm: each may refuse its activation, slow it down, or make it brake.
 
 A new limit on what is measured is a class of its own, one of the monitors of a `CommandedPart`;
-where goals may be is bounded in `limits.py` and `reachability.py`. In every tick in which the arm
-obeys they are asked in order: the first that finds a reason ends the activation, and the least of
-their slowdowns bounds the speed. Before an activation all of them are asked for reasons against it.
+where goals may be is `Limits.tcp_box` and the barriers of `reachability.py`. In every tick in which
+the arm obeys they are asked in order: the first that finds a reason ends the activation, and the
+least of their slowdowns bounds the speed. Before an activation all of them are asked for reasons
+against it.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ from vla_zenoh_policy_servers.state_vector import StateNumbers
 from vla_zenoh.errors import SpecError
 from vla_zenoh.kinematics.so3 import exp3, quat_from_rotation
 from vla_zenoh.lab.check.examples import example_observation
-from vla_zenoh.policy import ActionSpec, ModelSpec, Observation, ObservationSpec
+from vla_zenoh.policy import ActionSpec, ModelSpec, Observation, ObservationSpec, StatePart
 from vla_zenoh.types import GripperState, JointState, PoseState
 
 ATOL = 1e-6
@@ -63,6 +63,11 @@ def test_every_part_has_as_many_numbers_as_it_says() -> None:
     for name in state_vector.PARTS:
         numbers = in_numbers([name]).encode(seen())
         assert len(numbers) == state_vector.size_of(name, PANDA)
+
+
+def test_every_part_of_the_state_that_a_robot_reports_has_a_name_in_a_data_set() -> None:
+    named = {part for part, _ in state_vector.PARTS.values() if part is not None}
+    assert named == {*get_args(StatePart)} - {"privileged"}
 
 
 @pytest.mark.parametrize("joints", [UR, PANDA])
