@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -52,6 +53,12 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     for name in set(sys.modules) - before:
         if name.startswith("acme_lab"):
             del sys.modules[name]
+
+
+def test_the_folder_of_the_package_is_called_as_the_build_expects(folder: Path) -> None:
+    """By the name of the project hatchling finds what to ship."""
+    project = tomllib.loads((folder / "acme" / "pyproject.toml").read_text())["project"]
+    assert (folder / "acme" / project["name"].replace("-", "_") / "__init__.py").is_file()
 
 
 @pytest.fixture
@@ -339,7 +346,8 @@ def test_a_computer_without_the_package_loads_the_profile_and_says_what_the_node
         assert any(f"acme.yaml:{line}: {place}: no {what}" in error for error in errors), errors
     with pytest.raises(PluginError, match=r"no robot driver 'acme' .*docs/how-to/install\.md"):
         PythonDriver(load_profile(path))
-    with pytest.raises(PluginError, match="no camera source 'acme' is installed"):
+    why = rf"no camera source 'acme' is installed.* into {re.escape(sys.prefix)}, the environment"
+    with pytest.raises(PluginError, match=why):
         make_source(load_profile(path).cameras["front"])
 
 
