@@ -29,7 +29,7 @@ from vla_zenoh_policy_servers.state_vector import (
 
 from vla_zenoh.errors import RecordingError, SpecError
 from vla_zenoh.lab.recording.run import Run, nearest
-from vla_zenoh.policy import ActionSpec, Observation
+from vla_zenoh.policy import ActionSpec, Observation, StatePart
 from vla_zenoh.policy.meaning import ROTATION_FORMS
 from vla_zenoh.policy.spec import FIELD_OF, STREAM_OF
 from vla_zenoh.types import Task
@@ -294,7 +294,9 @@ def check_gripper_widths(episodes: Sequence[RecordedEpisode], names: Sequence[st
 
 def _states(episode: RecordedEpisode, run: Run, numbers: StateNumbers) -> NDArray[np.float32]:
     streams: dict[str, Any] = {"joint": run.joints, "pose": run.poses, "gripper": run.grippers}
-    wanted = {part: streams[STREAM_OF.get(part, part)] for part in parts_of(numbers.names)}
+    wanted: dict[StatePart, Any] = {
+        part: streams[STREAM_OF.get(part, part)] for part in parts_of(numbers.names)
+    }
     place = f"{run.part}/" if run.part else ""
     task = Task(0, True, "", episode.worker, 1.0)
     rows = []
