@@ -62,8 +62,11 @@ NAMED = {"rad": "radians", "m": "metres"}
 """Units of joints in sentences."""
 NEARER_M = 5e-4
 """m by which a motion may come nearer than a stop: goals are bounded step by step."""
-CHECK_TICKS = 4
-"""Between two checks of distances, which cost too much for every tick; they look as far ahead."""
+CHECK_TICKS, CHECK_S = 4, 0.016
+"""Between two checks of distances at most, which cost too much for every tick; they look as far
+ahead, and the joints get faster until then."""
+PROBE_RAD = 0.01
+"""First bit of the way of an arm that stands: the joint that moves furthest."""
 TCP_ROOM = np.array([[0.95], [0.8], [0.8]])
 """Parts of the TCP's velocity, acceleration and jerk that a straight motion is planned with."""
 BEND = 0.5
@@ -230,19 +233,34 @@ class JointBounds:
                 return LimitHit("workspace", outside_m, 0.0)
         return None
 
-    def ahead_hit(self, start_rad: FloatArray, end_rad: FloatArray) -> LimitHit | None:
+    def ahead_hit(
+        self, start_rad: FloatArray, end_rad: FloatArray, floor: FloatArray
+    ) -> LimitHit | None:
         """The bound that the straight motion between two joints would violate."""
         hit = self._box_hit(start_rad, end_rad)
-        return self.distance_hit(start_rad, end_rad) if hit is None else hit
+        return self.distance_hit(start_rad, end_rad, floor) if hit is None else hit
 
-    def distance_hit(self, start_rad: FloatArray, end_rad: FloatArray) -> LimitHit | None:
-        """The distance that would be too small at the end of a motion between two joints."""
+    def distance_hit(
+        self, start_rad: FloatArray, end_rad: FloatArray, floor: FloatArray
+    ) -> LimitHit | None:
+        """The distance that would be too small at the end of a motion between two joints.
+
+        Below zero it must not fall under its `floor` (n,), see `raised`.
+        """
         if np.array_equal(start_rad, end_rad):
             return None
-        before, after = self._barriers_at(start_rad), self._barriers_at(end_rad)
-        short = after - np.minimum(before, 0.0) + NEARER_M
+        after = self._barriers_at(end_rad)
+        short = after - floor + NEARER_M
         index = int(np.argmin(short))
         return self.barriers.hit(index, after[index]) if short[index] < 0 else None
+
+    def raised(self, floor: FloatArray, joints_rad: FloatArray) -> FloatArray:
+        """The floor (n,) of an arm that has come to these joints: no distance falls again.
+
+        If each motion were compared with its own start, a slow one, or one that stops and goes,
+        would pass any bound by `NEARER_M` at a time.
+        """
+        return np.maximum(floor, np.minimum(self._barriers_at(joints_rad), 0.0))
 
 
 class JointPath(AxisSmoother):
@@ -255,6 +273,7 @@ class JointPath(AxisSmoother):
         self._names = bounds.kinematics.arm_joints
         self._tcp_box = motion_limits(profile.limits).box
         self._ticks = 0
+        self._check_ticks = min(max(round(CHECK_S * profile.timing.command_hz), 1), CHECK_TICKS)
         self._hits: list[LimitHit] = []
         self._asked: tuple[Goal, Shares, bool]
         self._before_bound = False
@@ -265,6 +284,9 @@ class JointPath(AxisSmoother):
     def stand(self, position: FloatArray) -> None:
         super().stand(position)
         self._before_bound = False
+        self._floor = np.full(len(self._bounds.barriers.stop), -np.inf)
+        """(n,) greatest violation of each distance that is left, see `JointBounds.raised`."""
+        self._held = self._bounds.barriers.collisions.held
         self._follow()
 
     def leash(self, goal: Goal, ahead_s: float) -> tuple[Goal, list[LimitHit]]:
@@ -316,16 +338,23 @@ class JointPath(AxisSmoother):
         return into_workspace(self._bounds.limits, goal.pose.position_m, here_m)[1]
 
     def go_to(self, goal: Goal, shares: Shares = FULL, *, all_to_stop: bool = False) -> bool:
-        """Move to the joints of `goal`, or as near as the bounds allow; see `move_to`."""
+        """Move to the joints of `goal`, or as near as the bounds allow; see `move_to`.
+
+        A new goal does not end a brake before a bound: each would bring the arm nearer.
+        """
         self._asked, self._before_bound = (goal, shares, all_to_stop), False
         here_rad, end_rad = self.state.position, goal.known_rad
-        hit = self._bounds.ahead_hit(here_rad, end_rad)
+        near_hit = self._near_hit()
+        if near_hit is not None:
+            self._brake_at(near_hit)
+            return True
+        hit = self._bounds.ahead_hit(here_rad, end_rad, self._floor)
         if hit is not None:
             self._hits.append(hit)
             way_rad, low, high = end_rad - here_rad, 0.0, 1.0
             for _ in range(STEP_HALVINGS):
                 middle = 0.5 * (low + high)
-                found = self._bounds.ahead_hit(here_rad, here_rad + middle * way_rad)
+                found = self._bounds.ahead_hit(here_rad, here_rad + middle * way_rad, self._floor)
                 low, high = (low, middle) if found else (middle, high)
             end_rad = here_rad + low * way_rad
         return self.move_to(end_rad, shares, all_to_stop=all_to_stop)
@@ -335,10 +364,8 @@ class JointPath(AxisSmoother):
         self._ticks += 1
         if self._before_bound and self.at_rest:
             self._go_on()
-        if self._ticks % CHECK_TICKS == 0 and not self.braking and not self.at_rest:
-            here_rad = self.state.position
-            stop_rad = here_rad + stop_way(*self.state[1:], self.box, CHECK_TICKS * self._dt_s)
-            self._brake_at(self._bounds.distance_hit(here_rad, stop_rad))
+        if self._ticks % self._check_ticks == 0 and not self.braking and not self.at_rest:
+            self._brake_at(self._near_hit())
         before = self.state
         moves = self.advance(part)
         if moves and not self.braking and not self._stops_inside(part):
@@ -369,11 +396,30 @@ class JointPath(AxisSmoother):
             self.brake()
             self._before_bound = True
 
+    def _near_hit(self) -> LimitHit | None:
+        """The distance that would be too small at the end of a stop, begun before the next check.
+
+        Of an arm that stands: after the first bit of the way to what was asked for last.
+        """
+        here_rad, held = self.state.position, self._bounds.barriers.collisions.held
+        if held != self._held:  # what is too near now may move away
+            self._held, self._floor = held, np.full(len(self._floor), -np.inf)
+        self._floor = self._bounds.raised(self._floor, here_rad)
+        if self.at_rest:
+            way_rad = self._asked[0].known_rad - here_rad
+            longest_rad = float(np.abs(way_rad).max())
+            ahead_rad = way_rad * (PROBE_RAD / max(longest_rad, PROBE_RAD))
+        else:
+            ahead_rad = stop_way(*self.state[1:], self.box, self._check_ticks * self._dt_s)
+        return self._bounds.distance_hit(here_rad, here_rad + ahead_rad, self._floor)
+
     def _go_on(self) -> None:
         """Continue after a brake before a bound, if the straight way to the goal is free."""
         goal, shares, all_to_stop = self._asked
         self._before_bound = False
-        if self._bounds.ahead_hit(self.state.position, goal.known_rad) is None:
+        here_rad, goal_rad = self.state.position, goal.known_rad
+        near_hit = self._near_hit()
+        if not (near_hit or self._bounds.ahead_hit(here_rad, goal_rad, self._floor)):
             self.go_to(goal, shares, all_to_stop=all_to_stop)
 
     def _stop_hit(self) -> LimitHit | None:

@@ -10,7 +10,7 @@ from joint_rig import Joints, panda
 from panda_arm import HOME_RAD
 
 from vla_zenoh.control.joint_space import JointBounds, JointPath
-from vla_zenoh.control.limits import Slowdown, workspace_corners
+from vla_zenoh.control.limits import Shares, Slowdown, workspace_corners
 from vla_zenoh.control.plan_timeline import joint_goal
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.types import FloatArray
@@ -113,9 +113,46 @@ def test_joints_that_braked_before_a_bound_go_on_when_the_way_is_free() -> None:
         braked += 1
         assert goal.joints_rad is not None
         here_rad = path.state.position
-        if path._bounds.ahead_hit(here_rad, goal.joints_rad) is None:
+        if path._bounds.ahead_hit(here_rad, goal.joints_rad, path._floor) is None:
             assert np.abs(here_rad - goal.joints_rad).max() < PASSED_RAD
     assert braked > 5
+
+
+POST = {"centre_m": [0.25, 0.35, 0.16], "radius_m": 0.03}
+"""In the way of a hand whose base turns from home by `TURN_RAD`, 0.95 rad from there."""
+TURN_RAD, BEFORE_RAD = 2.0, 0.62
+PASSED_M = 0.002
+"""By so much may joints come nearer than a stop; at 50 Hz they are checked every 20 ms."""
+
+
+@pytest.mark.parametrize("command_hz", [50.0, 250.0])
+@pytest.mark.parametrize("goals_hz", [0.0, 20.0])
+@pytest.mark.parametrize(("begin_rad", "share"), [(0.0, 1.0), (0.0, 0.3), (BEFORE_RAD, 0.02)])
+def test_joints_stay_before_a_post_on_their_way_however_slow_and_however_often_asked(
+    command_hz: float, goals_hz: float, begin_rad: float, share: float
+) -> None:
+    """The goal behind it is free, as where an arm that lags would cut a corner."""
+    box = {"x_m": [-0.9, 0.9], "y_m": [-0.9, 0.9], "z_m": [0.02, 1.0]}
+    profile = panda(
+        limits={"workspace": box, "reach": {"keep_out": {"post": POST}}},
+        timing={"command_hz": command_hz},
+    )
+    reach = ReachabilityFilter(profile)
+    path = JointPath(profile, JointBounds(profile, reach.kinematics, reach.barriers))
+    turned = np.eye(7)[0]
+    path.stand(HOME_RAD + begin_rad * turned)
+    shares = Shares(share, share**2, share**3)
+    left_m = np.inf
+    for tick in range(int(4 * command_hz)):
+        again = goals_hz and tick % round(command_hz / goals_hz) == 0
+        if tick == 0 or again:
+            asked_rad = HOME_RAD + (TURN_RAD + 1e-3 * (tick % 3)) * turned
+            path.go_to(joint_goal(path.kinematics, asked_rad, 0.0), shares)
+        path.tick()
+        apart_m = reach.barriers.collisions.distances(path.state.position)
+        left_m = min(left_m, float((apart_m - reach.barriers.stop[1:]).min()))
+    assert path.at_rest or share < 0.1
+    assert -PASSED_M < left_m < 0.02
 
 
 @pytest.mark.parametrize("height_m", [0.02, 0.3])
