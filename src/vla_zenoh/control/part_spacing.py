@@ -65,6 +65,8 @@ class PartSpacing:
         """Distance of the commanded joints when last computed."""
         self._skip = 0
         self._held = self._slower = False
+        self._reached_m = -np.inf
+        """Greatest distance since the arms move, as far as it counts."""
         self._edge_m, self._monitor_ns = np.inf, 0
 
     def place(self) -> None:
@@ -88,7 +90,7 @@ class PartSpacing:
         """
         if not moves:
             self._held = self._slower = False
-            self._skip = 0
+            self._skip, self._reached_m = 0, -np.inf
             return None, None
         if self._skip > 0 and not self._held:
             self._skip -= 1
@@ -101,7 +103,7 @@ class PartSpacing:
         if self.nearest.distance_m >= self._within_m:
             self._skip, self._held = FAR_TICKS - 1, False
             return None, None
-        floor_m = min(self._stop_m + SPARE_M, self.nearest.distance_m - NOISE_M)
+        floor_m = self._floor_m(self.nearest.distance_m)
         stops = [part.motion.stopping_rad(ahead_s) for part in self._parts]
         ahead = self._nearest(at, floor_m + NOISE_M, stops)
         # A brake that is given up and begun again would end further on.
@@ -117,6 +119,18 @@ class PartSpacing:
             value_m = min(ahead.distance_m, self.nearest.distance_m)
             return None, LimitHit(NAME, value_m, self._stop_m, where=str(self.nearest))
         return self._slow(before), None
+
+    def _floor_m(self, now_m: float) -> float:
+        """The least distance allowed ahead of arms that are `now_m` apart.
+
+        Those that are too near to each other must not come nearer again: were each look compared
+        with the one before it, slow arms would pass the stop by `NOISE_M` at a time.
+        """
+        least_m = self._stop_m + SPARE_M
+        if now_m < self._reached_m - NOISE_M:  # they came nearer in a brake, by what they lagged
+            self._reached_m = now_m
+        self._reached_m = max(self._reached_m, min(now_m, least_m))
+        return min(least_m, max(now_m, self._reached_m) - NOISE_M)
 
     def _slow(self, before: Nearest) -> Slowdown | None:
         near = self.nearest

@@ -77,3 +77,20 @@ def test_measured_arms_are_looked_at_once_a_period() -> None:
     for late_ns in range(0, 10 * PERIOD_NS, PERIOD_NS // 10):
         arms.spacing.monitor(NOON_NS + late_ns)
     assert len(looks) == 10
+
+
+@pytest.mark.parametrize("share_s", [2e-3, 2e-2, 0.2])
+def test_arms_stand_before_their_stop_however_slowly_they_come_nearer(share_s: float) -> None:
+    """Both lean towards each other, by a share of `LEAN` a second, and brake at once."""
+    arms, tick_s, share = Arms(), 0.004, 1.525
+    for number in range(round(0.03 / share_s / tick_s)):
+        ahead = leaning(share + 2 * tick_s * share_s)
+        for part in arms.parts:
+            part.motion = SimpleNamespace(
+                joints_rad=leaning(share),
+                stopping_rad=lambda _, end=ahead: [end],
+                wanted_rad=lambda _: leaning(2.0),
+            )
+        _, hit = arms.spacing.look(NOON_NS + number, tick_s, moves=True)
+        share += 0.0 if hit else tick_s * share_s
+    assert arms.spacing.nearest.distance_m > pair().limits.reach.part_stop_m
