@@ -440,7 +440,8 @@ class JointPath(AxisSmoother):
         place = self.motion.pose.position_m
         room_m = float(np.minimum(place - low, high - place).min())
         way = np.abs(stop_way(*self.state[1:], self.box, part * self._dt_s))
-        # The TCP is further from an axis by at most its own way.
+        # A joint moves the TCP by its way times its lever, which grows by what the TCP has moved:
+        # all together by a factor of exp(their ways) at most (Gronwall).
         return float(way @ self._levers) * math.exp(float(way.sum())) < room_m
 
     def stopping_rad(self, ahead_s: float) -> list[FloatArray]:

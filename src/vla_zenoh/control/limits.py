@@ -103,7 +103,11 @@ def chain_motion_limits(profile: Profile, kinematics: Kinematics) -> JointMotion
 def stop_way(
     velocity: FloatArray, acceleration: FloatArray, box: FloatArray, ahead_s: float
 ) -> FloatArray:
-    """Longest distance (n,) of a stop of all axes together, within `box`, begun in `ahead_s`."""
+    """Distance (n,) of a stop of all axes together, within `box`, begun in `ahead_s`.
+
+    From a speed v a stop takes ``v / a + a / j`` at most and goes half as far as v would. It is an
+    upper bound, unless the axes are accelerated further until it begins.
+    """
     _, most, jerk = box
     ramp_s = np.abs(acceleration) / jerk
     later = velocity + 0.5 * acceleration * ramp_s
