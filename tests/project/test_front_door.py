@@ -10,8 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from chain import command_line
 
 import vla_zenoh
+from vla_zenoh.policy.loader import find_model, make_policy
 
 ROOT = Path(__file__).parents[2]
 HOME_M, STEP_M = 0.16, 0.01
@@ -64,6 +66,18 @@ def test_the_loop_in_one_process_is_short_and_lifts_the_arm_by_a_centimetre_a_st
     assert float(heights_m[0]) == pytest.approx(HOME_M, abs=0.001)
     assert rises_m[0] == pytest.approx(0.0, abs=0.001)  # it is not activated before the first chunk
     assert rises_m[2:] == pytest.approx(STEP_M, abs=0.002)
+
+
+def test_the_model_of_the_loop_is_found_as_a_file() -> None:
+    policy = make_policy(find_model(str(ROOT / "examples" / "ten_line_model.py")))
+    assert policy.spec.name == "lift"
+
+
+def test_the_python_robot_moves() -> None:
+    profile = str(ROOT / "examples" / "python_robot.yaml")
+    assert command_line("profile", "check", profile).returncode == 0
+    done = command_line("check", "scripted", "--profile", profile)
+    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_the_reference_pages_are_those_of_the_code() -> None:

@@ -12,12 +12,8 @@ from pathlib import Path
 import cv2
 import pytest
 from chain import LONG_PATIENCE_S, READY_PATIENCE_S, Chain, command_line
-from vla_zenoh_benchmarks.lockstep.loop import Lockstep
 
 import vla_zenoh
-from vla_zenoh.policy.loader import find_model, make_policy
-from vla_zenoh.profile import load_profile
-from vla_zenoh.simulation.world import build_world
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 MOVED_M = 0.04
@@ -105,25 +101,6 @@ def test_a_recording_is_evaluated_and_plotted(chain: Chain, tmp_path: Path) -> N
     assert float(re.findall(r"path of the TCP: ([\d.]+) m", text)[0]) > MOVED_M
     assert "p95" in text
     assert cv2.imread(str(tmp_path / "height.png")) is not None
-
-
-def test_the_model_lifts_the_arm() -> None:
-    profile = load_profile("panda_sim")
-    policy = make_policy(find_model(str(EXAMPLES / "ten_line_model.py")))
-    loop = Lockstep(profile, build_world(profile), policy)
-    loop.put("prompt", "lift")
-    loop.run(1.1)
-    before_m = loop.trace.position_m[-1][2]
-    loop.put("active", True)
-    loop.run(2.0)
-    assert loop.trace.position_m[-1][2] - before_m > MOVED_M
-
-
-def test_the_python_robot_moves(tmp_path: Path) -> None:
-    profile = str(EXAMPLES / "python_robot.yaml")
-    assert command_line("profile", "check", profile).returncode == 0
-    done = command_line("check", "scripted", "--profile", profile)
-    assert done.returncode == 0, done.stdout + done.stderr
 
 
 @pytest.mark.slow
