@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vla_zenoh.kinematics.kinematics import InverseKinematics, Kinematics
+from vla_zenoh.kinematics.kinematics import InverseKinematics, Kinematics, pose_error
 from vla_zenoh.kinematics.so3 import Pose, exp3
 from vla_zenoh.resources import robot_urdf
 from vla_zenoh.types import FloatArray
@@ -39,3 +39,15 @@ def moved(pose: Pose, translation_m: FloatArray, rotvec_rad: FloatArray) -> Pose
         pose.position_m + np.asarray(translation_m, float),
         exp3(np.asarray(rotvec_rad, float)) @ pose.rotation,
     )
+
+
+def swivelled(kinematics: Kinematics, swivel: float) -> FloatArray:
+    """Joints with the TCP of home, and the elbow turned about it by a motion of the null space."""
+    joints, home = HOME_RAD.copy(), kinematics.forward(HOME_RAD)
+    for _ in range(400):
+        pose, jacobian = kinematics.pose_and_jacobian(joints)
+        _, _, rows = np.linalg.svd(jacobian)
+        null = rows[-1] * np.sign(rows[-1][0])
+        back = np.linalg.lstsq(jacobian, pose_error(home, pose), rcond=None)[0]
+        joints = joints + back + null * (swivel / 400)
+    return joints

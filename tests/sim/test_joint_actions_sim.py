@@ -7,12 +7,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from arm_rig import activate
-from panda_arm import ARM_JOINTS, HOME_RAD, panda
+from panda_arm import ARM_JOINTS, HOME_RAD, panda, swivelled
 from vla_zenoh_benchmarks.lockstep.loop import Lockstep
 
 from vla_zenoh.control.limits import workspace_corners
 from vla_zenoh.control.reachability import ReachabilityFilter
-from vla_zenoh.kinematics.kinematics import pose_error
 from vla_zenoh.policy import (
     ActionSpec,
     ActionSteps,
@@ -95,21 +94,8 @@ class Arm:
         return {event.what for event in self.loop.events if event.kind == "limit"}
 
 
-def swivelled(swivel: float) -> FloatArray:
-    """Joints with the TCP of home, and the elbow turned about it by a motion of the null space."""
-    kinematics, joints = panda(), HOME_RAD.copy()
-    home = kinematics.forward(HOME_RAD)
-    for _ in range(400):
-        pose, jacobian = kinematics.pose_and_jacobian(joints)
-        _, _, rows = np.linalg.svd(jacobian)
-        null = rows[-1] * np.sign(rows[-1][0])
-        back = np.linalg.lstsq(jacobian, pose_error(home, pose), rcond=None)[0]
-        joints = joints + back + null * (swivel / 400)
-    return joints
-
-
 def test_an_elbow_swivels_with_the_tcp_at_rest() -> None:
-    arm, goal_rad = Arm(), swivelled(0.9)
+    arm, goal_rad = Arm(), swivelled(panda(), 0.9)
     reached = arm.follow(eased(HOME_RAD, goal_rad, 4.0), 4.0)
     assert np.abs(goal_rad - HOME_RAD).max() > 0.4
     assert np.abs(reached - goal_rad).max() < AT_REST_RAD, arm.hits()

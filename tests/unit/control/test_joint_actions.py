@@ -11,12 +11,12 @@ import pytest
 from command_rig import WORKER, model_spec
 from joint_rig import Joints, panda
 from other_arms import so101
-from panda_arm import ARM_JOINTS, HOME_RAD
+from panda_arm import ARM_JOINTS, HOME_RAD, swivelled
 
 from vla_zenoh.control.commander import Setting
 from vla_zenoh.control.limits import workspace_corners
 from vla_zenoh.kinematics import collision
-from vla_zenoh.kinematics.kinematics import Kinematics, pose_error
+from vla_zenoh.kinematics.kinematics import Kinematics
 from vla_zenoh.types import FloatArray, JointState, Stamped
 
 EXACT_RAD = 1e-6
@@ -88,19 +88,6 @@ def test_a_robot_that_takes_poses_gets_those_of_the_joints() -> None:
     arm.settle(goal_rad)
     assert np.abs(arm.rig.position_m - goal.position_m).max() < EXACT_RAD
     arm.rig.assert_smooth()
-
-
-def swivelled(kinematics: Kinematics, swivel: float) -> FloatArray:
-    """Joints with the TCP of home, and the elbow turned about it by a motion of the null space."""
-    joints = HOME_RAD.copy()
-    home = kinematics.forward(HOME_RAD)
-    for _ in range(400):
-        pose, jacobian = kinematics.pose_and_jacobian(joints)
-        _, _, rows = np.linalg.svd(jacobian)
-        null = rows[-1] * np.sign(rows[-1][0])
-        back = np.linalg.lstsq(jacobian, pose_error(home, pose), rcond=None)[0]
-        joints = joints + back + null * (swivel / 400)
-    return joints
 
 
 def test_an_elbow_swivels_as_asked_with_the_tcp_at_rest() -> None:
