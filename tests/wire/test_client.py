@@ -189,11 +189,12 @@ def test_what_is_lost_with_the_router_is_not_confirmed_by_an_older_status(state:
             router.close()
             until("the router is lost", lambda: "command" not in robot.alive)
             unconfirmed(robot)
-            robot.publish(robot.keys.stop, "stop")
-            assert not _reaches(robot, robot.stopped)
-            assert link.stop()["outcome"] == "not_confirmed"
-            with pytest.raises(SessionError, match="not accepted"):
-                link.hold_box("", "")
+            if state == "stopped":  # what a stop waits for; a reset waits for the other one
+                robot.publish(robot.keys.stop, "stop")
+                assert not _reaches(robot, robot.stopped)
+                assert link.stop()["outcome"] == "not_confirmed"
+                with pytest.raises(SessionError, match="not accepted"):
+                    link.hold_box("", "")
         finally:
             if link is not None:
                 link.close()
