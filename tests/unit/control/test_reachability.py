@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from panda_arm import HOME_RAD, moved, panda, tool_down_at
 from pydantic import ValidationError
 
-from vla_zenoh.control.limits import LEAST_NEAR_STOP, BoundedStep, LimitHit
+from vla_zenoh.control.limits import LEAST_NEAR_STOP, BoundedStep, LimitHit, Slowdown
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.errors import ProfileError, RecordError
 from vla_zenoh.kinematics.collision import HELD, TABLE
@@ -599,3 +599,42 @@ def test_away_from_a_bound_the_arm_has_its_full_speed() -> None:
     back = bounded(shadow, last, moved(last, STEP_M * BACK, STILL))
     assert not back.hits
     assert back.slowdown is None
+
+
+# -- slow zones ---------------------------------------------------------------------------------
+BARRIERS = SHADOW.barriers
+FAR = 2.0 * BARRIERS.zone
+
+
+def slowed(index: int, before: float, after: float) -> Slowdown | None:
+    """Of a step that changes one barrier, told in its zone, while all others are far."""
+    ends = np.array([FAR, FAR])
+    ends[:, index] = BARRIERS.zone[index] * np.array([before, after])
+    return BARRIERS.slowdown(*ends)
+
+
+@pytest.mark.parametrize("index", range(len(FAR)))
+def test_a_step_is_slowed_where_it_goes_further_into_a_zone_and_nowhere_else(index: int) -> None:
+    shares = []
+    for left in (0.9, 0.5, 0.25):
+        slower = slowed(index, 1.0, left)
+        assert slower is not None
+        assert (slower.name, slower.where) == (BARRIERS.names[index], BARRIERS.where(index))
+        assert slower.value == pytest.approx(BARRIERS.stop[index] + left * BARRIERS.zone[index])
+        shares.append(slower.share)
+    assert shares == sorted(shares, reverse=True)
+    # As a brake of constant deceleration: at a quarter of the way, half the speed.
+    assert shares[-1] == pytest.approx(0.5)
+    for beside in ((1.5, 1.0), (0.5, 0.5), (0.5, 0.9), (0.2, 1.1)):
+        assert slowed(index, *beside) is None
+
+
+def test_every_distance_has_a_zone_before_its_stop_as_the_profile_says_where_it_can() -> None:
+    reach, farthest_m = Limits().reach, BARRIERS.collisions.farthest_m
+    table = np.array([name == "table_distance" for name in BARRIERS.names[1:]])
+    assert (BARRIERS.slow > BARRIERS.stop).all()
+    roomy = ~table & (farthest_m > 2 * reach.collision_slow_m)
+    assert roomy.any()
+    assert (BARRIERS.slow[1:][roomy] == reach.collision_slow_m).all()
+    assert (BARRIERS.stop[1:][roomy] == reach.collision_stop_m).all()
+    assert (BARRIERS.slow[1:] < np.maximum(farthest_m, BARRIERS.stop[1:])).all()
