@@ -81,7 +81,8 @@ class RobotSession:
         self._chunks = node.declare_publisher(keys.delta(name), Kind.ORDER)
         self._specs = node.declare_publisher(keys.spec(name), Kind.TELEMETRY)
         node.serve(
-            keys.spec(name), lambda query: query.reply(keys.spec(name), records.encode(self.spec))
+            keys.spec(name),
+            lambda query: query.reply(keys.spec(self.name), records.encode(self.spec)),
         )
         tasks = CallbackRing(TASKS, SMALL_BYTES)
         self._tasks = Stream(node, keys.task, Task, tasks, TASK_PATIENCE_S)

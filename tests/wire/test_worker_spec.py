@@ -1,0 +1,49 @@
+"""A worker says what its model sees and does to whoever asks, whatever the model sees."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from camera_rig import routed_session
+
+from vla_zenoh.bus.buffers import Wake, bytes_of
+from vla_zenoh.codec import records
+from vla_zenoh.nodes.worker.robot_session import RobotSession
+from vla_zenoh.policy import ActionSpec, ActionSteps, CameraSpec, ModelSpec, ObservationSpec
+from vla_zenoh.profile import load_profile
+
+WAIT_S = 5.0
+
+
+class Feel:
+    """A model that reads states."""
+
+    def __init__(self, cameras: tuple[str, ...], state: tuple[str, ...]) -> None:
+        looks = ObservationSpec(
+            cameras=tuple(CameraSpec(camera=name) for name in cameras),
+            state=state,  # pyright: ignore[reportArgumentType]
+        )
+        action = ActionSpec(horizon=1, dt_s=0.1, rotation="rpy", gripper="none")
+        self.spec = ModelSpec(name="feel", observation=looks, action=action)
+
+    def infer(self, _: object) -> ActionSteps:
+        return ActionSteps(np.zeros((1, 6)))
+
+
+@pytest.mark.parametrize(
+    ("cameras", "state"), [((), ()), (("front",), ()), ((), ("pose",)), ((), ("joint", "gripper"))]
+)
+def test_a_worker_answers_a_query_of_its_spec(
+    cameras: tuple[str, ...], state: tuple[str, ...]
+) -> None:
+    profile, model = load_profile("panda_sim"), Feel(cameras, state)
+    with routed_session() as session:
+        worker = RobotSession(
+            profile, session, model, "feel", images="raw", host=None, changed=Wake()
+        )
+        replies = list(session.get(profile.keys.spec("feel"), timeout=WAIT_S))
+        worker.close()
+    (answer,) = (
+        records.decode(ModelSpec, bytes_of(each.ok.payload)) for each in replies if each.ok
+    )
+    assert answer == model.spec
