@@ -20,7 +20,9 @@ from vla_zenoh.policy import ActionSpec, ModelSpec, ObservationSpec
 from vla_zenoh.profile import Profile
 
 ROOT = Path(__file__).parents[2]
-SOURCES = [*(ROOT / "src").rglob("*.py"), *(ROOT / "models").rglob("*.py")]
+SOURCES = [
+    path for folder in ("src", "models", "plugins") for path in (ROOT / folder).rglob("*.py")
+]
 TRAINING = {"training", "measure.py"}
 RAW = re.compile(r"https?://|errors\.pydantic|Input should|unable to parse|type=")
 
@@ -36,6 +38,19 @@ def broad_handlers() -> Iterator[tuple[str, ast.ExceptHandler]]:
             caught = ast.unparse(node.type) if node.type else ""
             if re.search(r"\b(Base)?Exception\b", caught):
                 yield f"{path.relative_to(ROOT)}:{node.lineno}", node
+
+
+def test_faults_of_pydantic_are_put_into_words_in_one_place() -> None:
+    own = [
+        f"{path.relative_to(ROOT)}:{node.lineno}"
+        for path in SOURCES
+        if path != Path(errors.__file__)
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.FormattedValue)
+        and isinstance(node.value, ast.Subscript)
+        and ast.unparse(node.value.slice) == "'msg'"
+    ]
+    assert not own, f"use describe_faults(error, ...) in: {own}"
 
 
 def test_what_another_library_raises_is_put_into_words_before_it_is_shown() -> None:

@@ -8,10 +8,8 @@ from pathlib import Path
 
 import pytest
 
-import vla_zenoh
-
 ROOT = Path(__file__).parents[2]
-FOLDERS = (Path(vla_zenoh.__file__).parent, ROOT / "models", ROOT / "scripts", ROOT / "sim")
+FOLDERS = tuple(ROOT / name for name in ("src", "models", "plugins", "scripts", "sim"))
 SOURCES = sorted(path for folder in FOLDERS for path in folder.rglob("*.py"))
 MODULES = frozenset(
     {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "marshal", "shelve", "jsonpickle"}

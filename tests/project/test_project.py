@@ -16,6 +16,7 @@ from types import ModuleType
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
+FOLDERS = ["benchmarks", "examples", "models", "plugins", "reliability", "scripts", "sim", "tests"]
 TARGETS = ("setup", "demo", "test", "check", "bench", "build", "clean")
 
 
@@ -84,7 +85,7 @@ def test_ci_runs_what_people_run() -> None:
 def test_what_is_imported_from_the_package_is_there() -> None:
     """Of programs that no other test starts, and of models in environments of their own, too."""
     wrong = []
-    for folder in ("benchmarks", "examples", "models", "reliability", "scripts", "sim", "tests"):
+    for folder in FOLDERS:
         for path in (ROOT / folder).rglob("*.py"):
             for node in ast.walk(ast.parse(path.read_text())):
                 if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(

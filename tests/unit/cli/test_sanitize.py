@@ -17,7 +17,6 @@ from rich.progress import Progress, TextColumn
 from rich.table import Table
 from rich.text import Text
 
-import vla_zenoh
 from vla_zenoh.cli import status_table
 from vla_zenoh.cli.output import Screen, styled
 from vla_zenoh.lab.cli import net
@@ -29,8 +28,8 @@ SHOWN = "[/x] [red]r[/] :warning: \\x1b[2J\\r\\x07\\x9b\\u202e"
 WIDTH = 200
 MANY = 4000
 """Line breaks, as many as a record takes."""
-PACKAGE = Path(vla_zenoh.__file__).parent
-SOURCES = sorted(PACKAGE.rglob("*.py"))
+ROOT = Path(__file__).parents[3]
+SOURCES = sorted((ROOT / "src").rglob("*.py")) + sorted((ROOT / "plugins").rglob("*.py"))
 
 
 def screen(*, colours: bool = False) -> Screen:
@@ -234,20 +233,22 @@ def fault(node: ast.AST, rich: set[str]) -> str:
 
 
 PRINTS = {
-    "cli/silence.py": "that a stop is not confirmed, before the imports have ended",
-    "program/main.py": "the version",
-    "cli/plain.py": "lines made printable there",
-    "cli/nodes.py": "the profile's name, for a program that waits for it",
-    "lab/cli/profile.py": "a profile or a bridge's configuration as a file",
-    "runtime/process.py": "what this computer lacks for shared memory, in our own words",
-    "runtime/environments.py": "the packages of a model that is about to run here",
+    "src/vla_zenoh/cli/silence.py": "that a stop is not confirmed, before the imports have ended",
+    "src/vla_zenoh/program/main.py": "the version",
+    "src/vla_zenoh/cli/plain.py": "lines made printable there",
+    "src/vla_zenoh/cli/nodes.py": "the profile's name, for a program that waits for it",
+    "src/vla_zenoh/lab/cli/profile.py": "a profile as a file",
+    "src/vla_zenoh/runtime/process.py": "what this computer lacks for shared memory",
+    "src/vla_zenoh/runtime/environments.py": "the packages of a model that is about to run here",
+    "plugins/vla-zenoh-calibrate/src/vla_zenoh_calibrate/accuracy.py": "its own figures",
+    "plugins/vla-zenoh-ros2/src/vla_zenoh_ros2/cli.py": "a bridge's configuration as a file",
 }
 """Where `print` gets something else than JSON, and what."""
 
 
 def test_no_command_gives_rich_a_string_as_markup() -> None:
     faults = [
-        f"{path.relative_to(PACKAGE)}: {said}"
+        f"{path.relative_to(ROOT)}: {said}"
         for path in SOURCES
         for said in faults_in(path.read_text("utf-8"))
     ]

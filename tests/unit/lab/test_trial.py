@@ -341,9 +341,9 @@ def test_files_that_are_not_as_they_were_written_are_refused_by_line(tmp_path: P
     path = tmp_path / TRIALS
     good = path.read_text()
     for bad, why in (
-        (good.replace('"success"', '"splendid"'), "line 2: verdict: Input should be 'success'"),
-        (good.replace('"setup": 1', '"setup": "1"'), "line 2: setup: Input should be a valid int"),
-        ("{}\n", "line 2: number: Field required"),
+        (good.replace('"success"', '"splendid"'), "line 2: verdict: wants 'success'"),
+        (good.replace('"setup": 1', '"setup": "1"'), "line 2: setup: wants a whole number"),
+        ("{}\n", "line 2: number: is missing"),
         ("nonsense\n", "line 2: Invalid JSON"),
     ):
         path.write_text(good + bad)

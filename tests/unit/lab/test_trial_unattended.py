@@ -75,6 +75,11 @@ def test_a_wrong_plan_names_what_is_wrong(changed: Mapping[str, Any], named: str
     assert named in str(caught.value)
 
 
+def test_an_empty_plan_names_what_is_missing() -> None:
+    with pytest.raises(RecordError, match=r"plan\.yaml: workers: is missing; tasks: is missing"):
+        checked_plan({}, "plan.yaml")
+
+
 def test_a_plan_is_yaml_with_a_time_of_day_and_an_order(tmp_path: Path) -> None:
     file = tmp_path / "plan.yaml"
     file.write_text(

@@ -10,6 +10,7 @@ import typer
 from vla_zenoh_benchmarks.paired_tasks import TaskResultFile, read_run
 
 from vla_zenoh.cli.options import JsonOption
+from vla_zenoh.cli.output import console
 from vla_zenoh.errors import ResourceError
 from vla_zenoh.lab.cli.output import print_json, progress
 from vla_zenoh.lab.cli.output_path import ForceOption, output_file
@@ -144,4 +145,4 @@ def _tell(drawn: style.Drawn, output: Path, page: bool, as_json: bool) -> None:
         told: dict[str, Any] = {"file": str(output), "width_in": _width_in(page)}
         print_json(told | {"caption": drawn.caption})
         return
-    typer.echo(drawn.caption)
+    console().print(drawn.caption, soft_wrap=True)

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from vla_zenoh_trial.plan import TrialPlan
 from vla_zenoh_trial.verdict import EpisodeVerdict
 
-from vla_zenoh.errors import ProfileError, RecordError, in_words
+from vla_zenoh.errors import ProfileError, RecordError, describe_faults, in_words
 from vla_zenoh.lab.tasks.order import Order
 from vla_zenoh.profile.load import read_yaml
 
@@ -194,12 +194,7 @@ def checked_plan(data: Any, where: str) -> UnattendedPlan:
     try:
         return UnattendedPlan.model_validate(data)
     except ValidationError as error:
-        faults = [
-            f"{'.'.join(map(str, fault['loc'])) or 'plan'}: "
-            f"{fault['msg'].removeprefix('Value error, ')}"
-            for fault in error.errors()
-        ]
-        raise RecordError(f"{where}: {'; '.join(faults)}") from error
+        raise RecordError(f"{where}: {describe_faults(error, 'plan')}") from error
 
 
 def _at_end(verdicts: Sequence[str], kind: str) -> int:

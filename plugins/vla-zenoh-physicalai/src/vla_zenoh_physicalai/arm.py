@@ -12,6 +12,7 @@ from typing import Any
 
 import zenoh
 
+from vla_zenoh.bus.buffers import bytes_of
 from vla_zenoh.errors import CodecError, NodeError, VlaZenohError
 from vla_zenoh.profile import Profile
 from vla_zenoh.robot import Command, Reading
@@ -75,7 +76,7 @@ class PhysicalAiArm:
             for reply in self._session.get(key, timeout=1.0):
                 if reply.ok is not None:
                     try:
-                        return wire.decode_metadata(reply.ok.payload.to_bytes())
+                        return wire.decode_metadata(bytes_of(reply.ok.payload, wire.MAX_BYTES))
                     except CodecError as error:
                         raise NodeError(f"metadata of {self._options.name!r}: {error}") from error
             time.sleep(0.1)
@@ -150,11 +151,11 @@ class PhysicalAiArm:
         )
 
     def _newest(self) -> tuple[FloatArray, float | None] | None:
-        sample = self._states.try_recv()
-        if sample is None:
-            return None
         try:
-            vector, stamp_s = wire.decode_state(sample.payload.to_bytes(), self._layout.count)
+            payload = link.newest(self._states)
+            if payload is None:
+                return None
+            vector, stamp_s = wire.decode_state(payload, self._layout.count)
             if stamp_s <= self._stamp_s:
                 raise CodecError("stale", f"timestamp {stamp_s:.3f} is not after the last one")
         except CodecError as error:

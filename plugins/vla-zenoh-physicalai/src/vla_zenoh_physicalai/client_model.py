@@ -22,7 +22,7 @@ from vla_zenoh.policy import ActionSpec, ActionSteps, ModelSpec, Observation, Ob
 from vla_zenoh.policy.options import number, one_of, yes_no
 from vla_zenoh.profile import load_profile
 from vla_zenoh.types import FloatArray
-from vla_zenoh_physicalai import wire
+from vla_zenoh_physicalai import link, wire
 from vla_zenoh_physicalai.layout import Layout, Unit
 
 GRIPPER = "gripper"
@@ -83,8 +83,6 @@ class PhysicalAiClient:
 
     def load(self) -> None:
         """Listen as the owner of the robot, on this computer alone."""
-        from vla_zenoh_physicalai import link  # zenoh, which a check of models does not need
-
         where = wire.local_endpoint(self._name)
         try:
             session = self._session = link.open_session("peer", listen=where)
@@ -139,12 +137,12 @@ class PhysicalAiClient:
 
     def _take(self) -> None:
         """Keep the newest action, unless it is wrong."""
-        sample = self._actions.try_recv()
-        if sample is None:
-            return
         now_s = time.monotonic()
         try:
-            vector, sent_s = wire.decode_action(sample.payload.to_bytes(), self._layout.count)
+            payload = link.newest(self._actions)
+            if payload is None:
+                return
+            vector, sent_s = wire.decode_action(payload, self._layout.count)
             if not self._began_s < sent_s <= now_s + MAX_EARLY_S:
                 raise CodecError("stale", f"ts {sent_s:.3f} is not of this episode")
         except CodecError as error:

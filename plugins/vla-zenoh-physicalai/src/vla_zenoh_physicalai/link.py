@@ -7,7 +7,8 @@ from typing import Any
 
 import zenoh
 
-from vla_zenoh_physicalai.wire import key
+from vla_zenoh.bus.buffers import bytes_of
+from vla_zenoh_physicalai.wire import MAX_BYTES, key
 
 ZError = zenoh.ZError
 
@@ -48,3 +49,13 @@ def subscribe(
     return session.declare_subscriber(
         key(name, what), zenoh.handlers.RingChannel(1), allowed_origin=zenoh.Locality.REMOTE
     )
+
+
+def newest(subscriber: zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]]) -> bytes | None:
+    """The payload that came last, None if none has come since.
+
+    Raises:
+        CodecError: it has more than `MAX_BYTES`.
+    """
+    sample = subscriber.try_recv()
+    return None if sample is None else bytes_of(sample.payload, MAX_BYTES)

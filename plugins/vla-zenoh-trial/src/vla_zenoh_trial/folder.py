@@ -19,7 +19,7 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from vla_zenoh.errors import RecordingError
+from vla_zenoh.errors import RecordingError, describe_faults
 from vla_zenoh.lab.durable import append_lines, lock_folder, whole_lines, write_whole, writing
 from vla_zenoh_trial.plan import TrialPlan
 from vla_zenoh_trial.verdict import EpisodeVerdict
@@ -121,11 +121,10 @@ class TrialFolder:
         try:
             return _adapter(kind).validate_json(data, strict=True)
         except ValidationError as error:
-            fault = error.errors()[0]
-            at = ".".join(map(str, fault["loc"]))
+            why = describe_faults(error, "", most=1)
             raise RecordingError(
-                f"{self.path / where}: {at}{': ' if at else ''}{fault['msg']}; restore it as "
-                "`vla-zenoh trial` wrote it, or give another --output"
+                f"{self.path / where}: {why}; restore it as `vla-zenoh trial` wrote it, or give "
+                "another --output"
             ) from error
 
     # -- writing ------------------------------------------------------------------------------
