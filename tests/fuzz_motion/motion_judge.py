@@ -27,8 +27,6 @@ WANDER_M, WANDER_RAD = 1e-5, 1e-5
 OUTSIDE_M = 1e-4
 """Beyond the workspace box, of command and goal."""
 LEAD_M, LEAD_RAD = 1e-4, 1e-3
-LAG_M, LAG_RAD = 0.01, 0.05
-"""A pose waits for joints that are this far from it; the leash is on the pose."""
 """Beyond the leash."""
 SAME = 2e-7
 """m and rad: a goal that moves less is told to stay; float32 has 3e-8 of 0.5 m."""
@@ -261,20 +259,12 @@ class Judge:
         turn = log_of(np.einsum("nij,nkj->nik", goal_rotation, self._rotation[where]))
         if self._case.in_joints and self._case.joint:
             return  # its leash is on the joints
-        lag = self._case.joint
         # Where a late tick takes the arm is foreseen with the acceleration it had.
         late_s = np.diff(self._time_s, prepend=self._time_s[:1])[where]
         foreseen = motion_limits(self._limits).translation[2] * late_s**3 / 3
         for name, values, limit, tolerance, unit, factor in (
-            ("lead_m", ahead_m, self._limits.lead_m, LEAD_M + lag * LAG_M, "mm over", 1e3),
-            (
-                "lead_rad",
-                norms(turn)[:, 0],
-                self._limits.lead_rad,
-                LEAD_RAD + lag * LAG_RAD,
-                "mrad over",
-                1e3,
-            ),
+            ("lead_m", ahead_m, self._limits.lead_m, LEAD_M, "mm over", 1e3),
+            ("lead_rad", norms(turn)[:, 0], self._limits.lead_rad, LEAD_RAD, "mrad over", 1e3),
         ):
             sizes = np.zeros(len(self._told))
             sizes[where] = np.maximum(values - limit - foreseen, 0.0)

@@ -281,6 +281,11 @@ class JointPath(AxisSmoother):
         home_rad = self.kinematics.ordered(profile.robot.arm_joints, profile.robot.home_rad)
         super().__init__(home_rad, 1.0 / profile.timing.command_hz, np.array(bounds.motion))
 
+    @property
+    def tcp(self) -> Motion:
+        """The commanded motion of the TCP."""
+        return self.motion
+
     def stand(self, position: FloatArray) -> None:
         super().stand(position)
         self._before_bound = False

@@ -240,12 +240,10 @@ class PoseToJoint:
     def _stop(self, smoother: Smoother) -> None:
         """Stop the joints within their limits; the pose follows them."""
         self._now = self._follower.brake(self._now, self._dt_s)
-        position, velocity, acceleration, _ = self._now
         self._pull = self._pull_rate_1_s = 0.0
-        pose, jacobian = self._kinematics.pose_and_jacobian(position)
+        pose, twist, change = self.tcp
         # A motion planned from here must start within its limits.
-        change = np.clip(jacobian @ acceleration, -smoother.box[1], smoother.box[1])
-        smoother.brake_from(Motion(pose, jacobian @ velocity, change))
+        smoother.brake_from(Motion(pose, twist, np.clip(change, -smoother.box[1], smoother.box[1])))
 
     def _pulled_to(self, share: float) -> FloatArray:
         """The posture (n,) of this tick; its pull changes without a jerk of the elbow."""
@@ -260,6 +258,14 @@ class PoseToJoint:
     def position_rad(self) -> FloatArray:
         """(n,) the commanded joints."""
         return self._now.position_rad
+
+    @property
+    def tcp(self) -> Motion:
+        """The motion of the TCP that the commanded joints make, without what their Jacobian's
+        change adds to the acceleration."""
+        position, velocity, acceleration, _ = self._now
+        pose, jacobian = self._kinematics.pose_and_jacobian(position)
+        return Motion(pose, jacobian @ velocity, jacobian @ acceleration)
 
     @property
     def at_rest(self) -> bool:
@@ -291,6 +297,11 @@ class FollowedPath(PosePath):
     @property
     def stands(self) -> bool:
         return self.at_rest and self.joints.at_rest
+
+    @property
+    def tcp(self) -> Motion:
+        """The motion of the joints' TCP: it lags behind the path, and stays in the box."""
+        return self.joints.tcp
 
     @property
     def joints_rad(self) -> FloatArray:

@@ -194,6 +194,11 @@ class PosePath(Smoother):
         return self.at_rest
 
     @property
+    def tcp(self) -> Motion:
+        """The commanded motion of the TCP."""
+        return self.motion
+
+    @property
     def joints_rad(self) -> FloatArray | None:
         """(n,) joints commanded, None where poses are."""
         return None
@@ -238,9 +243,9 @@ class PosePath(Smoother):
     def leash(self, goal: Goal, ahead_s: float) -> tuple[Goal, list[LimitHit]]:
         """`goal`, or a nearer one on the leash, and the limits that acted.
 
-        It is no further outside the box than the arm is now: one that began there only comes in.
+        It is no further outside the box than the TCP is now: one that began there only comes in.
         """
-        (position_m, rotation), twist, acceleration = self.motion
+        (position_m, rotation), twist, acceleration = self.tcp
         way = ahead_s * (twist + 0.5 * ahead_s * acceleration)
         ahead = Pose(position_m + way[:3], exp3(way[3:]).dot(rotation))
         pose, hits = leash(self._bounds, goal.pose, ahead)
@@ -260,6 +265,8 @@ class PosePath(Smoother):
         if share >= 1.0:
             return goal
         nearer = interpolate(here, goal.pose, share)
+        inside_m, _ = into_workspace(self._bounds, nearer.position_m, self.tcp.pose.position_m)
+        nearer = Pose(inside_m, nearer.rotation)
         return Goal(nearer, goal.width_m, slowdown=goal.slowdown, response=goal.response)
 
     def resting_goal(self, actual: Pose, width_m: float) -> Goal:

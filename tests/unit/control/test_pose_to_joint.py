@@ -7,9 +7,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vla_zenoh.control.chunk_planner import ChunkPlanner
-from vla_zenoh.control.limits import joint_motion_limits, motion_limits
+from vla_zenoh.control.limits import into_workspace, joint_motion_limits, motion_limits
 from vla_zenoh.control.motion_pipeline import MotionPipeline
-from vla_zenoh.control.pose_to_joint import PoseToJoint
+from vla_zenoh.control.plan_timeline import Goal
+from vla_zenoh.control.pose_to_joint import FollowedPath, PoseToJoint
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.control.smoothing import Smoother
 from vla_zenoh.control.states import State
@@ -27,6 +28,7 @@ TICK_S, TICK_NS = 0.004, 4_000_000
 START_NS = 1_700_000_000_000_000_000
 RTOL = 1e-6
 MOVING_RAD_S = 0.05
+BOX_M = 1e-5
 
 
 @given(st.lists(st.tuples(st.booleans(), st.integers(1, 60)), min_size=1, max_size=6))
@@ -46,6 +48,29 @@ def test_the_elbow_sets_out_and_stops_within_the_jerk_limit(
             assert (jerk <= LIMITS.jerk_rad_s3 * (1 + RTOL)).all()
             before = acceleration
     assert stage.at_rest
+
+
+PLACES = st.tuples(*[st.floats(-0.4, 0.4)] * 3)
+
+
+@given(outside_m=st.floats(0.0005, 0.02), axis=st.integers(0, 2), high=st.booleans(), way_m=PLACES)
+@settings(max_examples=60, deadline=None)
+def test_no_goal_is_further_outside_the_box_than_the_arm_where_the_path_leaves_it(
+    outside_m: float, axis: int, high: bool, way_m: tuple[float, float, float]
+) -> None:
+    """The box bounds the joints, not the path that they follow."""
+    path = FollowedPath(PROFILE, PoseToJoint(PROFILE, KINEMATICS))
+    path.joints.restart(HOME_RAD)
+    inside = KINEMATICS.forward(HOME_RAD)
+    corners = PROFILE.limits.workspace.corners_m
+    start_m = inside.position_m.copy()
+    start_m[axis] = corners[high][axis] + (outside_m if high else -outside_m)
+    path.reset(Pose(start_m, inside.rotation))
+    there_m, _ = into_workspace(PROFILE.limits, start_m + way_m)
+    asked = Goal(Pose(there_m, inside.rotation), 0.08)
+    goals = [path.leash(asked, TICK_S)[0], path.near(asked), path.resting_goal(path.tcp.pose, 0.08)]
+    for goal in goals:
+        assert into_workspace(PROFILE.limits, goal.pose.position_m)[1] <= BOX_M
 
 
 class Moved:
