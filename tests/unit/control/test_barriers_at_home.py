@@ -225,7 +225,8 @@ def test_an_arm_that_began_outside_the_box_never_gets_a_goal_further_out(
         chunk = rig.chunk(steps.tolist(), observed_ago_s=float(rng.uniform(0.0, 0.2)))
         arm.tick(chunks=[chunk])
         for _ in range(int(rng.integers(10, 60))):
-            here = motion.commanded
+            joints_rad = motion.joints_rad
+            here = motion.commanded if joints_rad is None else arm.kinematics.forward(joints_rad)
             arm.tick()
             goal = motion.goal
             if goal is None or here is None:
