@@ -10,7 +10,7 @@ from joint_rig import Joints, panda
 from panda_arm import HOME_RAD
 
 from vla_zenoh.control.joint_space import JointBounds, JointPath
-from vla_zenoh.control.limits import Shares, Slowdown, workspace_corners
+from vla_zenoh.control.limits import PAUSE_LEAD_RAD, Shares, Slowdown, workspace_corners
 from vla_zenoh.control.plan_timeline import joint_goal
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.types import FloatArray
@@ -39,6 +39,17 @@ def test_a_goal_near_an_arm_that_is_held_keeps_its_slowdown() -> None:
     slow = Slowdown("table_distance", 0.1, 0.01, 0.05, "")
     asked = joint_goal(path.kinematics, HOME_RAD + 0.2, 0.0, slow)
     assert path.near(asked).slowdown == slow
+
+
+@pytest.mark.parametrize("turn_rad", [0.0, 0.5 * PAUSE_LEAD_RAD, PAUSE_LEAD_RAD, 0.3, -0.3])
+def test_the_goal_of_an_arm_that_is_held_is_on_its_way_and_no_further_than_it_can_retreat(
+    turn_rad: float,
+) -> None:
+    path = made_path()
+    way_rad = turn_rad * np.array([1.0, -0.5, 0.2, 0.0, 0.1, 0.0, 0.7])
+    near = path.near(joint_goal(path.kinematics, HOME_RAD + way_rad, 0.0))
+    share = min(1.0, PAUSE_LEAD_RAD / max(abs(turn_rad), 1e-9))
+    np.testing.assert_allclose(near.known_rad, HOME_RAD + share * way_rad, atol=1e-12)
 
 
 def test_a_goal_that_the_leash_cuts_stays_inside_the_box_and_on_the_leash() -> None:

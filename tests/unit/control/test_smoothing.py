@@ -10,9 +10,11 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from vla_zenoh.control.limits import MotionLimits, Shares
-from vla_zenoh.control.smoothing import Motion, Smoother
+from vla_zenoh.control.limits import PAUSE_LEAD_M, PAUSE_LEAD_RAD, MotionLimits, Shares
+from vla_zenoh.control.plan_timeline import Goal
+from vla_zenoh.control.smoothing import Motion, PosePath, Smoother
 from vla_zenoh.kinematics.so3 import Pose, angle_between, exp3, log3, norm3
+from vla_zenoh.profile import load_profile
 
 DT_S = 0.004
 LIMITS = MotionLimits((0.5, 2.0, 20.0), (1.5, 6.0, 60.0))
@@ -457,3 +459,19 @@ def test_an_axis_that_turns_round_for_its_target_reaches_it_without_passing_it()
         lowest_m = min(lowest_m, float(motion.tick().pose.position_m[2] - goal.position_m[2]))
     assert lowest_m > -AT_GOAL[0]
     assert motion.at_rest
+
+
+@pytest.mark.parametrize("way_m", [0.0, 0.5 * PAUSE_LEAD_M, 5 * PAUSE_LEAD_M])
+@pytest.mark.parametrize("way_rad", [0.0, 0.5 * PAUSE_LEAD_RAD, 8 * PAUSE_LEAD_RAD])
+def test_the_goal_of_an_arm_that_is_held_is_on_its_way_and_no_further_than_it_can_retreat(
+    way_m: float, way_rad: float
+) -> None:
+    path = PosePath(load_profile("panda_sim"))
+    path.reset(START)
+    way, turn = np.array([0.6, 0.0, -0.8]), np.array([0.0, 1.0, 0.0])
+    asked = Pose(START.position_m + way_m * way, exp3(way_rad * turn) @ START.rotation)
+    near = path.near(Goal(asked, 0.04)).pose
+    share = 1 / max(way_m / PAUSE_LEAD_M, way_rad / PAUSE_LEAD_RAD, 1.0)
+    np.testing.assert_allclose(near.position_m, START.position_m + share * way_m * way, atol=1e-12)
+    turned = log3(near.rotation @ START.rotation.T)
+    np.testing.assert_allclose(turned, share * way_rad * turn, atol=1e-9)
