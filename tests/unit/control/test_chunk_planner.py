@@ -337,6 +337,7 @@ def test_a_target_far_outside_the_workspace_is_refused_with_how_far_and_what_to_
     assert out.accepted is None
     assert rig.refused == {"workspace": 1}
     (event,) = [event for event in rig.events if event.kind == "refusal"]
+    assert event.why.startswith("scripted: a target at"), "of an arm without parts"
     assert f"{away}" in event.why
     assert "m outside the workspace" in event.why
     assert "position_scale_m" in event.why
