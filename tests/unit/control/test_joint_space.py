@@ -9,8 +9,14 @@ import pytest
 from joint_rig import Joints, panda
 from panda_arm import HOME_RAD
 
-from vla_zenoh.control.joint_space import JointBounds, JointPath
-from vla_zenoh.control.limits import PAUSE_LEAD_RAD, Shares, Slowdown, workspace_corners
+from vla_zenoh.control.joint_space import STEP_HALVINGS, JointBounds, JointPath
+from vla_zenoh.control.limits import (
+    PAUSE_LEAD_RAD,
+    BoundedStep,
+    Shares,
+    Slowdown,
+    workspace_corners,
+)
 from vla_zenoh.control.plan_timeline import joint_goal
 from vla_zenoh.control.reachability import ReachabilityFilter
 from vla_zenoh.types import FloatArray
@@ -212,3 +218,30 @@ def test_joints_that_brake_pass_and_end_where_they_were_said_to() -> None:
         np.testing.assert_allclose(end_rad, passed[-1], atol=PASSED_RAD)
         moved_rad = max(moved_rad, float(np.abs(end_rad - before.position).max()))
     assert moved_rad > 0.05
+
+
+@pytest.mark.parametrize("turn_rad", [-0.8, -1.5])
+def test_a_step_into_a_barrier_is_cut_where_it_is_forbidden_and_not_dropped(
+    turn_rad: float,
+) -> None:
+    profile = panda()
+    reach = ReachabilityFilter(profile)
+    way_rad = turn_rad * np.eye(7)[6]
+
+    def bounded(share: float) -> BoundedStep:
+        pieces = JointBounds(profile, reach.kinematics, reach.barriers).bound_in_pieces(
+            HOME_RAD, HOME_RAD + share * way_rad
+        )
+        while True:
+            try:
+                next(pieces)
+            except StopIteration as end:
+                return end.value
+
+    step = bounded(1.0)
+    share = float((step.joints_rad - HOME_RAD)[6] / turn_rad)
+    np.testing.assert_allclose(step.joints_rad, HOME_RAD + share * way_rad, atol=1e-12)
+    assert step.hits[0].name == "self_collision"
+    assert 0.05 < share < 1.0
+    assert not bounded(0.99 * share).hits
+    assert bounded(share + 2.0**-STEP_HALVINGS).hits
