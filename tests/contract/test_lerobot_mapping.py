@@ -78,7 +78,8 @@ def test_numbers_are_read_in_the_units_and_bounds_that_are_told(tmp_path: Path) 
         0.0,
     )
     steps = vars(policy)["_meaning"][""].steps(np.array([[1.0, -3.0, 0.5, 0.0, 0.2, 9.0, -1.0]]))
-    np.testing.assert_allclose(steps, [[0.05, -0.05, 0.025, 0, 0.1, 0.5, -1]], atol=ATOL)
+    assert action.position_scale_m == pytest.approx(0.05)
+    np.testing.assert_allclose(steps, [[1, -1, 0.5, 0, 0.1, 0.5, -1]], atol=ATOL)
 
 
 SMOLVLA: dict[str, Any] = {

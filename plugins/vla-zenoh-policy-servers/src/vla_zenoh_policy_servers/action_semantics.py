@@ -11,13 +11,15 @@ units it wants the state (`vla_zenoh_policy_servers.state_vector`)::
     controller none, or KP:DAMPING_RATIO of the data's controller, where that covers only a part of
                each delta (robosuite's and LIBERO's: 150:1)
     rotation   rpy, rotvec, quat_xyzw, quat_wxyz, rotation_6d (first two columns of the matrix),
-               rotation_6d_rows (first two rows)
+               rotation_6d_rows (first two rows), none (of deltas and velocities of a hand that
+               does not turn)
     rotation_reference  home, or x,y,z,w: of the numbers that one rotation has (both signs of a
                quaternion, angles that differ by a turn), the state has those nearest to this one;
                0,0,0,1: w >= 0 and angles within [-pi, pi]
     clip       numbers of the arm are clipped to [-clip, clip] first; empty: never
     position_scale_m, rotation_scale_rad   one unit of the numbers of a pose, default 1; of
-               absolute poses also that of the state
+               absolute poses also that of the state. Positions of deltas and velocities stay in
+               this unit: a robot with the same one is given them to the last bit
     joint_scale_rad    one unit of the numbers of joints: 1 for radians, 0.0174533 for degrees,
                negative for a joint that turns the other way; or one for each joint, with commas, m
                for a joint that slides; of joint_position also that of `joint` in the state
@@ -58,12 +60,13 @@ _JOINT_KINDS: Mapping[str, str] = {
     "joint_velocity": "velocity",
 }
 ForeignRotation = Literal[
-    "rpy", "rotvec", "quat_xyzw", "quat_wxyz", "rotation_6d", "rotation_6d_rows"
+    "rpy", "rotvec", "quat_xyzw", "quat_wxyz", "rotation_6d", "rotation_6d_rows", "none"
 ]
 _SPEC_ROTATIONS: Mapping[str, str] = {
     "quat_xyzw": "quaternion",
     "quat_wxyz": "quaternion",
     "rotation_6d_rows": "rotation_6d",
+    "none": "rotvec",
 }
 """Forms that are another one in a spec."""
 SCALED = ("rpy", "rotvec")
@@ -152,7 +155,7 @@ class ActionSemantics:
     Made by `read_action_semantics`.
 
     Args:
-        spec: of the converted steps, in metres and radians.
+        spec: of the converted steps, in radians, and metres where the spec has no other unit.
         action: kind of the arm's numbers.
         rotation: their representation of rotations, if they are poses.
         clip: bound of the arm's raw numbers; 0: none.
@@ -185,7 +188,8 @@ class ActionSemantics:
 
     def parts(self) -> dict[str, int]:
         """Parts of a row in order, with their sizes."""
-        arm = {"position": 3, self.rotation: ROTATION_FORMS[self.rotation].size}
+        size = 0 if self.rotation == "none" else ROTATION_FORMS[self.rotation].size
+        arm = {"position": 3, self.rotation: size}
         if self.needs_joints:
             arm = {"joints": len(self.spec.joints)}
         return arm if self.spec.gripper == "none" else {**arm, "gripper": 1}
@@ -213,11 +217,13 @@ class ActionSemantics:
         if self.needs_joints:
             arm = (arm - self._zeros) * np.array(self.units.joint_scales)
             return np.concatenate([arm, gripper], axis=1)
-        position_m, turns = arm[:, :3] * self.units.position_scale_m, arm[:, 3:]
-        if self.rotation in SCALED:
+        position, turns = arm[:, :3] * self._unit, arm[:, 3:]
+        if self.rotation == "none":
+            turns = np.zeros((len(rows), 3))
+        elif self.rotation in SCALED:
             turns = turns * self.units.rotation_scale_rad
         turns = _rewritten(turns, self.rotation, self.spec.rotation)
-        return np.concatenate([position_m, turns, gripper], axis=1)
+        return np.concatenate([position, turns, gripper], axis=1)
 
     def rows(self, steps: NDArray[Any]) -> NDArray[np.float64]:
         """The inverse of `steps`: action steps (K, D) as the policy's own numbers (K, C)."""
@@ -227,11 +233,18 @@ class ActionSemantics:
         if self.needs_joints:
             arm = arm / np.array(self.units.joint_scales) + self._zeros
             return np.concatenate([arm, gripper], axis=1)
-        position, turns = arm[:, :3] / self.units.position_scale_m, arm[:, 3:]
+        position, turns = arm[:, :3] / self._unit, arm[:, 3:]
+        if self.rotation == "none":
+            return np.concatenate([position, gripper], axis=1)
         turns = _rewritten(turns, self.spec.rotation, self.rotation)
         if self.rotation in SCALED:
             turns = turns / self.units.rotation_scale_rad
         return np.concatenate([position, turns, gripper], axis=1)
+
+    @property
+    def _unit(self) -> float:
+        """What one unit of a position is in the unit of the spec."""
+        return self.units.position_scale_m / self.spec.position_scale_m
 
     @property
     def _zeros(self) -> NDArray[np.float64]:
@@ -241,7 +254,7 @@ class ActionSemantics:
 
 def _rewritten(numbers: NDArray[np.float64], before: str, after: str) -> NDArray[np.float64]:
     """Rotations (n, ...) in another form, with the sign that they have."""
-    if before == after:
+    if before in (after, "none"):
         return numbers
     quats = [ROTATION_FORMS[before].decode(row) for row in numbers]
     rows = [ROTATION_FORMS[after].encode(quat, quat) for quat in quats]
@@ -302,6 +315,8 @@ def read_action_semantics(
     for name, values in scales.items():
         if 0.0 in values:
             raise SpecError(f"{name} is 0: every number would mean the same; give one unit's size")
+    if chosen["rotation"] == "none" and action not in ("delta", "velocity"):
+        raise SpecError("rotation=none goes with action=delta or velocity: a pose has a rotation")
     if any(units.joint_zeros) and action != "joint_position":
         raise SpecError("joint_zero goes with action=joint_position: a change has no zero")
     return ActionSemantics(
@@ -395,6 +410,7 @@ def _spec(
 ) -> ActionSpec:
     action = chosen["action"]
     rotation, threshold = chosen["rotation"], chosen["gripper_threshold"]
+    scale_m = number("position_scale_m", chosen["position_scale_m"])
     with as_spec_error():
         return ActionSpec.model_validate(
             {
@@ -408,6 +424,7 @@ def _spec(
                 "relative_to": chosen["relative_to"] or "previous",
                 "controller": read_controller(chosen["controller"]),
                 "rotation": _SPEC_ROTATIONS.get(rotation, rotation),
+                "position_scale_m": scale_m if action in ("delta", "velocity") else 1.0,
                 "gripper": chosen["gripper"],
                 "gripper_open_is_high": chosen["gripper_open"] != "low",
                 "gripper_threshold": number("gripper_threshold", threshold, least=-math.inf),

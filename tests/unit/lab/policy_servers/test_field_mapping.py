@@ -103,9 +103,10 @@ def test_one_unit_of_libero_is_5_cm_and_half_a_radian_and_more_is_clipped() -> N
     of = layout()
     answer = {"actions": np.array([[1, -0.5, 0, 0, 0.5, 0, -1], [9, 0, 0, 0, 0, -9, 1]])}
     steps = steps_of(of, answer)
-    expected = [[0.05, -0.025, 0, 0, 0.25, 0, -1], [0.05, 0, 0, 0, 0, -0.5, 1]]
+    expected = [[1, -0.5, 0, 0, 0.25, 0, -1], [1, 0, 0, 0, 0, -0.5, 1]]
     np.testing.assert_allclose(steps, expected, atol=ATOL)
     action = of.spec.action
+    assert action.position_scale_m == pytest.approx(0.05)
     assert (action.kind, action.rotation) == ("delta", "rotvec")
     assert (action.gripper, action.gripper_open_is_high, action.gripper_threshold) == (
         "binary",
