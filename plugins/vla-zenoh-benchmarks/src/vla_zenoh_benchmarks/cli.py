@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 import threading
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,19 +23,25 @@ from vla_zenoh.cli.options import (
     options,
 )
 from vla_zenoh.cli.output import console, errors, new_table
-from vla_zenoh.errors import ResourceError
+from vla_zenoh.errors import ResourceError, nearest
 from vla_zenoh.lab.cli.output import print_json, progress_bars
 from vla_zenoh.lab.cli.output_path import check_folder
 from vla_zenoh.lab.tasks.task import shown_camera
 from vla_zenoh_benchmarks.contract import BenchmarkTask
-from vla_zenoh_benchmarks.episode import EpisodeConditions, EpisodeOutcome, EpisodeRequest, Mode
+from vla_zenoh_benchmarks.episode import (
+    Composition,
+    EpisodeConditions,
+    EpisodeOutcome,
+    EpisodeRequest,
+    Mode,
+)
 from vla_zenoh_benchmarks.journal import PLAN, RunJournal, actions_file, read_episodes, read_json
 from vla_zenoh_benchmarks.process import BenchmarkProcess, BenchmarkSetting
 from vla_zenoh_benchmarks.result import summary, write_page, write_videos
 from vla_zenoh_benchmarks.result_file import counts, rate_cells, write_json
 from vla_zenoh_benchmarks.run import BenchmarkStage, Does, LocalRun, run_at_places
 
-REPLAY = "replay"
+REPLAY, RECORDINGS = "replay", "recordings"
 
 
 @dataclass(frozen=True)
@@ -81,11 +87,20 @@ class BenchmarkEpisodes:
         ),
     ] = 0
 
+    composition: Annotated[
+        Composition,
+        typer.Option("--composition", help="Of chunks that overlap, in mode command."),
+    ] = "replace"
+
     @property
     def conditions(self) -> EpisodeConditions:
         if self.mode == "native" and self.delay_ms:
             raise typer.BadParameter("--delay: in native mode no time passes; add --mode live")
-        return EpisodeConditions(self.mode, self.delay_ms, self.replan)
+        if self.mode != "command" and self.composition != "replace":
+            raise typer.BadParameter(
+                "--composition: only our command node has it; add --mode command"
+            )
+        return EpisodeConditions(self.mode, self.delay_ms, self.replan, self.composition)
 
     def requests(self, about: dict[str, Any]) -> list[EpisodeRequest]:
         known = [BenchmarkTask(**task) for task in about["tasks"]]
@@ -163,7 +178,29 @@ class BenchmarkOutput:
         int,
         typer.Option("--videos", min=0, max=100_000, help="Of failures, at most, with --output."),
     ] = 5
+    record: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--record",
+            help="Record every episode as MCAP into OUTPUT/recordings, with this camera; "
+            "repeatable. Not with --ray.",
+        ),
+    ] = None
     as_json: JsonOption = False
+
+    def recorded(self, place: BenchmarkPlace, known: Iterable[str]) -> tuple[str, ...]:
+        """The cameras to record."""
+        cameras = tuple(dict.fromkeys(self.record or ()))
+        if cameras and (self.output is None or place.ray is not None):
+            raise typer.BadParameter("--record needs --output, and is not for --ray")
+        for camera in cameras:
+            if camera not in known:
+                meant = nearest(camera, known, "")
+                raise typer.BadParameter(
+                    f"--record: the benchmark has no camera {camera!r}{meant}; "
+                    f"it has: {', '.join(known)}"
+                )
+        return cameras
 
 
 @options
@@ -221,6 +258,7 @@ def sim(
         if list_tasks:
             print_json(about)
             return
+        cameras = output.recorded(place, about["cameras"])
         requests = episodes.requests(about)
         plan = {
             "benchmark": setting.file.name,
@@ -230,6 +268,7 @@ def sim(
             "model": name,
             "options": dict(chosen.options) if chosen else {},
             **asdict(setting.conditions),
+            "record": list(cameras),
             "tasks": list(dict.fromkeys(each.task.name for each in requests)),
             "first": episodes.first,
             "episodes": episodes.episodes,
@@ -238,6 +277,12 @@ def sim(
             "versions": {"vla-zenoh": __version__, **about["versions"]},
         }
         journal = RunJournal(output.output, plan)
+        stage = replace(stage, max_width_m=about["max_width_m"])
+        if cameras and output.output is not None:
+            folder = output.output / RECORDINGS
+            folder.mkdir(exist_ok=True)
+            recorded = replace(setting, record=cameras, recordings=str(folder.resolve()))
+            stage = replace(stage, setting=recorded)
         stop = stop_on_signals()
         try:
             left = [each for each in requests if each.key not in journal.ended]

@@ -39,6 +39,7 @@ def run_through_command_node(clock: EpisodeClock, conditions: EpisodeConditions)
         load_profile("panda_sim"),
         {
             "limits": dict(getattr(benchmark, "limits", {})),
+            "composition": {"mode": conditions.composition},
             "robot": {"gripper": {"max_width_m": getattr(benchmark, "max_width_m", 0.08)}},
         },
     )

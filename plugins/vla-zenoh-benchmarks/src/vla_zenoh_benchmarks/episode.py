@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal, Protocol
 
@@ -21,6 +21,7 @@ from vla_zenoh_benchmarks.contract import (
 )
 
 Mode = Literal["native", "live", "command"]
+Composition = Literal["replace", "blend", "ensemble"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,11 +34,13 @@ class EpisodeConditions:
             ``command``: it runs on too, and our command node is between model and environment.
         delay_ms: what an inference takes on the environment's clock; None: what it took.
         replan: steps to carry out of each chunk; 0: all.
+        composition: of chunks that overlap, in mode ``command``: `composition.mode` of a profile.
     """
 
     mode: Mode = "native"
     delay_ms: float | None = None
     replan: int = 0
+    composition: Composition = "replace"
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,11 +95,36 @@ class Asked(Protocol):
     def ask(self, seen: BenchmarkObservation) -> ActionChunk: ...
 
 
-class EpisodeClock:
-    """The environment in an episode: its steps, their limit, and what they led to."""
+class Recorder(Protocol):
+    """Who keeps what happens in an episode, see `EpisodeRecorder`."""
 
-    def __init__(self, benchmark: Benchmark, request: EpisodeRequest, worker: Asked) -> None:
+    cameras: Sequence[str]
+
+    def begin(self, prompt: str) -> None: ...
+
+    def chunk(self, chunk: ActionChunk, step: int) -> None: ...
+
+    def saw(self, seen: BenchmarkObservation, step: int) -> None: ...
+
+    def moved(self, seen: BenchmarkObservation, step: int) -> None: ...
+
+
+class EpisodeClock:
+    """The environment in an episode: its steps, their limit, and what they led to.
+
+    Args:
+        recorder: who keeps every step; None: nobody.
+    """
+
+    def __init__(
+        self,
+        benchmark: Benchmark,
+        request: EpisodeRequest,
+        worker: Asked,
+        recorder: Recorder | None = None,
+    ) -> None:
         self.benchmark, self.request, self.worker = benchmark, request, worker
+        self.recorder = recorder
         self.spec = worker.spec
         self.cameras = [one.camera for one in self.spec.observation.cameras]
         self.outcome = EpisodeOutcome(request.suite, request.task.name, request.episode)
@@ -113,6 +141,8 @@ class EpisodeClock:
         chunk = self.worker.ask(self.benchmark.observe(self.cameras))
         self._asked_ms.append((time.perf_counter() - began_s) * 1e3)
         self.outcome.chunks += 1
+        if self.recorder is not None:
+            self.recorder.chunk(chunk, self.outcome.steps)
         return chunk.steps
 
     @property
@@ -125,7 +155,12 @@ class EpisodeClock:
         if self.over:
             return
         self._last = action
+        if self.recorder is not None:
+            seen = self.benchmark.observe(self.recorder.cameras)
+            self.recorder.saw(seen, self.outcome.steps)
         self.outcome.success = bool(self.benchmark.step(action))
+        if self.recorder is not None:
+            self.recorder.moved(self.benchmark.observe([]), self.outcome.steps)
         self.outcome.steps += 1
         self.outcome.actions.append(np.array(action))
 

@@ -32,6 +32,12 @@ def quat_xyzw(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.roll(quat_wxyz, -1)
 
 
+def draw_plainly(model: Any) -> None:
+    """Leave out shadows and smooth edges; for renderers that are made afterwards."""
+    model.vis.quality.shadowsize = 0
+    model.vis.quality.offsamples = 0
+
+
 class MujocoEnvironment:
     """State and images of `_env`, whose ``model`` and ``data`` are MuJoCo's.
 

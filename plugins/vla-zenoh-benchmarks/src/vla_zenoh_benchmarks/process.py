@@ -40,9 +40,12 @@ from vla_zenoh_benchmarks.episode import (
     EpisodeConditions,
     EpisodeOutcome,
     EpisodeRequest,
+    Recorder,
     state_hash,
 )
 
+EXTRAS = {"control": "ruckig", "record": "mcap"}
+"""Extra of this package -> one of its packages."""
 ANSWER_PATIENCE_S = 300.0
 FRAME_HZ = 10
 LAST_LINES = 20
@@ -58,6 +61,8 @@ class BenchmarkSetting:
 
     Args:
         profile_file: of the robot, with the address of the router.
+        record: cameras to record every episode with; none: nothing is recorded.
+        recordings: folder of the recordings.
     """
 
     benchmark: str
@@ -65,6 +70,8 @@ class BenchmarkSetting:
     profile_file: str = ""
     worker: str = ""
     conditions: EpisodeConditions = field(default_factory=EpisodeConditions)
+    record: tuple[str, ...] = ()
+    recordings: str = ""
 
     @property
     def file(self) -> ModelFile:
@@ -85,8 +92,11 @@ class BenchmarkProcess:
 
     def __init__(self, setting: BenchmarkSetting, robot: str, python: str | None = None) -> None:
         file = setting.file
-        extra = "control" if setting.conditions.mode == "command" else ""
-        lacks = file.missing() or (extra and not _has("ruckig"))
+        needs = {"control": setting.conditions.mode == "command", "record": bool(setting.record)}
+        extra = ",".join(name for name, needed in needs.items() if needed)
+        lacks = file.missing() or any(
+            needs[name] and not _has(package) for name, package in EXTRAS.items()
+        )
         command = [sys.executable]
         if python is not None:
             command = [python]
@@ -191,9 +201,16 @@ def _has(package: str) -> bool:
 
 
 def run_episode(
-    benchmark: Benchmark, request: EpisodeRequest, worker: Asked, conditions: EpisodeConditions
+    benchmark: Benchmark,
+    request: EpisodeRequest,
+    worker: Asked,
+    conditions: EpisodeConditions,
+    recorder: Recorder | None = None,
 ) -> EpisodeOutcome:
     """Run an episode; the model is asked by `worker`.
+
+    Args:
+        recorder: who keeps every step; None: nobody.
 
     Raises:
         NodeError: the worker does not answer.
@@ -202,7 +219,9 @@ def run_episode(
     began_s = time.perf_counter()
     benchmark.reset(request.suite, request.task.name, request.episode)
     worker.begin(request.task.prompt)
-    clock = EpisodeClock(benchmark, request, worker)
+    clock = EpisodeClock(benchmark, request, worker, recorder)
+    if recorder is not None:
+        recorder.begin(request.task.prompt)
     if conditions.mode == "command":
         from vla_zenoh_benchmarks.command_path import run_through_command_node
 
@@ -260,7 +279,7 @@ class _Child:
         file = request.pop("actions", "")
         wanted = EpisodeRequest(**{**request, "task": BenchmarkTask(**request["task"])})
         if do == "run":
-            found = run_episode(self.benchmark, wanted, self._asked(), self._setting.conditions)
+            found = self._run(wanted)
         else:
             every = max(1, round(1 / FRAME_HZ / self.benchmark.action.dt_s))
             steps = np.load(file)
@@ -275,9 +294,32 @@ class _Child:
         actions = [each.tolist() for each in found.actions]
         return {**found.to_dict(), "actions": actions}
 
+    def _run(self, wanted: EpisodeRequest) -> EpisodeOutcome:
+        worker, setting = self._asked(), self._setting
+        if not setting.record:
+            return run_episode(self.benchmark, wanted, worker, setting.conditions)
+        from vla_zenoh_benchmarks.recorded import EpisodeRecorder, recording_file
+
+        recorder = EpisodeRecorder(
+            recording_file(Path(setting.recordings), wanted.key),
+            self._profile,
+            setting.worker,
+            worker.spec,
+            setting.record,
+            self.benchmark.action.dt_s,
+        )
+        try:
+            found = run_episode(self.benchmark, wanted, worker, setting.conditions, recorder)
+            recorder.finish(success=found.success, steps=found.steps)
+        except BaseException:
+            recorder.abandon()
+            raise
+        return found
+
     def _asked(self) -> AskedWorker:
         if self._worker is None:
             profile = as_robot(load_profile(self._setting.profile_file), self._robot)
+            self._profile = profile
             session = open_session(profile.session, wait_s=10.0)
             name = self._setting.worker
             self._worker = AskedWorker(profile, session, name, ANSWER_PATIENCE_S)
@@ -308,6 +350,7 @@ class _Child:
             "tasks": [asdict(task) for task in found.tasks(suite)],
             "cameras": {name: list(size) for name, size in found.cameras.items()},
             "dt_s": found.action.dt_s,
+            "max_width_m": getattr(found, "max_width_m", None),
             "action": found.action.model_dump(mode="json"),
             "versions": {**versions, "python": sys.version.split()[0]},
         }

@@ -39,6 +39,7 @@ class BenchmarkStage:
     Args:
         worker_options: ``name=value`` of the model.
         connect: endpoint of a router with a worker that runs already; empty: both are started.
+        max_width_m: of the benchmark's gripper; None: it does not tell.
     """
 
     setting: BenchmarkSetting
@@ -47,6 +48,7 @@ class BenchmarkStage:
     worker_python: str | None = None
     benchmark_python: str | None = None
     connect: str = ""
+    max_width_m: float | None = None
 
 
 def robots(processes: int) -> list[str]:
@@ -58,11 +60,13 @@ def bench_profile(stage: BenchmarkStage, processes: int) -> Profile:
     """The profile of the robots of a run: no arm, a router and one worker."""
     worker = stage.setting.worker
     base = load_profile("panda_sim")
+    width_m = stage.max_width_m
+    gripper = {} if width_m is None else {"gripper": {"max_width_m": width_m}}
     profile = override(
         base,
         {
             "name": "benchmark",
-            "robot": {"name": robots(processes)[0]},
+            "robot": {"name": robots(processes)[0], **gripper},
             "cameras": dict.fromkeys(base.cameras),
             "workers": [worker],
             "models": {worker: stage.worker_model} if stage.worker_model else {},

@@ -46,6 +46,13 @@ def export(
             "for actions of joints joint+gripper_m.",
         ),
     ] = None,
+    rotation: Annotated[
+        bool,
+        typer.Option(
+            help="Numbers of rotations in the actions. --no-rotation: of a hand that never turns; "
+            "numbers that never change cannot be scaled."
+        ),
+    ] = True,
     labels: Annotated[
         list[EpisodeLabel] | None,
         typer.Option(
@@ -113,6 +120,7 @@ def export(
             parts or read_parts(usual_state(episodes)),
             lambda doing: status.update(f"writing {doing} ({counted(len(episodes), 'episode')})"),
             in_all(depths, "depth images") if depth else [],
+            rotation=rotation,
         )
     written = written._replace(folder=output)
     if as_json:

@@ -30,12 +30,14 @@ from vla_zenoh_policy_servers.state_vector import (
 from vla_zenoh.errors import RecordingError, SpecError
 from vla_zenoh.lab.recording.run import Run, nearest
 from vla_zenoh.policy import ActionSpec, Observation, StatePart
-from vla_zenoh.policy.meaning import ROTATION_FORMS
+from vla_zenoh.policy.meaning import ROTATION_FORMS, unturned
 from vla_zenoh.policy.spec import FIELD_OF, STREAM_OF
 from vla_zenoh.types import Task
 from vla_zenoh_dataset.episodes import RecordedEpisode
 
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
+LEAST_SPREAD = 1e-6
+"""Std of a number that changed; of one over 1 a share of its size. What is less is rounding."""
 STRIDE = 4
 """Only every fourth row and column of an image counts."""
 
@@ -52,6 +54,19 @@ def of_numbers(rows: ArrayLike) -> dict[str, list[Any]]:
         **{name: np.quantile(table, share, axis=0) for name, share in QUANTILES.items()},
     }
     return {name: value.tolist() for name, value in out.items()} | {"count": [len(table)]}
+
+
+def to_scale_with(found: Mapping[str, list[Any]]) -> dict[str, list[Any]]:
+    """Statistics of `of_numbers` that a policy can be scaled with.
+
+    The std of a number that never changed is 1: scaled with 0, a sensor's noise would be the
+    largest thing that a policy sees.
+    """
+    std = [
+        1.0 if spread <= LEAST_SPREAD * max(abs(mean), 1.0) else spread
+        for spread, mean in zip(found["std"], found["mean"], strict=True)
+    ]
+    return {**found, "std": std}
 
 
 class Histogram:
@@ -177,6 +192,43 @@ def names_of_state(numbers: Mapping[str, StateNumbers], spec: ActionSpec) -> lis
         for part, own in numbers.items()
     ]
     return [name for names in each for name in names]
+
+
+def kept_columns(spec: ActionSpec, *, rotation: bool) -> list[int]:
+    """Numbers of a step that a dataset has.
+
+    Args:
+        rotation: whether it has those of rotations.
+    """
+    out: list[int] = []
+    for part in [each.part for each in spec.parts] or [""]:
+        own, every = spec.of(part), range(spec.dimension)[spec.columns(part)]
+        turns = () if rotation or own.space == "joint" else every[own.rotation_columns]
+        out += [column for column in every if column not in turns]
+    return out
+
+
+def check_never_turns(episodes: Sequence[RecordedEpisode]) -> None:
+    """Nothing is lost without the numbers of rotations.
+
+    Raises:
+        RecordingError: a step turns the hand, or is a pose.
+    """
+    spec = episodes[0].spec.action
+    for part in episodes[0].spec.parts:
+        own = spec.of(part)
+        if own.space == "joint":
+            continue
+        if own.kind == "absolute":
+            raise RecordingError("--no-rotation: these actions are poses, which have a rotation")
+        still = unturned(own.rotation)
+        for episode in episodes:
+            steps = np.array([frame.action for frame in episode.frames])
+            if np.any(steps[:, spec.columns(part)][:, own.rotation_columns] != still):
+                raise RecordingError(
+                    f"--no-rotation: {episode.run.path} has steps that turn the hand; leave the "
+                    "option out"
+                )
 
 
 def action_names(spec: ActionSpec) -> list[str]:

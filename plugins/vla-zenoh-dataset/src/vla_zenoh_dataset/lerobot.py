@@ -32,11 +32,14 @@ from vla_zenoh_dataset.features import (
     action_names,
     actions_of,
     check_gripper_widths,
+    check_never_turns,
     joined,
+    kept_columns,
     names_of_state,
     numbers_of,
     of_numbers,
     states_of,
+    to_scale_with,
     worker_options,
 )
 from vla_zenoh_dataset.videos import DepthColumn, EpisodeVideo, chosen, stamps_of, write_videos
@@ -75,6 +78,8 @@ def export(
     parts: Sequence[str],
     progress: Callable[[str], None] = lambda doing: None,
     depth: Sequence[str] = (),
+    *,
+    rotation: bool = True,
 ) -> Written:
     """Write a dataset.
 
@@ -83,10 +88,12 @@ def export(
         parts: of the state, see `vla_zenoh_policy_servers.state_vector`.
         progress: called with what is being written.
         depth: cameras whose depth images to export.
+        rotation: False: without the numbers of rotations, which have to be no rotation throughout.
 
     Raises:
         RecordingError: the folder is not empty; there are no episodes; their actions differ in
-            meaning, or their grippers in width; a part of them was not recorded.
+            meaning, or their grippers in width; a part of them was not recorded; they turn the
+            hand, and `rotation` is False.
     """
     if not episodes:
         raise RecordingError("the recordings hold no episode: no chunk was executed in them")
@@ -96,9 +103,11 @@ def export(
             f"the actions of the workers {whose} do not mean the same; choose one with --worker"
         )
     check_gripper_widths(episodes, parts)
+    if not rotation:
+        check_never_turns(episodes)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise RecordingError(f"{folder} is there already; give --output a new folder")
-    return _Dataset(folder, episodes, cameras, parts, depth).write(progress)
+    return _Dataset(folder, episodes, cameras, parts, depth, rotation=rotation).write(progress)
 
 
 class _Dataset:
@@ -109,11 +118,15 @@ class _Dataset:
         cameras: Sequence[str],
         parts: Sequence[str],
         depth: Sequence[str],
+        *,
+        rotation: bool,
     ) -> None:
         self._root, self._episodes = root, list(episodes)
         self._cameras, self._parts = tuple(cameras), parts
         self._depths = [DepthColumn(camera) for camera in depth]
         self._spec = episodes[0].spec
+        self._rotation = rotation
+        self._columns = kept_columns(self._spec.action, rotation=rotation)
         self._fps = fps_of(self._spec.action)
         # One meaning for all runs, whatever their profiles say of joint order and home.
         self._numbers = numbers_of(episodes[0], parts)
@@ -173,7 +186,7 @@ class _Dataset:
 
     def _write_data(self) -> list[dict[str, NDArray[Any]]]:
         """Write the frames; returns the rows of each episode."""
-        numbers = {STATE: len(self._state_names), ACTION: self._spec.action.dimension}
+        numbers = {STATE: len(self._state_names), ACTION: len(self._columns)}
         schema = pa.schema(
             [(name, pa.list_(pa.float32(), size)) for name, size in numbers.items()]
             + [(INTERVENTION, pa.bool_()), ("timestamp", pa.float32())]
@@ -191,7 +204,7 @@ class _Dataset:
                 tasks = [self._tasks.index(frame.prompt) for frame in episode.frames]
                 rows: dict[str, NDArray[Any]] = {
                     STATE: states,
-                    ACTION: actions_of(episode),
+                    ACTION: np.ascontiguousarray(actions_of(episode)[:, self._columns]),
                     INTERVENTION: np.array([frame.intervention for frame in episode.frames]),
                     "timestamp": (np.arange(count) / self._fps).astype(np.float32),
                     "frame_index": np.arange(count),
@@ -283,6 +296,7 @@ class _Dataset:
         stats = {
             name: of_numbers(np.concatenate([each[name] for each in rows])) for name in rows[0]
         }
+        stats |= {name: to_scale_with(stats[name]) for name in (STATE, ACTION)}
         for camera, of_episodes in videos.items():
             stats[PICTURE + camera] = joined([video.histogram for video in of_episodes])
         for depth in self._depths:
@@ -334,6 +348,8 @@ class _Dataset:
         options = worker_options(action.of(parts[0]))
         if any(worker_options(action.of(part)) != options for part in parts):
             return None
+        if not self._rotation and action.of(parts[0]).space == "tcp":
+            options["rotation"] = "none"
         return {**options, "state": "+".join(self._parts), "parts": ",".join(filter(None, parts))}
 
     def _features(self, videos: dict[str, list[EpisodeVideo]]) -> dict[str, Any]:
@@ -356,7 +372,9 @@ class _Dataset:
                 },
             }
         out |= {depth.name: depth.feature() for depth in self._depths}
-        for name, names in ((STATE, self._state_names), (ACTION, action_names(self._spec.action))):
+        every = action_names(self._spec.action)
+        actions = [every[column] for column in self._columns]
+        for name, names in ((STATE, self._state_names), (ACTION, actions)):
             out[name] = {"dtype": "float32", "shape": [len(names)], "names": names}
         for name in (INTERVENTION, *COUNTERS):
             dtype = {INTERVENTION: "bool", "timestamp": "float32"}.get(name, "int64")
