@@ -43,7 +43,7 @@ from lerobot_robot_vla_zenoh import (
 from lerobot_robot_vla_zenoh.numbers import ArmNumbers
 
 from vla_zenoh.errors import ProfileError
-from vla_zenoh.profile import load_profile
+from vla_zenoh.profile import load_profile, override
 
 pytestmark = [pytest.mark.models, pytest.mark.timeout(280)]
 
@@ -189,6 +189,13 @@ def test_a_camera_reads_new_images_and_names_what_does_not_fit(arm: Chain) -> No
         VlaZenohCameraConfig(profile=profile, camera="fronts")
     with pytest.raises(ProfileError, match="20 images a second, not fps=30"):
         VlaZenohCameraConfig(profile=profile, camera="front", fps=30)
+
+
+def test_an_image_that_is_late_is_waited_for(robot: VlaZenoh) -> None:
+    own = vars(robot)
+    own["_profile"] = override(own["_profile"], {"timing": {"max_observation_age_s": 0.001}})
+    first, second = (robot.get_observation()["front"] for _ in range(2))
+    assert first is not second
 
 
 def test_a_leader_is_read_in_the_numbers_of_the_follower(arm: Chain, tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from functools import cached_property
 from typing import Any
 
-from lerobot.cameras import make_cameras_from_configs
+from lerobot.cameras import Camera, make_cameras_from_configs
 from lerobot.robots import Robot
 from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
 from lerobot.utils.errors import DeviceNotConnectedError
@@ -21,7 +21,8 @@ from vla_zenoh.errors import VlaZenohError
 from vla_zenoh.keys import worker_node
 from vla_zenoh.profile import override
 
-FIRST_CHUNK_S = 5.0
+FIRST_CHUNK_S = 20.0
+"""A command node that is just starting has sent its task within this."""
 logger = logging.getLogger(__name__)
 
 
@@ -106,16 +107,25 @@ class VlaZenoh(Robot):
 
     @check_if_not_connected
     def get_observation(self) -> dict[str, Any]:
-        """The newest state and images.
+        """The newest state and images, waiting for a new image where the newest is too old.
+
+        A computer that stalls, as where LeRobot begins an episode, makes images late: the arm
+        stands meanwhile, and the loop goes on.
 
         Raises:
             DeviceNotConnectedError: the robot sends no states.
-            TimeoutError: an image is older than ``timing.max_observation_age_s``.
+            TimeoutError: an image is older than ``timing.max_observation_age_s``, and no new one
+                comes.
         """
         assert self._remote is not None
-        oldest_ms = round(1e3 * self._profile.timing.max_observation_age_s)
-        images = {name: each.read_latest(oldest_ms) for name, each in self.cameras.items()}
+        images = {name: self._image(each) for name, each in self.cameras.items()}
         return {**self._numbers.measured(self._remote), **images}
+
+    def _image(self, camera: Camera) -> Any:
+        try:
+            return camera.read_latest(round(1e3 * self._profile.timing.max_observation_age_s))
+        except TimeoutError:
+            return camera.read()
 
     @check_if_not_connected
     def send_action(self, action: dict[str, Any]) -> dict[str, float]:

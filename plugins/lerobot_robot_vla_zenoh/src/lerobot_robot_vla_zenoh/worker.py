@@ -50,7 +50,9 @@ class LoopWorker:
             profile, session, self, name, images="raw", host=None, changed=Wake()
         )
         self._session.complaint = ""
-        self._patience_s = profile.timing.state_timeout_s
+        # More than `state_timeout_s`, with which the guard decides when late states brake the arm.
+        timing = profile.timing
+        self._patience_s = max(timing.state_timeout_s, timing.max_observation_age_s)
         self._goal: FloatArray | None = None
         self._sent_s = 0.0
         self._lock, self._end = threading.Lock(), threading.Event()
@@ -70,7 +72,7 @@ class LoopWorker:
         return ActionSteps(self._goal)
 
     def send(self, step: FloatArray) -> bool:
-        """Publish a step as a chunk; False: no state came within ``timing.state_timeout_s``."""
+        """Publish a step as a chunk; False: no state within ``timing.max_observation_age_s``."""
         give_up_s = time.monotonic() + self._patience_s
         with self._lock:
             self._goal = step
