@@ -8,6 +8,7 @@ DEMO_EXTRAS ?= brick,sim
 ARGS ?=
 SECONDS ?= 60
 MINUTES ?= 60
+OUTPUT ?= runs/flywheel
 BIN := .venv/bin
 COMMA := ,
 READY := .venv/.ready-$(subst $(COMMA),-,$(EXTRAS))
@@ -23,7 +24,7 @@ AT_THE_END := --last-failed --last-failed-no-failures none --reruns 0 -r fEs
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-long slow fuzz fuzz-motion mutants soak test-ros2 test-franka test-rivals test-clients test-realsense test-models check format bench bench-faults bench-ros2 bench-rclpy build docs ros2-bridge ros2-environment clean
+.PHONY: help setup demo test test-long slow fuzz fuzz-motion mutants soak test-ros2 test-franka test-rivals test-clients test-realsense test-models check format bench flywheel bench-faults bench-ros2 bench-rclpy build docs ros2-bridge ros2-environment clean
 
 help: ## Show this list
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z0-9-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
@@ -110,6 +111,9 @@ format: $(READY) ## Let ruff put files into shape
 
 bench: $(READY) ## Measure camera to command on this machine
 	$(BIN)/python -m benchmarks chain $(ARGS)
+
+flywheel: $(READY) ## Meta-World's expert to a policy and its tables, hours on a CPU; OUTPUT=runs/flywheel, goes on there
+	$(BIN)/python -m benchmarks flywheel -o $(OUTPUT) $(ARGS)
 
 bench-faults: $(READY) ## Faults of a lab network on an arm in motion (root), table into docs/explanation/reliability.md
 	$(BIN)/python reliability/netns/bench_faults.py $(ARGS)

@@ -11,6 +11,7 @@ from benchmarks.codec.cli import codec
 from benchmarks.delay import delay
 from benchmarks.deployment import deployment
 from benchmarks.depth import depth
+from benchmarks.flywheel.cli import flywheel
 from benchmarks.footprint import footprint
 from benchmarks.load.cli import load
 from benchmarks.motion.cli import motion
@@ -34,6 +35,7 @@ COMMANDS = (
     delay,
     deployment,
     depth,
+    flywheel,
     footprint,
     load,
     motion,

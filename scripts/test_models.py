@@ -104,8 +104,7 @@ def main() -> int:
         verdict, why = run_model(name, asked.added, options, environ)
         verdicts[name] = verdict, why or f"in {time.monotonic() - began_s:.0f} s"
     ready = [name for name, (verdict, _) in verdicts.items() if verdict == "passed"]
-    chains = [str(TESTS / f"test_{name}_chain.py") for name in ready]
-    chains = [path for path in chains if Path(path).is_file()]
+    chains = [str(path) for name in ready for path in sorted(TESTS.glob(f"test_{name}_*.py"))]
     adapters = [] if asked.models else [str(TESTS / "test_adapters_alone.py")]
     for name, files in (("chains", chains), ("adapters", adapters)):
         if not files:
