@@ -42,7 +42,9 @@ FIRST_UNSEEN = 1000
 """Demonstrations have the seeds from 0 on."""
 BATCH = 10
 """Episodes of one call of ``lerobot-eval``, which does not resume."""
-REPLAN = 20
+CHUNK, REPLAN = 80, 20
+"""Steps that the policy plans, a second, and those of them that are carried out where it is on
+time."""
 DELAYS_MS = (0, 100, 200, 400)
 WAYS = {
     "stand": ("--mode", "live"),
@@ -53,7 +55,7 @@ POLICY = {
     "type": "act",
     "device": "cpu",
     "push_to_hub": "false",
-    "chunk_size": "80",
+    "chunk_size": str(CHUNK),
     "n_action_steps": str(REPLAN),
     "dim_model": "128",
     "dim_feedforward": "512",
@@ -123,7 +125,7 @@ class Flywheel:
             words += [f"--policy.{name}={value}" for name, value in POLICY.items()]
             words += [f"--output_dir={output}", "--env_eval_freq=0", "--batch_size=16"]
             words += ["--num_workers=1", "--log_freq=50", f"--save_freq={self.save_every}"]
-        words += [f"--steps={self.steps}", *self.train]
+        words += [f"--steps={self.steps}", *(f"--{each}" for each in self.train)]
         command = self._lerobot("lerobot-train", words)
         return {"command": command, "steps": self.steps}
 
@@ -252,7 +254,7 @@ def flywheel(
     ),
     save_every: Annotated[int, typer.Option(help="Training steps between checkpoints.")] = 500,
     train: Annotated[
-        list[str] | None, typer.Option("--train", help="More for lerobot-train; repeatable.")
+        list[str] | None, typer.Option("--train", help="name=value for lerobot-train; repeatable.")
     ] = None,
     python: Annotated[
         Path | None,
@@ -284,7 +286,7 @@ def flywheel(
     for delay_ms in waits:
         for way, words in WAYS.items():
             name = f"{way}-{delay_ms}ms"
-            more = (*words, "--delay", str(delay_ms))
+            more = (*words, "--delay", str(delay_ms), "--set", f"horizon={CHUNK}")
             plan[name] = lambda name=name, more=more: wheel.policy(name, *more)
     if until and until not in plan:
         raise typer.BadParameter(f"--until: the steps are {', '.join(plan)}")

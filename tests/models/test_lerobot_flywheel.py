@@ -25,7 +25,7 @@ SMALL = ("policy.dim_model=32", "policy.dim_feedforward=64", "policy.n_heads=2",
 
 def run(folder: Path) -> None:
     words = ["--demonstrations", str(EPISODES), "--steps", "20", "--episodes", str(EPISODES)]
-    words += [word for each in SMALL for word in ("--train", f"--{each}")]
+    words += [word for each in SMALL for word in ("--train", each)]
     command = [sys.executable, "-m", "benchmarks", "flywheel", "-o", str(folder), "--delays", ""]
     done = subprocess.run(
         [*command, *words, "--until", "cells"],
