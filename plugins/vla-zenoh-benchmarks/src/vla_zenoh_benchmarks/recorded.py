@@ -62,7 +62,7 @@ class EpisodeRecorder:
         cameras: Sequence[str],
         dt_s: float,
     ) -> None:
-        self.cameras = tuple(cameras)
+        self.cameras: Sequence[str] = tuple(cameras)
         self._path, self._part = path, path.with_suffix(".part")
         self._part.unlink(missing_ok=True)
         self._keys, self._worker, self._dt_s = profile.keys, worker, dt_s
