@@ -21,7 +21,7 @@ from vla_zenoh.errors import VlaZenohError
 from vla_zenoh.keys import worker_node
 from vla_zenoh.profile import override
 
-FIRST_TASK_S = 20.0
+FIRST_CHUNK_S = 20.0
 """A command node that is just starting has sent its task within this."""
 logger = logging.getLogger(__name__)
 
@@ -97,7 +97,7 @@ class VlaZenoh(Robot):
                     self._profile, session, self.config.worker, self._numbers.action
                 )
                 opened.callback(worker.close)
-                remote.wait_for(lambda: worker.ready, FIRST_TASK_S)
+                remote.wait_for(lambda: worker.ready, FIRST_CHUNK_S)
                 remote.set_worker(self.config.worker)
                 remote.activate_with_deadman("lerobot")
             except VlaZenohError as error:
