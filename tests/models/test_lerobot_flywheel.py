@@ -20,7 +20,13 @@ ROOT = Path(__file__).resolve().parents[2]
 EPISODES, RUN_S = 2, 500.0
 ROUNDING = 1e-6
 """Of statistics: a data set holds float32."""
-SMALL = ("policy.dim_model=32", "policy.dim_feedforward=64", "policy.n_heads=2", "batch_size=2")
+SMALL = (
+    "policy.dim_model=32",
+    "policy.dim_feedforward=64",
+    "policy.n_heads=2",
+    "batch_size=2",
+    "num_workers=0",
+)
 
 
 def run(folder: Path) -> None:
