@@ -103,7 +103,7 @@ MORE = {
     "bench task": Writer("bench task --model hold --lockstep", "out"),
 }
 """The same commands in another mode."""
-CONTINUE = ("trial", "nights", "bench sim", "delay")
+CONTINUE = ("trial", "nights", "bench sim", "delay", "flywheel")
 """Their output is filled by several calls."""
 CONTINUING = [WRITERS[name] for name in CONTINUE if name in WRITERS]
 PLAN = """\
