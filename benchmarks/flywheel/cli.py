@@ -21,7 +21,9 @@ from typing import Annotated, Any
 import typer
 
 from benchmarks.flywheel.cells import compare_cells, mean_action, statistics_differ
+from vla_zenoh.cli.options import JsonOption
 from vla_zenoh.errors import NodeError, ResourceError
+from vla_zenoh.lab.cli.output import print_json
 
 ROOT = Path(__file__).resolve().parents[2]
 REQUIREMENTS = (
@@ -85,7 +87,7 @@ class Flywheel:
         """The row of a step, which is done if there is none yet."""
         file = self.folder / "rows" / f"{name}.json"
         if not file.exists():
-            print(f"== {name}", flush=True)
+            print(f"== {name}", file=sys.stderr, flush=True)
             began_s = time.monotonic()
             found = {"step": name, **do(), "seconds": round(time.monotonic() - began_s, 1)}
             file.parent.mkdir(parents=True, exist_ok=True)
@@ -219,7 +221,10 @@ def _cells(folder: Path) -> list[dict[str, Any]]:
 
 
 def _call(command: Sequence[str], environ: dict[str, str]) -> None:
-    done = subprocess.run(command, cwd=ROOT, env={**os.environ, **environ}, check=False)
+    # Its stdout is not ours: with --json that has the rows.
+    done = subprocess.run(
+        command, cwd=ROOT, env={**os.environ, **environ}, stdout=sys.stderr, check=False
+    )
     if done.returncode:
         raise NodeError(f"{_shown(command)} ended with status {done.returncode}")
 
@@ -261,6 +266,7 @@ def flywheel(
         typer.Option(help="Interpreter of a prepared environment; default: one is made."),
     ] = None,
     until: Annotated[str, typer.Option(help="Name of the last step.")] = "",
+    as_json: JsonOption = False,
 ) -> None:
     """Train a policy on demonstrations of Meta-World's expert; measure it by LeRobot and by us."""
     folder = output.resolve()
@@ -294,7 +300,10 @@ def flywheel(
         wheel.row(name, do)
         if name == until:
             break
-    _print(wheel.rows)
+    if as_json:
+        print_json(wheel.rows)
+    else:
+        _print(wheel.rows)
 
 
 def _print(rows: dict[str, Any]) -> None:
