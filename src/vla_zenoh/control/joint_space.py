@@ -362,7 +362,10 @@ class JointPath(AxisSmoother):
                 found = self._bounds.ahead_hit(here_rad, here_rad + middle * way_rad, self._floor)
                 low, high = (low, middle) if found else (middle, high)
             end_rad = here_rad + low * way_rad
-        return self.move_to(end_rad, shares, all_to_stop=all_to_stop)
+        planned = self.move_to(end_rad, shares, all_to_stop=all_to_stop)
+        if not self.braking and not self.at_rest:  # it may get faster until the next check
+            self._brake_at(self._near_hit())
+        return planned
 
     def tick(self, part: float = 1.0) -> Motion:
         """Advance by `part` of a tick; brakes where the motion would come too near to a bound."""
@@ -414,8 +417,10 @@ class JointPath(AxisSmoother):
             way_rad = self._asked[0].known_rad - here_rad
             longest_rad = float(np.abs(way_rad).max())
             ahead_rad = way_rad * (PROBE_RAD / max(longest_rad, PROBE_RAD))
-        else:
+        elif self.braking:  # an upper bound, so that a new goal does not end the brake
             ahead_rad = stop_way(*self.state[1:], self.box, self._check_ticks * self._dt_s)
+        else:  # of the motion in progress, which may still get faster
+            ahead_rad = self.stopping_rad(self._check_ticks * self._dt_s)[-1] - here_rad
         return self._bounds.distance_hit(here_rad, here_rad + ahead_rad, self._floor)
 
     def _go_on(self) -> None:
